@@ -1,0 +1,1 @@
+//! The reference backend: many teams per instruction, rayon across blocks of teams.

@@ -1,0 +1,1 @@
+//! The GPU backend, on any adapter that wgpu reaches.

@@ -1,0 +1,121 @@
+//! The seam between training and the hardware: whole episodes of many teams.
+
+use glam::Vec2;
+
+use crate::world::World;
+
+pub mod cpu;
+pub mod gpu;
+
+/// Teams of one world that start alike and are made of one set of policies.
+#[derive(Clone, Copy, Debug)]
+pub struct Group<'a> {
+    pub world: &'a World,
+    /// Start positions `[agents]`, leaders first.
+    pub starts: &'a [Vec2],
+    /// Weights `[leaders][policies][parameters]`: 0 or of size 2^-30 to 2^20.
+    pub weights: &'a [f32],
+    /// Policies a leader has to choose from.
+    pub policies: usize,
+    /// The policy each leader plays in each team, `[teams][leaders]`.
+    pub teams: &'a [u32],
+}
+
+impl Group<'_> {
+    /// How many teams play.
+    pub fn team_count(&self) -> usize {
+        self.teams.len() / self.world.leaders()
+    }
+}
+
+/// What one team did, as far as credit needs it.
+#[derive(Clone, Copy, Debug)]
+pub struct Episode<'a> {
+    /// Index of its group in the batch, and of the team in the group.
+    pub group: usize,
+    pub team: usize,
+    /// The agents near each POI after each step, a bit an agent: `[steps][pois][words]`.
+    pub sets: Strided<'a>,
+    /// At how many steps each follower saw each leader: `[followers][leaders]`.
+    pub seen: Strided<'a>,
+}
+
+/// Words of one team among those of its neighbours: word i of this team is `words[i * stride + offset]`.
+#[derive(Clone, Copy, Debug)]
+pub struct Strided<'a> {
+    pub words: &'a [u32],
+    pub stride: usize,
+    pub offset: usize,
+}
+
+impl Strided<'_> {
+    #[inline]
+    pub fn get(&self, index: usize) -> u32 {
+        self.words[index * self.stride + self.offset]
+    }
+
+    pub fn len(&self) -> usize {
+        self.words.len() / self.stride
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// Floats that a [`Trace`] holds of one agent at one step, in this order.
+///
+/// The inputs and the outputs are a leader's, the force a follower's; who has none has zeros. So does step 0, the start.
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub struct Moment {
+    /// Sensed densities.
+    pub inputs: [f32; 8],
+    /// What the policy answered, each in -1..1.
+    pub outputs: [f32; 2],
+    /// Attraction, repulsion and wall push together.
+    pub force: [f32; 2],
+    /// State after the step.
+    pub position: [f32; 2],
+    pub heading: [f32; 2],
+    pub speed: f32,
+}
+
+/// Every stage of every step: `moments[(step * teams + team) * agents + agent]`, steps `0..=steps`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Trace {
+    pub teams: usize,
+    pub agents: usize,
+    pub moments: Vec<Moment>,
+    /// The record of the rollout, team by team: `[teams][steps][pois][words]` and `[teams][followers][leaders]`.
+    pub sets: Vec<u32>,
+    pub seen: Vec<u32>,
+}
+
+impl Trace {
+    pub fn moment(&self, step: usize, team: usize, agent: usize) -> &Moment {
+        &self.moments[(step * self.teams + team) * self.agents + agent]
+    }
+}
+
+/// Called once for each team, from any thread, in any order.
+pub type Visit<'a> = dyn Fn(Episode<'_>) + Sync + 'a;
+
+/// Plays episodes. Every implementation gives the same bits.
+pub trait Backend: Send {
+    /// Plays every team of every group once.
+    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError>;
+
+    /// Plays one group and keeps every stage of every step.
+    fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError>;
+
+    /// What it runs on, for people: "cpu (AVX2, 2 threads)".
+    fn describe(&self) -> String;
+}
+
+/// Why episodes could not be played.
+#[derive(Debug, thiserror::Error)]
+pub enum BackendError {
+    #[error("{0}")]
+    Device(String),
+}

@@ -1,0 +1,1 @@
+//! One file a command; what was typed becomes ready objects here.

@@ -1,0 +1,31 @@
+//! flotilla trains cooperative teams by coevolution, in batches, on any GPU, with the same bits on a CPU.
+//!
+//! # Follow one team from config to fitness
+//!
+//! ```text
+//! config ─▶ world ─▶ trainer ──▶ backend.rollout(teams) ──▶ credit ──▶ evolve ─┐
+//!                       ▲              │ sense ▸ policy ▸ influence ▸ follow ▸ move ▸ couple
+//!                       └──────────────┴────────────── next generation ◀───────┘
+//! ```
+//!
+//! 1. [`config`] reads a TOML file and names everything that is wrong with it.
+//! 2. [`world`] turns it into one experiment's constants and start state.
+//! 3. [`trainer`] asks [`evolve`] for teams and hands all of them, of all trials, to a [`backend`] as one batch.
+//! 4. The backend plays each team's whole episode: by [`kernels`] on the CPU, by their twins under `shaders/` on a GPU.
+//!    It reports who was near which POI at which step, and which leader each follower saw.
+//! 5. [`credit`] turns that record into G, D, Df and D++.
+//! 6. [`evolve`] selects and mutates; [`record`] writes what came out; [`report`] draws it.
+//!
+//! Imports run one way: `main ▸ cli ▸ trainer ▸ {evolve, credit, backend, record}`, `backend ▸ kernels`.
+//! Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
+
+pub mod backend;
+pub mod cli;
+pub mod config;
+pub mod credit;
+pub mod evolve;
+pub mod kernels;
+pub mod record;
+pub mod report;
+pub mod trainer;
+pub mod world;

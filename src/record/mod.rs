@@ -1,0 +1,1 @@
+//! Policies, metrics and the run folder.
