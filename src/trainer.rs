@@ -1,1 +1,361 @@
-//! (being written)
+//! The generation loop: all trials of all arms advance together, one batch a generation.
+
+use std::cell::RefCell;
+use std::ops::Range;
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
+use fearless_simd::Level;
+use glam::Vec2;
+use rayon::prelude::*;
+
+use crate::backend::{Backend, BackendError, Episode, Group};
+use crate::config::{Config, Learning};
+use crate::credit::Credit;
+use crate::evolve::{self, Key, Purpose};
+use crate::world::World;
+
+/// What one generation of one trial came to; every G is in 0..1.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Row {
+    pub arm: usize,
+    pub trial: usize,
+    pub generation: usize,
+    /// The best and the mean team of the generation.
+    pub best_g: f64,
+    pub mean_g: f64,
+    /// The team of every population's best policy.
+    pub champion_g: f64,
+}
+
+/// Trains any number of arms (one experiment each) side by side.
+pub struct Trainer {
+    arms: Vec<Arm>,
+    generation: usize,
+    level: Level,
+}
+
+/// One experiment and its trials.
+struct Arm {
+    config: Config,
+    world: World,
+    trials: Vec<Trial>,
+}
+
+/// One trial's populations and the room its generations are worked out in.
+///
+/// A population has one slot more than policies: the last holds the champion of the generation before, which plays
+/// along as one more team.
+struct Trial {
+    index: usize,
+    /// `[leaders][policies + 1][parameters]`, this generation's and the next.
+    weights: Vec<f32>,
+    children: Vec<f32>,
+    /// Policies of each team, `[policies + 1][leaders]`.
+    teams: Vec<u32>,
+    /// Start positions, `[episodes][agents]`.
+    starts: Vec<Vec<Vec2>>,
+    /// POIs observed, `[episodes][policies + 1]`, and f32 scores as bits, `[episodes][policies + 1][leaders]`.
+    observed: Vec<AtomicU32>,
+    scores: Vec<AtomicU32>,
+    /// Mean score of every policy, `[leaders][policies]`.
+    fitness: Vec<f32>,
+    /// The last generation's row, whose champion has yet to play.
+    pending: Option<Row>,
+}
+
+/// What training needs to go on from where it was: the populations about to play, and each trial's unfinished row.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Snapshot {
+    pub generation: usize,
+    /// `[arms][trials]` of weights `[leaders][policies + 1][parameters]`.
+    pub weights: Vec<Vec<Vec<f32>>>,
+    pub pending: Vec<Vec<Option<Row>>>,
+}
+
+impl Trainer {
+    /// Fresh populations for every trial of every (valid) config.
+    pub fn new(configs: Vec<Config>) -> Trainer {
+        let level = Level::new();
+        let arms = configs.into_iter().map(|config| Arm::new(config, level)).collect();
+        Trainer { arms, generation: 0, level }
+    }
+
+    /// The generation that plays next.
+    pub fn generation(&self) -> usize {
+        self.generation
+    }
+
+    /// Whether every arm has played its last generation.
+    pub fn is_done(&self) -> bool {
+        self.arms.iter().all(|arm| arm.config.learning.generations < self.generation)
+    }
+
+    /// Plays one generation of every arm that has one left, scores, selects and mutates.
+    ///
+    /// Returns the rows that became complete, by arm, trial and generation: a generation's champion plays along with
+    /// the next one, the last generation's at once.
+    ///
+    /// # Errors
+    /// When the backend fails; the trainer then still stands before this generation.
+    pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
+        let (generation, level) = (self.generation, self.level);
+        let mut playing: Vec<(usize, &mut Arm)> =
+            self.arms.iter_mut().enumerate().filter(|(_, arm)| generation <= arm.config.learning.generations).collect();
+
+        playing.par_iter_mut().for_each(|(_, arm)| arm.prepare(generation));
+        // The first generation has no champion before it.
+        play(backend, &playing, |population| 0..population + usize::from(generation > 0))?;
+        let mut rows = Vec::new();
+        for (index, arm) in &mut playing {
+            rows.extend(arm.conclude(*index, generation));
+        }
+
+        let (mut last, mut rest): (Vec<_>, Vec<_>) =
+            playing.into_iter().partition(|(_, arm)| generation == arm.config.learning.generations);
+        if !last.is_empty() {
+            play(backend, &last, |population| population..population + 1)?;
+            for (_, arm) in &mut last {
+                rows.extend(arm.finish());
+            }
+        }
+        rest.par_iter_mut().for_each(|(_, arm)| arm.breed(generation, level));
+        rows.sort_by_key(|row| (row.arm, row.trial, row.generation));
+        self.generation += 1;
+        Ok(rows)
+    }
+
+    /// The policies of the last generation played, best first in each population, one `[leaders][policies][parameters]`
+    /// a trial.
+    pub fn policies(&self, arm: usize) -> Vec<Vec<f32>> {
+        let arm = &self.arms[arm];
+        arm.trials.iter().map(|trial| arm.best_first(trial)).collect()
+    }
+
+    /// The world that an arm trains in.
+    pub fn world(&self, arm: usize) -> &World {
+        &self.arms[arm].world
+    }
+
+    /// What [`Trainer::restore`] needs.
+    pub fn snapshot(&self) -> Snapshot {
+        let each = |arm: &Arm| arm.trials.iter().map(|trial| trial.weights.clone()).collect();
+        let pending = |arm: &Arm| arm.trials.iter().map(|trial| trial.pending).collect();
+        Snapshot {
+            generation: self.generation,
+            weights: self.arms.iter().map(each).collect(),
+            pending: self.arms.iter().map(pending).collect(),
+        }
+    }
+
+    /// Goes on from a snapshot of a trainer of the same configs; false where its sizes do not fit them.
+    #[must_use]
+    pub fn restore(&mut self, snapshot: Snapshot) -> bool {
+        let fits = snapshot.weights.len() == self.arms.len()
+            && snapshot.pending.len() == self.arms.len()
+            && self.arms.iter().zip(&snapshot.weights).zip(&snapshot.pending).all(|((arm, weights), pending)| {
+                weights.len() == arm.trials.len()
+                    && pending.len() == arm.trials.len()
+                    && arm.trials.iter().zip(weights).all(|(trial, weights)| trial.weights.len() == weights.len())
+            });
+        if fits {
+            self.generation = snapshot.generation;
+            for ((arm, weights), pending) in self.arms.iter_mut().zip(snapshot.weights).zip(snapshot.pending) {
+                for ((trial, weights), pending) in arm.trials.iter_mut().zip(weights).zip(pending) {
+                    (trial.weights, trial.pending) = (weights, pending);
+                }
+            }
+        }
+        fits
+    }
+}
+
+/// Plays a range of the teams of every trial, given the population, all as one batch; keeps what they scored.
+fn play(
+    backend: &mut dyn Backend,
+    arms: &[(usize, &mut Arm)],
+    range: impl Fn(usize) -> Range<usize>,
+) -> Result<(), BackendError> {
+    thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
+    let mut groups = Vec::new();
+    let mut places = Vec::new();
+    for (_, arm) in arms {
+        let (population, leaders) = (arm.config.learning.population, arm.world.leaders());
+        let range = range(population);
+        for trial in &arm.trials {
+            let teams = &trial.teams[range.start * leaders..range.end * leaders];
+            for (episode, starts) in trial.starts.iter().enumerate() {
+                groups.push(Group {
+                    world: &arm.world,
+                    starts,
+                    weights: &trial.weights,
+                    policies: population + 1,
+                    teams,
+                });
+                places.push((&**arm, trial, episode * (population + 1) + range.start));
+            }
+        }
+    }
+    backend.rollout(&groups, &|episode: Episode<'_>| {
+        let (arm, trial, first) = places[episode.group];
+        let (team, leaders) = (first + episode.team, arm.world.leaders());
+        CREDIT.with_borrow_mut(|(credit, scores)| {
+            scores.resize(leaders, 0.0);
+            let observed = credit.score(&episode, &arm.world, arm.config.learning.fitness, scores);
+            trial.observed[team].store(observed, Relaxed);
+            for (to, score) in trial.scores[team * leaders..].iter().zip(&*scores) {
+                to.store(score.to_bits(), Relaxed);
+            }
+        });
+    })
+}
+
+impl Arm {
+    fn new(config: Config, level: Level) -> Arm {
+        let world = World::new(&config);
+        let trials = (0..config.learning.trials).into_par_iter().map(|index| Trial::new(&config, &world, index, level));
+        Arm { trials: trials.collect(), world, config }
+    }
+
+    /// Forms the teams of a generation and draws its starts.
+    fn prepare(&mut self, generation: usize) {
+        let Arm { config, world, trials } = self;
+        let Learning { seed, population, start_jitter, .. } = config.learning;
+        let leaders = world.leaders();
+        trials.par_iter_mut().for_each(|trial| {
+            let key = Key::new(seed, trial.index, Purpose::Teams);
+            evolve::form_teams(key, generation, leaders, &mut trial.teams[..population * leaders]);
+            let key = Key::new(seed, trial.index, Purpose::Starts);
+            for (episode, starts) in trial.starts.iter_mut().enumerate() {
+                evolve::jitter_starts(key, generation, episode, world, start_jitter, starts);
+            }
+        });
+    }
+
+    /// Turns what was observed into fitness and rows, and takes the champion's policies aside.
+    fn conclude(&mut self, arm: usize, generation: usize) -> Vec<Row> {
+        let Arm { config, world, trials } = self;
+        let population = config.learning.population;
+        let mut rows = Vec::with_capacity(trials.len());
+        for trial in trials {
+            let [best_g, mean_g, champion_g] = trial.summary(world.pois.len(), population);
+            rows.extend(trial.pending.map(|row| Row { champion_g, ..row }));
+            trial.pending = Some(Row { arm, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
+            trial.rate(world.leaders(), population);
+            let policies = trial.weights.par_chunks_exact_mut((population + 1) * world.parameters());
+            policies.zip(trial.fitness.par_chunks_exact(population)).for_each(|(policies, fitness)| {
+                let best = evolve::best(fitness, 1)[0] * world.parameters();
+                policies.copy_within(best..best + world.parameters(), population * world.parameters());
+            });
+        }
+        rows
+    }
+
+    /// Completes the last generation's rows, whose champions have just played.
+    fn finish(&mut self) -> Vec<Row> {
+        let (pois, population) = (self.world.pois.len(), self.config.learning.population);
+        let row = |trial: &mut Trial| {
+            let [_, _, champion_g] = trial.summary(pois, population);
+            trial.pending.take().map(|row| Row { champion_g, ..row })
+        };
+        self.trials.iter_mut().filter_map(row).collect()
+    }
+
+    /// Makes the next generation: the elites untouched, every other slot a mutated winner of a tournament.
+    fn breed(&mut self, generation: usize, level: Level) {
+        let Arm { config, world, trials } = self;
+        let Learning { seed, population, elites, .. } = config.learning;
+        let parameters = world.parameters();
+        trials.par_iter_mut().for_each(|trial| {
+            let tournaments = Key::new(seed, trial.index, Purpose::Tournament);
+            let mutations = Key::new(seed, trial.index, Purpose::Mutation);
+            let stride = (population + 1) * parameters;
+            let parents = trial.weights.par_chunks_exact(stride).zip(trial.fitness.par_chunks_exact(population));
+            let children = trial.children.par_chunks_exact_mut(stride);
+            parents.zip(children).enumerate().for_each(|(leader, ((parents, fitness), children))| {
+                let best = evolve::best(fitness, elites);
+                let policy = |index: usize| &parents[index * parameters..(index + 1) * parameters];
+                let slots = children.par_chunks_exact_mut(parameters).with_min_len(64).enumerate();
+                slots.for_each(|(slot, child)| match best.get(slot) {
+                    Some(&elite) => child.copy_from_slice(policy(elite)),
+                    None if slot == population => child.copy_from_slice(policy(population)),
+                    None => {
+                        let winner = evolve::tournament(tournaments.at(generation, leader, slot), fitness);
+                        child.copy_from_slice(policy(winner));
+                        evolve::mutate(level, mutations.at(generation, leader, slot), &config.learning, child);
+                    }
+                });
+            });
+            std::mem::swap(&mut trial.weights, &mut trial.children);
+        });
+    }
+
+    /// A trial's policies without the champion's slot, best first in each population.
+    fn best_first(&self, trial: &Trial) -> Vec<f32> {
+        let (population, parameters) = (self.config.learning.population, self.world.parameters());
+        let mut policies = Vec::with_capacity(self.world.leaders() * population * parameters);
+        let populations = trial.weights.chunks_exact((population + 1) * parameters);
+        for (weights, fitness) in populations.zip(trial.fitness.chunks_exact(population)) {
+            for index in evolve::best(fitness, population) {
+                policies.extend_from_slice(&weights[index * parameters..(index + 1) * parameters]);
+            }
+        }
+        policies
+    }
+}
+
+impl Trial {
+    fn new(config: &Config, world: &World, index: usize, level: Level) -> Trial {
+        let Learning { seed, population, episodes_per_team, .. } = config.learning;
+        let (leaders, parameters) = (world.leaders(), world.parameters());
+        let key = Key::new(seed, index, Purpose::Weights);
+        let mut weights = vec![0.0; leaders * (population + 1) * parameters];
+        weights.par_chunks_exact_mut((population + 1) * parameters).enumerate().for_each(|(leader, policies)| {
+            policies[..population * parameters]
+                .par_chunks_exact_mut(parameters)
+                .with_min_len(64)
+                .enumerate()
+                .for_each(|(slot, policy)| evolve::random_policy(level, key.at(0, leader, slot), policy));
+        });
+        let slots = episodes_per_team * (population + 1);
+        Trial {
+            index,
+            children: vec![0.0; weights.len()],
+            weights,
+            // The champion's team, the last, is made of every population's last slot.
+            teams: vec![population as u32; (population + 1) * leaders],
+            starts: vec![Vec::new(); episodes_per_team],
+            observed: std::iter::repeat_with(AtomicU32::default).take(slots).collect(),
+            scores: std::iter::repeat_with(AtomicU32::default).take(slots * leaders).collect(),
+            fitness: vec![0.0; leaders * population],
+            pending: None,
+        }
+    }
+
+    /// G of the best team, of the mean team and of the champion's team.
+    fn summary(&self, pois: usize, population: usize) -> [f64; 3] {
+        let episodes = self.starts.len();
+        let observed = |team: usize| -> u64 {
+            (0..episodes).map(|episode| u64::from(self.observed[episode * (population + 1) + team].load(Relaxed))).sum()
+        };
+        let whole = (pois * episodes) as f64;
+        let best = (0..population).map(observed).max().unwrap_or(0);
+        let total: u64 = (0..population).map(observed).sum();
+        [best as f64 / whole, total as f64 / (whole * population as f64), observed(population) as f64 / whole]
+    }
+
+    /// Hands each team's scores, averaged over its episodes, back to its policies.
+    fn rate(&mut self, leaders: usize, population: usize) {
+        let episodes = self.starts.len();
+        let Trial { teams, scores, fitness, .. } = self;
+        for (team, policies) in teams[..population * leaders].chunks_exact(leaders).enumerate() {
+            for (leader, &policy) in policies.iter().enumerate() {
+                let score = |episode: usize| {
+                    let at = (episode * (population + 1) + team) * leaders + leader;
+                    f64::from(f32::from_bits(scores[at].load(Relaxed)))
+                };
+                let total: f64 = (0..episodes).map(score).sum();
+                fitness[leader * population + policy as usize] = (total / episodes as f64) as f32;
+            }
+        }
+    }
+}

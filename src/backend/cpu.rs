@@ -1,1 +1,455 @@
-//! The reference backend: many teams per instruction, rayon across blocks of teams.
+//! The reference backend: one team a lane, one vector of teams a block, blocks shared out over threads.
+//!
+//! The loops here may skip whatever adds nothing (an agent out of reach of every lane), since sums start at +0 and
+//! keep their order; the formulas are [`crate::kernels`]'.
+
+use fearless_simd::{Level, Select, Simd, SimdMask, dispatch, prelude::*};
+use glam::Vec2;
+use rayon::prelude::*;
+
+use super::{Backend, BackendError, Episode, Group, Moment, Strided, Trace, Visit};
+use crate::kernels::{couple, follow, motion, policy, sense, splat};
+use crate::world::{Constants, INPUTS, OUTPUTS, World};
+
+/// Plays episodes on the processor, at the widest instruction set it has, on the threads of the current rayon pool.
+pub struct Cpu {
+    level: Level,
+}
+
+impl Default for Cpu {
+    fn default() -> Cpu {
+        Cpu::at_level(Level::new())
+    }
+}
+
+impl Cpu {
+    /// A backend that uses a chosen instruction set (tests compare them; benches choose one).
+    pub fn at_level(level: Level) -> Cpu {
+        Cpu { level }
+    }
+
+    /// Every instruction set that this processor has, narrowest first.
+    pub fn levels() -> Vec<Level> {
+        let best = Level::new();
+        let mut levels = vec![Level::baseline()];
+        #[cfg(target_arch = "x86_64")]
+        {
+            levels.extend(best.as_sse4_2().map(Level::Sse4_2));
+            levels.extend(best.as_avx2().map(Level::Avx2));
+            levels.extend(best.as_avx512().map(Level::Avx512));
+        }
+        if levels.iter().all(|level| level_name(*level) != level_name(best)) {
+            levels.push(best);
+        }
+        levels
+    }
+}
+
+/// What people call an instruction set.
+pub fn level_name(level: Level) -> &'static str {
+    #[cfg(target_arch = "x86_64")]
+    match level {
+        Level::Sse2(_) => return "SSE2",
+        Level::Sse4_2(_) => return "SSE4.2",
+        Level::Avx2(_) => return "AVX2",
+        Level::Avx512(_) => return "AVX-512",
+        _ => {}
+    }
+    #[cfg(target_arch = "aarch64")]
+    if level.as_neon().is_some() {
+        return "NEON";
+    }
+    let _ = level;
+    "scalar"
+}
+
+impl Backend for Cpu {
+    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
+        let level = self.level;
+        dispatch!(level, simd => rollout(simd, groups, visit));
+        Ok(())
+    }
+
+    fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
+        let level = self.level;
+        Ok(dispatch!(level, simd => trace(simd, group)))
+    }
+
+    fn describe(&self) -> String {
+        let threads = rayon::current_num_threads();
+        format!("cpu ({}, {threads} thread{})", level_name(self.level), if threads == 1 { "" } else { "s" })
+    }
+}
+
+/// Groups that follow each other in the same world: their teams may share a block.
+struct Run<'a> {
+    world: &'a World,
+    /// Index in the batch of the first group, and the groups.
+    first: usize,
+    groups: &'a [Group<'a>],
+    teams: usize,
+}
+
+impl Run<'_> {
+    /// Group (in the run) and team (in the group) of a team of the run.
+    fn locate(&self, mut team: usize) -> (usize, usize) {
+        for (index, group) in self.groups.iter().enumerate() {
+            if team < group.team_count() {
+                return (index, team);
+            }
+            team -= group.team_count();
+        }
+        unreachable!("a team of the run")
+    }
+}
+
+fn runs<'a>(groups: &'a [Group<'a>]) -> Vec<Run<'a>> {
+    let mut first = 0;
+    let mut runs = Vec::new();
+    for groups in groups.chunk_by(|a, b| std::ptr::eq(a.world, b.world)) {
+        let teams = groups.iter().map(Group::team_count).sum();
+        runs.push(Run { world: groups[0].world, first, groups, teams });
+        first += groups.len();
+    }
+    runs
+}
+
+fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
+    let width = S::f32s::LEN;
+    let runs = runs(groups);
+    let blocks: Vec<(&Run<'_>, usize)> =
+        runs.iter().flat_map(|run| (0..run.teams).step_by(width).map(move |team| (run, team))).collect();
+    blocks.par_iter().with_max_len(1).for_each_init(
+        || None,
+        |block: &mut Option<Block<S>>, &(run, first)| {
+            let block = match block {
+                Some(block) if block.world == run.world.constants => block,
+                _ => block.insert(Block::new(simd, run.world)),
+            };
+            let teams = width.min(run.teams - first);
+            block.load(run, first, teams);
+            simd.vectorize(
+                #[inline(always)]
+                || {
+                    for step in 0..run.world.steps() {
+                        block.step(run.world, step);
+                    }
+                },
+            );
+            for lane in 0..teams {
+                let (group, team) = run.locate(first + lane);
+                visit(block.episode(lane, run.first + group, team));
+            }
+        },
+    );
+}
+
+fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
+    let world = group.world;
+    let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
+    let run = Run { world, first: 0, groups: std::slice::from_ref(group), teams };
+    let mut moments = vec![bytemuck::Zeroable::zeroed(); (steps + 1) * teams * agents];
+    let (mut sets, mut seen) = (Vec::new(), Vec::new());
+    let mut block = Block::new(simd, world);
+    for first in (0..teams).step_by(S::f32s::LEN) {
+        let lanes = S::f32s::LEN.min(teams - first);
+        block.load(&run, first, lanes);
+        for step in 0..=steps {
+            if step > 0 {
+                simd.vectorize(
+                    #[inline(always)]
+                    || block.step(world, step - 1),
+                );
+            }
+            for lane in 0..lanes {
+                let at = (step * teams + first + lane) * agents;
+                block.moments(lane, step > 0, &mut moments[at..at + agents]);
+            }
+        }
+        for lane in 0..lanes {
+            let episode = block.episode(lane, 0, first + lane);
+            sets.extend((0..episode.sets.len()).map(|i| episode.sets.get(i)));
+            seen.extend((0..episode.seen.len()).map(|i| episode.seen.get(i)));
+        }
+    }
+    Trace { teams, agents, moments, sets, seen }
+}
+
+/// The state of one vector of teams, everything a lane a team. Agents are leaders first.
+struct Block<S: Simd> {
+    simd: S,
+    world: Constants,
+    x: Vec<S::f32s>,
+    y: Vec<S::f32s>,
+    hx: Vec<S::f32s>,
+    hy: Vec<S::f32s>,
+    speed: Vec<S::f32s>,
+    /// What each agent wants next: heading and speed.
+    next: Vec<[S::f32s; 3]>,
+    /// `[leaders]`, per layer and unit the input weights, then the bias.
+    weights: Vec<S::f32s>,
+    inputs: Vec<S::f32s>,
+    hidden: [Vec<S::f32s>; 2],
+    outputs: Vec<S::f32s>,
+    forces: Vec<[S::f32s; 2]>,
+    /// A bit for each pair of agents that may be in reach in some lane: `[agents][near_words]`.
+    near: Vec<u64>,
+    near_words: usize,
+    /// `[steps][pois][words][lanes]` and `[followers][leaders][lanes]`.
+    sets: Vec<u32>,
+    seen: Vec<u32>,
+    /// Index in a policy file's order of every weight of `weights`.
+    order: Vec<u32>,
+}
+
+impl<S: Simd> Block<S> {
+    fn new(simd: S, world: &World) -> Block<S> {
+        let constants = world.constants;
+        let zero = splat(simd, 0.0);
+        let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
+        let widest = constants.widths.into_iter().max().unwrap_or(0) as usize;
+        let near_words = agents.div_ceil(64);
+        let mut order = Vec::with_capacity(world.parameters());
+        let mut first = 0;
+        for layer in 0..constants.layers as usize {
+            let (rows, columns) = (constants.widths[layer] + 1, constants.widths[layer + 1]);
+            for column in 0..columns {
+                order.extend((0..rows).map(|row| first + row * columns + column));
+            }
+            first += rows * columns;
+        }
+        Block {
+            simd,
+            world: constants,
+            x: vec![zero; agents],
+            y: vec![zero; agents],
+            hx: vec![zero; agents],
+            hy: vec![zero; agents],
+            speed: vec![zero; agents],
+            next: vec![[zero; 3]; agents],
+            weights: vec![zero; leaders * world.parameters()],
+            inputs: vec![zero; leaders * INPUTS],
+            hidden: [vec![zero; widest], vec![zero; widest]],
+            outputs: vec![zero; leaders * OUTPUTS],
+            forces: vec![[zero; 2]; followers],
+            near: vec![0; agents * near_words],
+            near_words,
+            sets: vec![0; world.set_words() * S::f32s::LEN],
+            seen: vec![0; followers * leaders * S::f32s::LEN],
+            order,
+        }
+    }
+
+    /// Puts `teams` teams of the run, from `first` on, at their start; lanes left over repeat the first.
+    fn load(&mut self, run: &Run<'_>, first: usize, teams: usize) {
+        let (leaders, parameters) = (self.world.leaders as usize, self.world.parameters as usize);
+        for lane in 0..S::f32s::LEN {
+            let (group, team) = run.locate(first + if lane < teams { lane } else { 0 });
+            let group = &run.groups[group];
+            for (agent, start) in group.starts.iter().enumerate() {
+                self.x[agent][lane] = start.x;
+                self.y[agent][lane] = start.y;
+            }
+            for leader in 0..leaders {
+                let policy = group.teams[team * leaders + leader] as usize;
+                let from = (leader * group.policies + policy) * parameters;
+                let from = &group.weights[from..from + parameters];
+                let to = &mut self.weights[leader * parameters..(leader + 1) * parameters];
+                for (to, &index) in to.iter_mut().zip(&self.order) {
+                    to[lane] = from[index as usize];
+                }
+            }
+        }
+        self.hx.fill(splat(self.simd, self.world.heading_x));
+        self.hy.fill(splat(self.simd, self.world.heading_y));
+        self.speed.fill(splat(self.simd, self.world.speed));
+        self.seen.fill(0);
+    }
+
+    /// One step of all agents; every read is of the state before it.
+    #[inline(always)]
+    fn step(&mut self, world: &World, step: usize) {
+        self.find_near();
+        self.sense(&world.pois);
+        self.decide();
+        self.follow();
+        self.advance();
+        self.couple(&world.pois, step);
+    }
+
+    /// Marks the pairs of agents that one of them may sense or be drawn to, in any lane.
+    #[inline(always)]
+    fn find_near(&mut self) {
+        let (agents, leaders) = (self.x.len(), self.world.leaders as usize);
+        let (sensed, drawn) = (self.world.agent_range2, self.world.attraction_radius2);
+        self.near.fill(0);
+        for i in 0..agents {
+            let (x, y) = (self.x[i], self.y[i]);
+            for j in i + 1..agents {
+                let reach2 = match (i < leaders, j < leaders) {
+                    (true, true) => sensed,
+                    (true, false) => sensed.max(drawn),
+                    _ => drawn,
+                };
+                let dx = self.x[j] - x;
+                let dy = self.y[j] - y;
+                if (dx * dx + dy * dy).simd_le(reach2).any_true() {
+                    self.near[i * self.near_words + j / 64] |= 1 << (j % 64);
+                    self.near[j * self.near_words + i / 64] |= 1 << (i % 64);
+                }
+            }
+        }
+    }
+
+    /// Leaders sense: all POIs, then the other agents, each in ascending order.
+    #[inline(always)]
+    fn sense(&mut self, pois: &[Vec2]) {
+        let world = &self.world;
+        for leader in 0..world.leaders as usize {
+            let (x, y, hx, hy) = (self.x[leader], self.y[leader], self.hx[leader], self.hy[leader]);
+            let mut sums = [splat(self.simd, 0.0); 4];
+            for poi in pois {
+                let dx = splat(self.simd, poi.x) - x;
+                let dy = splat(self.simd, poi.y) - y;
+                sense::sense::<S>(world, world.poi_range2, dx, dy, hx, hy, &mut sums);
+            }
+            let inputs = &mut self.inputs[leader * INPUTS..(leader + 1) * INPUTS];
+            for (input, sum) in inputs.iter_mut().zip(sums) {
+                *input = sum * world.poi_share;
+            }
+            let mut sums = [splat(self.simd, 0.0); 4];
+            for agent in bits(&self.near[leader * self.near_words..(leader + 1) * self.near_words]) {
+                let dx = self.x[agent] - x;
+                let dy = self.y[agent] - y;
+                sense::sense::<S>(world, world.agent_range2, dx, dy, hx, hy, &mut sums);
+            }
+            for (input, sum) in inputs[4..].iter_mut().zip(sums) {
+                *input = sum * world.agent_share;
+            }
+        }
+    }
+
+    /// Leaders decide where to turn and how fast to go.
+    #[inline(always)]
+    fn decide(&mut self) {
+        let world = &self.world;
+        let parameters = world.parameters as usize;
+        for leader in 0..world.leaders as usize {
+            let mut weights = &self.weights[leader * parameters..(leader + 1) * parameters];
+            let [mut from, mut to] = self.hidden.each_mut().map(|hidden| &mut hidden[..]);
+            from[..INPUTS].copy_from_slice(&self.inputs[leader * INPUTS..(leader + 1) * INPUTS]);
+            for layer in 0..world.layers as usize {
+                let (inputs, units) = (world.widths[layer] as usize, world.widths[layer + 1] as usize);
+                for (unit, weights) in to[..units].iter_mut().zip(weights.chunks_exact(inputs + 1)) {
+                    *unit = policy::weigh::<S>(&from[..inputs], weights);
+                }
+                for unit in &mut to[..units] {
+                    *unit = policy::activate::<S>(*unit);
+                }
+                weights = &weights[(inputs + 1) * units..];
+                std::mem::swap(&mut from, &mut to);
+            }
+            self.outputs[leader * OUTPUTS..(leader + 1) * OUTPUTS].copy_from_slice(&from[..OUTPUTS]);
+            let turn = policy::wanted_turn::<S>(from[0]);
+            let (hx, hy) = motion::turn::<S>(world, self.hx[leader], self.hy[leader], turn);
+            self.next[leader] = [hx, hy, policy::wanted_speed::<S>(from[1], world.max_speed)];
+        }
+    }
+
+    /// Followers count the leaders they see and follow whoever is near.
+    #[inline(always)]
+    fn follow(&mut self) {
+        let world = &self.world;
+        let (leaders, lanes) = (world.leaders as usize, S::f32s::LEN);
+        for follower in 0..world.followers as usize {
+            let agent = leaders + follower;
+            let (x, y, hx, hy) = (self.x[agent], self.y[agent], self.hx[agent], self.hy[agent]);
+            let mut sums = follow::Sums::new(self.simd);
+            for other in bits(&self.near[agent * self.near_words..(agent + 1) * self.near_words]) {
+                let dx = self.x[other] - x;
+                let dy = self.y[other] - y;
+                let seen = follow::influence::<S>(world, dx, dy, &mut sums);
+                if other < leaders {
+                    let counts = &mut self.seen[(follower * leaders + other) * lanes..][..lanes];
+                    let count = S::u32s::from_slice(self.simd, counts);
+                    seen.select(count + 1, count).store_slice(counts);
+                }
+            }
+            let (force_x, force_y) = follow::force::<S>(world, &sums, x, y);
+            let influenced = (sums.repel_count + sums.attract_count).simd_gt(0.0)
+                | follow::wall_near::<S>(world, x, world.map_x)
+                | follow::wall_near::<S>(world, y, world.map_y);
+            self.forces[follower] = [force_x, force_y];
+            let (hx, hy, wanted) = follow::steer::<S>(world, force_x, force_y, influenced, hx, hy, self.speed[agent]);
+            self.next[agent] = [hx, hy, wanted];
+        }
+    }
+
+    /// Everyone moves.
+    #[inline(always)]
+    fn advance(&mut self) {
+        let world = &self.world;
+        for (agent, &[hx, hy, wanted]) in self.next.iter().enumerate() {
+            let (hx, hy) = motion::straighten::<S>(hx, hy);
+            let speed = motion::accelerate::<S>(world, self.speed[agent], wanted);
+            let step = speed * world.dt;
+            self.x[agent] = motion::advance::<S>(self.x[agent], step, hx, world.map_x);
+            self.y[agent] = motion::advance::<S>(self.y[agent], step, hy, world.map_y);
+            self.hx[agent] = hx;
+            self.hy[agent] = hy;
+            self.speed[agent] = speed;
+        }
+    }
+
+    /// Records who is near each POI.
+    #[inline(always)]
+    fn couple(&mut self, pois: &[Vec2], step: usize) {
+        let world = &self.world;
+        let (words, lanes) = (world.words as usize, S::f32s::LEN);
+        let zero = S::u32s::simd_from(self.simd, 0);
+        for (index, poi) in pois.iter().enumerate() {
+            let (x, y) = (splat(self.simd, poi.x), splat(self.simd, poi.y));
+            for word in 0..words {
+                let mut set = zero;
+                let agents = word * 32..self.x.len().min(word * 32 + 32);
+                for (bit, agent) in agents.enumerate() {
+                    let near = couple::observes::<S>(world, x - self.x[agent], y - self.y[agent]);
+                    set |= near.select(S::u32s::simd_from(self.simd, 1 << bit), zero);
+                }
+                let at = ((step * pois.len() + index) * words + word) * lanes;
+                set.store_slice(&mut self.sets[at..at + lanes]);
+            }
+        }
+    }
+
+    /// One lane's record.
+    fn episode(&self, lane: usize, group: usize, team: usize) -> Episode<'_> {
+        let strided = |words| Strided { words, stride: S::f32s::LEN, offset: lane };
+        Episode { group, team, sets: strided(&self.sets), seen: strided(&self.seen) }
+    }
+
+    /// One lane's agents as they stand; before the first step nothing has been sensed yet.
+    fn moments(&self, lane: usize, sensed: bool, moments: &mut [Moment]) {
+        let leaders = self.world.leaders as usize;
+        for (agent, moment) in moments.iter_mut().enumerate() {
+            if sensed && agent < leaders {
+                moment.inputs = std::array::from_fn(|i| self.inputs[agent * INPUTS + i][lane]);
+                moment.outputs = std::array::from_fn(|i| self.outputs[agent * OUTPUTS + i][lane]);
+            } else if sensed {
+                moment.force = self.forces[agent - leaders].map(|component| component[lane]);
+            }
+            moment.position = [self.x[agent][lane], self.y[agent][lane]];
+            moment.heading = [self.hx[agent][lane], self.hy[agent][lane]];
+            moment.speed = self.speed[agent][lane];
+        }
+    }
+}
+
+/// The indices of set bits, ascending.
+#[inline(always)]
+fn bits(words: &[u64]) -> impl Iterator<Item = usize> {
+    words.iter().enumerate().flat_map(|(index, &word)| {
+        std::iter::successors((word != 0).then_some(word), |word| Some(word & (word - 1)).filter(|&rest| rest != 0))
+            .map(move |word| index * 64 + word.trailing_zeros() as usize)
+    })
+}

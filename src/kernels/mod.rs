@@ -4,4 +4,30 @@
 //! select, abs, floor and integer operations are used, each correctly rounded everywhere, so lane width, processor
 //! and GPU cannot show in the bits.
 
+use fearless_simd::{Select, Simd, prelude::*};
+
+pub mod couple;
+pub mod follow;
 pub mod math;
+pub mod motion;
+pub mod policy;
+pub mod sense;
+
+/// `if_true` in the lanes where `condition` holds, `if_false` elsewhere, in WGSL's order of arguments.
+#[inline(always)]
+pub fn select<S: Simd>(if_false: S::f32s, if_true: S::f32s, condition: S::mask32s) -> S::f32s {
+    condition.select(if_true, if_false)
+}
+
+/// The same number in every lane.
+#[inline(always)]
+pub fn splat<S: Simd>(simd: S, value: f32) -> S::f32s {
+    S::f32s::simd_from(simd, value)
+}
+
+/// `x` moved into `low..=high`.
+#[inline(always)]
+pub fn bound<S: Simd>(x: S::f32s, low: S::f32s, high: S::f32s) -> S::f32s {
+    let raised = select::<S>(x, low, x.simd_lt(low));
+    select::<S>(raised, high, raised.simd_gt(high))
+}

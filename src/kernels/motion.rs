@@ -1,0 +1,59 @@
+//! How agents move: a proportional controller within the limits of turn, acceleration and speed (Section 3.1).
+
+use fearless_simd::{Simd, prelude::*};
+
+use super::{
+    bound,
+    math::{flush, sin_cos},
+    splat,
+};
+use crate::world::Constants;
+
+/// Heading components under this size (2^-30) count as 0.
+pub const TINY: f32 = 9.313_225_7e-10;
+/// Positions lie on a grid of 2^-18: their differences are exact and their squares far from denormal.
+pub const GRID: f32 = 262_144.0;
+
+/// The heading turned by the angle of this cosine and sine, to the left.
+#[inline(always)]
+pub fn rotate<S: Simd>(hx: S::f32s, hy: S::f32s, cosine: S::f32s, sine: S::f32s) -> (S::f32s, S::f32s) {
+    (hx * cosine - hy * sine, hx * sine + hy * cosine)
+}
+
+/// The heading turned by a wanted angle (radians, to the left), as far as one step allows.
+#[inline(always)]
+pub fn turn<S: Simd>(world: &Constants, hx: S::f32s, hy: S::f32s, wanted: S::f32s) -> (S::f32s, S::f32s) {
+    let simd = hx.token();
+    let angle = bound::<S>(wanted, splat(simd, -world.max_turn), splat(simd, world.max_turn));
+    let (sine, cosine) = sin_cos::<S>(angle);
+    rotate::<S>(hx, hy, cosine, sine)
+}
+
+/// The heading scaled back to length 1, by one Newton step: turning lets it drift by a rounding.
+#[inline(always)]
+pub fn straighten<S: Simd>(hx: S::f32s, hy: S::f32s) -> (S::f32s, S::f32s) {
+    let scale = splat(hx.token(), 1.5) - (hx * hx + hy * hy) * 0.5;
+    (flush::<S>(hx * scale, TINY), flush::<S>(hy * scale, TINY))
+}
+
+/// The speed brought towards the wanted one, as far as one step and the limits allow.
+#[inline(always)]
+pub fn accelerate<S: Simd>(world: &Constants, speed: S::f32s, wanted: S::f32s) -> S::f32s {
+    let simd = speed.token();
+    let limit = world.max_speed_change;
+    let change = bound::<S>(wanted - speed, splat(simd, -limit), splat(simd, limit));
+    bound::<S>(speed + change, splat(simd, world.min_speed), splat(simd, world.max_speed))
+}
+
+/// One coordinate after a step along the new heading, on the map and on the grid.
+#[inline(always)]
+pub fn advance<S: Simd>(at: S::f32s, step: S::f32s, heading: S::f32s, size: f32) -> S::f32s {
+    let simd = at.token();
+    bound::<S>(snap::<S>(at + step * heading), splat(simd, 0.0), splat(simd, size))
+}
+
+/// The nearest place on the grid.
+#[inline(always)]
+pub fn snap<S: Simd>(at: S::f32s) -> S::f32s {
+    (at * GRID + 0.5).floor() * (1.0 / GRID)
+}

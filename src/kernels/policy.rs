@@ -1,0 +1,37 @@
+//! A leader's policy: a fully connected network with a bias and tanh in every layer (Sections 2.4 and 3.1).
+
+use fearless_simd::{Simd, prelude::*};
+
+use super::{math, splat};
+
+/// One unit before its tanh: the bias (the last of `weights`) and the weighted inputs, added in order.
+#[inline(always)]
+pub fn weigh<S: Simd>(inputs: &[S::f32s], weights: &[S::f32s]) -> S::f32s {
+    let (bias, weights) = weights.split_last().expect("a unit has a bias");
+    let mut sum = *bias;
+    for (&input, &weight) in inputs.iter().zip(weights) {
+        sum += input * weight;
+    }
+    sum
+}
+
+/// The unit's activation; sums too small to matter become 0, which keeps the next layer away from denormals.
+#[inline(always)]
+pub fn activate<S: Simd>(sum: S::f32s) -> S::f32s {
+    math::tanh::<S>(math::flush::<S>(sum, TINY))
+}
+
+/// Sums under this size (2^-30) count as 0.
+pub const TINY: f32 = 9.313_225_7e-10;
+
+/// The wanted turn, in radians to the left, of the policy's first output in -1..1.
+#[inline(always)]
+pub fn wanted_turn<S: Simd>(output: S::f32s) -> S::f32s {
+    output * std::f32::consts::PI
+}
+
+/// The wanted speed of the policy's second output in -1..1.
+#[inline(always)]
+pub fn wanted_speed<S: Simd>(output: S::f32s, max_speed: f32) -> S::f32s {
+    (output + 1.0) * 0.5 * splat(output.token(), max_speed)
+}
