@@ -1,1 +1,284 @@
 //! Structural credit assignment: what each leader was worth to its team, from the record of one episode.
+//!
+//! Every fitness is a share of the world's P POIs, so it is counted in whole POIs and divided once. Nothing is
+//! simulated again: who stood near a POI at which step says what would have been observed without a leader, without
+//! its whole group, or with more of it.
+
+use crate::backend::{Episode, Strided};
+use crate::config::Fitness;
+use crate::world::World;
+
+/// Owner of an agent that belongs to no group.
+const NOBODY: u32 = u32::MAX;
+
+/// Every fitness of one team; the differences are `[leaders]`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Scores {
+    /// POIs that at some step had as many agents near as they need.
+    pub observed: u32,
+    /// Observed POIs over P, the same for every leader (paper, Equation 1).
+    pub g: f32,
+    /// G less G without the leader (paper, Equation 5; "leader trajectory removal").
+    pub d: Vec<f32>,
+    /// G less G without the leader and its followers (paper, section 4.2; "leader-follower trajectory assignment").
+    pub df: Vec<f32>,
+    /// D, or what copies of the leader would add, each its share (Rahmattalabi et al., the paper's [12]).
+    pub dpp: Vec<f32>,
+}
+
+/// Scratch for scoring one episode after another without allocating; one a thread.
+#[derive(Clone, Debug, Default)]
+pub struct Credit {
+    /// Was the POI observed? `[pois]`
+    observed: Vec<bool>,
+    /// The agents without any one of whom (D), or of whose groups (Df), an observed POI is lost: `[pois][words]`.
+    critical: Vec<u32>,
+    /// POIs lost without the leader, `[leaders]`.
+    lost: Vec<u32>,
+    /// The leader in whose group an agent is, itself for a leader, or [`NOBODY`]: `[agents]`.
+    owner: Vec<u32>,
+    /// Members of each leader's group in one set (zero between sets), `[leaders]`.
+    members: Vec<u32>,
+    /// The leaders whose groups one set cannot spare, `[words]`.
+    needed: Vec<u32>,
+    /// Most agents near the POI at a step with the leader among them, `[pois][leaders]`.
+    company: Vec<u32>,
+    /// Unobserved POIs that a number of copies of one leader would just complete, `[copies]`.
+    completed: Vec<u32>,
+    /// One set, `[words]`.
+    set: Vec<u32>,
+}
+
+impl Credit {
+    /// Scores every leader of the team by `fitness` into `scores`, `[leaders]`, and returns how many POIs the team
+    /// observed. The episode must be one of `world`.
+    pub fn score(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
+        self.observed.clear();
+        self.observed.resize(world.pois.len(), false);
+        match fitness {
+            Fitness::G => self.observe(episode, world),
+            Fitness::Df if world.followers() > 0 => self.lose_groups(episode, world),
+            Fitness::D | Fitness::Df => self.lose_leaders(episode, world),
+            Fitness::Dpp => self.add_copies(episode, world),
+        }
+        let observed = self.observed.iter().filter(|&&observed| observed).count() as u32;
+        let pois = world.pois.len();
+        match fitness {
+            Fitness::G => scores.fill(share(observed, pois)),
+            Fitness::D | Fitness::Df => {
+                self.count_lost(world);
+                scores.iter_mut().zip(&self.lost).for_each(|(score, &lost)| *score = share(lost, pois));
+            }
+            Fitness::Dpp => {
+                self.count_lost(world);
+                for (leader, score) in scores.iter_mut().enumerate().take(world.leaders()) {
+                    *score = self.stepping_stone(world, leader);
+                }
+            }
+        }
+        observed
+    }
+
+    /// Every fitness of every leader. The episode must be one of `world`.
+    pub fn all(&mut self, episode: &Episode<'_>, world: &World) -> Scores {
+        let leaders = world.leaders();
+        let mut by = |fitness| {
+            let mut scores = vec![0.0; leaders];
+            let observed = self.score(episode, world, fitness, &mut scores);
+            (observed, scores)
+        };
+        let ((observed, d), (_, df), (_, dpp)) = (by(Fitness::D), by(Fitness::Df), by(Fitness::Dpp));
+        Scores { observed, g: share(observed, world.pois.len()), d, df, dpp }
+    }
+
+    /// Which POIs were observed.
+    fn observe(&mut self, episode: &Episode<'_>, world: &World) {
+        let Credit { observed, set, .. } = self;
+        each_set(&episode.sets, world, set, |poi, size, _| observed[poi] |= size >= world.coupling[poi]);
+    }
+
+    /// A POI is lost without an agent who was in every set that was large enough, each without one to spare.
+    fn lose_leaders(&mut self, episode: &Episode<'_>, world: &World) {
+        self.all_critical(world);
+        let Credit { observed, critical, set, .. } = self;
+        each_set(&episode.sets, world, set, |poi, size, set| {
+            if size >= world.coupling[poi] {
+                observed[poi] = true;
+                let critical = &mut critical[poi * set.len()..][..set.len()];
+                narrow(critical, set, size == world.coupling[poi]);
+            }
+        });
+    }
+
+    /// A POI is lost without a group of whom every set that was large enough had more members than agents to spare.
+    fn lose_groups(&mut self, episode: &Episode<'_>, world: &World) {
+        self.all_critical(world);
+        self.members.clear();
+        self.members.resize(world.leaders(), 0);
+        self.needed.resize(world.constants.words as usize, 0);
+        let Credit { observed, critical, owner, members, needed, set, .. } = self;
+        owner.clear();
+        each_set(&episode.sets, world, set, |poi, size, set| {
+            if size < world.coupling[poi] {
+                return;
+            }
+            let critical = &mut critical[poi * set.len()..][..set.len()];
+            if observed[poi] && critical.iter().all(|&word| word == 0) {
+                return;
+            }
+            observed[poi] = true;
+            if owner.is_empty() {
+                assign(&episode.seen, world, owner);
+            }
+            let spare = size - world.coupling[poi];
+            needed.fill(0);
+            for agent in bits(set) {
+                let leader = owner[agent] as usize;
+                if let Some(count) = members.get_mut(leader) {
+                    *count += 1;
+                    if *count == spare + 1 {
+                        needed[leader / 32] |= 1 << (leader % 32);
+                    }
+                }
+            }
+            narrow(critical, needed, true);
+            for agent in bits(set) {
+                if let Some(count) = members.get_mut(owner[agent] as usize) {
+                    *count = 0;
+                }
+            }
+        });
+    }
+
+    /// What [`Credit::lose_leaders`] finds, and how close each leader came to every other POI.
+    fn add_copies(&mut self, episode: &Episode<'_>, world: &World) {
+        self.all_critical(world);
+        let leaders = world.leaders();
+        self.company.clear();
+        self.company.resize(world.pois.len() * leaders, 0);
+        let Credit { observed, critical, company, set, .. } = self;
+        each_set(&episode.sets, world, set, |poi, size, set| {
+            if size >= world.coupling[poi] {
+                observed[poi] = true;
+                let critical = &mut critical[poi * set.len()..][..set.len()];
+                narrow(critical, set, size == world.coupling[poi]);
+            } else if !observed[poi] {
+                for leader in bits(set).take_while(|&agent| agent < leaders) {
+                    let most = &mut company[poi * leaders + leader];
+                    *most = size.max(*most);
+                }
+            }
+        });
+    }
+
+    /// D++ of one leader. With `D++(n) = (POIs that n copies complete) / n`: D if it is at least D++(C), C being the
+    /// largest coupling of the world, else the first D++(n), n = 1, 2, …, that D++(n + 1) does not better.
+    fn stepping_stone(&mut self, world: &World, leader: usize) -> f32 {
+        let most = world.coupling.iter().copied().max().unwrap_or(0) as usize;
+        self.completed.clear();
+        self.completed.resize(most + 1, 0);
+        let mut at_most = 0u32;
+        for (poi, &coupling) in world.coupling.iter().enumerate() {
+            let company = self.company[poi * world.leaders() + leader];
+            if !self.observed[poi] && company > 0 {
+                self.completed[(coupling - company) as usize] += 1;
+                at_most += 1;
+            }
+        }
+        // Copies needed are under C, so C copies complete all that any number would.
+        let (lost, pois) = (self.lost[leader], world.pois.len());
+        if u64::from(lost) * most as u64 >= u64::from(at_most) {
+            return share(lost, pois);
+        }
+        let mut gain = self.completed[1];
+        for copies in 1..most {
+            let next = gain + self.completed[copies + 1];
+            if u64::from(next) * copies as u64 <= u64::from(gain) * (copies as u64 + 1) {
+                return share(gain, pois * copies);
+            }
+            gain = next;
+        }
+        share(gain, pois * most)
+    }
+
+    /// Before any large enough set, anyone may be critical.
+    fn all_critical(&mut self, world: &World) {
+        self.critical.clear();
+        self.critical.resize(world.pois.len() * world.constants.words as usize, u32::MAX);
+    }
+
+    /// Counts the observed POIs to which each leader was critical.
+    fn count_lost(&mut self, world: &World) {
+        let (leaders, words) = (world.leaders(), world.constants.words as usize);
+        self.lost.clear();
+        self.lost.resize(leaders, 0);
+        for (critical, _) in self.critical.chunks_exact(words).zip(&self.observed).filter(|&(_, &observed)| observed) {
+            bits(critical).take_while(|&agent| agent < leaders).for_each(|leader| self.lost[leader] += 1);
+        }
+    }
+}
+
+/// A count over a count, both exact in f32.
+fn share(count: u32, of: usize) -> f32 {
+    count as f32 / of as f32
+}
+
+/// Calls `visit(poi, size, set)` in order of steps for every set that has agents and is not that POI's set of the
+/// step before: repetition changes no fitness.
+#[inline(always)]
+fn each_set(sets: &Strided<'_>, world: &World, set: &mut Vec<u32>, mut visit: impl FnMut(usize, u32, &[u32])) {
+    let (pois, words) = (world.pois.len(), world.constants.words as usize);
+    if words == 1 {
+        let mut record = sets.words.iter().skip(sets.offset).step_by(sets.stride);
+        let before = sets.words.iter().skip(sets.offset).step_by(sets.stride);
+        let mut before = std::iter::repeat_n(&0, pois).chain(before);
+        for _ in 0..world.steps() {
+            for (poi, (&word, &before)) in record.by_ref().zip(before.by_ref()).take(pois).enumerate() {
+                if word != 0 && word != before {
+                    visit(poi, word.count_ones(), &[word]);
+                }
+            }
+        }
+        return;
+    }
+    for index in 0..world.steps() * pois {
+        let word = |index: usize, word| sets.get(index * words + word);
+        set.clear();
+        set.extend((0..words).map(|w| word(index, w)));
+        let size = set.iter().map(|word| word.count_ones()).sum();
+        if size > 0 && (index < pois || set.iter().enumerate().any(|(w, &now)| now != word(index - pois, w))) {
+            visit(index % pois, size, set);
+        }
+    }
+}
+
+/// Gives each follower to the leader it saw at most steps, ties to the lower index, or to nobody if it saw none.
+fn assign(seen: &Strided<'_>, world: &World, owner: &mut Vec<u32>) {
+    let leaders = world.constants.leaders;
+    owner.clear();
+    owner.extend(0..leaders);
+    owner.extend((0..world.followers()).map(|follower| {
+        let (mut most, mut best) = (0, NOBODY);
+        for leader in 0..leaders {
+            let steps = seen.get(follower * leaders as usize + leader as usize);
+            if steps > most {
+                (most, best) = (steps, leader);
+            }
+        }
+        best
+    }));
+}
+
+/// Leaves the agents of `critical` that are in `set`, if any of that set was needed, or none.
+fn narrow(critical: &mut [u32], set: &[u32], needed: bool) {
+    critical.iter_mut().zip(set).for_each(|(word, set)| *word &= if needed { *set } else { 0 });
+}
+
+/// The agents of a set, in ascending order.
+fn bits(set: &[u32]) -> impl Iterator<Item = usize> {
+    set.iter().enumerate().flat_map(|(index, &word)| {
+        std::iter::successors(Some(word), |word| Some(word & word.wrapping_sub(1)))
+            .take_while(|&word| word != 0)
+            .map(move |word| index * 32 + word.trailing_zeros() as usize)
+    })
+}
