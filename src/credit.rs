@@ -229,12 +229,11 @@ fn share(count: u32, of: usize) -> f32 {
 fn each_set(sets: &Strided<'_>, world: &World, set: &mut Vec<u32>, mut visit: impl FnMut(usize, u32, &[u32])) {
     let (pois, words) = (world.pois.len(), world.constants.words as usize);
     if words == 1 {
-        let mut record = sets.words.iter().skip(sets.offset).step_by(sets.stride);
-        let before = sets.words.iter().skip(sets.offset).step_by(sets.stride);
-        let mut before = std::iter::repeat_n(&0, pois).chain(before);
-        for _ in 0..world.steps() {
-            for (poi, (&word, &before)) in record.by_ref().zip(before.by_ref()).take(pois).enumerate() {
-                if word != 0 && word != before {
+        for step in 0..world.steps() {
+            for poi in 0..pois {
+                let index = step * pois + poi;
+                let word = sets.get(index);
+                if word != 0 && (step == 0 || word != sets.get(index - pois)) {
                     visit(poi, word.count_ones(), &[word]);
                 }
             }
