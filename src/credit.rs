@@ -105,7 +105,7 @@ impl Credit {
             if size >= world.coupling[poi] {
                 observed[poi] = true;
                 let critical = &mut critical[poi * set.len()..][..set.len()];
-                if size == world.coupling[poi] { intersect(critical, set) } else { critical.fill(0) }
+                narrow(critical, set, size == world.coupling[poi]);
             }
         });
     }
@@ -141,7 +141,7 @@ impl Credit {
                     }
                 }
             }
-            intersect(critical, needed);
+            narrow(critical, needed, true);
             for agent in bits(set) {
                 if let Some(count) = members.get_mut(owner[agent] as usize) {
                     *count = 0;
@@ -161,7 +161,7 @@ impl Credit {
             if size >= world.coupling[poi] {
                 observed[poi] = true;
                 let critical = &mut critical[poi * set.len()..][..set.len()];
-                if size == world.coupling[poi] { intersect(critical, set) } else { critical.fill(0) }
+                narrow(critical, set, size == world.coupling[poi]);
             } else if !observed[poi] {
                 for leader in bits(set).take_while(|&agent| agent < leaders) {
                     let most = &mut company[poi * leaders + leader];
@@ -177,7 +177,7 @@ impl Credit {
         let most = world.coupling.iter().copied().max().unwrap_or(0) as usize;
         self.completed.clear();
         self.completed.resize(most + 1, 0);
-        let mut at_most = 0;
+        let mut at_most = 0u32;
         for (poi, &coupling) in world.coupling.iter().enumerate() {
             let company = self.company[poi * world.leaders() + leader];
             if !self.observed[poi] && company > 0 {
@@ -187,7 +187,7 @@ impl Credit {
         }
         // Copies needed are under C, so C copies complete all that any number would.
         let (lost, pois) = (self.lost[leader], world.pois.len());
-        if u64::from(lost) * most as u64 >= at_most as u64 {
+        if u64::from(lost) * most as u64 >= u64::from(at_most) {
             return share(lost, pois);
         }
         let mut gain = self.completed[1];
@@ -229,12 +229,11 @@ fn share(count: u32, of: usize) -> f32 {
 fn each_set(sets: &Strided<'_>, world: &World, set: &mut Vec<u32>, mut visit: impl FnMut(usize, u32, &[u32])) {
     let (pois, words) = (world.pois.len(), world.constants.words as usize);
     if words == 1 {
-        let mut record = sets.words.iter().skip(sets.offset).step_by(sets.stride);
-        let before = sets.words.iter().skip(sets.offset).step_by(sets.stride);
-        let mut before = std::iter::repeat_n(&0, pois).chain(before);
-        for _ in 0..world.steps() {
-            for (poi, (&word, &before)) in record.by_ref().zip(before.by_ref()).take(pois).enumerate() {
-                if word != 0 && word != before {
+        for step in 0..world.steps() {
+            for poi in 0..pois {
+                let index = step * pois + poi;
+                let word = sets.get(index);
+                if word != 0 && (step == 0 || word != sets.get(index - pois)) {
                     visit(poi, word.count_ones(), &[word]);
                 }
             }
@@ -269,8 +268,9 @@ fn assign(seen: &Strided<'_>, world: &World, owner: &mut Vec<u32>) {
     }));
 }
 
-fn intersect(set: &mut [u32], with: &[u32]) {
-    set.iter_mut().zip(with).for_each(|(word, with)| *word &= with);
+/// Leaves the agents of `critical` that are in `set`, if any of that set was needed, or none.
+fn narrow(critical: &mut [u32], set: &[u32], needed: bool) {
+    critical.iter_mut().zip(set).for_each(|(word, set)| *word &= if needed { *set } else { 0 });
 }
 
 /// The agents of a set, in ascending order.

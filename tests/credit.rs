@@ -1,0 +1,261 @@
+//! Credit against its definition: the record is edited (agents taken out, copies added) and G counted anew.
+
+use flotilla::backend::{Episode, Strided};
+use flotilla::config::Fitness;
+use flotilla::credit::{Credit, Scores};
+use flotilla::world::{Constants, World};
+use glam::Vec2;
+use rand::rngs::ChaCha8Rng;
+use rand::{RngExt, SeedableRng};
+
+/// One team's record, sets as lists of agents: `near[step][poi]`, and `seen[follower][leader]`.
+struct Record {
+    leaders: usize,
+    followers: usize,
+    coupling: Vec<u32>,
+    near: Vec<Vec<Vec<usize>>>,
+    seen: Vec<Vec<u32>>,
+}
+
+impl Record {
+    fn world(&self) -> World {
+        let agents = self.leaders + self.followers;
+        World {
+            constants: Constants {
+                leaders: self.leaders as u32,
+                followers: self.followers as u32,
+                pois: self.coupling.len() as u32,
+                steps: self.near.len() as u32,
+                words: agents.div_ceil(32) as u32,
+                ..bytemuck::Zeroable::zeroed()
+            },
+            starts: vec![Vec2::ZERO; agents],
+            pois: vec![Vec2::ZERO; self.coupling.len()],
+            coupling: self.coupling.clone(),
+        }
+    }
+
+    /// The record as a backend lays it out, among neighbours whose words are noise.
+    fn words(&self, stride: usize, offset: usize, rng: &mut ChaCha8Rng) -> (Vec<u32>, Vec<u32>) {
+        let words = (self.leaders + self.followers).div_ceil(32);
+        let pois = self.coupling.len();
+        let mut sets: Vec<u32> = (0..self.near.len() * pois * words * stride).map(|_| rng.random()).collect();
+        for (index, set) in self.near.iter().flatten().enumerate() {
+            for word in 0..words {
+                let bits = set.iter().filter(|&&agent| agent / 32 == word).map(|agent| 1 << (agent % 32)).sum();
+                sets[(index * words + word) * stride + offset] = bits;
+            }
+        }
+        let mut seen: Vec<u32> = (0..self.followers * self.leaders * stride).map(|_| rng.random()).collect();
+        for (index, &steps) in self.seen.iter().flatten().enumerate() {
+            seen[index * stride + offset] = steps;
+        }
+        (sets, seen)
+    }
+
+    /// Observed POIs if each agent counted as many times as `weight` says.
+    fn observed(&self, weight: impl Fn(usize) -> u32) -> u32 {
+        let enough = |poi: usize| {
+            let total = |sets: &Vec<Vec<usize>>| sets[poi].iter().map(|&agent| weight(agent)).sum::<u32>();
+            self.near.iter().any(|sets| total(sets) >= self.coupling[poi])
+        };
+        (0..self.coupling.len()).filter(|&poi| enough(poi)).count() as u32
+    }
+
+    /// The leader a follower belongs to.
+    fn owner(&self, agent: usize) -> Option<usize> {
+        if agent < self.leaders {
+            return Some(agent);
+        }
+        let seen = &self.seen[agent - self.leaders];
+        let most = *seen.iter().max()?;
+        (most > 0).then(|| seen.iter().position(|&steps| steps == most).unwrap())
+    }
+
+    fn scores(&self) -> Scores {
+        let share = |count: u32, of: u32| count as f32 / of as f32;
+        let pois = self.coupling.len() as u32;
+        let observed = self.observed(|_| 1);
+        let owners: Vec<_> = (0..self.leaders + self.followers).map(|agent| self.owner(agent)).collect();
+        let without = |leader| observed - self.observed(|agent| (agent != leader) as u32);
+        let without_group = |leader| observed - self.observed(|agent| (owners[agent] != Some(leader)) as u32);
+        let gain = |leader, copies| self.observed(|agent| 1 + if agent == leader { copies } else { 0 }) - observed;
+        // a/b is bettered by c/d
+        let bettered =
+            |(a, b): (u32, u32), (c, d): (u32, u32)| u64::from(c) * u64::from(b) > u64::from(a) * u64::from(d);
+        let stepping_stone = |leader| {
+            let (d, most) = (without(leader), *self.coupling.iter().max().unwrap());
+            if !bettered((d, 1), (gain(leader, most), most)) {
+                return share(d, pois);
+            }
+            let copies = (1..).find(|&n| !bettered((gain(leader, n), n), (gain(leader, n + 1), n + 1))).unwrap();
+            share(gain(leader, copies), pois * copies)
+        };
+        Scores {
+            observed,
+            g: share(observed, pois),
+            d: (0..self.leaders).map(|leader| share(without(leader), pois)).collect(),
+            df: (0..self.leaders).map(|leader| share(without_group(leader), pois)).collect(),
+            dpp: (0..self.leaders).map(stepping_stone).collect(),
+        }
+    }
+}
+
+/// A random record of at most `agents` agents, with sets whose sizes keep close to the coupling.
+fn random(rng: &mut ChaCha8Rng, agents: usize) -> Record {
+    let agents = rng.random_range(1..=agents);
+    let leaders = if rng.random_bool(0.2) { agents } else { rng.random_range(1..=agents) };
+    let followers = agents - leaders;
+    let (pois, steps) = (rng.random_range(1..=8), rng.random_range(1..=20));
+    let any = |rng: &mut ChaCha8Rng| match rng.random_range(0..6) {
+        0 => 1,
+        1 => agents,
+        2 => agents + 1,
+        3 => rng.random_range(1..=agents),
+        _ => rng.random_range(1..=agents.min(6)),
+    } as u32;
+    let same = any(rng);
+    let each = rng.random_bool(0.3);
+    let coupling: Vec<u32> = (0..pois).map(|_| if each { any(rng) } else { same }).collect();
+    let mut near: Vec<Vec<Vec<usize>>> = Vec::new();
+    // Agents that come together make losses; a POI with a regular crowd has critical members.
+    let (empty, stay, regular) = (rng.random_range(0.0..1.0), rng.random_range(0.0..0.8), rng.random_bool(0.7));
+    for step in 0..steps {
+        let sets = (0..pois).map(|poi| {
+            if step > 0 && rng.random_bool(stay) {
+                return near[step - 1][poi].clone();
+            }
+            if rng.random_bool(empty) {
+                return Vec::new();
+            }
+            let wanted = coupling[poi] as i32 + rng.random_range(-3..=2);
+            let size = wanted.clamp(1, agents as i32) as usize;
+            let first = if regular { poi % agents } else { rng.random_range(0..agents) };
+            let stride = if regular || rng.random_bool(0.5) { 1 } else { rng.random_range(1..=agents) };
+            let mut set: Vec<_> = (0..size).map(|i| (first + i * stride) % agents).collect();
+            if rng.random_bool(0.3) {
+                set[0] = rng.random_range(0..agents);
+            }
+            set.sort_unstable();
+            set.dedup();
+            set
+        });
+        let sets = sets.collect();
+        near.push(sets);
+    }
+    let most = if rng.random_bool(0.5) { 2 } else { steps as u32 };
+    let row = |rng: &mut ChaCha8Rng| match rng.random_range(0..5) {
+        0 => vec![0; leaders],
+        1 => vec![most; leaders],
+        _ => (0..leaders).map(|_| rng.random_range(0..=most)).collect(),
+    };
+    let seen = (0..followers).map(|_| row(rng)).collect();
+    Record { leaders, followers, coupling, near, seen }
+}
+
+fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: usize) -> Scores {
+    let world = record.world();
+    let offset = rng.random_range(0..stride);
+    let (sets, seen) = record.words(stride, offset, rng);
+    let strided = |words| Strided { words, stride, offset };
+    let episode = Episode { group: 0, team: 0, sets: strided(&sets), seen: strided(&seen) };
+    let expected = record.scores();
+    assert_eq!(credit.all(&episode, &world), expected);
+    let mut g = vec![f32::NAN; record.leaders];
+    assert_eq!(credit.score(&episode, &world, Fitness::G, &mut g), expected.observed);
+    assert_eq!(g, vec![expected.g; record.leaders]);
+    expected
+}
+
+#[test]
+fn every_fitness_is_its_definition() {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let mut credit = Credit::default();
+    let mut differ = [0; 5];
+    for case in 0..6000 {
+        let agents = [3, 12, 20, 32, 33, 70][case % 6];
+        let record = random(&mut rng, agents);
+        let stride = [1, 8, 16][case % 3];
+        let scores = compare(&record, &mut credit, &mut rng, stride);
+        let any = |list: &[f32]| list.iter().any(|&score| score > 0.0);
+        differ[0] += any(&scores.d) as u32;
+        differ[1] += (scores.df != scores.d) as u32;
+        differ[2] += (scores.dpp != scores.d) as u32;
+        differ[3] += (scores.observed as usize == record.coupling.len()) as u32;
+        differ[4] += (scores.observed == 0) as u32;
+    }
+    // The records are of every kind: with critical leaders, with critical groups, with stepping stones, all, none.
+    assert!(differ.iter().all(|&cases| cases > 300), "{differ:?}");
+}
+
+#[test]
+fn a_thousand_agents() {
+    let mut rng = ChaCha8Rng::seed_from_u64(2);
+    let mut credit = Credit::default();
+    for case in 0..30 {
+        let record = random(&mut rng, 1000);
+        compare(&record, &mut credit, &mut rng, [1, 8, 16][case % 3]);
+    }
+}
+
+fn by_hand(record: &Record) -> Scores {
+    compare(record, &mut Credit::default(), &mut ChaCha8Rng::seed_from_u64(0), 8)
+}
+
+/// Equations 1 and 2 with C = 2: a pair at one step observes, the same two at different steps do not.
+#[test]
+fn a_pair_must_meet() {
+    let near = vec![vec![vec![0, 1], vec![0]], vec![vec![], vec![1]]];
+    let scores = by_hand(&Record { leaders: 2, followers: 0, coupling: vec![2, 2], near, seen: vec![] });
+    assert_eq!((scores.observed, scores.g), (1, 0.5));
+    assert_eq!((scores.d, scores.df), (vec![0.5, 0.5], vec![0.5, 0.5]));
+}
+
+/// Three near a POI of C = 2: nobody alone is missed, but a leader with its follower is.
+#[test]
+fn a_spare_agent_hides_a_leader_but_not_its_group() {
+    let near = vec![vec![vec![0, 1, 2]]];
+    let record = Record { leaders: 2, followers: 1, coupling: vec![2], near, seen: vec![vec![3, 1]] };
+    let scores = by_hand(&record);
+    assert_eq!(scores.d, [0.0, 0.0]);
+    assert_eq!(scores.df, [1.0, 0.0]);
+    let tied = by_hand(&Record { seen: vec![vec![2, 2]], ..record });
+    assert_eq!(tied.df, [1.0, 0.0]);
+}
+
+/// A follower that saw no leader belongs to none, and is missed with none.
+#[test]
+fn an_unled_follower_is_nobodys() {
+    let near = vec![vec![vec![1, 2]]];
+    let scores = by_hand(&Record { leaders: 1, followers: 2, coupling: vec![2], near, seen: vec![vec![0], vec![0]] });
+    assert_eq!((scores.g, scores.d, scores.df), (1.0, vec![0.0], vec![0.0]));
+}
+
+/// One observation by others, at another step, makes a leader dispensable.
+#[test]
+fn a_second_pair_at_another_step_is_enough() {
+    let near = vec![vec![vec![0, 1]], vec![vec![2, 3]]];
+    let scores = by_hand(&Record { leaders: 4, followers: 0, coupling: vec![2], near, seen: vec![] });
+    assert_eq!((scores.g, scores.d), (1.0, vec![0.0; 4]));
+}
+
+/// Two POIs of C = 3: one leader alone at the first needs two copies, at the second, in company, one.
+#[test]
+fn stepping_stones() {
+    let near = vec![vec![vec![0], vec![0, 1]]];
+    let scores = by_hand(&Record { leaders: 3, followers: 0, coupling: vec![3, 3], near, seen: vec![] });
+    // Leader 0: one copy completes 1 of 2 POIs (value 1/2), two copies both (2/2 over 2 = 1/2): not bettered.
+    // Leader 1: one copy completes the second POI. Leader 2 was near nothing.
+    assert_eq!((scores.d, scores.dpp), (vec![0.0; 3], vec![0.5, 0.5, 0.0]));
+}
+
+/// The first value that the next does not better ends the search: 0 copies' worth at n = 1 and 2 is such a value.
+#[test]
+fn a_stepping_stone_two_copies_away_is_found_and_three_away_is_not() {
+    let near = |set: &[usize]| vec![vec![set.to_vec()]];
+    let alone =
+        |coupling| Record { leaders: 1, followers: 0, coupling: vec![coupling], near: near(&[0]), seen: vec![] };
+    assert_eq!(by_hand(&alone(2)).dpp, [1.0]);
+    assert_eq!(by_hand(&alone(3)).dpp, [0.5]);
+    assert_eq!(by_hand(&alone(4)).dpp, [0.0]);
+}
