@@ -1,6 +1,20 @@
 //! The config file: what an experiment is, with every default of the paper's calibration.
+//!
+//! A file is read by [`Config::load`], or by [`Config::read`] where flags or a sweep change some of its keys. [`Config::experiment`]
+//! is the one place that knows keys: each stands there on one line with the values it allows and its default.
+//! Everything wrong with a file is found in one pass and reported by line.
 
-use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::fmt::{self, Display};
+use std::io::Read;
+use std::ops::RangeInclusive;
+use std::path::Path;
+
+use serde::Serialize;
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+use crate::world::{INPUTS, OUTPUTS};
 
 /// Most agents (leaders and followers) in a team.
 pub const MAX_AGENTS: usize = 1024;
@@ -14,9 +28,25 @@ pub const MAX_HIDDEN_LAYERS: usize = 3;
 pub const MAX_HIDDEN_UNITS: usize = 64;
 /// Most teams (policies a population) in one generation.
 pub const MAX_POPULATION: usize = 1 << 20;
+/// Most generations after the random start.
+pub const MAX_GENERATIONS: usize = 1_000_000;
+/// Most trials in one run.
+pub const MAX_TRIALS: usize = 4096;
+/// Most episodes averaged for one team's score.
+pub const MAX_EPISODES: usize = 1000;
+/// Most bytes that the policies of all trials of a run may take.
+pub const MAX_POLICY_BYTES: usize = 1 << 38;
+/// Most bytes in a config file.
+pub const MAX_FILE_BYTES: u64 = 1 << 20;
+/// Most problems listed of one file.
+const MAX_LISTED: usize = 50;
+/// Longest map side, radius or range: squares of distances stay far from the ends of f32.
+const LONGEST: f64 = 1e4;
+/// Least size of a length or speed that is not 0: its square stays far from the denormals of f32.
+const LEAST: f64 = 1e-6;
 
 /// One experiment, as written in a config file.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Config {
     pub world: World,
     pub motion: Motion,
@@ -27,7 +57,7 @@ pub struct Config {
 }
 
 /// `[world]`: where everything starts. Lengths in map units, time in seconds, angles in radians.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct World {
     pub map: [f64; 2],
     pub leaders: Vec<[f64; 2]>,
@@ -42,7 +72,7 @@ pub struct World {
 }
 
 /// Agents needed at a POI at the same step: one number for all POIs, or one per POI.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(untagged)]
 pub enum Coupling {
     Same(usize),
@@ -50,7 +80,7 @@ pub enum Coupling {
 }
 
 /// `[motion]`: the limits of every agent's movement.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Motion {
     pub min_speed: f64,
     pub max_speed: f64,
@@ -59,7 +89,7 @@ pub struct Motion {
 }
 
 /// `[follow]`: the followers' preset behaviour.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Follow {
     pub attraction_radius: f64,
     pub repulsion_radius: f64,
@@ -68,32 +98,22 @@ pub struct Follow {
     pub wall_gain: f64,
 }
 
-/// `[sense]`: what a leader senses. A range left out is unlimited.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// `[sense]`: what a leader senses. An infinite range is unlimited; a config file says so with `inf`.
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Sense {
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub poi_range: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub agent_range: Option<f64>,
+    pub poi_range: f64,
+    pub agent_range: f64,
     pub density: Density,
 }
 
-/// How a sensed distance `d` counts: `1 - d/D` with D the map's diagonal bound, or `1 / max(d, 1)`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Density {
-    Linear,
-    Inverse,
-}
-
 /// `[policy]`: the leaders' network, `8, hidden…, 2`.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Policy {
     pub hidden: Vec<usize>,
 }
 
 /// `[learning]`: the cooperative coevolution.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Learning {
     pub paradigm: Paradigm,
     pub fitness: Fitness,
@@ -109,28 +129,710 @@ pub struct Learning {
     pub seed: u64,
 }
 
-/// Who learns: the leaders alone, or every agent (the followers' places become leaders, appended after the leaders).
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Paradigm {
-    LeaderFollower,
-    AllLeaders,
+/// A key whose value is one of a few words.
+pub trait Choice: Copy + 'static {
+    /// Every word with what it stands for.
+    const ALL: &'static [(&'static str, Self)];
+
+    /// The words, for a command line's list of possible values.
+    fn names() -> impl Iterator<Item = &'static str> {
+        Self::ALL.iter().map(|&(name, _)| name)
+    }
 }
 
-/// Which score a policy is selected by (see [`crate::credit`]).
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub enum Fitness {
-    G,
-    D,
-    Df,
-    #[serde(rename = "D++")]
-    Dpp,
+/// Defines an enum whose variants are written in configs as the words given.
+macro_rules! choice {
+    ($(#[$doc:meta])* $name:ident { $($(#[$variant_doc:meta])* $variant:ident = $word:literal,)* }) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize)]
+        pub enum $name {
+            $($(#[$variant_doc])* #[serde(rename = $word)] $variant,)*
+        }
+
+        impl Choice for $name {
+            const ALL: &'static [(&'static str, Self)] = &[$(($word, Self::$variant),)*];
+        }
+
+        impl Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.pad(match self { $(Self::$variant => $word,)* })
+            }
+        }
+    };
 }
 
-/// How a mutated weight gains its noise: times itself, or plainly.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Mutation {
-    Scaled,
-    Additive,
+choice! {
+    /// How a sensed distance counts.
+    Density {
+        /// `1 - d/D` with D = √2·max(map).
+        Linear = "linear",
+        /// `1 / max(d, 1)`.
+        Inverse = "inverse",
+    }
+}
+
+choice! {
+    /// Who learns.
+    Paradigm {
+        /// The leaders; followers keep their preset behaviour.
+        LeaderFollower = "leader-follower",
+        /// Every agent: the followers' places become leaders, appended after the leaders.
+        AllLeaders = "all-leaders",
+    }
+}
+
+choice! {
+    /// Which score a policy is selected by (see [`crate::credit`]).
+    Fitness {
+        /// The team's score.
+        G = "G",
+        /// Difference evaluation.
+        D = "D",
+        /// Difference evaluation that takes a leader's followers out with it.
+        Df = "Df",
+        /// Difference evaluation with copies of the leader as stepping stones.
+        Dpp = "D++",
+    }
+}
+
+choice! {
+    /// How a mutated weight gains its noise.
+    Mutation {
+        /// Times itself.
+        Scaled = "scaled",
+        /// Plainly.
+        Additive = "additive",
+    }
+}
+
+impl Config {
+    /// Reads a config file.
+    ///
+    /// # Errors
+    /// A file that cannot be read, or everything that is wrong with what it says.
+    pub fn load(path: &Path) -> Result<Config, ConfigError> {
+        Config::parse(&read_file(path)?, &path.display().to_string())
+    }
+
+    /// Reads a config from its text; `name` stands for the file in errors.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the text.
+    pub fn parse(text: &str, name: &str) -> Result<Config, ConfigError> {
+        Config::read(text, name, &[], &[])
+    }
+
+    /// Reads a config with some keys set from elsewhere, checked together with the rest.
+    ///
+    /// Sections named in `foreign` belong to somebody else (a sweep's `grid`) and are passed over.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the text and the overrides.
+    pub fn read(text: &str, name: &str, foreign: &[&str], overrides: &[Override]) -> Result<Config, ConfigError> {
+        let (document, errors) = DeTable::parse_recoverable(text);
+        let mut reader = Reader::default();
+        for error in errors {
+            let place = Place::Offset(error.span().map_or(0, |span| span.start));
+            reader.blame(place, "", error.message().trim().replace('\n', ", "));
+        }
+        if reader.problems.is_empty() {
+            reader.fill(document.into_inner(), text, foreign, overrides);
+            let config = Config::experiment(&mut reader);
+            reader.blame_unknown();
+            if reader.problems.is_empty() {
+                return Ok(config);
+            }
+        }
+        Err(reader.into_error(text, name))
+    }
+
+    /// This config with some keys changed.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the overrides.
+    pub fn with(&self, overrides: &[Override]) -> Result<Config, ConfigError> {
+        Config::read(&self.to_toml(), "the config", &[], overrides)
+    }
+
+    /// The config file that says this, every key written out.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("numbers, words and lists of them under plain keys are TOML")
+    }
+
+    /// Everything that learns: the leaders, and in the all-leaders paradigm the followers too.
+    pub fn learners(&self) -> usize {
+        match self.learning.paradigm {
+            Paradigm::LeaderFollower => self.world.leaders.len(),
+            Paradigm::AllLeaders => self.world.leaders.len() + self.world.followers.len(),
+        }
+    }
+
+    /// Weights of one policy, biases included.
+    pub fn parameters(&self) -> usize {
+        let widths = [&[INPUTS], &self.policy.hidden[..], &[OUTPUTS]].concat();
+        widths.windows(2).map(|w| (w[0] + 1) * w[1]).sum()
+    }
+
+    /// Bytes that the policies of all trials take.
+    pub fn policy_bytes(&self) -> usize {
+        self.learning.trials * self.learners() * self.learning.population * self.parameters() * size_of::<f32>()
+    }
+
+    /// Every key with what it allows and its default. A faulty number reads as the most that is allowed, a faulty list as
+    /// none, so that what depends on it is not blamed as well.
+    fn experiment(r: &mut Reader<'_>) -> Config {
+        let map = r.pair("world.map", between(1.0, LONGEST), [50.0, 50.0]);
+        let leaders = r.points("world.leaders", 1..=MAX_AGENTS, map, None);
+        let followers = r.points("world.followers", 0..=MAX_AGENTS - 1, map, Some(vec![]));
+        let pois = r.points("world.pois", 1..=MAX_POIS, map, None);
+        let agents = leaders.as_ref().zip(followers.as_ref()).map_or(MAX_AGENTS, |(l, f)| l.len() + f.len());
+        if agents > MAX_AGENTS {
+            r.blame_key(
+                "world.followers",
+                format!("found {agents} agents with the leaders, allowed 2 to {MAX_AGENTS}"),
+            );
+        }
+        let needed = between(1, agents.min(MAX_AGENTS)).because("the number of agents");
+
+        let max_speed = r.number("motion.max_speed", between(LEAST, 1e3).or_zero(), 3.0);
+        let slowest = between(LEAST, max_speed).or_zero().because("motion.max_speed");
+        let before = r.problems.len();
+        let min_speed = r.number("motion.min_speed", slowest, 0.0);
+        let least = if r.problems.len() > before { 0.0 } else { min_speed };
+        let start_speed = between(least.max(LEAST), max_speed).because("motion.min_speed to motion.max_speed");
+        let start_speed = if least == 0.0 { start_speed.or_zero() } else { start_speed };
+        let attraction_radius = r.number("follow.attraction_radius", between(0.01, LONGEST), 5.0);
+        let closest = between(0.01, attraction_radius).because("follow.attraction_radius");
+        let gain = between(1e-3, 1e3).or_zero();
+        let population = r.number("learning.population", between(2, MAX_POPULATION), 50);
+
+        let config = Config {
+            world: World {
+                map,
+                coupling: r.coupling(needed, pois.as_ref().map(Vec::len)),
+                leaders: leaders.unwrap_or_default(),
+                followers: followers.unwrap_or_default(),
+                pois: pois.unwrap_or_default(),
+                observation_radius: r.number("world.observation_radius", between(0.01, LONGEST), 5.0),
+                steps: r.number("world.steps", between(1, MAX_STEPS), 25),
+                dt: r.number("world.dt", between(1e-4, 10.0), 0.2),
+                heading: r.number("world.heading", between(-1e3, 1e3), std::f64::consts::FRAC_PI_2),
+                speed: r.number("world.speed", start_speed, 0.0),
+            },
+            motion: Motion {
+                min_speed,
+                max_speed,
+                max_acceleration: r.number("motion.max_acceleration", between(1e-3, 1e3).or_zero(), 5.0),
+                max_turn_rate: r.number(
+                    "motion.max_turn_rate",
+                    between(1e-3, 1e3).or_zero(),
+                    std::f64::consts::FRAC_PI_2,
+                ),
+            },
+            follow: Follow {
+                attraction_radius,
+                repulsion_radius: r.number("follow.repulsion_radius", closest, 1.0),
+                attraction_gain: r.number("follow.attraction_gain", gain, 5.0),
+                repulsion_gain: r.number("follow.repulsion_gain", gain, 1.0),
+                wall_gain: r.number("follow.wall_gain", gain, 1.0),
+            },
+            sense: Sense {
+                poi_range: r.number("sense.poi_range", between(0.01, LONGEST).or_unlimited(), f64::INFINITY),
+                agent_range: r.number("sense.agent_range", between(0.01, LONGEST).or_unlimited(), 5.0),
+                density: r.choice("sense.density", Density::Linear),
+            },
+            policy: Policy {
+                hidden: r.numbers("policy.hidden", 1..=MAX_HIDDEN_LAYERS, between(1, MAX_HIDDEN_UNITS), vec![10]),
+            },
+            learning: Learning {
+                paradigm: r.choice("learning.paradigm", Paradigm::LeaderFollower),
+                fitness: r.choice("learning.fitness", Fitness::Df),
+                population,
+                generations: r.number("learning.generations", between(0, MAX_GENERATIONS), 100),
+                trials: r.number("learning.trials", between(1, MAX_TRIALS), 5),
+                elites: r.number("learning.elites", between(0, population).because("learning.population"), 1),
+                mutation: r.choice("learning.mutation", Mutation::Scaled),
+                mutation_probability: r.number("learning.mutation_probability", between(LEAST, 1.0).or_zero(), 0.15),
+                mutation_sigma: r.number("learning.mutation_sigma", between(LEAST, 100.0).or_zero(), 0.1),
+                episodes_per_team: r.number("learning.episodes_per_team", between(1, MAX_EPISODES), 1),
+                start_jitter: r.number("learning.start_jitter", between(LEAST, LONGEST).or_zero(), 0.0),
+                seed: r.number("learning.seed", between(0, i64::MAX as u64), 0),
+            },
+        };
+        if r.problems.is_empty() && config.policy_bytes() > MAX_POLICY_BYTES {
+            let gib = |bytes: usize| bytes.div_ceil(1 << 30);
+            let (bytes, most) = (gib(config.policy_bytes()), gib(MAX_POLICY_BYTES));
+            let text = format!("found {population}, whose policies of all trials take {bytes} GiB, allowed {most} GiB");
+            r.blame_key("learning.population", text);
+        }
+        config
+    }
+}
+
+/// The text of a config or sweep file.
+///
+/// # Errors
+/// No such file, not a file, larger than [`MAX_FILE_BYTES`], not UTF-8.
+pub fn read_file(path: &Path) -> Result<String, ConfigError> {
+    let fail = |reason: String| ConfigError::Unreadable { name: path.display().to_string(), reason };
+    if path.is_dir() {
+        return Err(fail("it is a directory; name a config file in it".into()));
+    }
+    let mut bytes = Vec::new();
+    let file = std::fs::File::open(path).map_err(|error| fail(error.to_string()))?;
+    file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes).map_err(|error| fail(error.to_string()))?;
+    if bytes.len() as u64 > MAX_FILE_BYTES {
+        return Err(fail(format!("it is larger than {MAX_FILE_BYTES} bytes, the most a config file may have")));
+    }
+    String::from_utf8(bytes).map_err(|error| {
+        let line =
+            error.as_bytes()[..error.utf8_error().valid_up_to()].iter().filter(|&&byte| byte == b'\n').count() + 1;
+        fail(format!("line {line} is not UTF-8 text"))
+    })
+}
+
+/// A key set from outside the config file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Override {
+    /// The dotted key: `learning.population`.
+    pub key: String,
+    /// What it is set to, as TOML.
+    pub text: String,
+    /// What errors call it: `--population`.
+    pub name: String,
+}
+
+impl Override {
+    /// Sets `key` to `value`; errors call it `name`.
+    pub fn new(key: impl Into<String>, value: impl Into<toml::Value>, name: impl Into<String>) -> Override {
+        Override { key: key.into(), text: value.into().to_string(), name: name.into() }
+    }
+}
+
+/// Why there is no config.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ConfigError {
+    #[error("{name}: cannot be read: {reason}")]
+    Unreadable { name: String, reason: String },
+    /// All that is wrong, by line; what came from outside the file (see [`Override`]) last.
+    #[error("{}", list(name, problems, *unlisted))]
+    Invalid { name: String, problems: Vec<Problem>, unlisted: usize },
+}
+
+/// One thing wrong with a config.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Problem {
+    /// The line in the file, from 1; none for an [`Override`].
+    pub line: Option<usize>,
+    /// The dotted key with any place in its list, `world.leaders[3][1]`, or the override's name; empty for broken TOML.
+    pub key: String,
+    /// What was found and what is allowed.
+    pub message: String,
+}
+
+fn list(name: &str, problems: &[Problem], unlisted: usize) -> String {
+    let lines = problems.iter().map(|Problem { line, key, message }| {
+        let place = line.map_or(String::new(), |line| format!("{name}:{line}: "));
+        let key = if key.is_empty() { String::new() } else { format!("{key}: ") };
+        format!("{place}{key}{message}")
+    });
+    let mut lines: Vec<String> = lines.collect();
+    if unlisted > 0 {
+        lines.push(format!("… and {unlisted} more"));
+    }
+    if lines.len() > 1 {
+        lines.insert(0, format!("{} problems in {name}", problems.len() + unlisted));
+    }
+    lines.join("\n")
+}
+
+/// The values a number may have.
+#[derive(Clone, Copy, Debug)]
+struct Allowed<T> {
+    low: T,
+    high: T,
+    zero: bool,
+    unlimited: bool,
+    /// Where the bounds come from.
+    because: &'static str,
+}
+
+fn between<T>(low: T, high: T) -> Allowed<T> {
+    Allowed { low, high, zero: false, unlimited: false, because: "" }
+}
+
+impl<T: Number> Allowed<T> {
+    /// Also 0, where the least other value is greater.
+    fn or_zero(self) -> Self {
+        Allowed { zero: true, ..self }
+    }
+
+    /// Also infinity.
+    fn or_unlimited(self) -> Self {
+        Allowed { unlimited: true, ..self }
+    }
+
+    fn because(self, because: &'static str) -> Self {
+        Allowed { because, ..self }
+    }
+
+    fn holds(&self, value: T) -> bool {
+        (self.low..=self.high).contains(&value)
+            || self.zero && value == T::ZERO
+            || self.unlimited && value.is_infinite()
+    }
+
+    /// The default, or the bound next to it where other keys leave no room for it.
+    fn nearest(&self, default: T) -> T {
+        match default {
+            _ if self.holds(default) => default,
+            _ if default < self.low => self.low,
+            _ => self.high,
+        }
+    }
+}
+
+impl<T: Number> Display for Allowed<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Allowed { low, high, .. } = self;
+        match (self.zero, low.partial_cmp(high)) {
+            (true, Some(std::cmp::Ordering::Less)) => write!(f, "0 or {low} to {high}")?,
+            (true, _) => write!(f, "0")?,
+            (false, Some(std::cmp::Ordering::Less)) => write!(f, "{low} to {high}")?,
+            (false, _) => write!(f, "{high}")?,
+        }
+        if self.unlimited {
+            write!(f, " or inf (unlimited)")?;
+        }
+        if !self.because.is_empty() {
+            write!(f, " ({})", self.because)?;
+        }
+        Ok(())
+    }
+}
+
+/// A type that keys have numbers of.
+trait Number: Copy + PartialOrd + Display {
+    const ZERO: Self;
+    const KIND: &'static str;
+
+    /// The number that was written, `None` inside where the type cannot hold it, or `None` for another kind of value.
+    fn read(value: &DeValue<'_>) -> Option<Option<Self>>;
+
+    fn is_infinite(self) -> bool {
+        false
+    }
+}
+
+impl Number for f64 {
+    const ZERO: f64 = 0.0;
+    const KIND: &'static str = "a number";
+
+    fn read(value: &DeValue<'_>) -> Option<Option<f64>> {
+        match value {
+            DeValue::Integer(_) => Some(i64::read(value)?.map(|integer| integer as f64)),
+            DeValue::Float(float) => {
+                let value: Option<f64> = float.as_str().parse().ok();
+                let written = |value: &f64| value.is_finite() || float.as_str().contains("inf");
+                // Adding 0 turns -0 into 0.
+                Some(value.filter(written).map(|value| value + 0.0))
+            }
+            _ => None,
+        }
+    }
+
+    fn is_infinite(self) -> bool {
+        self == f64::INFINITY
+    }
+}
+
+macro_rules! whole_number {
+    ($($type:ty)*) => {$(
+        impl Number for $type {
+            const ZERO: $type = 0;
+            const KIND: &'static str = "a whole number";
+
+            fn read(value: &DeValue<'_>) -> Option<Option<$type>> {
+                value.as_integer().map(|integer| <$type>::from_str_radix(integer.as_str(), integer.radix()).ok())
+            }
+        }
+    )*};
+}
+whole_number!(i64 u64 usize);
+
+/// Where a value was written, in the order in which problems are told.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Place {
+    /// This many bytes into the file.
+    Offset(usize),
+    Outside,
+}
+
+/// A value and what errors say of it.
+struct Entry<'a> {
+    value: Spanned<DeValue<'a>>,
+    /// The text that the value's span counts in.
+    text: &'a str,
+    outside: bool,
+    /// What the user calls it: the key, with any place in its list, or the override's name.
+    name: String,
+}
+
+impl Entry<'_> {
+    fn place(&self) -> Place {
+        if self.outside { Place::Outside } else { Place::Offset(self.value.span().start) }
+    }
+
+    fn found(&self) -> String {
+        match self.value.get_ref() {
+            DeValue::Array(items) => format!("a list of {}", items.len()),
+            DeValue::Table(_) => "a table".into(),
+            _ => shorten(self.text.get(self.value.span()).unwrap_or_default()),
+        }
+    }
+}
+
+/// A text from the file, fit for one line of an error.
+fn shorten(text: &str) -> String {
+    let line = text.lines().next().unwrap_or_default();
+    let end = line.char_indices().nth(40).map_or(line.len(), |(end, _)| end);
+    let more = if end < text.len() { "…" } else { "" };
+    line[..end].chars().map(|c| if c.is_control() { ' ' } else { c }).chain(more.chars()).collect()
+}
+
+/// The values of a file that were not asked for yet, and what is wrong with those that were.
+#[derive(Default)]
+struct Reader<'a> {
+    /// By dotted key.
+    entries: BTreeMap<String, Entry<'a>>,
+    /// Values outside any section.
+    strays: Vec<Entry<'a>>,
+    /// Where each section starts.
+    sections: BTreeMap<String, usize>,
+    /// The keys asked for, with the place and name of those that were there.
+    known: BTreeMap<&'static str, Option<(Place, String)>>,
+    /// Place, name and message of each.
+    problems: Vec<(Place, String, String)>,
+}
+
+impl<'a> Reader<'a> {
+    fn fill(&mut self, document: DeTable<'a>, text: &'a str, foreign: &[&str], overrides: &'a [Override]) {
+        for (section, value) in document {
+            let start = section.span().start;
+            let section = section.into_inner().into_owned();
+            if foreign.contains(&section.as_str()) {
+                continue;
+            }
+            let span = value.span();
+            match value.into_inner() {
+                DeValue::Table(table) => {
+                    for (key, value) in table {
+                        let name = format!("{section}.{}", key.into_inner());
+                        self.entries.insert(name.clone(), Entry { value, text, outside: false, name });
+                    }
+                    self.sections.insert(section, start);
+                }
+                other => {
+                    let value = Spanned::new(span, other);
+                    self.strays.push(Entry { value, text, outside: false, name: section });
+                }
+            }
+        }
+        for Override { key, text, name } in overrides {
+            let (value, errors) = DeValue::parse_recoverable(text);
+            for error in errors {
+                self.blame(Place::Outside, name, format!("found {}: {}", shorten(text), error.message().trim()));
+            }
+            self.entries.insert(key.clone(), Entry { value, text, outside: true, name: name.clone() });
+        }
+    }
+
+    fn take(&mut self, key: &'static str) -> Option<Entry<'a>> {
+        let entry = self.entries.remove(key);
+        self.known.insert(key, entry.as_ref().map(|entry| (entry.place(), entry.name.clone())));
+        entry
+    }
+
+    /// A number, or its default where the key was left out.
+    fn number<T: Number>(&mut self, key: &'static str, allowed: Allowed<T>, default: T) -> T {
+        self.take(key).map_or_else(|| allowed.nearest(default), |entry| self.check(&entry, allowed))
+    }
+
+    fn check<T: Number>(&mut self, entry: &Entry<'_>, allowed: Allowed<T>) -> T {
+        let kind = match T::read(entry.value.get_ref()) {
+            Some(Some(value)) if allowed.holds(value) => return value,
+            Some(_) => String::new(),
+            None => format!("{}, ", T::KIND),
+        };
+        self.blame(entry.place(), &entry.name, format!("found {}, allowed {kind}{allowed}", entry.found()));
+        allowed.high
+    }
+
+    fn choice<T: Choice>(&mut self, key: &'static str, default: T) -> T {
+        let Some(entry) = self.take(key) else { return default };
+        let word = entry.value.get_ref().as_str();
+        T::ALL.iter().find(|choice| Some(choice.0) == word).map_or_else(
+            || {
+                let words: Vec<_> = T::names().map(|word| format!("{word:?}")).collect();
+                self.blame(
+                    entry.place(),
+                    &entry.name,
+                    format!("found {}, allowed {}", entry.found(), words.join(" or ")),
+                );
+                default
+            },
+            |choice| choice.1,
+        )
+    }
+
+    /// The items of a list, or none of a list of another length or of another thing.
+    fn items(&mut self, entry: Entry<'a>, lengths: RangeInclusive<usize>, what: &str) -> Option<Vec<Entry<'a>>> {
+        let found = entry.found();
+        let (place, Entry { value, text, outside, name }) = (entry.place(), entry);
+        match value.into_inner() {
+            DeValue::Array(items) if lengths.contains(&items.len()) => {
+                let named = |(index, value)| Entry { value, text, outside, name: format!("{name}[{index}]") };
+                Some(items.into_iter().enumerate().map(named).collect())
+            }
+            _ => {
+                let lengths = between(*lengths.start(), *lengths.end());
+                self.blame(place, &name, format!("found {found}, allowed a list of {lengths} {what}"));
+                None
+            }
+        }
+    }
+
+    fn pair(&mut self, key: &'static str, allowed: Allowed<f64>, default: [f64; 2]) -> [f64; 2] {
+        let Some(entry) = self.take(key) else { return default };
+        self.two(entry, [allowed; 2])
+    }
+
+    fn two(&mut self, entry: Entry<'a>, allowed: [Allowed<f64>; 2]) -> [f64; 2] {
+        let most = allowed.map(|side| side.high);
+        let Some(items) = self.items(entry, 2..=2, "numbers") else { return most };
+        let mut values = most;
+        for ((value, item), side) in values.iter_mut().zip(&items).zip(allowed) {
+            *value = self.check(item, side);
+        }
+        values
+    }
+
+    /// Positions on the map.
+    fn points(
+        &mut self,
+        key: &'static str,
+        counts: RangeInclusive<usize>,
+        map: [f64; 2],
+        default: Option<Vec<[f64; 2]>>,
+    ) -> Option<Vec<[f64; 2]>> {
+        const WHAT: &str = "positions [x, y]";
+        let Some(entry) = self.take(key) else {
+            if default.is_none() {
+                let counts = between(*counts.start(), *counts.end());
+                self.blame_key(key, format!("missing, allowed a list of {counts} {WHAT}"));
+            }
+            return default;
+        };
+        let sides = map.map(|side| between(LEAST, side).or_zero().because("the map"));
+        let items = self.items(entry, counts, WHAT)?;
+        Some(items.into_iter().map(|item| self.two(item, sides)).collect())
+    }
+
+    fn numbers<T: Number>(
+        &mut self,
+        key: &'static str,
+        counts: RangeInclusive<usize>,
+        allowed: Allowed<T>,
+        default: Vec<T>,
+    ) -> Vec<T> {
+        let Some(entry) = self.take(key) else { return default };
+        let items = self.items(entry, counts, &format!("numbers, each {allowed}")).unwrap_or_default();
+        items.iter().map(|item| self.check(item, allowed)).collect()
+    }
+
+    /// One number, or one for each of the POIs (whose count is none where it is unknown).
+    fn coupling(&mut self, allowed: Allowed<usize>, pois: Option<usize>) -> Coupling {
+        const KEY: &str = "world.coupling";
+        match self.entries.get(KEY).map(|entry| entry.value.get_ref().is_array()) {
+            Some(true) => {
+                let counts = pois.map_or(0..=usize::MAX, |pois| pois..=pois);
+                Coupling::Each(self.numbers(KEY, counts, allowed, vec![]))
+            }
+            _ => Coupling::Same(self.number(KEY, allowed, 3)),
+        }
+    }
+
+    fn blame(&mut self, place: Place, name: &str, message: String) {
+        self.problems.push((place, name.to_string(), message));
+    }
+
+    /// Blames a key that was asked for; where it is missing, at its section's start.
+    fn blame_key(&mut self, key: &'static str, message: String) {
+        let section = || self.sections.get(section(key)).copied().unwrap_or(0);
+        let known = self.known.get(key).cloned().flatten();
+        let (place, name) = known.unwrap_or_else(|| (Place::Offset(section()), key.to_string()));
+        self.blame(place, &name, message);
+    }
+
+    /// Blames all that was not asked for.
+    fn blame_unknown(&mut self) {
+        let known: Vec<&str> = self.known.keys().copied().collect();
+        let mut sections: Vec<&str> = known.iter().map(|key| section(key)).collect();
+        sections.dedup();
+        for entry in std::mem::take(&mut self.strays) {
+            let name = &entry.name;
+            let message = if sections.contains(&name.as_str()) {
+                format!("found {}, allowed a section [{name}]", entry.found())
+            } else {
+                format!("unknown key{}", hint(name, &known))
+            };
+            self.blame(entry.place(), &shorten(name), message);
+        }
+        for (name, start) in std::mem::take(&mut self.sections) {
+            if !sections.contains(&name.as_str()) {
+                let message = format!("unknown section{}", hint(&name, &sections));
+                self.blame(Place::Offset(start), &shorten(&name), message);
+                self.entries.retain(|key, entry| entry.outside || section(key) != name);
+            }
+        }
+        for (key, entry) in std::mem::take(&mut self.entries) {
+            self.blame(entry.place(), &shorten(&entry.name), format!("unknown key{}", hint(&key, &known)));
+        }
+    }
+
+    fn into_error(mut self, text: &str, name: &str) -> ConfigError {
+        self.problems.sort_by_key(|problem| problem.0);
+        let unlisted = self.problems.len().saturating_sub(MAX_LISTED);
+        let problems = self.problems.into_iter().take(MAX_LISTED).map(|(place, key, message)| {
+            let line = match place {
+                Place::Offset(offset) => Some(text.bytes().take(offset).filter(|&byte| byte == b'\n').count() + 1),
+                Place::Outside => None,
+            };
+            Problem { line, key, message }
+        });
+        ConfigError::Invalid { name: name.to_string(), problems: problems.collect(), unlisted }
+    }
+}
+
+/// The section of a dotted key.
+fn section(key: &str) -> &str {
+    key.split_once('.').map_or(key, |(section, _)| section)
+}
+
+/// `, did you mean …?` with the known name nearest to an unknown one, or else what its section knows.
+fn hint(name: &str, known: &[&str]) -> String {
+    const LONGEST_NAME: usize = 64;
+    let last = |key: &'_ str| key.rsplit('.').next().unwrap_or_default().to_lowercase();
+    let leaf = last(name);
+    let same_section = |key: &str| section(key) == section(name);
+    let distance = |key: &str| (strsim::damerau_levenshtein(&last(key), &leaf), !same_section(key));
+    let nearest = known.iter().filter(|_| name.len() <= LONGEST_NAME).min_by_key(|key| distance(key));
+    if let Some(key) = nearest.filter(|key| distance(key).0 <= leaf.len() / 3) {
+        return format!(", did you mean `{key}`?");
+    }
+    let siblings: Vec<String> = known.iter().filter(|key| same_section(key)).map(|key| last(key)).collect();
+    match siblings.is_empty() {
+        true => String::new(),
+        false => format!("; [{}] has {}", section(name), siblings.join(", ")),
+    }
 }

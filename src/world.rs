@@ -96,6 +96,7 @@ impl World {
         let turn = (motion.max_turn_rate * world.dt).min(std::f64::consts::PI);
         let any_turn = turn >= std::f64::consts::PI;
         let squared = |radius: f64| (radius * radius) as f32;
+        let range = |range: f64| if range.is_infinite() { UNLIMITED } else { squared(range) };
         let constants = Constants {
             leaders: leaders as u32,
             followers: followers as u32,
@@ -120,8 +121,8 @@ impl World {
             observation_radius2: squared(world.observation_radius),
             attraction_radius2: squared(follow.attraction_radius),
             repulsion_radius2: squared(follow.repulsion_radius),
-            poi_range2: sense.poi_range.map_or(UNLIMITED, squared),
-            agent_range2: sense.agent_range.map_or(UNLIMITED, squared),
+            poi_range2: range(sense.poi_range),
+            agent_range2: range(sense.agent_range),
             repulsion_radius: follow.repulsion_radius as f32,
             attraction_scale: (follow.attraction_gain / follow.attraction_radius) as f32,
             repulsion_scale: (follow.repulsion_gain / follow.repulsion_radius) as f32,

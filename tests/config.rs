@@ -1,0 +1,371 @@
+//! Configs: defaults, round trips, and that no text makes the reader panic.
+
+use std::path::Path;
+
+use flotilla::config::{
+    Config, ConfigError, Coupling, Density, Fitness, Follow, Learning, MAX_EPISODES, MAX_GENERATIONS,
+    MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion, Mutation, Override, Paradigm,
+    Policy, Problem, Sense, World,
+};
+use proptest::collection::vec;
+use proptest::prelude::*;
+
+const SMALLEST: &str = "[world]\nleaders = [[1, 2]]\npois = [[3, 4]]\n";
+const LAYOUTS: [&str; 3] = ["generally_forward", "strictly_forward", "chaotic"];
+
+fn problems(text: &str) -> Vec<Problem> {
+    match Config::parse(text, "test.toml") {
+        Err(ConfigError::Invalid { problems, .. }) => problems,
+        other => panic!("expected problems, got {other:?}"),
+    }
+}
+
+#[test]
+fn every_key_but_leaders_and_pois_has_its_default() {
+    let config = Config::parse(SMALLEST, "test.toml").unwrap();
+    let expected = Config {
+        world: World {
+            map: [50.0, 50.0],
+            leaders: vec![[1.0, 2.0]],
+            followers: vec![],
+            pois: vec![[3.0, 4.0]],
+            coupling: Coupling::Same(1), // 3 where there are as many agents
+            observation_radius: 5.0,
+            steps: 25,
+            dt: 0.2,
+            heading: std::f64::consts::FRAC_PI_2,
+            speed: 0.0,
+        },
+        motion: Motion {
+            min_speed: 0.0,
+            max_speed: 3.0,
+            max_acceleration: 5.0,
+            max_turn_rate: std::f64::consts::FRAC_PI_2,
+        },
+        follow: Follow {
+            attraction_radius: 5.0,
+            repulsion_radius: 1.0,
+            attraction_gain: 5.0,
+            repulsion_gain: 1.0,
+            wall_gain: 1.0,
+        },
+        sense: Sense { poi_range: f64::INFINITY, agent_range: 5.0, density: Density::Linear },
+        policy: Policy { hidden: vec![10] },
+        learning: Learning {
+            paradigm: Paradigm::LeaderFollower,
+            fitness: Fitness::Df,
+            population: 50,
+            generations: 100,
+            trials: 5,
+            elites: 1,
+            mutation: Mutation::Scaled,
+            mutation_probability: 0.15,
+            mutation_sigma: 0.1,
+            episodes_per_team: 1,
+            start_jitter: 0.0,
+            seed: 0,
+        },
+    };
+    assert_eq!(config, expected);
+}
+
+#[test]
+fn the_papers_layouts_are_what_the_paper_shows() {
+    for (name, groups, offsets, coupling, steps) in [
+        (LAYOUTS[0], vec![10.0, 20.0, 30.0, 40.0], vec![[2.0, -3.0], [-2.0, -3.0]], 3, 25),
+        (LAYOUTS[1], vec![10.0, 40.0], vec![[2.0, -3.0], [-2.0, -3.0]], 3, 25),
+        (LAYOUTS[2], vec![10.0, 20.0, 30.0, 40.0], vec![[2.0, -3.0], [-2.0, -3.0], [2.0, 2.0], [-2.0, 2.0]], 5, 50),
+    ] {
+        let config = Config::load(Path::new(&format!("configs/{name}.toml"))).unwrap();
+        let place = |y: f64| groups.iter().map(|&x| [x, y]).collect::<Vec<_>>();
+        let followers: Vec<[f64; 2]> =
+            groups.iter().flat_map(|x| offsets.iter().map(move |[dx, dy]| [x + dx, 5.0 + dy])).collect();
+        let mut expected = Config::parse(SMALLEST, "test.toml").unwrap();
+        expected.world.leaders = place(5.0);
+        expected.world.followers = followers;
+        expected.world.pois = place(15.0);
+        expected.world.coupling = Coupling::Same(coupling);
+        expected.world.steps = steps;
+        assert_eq!(config, expected, "{name}");
+    }
+}
+
+#[test]
+fn an_unlimited_range_is_written_as_inf_and_read_back() {
+    let mut config =
+        Config::parse(&format!("{SMALLEST}[sense]\nagent_range = inf\npoi_range = 7"), "test.toml").unwrap();
+    assert_eq!((config.sense.agent_range, config.sense.poi_range), (f64::INFINITY, 7.0));
+    config.sense.poi_range = f64::INFINITY;
+    assert!(config.to_toml().contains("poi_range = inf\nagent_range = inf\n"));
+    assert_eq!(Config::parse(&config.to_toml(), "again.toml"), Ok(config));
+}
+
+#[test]
+fn defaults_give_way_to_what_was_written() {
+    let text = format!("{SMALLEST}[motion]\nmin_speed = 1\n[follow]\nattraction_radius = 0.5\n");
+    let config = Config::parse(&text, "test.toml").unwrap();
+    assert_eq!((config.world.speed, config.follow.repulsion_radius), (1.0, 0.5));
+}
+
+#[test]
+fn a_faulty_value_is_blamed_alone() {
+    for (text, key) in [
+        ("[world]\nmap = [1e9, 50]\nleaders = [[900, 2]]\npois = [[3, 4]]", "world.map[0]"),
+        ("[world]\nleaders = 3\npois = [[3, 4]]\ncoupling = 7", "world.leaders"),
+        ("[world]\nleaders = [[3, 4]]\npois = 3\ncoupling = [1, 1, 1]", "world.pois"),
+        (&format!("{SMALLEST}speed = 2\n[motion]\nmin_speed = 'x'"), "motion.min_speed"),
+        (&format!("{SMALLEST}[motion]\nmax_speed = -1\nmin_speed = 9"), "motion.max_speed"),
+        (&format!("{SMALLEST}[follow]\nattraction_radius = nan\nrepulsion_radius = 9"), "follow.attraction_radius"),
+        (&format!("{SMALLEST}[learning]\npopulation = 1\nelites = 9"), "learning.population"),
+    ] {
+        let keys: Vec<String> = problems(text).into_iter().map(|problem| problem.key).collect();
+        assert_eq!(keys, [key], "{text}");
+    }
+}
+
+#[test]
+fn overrides_are_checked_with_the_file_and_named_as_the_user_knows_them() {
+    let text = format!("{SMALLEST}coupling = 2");
+    let more = Override::new("world.followers", vec![vec![5.0, 5.0]], "grid \"world.followers\"");
+    assert!(Config::parse(&text, "test.toml").is_err());
+    let config = Config::read(&text, "test.toml", &[], std::slice::from_ref(&more)).unwrap();
+    assert_eq!(config.world.coupling, Coupling::Same(2));
+    let error = Config::read(
+        &text,
+        "test.toml",
+        &[],
+        &[
+            more,
+            Override::new("learning.population", 1, "--population"),
+            Override::new("world.pois", vec![vec![5.0, 51.0]], "grid \"world.pois\""),
+            Override::new("world.dtt", 1, "grid \"world.dtt\""),
+        ],
+    );
+    assert_eq!(
+        error.unwrap_err().to_string(),
+        "3 problems in test.toml\n\
+         grid \"world.pois\"[0][1]: found 51.0, allowed 0 or 0.000001 to 50 (the map)\n\
+         --population: found 1, allowed 2 to 1048576\n\
+         grid \"world.dtt\": unknown key, did you mean `world.dt`?"
+    );
+    let again = config.with(&[Override::new("learning.fitness", "D++", "--fitness")]).unwrap();
+    assert_eq!(again.learning.fitness, Fitness::Dpp);
+}
+
+#[test]
+fn foreign_sections_are_passed_over_only_when_named() {
+    let text = format!("{SMALLEST}[grid]\n\"world.coupling\" = [1, 2]\n");
+    assert_eq!(problems(&text)[0].key, "grid");
+    assert_eq!(Config::read(&text, "test.toml", &["grid"], &[]), Config::parse(SMALLEST, "test.toml"));
+}
+
+#[test]
+fn a_quoted_dotted_key_is_not_the_key_it_looks_like() {
+    let found = problems(&format!("\"world.dt\" = 0.1\n{SMALLEST}"));
+    assert_eq!((found.len(), found[0].line, found[0].key.as_str()), (1, Some(1), "world.dt"));
+}
+
+#[test]
+fn long_lists_of_problems_are_cut() {
+    let text = format!("[world]\npois = [[1, 1]]\nleaders = [{}]", "[-1, -1],".repeat(1000));
+    let message = Config::parse(&text, "test.toml").unwrap_err().to_string();
+    assert_eq!(message.lines().count(), 52);
+    assert!(message.starts_with("2000 problems in test.toml\n") && message.ends_with("… and 1950 more"), "{message}");
+}
+
+/// 0, or a size from `low` to `high` of any magnitude between.
+fn size(low: f64, high: f64) -> impl Strategy<Value = f64> {
+    (0.0..=1.0f64).prop_map(move |t| (low * (high / low).powf(t)).clamp(low, high))
+}
+
+fn size_or_zero(low: f64, high: f64) -> impl Strategy<Value = f64> {
+    prop_oneof![1 => Just(0.0), 4 => size(low, high)]
+}
+
+fn word<T: flotilla::config::Choice + std::fmt::Debug>() -> impl Strategy<Value = T> {
+    (0..T::ALL.len()).prop_map(|index| T::ALL[index].1)
+}
+
+fn worlds() -> impl Strategy<Value = (World, Motion)> {
+    let speeds = (size_or_zero(1e-6, 1e3), 0.0..=1.0, 0.0..=1.0).prop_map(|(max, a, b): (f64, f64, f64)| {
+        let tidy = |speed: f64| if speed < 1e-6 { 0.0 } else { speed };
+        let min = tidy(max * a);
+        (min, tidy(min + (max - min) * b).clamp(min, max), max)
+    });
+    (size(1.0, 1e4), size(1.0, 1e4), 1..20usize, 0..20usize, 1..9usize, speeds).prop_flat_map(
+        |(x, y, leaders, followers, pois, (min_speed, speed, max_speed))| {
+            let places =
+                move |count| vec((size_or_zero(1e-6, x), size_or_zero(1e-6, y)).prop_map(|(x, y)| [x, y]), count);
+            let agents = leaders + followers;
+            let coupling =
+                prop_oneof![(1..=agents).prop_map(Coupling::Same), vec(1..=agents, pois).prop_map(Coupling::Each)];
+            let rest = (size(0.01, 1e4), 1..=MAX_STEPS, size(1e-4, 10.0), -1e3..=1e3);
+            let motion = (size_or_zero(1e-3, 1e3), size_or_zero(1e-3, 1e3));
+            (places(leaders), places(followers), places(pois), coupling, rest, motion).prop_map(
+                move |(leaders, followers, pois, coupling, (observation_radius, steps, dt, heading), motion)| {
+                    let map = [x, y];
+                    (
+                        World {
+                            map,
+                            leaders,
+                            followers,
+                            pois,
+                            coupling,
+                            observation_radius,
+                            steps,
+                            dt,
+                            heading,
+                            speed,
+                        },
+                        Motion { min_speed, max_speed, max_acceleration: motion.0, max_turn_rate: motion.1 },
+                    )
+                },
+            )
+        },
+    )
+}
+
+fn configs() -> impl Strategy<Value = Config> {
+    let gain = || size_or_zero(1e-3, 1e3);
+    let follow = (size(0.01, 1e4), 0.0..=1.0, gain(), gain(), gain()).prop_map(
+        |(attraction_radius, part, attraction_gain, repulsion_gain, wall_gain): (f64, f64, f64, f64, f64)| Follow {
+            attraction_radius,
+            repulsion_radius: (attraction_radius * part).max(0.01),
+            attraction_gain,
+            repulsion_gain,
+            wall_gain,
+        },
+    );
+    let range = || prop_oneof![Just(f64::INFINITY), size(0.01, 1e4)];
+    let sense = (range(), range(), word()).prop_map(|(poi_range, agent_range, density)| Sense {
+        poi_range,
+        agent_range,
+        density,
+    });
+    let policy = vec(1..=MAX_HIDDEN_UNITS, 1..=MAX_HIDDEN_LAYERS).prop_map(|hidden| Policy { hidden });
+    let sizes = (2..=5000usize, 0..=MAX_GENERATIONS, 1..=9usize, 0.0..=1.0f64, 1..=MAX_EPISODES);
+    let mutation = (word(), size_or_zero(1e-6, 1.0), size_or_zero(1e-6, 100.0));
+    let learning = (word(), word(), sizes, mutation, size_or_zero(1e-6, 1e4), 0..=i64::MAX as u64).prop_map(
+        |(
+            paradigm,
+            fitness,
+            (population, generations, trials, part, episodes_per_team),
+            mutation,
+            start_jitter,
+            seed,
+        )| {
+            let (mutation, mutation_probability, mutation_sigma) = mutation;
+            Learning {
+                paradigm,
+                fitness,
+                population,
+                generations,
+                trials,
+                elites: (population as f64 * part) as usize,
+                mutation,
+                mutation_probability,
+                mutation_sigma,
+                episodes_per_team,
+                start_jitter,
+                seed,
+            }
+        },
+    );
+    (worlds(), follow, sense, policy, learning).prop_map(|((world, motion), follow, sense, policy, learning)| Config {
+        world,
+        motion,
+        follow,
+        sense,
+        policy,
+        learning,
+    })
+}
+
+/// A piece of text that means something to TOML or to a config.
+fn token() -> impl Strategy<Value = String> {
+    let known = "[ ] [[ ]] = , . # \" ''' { } inf -inf nan -0.0 1e999 -1 0 3 0x7f 99999999999999999999 1e-40 true 1979-05-27 \
+                 [world] [learning] [grid] world.dt leaders pois coupling hidden = [] [[1,2],[3]] é \u{1f6a2}";
+    let known: Vec<String> = known.split(' ').map(str::to_string).chain(["\n".into(), "\\u0000".into()]).collect();
+    prop_oneof![4 => (0..known.len()).prop_map(move |index| known[index].clone()), 1 => "\\PC{0,6}"]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn what_is_written_reads_back_the_same(config in configs()) {
+        let text = config.to_toml();
+        prop_assert_eq!(Config::parse(&text, "test.toml"), Ok(config), "{}", text);
+    }
+
+    /// Ranges and relations leave the sums of the exact arithmetic inside f32: no constant is infinite, NaN or denormal.
+    #[test]
+    fn a_valid_config_makes_normal_constants(config in configs()) {
+        let constants = flotilla::world::World::new(&config).constants;
+        let c = &constants;
+        for value in [
+            c.map_x, c.map_y, c.dt, c.heading_x, c.heading_y, c.speed, c.min_speed, c.max_speed, c.max_speed_change,
+            c.max_turn, c.max_turn_cos, c.max_turn_sin, c.observation_radius2, c.attraction_radius2, c.repulsion_radius2,
+            c.poi_range2, c.agent_range2, c.attraction_scale, c.repulsion_scale, c.wall_gain, c.poi_share, c.agent_share,
+            c.inverse_diagonal,
+        ] {
+            prop_assert!(value == 0.0 || (2f32.powi(-100)..=1e30).contains(&value.abs()), "{:?}", constants);
+        }
+        prop_assert_eq!(config.parameters(), c.parameters as usize);
+        prop_assert_eq!(config.learners(), c.leaders as usize);
+    }
+
+    #[test]
+    fn mangled_bytes_never_panic(
+        layout in 0..LAYOUTS.len(),
+        edits in vec((any::<prop::sample::Index>(), 0..12usize, token()), 1..6),
+    ) {
+        let mut text = std::fs::read_to_string(format!("configs/{}.toml", LAYOUTS[layout])).unwrap().into_bytes();
+        for (at, cut, token) in edits {
+            let at = at.index(text.len() + 1);
+            let end = (at + cut).min(text.len());
+            text.splice(at..end, token.into_bytes());
+        }
+        let text = String::from_utf8_lossy(&text);
+        if let Err(error) = Config::parse(&text, "test.toml") {
+            prop_assert!(error.to_string().contains("test.toml"));
+        }
+    }
+
+    /// One key of a valid config set to anything: taken, or refused with what was found.
+    #[test]
+    fn one_changed_value_is_taken_or_refused(config in configs(), key in any::<prop::sample::Index>(), value in token()) {
+        let table: toml::Table = config.to_toml().parse().unwrap();
+        let keys: Vec<String> = table
+            .iter()
+            .flat_map(|(section, keys)| keys.as_table().unwrap().keys().map(move |key| format!("{section}.{key}")))
+            .collect();
+        let key = &keys[key.index(keys.len())];
+        if let Ok(value) = format!("x = {value}").parse::<toml::Table>() {
+            let changed = Override::new(key, value["x"].clone(), "the change");
+            if let Err(error) = config.with(&[changed]) {
+                prop_assert!(error.to_string().contains("found"), "{}: {}", key, error);
+            }
+        }
+    }
+}
+
+#[test]
+fn counts_at_their_limits_are_valid() {
+    let many = |count: usize| format!("[{}]", "[1, 1],".repeat(count));
+    let text = format!(
+        "[world]\nleaders = {}\nfollowers = {}\npois = {}\nsteps = {MAX_STEPS}\ncoupling = 1024\n\
+         [policy]\nhidden = [64, 64, 64]\n[learning]\npopulation = 2\ntrials = 7\nseed = 9223372036854775807",
+        many(1000),
+        many(24),
+        many(256)
+    );
+    let config = Config::parse(&text, "test.toml").unwrap();
+    assert_eq!(config.learning.seed, i64::MAX as u64);
+    assert_eq!(Config::parse(&config.to_toml(), "again.toml"), Ok(config));
+    for (key, most) in [("population", MAX_POPULATION), ("trials", MAX_TRIALS), ("generations", MAX_GENERATIONS)] {
+        let text = |value: usize| format!("{SMALLEST}[learning]\n{key} = {value}");
+        assert!(Config::parse(&text(most), "test.toml").is_ok());
+        assert_eq!(problems(&text(most + 1))[0].key, format!("learning.{key}"));
+    }
+}
