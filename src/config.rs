@@ -1,7 +1,7 @@
 //! The config file: what an experiment is, with every default of the paper's calibration.
 //!
-//! A file is read by [`Config::load`], or by [`Config::read`] where flags or a sweep change some of its keys. [`Config::experiment`]
-//! is the one place that knows keys: each stands there on one line with the values it allows and its default.
+//! A file is read by [`Config::load`], or by [`Config::read`] where flags or a sweep change some of its keys. One
+//! function below, `experiment`, knows the keys: each stands there once, with the values it allows and its default.
 //! Everything wrong with a file is found in one pass and reported by line.
 
 use std::collections::BTreeMap;
@@ -34,6 +34,8 @@ pub const MAX_GENERATIONS: usize = 1_000_000;
 pub const MAX_TRIALS: usize = 4096;
 /// Most episodes averaged for one team's score.
 pub const MAX_EPISODES: usize = 1000;
+/// A team's record stays under a gigabyte whatever the config.
+const _: () = assert!(MAX_STEPS * MAX_POIS * MAX_AGENTS.div_ceil(32) * size_of::<u32>() < 1 << 30);
 /// Most bytes that the policies of all trials of a run may take.
 pub const MAX_POLICY_BYTES: usize = 1 << 38;
 /// Most bytes in a config file.
@@ -278,8 +280,8 @@ impl Config {
         self.learning.trials * self.learners() * self.learning.population * self.parameters() * size_of::<f32>()
     }
 
-    /// Every key with what it allows and its default. A faulty number reads as the most that is allowed, a faulty list as
-    /// none, so that what depends on it is not blamed as well.
+    /// Every key with what it allows and its default. A faulty number reads as the most that is allowed, a faulty
+    /// list as none, so that what depends on it is not blamed as well.
     fn experiment(r: &mut Reader<'_>) -> Config {
         let map = r.pair("world.map", between(1.0, LONGEST), [50.0, 50.0]);
         let leaders = r.points("world.leaders", 1..=MAX_AGENTS, map, None);

@@ -1,1 +1,161 @@
 //! One file a command; what was typed becomes ready objects here.
+//!
+//! A command's file holds `Args` (its flags) and `run(Args) -> Result<(), Error>`; [`Command`] lists it.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+
+use clap::builder::PossibleValuesParser;
+use clap::{Parser, Subcommand, ValueEnum};
+
+use crate::backend::BackendError;
+use crate::config::{self, Choice, Config, ConfigError, Fitness, Override, Paradigm};
+
+mod check;
+
+/// Lists the commands, each with its file, and calls the one that was typed.
+macro_rules! commands {
+    ($($(#[$doc:meta])* $name:ident($file:ident),)*) => {
+        /// What to do.
+        #[derive(Subcommand)]
+        enum Command {
+            $($(#[$doc])* $name($file::Args),)*
+        }
+
+        impl Command {
+            fn run(self) -> Result<(), Error> {
+                match self { $(Command::$name(args) => $file::run(args),)* }
+            }
+        }
+    };
+}
+
+commands! {
+    /// Check a config; print it with every default written out, and what a run of it costs.
+    Check(check),
+}
+
+/// Trains cooperative teams by coevolution on any GPU, with the same bits on a CPU.
+#[derive(Parser)]
+#[command(version, arg_required_else_help = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+/// Does what was typed; wrong usage ends the program here, with exit code 2.
+///
+/// # Errors
+/// The command failed.
+pub fn run() -> Result<(), Error> {
+    Cli::parse().command.run()
+}
+
+/// Why a command failed.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    #[error(transparent)]
+    Backend(#[from] BackendError),
+    #[error("standard output cannot be written: {0}")]
+    Output(io::Error),
+}
+
+/// Writes a result to standard output. A reader that has heard enough (`| head`) is no failure.
+///
+/// # Errors
+/// Standard output is closed or full.
+pub fn print(text: &str) -> Result<(), Error> {
+    let mut stdout = io::stdout().lock();
+    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Error::Output(error)),
+        _ => Ok(()),
+    }
+}
+
+const IN_CONFIG: &str = "Instead of the config's";
+const WHERE: &str = "Where to run (the results are the same)";
+
+/// A config file and the flags that change it.
+#[derive(clap::Args)]
+pub struct ConfigArgs {
+    /// Config file (TOML)
+    pub config: PathBuf,
+    #[command(flatten)]
+    pub overrides: Overrides,
+}
+
+impl ConfigArgs {
+    /// The config that was meant.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the file and the flags.
+    pub fn load(&self) -> Result<Config, Error> {
+        let text = config::read_file(&self.config)?;
+        Ok(Config::read(&text, &self.config.display().to_string(), &[], &self.overrides.list())?)
+    }
+}
+
+/// Flags that stand for config keys; their ranges are checked with the config.
+#[derive(clap::Args, Default)]
+pub struct Overrides {
+    /// Start of all randomness
+    #[arg(long, help_heading = IN_CONFIG, value_name = "N", allow_negative_numbers = true)]
+    pub seed: Option<i64>,
+    /// Independent repetitions
+    #[arg(long, help_heading = IN_CONFIG, value_name = "N", allow_negative_numbers = true)]
+    pub trials: Option<i64>,
+    /// Generations after the random start
+    #[arg(long, help_heading = IN_CONFIG, value_name = "N", allow_negative_numbers = true)]
+    pub generations: Option<i64>,
+    /// Policies a population, and teams a generation
+    #[arg(long, help_heading = IN_CONFIG, value_name = "N", allow_negative_numbers = true)]
+    pub population: Option<i64>,
+    /// Score that policies are selected by
+    #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = PossibleValuesParser::new(Fitness::names()))]
+    pub fitness: Option<String>,
+    /// Who learns
+    #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = PossibleValuesParser::new(Paradigm::names()))]
+    pub paradigm: Option<String>,
+}
+
+impl Overrides {
+    /// The keys that were set, each named as its flag.
+    pub fn list(&self) -> Vec<Override> {
+        let Overrides { seed, trials, generations, population, fitness, paradigm } = self;
+        let numbers = [("seed", seed), ("trials", trials), ("generations", generations), ("population", population)]
+            .map(|(name, &value)| (name, value.map(toml::Value::from)));
+        let words = [("fitness", fitness), ("paradigm", paradigm)]
+            .map(|(name, value)| (name, value.clone().map(toml::Value::from)));
+        let set = |(name, value): (&str, Option<toml::Value>)| {
+            Some(Override::new(format!("learning.{name}"), value?, format!("--{name}")))
+        };
+        numbers.into_iter().chain(words).filter_map(set).collect()
+    }
+}
+
+/// What to run on.
+#[derive(clap::Args, Clone, Debug)]
+pub struct RunOptions {
+    /// Processor
+    #[arg(long, help_heading = WHERE, value_enum, default_value_t = BackendChoice::Auto)]
+    pub backend: BackendChoice,
+    /// GPU whose name contains this, as `flotilla devices` lists it
+    #[arg(long, help_heading = WHERE, value_name = "NAME")]
+    pub adapter: Option<String>,
+    /// CPU threads [default: all]
+    #[arg(long, help_heading = WHERE, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    pub threads: Option<u16>,
+}
+
+/// Which kind of processor plays the episodes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum BackendChoice {
+    /// A GPU where there is one, else the CPU
+    Auto,
+    /// All cores, or `--threads`
+    Cpu,
+    /// A GPU, or fail
+    Gpu,
+}

@@ -1,0 +1,85 @@
+//! `flotilla check`: the config as resolved, and what a run of it costs.
+
+use serde::Serialize;
+
+use super::{ConfigArgs, Error, print};
+use crate::config::Config;
+use crate::world::World;
+
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(flatten)]
+    config: ConfigArgs,
+    /// Print one JSON object with `config` and `cost` (an unlimited range is null)
+    #[arg(long)]
+    json: bool,
+}
+
+/// What a whole run takes: all trials, all generations with the random start, every team and each generation's champion.
+#[derive(Serialize)]
+struct Cost {
+    agents: usize,
+    learners: usize,
+    /// Episodes played.
+    teams: u128,
+    team_steps: u128,
+    agent_steps: u128,
+    /// Weights of one policy.
+    parameters: usize,
+    /// Bytes of all trials' policies.
+    policy_bytes: usize,
+    /// Bytes of one team's record: who was near which POI at which step, and which leader each follower saw.
+    record_bytes: usize,
+}
+
+impl Cost {
+    fn of(config: &Config) -> Cost {
+        let world = World::new(config);
+        let learning = &config.learning;
+        let wide = |count: usize| count as u128;
+        let teams = wide(learning.trials)
+            * wide(learning.generations + 1)
+            * wide(learning.population + 1)
+            * wide(learning.episodes_per_team);
+        let team_steps = teams * wide(world.steps());
+        Cost {
+            agents: world.agents(),
+            learners: config.learners(),
+            teams,
+            team_steps,
+            agent_steps: team_steps * wide(world.agents()),
+            parameters: config.parameters(),
+            policy_bytes: config.policy_bytes(),
+            record_bytes: (world.set_words() + world.followers() * world.leaders()) * size_of::<u32>(),
+        }
+    }
+}
+
+#[derive(Serialize)]
+struct Report<'a> {
+    config: &'a Config,
+    cost: &'a Cost,
+}
+
+/// Prints the config, so that standard output is a config file again, with the cost as comments below it.
+pub fn run(args: Args) -> Result<(), Error> {
+    let config = args.config.load()?;
+    let cost = Cost::of(&config);
+    if args.json {
+        let report = Report { config: &config, cost: &cost };
+        return print(&(serde_json::to_string(&report).expect("plain fields are JSON") + "\n"));
+    }
+    let Cost { agents, learners, teams, team_steps, agent_steps, parameters, policy_bytes, record_bytes } = cost;
+    print(&format!(
+        "{}
+# A run of this plays {teams} teams, champions included:
+#   agents a team         {agents}, of which {learners} learn
+#   team-steps            {team_steps}
+#   agent-steps           {agent_steps}
+#   parameters a policy   {parameters}
+#   policies, all trials  {policy_bytes} bytes
+#   record of a team      {record_bytes} bytes
+",
+        config.to_toml()
+    ))
+}

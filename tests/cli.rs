@@ -1,0 +1,346 @@
+//! The binary on good and bad input: exit codes, what it prints and where.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Output;
+
+use assert_cmd::cargo::cargo_bin_cmd;
+use tempfile::TempDir;
+
+/// Two leaders, four followers, two POIs; each test below changes one line.
+const GOOD: &str = "\
+[world]
+map = [50, 40]
+leaders = [[10, 5], [20, 5]]
+followers = [[12, 2], [8, 2], [22, 2], [18, 2]]
+pois = [[10, 15], [20, 15]]
+coupling = 3
+steps = 25
+dt = 0.2
+heading = 1.5
+speed = 0
+[motion]
+min_speed = 0
+max_speed = 3
+[follow]
+attraction_radius = 5
+repulsion_radius = 1
+[sense]
+poi_range = inf
+density = 'linear'
+[policy]
+hidden = [10]
+[learning]
+population = 50
+";
+
+fn flotilla(args: &[&str]) -> Output {
+    cargo_bin_cmd!("flotilla").args(args).output().unwrap()
+}
+
+fn written(text: impl AsRef<[u8]>) -> (TempDir, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.toml");
+    fs::write(&path, text).unwrap();
+    (folder, path)
+}
+
+fn check(text: impl AsRef<[u8]>, flags: &[&str]) -> Output {
+    let (_folder, path) = written(text);
+    flotilla(&[&["check", path.to_str().unwrap()], flags].concat())
+}
+
+/// What standard error says of a failed run, without the folder's name; nothing may be on standard output.
+fn refusal(output: Output) -> String {
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{error}");
+    assert!(output.stdout.is_empty(), "{}", String::from_utf8_lossy(&output.stdout));
+    let error = error.strip_prefix("error: ").expect(&error).trim_end();
+    let name = |line: &str| line.find("x.toml").map_or(line.to_string(), |at| line[at..].to_string());
+    error.lines().map(name).collect::<Vec<_>>().join("\n")
+}
+
+/// A line of [`GOOD`], by number, replaced.
+fn with_line(number: usize, line: &str) -> String {
+    GOOD.lines().enumerate().map(|(at, old)| if at + 1 == number { line } else { old }).collect::<Vec<_>>().join("\n")
+}
+
+#[test]
+fn a_good_config_is_printed_as_resolved_and_prints_itself_again() {
+    let output = check(GOOD, &[]);
+    assert_eq!(output.status.code(), Some(0));
+    assert!(output.stderr.is_empty());
+    let text = String::from_utf8(output.stdout).unwrap();
+    for line in [
+        "poi_range = inf",
+        "agent_range = 5.0",
+        "fitness = \"Df\"",
+        "# A run of this plays 25755 teams, champions included:", // 5 trials × 101 generations × 51 teams
+        "#   agents a team         6, of which 2 learn",
+        "#   team-steps            643875",
+        "#   agent-steps           3863250",
+        "#   parameters a policy   112",          // 9·10 + 11·2
+        "#   policies, all trials  224000 bytes", // 5 × 2 × 50 × 112 × 4
+        "#   record of a team      232 bytes",    // (25 × 2 + 4 × 2) × 4
+    ] {
+        assert!(text.lines().any(|found| found == line), "no {line:?} in\n{text}");
+    }
+    assert_eq!(String::from_utf8(check(&text, &[]).stdout).unwrap(), text);
+}
+
+#[test]
+fn json_is_one_object_with_config_and_cost() {
+    let output = check(GOOD, &["--json", "--paradigm", "all-leaders", "--fitness", "D++", "--seed", "7"]);
+    let json: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(json["config"]["learning"]["fitness"], "D++");
+    assert_eq!(json["config"]["learning"]["seed"], 7);
+    assert_eq!(json["config"]["sense"]["poi_range"], serde_json::Value::Null);
+    assert_eq!((json["cost"]["learners"].as_u64(), json["cost"]["agents"].as_u64()), (Some(6), Some(6)));
+    assert_eq!(json["cost"]["team_steps"], 643_875);
+}
+
+#[test]
+fn the_most_expensive_run_is_still_counted() {
+    let text = GOOD.replace("steps = 25", "steps = 10000").replace("population = 50", "population = 1048576")
+        + "trials = 100\ngenerations = 1000000\nepisodes_per_team = 1000\n";
+    let output = check(text, &["--json"]);
+    let text = String::from_utf8(output.stdout).unwrap();
+    // 100 × 1 000 001 × 1 048 577 × 1000 × 10 000, beyond 64 bits
+    assert!(text.contains("\"team_steps\":1048578048577000000000"), "{text}");
+}
+
+#[test]
+fn the_papers_configs_are_good() {
+    for name in ["generally_forward", "strictly_forward", "chaotic"] {
+        assert_eq!(flotilla(&["check", &format!("configs/{name}.toml")]).status.code(), Some(0), "{name}");
+    }
+}
+
+/// Each wrong line is answered by its place, its key, what was found and what is allowed.
+#[test]
+fn every_wrong_value_is_named_with_line_and_range() {
+    let many = |count: usize| format!("[{}]", vec!["[1, 1]"; count].join(", "));
+    let agents = format!("found 1028 agents with the leaders, allowed 2 to {}", 1024);
+    let leaders = format!("leaders = {}", many(1025));
+    let pois = format!("pois = {}", many(257));
+    let followers = format!("followers = {}", many(1022 + 4));
+    for (line, text, expected) in [
+        // unknown keys and sections
+        (13, "max_sped = 3", "motion.max_sped: unknown key, did you mean `motion.max_speed`?"),
+        (10, "max_speed = 3", "world.max_speed: unknown key, did you mean `motion.max_speed`?"),
+        (21, "hiden = [10]", "policy.hiden: unknown key, did you mean `policy.hidden`?"),
+        (21, "qwertz = 1", "policy.qwertz: unknown key; [policy] has hidden"),
+        (20, "[polcy]", "polcy: unknown section, did you mean `policy`?"),
+        // wrong types
+        (8, "dt = 'fast'", "world.dt: found 'fast', allowed a number, 0.0001 to 10"),
+        (8, "dt = true", "world.dt: found true, allowed a number, 0.0001 to 10"),
+        (8, "dt = [1]", "world.dt: found a list of 1, allowed a number, 0.0001 to 10"),
+        (8, "dt = {}", "world.dt: found a table, allowed a number, 0.0001 to 10"),
+        (8, "dt = 1979-05-27", "world.dt: found 1979-05-27, allowed a number, 0.0001 to 10"),
+        (7, "steps = 2.5", "world.steps: found 2.5, allowed a whole number, 1 to 10000"),
+        (2, "map = 50", "world.map: found 50, allowed a list of 2 numbers"),
+        (2, "map = [50]", "world.map: found a list of 1, allowed a list of 2 numbers"),
+        (3, "leaders = [[1, 2], 3]", "world.leaders[1]: found 3, allowed a list of 2 numbers"),
+        (3, "leaders = [[1, 2, 3]]", "world.leaders[0]: found a list of 3, allowed a list of 2 numbers"),
+        (3, "leaders = [[1, 'a']]", "world.leaders[0][1]: found 'a', allowed a number, 0 or 0.000001 to 40 (the map)"),
+        (19, "density = 3", "sense.density: found 3, allowed \"linear\" or \"inverse\""),
+        (19, "density = 'flat'", "sense.density: found 'flat', allowed \"linear\" or \"inverse\""),
+        (23, "fitness = 'd'", "learning.fitness: found 'd', allowed \"G\" or \"D\" or \"Df\" or \"D++\""),
+        (23, "mutation = ''", "learning.mutation: found '', allowed \"scaled\" or \"additive\""),
+        (23, "paradigm = 'x'", "learning.paradigm: found 'x', allowed \"leader-follower\" or \"all-leaders\""),
+        // NaN and infinity
+        (8, "dt = nan", "world.dt: found nan, allowed 0.0001 to 10"),
+        (8, "dt = inf", "world.dt: found inf, allowed 0.0001 to 10"),
+        (2, "map = [50, inf]", "world.map[1]: found inf, allowed 1 to 10000"),
+        (9, "heading = -inf", "world.heading: found -inf, allowed -1000 to 1000"),
+        (18, "poi_range = nan", "sense.poi_range: found nan, allowed 0.01 to 10000 or inf (unlimited)"),
+        (18, "poi_range = -inf", "sense.poi_range: found -inf, allowed 0.01 to 10000 or inf (unlimited)"),
+        (18, "agent_range = 0", "sense.agent_range: found 0, allowed 0.01 to 10000 or inf (unlimited)"),
+        // out of range
+        (8, "dt = 0", "world.dt: found 0, allowed 0.0001 to 10"),
+        (8, "dt = -0.2", "world.dt: found -0.2, allowed 0.0001 to 10"),
+        (8, "dt = 99999999999999999999", "world.dt: found 99999999999999999999, allowed 0.0001 to 10"),
+        (2, "map = [0, 40]", "world.map[0]: found 0, allowed 1 to 10000"),
+        (7, "steps = 0", "world.steps: found 0, allowed 1 to 10000"),
+        (7, "steps = 10_001", "world.steps: found 10_001, allowed 1 to 10000"),
+        (7, "observation_radius = 0", "world.observation_radius: found 0, allowed 0.01 to 10000"),
+        (10, "speed = 4", "world.speed: found 4, allowed 0 or 0.000001 to 3 (motion.min_speed to motion.max_speed)"),
+        (12, "min_speed = 4", "motion.min_speed: found 4, allowed 0 or 0.000001 to 3 (motion.max_speed)"),
+        (13, "max_speed = 1e4", "motion.max_speed: found 1e4, allowed 0 or 0.000001 to 1000"),
+        (13, "max_speed = 1e-40", "motion.max_speed: found 1e-40, allowed 0 or 0.000001 to 1000"),
+        (13, "max_acceleration = -1", "motion.max_acceleration: found -1, allowed 0 or 0.001 to 1000"),
+        (13, "max_turn_rate = -1", "motion.max_turn_rate: found -1, allowed 0 or 0.001 to 1000"),
+        (15, "attraction_radius = 0", "follow.attraction_radius: found 0, allowed 0.01 to 10000"),
+        (16, "repulsion_radius = 6", "follow.repulsion_radius: found 6, allowed 0.01 to 5 (follow.attraction_radius)"),
+        (16, "attraction_gain = -1", "follow.attraction_gain: found -1, allowed 0 or 0.001 to 1000"),
+        (16, "repulsion_gain = 1e9", "follow.repulsion_gain: found 1e9, allowed 0 or 0.001 to 1000"),
+        (16, "wall_gain = -1", "follow.wall_gain: found -1, allowed 0 or 0.001 to 1000"),
+        (23, "population = 1", "learning.population: found 1, allowed 2 to 1048576"),
+        (23, "population = 1048577", "learning.population: found 1048577, allowed 2 to 1048576"),
+        (23, "elites = 51", "learning.elites: found 51, allowed 0 to 50 (learning.population)"),
+        (23, "generations = -1", "learning.generations: found -1, allowed 0 to 1000000"),
+        (23, "trials = 0", "learning.trials: found 0, allowed 1 to 4096"),
+        (23, "episodes_per_team = 0", "learning.episodes_per_team: found 0, allowed 1 to 1000"),
+        (23, "start_jitter = -1", "learning.start_jitter: found -1, allowed 0 or 0.000001 to 10000"),
+        (23, "mutation_sigma = -1", "learning.mutation_sigma: found -1, allowed 0 or 0.000001 to 100"),
+        (23, "mutation_probability = 1.5", "learning.mutation_probability: found 1.5, allowed 0 or 0.000001 to 1"),
+        (23, "seed = -1", "learning.seed: found -1, allowed 0 to 9223372036854775807"),
+        (
+            23,
+            "seed = 18446744073709551615",
+            "learning.seed: found 18446744073709551615, allowed 0 to 9223372036854775807",
+        ),
+        // positions, coupling and sizes
+        (3, "leaders = [[10, 41]]", "world.leaders[0][1]: found 41, allowed 0 or 0.000001 to 40 (the map)"),
+        (4, "followers = [[51, 4]]", "world.followers[0][0]: found 51, allowed 0 or 0.000001 to 50 (the map)"),
+        (5, "pois = [[1, 1], [1, -1]]", "world.pois[1][1]: found -1, allowed 0 or 0.000001 to 40 (the map)"),
+        (3, "leaders = []", "world.leaders: found a list of 0, allowed a list of 1 to 1024 positions [x, y]"),
+        (5, "pois = []", "world.pois: found a list of 0, allowed a list of 1 to 256 positions [x, y]"),
+        (3, &leaders, "world.leaders: found a list of 1025, allowed a list of 1 to 1024 positions [x, y]"),
+        (5, &pois, "world.pois: found a list of 257, allowed a list of 1 to 256 positions [x, y]"),
+        (4, &followers, "world.followers: found a list of 1026, allowed a list of 0 to 1023 positions [x, y]"),
+        (6, "coupling = 9", "world.coupling: found 9, allowed 1 to 6 (the number of agents)"),
+        (6, "coupling = 0", "world.coupling: found 0, allowed 1 to 6 (the number of agents)"),
+        (6, "coupling = [3, 7]", "world.coupling[1]: found 7, allowed 1 to 6 (the number of agents)"),
+        (
+            6,
+            "coupling = [3]",
+            "world.coupling: found a list of 1, allowed a list of 2 numbers, each 1 to 6 (the number of agents)",
+        ),
+        (21, "hidden = []", "policy.hidden: found a list of 0, allowed a list of 1 to 3 numbers, each 1 to 64"),
+        (
+            21,
+            "hidden = [9, 9, 9, 9]",
+            "policy.hidden: found a list of 4, allowed a list of 1 to 3 numbers, each 1 to 64",
+        ),
+        (21, "hidden = [65]", "policy.hidden[0]: found 65, allowed 1 to 64"),
+        (21, "hidden = [10, 0]", "policy.hidden[1]: found 0, allowed 1 to 64"),
+        (21, "hidden = 10", "policy.hidden: found 10, allowed a list of 1 to 3 numbers, each 1 to 64"),
+    ] {
+        let expected = format!("x.toml:{line}: {expected}");
+        let found = refusal(check(with_line(line, text), &[]));
+        assert_eq!(found.lines().next(), Some(expected.as_str()), "{text}");
+    }
+    let crowd =
+        GOOD.replace("[[12, 2], [8, 2], [22, 2], [18, 2]]", &many(1023)).replace("[[10, 5], [20, 5]]", &many(5));
+    assert_eq!(refusal(check(crowd, &[])), format!("x.toml:4: world.followers: {agents}"));
+}
+
+#[test]
+fn policies_beyond_memory_are_refused_with_the_limit() {
+    let text = GOOD.replace("population = 50", "population = 1048576\ntrials = 4096");
+    assert_eq!(
+        refusal(check(text, &[])),
+        "x.toml:23: learning.population: found 1048576, whose policies of all trials take 3584 GiB, allowed 256 GiB"
+    );
+}
+
+#[test]
+fn several_problems_are_told_together_by_line() {
+    let text = GOOD.replace("coupling = 3", "coupling = 9").replace("max_speed", "max_sped").replace("[10]", "[65]");
+    assert_eq!(
+        refusal(check(format!("{text}trials = 0\nfoo = 1\n"), &["--population", "1"])),
+        "x.toml
+x.toml:6: world.coupling: found 9, allowed 1 to 6 (the number of agents)
+x.toml:13: motion.max_sped: unknown key, did you mean `motion.max_speed`?
+x.toml:21: policy.hidden[0]: found 65, allowed 1 to 64
+x.toml:24: learning.trials: found 0, allowed 1 to 4096
+x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, fitness, generations, mutation, \
+         mutation_probability, mutation_sigma, paradigm, population, seed, start_jitter, trials
+--population: found 1, allowed 2 to 1048576"
+    );
+}
+
+#[test]
+fn missing_positions_and_sections_of_another_kind_are_named() {
+    let leaders = "world.leaders: missing, allowed a list of 1 to 1024 positions [x, y]";
+    let pois = "world.pois: missing, allowed a list of 1 to 256 positions [x, y]";
+    assert_eq!(refusal(check("", &[])), format!("x.toml\nx.toml:1: {leaders}\nx.toml:1: {pois}"));
+    let found = refusal(check("# no positions\n\n[world]\nsteps = 3\n", &[]));
+    assert_eq!(found, format!("x.toml\nx.toml:3: {leaders}\nx.toml:3: {pois}"));
+    let found =
+        refusal(check(format!("learning = 3\nseed = 1\n{GOOD}").replace("[learning]\npopulation = 50\n", ""), &[]));
+    let expected = "x.toml\nx.toml:1: learning: found 3, allowed a section [learning]\n\
+                    x.toml:2: seed: unknown key, did you mean `learning.seed`?";
+    assert_eq!(found, expected);
+}
+
+#[test]
+fn broken_toml_is_told_with_its_line() {
+    for (line, text) in
+        [(2, "map = [50, 40"), (8, "dt ="), (8, "dt = 0.2 0.3"), (10, "dt = 0.1"), (13, "max speed = 3")]
+    {
+        let found = refusal(check(with_line(line, text), &[]));
+        let told = found.lines().any(|problem| {
+            let place = problem.strip_prefix("x.toml:").and_then(|rest| rest.split_once(": "));
+            place.is_some_and(|(number, message)| number.parse::<usize>().unwrap() >= line && !message.is_empty())
+        });
+        assert!(told, "{text}: {found}");
+    }
+}
+
+#[test]
+fn what_is_no_config_file_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    let refused = |path: &str, reason: &str| {
+        let found = refusal(flotilla(&["check", path]));
+        assert!(found.contains(reason) && found.contains("x.toml"), "{found}");
+    };
+    refused(&path("x.toml"), "cannot be read: No such file");
+    fs::create_dir(path("dir-x.toml")).unwrap();
+    refused(&path("dir-x.toml"), "it is a directory; name a config file in it");
+    fs::write(path("latin-x.toml"), b"[world]\n# caf\xe9\n").unwrap();
+    refused(&path("latin-x.toml"), "line 2 is not UTF-8 text");
+    // 100 MB of nothing: refused by its size, before most of it is read.
+    let big = path("big-x.toml");
+    fs::File::create(Path::new(&big)).unwrap().set_len(100_000_000).unwrap();
+    refused(&big, "larger than 1048576 bytes");
+}
+
+#[test]
+fn overrides_out_of_range_name_the_flag() {
+    let whole = "allowed 0 to 9223372036854775807";
+    for (flags, expected) in [
+        (["--population", "1"], "--population: found 1, allowed 2 to 1048576"),
+        (["--trials", "0"], "--trials: found 0, allowed 1 to 4096"),
+        (["--generations", "-1"], "--generations: found -1, allowed 0 to 1000000"),
+        (["--seed", "-1"], &format!("--seed: found -1, {whole}")),
+    ] {
+        assert_eq!(refusal(check(GOOD, &flags)), expected);
+    }
+    // A flag mends what the file has wrong.
+    assert_eq!(check(with_line(23, "trials = 0"), &["--trials", "3"]).status.code(), Some(0));
+}
+
+#[test]
+fn wrong_usage_is_exit_code_2() {
+    for args in [
+        &["check"][..],
+        &["chekc", "configs/chaotic.toml"],
+        &["check", "configs/chaotic.toml", "--sed", "1"],
+        &["check", "configs/chaotic.toml", "--seed"],
+        &["check", "configs/chaotic.toml", "--seed", "many"],
+        &["check", "configs/chaotic.toml", "--fitness", "E"],
+        &["check", "configs/chaotic.toml", "--paradigm", "leaders"],
+        &["check", "configs/chaotic.toml", "another.toml"],
+        &[],
+    ] {
+        let output = flotilla(args);
+        assert_eq!(output.status.code(), Some(2), "{args:?}");
+        assert!(output.stdout.is_empty() && !output.stderr.is_empty(), "{args:?}");
+    }
+    assert_eq!(flotilla(&["--help"]).status.code(), Some(0));
+    assert_eq!(flotilla(&["--version"]).status.code(), Some(0));
+}
+
+#[test]
+fn a_reader_that_leaves_early_is_no_failure() {
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let binary = assert_cmd::cargo::cargo_bin!("flotilla");
+    let mut child = std::process::Command::new(binary);
+    let child = child.args(["check", "configs/chaotic.toml"]).stdout(writer).stderr(std::process::Stdio::piped());
+    let output = child.spawn().unwrap().wait_with_output().unwrap();
+    assert_eq!((output.status.code(), String::from_utf8_lossy(&output.stderr).as_ref()), (Some(0), ""));
+}
