@@ -5,6 +5,7 @@
 //! Everything wrong with a file is found in one pass and reported by line.
 
 use std::collections::BTreeMap;
+use std::f64::consts::FRAC_PI_2;
 use std::fmt::{self, Display};
 use std::io::Read;
 use std::ops::RangeInclusive;
@@ -233,9 +234,17 @@ impl Config {
     pub fn read(text: &str, name: &str, foreign: &[&str], overrides: &[Override]) -> Result<Config, ConfigError> {
         let (document, errors) = DeTable::parse_recoverable(text);
         let mut reader = Reader::default();
+        let mut told = 0;
         for error in errors {
-            let place = Place::Offset(error.span().map_or(0, |span| span.start));
-            reader.blame(place, "", error.message().trim().replace('\n', ", "));
+            let span = error.span().unwrap_or(0..0);
+            // One slip of the pen breaks the rest of its line; the first error tells which.
+            if reader.problems.is_empty() || text.get(told..span.start).is_some_and(|between| between.contains('\n')) {
+                told = span.start;
+                let at = text.get(span).filter(|at| !at.trim().is_empty());
+                let at = at.map_or(String::new(), |at| format!(" (at `{}`)", shorten(at)));
+                let message = format!("{}{at}", error.message().trim().replace('\n', ", "));
+                reader.blame(Place::Offset(told), "", message);
+            }
         }
         if reader.problems.is_empty() {
             reader.fill(document.into_inner(), text, foreign, overrides);
@@ -289,10 +298,8 @@ impl Config {
         let pois = r.points("world.pois", 1..=MAX_POIS, map, None);
         let agents = leaders.as_ref().zip(followers.as_ref()).map_or(MAX_AGENTS, |(l, f)| l.len() + f.len());
         if agents > MAX_AGENTS {
-            r.blame_key(
-                "world.followers",
-                format!("found {agents} agents with the leaders, allowed 2 to {MAX_AGENTS}"),
-            );
+            let message = format!("found {agents} agents with the leaders, allowed 1 to {MAX_AGENTS}");
+            r.blame_key("world.followers", message);
         }
         let needed = between(1, agents.min(MAX_AGENTS)).because("the number of agents");
 
@@ -318,18 +325,14 @@ impl Config {
                 observation_radius: r.number("world.observation_radius", between(0.01, LONGEST), 5.0),
                 steps: r.number("world.steps", between(1, MAX_STEPS), 25),
                 dt: r.number("world.dt", between(1e-4, 10.0), 0.2),
-                heading: r.number("world.heading", between(-1e3, 1e3), std::f64::consts::FRAC_PI_2),
+                heading: r.number("world.heading", between(-1e3, 1e3), FRAC_PI_2),
                 speed: r.number("world.speed", start_speed, 0.0),
             },
             motion: Motion {
                 min_speed,
                 max_speed,
                 max_acceleration: r.number("motion.max_acceleration", between(1e-3, 1e3).or_zero(), 5.0),
-                max_turn_rate: r.number(
-                    "motion.max_turn_rate",
-                    between(1e-3, 1e3).or_zero(),
-                    std::f64::consts::FRAC_PI_2,
-                ),
+                max_turn_rate: r.number("motion.max_turn_rate", between(1e-3, 1e3).or_zero(), FRAC_PI_2),
             },
             follow: Follow {
                 attraction_radius,

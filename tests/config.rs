@@ -283,8 +283,8 @@ fn configs() -> impl Strategy<Value = Config> {
 
 /// A piece of text that means something to TOML or to a config.
 fn token() -> impl Strategy<Value = String> {
-    let known = "[ ] [[ ]] = , . # \" ''' { } inf -inf nan -0.0 1e999 -1 0 3 0x7f 99999999999999999999 1e-40 true 1979-05-27 \
-                 [world] [learning] [grid] world.dt leaders pois coupling hidden = [] [[1,2],[3]] é \u{1f6a2}";
+    let known = "[ ] [[ ]] = , . # \" ''' { } inf -inf nan -0.0 1e999 -1 0 3 0x7f 99999999999999999999 1e-40 true \
+                 1979-05-27 [world] [learning] [grid] world.dt leaders pois coupling hidden = [] [[1,2],[3]] é \u{1f6a2}";
     let known: Vec<String> = known.split(' ').map(str::to_string).chain(["\n".into(), "\\u0000".into()]).collect();
     prop_oneof![4 => (0..known.len()).prop_map(move |index| known[index].clone()), 1 => "\\PC{0,6}"]
 }
@@ -298,16 +298,16 @@ proptest! {
         prop_assert_eq!(Config::parse(&text, "test.toml"), Ok(config), "{}", text);
     }
 
-    /// Ranges and relations leave the sums of the exact arithmetic inside f32: no constant is infinite, NaN or denormal.
+    /// Ranges and relations keep the exact arithmetic well inside f32: no constant is infinite, NaN or denormal.
     #[test]
     fn a_valid_config_makes_normal_constants(config in configs()) {
         let constants = flotilla::world::World::new(&config).constants;
         let c = &constants;
         for value in [
-            c.map_x, c.map_y, c.dt, c.heading_x, c.heading_y, c.speed, c.min_speed, c.max_speed, c.max_speed_change,
-            c.max_turn, c.max_turn_cos, c.max_turn_sin, c.observation_radius2, c.attraction_radius2, c.repulsion_radius2,
-            c.poi_range2, c.agent_range2, c.attraction_scale, c.repulsion_scale, c.wall_gain, c.poi_share, c.agent_share,
-            c.inverse_diagonal,
+            c.map_x, c.map_y, c.dt, c.heading_x, c.heading_y, c.speed, c.min_speed, c.max_speed,
+            c.max_speed_change, c.max_turn, c.max_turn_cos, c.max_turn_sin, c.observation_radius2,
+            c.attraction_radius2, c.repulsion_radius2, c.poi_range2, c.agent_range2, c.attraction_scale,
+            c.repulsion_scale, c.wall_gain, c.poi_share, c.agent_share, c.inverse_diagonal,
         ] {
             prop_assert!(value == 0.0 || (2f32.powi(-100)..=1e30).contains(&value.abs()), "{:?}", constants);
         }
@@ -334,7 +334,11 @@ proptest! {
 
     /// One key of a valid config set to anything: taken, or refused with what was found.
     #[test]
-    fn one_changed_value_is_taken_or_refused(config in configs(), key in any::<prop::sample::Index>(), value in token()) {
+    fn one_changed_value_is_taken_or_refused(
+        config in configs(),
+        key in any::<prop::sample::Index>(),
+        value in token(),
+    ) {
         let table: toml::Table = config.to_toml().parse().unwrap();
         let keys: Vec<String> = table
             .iter()

@@ -15,7 +15,7 @@ pub struct Args {
     json: bool,
 }
 
-/// What a whole run takes: all trials, all generations with the random start, every team and each generation's champion.
+/// What a whole run takes: all trials, all generations and the random start, every team and the champions.
 #[derive(Serialize)]
 struct Cost {
     agents: usize,

@@ -5,7 +5,7 @@
 use std::io::{self, Write};
 use std::path::PathBuf;
 
-use clap::builder::PossibleValuesParser;
+use clap::builder::PossibleValuesParser as Words;
 use clap::{Parser, Subcommand, ValueEnum};
 
 use crate::backend::BackendError;
@@ -113,10 +113,10 @@ pub struct Overrides {
     #[arg(long, help_heading = IN_CONFIG, value_name = "N", allow_negative_numbers = true)]
     pub population: Option<i64>,
     /// Score that policies are selected by
-    #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = PossibleValuesParser::new(Fitness::names()))]
+    #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = Words::new(Fitness::names()))]
     pub fitness: Option<String>,
     /// Who learns
-    #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = PossibleValuesParser::new(Paradigm::names()))]
+    #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = Words::new(Paradigm::names()))]
     pub paradigm: Option<String>,
 }
 
