@@ -234,17 +234,12 @@ impl Config {
     pub fn read(text: &str, name: &str, foreign: &[&str], overrides: &[Override]) -> Result<Config, ConfigError> {
         let (document, errors) = DeTable::parse_recoverable(text);
         let mut reader = Reader::default();
-        let mut told = 0;
-        for error in errors {
+        for error in first_slips(text, &errors) {
             let span = error.span().unwrap_or(0..0);
-            // One slip of the pen breaks the rest of its line; the first error tells which.
-            if reader.problems.is_empty() || text.get(told..span.start).is_some_and(|between| between.contains('\n')) {
-                told = span.start;
-                let at = text.get(span).filter(|at| !at.trim().is_empty());
-                let at = at.map_or(String::new(), |at| format!(" (at `{}`)", shorten(at)));
-                let message = format!("{}{at}", error.message().trim().replace('\n', ", "));
-                reader.blame(Place::Offset(told), "", message);
-            }
+            let at = text.get(span.clone()).filter(|at| !at.trim().is_empty());
+            let at = at.map_or(String::new(), |at| format!(" (at `{}`)", shorten(at)));
+            let message = error.message().trim().replace('\n', ", ") + &at;
+            reader.blame(Place::Offset(span.start), "", message);
         }
         if reader.problems.is_empty() {
             reader.fill(document.into_inner(), text, foreign, overrides);
@@ -372,6 +367,21 @@ impl Config {
         }
         config
     }
+}
+
+/// The syntax errors that no earlier one explains: a slip can break the rest of its line, a list left open the rest of
+/// the file.
+fn first_slips<'e>(text: &str, errors: &'e [toml::de::Error]) -> impl Iterator<Item = &'e toml::de::Error> {
+    let left_open = errors.iter().any(|error| error.message().contains("unclosed array"));
+    let in_list = |error: &toml::de::Error| left_open && error.message().contains("array");
+    let end = errors.iter().position(in_list).map_or(errors.len(), |first| first + 1);
+    let mut last = None;
+    errors[..end].iter().filter(move |error| {
+        let start = error.span().map_or(0, |span| span.start);
+        let new_line = last.is_none_or(|last| text.get(last..start).is_some_and(|since| since.contains('\n')));
+        last = if new_line { Some(start) } else { last };
+        new_line
+    })
 }
 
 /// The text of a config or sweep file.

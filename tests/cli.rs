@@ -272,12 +272,12 @@ fn broken_toml_is_told_with_its_line() {
         (8, "dt = 0.2 0.3", 8, "0.2 0.3"),
         (8, "steps = 3", 8, "steps"),
         (13, "max speed = 3", 13, ""),
-        (2, "map = [50, 40", 3, "leaders"),
+        (2, "map = [50, 40", 3, "comma"),
     ] {
         let found = refusal(check(with_line(line, text), &[]));
-        let problem = found.lines().find(|line| line.starts_with("x.toml:")).unwrap();
         let place = format!("x.toml:{told}: ");
-        assert!(problem.starts_with(&place) && problem.len() > place.len() && problem.contains(at), "{text}: {found}");
+        assert!(found.starts_with(&place) && found.len() > place.len() && found.contains(at), "{text}: {found}");
+        assert_eq!(found.lines().count(), 1, "{text}: {found}");
     }
     let twice = refusal(check(with_line(8, "dt =").replace("max_speed = 3", "max_speed ="), &[]));
     assert_eq!(twice.lines().filter(|line| line.starts_with("x.toml:")).count(), 2, "{twice}");

@@ -108,6 +108,12 @@ fn defaults_give_way_to_what_was_written() {
 }
 
 #[test]
+fn minus_zero_is_zero() {
+    let config = Config::parse(&format!("{SMALLEST}speed = -0.0\nheading = -0.0"), "test.toml").unwrap();
+    assert!(config.world.speed.is_sign_positive() && config.world.heading.is_sign_positive());
+}
+
+#[test]
 fn a_faulty_value_is_blamed_alone() {
     for (text, key) in [
         ("[world]\nmap = [1e9, 50]\nleaders = [[900, 2]]\npois = [[3, 4]]", "world.map[0]"),
@@ -283,8 +289,9 @@ fn configs() -> impl Strategy<Value = Config> {
 
 /// A piece of text that means something to TOML or to a config.
 fn token() -> impl Strategy<Value = String> {
-    let known = "[ ] [[ ]] = , . # \" ''' { } inf -inf nan -0.0 1e999 -1 0 3 0x7f 99999999999999999999 1e-40 true \
-                 1979-05-27 [world] [learning] [grid] world.dt leaders pois coupling hidden = [] [[1,2],[3]] é \u{1f6a2}";
+    let known = "[ ] [[ ]] = , . # \" ''' { } inf -inf nan -0.0 1e999 -1 0 3 0x7f \
+                 99999999999999999999 1e-40 true 1979-05-27 [world] [learning] [grid] \
+                 world.dt leaders pois coupling hidden = [] [[1,2],[3]] é \u{1f6a2}";
     let known: Vec<String> = known.split(' ').map(str::to_string).chain(["\n".into(), "\\u0000".into()]).collect();
     prop_oneof![4 => (0..known.len()).prop_map(move |index| known[index].clone()), 1 => "\\PC{0,6}"]
 }

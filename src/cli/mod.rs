@@ -1,6 +1,6 @@
 //! One file a command; what was typed becomes ready objects here.
 //!
-//! A command's file holds `Args` (its flags) and `run(Args) -> Result<(), Error>`; [`Command`] lists it.
+//! A command's file holds `Args` (its flags) and `run(Args) -> Result<(), Error>`; the list `commands!` below names it.
 
 use std::io::{self, Write};
 use std::path::PathBuf;
