@@ -1,0 +1,102 @@
+// The exact core. Twin of src/kernels/math.rs, which documents ranges and errors: same names, statements and order.
+
+// 1/√x; some finite value for 0.
+fn rsqrt(x: f32) -> f32 {
+    let y = rough_rsqrt(x);
+    return y * (1.8898816 - x * y * y);
+}
+
+// √x.
+fn root(x: f32) -> f32 {
+    let y = rough_rsqrt(x);
+    let g = x * y;
+    return g * (1.8898816 - g * y);
+}
+
+// 2^(-1/3)/√x.
+fn rough_rsqrt(x: f32) -> f32 {
+    let bits = bitcast<u32>(x);
+    let y = bitcast<f32>(0x5f095e83u - (bits >> 1u));
+    let r = x * y * y;
+    return y * ((r - 2.0547438) * r + 1.8974159);
+}
+
+// 1/x for positive x.
+fn recip(x: f32) -> f32 {
+    let y = rough_twice_recip(x);
+    return y * (1.0 - x * 0.25 * y);
+}
+
+// 2/x.
+fn rough_twice_recip(x: f32) -> f32 {
+    let bits = bitcast<u32>(x);
+    let y = bitcast<f32>(0x7f3249aeu - bits);
+    return y * (2.8286953 - x * y);
+}
+
+fn hyperbolic_tangent(unclamped: f32) -> f32 {
+    let limit = 7.5501223;
+    var x = select(limit, unclamped, unclamped < limit);
+    x = select(-limit, x, x > -limit);
+    let z = x * x;
+    let n = x * ((z * 0.02999907 + 14.7163315) * z + 544.93274);
+    let d = (z + 120.25281) * z + 1089.8662;
+    let s = n * n + d * d;
+    let y = rough_twice_recip(s);
+    return n * d * (y * (2.0 - s * 0.5 * y));
+}
+
+// (sin x, cos x) for |x| up to π.
+fn sin_cos(x: f32) -> vec2<f32> {
+    let z = x * x;
+    let u = 9.869604 - z;
+    let v = 2.467401 - z;
+    let p = ((((z * -1.3418489e-10 + 2.3345717e-8) * z - 2.5224422e-6) * z + 1.7350535e-4) * z - 6.6208807e-3) * z
+        + 0.10132119;
+    let q = ((((v * 1.7276196e-9 + 2.4530118e-7) * v + 2.1586782e-5) * v + 1.1602798e-3) * v + 3.2251544e-2) * v
+        + 0.31830987;
+    return vec2<f32>(x * (u * p), v * q);
+}
+
+// ln x for x in 2^-24..1.
+fn ln(x: f32) -> f32 {
+    let bits = bitcast<u32>(x);
+    // x = 2^(k - 32) · m with m from √½ to √2.
+    let i = bits - 0x2f3504f3u;
+    let k = f32(i >> 23u);
+    let m = bitcast<f32>((i & 0x7fffffu) + 0x3f3504f3u);
+    let f = m - 1.0;
+    let p = (((((f * -0.10347979 + 0.16278985) * f - 0.17201562) * f + 0.19893996) * f - 0.24973385) * f + 0.3333509)
+        * f
+        - 0.50000286;
+    return (k - 32.0) * 0.6931472 + f * (f * p + 1.0);
+}
+
+// A standard normal deviate from two uniform words.
+fn normal(a: u32, b: u32) -> f32 {
+    let u = f32((a >> 8u) + 1u) * 5.9604645e-8;
+    let angle = (f32(b >> 8u) - 8388608.0) * 3.7450704e-7;
+    let radius = root(ln(u) * -2.0);
+    let cosine = sin_cos(angle).y;
+    return flush(radius * cosine, 9.094947e-13);
+}
+
+// +0 where |x| < limit, else x.
+fn flush(x: f32, limit: f32) -> f32 {
+    return select(x, 0.0, abs(x) < limit);
+}
+
+// Four random words for a counter: pcg4d and one more fold.
+fn draw(counter: vec4<u32>) -> vec4<u32> {
+    var v = counter * 1664525u + 1013904223u;
+    v.x += v.y * v.w;
+    v.y += v.z * v.x;
+    v.z += v.x * v.y;
+    v.w += v.y * v.z;
+    v = v ^ (v >> vec4<u32>(16u));
+    v.x += v.y * v.w;
+    v.y += v.z * v.x;
+    v.z += v.x * v.y;
+    v.w += v.y * v.z;
+    return v ^ (v >> vec4<u32>(16u));
+}
