@@ -342,7 +342,7 @@ impl Config {
                 density: r.choice("sense.density", Density::Linear),
             },
             policy: Policy {
-                hidden: r.numbers("policy.hidden", 1..=MAX_HIDDEN_LAYERS, between(1, MAX_HIDDEN_UNITS), vec![10]),
+                hidden: r.numbers("policy.hidden", 0..=MAX_HIDDEN_LAYERS, between(1, MAX_HIDDEN_UNITS), vec![10]),
             },
             learning: Learning {
                 paradigm: r.choice("learning.paradigm", Paradigm::LeaderFollower),

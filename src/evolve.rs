@@ -11,7 +11,7 @@ use crate::kernels::{bound, math, motion, splat};
 use crate::world::World;
 
 /// Weights are 0 or of this size (2^-30) at least, so that no product in a policy is denormal.
-const MIN_WEIGHT: f32 = 9.313_225_7e-10;
+const MIN_WEIGHT: f32 = 1.0 / 1_073_741_824.0;
 /// Weights of larger size (2^20) stay at it.
 const MAX_WEIGHT: f32 = 1_048_576.0;
 

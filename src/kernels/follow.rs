@@ -10,7 +10,7 @@ use super::{
 use crate::world::Constants;
 
 /// Forces under this size (2^-30) count as 0.
-pub const TINY: f32 = 9.313_225_7e-10;
+pub const TINY: f32 = 1.0 / 1_073_741_824.0;
 
 /// Offsets to the agents within a follower's radii, summed and counted.
 #[derive(Clone, Copy)]
@@ -82,8 +82,8 @@ pub fn force<S: Simd>(world: &Constants, sums: &Sums<S>, x: S::f32s, y: S::f32s)
 
 /// The heading turned towards the force by at most the largest turn, and the wanted speed.
 ///
-/// No angle is needed: the force's direction is taken where it lies within the largest turn (by its cosine), else
-/// the heading turns by that much, to the side of the force.
+/// No angle is needed: the force's direction is taken where it lies within the largest turn (by its sine or cosine),
+/// else the heading turns by that much, to the side of the force.
 #[inline(always)]
 #[allow(clippy::too_many_arguments)]
 pub fn steer<S: Simd>(
@@ -106,7 +106,12 @@ pub fn steer<S: Simd>(
     let sine = splat(simd, world.max_turn_sin);
     let sine = select::<S>(zero - sine, sine, across.simd_ge(zero));
     let (turned_x, turned_y) = rotate::<S>(hx, hy, splat(simd, world.max_turn_cos), sine);
-    let reached = along.simd_ge(world.max_turn_cos);
+    // A cosine near 1 cannot tell small angles apart, a sine near 1 cannot tell large ones.
+    let reached = if world.max_turn_cos > 0.7 {
+        along.simd_gt(zero) & across.abs().simd_le(world.max_turn_sin)
+    } else {
+        along.simd_ge(world.max_turn_cos)
+    };
     let pulled = force2.simd_gt(zero);
     let next_x = select::<S>(hx, select::<S>(turned_x, ux, reached), pulled);
     let next_y = select::<S>(hy, select::<S>(turned_y, uy, reached), pulled);

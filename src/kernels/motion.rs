@@ -10,7 +10,7 @@ use super::{
 use crate::world::Constants;
 
 /// Heading components under this size (2^-30) count as 0.
-pub const TINY: f32 = 9.313_225_7e-10;
+pub const TINY: f32 = 1.0 / 1_073_741_824.0;
 /// Positions lie on a grid of 2^-18: their differences are exact and their squares far from denormal.
 pub const GRID: f32 = 262_144.0;
 

@@ -18,11 +18,11 @@ pub fn weigh<S: Simd>(inputs: &[S::f32s], weights: &[S::f32s]) -> S::f32s {
 /// The unit's activation; sums too small to matter become 0, which keeps the next layer away from denormals.
 #[inline(always)]
 pub fn activate<S: Simd>(sum: S::f32s) -> S::f32s {
-    math::tanh::<S>(math::flush::<S>(sum, TINY))
+    math::hyperbolic_tangent::<S>(math::flush::<S>(sum, TINY))
 }
 
 /// Sums under this size (2^-30) count as 0.
-pub const TINY: f32 = 9.313_225_7e-10;
+pub const TINY: f32 = 1.0 / 1_073_741_824.0;
 
 /// The wanted turn, in radians to the left, of the policy's first output in -1..1.
 #[inline(always)]

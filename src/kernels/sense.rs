@@ -2,7 +2,10 @@
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::{math::rsqrt, select, splat};
+use super::{
+    math::{root, rsqrt},
+    select, splat,
+};
 use crate::world::Constants;
 
 /// What an entity at squared distance `d2` adds to a density.
@@ -11,7 +14,7 @@ pub fn density<S: Simd>(world: &Constants, d2: S::f32s) -> S::f32s {
     let simd = d2.token();
     let one = splat(simd, 1.0);
     if world.density == 0 {
-        one - d2 * rsqrt::<S>(d2) * world.inverse_diagonal
+        one - root::<S>(d2) * world.inverse_diagonal
     } else {
         rsqrt::<S>(select::<S>(one, d2, d2.simd_gt(one)))
     }

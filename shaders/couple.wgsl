@@ -1,0 +1,7 @@
+// Who is close enough to a POI to observe it (Equations 3 and 4).
+
+// Whether the POI at offset (`dx`, `dy`) is within its observation radius.
+fn observes(dx: f32, dy: f32) -> bool {
+    let d2 = dx * dx + dy * dy;
+    return d2 <= world.observation_radius2;
+}
