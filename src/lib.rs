@@ -27,5 +27,6 @@ pub mod evolve;
 pub mod kernels;
 pub mod record;
 pub mod report;
+pub mod sample;
 pub mod trainer;
 pub mod world;

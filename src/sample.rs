@@ -1,0 +1,215 @@
+//! Random worlds for verification: a spread of sizes, shapes and gains, rich in the exact ties that real layouts have.
+
+use rand::rngs::ChaCha8Rng;
+use rand::{RngExt, SeedableRng};
+
+use crate::config::*;
+use crate::world::World;
+
+/// How a world's agents and POIs are laid out.
+#[derive(Clone, Copy)]
+enum Layout {
+    /// Anywhere on the map.
+    Scattered,
+    /// Within a few radii of one point, as in a team that has come together.
+    Crowded,
+    /// On a grid of halves: radii and quadrants are met exactly.
+    Grid,
+    /// As the paper has it: groups side by side, followers behind or around their leader, a POI straight ahead.
+    Groups,
+    /// All at one point.
+    OnePoint,
+    /// On walls and in corners.
+    Walls,
+    /// On the axes and diagonals through the first leader, at exactly a radius or a range from it.
+    Boundaries,
+}
+
+const LAYOUTS: [Layout; 10] = [
+    Layout::Scattered,
+    Layout::Scattered,
+    Layout::Crowded,
+    Layout::Crowded,
+    Layout::Grid,
+    Layout::Groups,
+    Layout::Groups,
+    Layout::OnePoint,
+    Layout::Walls,
+    Layout::Boundaries,
+];
+
+/// A valid config of 1 to 40 agents and 1 to 8 POIs, a pure function of the seed: a hundred seeds in a row hold every
+/// kind of layout, both paradigms and densities, 0 to 3 hidden layers, and gains, speeds and turn rates down to 0.
+pub fn world(seed: u64) -> Config {
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+    let layout = LAYOUTS[(seed % LAYOUTS.len() as u64) as usize];
+    let exact = matches!(layout, Layout::Grid | Layout::Groups | Layout::OnePoint | Layout::Boundaries);
+    let number = |rng: &mut ChaCha8Rng, low: f64, high: f64| {
+        let value = rng.random_range(low..high);
+        if exact { (value * 2.0).ceil() / 2.0 } else { value }
+    };
+    let map = match rng.random_range(0..5) {
+        0 => [number(rng, 2.0, 10.0), number(rng, 2.0, 10.0)],
+        1 => [number(rng, 50.0, 200.0), number(rng, 20.0, 200.0)],
+        _ => [50.0, 50.0],
+    };
+    let agents = match rng.random_range(0..8) {
+        0 => 1,
+        1 => rng.random_range(30..=40),
+        _ => rng.random_range(2..=20),
+    };
+    let leaders = rng.random_range(1..=agents.min(8));
+    let pois = rng.random_range(1..=8);
+    let attraction_radius = number(rng, 0.5, 8.0);
+    let repulsion_radius = number(rng, 0.2, 2.0).min(attraction_radius);
+    let observation_radius = number(rng, 0.5, 8.0);
+    let unlimited = [rng.random_bool(0.4), rng.random_bool(0.2)];
+    let range = [0, 1].map(|class| Some(number(rng, 1.0, 15.0)).filter(|_| !unlimited[class]));
+
+    let centre = map.map(|side| number(rng, 0.0, side).min(side));
+    let radii = [attraction_radius, repulsion_radius, observation_radius, range[1].unwrap_or(5.0)];
+    let mut place = |index: usize, agent: bool| -> [f64; 2] {
+        let offset = match layout {
+            Layout::Scattered => map.map(|side| rng.random_range(0.0..1.0) * side),
+            Layout::Crowded => {
+                let reach = 1.5 * attraction_radius;
+                centre.map(|at| at + rng.random_range(-reach..reach))
+            }
+            Layout::Grid => {
+                let reach = if agent { 8 } else { 16 };
+                centre.map(|at| at + f64::from(rng.random_range(-reach..=reach)) / 2.0)
+            }
+            Layout::Groups => {
+                let group = (index % 4) as f64;
+                let [x, y] = match (agent, index / 4) {
+                    (true, 0) => [0.0, 0.0],
+                    (true, 1) => [2.0, -3.0],
+                    (true, 2) => [-2.0, -3.0],
+                    (true, 3) => [2.0, 2.0],
+                    (true, _) => [-2.0, 2.0],
+                    (false, row) => [0.0, 10.0 + 5.0 * row as f64],
+                };
+                [10.0 + 10.0 * group + x, 5.0 + y]
+            }
+            Layout::OnePoint => centre,
+            Layout::Walls => {
+                let mut at = map.map(|side| rng.random_range(0.0..1.0) * side);
+                let axis = rng.random_range(0..2);
+                at[axis] = if rng.random_bool(0.5) { 0.0 } else { map[axis] };
+                if rng.random_bool(0.3) {
+                    at[1 - axis] = 0.0;
+                }
+                at
+            }
+            Layout::Boundaries if agent && index == 0 => centre,
+            Layout::Boundaries => {
+                let radius = radii[rng.random_range(0..radii.len())];
+                let [x, y] = [[1, 0], [0, 1], [-1, 0], [0, -1], [1, 1], [-1, 1], [-1, -1], [1, -1]]
+                    [rng.random_range(0..8)]
+                .map(f64::from);
+                [centre[0] + radius * x, centre[1] + radius * y]
+            }
+        };
+        [offset[0].clamp(0.0, map[0]), offset[1].clamp(0.0, map[1])]
+    };
+    let starts: Vec<_> = (0..agents).map(|agent| place(agent, true)).collect();
+    let pois: Vec<_> = (0..pois).map(|poi| place(poi, false)).collect();
+
+    let quarter = std::f64::consts::FRAC_PI_2;
+    let max_speed = [0.5, 3.0, 3.0, 5.0][rng.random_range(0..4)];
+    let min_speed = [0.0, 0.0, 0.0, 0.25][rng.random_range(0..4)];
+    let mut coupling = || rng.random_range(1..=agents.min(5));
+    let coupling = if seed.is_multiple_of(3) {
+        Coupling::Each(pois.iter().map(|_| coupling()).collect())
+    } else {
+        Coupling::Same(coupling())
+    };
+    let gain = |rng: &mut ChaCha8Rng, high: f64| if rng.random_bool(0.1) { 0.0 } else { rng.random_range(0.1..high) };
+    Config {
+        world: crate::config::World {
+            map,
+            leaders: starts[..leaders].to_vec(),
+            followers: starts[leaders..].to_vec(),
+            pois,
+            coupling,
+            observation_radius,
+            steps: rng.random_range(20..=60),
+            dt: [0.05, 0.2, 0.2, 0.5, 1.0][rng.random_range(0..5)],
+            heading: if exact || rng.random_bool(0.3) {
+                quarter * f64::from(rng.random_range(-2..=2))
+            } else {
+                rng.random_range(-4.0..4.0)
+            },
+            speed: if rng.random_bool(0.5) { min_speed } else { max_speed },
+        },
+        motion: Motion {
+            min_speed,
+            max_speed,
+            max_acceleration: [0.5, 5.0, 5.0, 100.0][rng.random_range(0..4)],
+            max_turn_rate: match rng.random_range(0..8) {
+                0 => 0.0,
+                1 => 100.0,
+                2 => rng.random_range(0.1..10.0),
+                _ => quarter,
+            },
+        },
+        follow: Follow {
+            attraction_radius,
+            repulsion_radius,
+            attraction_gain: gain(rng, 10.0),
+            repulsion_gain: gain(rng, 5.0),
+            wall_gain: gain(rng, 5.0),
+        },
+        sense: Sense {
+            poi_range: range[0],
+            agent_range: range[1],
+            density: if rng.random_bool(0.5) { Density::Linear } else { Density::Inverse },
+        },
+        policy: Policy {
+            hidden: match rng.random_range(0..5) {
+                0 => vec![],
+                1 => vec![16, 7],
+                2 => vec![5, 5, 5],
+                _ => vec![10],
+            },
+        },
+        learning: Learning {
+            paradigm: if rng.random_bool(0.25) { Paradigm::AllLeaders } else { Paradigm::LeaderFollower },
+            fitness: [Fitness::G, Fitness::D, Fitness::Df, Fitness::Dpp][rng.random_range(0..4)],
+            population: rng.random_range(2..=20),
+            generations: 3,
+            trials: 1,
+            elites: 1,
+            mutation: if rng.random_bool(0.5) { Mutation::Scaled } else { Mutation::Additive },
+            mutation_probability: 0.15,
+            mutation_sigma: 0.1,
+            episodes_per_team: 1,
+            start_jitter: 0.0,
+            seed,
+        },
+    }
+}
+
+/// Weights `[leaders][policies][parameters]`, nearly normal; of some policies all small, all large, or mostly 0.
+pub fn weights(world: &World, policies: usize, seed: u64) -> Vec<f32> {
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+    let mut weights = Vec::with_capacity(world.leaders() * policies * world.parameters());
+    for _ in 0..world.leaders() * policies {
+        let (scale, zeros) = match rng.random_range(0..8) {
+            0 => (0.1, 0.0),
+            1 => (4.0, 0.0),
+            2 => (1.0, 0.8),
+            _ => (1.0, 0.0),
+        };
+        weights.extend((0..world.parameters()).map(|_| {
+            // The sum of twelve uniform numbers has variance 1, and needs no function that a platform could round.
+            let normal = (0..12).map(|_| rng.random::<f32>()).sum::<f32>() - 6.0;
+            let weight = if rng.random_bool(zeros) { 0.0 } else { scale * normal };
+            if weight.abs() < LEAST_WEIGHT { 0.0 } else { weight }
+        }));
+    }
+    weights
+}
+
+/// Smaller weights are 0, so that no product of the kernels is denormal.
+const LEAST_WEIGHT: f32 = 1.0 / (1 << 30) as f32;
