@@ -39,7 +39,7 @@ const LAYOUTS: [Layout; 10] = [
 ];
 
 /// A valid config of 1 to 40 agents and 1 to 8 POIs, a pure function of the seed: a hundred seeds in a row hold every
-/// kind of layout, both paradigms and densities, 0 to 3 hidden layers, and gains, speeds and turn rates down to 0.
+/// kind of layout, both paradigms and densities, 1 to 3 hidden layers, and gains, speeds and turn rates down to 0.
 pub fn world(seed: u64) -> Config {
     let rng = &mut ChaCha8Rng::seed_from_u64(seed);
     let layout = LAYOUTS[(seed % LAYOUTS.len() as u64) as usize];
@@ -64,10 +64,16 @@ pub fn world(seed: u64) -> Config {
     let repulsion_radius = number(rng, 0.2, 2.0).min(attraction_radius);
     let observation_radius = number(rng, 0.5, 8.0);
     let unlimited = [rng.random_bool(0.4), rng.random_bool(0.2)];
-    let range = [0, 1].map(|class| Some(number(rng, 1.0, 15.0)).filter(|_| !unlimited[class]));
+    let [poi_range, agent_range] =
+        unlimited.map(|unlimited| if unlimited { f64::INFINITY } else { number(rng, 1.0, 15.0) });
 
     let centre = map.map(|side| number(rng, 0.0, side).min(side));
-    let radii = [attraction_radius, repulsion_radius, observation_radius, range[1].unwrap_or(5.0)];
+    let radii = [
+        attraction_radius,
+        repulsion_radius,
+        observation_radius,
+        if agent_range.is_finite() { agent_range } else { 5.0 },
+    ];
     let mut place = |index: usize, agent: bool| -> [f64; 2] {
         let offset = match layout {
             Layout::Scattered => map.map(|side| rng.random_range(0.0..1.0) * side),
@@ -161,13 +167,13 @@ pub fn world(seed: u64) -> Config {
             wall_gain: gain(rng, 5.0),
         },
         sense: Sense {
-            poi_range: range[0],
-            agent_range: range[1],
+            poi_range,
+            agent_range,
             density: if rng.random_bool(0.5) { Density::Linear } else { Density::Inverse },
         },
         policy: Policy {
             hidden: match rng.random_range(0..5) {
-                0 => vec![],
+                0 => vec![3],
                 1 => vec![16, 7],
                 2 => vec![5, 5, 5],
                 _ => vec![10],

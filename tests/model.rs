@@ -1,0 +1,537 @@
+//! One step of an episode in float64, as the mission states it, against the kernels on random worlds.
+//!
+//! The model starts every step from the kernels' own state, since radii and quadrants turn roundings into units within
+//! a few steps. A step on which a threshold is met within rounding may fall on either side and is counted instead of
+//! compared, unless every operation before the threshold was exact: the ties of a layout must fall as the mission says.
+//! Counted too is a step on which roundings grow beyond [`STATE`]: a policy may be steep, and forces may cancel.
+
+use std::f64::consts::PI;
+
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::{Backend, Group, Moment, Trace};
+use flotilla::config::{Config, Coupling, Density, Paradigm};
+use flotilla::evolve::on_grid;
+use flotilla::sample;
+use flotilla::world::World;
+use glam::{DVec2, Vec2};
+use rand::rngs::ChaCha8Rng;
+use rand::{RngExt, SeedableRng};
+use rayon::prelude::*;
+
+/// A threshold met more closely than this, in proportion to what is compared with it, decides nothing.
+const MARGIN: f64 = 3e-7;
+/// Largest difference of a position, a heading or a speed.
+const STATE: f64 = 3e-5;
+/// Largest difference of a sensed density, and of a force in proportion to its parts.
+const INPUT: f64 = 1e-5;
+/// Largest difference of an output for the same inputs, beside what the network makes of roundings.
+const OUTPUT: f64 = 1e-5;
+
+/// An offset between two points, and whether it and its square are the same in f32.
+struct Offset {
+    r: DVec2,
+    d: f64,
+    exact: bool,
+}
+
+impl Offset {
+    fn new(from: DVec2, to: DVec2) -> Offset {
+        let r = to - from;
+        let (x, y) = (r.x as f32, r.y as f32);
+        let exact = DVec2::new(x.into(), y.into()) == r && f64::from(x * x + y * y) == r.x * r.x + r.y * r.y;
+        Offset { r, d: (r.x * r.x + r.y * r.y).sqrt(), exact }
+    }
+
+    /// d ≤ radius; `shaky` if that may differ in f32.
+    fn within(&self, radius: f64, shaky: &mut bool) -> bool {
+        let square = radius * radius;
+        *shaky |= (self.d - radius).abs() < MARGIN * radius && !(self.exact && f64::from(square as f32) == square);
+        self.d <= radius
+    }
+}
+
+/// a + b of two products; `shaky` if its sign may differ in f32, where only the products and the sum are rounded.
+fn signed_sum(a: f64, b: f64, shaky: &mut bool) -> f64 {
+    *shaky |= a + b != 0.0 && (a + b).abs() < MARGIN * (a.abs() + b.abs()) && a != 0.0 && b != 0.0;
+    a + b
+}
+
+/// A mean offset times a factor, and whether its zeros are zeros in f32.
+#[derive(Default)]
+struct Pull {
+    sum: DVec2,
+    sum32: Vec2,
+    length: f64,
+    count: u32,
+    exact: bool,
+}
+
+impl Pull {
+    fn new() -> Pull {
+        Pull { exact: true, ..Pull::default() }
+    }
+
+    fn add(&mut self, offset: &Offset) {
+        self.sum += offset.r;
+        self.sum32 += offset.r.as_vec2();
+        self.length += offset.d;
+        self.count += 1;
+        self.exact &= self.sum32.as_dvec2() == self.sum && offset.r.as_vec2().as_dvec2() == offset.r;
+    }
+
+    fn mean(&self) -> DVec2 {
+        if self.count == 0 { DVec2::ZERO } else { self.sum / f64::from(self.count) }
+    }
+}
+
+/// What the followers' rule makes of an agent's surroundings.
+struct Force {
+    s: DVec2,
+    /// Lengths of all parts together: roundings of `s` are in proportion to it.
+    parts: f64,
+    /// Somebody or a wall is near.
+    near: bool,
+    /// A zero of s on this axis is one in f32.
+    sure_zero: [bool; 2],
+    /// One part alone, from an exact sum: its scale may be rounded, its direction is not.
+    plain: bool,
+}
+
+impl Force {
+    /// How far f32 may turn `s`, in radians: where parts cancel, their roundings remain.
+    fn blur(&self) -> f64 {
+        if self.plain || self.s == DVec2::ZERO { 0.0 } else { MARGIN * self.parts / self.s.length() }
+    }
+}
+
+/// One agent's state.
+#[derive(Clone, Copy)]
+struct State {
+    position: DVec2,
+    heading: DVec2,
+    speed: f64,
+}
+
+impl State {
+    fn of(moment: &Moment) -> State {
+        let vector = |v: [f32; 2]| Vec2::from(v).as_dvec2();
+        State { position: vector(moment.position), heading: vector(moment.heading), speed: moment.speed.into() }
+    }
+}
+
+struct Model {
+    config: Config,
+    leaders: usize,
+    agents: usize,
+    map: DVec2,
+    pois: Vec<DVec2>,
+}
+
+impl Model {
+    fn new(config: &Config) -> Model {
+        let world = &config.world;
+        let agents = world.leaders.len() + world.followers.len();
+        let leaders = if config.learning.paradigm == Paradigm::AllLeaders { agents } else { world.leaders.len() };
+        let single = |point: &[f64; 2]| DVec2::from(*point).as_vec2().as_dvec2();
+        Model {
+            config: config.clone(),
+            leaders,
+            agents,
+            map: single(&world.map),
+            pois: world.pois.iter().map(single).collect(),
+        }
+    }
+
+    /// 1: what a leader senses.
+    fn sense(&self, states: &[State], leader: usize, shaky: &mut bool) -> [f64; 8] {
+        let sense = &self.config.sense;
+        let here = states[leader];
+        let diagonal = 2f64.sqrt() * self.map.max_element();
+        let mut inputs = [0.0; 8];
+        let mut class = |first: usize, points: &[DVec2], range: f64, size: usize| {
+            for &point in points {
+                let offset = Offset::new(here.position, point);
+                if !offset.within(range, shaky) {
+                    continue;
+                }
+                let fx = signed_sum(here.heading.x * offset.r.x, here.heading.y * offset.r.y, shaky);
+                let fy = signed_sum(here.heading.x * offset.r.y, -here.heading.y * offset.r.x, shaky);
+                let left = fy > 0.0 || (fy == 0.0 && fx >= 0.0);
+                let front = fx > 0.0 || (fx == 0.0 && fy <= 0.0);
+                let quadrant = match (front, left) {
+                    (false, false) => 0,
+                    (true, false) => 1,
+                    (true, true) => 2,
+                    (false, true) => 3,
+                };
+                let value = match sense.density {
+                    Density::Linear => 1.0 - offset.d / diagonal,
+                    Density::Inverse => 1.0 / offset.d.max(1.0),
+                };
+                inputs[first + quadrant] += value / size as f64;
+            }
+        };
+        class(0, &self.pois, sense.poi_range, self.pois.len());
+        let others = states.iter().enumerate().filter(|&(agent, _)| agent != leader).map(|(_, state)| state.position);
+        class(4, &others.collect::<Vec<_>>(), sense.agent_range, self.agents);
+        inputs
+    }
+
+    /// 2: a leader's policy; with every output, how far f32 may be from it if the inputs differ by up to `error`.
+    fn policy(&self, weights: &[f32], inputs: [f64; 8], error: f64) -> [(f64, f64); 2] {
+        let mut values: Vec<(f64, f64)> = inputs.map(|input| (input, error)).to_vec();
+        let mut first = 0;
+        for &width in self.config.policy.hidden.iter().chain(&[2]) {
+            let rows = values.len() + 1;
+            let weight = |row: usize, column: usize| f64::from(weights[first + row * width + column]);
+            values = (0..width)
+                .map(|column| {
+                    let bias = weight(rows - 1, column);
+                    let (mut sum, mut size, mut error) = (bias, bias.abs(), 0.0);
+                    for (row, (value, off)) in values.iter().enumerate() {
+                        let weight = weight(row, column);
+                        sum += weight * value;
+                        size += (weight * value).abs();
+                        error += weight.abs() * off;
+                    }
+                    error += 2e-7 * size;
+                    let slope = 1.0 - (sum.abs() - error).max(0.0).tanh().powi(2);
+                    (sum.tanh(), slope * error + 1e-6)
+                })
+                .collect();
+            first += rows * width;
+        }
+        [values[0], values[1]]
+    }
+
+    /// 4, first half: the forces on a follower.
+    fn force(&self, states: &[State], agent: usize, shaky: &mut bool) -> Force {
+        let follow = &self.config.follow;
+        let (mut repulsion, mut attraction) = (Pull::new(), Pull::new());
+        for other in (0..self.agents).filter(|&other| other != agent) {
+            let offset = Offset::new(states[agent].position, states[other].position);
+            let (near, close) =
+                (offset.within(follow.attraction_radius, shaky), offset.within(follow.repulsion_radius, shaky));
+            if close {
+                repulsion.add(&offset);
+            } else if near {
+                attraction.add(&offset);
+            }
+        }
+        let someone = repulsion.count + attraction.count > 0;
+        let (mut push, mut wall) = (DVec2::ZERO, false);
+        let (mut parts, radius) = (0.0, f64::from(follow.repulsion_radius as f32));
+        for axis in 0..2 {
+            let at = states[agent].position[axis];
+            for (distance, away) in [(at, 1.0), (self.map[axis] - at, -1.0)] {
+                let rounding = (f64::from(distance as f32) - distance).abs();
+                // A push sets in at 0, so that only the question whether there is one at all can fall either way.
+                *shaky |= !someone && (distance - radius).abs() < rounding;
+                if distance <= radius {
+                    wall = true;
+                    push[axis] += away * follow.wall_gain * (radius - distance);
+                    parts += follow.wall_gain * (radius - distance + rounding / MARGIN);
+                }
+            }
+        }
+        let repel = -repulsion.mean() / follow.repulsion_radius * follow.repulsion_gain;
+        let attract = attraction.mean() / follow.attraction_radius * follow.attraction_gain;
+        let size = |pull: &Pull, gain: f64, radius: f64| pull.length / f64::from(pull.count.max(1)) / radius * gain;
+        parts += size(&repulsion, follow.repulsion_gain, follow.repulsion_radius)
+            + size(&attraction, follow.attraction_gain, follow.attraction_radius);
+        let exact =
+            (repulsion.exact || follow.repulsion_gain == 0.0) && (attraction.exact || follow.attraction_gain == 0.0);
+        let pulls = [repel, attract].iter().filter(|&&pull| pull != DVec2::ZERO).count();
+        let zero = |axis: usize| exact && repel[axis] == 0.0 && attract[axis] == 0.0 && push[axis] == 0.0;
+        Force {
+            s: repel + attract + push,
+            parts,
+            near: someone || wall,
+            sure_zero: [zero(0), zero(1)],
+            plain: exact && pulls == 1 && push == DVec2::ZERO,
+        }
+    }
+
+    /// 4, second half: the wanted change of heading, and the wanted speed. `None` keeps both.
+    fn follow(&self, state: &State, force: &Force, shaky: &mut bool) -> Option<(f64, f64)> {
+        if !force.near {
+            return None;
+        }
+        let Force { s, sure_zero, .. } = *force;
+        let length = s.length();
+        if length == 0.0 {
+            *shaky |= !(sure_zero[0] && sure_zero[1]);
+            return Some((0.0, 0.0));
+        }
+        let blur = force.blur();
+        *shaky |= blur > 0.1;
+        // One term alone, the other a true zero, keeps its sign however small it is.
+        let (mut zeros, mut signs) = ([false; 2], [false; 2]);
+        for axis in 0..2 {
+            zeros[axis] = s[axis] == 0.0 && sure_zero[axis];
+            signs[axis] = zeros[axis] || s[axis].abs() > MARGIN * force.parts;
+        }
+        let (heading, unit) = (state.heading, s / length);
+        let sure = |x: f64, y: f64| (x == 0.0 || zeros[0]) && signs[1] || (y == 0.0 || zeros[1]) && signs[0];
+        let (dot, cross) = (heading.dot(unit), heading.perp_dot(unit));
+        let close = |sum: f64, term: f64| sum.abs() < MARGIN * (term.abs() + (sum - term).abs()) + blur;
+        *shaky |= close(dot, heading.x * unit.x) && !sure(heading.x, heading.y);
+        let any_turn = self.config.motion.max_turn_rate * self.config.world.dt >= PI;
+        *shaky |= !any_turn && dot < 0.0 && close(cross, heading.x * unit.y) && !sure(heading.y, heading.x);
+        // Of the two half turns the one to the left, whatever the sign of the zero.
+        let angle = if cross == 0.0 { 0f64.atan2(dot) } else { cross.atan2(dot) };
+        Some((angle, if angle.abs() < PI / 2.0 && dot > 0.0 { length } else { self.config.motion.min_speed }))
+    }
+
+    /// 5: the proportional controller and its limits.
+    fn step(&self, state: &State, turn: f64, wanted: f64) -> State {
+        let (motion, dt) = (&self.config.motion, self.config.world.dt);
+        let (most, change) = (motion.max_turn_rate * dt, motion.max_acceleration * dt);
+        let angle = state.heading.y.atan2(state.heading.x) + turn.clamp(-most, most);
+        let heading = DVec2::new(angle.cos(), angle.sin());
+        let speed = state.speed + (wanted - state.speed).clamp(-change, change);
+        let speed = speed.clamp(motion.min_speed, motion.max_speed);
+        let position = (state.position + heading * speed * dt).clamp(DVec2::ZERO, self.map);
+        State { position, heading, speed }
+    }
+}
+
+/// What was compared, and how closely it agreed.
+#[derive(Default)]
+struct Tally {
+    agent_steps: u64,
+    borderline: u64,
+    /// Largest differences: inputs, outputs, force over its parts, position, heading, speed.
+    worst: [f64; 6],
+    wrong: Vec<String>,
+}
+
+impl Tally {
+    fn merge(mut self, other: Tally) -> Tally {
+        self.agent_steps += other.agent_steps;
+        self.borderline += other.borderline;
+        self.worst.iter_mut().zip(other.worst).for_each(|(mine, theirs)| *mine = mine.max(theirs));
+        self.wrong.extend(other.wrong);
+        self
+    }
+
+    /// Holds values of one stage against the model's; the largest difference.
+    fn compare(&mut self, stage: usize, found: &[f32], expected: &[f64], tolerance: f64, place: &str) -> f64 {
+        let mut largest = 0f64;
+        for (&found, &expected) in found.iter().zip(expected) {
+            let difference = (f64::from(found) - expected).abs();
+            // Not `>`: a NaN is wrong.
+            if !(difference <= tolerance) {
+                let name = ["input", "output", "force", "position", "heading", "speed"][stage];
+                self.wrong.push(format!("{place}: {name} {found}, expected {expected} within {tolerance:e}"));
+            }
+            largest = largest.max(difference);
+        }
+        self.worst[stage] = self.worst[stage].max(largest);
+        largest
+    }
+}
+
+/// Plays `teams` teams of the world and holds every step of every agent against the model.
+fn check(cpu: &mut Cpu, world: &Config, model: &Model, seed: u64) -> Tally {
+    const TEAMS: usize = 9;
+    let compiled = World::new(world);
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+    let policies = 4;
+    let weights = sample::weights(&compiled, policies, seed);
+    let teams: Vec<u32> = (0..TEAMS * model.leaders).map(|_| rng.random_range(0..policies as u32)).collect();
+    let jitter = if seed.is_multiple_of(4) { 0.5 } else { 0.0 };
+    let starts: Vec<Vec2> = (compiled.starts.iter())
+        .map(|start| start + Vec2::new(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0)) * jitter)
+        .map(|start| on_grid(start.clamp(Vec2::ZERO, model.map.as_vec2())))
+        .collect();
+    let group = Group { world: &compiled, starts: &starts, weights: &weights, policies, teams: &teams };
+    let trace = cpu.trace(&group).unwrap();
+    assert_eq!((trace.teams, trace.agents), (TEAMS, model.agents));
+    let mut tally = Tally::default();
+    for team in 0..TEAMS {
+        let policy = |leader: usize| {
+            let index = leader * policies + teams[team * model.leaders + leader] as usize;
+            &weights[index * compiled.parameters()..][..compiled.parameters()]
+        };
+        check_team(&trace, model, team, policy, &starts, seed, &mut tally);
+    }
+    tally
+}
+
+fn check_team<'a>(
+    trace: &Trace,
+    model: &Model,
+    team: usize,
+    policy: impl Fn(usize) -> &'a [f32],
+    starts: &[Vec2],
+    seed: u64,
+    tally: &mut Tally,
+) {
+    let Model { config, leaders, agents, .. } = model;
+    let (leaders, agents, steps) = (*leaders, *agents, config.world.steps);
+    let mut states: Vec<State> = (0..agents).map(|agent| State::of(trace.moment(0, team, agent))).collect();
+    let heading = DVec2::new(config.world.heading.cos(), config.world.heading.sin());
+    for (agent, state) in states.iter().enumerate() {
+        let tidy = |component: f64| if component.abs() < 1e-6 { 0.0 } else { f64::from(component as f32) };
+        assert_eq!(state.position, starts[agent].as_dvec2());
+        assert_eq!(state.heading, DVec2::new(tidy(heading.x), tidy(heading.y)));
+        assert_eq!(state.speed, f64::from(config.world.speed as f32));
+    }
+    // At least and at most so many steps, where some are borderline.
+    let mut seen = vec![(0, 0); (agents - leaders) * leaders];
+    for step in 1..=steps {
+        let moments: Vec<&Moment> = (0..agents).map(|agent| trace.moment(step, team, agent)).collect();
+        for agent in 0..agents {
+            let (found, place) = (moments[agent], format!("seed {seed} team {team} step {step} agent {agent}"));
+            let mut shaky = false;
+            let mut slack = (0.0, 0.0);
+            let wanted = if agent < leaders {
+                let mut inputs = model.sense(&states, agent, &mut shaky);
+                if shaky {
+                    inputs = found.inputs.map(f64::from);
+                } else {
+                    tally.compare(0, &found.inputs, &inputs, INPUT, &place);
+                }
+                let outputs = model.policy(policy(agent), found.inputs.map(f64::from), 0.0);
+                for (found, (expected, error)) in found.outputs.iter().zip(outputs) {
+                    tally.compare(1, &[*found], &[expected], OUTPUT + error, &place);
+                }
+                let [(turn, turn_error), (speed, speed_error)] = model.policy(policy(agent), inputs, 1e-6);
+                slack = (PI * turn_error, speed_error * config.motion.max_speed / 2.0);
+                Some((PI * turn, (speed + 1.0) / 2.0 * config.motion.max_speed))
+            } else {
+                let force = model.force(&states, agent, &mut shaky);
+                if !shaky {
+                    let expected = if force.near { force.s } else { DVec2::ZERO };
+                    tally.compare(2, &found.force, &expected.to_array(), INPUT * (1.0 + force.parts), &place);
+                }
+                for leader in 0..leaders {
+                    let mut tie = false;
+                    let offset = Offset::new(states[agent].position, states[leader].position);
+                    let near = offset.within(config.follow.attraction_radius, &mut tie);
+                    let (least, most) = &mut seen[(agent - leaders) * leaders + leader];
+                    *least += (near && !tie) as u32;
+                    *most += (near || tie) as u32;
+                }
+                slack = (force.blur(), MARGIN * force.parts);
+                model.follow(&states[agent], &force, &mut shaky)
+            };
+            let kept = states[agent];
+            let expected = match wanted {
+                Some((turn, speed)) => model.step(&kept, turn, speed),
+                None => model.step(&kept, 0.0, kept.speed),
+            };
+            if agent < leaders || !shaky {
+                let heading = expected.heading.to_array();
+                let moved = config.world.dt * (slack.0 * config.motion.max_speed + slack.1);
+                let position = expected.position.to_array();
+                let largest = tally.compare(3, &found.position, &position, STATE + moved, &place);
+                let largest = largest.max(tally.compare(4, &found.heading, &heading, STATE + slack.0, &place));
+                let largest = largest.max(tally.compare(5, &[found.speed], &[expected.speed], STATE + slack.1, &place));
+                shaky |= largest > STATE;
+            }
+            let after = State::of(found);
+            for (poi, &point) in model.pois.iter().enumerate() {
+                let mut tie = false;
+                let near = Offset::new(after.position, point).within(config.world.observation_radius, &mut tie);
+                let words = agents.div_ceil(32);
+                let set = (team * steps + step - 1) * model.pois.len() + poi;
+                let found = trace.sets[set * words + agent / 32] >> (agent % 32) & 1 == 1;
+                if found != near && !tie {
+                    tally.wrong.push(format!("{place}: near POI {poi} {found}, expected {near}"));
+                }
+                shaky |= tie;
+            }
+            tally.agent_steps += 1;
+            tally.borderline += shaky as u64;
+        }
+        states = moments.into_iter().map(State::of).collect();
+    }
+    let found = &trace.seen[team * seen.len()..][..seen.len()];
+    for (index, (&found, &(least, most))) in found.iter().zip(&seen).enumerate() {
+        if !(least..=most).contains(&found) {
+            tally.wrong.push(format!("seed {seed} team {team}: seen {index} {found}, expected {least} to {most}"));
+        }
+    }
+}
+
+#[test]
+fn kernels_follow_the_mission() {
+    let tally = (0..400u64)
+        .into_par_iter()
+        .map_init(Cpu::default, |cpu, seed| {
+            let mut config = sample::world(seed);
+            if seed % 16 == 5 {
+                config.policy.hidden.clear();
+            }
+            check(cpu, &config, &Model::new(&config), seed)
+        })
+        .reduce(Tally::default, Tally::merge);
+    let Tally { agent_steps, borderline, worst, wrong } = tally;
+    println!("{agent_steps} agent-steps, {borderline} borderline, worst differences {worst:?}");
+    assert!(wrong.is_empty(), "{} differences, the first:\n{}", wrong.len(), wrong[..wrong.len().min(10)].join("\n"));
+    assert!(agent_steps >= 1_000_000, "{agent_steps} agent-steps");
+    assert!(borderline * 1000 < agent_steps, "{borderline} of {agent_steps} agent-steps are borderline");
+}
+
+/// The comparison can fail: a model with one constant changed by a thousandth, or one rule changed, is told apart.
+#[test]
+fn a_wrong_model_is_noticed() {
+    type Edit = fn(&mut Config);
+    let edits: [(&str, Edit); 14] = [
+        ("map", |c| c.world.map = c.world.map.map(|side| side * 0.999)),
+        ("observation radius", |c| c.world.observation_radius *= 1.01),
+        ("dt", |c| c.world.dt *= 1.001),
+        ("min speed", |c| c.motion.min_speed += 0.001),
+        ("max speed", |c| c.motion.max_speed *= 1.001),
+        ("acceleration", |c| c.motion.max_acceleration *= 1.001),
+        ("turn rate", |c| c.motion.max_turn_rate *= 1.001),
+        ("attraction radius", |c| c.follow.attraction_radius *= 1.001),
+        ("repulsion radius", |c| c.follow.repulsion_radius *= 0.999),
+        ("attraction gain", |c| c.follow.attraction_gain *= 1.001),
+        ("repulsion gain", |c| c.follow.repulsion_gain *= 1.001),
+        ("wall gain", |c| c.follow.wall_gain *= 1.001),
+        ("POI range", |c| c.sense.poi_range *= 1.01),
+        ("agent range", |c| c.sense.agent_range *= 1.01),
+    ];
+    let mut cpu = Cpu::default();
+    for (name, edit) in edits {
+        let noticed = (0..60u64).any(|seed| {
+            let config = sample::world(seed);
+            let mut edited = config.clone();
+            edit(&mut edited);
+            !check(&mut cpu, &config, &Model::new(&edited), seed).wrong.is_empty()
+        });
+        assert!(noticed, "{name}");
+    }
+}
+
+/// The random worlds are of every kind.
+#[test]
+fn random_worlds_are_a_spread() {
+    let worlds: Vec<Config> = (0..100).map(sample::world).collect();
+    let some = |kind: fn(&Config) -> bool| worlds.iter().filter(|&world| kind(world)).count() >= 3;
+    let agents = |c: &Config| c.world.leaders.len() + c.world.followers.len();
+    let sizes: Vec<usize> = worlds.iter().map(agents).collect();
+    assert!(sizes.contains(&1) && sizes.iter().any(|&size| size > 32) && sizes.iter().all(|&size| size <= 40));
+    assert!(some(|c| c.learning.paradigm == Paradigm::AllLeaders));
+    assert!(some(|c| c.learning.paradigm == Paradigm::LeaderFollower && !c.world.followers.is_empty()));
+    assert!(some(|c| c.world.followers.is_empty()));
+    assert!(some(|c| c.sense.density == Density::Linear) && some(|c| c.sense.density == Density::Inverse));
+    assert!(some(|c| c.sense.poi_range.is_infinite()) && some(|c| c.sense.agent_range.is_infinite()));
+    assert!(some(|c| matches!(c.world.coupling, Coupling::Each(_))));
+    for layers in [1, 2, 3] {
+        assert!(worlds.iter().any(|c| c.policy.hidden.len() == layers), "{layers} hidden layers");
+    }
+    assert!(some(|c| c.motion.max_turn_rate == 0.0) && some(|c| c.motion.max_turn_rate * c.world.dt > PI));
+    assert!(some(|c| c.follow.attraction_gain == 0.0) && some(|c| c.follow.repulsion_gain == 0.0));
+    let inside = |c: &Config| {
+        let points = c.world.leaders.iter().chain(&c.world.followers).chain(&c.world.pois);
+        points.into_iter().all(|p| (0.0..=c.world.map[0]).contains(&p[0]) && (0.0..=c.world.map[1]).contains(&p[1]))
+    };
+    assert!(worlds.iter().all(inside));
+    for world in &worlds {
+        assert_eq!(Config::parse(&world.to_toml(), "sample").unwrap(), *world);
+    }
+}
