@@ -39,7 +39,7 @@ const LAYOUTS: [Layout; 10] = [
 ];
 
 /// A valid config of 1 to 40 agents and 1 to 8 POIs, a pure function of the seed: a hundred seeds in a row hold every
-/// kind of layout, both paradigms and densities, 1 to 3 hidden layers, and gains, speeds and turn rates down to 0.
+/// kind of layout, both paradigms and densities, 0 to 3 hidden layers, and gains, speeds and turn rates down to 0.
 pub fn world(seed: u64) -> Config {
     let rng = &mut ChaCha8Rng::seed_from_u64(seed);
     let layout = LAYOUTS[(seed % LAYOUTS.len() as u64) as usize];
@@ -173,7 +173,7 @@ pub fn world(seed: u64) -> Config {
         },
         policy: Policy {
             hidden: match rng.random_range(0..5) {
-                0 => vec![3],
+                0 => vec![],
                 1 => vec![16, 7],
                 2 => vec![5, 5, 5],
                 _ => vec![10],
