@@ -1,6 +1,6 @@
 // How agents move: a proportional controller within the limits of turn, acceleration and speed (Section 3.1).
 
-// Positions lie on a grid of 2^-18: their differences are exact and their squares far from denormal.
+// Positions lie on a grid of 2^-18 (or on a wall): their differences are exact, and their squares far from denormal.
 const GRID: f32 = 262144.0;
 
 // `x` moved into `low..=high`.
@@ -41,5 +41,5 @@ fn advance(at: f32, step: f32, heading: f32, size: f32) -> f32 {
 
 // The nearest place on the grid.
 fn snap(at: f32) -> f32 {
-    return floor(at * GRID + 0.5) * (1.0 / GRID);
+    return floor(at * GRID + 0.5) * 0x1p-18f;
 }

@@ -7,8 +7,8 @@ use fearless_simd::{Level, Select, Simd, SimdMask, dispatch, prelude::*};
 use glam::Vec2;
 
 use crate::config::{Learning, Mutation};
-use crate::kernels::{bound, math, motion, splat};
-use crate::world::World;
+use crate::kernels::{bound, math, splat};
+use crate::world::{World, on_grid};
 
 /// Weights are 0 or of this size (2^-30) at least, so that no product in a policy is denormal.
 const MIN_WEIGHT: f32 = 1.0 / 1_073_741_824.0;
@@ -91,13 +91,8 @@ pub fn jitter_starts(key: Key, generation: usize, episode: usize, world: &World,
             // 53 bits are exact in f64, and so is every step but the last, which rounds to f32.
             ((word as f64 / (1u64 << 32) as f64) * 2.0 - 1.0) * jitter
         });
-        *start = on_grid((*start + Vec2::new(x as f32, y as f32)).clamp(Vec2::ZERO, map));
+        *start = on_grid(*start + Vec2::new(x as f32, y as f32), map);
     }
-}
-
-/// The nearest place on the kernels' grid.
-pub fn on_grid(place: Vec2) -> Vec2 {
-    (place * motion::GRID + 0.5).floor() / motion::GRID
 }
 
 /// The indices of the `count` best scores, best first; ties go to the lower index.

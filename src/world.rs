@@ -9,6 +9,8 @@ use crate::config::{Config, Coupling, Density, MAX_HIDDEN_LAYERS, Paradigm};
 pub const INPUTS: usize = 8;
 /// Outputs of a policy: wanted change of heading and wanted speed.
 pub const OUTPUTS: usize = 2;
+/// Positions lie on a grid of 2^-18 (or on a wall): their differences are exact, and their squares far from denormal.
+pub const GRID: f32 = 262_144.0;
 /// A squared range no distance on a map reaches.
 const UNLIMITED: f32 = 1e30;
 
@@ -135,7 +137,9 @@ impl World {
             },
             inverse_diagonal: (1.0 / (2f64.sqrt() * world.map[0].max(world.map[1]))) as f32,
         };
-        let points = |list: &[[f64; 2]]| list.iter().map(|&p| DVec2::from(p).as_vec2()).collect::<Vec<_>>();
+        let map = Vec2::new(constants.map_x, constants.map_y);
+        let points =
+            |list: &[[f64; 2]]| list.iter().map(|&at| on_grid(DVec2::from(at).as_vec2(), map)).collect::<Vec<_>>();
         World {
             constants,
             starts: [points(&world.leaders), points(&world.followers)].concat(),
@@ -172,6 +176,11 @@ impl World {
     pub fn set_words(&self) -> usize {
         self.steps() * self.pois.len() * self.constants.words as usize
     }
+}
+
+/// The nearest place of the kernels' grid that is on the map.
+pub fn on_grid(place: Vec2, map: Vec2) -> Vec2 {
+    ((place * GRID + 0.5).floor() / GRID).clamp(Vec2::ZERO, map)
 }
 
 /// The unit vector of an angle; a component under 1e-6 in size is 0, so that layouts full of exact ties keep them.

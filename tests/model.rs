@@ -10,9 +10,9 @@ use std::f64::consts::PI;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Backend, Group, Moment, Trace};
 use flotilla::config::{Config, Coupling, Density, Paradigm};
-use flotilla::evolve::on_grid;
 use flotilla::sample;
 use flotilla::world::World;
+use flotilla::world::on_grid;
 use glam::{DVec2, Vec2};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
@@ -133,12 +133,13 @@ impl Model {
         let agents = world.leaders.len() + world.followers.len();
         let leaders = if config.learning.paradigm == Paradigm::AllLeaders { agents } else { world.leaders.len() };
         let single = |point: &[f64; 2]| DVec2::from(*point).as_vec2().as_dvec2();
+        let map = single(&world.map).as_vec2();
         Model {
             config: config.clone(),
             leaders,
             agents,
             map: single(&world.map),
-            pois: world.pois.iter().map(single).collect(),
+            pois: world.pois.iter().map(|&poi| on_grid(single(&poi).as_vec2(), map).as_dvec2()).collect(),
         }
     }
 
@@ -343,7 +344,7 @@ fn check(cpu: &mut Cpu, world: &Config, model: &Model, seed: u64) -> Tally {
     let jitter = if seed.is_multiple_of(4) { 0.5 } else { 0.0 };
     let starts: Vec<Vec2> = (compiled.starts.iter())
         .map(|start| start + Vec2::new(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0)) * jitter)
-        .map(|start| on_grid(start.clamp(Vec2::ZERO, model.map.as_vec2())))
+        .map(|start| on_grid(start, model.map.as_vec2()))
         .collect();
     let group = Group { world: &compiled, starts: &starts, weights: &weights, policies, teams: &teams };
     let trace = cpu.trace(&group).unwrap();

@@ -7,12 +7,10 @@ use super::{
     math::{flush, sin_cos},
     splat,
 };
-use crate::world::Constants;
+use crate::world::{Constants, GRID};
 
 /// Heading components under this size (2^-30) count as 0.
 pub const TINY: f32 = 1.0 / 1_073_741_824.0;
-/// Positions lie on a grid of 2^-18: their differences are exact and their squares far from denormal.
-pub const GRID: f32 = 262_144.0;
 
 /// The heading turned by the angle of this cosine and sine, to the left.
 #[inline(always)]
