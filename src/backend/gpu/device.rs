@@ -1,0 +1,534 @@
+//! Finding, opening and talking to a GPU.
+//!
+//! [`open`] tests the device before handing it out: it tries the exact passes in turn and keeps the first under which
+//! every probe of [`super::probe`] gives the CPU's bits, or refuses the device by name.
+
+use std::fmt;
+use std::ops::Range;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use bytemuck::Pod;
+use pollster::block_on;
+use wgpu::util::DeviceExt;
+
+use super::exact::{self, Pass, ShaderError};
+use super::probe;
+
+/// Names of renderers that run on the CPU, for drivers that do not admit it in their device type.
+const SOFTWARE: [&str; 5] = ["llvmpipe", "lavapipe", "swiftshader", "microsoft basic render", "software"];
+
+/// An adapter, as a person would tell it from others.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AdapterInfo {
+    /// What the driver calls the device.
+    pub name: String,
+    /// Driver and version; empty where the backend does not say.
+    pub driver: String,
+    /// "vulkan", "metal", "dx12".
+    pub backend: String,
+    pub kind: Kind,
+}
+
+/// What an adapter runs on, the most wanted first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Kind {
+    Discrete,
+    Integrated,
+    Virtual,
+    Unknown,
+    /// A renderer that runs on the CPU.
+    Software,
+}
+
+impl Kind {
+    /// Whether this is a GPU for sure.
+    pub fn is_real(self) -> bool {
+        self <= Kind::Virtual
+    }
+}
+
+impl fmt::Display for Kind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Kind::Discrete => "discrete GPU",
+            Kind::Integrated => "integrated GPU",
+            Kind::Virtual => "virtual GPU",
+            Kind::Unknown => "unknown kind",
+            Kind::Software => "software renderer",
+        })
+    }
+}
+
+impl fmt::Display for AdapterInfo {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} ({}, {}", self.name, self.kind, self.backend)?;
+        if !self.driver.is_empty() {
+            write!(f, ", {}", self.driver)?;
+        }
+        f.write_str(")")
+    }
+}
+
+impl From<&wgpu::AdapterInfo> for AdapterInfo {
+    fn from(info: &wgpu::AdapterInfo) -> Self {
+        let name = info.name.to_lowercase();
+        let kind = match info.device_type {
+            wgpu::DeviceType::Cpu => Kind::Software,
+            _ if SOFTWARE.iter().any(|software| name.contains(software)) => Kind::Software,
+            wgpu::DeviceType::DiscreteGpu => Kind::Discrete,
+            wgpu::DeviceType::IntegratedGpu => Kind::Integrated,
+            wgpu::DeviceType::VirtualGpu => Kind::Virtual,
+            wgpu::DeviceType::Other => Kind::Unknown,
+        };
+        let driver = [info.driver.as_str(), info.driver_info.as_str()];
+        AdapterInfo {
+            name: info.name.clone(),
+            driver: driver.iter().filter(|part| !part.is_empty()).copied().collect::<Vec<_>>().join(" "),
+            backend: info.backend.to_str().to_string(),
+            kind,
+        }
+    }
+}
+
+/// Why a GPU could not be had, or failed at work.
+#[derive(Debug, thiserror::Error)]
+pub enum DeviceError {
+    #[error("no GPU adapter found (is a Vulkan, Metal or DirectX 12 driver installed?); use --backend cpu")]
+    NoAdapter,
+    #[error("no GPU among the adapters, only {}; name one with --adapter, or use --backend cpu", list(.found))]
+    NoRealAdapter { found: Vec<AdapterInfo> },
+    #[error("no adapter matches \"{name}\"; there {}", there_are(.found))]
+    UnknownAdapter { name: String, found: Vec<AdapterInfo> },
+    #[error("{adapter}: cannot be opened: {reason}; choose another with --adapter, or use --backend cpu")]
+    Refused { adapter: String, reason: String },
+    #[error(
+        "{adapter}: not bit-exact, so it cannot be used: {}; choose another with --adapter, or use --backend cpu",
+        inexact(.failures)
+    )]
+    Inexact { adapter: String, failures: Vec<(Pass, probe::Mismatch)> },
+    #[error("{adapter}: the device was lost ({reason}); run again, or use --backend cpu")]
+    Lost { adapter: String, reason: String },
+    #[error("{adapter}: out of memory for {what}; use a smaller batch, or --backend cpu")]
+    OutOfMemory { adapter: String, what: String },
+    #[error(
+        "{adapter}: {what} needs {bytes} bytes, the device allows {allowed}; use a smaller batch, or --backend cpu"
+    )]
+    TooLarge { adapter: String, what: String, bytes: u64, allowed: u64 },
+    #[error("shader {label} {source}")]
+    Shader { label: String, source: ShaderError },
+    #[error("{adapter}: {what} failed: {reason}; use --backend cpu")]
+    Failed { adapter: String, what: String, reason: String },
+}
+
+fn list(found: &[AdapterInfo]) -> String {
+    found.iter().enumerate().map(|(index, info)| format!("{index}: {info}")).collect::<Vec<_>>().join(", ")
+}
+
+fn there_are(found: &[AdapterInfo]) -> String {
+    if found.is_empty() { "is none at all; use --backend cpu".into() } else { format!("is {}", list(found)) }
+}
+
+fn inexact(failures: &[(Pass, probe::Mismatch)]) -> String {
+    failures.iter().map(|(pass, mismatch)| format!("under the {pass} pass, {mismatch}")).collect::<Vec<_>>().join("; ")
+}
+
+/// All adapters that can compute, the most wanted first. None is no error.
+///
+/// `WGPU_BACKEND` narrows the backends (`vulkan`, `metal`, `dx12`); the Vulkan loader has its own `VK_DRIVER_FILES`.
+pub fn adapters() -> Vec<AdapterInfo> {
+    found().into_iter().map(|(_, info)| info).collect()
+}
+
+fn found() -> Vec<(wgpu::Adapter, AdapterInfo)> {
+    // Not the default instance, which ignores the environment and asks for validation layers in debug builds.
+    let backends = wgpu::Backends::all().with_env();
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
+        backends,
+        flags: wgpu::InstanceFlags::empty().with_env(),
+        ..wgpu::InstanceDescriptor::new_without_display_handle()
+    });
+    let mut adapters: Vec<_> = block_on(instance.enumerate_adapters(backends))
+        .into_iter()
+        .filter(|a| a.get_downlevel_capabilities().flags.contains(wgpu::DownlevelFlags::COMPUTE_SHADERS))
+        .map(|adapter| (adapter.get_info(), adapter))
+        .collect();
+    // One device through two backends is one adapter, by the backend that needs no guards.
+    adapters.sort_by_key(|(info, _)| (AdapterInfo::from(info).kind, info.backend != wgpu::Backend::Vulkan));
+    let same = |a: &wgpu::AdapterInfo, b: &wgpu::AdapterInfo| {
+        a.backend != b.backend && (a.vendor, a.device, &a.name) == (b.vendor, b.device, &b.name)
+    };
+    let infos: Vec<_> = adapters.iter().map(|(info, _)| info.clone()).collect();
+    let first = |index: usize| !infos[..index].iter().any(|earlier| same(earlier, &infos[index]));
+    let kept = adapters.into_iter().enumerate().filter(|(index, _)| first(*index));
+    kept.map(|(_, (info, adapter))| (adapter, AdapterInfo::from(&info))).collect()
+}
+
+/// Which adapter to open.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Choice {
+    /// A GPU, never a software renderer.
+    Real,
+    /// A GPU if there is one, else whatever there is.
+    Any,
+    /// By its index in [`adapters`], or by a part of its name in any case (the first that matches).
+    Named(String),
+}
+
+/// What to open, and how. Only tests and `verify` need more than a [`Choice`].
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Request {
+    pub choice: Choice,
+    /// This pass alone instead of the first that is exact. [`Pass::Plain`] is opened untested.
+    pub pass: Option<Pass>,
+    /// WebGPU's default limits instead of the adapter's own.
+    pub default_limits: bool,
+    /// Shaders keep bounds checks, loop bounds and zeroed workgroup memory.
+    pub checked: bool,
+}
+
+impl From<Choice> for Request {
+    fn from(choice: Choice) -> Self {
+        Request { choice, pass: None, default_limits: false, checked: false }
+    }
+}
+
+/// What has gone wrong since the device was opened, as told by wgpu's callbacks.
+#[derive(Default)]
+struct Trouble {
+    lost: Option<String>,
+    error: Option<String>,
+}
+
+/// An opened device whose arithmetic was seen to be exact under `pass`.
+pub struct Gpu {
+    pub adapter: AdapterInfo,
+    /// What may be asked of the device.
+    pub limits: wgpu::Limits,
+    /// How shaders are compiled.
+    pub pass: Pass,
+    pub checked: bool,
+    pub device: wgpu::Device,
+    pub queue: wgpu::Queue,
+    /// The zero that guarded arithmetic is masked with: binding 0 of every bind group.
+    guard: wgpu::Buffer,
+    trouble: Arc<Mutex<Trouble>>,
+}
+
+impl fmt::Debug for Gpu {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Gpu").field("adapter", &self.adapter).field("pass", &self.pass).finish_non_exhaustive()
+    }
+}
+
+/// Opens an adapter and finds the first pass under which it is exact: no contraction on Vulkan, else guarded.
+pub fn open(request: impl Into<Request>) -> Result<Gpu, DeviceError> {
+    let request = request.into();
+    let (adapter, info) = choose(&request.choice)?;
+    let features = adapter.features() & wgpu::Features::PASSTHROUGH_SHADERS;
+    let own = adapter.get_info().backend == wgpu::Backend::Vulkan && !features.is_empty();
+    let candidates = match request.pass {
+        Some(Pass::NoContraction) if !own => {
+            let reason = "the no-contraction pass needs Vulkan".into();
+            return Err(DeviceError::Refused { adapter: info.to_string(), reason });
+        }
+        Some(pass) => vec![pass],
+        None if own => vec![Pass::NoContraction, Pass::Guarded],
+        None => vec![Pass::Guarded],
+    };
+    let limits = if request.default_limits { wgpu::Limits::defaults() } else { adapter.limits() };
+    let mut gpu = Gpu::new(&adapter, info, candidates[0], limits, features, request.checked)?;
+    let mut failures = Vec::new();
+    for pass in candidates {
+        gpu.pass = pass;
+        if pass == Pass::Plain {
+            return Ok(gpu);
+        }
+        match gpu.self_test()? {
+            None => return Ok(gpu),
+            Some(mismatch) => failures.push((pass, mismatch)),
+        }
+    }
+    Err(DeviceError::Inexact { adapter: gpu.adapter.to_string(), failures })
+}
+
+fn choose(choice: &Choice) -> Result<(wgpu::Adapter, AdapterInfo), DeviceError> {
+    let mut found = found();
+    let infos: Vec<_> = found.iter().map(|(_, info)| info.clone()).collect();
+    let index = match choice {
+        Choice::Named(name) => {
+            let part = name.to_lowercase();
+            let by_index = name.parse().ok().filter(|&index: &usize| index < infos.len());
+            let by_name = || infos.iter().position(|info| info.name.to_lowercase().contains(&part));
+            match by_index.or_else(by_name) {
+                Some(index) => index,
+                None => return Err(DeviceError::UnknownAdapter { name: name.clone(), found: infos }),
+            }
+        }
+        // The most wanted adapter is the first.
+        Choice::Real if infos.first().is_some_and(|info| !info.kind.is_real()) => {
+            return Err(DeviceError::NoRealAdapter { found: infos });
+        }
+        Choice::Real | Choice::Any if infos.is_empty() => return Err(DeviceError::NoAdapter),
+        Choice::Real | Choice::Any => 0,
+    };
+    Ok(found.swap_remove(index))
+}
+
+/// How a shader uses a buffer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Binding {
+    Uniform,
+    /// `var<storage, read>`.
+    Read,
+    /// `var<storage, read_write>`.
+    Write,
+}
+
+/// The buffers of a pipeline: group 0, the guard at 0, then the given ones from 1 on.
+#[derive(Clone, Debug)]
+pub struct Layout {
+    bindings: wgpu::BindGroupLayout,
+    pipeline: wgpu::PipelineLayout,
+}
+
+impl Gpu {
+    fn new(
+        adapter: &wgpu::Adapter,
+        info: AdapterInfo,
+        pass: Pass,
+        limits: wgpu::Limits,
+        features: wgpu::Features,
+        checked: bool,
+    ) -> Result<Gpu, DeviceError> {
+        let descriptor = wgpu::DeviceDescriptor {
+            label: Some("flotilla"),
+            required_features: features,
+            required_limits: limits.clone(),
+            ..Default::default()
+        };
+        let refused = |error: wgpu::RequestDeviceError| DeviceError::Refused {
+            adapter: info.to_string(),
+            reason: error.to_string(),
+        };
+        let (device, queue) = block_on(adapter.request_device(&descriptor)).map_err(refused)?;
+        let trouble = Arc::new(Mutex::new(Trouble::default()));
+        let noted = trouble.clone();
+        device.set_device_lost_callback(move |reason, message| {
+            let reason = if message.is_empty() { format!("{reason:?}") } else { message };
+            noted.lock().unwrap_or_else(PoisonError::into_inner).lost.get_or_insert(reason);
+        });
+        let noted = trouble.clone();
+        device.on_uncaptured_error(Arc::new(move |error| {
+            noted.lock().unwrap_or_else(PoisonError::into_inner).error.get_or_insert(chain(&error));
+        }));
+        let guard = device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+            label: Some("guard"),
+            contents: &[0; 16],
+            usage: wgpu::BufferUsages::UNIFORM,
+        });
+        Ok(Gpu { adapter: info, limits, pass, checked, device, queue, guard, trouble })
+    }
+
+    /// Runs every probe under the current pass; the first that differs from the CPU, if any.
+    pub fn self_test(&self) -> Result<Option<probe::Mismatch>, DeviceError> {
+        for probe in probe::ALL {
+            if let Some(mismatch) = probe(self)? {
+                return Ok(Some(mismatch));
+            }
+        }
+        Ok(None)
+    }
+
+    /// An error if the device was lost or anything failed outside the calls below; to be asked after every wait.
+    pub fn check(&self) -> Result<(), DeviceError> {
+        let mut trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(reason) = &trouble.lost {
+            return Err(DeviceError::Lost { adapter: self.adapter.to_string(), reason: reason.clone() });
+        }
+        match trouble.error.take() {
+            Some(reason) => Err(self.failed("a command", reason)),
+            None => Ok(()),
+        }
+    }
+
+    fn failed(&self, what: &str, reason: impl ToString) -> DeviceError {
+        DeviceError::Failed { adapter: self.adapter.to_string(), what: what.into(), reason: reason.to_string() }
+    }
+
+    /// Runs `make` and reports what wgpu found wrong with it, as an error about `what`.
+    pub fn scoped<T>(&self, what: &str, make: impl FnOnce() -> T) -> Result<T, DeviceError> {
+        use wgpu::ErrorFilter::{Internal, OutOfMemory, Validation};
+        let [memory, validation, internal] =
+            [OutOfMemory, Validation, Internal].map(|f| self.device.push_error_scope(f));
+        let made = make();
+        // Innermost first; array elements would be dropped in the wrong order.
+        let errors = [block_on(internal.pop()), block_on(validation.pop()), block_on(memory.pop())];
+        self.check()?;
+        match errors.into_iter().flatten().next() {
+            None => Ok(made),
+            Some(wgpu::Error::OutOfMemory { .. }) => {
+                Err(DeviceError::OutOfMemory { adapter: self.adapter.to_string(), what: what.into() })
+            }
+            Some(error) => Err(self.failed(what, chain(&error))),
+        }
+    }
+
+    /// A new buffer of `bytes` bytes, all zero.
+    pub fn buffer(&self, what: &str, bytes: u64, usage: wgpu::BufferUsages) -> Result<wgpu::Buffer, DeviceError> {
+        let mut allowed = self.limits.max_buffer_size;
+        if usage.contains(wgpu::BufferUsages::STORAGE) {
+            allowed = allowed.min(self.limits.max_storage_buffer_binding_size);
+        }
+        if usage.contains(wgpu::BufferUsages::UNIFORM) {
+            allowed = allowed.min(self.limits.max_uniform_buffer_binding_size);
+        }
+        if bytes > allowed {
+            return Err(DeviceError::TooLarge { adapter: self.adapter.to_string(), what: what.into(), bytes, allowed });
+        }
+        let descriptor = wgpu::BufferDescriptor { label: Some(what), size: bytes, usage, mapped_at_creation: false };
+        self.scoped(what, || self.device.create_buffer(&descriptor))
+    }
+
+    /// A new buffer that holds `contents`.
+    pub fn upload<T: Pod>(
+        &self,
+        what: &str,
+        contents: &[T],
+        usage: wgpu::BufferUsages,
+    ) -> Result<wgpu::Buffer, DeviceError> {
+        let bytes = bytemuck::cast_slice(contents);
+        let buffer = self.buffer(what, bytes.len() as u64, usage | wgpu::BufferUsages::COPY_DST)?;
+        self.scoped(what, || self.queue.write_buffer(&buffer, 0, bytes))?;
+        Ok(buffer)
+    }
+
+    /// Waits for all work and reads a range of a buffer (in bytes, multiples of 4; usage `COPY_SRC`).
+    pub fn read<T: Pod>(&self, buffer: &wgpu::Buffer, bytes: Range<u64>) -> Result<Vec<T>, DeviceError> {
+        let size = bytes.end - bytes.start;
+        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ;
+        let landing = self.buffer("reading back", size, usage)?;
+        let (send, receive) = std::sync::mpsc::channel();
+        self.scoped("reading back", || {
+            let mut encoder = self.device.create_command_encoder(&Default::default());
+            encoder.copy_buffer_to_buffer(buffer, bytes.start, &landing, 0, size);
+            self.queue.submit([encoder.finish()]);
+            // Nobody listens any more only if waiting failed.
+            landing.map_async(wgpu::MapMode::Read, .., move |result| drop(send.send(result)));
+        })?;
+        self.wait()?;
+        let mapped = receive.recv().map_err(|error| self.failed("reading back", error))?;
+        mapped.map_err(|error| self.failed("reading back", error))?;
+        let view = landing.get_mapped_range(..).map_err(|error| self.failed("reading back", error))?;
+        Ok(bytemuck::pod_collect_to_vec(&view[..]))
+    }
+
+    /// Waits until everything submitted is done.
+    pub fn wait(&self) -> Result<(), DeviceError> {
+        let waited = self.device.poll(wgpu::PollType::wait_indefinitely());
+        self.check()?;
+        waited.map(drop).map_err(|error| self.failed("waiting", error))
+    }
+
+    /// The layout of a pipeline that uses these buffers as bindings 1, 2, … of group 0.
+    pub fn layout(&self, label: &str, buffers: &[Binding]) -> Result<Layout, DeviceError> {
+        let entry = |(binding, &kind): (u32, &Binding)| wgpu::BindGroupLayoutEntry {
+            binding,
+            visibility: wgpu::ShaderStages::COMPUTE,
+            ty: wgpu::BindingType::Buffer {
+                ty: match kind {
+                    Binding::Uniform => wgpu::BufferBindingType::Uniform,
+                    Binding::Read => wgpu::BufferBindingType::Storage { read_only: true },
+                    Binding::Write => wgpu::BufferBindingType::Storage { read_only: false },
+                },
+                has_dynamic_offset: false,
+                min_binding_size: None,
+            },
+            count: None,
+        };
+        let entries: Vec<_> = (0..).zip(std::iter::once(&Binding::Uniform).chain(buffers)).map(entry).collect();
+        self.scoped(label, || {
+            let descriptor = wgpu::BindGroupLayoutDescriptor { label: Some(label), entries: &entries };
+            let bindings = self.device.create_bind_group_layout(&descriptor);
+            let pipeline = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+                label: Some(label),
+                bind_group_layouts: &[Some(&bindings)],
+                immediate_size: 0,
+            });
+            Layout { bindings, pipeline }
+        })
+    }
+
+    /// Buffers for a pipeline, in the order of its layout.
+    pub fn bind(
+        &self,
+        label: &str,
+        layout: &Layout,
+        buffers: &[wgpu::BufferBinding<'_>],
+    ) -> Result<wgpu::BindGroup, DeviceError> {
+        let all = std::iter::once(self.guard.as_entire_buffer_binding()).chain(buffers.iter().cloned());
+        let entries: Vec<_> = (0..)
+            .zip(all)
+            .map(|(binding, buffer)| wgpu::BindGroupEntry { binding, resource: wgpu::BindingResource::Buffer(buffer) })
+            .collect();
+        let descriptor = wgpu::BindGroupDescriptor { label: Some(label), layout: &layout.bindings, entries: &entries };
+        self.scoped(label, || self.device.create_bind_group(&descriptor))
+    }
+
+    /// Compiles an entry point under the device's pass. Workgroup memory starts undefined unless `checked`.
+    pub fn pipeline(
+        &self,
+        label: &str,
+        wgsl: &str,
+        entry: &str,
+        layout: &Layout,
+    ) -> Result<wgpu::ComputePipeline, DeviceError> {
+        let compiled = self.scoped(label, || exact::compile(&self.device, label, wgsl, self.pass, self.checked))?;
+        let module = compiled.map_err(|source| DeviceError::Shader { label: label.into(), source })?;
+        let descriptor = wgpu::ComputePipelineDescriptor {
+            label: Some(label),
+            layout: Some(&layout.pipeline),
+            module: &module,
+            entry_point: Some(entry),
+            compilation_options: wgpu::PipelineCompilationOptions {
+                zero_initialize_workgroup_memory: self.checked,
+                ..Default::default()
+            },
+            cache: None,
+        };
+        self.scoped(label, || self.device.create_compute_pipeline(&descriptor))
+    }
+
+    /// Submits one dispatch, without waiting for it.
+    pub fn dispatch(
+        &self,
+        what: &str,
+        pipeline: &wgpu::ComputePipeline,
+        buffers: &wgpu::BindGroup,
+        workgroups: [u32; 3],
+    ) -> Result<(), DeviceError> {
+        let [x, y, z] = workgroups;
+        self.scoped(what, || {
+            let mut encoder = self.device.create_command_encoder(&Default::default());
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            pass.set_pipeline(pipeline);
+            pass.set_bind_group(0, buffers, &[]);
+            pass.dispatch_workgroups(x, y, z);
+            drop(pass);
+            self.queue.submit([encoder.finish()]);
+        })
+    }
+}
+
+/// An error with all its causes.
+fn chain(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        let inner = error.to_string();
+        if !text.contains(&inner) {
+            text += &format!(": {inner}");
+        }
+        cause = error.source();
+    }
+    text
+}

@@ -1,0 +1,222 @@
+//! The self-test of a device: small computations whose bits must be the CPU's.
+
+use std::fmt;
+
+use wgpu::BufferUsages;
+
+use super::device::{Binding, DeviceError, Gpu};
+
+/// Where a device first differed from the CPU.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Mismatch {
+    /// What was computed.
+    pub probe: &'static str,
+    /// From which values, in the order `x, y, z, w`.
+    pub values: Vec<u32>,
+    pub cpu: u32,
+    pub gpu: u32,
+}
+
+impl fmt::Display for Mismatch {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Mismatch { probe, values, cpu, gpu } = self;
+        write!(f, "probe \"{probe}\" gives {gpu:#010x} instead of {cpu:#010x}")?;
+        if !values.is_empty() {
+            let values: Vec<_> = values.iter().map(|&word| format!("{:e}", f32::from_bits(word))).collect();
+            write!(f, " from {}", values.join(", "))?;
+        }
+        Ok(())
+    }
+}
+
+/// The shader of the arithmetic probe.
+pub const SHADER: &str = include_str!("../../../shaders/probe.wgsl");
+
+/// One probe: the first mismatch under the device's current pass, or none.
+pub type Probe = fn(&Gpu) -> Result<Option<Mismatch>, DeviceError>;
+
+/// All probes that a pass must survive, the quickest first.
+///
+/// A new one is a function here: it compiles through `gpu.pipeline`, so that the pass under test applies to it.
+pub const ALL: &[Probe] = &[arithmetic];
+
+/// Computations of `arithmetic`, in the order of `shaders/probe.wgsl`.
+const NAMES: [&str; 36] = [
+    "x*y + z",
+    "x*y - z",
+    "z - x*y",
+    "x*y + y*z",
+    "x*y - x*z",
+    "x*y - y*x",
+    "(x + y) - x",
+    "(x - y) + y",
+    "((x + y) + z) + w",
+    "x + (y + (z + w))",
+    "((x*y)*z)*w",
+    "x*(y*(z*w))",
+    "x + x + x",
+    "(x*0.1)*10",
+    "(x + 4096) - 4096",
+    "x*2.7 + x*0.3",
+    "x*x + y*y + z*z",
+    "-(x*y) + z",
+    "abs(x*y - z)",
+    "product(x, y) + z",
+    "a product kept over a branch",
+    "a selected product, plus z",
+    "vectors, v*v + v",
+    "vectors, v*y - (v + v)",
+    "a polynomial",
+    "Newton's reciprocal",
+    "Newton's reciprocal root",
+    "a sum in a loop",
+    "a sum of products in a loop",
+    "floor(x*y)",
+    "u32 to f32",
+    "i32 to f32",
+    "f32 to u32 and i32",
+    "comparisons",
+    "selection by comparison",
+    "bit casts",
+];
+
+/// Groups of four values that [`arithmetic`] tries.
+const ITEMS: usize = 4096;
+const WORKGROUP: usize = 64;
+
+/// Contraction, reassociation, conversion and comparison, on [`ITEMS`] groups of values.
+fn arithmetic(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
+    let values = values();
+    let bytes = (ITEMS * NAMES.len() * size_of::<u32>()) as u64;
+    let from = gpu.upload("probe values", &values, BufferUsages::STORAGE)?;
+    let to = gpu.buffer("probe words", bytes, BufferUsages::STORAGE | BufferUsages::COPY_SRC)?;
+    let layout = gpu.layout("probe", &[Binding::Read, Binding::Write])?;
+    let pipeline = gpu.pipeline("probe", SHADER, "probe", &layout)?;
+    let buffers = gpu.bind("probe", &layout, &[from.as_entire_buffer_binding(), to.as_entire_buffer_binding()])?;
+    gpu.dispatch("probe", &pipeline, &buffers, [ITEMS.div_ceil(WORKGROUP) as u32, 1, 1])?;
+    let words: Vec<u32> = gpu.read(&to, 0..bytes)?;
+    Ok((0..ITEMS).zip(words.chunks_exact(NAMES.len())).find_map(|(item, words)| {
+        let expected = expected(&values, item);
+        let differs = (0..NAMES.len()).find(|&probe| words[probe] != expected[probe])?;
+        let inputs = values[item * 4..][..4].iter().map(|value| value.to_bits()).collect();
+        Some(Mismatch { probe: NAMES[differs], values: inputs, cpu: expected[differs], gpu: words[differs] })
+    }))
+}
+
+/// Reproducible values that make rounding show: zeros, equal pairs, small integers, sums that nearly cancel, and full
+/// mantissas over 2^-12 to 2^12, so that nothing under 2^-100 but 0 comes up on the way.
+fn values() -> Vec<f32> {
+    let mut state = 0u64;
+    let mut next = || {
+        // splitmix64
+        state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut word = state;
+        word = (word ^ (word >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        word = (word ^ (word >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        word ^ (word >> 31)
+    };
+    let mut values = Vec::with_capacity(ITEMS * 4);
+    for item in 0..ITEMS {
+        let mut group: [f32; 4] = std::array::from_fn(|_| {
+            let word = next();
+            let exponent = 127 - 12 + (word >> 32) as u32 % 24;
+            let sign = (word >> 63) as u32;
+            f32::from_bits(sign << 31 | exponent << 23 | word as u32 & 0x7f_ffff)
+        });
+        match item % 8 {
+            0 => group[item / 8 % 4] = 0.0,
+            1 => group[1] = group[0],
+            2 => group = group.map(|value| (value * 0.01).round()),
+            3 => group[2] = group[0] * group[1],
+            4 => group[2] = -(group[0] * group[1]),
+            _ => {}
+        }
+        values.extend(group.map(|value| value + 0.0));
+    }
+    values
+}
+
+fn bits(x: f32) -> u32 {
+    let word = x.to_bits();
+    if word == 0x8000_0000 { 0 } else { word }
+}
+
+fn mixed(v: [f32; 4]) -> u32 {
+    let [x, y, z, w] = v.map(bits);
+    x ^ y.wrapping_mul(3) ^ z.wrapping_mul(5) ^ w.wrapping_mul(7)
+}
+
+fn product(a: f32, b: f32) -> f32 {
+    a * b
+}
+
+fn reciprocal(d: f32) -> f32 {
+    let mut r = f32::from_bits(0x7ef3_11c3 - d.to_bits());
+    for _ in 0..3 {
+        r = r * (2.0 - d * r);
+    }
+    r
+}
+
+fn reciprocal_root(d: f32) -> f32 {
+    let mut r = f32::from_bits(0x5f37_59df - (d.to_bits() >> 1));
+    for _ in 0..3 {
+        r = r * (1.5 - 0.5 * d * r * r);
+    }
+    r
+}
+
+/// The twin of `probe` in `shaders/probe.wgsl`.
+#[allow(clippy::eq_op, reason = "x*y - y*x is 0 but where it is contracted")]
+fn expected(values: &[f32], item: usize) -> [u32; NAMES.len()] {
+    let v: [f32; 4] = std::array::from_fn(|i| values[item * 4 + i]);
+    let [x, y, z, w] = v;
+    let select = |otherwise: f32, then: f32, condition: bool| if condition { then } else { otherwise };
+    let kept = if w > 0.0 { x * y + z } else { x * y - w };
+    let mut sum = 0.0;
+    let mut products = 0.0;
+    for k in 0..16 {
+        let value = values[(item * 4 + k) % values.len()];
+        sum += value;
+        products += value * y;
+    }
+    let flags = [x < y, x <= y, x == y, x >= y, x * y > z];
+    [
+        bits(x * y + z),
+        bits(x * y - z),
+        bits(z - x * y),
+        bits(x * y + y * z),
+        bits(x * y - x * z),
+        bits(x * y - y * x),
+        bits((x + y) - x),
+        bits((x - y) + y),
+        bits(((x + y) + z) + w),
+        bits(x + (y + (z + w))),
+        bits(((x * y) * z) * w),
+        bits(x * (y * (z * w))),
+        bits(x + x + x),
+        bits((x * 0.1) * 10.0),
+        bits((x + 4096.0) - 4096.0),
+        bits(x * 2.7 + x * 0.3),
+        bits(x * x + y * y + z * z),
+        bits(-(x * y) + z),
+        bits((x * y - z).abs()),
+        bits(product(x, y) + z),
+        bits(kept),
+        bits(select(x * y, z * w, x < y) + z),
+        mixed(std::array::from_fn(|i| v[i] * v[(i + 1) % 4] + v[(i + 2) % 4])),
+        mixed(std::array::from_fn(|i| v[i] * y - (v[i] + v[(i + 3) % 4]))),
+        bits(((x * 0.3 + 0.7) * x - 1.1) * x + 0.9),
+        bits(reciprocal(1.0 + x.abs())),
+        bits(reciprocal_root(1.0 + y.abs())),
+        bits(sum),
+        bits(products),
+        bits((x * y).floor()),
+        bits((x.to_bits() >> 8) as f32),
+        bits((x.to_bits() as i32 >> 7) as f32),
+        x.abs() as u32 ^ y as i32 as u32,
+        (0..).zip(flags).map(|(bit, flag)| u32::from(flag) << bit).sum(),
+        bits(select(x, y, x <= y)) ^ bits(select(z, w, z >= w)),
+        bits(f32::from_bits(z.to_bits() & 0x7fff_ffff) + f32::from_bits(w.to_bits() & 0x7fff_0000)),
+    ]
+}

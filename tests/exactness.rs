@@ -1,0 +1,288 @@
+//! The shaders stay inside the exact core, the compile passes reach all of their arithmetic, and devices obey.
+
+mod common;
+
+use std::path::{Path, PathBuf};
+
+use flotilla::backend::gpu::device::{self, Choice, DeviceError, Kind, Request};
+use flotilla::backend::gpu::exact::{self, Pass, ShaderError};
+use flotilla::backend::gpu::{probe, shaders};
+use wgpu::BufferUsages;
+
+const BOTH: [Pass; 2] = [Pass::NoContraction, Pass::Guarded];
+
+/// A shader that computes one expression of the floats x, y, the vectors v, u, the matrix m and the integers i, j.
+fn shader(expression: &str) -> String {
+    format!(
+        "struct Values {{ m: mat2x2<f32>, x: f32, y: f32, i: i32, j: u32, v: vec2<f32>, u: vec2<f32> }}
+        @group(0) @binding(1) var<storage, read> values: Values;
+        @group(0) @binding(2) var<storage, read_write> word: atomic<u32>;
+        @compute @workgroup_size(1) fn main() {{
+            let x = values.x; let y = values.y; let i = values.i; let j = values.j; let v = values.v; let u = values.u;
+            let result = {expression};
+            atomicStore(&word, u32(result));
+        }}"
+    )
+}
+
+fn foreign(expression: &str) -> Vec<String> {
+    let (module, _) = exact::parse(&shader(expression)).unwrap_or_else(|error| panic!("{expression}: {error}"));
+    exact::foreign_operations(&module)
+}
+
+fn files(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).expect("the shaders' folder can be listed");
+    let paths = entries.map(|entry| entry.expect("its entries too").path());
+    paths.flat_map(|path| if path.is_dir() { files(&path) } else { vec![path] }).collect()
+}
+
+#[test]
+fn every_shader_file_is_walked() {
+    let texts = shaders();
+    for path in files(&Path::new(env!("CARGO_MANIFEST_DIR")).join("shaders")) {
+        let file = std::fs::read_to_string(&path).expect("a shader is text");
+        assert!(texts.iter().any(|(_, text)| text.contains(file.trim())), "{} is in no shader", path.display());
+    }
+}
+
+#[test]
+fn no_shader_leaves_the_core() {
+    for (name, text) in shaders() {
+        let (module, _) = exact::parse(&text).unwrap_or_else(|error| panic!("{name} {error}"));
+        assert_eq!(exact::foreign_operations(&module), Vec::<String>::new(), "{name}");
+    }
+}
+
+#[test]
+fn the_lint_knows_the_core() {
+    for inside in [
+        "x + y * x - 2.0",
+        "-x",
+        "abs(x)",
+        "floor(y)",
+        "select(x, y, x <= y)",
+        "(v * u + x * v).y",
+        "(vec2(x, y) - u.yx).x",
+        "bitcast<f32>(bitcast<u32>(x) ^ 5u)",
+        "f32(i) + f32(j)",
+        "i32(x) / 3 % i",
+        "j / 3u + j % 7u + (j << 2u)",
+        "min(j, 4u) + bitcast<u32>(clamp(i, 2, 5)) + max(j, 1u)",
+        "countOneBits(j) + firstTrailingBit(j) + firstLeadingBit(j) + reverseBits(j) + u32(abs(i))",
+        "select(0u, 1u, any(v < u) || all(v == u))",
+        "atomicAdd(&word, 1u) + atomicLoad(&word)",
+    ] {
+        assert_eq!(foreign(inside), Vec::<String>::new(), "{inside}");
+    }
+}
+
+#[test]
+fn the_lint_names_what_is_outside() {
+    for (outside, named) in [
+        ("x / y", "Divide"),
+        ("x % y", "Modulo"),
+        ("(v / u).x", "Divide"),
+        ("(v / 2.0).x", "Divide"),
+        ("min(x, y)", "Min"),
+        ("max(v, u).x", "Max"),
+        ("clamp(x, 0.0, y)", "Clamp"),
+        ("saturate(x)", "Saturate"),
+        ("sign(x)", "Sign"),
+        ("sqrt(x)", "Sqrt"),
+        ("inverseSqrt(x)", "InverseSqrt"),
+        ("exp(x)", "Exp"),
+        ("log2(x)", "Log2"),
+        ("pow(x, y)", "Pow"),
+        ("sin(x)", "Sin"),
+        ("atan2(x, y)", "Atan2"),
+        ("tanh(x)", "Tanh"),
+        ("ceil(x)", "Ceil"),
+        ("round(x)", "Round"),
+        ("trunc(x)", "Trunc"),
+        ("fract(x)", "Fract"),
+        ("fma(x, y, x)", "Fma"),
+        ("mix(x, y, 0.5)", "Mix"),
+        ("step(x, y)", "Step"),
+        ("smoothstep(x, y, 0.5)", "SmoothStep"),
+        ("dot(v, u)", "Dot"),
+        ("length(v)", "Length"),
+        ("distance(v, u)", "Distance"),
+        ("normalize(v).x", "Normalize"),
+        ("reflect(v, u).x", "Reflect"),
+        ("ldexp(x, i)", "Ldexp"),
+        ("unpack2x16snorm(j).x", "Unpack2x16snorm"),
+        ("(values.m * v).x", "Matrix"),
+    ] {
+        let found = foreign(outside);
+        assert!(found.iter().any(|line| line.starts_with("main: ") && line.contains(named)), "{outside}: {found:?}");
+    }
+}
+
+#[test]
+fn a_foreign_operation_inside_a_function_and_a_loop_is_found() {
+    let text = "fn deep(x: f32) -> f32 { var y = x; loop { if y > 9.0 { break; } y = y + 1.0 / x; } return y; }
+        @group(0) @binding(1) var<storage, read_write> value: f32;
+        @compute @workgroup_size(1) fn main() { value = deep(value); }";
+    let (module, _) = exact::parse(text).expect("it is sound WGSL");
+    assert_eq!(exact::foreign_operations(&module), ["deep: float Divide"]);
+}
+
+#[test]
+fn every_float_result_is_decorated() {
+    for (name, text) in shaders() {
+        let (module, info) = exact::parse(&text).expect("shaders are valid");
+        for checked in [false, true] {
+            let plain = exact::emit(&module, &info, checked).expect("shaders have SPIR-V");
+            let exact = exact::spirv(&text, checked).expect("shaders have SPIR-V");
+            assert!(exact::undecorated(&plain) > 0, "{name}: naga decorates by itself, so this test shows nothing");
+            assert_eq!(exact::undecorated(&exact), 0, "{name}");
+            assert_eq!(exact.len(), plain.len() + 3 * exact::undecorated(&plain), "{name}: only decorations are added");
+        }
+    }
+}
+
+#[test]
+fn every_kind_of_float_arithmetic_is_decorated() {
+    for expression in ["x + y", "x - y", "x * y", "-x", "x / y", "x % y", "(v * x).x", "dot(v, u)", "fma(x, y, x)"] {
+        let (module, info) = exact::parse(&shader(expression)).expect("it is valid");
+        let plain = exact::emit(&module, &info, false).expect("it has SPIR-V");
+        assert!(exact::undecorated(&plain) > 0, "{expression}");
+        assert_eq!(exact::undecorated(&exact::decorate(&plain)), 0, "{expression}");
+    }
+}
+
+#[test]
+fn every_sum_and_product_is_guarded() {
+    for (name, text) in shaders() {
+        let (module, _) = exact::parse(&text).expect("shaders are valid");
+        assert!(exact::unguarded(&module).expect("shaders are valid") > 0, "{name}");
+        let guarded = exact::guarded(&module).unwrap_or_else(|error| panic!("{name} {error}"));
+        assert_eq!(exact::unguarded(&guarded).expect("guarded shaders are valid"), 0, "{name}");
+    }
+}
+
+#[test]
+fn shaders_that_no_pass_can_save_are_refused() {
+    let (module, _) = exact::parse(&shader("x / y")).expect("it is valid");
+    assert!(matches!(exact::guarded(&module), Err(ShaderError::Foreign(_))));
+    let (module, _) = exact::parse(&shader("x * y").replace("binding(1)", "binding(0)")).expect("it is valid");
+    assert!(matches!(exact::guarded(&module), Err(ShaderError::GuardTaken)));
+    let error = exact::parse(&shader("x * nothing")).expect_err("it has no such name").to_string();
+    assert!(error.contains("x * nothing"), "{error}");
+    assert!(matches!(exact::parse(&shader("x * i")), Err(ShaderError::Invalid(_))));
+}
+
+#[test]
+fn devices_are_exact_under_both_passes() {
+    for (request, info) in common::adapters("devices_are_exact_under_both_passes") {
+        for pass in BOTH {
+            for checked in [false, true] {
+                match device::open(Request { pass: Some(pass), checked, ..request.clone() }) {
+                    Ok(gpu) => assert_eq!((gpu.pass, gpu.checked), (pass, checked)),
+                    Err(DeviceError::Refused { .. }) if pass == Pass::NoContraction && info.backend != "vulkan" => {}
+                    Err(error) => panic!("{error}"),
+                }
+            }
+        }
+        let gpu = device::open(request).unwrap_or_else(|error| panic!("{error}"));
+        assert_eq!(gpu.pass == Pass::NoContraction, info.backend == "vulkan", "{info}: the cheaper pass is taken");
+    }
+}
+
+/// The canary: a device known to be inexact has to be caught, or the probes are blind.
+#[test]
+fn the_probes_catch_lavapipe_without_a_pass() {
+    for (request, info) in common::adapters("the_probes_catch_lavapipe_without_a_pass") {
+        let gpu =
+            device::open(Request { pass: Some(Pass::Plain), ..request }).unwrap_or_else(|error| panic!("{error}"));
+        let mismatch = gpu.self_test().unwrap_or_else(|error| panic!("{error}"));
+        if info.name.contains("llvmpipe") {
+            let mismatch = mismatch.expect("lavapipe reassociates");
+            assert_ne!(mismatch.cpu, mismatch.gpu, "{mismatch}");
+        }
+    }
+}
+
+#[test]
+fn webgpus_default_limits_are_enough() {
+    for (request, _) in common::adapters("webgpus_default_limits_are_enough") {
+        let gpu = device::open(Request { default_limits: true, ..request }).unwrap_or_else(|error| panic!("{error}"));
+        assert_eq!(gpu.limits, wgpu::Limits::defaults());
+        let error = gpu.buffer("the weights", (128 << 20) + 4, BufferUsages::STORAGE).expect_err("it is over 128 MiB");
+        assert!(matches!(error, DeviceError::TooLarge { allowed, .. } if allowed == 128 << 20), "{error}");
+        let message = error.to_string();
+        assert!(message.contains("the weights") && message.contains("smaller batch"), "{message}");
+    }
+}
+
+#[test]
+fn a_shader_over_the_devices_limits_is_refused() {
+    for (request, _) in common::adapters("a_shader_over_the_devices_limits_is_refused") {
+        for pass in BOTH {
+            let request = Request { default_limits: true, pass: Some(pass), ..request.clone() };
+            let gpu = match device::open(request) {
+                Err(DeviceError::Refused { .. }) if pass == Pass::NoContraction => continue,
+                opened => opened.unwrap_or_else(|error| panic!("{error}")),
+            };
+            let layout = gpu.layout("test", &[]).unwrap_or_else(|error| panic!("{error}"));
+            let wide = "@compute @workgroup_size(257) fn main() {}";
+            let heavy = "var<workgroup> much: array<u32, 4097>;
+                @compute @workgroup_size(1) fn main() { much[0] = 1u; }";
+            for (text, named) in [(wide, "257"), (heavy, "16388")] {
+                let error = gpu.pipeline("test", text, "main", &layout).expect_err("it is over the limits").to_string();
+                assert!(error.contains(named), "{error}");
+            }
+        }
+    }
+}
+
+#[test]
+fn an_unknown_adapter_lists_those_there_are() {
+    let error = device::open(Choice::Named("no such adapter".into())).expect_err("there is no such adapter");
+    let message = error.to_string();
+    assert!(message.contains("no such adapter") && message.contains("--backend cpu") || !device::adapters().is_empty());
+    for info in device::adapters() {
+        assert!(message.contains(&info.name), "{message}");
+    }
+    for (request, info) in common::adapters("an_unknown_adapter_lists_those_there_are") {
+        let by_name = Choice::Named(info.name.to_uppercase());
+        let gpu = device::open(Request { choice: by_name, ..request }).unwrap_or_else(|error| panic!("{error}"));
+        assert_eq!(gpu.adapter.name, info.name);
+    }
+}
+
+#[test]
+fn a_real_gpu_is_never_a_software_renderer() {
+    match device::open(Choice::Real) {
+        Ok(gpu) => assert!(gpu.adapter.kind.is_real(), "{}", gpu.adapter),
+        Err(DeviceError::NoRealAdapter { found }) => assert!(found.iter().all(|info| !info.kind.is_real())),
+        Err(DeviceError::NoAdapter) => assert!(device::adapters().is_empty()),
+        Err(error) => panic!("{error}"),
+    }
+    for info in device::adapters().iter().filter(|info| info.name.contains("llvmpipe") || info.name.contains("Swift")) {
+        assert_eq!(info.kind, Kind::Software, "{info}");
+    }
+}
+
+#[test]
+fn a_lost_device_is_an_error() {
+    for (request, info) in common::adapters("a_lost_device_is_an_error") {
+        let gpu = device::open(request).unwrap_or_else(|error| panic!("{error}"));
+        gpu.check().expect("nothing has happened yet");
+        gpu.device.destroy();
+        let error = gpu.wait().and_then(|()| gpu.buffer("a buffer", 64, BufferUsages::STORAGE).map(drop));
+        let error = error.expect_err("the device is gone");
+        assert!(matches!(error, DeviceError::Lost { .. }), "{error}");
+        assert!(error.to_string().contains(&info.name), "{error}");
+    }
+}
+
+#[test]
+fn a_refusal_names_the_device_and_the_probe() {
+    let mismatch = probe::Mismatch { probe: "x*y + z", values: vec![1.5f32.to_bits()], cpu: 1, gpu: 2 };
+    let failures = vec![(Pass::NoContraction, mismatch.clone()), (Pass::Guarded, mismatch)];
+    let message = DeviceError::Inexact { adapter: "Some GPU".into(), failures }.to_string();
+    for part in ["Some GPU", "x*y + z", "no-contraction", "guarded", "0x00000002", "1.5e0", "--backend cpu"] {
+        assert!(message.contains(part), "{part}: {message}");
+    }
+}
