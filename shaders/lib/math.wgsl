@@ -16,9 +16,9 @@ fn root(x: f32) -> f32 {
 // 2^(-1/3)/√x.
 fn rough_rsqrt(x: f32) -> f32 {
     let bits = bitcast<u32>(x);
-    let y = bitcast<f32>(0x5f095e83u - (bits >> 1u));
+    let y = bitcast<f32>(0x5f096417u - (bits >> 1u));
     let r = x * y * y;
-    return y * ((r - 2.0547438) * r + 1.8974159);
+    return y * ((r - 2.0547535) * r + 1.8974205);
 }
 
 // 1/x for positive x.
@@ -30,8 +30,8 @@ fn recip(x: f32) -> f32 {
 // 2/x.
 fn rough_twice_recip(x: f32) -> f32 {
     let bits = bitcast<u32>(x);
-    let y = bitcast<f32>(0x7f3249aeu - bits);
-    return y * (2.8286953 - x * y);
+    let y = bitcast<f32>(0x7f32428eu - bits);
+    return y * (2.8286855 - x * y);
 }
 
 fn hyperbolic_tangent(unclamped: f32) -> f32 {
@@ -49,13 +49,13 @@ fn hyperbolic_tangent(unclamped: f32) -> f32 {
 // (sin x, cos x) for |x| up to π.
 fn sin_cos(x: f32) -> vec2<f32> {
     let z = x * x;
-    let u = 9.869604 - z;
+    let u = 9.869605 - z;
     let v = 2.467401 - z;
-    let p = ((((z * -1.3418489e-10 + 2.3345717e-8) * z - 2.5224422e-6) * z + 1.7350535e-4) * z - 6.6208807e-3) * z
-        + 0.10132119;
-    let q = ((((v * 1.7276196e-9 + 2.4530118e-7) * v + 2.1586782e-5) * v + 1.1602798e-3) * v + 3.2251544e-2) * v
+    let p = ((((z * -1.3433592e-10 + 2.3344368e-8) * z - 2.5224585e-6) * z + 1.7350527e-4) * z - 6.6208793e-3) * z
+        + 0.101321176;
+    let q = ((((v * 1.7268913e-9 + 2.452929e-7) * v + 2.1586762e-5) * v + 1.1602798e-3) * v + 3.2251544e-2) * v
         + 0.31830987;
-    return vec2<f32>(x * (u * p), v * q);
+    return vec2<f32>(x * u * p, v * q);
 }
 
 // ln x for x in 2^-24..1.
@@ -88,12 +88,12 @@ fn flush(x: f32, limit: f32) -> f32 {
 
 // Four random words for a counter: pcg4d and one more fold.
 fn draw(counter: vec4<u32>) -> vec4<u32> {
-    var v = counter * 1664525u + 1013904223u;
-    v.x += v.y * v.w;
-    v.y += v.z * v.x;
-    v.z += v.x * v.y;
-    v.w += v.y * v.z;
-    v = v ^ (v >> vec4<u32>(16u));
+    return stir(stir(counter * 1664525u + 1013904223u));
+}
+
+// One round of draw.
+fn stir(counter: vec4<u32>) -> vec4<u32> {
+    var v = counter;
     v.x += v.y * v.w;
     v.y += v.z * v.x;
     v.z += v.x * v.y;
