@@ -53,22 +53,22 @@ fn seat(index: u32, teams: u32) -> Agent {
 }
 
 // A leader senses POIs, then the other agents, and decides.
-fn lead(task: Task, self_: ptr<function, Agent>) {
+fn lead(task: Task, me: ptr<function, Agent>) {
     let agents = world.leaders + world.followers;
-    let team = (*self_).team;
-    let leader = (*self_).agent;
-    let x = (*self_).x;
-    let y = (*self_).y;
-    let hx = (*self_).hx;
-    let hy = (*self_).hy;
-    var from: array<f32, WIDEST>;
+    let team = (*me).team;
+    let leader = (*me).agent;
+    let x = (*me).x;
+    let y = (*me).y;
+    let hx = (*me).hx;
+    let hy = (*me).hy;
+    var inputs: array<f32, WIDEST>;
     var sums = array<f32, 4>(0.0, 0.0, 0.0, 0.0);
     for (var poi = 0u; poi < world.pois; poi++) {
         let place = places[task.pois + poi];
         sense(world.poi_range2, place.x - x, place.y - y, hx, hy, &sums);
     }
     for (var quadrant = 0u; quadrant < 4u; quadrant++) {
-        from[quadrant] = sums[quadrant] * world.poi_share;
+        inputs[quadrant] = sums[quadrant] * world.poi_share;
     }
     sums = array<f32, 4>(0.0, 0.0, 0.0, 0.0);
     for (var other = 0u; other < agents; other++) {
@@ -78,11 +78,11 @@ fn lead(task: Task, self_: ptr<function, Agent>) {
         }
     }
     for (var quadrant = 0u; quadrant < 4u; quadrant++) {
-        from[4u + quadrant] = sums[quadrant] * world.agent_share;
+        inputs[4u + quadrant] = sums[quadrant] * world.agent_share;
     }
     if TRACE {
         for (var input = 0u; input < 8u; input++) {
-            (*self_).inputs[input] = from[input];
+            (*me).inputs[input] = inputs[input];
         }
     }
     let stride = task.teams * world.leaders;
@@ -90,27 +90,27 @@ fn lead(task: Task, self_: ptr<function, Agent>) {
     for (var layer = 0u; layer < world.layers; layer++) {
         let rows = world.widths[layer];
         let columns = world.widths[layer + 1u];
-        var to: array<f32, WIDEST>;
+        var units: array<f32, WIDEST>;
         for (var column = 0u; column < columns; column++) {
-            to[column] = activate(weigh(&from, rows, first + column * stride, columns * stride));
+            units[column] = activate(weigh(&inputs, rows, first + column * stride, columns * stride));
         }
-        from = to;
+        inputs = units;
         first += (rows + 1u) * columns * stride;
     }
     if TRACE {
-        (*self_).outputs = array<f32, 2>(from[0], from[1]);
+        (*me).outputs = array<f32, 2>(inputs[0], inputs[1]);
     }
-    let heading = turn(hx, hy, wanted_turn(from[0]));
-    (*self_).next = Course(heading.x, heading.y, wanted_speed(from[1]));
+    let heading = turn(hx, hy, wanted_turn(inputs[0]));
+    (*me).next = Course(heading.x, heading.y, wanted_speed(inputs[1]));
 }
 
 // A follower counts the leaders that it sees and follows whoever is near.
-fn follow(task: Task, self_: ptr<function, Agent>) {
+fn follow(task: Task, me: ptr<function, Agent>) {
     let agents = world.leaders + world.followers;
-    let team = (*self_).team;
-    let agent = (*self_).agent;
-    let x = (*self_).x;
-    let y = (*self_).y;
+    let team = (*me).team;
+    let agent = (*me).agent;
+    let x = (*me).x;
+    let y = (*me).y;
     var sums = Sums();
     for (var other = 0u; other < agents; other++) {
         let place = positions[team * agents + other];
@@ -124,22 +124,22 @@ fn follow(task: Task, self_: ptr<function, Agent>) {
     let pull = force(sums, x, y);
     let influenced = sums.repel_count + sums.attract_count > 0.0 || wall_near(x, world.map_x) || wall_near(y, world.map_y);
     if TRACE {
-        (*self_).force = pull;
+        (*me).force = pull;
     }
-    (*self_).next = steer(pull.x, pull.y, influenced, (*self_).hx, (*self_).hy, (*self_).speed);
+    (*me).next = steer(pull.x, pull.y, influenced, (*me).hx, (*me).hy, (*me).speed);
 }
 
 // Everyone moves.
-fn go(self_: ptr<function, Agent>) {
-    let next = (*self_).next;
+fn go(me: ptr<function, Agent>) {
+    let next = (*me).next;
     let heading = straighten(next.hx, next.hy);
-    let speed = accelerate((*self_).speed, next.speed);
+    let speed = accelerate((*me).speed, next.speed);
     let step = speed * world.dt;
-    (*self_).x = advance((*self_).x, step, heading.x, world.map_x);
-    (*self_).y = advance((*self_).y, step, heading.y, world.map_y);
-    (*self_).hx = heading.x;
-    (*self_).hy = heading.y;
-    (*self_).speed = speed;
+    (*me).x = advance((*me).x, step, heading.x, world.map_x);
+    (*me).y = advance((*me).y, step, heading.y, world.map_y);
+    (*me).hx = heading.x;
+    (*me).hy = heading.y;
+    (*me).speed = speed;
 }
 
 // Records who is near each POI after a step: one thread a POI, word and team.
@@ -152,25 +152,25 @@ fn couple(task: Task, step: u32, thread: u32) {
         let place = places[task.pois + row / world.words];
         let first = row % world.words * 32u;
         let last = min(first + 32u, agents);
-        var set = 0u;
+        var near = 0u;
         for (var agent = first; agent < last; agent++) {
             let at = positions[team * agents + agent];
-            set |= select(0u, 1u << (agent - first), observes(place.x - at.x, place.y - at.y));
+            near |= select(0u, 1u << (agent - first), observes(place.x - at.x, place.y - at.y));
         }
-        record[task.sets + step * rows * task.teams + item] = set;
+        record[task.sets + step * rows * task.teams + item] = near;
     }
 }
 
-fn trace(task: Task, step: u32, self_: ptr<function, Agent>) {
+fn trace(task: Task, step: u32, me: ptr<function, Agent>) {
     let agents = world.leaders + world.followers;
     var moment: Moment;
-    moment.inputs = (*self_).inputs;
-    moment.outputs = (*self_).outputs;
-    moment.force = array<f32, 2>((*self_).force.x, (*self_).force.y);
-    moment.position = array<f32, 2>((*self_).x, (*self_).y);
-    moment.heading = array<f32, 2>((*self_).hx, (*self_).hy);
-    moment.speed = (*self_).speed;
-    moments[task.moments + (step * task.teams + (*self_).team) * agents + (*self_).agent] = moment;
+    moment.inputs = (*me).inputs;
+    moment.outputs = (*me).outputs;
+    moment.force = array<f32, 2>((*me).force.x, (*me).force.y);
+    moment.position = array<f32, 2>((*me).x, (*me).y);
+    moment.heading = array<f32, 2>((*me).hx, (*me).hy);
+    moment.speed = (*me).speed;
+    moments[task.moments + (step * task.teams + (*me).team) * agents + (*me).agent] = moment;
 }
 
 @compute @workgroup_size(WORKGROUP)
@@ -187,42 +187,42 @@ fn episode(
 
     var team: array<Agent, SLOTS>;
     for (var slot = 0u; slot < SLOTS; slot++) {
-        var self_ = seat(slot * WORKGROUP + thread, task.teams);
-        if self_.plays {
-            let start = places[task.starts + self_.agent];
-            self_.x = start.x;
-            self_.y = start.y;
-            self_.hx = world.heading_x;
-            self_.hy = world.heading_y;
-            self_.speed = world.speed;
-            positions[self_.team * agents + self_.agent] = start;
-            for (var leader = 0u; leader < world.leaders && self_.agent >= world.leaders; leader++) {
-                record[task.seen + ((self_.agent - world.leaders) * world.leaders + leader) * task.teams + self_.team] = 0u;
+        var me = seat(slot * WORKGROUP + thread, task.teams);
+        if me.plays {
+            let start = places[task.starts + me.agent];
+            me.x = start.x;
+            me.y = start.y;
+            me.hx = world.heading_x;
+            me.hy = world.heading_y;
+            me.speed = world.speed;
+            positions[me.team * agents + me.agent] = start;
+            for (var leader = 0u; leader < world.leaders && me.agent >= world.leaders; leader++) {
+                record[task.seen + ((me.agent - world.leaders) * world.leaders + leader) * task.teams + me.team] = 0u;
             }
             if TRACE {
-                trace(task, 0u, &self_);
+                trace(task, 0u, &me);
             }
         }
-        team[slot] = self_;
+        team[slot] = me;
     }
     workgroupBarrier();
 
     let steps = worlds[task.world].steps;
     for (var step = 0u; step < steps; step++) {
         for (var slot = 0u; slot < SLOTS; slot++) {
-            var self_ = team[slot];
-            if self_.plays {
-                if self_.agent < world.leaders {
-                    lead(task, &self_);
+            var me = team[slot];
+            if me.plays {
+                if me.agent < world.leaders {
+                    lead(task, &me);
                 } else {
-                    follow(task, &self_);
+                    follow(task, &me);
                 }
-                go(&self_);
+                go(&me);
                 if TRACE {
-                    trace(task, step + 1u, &self_);
+                    trace(task, step + 1u, &me);
                 }
             }
-            team[slot] = self_;
+            team[slot] = me;
         }
         workgroupBarrier();
         for (var slot = 0u; slot < SLOTS; slot++) {

@@ -29,4 +29,5 @@ pub mod record;
 pub mod report;
 pub mod sample;
 pub mod trainer;
+pub mod verify;
 pub mod world;

@@ -116,6 +116,10 @@ pub trait Backend: Send {
 /// Why episodes could not be played.
 #[derive(Debug, thiserror::Error)]
 pub enum BackendError {
+    /// A GPU could not be opened, or failed.
+    #[error(transparent)]
+    Gpu(#[from] gpu::device::DeviceError),
+    /// What was asked does not fit the device.
     #[error("{0}")]
-    Device(String),
+    TooLarge(String),
 }

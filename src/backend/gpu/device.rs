@@ -422,9 +422,39 @@ impl Gpu {
         Ok(bytemuck::pod_collect_to_vec(&view[..]))
     }
 
+    /// Shows a range of a buffer whose work was waited for (in bytes, multiples of 4; usage `MAP_READ`).
+    pub fn mapped<T>(
+        &self,
+        buffer: &wgpu::Buffer,
+        bytes: Range<u64>,
+        show: impl FnOnce(&[u8]) -> T,
+    ) -> Result<T, DeviceError> {
+        let (send, receive) = std::sync::mpsc::channel();
+        // Nobody listens any more only if waiting failed.
+        self.scoped("reading back", || {
+            buffer.map_async(wgpu::MapMode::Read, bytes.clone(), move |result| drop(send.send(result)));
+        })?;
+        // The work was waited for: polling once lets the map through.
+        let polled = self.device.poll(wgpu::PollType::Poll);
+        self.check()?;
+        polled.map_err(|error| self.failed("reading back", error))?;
+        let mapped = receive.recv().map_err(|error| self.failed("reading back", error))?;
+        mapped.map_err(|error| self.failed("reading back", error))?;
+        let view = buffer.get_mapped_range(bytes).map_err(|error| self.failed("reading back", error))?;
+        let shown = show(&view);
+        drop(view);
+        buffer.unmap();
+        Ok(shown)
+    }
+
     /// Waits until everything submitted is done.
     pub fn wait(&self) -> Result<(), DeviceError> {
-        let waited = self.device.poll(wgpu::PollType::wait_indefinitely());
+        self.wait_for(None)
+    }
+
+    /// Waits until a submission is done, or everything.
+    pub fn wait_for(&self, submission_index: Option<wgpu::SubmissionIndex>) -> Result<(), DeviceError> {
+        let waited = self.device.poll(wgpu::PollType::Wait { submission_index, timeout: None });
         self.check()?;
         waited.map(drop).map_err(|error| self.failed("waiting", error))
     }

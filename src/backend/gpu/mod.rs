@@ -4,10 +4,11 @@
 //! [`probe`] tests on the opened device that it is.
 
 pub mod device;
+pub mod episode;
 pub mod exact;
 pub mod probe;
 
 /// The whole text of every shader, with a name for each: what the lints and the exactness tests walk over.
 pub fn shaders() -> Vec<(&'static str, String)> {
-    vec![("probe", probe::SHADER.into())]
+    [vec![("probe", probe::SHADER.into())], episode::shaders()].concat()
 }

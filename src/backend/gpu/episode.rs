@@ -1,0 +1,505 @@
+//! Whole episodes on a GPU: teams are packed into workgroups, workgroups into batches that fit the device.
+//!
+//! While the GPU plays one batch, the CPU reads the record of the batch before it.
+
+use std::collections::HashMap;
+use std::collections::hash_map::Entry;
+
+use bytemuck::{Pod, Zeroable};
+use glam::Vec2;
+use rayon::prelude::*;
+
+use super::device::{Binding, DeviceError, Gpu, Layout};
+use super::exact;
+use crate::backend::{Backend, BackendError, Episode, Group, Moment, Strided, Trace, Visit};
+use crate::world::{Constants, World};
+
+/// Threads that share a warp on most GPUs; leaders and followers are kept apart by as many (`ROLE` in the shader).
+const ROLE: usize = 32;
+/// Workgroup sizes to choose from; every WebGPU device takes them.
+const WORKGROUPS: [usize; 3] = [64, 128, 256];
+/// Bytes of one buffer that a batch aims for: enough to fill a GPU, small enough to overlap batches.
+const BATCH_BYTES: u64 = 256 << 20;
+/// Offsets within a buffer are u32 words.
+const MAX_OFFSET: u64 = 1 << 33;
+/// Offsets of bindings are multiples of this on every WebGPU device.
+const BINDING_ALIGNMENT: usize = 256;
+
+/// One workgroup's share of the work (`struct Task` in `shaders/lib/layout.wgsl`); offsets count elements.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Task {
+    pub world: u32,
+    pub starts: u32,
+    pub pois: u32,
+    pub weights: u32,
+    pub sets: u32,
+    pub seen: u32,
+    pub moments: u32,
+    pub teams: u32,
+}
+
+/// What a pipeline is compiled for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+struct Shape {
+    workgroup: usize,
+    /// Agents a thread plays, one after another.
+    slots: usize,
+    /// Widest layer, inputs included.
+    widest: usize,
+    trace: bool,
+}
+
+/// How the teams of one world are packed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Packing {
+    workgroup: usize,
+    slots: usize,
+    /// Teams of a workgroup.
+    teams: usize,
+}
+
+/// Threads that `teams` teams take.
+fn seats(world: &World, teams: usize) -> usize {
+    (teams * world.leaders()).next_multiple_of(ROLE) + teams * world.followers()
+}
+
+impl Packing {
+    /// The packing that leaves the fewest threads idle.
+    fn of(world: &World, largest: usize) -> Packing {
+        let sizes = WORKGROUPS.into_iter().filter(|&size| size <= largest);
+        let packed = sizes.clone().filter_map(|workgroup| {
+            let teams = (1..=workgroup).take_while(|&teams| seats(world, teams) <= workgroup).last()?;
+            Some(Packing { workgroup, slots: 1, teams })
+        });
+        // The share of threads that play, compared crosswise to stay in integers; the smaller workgroup wins ties.
+        packed.reduce(|a, b| if b.teams * a.workgroup > a.teams * b.workgroup { b } else { a }).unwrap_or_else(|| {
+            let workgroup = sizes.max().unwrap_or(WORKGROUPS[0]);
+            Packing { workgroup, slots: seats(world, 1).div_ceil(workgroup), teams: 1 }
+        })
+    }
+}
+
+/// Words of a team's record: sets and counts.
+fn record_words(world: &World) -> usize {
+    world.set_words() + world.leaders() * world.followers()
+}
+
+/// A task and where its teams come from.
+struct Share {
+    group: usize,
+    first_team: usize,
+    shape: Shape,
+    task: Task,
+}
+
+/// Tasks that fit the device's buffers together.
+#[derive(Default)]
+struct Work {
+    shares: Vec<Share>,
+    worlds: Vec<Constants>,
+    places: Vec<Vec2>,
+    weights: usize,
+    record: usize,
+    moments: usize,
+}
+
+/// Sizes of a device that bound a batch.
+#[derive(Clone, Copy, Debug)]
+struct Room {
+    /// Bytes of the largest buffer.
+    buffer: u64,
+    /// Threads of the largest workgroup.
+    workgroup: usize,
+}
+
+/// Cuts the groups' teams into tasks and the tasks into batches.
+///
+/// # Errors
+/// When one team's record is larger than the device's largest buffer.
+fn plan(groups: &[Group<'_>], trace: bool, room: Room) -> Result<Vec<Work>, BackendError> {
+    let target = room.buffer.min(BATCH_BYTES);
+    let mut batches = vec![Work::default()];
+    for (index, group) in groups.iter().enumerate() {
+        let world = group.world;
+        let moments_a_team = if trace { (world.steps() + 1) * world.agents() } else { 0 };
+        let bytes_a_team = [
+            record_words(world) * size_of::<u32>(),
+            world.leaders() * world.parameters() * size_of::<f32>(),
+            moments_a_team * size_of::<Moment>(),
+        ]
+        .into_iter()
+        .max()
+        .unwrap_or(0) as u64;
+        if bytes_a_team > room.buffer {
+            return Err(BackendError::TooLarge(format!(
+                "one team takes {bytes_a_team} bytes in one buffer, this adapter allows {}; \
+                 use --backend cpu, fewer steps or fewer POIs",
+                room.buffer
+            )));
+        }
+        let packing = Packing::of(world, room.workgroup);
+        let teams_a_task = packing.teams.min((target / bytes_a_team.max(1)).max(1) as usize);
+        let widest = world.constants.widths.into_iter().max().unwrap_or(0) as usize;
+        let shape = Shape { workgroup: packing.workgroup, slots: packing.slots, widest, trace };
+        // A group's world, starts and POIs are stored once a batch.
+        let mut stored: Option<(usize, Task)> = None;
+        for first_team in (0..group.team_count()).step_by(teams_a_task) {
+            let teams = teams_a_task.min(group.team_count() - first_team);
+            let mut work = batches.last_mut().expect("there is a batch");
+            let full = |used: usize, size: usize| used as u64 * size as u64 + teams as u64 * bytes_a_team > target;
+            if full(work.record, size_of::<u32>())
+                || full(work.weights, size_of::<f32>())
+                || full(work.moments, size_of::<Moment>())
+            {
+                batches.push(Work::default());
+                work = batches.last_mut().expect("just pushed");
+                stored = None;
+            }
+            let (world_index, base) = *stored.get_or_insert_with(|| {
+                let starts = work.places.len() as u32;
+                work.places.extend(group.starts);
+                let pois = work.places.len() as u32;
+                work.places.extend(&world.pois);
+                work.worlds.push(world.constants);
+                (work.worlds.len() - 1, Task { starts, pois, ..Task::default() })
+            });
+            let task = Task {
+                world: world_index as u32,
+                weights: work.weights as u32,
+                sets: work.record as u32,
+                seen: (work.record + world.set_words() * teams) as u32,
+                moments: work.moments as u32,
+                teams: teams as u32,
+                ..base
+            };
+            work.weights += world.leaders() * world.parameters() * teams;
+            work.record += record_words(world) * teams;
+            work.moments += moments_a_team * teams;
+            work.shares.push(Share { group: index, first_team, shape, task });
+        }
+    }
+    batches.retain(|work| !work.shares.is_empty());
+    Ok(batches)
+}
+
+/// A task's weights, `[parameters][teams][leaders]`: neighbouring threads read neighbouring weights.
+fn gather(group: &Group<'_>, first_team: usize, teams: usize, to: &mut [f32]) {
+    let (leaders, parameters) = (group.world.leaders(), group.world.parameters());
+    let lanes = teams * leaders;
+    let policies = &group.teams[first_team * leaders..(first_team + teams) * leaders];
+    for (lane, &policy) in policies.iter().enumerate() {
+        let from = ((lane % leaders) * group.policies + policy as usize) * parameters;
+        for (index, &weight) in group.weights[from..from + parameters].iter().enumerate() {
+            to[index * lanes + lane] = weight;
+        }
+    }
+}
+
+/// Plays episodes on a GPU.
+pub struct GpuEpisodes {
+    gpu: Gpu,
+    layout: Layout,
+    pipelines: HashMap<Shape, wgpu::ComputePipeline>,
+    /// Two sets, so that one batch plays while the other is read.
+    lanes: [Buffers; 2],
+    /// Weights on their way to the device.
+    staging: Vec<f32>,
+}
+
+/// The device's side of one batch; buffers only grow.
+#[derive(Default)]
+struct Buffers {
+    worlds: Option<wgpu::Buffer>,
+    tasks: Option<wgpu::Buffer>,
+    places: Option<wgpu::Buffer>,
+    weights: Option<wgpu::Buffer>,
+    record: Option<wgpu::Buffer>,
+    moments: Option<wgpu::Buffer>,
+    record_back: Option<wgpu::Buffer>,
+    moments_back: Option<wgpu::Buffer>,
+    /// What to wait for.
+    submitted: Option<wgpu::SubmissionIndex>,
+}
+
+/// A buffer of at least so many bytes, made anew where the present one is too small.
+fn grown<'a>(
+    gpu: &Gpu,
+    buffer: &'a mut Option<wgpu::Buffer>,
+    what: &str,
+    bytes: u64,
+    usage: wgpu::BufferUsages,
+) -> Result<&'a wgpu::Buffer, DeviceError> {
+    let bytes = bytes.max(BINDING_ALIGNMENT as u64);
+    if buffer.as_ref().is_none_or(|buffer| buffer.size() < bytes) {
+        // Free the old one first: the two together may not fit.
+        if let Some(old) = buffer.take() {
+            old.destroy();
+        }
+        *buffer = Some(gpu.buffer(what, bytes, usage)?);
+    }
+    Ok(buffer.as_ref().expect("just made"))
+}
+
+impl GpuEpisodes {
+    /// Readies an opened device for episodes.
+    ///
+    /// # Errors
+    /// When the device does not take the episode's bindings.
+    pub fn new(gpu: Gpu) -> Result<GpuEpisodes, DeviceError> {
+        use Binding::{Read, Write};
+        let layout = gpu.layout("episode", &[Read, Read, Read, Read, Write, Write])?;
+        Ok(GpuEpisodes { gpu, layout, pipelines: HashMap::new(), lanes: Default::default(), staging: Vec::new() })
+    }
+
+    /// The device it plays on.
+    pub fn gpu(&self) -> &Gpu {
+        &self.gpu
+    }
+
+    fn room(&self) -> Room {
+        let limits = &self.gpu.limits;
+        Room {
+            buffer: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(MAX_OFFSET),
+            workgroup: limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x) as usize,
+        }
+    }
+
+    /// Plays all tasks; `done` gets each with the batch's record and moments.
+    fn play(
+        &mut self,
+        groups: &[Group<'_>],
+        trace: bool,
+        done: &(dyn Fn(&Share, &[u32], &[Moment]) + Sync),
+    ) -> Result<(), BackendError> {
+        let batches = plan(groups, trace, self.room())?;
+        for index in 0..=batches.len() {
+            if let Some(work) = batches.get(index) {
+                self.submit(index % 2, groups, work, trace)?;
+            }
+            if let Some(previous) = index.checked_sub(1) {
+                self.collect(previous % 2, &batches[previous], trace, done)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Hands one batch to the device.
+    fn submit(&mut self, lane: usize, groups: &[Group<'_>], work: &Work, trace: bool) -> Result<(), DeviceError> {
+        use wgpu::BufferUsages as Usage;
+        self.fill_staging(groups, work);
+        // Each shape's tasks stand together, from where a binding may start.
+        let mut tasks: Vec<Task> = Vec::new();
+        let mut dispatches: Vec<(Shape, usize, [u32; 3])> = Vec::new();
+        let mut shapes: Vec<Shape> = work.shares.iter().map(|share| share.shape).collect();
+        shapes.sort_unstable();
+        shapes.dedup();
+        for shape in shapes {
+            tasks.resize(tasks.len().next_multiple_of(BINDING_ALIGNMENT / size_of::<Task>()), Task::default());
+            let first = tasks.len();
+            tasks.extend(work.shares.iter().filter(|share| share.shape == shape).map(|share| share.task));
+            let grid = grid(tasks.len() - first, &self.gpu.limits);
+            // The grid's last row may be longer than the tasks: those workgroups play no team.
+            tasks.resize(first + (grid[0] * grid[1]) as usize, Task::default());
+            dispatches.push((shape, first, grid));
+            self.prepare_pipeline(shape)?;
+        }
+
+        let gpu = &self.gpu;
+        let buffers = &mut self.lanes[lane];
+        let input = Usage::STORAGE | Usage::COPY_DST;
+        let output = Usage::STORAGE | Usage::COPY_SRC;
+        let back = Usage::COPY_DST | Usage::MAP_READ;
+        let record_bytes = (work.record * size_of::<u32>()) as u64;
+        let moment_bytes = (work.moments * size_of::<Moment>()) as u64;
+        let upload = |buffer, what, bytes: &[u8]| -> Result<wgpu::Buffer, DeviceError> {
+            let buffer = grown(gpu, buffer, what, bytes.len() as u64, input)?;
+            gpu.scoped(what, || gpu.queue.write_buffer(buffer, 0, bytes))?;
+            Ok(buffer.clone())
+        };
+        let worlds = upload(&mut buffers.worlds, "worlds", bytemuck::cast_slice(&work.worlds))?;
+        let all_tasks = upload(&mut buffers.tasks, "tasks", bytemuck::cast_slice(&tasks))?;
+        let places = upload(&mut buffers.places, "places", bytemuck::cast_slice(&work.places))?;
+        let weights = upload(&mut buffers.weights, "weights", bytemuck::cast_slice(&self.staging))?;
+        let record = grown(gpu, &mut buffers.record, "record", record_bytes, output)?;
+        let moments = grown(gpu, &mut buffers.moments, "moments", moment_bytes, output)?;
+        let record_back = grown(gpu, &mut buffers.record_back, "record, read back", record_bytes, back)?;
+        let moments_back = match trace {
+            true => Some(grown(gpu, &mut buffers.moments_back, "moments, read back", moment_bytes, back)?),
+            false => None,
+        };
+
+        let mut bound = Vec::with_capacity(dispatches.len());
+        for (shape, first, grid) in dispatches {
+            let tasks = wgpu::BufferBinding {
+                buffer: &all_tasks,
+                offset: (first * size_of::<Task>()) as u64,
+                size: wgpu::BufferSize::new(u64::from(grid[0] * grid[1]) * size_of::<Task>() as u64),
+            };
+            let [worlds, places, weights, record, moments] =
+                [&worlds, &places, &weights, record, moments].map(|buffer| buffer.as_entire_buffer_binding());
+            let group = gpu.bind("episode", &self.layout, &[worlds, tasks, places, weights, record, moments])?;
+            bound.push((&self.pipelines[&shape], group, grid));
+        }
+        let submitted = gpu.scoped("episodes", || {
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            for (pipeline, group, [x, y, z]) in &bound {
+                pass.set_pipeline(pipeline);
+                pass.set_bind_group(0, group, &[]);
+                pass.dispatch_workgroups(*x, *y, *z);
+            }
+            drop(pass);
+            encoder.copy_buffer_to_buffer(record, 0, record_back, 0, record_bytes);
+            if let Some(moments_back) = moments_back {
+                encoder.copy_buffer_to_buffer(moments, 0, moments_back, 0, moment_bytes);
+            }
+            gpu.queue.submit([encoder.finish()])
+        })?;
+        buffers.submitted = Some(submitted);
+        Ok(())
+    }
+
+    /// Waits for one batch and hands its record on.
+    fn collect(
+        &mut self,
+        lane: usize,
+        work: &Work,
+        trace: bool,
+        done: &(dyn Fn(&Share, &[u32], &[Moment]) + Sync),
+    ) -> Result<(), DeviceError> {
+        let buffers = &self.lanes[lane];
+        self.gpu.wait_for(buffers.submitted.clone())?;
+        let share_out = |record: &[u8], moments: &[u8]| {
+            let (record, moments) = (bytemuck::cast_slice(record), bytemuck::cast_slice(moments));
+            work.shares.par_iter().for_each(|share| done(share, record, moments));
+        };
+        let record_bytes = (work.record * size_of::<u32>()) as u64;
+        let moment_bytes = (work.moments * size_of::<Moment>()) as u64;
+        match (&buffers.record_back, &buffers.moments_back) {
+            (Some(record), Some(moments)) if trace => self.gpu.mapped(record, 0..record_bytes, |record| {
+                self.gpu.mapped(moments, 0..moment_bytes, |moments| share_out(record, moments))
+            })?,
+            (Some(record), _) => self.gpu.mapped(record, 0..record_bytes, |record| share_out(record, &[])),
+            _ => unreachable!("a batch was submitted"),
+        }
+    }
+
+    /// Gathers the weights of every task.
+    fn fill_staging(&mut self, groups: &[Group<'_>], work: &Work) {
+        self.staging.resize(work.weights, 0.0);
+        let mut rest = &mut self.staging[..];
+        let mut parts = Vec::with_capacity(work.shares.len());
+        for share in &work.shares {
+            let group = &groups[share.group];
+            let size = share.task.teams as usize * group.world.leaders() * group.world.parameters();
+            let (part, tail) = rest.split_at_mut(size);
+            rest = tail;
+            parts.push((share, group, part));
+        }
+        parts.into_par_iter().for_each(|(share, group, part)| {
+            gather(group, share.first_team, share.task.teams as usize, part);
+        });
+    }
+
+    fn prepare_pipeline(&mut self, shape: Shape) -> Result<(), DeviceError> {
+        if let Entry::Vacant(entry) = self.pipelines.entry(shape) {
+            entry.insert(self.gpu.pipeline("episode", &source(shape), "episode", &self.layout)?);
+        }
+        Ok(())
+    }
+}
+
+/// A dispatch of at least `tasks` workgroups, within the device's limit on each side.
+fn grid(tasks: usize, limits: &wgpu::Limits) -> [u32; 3] {
+    let rows = tasks.div_ceil(limits.max_compute_workgroups_per_dimension as usize).max(1);
+    [tasks.div_ceil(rows) as u32, rows as u32, 1]
+}
+
+/// The whole shader, with its constants in front.
+fn source(shape: Shape) -> String {
+    let Shape { workgroup, slots, widest, trace } = shape;
+    let shared = workgroup * slots;
+    let constants = format!(
+        "const WORKGROUP: u32 = {workgroup}u;\nconst SLOTS: u32 = {slots}u;\nconst SHARED: u32 = {shared}u;\n\
+         const WIDEST: u32 = {widest}u;\nconst TRACE: bool = {trace};"
+    );
+    exact::assemble(&[
+        &constants,
+        include_str!("../../../shaders/lib/layout.wgsl"),
+        include_str!("../../../shaders/lib/math.wgsl"),
+        include_str!("../../../shaders/sense.wgsl"),
+        include_str!("../../../shaders/policy.wgsl"),
+        include_str!("../../../shaders/follow.wgsl"),
+        include_str!("../../../shaders/motion.wgsl"),
+        include_str!("../../../shaders/couple.wgsl"),
+        include_str!("../../../shaders/episode.wgsl"),
+    ])
+}
+
+/// The episode's shader in a few of its variants, small and large.
+pub fn shaders() -> Vec<(&'static str, String)> {
+    let shape = |workgroup, slots, widest, trace| source(Shape { workgroup, slots, widest, trace });
+    vec![
+        ("episode", shape(64, 1, 10, false)),
+        ("episode, traced", shape(128, 1, 64, true)),
+        ("episode, large teams", shape(256, 5, 64, false)),
+    ]
+}
+
+impl Backend for GpuEpisodes {
+    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
+        self.play(groups, false, &|share, record, _| {
+            let world = groups[share.group].world;
+            let Task { sets, seen, teams, .. } = share.task;
+            let stride = teams as usize;
+            let sets = &record[sets as usize..][..world.set_words() * stride];
+            let seen = &record[seen as usize..][..world.leaders() * world.followers() * stride];
+            for offset in 0..stride {
+                visit(Episode {
+                    group: share.group,
+                    team: share.first_team + offset,
+                    sets: Strided { words: sets, stride, offset },
+                    seen: Strided { words: seen, stride, offset },
+                });
+            }
+        })
+    }
+
+    fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
+        let world = group.world;
+        let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
+        let (set_words, seen_words) = (world.set_words(), world.leaders() * world.followers());
+        let trace = std::sync::Mutex::new(Trace {
+            teams,
+            agents,
+            moments: vec![Moment::zeroed(); (steps + 1) * teams * agents],
+            sets: vec![0; teams * set_words],
+            seen: vec![0; teams * seen_words],
+        });
+        self.play(std::slice::from_ref(group), true, &|share, record, moments| {
+            let mut trace = trace.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+            let task = share.task;
+            let stride = task.teams as usize;
+            for step in 0..=steps {
+                let from = task.moments as usize + step * stride * agents;
+                let to = (step * teams + share.first_team) * agents;
+                trace.moments[to..to + stride * agents].copy_from_slice(&moments[from..from + stride * agents]);
+            }
+            for offset in 0..stride {
+                let team = share.first_team + offset;
+                for word in 0..set_words {
+                    trace.sets[team * set_words + word] = record[task.sets as usize + word * stride + offset];
+                }
+                for word in 0..seen_words {
+                    trace.seen[team * seen_words + word] = record[task.seen as usize + word * stride + offset];
+                }
+            }
+        })?;
+        Ok(trace.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
+    }
+
+    fn describe(&self) -> String {
+        format!("gpu ({}, {} pass)", self.gpu.adapter, self.gpu.pass)
+    }
+}
