@@ -15,7 +15,7 @@ pub fn adapters(test: &str) -> Vec<(Request, AdapterInfo)> {
         let message = format!("{test}: skipped: no GPU adapter found ({reason})");
         assert!(std::env::var("FLOTILLA_REQUIRE_GPU").as_deref() != Ok("1"), "{message}, but one is required");
         // Straight to the stream: what a passing test prints by macro is not shown.
-        writeln!(std::io::stderr(), "{message}").expect("standard error takes a line");
+        writeln!(std::io::stderr(), "\n{message}").expect("standard error takes a line");
     }
     let request = |index: usize| Request::from(Choice::Named(index.to_string()));
     found.into_iter().enumerate().map(|(index, info)| (request(index), info)).collect()

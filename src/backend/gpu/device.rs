@@ -105,7 +105,7 @@ pub enum DeviceError {
         "{adapter}: not bit-exact, so it cannot be used: {}; choose another with --adapter, or use --backend cpu",
         inexact(.failures)
     )]
-    Inexact { adapter: String, failures: Vec<(Pass, probe::Mismatch)> },
+    Inexact { adapter: String, failures: Vec<(Pass, String)> },
     #[error("{adapter}: the device was lost ({reason}); run again, or use --backend cpu")]
     Lost { adapter: String, reason: String },
     #[error("{adapter}: out of memory for {what}; use a smaller batch, or --backend cpu")]
@@ -128,8 +128,8 @@ fn there_are(found: &[AdapterInfo]) -> String {
     if found.is_empty() { "is none at all; use --backend cpu".into() } else { format!("is {}", list(found)) }
 }
 
-fn inexact(failures: &[(Pass, probe::Mismatch)]) -> String {
-    failures.iter().map(|(pass, mismatch)| format!("under the {pass} pass, {mismatch}")).collect::<Vec<_>>().join("; ")
+fn inexact(failures: &[(Pass, String)]) -> String {
+    failures.iter().map(|(pass, failure)| format!("under the {pass} pass, {failure}")).collect::<Vec<_>>().join("; ")
 }
 
 /// All adapters that can compute, the most wanted first. None is no error.
@@ -243,9 +243,11 @@ pub fn open(request: impl Into<Request>) -> Result<Gpu, DeviceError> {
         if pass == Pass::Plain {
             return Ok(gpu);
         }
-        match gpu.self_test()? {
-            None => return Ok(gpu),
-            Some(mismatch) => failures.push((pass, mismatch)),
+        match gpu.self_test() {
+            Ok(None) => return Ok(gpu),
+            Ok(Some(mismatch)) => failures.push((pass, mismatch.to_string())),
+            Err(lost @ DeviceError::Lost { .. }) => return Err(lost),
+            Err(error) => failures.push((pass, error.to_string())),
         }
     }
     Err(DeviceError::Inexact { adapter: gpu.adapter.to_string(), failures })

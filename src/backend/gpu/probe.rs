@@ -131,6 +131,7 @@ fn values() -> Vec<f32> {
             4 => group[2] = -(group[0] * group[1]),
             _ => {}
         }
+        // + 0.0: rounding may have made a -0.
         values.extend(group.map(|value| value + 0.0));
     }
     values
@@ -219,4 +220,61 @@ fn expected(values: &[f32], item: usize) -> [u32; NAMES.len()] {
         bits(select(x, y, x <= y)) ^ bits(select(z, w, z >= w)),
         bits(f32::from_bits(z.to_bits() & 0x7fff_ffff) + f32::from_bits(w.to_bits() & 0x7fff_0000)),
     ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    type Formula = fn([f32; 4]) -> f32;
+
+    /// How many of the groups give another word for `probe` by this formula.
+    fn shown(probe: &str, formula: Formula) -> usize {
+        let values = values();
+        let index = NAMES.iter().position(|name| *name == probe).expect("it is one of the probes");
+        let differs = |item: &usize| {
+            let group = std::array::from_fn(|i| values[item * 4 + i]);
+            bits(formula(group)) != expected(&values, *item)[index]
+        };
+        (0..ITEMS).filter(differs).count()
+    }
+
+    #[test]
+    fn the_values_show_contraction_and_reassociation() {
+        let fused: [(&str, Formula); 9] = [
+            ("x*y + z", |[x, y, z, _]| x.mul_add(y, z)),
+            ("x*y - z", |[x, y, z, _]| x.mul_add(y, -z)),
+            ("z - x*y", |[x, y, z, _]| (-x).mul_add(y, z)),
+            ("x*y + y*z", |[x, y, z, _]| x.mul_add(y, y * z)),
+            ("x*y - y*x", |[x, y, ..]| x.mul_add(y, -(y * x))),
+            ("x*x + y*y + z*z", |[x, y, z, _]| z.mul_add(z, x * x + y * y)),
+            ("-(x*y) + z", |[x, y, z, _]| (-x).mul_add(y, z)),
+            ("product(x, y) + z", |[x, y, z, _]| x.mul_add(y, z)),
+            ("a product kept over a branch", |[x, y, z, w]| x.mul_add(y, if w > 0.0 { z } else { -w })),
+        ];
+        let reassociated: [(&str, Formula); 10] = [
+            ("x*y + y*z", |[x, y, z, _]| y * (x + z)),
+            ("x*y - x*z", |[x, y, z, _]| x * (y - z)),
+            ("(x + y) - x", |[_, y, ..]| y),
+            ("(x - y) + y", |[x, ..]| x),
+            ("((x + y) + z) + w", |[x, y, z, w]| (x + y) + (z + w)),
+            ("x + (y + (z + w))", |[x, y, z, w]| ((x + y) + z) + w),
+            ("((x*y)*z)*w", |[x, y, z, w]| (x * y) * (z * w)),
+            ("(x*0.1)*10", |[x, ..]| x),
+            ("(x + 4096) - 4096", |[x, ..]| x),
+            ("x*2.7 + x*0.3", |[x, ..]| x * 3.0),
+        ];
+        for (probe, formula) in fused.into_iter().chain(reassociated) {
+            let groups = shown(probe, formula);
+            assert!(groups > ITEMS / 50, "{probe}: only {groups} groups show it");
+        }
+        assert_eq!(shown("x*y + z", |[x, y, z, _]| x * y + z), 0);
+    }
+
+    #[test]
+    fn no_value_comes_near_the_denormals() {
+        assert!(
+            values().iter().all(|&value| value == 0.0 && value.is_sign_positive() || value.abs() >= 2f32.powi(-25))
+        );
+    }
 }
