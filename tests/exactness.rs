@@ -4,7 +4,7 @@ mod common;
 
 use std::path::{Path, PathBuf};
 
-use flotilla::backend::gpu::device::{self, Choice, DeviceError, Kind, Request};
+use flotilla::backend::gpu::device::{self, Binding, Choice, DeviceError, Kind, Request};
 use flotilla::backend::gpu::exact::{self, Pass, ShaderError};
 use flotilla::backend::gpu::{probe, shaders};
 use wgpu::BufferUsages;
@@ -158,6 +158,71 @@ fn every_sum_and_product_is_guarded() {
         assert!(exact::unguarded(&module).expect("shaders are valid") > 0, "{name}");
         let guarded = exact::guarded(&module).unwrap_or_else(|error| panic!("{name} {error}"));
         assert_eq!(exact::unguarded(&guarded).expect("guarded shaders are valid"), 0, "{name}");
+    }
+}
+
+/// Statements and expressions of the core that the probe does not use.
+#[test]
+fn all_of_the_core_can_be_guarded() {
+    let text = "struct Agent { place: vec2<f32>, speed: f32, seen: array<u32, 3> }
+        @group(0) @binding(1) var<storage, read_write> agents: array<Agent>;
+        @group(0) @binding(2) var<storage, read_write> counts: array<atomic<u32>>;
+        @group(0) @binding(3) var<uniform> gains: vec4<f32>;
+        const table = array<f32, 3>(0.5, 0.25, 0.125);
+        var<private> calls: u32 = 2u;
+        var<workgroup> shared_places: array<vec2<f32>, 64>;
+        var<workgroup> flags: atomic<u32>;
+        var<workgroup> total: u32;
+        fn advance(place: ptr<function, vec2<f32>>, by: f32) { *place = *place + vec2(by * 2.0, by); calls += 1u; }
+        fn gain(kind: u32, x: f32) -> f32 {
+            switch kind {
+                case 0u, 1u: { return x * gains.x + gains.y; }
+                case 2u: { if x * x > 4.0 { break; } return x - 1.0; }
+                default: { return -x * 3.0; }
+            }
+            return x + x;
+        }
+        @compute @workgroup_size(64) fn main(
+            @builtin(local_invocation_index) lane: u32, @builtin(workgroup_id) group: vec3<u32>
+        ) {
+            var agent = agents[group.x * 64u + lane];
+            var place = agent.place;
+            advance(&place, agent.speed * gains[lane % 4u]);
+            shared_places[lane] = place * 0.5;
+            if lane == 0u { atomicStore(&flags, 0u); total = 7u; }
+            workgroupBarrier();
+            let limit = workgroupUniformLoad(&total);
+            var sum = vec3<f32>();
+            var other = 0u;
+            loop {
+                if other >= limit { break; }
+                let offset = shared_places[other] - place;
+                if all(offset == vec2(0.0)) { other += 1u; continue; }
+                sum += vec3(offset, offset.x * offset.y) * table[other % 3u];
+                continuing { other += 1u; break if sum.z > 1e6; }
+            }
+            let swapped = atomicCompareExchangeWeak(&counts[lane], 0u, u32(gain(lane & 3u, sum.x)));
+            if !swapped.exchanged { atomicOr(&flags, 1u << (lane & 31u)); }
+            agent.place = place - sum.xy * f32(atomicLoad(&flags));
+            agent.speed *= sum[lane % 3u];
+            agent.seen[lane % 3u] += calls;
+            agents[group.x * 64u + lane] = agent;
+        }";
+    let (module, _) = exact::parse(text).unwrap_or_else(|error| panic!("{error}"));
+    assert_eq!(exact::foreign_operations(&module), Vec::<String>::new());
+    let guarded = exact::guarded(&module).unwrap_or_else(|error| panic!("{error}"));
+    assert!(exact::unguarded(&module).expect("it is valid") > 10);
+    assert_eq!(exact::unguarded(&guarded).expect("it is valid"), 0);
+    for (request, _) in common::adapters("all_of_the_core_can_be_guarded") {
+        for (pass, checked) in [(BOTH[0], false), (BOTH[0], true), (BOTH[1], false), (BOTH[1], true)] {
+            let gpu = match device::open(Request { pass: Some(pass), checked, ..request.clone() }) {
+                Err(DeviceError::Refused { .. }) if pass == Pass::NoContraction => continue,
+                opened => opened.unwrap_or_else(|error| panic!("{error}")),
+            };
+            let layout = gpu.layout("core", &[Binding::Write, Binding::Write, Binding::Uniform]);
+            let layout = layout.unwrap_or_else(|error| panic!("{error}"));
+            gpu.pipeline("core", text, "main", &layout).unwrap_or_else(|error| panic!("{error}"));
+        }
     }
 }
 
