@@ -57,6 +57,7 @@ pub struct Config {
     pub sense: Sense,
     pub policy: Policy,
     pub learning: Learning,
+    pub checkpoint: Checkpoint,
 }
 
 /// `[world]`: where everything starts. Lengths in map units, time in seconds, angles in radians.
@@ -130,6 +131,21 @@ pub struct Learning {
     pub episodes_per_team: usize,
     pub start_jitter: f64,
     pub seed: u64,
+}
+
+/// `[checkpoint]`: how often a run saves what it needs to go on, without a say in its results; 0 is never.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Checkpoint {
+    /// After so many generations.
+    pub generations: usize,
+    /// After so many seconds.
+    pub seconds: f64,
+}
+
+impl Default for Checkpoint {
+    fn default() -> Checkpoint {
+        Checkpoint { generations: 0, seconds: 30.0 }
+    }
 }
 
 /// A key whose value is one of a few words.
@@ -357,6 +373,10 @@ impl Config {
                 episodes_per_team: r.number("learning.episodes_per_team", between(1, MAX_EPISODES), 1),
                 start_jitter: r.number("learning.start_jitter", between(LEAST, LONGEST).or_zero(), 0.0),
                 seed: r.number("learning.seed", between(0, i64::MAX as u64), 0),
+            },
+            checkpoint: Checkpoint {
+                generations: r.number("checkpoint.generations", between(0, MAX_GENERATIONS), 0),
+                seconds: r.number("checkpoint.seconds", between(0.01, 1e9).or_zero(), Checkpoint::default().seconds),
             },
         };
         if r.problems.is_empty() && config.policy_bytes() > MAX_POLICY_BYTES {

@@ -11,9 +11,9 @@ use crate::kernels::{bound, math, splat};
 use crate::world::{World, on_grid};
 
 /// Weights are 0 or of this size (2^-30) at least, so that no product in a policy is denormal.
-const MIN_WEIGHT: f32 = 1.0 / 1_073_741_824.0;
+pub const MIN_WEIGHT: f32 = 1.0 / 1_073_741_824.0;
 /// Weights of larger size (2^20) stay at it.
-const MAX_WEIGHT: f32 = 1_048_576.0;
+pub const MAX_WEIGHT: f32 = 1_048_576.0;
 
 /// What a random number is for; no two purposes share any.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

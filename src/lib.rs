@@ -14,9 +14,9 @@
 //! 4. The backend plays each team's whole episode: by [`kernels`] on the CPU, by their twins under `shaders/` on a GPU.
 //!    It reports who was near which POI at which step, and which leader each follower saw.
 //! 5. [`credit`] turns that record into G, D, Df and D++.
-//! 6. [`evolve`] selects and mutates; [`record`] writes what came out; [`report`] draws it.
+//! 6. [`evolve`] selects and mutates; [`run`] keeps what came out by [`record`]; [`report`] draws it.
 //!
-//! Imports run one way: `main ▸ cli ▸ trainer ▸ {evolve, credit, backend, record}`, `backend ▸ kernels`.
+//! Imports run one way: `main ▸ cli ▸ run ▸ trainer ▸ {evolve, credit, backend, record}`, `backend ▸ kernels`.
 //! Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
 
 pub mod backend;
@@ -27,6 +27,7 @@ pub mod evolve;
 pub mod kernels;
 pub mod record;
 pub mod report;
+pub mod run;
 pub mod sample;
 pub mod trainer;
 pub mod verify;

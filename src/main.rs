@@ -1,13 +1,14 @@
-use std::io::{self, Write};
 use std::process::ExitCode;
 
+use flotilla::cli::{self, Error};
+
 fn main() -> ExitCode {
-    match flotilla::cli::run() {
+    match cli::run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            // With standard error gone there is nobody left to tell.
-            let _ = writeln!(io::stderr(), "error: {error}");
-            ExitCode::FAILURE
+            let word = if matches!(error, Error::Stopped(_)) { "stopped" } else { "error" };
+            cli::say(format_args!("{word}: {error}"));
+            ExitCode::from(error.exit_code())
         }
     }
 }

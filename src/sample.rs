@@ -193,6 +193,7 @@ pub fn world(seed: u64) -> Config {
             start_jitter: 0.0,
             seed,
         },
+        checkpoint: Checkpoint::default(),
     }
 }
 

@@ -1,6 +1,7 @@
 //! The generation loop: all trials of all arms advance together, one batch a generation.
 
 use std::cell::RefCell;
+use std::collections::TryReserveError;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
@@ -12,20 +13,9 @@ use crate::backend::{Backend, BackendError, Episode, Group};
 use crate::config::{Config, Learning};
 use crate::credit::Credit;
 use crate::evolve::{self, Key, Purpose};
+pub use crate::record::checkpoint::Snapshot;
+pub use crate::record::metrics::Row;
 use crate::world::World;
-
-/// What one generation of one trial came to; every G is in 0..1.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Row {
-    pub arm: usize,
-    pub trial: usize,
-    pub generation: usize,
-    /// The best and the mean team of the generation.
-    pub best_g: f64,
-    pub mean_g: f64,
-    /// The team of every population's best policy.
-    pub champion_g: f64,
-}
 
 /// Trains any number of arms (one experiment each) side by side.
 pub struct Trainer {
@@ -63,15 +53,6 @@ struct Trial {
     pending: Option<Row>,
 }
 
-/// What training needs to go on from where it was: the populations about to play, and each trial's unfinished row.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Snapshot {
-    pub generation: usize,
-    /// `[arms][trials]` of weights `[leaders][policies + 1][parameters]`.
-    pub weights: Vec<Vec<Vec<f32>>>,
-    pub pending: Vec<Vec<Option<Row>>>,
-}
-
 impl Trainer {
     /// Fresh populations for every trial of every (valid) config.
     pub fn new(configs: Vec<Config>) -> Trainer {
@@ -85,40 +66,36 @@ impl Trainer {
         self.generation
     }
 
-    /// Whether every arm has played its last generation.
+    /// Whether every arm has played its last generation, and the champions of that.
     pub fn is_done(&self) -> bool {
-        self.arms.iter().all(|arm| arm.config.learning.generations < self.generation)
+        self.arms.iter().all(|arm| arm.last() + 1 < self.generation)
     }
 
     /// Plays one generation of every arm that has one left, scores, selects and mutates.
     ///
     /// Returns the rows that became complete, by arm, trial and generation: a generation's champion plays along with
-    /// the next one, the last generation's at once.
+    /// the next one, and alone after the last.
     ///
     /// # Errors
     /// When the backend fails; the trainer then still stands before this generation.
     pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
         let (generation, level) = (self.generation, self.level);
-        let mut playing: Vec<(usize, &mut Arm)> =
-            self.arms.iter_mut().enumerate().filter(|(_, arm)| generation <= arm.config.learning.generations).collect();
+        let playing = self.arms.iter_mut().enumerate().filter(|(_, arm)| generation <= arm.last() + 1);
+        let mut playing: Vec<(usize, &mut Arm)> = playing.collect();
 
         playing.par_iter_mut().for_each(|(_, arm)| arm.prepare(generation));
-        // The first generation has no champion before it.
-        play(backend, &playing, |population| 0..population + usize::from(generation > 0))?;
+        play(backend, &playing, |arm| {
+            let population = arm.config.learning.population;
+            let first = if generation > arm.last() { population } else { 0 };
+            // The first generation has no champion before it.
+            first..population + usize::from(generation > 0)
+        })?;
         let mut rows = Vec::new();
         for (index, arm) in &mut playing {
-            rows.extend(arm.conclude(*index, generation));
+            rows.extend(if generation > arm.last() { arm.finish() } else { arm.conclude(*index, generation) });
         }
-
-        let (mut last, mut rest): (Vec<_>, Vec<_>) =
-            playing.into_iter().partition(|(_, arm)| generation == arm.config.learning.generations);
-        if !last.is_empty() {
-            play(backend, &last, |population| population..population + 1)?;
-            for (_, arm) in &mut last {
-                rows.extend(arm.finish());
-            }
-        }
-        rest.par_iter_mut().for_each(|(_, arm)| arm.breed(generation, level));
+        playing.retain(|(_, arm)| generation < arm.last());
+        playing.par_iter_mut().for_each(|(_, arm)| arm.breed(generation, level));
         rows.sort_by_key(|row| (row.arm, row.trial, row.generation));
         self.generation += 1;
         Ok(rows)
@@ -136,33 +113,51 @@ impl Trainer {
         &self.arms[arm].world
     }
 
-    /// What [`Trainer::restore`] needs.
-    pub fn snapshot(&self) -> Snapshot {
-        let each = |arm: &Arm| arm.trials.iter().map(|trial| trial.weights.clone()).collect();
-        let pending = |arm: &Arm| arm.trials.iter().map(|trial| trial.pending).collect();
-        Snapshot {
+    /// What [`Trainer::restore`] needs, in memory of its own.
+    ///
+    /// # Errors
+    /// There is not so much memory.
+    pub fn snapshot(&self) -> Result<Snapshot, TryReserveError> {
+        let copy = |numbers: &Vec<f32>| {
+            let mut copy = Vec::new();
+            copy.try_reserve_exact(numbers.len())?;
+            copy.extend_from_slice(numbers);
+            Ok(copy)
+        };
+        let each = |numbers: fn(&Trial) -> &Vec<f32>| -> Result<_, TryReserveError> {
+            self.arms.iter().map(|arm| arm.trials.iter().map(|trial| copy(numbers(trial))).collect()).collect()
+        };
+        Ok(Snapshot {
             generation: self.generation,
-            weights: self.arms.iter().map(each).collect(),
-            pending: self.arms.iter().map(pending).collect(),
-        }
+            weights: each(|trial| &trial.weights)?,
+            fitness: each(|trial| &trial.fitness)?,
+            pending: self.arms.iter().map(|arm| arm.trials.iter().map(|trial| trial.pending).collect()).collect(),
+        })
     }
 
     /// Goes on from a snapshot of a trainer of the same configs; false where its sizes do not fit them.
     #[must_use]
     pub fn restore(&mut self, snapshot: Snapshot) -> bool {
-        let fits = snapshot.weights.len() == self.arms.len()
-            && snapshot.pending.len() == self.arms.len()
-            && self.arms.iter().zip(&snapshot.weights).zip(&snapshot.pending).all(|((arm, weights), pending)| {
-                weights.len() == arm.trials.len()
-                    && pending.len() == arm.trials.len()
-                    && arm.trials.iter().zip(weights).all(|(trial, weights)| trial.weights.len() == weights.len())
-            });
+        let Snapshot { generation, weights, fitness, pending } = snapshot;
+        let counts = [weights.len(), fitness.len(), pending.len()];
+        let fits = |trial: &Trial, weights: &Vec<f32>, fitness: &Vec<f32>| {
+            trial.weights.len() == weights.len() && trial.fitness.len() == fitness.len()
+        };
+        let fits = counts == [self.arms.len(); 3]
+            && self.arms.iter().zip(&weights).zip(&fitness).zip(&pending).all(
+                |(((arm, weights), fitness), pending)| {
+                    let counts = [weights.len(), fitness.len(), pending.len()];
+                    counts == [arm.trials.len(); 3]
+                        && arm.trials.iter().zip(weights).zip(fitness).all(|((trial, w), f)| fits(trial, w, f))
+                },
+            );
         if fits {
-            self.generation = snapshot.generation;
-            for ((arm, weights), pending) in self.arms.iter_mut().zip(snapshot.weights).zip(snapshot.pending) {
-                for ((trial, weights), pending) in arm.trials.iter_mut().zip(weights).zip(pending) {
-                    (trial.weights, trial.pending) = (weights, pending);
-                }
+            self.generation = generation;
+            let trials = self.arms.iter_mut().flat_map(|arm| &mut arm.trials);
+            let saved =
+                weights.into_iter().flatten().zip(fitness.into_iter().flatten()).zip(pending.into_iter().flatten());
+            for (trial, ((weights, fitness), pending)) in trials.zip(saved) {
+                (trial.weights, trial.fitness, trial.pending) = (weights, fitness, pending);
             }
         }
         fits
@@ -173,14 +168,14 @@ impl Trainer {
 fn play(
     backend: &mut dyn Backend,
     arms: &[(usize, &mut Arm)],
-    range: impl Fn(usize) -> Range<usize>,
+    range: impl Fn(&Arm) -> Range<usize>,
 ) -> Result<(), BackendError> {
     thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
     let mut groups = Vec::new();
     let mut places = Vec::new();
     for (_, arm) in arms {
         let (population, leaders) = (arm.config.learning.population, arm.world.leaders());
-        let range = range(population);
+        let range = range(arm);
         for trial in &arm.trials {
             let teams = &trial.teams[range.start * leaders..range.end * leaders];
             for (episode, starts) in trial.starts.iter().enumerate() {
@@ -214,6 +209,11 @@ impl Arm {
         let world = World::new(&config);
         let trials = (0..config.learning.trials).into_par_iter().map(|index| Trial::new(&config, &world, index, level));
         Arm { trials: trials.collect(), world, config }
+    }
+
+    /// The last generation.
+    fn last(&self) -> usize {
+        self.config.learning.generations
     }
 
     /// Forms the teams of a generation and draws its starts.

@@ -79,7 +79,7 @@ pub struct World {
 impl World {
     /// Builds the world of a valid config; in the all-leaders paradigm the followers' places hold leaders.
     pub fn new(config: &Config) -> World {
-        let Config { world, motion, follow, sense, policy, learning } = config;
+        let Config { world, motion, follow, sense, policy, learning, .. } = config;
         let (leaders, followers) = match learning.paradigm {
             Paradigm::LeaderFollower => (world.leaders.len(), world.followers.len()),
             Paradigm::AllLeaders => (world.leaders.len() + world.followers.len(), 0),

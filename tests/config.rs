@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use flotilla::config::{
-    Config, ConfigError, Coupling, Density, Fitness, Follow, Learning, MAX_EPISODES, MAX_GENERATIONS,
+    Checkpoint, Config, ConfigError, Coupling, Density, Fitness, Follow, Learning, MAX_EPISODES, MAX_GENERATIONS,
     MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion, Mutation, Override, Paradigm,
     Policy, Problem, Sense, World,
 };
@@ -65,6 +65,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             start_jitter: 0.0,
             seed: 0,
         },
+        checkpoint: Checkpoint { generations: 0, seconds: 30.0 },
     };
     assert_eq!(config, expected);
 }
@@ -277,14 +278,19 @@ fn configs() -> impl Strategy<Value = Config> {
             }
         },
     );
-    (worlds(), follow, sense, policy, learning).prop_map(|((world, motion), follow, sense, policy, learning)| Config {
-        world,
-        motion,
-        follow,
-        sense,
-        policy,
-        learning,
-    })
+    let checkpoint = (0..=MAX_GENERATIONS, prop_oneof![Just(0.0), 0.01..=1e9])
+        .prop_map(|(generations, seconds)| Checkpoint { generations, seconds });
+    (worlds(), follow, sense, policy, learning, checkpoint).prop_map(
+        |((world, motion), follow, sense, policy, learning, checkpoint)| Config {
+            world,
+            motion,
+            follow,
+            sense,
+            policy,
+            learning,
+            checkpoint,
+        },
+    )
 }
 
 /// A piece of text that means something to TOML or to a config.

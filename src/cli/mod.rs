@@ -2,6 +2,7 @@
 //!
 //! A command's file holds `Args` (its flags) and `run(Args) -> Result<(), Error>`; the list `commands!` below names it.
 
+use std::fmt::Display;
 use std::io::{self, Write};
 use std::path::PathBuf;
 
@@ -9,9 +10,15 @@ use clap::builder::PossibleValuesParser as Words;
 use clap::{Parser, Subcommand, ValueEnum};
 
 use crate::backend::BackendError;
+use crate::backend::gpu::device::DeviceError;
 use crate::config::{self, Choice, Config, ConfigError, Fitness, Override, Paradigm};
+use crate::record::RecordError;
+use crate::run::RunError;
 
+mod backend;
 mod check;
+mod rollout;
+mod train;
 
 /// Lists the commands, each with its file, and calls the one that was typed.
 macro_rules! commands {
@@ -33,6 +40,10 @@ macro_rules! commands {
 commands! {
     /// Check a config; print it with every default written out, and what a run of it costs.
     Check(check),
+    /// Train the teams of a config, and save what they learned.
+    Train(train),
+    /// Play teams of policies from a file, and score every leader.
+    Rollout(rollout),
 }
 
 /// Trains cooperative teams by coevolution on any GPU, with the same bits on a CPU.
@@ -58,8 +69,38 @@ pub enum Error {
     Config(#[from] ConfigError),
     #[error(transparent)]
     Backend(#[from] BackendError),
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+    #[error(transparent)]
+    Record(#[from] RecordError),
+    #[error(transparent)]
+    Run(#[from] RunError),
     #[error("standard output cannot be written: {0}")]
     Output(io::Error),
+    #[error("signals cannot be listened for: {0}")]
+    Signals(io::Error),
+    /// Wrong usage that only shows once flags are read together.
+    #[error("{0}")]
+    Usage(String),
+    /// Stopped by a signal, with everything saved.
+    #[error("{0}")]
+    Stopped(String),
+}
+
+impl Error {
+    /// The process's exit code: 1 failed, 2 wrong usage, 75 stopped and ready to be resumed.
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Error::Usage(_) => 2,
+            Error::Stopped(_) => 75,
+            _ => 1,
+        }
+    }
+}
+
+/// Tells something on standard error; with that gone there is nobody left to tell.
+pub fn say(text: impl Display) {
+    let _ = writeln!(io::stderr(), "{text}");
 }
 
 /// Writes a result to standard output. A reader that has heard enough (`| head`) is no failure.
@@ -92,8 +133,17 @@ impl ConfigArgs {
     /// # Errors
     /// Everything that is wrong with the file and the flags.
     pub fn load(&self) -> Result<Config, Error> {
+        self.load_with(vec![])
+    }
+
+    /// The config that was meant, with more keys set by a command's own flags.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the file and the flags.
+    pub fn load_with(&self, more: Vec<Override>) -> Result<Config, Error> {
         let text = config::read_file(&self.config)?;
-        Ok(Config::read(&text, &self.config.display().to_string(), &[], &self.overrides.list())?)
+        let overrides = [self.overrides.list(), more].concat();
+        Ok(Config::read(&text, &self.config.display().to_string(), &[], &overrides)?)
     }
 }
 

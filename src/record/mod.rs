@@ -1,1 +1,89 @@
-//! Policies, metrics and the run folder.
+//! What a run leaves on disk, and how it is found again after anything.
+//!
+//! | module | holds |
+//! |---|---|
+//! | [`disk`] | files replaced whole or not at all; the one place that writes, so that tests can make any write fail |
+//! | [`tensors`] | safetensors files under a checksum |
+//! | [`policies`] | `policies.safetensors` |
+//! | [`metrics`] | `metrics.csv` |
+//! | [`checkpoint`] | `checkpoints/`, written beside training |
+//! | [`folder`] | the run's folder, its lock and `run.json` |
+//!
+//! Every file that is read is taken as hostile: its size is checked before memory is taken, what it says is checked
+//! before it is used, and nothing in it names another file.
+
+use std::fmt::Display;
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+
+pub mod checkpoint;
+pub mod disk;
+pub mod folder;
+pub mod metrics;
+pub mod policies;
+pub mod tensors;
+
+/// Why a run's files could not be written, read or used.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordError {
+    #[error("{path}: cannot be written: {error}{}", remedy(error))]
+    Write { path: PathBuf, error: io::Error },
+    #[error("{path}: cannot be read: {error}")]
+    Read { path: PathBuf, error: io::Error },
+    /// The file is not what it should be; `reason` says in what.
+    #[error("{path}: {reason}")]
+    Damaged { path: PathBuf, reason: String },
+    #[error("{path} holds a run already; go on with it by --resume, write over it by --force, or choose another --out")]
+    Exists { path: PathBuf },
+    #[error("another process is training in {path}; wait for it, stop it, or choose another --out")]
+    Locked { path: PathBuf },
+    #[error(
+        "{path} is a run of another config, so it cannot go on with this one; what differs:\n{}\n\
+         resume with the config it was started with ({path}/config.toml), or choose another --out",
+        differences.join("\n")
+    )]
+    ConfigDiffers { path: PathBuf, differences: Vec<String> },
+}
+
+impl RecordError {
+    fn write(path: &Path) -> impl FnOnce(io::Error) -> RecordError {
+        move |error| RecordError::Write { path: path.into(), error }
+    }
+
+    fn read(path: &Path) -> impl FnOnce(io::Error) -> RecordError {
+        move |error| RecordError::Read { path: path.into(), error }
+    }
+
+    fn damaged(path: &Path, reason: impl Display) -> RecordError {
+        RecordError::Damaged { path: path.into(), reason: reason.to_string() }
+    }
+}
+
+/// What to do about a failed write.
+fn remedy(error: &io::Error) -> &'static str {
+    match error.kind() {
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => "; free some space, then go on with --resume",
+        io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem => "; choose a folder you may write to",
+        _ => "",
+    }
+}
+
+/// A small text file, refused where it is larger than `most` bytes.
+fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
+    let mut bytes = Vec::new();
+    let file = File::open(path).map_err(RecordError::read(path))?;
+    file.take(most + 1).read_to_end(&mut bytes).map_err(RecordError::read(path))?;
+    if bytes.len() as u64 > most {
+        return Err(RecordError::damaged(
+            path,
+            format_args!("it is larger than the {most} bytes such a file may have"),
+        ));
+    }
+    String::from_utf8(bytes).map_err(|_| RecordError::damaged(path, "it is not UTF-8 text"))
+}
+
+/// Lowercase hexadecimal.
+pub fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}

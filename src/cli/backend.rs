@@ -1,0 +1,64 @@
+//! Opens what episodes are played on.
+
+use super::{BackendChoice, Error, RunOptions};
+use crate::backend::Backend;
+use crate::backend::cpu::Cpu;
+use crate::backend::gpu::device::{self, Choice, DeviceError};
+use crate::backend::gpu::episode::GpuEpisodes;
+use crate::run::Machine;
+
+/// A backend, and what it is for `run.json`.
+pub type Opened = (Box<dyn Backend>, Machine);
+
+/// Opens the backend that was asked for; `--threads` holds for the whole process.
+///
+/// # Errors
+/// There is no such backend here, or no threads.
+pub fn open(options: &RunOptions) -> Result<Opened, Error> {
+    start_threads(options)?;
+    let named = options.adapter.clone().map(Choice::Named);
+    match (options.backend, named) {
+        (BackendChoice::Cpu, Some(_)) => {
+            Err(Error::Usage("--adapter names a GPU, --backend cpu uses none; leave out one of the two".into()))
+        }
+        (BackendChoice::Cpu, None) => Ok(cpu()),
+        (BackendChoice::Auto, None) => match gpu(Choice::Real) {
+            Err(DeviceError::NoAdapter | DeviceError::NoRealAdapter { .. }) => Ok(cpu()),
+            Err(error) => {
+                eprintln!("note: no GPU is used: {error}");
+                Ok(cpu())
+            }
+            opened => Ok(opened?),
+        },
+        (BackendChoice::Auto | BackendChoice::Gpu, Some(named)) => Ok(gpu(named)?),
+        (BackendChoice::Gpu, None) => Ok(gpu(Choice::Any)?),
+    }
+}
+
+/// Makes `--threads` hold for the whole process.
+///
+/// # Errors
+/// So many cannot be started.
+pub fn start_threads(options: &RunOptions) -> Result<(), Error> {
+    let Some(threads) = options.threads else { return Ok(()) };
+    let started = rayon::ThreadPoolBuilder::new().num_threads(threads.into()).build_global();
+    started.map_err(|error| Error::Usage(format!("--threads {threads} cannot be started: {error}")))
+}
+
+fn gpu(choice: Choice) -> Result<Opened, DeviceError> {
+    let backend = GpuEpisodes::new(device::open(choice)?)?;
+    let adapter = &backend.gpu().adapter;
+    let machine = Machine {
+        backend: "gpu".into(),
+        adapter: Some(adapter.name.clone()),
+        driver: Some(adapter.driver.clone()),
+        threads: rayon::current_num_threads(),
+    };
+    Ok((Box::new(backend), machine))
+}
+
+/// The backend that is always there.
+pub fn cpu() -> Opened {
+    let machine = Machine { backend: "cpu".into(), threads: rayon::current_num_threads(), ..Machine::default() };
+    (Box::new(Cpu::default()), machine)
+}

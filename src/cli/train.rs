@@ -1,0 +1,298 @@
+//! `flotilla train`: a run from its config to its policies.
+
+use std::fmt::Write;
+use std::io::{self, IsTerminal};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+use clap::ValueEnum;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+use super::{ConfigArgs, Error, RunOptions, backend, print, say};
+use crate::config::{Config, Override};
+use crate::record::checkpoint::Schedule;
+use crate::record::disk::Disk;
+use crate::record::folder::{self, METRICS, POLICIES, Start};
+use crate::record::metrics::Row;
+use crate::run::{Opened, Options, Outcome, Progress, Results, Session};
+
+/// Where runs without `--out` go.
+const RUNS: &str = "runs";
+/// How often a line is written where there is no terminal to draw on.
+const LINES: Duration = Duration::from_secs(10);
+/// How often the terminal's line changes.
+const DRAWS: Duration = Duration::from_millis(100);
+
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(flatten)]
+    config: ConfigArgs,
+    #[command(flatten)]
+    run: RunOptions,
+    /// Folder for what comes out [default: runs/NAME of the config, or the next free runs/NAME-2, …]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Go on with the run in the folder (without --out the latest of this config's name), or start it if there is none
+    #[arg(long, conflicts_with = "force")]
+    resume: bool,
+    /// Write over the run in the folder
+    #[arg(long)]
+    force: bool,
+    /// No progress on standard error
+    #[arg(long)]
+    quiet: bool,
+    /// Save what --resume needs after so many generations; 0 is never
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    checkpoint_generations: Option<i64>,
+    /// Save what --resume needs after so many seconds; 0 is never
+    #[arg(long, value_name = "S", allow_negative_numbers = true)]
+    checkpoint_seconds: Option<f64>,
+    /// What to do when the device fails in mid-run
+    #[arg(long, value_enum, value_name = "WHAT", default_value_t = OnLoss::Stop)]
+    on_device_loss: OnLoss,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum OnLoss {
+    /// Save and fail, to be resumed
+    Stop,
+    /// Go on with the CPU, to the same results
+    Cpu,
+}
+
+impl Args {
+    fn load(&self) -> Result<Config, Error> {
+        let generations = self.checkpoint_generations.map(toml::Value::from);
+        let seconds = self.checkpoint_seconds.map(toml::Value::from);
+        let set = |(name, value): (&str, Option<toml::Value>)| {
+            Some(Override::new(format!("checkpoint.{name}"), value?, format!("--checkpoint-{name}")))
+        };
+        self.config
+            .load_with([("generations", generations), ("seconds", seconds)].into_iter().filter_map(set).collect())
+    }
+
+    /// The run's folder, and what to do with a run in it.
+    fn folder(&self) -> Result<(PathBuf, Start), Error> {
+        let start = match (self.resume, self.force) {
+            (true, _) => Start::Resume,
+            (_, true) => Start::Force,
+            _ => Start::Fresh,
+        };
+        let stem = self.config.config.file_stem().unwrap_or_default().to_string_lossy();
+        let runs = Path::new(RUNS);
+        Ok(match (&self.out, start) {
+            (Some(out), _) => (out.clone(), start),
+            (None, Start::Resume) => (folder::latest(runs, &stem), start),
+            (None, Start::Force) => (runs.join(&*stem), start),
+            (None, Start::Fresh) => (folder::next_free(runs, &stem)?, start),
+        })
+    }
+}
+
+pub fn run(args: Args) -> Result<(), Error> {
+    let config = args.load()?;
+    let (backend, machine) = backend::open(&args.run)?;
+    let runs_on = backend.describe();
+    let (folder, start) = args.folder()?;
+    if !args.quiet {
+        say(format_args!("training on {runs_on}, into {}", folder.display()));
+    }
+    let signals = Signals::listen()?;
+    let (opened, notes) = Session::open(config.clone(), &folder, start, Disk::default())?;
+    for note in notes {
+        say(note);
+    }
+    let report = |results: &Results, trained: &str| report(&config, &folder, results, trained);
+    let mut session = match opened {
+        Opened::Ready(session) => session,
+        Opened::Done(results) => return print(&report(&results, "This run was done already")),
+    };
+
+    let start = (Instant::now(), session.generation());
+    let mut ticker = Ticker::new(&config, session.generation(), args.quiet);
+    let mut instead = |error: &_| {
+        (args.on_device_loss == OnLoss::Cpu).then(|| {
+            let (backend, machine) = backend::cpu();
+            say(format_args!("{error}\ngoing on with {}, to the same results", backend.describe()));
+            (backend, machine)
+        })
+    };
+    let options = Options {
+        schedule: Schedule { generations: config.checkpoint.generations, seconds: config.checkpoint.seconds },
+        stop: &signals.stop,
+        save: &signals.save,
+        instead: &mut instead,
+        watch: &mut |progress| ticker.tick(progress),
+    };
+    let outcome = session.train(backend, machine, options);
+    ticker.clear();
+    match outcome? {
+        Outcome::Done(results) => {
+            let (seconds, rate) = ticker.rate(start.0, start.1, session.generation());
+            let learning = &config.learning;
+            let trained = format!(
+                "Trained {} trials of {} teams, {} generations, in {seconds:.1} s ({rate:.1} generations/s) on {runs_on}",
+                learning.trials, learning.population, learning.generations
+            );
+            print(&report(&results, &trained))
+        }
+        Outcome::Stopped { generation } => Err(Error::Stopped(format!(
+            "before generation {generation} of {}, with everything saved; go on with\n  {}",
+            config.learning.generations,
+            command_to_resume(&folder)
+        ))),
+    }
+}
+
+/// What to type to go on.
+fn command_to_resume(folder: &Path) -> String {
+    let folder = folder.display();
+    format!("flotilla train {folder}/{} --out {folder} --resume", folder::CONFIG)
+}
+
+/// Signals that ask for something.
+struct Signals {
+    stop: Arc<AtomicBool>,
+    save: Arc<AtomicBool>,
+}
+
+impl Signals {
+    /// From here on SIGINT and SIGTERM set `stop`, and end the process at once where it is set already; SIGUSR1 sets
+    /// `save`.
+    fn listen() -> Result<Signals, Error> {
+        use signal_hook::consts::{SIGINT, SIGTERM};
+        use signal_hook::flag;
+        let signals = Signals { stop: Arc::default(), save: Arc::default() };
+        let listen = || -> io::Result<()> {
+            for signal in [SIGINT, SIGTERM] {
+                flag::register_conditional_shutdown(signal, 128 + signal, signals.stop.clone())?;
+                flag::register(signal, signals.stop.clone())?;
+            }
+            #[cfg(unix)]
+            flag::register(signal_hook::consts::SIGUSR1, signals.save.clone())?;
+            Ok(())
+        };
+        listen().map_err(Error::Signals)?;
+        Ok(signals)
+    }
+}
+
+/// Shows how a run comes on: a bar on a terminal, a line from time to time elsewhere.
+struct Ticker {
+    bar: Option<ProgressBar>,
+    quiet: bool,
+    pois: usize,
+    trials: usize,
+    last: usize,
+    /// When and with which generation this session started.
+    start: (Instant, usize),
+    shown: Instant,
+    /// Means over the trials of the newest complete generation.
+    scores: String,
+}
+
+impl Ticker {
+    fn new(config: &Config, generation: usize, quiet: bool) -> Ticker {
+        let last = config.learning.generations;
+        let bar = (!quiet && io::stderr().is_terminal()).then(|| {
+            let style = "{bar:24} generation {pos}/{len}  {msg}  {eta} left";
+            let style = ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar());
+            let bar = ProgressBar::with_draw_target(Some(last as u64), ProgressDrawTarget::stderr()).with_style(style);
+            bar.with_position(generation as u64)
+        });
+        let (pois, trials) = (config.world.pois.len(), config.learning.trials);
+        let now = Instant::now();
+        Ticker { bar, quiet, pois, trials, last, start: (now, generation), shown: now, scores: String::new() }
+    }
+
+    fn tick(&mut self, progress: &Progress<'_>) {
+        let pause = if self.bar.is_some() { DRAWS } else { LINES };
+        if self.quiet || self.shown.elapsed() < pause && progress.generation <= self.last {
+            return;
+        }
+        if let Some(generation) = progress.rows.last().map(|row| row.generation) {
+            let newest: Vec<Row> = progress.rows.iter().filter(|row| row.generation == generation).copied().collect();
+            let mean =
+                |share: fn(&Row) -> f64| self.pois as f64 * newest.iter().map(share).sum::<f64>() / self.trials as f64;
+            self.scores =
+                format!("best {:.2}, mean {:.2} of {} POIs", mean(|row| row.best_g), mean(|row| row.mean_g), self.pois);
+        }
+        let (_, rate) = self.rate(self.start.0, self.start.1, progress.generation);
+        match &self.bar {
+            Some(bar) => {
+                bar.set_message(format!("{}  {rate:.1} generations/s", self.scores));
+                bar.set_position(progress.generation.min(self.last) as u64);
+            }
+            None if progress.generation <= self.last => {
+                let left = (self.last + 1 - progress.generation) as f64 / rate;
+                say(format_args!(
+                    "generation {}/{}  {}  {rate:.1} generations/s  {left:.0} s left",
+                    progress.generation - 1,
+                    self.last,
+                    self.scores
+                ));
+            }
+            None => {}
+        }
+        self.shown = Instant::now();
+    }
+
+    /// Seconds since `start`, and generations a second from `first` to before `next`.
+    fn rate(&self, start: Instant, first: usize, next: usize) -> (f64, f64) {
+        let seconds = start.elapsed().as_secs_f64();
+        (seconds, (next.min(self.last + 1) - first.min(next)) as f64 / seconds.max(1e-9))
+    }
+
+    fn clear(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+/// One of a row's scores.
+type Score = fn(&Row) -> f64;
+
+/// What a person wants to know at the end.
+fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> String {
+    let Results { story, digest } = results;
+    let pois = config.world.pois.len();
+    let mut text = format!("{trained}.\n\nPOIs observed, of {pois}: mean over trials (lowest to highest trial)\n");
+    let scores: [(&str, Score); 3] =
+        [("best team", |row| row.best_g), ("mean team", |row| row.mean_g), ("champion", |row| row.champion_g)];
+    let _ = writeln!(text, "  {:<16}{:<22}{:<22}{}", "", scores[0].0, scores[1].0, scores[2].0);
+    for (name, rows) in
+        [("start", &story.first), (&*format!("generation {}", config.learning.generations), &story.last)]
+    {
+        let spread = |share: Score| {
+            let mut all: Vec<f64> = rows.iter().map(|row| share(row) * pois as f64).collect();
+            all.sort_by(f64::total_cmp);
+            let mean = all.iter().sum::<f64>() / all.len() as f64;
+            format!("{mean:.2} ({:.2} to {:.2})", all[0], all[all.len() - 1])
+        };
+        let [best, mean, champion] = scores.map(|(_, share)| spread(share));
+        let _ = writeln!(text, "  {name:<16}{best:<22}{mean:<22}{champion}");
+    }
+    let folder = folder.display();
+    let _ = write!(
+        text,
+        "
+Files in {folder}:
+  {METRICS:<22}every trial, generation by generation
+  {POLICIES:<22}what was learned, best policy first
+  {:<22}the config, every default written out
+  {:<22}what it ran on; digest {digest}
+
+Next:
+  flotilla plot {folder}
+  flotilla replay {folder}
+  flotilla rollout {folder}/{} --policies {folder}/{POLICIES} --scores scores.csv
+",
+        folder::CONFIG,
+        folder::RUN,
+        folder::CONFIG,
+    );
+    text
+}

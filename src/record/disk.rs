@@ -1,0 +1,147 @@
+//! Everything that is written goes through here: a file is replaced whole or not at all, and tests can make any
+//! single operation fail.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, BufWriter, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// One thing done to a disk.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Operation {
+    CreateFolder,
+    Create,
+    Write,
+    Flush,
+    Truncate,
+    Rename,
+    Remove,
+}
+
+/// Asked before each operation; its error becomes the operation's.
+pub type Gate = dyn Fn(Operation, &Path) -> io::Result<()> + Send + Sync;
+
+/// The file system, or a test's failing one.
+#[derive(Clone, Default)]
+pub struct Disk {
+    gate: Option<Arc<Gate>>,
+}
+
+impl Disk {
+    /// A disk whose operations fail when `gate` says so. A write that fails has written the first half.
+    pub fn failing(gate: impl Fn(Operation, &Path) -> io::Result<()> + Send + Sync + 'static) -> Disk {
+        Disk { gate: Some(Arc::new(gate)) }
+    }
+
+    fn pass(&self, operation: Operation, path: &Path) -> io::Result<()> {
+        self.gate.as_ref().map_or(Ok(()), |gate| gate(operation, path))
+    }
+
+    /// Creates a folder and those above it.
+    pub fn create_folder(&self, path: &Path) -> io::Result<()> {
+        self.pass(Operation::CreateFolder, path)?;
+        fs::create_dir_all(path)
+    }
+
+    /// A new file in the place of any other; a link that stands there is replaced, never followed.
+    pub fn create(&self, path: &Path) -> io::Result<Output> {
+        self.remove(path)?;
+        self.pass(Operation::Create, path)?;
+        let file = OpenOptions::new().write(true).create_new(true).open(path)?;
+        Ok(Output { disk: self.clone(), path: path.into(), file })
+    }
+
+    /// The file as it is up to `length` bytes, to be written on from there.
+    pub fn append(&self, path: &Path, length: u64) -> io::Result<Output> {
+        let mut file = OpenOptions::new().write(true).open(path)?;
+        self.pass(Operation::Truncate, path)?;
+        file.set_len(length)?;
+        file.seek(SeekFrom::End(0))?;
+        Ok(Output { disk: self.clone(), path: path.into(), file })
+    }
+
+    /// Gives a file new content: after a crash at any moment it has either all of the old or all of the new.
+    pub fn replace(&self, path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
+        let temporary = temporary(path);
+        let write = || {
+            let mut output = BufWriter::with_capacity(1 << 20, self.create(&temporary)?);
+            content(&mut output)?;
+            output.into_inner().map_err(|error| error.into_error())?.sync()?;
+            self.rename(&temporary, path)
+        };
+        write().inspect_err(|_| {
+            // Whatever is left is cleared away with the next attempt.
+            let _ = self.remove(&temporary);
+        })
+    }
+
+    /// Renames within a folder, for good.
+    pub fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        self.pass(Operation::Rename, to)?;
+        fs::rename(from, to)?;
+        self.sync_folder(to.parent().unwrap_or(Path::new(".")))
+    }
+
+    /// Removes a file, if it is there.
+    pub fn remove(&self, path: &Path) -> io::Result<()> {
+        if fs::symlink_metadata(path).is_err_and(|error| error.kind() == io::ErrorKind::NotFound) {
+            return Ok(());
+        }
+        self.pass(Operation::Remove, path)?;
+        fs::remove_file(path)
+    }
+
+    /// Makes the names in a folder last, where the system can.
+    fn sync_folder(&self, path: &Path) -> io::Result<()> {
+        self.pass(Operation::Flush, path)?;
+        #[cfg(unix)]
+        File::open(path)?.sync_all()?;
+        Ok(())
+    }
+}
+
+/// Where a file's next content is written until it is whole.
+pub fn temporary(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".tmp");
+    name.into()
+}
+
+/// A file being written.
+pub struct Output {
+    disk: Disk,
+    path: PathBuf,
+    file: File,
+}
+
+impl Output {
+    /// Waits until all that was written is on the disk.
+    pub fn sync(&self) -> io::Result<()> {
+        self.disk.pass(Operation::Flush, &self.path)?;
+        self.file.sync_all()
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The same file, to flush it from another thread.
+    pub fn share(&self) -> io::Result<Output> {
+        Ok(Output { disk: self.disk.clone(), path: self.path.clone(), file: self.file.try_clone()? })
+    }
+}
+
+impl Write for Output {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if let Err(error) = self.disk.pass(Operation::Write, &self.path) {
+            self.file.write_all(&bytes[..bytes.len() / 2])?;
+            return Err(error);
+        }
+        self.file.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}

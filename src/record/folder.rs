@@ -1,0 +1,422 @@
+//! A run's folder: who may write in it, what is in it, and where a run in it goes on.
+
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use super::checkpoint::{self, Checkpoint};
+use super::disk::Disk;
+use super::metrics::{self, Row};
+use super::{RecordError, hex, policies, read_text, tensors};
+use crate::config::Config;
+
+pub const CONFIG: &str = "config.toml";
+pub const RUN: &str = "run.json";
+pub const METRICS: &str = "metrics.csv";
+pub const POLICIES: &str = "policies.safetensors";
+pub const CHECKPOINTS: &str = "checkpoints";
+/// Locked by whoever trains in the folder. The lock is the system's: it goes with the process, however that ends.
+const LOCK: &str = ".lock";
+/// Pictures made of a run, gone with it.
+const PICTURES: [&str; 2] = ["curves.svg", "replay.html"];
+/// Most bytes in `run.json`.
+const MAX_RUN_BYTES: u64 = 1 << 16;
+
+/// What to do with a folder that holds a run already.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Start {
+    /// Refuse it.
+    Fresh,
+    /// Write over it.
+    Force,
+    /// Go on with it, or start it where there is none.
+    Resume,
+}
+
+/// `run.json`: what a run ran on, and how far it came.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Run {
+    /// Of the program.
+    pub version: String,
+    pub state: State,
+    pub seed: u64,
+    /// "cpu" or "gpu", and in words.
+    pub backend: String,
+    pub description: String,
+    pub adapter: Option<String>,
+    pub driver: Option<String>,
+    pub threads: usize,
+    /// UTC, of the first session's start and of this file.
+    pub started: String,
+    pub updated: String,
+    /// Time trained in all sessions.
+    pub seconds: f64,
+    /// How often it was started or resumed.
+    pub sessions: u64,
+    /// Generations played, the random start included.
+    pub generations: usize,
+    /// See [`Folder::digest`]; once the run is done.
+    pub digest: Option<String>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum State {
+    /// Or killed.
+    Running,
+    /// By a signal or an error, after saving.
+    Stopped,
+    Done,
+}
+
+impl Run {
+    /// A run that has not started yet.
+    pub fn new(config: &Config) -> Run {
+        Run {
+            version: String::new(),
+            state: State::Running,
+            seed: config.learning.seed,
+            backend: String::new(),
+            description: String::new(),
+            adapter: None,
+            driver: None,
+            threads: 0,
+            started: now(),
+            updated: String::new(),
+            seconds: 0.0,
+            sessions: 0,
+            generations: 0,
+            digest: None,
+        }
+    }
+
+    /// Reads `run.json`.
+    ///
+    /// # Errors
+    /// It cannot be read, or is not what it should be.
+    pub fn read(path: &Path) -> Result<Run, RecordError> {
+        Run::parse(&read_text(path, MAX_RUN_BYTES)?).map_err(|reason| RecordError::damaged(path, reason))
+    }
+
+    /// Reads the text of a `run.json`.
+    ///
+    /// # Errors
+    /// What is wrong with it, in words.
+    pub fn parse(text: &str) -> Result<Run, String> {
+        serde_json::from_str(text).map_err(|error| format!("it is no record of a run: {error}"))
+    }
+}
+
+/// A folder that this process, and no other, trains in.
+pub struct Folder {
+    pub path: PathBuf,
+    pub disk: Disk,
+    _lock: Option<File>,
+}
+
+/// Where a run goes on, and what there is to tell about it.
+pub struct Found {
+    /// The newest whole checkpoint, and metrics cut to where it stands.
+    pub checkpoint: Option<(Checkpoint, metrics::Writer)>,
+    /// Generations of all checkpoints that may be used, oldest first.
+    pub kept: Vec<usize>,
+    /// `run.json` as the last session left it.
+    pub run: Option<Run>,
+    /// What the run came to, where it is done and all its files are as it left them; nothing else is looked at then.
+    pub finished: Option<Story>,
+    /// For the user: what was damaged, and what is done about it.
+    pub notes: Vec<String>,
+}
+
+/// Where a run came from and to, `[trials]` each.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Story {
+    pub first: Vec<Row>,
+    pub last: Vec<Row>,
+}
+
+impl Folder {
+    /// Takes a folder for a run of a config, creating it where needed.
+    ///
+    /// # Errors
+    /// It holds a run that must not be written over, is in use, belongs to another config or cannot be written.
+    pub fn open(path: &Path, start: Start, config: &Config, disk: Disk) -> Result<(Folder, Found), RecordError> {
+        let checkpoints = path.join(CHECKPOINTS);
+        let holds_run = || [CONFIG, RUN, METRICS, POLICIES, CHECKPOINTS].iter().any(|name| path.join(name).exists());
+        if start == Start::Fresh && holds_run() {
+            return Err(RecordError::Exists { path: path.into() });
+        }
+        disk.create_folder(path).map_err(RecordError::write(path))?;
+        let lock = lock(path)?;
+        // Only now is nobody else writing here.
+        if start == Start::Fresh && holds_run() {
+            return Err(RecordError::Exists { path: path.into() });
+        }
+        disk.create_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
+        let folder = Folder { path: path.into(), disk, _lock: lock };
+        if start == Start::Force {
+            folder.clear()?;
+        }
+        let mut found = Found { checkpoint: None, kept: vec![], run: None, finished: None, notes: vec![] };
+        if start == Start::Resume {
+            folder.find(config, &mut found)?;
+        }
+        if found.finished.is_some() {
+            return Ok((folder, found));
+        }
+        folder.write_text(CONFIG, &config.to_toml())?;
+        Ok((folder, found))
+    }
+
+    /// Removes a run; whatever else is in the folder stays.
+    fn clear(&self) -> Result<(), RecordError> {
+        let checkpoints = self.file(CHECKPOINTS);
+        let generations = checkpoint::tidy(&self.disk, &checkpoints)?;
+        let old = generations.into_iter().map(|generation| checkpoint::path(&checkpoints, generation));
+        let files = [RUN, METRICS, POLICIES, CONFIG].into_iter().chain(PICTURES).map(|name| self.file(name));
+        for path in old.chain(files) {
+            self.disk.remove(&path).map_err(RecordError::write(&path))?;
+        }
+        Ok(())
+    }
+
+    /// Finds where the run goes on.
+    fn find(&self, config: &Config, found: &mut Found) -> Result<(), RecordError> {
+        let checkpoints = self.file(CHECKPOINTS);
+        let mut kept = checkpoint::tidy(&self.disk, &checkpoints)?;
+        self.compare(config, found, !kept.is_empty())?;
+        match Run::read(&self.file(RUN)) {
+            Ok(run) => found.run = Some(run),
+            Err(RecordError::Read { error, .. }) if error.kind() == ErrorKind::NotFound => {}
+            Err(error) => found.notes.push(format!("{error}; it is written anew")),
+        }
+        found.finished = found.run.as_ref().and_then(|run| self.finished(run, config));
+        if found.finished.is_some() {
+            return Ok(());
+        }
+        let digest = checkpoint::digest(config);
+        let any = !kept.is_empty();
+        while let Some(&generation) = kept.last() {
+            let path = checkpoint::path(&checkpoints, generation);
+            let reason = match checkpoint::read(&path, std::slice::from_ref(config)) {
+                Ok(checkpoint) if checkpoint.config != digest => {
+                    let differences = vec![format!("  {} says so, without saying what", path.display())];
+                    return Err(RecordError::ConfigDiffers { path: self.path.clone(), differences });
+                }
+                Ok(checkpoint) => {
+                    let metrics = self.file(METRICS);
+                    let resumed = metrics::Writer::resume(&self.disk, &metrics, &checkpoint.metrics);
+                    match resumed.map_err(RecordError::write(&metrics))? {
+                        Some(metrics) => {
+                            found.checkpoint = Some((checkpoint, metrics));
+                            break;
+                        }
+                        None => format!("{}: {} is not as this left it", path.display(), metrics.display()),
+                    }
+                }
+                Err(error @ RecordError::Damaged { .. }) => error.to_string(),
+                Err(error) => return Err(error),
+            };
+            found.notes.push(format!("{reason}; set aside, going back to the one before"));
+            let aside = checkpoint::aside(&path);
+            self.disk.rename(&path, &aside).map_err(RecordError::write(&aside))?;
+            kept.pop();
+        }
+        match &found.checkpoint {
+            Some((checkpoint, _)) => {
+                let generation = checkpoint.snapshot.generation;
+                found.notes.push(format!("going on before generation {generation}"));
+            }
+            None if any => found.notes.push("no checkpoint can be used: starting over, to the same results".into()),
+            None => found.notes.push("no checkpoint yet: starting from the beginning".into()),
+        }
+        found.kept = kept;
+        Ok(())
+    }
+
+    /// Refuses another config than the one the run was started with.
+    fn compare(&self, config: &Config, found: &mut Found, has_checkpoints: bool) -> Result<(), RecordError> {
+        let path = self.file(CONFIG);
+        match Config::load(&path) {
+            Ok(old) => {
+                let differences = differences(&old, config);
+                if !differences.is_empty() {
+                    return Err(RecordError::ConfigDiffers { path: self.path.clone(), differences });
+                }
+            }
+            Err(_) if !path.exists() && !has_checkpoints => {}
+            Err(error) => found.notes.push(format!("{error}; it is written anew")),
+        }
+        Ok(())
+    }
+
+    /// Writes a small text file, whole or not at all.
+    fn write_text(&self, name: &str, text: &str) -> Result<(), RecordError> {
+        let path = self.file(name);
+        self.disk.replace(&path, |output| output.write_all(text.as_bytes())).map_err(RecordError::write(&path))
+    }
+
+    /// Writes `run.json`.
+    ///
+    /// # Errors
+    /// It cannot be written.
+    pub fn write_run(&self, run: &Run) -> Result<(), RecordError> {
+        let text = serde_json::to_string_pretty(run).expect("plain fields are JSON");
+        self.write_text(RUN, &(text + "\n"))
+    }
+
+    pub fn file(&self, name: &str) -> PathBuf {
+        self.path.join(name)
+    }
+
+    /// Reads the whole of the metrics of a finished run: where it came from and to, and the run's digest.
+    ///
+    /// The digest is SHA-256 over `metrics.csv` without its last column, then over every trial's policies as in their
+    /// file (f32, little-endian). It is the same for all runs of a config, on any backend, however often resumed.
+    ///
+    /// # Errors
+    /// The metrics cannot be read, or have not one row for every trial and generation.
+    pub fn digest(&self, config: &Config, policies: &[Vec<f32>]) -> Result<(Story, String), RecordError> {
+        let path = self.file(METRICS);
+        let damaged = |reason: String| RecordError::damaged(&path, reason);
+        let mut rows = metrics::open(&path)?;
+        let (trials, last) = (config.learning.trials, config.learning.generations);
+        let mut story = Story { first: vec![], last: vec![] };
+        let mut count = 0;
+        for row in &mut rows {
+            let (row, _) = row.map_err(damaged)?;
+            if (row.generation, row.trial) != (count / trials, count % trials) {
+                let (generation, trial) = (count / trials, count % trials);
+                return Err(damaged(format!("line {} is not trial {trial}, generation {generation}", count + 2)));
+            }
+            if row.generation == 0 {
+                story.first.push(row);
+            }
+            if row.generation == last {
+                story.last.push(row);
+            }
+            count += 1;
+        }
+        if count != trials * (last + 1) {
+            return Err(damaged(format!("it has {count} rows, not {}", trials * (last + 1))));
+        }
+        let mut hash: Sha256 = rows.digest();
+        policies.iter().for_each(|weights| hash.update(bytemuck::cast_slice::<f32, u8>(weights)));
+        Ok((story, hex(&hash.finalize())))
+    }
+
+    /// What a run that is done came to; none where its files are not all as it left them.
+    fn finished(&self, run: &Run, config: &Config) -> Option<Story> {
+        let digest = run.digest.as_ref().filter(|_| run.state == State::Done)?;
+        let mut file = tensors::open(&self.file(POLICIES)).ok()?;
+        let all: Result<Vec<_>, String> = (0..config.learning.trials)
+            .map(|trial| Ok(policies::from_file(&mut file, config, Some(trial))?.weights))
+            .collect();
+        let (story, found) = self.digest(config, &all.ok()?).ok()?;
+        (found == *digest).then_some(story)
+    }
+}
+
+/// Locks a folder for this process; none where the file system has no locks.
+fn lock(path: &Path) -> Result<Option<File>, RecordError> {
+    let name = path.join(LOCK);
+    let file =
+        OpenOptions::new().create(true).truncate(false).write(true).open(&name).map_err(RecordError::write(&name))?;
+    match file.try_lock() {
+        Ok(()) => Ok(Some(file)),
+        Err(TryLockError::WouldBlock) => Err(RecordError::Locked { path: path.into() }),
+        Err(TryLockError::Error(error)) if error.kind() == ErrorKind::Unsupported => Ok(None),
+        Err(TryLockError::Error(error)) => Err(RecordError::write(&name)(error)),
+    }
+}
+
+/// Creates and gives the first of `stem`, `stem-2`, `stem-3`, … that does not exist.
+///
+/// # Errors
+/// A folder cannot be created.
+pub fn next_free(parent: &Path, stem: &str) -> Result<PathBuf, RecordError> {
+    fs::create_dir_all(parent).map_err(RecordError::write(parent))?;
+    let mut number = 1;
+    loop {
+        let path = numbered(parent, stem, number);
+        match fs::create_dir(&path) {
+            Ok(()) => return Ok(path),
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => number += 1,
+            Err(error) => return Err(RecordError::write(&path)(error)),
+        }
+    }
+}
+
+/// The last of `stem`, `stem-2`, … that exists, or else `stem`.
+pub fn latest(parent: &Path, stem: &str) -> PathBuf {
+    let paths = (1..).map(|number| numbered(parent, stem, number));
+    paths.take_while(|path| path.exists()).last().unwrap_or_else(|| numbered(parent, stem, 1))
+}
+
+fn numbered(parent: &Path, stem: &str, number: usize) -> PathBuf {
+    parent.join(if number == 1 { stem.to_string() } else { format!("{stem}-{number}") })
+}
+
+/// The keys in which two configs differ, those without a say in the results left out.
+pub fn differences(old: &Config, new: &Config) -> Vec<String> {
+    let table = |config: &Config| toml::Table::try_from(checkpoint::without_checkpoint(config)).unwrap_or_default();
+    let (old, new) = (table(old), table(new));
+    let mut differences = Vec::new();
+    for (section, keys) in &new {
+        for (key, value) in keys.as_table().into_iter().flatten() {
+            let before = old.get(section).and_then(|keys| keys.get(key));
+            if before != Some(value) {
+                let before = before.map_or("nothing".to_string(), shorten);
+                differences.push(format!("  {section}.{key}: {before} there, {} here", shorten(value)));
+            }
+        }
+    }
+    differences
+}
+
+fn shorten(value: &toml::Value) -> String {
+    let text = value.to_string();
+    if text.len() > 60 { text.chars().take(60).chain(['…']).collect() } else { text }
+}
+
+/// The time now, as in "2026-01-31T23:59:59Z".
+pub fn now() -> String {
+    utc(SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |time| time.as_secs()))
+}
+
+/// A number of seconds after the start of 1970 (Gregorian calendar, days counted in eras of 400 years from March).
+fn utc(seconds: u64) -> String {
+    let (days, second) = (seconds / 86_400 + 719_468, seconds % 86_400);
+    let (era, day) = (days / 146_097, days % 146_097);
+    let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;
+    let day = day - (365 * year + year / 4 - year / 100);
+    let month = (5 * day + 2) / 153;
+    let day = day - (153 * month + 2) / 5 + 1;
+    let (month, year) = if month < 10 { (month + 3, year) } else { (month - 9, year + 1) };
+    let year = era * 400 + year;
+    let (hour, minute, second) = (second / 3600, second / 60 % 60, second % 60);
+    format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::utc;
+
+    #[test]
+    fn dates_are_the_calendars() {
+        for (seconds, date) in [
+            (0, "1970-01-01T00:00:00Z"),
+            (951_782_399, "2000-02-28T23:59:59Z"),
+            (951_782_400, "2000-02-29T00:00:00Z"),
+            (1_709_251_200, "2024-03-01T00:00:00Z"),
+            (4_107_542_399, "2100-02-28T23:59:59Z"),
+            (4_107_542_400, "2100-03-01T00:00:00Z"),
+        ] {
+            assert_eq!(utc(seconds), date);
+        }
+    }
+}

@@ -1,0 +1,193 @@
+//! `metrics.csv`: how every trial came on, generation by generation.
+//!
+//! One line a trial and generation, generation by generation and in each trial by trial. G is in 0..1; `seconds` is
+//! the time trained until the line was complete, earlier sessions of a resumed run included. All but `seconds` is the
+//! same bits on every backend.
+
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
+use std::path::Path;
+
+use sha2::{Digest, Sha256};
+
+use super::disk::{Disk, Output};
+use super::{RecordError, hex};
+use crate::config::{MAX_GENERATIONS, MAX_TRIALS};
+
+pub const HEADER: &str = "trial,generation,best_g,mean_g,champion_g,seconds";
+/// Most bytes in one line.
+const MAX_LINE: u64 = 256;
+
+/// What one generation of one trial came to; every G is in 0..1.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Row {
+    pub arm: usize,
+    pub trial: usize,
+    pub generation: usize,
+    /// The best and the mean team of the generation.
+    pub best_g: f64,
+    pub mean_g: f64,
+    /// The team of every population's best policy.
+    pub champion_g: f64,
+}
+
+/// How far a file has come, to be found there again.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Mark {
+    pub bytes: u64,
+    /// SHA-256 of these bytes.
+    pub sha256: String,
+}
+
+/// A file being written.
+pub struct Writer {
+    output: BufWriter<Output>,
+    bytes: u64,
+    hash: Sha256,
+}
+
+impl Writer {
+    /// Starts a file with its header, in the place of any other.
+    pub fn create(disk: &Disk, path: &Path) -> io::Result<Writer> {
+        let mut writer = Writer { output: BufWriter::new(disk.create(path)?), bytes: 0, hash: Sha256::new() };
+        writer.line(HEADER)?;
+        writer.output.flush()?;
+        Ok(writer)
+    }
+
+    /// Goes on from a mark, dropping what was written after it; none where the file no longer is what was marked.
+    pub fn resume(disk: &Disk, path: &Path, mark: &Mark) -> io::Result<Option<Writer>> {
+        let mut hash = Sha256::new();
+        let mut file = match File::open(path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            file => file?.take(mark.bytes),
+        };
+        let mut chunk = [0; 1 << 14];
+        loop {
+            match file.read(&mut chunk)? {
+                0 => break,
+                read => hash.update(&chunk[..read]),
+            }
+        }
+        if file.limit() > 0 || hex(&hash.clone().finalize()) != mark.sha256 {
+            return Ok(None);
+        }
+        let output = BufWriter::new(disk.append(path, mark.bytes)?);
+        Ok(Some(Writer { output, bytes: mark.bytes, hash }))
+    }
+
+    fn line(&mut self, line: &str) -> io::Result<()> {
+        let line = format!("{line}\n");
+        self.bytes += line.len() as u64;
+        self.hash.update(&line);
+        self.output.write_all(line.as_bytes())
+    }
+
+    /// Adds rows that became complete after so many seconds.
+    pub fn add(&mut self, rows: &[Row], seconds: f64) -> io::Result<()> {
+        rows.iter().try_for_each(|row| {
+            let Row { trial, generation, best_g, mean_g, champion_g, .. } = row;
+            self.line(&format!("{trial},{generation},{best_g},{mean_g},{champion_g},{seconds:.3}"))
+        })
+    }
+
+    /// Hands all lines to the system, so that others can read them.
+    pub fn flush(&mut self) -> io::Result<()> {
+        self.output.flush()
+    }
+
+    /// Where the file stands, and the file, for whoever has to see that this much of it is on the disk.
+    pub fn mark(&mut self) -> io::Result<(Mark, Output)> {
+        self.output.flush()?;
+        let sha256 = hex(&self.hash.clone().finalize());
+        Ok((Mark { bytes: self.bytes, sha256 }, self.output.get_ref().share()?))
+    }
+}
+
+/// The rows of a file one by one, with the seconds of each; stops at the first that is wrong.
+pub struct Rows<R> {
+    source: R,
+    line: usize,
+    done: bool,
+    /// SHA-256 of every line without its seconds.
+    hash: Sha256,
+}
+
+impl<R: BufRead> Rows<R> {
+    /// # Errors
+    /// The first line is not the header.
+    pub fn new(source: R) -> Result<Rows<R>, String> {
+        let mut rows = Rows { source, line: 0, done: false, hash: Sha256::new() };
+        match rows.line()? {
+            Some(header) if header == HEADER => Ok(rows),
+            _ => Err(format!("line 1 is not {HEADER}")),
+        }
+    }
+
+    fn line(&mut self) -> Result<Option<String>, String> {
+        self.line += 1;
+        let mut line = Vec::new();
+        let read = (&mut self.source).take(MAX_LINE).read_until(b'\n', &mut line);
+        if read.map_err(|error| format!("cannot be read: {error}"))? == 0 {
+            return Ok(None);
+        }
+        if line.pop() != Some(b'\n') {
+            return Err(format!("line {} is cut short or longer than {MAX_LINE} bytes", self.line));
+        }
+        let line = String::from_utf8(line).map_err(|_| format!("line {} is not UTF-8 text", self.line))?;
+        let shared = line.rsplit_once(',').map_or("", |(shared, _)| shared);
+        self.hash.update(shared);
+        self.hash.update("\n");
+        Ok(Some(line))
+    }
+
+    fn row(&mut self) -> Result<Option<(Row, f64)>, String> {
+        let Some(line) = self.line()? else { return Ok(None) };
+        let parse = || {
+            let mut fields = line.split(',');
+            let mut field = || fields.next();
+            let row = Row {
+                arm: 0,
+                trial: field()?.parse().ok().filter(|&trial| trial < MAX_TRIALS)?,
+                generation: field()?.parse().ok().filter(|&generation| generation <= MAX_GENERATIONS)?,
+                best_g: share(field()?)?,
+                mean_g: share(field()?)?,
+                champion_g: share(field()?)?,
+            };
+            let seconds = field()?.parse().ok().filter(|seconds: &f64| seconds.is_finite() && *seconds >= 0.0)?;
+            fields.next().is_none().then_some((row, seconds))
+        };
+        parse().map(Some).ok_or_else(|| format!("line {} is not {HEADER} with every G in 0..1", self.line))
+    }
+
+    /// SHA-256 over all that was read, without the seconds.
+    pub fn digest(self) -> Sha256 {
+        self.hash
+    }
+}
+
+fn share(text: &str) -> Option<f64> {
+    text.parse().ok().filter(|share| (0.0..=1.0).contains(share))
+}
+
+impl<R: BufRead> Iterator for Rows<R> {
+    type Item = Result<(Row, f64), String>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.done {
+            return None;
+        }
+        let row = self.row().transpose();
+        self.done = !matches!(row, Some(Ok(_)));
+        row
+    }
+}
+
+/// Opens a run's metrics.
+///
+/// # Errors
+/// No such file, or another first line.
+pub fn open(path: &Path) -> Result<Rows<BufReader<File>>, RecordError> {
+    let file = File::open(path).map_err(RecordError::read(path))?;
+    Rows::new(BufReader::new(file)).map_err(|reason| RecordError::damaged(path, reason))
+}

@@ -1,0 +1,126 @@
+//! `policies.safetensors`: what a run learned.
+//!
+//! One f32 tensor `weights.N` a trial, `[leaders, policies, parameters]`, best policy first in each population, so
+//! that the team of all first policies is the trial's champion; metadata `layers` is the policies' network, "8,10,2".
+//! Other programs may write such files too, also with a single tensor `weights`.
+
+use std::collections::BTreeMap;
+use std::io::{Read, Seek};
+use std::path::Path;
+
+use safetensors::tensor::Dtype;
+
+use super::RecordError;
+use super::disk::Disk;
+use super::tensors::{self, Tensor, TensorFile};
+use crate::config::{Config, MAX_POPULATION};
+use crate::evolve::{MAX_WEIGHT, MIN_WEIGHT};
+use crate::world::{INPUTS, OUTPUTS};
+
+const KIND: &str = "policies 1";
+
+/// Policies of one trial.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Policies {
+    /// How many each leader has.
+    pub policies: usize,
+    /// `[leaders][policies][parameters]`.
+    pub weights: Vec<f32>,
+}
+
+/// Widths of a config's policies, "8,10,2".
+pub fn layers(config: &Config) -> String {
+    let widths = [&[INPUTS], &config.policy.hidden[..], &[OUTPUTS]].concat();
+    widths.iter().map(ToString::to_string).collect::<Vec<_>>().join(",")
+}
+
+/// Writes the policies of all trials of a config, each `[leaders][population][parameters]`.
+///
+/// # Errors
+/// The file cannot be written; the one before it is then still there.
+pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[Vec<f32>]) -> Result<(), RecordError> {
+    let shape = vec![config.learners(), config.learning.population, config.parameters()];
+    let tensor = |(trial, weights)| Tensor::floats(format!("weights.{trial}"), shape.clone(), [weights]);
+    let tensors: Vec<_> = trials.iter().map(Vec::as_slice).enumerate().map(tensor).collect();
+    let metadata = BTreeMap::from([("layers".to_string(), layers(config))]);
+    tensors::write(disk, path, KIND, &metadata, &tensors).map_err(RecordError::write(path))
+}
+
+/// Reads the policies of one trial for a config: tensor `weights.N`, or without a number `weights`, else `weights.0`.
+///
+/// # Errors
+/// No such file, damage, another shape than the config's, or weights that no policy may have.
+pub fn read(path: &Path, config: &Config, trial: Option<usize>) -> Result<Policies, RecordError> {
+    let mut file = tensors::open(path)?;
+    from_file(&mut file, config, trial).map_err(|reason| RecordError::damaged(path, reason))
+}
+
+/// [`read`], from anything.
+///
+/// # Errors
+/// What is wrong, in words.
+pub fn from_source(source: impl Read + Seek, config: &Config, trial: Option<usize>) -> Result<Policies, String> {
+    from_file(&mut TensorFile::open(source)?, config, trial)
+}
+
+/// [`read`], from a file that is open.
+///
+/// # Errors
+/// What is wrong, in words.
+pub fn from_file(
+    file: &mut TensorFile<impl Read + Seek>,
+    config: &Config,
+    trial: Option<usize>,
+) -> Result<Policies, String> {
+    if let Some(kind) = file.kind().filter(|kind| *kind != KIND) {
+        return Err(format!("it holds {kind:?}, not {KIND:?}"));
+    }
+    let name = match trial {
+        None if file.info("weights").is_some() => "weights".to_string(),
+        trial => format!("weights.{}", trial.unwrap_or(0)),
+    };
+    let Some(info) = file.info(&name) else {
+        let mut names = file.names();
+        let more = if names.len() > 8 { ", …" } else { "" };
+        names.truncate(8);
+        return Err(format!("it has no tensor {name}; it has {}{more}", names.join(", ")));
+    };
+    let (leaders, parameters) = (config.learners(), config.parameters());
+    let fits = info.dtype == Dtype::F32
+        && matches!(info.shape[..], [l, p, w] if l == leaders && w == parameters && (1..=MAX_POPULATION).contains(&p));
+    if !fits {
+        return Err(format!(
+            "{name} is {:?} {:?}, but the config needs F32 [{leaders}, 1 to {MAX_POPULATION}, {parameters}] \
+             (leaders, policies, parameters of layers {})",
+            info.dtype,
+            info.shape,
+            layers(config)
+        ));
+    }
+    if let Some(found) = file.metadata("layers").filter(|found| *found != layers(config)) {
+        return Err(format!("its policies have layers {found:?}, but the config's have {:?}", layers(config)));
+    }
+    let shape = info.shape.clone();
+    let mut weights: Vec<f32> = file.read(&name, Dtype::F32, &shape)?;
+    if let Some(index) = admit(&mut weights) {
+        let (policy, parameter) = (index / parameters, index % parameters);
+        return Err(format!(
+            "{name}[{}, {}, {parameter}] is {}, allowed are numbers of size up to {MAX_WEIGHT}",
+            policy / shape[1],
+            policy % shape[1],
+            weights[index]
+        ));
+    }
+    Ok(Policies { policies: shape[1], weights })
+}
+
+/// Makes weights fit for the kernels: those too small for them become 0. Gives the place of one that is too large or
+/// no number.
+pub(super) fn admit(weights: &mut [f32]) -> Option<usize> {
+    weights.iter_mut().position(|weight| {
+        if weight.abs() < MIN_WEIGHT {
+            *weight = 0.0;
+        }
+        !(weight.abs() <= MAX_WEIGHT)
+    })
+}

@@ -1,0 +1,260 @@
+//! One recorded run: a trainer, its folder and its checkpoints together.
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+
+use crate::backend::{Backend, BackendError};
+use crate::config::Config;
+use crate::record::RecordError;
+use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule};
+use crate::record::disk::Disk;
+use crate::record::folder::{self, Folder, METRICS, POLICIES, Run, Start, State, Story};
+use crate::record::metrics::{self, Row};
+use crate::record::policies;
+use crate::trainer::Trainer;
+
+/// How often a run hands its metrics to the system.
+const FLUSH: Duration = Duration::from_secs(1);
+
+/// Why a run could not go on.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    #[error(transparent)]
+    Record(#[from] RecordError),
+    #[error("{error}\ngeneration {generation} could not be played{}", after(saved))]
+    Backend { error: BackendError, generation: usize, saved: Result<(), Box<RunError>> },
+    #[error(
+        "there is no memory for {what}, {bytes} bytes; choose a smaller population, fewer trials or another machine"
+    )]
+    Memory { what: &'static str, bytes: usize },
+}
+
+fn after(saved: &Result<(), Box<RunError>>) -> String {
+    match saved {
+        Ok(()) => {
+            "; all before it is saved: go on with --resume, with --on-device-loss cpu to change to the CPU".into()
+        }
+        Err(error) => format!(", and what came before it could not be saved: {error}"),
+    }
+}
+
+/// What a run runs on, for `run.json`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Machine {
+    /// "cpu" or "gpu".
+    pub backend: String,
+    pub adapter: Option<String>,
+    pub driver: Option<String>,
+    pub threads: usize,
+}
+
+/// What others may want of a run while it runs.
+pub struct Options<'a> {
+    pub schedule: Schedule,
+    /// Set by whoever wants the run to finish its generation, save and stop.
+    pub stop: &'a AtomicBool,
+    /// Set by whoever wants a checkpoint now.
+    pub save: &'a AtomicBool,
+    /// Asked for another backend when one fails.
+    pub instead: &'a mut dyn FnMut(&BackendError) -> Option<(Box<dyn Backend>, Machine)>,
+    /// Told of every generation played.
+    pub watch: &'a mut dyn FnMut(&Progress<'_>),
+}
+
+/// A generation just played.
+pub struct Progress<'a> {
+    /// The generation that plays next.
+    pub generation: usize,
+    /// Rows that became complete.
+    pub rows: &'a [Row],
+}
+
+/// What a run came to.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Results {
+    pub story: Story,
+    /// See [`Folder::digest`].
+    pub digest: String,
+}
+
+/// How a run ended.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Outcome {
+    Done(Results),
+    /// Saved before this generation.
+    Stopped {
+        generation: usize,
+    },
+}
+
+/// A run that was found or made.
+pub enum Opened {
+    /// It has something left to do.
+    Ready(Box<Session>),
+    /// It was done already.
+    Done(Results),
+}
+
+/// A run in its folder.
+pub struct Session {
+    config: Config,
+    folder: Folder,
+    trainer: Trainer,
+    metrics: metrics::Writer,
+    keeper: Keeper,
+    run: Run,
+    /// Time trained in earlier sessions, and the start of this.
+    before: f64,
+    since: Instant,
+}
+
+impl Session {
+    /// Starts or resumes a run; also gives what the user should be told about its folder.
+    ///
+    /// # Errors
+    /// The folder cannot be used (see [`Folder::open`]), or there is no memory for the populations.
+    pub fn open(config: Config, path: &Path, start: Start, disk: Disk) -> Result<(Opened, Vec<String>), RunError> {
+        let (folder, found) = Folder::open(path, start, &config, disk.clone())?;
+        let run = found.run.unwrap_or_else(|| Run::new(&config));
+        if let Some((story, digest)) = found.finished.zip(run.digest.clone()) {
+            return Ok((Opened::Done(Results { story, digest }), found.notes));
+        }
+        // This generation, the next one and a checkpoint; asked for first, since later a refusal would be an abort.
+        let bytes = 3 * config.policy_bytes();
+        Vec::<u8>::new()
+            .try_reserve_exact(bytes)
+            .map_err(|_| RunError::Memory { what: "three times the policies of all trials", bytes })?;
+        let mut trainer = Trainer::new(vec![config.clone()]);
+        let (metrics, before) = match found.checkpoint {
+            Some((Checkpoint { snapshot, seconds, .. }, metrics)) => {
+                if !trainer.restore(snapshot) {
+                    unreachable!("a checkpoint is read in the sizes of its config");
+                }
+                (metrics, seconds)
+            }
+            None => {
+                let path = folder.file(METRICS);
+                (metrics::Writer::create(&disk, &path).map_err(|error| RecordError::Write { path, error })?, 0.0)
+            }
+        };
+        let checkpoints = folder.file(folder::CHECKPOINTS);
+        let keeper = Keeper::new(disk, checkpoints, vec![config.clone()], found.kept, trainer.generation());
+        let since = Instant::now();
+        let session = Session { config, folder, trainer, metrics, keeper, run, before, since };
+        Ok((Opened::Ready(Box::new(session)), found.notes))
+    }
+
+    /// The generation that plays next.
+    pub fn generation(&self) -> usize {
+        self.trainer.generation()
+    }
+
+    /// Trains to the end, or until stopped.
+    ///
+    /// # Errors
+    /// The backend fails (what came before is saved then), or something cannot be written.
+    pub fn train(
+        &mut self,
+        mut backend: Box<dyn Backend>,
+        machine: Machine,
+        options: Options<'_>,
+    ) -> Result<Outcome, RunError> {
+        self.since = Instant::now();
+        self.run.sessions = self.run.sessions.saturating_add(1);
+        self.settle_on(&*backend, machine);
+        self.write_run(State::Running, None)?;
+        let mut flushed = Instant::now();
+        while !self.trainer.is_done() {
+            let rows = match self.trainer.advance(&mut *backend) {
+                Ok(rows) => rows,
+                Err(error) => match (options.instead)(&error) {
+                    Some((other, machine)) => {
+                        backend = other;
+                        self.settle_on(&*backend, machine);
+                        continue;
+                    }
+                    None => {
+                        let generation = self.generation();
+                        return Err(RunError::Backend { error, generation, saved: self.stop().map_err(Box::new) });
+                    }
+                },
+            };
+            let mut in_order = rows;
+            in_order.sort_by_key(|row| (row.generation, row.trial));
+            self.metrics.add(&in_order, self.seconds()).map_err(self.metrics_failed())?;
+            if flushed.elapsed() >= FLUSH {
+                self.metrics.flush().map_err(self.metrics_failed())?;
+                flushed = Instant::now();
+            }
+            (options.watch)(&Progress { generation: self.generation(), rows: &in_order });
+            self.keeper.poll()?;
+            if options.stop.load(Relaxed) && !self.trainer.is_done() {
+                self.stop()?;
+                return Ok(Outcome::Stopped { generation: self.generation() });
+            }
+            let asked = options.save.swap(false, Relaxed);
+            if !self.trainer.is_done() && (asked || self.keeper.is_due(&options.schedule, self.generation())) {
+                self.save()?;
+            }
+        }
+        self.finish().map(Outcome::Done)
+    }
+
+    /// What it runs on from now on.
+    fn settle_on(&mut self, backend: &dyn Backend, machine: Machine) {
+        let Machine { backend: kind, adapter, driver, threads } = machine;
+        let version = env!("CARGO_PKG_VERSION").to_string();
+        let run = Run { version, backend: kind, adapter, driver, threads, ..self.run.clone() };
+        self.run = Run { description: backend.describe(), ..run };
+    }
+
+    /// Starts writing a checkpoint.
+    fn save(&mut self) -> Result<(), RunError> {
+        let since = Instant::now();
+        let (metrics, output) = self.metrics.mark().map_err(self.metrics_failed())?;
+        let bytes = self.config.policy_bytes();
+        let snapshot =
+            self.trainer.snapshot().map_err(|_| RunError::Memory { what: "a checkpoint beside training", bytes })?;
+        let (config, seconds) = (checkpoint::digest(&self.config), self.seconds());
+        Ok(self.keeper.save(Checkpoint { config, seconds, metrics, snapshot }, output, since)?)
+    }
+
+    /// Saves and waits until all is on the disk.
+    fn stop(&mut self) -> Result<(), RunError> {
+        self.keeper.wait()?;
+        if self.keeper.newest() != Some(self.generation()) {
+            self.save()?;
+            self.keeper.wait()?;
+        }
+        self.write_run(State::Stopped, None)
+    }
+
+    /// Writes what came out.
+    fn finish(&mut self) -> Result<Results, RunError> {
+        self.keeper.wait()?;
+        let (_, output) = self.metrics.mark().map_err(self.metrics_failed())?;
+        output.sync().map_err(self.metrics_failed())?;
+        let trials = self.trainer.policies(0);
+        policies::write(&self.folder.disk, &self.folder.file(POLICIES), &self.config, &trials)?;
+        let (story, digest) = self.folder.digest(&self.config, &trials)?;
+        self.write_run(State::Done, Some(digest.clone()))?;
+        Ok(Results { story, digest })
+    }
+
+    fn write_run(&mut self, state: State, digest: Option<String>) -> Result<(), RunError> {
+        let generations = self.generation().min(self.config.learning.generations + 1);
+        let (updated, seconds) = (folder::now(), self.seconds());
+        self.run = Run { state, updated, seconds, generations, digest, ..self.run.clone() };
+        Ok(self.folder.write_run(&self.run)?)
+    }
+
+    fn seconds(&self) -> f64 {
+        self.before + self.since.elapsed().as_secs_f64()
+    }
+
+    fn metrics_failed(&self) -> impl FnOnce(std::io::Error) -> RunError + use<> {
+        let path = self.folder.file(METRICS);
+        move |error| RecordError::Write { path, error }.into()
+    }
+}
