@@ -370,15 +370,17 @@ impl GpuEpisodes {
     ) -> Result<(), DeviceError> {
         let buffers = &self.lanes[lane];
         self.gpu.wait_for(buffers.submitted.clone())?;
-        let share_out = |record: &[u8], moments: &[u8]| {
-            let (record, moments) = (bytemuck::cast_slice(record), bytemuck::cast_slice(moments));
+        let share_out = |record: &[u8], moments: &[Moment]| {
+            let record = bytemuck::cast_slice(record);
             work.shares.par_iter().for_each(|share| done(share, record, moments));
         };
         let record_bytes = (work.record * size_of::<u32>()) as u64;
         let moment_bytes = (work.moments * size_of::<Moment>()) as u64;
         match (&buffers.record_back, &buffers.moments_back) {
             (Some(record), Some(moments)) if trace => self.gpu.mapped(record, 0..record_bytes, |record| {
-                self.gpu.mapped(moments, 0..moment_bytes, |moments| share_out(record, moments))
+                self.gpu.mapped(moments, 0..moment_bytes, |moments| {
+                    share_out(record, bytemuck::cast_slice(moments));
+                })
             })?,
             (Some(record), _) => self.gpu.mapped(record, 0..record_bytes, |record| share_out(record, &[])),
             _ => unreachable!("a batch was submitted"),
