@@ -1,4 +1,5 @@
-// Whole episodes: a workgroup plays some teams from start to end, state in registers and workgroup memory.
+// Whole episodes: a workgroup plays some teams from start to end, state in registers and workgroup memory. Long ones
+// take several dispatches, with the state kept in between.
 //
 // The host puts these constants in front:
 //   WORKGROUP  threads of a workgroup
@@ -173,13 +174,40 @@ fn trace(task: Task, step: u32, me: ptr<function, Agent>) {
     moments[task.moments + (step * task.teams + (*me).team) * agents + (*me).agent] = moment;
 }
 
+// The start of an episode.
+fn begin(task: Task, me: ptr<function, Agent>) {
+    let start = places[task.starts + (*me).agent];
+    (*me).x = start.x;
+    (*me).y = start.y;
+    (*me).hx = world.heading_x;
+    (*me).hy = world.heading_y;
+    (*me).speed = world.speed;
+    for (var leader = 0u; leader < world.leaders && (*me).agent >= world.leaders; leader++) {
+        let pair = ((*me).agent - world.leaders) * world.leaders + leader;
+        record[task.seen + pair * task.teams + (*me).team] = 0u;
+    }
+    if TRACE {
+        trace(task, 0u, me);
+    }
+}
+
+// Where the dispatch before this one left off.
+fn resume(task: Task, me: ptr<function, Agent>) {
+    let state = states[task.states + (*me).team * (world.leaders + world.followers) + (*me).agent];
+    (*me).x = state.x;
+    (*me).y = state.y;
+    (*me).hx = state.hx;
+    (*me).hy = state.hy;
+    (*me).speed = state.speed;
+}
+
 @compute @workgroup_size(WORKGROUP)
 fn episode(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    // A dispatch may hold a few workgroups more than there are tasks; they play the last one's empty share.
+    // A dispatch may hold a few workgroups more than there are tasks; their tasks are empty.
     let index = workgroup.y * workgroups.x + workgroup.x;
     let task = tasks[index];
     world = worlds[task.world];
@@ -189,26 +217,18 @@ fn episode(
     for (var slot = 0u; slot < SLOTS; slot++) {
         var me = seat(slot * WORKGROUP + thread, task.teams);
         if me.plays {
-            let start = places[task.starts + me.agent];
-            me.x = start.x;
-            me.y = start.y;
-            me.hx = world.heading_x;
-            me.hy = world.heading_y;
-            me.speed = world.speed;
-            positions[me.team * agents + me.agent] = start;
-            for (var leader = 0u; leader < world.leaders && me.agent >= world.leaders; leader++) {
-                record[task.seen + ((me.agent - world.leaders) * world.leaders + leader) * task.teams + me.team] = 0u;
+            if task.first == 0u {
+                begin(task, &me);
+            } else {
+                resume(task, &me);
             }
-            if TRACE {
-                trace(task, 0u, &me);
-            }
+            positions[me.team * agents + me.agent] = vec2(me.x, me.y);
         }
         team[slot] = me;
     }
     workgroupBarrier();
 
-    let steps = worlds[task.world].steps;
-    for (var step = 0u; step < steps; step++) {
+    for (var step = task.first; step < task.end; step++) {
         for (var slot = 0u; slot < SLOTS; slot++) {
             var me = team[slot];
             if me.plays {
@@ -232,5 +252,11 @@ fn episode(
         }
         workgroupBarrier();
         couple(task, step, thread);
+    }
+    for (var slot = 0u; slot < SLOTS && task.end < world.steps; slot++) {
+        if team[slot].plays {
+            let me = team[slot];
+            states[task.states + me.team * agents + me.agent] = State(me.x, me.y, me.hx, me.hy, me.speed);
+        }
     }
 }

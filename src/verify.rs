@@ -1,193 +1,174 @@
-//! Whether two backends agree, bit for bit, and where they first do not.
+//! Whether a backend agrees with the CPU, bit for bit: random worlds stage by stage, all of them as one batch, and
+//! short training runs.
 
-use std::fmt;
+use std::ops::Range;
+use std::sync::Mutex;
 
-use crate::backend::{Backend, BackendError, Group, Moment, Trace};
+use crate::backend::compare::{Mismatch, first_mismatch};
+use crate::backend::{Backend, BackendError, Group};
 use crate::config::Config;
 use crate::sample;
+use crate::trainer::{Row, Trainer};
 use crate::world::World;
 
-/// What is compared of a step, in the order in which a step works it out.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Stage {
-    /// The inputs of a leader's policy.
-    Sense,
-    /// What the policy answered.
-    Policy,
-    /// The force on a follower.
-    Follow,
-    /// Position, heading and speed after the step.
-    Move,
-    /// The agents near a POI.
-    Couple,
-    /// How often a follower saw a leader.
-    Influence,
+/// What is compared.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    /// The worlds and what each is called in a report.
+    pub worlds: Vec<(String, Config)>,
+    /// Random teams of each.
+    pub teams: usize,
+    /// Start of the teams' randomness.
+    pub seed: u64,
+    /// Generations of the short training run of the first few worlds.
+    pub generations: usize,
 }
 
-impl fmt::Display for Stage {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Stage::Sense => "sense",
-            Stage::Policy => "policy",
-            Stage::Follow => "follow",
-            Stage::Move => "move",
-            Stage::Couple => "couple",
-            Stage::Influence => "influence",
-        })
+/// Worlds that train for a few generations, all side by side.
+const TRAINED: usize = 8;
+
+impl Plan {
+    /// A spread of random worlds of every kind, degenerate ones among them.
+    pub fn random(seeds: Range<u64>, teams: usize) -> Plan {
+        let seed = seeds.start;
+        let worlds = seeds.map(|seed| (format!("random world {seed}"), sample::world(seed))).collect();
+        Plan { worlds, teams, seed, generations: 3 }
     }
 }
 
-/// The first place where a trace differs from the reference.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Mismatch {
-    pub step: usize,
-    pub team: usize,
-    pub stage: Stage,
-    /// Which number of the stage: "agent 3, input 2".
-    pub place: String,
-    /// Both bit patterns.
-    pub expected: u32,
-    pub found: u32,
-}
-
-impl fmt::Display for Mismatch {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Mismatch { step, team, stage, place, expected, found } = self;
-        write!(f, "stage {stage}, team {team}, {place}, step {step}: expected {expected:#010x}")?;
-        if matches!(stage, Stage::Couple | Stage::Influence) {
-            return write!(f, ", found {found:#010x}");
-        }
-        let (expected, value) = (f32::from_bits(*expected), f32::from_bits(*found));
-        write!(f, " ({expected:?}), found {found:#010x} ({value:?})")
-    }
-}
-
-/// The first difference of two traces of the same group: the earliest step, there the earliest stage, then team.
-pub fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mismatch> {
-    if expected == found && bits(expected) == bits(found) {
-        return None;
-    }
-    let mut first: Option<Mismatch> = None;
-    let mut note = |mismatch: Mismatch| {
-        let key = |m: &Mismatch| (m.step, m.stage, m.team);
-        if first.as_ref().is_none_or(|earlier| key(&mismatch) < key(earlier)) {
-            first = Some(mismatch);
-        }
-    };
-    for (index, (a, b)) in expected.moments.iter().zip(&found.moments).enumerate() {
-        let (agent, team) = (index % expected.agents, index / expected.agents % expected.teams);
-        let step = index / expected.agents / expected.teams;
-        for (field, (&a, &b)) in words(a).iter().zip(words(b)).enumerate() {
-            if a != b {
-                let (stage, name) = FIELDS[field];
-                note(Mismatch { step, team, stage, place: format!("agent {agent}, {name}"), expected: a, found: b });
-            }
-        }
-    }
-    let (pois, set_words) = (world.pois.len(), world.constants.words as usize);
-    for (index, (&a, &b)) in expected.sets.iter().zip(&found.sets).enumerate() {
-        if a != b {
-            let (team, row) = (index / world.set_words(), index % world.set_words());
-            let (step, poi, word) = (row / pois / set_words, row / set_words % pois, row % set_words);
-            let place = format!("POI {poi}, agents from {}", word * 32);
-            note(Mismatch { step: step + 1, team, stage: Stage::Couple, place, expected: a, found: b });
-        }
-    }
-    let pairs = world.leaders() * world.followers();
-    for (index, (&a, &b)) in expected.seen.iter().zip(&found.seen).enumerate() {
-        if a != b {
-            let (team, pair) = (index / pairs, index % pairs);
-            let place = format!("follower {}, leader {}", pair / world.leaders(), pair % world.leaders());
-            note(Mismatch { step: world.steps(), team, stage: Stage::Influence, place, expected: a, found: b });
-        }
-    }
-    first
-}
-
-/// The stage and name of each word of a [`Moment`].
-const FIELDS: [(Stage, &str); 17] = [
-    (Stage::Sense, "POIs back right"),
-    (Stage::Sense, "POIs front right"),
-    (Stage::Sense, "POIs front left"),
-    (Stage::Sense, "POIs back left"),
-    (Stage::Sense, "agents back right"),
-    (Stage::Sense, "agents front right"),
-    (Stage::Sense, "agents front left"),
-    (Stage::Sense, "agents back left"),
-    (Stage::Policy, "turn"),
-    (Stage::Policy, "speed"),
-    (Stage::Follow, "force x"),
-    (Stage::Follow, "force y"),
-    (Stage::Move, "x"),
-    (Stage::Move, "y"),
-    (Stage::Move, "heading x"),
-    (Stage::Move, "heading y"),
-    (Stage::Move, "speed"),
-];
-
-fn words(moment: &Moment) -> &[u32; 17] {
-    bytemuck::cast_ref(moment)
-}
-
-fn bits(trace: &Trace) -> &[u32] {
-    bytemuck::cast_slice(&trace.moments)
-}
-
-/// How much was compared, and what came of it.
+/// How much was compared, and the first difference, if any.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Outcome {
     pub worlds: usize,
     pub agent_steps: u64,
-    /// The world (its seed) and place of the first difference.
-    pub mismatch: Option<(u64, Mismatch)>,
+    /// Where, in words.
+    pub mismatch: Option<String>,
 }
 
-/// Plays `teams` random teams of a world on both backends, stage by stage.
+/// The teams of one world: leader l of team t plays policy t + l, so that every team mixes policies of its own.
+struct Teams {
+    world: World,
+    policies: usize,
+    weights: Vec<f32>,
+    choice: Vec<u32>,
+}
+
+impl Teams {
+    fn new(config: &Config, teams: usize, seed: u64) -> Teams {
+        let world = World::new(config);
+        let policies = teams.min(64);
+        let leaders = world.leaders();
+        let policy = |place: usize| ((place / leaders + place % leaders) % policies) as u32;
+        let choice = (0..teams * leaders).map(policy).collect();
+        Teams { policies, weights: sample::weights(&world, policies, seed), choice, world }
+    }
+
+    fn group(&self) -> Group<'_> {
+        let Teams { world, policies, weights, choice } = self;
+        Group { world, starts: &world.starts, weights, policies: *policies, teams: choice }
+    }
+}
+
+/// Compares a backend with the reference; stops at the first difference.
 ///
 /// # Errors
 /// When a backend fails.
-pub fn compare_world(
+pub fn compare(
+    plan: &Plan,
     reference: &mut dyn Backend,
     backend: &mut dyn Backend,
-    config: &Config,
-    teams: usize,
-    seed: u64,
-) -> Result<(u64, Option<Mismatch>), BackendError> {
-    let world = World::new(config);
-    let policies = teams.min(16);
-    let weights = sample::weights(&world, policies, seed);
-    let leaders = world.leaders();
-    // Every team mixes policies of its own: leader l of team t plays policy t + l.
-    let choice: Vec<u32> =
-        (0..teams * leaders).map(|index| ((index / leaders + index % leaders) % policies) as u32).collect();
-    let group = Group { world: &world, starts: &world.starts, weights: &weights, policies, teams: &choice };
-    let (expected, found) = (reference.trace(&group)?, backend.trace(&group)?);
-    let agent_steps = (teams * world.agents() * world.steps()) as u64;
-    Ok((agent_steps, first_mismatch(&world, &expected, &found)))
-}
-
-/// Compares random worlds of every kind, by seed, until `agent_steps` have been compared; stops at a difference.
-///
-/// # Errors
-/// When a backend fails.
-pub fn compare_random(
-    reference: &mut dyn Backend,
-    backend: &mut dyn Backend,
-    seeds: std::ops::Range<u64>,
-    teams: usize,
     mut progress: impl FnMut(&Outcome),
 ) -> Result<Outcome, BackendError> {
     let mut outcome = Outcome::default();
-    for seed in seeds {
-        let config = sample::world(seed);
-        let (agent_steps, mismatch) = compare_world(reference, backend, &config, teams, seed)?;
-        outcome.worlds += 1;
-        outcome.agent_steps += agent_steps;
-        if let Some(mismatch) = mismatch {
-            outcome.mismatch = Some((seed, mismatch));
-            break;
+    let mut all = Vec::with_capacity(plan.worlds.len());
+    for (name, config) in &plan.worlds {
+        let teams = Teams::new(config, plan.teams, plan.seed);
+        if let Some(mismatch) = compare_stages(&teams, reference, backend)? {
+            outcome.mismatch = Some(format!("{name}: {mismatch}"));
+            return Ok(outcome);
         }
+        outcome.worlds += 1;
+        outcome.agent_steps += (plan.teams * teams.world.agents() * teams.world.steps()) as u64;
         progress(&outcome);
+        all.push(teams);
     }
+    let groups: Vec<Group<'_>> = all.iter().map(Teams::group).collect();
+    if let Some((group, team)) = compare_batch(&groups, reference, backend)? {
+        let (name, _) = &plan.worlds[group];
+        outcome.mismatch = Some(format!("{name}: the record of team {team} differs when all worlds are one batch"));
+        return Ok(outcome);
+    }
+    outcome.agent_steps *= 2;
+    progress(&outcome);
+    outcome.mismatch = compare_training(plan, reference, backend)?;
     Ok(outcome)
+}
+
+fn compare_stages(
+    teams: &Teams,
+    reference: &mut dyn Backend,
+    backend: &mut dyn Backend,
+) -> Result<Option<Mismatch>, BackendError> {
+    let (expected, found) = (reference.trace(&teams.group())?, backend.trace(&teams.group())?);
+    Ok(first_mismatch(&teams.world, &expected, &found))
+}
+
+/// Plays all groups as one batch, without a trace; the first group and team whose record differs.
+fn compare_batch(
+    groups: &[Group<'_>],
+    reference: &mut dyn Backend,
+    backend: &mut dyn Backend,
+) -> Result<Option<(usize, usize)>, BackendError> {
+    let play = |backend: &mut dyn Backend| {
+        let records: Vec<Vec<Mutex<Vec<u32>>>> =
+            groups.iter().map(|group| (0..group.team_count()).map(|_| Mutex::default()).collect()).collect();
+        backend.rollout(groups, &|episode| {
+            // A team that is visited twice has a record twice as long.
+            let mut record = records[episode.group][episode.team].lock().expect("no visit panics");
+            record.extend(episode.sets.iter().chain(episode.seen.iter()));
+        })?;
+        Ok::<_, BackendError>(records)
+    };
+    let (expected, found) = (play(reference)?, play(backend)?);
+    let differs = |(group, team): &(usize, usize)| {
+        let record = |records: &[Vec<Mutex<Vec<u32>>>]| records[*group][*team].lock().expect("no visit panics").clone();
+        record(&expected) != record(&found)
+    };
+    let teams =
+        groups.iter().enumerate().flat_map(|(index, group)| (0..group.team_count()).map(move |team| (index, team)));
+    Ok(teams.into_iter().find(differs))
+}
+
+/// Trains the first few worlds for a few generations side by side.
+fn compare_training(
+    plan: &Plan,
+    reference: &mut dyn Backend,
+    backend: &mut dyn Backend,
+) -> Result<Option<String>, BackendError> {
+    let configs: Vec<Config> = (plan.worlds.iter().take(TRAINED))
+        .map(|(_, config)| {
+            let mut config = config.clone();
+            config.learning.generations = plan.generations;
+            config.learning.trials = config.learning.trials.min(2);
+            config
+        })
+        .collect();
+    let train = |backend: &mut dyn Backend| {
+        let mut trainer = Trainer::new(configs.clone());
+        let mut rows: Vec<Row> = Vec::new();
+        while !trainer.is_done() {
+            rows.extend(trainer.advance(backend)?);
+        }
+        let weights: Vec<Vec<u32>> = (0..configs.len())
+            .map(|arm| trainer.policies(arm).concat().iter().map(|weight| weight.to_bits()).collect())
+            .collect();
+        Ok::<_, BackendError>((rows, weights))
+    };
+    let ((rows, weights), (found_rows, found_weights)) = (train(reference)?, train(backend)?);
+    let name = |arm: usize| plan.worlds[arm].0.as_str();
+    if let Some((a, b)) = rows.iter().zip(&found_rows).find(|(a, b)| a != b) {
+        return Ok(Some(format!("{}: training differs: {a:?}, found {b:?}", name(a.arm))));
+    }
+    let differs = (0..configs.len()).find(|&arm| weights[arm] != found_weights[arm]);
+    Ok(differs.map(|arm| format!("{}: the trained weights differ", name(arm))))
 }

@@ -360,7 +360,8 @@ fn running_out_of_memory_is_an_error() {
 
 #[test]
 fn a_refusal_names_the_device_and_the_probe() {
-    let mismatch = probe::Mismatch { probe: "x*y + z", values: vec![1.5f32.to_bits()], cpu: 1, gpu: 2 }.to_string();
+    let mismatch =
+        probe::Mismatch { probe: "x*y + z".into(), values: vec![1.5f32.to_bits()], cpu: 1, gpu: 2 }.to_string();
     let failures = vec![(Pass::NoContraction, mismatch.clone()), (Pass::Guarded, mismatch)];
     let message = DeviceError::Inexact { adapter: "Some GPU".into(), failures }.to_string();
     for part in ["Some GPU", "x*y + z", "no-contraction", "guarded", "0x00000002", "1.5e0", "--backend cpu"] {

@@ -1,26 +1,241 @@
-//! GPUs against the CPU, bit for bit: stage by stage on random worlds, whole rollouts, and whole training runs.
+//! GPUs against the CPU, bit for bit: stage by stage on random worlds, whole batches, whole training runs; and that
+//! the comparison can fail.
+//!
+//! Every test walks all adapters. What each has caught is said where it stands.
 
 mod common;
 
+use std::mem::offset_of;
+
+use flotilla::backend::compare::Stage;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::device::{self, Request};
-use flotilla::backend::gpu::episode::GpuEpisodes;
-use flotilla::backend::gpu::exact::Pass;
-use flotilla::verify;
+use flotilla::backend::gpu::episode::{GpuEpisodes, State, Task};
+use flotilla::backend::gpu::exact::{self, Pass};
+use flotilla::backend::{Backend, Group, Moment};
+use flotilla::config::{Config, Fitness};
+use flotilla::trainer::Trainer;
+use flotilla::verify::{Outcome, Plan, compare};
+use flotilla::world::{Constants, World};
+use flotilla::{backend::gpu, sample};
 
-fn backend(request: &Request, pass: Pass) -> GpuEpisodes {
-    let gpu = device::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
-    GpuEpisodes::new(gpu).unwrap()
+fn open(request: &Request, pass: Pass) -> GpuEpisodes {
+    GpuEpisodes::new(device::open(Request { pass: Some(pass), ..request.clone() }).unwrap()).unwrap()
 }
 
+fn check(plan: &Plan, mut backend: GpuEpisodes) -> Outcome {
+    compare(plan, &mut Cpu::default(), &mut backend, |_| ()).unwrap()
+}
+
+/// Caught an empty slice of moments that was cast at the wrong alignment in rollouts.
 #[test]
-fn random_worlds_agree_stage_by_stage() {
-    for (request, info) in common::adapters("random_worlds_agree_stage_by_stage") {
+fn random_worlds_agree_under_both_passes() {
+    for (request, info) in common::adapters("random_worlds_agree_under_both_passes") {
         for pass in [Pass::NoContraction, Pass::Guarded] {
-            let outcome =
-                verify::compare_random(&mut Cpu::default(), &mut backend(&request, pass), 0..40, 9, |_| ()).unwrap();
+            let outcome = check(&Plan::random(0..40, 9), open(&request, pass));
             println!("{info}, {pass}: {} worlds, {} agent-steps", outcome.worlds, outcome.agent_steps);
             assert_eq!(outcome.mismatch, None, "{info}, {pass}");
         }
     }
+}
+
+#[test]
+fn checked_shaders_and_default_limits_agree() {
+    for (request, info) in common::adapters("checked_shaders_and_default_limits_agree") {
+        for request in
+            [Request { checked: true, ..request.clone() }, Request { default_limits: true, ..request.clone() }]
+        {
+            let backend = GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap();
+            assert_eq!(check(&Plan::random(100..112, 5), backend).mismatch, None, "{info}, {request:?}");
+        }
+    }
+}
+
+/// The canary of the twins: one constant of one shader changed is found, in the stage that it belongs to.
+#[test]
+fn a_changed_twin_is_named_by_its_stage() {
+    let edits: [(Stage, fn(String) -> String); 6] = [
+        (Stage::Sense, |text| replaced(text, "return 1.0 - root(d2)", "return 1.0000001 - root(d2)")),
+        (Stage::Policy, |text| replaced(text, "14.7163315", "14.716334")),
+        (Stage::Follow, |text| replaced(text, "return push * world.wall_gain", "return push * 1.01 * world.wall_gain")),
+        (Stage::Move, |text| replaced(text, "let scale = 1.5", "let scale = 1.5000001")),
+        (Stage::Couple, |text| {
+            replaced(text, "d2 <= world.observation_radius2", "d2 <= 0.99 * world.observation_radius2")
+        }),
+        (Stage::Influence, |text| replaced(text, "* task.teams + team] += 1u", "* task.teams + team] += 2u")),
+    ];
+    for (request, info) in common::adapters("a_changed_twin_is_named_by_its_stage") {
+        for (stage, edit) in edits {
+            let backend = open(&request, Pass::NoContraction).edited(edit);
+            let mismatch = check(&Plan::random(0..40, 9), backend).mismatch;
+            let named = mismatch.as_ref().is_some_and(|text| text.contains(&format!("stage {stage},")));
+            assert!(named, "{info}: a change of stage {stage} was reported as {mismatch:?}");
+        }
+    }
+}
+
+fn replaced(text: String, from: &str, to: &str) -> String {
+    assert_eq!(text.matches(from).count(), 1, "{from} is there once");
+    text.replace(from, to)
+}
+
+/// The largest worlds: several agents a thread, many words a set, three wide layers.
+#[test]
+fn large_worlds_agree() {
+    let config = |text: &str| Config::parse(text, "large.toml").unwrap();
+    let places = |count: usize, y: f64| -> String {
+        (0..count).map(|i| format!("[{:?}, {:?}],", (i % 40) as f64 * 1.2, y + (i / 40) as f64)).collect()
+    };
+    let crowd = config(&format!(
+        "[world]\nleaders = [{}]\nfollowers = [{}]\npois = [{}]\nsteps = 3\n[policy]\nhidden = [64, 64, 64]",
+        places(300, 5.0),
+        places(724, 14.0),
+        places(256, 25.0)
+    ));
+    let leaders_only = config(&format!(
+        "[world]\nleaders = [{}]\npois = [{}]\nsteps = 3\n[sense]\nagent_range = inf",
+        places(257, 5.0),
+        places(33, 20.0)
+    ));
+    for (request, info) in common::adapters("large_worlds_agree") {
+        let worlds = vec![("crowd".into(), crowd.clone()), ("leaders only".into(), leaders_only.clone())];
+        let plan = Plan { worlds, teams: 2, seed: 0, generations: 0 };
+        let backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap();
+        // Training them would take the software drivers minutes: traces and batches are enough.
+        let plan = Plan { worlds: plan.worlds.into_iter().map(small_population).collect(), ..plan };
+        assert_eq!(check(&plan, backend).mismatch, None, "{info}");
+    }
+}
+
+fn small_population((name, mut config): (String, Config)) -> (String, Config) {
+    (config.learning.population, config.learning.trials) = (2, 1);
+    (name, config)
+}
+
+/// Long episodes take several dispatches. Caught llvmpipe leaving all loops after 65 535 turns.
+#[test]
+fn long_episodes_agree() {
+    let text = "[world]\nleaders = [[10.0, 5.0], [20.0, 5.0]]\nfollowers = [[12.0, 2.0], [8.0, 2.0]]\n\
+                pois = [[10.0, 15.0], [30.0, 40.0]]\nsteps = 3000\n[learning]\npopulation = 2\ntrials = 1";
+    let config = Config::parse(text, "long.toml").unwrap();
+    for (request, info) in common::adapters("long_episodes_agree") {
+        let plan = Plan { worlds: vec![("long".into(), config.clone())], teams: 9, seed: 0, generations: 0 };
+        let backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap();
+        assert_eq!(check(&plan, backend).mismatch, None, "{info}");
+    }
+}
+
+/// Batches are cut to the device's memory; where they are cut must not show.
+#[test]
+fn batches_cut_small_give_the_same_record() {
+    let config = sample::world(3);
+    let world = World::new(&config);
+    let (policies, teams) = (4, 300);
+    let weights = sample::weights(&world, policies, 1);
+    let choice: Vec<u32> = (0..teams * world.leaders()).map(|i| (i * 7 % policies) as u32).collect();
+    let group = Group { world: &world, starts: &world.starts, weights: &weights, policies, teams: &choice };
+    let record = |backend: &mut dyn Backend| {
+        let record = std::sync::Mutex::new(vec![Vec::new(); teams]);
+        backend
+            .rollout(&[group], &|episode| {
+                record.lock().unwrap()[episode.team].extend(episode.sets.iter());
+            })
+            .unwrap();
+        record.into_inner().unwrap()
+    };
+    let expected = record(&mut Cpu::default());
+    for (request, info) in common::adapters("batches_cut_small_give_the_same_record") {
+        for bytes in [1 << 12, 1 << 15, 1 << 28] {
+            let backend = GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap();
+            assert_eq!(record(&mut backend.batched(bytes)), expected, "{info}, batches of {bytes} bytes");
+        }
+    }
+}
+
+/// Several experiments side by side end in the bits of each alone, on the GPU as on the CPU.
+#[test]
+fn training_gives_the_same_metrics_and_weights() {
+    let mut config = Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap();
+    (config.learning.trials, config.learning.generations, config.learning.population) = (2, 4, 20);
+    let mut jittered = Config::parse(include_str!("../configs/chaotic.toml"), "config").unwrap();
+    (jittered.learning.trials, jittered.learning.generations, jittered.learning.population) = (1, 2, 20);
+    (jittered.learning.start_jitter, jittered.learning.episodes_per_team) = (0.5, 3);
+    jittered.learning.fitness = Fitness::Dpp;
+    let train = |backend: &mut dyn Backend, configs: &[Config]| {
+        let mut trainer = Trainer::new(configs.to_vec());
+        let mut rows = Vec::new();
+        while !trainer.is_done() {
+            rows.extend(trainer.advance(backend).unwrap());
+        }
+        let weights: Vec<Vec<Vec<f32>>> = (0..configs.len()).map(|arm| trainer.policies(arm)).collect();
+        (rows, weights)
+    };
+    let both = [config.clone(), jittered.clone()];
+    let (rows, weights) = train(&mut Cpu::default(), &both);
+    assert!(rows.iter().any(|row| row.best_g > 0.0), "nothing was observed: {rows:?}");
+    for (arm, config) in both.iter().enumerate() {
+        assert_eq!(train(&mut Cpu::default(), std::slice::from_ref(config)).1[0], weights[arm]);
+    }
+    for (request, info) in common::adapters("training_gives_the_same_metrics_and_weights") {
+        let mut backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap();
+        assert_eq!(train(&mut backend, &both), (rows.clone(), weights.clone()), "{info}");
+    }
+}
+
+/// The structs of `shaders/lib/layout.wgsl` lie in memory as the host writes them.
+#[test]
+fn structs_lie_alike_on_both_sides() {
+    let (_, text) = gpu::shaders().into_iter().find(|(name, _)| *name == "episode").unwrap();
+    let (module, _) = exact::parse(&text).unwrap();
+    macro_rules! check {
+        ($wgsl:literal, $host:ty, $($field:ident),*) => {
+            let host = [$((stringify!($field), offset_of!($host, $field))),*];
+            let (_, found) = module.types.iter().find(|(_, ty)| ty.name.as_deref() == Some($wgsl)).unwrap();
+            let naga::TypeInner::Struct { members, span } = &found.inner else { panic!("{} is a struct", $wgsl) };
+            let wgsl: Vec<_> =
+                members.iter().map(|member| (member.name.as_deref().unwrap(), member.offset as usize)).collect();
+            assert_eq!(wgsl, host, $wgsl);
+            assert_eq!(*span as usize, size_of::<$host>(), $wgsl);
+        };
+    }
+    check!(
+        "World",
+        Constants,
+        leaders,
+        followers,
+        pois,
+        steps,
+        words,
+        layers,
+        widths,
+        parameters,
+        map_x,
+        map_y,
+        dt,
+        heading_x,
+        heading_y,
+        speed,
+        min_speed,
+        max_speed,
+        max_speed_change,
+        max_turn,
+        max_turn_cos,
+        max_turn_sin,
+        observation_radius2,
+        attraction_radius2,
+        repulsion_radius2,
+        poi_range2,
+        agent_range2,
+        repulsion_radius,
+        attraction_scale,
+        repulsion_scale,
+        wall_gain,
+        poi_share,
+        agent_share,
+        density,
+        inverse_diagonal
+    );
+    check!("Task", Task, world, starts, pois, weights, sets, seen, moments, states, teams, first, end);
+    check!("State", State, x, y, hx, hy, speed);
+    check!("Moment", Moment, inputs, outputs, force, position, heading, speed);
 }

@@ -47,7 +47,20 @@ struct Task {
     sets: u32,
     seen: u32,
     moments: u32,
+    states: u32,
     teams: u32,
+    // The steps that this dispatch plays: from `first` on, before `end`.
+    first: u32,
+    end: u32,
+}
+
+// An agent between two dispatches. `State` in src/backend/gpu/episode.rs.
+struct State {
+    x: f32,
+    y: f32,
+    hx: f32,
+    hy: f32,
+    speed: f32,
 }
 
 // `Moment` in src/backend/mod.rs.
@@ -70,3 +83,5 @@ struct Moment {
 @group(0) @binding(5) var<storage, read_write> record: array<u32>;
 // Of each task `[steps + 1][teams][agents]`; written only where TRACE holds.
 @group(0) @binding(6) var<storage, read_write> moments: array<Moment>;
+// Of each task `[teams][agents]`; used only by episodes of several dispatches.
+@group(0) @binding(7) var<storage, read_write> states: array<State>;

@@ -168,8 +168,8 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
         }
         for lane in 0..lanes {
             let episode = block.episode(lane, 0, first + lane);
-            sets.extend((0..episode.sets.len()).map(|i| episode.sets.get(i)));
-            seen.extend((0..episode.seen.len()).map(|i| episode.seen.get(i)));
+            sets.extend(episode.sets.iter());
+            seen.extend(episode.seen.iter());
         }
     }
     Trace { teams, agents, moments, sets, seen }

@@ -4,6 +4,7 @@ use glam::Vec2;
 
 use crate::world::World;
 
+pub mod compare;
 pub mod cpu;
 pub mod gpu;
 
@@ -48,7 +49,12 @@ pub struct Strided<'a> {
     pub offset: usize,
 }
 
-impl Strided<'_> {
+impl<'a> Strided<'a> {
+    /// All words of this team.
+    pub fn iter(self) -> impl Iterator<Item = u32> + 'a {
+        (0..self.len()).map(move |index| self.get(index))
+    }
+
     #[inline]
     pub fn get(&self, index: usize) -> u32 {
         self.words[index * self.stride + self.offset]

@@ -17,8 +17,10 @@ use crate::run::RunError;
 
 mod backend;
 mod check;
+mod devices;
 mod rollout;
 mod train;
+mod verify;
 
 /// Lists the commands, each with its file, and calls the one that was typed.
 macro_rules! commands {
@@ -44,6 +46,10 @@ commands! {
     Train(train),
     /// Play teams of policies from a file, and score every leader.
     Rollout(rollout),
+    /// Compare every GPU with the CPU, bit for bit.
+    Verify(verify),
+    /// List what can be trained on.
+    Devices(devices),
 }
 
 /// Trains cooperative teams by coevolution on any GPU, with the same bits on a CPU.
@@ -82,6 +88,9 @@ pub enum Error {
     /// Wrong usage that only shows once flags are read together.
     #[error("{0}")]
     Usage(String),
+    /// What was to be equal is not.
+    #[error("{0}")]
+    Different(String),
     /// Stopped by a signal, with everything saved.
     #[error("{0}")]
     Stopped(String),

@@ -199,7 +199,8 @@ struct Trouble {
     error: Option<String>,
 }
 
-/// An opened device whose arithmetic was seen to be exact under `pass`.
+/// An opened device whose arithmetic was seen to be exact under `pass`; a clone is the same device.
+#[derive(Clone)]
 pub struct Gpu {
     pub adapter: AdapterInfo,
     /// What may be asked of the device.
@@ -256,24 +257,26 @@ pub fn open(request: impl Into<Request>) -> Result<Gpu, DeviceError> {
 fn choose(choice: &Choice) -> Result<(wgpu::Adapter, AdapterInfo), DeviceError> {
     let mut found = found();
     let infos: Vec<_> = found.iter().map(|(_, info)| info.clone()).collect();
-    let index = match choice {
+    Ok(found.swap_remove(position(choice, &infos)?))
+}
+
+/// Which of the [`adapters`] is chosen.
+pub fn position(choice: &Choice, infos: &[AdapterInfo]) -> Result<usize, DeviceError> {
+    match choice {
         Choice::Named(name) => {
             let part = name.to_lowercase();
             let by_index = name.parse().ok().filter(|&index: &usize| index < infos.len());
             let by_name = || infos.iter().position(|info| info.name.to_lowercase().contains(&part));
-            match by_index.or_else(by_name) {
-                Some(index) => index,
-                None => return Err(DeviceError::UnknownAdapter { name: name.clone(), found: infos }),
-            }
+            let unknown = || DeviceError::UnknownAdapter { name: name.clone(), found: infos.to_vec() };
+            by_index.or_else(by_name).ok_or_else(unknown)
         }
         // The most wanted adapter is the first.
         Choice::Real if infos.first().is_some_and(|info| !info.kind.is_real()) => {
-            return Err(DeviceError::NoRealAdapter { found: infos });
+            Err(DeviceError::NoRealAdapter { found: infos.to_vec() })
         }
-        Choice::Real | Choice::Any if infos.is_empty() => return Err(DeviceError::NoAdapter),
-        Choice::Real | Choice::Any => 0,
-    };
-    Ok(found.swap_remove(index))
+        Choice::Real | Choice::Any if infos.is_empty() => Err(DeviceError::NoAdapter),
+        Choice::Real | Choice::Any => Ok(0),
+    }
 }
 
 /// How a shader uses a buffer.

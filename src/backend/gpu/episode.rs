@@ -18,10 +18,15 @@ use crate::world::{Constants, World};
 const ROLE: usize = 32;
 /// Workgroup sizes to choose from; every WebGPU device takes them.
 const WORKGROUPS: [usize; 3] = [64, 128, 256];
+/// Tasks, as many as end where a binding may start (their size is no power of two).
+const TASK_ALIGNMENT: usize = BINDING_ALIGNMENT / 4;
 /// Bytes of one buffer that a batch aims for: enough to fill a GPU, small enough to overlap batches.
 const BATCH_BYTES: u64 = 256 << 20;
 /// Offsets within a buffer are u32 words.
 const MAX_OFFSET: u64 = 1 << 33;
+/// Turns of loops that one thread takes in a dispatch, over all loops. Mesa's llvmpipe 22.3 leaves every loop for good
+/// after 65 535, and drivers stop a dispatch that runs for seconds: longer episodes take several dispatches.
+const TURNS: usize = 60_000;
 /// Offsets of bindings are multiples of this on every WebGPU device.
 const BINDING_ALIGNMENT: usize = 256;
 
@@ -36,7 +41,22 @@ pub struct Task {
     pub sets: u32,
     pub seen: u32,
     pub moments: u32,
+    pub states: u32,
     pub teams: u32,
+    /// The steps that a dispatch plays: from `first` on, before `end`.
+    pub first: u32,
+    pub end: u32,
+}
+
+/// An agent between two dispatches (`struct State` in the shader).
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C)]
+pub struct State {
+    pub x: f32,
+    pub y: f32,
+    pub hx: f32,
+    pub hy: f32,
+    pub speed: f32,
 }
 
 /// What a pipeline is compiled for.
@@ -45,7 +65,7 @@ struct Shape {
     workgroup: usize,
     /// Agents a thread plays, one after another.
     slots: usize,
-    /// Widest layer, inputs included.
+    /// Widest layer, inputs included, rounded up to spare compilations.
     widest: usize,
     trace: bool,
 }
@@ -80,6 +100,15 @@ impl Packing {
     }
 }
 
+/// Steps that one dispatch may play, see [`TURNS`].
+fn steps_a_dispatch(world: &World, packing: Packing) -> usize {
+    let Constants { widths, words, .. } = world.constants;
+    let network: u32 = widths.windows(2).map(|w| (w[0] + 2) * w[1]).sum();
+    let agent = world.pois.len() + world.agents() + network as usize + 20;
+    let items = (world.pois.len() * words as usize * packing.teams).div_ceil(packing.workgroup);
+    (TURNS / (packing.slots * agent + items * 33)).max(1)
+}
+
 /// Words of a team's record: sets and counts.
 fn record_words(world: &World) -> usize {
     world.set_words() + world.leaders() * world.followers()
@@ -90,7 +119,18 @@ struct Share {
     group: usize,
     first_team: usize,
     shape: Shape,
+    /// All steps of the episode.
     task: Task,
+    steps_a_dispatch: usize,
+}
+
+impl Share {
+    /// The task's part in one round of dispatches; none when it is done.
+    fn round(&self, round: usize) -> Option<Task> {
+        let first = (round * self.steps_a_dispatch) as u32;
+        let end = self.task.end.min(first + self.steps_a_dispatch as u32);
+        (first < end).then_some(Task { first, end, ..self.task })
+    }
 }
 
 /// Tasks that fit the device's buffers together.
@@ -102,11 +142,14 @@ struct Work {
     weights: usize,
     record: usize,
     moments: usize,
+    states: usize,
 }
 
 /// Sizes of a device that bound a batch.
 #[derive(Clone, Copy, Debug)]
 struct Room {
+    /// Bytes of one buffer that a batch aims for.
+    batch: u64,
     /// Bytes of the largest buffer.
     buffer: u64,
     /// Threads of the largest workgroup.
@@ -118,7 +161,7 @@ struct Room {
 /// # Errors
 /// When one team's record is larger than the device's largest buffer.
 fn plan(groups: &[Group<'_>], trace: bool, room: Room) -> Result<Vec<Work>, BackendError> {
-    let target = room.buffer.min(BATCH_BYTES);
+    let target = room.buffer.min(room.batch);
     let mut batches = vec![Work::default()];
     for (index, group) in groups.iter().enumerate() {
         let world = group.world;
@@ -140,7 +183,8 @@ fn plan(groups: &[Group<'_>], trace: bool, room: Room) -> Result<Vec<Work>, Back
         }
         let packing = Packing::of(world, room.workgroup);
         let teams_a_task = packing.teams.min((target / bytes_a_team.max(1)).max(1) as usize);
-        let widest = world.constants.widths.into_iter().max().unwrap_or(0) as usize;
+        let widest = world.constants.widths.into_iter().max().unwrap_or(0).next_power_of_two() as usize;
+        let steps_a_dispatch = steps_a_dispatch(world, packing);
         let shape = Shape { workgroup: packing.workgroup, slots: packing.slots, widest, trace };
         // A group's world, starts and POIs are stored once a batch.
         let mut stored: Option<(usize, Task)> = None;
@@ -170,13 +214,18 @@ fn plan(groups: &[Group<'_>], trace: bool, room: Room) -> Result<Vec<Work>, Back
                 sets: work.record as u32,
                 seen: (work.record + world.set_words() * teams) as u32,
                 moments: work.moments as u32,
+                states: work.states as u32,
                 teams: teams as u32,
+                end: world.constants.steps,
                 ..base
             };
             work.weights += world.leaders() * world.parameters() * teams;
             work.record += record_words(world) * teams;
             work.moments += moments_a_team * teams;
-            work.shares.push(Share { group: index, first_team, shape, task });
+            if world.steps() > steps_a_dispatch {
+                work.states += world.agents() * teams;
+            }
+            work.shares.push(Share { group: index, first_team, shape, task, steps_a_dispatch });
         }
     }
     batches.retain(|work| !work.shares.is_empty());
@@ -205,6 +254,10 @@ pub struct GpuEpisodes {
     lanes: [Buffers; 2],
     /// Weights on their way to the device.
     staging: Vec<f32>,
+    /// Bytes of one buffer that a batch aims for.
+    batch_bytes: u64,
+    /// Changes the shader's text, so that tests can show that a change is noticed.
+    edit: fn(String) -> String,
 }
 
 /// The device's side of one batch; buffers only grow.
@@ -216,6 +269,7 @@ struct Buffers {
     weights: Option<wgpu::Buffer>,
     record: Option<wgpu::Buffer>,
     moments: Option<wgpu::Buffer>,
+    states: Option<wgpu::Buffer>,
     record_back: Option<wgpu::Buffer>,
     moments_back: Option<wgpu::Buffer>,
     /// What to wait for.
@@ -248,8 +302,27 @@ impl GpuEpisodes {
     /// When the device does not take the episode's bindings.
     pub fn new(gpu: Gpu) -> Result<GpuEpisodes, DeviceError> {
         use Binding::{Read, Write};
-        let layout = gpu.layout("episode", &[Read, Read, Read, Read, Write, Write])?;
-        Ok(GpuEpisodes { gpu, layout, pipelines: HashMap::new(), lanes: Default::default(), staging: Vec::new() })
+        let layout = gpu.layout("episode", &[Read, Read, Read, Read, Write, Write, Write])?;
+        Ok(GpuEpisodes {
+            gpu,
+            layout,
+            pipelines: HashMap::new(),
+            lanes: Default::default(),
+            staging: Vec::new(),
+            batch_bytes: BATCH_BYTES,
+            edit: |text| text,
+        })
+    }
+
+    /// The same with batches of other sizes; no result depends on them.
+    pub fn batched(self, bytes: u64) -> GpuEpisodes {
+        GpuEpisodes { batch_bytes: bytes, ..self }
+    }
+
+    /// The same with a changed shader, for tests that show that a change is noticed.
+    #[doc(hidden)]
+    pub fn edited(self, edit: fn(String) -> String) -> GpuEpisodes {
+        GpuEpisodes { edit, ..self }
     }
 
     /// The device it plays on.
@@ -260,6 +333,7 @@ impl GpuEpisodes {
     fn room(&self) -> Room {
         let limits = &self.gpu.limits;
         Room {
+            batch: self.batch_bytes,
             buffer: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(MAX_OFFSET),
             workgroup: limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x) as usize,
         }
@@ -288,21 +362,26 @@ impl GpuEpisodes {
     fn submit(&mut self, lane: usize, groups: &[Group<'_>], work: &Work, trace: bool) -> Result<(), DeviceError> {
         use wgpu::BufferUsages as Usage;
         self.fill_staging(groups, work);
-        // Each shape's tasks stand together, from where a binding may start.
+        // Round by round, each shape's tasks stand together, from where a binding may start.
         let mut tasks: Vec<Task> = Vec::new();
         let mut dispatches: Vec<(Shape, usize, [u32; 3])> = Vec::new();
         let mut shapes: Vec<Shape> = work.shares.iter().map(|share| share.shape).collect();
         shapes.sort_unstable();
         shapes.dedup();
-        for shape in shapes {
-            tasks.resize(tasks.len().next_multiple_of(BINDING_ALIGNMENT / size_of::<Task>()), Task::default());
+        let rounds = work.shares.iter().map(|share| (share.task.end as usize).div_ceil(share.steps_a_dispatch)).max();
+        for (round, &shape) in (0..rounds.unwrap_or(0)).flat_map(|round| shapes.iter().map(move |shape| (round, shape)))
+        {
+            tasks.resize(tasks.len().next_multiple_of(TASK_ALIGNMENT), Task::default());
             let first = tasks.len();
-            tasks.extend(work.shares.iter().filter(|share| share.shape == shape).map(|share| share.task));
-            let grid = grid(tasks.len() - first, &self.gpu.limits);
-            // The grid's last row may be longer than the tasks: those workgroups play no team.
-            tasks.resize(first + (grid[0] * grid[1]) as usize, Task::default());
-            dispatches.push((shape, first, grid));
-            self.prepare_pipeline(shape)?;
+            tasks
+                .extend(work.shares.iter().filter(|share| share.shape == shape).filter_map(|share| share.round(round)));
+            if tasks.len() > first {
+                let grid = grid(tasks.len() - first, &self.gpu.limits);
+                // The grid's last row may be longer than the tasks: those workgroups play no team.
+                tasks.resize(first + (grid[0] * grid[1]) as usize, Task::default());
+                dispatches.push((shape, first, grid));
+                self.prepare_pipeline(shape)?;
+            }
         }
 
         let gpu = &self.gpu;
@@ -323,6 +402,8 @@ impl GpuEpisodes {
         let weights = upload(&mut buffers.weights, "weights", bytemuck::cast_slice(&self.staging))?;
         let record = grown(gpu, &mut buffers.record, "record", record_bytes, output)?;
         let moments = grown(gpu, &mut buffers.moments, "moments", moment_bytes, output)?;
+        let state_bytes = (work.states * size_of::<State>()) as u64;
+        let states = grown(gpu, &mut buffers.states, "states", state_bytes, output)?;
         let record_back = grown(gpu, &mut buffers.record_back, "record, read back", record_bytes, back)?;
         let moments_back = match trace {
             true => Some(grown(gpu, &mut buffers.moments_back, "moments, read back", moment_bytes, back)?),
@@ -336,9 +417,10 @@ impl GpuEpisodes {
                 offset: (first * size_of::<Task>()) as u64,
                 size: wgpu::BufferSize::new(u64::from(grid[0] * grid[1]) * size_of::<Task>() as u64),
             };
-            let [worlds, places, weights, record, moments] =
-                [&worlds, &places, &weights, record, moments].map(|buffer| buffer.as_entire_buffer_binding());
-            let group = gpu.bind("episode", &self.layout, &[worlds, tasks, places, weights, record, moments])?;
+            let [worlds, places, weights, record, moments, states] =
+                [&worlds, &places, &weights, record, moments, states].map(|buffer| buffer.as_entire_buffer_binding());
+            let group =
+                gpu.bind("episode", &self.layout, &[worlds, tasks, places, weights, record, moments, states])?;
             bound.push((&self.pipelines[&shape], group, grid));
         }
         let submitted = gpu.scoped("episodes", || {
@@ -406,7 +488,7 @@ impl GpuEpisodes {
 
     fn prepare_pipeline(&mut self, shape: Shape) -> Result<(), DeviceError> {
         if let Entry::Vacant(entry) = self.pipelines.entry(shape) {
-            entry.insert(self.gpu.pipeline("episode", &source(shape), "episode", &self.layout)?);
+            entry.insert(self.gpu.pipeline("episode", &(self.edit)(source(shape)), "episode", &self.layout)?);
         }
         Ok(())
     }
@@ -443,7 +525,7 @@ fn source(shape: Shape) -> String {
 pub fn shaders() -> Vec<(&'static str, String)> {
     let shape = |workgroup, slots, widest, trace| source(Shape { workgroup, slots, widest, trace });
     vec![
-        ("episode", shape(64, 1, 10, false)),
+        ("episode", shape(64, 1, 16, false)),
         ("episode, traced", shape(128, 1, 64, true)),
         ("episode, large teams", shape(256, 5, 64, false)),
     ]

@@ -1,16 +1,24 @@
 //! The self-test of a device: small computations whose bits must be the CPU's.
 
+use std::borrow::Cow;
 use std::fmt;
 
 use wgpu::BufferUsages;
 
 use super::device::{Binding, DeviceError, Gpu};
+use super::episode::GpuEpisodes;
+use crate::backend::compare::first_mismatch;
+use crate::backend::cpu::Cpu;
+use crate::backend::{Backend, BackendError, Group};
+use crate::config::Config;
+use crate::sample;
+use crate::world::World;
 
 /// Where a device first differed from the CPU.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Mismatch {
     /// What was computed.
-    pub probe: &'static str,
+    pub probe: Cow<'static, str>,
     /// From which values, in the order `x, y, z, w`.
     pub values: Vec<u32>,
     pub cpu: u32,
@@ -38,7 +46,7 @@ pub type Probe = fn(&Gpu) -> Result<Option<Mismatch>, DeviceError>;
 /// All probes that a pass must survive, the quickest first.
 ///
 /// A new one is a function here: it compiles through `gpu.pipeline`, so that the pass under test applies to it.
-pub const ALL: &[Probe] = &[arithmetic];
+pub const ALL: &[Probe] = &[arithmetic, episode];
 
 /// Computations of `arithmetic`, in the order of `shaders/probe.wgsl`.
 const NAMES: [&str; 36] = [
@@ -99,7 +107,30 @@ fn arithmetic(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
         let expected = expected(&values, item);
         let differs = (0..NAMES.len()).find(|&probe| words[probe] != expected[probe])?;
         let inputs = values[item * 4..][..4].iter().map(|value| value.to_bits()).collect();
-        Some(Mismatch { probe: NAMES[differs], values: inputs, cpu: expected[differs], gpu: words[differs] })
+        Some(Mismatch { probe: NAMES[differs].into(), values: inputs, cpu: expected[differs], gpu: words[differs] })
+    }))
+}
+
+/// A whole episode of the paper's first layout, stage by stage.
+fn episode(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
+    const TEAMS: usize = 8;
+    let config = include_str!("../../../configs/generally_forward.toml");
+    let config = Config::parse(config, "generally_forward.toml").expect("the project's own config");
+    let world = World::new(&config);
+    let weights = sample::weights(&world, TEAMS, 0);
+    let teams: Vec<u32> = (0..TEAMS as u32).flat_map(|team| vec![team; world.leaders()]).collect();
+    let group = Group { world: &world, starts: &world.starts, weights: &weights, policies: TEAMS, teams: &teams };
+    let traced = |error| match error {
+        BackendError::Gpu(error) => error,
+        error => DeviceError::Refused { adapter: gpu.adapter.to_string(), reason: error.to_string() },
+    };
+    let expected = Cpu::default().trace(&group).map_err(traced)?;
+    let found = GpuEpisodes::new(gpu.clone())?.trace(&group).map_err(traced)?;
+    Ok(first_mismatch(&world, &expected, &found).map(|mismatch| Mismatch {
+        probe: format!("an episode, {mismatch}").into(),
+        values: Vec::new(),
+        cpu: mismatch.expected,
+        gpu: mismatch.found,
     }))
 }
 

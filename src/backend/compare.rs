@@ -1,0 +1,132 @@
+//! Where two traces of the same teams first differ.
+
+use std::fmt;
+
+use super::{Moment, Trace};
+use crate::world::World;
+
+/// What is compared of a step, in the order in which a step works it out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Stage {
+    /// The inputs of a leader's policy.
+    Sense,
+    /// What the policy answered.
+    Policy,
+    /// The force on a follower.
+    Follow,
+    /// Position, heading and speed after the step.
+    Move,
+    /// The agents near a POI.
+    Couple,
+    /// How often a follower saw a leader.
+    Influence,
+}
+
+impl fmt::Display for Stage {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Stage::Sense => "sense",
+            Stage::Policy => "policy",
+            Stage::Follow => "follow",
+            Stage::Move => "move",
+            Stage::Couple => "couple",
+            Stage::Influence => "influence",
+        })
+    }
+}
+
+/// The first place where a trace differs from the reference.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Mismatch {
+    pub step: usize,
+    pub team: usize,
+    pub stage: Stage,
+    /// Which number of the stage: "agent 3, input 2".
+    pub place: String,
+    /// Both bit patterns.
+    pub expected: u32,
+    pub found: u32,
+}
+
+impl fmt::Display for Mismatch {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Mismatch { step, team, stage, place, expected, found } = self;
+        write!(f, "stage {stage}, team {team}, {place}, step {step}: expected {expected:#010x}")?;
+        if matches!(stage, Stage::Couple | Stage::Influence) {
+            return write!(f, ", found {found:#010x}");
+        }
+        let (expected, value) = (f32::from_bits(*expected), f32::from_bits(*found));
+        write!(f, " ({expected:?}), found {found:#010x} ({value:?})")
+    }
+}
+
+/// The first difference of two traces of the same group: the earliest step, there the earliest stage, then team.
+pub fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mismatch> {
+    if expected == found && bits(expected) == bits(found) {
+        return None;
+    }
+    let mut first: Option<Mismatch> = None;
+    let mut note = |mismatch: Mismatch| {
+        let key = |m: &Mismatch| (m.step, m.stage, m.team);
+        if first.as_ref().is_none_or(|earlier| key(&mismatch) < key(earlier)) {
+            first = Some(mismatch);
+        }
+    };
+    for (index, (a, b)) in expected.moments.iter().zip(&found.moments).enumerate() {
+        let (agent, team) = (index % expected.agents, index / expected.agents % expected.teams);
+        let step = index / expected.agents / expected.teams;
+        for (field, (&a, &b)) in words(a).iter().zip(words(b)).enumerate() {
+            if a != b {
+                let (stage, name) = FIELDS[field];
+                note(Mismatch { step, team, stage, place: format!("agent {agent}, {name}"), expected: a, found: b });
+            }
+        }
+    }
+    let (pois, set_words) = (world.pois.len(), world.constants.words as usize);
+    for (index, (&a, &b)) in expected.sets.iter().zip(&found.sets).enumerate() {
+        if a != b {
+            let (team, row) = (index / world.set_words(), index % world.set_words());
+            let (step, poi, word) = (row / pois / set_words, row / set_words % pois, row % set_words);
+            let place = format!("POI {poi}, agents from {}", word * 32);
+            note(Mismatch { step: step + 1, team, stage: Stage::Couple, place, expected: a, found: b });
+        }
+    }
+    let pairs = world.leaders() * world.followers();
+    for (index, (&a, &b)) in expected.seen.iter().zip(&found.seen).enumerate() {
+        if a != b {
+            let (team, pair) = (index / pairs, index % pairs);
+            let place = format!("follower {}, leader {}", pair / world.leaders(), pair % world.leaders());
+            note(Mismatch { step: world.steps(), team, stage: Stage::Influence, place, expected: a, found: b });
+        }
+    }
+    first
+}
+
+/// The stage and name of each word of a [`Moment`].
+const FIELDS: [(Stage, &str); 17] = [
+    (Stage::Sense, "POIs back right"),
+    (Stage::Sense, "POIs front right"),
+    (Stage::Sense, "POIs front left"),
+    (Stage::Sense, "POIs back left"),
+    (Stage::Sense, "agents back right"),
+    (Stage::Sense, "agents front right"),
+    (Stage::Sense, "agents front left"),
+    (Stage::Sense, "agents back left"),
+    (Stage::Policy, "turn"),
+    (Stage::Policy, "speed"),
+    (Stage::Follow, "force x"),
+    (Stage::Follow, "force y"),
+    (Stage::Move, "x"),
+    (Stage::Move, "y"),
+    (Stage::Move, "heading x"),
+    (Stage::Move, "heading y"),
+    (Stage::Move, "speed"),
+];
+
+fn words(moment: &Moment) -> &[u32; 17] {
+    bytemuck::cast_ref(moment)
+}
+
+fn bits(trace: &Trace) -> &[u32] {
+    bytemuck::cast_slice(&trace.moments)
+}

@@ -1,0 +1,133 @@
+//! `flotilla verify`: every adapter against the CPU, bit for bit.
+
+use std::path::PathBuf;
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::{Error, print};
+use crate::backend::cpu::Cpu;
+use crate::backend::gpu::device::{self, AdapterInfo, Choice, DeviceError, Request};
+use crate::backend::gpu::episode::GpuEpisodes;
+use crate::backend::gpu::exact::Pass;
+use crate::config::Config;
+use crate::verify::{Outcome, Plan, compare};
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Compare this experiment alone, instead of random worlds of every kind
+    config: Option<PathBuf>,
+    /// Random teams of each world
+    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    teams: u32,
+    /// Random worlds
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..))]
+    worlds: u32,
+    /// Start of all randomness
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u32,
+    /// Only the adapter whose name contains this, or of this number
+    #[arg(long, value_name = "NAME")]
+    adapter: Option<String>,
+    /// Only this pass, instead of all exact ones that the adapter takes; `plain` shows what the passes are for
+    #[arg(long, value_name = "PASS", value_parser = ["no-contraction", "guarded", "plain"])]
+    pass: Option<String>,
+}
+
+/// One line of the table; an error of the device counts as a failure.
+struct Line {
+    adapter: String,
+    pass: Pass,
+    result: Result<Outcome, Error>,
+}
+
+impl Line {
+    fn failed(&self) -> bool {
+        !matches!(&self.result, Ok(Outcome { mismatch: None, .. }))
+    }
+}
+
+/// Prints a table of adapters and passes, and after it what differs.
+pub fn run(args: Args) -> Result<(), Error> {
+    let plan = plan(&args)?;
+    let adapters = adapters(args.adapter.as_deref())?;
+    let mut lines = Vec::new();
+    for (choice, info) in adapters {
+        for pass in passes(args.pass.as_deref(), &info) {
+            let request = Request { pass: Some(pass), ..choice.clone().into() };
+            lines.push(Line { adapter: info.to_string(), pass, result: verify(&plan, request, &info) });
+        }
+    }
+    let mut text = format!("{:<15} {:>7} {:>13} {:<10} adapter\n", "pass", "worlds", "agent-steps", "result");
+    for line in &lines {
+        let (worlds, agent_steps) =
+            line.result.as_ref().map_or((0, 0), |outcome| (outcome.worlds, outcome.agent_steps));
+        let result = if line.failed() { "DIFFERENT" } else { "equal" };
+        text += &format!("{:<15} {worlds:>7} {agent_steps:>13} {result:<10} {}\n", line.pass, line.adapter);
+    }
+    for line in lines.iter().filter(|line| line.failed()) {
+        let what = match &line.result {
+            Ok(outcome) => outcome.mismatch.clone().unwrap_or_default(),
+            Err(error) => error.to_string(),
+        };
+        text += &format!("\n{}, {} pass:\n  {what}\n", line.adapter, line.pass);
+    }
+    print(&text)?;
+    match lines.iter().filter(|line| line.failed()).count() {
+        0 => Ok(()),
+        failed => Err(Error::Different(format!(
+            "{failed} of {} comparisons found other bits than the CPU's; until that is mended, use --backend cpu",
+            lines.len()
+        ))),
+    }
+}
+
+fn plan(args: &Args) -> Result<Plan, Error> {
+    let (seed, teams) = (u64::from(args.seed), args.teams as usize);
+    Ok(match &args.config {
+        None => Plan::random(seed..seed + u64::from(args.worlds), teams),
+        Some(path) => {
+            let worlds = vec![(path.display().to_string(), Config::load(path)?)];
+            Plan { worlds, teams, seed, generations: 5 }
+        }
+    })
+}
+
+/// The adapters to verify, each with what opens it.
+fn adapters(name: Option<&str>) -> Result<Vec<(Choice, AdapterInfo)>, Error> {
+    let found = device::adapters();
+    let all = found.iter().cloned().enumerate().map(|(index, info)| (Choice::Named(index.to_string()), info));
+    match name {
+        Some(name) => {
+            let named = Choice::Named(name.into());
+            let index = device::position(&named, &found)?;
+            Ok(vec![(named, found[index].clone())])
+        }
+        None if found.is_empty() => Err(DeviceError::NoAdapter.into()),
+        None => Ok(all.collect()),
+    }
+}
+
+fn passes(name: Option<&str>, info: &AdapterInfo) -> Vec<Pass> {
+    let all = [Pass::NoContraction, Pass::Guarded, Pass::Plain];
+    match name {
+        Some(name) => all.into_iter().filter(|pass| pass.to_string() == name).collect(),
+        None if info.backend == "vulkan" => vec![Pass::NoContraction, Pass::Guarded],
+        None => vec![Pass::Guarded],
+    }
+}
+
+fn verify(plan: &Plan, request: Request, info: &AdapterInfo) -> Result<Outcome, Error> {
+    let pass = request.pass.map_or_else(String::new, |pass| format!(", {pass} pass"));
+    let bar = ProgressBar::new(plan.worlds.len() as u64).with_message(format!("{}{pass}", info.name));
+    bar.set_style(
+        ProgressStyle::with_template("{msg}: {pos}/{len} worlds {wide_bar} {eta}").expect("a valid template"),
+    );
+    let gpu = device::open(request)?;
+    if let Some(mismatch) = gpu.self_test()? {
+        return Ok(Outcome { mismatch: Some(mismatch.to_string()), ..Outcome::default() });
+    }
+    let mut gpu = GpuEpisodes::new(gpu)?;
+    let outcome = compare(plan, &mut Cpu::default(), &mut gpu, |outcome| bar.set_position(outcome.worlds as u64))?;
+    bar.finish_and_clear();
+    Ok(outcome)
+}
