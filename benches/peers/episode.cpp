@@ -232,9 +232,11 @@ int main(int argc, char** argv) {
         for (float value : values) sum += value;
         return sum / values.size();
     };
+    double mean_g = mean(g), variance = 0;
+    for (float value : g) variance += (value - mean_g) * (value - mean_g) / teams;
     std::sort(rates.begin(), rates.end());
     double median = (rates[(repeats - 1) / 2] + rates[repeats / 2]) / 2;
     std::printf("{\"peer\": \"c++\", \"layout\": \"%s\", \"teams\": %d, \"agents\": %d, \"steps\": %d, \"team_steps_per_s\": %.1f, "
-                "\"best_team_steps_per_s\": %.1f, \"mean_g\": %.6f, \"mean_d\": %.6f, \"mean_df\": %.6f, \"threads\": %d}\n",
-                argv[1], teams, w.agents, w.steps, median, rates.back(), mean(g), mean(d), mean(df), omp_get_max_threads());
+                "\"best_team_steps_per_s\": %.1f, \"mean_g\": %.6f, \"sd_g\": %.6f, \"mean_d\": %.6f, \"mean_df\": %.6f, \"threads\": %d}\n",
+                argv[1], teams, w.agents, w.steps, median, rates.back(), mean_g, std::sqrt(variance), mean(d), mean(df), omp_get_max_threads());
 }

@@ -188,6 +188,7 @@ def main():
         compile_seconds, (g, d, df) = timed(lambda: rollout(weights))
         seconds = [timed(lambda: rollout(weights))[0] for _ in range(repeats)]
         prefix, scores = "", {"mean_g": g, "mean_d": d, "mean_df": df}
+        line["sd_g"] = round(float(jnp.std(g)), 6)
     rates = [teams * world.steps / elapsed for elapsed in seconds]
     line[prefix + "team_steps_per_s"] = round(statistics.median(rates), 1)
     line["best_" + prefix + "team_steps_per_s"] = round(max(rates), 1)

@@ -189,17 +189,18 @@ def paper(arguments):
 def random_teams(arguments):
     world = make_world(arguments.rollout)
     random, chunk = np.random.default_rng(arguments.seed), 512
-    rates, sums = [], np.zeros(3)
+    rates = []
     weights = random.standard_normal((arguments.teams, world.leaders, WEIGHTS), np.float32)
     chunks = [np.ascontiguousarray(weights[at : at + chunk].transpose(1, 2, 0)) for at in range(0, len(weights), chunk)]
     for _ in range(arguments.repeats):
         begin = time.perf_counter()
         scores = [rollout(world, part) for part in chunks]
         rates.append(arguments.teams * world.steps / (time.perf_counter() - begin))
-    sums = [np.concatenate(score, axis=-1).mean() for score in zip(*scores)]
+    g, d, df = (np.concatenate(score, axis=-1) for score in zip(*scores))
     line = {"peer": "numpy", "layout": arguments.rollout, "teams": arguments.teams, "agents": world.agents, "steps": world.steps}
     line |= {"team_steps_per_s": round(statistics.median(rates), 1), "best_team_steps_per_s": round(max(rates), 1)}
-    line |= {name: round(float(mean), 6) for name, mean in zip(("mean_g", "mean_d", "mean_df"), sums)}
+    figures = {"mean_g": g.mean(), "sd_g": g.std(), "mean_d": d.mean(), "mean_df": df.mean()}
+    line |= {name: round(float(figure), 6) for name, figure in figures.items()}
     print(json.dumps(line | {"threads": 1}))
 
 
