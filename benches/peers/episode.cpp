@@ -20,7 +20,7 @@
 struct Team {
     std::vector<float> x, y, hx, hy, speed;         // state: position, heading (a unit vector), speed
     std::vector<float> turn, wanted_speed;          // what each agent decided in this step
-    std::vector<int> seen;                          // [followers][leaders]: at how many steps the follower saw the leader
+    std::vector<int> seen;                          // [followers][leaders]: steps at which the follower saw the leader
     std::vector<uint32_t> sets;                     // [steps][pois]: who was near, a bit an agent
 
     explicit Team(const World& w)
@@ -51,11 +51,11 @@ inline void sense(float rx, float ry, float hx, float hy, float range, float* qu
 }
 
 void lead(const World& w, Team& team, int i, const float* weights) {
-    float inputs[INPUTS] = {};
+    float x = team.x[i], y = team.y[i], inputs[INPUTS] = {};
     for (int p = 0; p < w.pois; ++p)
-        sense(w.poi_x[p] - team.x[i], w.poi_y[p] - team.y[i], team.hx[i], team.hy[i], 1e30f, inputs);
+        sense(w.poi_x[p] - x, w.poi_y[p] - y, team.hx[i], team.hy[i], 1e30f, inputs);
     for (int j = 0; j < w.agents; ++j)
-        if (j != i) sense(team.x[j] - team.x[i], team.y[j] - team.y[i], team.hx[i], team.hy[i], AGENT_RANGE, inputs + 4);
+        if (j != i) sense(team.x[j] - x, team.y[j] - y, team.hx[i], team.hy[i], AGENT_RANGE, inputs + 4);
     for (int k = 0; k < 4; ++k) {
         inputs[k] /= w.pois;
         inputs[4 + k] /= w.agents;
@@ -236,7 +236,9 @@ int main(int argc, char** argv) {
     for (float value : g) variance += (value - mean_g) * (value - mean_g) / teams;
     std::sort(rates.begin(), rates.end());
     double median = (rates[(repeats - 1) / 2] + rates[repeats / 2]) / 2;
-    std::printf("{\"peer\": \"c++\", \"layout\": \"%s\", \"teams\": %d, \"agents\": %d, \"steps\": %d, \"team_steps_per_s\": %.1f, "
-                "\"best_team_steps_per_s\": %.1f, \"mean_g\": %.6f, \"sd_g\": %.6f, \"mean_d\": %.6f, \"mean_df\": %.6f, \"threads\": %d}\n",
-                argv[1], teams, w.agents, w.steps, median, rates.back(), mean_g, std::sqrt(variance), mean(d), mean(df), omp_get_max_threads());
+    std::printf("{\"peer\": \"c++\", \"layout\": \"%s\", \"teams\": %d, \"agents\": %d, \"steps\": %d, ", argv[1], teams,
+                w.agents, w.steps);
+    std::printf("\"team_steps_per_s\": %.1f, \"best_team_steps_per_s\": %.1f, ", median, rates.back());
+    std::printf("\"mean_g\": %.6f, \"sd_g\": %.6f, \"mean_d\": %.6f, \"mean_df\": %.6f, \"threads\": %d}\n", mean_g,
+                std::sqrt(variance), mean(d), mean(df), omp_get_max_threads());
 }

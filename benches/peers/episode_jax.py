@@ -17,7 +17,9 @@ parser.add_argument("layout", choices=["generally_forward", "strictly_forward", 
 parser.add_argument("teams", type=int)
 parser.add_argument("repeats", type=int)
 parser.add_argument("seed", type=int, nargs="?", default=0)
-parser.add_argument("--generation", action="store_true", help="time whole generations: teams, episodes, D, selection, mutation")
+parser.add_argument(
+    "--generation", action="store_true", help="time whole generations: teams, episodes, D, selection, mutation"
+)
 parser.add_argument("--platform", help="the JAX platform to run on")
 arguments = parser.parse_args()
 if arguments.platform:

@@ -83,7 +83,9 @@ def rollout(world, weights):
             seen += attracted[:, :L]
             near_count, count = near.sum(1), attracted.sum(1)
             near_scale = np.float32(REPULSION_GAIN / REPULSION_RADIUS) / np.maximum(near_count, 1).astype(np.float32)
-            far_scale = np.float32(ATTRACTION_GAIN / ATTRACTION_RADIUS) / np.maximum(count - near_count, 1).astype(np.float32)
+            far_scale = np.float32(ATTRACTION_GAIN / ATTRACTION_RADIUS) / np.maximum(count - near_count, 1).astype(
+                np.float32
+            )
             far = attracted & ~near
             forces, walls = [], []
             for r, at in ((rx, x), (ry, y)):
@@ -175,14 +177,27 @@ def paper(arguments):
                 row["mean_curve"] = [round(float(value), 4) for value in curves.mean(0)]
                 row["sd_curve"] = [round(float(value), 4) for value in curves.std(0)]
                 rows.append(row)
-                marks = " ".join(f"{g}: {curves[:, g].mean():.2f}±{curves[:, g].std():.2f}" for g in (0, 5, 10, 20, 30, 40, 100) if g <= generations)
+                marks = " ".join(
+                    f"{g}: {curves[:, g].mean():.2f}±{curves[:, g].std():.2f}"
+                    for g in (0, 5, 10, 20, 30, 40, 100)
+                    if g <= generations
+                )
                 if not arguments.json:
-                    print(f"{layout:18} {paradigm:15} {fitness:2}  best team, POIs of {len(world.pois)}, by generation: {marks}", flush=True)
+                    print(
+                        f"{layout:18} {paradigm:15} {fitness:2}  best team, POIs of {len(world.pois)}, by generation: {marks}",
+                        flush=True,
+                    )
             if not arguments.json:
                 print(f"{layout:18} {paradigm:15} {elapsed:.2f} s", flush=True)
     # Generation 0 only plays, every later one also selects first: generations + 1 episodes.
     estimate = seconds * (arguments.generations + 1) / (generations + 1)
-    summary = {"peer": "numpy", "trials": arguments.trials, "generations": generations, "seconds": round(seconds, 3), "paper_seconds": round(estimate, 2)}
+    summary = {
+        "peer": "numpy",
+        "trials": arguments.trials,
+        "generations": generations,
+        "seconds": round(seconds, 3),
+        "paper_seconds": round(estimate, 2),
+    }
     print(json.dumps(summary | {"rows": rows}) if arguments.json else json.dumps(summary))
 
 
@@ -197,7 +212,13 @@ def random_teams(arguments):
         scores = [rollout(world, part) for part in chunks]
         rates.append(arguments.teams * world.steps / (time.perf_counter() - begin))
     g, d, df = (np.concatenate(score, axis=-1) for score in zip(*scores))
-    line = {"peer": "numpy", "layout": arguments.rollout, "teams": arguments.teams, "agents": world.agents, "steps": world.steps}
+    line = {
+        "peer": "numpy",
+        "layout": arguments.rollout,
+        "teams": arguments.teams,
+        "agents": world.agents,
+        "steps": world.steps,
+    }
     line |= {"team_steps_per_s": round(statistics.median(rates), 1), "best_team_steps_per_s": round(max(rates), 1)}
     figures = {"mean_g": g.mean(), "sd_g": g.std(), "mean_d": d.mean(), "mean_df": df.mean()}
     line |= {name: round(float(figure), 6) for name, figure in figures.items()}

@@ -69,7 +69,9 @@ def contenders(options, folder):
 
     def flotilla():
         if not options.flotilla.exists():
-            raise Unavailable(f"no {options.flotilla}: build it with `cargo build --release`, or name it with --flotilla")
+            raise Unavailable(
+                f"no {options.flotilla}: build it with `cargo build --release`, or name it with --flotilla"
+            )
         flags = ["--teams", options.teams, "--backend", options.backend, "--json"]
         return lambda layout, _: [options.flotilla, "bench", ROOT / "configs" / f"{layout}.toml", *flags]
 
@@ -81,7 +83,9 @@ def contenders(options, folder):
     def cuda():
         if shutil.which("nvidia-smi") is None:
             raise Unavailable("no NVIDIA GPU here")
-        binary = build("nvcc", ["-std=c++17", "-O3", "-arch=native", "--use_fast_math"], "episode.cu", folder / "episode_cuda")
+        binary = build(
+            "nvcc", ["-std=c++17", "-O3", "-arch=native", "--use_fast_math"], "episode.cu", folder / "episode_cuda"
+        )
         return lambda layout, seed: [binary, layout, options.teams, options.repeats, seed]
 
     def numpy():
@@ -160,11 +164,15 @@ def table(layout, results, options):
         print(f"\n{layout}, {options.teams} teams; flotilla on {ours[0].get('backend')} ({ours[0].get('adapter')})\n")
     else:
         print(f"\n{layout}, {options.teams} teams; without flotilla\n")
-    print("| | rollout, team-steps/s | flotilla is × | generation, team-steps/s | flotilla is × | mean G of random teams |")
+    print(
+        "| | rollout, team-steps/s | flotilla is × | generation, team-steps/s | flotilla is × | mean G of random teams |"
+    )
     print("|---|---|---|---|---|---|")
     for name, lines in results.items():
         times = ["", ""] if name == "flotilla" else [ratio(ours, lines, key) for key in (ROLLOUT, GENERATION)]
-        print(f"| {name} | {rate(lines, ROLLOUT)} | {times[0]} | {rate(lines, GENERATION)} | {times[1]} | {mean_g(lines)} |")
+        print(
+            f"| {name} | {rate(lines, ROLLOUT)} | {times[0]} | {rate(lines, GENERATION)} | {times[1]} | {mean_g(lines)} |"
+        )
     sys.stdout.flush()
 
 
@@ -173,7 +181,16 @@ def paper(options):
     ours, theirs = [], []
     for number in range(options.rounds):
         with tempfile.TemporaryDirectory() as out:
-            command = [options.flotilla, "paper", "--trials", 5, "--backend", options.backend, "--out", Path(out) / "paper"]
+            command = [
+                options.flotilla,
+                "paper",
+                "--trials",
+                5,
+                "--backend",
+                options.backend,
+                "--out",
+                Path(out) / "paper",
+            ]
             begin = time.perf_counter()
             call(command)
             ours.append(time.perf_counter() - begin)
@@ -191,7 +208,9 @@ def main():
     parser.add_argument("--layouts", default="generally_forward,chaotic", help="names with commas between them")
     parser.add_argument("--teams", type=int, default=4096)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--repeats", type=int, default=3, help="rollouts a peer times in one round; their median counts")
+    parser.add_argument(
+        "--repeats", type=int, default=3, help="rollouts a peer times in one round; their median counts"
+    )
     parser.add_argument("--backend", default="auto", help="flotilla's backend: auto, cpu or gpu")
     parser.add_argument("--flotilla", type=Path, default=ROOT / "target" / "release" / "flotilla")
     parser.add_argument("--python", default=sys.executable, help="an interpreter with JAX and NumPy")
