@@ -177,14 +177,11 @@ def paper(arguments):
                 row["mean_curve"] = [round(float(value), 4) for value in curves.mean(0)]
                 row["sd_curve"] = [round(float(value), 4) for value in curves.std(0)]
                 rows.append(row)
-                marks = " ".join(
-                    f"{g}: {curves[:, g].mean():.2f}±{curves[:, g].std():.2f}"
-                    for g in (0, 5, 10, 20, 30, 40, 100)
-                    if g <= generations
-                )
+                shown = sorted({g for g in (0, 5, 10, 20, 30, 40) if g <= generations} | {generations})
+                marks = " ".join(f"{g}: {curves[:, g].mean():.2f}±{curves[:, g].std():.2f}" for g in shown)
                 if not arguments.json:
                     print(
-                        f"{layout:18} {paradigm:15} {fitness:2}  best team, POIs of {len(world.pois)}, by generation: {marks}",
+                        f"{layout:18} {paradigm:15} {fitness:2}  best team, POIs of {len(world.pois)}: {marks}",
                         flush=True,
                     )
             if not arguments.json:
