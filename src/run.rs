@@ -49,6 +49,9 @@ pub struct Machine {
     pub threads: usize,
 }
 
+/// A backend and what it is.
+pub type Player = (Box<dyn Backend>, Machine);
+
 /// What others may want of a run while it runs.
 pub struct Options<'a> {
     pub schedule: Schedule,
@@ -57,7 +60,7 @@ pub struct Options<'a> {
     /// Set by whoever wants a checkpoint now.
     pub save: &'a AtomicBool,
     /// Asked for another backend when one fails.
-    pub instead: &'a mut dyn FnMut(&BackendError) -> Option<(Box<dyn Backend>, Machine)>,
+    pub instead: &'a mut dyn FnMut(&BackendError) -> Option<Player>,
     /// Told of every generation played.
     pub watch: &'a mut dyn FnMut(&Progress<'_>),
 }
@@ -96,13 +99,13 @@ pub enum Opened {
     Done(Results),
 }
 
-/// A run in its folder.
+/// A run in its folder, whose lock is the last to go.
 pub struct Session {
     config: Config,
-    folder: Folder,
     trainer: Trainer,
     metrics: metrics::Writer,
     keeper: Keeper,
+    folder: Folder,
     run: Run,
     /// Time trained in earlier sessions, and the start of this.
     before: f64,
@@ -154,12 +157,7 @@ impl Session {
     ///
     /// # Errors
     /// The backend fails (what came before is saved then), or something cannot be written.
-    pub fn train(
-        &mut self,
-        mut backend: Box<dyn Backend>,
-        machine: Machine,
-        options: Options<'_>,
-    ) -> Result<Outcome, RunError> {
+    pub fn train(&mut self, (mut backend, machine): Player, options: Options<'_>) -> Result<Outcome, RunError> {
         self.since = Instant::now();
         self.run.sessions = self.run.sessions.saturating_add(1);
         self.settle_on(&*backend, machine);
@@ -209,8 +207,9 @@ impl Session {
         self.run = Run { description: backend.describe(), ..run };
     }
 
-    /// Starts writing a checkpoint.
+    /// Starts writing a checkpoint, once the one before is written: there is memory for one.
     fn save(&mut self) -> Result<(), RunError> {
+        self.keeper.wait()?;
         let since = Instant::now();
         let (metrics, output) = self.metrics.mark().map_err(self.metrics_failed())?;
         let bytes = self.config.policy_bytes();

@@ -1,20 +1,16 @@
 //! Opens what episodes are played on.
 
 use super::{BackendChoice, Error, RunOptions};
-use crate::backend::Backend;
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu::device::{self, Choice, DeviceError};
 use crate::backend::gpu::episode::GpuEpisodes;
-use crate::run::Machine;
-
-/// A backend, and what it is for `run.json`.
-pub type Opened = (Box<dyn Backend>, Machine);
+use crate::run::{Machine, Player};
 
 /// Opens the backend that was asked for; `--threads` holds for the whole process.
 ///
 /// # Errors
 /// There is no such backend here, or no threads.
-pub fn open(options: &RunOptions) -> Result<Opened, Error> {
+pub fn open(options: &RunOptions) -> Result<Player, Error> {
     start_threads(options)?;
     let named = options.adapter.clone().map(Choice::Named);
     match (options.backend, named) {
@@ -45,7 +41,7 @@ pub fn start_threads(options: &RunOptions) -> Result<(), Error> {
     started.map_err(|error| Error::Usage(format!("--threads {threads} cannot be started: {error}")))
 }
 
-fn gpu(choice: Choice) -> Result<Opened, DeviceError> {
+fn gpu(choice: Choice) -> Result<Player, DeviceError> {
     let backend = GpuEpisodes::new(device::open(choice)?)?;
     let adapter = &backend.gpu().adapter;
     let machine = Machine {
@@ -58,7 +54,7 @@ fn gpu(choice: Choice) -> Result<Opened, DeviceError> {
 }
 
 /// The backend that is always there.
-pub fn cpu() -> Opened {
+pub fn cpu() -> Player {
     let machine = Machine { backend: "cpu".into(), threads: rayon::current_num_threads(), ..Machine::default() };
     (Box::new(Cpu::default()), machine)
 }

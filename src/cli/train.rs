@@ -126,7 +126,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         instead: &mut instead,
         watch: &mut |progress| ticker.tick(progress),
     };
-    let outcome = session.train(backend, machine, options);
+    let outcome = session.train((backend, machine), options);
     ticker.clear();
     match outcome? {
         Outcome::Done(results) => {

@@ -133,11 +133,11 @@ impl Checkpoint {
         for (arm, config) in configs.iter().enumerate() {
             let shapes = Shapes::of(config);
             let mut floats = |name: String, shape: &[usize]| -> Result<Vec<Vec<f32>>, String> {
-                let mut all: Vec<f32> = file.read(&name, Dtype::F32, shape)?;
-                if admit(&mut all).is_some() {
-                    return Err(format!("{name} has numbers that cannot be"));
+                let mut trials: Vec<Vec<f32>> = file.read(&name, Dtype::F32, shape, shape[0])?;
+                match trials.iter_mut().any(|numbers| admit(numbers).is_some()) {
+                    true => Err(format!("{name} has numbers that cannot be")),
+                    false => Ok(trials),
                 }
-                Ok(all.chunks_exact(shape[1..].iter().product()).map(<[f32]>::to_vec).collect())
             };
             snapshot.weights.push(floats(format!("weights.{arm}"), &shapes.weights)?);
             snapshot.fitness.push(floats(format!("fitness.{arm}"), &shapes.fitness)?);
@@ -145,7 +145,7 @@ impl Checkpoint {
             // An arm's rows wait from its first generation until its champions have played.
             let waiting = (1..=config.learning.generations + 1).contains(&generation);
             let pending: Vec<[f64; 2]> = match waiting {
-                true => file.read(&name, Dtype::F64, &[config.learning.trials, 2])?,
+                true => file.read(&name, Dtype::F64, &[config.learning.trials, 2], 1)?.pop().unwrap_or_default(),
                 false => vec![],
             };
             if pending.iter().flatten().any(|share| !(0.0..=1.0).contains(share)) {

@@ -101,7 +101,7 @@ pub fn from_file(
         return Err(format!("its policies have layers {found:?}, but the config's have {:?}", layers(config)));
     }
     let shape = info.shape.clone();
-    let mut weights: Vec<f32> = file.read(&name, Dtype::F32, &shape)?;
+    let mut weights: Vec<f32> = file.read(&name, Dtype::F32, &shape, 1)?.pop().unwrap_or_default();
     if let Some(index) = admit(&mut weights) {
         let (policy, parameter) = (index / parameters, index % parameters);
         return Err(format!(
@@ -121,6 +121,6 @@ pub(super) fn admit(weights: &mut [f32]) -> Option<usize> {
         if weight.abs() < MIN_WEIGHT {
             *weight = 0.0;
         }
-        !(weight.abs() <= MAX_WEIGHT)
+        weight.is_nan() || weight.abs() > MAX_WEIGHT
     })
 }

@@ -164,28 +164,34 @@ impl<R: Read + Seek> TensorFile<R> {
         self.header.offset_keys()
     }
 
-    /// A tensor's numbers.
+    /// A tensor's numbers, in so many equal parts.
     ///
     /// # Errors
     /// No such tensor, another type or shape, or no memory for it.
-    pub fn read<T: bytemuck::Pod>(&mut self, name: &str, dtype: Dtype, shape: &[usize]) -> Result<Vec<T>, String> {
+    pub fn read<T: bytemuck::Pod>(
+        &mut self,
+        name: &str,
+        dtype: Dtype,
+        shape: &[usize],
+        parts: usize,
+    ) -> Result<Vec<Vec<T>>, String> {
         let info = self.info(name).ok_or_else(|| format!("it has no tensor {name}"))?;
         if info.dtype != dtype || info.shape != shape {
             return Err(format!("{name} is {:?} {:?}, not {dtype:?} {shape:?}", info.dtype, info.shape));
         }
         let (start, end) = info.data_offsets;
-        let count = (end - start) / size_of::<T>();
-        let mut values = Vec::new();
-        values
-            .try_reserve_exact(count)
-            .map_err(|_| format!("there is no memory for the {} bytes of {name}", end - start))?;
-        values.resize(count, T::zeroed());
-        let mut fill = || {
-            self.source.seek(SeekFrom::Start(self.start + start as u64))?;
-            self.source.read_exact(bytemuck::cast_slice_mut(&mut values))
+        let count = (end - start) / size_of::<T>() / parts;
+        let told = |error: io::Error| format!("cannot be read: {error}");
+        self.source.seek(SeekFrom::Start(self.start + start as u64)).map_err(told)?;
+        let part = |_| {
+            let mut values = Vec::new();
+            let refused = |_| format!("there is no memory for the {} bytes of {name}", end - start);
+            values.try_reserve_exact(count).map_err(refused)?;
+            values.resize(count, T::zeroed());
+            self.source.read_exact(bytemuck::cast_slice_mut(&mut values)).map_err(told)?;
+            Ok(values)
         };
-        fill().map_err(|error| format!("cannot be read: {error}"))?;
-        Ok(values)
+        (0..parts).map(part).collect()
     }
 }
 

@@ -1,0 +1,685 @@
+//! A run that was stopped at any point goes on as if nothing had happened, to the same bits.
+//!
+//! `FLOTILLA_KILLS` is how often the real program is killed (20 if left out).
+
+use std::fs;
+use std::io::{self, Cursor, Read};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::SeqCst};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::{Backend, BackendError, Group, Trace, Visit};
+use flotilla::config::Config;
+use flotilla::record::checkpoint::{self, Checkpoint, Schedule};
+use flotilla::record::disk::{Disk, Operation};
+use flotilla::record::folder::{Folder, METRICS, POLICIES, Run, Start, State};
+use flotilla::record::{RecordError, policies};
+use flotilla::run::{Machine, Opened, Options, Outcome, Player, Results, RunError, Session};
+use rand::{RngExt, SeedableRng, rngs::ChaCha8Rng};
+use tempfile::TempDir;
+
+/// A run of 14 generations that takes milliseconds.
+const SMALL: &str = "
+[world]
+leaders = [[10, 5], [20, 5]]
+followers = [[12, 2], [22, 2]]
+pois = [[10, 9], [20, 9]]
+coupling = 2
+steps = 8
+[policy]
+hidden = [3]
+[learning]
+population = 6
+generations = 14
+trials = 2
+[checkpoint]
+generations = 1
+seconds = 0
+";
+
+fn small() -> Config {
+    Config::parse(SMALL, "small.toml").unwrap()
+}
+
+fn cpu() -> Player {
+    (Box::new(Cpu::default()), Machine::default())
+}
+
+/// What one session came to: how it ended, what was told of the folder, and the generations it started before and
+/// reached.
+struct Told {
+    end: Result<Outcome, RunError>,
+    notes: Vec<String>,
+    start: usize,
+    reached: usize,
+}
+
+fn session(config: &Config, path: &Path, start: Start, disk: Disk, player: Player, stop_at: Option<usize>) -> Told {
+    let (opened, notes) = match Session::open(config.clone(), path, start, disk) {
+        Ok(opened) => opened,
+        Err(error) => return Told { end: Err(error), notes: vec![], start: 0, reached: 0 },
+    };
+    let mut session = match opened {
+        Opened::Ready(session) => session,
+        Opened::Done(results) => return Told { end: Ok(Outcome::Done(results)), notes, start: 0, reached: 0 },
+    };
+    let start = session.generation();
+    let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
+    let options = Options {
+        schedule: Schedule { generations: config.checkpoint.generations, seconds: config.checkpoint.seconds },
+        stop: &stop,
+        save: &save,
+        instead: &mut |_| None,
+        watch: &mut |progress| stop.store(stop_at.is_some_and(|at| progress.generation >= at), SeqCst),
+    };
+    let end = session.train(player, options);
+    Told { end, notes, start, reached: session.generation() }
+}
+
+/// Goes on to the end on a good disk.
+fn resume(config: &Config, path: &Path) -> (Results, Told) {
+    let told = session(config, path, Start::Resume, Disk::default(), cpu(), None);
+    match &told.end {
+        Ok(Outcome::Done(results)) => (results.clone(), told),
+        other => panic!("{other:?}"),
+    }
+}
+
+/// The metrics without the seconds, and the policies.
+fn what_came_out(path: &Path) -> (String, Vec<u8>) {
+    let metrics = fs::read_to_string(path.join(METRICS)).unwrap();
+    let shared = metrics.lines().map(|line| line.rsplit_once(',').unwrap().0.to_string() + "\n").collect();
+    (shared, fs::read(path.join(POLICIES)).unwrap())
+}
+
+/// An uninterrupted run: its results and files.
+fn reference(config: &Config) -> (Results, (String, Vec<u8>)) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run");
+    let told = session(config, &path, Start::Fresh, Disk::default(), cpu(), None);
+    let Ok(Outcome::Done(results)) = told.end else { panic!("{:?}", told.end) };
+    (results, what_came_out(&path))
+}
+
+#[test]
+fn checkpointing_has_no_say_in_the_results() {
+    let config = small();
+    let mut never = config.clone();
+    never.checkpoint.generations = 0;
+    assert_eq!(reference(&config), reference(&never));
+}
+
+#[test]
+fn a_run_stopped_before_any_generation_goes_on_to_the_same_results() {
+    let config = small();
+    let expected = reference(&config);
+    for stop_at in 1..=config.learning.generations + 2 {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run");
+        let told = session(&config, &path, Start::Fresh, Disk::default(), cpu(), Some(stop_at));
+        // The last step completes the run, so there is nothing left to stop.
+        let done = stop_at == config.learning.generations + 2;
+        match told.end.unwrap() {
+            Outcome::Stopped { generation } => assert_eq!((generation, done), (stop_at, false)),
+            Outcome::Done(_) => assert!(done),
+        }
+        let (results, told) = resume(&config, &path);
+        assert_eq!(told.start, if done { 0 } else { stop_at });
+        assert_eq!((results, what_came_out(&path)), expected, "stopped before generation {stop_at}");
+    }
+}
+
+#[test]
+fn a_run_that_is_done_is_not_run_again() {
+    let config = small();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run");
+    let expected = reference(&config);
+    session(&config, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+    let before = fs::read(path.join(METRICS)).unwrap();
+    let disk = Disk::failing(|operation, path| match operation {
+        Operation::CreateFolder => Ok(()),
+        _ => panic!("{operation:?} {}", path.display()),
+    });
+    let told = session(&config, &path, Start::Resume, disk, cpu(), None);
+    assert_eq!(told.end.unwrap(), Outcome::Done(expected.0.clone()));
+    assert_eq!(fs::read(path.join(METRICS)).unwrap(), before);
+    // With one of its results damaged, it goes on from its last checkpoint to restore it.
+    for (name, at) in [(POLICIES, 500), (METRICS, 60)] {
+        let mut bytes = fs::read(path.join(name)).unwrap();
+        bytes[at] ^= 1;
+        fs::write(path.join(name), bytes).unwrap();
+        let (results, _) = resume(&config, &path);
+        assert_eq!((results, what_came_out(&path)), expected, "{name}");
+    }
+}
+
+/// Every operation of a run fails once, alone or with all after it; a write that fails leaves its first half.
+#[test]
+fn no_failing_disk_operation_costs_a_run() {
+    let config = small();
+    let expected = reference(&config);
+    let attempt = |fails: Box<dyn Fn(usize) -> bool + Send + Sync>| {
+        let folder = in_memory();
+        let count = Arc::new(AtomicUsize::new(0));
+        let failed = Arc::new(Mutex::new(None));
+        let disk = Disk::failing({
+            let (count, failed) = (count.clone(), failed.clone());
+            move |operation, path| {
+                if fails(count.fetch_add(1, SeqCst)) {
+                    *failed.lock().unwrap() = Some((operation, path.to_path_buf()));
+                    return Err(io::Error::from(io::ErrorKind::StorageFull));
+                }
+                Ok(())
+            }
+        });
+        let path = folder.path().join("run");
+        let told = session(&config, &path, Start::Fresh, disk, cpu(), None);
+        let failed = failed.lock().unwrap().clone();
+        (folder, path, told, count.load(SeqCst), failed)
+    };
+    let (_, _, told, operations, _) = attempt(Box::new(|_| false));
+    assert_eq!(told.end.unwrap(), Outcome::Done(expected.0.clone()));
+    assert!(operations > 14 * 5, "{operations}");
+    let mut kinds = Vec::new();
+    for at in 0..operations {
+        for all_after in [false, true] {
+            let (_folder, path, told, _, failed) =
+                attempt(Box::new(move |operation| operation == at || all_after && operation > at));
+            let (operation, file) = failed.expect("the operation was reached");
+            let context = format!("operation {at}: {operation:?} {}", file.display());
+            if let Err(error) = told.end {
+                assert!(error.to_string().contains("free some space, then go on with --resume"), "{context}: {error}");
+                kinds.push(operation);
+            }
+            let (results, again) = resume(&config, &path);
+            assert_eq!((results, what_came_out(&path)), expected, "{context}");
+            // With a checkpoint every generation, the one before what was played last is whole.
+            assert!(
+                again.start + 2 >= told.reached || told.reached > 15,
+                "{context}: {} {}",
+                again.start,
+                told.reached
+            );
+            assert_eq!(leftovers(&path), Vec::<PathBuf>::new(), "{context}");
+        }
+    }
+    for operation in [
+        Operation::CreateFolder,
+        Operation::Create,
+        Operation::Write,
+        Operation::Flush,
+        Operation::Rename,
+        Operation::Remove,
+    ] {
+        assert!(kinds.contains(&operation), "{operation:?} never failed");
+    }
+}
+
+/// A folder whose flushes cost nothing, where the system has such a place.
+fn in_memory() -> TempDir {
+    tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap()
+}
+
+/// Files that an interrupted writer left.
+fn leftovers(path: &Path) -> Vec<PathBuf> {
+    let checkpoints = path.join("checkpoints");
+    let entries = [path, &checkpoints].into_iter().flat_map(|folder| fs::read_dir(folder).into_iter().flatten());
+    entries.map(|entry| entry.unwrap().path()).filter(|path| path.extension().is_some_and(|e| e == "tmp")).collect()
+}
+
+/// The checkpoints of a run that was stopped, oldest first.
+fn stopped_run(config: &Config) -> (TempDir, PathBuf, Vec<PathBuf>) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run");
+    session(config, &path, Start::Fresh, Disk::default(), cpu(), Some(9)).end.unwrap();
+    let checkpoints = path.join("checkpoints");
+    let generations = checkpoint::list(&checkpoints).unwrap();
+    assert_eq!(generations, [8, 9]);
+    let paths = generations.into_iter().map(|generation| checkpoint::path(&checkpoints, generation)).collect();
+    (folder, path, paths)
+}
+
+/// Every way to cut a file short, and three ways to flip each of its bytes.
+fn damaged(whole: &[u8]) -> impl Iterator<Item = (String, Vec<u8>)> {
+    let cut = (0..whole.len()).map(|length| (format!("cut to {length}"), whole[..length].to_vec()));
+    let flipped = (0..whole.len()).flat_map(|at| [0x01, 0x20, 0xff].map(|mask| (at, mask))).map(|(at, mask)| {
+        let mut bytes = whole.to_vec();
+        bytes[at] ^= mask;
+        (format!("byte {at} ^ {mask:#x}"), bytes)
+    });
+    let longer = [("one byte more".to_string(), [whole, b" "].concat())];
+    cut.chain(flipped).chain(longer)
+}
+
+#[test]
+fn every_damaged_byte_of_a_checkpoint_is_found() {
+    let config = small();
+    let (_folder, _, paths) = stopped_run(&config);
+    let whole = fs::read(&paths[1]).unwrap();
+    Checkpoint::read(Cursor::new(&whole), std::slice::from_ref(&config)).unwrap();
+    for (damage, bytes) in damaged(&whole) {
+        let read = Checkpoint::read(Cursor::new(&bytes), std::slice::from_ref(&config));
+        assert!(read.is_err(), "{damage}");
+    }
+}
+
+#[test]
+fn every_damaged_byte_of_a_policies_file_is_found() {
+    let config = small();
+    let (_, (_, whole)) = reference(&config);
+    for trial in [None, Some(0), Some(1)] {
+        policies::from_source(Cursor::new(&whole), &config, trial).unwrap();
+    }
+    for (damage, bytes) in damaged(&whole) {
+        assert!(policies::from_source(Cursor::new(&bytes), &config, None).is_err(), "{damage}");
+    }
+}
+
+#[test]
+fn a_damaged_checkpoint_is_named_and_the_one_before_is_used() {
+    let config = small();
+    let expected = reference(&config);
+    let (_folder, path, paths) = stopped_run(&config);
+    let kept: Vec<_> = paths.iter().map(|path| (path, fs::read(path).unwrap())).collect();
+    let metrics = fs::read(path.join(METRICS)).unwrap();
+    for (damage, bytes) in damaged(&kept[1].1).step_by(97) {
+        for (path, bytes) in &kept {
+            fs::write(path, bytes).unwrap();
+        }
+        fs::write(path.join(METRICS), &metrics).unwrap();
+        fs::write(&paths[1], bytes).unwrap();
+        let told = session(&config, &path, Start::Resume, Disk::default(), cpu(), Some(10));
+        assert_eq!(told.start, 8, "{damage}");
+        assert!(told.notes[0].contains("000000009.safetensors: "), "{damage}: {:?}", told.notes);
+        assert_eq!(checkpoint::list(&path.join("checkpoints")).unwrap(), [9, 10]);
+        for generation in [9, 10] {
+            fs::remove_file(checkpoint::path(&path.join("checkpoints"), generation)).unwrap();
+        }
+    }
+    // Both damaged: the run starts over.
+    for (path, bytes) in &kept {
+        fs::write(path, &bytes[..bytes.len() - 1]).unwrap();
+    }
+    fs::write(path.join(METRICS), &metrics).unwrap();
+    let (results, told) = resume(&config, &path);
+    assert_eq!((told.start, told.notes.len()), (0, 3), "{:?}", told.notes);
+    assert_eq!((results, what_came_out(&path)), expected);
+}
+
+#[test]
+fn damaged_metrics_send_a_run_back_to_where_they_are_whole() {
+    let config = small();
+    let expected = reference(&config);
+    for (cut, start) in [(0, 9), (1, 8), (100, 0)] {
+        let (_folder, path, _) = stopped_run(&config);
+        let metrics = fs::read(path.join(METRICS)).unwrap();
+        fs::write(path.join(METRICS), &metrics[..metrics.len() - cut]).unwrap();
+        let (results, told) = resume(&config, &path);
+        assert_eq!(told.start, start, "{:?}", told.notes);
+        assert_eq!((results, what_came_out(&path)), expected);
+    }
+}
+
+#[test]
+fn a_changed_config_is_refused_by_the_names_of_its_keys() {
+    let config = small();
+    let (_folder, path, _) = stopped_run(&config);
+    let mut changed = config.clone();
+    changed.learning.seed = 5;
+    changed.world.steps = 9;
+    changed.checkpoint.seconds = 1.0;
+    let error = session(&changed, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err().to_string();
+    assert!(
+        error.contains("learning.seed: 0 there, 5 here") && error.contains("world.steps: 8 there, 9 here"),
+        "{error}"
+    );
+    assert!(!error.contains("checkpoint."), "{error}");
+    // Also where the config's file is gone, since a checkpoint knows whose it is.
+    fs::remove_file(path.join("config.toml")).unwrap();
+    let error = session(&changed, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err();
+    assert!(matches!(error, RunError::Record(RecordError::ConfigDiffers { .. })), "{error}");
+    // How often checkpoints are made may change.
+    let mut rarer = config;
+    rarer.checkpoint.generations = 0;
+    assert_eq!(resume(&rarer, &path).1.start, 9);
+}
+
+#[test]
+fn a_folder_is_one_process_at_a_time_and_one_run() {
+    let config = small();
+    let (_folder, path, _) = stopped_run(&config);
+    let refused = |start| match Folder::open(&path, start, &config, Disk::default()) {
+        Err(error) => error,
+        Ok(_) => panic!("opened"),
+    };
+    assert!(matches!(refused(Start::Fresh), RecordError::Exists { .. }));
+    let held = Folder::open(&path, Start::Resume, &config, Disk::default()).unwrap();
+    assert!(matches!(refused(Start::Resume), RecordError::Locked { .. }));
+    assert!(matches!(refused(Start::Force), RecordError::Locked { .. }));
+    drop(held);
+    fs::write(path.join("notes.txt"), "mine").unwrap();
+    let told = session(&config, &path, Start::Force, Disk::default(), cpu(), Some(3));
+    assert_eq!(told.start, 0);
+    assert_eq!(checkpoint::list(&path.join("checkpoints")).unwrap(), [2, 3]);
+    assert_eq!(fs::read(path.join("notes.txt")).unwrap(), b"mine");
+}
+
+/// Fails at one rollout.
+struct Failing {
+    cpu: Cpu,
+    left: usize,
+}
+
+impl Backend for Failing {
+    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
+        // Half the work is done when it fails.
+        self.cpu.rollout(&groups[..groups.len().div_ceil(2)], visit)?;
+        self.left = self.left.checked_sub(1).ok_or(BackendError::Device("the device was lost".into()))?;
+        self.cpu.rollout(groups, visit)
+    }
+
+    fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
+        self.cpu.trace(group)
+    }
+
+    fn describe(&self) -> String {
+        "a device about to be lost".into()
+    }
+}
+
+#[test]
+fn a_lost_device_costs_nothing() {
+    let config = Config::parse(&SMALL.replace("[checkpoint]\ngenerations = 1", "[checkpoint]"), "small.toml").unwrap();
+    let expected = reference(&config);
+    for left in 0..=config.learning.generations + 1 {
+        let failing = || -> Player { (Box::new(Failing { cpu: Cpu::default(), left }), Machine::default()) };
+        let folder = tempfile::tempdir().unwrap();
+        // It saves, and is resumed.
+        let path = folder.path().join("stop");
+        let told = session(&config, &path, Start::Fresh, Disk::default(), failing(), None);
+        let error = told.end.unwrap_err().to_string();
+        assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
+        assert_eq!(Run::read(&path.join("run.json")).unwrap().state, State::Stopped);
+        let (results, told) = resume(&config, &path);
+        assert_eq!((told.start, results), (left, expected.0.clone()));
+        assert_eq!(what_came_out(&path), expected.1);
+
+        // It goes on with the CPU.
+        let path = folder.path().join("cpu");
+        let (opened, _) = Session::open(config.clone(), &path, Start::Fresh, Disk::default()).unwrap();
+        let Opened::Ready(mut session) = opened else { panic!("nothing to do") };
+        let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
+        let mut asked = 0;
+        let options = Options {
+            schedule: Schedule { generations: 0, seconds: 0.0 },
+            stop: &stop,
+            save: &save,
+            instead: &mut |_| {
+                asked += 1;
+                Some(cpu())
+            },
+            watch: &mut |_| {},
+        };
+        assert_eq!(session.train(failing(), options).unwrap(), Outcome::Done(expected.0.clone()));
+        assert_eq!((asked, what_came_out(&path)), (1, expected.1.clone()));
+    }
+}
+
+/// The real program.
+fn flotilla() -> Command {
+    let mut command = Command::new(assert_cmd::cargo::cargo_bin!("flotilla"));
+    command.stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+/// A command that trains in a folder.
+fn train(config: &Path, out: &Path, flags: &[&str]) -> Command {
+    let mut command = flotilla();
+    command.arg("train").arg(config).arg("--out").arg(out).args(flags);
+    command
+}
+
+fn config_file(folder: &Path, text: &str) -> PathBuf {
+    let path = folder.join("config.toml");
+    fs::write(&path, text).unwrap();
+    path
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// Generations whose rows are all in the metrics.
+fn generations_recorded(path: &Path) -> usize {
+    let metrics = fs::read_to_string(path.join(METRICS)).unwrap_or_default();
+    let whole = metrics.rfind('\n').map_or("", |end| &metrics[..end]);
+    whole.lines().skip(1).filter(|line| line.starts_with("1,")).count()
+}
+
+/// A run of a second or two, most of which goes into checkpoints.
+const HEAVY: &str = "
+[world]
+leaders = [[10, 5], [20, 5], [30, 5], [40, 5]]
+followers = [[12, 2], [22, 2], [32, 2], [42, 2]]
+pois = [[10, 9], [20, 9], [30, 9], [40, 9]]
+coupling = 2
+steps = 4
+[policy]
+hidden = [24, 24]
+[learning]
+population = 60
+generations = 60
+trials = 2
+[checkpoint]
+generations = 1
+seconds = 0
+";
+
+#[test]
+fn a_killed_run_goes_on_to_the_same_results() {
+    let kills: usize = std::env::var("FLOTILLA_KILLS").map_or(20, |text| text.parse().expect("a number of kills"));
+    let config = Config::parse(HEAVY, "heavy.toml").unwrap();
+    let expected = reference(&config);
+    let folder = tempfile::tempdir().unwrap();
+    let file = config_file(folder.path(), HEAVY);
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let (mut killed, mut inside, mut runs) = (0, 0, 0);
+    while killed < kills {
+        let out = folder.path().join(format!("run-{runs}"));
+        runs += 1;
+        loop {
+            let recorded = generations_recorded(&out);
+            // Another number of threads each time.
+            let threads = (1 + random.random_range(0..3)).to_string();
+            let mut child = train(&file, &out, &["--resume", "--threads", &threads]).spawn().unwrap();
+            let moment = Instant::now() + Duration::from_micros(random.random_range(0..150_000));
+            let over = loop {
+                match child.try_wait().unwrap() {
+                    Some(status) => break Some(status),
+                    None if killed < kills && Instant::now() >= moment => {
+                        child.kill().unwrap();
+                        child.wait().unwrap();
+                        break None;
+                    }
+                    None => std::thread::sleep(Duration::from_micros(200)),
+                }
+            };
+            let told = read_all(child.stderr.take());
+            // A row is written once the checkpoint before its generation's is whole, and none of that is done again.
+            if let Some((_, start)) = told.split_once("going on before generation ") {
+                let start: usize = start.split_whitespace().next().unwrap().parse().unwrap();
+                assert!(start >= recorded, "{recorded} generations were recorded: {told}");
+            } else {
+                assert!(recorded == 0 || !told.contains("generation"), "{recorded} recorded: {told}");
+            }
+            assert!(!told.contains("damaged") && !told.contains("not as this left it"), "{told}");
+            match over {
+                None => {
+                    killed += 1;
+                    inside += usize::from(!leftovers(&out).is_empty());
+                }
+                Some(status) => {
+                    assert_eq!(status.code(), Some(0), "{told}");
+                    break;
+                }
+            }
+        }
+        assert_eq!(what_came_out(&out), expected.1);
+        assert_eq!(Run::read(&out.join("run.json")).unwrap().digest, Some(expected.0.digest.clone()));
+        fs::remove_dir_all(out).unwrap();
+    }
+    println!("killed {killed} times, {inside} of them inside writing a file, in {runs} runs");
+}
+
+fn read_all(pipe: Option<impl Read>) -> String {
+    let mut text = String::new();
+    pipe.unwrap().read_to_string(&mut text).unwrap();
+    text
+}
+
+/// Waits for something that should come soon.
+fn until(what: &str, mut there: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !there() {
+        assert!(start.elapsed() < Duration::from_secs(60), "{what}");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+#[test]
+fn a_second_process_is_refused_until_the_first_is_gone() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = config_file(folder.path(), &HEAVY.replace("generations = 60", "generations = 100000"));
+    let out = folder.path().join("run");
+    let mut first = train(&file, &out, &[]).spawn().unwrap();
+    until("the run starts", || generations_recorded(&out) > 0);
+    for flags in [&["--resume"][..], &["--force"]] {
+        let second = train(&file, &out, flags).output().unwrap();
+        assert_eq!(second.status.code(), Some(1));
+        assert!(stderr(&second).contains("error: another process is training in"), "{}", stderr(&second));
+    }
+    let third = train(&file, &out, &[]).output().unwrap();
+    assert_eq!(third.status.code(), Some(1));
+    assert!(stderr(&third).contains("holds a run already; go on with it by --resume"), "{}", stderr(&third));
+    first.kill().unwrap();
+    first.wait().unwrap();
+    let changed = train(&file, &out, &["--resume", "--seed", "3"]).output().unwrap();
+    assert_eq!(changed.status.code(), Some(1));
+    assert!(stderr(&changed).contains("learning.seed: 0 there, 3 here"), "{}", stderr(&changed));
+    let mut again = train(&file, &out, &["--resume"]).spawn().unwrap();
+    let recorded = generations_recorded(&out);
+    until("the run goes on", || generations_recorded(&out) > recorded + 2);
+    again.kill().unwrap();
+    again.wait().unwrap();
+}
+
+#[cfg(unix)]
+mod unix {
+    use super::*;
+
+    fn signal(child: &Child, name: &str) {
+        let status = Command::new("kill").args([format!("-{name}"), child.id().to_string()]).status().unwrap();
+        assert!(status.success());
+    }
+
+    fn ended(child: Child) -> (ExitStatus, String) {
+        let output = child.wait_with_output().unwrap();
+        (output.status, stderr(&output))
+    }
+
+    #[test]
+    fn a_signal_stops_a_run_after_its_generation_and_says_how_to_go_on() {
+        let config = Config::parse(HEAVY, "heavy.toml").unwrap();
+        let expected = reference(&config);
+        let folder = tempfile::tempdir().unwrap();
+        let file = config_file(folder.path(), HEAVY);
+        // Checkpoints come from signals alone here.
+        let flags = ["--checkpoint-generations", "0", "--checkpoint-seconds", "0", "--quiet"];
+        for name in ["TERM", "INT"] {
+            let out = folder.path().join(name);
+            let child = train(&file, &out, &flags).spawn().unwrap();
+            until("the run starts", || out.join("run.json").exists());
+            signal(&child, name);
+            let (status, told) = ended(child);
+            assert_eq!(status.code(), Some(75), "{told}");
+            let (_, command) = told.split_once("go on with\n  flotilla ").expect(&told);
+            let again = flotilla().args(command.split_whitespace()).output().unwrap();
+            assert_eq!(again.status.code(), Some(0), "{}", stderr(&again));
+            assert!(stderr(&again).contains("going on before generation"), "{}", stderr(&again));
+            assert!(String::from_utf8_lossy(&again.stdout).contains(&expected.0.digest));
+            assert_eq!(what_came_out(&out), expected.1);
+        }
+    }
+
+    #[test]
+    fn a_second_signal_stops_a_run_at_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let text = HEAVY.replace("population = 60", "population = 2000").replace("steps = 4", "steps = 10000");
+        let file = config_file(folder.path(), &text);
+        let out = folder.path().join("run");
+        let child = train(&file, &out, &["--threads", "1"]).spawn().unwrap();
+        until("the run starts", || out.join("run.json").exists());
+        let start = Instant::now();
+        signal(&child, "TERM");
+        std::thread::sleep(Duration::from_millis(100));
+        signal(&child, "TERM");
+        assert_eq!(ended(child).0.code(), Some(143));
+        assert!(start.elapsed() < Duration::from_secs(5));
+    }
+
+    #[test]
+    fn sigusr1_saves_and_goes_on() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = config_file(folder.path(), &HEAVY.replace("generations = 60", "generations = 100000"));
+        let out = folder.path().join("run");
+        let flags = ["--checkpoint-generations", "0", "--checkpoint-seconds", "0"];
+        let child = train(&file, &out, &flags).spawn().unwrap();
+        until("the run starts", || out.join("run.json").exists());
+        let checkpoints = out.join("checkpoints");
+        assert!(checkpoint::list(&checkpoints).unwrap().is_empty());
+        for count in [1, 2] {
+            signal(&child, "USR1");
+            until("a checkpoint", || checkpoint::list(&checkpoints).unwrap().len() == count);
+        }
+        signal(&child, "TERM");
+        assert_eq!(ended(child).0.code(), Some(75));
+    }
+
+    /// The system itself refuses to write more than some bytes to a file.
+    #[test]
+    fn a_write_that_the_system_refuses_is_told_and_leaves_the_last_checkpoint() {
+        let config = Config::parse(HEAVY, "heavy.toml").unwrap();
+        let expected = reference(&config);
+        let folder = tempfile::tempdir().unwrap();
+        let file = config_file(folder.path(), HEAVY);
+        let out = folder.path().join("run");
+        let program = assert_cmd::cargo::cargo_bin!("flotilla");
+        let limited = |blocks: &str| {
+            let script = format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$@\"");
+            let mut command = Command::new("sh");
+            command.args(["-c", &script, "sh"]).arg(program).arg("train").arg(&file).arg("--out").arg(&out);
+            command.arg("--resume").output().unwrap()
+        };
+        // Not even a checkpoint fits.
+        let refused = limited("100");
+        assert_eq!(refused.status.code(), Some(1), "{}", stderr(&refused));
+        assert!(stderr(&refused).contains(".safetensors: cannot be written"), "{}", stderr(&refused));
+        let again = train(&file, &out, &["--resume"]).output().unwrap();
+        assert_eq!(again.status.code(), Some(0), "{}", stderr(&again));
+        assert_eq!(what_came_out(&out), expected.1);
+    }
+
+    #[test]
+    fn a_folder_that_cannot_be_is_told() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = config_file(folder.path(), SMALL);
+        // A file stands where the folder should be.
+        let output = train(&file, &file.join("run"), &[]).output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        assert!(stderr(&output).contains("cannot be written"), "{}", stderr(&output));
+    }
+}
