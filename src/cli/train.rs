@@ -197,7 +197,7 @@ impl Ticker {
     fn new(config: &Config, generation: usize, quiet: bool) -> Ticker {
         let last = config.learning.generations;
         let bar = (!quiet && io::stderr().is_terminal()).then(|| {
-            let style = "{bar:24} generation {pos}/{len}  {msg}  {eta} left";
+            let style = "generation {pos}/{len}  {msg}  {eta} left  {wide_bar}";
             let style = ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar());
             let bar = ProgressBar::with_draw_target(Some(last as u64), ProgressDrawTarget::stderr()).with_style(style);
             bar.with_position(generation as u64)

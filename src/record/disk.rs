@@ -95,7 +95,13 @@ impl Disk {
     fn sync_folder(&self, path: &Path) -> io::Result<()> {
         self.pass(Operation::Flush, path)?;
         #[cfg(unix)]
-        File::open(path)?.sync_all()?;
+        match File::open(path)?.sync_all() {
+            // Some network file systems cannot.
+            Err(error) if !matches!(error.kind(), io::ErrorKind::InvalidInput | io::ErrorKind::Unsupported) => {
+                return Err(error);
+            }
+            _ => {}
+        }
         Ok(())
     }
 }
