@@ -118,16 +118,16 @@ impl Session {
     /// # Errors
     /// The folder cannot be used (see [`Folder::open`]), or there is no memory for the populations.
     pub fn open(config: Config, path: &Path, start: Start, disk: Disk) -> Result<(Opened, Vec<String>), RunError> {
-        let (folder, found) = Folder::open(path, start, &config, disk.clone())?;
-        let run = found.run.unwrap_or_else(|| Run::new(&config));
-        if let Some((story, digest)) = found.finished.zip(run.digest.clone()) {
-            return Ok((Opened::Done(Results { story, digest }), found.notes));
-        }
         // This generation, the next one and a checkpoint; asked for first, since later a refusal would be an abort.
         let bytes = 3 * config.policy_bytes();
         Vec::<u8>::new()
             .try_reserve_exact(bytes)
             .map_err(|_| RunError::Memory { what: "three times the policies of all trials", bytes })?;
+        let (folder, found) = Folder::open(path, start, &config, disk.clone())?;
+        let run = found.run.unwrap_or_else(|| Run::new(&config));
+        if let Some((story, digest)) = found.finished.zip(run.digest.clone()) {
+            return Ok((Opened::Done(Results { story, digest }), found.notes));
+        }
         let mut trainer = Trainer::new(vec![config.clone()]);
         let (metrics, before) = match found.checkpoint {
             Some((Checkpoint { snapshot, seconds, .. }, metrics)) => {

@@ -51,8 +51,11 @@ impl Disk {
         Ok(Output { disk: self.clone(), path: path.into(), file })
     }
 
-    /// The file as it is up to `length` bytes, to be written on from there.
+    /// The file as it is up to `length` bytes, to be written on from there; a link to another file is refused.
     pub fn append(&self, path: &Path, length: u64) -> io::Result<Output> {
+        if !fs::symlink_metadata(path)?.is_file() {
+            return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no plain file"));
+        }
         let mut file = OpenOptions::new().write(true).open(path)?;
         self.pass(Operation::Truncate, path)?;
         file.set_len(length)?;
