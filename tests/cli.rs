@@ -207,15 +207,14 @@ fn every_wrong_value_is_named_with_line_and_range() {
             "coupling = [3]",
             "world.coupling: found a list of 1, allowed a list of 2 numbers, each 1 to 6 (the number of agents)",
         ),
-        (21, "hidden = []", "policy.hidden: found a list of 0, allowed a list of 1 to 3 numbers, each 1 to 64"),
         (
             21,
             "hidden = [9, 9, 9, 9]",
-            "policy.hidden: found a list of 4, allowed a list of 1 to 3 numbers, each 1 to 64",
+            "policy.hidden: found a list of 4, allowed a list of 0 to 3 numbers, each 1 to 64",
         ),
         (21, "hidden = [65]", "policy.hidden[0]: found 65, allowed 1 to 64"),
         (21, "hidden = [10, 0]", "policy.hidden[1]: found 0, allowed 1 to 64"),
-        (21, "hidden = 10", "policy.hidden: found 10, allowed a list of 1 to 3 numbers, each 1 to 64"),
+        (21, "hidden = 10", "policy.hidden: found 10, allowed a list of 0 to 3 numbers, each 1 to 64"),
     ] {
         let expected = format!("x.toml:{line}: {expected}");
         let found = refusal(check(with_line(line, text), &[]));

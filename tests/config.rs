@@ -249,7 +249,7 @@ fn configs() -> impl Strategy<Value = Config> {
         agent_range,
         density,
     });
-    let policy = vec(1..=MAX_HIDDEN_UNITS, 1..=MAX_HIDDEN_LAYERS).prop_map(|hidden| Policy { hidden });
+    let policy = vec(1..=MAX_HIDDEN_UNITS, 0..=MAX_HIDDEN_LAYERS).prop_map(|hidden| Policy { hidden });
     let sizes = (2..=5000usize, 0..=MAX_GENERATIONS, 1..=9usize, 0.0..=1.0f64, 1..=MAX_EPISODES);
     let mutation = (word(), size_or_zero(1e-6, 1.0), size_or_zero(1e-6, 100.0));
     let learning = (word(), word(), sizes, mutation, size_or_zero(1e-6, 1e4), 0..=i64::MAX as u64).prop_map(

@@ -11,6 +11,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::Cpu;
+use flotilla::backend::gpu::device::DeviceError;
 use flotilla::backend::{Backend, BackendError, Group, Trace, Visit};
 use flotilla::config::Config;
 use flotilla::record::checkpoint::{self, Checkpoint, Schedule};
@@ -378,7 +379,10 @@ impl Backend for Failing {
     fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
         // Half the work is done when it fails.
         self.cpu.rollout(&groups[..groups.len().div_ceil(2)], visit)?;
-        self.left = self.left.checked_sub(1).ok_or(BackendError::Device("the device was lost".into()))?;
+        self.left = self
+            .left
+            .checked_sub(1)
+            .ok_or(BackendError::from(DeviceError::Lost { adapter: "test".into(), reason: "pulled out".into() }))?;
         self.cpu.rollout(groups, visit)
     }
 
