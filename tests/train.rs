@@ -88,7 +88,7 @@ fn rows(text: &str) -> (&str, Vec<Vec<&str>>) {
 #[test]
 fn training_writes_a_folder_that_says_everything() {
     let place = Place::new();
-    let (summary, told) = place.good("train small.toml");
+    let (summary, told) = place.good("train small.toml --backend cpu");
     assert!(told.starts_with("training on cpu ("), "{told}");
     let files = ["config.toml", "run.json", "metrics.csv", "policies.safetensors", "checkpoints"];
     for name in files {
@@ -149,7 +149,7 @@ fn flags_stand_in_the_resolved_config_and_quiet_is_quiet() {
     let place = Place::new();
     let (_, told) = place.good(
         "train small.toml --seed 4 --trials 1 --generations 2 --population 5 --fitness D++ --paradigm all-leaders \
-         --checkpoint-generations 1 --checkpoint-seconds 0.5 --quiet",
+         --checkpoint-generations 1 --checkpoint-seconds 0.5 --quiet --backend cpu",
     );
     assert_eq!(told, "");
     let config = place.read("runs/small/config.toml");

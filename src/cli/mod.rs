@@ -16,6 +16,7 @@ use crate::record::RecordError;
 use crate::run::RunError;
 
 mod backend;
+mod bench;
 mod check;
 mod devices;
 mod rollout;
@@ -46,6 +47,8 @@ commands! {
     Train(train),
     /// Play teams of policies from a file, and score every leader.
     Rollout(rollout),
+    /// Measure how fast teams are played, alone and in whole generations.
+    Bench(bench),
     /// Compare every GPU with the CPU, bit for bit.
     Verify(verify),
     /// List what can be trained on.
