@@ -3,7 +3,7 @@
 //! Everything random is a pure function of counters, so that it depends on neither threads, batch size, backend nor
 //! on having been interrupted.
 
-use fearless_simd::{Level, Select, Simd, SimdMask, dispatch, prelude::*};
+use fearless_simd::{Level, Simd, SimdMask, dispatch, prelude::*};
 use glam::Vec2;
 
 use crate::config::{Learning, Mutation};
@@ -124,54 +124,77 @@ pub fn random_policy(level: Level, key: Key, weights: &mut [f32]) {
 
 #[inline(always)]
 fn random_lanes<S: Simd>(simd: S, key: Key, weights: &mut [f32]) {
-    each_weight(
-        simd,
-        weights,
-        #[inline(always)]
-        |_, index| {
-            let [a, b, ..] = key.draw_lanes::<S>(index);
-            math::normal::<S>(a, b)
-        },
-    );
+    let width = S::f32s::LEN;
+    let mut index = S::u32s::from_fn(simd, |lane| lane as u32);
+    for chunk in weights.chunks_mut(width) {
+        let [a, b, ..] = key.draw_lanes::<S>(index);
+        let weight = within_limits(simd, math::normal::<S>(a, b));
+        chunk.copy_from_slice(&weight.as_slice()[..chunk.len()]);
+        index += width as u32;
+    }
 }
 
 /// Mutates a policy: every weight, with the configured probability, gains noise, `N(0, sigma)` times itself or plainly.
 ///
-/// `key` is a slot's of purpose [`Purpose::Mutation`].
-pub fn mutate(level: Level, key: Key, learning: &Learning, weights: &mut [f32]) {
-    dispatch!(level, simd => mutate_lanes(simd, key, learning, weights));
+/// `key` is a slot's of purpose [`Purpose::Mutation`]; `chosen` is scratch.
+pub fn mutate(level: Level, key: Key, learning: &Learning, weights: &mut [f32], chosen: &mut Vec<u32>) {
+    dispatch!(level, simd => mutate_lanes(simd, key, learning, weights, chosen));
 }
 
 #[inline(always)]
-fn mutate_lanes<S: Simd>(simd: S, key: Key, learning: &Learning, weights: &mut [f32]) {
-    let always = S::mask32s::splat(simd, learning.mutation_probability >= 1.0);
-    let threshold = (learning.mutation_probability * (1u64 << 32) as f64) as u32;
+fn mutate_lanes<S: Simd>(simd: S, key: Key, learning: &Learning, weights: &mut [f32], chosen: &mut Vec<u32>) {
+    choose(simd, key, learning.mutation_probability, weights.len(), chosen);
+    // No weight has this counter.
+    let noises = Key(key.draw(u32::MAX));
     let sigma = learning.mutation_sigma as f32;
-    let scaled = learning.mutation == Mutation::Scaled;
-    each_weight(
-        simd,
-        weights,
-        #[inline(always)]
-        |weight, index| {
-            let [chance, a, b, _] = key.draw_lanes::<S>(index);
-            let noise = math::normal::<S>(a, b) * sigma;
-            let noise = if scaled { noise * weight } else { noise };
-            (chance.simd_lt(threshold) | always).select(weight + noise, weight)
-        },
-    );
+    for chosen in chosen.chunks(S::f32s::LEN) {
+        let (mut index, mut weight) = (S::u32s::simd_from(simd, 0), splat(simd, 0.0));
+        for (lane, &chosen) in chosen.iter().enumerate() {
+            index.as_mut_slice()[lane] = chosen;
+            weight.as_mut_slice()[lane] = weights[chosen as usize];
+        }
+        let [a, b, ..] = noises.draw_lanes::<S>(index);
+        let noise = math::normal::<S>(a, b) * sigma;
+        let noise = if learning.mutation == Mutation::Scaled { noise * weight } else { noise };
+        let mutated = within_limits(simd, weight + noise);
+        for (lane, &chosen) in chosen.iter().enumerate() {
+            weights[chosen as usize] = mutated.as_slice()[lane];
+        }
+    }
 }
 
-/// Replaces each weight by a function of it and its index, kept within the sizes that policies may have.
+/// Which of `count` weights mutate: each by a random word of its own, of which a draw makes four.
+///
+/// Weight 64·block + 16·word + place takes its word from counter 16·block + place: no lane width shows in that.
 #[inline(always)]
-fn each_weight<S: Simd>(simd: S, weights: &mut [f32], new: impl Fn(S::f32s, S::u32s) -> S::f32s) {
-    let width = S::f32s::LEN;
-    let (low, high) = (splat(simd, -MAX_WEIGHT), splat(simd, MAX_WEIGHT));
-    let mut index = S::u32s::from_fn(simd, |lane| lane as u32);
-    for chunk in weights.chunks_mut(width) {
-        let mut lanes = splat(simd, 0.0);
-        lanes.as_mut_slice()[..chunk.len()].copy_from_slice(chunk);
-        let weight = math::flush::<S>(bound::<S>(new(lanes, index), low, high), MIN_WEIGHT);
-        chunk.copy_from_slice(&weight.as_slice()[..chunk.len()]);
-        index += width as u32;
+fn choose<S: Simd>(simd: S, key: Key, probability: f64, count: usize, chosen: &mut Vec<u32>) {
+    chosen.clear();
+    if probability >= 1.0 {
+        chosen.extend(0..count as u32);
+        return;
     }
+    let threshold = (probability * (1u64 << 32) as f64) as u32;
+    for block in 0..count.div_ceil(64) as u32 {
+        let mut mutates = 0u64;
+        for place in (0..16).step_by(S::f32s::LEN) {
+            let counter = S::u32s::from_fn(simd, |lane| 16 * block + place + lane as u32);
+            for (index, word) in (0..).zip(key.draw_lanes::<S>(counter)) {
+                mutates |= word.simd_lt(threshold).to_bitmask() << (16 * index + place);
+            }
+        }
+        while mutates != 0 {
+            let index = 64 * block + mutates.trailing_zeros();
+            if index < count as u32 {
+                chosen.push(index);
+            }
+            mutates &= mutates - 1;
+        }
+    }
+}
+
+/// A weight brought within the sizes that policies may have.
+#[inline(always)]
+fn within_limits<S: Simd>(simd: S, weight: S::f32s) -> S::f32s {
+    let bounded = bound::<S>(weight, splat(simd, -MAX_WEIGHT), splat(simd, MAX_WEIGHT));
+    math::flush::<S>(bounded, MIN_WEIGHT)
 }

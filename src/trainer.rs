@@ -275,13 +275,14 @@ impl Arm {
                 let best = evolve::best(fitness, elites);
                 let policy = |index: usize| &parents[index * parameters..(index + 1) * parameters];
                 let slots = children.par_chunks_exact_mut(parameters).with_min_len(64).enumerate();
-                slots.for_each(|(slot, child)| match best.get(slot) {
+                slots.for_each_init(Vec::new, |chosen, (slot, child)| match best.get(slot) {
                     Some(&elite) => child.copy_from_slice(policy(elite)),
                     None if slot == population => child.copy_from_slice(policy(population)),
                     None => {
                         let winner = evolve::tournament(tournaments.at(generation, leader, slot), fitness);
                         child.copy_from_slice(policy(winner));
-                        evolve::mutate(level, mutations.at(generation, leader, slot), &config.learning, child);
+                        let key = mutations.at(generation, leader, slot);
+                        evolve::mutate(level, key, &config.learning, child, chosen);
                     }
                 });
             });

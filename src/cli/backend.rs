@@ -1,6 +1,6 @@
 //! Opens what episodes are played on.
 
-use super::{BackendChoice, Error, RunOptions};
+use super::{BackendChoice, Error, RunOptions, say};
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu::device::{self, Choice, DeviceError};
 use crate::backend::gpu::episode::GpuEpisodes;
@@ -21,7 +21,7 @@ pub fn open(options: &RunOptions) -> Result<Player, Error> {
         (BackendChoice::Auto, None) => match gpu(Choice::Real) {
             Err(DeviceError::NoAdapter | DeviceError::NoRealAdapter { .. }) => Ok(cpu()),
             Err(error) => {
-                eprintln!("note: no GPU is used: {error}");
+                say(format_args!("note: no GPU is used: {error}"));
                 Ok(cpu())
             }
             opened => Ok(opened?),
