@@ -2,6 +2,8 @@
 //!
 //! `FLOTILLA_KILLS` is how often the real program is killed (20 if left out).
 
+mod common;
+
 use std::fs;
 use std::io::{self, Cursor, Read};
 use std::path::{Path, PathBuf};
@@ -11,7 +13,8 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::gpu::device::DeviceError;
+use flotilla::backend::gpu::device::{self, DeviceError};
+use flotilla::backend::gpu::episode::GpuEpisodes;
 use flotilla::backend::{Backend, BackendError, Group, Trace, Visit};
 use flotilla::config::Config;
 use flotilla::record::checkpoint::{self, Checkpoint, Schedule};
@@ -435,6 +438,27 @@ fn a_lost_device_costs_nothing() {
     }
 }
 
+#[test]
+fn a_run_may_change_to_another_processor_and_back() {
+    let config = small();
+    let expected = reference(&config);
+    for (request, info) in common::adapters("a_run_may_change_to_another_processor_and_back") {
+        let gpu = || -> Player {
+            let backend = GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap();
+            (Box::new(backend), Machine { backend: "gpu".into(), ..Machine::default() })
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run");
+        for (stop_at, player) in [(4, cpu()), (9, gpu()), (12, cpu())] {
+            let told = session(&config, &path, Start::Resume, Disk::default(), player, Some(stop_at));
+            assert_eq!(told.end.unwrap(), Outcome::Stopped { generation: stop_at });
+        }
+        let told = session(&config, &path, Start::Resume, Disk::default(), gpu(), None);
+        assert_eq!(told.end.unwrap(), Outcome::Done(expected.0.clone()), "{info}");
+        assert_eq!(what_came_out(&path), expected.1, "{info}");
+    }
+}
+
 /// The real program.
 fn flotilla() -> Command {
     let mut command = Command::new(assert_cmd::cargo::cargo_bin!("flotilla"));
@@ -445,7 +469,8 @@ fn flotilla() -> Command {
 /// A command that trains in a folder.
 fn train(config: &Path, out: &Path, flags: &[&str]) -> Command {
     let mut command = flotilla();
-    command.arg("train").arg(config).arg("--out").arg(out).args(flags);
+    // No time is lost on looking for GPUs.
+    command.arg("train").arg(config).arg("--out").arg(out).args(["--backend", "cpu"]).args(flags);
     command
 }
 
@@ -668,7 +693,7 @@ mod unix {
             let script = format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$@\"");
             let mut command = Command::new("sh");
             command.args(["-c", &script, "sh"]).arg(program).arg("train").arg(&file).arg("--out").arg(&out);
-            command.arg("--resume").output().unwrap()
+            command.args(["--resume", "--backend", "cpu"]).output().unwrap()
         };
         // Not even a checkpoint fits.
         let refused = limited("100");

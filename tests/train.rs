@@ -42,7 +42,10 @@ impl Place {
         self.0.path().join(name)
     }
 
+    /// Runs a command, on the CPU unless it says otherwise: a GPU's driver may have things to tell of its own.
     fn run(&self, line: &str) -> Output {
+        let backend = if line.contains("--backend") { "" } else { " --backend cpu" };
+        let line = line.to_string() + backend;
         cargo_bin_cmd!("flotilla").args(line.split_whitespace()).current_dir(self.0.path()).output().unwrap()
     }
 

@@ -115,7 +115,7 @@ impl Run {
 pub struct Folder {
     pub path: PathBuf,
     pub disk: Disk,
-    _lock: Option<File>,
+    lock: Option<File>,
 }
 
 /// Where a run goes on, and what there is to tell about it.
@@ -157,7 +157,7 @@ impl Folder {
             return Err(RecordError::Exists { path: path.into() });
         }
         disk.create_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
-        let folder = Folder { path: path.into(), disk, _lock: lock };
+        let folder = Folder { path: path.into(), disk, lock };
         if start == Start::Force {
             folder.clear()?;
         }
@@ -318,6 +318,15 @@ impl Folder {
             .collect();
         let (story, found) = self.digest(config, &all.ok()?).ok()?;
         (found == *digest).then_some(story)
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        // Closing the file is not enough where a process being started has a copy of it for a moment.
+        if let Some(lock) = &self.lock {
+            let _ = lock.unlock();
+        }
     }
 }
 
