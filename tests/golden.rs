@@ -1,0 +1,280 @@
+//! Golden digests of whole training runs: the same bits on any number of threads, by every instruction set, in one
+//! batch or in many, and the same as when they were minted.
+//!
+//! `tests/golden.txt` says what each of its lines covers and when they may be minted anew.
+
+mod common;
+
+use std::fmt::Write;
+use std::sync::LazyLock;
+
+use flotilla::backend::cpu::{Cpu, level_name};
+use flotilla::backend::gpu::device;
+use flotilla::backend::gpu::episode::GpuEpisodes;
+use flotilla::backend::{Backend, BackendError, Episode, Group, Trace, Visit};
+use flotilla::config::{Config, Override};
+use flotilla::record::{hex, metrics};
+use flotilla::trainer::Trainer;
+use flotilla::world::World;
+use sha2::{Digest, Sha256};
+
+const GENERALLY_FORWARD: &str = include_str!("../configs/generally_forward.toml");
+const STRICTLY_FORWARD: &str = include_str!("../configs/strictly_forward.toml");
+const CHAOTIC: &str = include_str!("../configs/chaotic.toml");
+/// Ten groups of a leader and three followers: a set of agents takes two words.
+const FORTY_AGENTS: &str = "
+[world]
+leaders = [[5, 5], [15, 5], [25, 5], [35, 5], [45, 5], [5, 40], [15, 40], [25, 40], [35, 40], [45, 40]]
+followers = [
+    [7, 2], [3, 2], [5, 8], [17, 2], [13, 2], [15, 8], [27, 2], [23, 2], [25, 8], [37, 2], [33, 2], [35, 8],
+    [47, 2], [43, 2], [45, 8], [7, 37], [3, 37], [5, 43], [17, 37], [13, 37], [15, 43], [27, 37], [23, 37], [25, 43],
+    [37, 37], [33, 37], [35, 43], [47, 37], [43, 37], [45, 43],
+]
+pois = [[5, 12], [20, 12], [45, 12], [10, 47], [30, 47], [48, 30]]
+coupling = 4
+";
+
+/// Name, what is covered, the config and what of it is changed.
+type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
+
+/// Which between them cover every choice that a config has, and sizes on both sides of every special case.
+const CASES: [Case; 13] = [
+    ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
+    ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
+    ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
+    (
+        "all-leaders",
+        "all-leaders, D, two agents at a POI",
+        GENERALLY_FORWARD,
+        &[("learning.paradigm", "'all-leaders'"), ("learning.fitness", "'D'"), ("world.coupling", "2")],
+    ),
+    (
+        "all-leaders-chaotic",
+        "20 leaders, D++",
+        CHAOTIC,
+        &[("learning.paradigm", "'all-leaders'"), ("learning.fitness", "'D++'")],
+    ),
+    (
+        "jittered",
+        "three episodes a team from jittered starts, D",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.start_jitter", "0.75"),
+            ("learning.episodes_per_team", "3"),
+            ("learning.population", "13"),
+            ("learning.fitness", "'D'"),
+        ],
+    ),
+    (
+        "additive",
+        "additive mutation of every weight, no elites",
+        STRICTLY_FORWARD,
+        &[
+            ("learning.mutation", "'additive'"),
+            ("learning.mutation_probability", "1.0"),
+            ("learning.mutation_sigma", "0.3"),
+            ("learning.elites", "0"),
+        ],
+    ),
+    (
+        "inverse",
+        "inverse density, POIs sensed only when near",
+        GENERALLY_FORWARD,
+        &[("sense.density", "'inverse'"), ("sense.poi_range", "12.0")],
+    ),
+    ("unlimited", "agents sensed at any distance", CHAOTIC, &[("sense.agent_range", "inf")]),
+    (
+        "two-hidden",
+        "two hidden layers, three elites",
+        GENERALLY_FORWARD,
+        &[("policy.hidden", "[16, 7]"), ("learning.elites", "3")],
+    ),
+    ("no-hidden", "no hidden layer", GENERALLY_FORWARD, &[("policy.hidden", "[]")]),
+    (
+        "each-coupling",
+        "a coupling for each POI, a seed above 32 bits",
+        CHAOTIC,
+        &[("world.coupling", "[1, 2, 5, 7]"), ("learning.seed", "81985529216486895")],
+    ),
+    ("forty-agents", "40 agents, two words a set, six POIs", FORTY_AGENTS, &[]),
+];
+
+static CONFIGS: LazyLock<Vec<Config>> = LazyLock::new(|| {
+    let small = [("learning.trials", "2"), ("learning.generations", "8"), ("learning.population", "20")];
+    let config = |(name, _, text, changes): Case| {
+        let change = |&(key, text): &(&str, &str)| Override { key: key.into(), text: text.into(), name: key.into() };
+        let small: Vec<Override> = small.iter().map(change).collect();
+        let changes: Vec<Override> = changes.iter().map(change).collect();
+        let config = Config::parse(text, name).and_then(|config| config.with(&small)?.with(&changes));
+        config.unwrap_or_else(|error| panic!("{name}: {error}"))
+    };
+    CASES.map(config).into()
+});
+
+/// What a run came to.
+#[derive(Clone, Debug, PartialEq)]
+struct Golden {
+    /// Bytes hashed and their SHA-256, as `flotilla train` tells it.
+    bytes: usize,
+    sha256: String,
+    /// SHA-256 of every stage of every step of the last policies: one flipped bit need not change what is selected.
+    episodes: String,
+}
+
+/// Trains all cases side by side.
+fn train(backend: &mut dyn Backend) -> Vec<Golden> {
+    let mut trainer = Trainer::new(CONFIGS.clone());
+    let mut texts = vec![format!("{}\n", metrics::HEADER); CONFIGS.len()];
+    let mut most = vec![0f64; CONFIGS.len()];
+    while !trainer.is_done() {
+        for row in trainer.advance(backend).unwrap() {
+            most[row.arm] = most[row.arm].max(row.best_g);
+            let metrics::Row { arm, trial, generation, best_g, mean_g, champion_g } = row;
+            writeln!(texts[arm], "{trial},{generation},{best_g},{mean_g},{champion_g},0").unwrap();
+        }
+    }
+    let golden = |(arm, text): (usize, &String)| {
+        assert!(most[arm] > 0.0, "{}: nothing was observed, so selection had nothing to go by", CASES[arm].0);
+        let mut rows = metrics::Rows::new(text.as_bytes()).unwrap();
+        let count = rows.by_ref().map(Result::unwrap).count();
+        // Without the last column, as the hash has it.
+        let text = text.len() - ",seconds".len() - count * ",0".len();
+        let mut hash = rows.digest();
+        let policies = trainer.policies(arm).concat();
+        hash.update(bytemuck::cast_slice::<f32, u8>(&policies));
+        Golden {
+            bytes: text + size_of_val(&policies[..]),
+            sha256: hex(&hash.finalize()),
+            episodes: trace(backend, trainer.world(arm), &trainer.policies(arm)[0]),
+        }
+    };
+    texts.iter().enumerate().map(golden).collect()
+}
+
+/// Plays a trial's policies, team j of the policies with index j, and hashes every float without the sign of a zero.
+fn trace(backend: &mut dyn Backend, world: &World, weights: &[f32]) -> String {
+    let policies = weights.len() / world.leaders() / world.parameters();
+    let teams: Vec<u32> = (0..policies * world.leaders()).map(|place| (place / world.leaders()) as u32).collect();
+    let group = Group { world, starts: &world.starts, weights, policies, teams: &teams };
+    let trace = backend.trace(&group).unwrap();
+    let floats: Vec<f32> = bytemuck::cast_slice(&trace.moments).iter().map(|float: &f32| float + 0.0).collect();
+    hex(&Sha256::digest(bytemuck::cast_slice::<f32, u8>(&floats)))
+}
+
+/// What it takes to compare runs with those of the past, or to mint them.
+static GOLDEN: LazyLock<Vec<Golden>> = LazyLock::new(|| {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden.txt");
+    if std::env::var("FLOTILLA_MINT").as_deref() == Ok("1") {
+        let mut text = String::from(HEADER);
+        for ((name, what, ..), Golden { bytes, sha256, episodes }) in CASES.iter().zip(train(&mut Cpu::default())) {
+            writeln!(text, "{name:<20} {bytes:>6} {sha256} {episodes}  {what}").unwrap();
+        }
+        std::fs::write(path, text).unwrap();
+    }
+    let text = std::fs::read_to_string(path).unwrap();
+    let lines: Vec<&str> = text.lines().filter(|line| !line.starts_with('#')).collect();
+    assert_eq!(lines.len(), CASES.len(), "{path} has a line a case");
+    let golden = |((name, ..), line): (&Case, &&str)| {
+        let mut words = line.split_whitespace();
+        assert_eq!(words.next(), Some(*name), "{path}: {line}");
+        let mut word = || words.next().unwrap_or_else(|| panic!("{path}: {line}"));
+        Golden { bytes: word().parse().unwrap(), sha256: word().into(), episodes: word().into() }
+    };
+    CASES.iter().zip(&lines).map(golden).collect()
+});
+
+const HEADER: &str = "\
+# Digests of whole training runs, one a line: name, bytes hashed, SHA-256 of the run, SHA-256 of its last episodes, what
+# the line covers.
+#
+# Each is a layout of the paper, or one of tests/golden.rs, with 2 trials of 8 generations of 20 policies, changed as
+# that file says. Of the run, the rows of metrics.csv without the seconds and then the policies are hashed: the digest
+# that `flotilla train` prints. Of the episodes, every stage of every step that the first trial's last policies play.
+#
+# These are promises to whoever has runs of earlier versions. Where results have to change, say why in the changelog and
+# mint them anew: FLOTILLA_MINT=1 cargo test --test golden
+";
+
+fn check(what: &str, backend: &mut dyn Backend) {
+    for (((name, ..), golden), found) in CASES.iter().zip(&*GOLDEN).zip(train(backend)) {
+        assert_eq!(found, *golden, "{name}, {what}");
+    }
+}
+
+fn on_threads(count: usize, work: impl FnOnce() + Send) {
+    rayon::ThreadPoolBuilder::new().num_threads(count).build().unwrap().install(work);
+}
+
+#[test]
+fn any_number_of_threads() {
+    for count in [1, 2, 8] {
+        on_threads(count, || check(&format!("{count} threads"), &mut Cpu::default()));
+    }
+}
+
+#[test]
+fn every_instruction_set() {
+    for level in Cpu::levels() {
+        check(level_name(level), &mut Cpu::at_level(level));
+    }
+}
+
+#[test]
+fn every_adapter() {
+    for (request, info) in common::adapters("every_adapter") {
+        check(&info.to_string(), &mut GpuEpisodes::new(device::open(request).unwrap()).unwrap());
+    }
+}
+
+/// Plays so many teams at a time: each group, and each group's teams, in rollouts of their own.
+struct Few {
+    teams: usize,
+    backend: Cpu,
+}
+
+impl Backend for Few {
+    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
+        for (index, group) in groups.iter().enumerate() {
+            let leaders = group.world.leaders();
+            for (chunk, teams) in group.teams.chunks(self.teams * leaders).enumerate() {
+                let team = |team: usize| chunk * self.teams + team;
+                self.backend.rollout(&[Group { teams, ..*group }], &|episode| {
+                    visit(Episode { group: index, team: team(episode.team), ..episode });
+                })?;
+            }
+        }
+        Ok(())
+    }
+
+    fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
+        self.backend.trace(group)
+    }
+
+    fn describe(&self) -> String {
+        format!("{}, {} teams at a time", self.backend.describe(), self.teams)
+    }
+}
+
+#[test]
+fn one_batch_or_many() {
+    for teams in [1, 5, 16] {
+        let mut backend = Few { teams, backend: Cpu::default() };
+        check(&backend.describe(), &mut backend);
+    }
+}
+
+/// Alone and from the command line, a case ends as it does here, side by side with all others.
+#[test]
+fn the_program_tells_the_same_digest() {
+    let folder = tempfile::tempdir().unwrap();
+    for (index, (name, ..)) in CASES.iter().enumerate() {
+        let file = folder.path().join(format!("{name}.toml"));
+        std::fs::write(&file, CONFIGS[index].to_toml()).unwrap();
+        let out = folder.path().join(name);
+        let mut command = assert_cmd::cargo::cargo_bin_cmd!("flotilla");
+        command.args(["train", "--quiet", "--backend", "cpu", "--out"]).arg(&out).arg(&file).assert().success();
+        let run = std::fs::read_to_string(out.join("run.json")).unwrap();
+        let run: serde_json::Value = serde_json::from_str(&run).unwrap();
+        assert_eq!(run["digest"], GOLDEN[index].sha256, "{name}");
+    }
+}
