@@ -1,0 +1,592 @@
+//! Teams, starts, selection and mutation are what the paper's Algorithm 1 says, and the trainer puts them together so.
+//!
+//! Statistics are of seeded draws: counts and means have to lie within five standard deviations of what they should be.
+
+use std::collections::HashSet;
+
+use fearless_simd::Level;
+use flotilla::backend::cpu::{Cpu, level_name};
+use flotilla::backend::{Backend, Group};
+use flotilla::config::{Config, Fitness, Learning, Mutation, Paradigm};
+use flotilla::credit::Credit;
+use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose};
+use flotilla::trainer::{Row, Trainer};
+use flotilla::world::{GRID, World};
+use glam::Vec2;
+use proptest::prelude::*;
+
+const PURPOSES: [Purpose; 5] =
+    [Purpose::Weights, Purpose::Teams, Purpose::Starts, Purpose::Tournament, Purpose::Mutation];
+const GENERALLY_FORWARD: &str = include_str!("../configs/generally_forward.toml");
+const STRICTLY_FORWARD: &str = include_str!("../configs/strictly_forward.toml");
+const CHAOTIC: &str = include_str!("../configs/chaotic.toml");
+
+fn config(text: &str, change: impl FnOnce(&mut Config)) -> Config {
+    let mut config = Config::parse(text, "config").unwrap();
+    change(&mut config);
+    // What a test asks for has to be what a user may ask for.
+    config.with(&[]).unwrap()
+}
+
+fn learning(mutation: Mutation, probability: f64, sigma: f64) -> Learning {
+    let change = |config: &mut Config| {
+        let Learning { mutation: kind, mutation_probability, mutation_sigma, .. } = &mut config.learning;
+        (*kind, *mutation_probability, *mutation_sigma) = (mutation, probability, sigma);
+    };
+    config(GENERALLY_FORWARD, change).learning
+}
+
+#[track_caller]
+fn near(what: &str, found: f64, expected: f64, deviation: f64) {
+    assert!((found - expected).abs() <= 5.0 * deviation, "{what}: {found}, expected {expected} ± {deviation}");
+}
+
+/// Whether counts are as likely as they should be, given the probability of each.
+#[track_caller]
+fn chi_square(what: &str, counts: &[u32], probability: impl Fn(usize) -> f64) {
+    let total: u32 = counts.iter().sum();
+    let term = |(index, &count): (usize, &u32)| {
+        let expected = f64::from(total) * probability(index);
+        assert!(expected > 5.0, "{what}: too few to tell");
+        (f64::from(count) - expected).powi(2) / expected
+    };
+    let freedom = (counts.len() - 1) as f64;
+    near(what, counts.iter().enumerate().map(term).sum(), freedom, (2.0 * freedom).sqrt());
+}
+
+fn uniform(word: u32) -> f64 {
+    f64::from(word) / (1u64 << 32) as f64
+}
+
+fn bits(weights: &[f32]) -> Vec<u32> {
+    weights.iter().map(|weight| weight.to_bits()).collect()
+}
+
+proptest! {
+    #[test]
+    fn every_policy_is_on_one_team(seed: u64, generation in 0usize..200, leaders in 1usize..30, population in 1usize..300) {
+        let mut teams = vec![u32::MAX; population * leaders];
+        evolve::form_teams(Key::new(seed, 3, Purpose::Teams), generation, leaders, &mut teams);
+        for leader in 0..leaders {
+            let mut policies: Vec<u32> = teams.iter().skip(leader).step_by(leaders).copied().collect();
+            policies.sort_unstable();
+            prop_assert!(policies.into_iter().eq(0..population as u32));
+        }
+    }
+
+    /// Few distinct scores, so that nearly all are tied.
+    #[test]
+    fn elites_come_best_first_and_ties_go_to_the_lower_index(
+        scores in prop::collection::vec(0u8..6, 1..80), share in 0.0..=1.0f64,
+    ) {
+        let scores: Vec<f32> = scores.into_iter().map(|score| f32::from(score) / 4.0).collect();
+        let count = (share * scores.len() as f64) as usize;
+        let mut order: Vec<usize> = (0..scores.len()).collect();
+        // A stable sort leaves ties as they were.
+        order.sort_by(|&a, &b| scores[b].partial_cmp(&scores[a]).unwrap());
+        prop_assert_eq!(evolve::best(&scores, count), &order[..count]);
+    }
+
+    #[test]
+    fn starts_stay_on_the_map_and_on_the_grid(seed: u64, jitter in 1e-6..30.0f64, width in 1.0..60.0f64, height in 1.0..60.0f64) {
+        let world = World::new(&config(GENERALLY_FORWARD, |config| {
+            config.world.map = [width, height];
+            for places in [&mut config.world.leaders, &mut config.world.followers, &mut config.world.pois] {
+                places.iter_mut().for_each(|place| *place = [place[0].min(width), place[1].min(height)]);
+            }
+        }));
+        let mut starts = vec![Vec2::NAN; 2];
+        evolve::jitter_starts(Key::new(seed, 0, Purpose::Starts), 7, 1, &world, jitter, &mut starts);
+        prop_assert_eq!(starts.len(), world.agents());
+        for (start, from) in starts.iter().zip(&world.starts) {
+            for (at, from, wall) in [(start.x, from.x, world.constants.map_x), (start.y, from.y, world.constants.map_y)] {
+                prop_assert!((0.0..=wall).contains(&at));
+                prop_assert!((at * GRID).fract() == 0.0 || at == wall, "{} is off the grid", at);
+                prop_assert!(f64::from((at - from).abs()) <= jitter + 1.0 / f64::from(GRID) + 1e-5, "{} from {}", at, from);
+            }
+        }
+    }
+}
+
+#[test]
+fn every_way_to_form_teams_is_as_likely() {
+    let (leaders, population) = (3, 4);
+    let mut teams = vec![0; population * leaders];
+    // Where policy 0 of each population plays, together: the populations are shuffled apart from each other.
+    let mut together = vec![0; population * population * population];
+    let mut orders = vec![0; 256];
+    for generation in 0..12_000 {
+        evolve::form_teams(Key::new(5, 0, Purpose::Teams), generation, leaders, &mut teams);
+        let team = |leader: usize| (0..population).position(|team| teams[team * leaders + leader] == 0).unwrap();
+        together[(team(0) * population + team(1)) * population + team(2)] += 1;
+        let order = (0..population).fold(0, |order, team| order * 4 + teams[team * leaders] as usize);
+        orders[order] += 1;
+    }
+    chi_square("places of policy 0", &together, |_| 1.0 / 64.0);
+    orders.retain(|&count| count > 0);
+    assert_eq!(orders.len(), 24);
+    chi_square("orders of four policies", &orders, |_| 1.0 / 24.0);
+}
+
+#[test]
+fn starts_are_jittered_evenly_and_anew_for_every_episode() {
+    let world = World::new(&config(GENERALLY_FORWARD, |_| ()));
+    let key = Key::new(1, 2, Purpose::Starts);
+    let mut starts = Vec::new();
+    evolve::jitter_starts(key, 3, 4, &world, 0.0, &mut starts);
+    assert_eq!(starts, world.starts, "without jitter, all start where the config says");
+
+    let (jitter, mut counts, mut seen) = (1.5, vec![0; 30], HashSet::new());
+    for generation in 0..100 {
+        for episode in 0..10 {
+            evolve::jitter_starts(key, generation, episode, &world, jitter, &mut starts);
+            for (start, from) in starts.iter().zip(&world.starts) {
+                for offset in (*start - *from).to_array() {
+                    let share = (f64::from(offset) / jitter + 1.0) / 2.0;
+                    counts[((share * 30.0) as usize).min(29)] += 1;
+                }
+            }
+            seen.insert(starts.iter().flat_map(|start| start.to_array().map(f32::to_bits)).collect::<Vec<_>>());
+        }
+    }
+    chi_square("offsets", &counts, |_| 1.0 / 30.0);
+    assert_eq!(seen.len(), 1000, "no two episodes start alike");
+}
+
+#[test]
+fn a_tournament_is_between_any_two_policies() {
+    let population = 20;
+    let rising: Vec<f32> = (0..population).map(|index| index as f32).collect();
+    let tied = vec![0.5; population];
+    let mut counts = vec![0; population * population];
+    let tournaments = Key::new(9, 0, Purpose::Tournament);
+    for generation in 0..400 {
+        for slot in 0..100 {
+            let key = tournaments.at(generation, 1, slot);
+            // One draw, seen from both sides: rising scores tell the higher index, ties the lower.
+            let (high, low) = (evolve::tournament(key, &rising), evolve::tournament(key, &tied));
+            assert!(low < high, "two distinct policies, and ties to the lower index: {low}, {high}");
+            counts[low * population + high] += 1;
+            let falling: Vec<f32> = rising.iter().map(|score| -score).collect();
+            assert_eq!(evolve::tournament(key, &falling), low, "the higher score wins");
+        }
+    }
+    counts.retain(|&count| count > 0);
+    assert_eq!(counts.len(), 190, "every pair meets");
+    chi_square("pairs", &counts, |_| 1.0 / 190.0);
+    let mut duels = (0..100).map(|slot| evolve::tournament(tournaments.at(0, 0, slot), &[0.0, 1.0]));
+    assert!(duels.all(|winner| winner == 1), "of two policies, both play");
+}
+
+/// Mean, standard deviation and shape of numbers that should be N(0, 1).
+#[track_caller]
+fn normal(what: &str, numbers: &[f64]) {
+    let count = numbers.len() as f64;
+    let mean = numbers.iter().sum::<f64>() / count;
+    let deviation = (numbers.iter().map(|number| (number - mean).powi(2)).sum::<f64>() / count).sqrt();
+    near(what, mean, 0.0, 1.0 / count.sqrt());
+    near(what, deviation, 1.0, 1.0 / (2.0 * count).sqrt());
+    // Φ at 0, 0.5, … 3, from tables.
+    let below = [0.5, 0.691462461, 0.841344746, 0.933192799, 0.977249868, 0.993790335, 0.998650102, 1.0];
+    let cumulative = |bin: usize| if bin < 7 { 1.0 - below[7 - bin] } else { below[bin - 7] };
+    let mut counts = vec![0; 14];
+    numbers.iter().for_each(|number| counts[((number * 2.0).floor() + 7.0).clamp(0.0, 13.0) as usize] += 1);
+    chi_square(what, &counts, |bin| cumulative(bin + 1) - cumulative(bin));
+}
+
+#[test]
+fn new_policies_are_normal() {
+    let mut weights = vec![0.0; 200_000];
+    evolve::random_policy(Level::new(), Key::new(0, 0, Purpose::Weights).at(0, 0, 0), &mut weights);
+    normal("new weights", &weights.iter().map(|&weight| f64::from(weight)).collect::<Vec<_>>());
+}
+
+#[test]
+fn mutation_touches_its_share_of_weights_with_its_noise() {
+    let old: Vec<f32> = (0..200_000).map(|index| [-2.0, 0.5, 1.25][index % 3] + (index % 97) as f32 * 1e-3).collect();
+    let key = Key::new(3, 1, Purpose::Mutation).at(17, 2, 5);
+    for (mutation, sigma) in [(Mutation::Scaled, 0.1), (Mutation::Additive, 0.1), (Mutation::Additive, 2.5)] {
+        for probability in [0.0, 0.15, 1.0] {
+            let what = format!("{mutation}, probability {probability}, sigma {sigma}");
+            let mut new = old.clone();
+            evolve::mutate(Level::new(), key, &learning(mutation, probability, sigma), &mut new);
+            let noise = |(old, new): (&f32, &f32)| {
+                let gain = f64::from(*new) - f64::from(*old);
+                (old != new).then(|| gain / sigma / if mutation == Mutation::Scaled { f64::from(*old) } else { 1.0 })
+            };
+            let noise: Vec<f64> = old.iter().zip(&new).filter_map(noise).collect();
+            let count = old.len() as f64;
+            // Noise too small to show in f32 is as good as never.
+            let deviation = (count * probability * (1.0 - probability)).sqrt() + 2.0 * probability;
+            near(&what, noise.len() as f64, count * probability, deviation);
+            if probability == 0.0 {
+                assert_eq!(bits(&new), bits(&old), "{what}");
+            } else {
+                normal(&what, &noise);
+            }
+        }
+    }
+    let mut new = old.clone();
+    evolve::mutate(Level::new(), key, &learning(Mutation::Additive, 1.0, 0.0), &mut new);
+    assert_eq!(bits(&new), bits(&old), "noise of no size");
+}
+
+/// Weight by weight: Box and Muller's formula in f64, from the draws that the counters give.
+#[test]
+fn weights_follow_from_their_own_counters() {
+    let (weights, mutations) = (Key::new(8, 0, Purpose::Weights).at(0, 1, 2), Key::new(8, 0, Purpose::Mutation));
+    let deviate = |a: u32, b: u32| {
+        let unit = (f64::from(a >> 8) + 1.0) / (1u32 << 24) as f64;
+        let angle = (f64::from(b >> 8) / (1u32 << 23) as f64 - 1.0) * std::f64::consts::PI;
+        (-2.0 * unit.ln()).sqrt() * angle.cos()
+    };
+    let mut first = vec![0.0; 5000];
+    evolve::random_policy(Level::new(), weights, &mut first);
+    for (index, &weight) in first.iter().enumerate() {
+        let [a, b, ..] = weights.draw(index as u32);
+        assert!((f64::from(weight) - deviate(a, b)).abs() < 1e-5, "weight {index}: {weight}");
+    }
+    for mutation in [Mutation::Scaled, Mutation::Additive] {
+        let mut second = first.clone();
+        evolve::mutate(Level::new(), mutations.at(4, 5, 6), &learning(mutation, 0.15, 0.1), &mut second);
+        for (index, (&old, &new)) in first.iter().zip(&second).enumerate() {
+            let [chance, a, b, _] = mutations.at(4, 5, 6).draw(index as u32);
+            let scale = if mutation == Mutation::Scaled { f64::from(old) } else { 1.0 };
+            let noise = if uniform(chance) < 0.15 { 0.1 * deviate(a, b) * scale } else { 0.0 };
+            assert!((f64::from(new) - f64::from(old) - noise).abs() < 1e-5, "{mutation}, weight {index}: {old}, {new}");
+        }
+    }
+}
+
+/// Every weight has a size that the kernels can take, however often and hard policies are mutated.
+#[test]
+fn weights_stay_in_bounds() {
+    let starts = [MAX_WEIGHT, -MAX_WEIGHT, MIN_WEIGHT, -MIN_WEIGHT, 0.0, 1e-4, 1.0, -1e5];
+    let (mut smallest, mut largest, mut zeros) = (f32::MAX, 0f32, 0);
+    for mutation in [Mutation::Scaled, Mutation::Additive] {
+        for sigma in [1e-6, 0.9, 100.0] {
+            let mut weights: Vec<f32> = starts.into_iter().cycle().take(4000).collect();
+            for generation in 0..60 {
+                let key = Key::new(2, 0, Purpose::Mutation).at(generation, 0, 0);
+                evolve::mutate(Level::new(), key, &learning(mutation, 0.5, sigma), &mut weights);
+                for &weight in &weights {
+                    assert!(weight == 0.0 || (MIN_WEIGHT..=MAX_WEIGHT).contains(&weight.abs()), "{mutation}, {sigma}");
+                    zeros += usize::from(weight == 0.0);
+                    largest = largest.max(weight.abs());
+                    smallest = if weight == 0.0 { smallest } else { smallest.min(weight.abs()) };
+                }
+            }
+            if mutation == Mutation::Scaled {
+                assert!(
+                    weights.iter().skip(4).step_by(starts.len()).all(|&weight| weight == 0.0),
+                    "0 times noise is 0"
+                );
+            }
+        }
+    }
+    assert!(largest == MAX_WEIGHT && smallest < 2.0 * MIN_WEIGHT && zeros > 0, "{largest}, {smallest}: ends not met");
+}
+
+/// A place in the space of all randomness: seed, trial, purpose, generation, population, slot, counter.
+type Place = [u64; 7];
+
+fn draw(place: Place) -> [u32; 4] {
+    let [seed, trial, purpose, generation, population, slot, counter] = place;
+    let key = Key::new(seed, trial as usize, PURPOSES[purpose as usize]);
+    key.at(generation as usize, population as usize, slot as usize).draw(counter as u32)
+}
+
+#[test]
+fn no_two_places_share_a_draw() {
+    let mut seen = HashSet::new();
+    let mut places: Vec<Place> = vec![[0; 7]];
+    // Of each coordinate, small numbers, and one whose high bits alone differ.
+    let values: [&[u64]; 7] = [
+        &[0, 1, 1 << 32, 1 << 62],
+        &[0, 1, 4095],
+        &[0, 1, 2, 3, 4],
+        &[0, 1, 1 << 19],
+        &[0, 1, 1023],
+        &[0, 1, 2, (1 << 20) - 1],
+        &[0, 1, 2, 1 << 12],
+    ];
+    for (coordinate, values) in values.into_iter().enumerate() {
+        let with = |place: &Place| {
+            let mut place = *place;
+            values.iter().map(move |&value| {
+                place[coordinate] = value;
+                place
+            })
+        };
+        places = places.iter().flat_map(with).collect();
+    }
+    let draws: usize = places.iter().map(|&place| usize::from(seen.insert(draw(place)))).sum();
+    assert_eq!((draws, draws), (places.len(), 4 * 3 * 5 * 3 * 3 * 4 * 4));
+}
+
+/// Draws at neighbouring places are no more alike than any two: neither bit by bit nor as numbers.
+#[test]
+fn neighbouring_draws_are_uncorrelated() {
+    let pairs = 8192;
+    // Steps along each coordinate, the high half of the seed's too; of the purposes there are only five.
+    let steps: [Place; 7] = [
+        [1, 0, 0, 0, 0, 0, 0],
+        [1 << 32, 0, 0, 0, 0, 0, 0],
+        [0, 1, 0, 0, 0, 0, 0],
+        [0, 0, 0, 1, 0, 0, 0],
+        [0, 0, 0, 0, 1, 0, 0],
+        [0, 0, 0, 0, 0, 1, 0],
+        [0, 0, 0, 0, 0, 0, 1],
+    ];
+    let along = |step: Place, from: Place, index: u64| {
+        std::array::from_fn(|coordinate| from[coordinate] + step[coordinate] * index)
+    };
+    let mut rows: Vec<(String, Vec<[[u32; 4]; 2]>)> = Vec::new();
+    for purpose in 0..5u64 {
+        for step in steps {
+            let from = [11, 2, purpose, 5, 1, 7, 3];
+            let pair = |index| [draw(along(step, from, index)), draw(along(step, from, index + 1))];
+            rows.push((format!("purpose {purpose}, step {step:?}"), (0..pairs).map(pair).collect()));
+        }
+        let other = (purpose + 1) % 5;
+        let pair = |index| [purpose, other].map(|purpose| draw([11, 2, purpose, 5, 1, 7, index]));
+        rows.push((format!("purposes {purpose} and {other}"), (0..pairs).map(pair).collect()));
+    }
+    let count = pairs as f64;
+    for (what, pairs) in rows {
+        let differ = |[a, b]: &[[u32; 4]; 2]| a.iter().zip(b).map(|(a, b)| (a ^ b).count_ones()).sum::<u32>();
+        let differing = f64::from(pairs.iter().map(differ).sum::<u32>()) / count;
+        near(&format!("{what}: differing bits"), differing, 64.0, (32.0 / count).sqrt());
+        for (a, b) in (0..16).map(|index| (index / 4, index % 4)) {
+            let product = |[x, y]: &[[u32; 4]; 2]| (uniform(x[a]) - 0.5) * (uniform(y[b]) - 0.5) * 12.0;
+            let correlation = pairs.iter().map(product).sum::<f64>() / count;
+            near(&format!("{what}: words {a} and {b}"), correlation, 0.0, 1.0 / count.sqrt());
+        }
+        for word in 0..4 {
+            let mut counts = vec![0; 64];
+            pairs.iter().for_each(|[x, _]| counts[(x[word] >> 26) as usize] += 1);
+            chi_square(&format!("{what}: high bits of word {word}"), &counts, |_| 1.0 / 64.0);
+            counts.fill(0);
+            pairs.iter().for_each(|[x, _]| counts[(x[word] & 63) as usize] += 1);
+            chi_square(&format!("{what}: low bits of word {word}"), &counts, |_| 1.0 / 64.0);
+        }
+    }
+}
+
+/// Every instruction set gives the same policies, and a weight depends on its index alone, not on how many follow.
+#[test]
+fn policies_depend_on_no_instruction_set() {
+    let key = |purpose| Key::new(77, 1, purpose).at(3, 4, 5);
+    let evolved = |level, parameters: usize| {
+        let mut weights = vec![0.0; parameters];
+        evolve::random_policy(level, key(Purpose::Weights), &mut weights);
+        let mut all = vec![weights];
+        for learning in [
+            learning(Mutation::Scaled, 0.15, 0.1),
+            learning(Mutation::Additive, 0.5, 100.0),
+            learning(Mutation::Scaled, 1.0, 100.0),
+        ] {
+            let mut child = all.last().unwrap().clone();
+            evolve::mutate(level, key(Purpose::Mutation), &learning, &mut child);
+            all.push(child);
+        }
+        all
+    };
+    let expected = evolved(Level::baseline(), 9_000);
+    assert_ne!(expected[0], expected[1]);
+    for level in Cpu::levels() {
+        for parameters in (1..70).chain([112, 8_999, 9_000]) {
+            for (found, expected) in evolved(level, parameters).iter().zip(&expected) {
+                assert_eq!(bits(found), bits(&expected[..parameters]), "{}, {parameters}", level_name(level));
+            }
+        }
+    }
+}
+
+/// Arms of every kind that end at different generations.
+fn arms() -> Vec<Config> {
+    let small = |config: &mut Config, population, generations, trials| {
+        let Learning { population: p, generations: g, trials: t, .. } = &mut config.learning;
+        (*p, *g, *t) = (population, generations, trials);
+    };
+    vec![
+        config(GENERALLY_FORWARD, |config| {
+            small(config, 12, 5, 3);
+            config.learning.elites = 3;
+        }),
+        config(CHAOTIC, |config| {
+            small(config, 9, 3, 2);
+            (config.learning.start_jitter, config.learning.episodes_per_team) = (0.75, 3);
+            (config.learning.mutation, config.learning.mutation_sigma) = (Mutation::Additive, 0.5);
+            (config.learning.fitness, config.learning.elites, config.learning.seed) = (Fitness::Dpp, 0, 1 << 40);
+        }),
+        config(STRICTLY_FORWARD, |config| {
+            small(config, 17, 4, 1);
+            (config.learning.paradigm, config.learning.fitness) = (Paradigm::AllLeaders, Fitness::D);
+            config.world.coupling = flotilla::config::Coupling::Each(vec![1, 2]);
+        }),
+        config(STRICTLY_FORWARD, |config| {
+            small(config, 2, 0, 1);
+            config.learning.fitness = Fitness::G;
+        }),
+        config(GENERALLY_FORWARD, |config| {
+            small(config, 6, 2, 1);
+            config.learning.elites = 6;
+        }),
+    ]
+}
+
+/// Rows and policies of every arm.
+fn train(configs: &[Config]) -> Vec<(Vec<Row>, Vec<Vec<f32>>)> {
+    let (mut trainer, mut backend) = (Trainer::new(configs.to_vec()), Cpu::default());
+    let mut rows = vec![Vec::new(); configs.len()];
+    while !trainer.is_done() {
+        for row in trainer.advance(&mut backend).unwrap() {
+            rows[row.arm].push(row);
+        }
+    }
+    rows.into_iter().enumerate().map(|(arm, rows)| (rows, trainer.policies(arm))).collect()
+}
+
+#[test]
+fn arms_side_by_side_come_out_as_alone() {
+    let configs = arms();
+    for (arm, (rows, policies)) in train(&configs).into_iter().enumerate() {
+        let (mut alone, same) = train(&configs[arm..=arm]).remove(0);
+        alone.iter_mut().for_each(|row| row.arm = arm);
+        assert_eq!(rows, alone, "arm {arm}");
+        assert_eq!(policies, same, "arm {arm}");
+        let config = &configs[arm].learning;
+        let expected = (0..=config.generations).flat_map(|g| (0..config.trials).map(move |trial| (g, trial)));
+        assert!(
+            rows.iter().map(|row| (row.generation, row.trial)).eq(expected),
+            "arm {arm}: a row a generation and trial"
+        );
+    }
+}
+
+/// One trial as Algorithm 1 has it, plainly: every team is played by itself, from weights of its own.
+struct Plain<'a> {
+    config: &'a Config,
+    world: World,
+    trial: usize,
+    /// `[leaders][policies][parameters]`.
+    policies: Vec<Vec<Vec<f32>>>,
+}
+
+impl Plain<'_> {
+    fn key(&self, purpose: Purpose) -> Key {
+        Key::new(self.config.learning.seed, self.trial, purpose)
+    }
+
+    /// Observed POIs over all episodes of a generation, and each leader's mean score.
+    fn play(&self, generation: usize, team: &[usize]) -> (u32, Vec<f32>) {
+        let Learning { fitness, episodes_per_team, start_jitter, .. } = self.config.learning;
+        let weights: Vec<f32> =
+            team.iter().zip(&self.policies).flat_map(|(&policy, all)| all[policy].clone()).collect();
+        let (mut observed, mut totals) = (0, vec![0.0; team.len()]);
+        for episode in 0..episodes_per_team {
+            let mut starts = Vec::new();
+            let key = self.key(Purpose::Starts);
+            evolve::jitter_starts(key, generation, episode, &self.world, start_jitter, &mut starts);
+            let teams = vec![0; team.len()];
+            let group = Group { world: &self.world, starts: &starts, weights: &weights, policies: 1, teams: &teams };
+            let found = std::sync::Mutex::new(None);
+            let visit = |episode: flotilla::backend::Episode<'_>| {
+                let scores = Credit::default().all(&episode, &self.world);
+                let mine = match fitness {
+                    Fitness::G => vec![scores.g; team.len()],
+                    Fitness::D => scores.d,
+                    Fitness::Df => scores.df,
+                    Fitness::Dpp => scores.dpp,
+                };
+                assert!(found.lock().unwrap().replace((scores.observed, mine)).is_none(), "one visit a team");
+            };
+            Cpu::default().rollout(&[group], &visit).unwrap();
+            let (pois, scores) = found.into_inner().unwrap().unwrap();
+            observed += pois;
+            totals.iter_mut().zip(scores).for_each(|(total, score)| *total += f64::from(score));
+        }
+        (observed, totals.iter().map(|total| (total / episodes_per_team as f64) as f32).collect())
+    }
+
+    /// Rows, then the policies best first.
+    fn train(mut self) -> (Vec<Row>, Vec<f32>) {
+        let Learning { population, generations, elites, episodes_per_team, .. } = self.config.learning;
+        let leaders = self.world.leaders();
+        let whole = (self.world.pois.len() * episodes_per_team) as f64;
+        let mut rows = Vec::new();
+        for generation in 0..=generations {
+            let mut teams = vec![0; population * leaders];
+            evolve::form_teams(self.key(Purpose::Teams), generation, leaders, &mut teams);
+            let (mut observed, mut fitness) = (Vec::new(), vec![vec![0.0; population]; leaders]);
+            for team in teams.chunks(leaders) {
+                let team: Vec<usize> = team.iter().map(|&policy| policy as usize).collect();
+                let (pois, scores) = self.play(generation, &team);
+                observed.push(pois);
+                team.iter()
+                    .zip(scores)
+                    .enumerate()
+                    .for_each(|(leader, (&policy, score))| fitness[leader][policy] = score);
+            }
+            let ranked: Vec<Vec<usize>> = (fitness.iter())
+                .map(|scores| {
+                    let mut order: Vec<usize> = (0..population).collect();
+                    order.sort_by(|&a, &b| scores[b].partial_cmp(&scores[a]).unwrap());
+                    order
+                })
+                .collect();
+            // The champion plays along with the next generation, so from the starts of that.
+            let champion: Vec<usize> = ranked.iter().map(|order| order[0]).collect();
+            let (champion, _) = self.play(generation + 1, &champion);
+            let total: u32 = observed.iter().sum();
+            rows.push(Row {
+                arm: 0,
+                trial: self.trial,
+                generation,
+                best_g: f64::from(*observed.iter().max().unwrap()) / whole,
+                mean_g: f64::from(total) / (whole * population as f64),
+                champion_g: f64::from(champion) / whole,
+            });
+            for (leader, (policies, order)) in self.policies.clone().iter().zip(&ranked).enumerate() {
+                let sorted = order.iter().map(|&policy| policies[policy].clone());
+                self.policies[leader] = sorted.collect();
+                for slot in if generation < generations { elites..population } else { 0..0 } {
+                    let key = self.key(Purpose::Tournament).at(generation, leader, slot);
+                    let mut child = policies[evolve::tournament(key, &fitness[leader])].clone();
+                    let key = self.key(Purpose::Mutation).at(generation, leader, slot);
+                    evolve::mutate(Level::baseline(), key, &self.config.learning, &mut child);
+                    self.policies[leader][slot] = child;
+                }
+            }
+        }
+        (rows, self.policies.concat().concat())
+    }
+}
+
+#[test]
+fn the_trainer_is_algorithm_1() {
+    let configs = arms();
+    let mut improved = 0;
+    for (arm, (rows, policies)) in train(&configs).into_iter().enumerate() {
+        let config = &configs[arm];
+        for (trial, policies) in policies.iter().enumerate() {
+            let world = World::new(config);
+            let key = Key::new(config.learning.seed, trial, Purpose::Weights);
+            let policy = |leader, slot| {
+                let mut weights = vec![0.0; world.parameters()];
+                evolve::random_policy(Level::baseline(), key.at(0, leader, slot), &mut weights);
+                weights
+            };
+            let population = |leader| (0..config.learning.population).map(|slot| policy(leader, slot)).collect();
+            let fresh = (0..world.leaders()).map(population).collect();
+            let (expected, weights) = Plain { config, world, trial, policies: fresh }.train();
+            let rows: Vec<Row> =
+                rows.iter().filter(|row| row.trial == trial).map(|&row| Row { arm: 0, ..row }).collect();
+            assert_eq!(rows, expected, "arm {arm}, trial {trial}");
+            assert_eq!(bits(policies), bits(&weights), "arm {arm}, trial {trial}");
+            improved += usize::from(rows.last().unwrap().mean_g > rows[0].mean_g);
+        }
+    }
+    assert!(improved > 2, "nothing was learned, so selection had no say");
+}
