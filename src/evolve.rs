@@ -47,6 +47,11 @@ impl Key {
         math::draw_scalar([x, y, z, w ^ counter])
     }
 
+    /// Another key of the same place, with numbers of its own: those of a counter that nothing else uses.
+    pub fn fork(self) -> Key {
+        Key(self.draw(u32::MAX))
+    }
+
     /// [`Key::draw`] for a counter a lane.
     #[inline(always)]
     fn draw_lanes<S: Simd>(self, counter: S::u32s) -> [S::u32s; 4] {
@@ -144,8 +149,7 @@ pub fn mutate(level: Level, key: Key, learning: &Learning, weights: &mut [f32], 
 #[inline(always)]
 fn mutate_lanes<S: Simd>(simd: S, key: Key, learning: &Learning, weights: &mut [f32], chosen: &mut Vec<u32>) {
     choose(simd, key, learning.mutation_probability, weights.len(), chosen);
-    // No weight has this counter.
-    let noises = Key(key.draw(u32::MAX));
+    let noises = key.fork();
     let sigma = learning.mutation_sigma as f32;
     for chosen in chosen.chunks(S::f32s::LEN) {
         let (mut index, mut weight) = (S::u32s::simd_from(simd, 0), splat(simd, 0.0));
