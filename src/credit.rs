@@ -9,7 +9,7 @@ use crate::config::Fitness;
 use crate::world::World;
 
 /// Owner of an agent that belongs to no group.
-const NOBODY: u32 = u32::MAX;
+pub const NOBODY: u32 = u32::MAX;
 
 /// Every fitness of one team; the differences are `[leaders]`.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -251,8 +251,9 @@ fn each_set(sets: &Strided<'_>, world: &World, set: &mut Vec<u32>, mut visit: im
     }
 }
 
-/// Gives each follower to the leader it saw at most steps, ties to the lower index, or to nobody if it saw none.
-fn assign(seen: &Strided<'_>, world: &World, owner: &mut Vec<u32>) {
+/// Gives each follower to the leader it saw at most steps, ties to the lower index, or to [`NOBODY`] if it saw none:
+/// the owner of every agent, leaders their own, `[agents]`.
+pub fn assign(seen: &Strided<'_>, world: &World, owner: &mut Vec<u32>) {
     let leaders = world.constants.leaders;
     owner.clear();
     owner.extend(0..leaders);

@@ -57,8 +57,17 @@ impl Trainer {
     /// Fresh populations for every trial of every (valid) config.
     pub fn new(configs: Vec<Config>) -> Trainer {
         let level = Level::new();
-        let arms = configs.into_iter().map(|config| Arm::new(config, level)).collect();
-        Trainer { arms, generation: 0, level }
+        let arm = |config: Config| {
+            let trials = 0..config.learning.trials;
+            Arm::new(config, trials, level)
+        };
+        Trainer { arms: configs.into_iter().map(arm).collect(), generation: 0, level }
+    }
+
+    /// Fresh populations for one trial of a (valid) config; it comes to the rows that it comes to among the others.
+    pub fn of_trial(config: Config, trial: usize) -> Trainer {
+        let level = Level::new();
+        Trainer { arms: vec![Arm::new(config, trial..trial + 1, level)], generation: 0, level }
     }
 
     /// The generation that plays next.
@@ -106,6 +115,12 @@ impl Trainer {
     pub fn policies(&self, arm: usize) -> Vec<Vec<f32>> {
         let arm = &self.arms[arm];
         arm.trials.iter().map(|trial| arm.best_first(trial)).collect()
+    }
+
+    /// The populations of a trial about to play, `[leaders][policies + 1][parameters]`; a population's last slot is
+    /// the champion's of the generation before.
+    pub fn weights(&self, arm: usize, trial: usize) -> &[f32] {
+        &self.arms[arm].trials[trial].weights
     }
 
     /// The world that an arm trains in.
@@ -205,9 +220,9 @@ fn play(
 }
 
 impl Arm {
-    fn new(config: Config, level: Level) -> Arm {
+    fn new(config: Config, trials: Range<usize>, level: Level) -> Arm {
         let world = World::new(&config);
-        let trials = (0..config.learning.trials).into_par_iter().map(|index| Trial::new(&config, &world, index, level));
+        let trials = trials.into_par_iter().map(|index| Trial::new(&config, &world, index, level));
         Arm { trials: trials.collect(), world, config }
     }
 

@@ -19,6 +19,9 @@ mod backend;
 mod bench;
 mod check;
 mod devices;
+mod paper;
+mod plot;
+mod replay;
 mod rollout;
 mod train;
 mod verify;
@@ -47,6 +50,12 @@ commands! {
     Train(train),
     /// Play teams of policies from a file, and score every leader.
     Rollout(rollout),
+    /// Train all of the paper's experiments, draw its figures and check its claims.
+    Paper(paper),
+    /// Draw the learning curves of one run, or of several side by side.
+    Plot(plot),
+    /// Play the best team of a trial and generation again, as a page or a picture.
+    Replay(replay),
     /// Measure how fast teams are played, alone and in whole generations.
     Bench(bench),
     /// Compare every GPU with the CPU, bit for bit.
@@ -84,6 +93,10 @@ pub enum Error {
     Record(#[from] RecordError),
     #[error(transparent)]
     Run(#[from] RunError),
+    #[error(transparent)]
+    Shown(#[from] crate::report::runs::RunError),
+    #[error(transparent)]
+    Replayed(#[from] crate::report::replay::ReplayError),
     #[error("standard output cannot be written: {0}")]
     Output(io::Error),
     #[error("signals cannot be listened for: {0}")]

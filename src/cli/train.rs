@@ -1,14 +1,13 @@
 //! `flotilla train`: a run from its config to its policies.
 
 use std::fmt::Write;
-use std::io::{self, IsTerminal};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use clap::ValueEnum;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use super::{ConfigArgs, Error, RunOptions, backend, print, say};
 use crate::config::{Config, Override};
@@ -16,14 +15,17 @@ use crate::record::checkpoint::Schedule;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, METRICS, POLICIES, Start};
 use crate::record::metrics::Row;
-use crate::run::{Opened, Options, Outcome, Progress, Results, Session};
+use crate::report::progress::Progress;
+use crate::report::runs;
+use crate::report::tensorboard::Events;
+use crate::run::{Opened, Options, Outcome, Results, Session};
 
 /// Where runs without `--out` go.
 const RUNS: &str = "runs";
-/// How often a line is written where there is no terminal to draw on.
-const LINES: Duration = Duration::from_secs(10);
-/// How often the terminal's line changes.
-const DRAWS: Duration = Duration::from_millis(100);
+/// The run's learning curves, in its folder.
+const CURVES: &str = "curves.svg";
+/// Event files for TensorBoard, in a run's folder.
+const TENSORBOARD: &str = "tensorboard";
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -43,6 +45,9 @@ pub struct Args {
     /// No progress on standard error
     #[arg(long)]
     quiet: bool,
+    /// Also write event files for TensorBoard, in OUT/tensorboard
+    #[arg(long)]
+    tensorboard: bool,
     /// Save what --resume needs after so many generations; 0 is never
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     checkpoint_generations: Option<i64>,
@@ -110,8 +115,16 @@ pub fn run(args: Args) -> Result<(), Error> {
         Opened::Done(results) => return print(&report(&results, "This run was done already")),
     };
 
-    let start = (Instant::now(), session.generation());
-    let mut ticker = Ticker::new(&config, session.generation(), args.quiet);
+    let (since, from, last) = (Instant::now(), session.generation(), config.learning.generations);
+    let mut shown = Progress::new(vec![(String::new(), config.world.pois.len())], from, last, args.quiet);
+    let path = folder.join(TENSORBOARD);
+    let events_failed = |error| {
+        say(format_args!("{}: cannot be written: {error}; training goes on without event files", path.display()));
+    };
+    let mut events = match args.tensorboard.then(|| Events::create(&path, config.learning.trials, from == 0)) {
+        Some(events) => events.map_err(events_failed).ok(),
+        None => None,
+    };
     let mut instead = |error: &_| {
         (args.on_device_loss == OnLoss::Cpu).then(|| {
             let (backend, machine) = backend::cpu();
@@ -124,13 +137,24 @@ pub fn run(args: Args) -> Result<(), Error> {
         stop: &signals.stop,
         save: &signals.save,
         instead: &mut instead,
-        watch: &mut |progress| ticker.tick(progress),
+        watch: &mut |progress| {
+            shown.show(progress.generation, progress.rows);
+            if let Some(Err(error)) = events.as_mut().map(|events| events.add(progress.rows)) {
+                events_failed(error);
+                events = None;
+            }
+        },
     };
     let outcome = session.train((backend, machine), options);
-    ticker.clear();
+    shown.clear();
+    if let Some(Err(error)) = events.as_mut().map(Events::flush) {
+        events_failed(error);
+    }
     match outcome? {
         Outcome::Done(results) => {
-            let (seconds, rate) = ticker.rate(start.0, start.1, session.generation());
+            let seconds = since.elapsed().as_secs_f64();
+            let rate = (session.generation().min(last + 1) - from.min(last + 1)) as f64 / seconds.max(1e-9);
+            draw(&folder);
             let learning = &config.learning;
             let trained = format!(
                 "Trained {} trials of {} teams, {} generations, in {seconds:.1} s ({rate:.1} generations/s) on {runs_on}",
@@ -143,6 +167,19 @@ pub fn run(args: Args) -> Result<(), Error> {
             config.learning.generations,
             command_to_resume(&folder)
         ))),
+    }
+}
+
+/// Draws the run's curves. All that was learned is saved by now, so a picture that fails is no failure of the run.
+fn draw(folder: &Path) {
+    let path = folder.join(CURVES);
+    let drawn = runs::figure(&[folder.to_path_buf()]).map(|figure| figure.scene().svg());
+    let written = drawn.map_err(|error| error.to_string()).and_then(|svg| {
+        let written = Disk::default().replace(&path, |output| output.write_all(svg.as_bytes()));
+        written.map_err(|error| error.to_string())
+    });
+    if let Err(error) = written {
+        say(format_args!("{}: not drawn: {error}", path.display()));
     }
 }
 
@@ -179,79 +216,6 @@ impl Signals {
     }
 }
 
-/// Shows how a run comes on: a bar on a terminal, a line from time to time elsewhere.
-struct Ticker {
-    bar: Option<ProgressBar>,
-    quiet: bool,
-    pois: usize,
-    trials: usize,
-    last: usize,
-    /// When and with which generation this session started.
-    start: (Instant, usize),
-    shown: Instant,
-    /// Means over the trials of the newest complete generation.
-    scores: String,
-}
-
-impl Ticker {
-    fn new(config: &Config, generation: usize, quiet: bool) -> Ticker {
-        let last = config.learning.generations;
-        let bar = (!quiet && io::stderr().is_terminal()).then(|| {
-            let style = "generation {pos}/{len}  {msg}  {eta} left  {wide_bar}";
-            let style = ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar());
-            let bar = ProgressBar::with_draw_target(Some(last as u64), ProgressDrawTarget::stderr()).with_style(style);
-            bar.with_position(generation as u64)
-        });
-        let (pois, trials) = (config.world.pois.len(), config.learning.trials);
-        let now = Instant::now();
-        Ticker { bar, quiet, pois, trials, last, start: (now, generation), shown: now, scores: String::new() }
-    }
-
-    fn tick(&mut self, progress: &Progress<'_>) {
-        let pause = if self.bar.is_some() { DRAWS } else { LINES };
-        if self.quiet || self.shown.elapsed() < pause && progress.generation <= self.last {
-            return;
-        }
-        if let Some(generation) = progress.rows.last().map(|row| row.generation) {
-            let newest: Vec<Row> = progress.rows.iter().filter(|row| row.generation == generation).copied().collect();
-            let mean =
-                |share: fn(&Row) -> f64| self.pois as f64 * newest.iter().map(share).sum::<f64>() / self.trials as f64;
-            self.scores =
-                format!("best {:.2}, mean {:.2} of {} POIs", mean(|row| row.best_g), mean(|row| row.mean_g), self.pois);
-        }
-        let (_, rate) = self.rate(self.start.0, self.start.1, progress.generation);
-        match &self.bar {
-            Some(bar) => {
-                bar.set_message(format!("{}  {rate:.1} generations/s", self.scores));
-                bar.set_position(progress.generation.min(self.last) as u64);
-            }
-            None if progress.generation <= self.last => {
-                let left = (self.last + 1 - progress.generation) as f64 / rate;
-                say(format_args!(
-                    "generation {}/{}  {}  {rate:.1} generations/s  {left:.0} s left",
-                    progress.generation - 1,
-                    self.last,
-                    self.scores
-                ));
-            }
-            None => {}
-        }
-        self.shown = Instant::now();
-    }
-
-    /// Seconds since `start`, and generations a second from `first` to before `next`.
-    fn rate(&self, start: Instant, first: usize, next: usize) -> (f64, f64) {
-        let seconds = start.elapsed().as_secs_f64();
-        (seconds, (next.min(self.last + 1) - first.min(next)) as f64 / seconds.max(1e-9))
-    }
-
-    fn clear(&self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
-    }
-}
-
 /// One of a row's scores.
 type Score = fn(&Row) -> f64;
 
@@ -282,11 +246,11 @@ fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> S
 Files in {folder}:
   {METRICS:<22}every trial, generation by generation
   {POLICIES:<22}what was learned, best policy first
+  {CURVES:<22}its learning curves, to look at
   {:<22}the config, every default written out
   {:<22}what it ran on; digest {digest}
 
 Next:
-  flotilla plot {folder}
   flotilla replay {folder}
   flotilla rollout {folder}/{} --policies {folder}/{POLICIES} --scores scores.csv
 ",

@@ -1,1 +1,19 @@
-//! Pictures of what was learned.
+//! Pictures of what was learned, for people.
+//!
+//! | module | holds |
+//! |---|---|
+//! | [`scene`] | a picture described once, written as SVG or PNG |
+//! | [`curves`] | learning curves: mean and standard error over trials, and the figure that shows them |
+//! | [`runs`] | what runs' folders say of their curves, and what is wrong with them |
+//! | [`paper`] | the paper's experiments, its figures and its claims, one by one |
+//! | [`replay`] | episodes of any trial and generation, as a page or a picture |
+//! | [`tensorboard`] | event files for TensorBoard |
+//! | [`progress`] | every arm's curve on the terminal while it grows |
+
+pub mod curves;
+pub mod paper;
+pub mod progress;
+pub mod replay;
+pub mod runs;
+pub mod scene;
+pub mod tensorboard;

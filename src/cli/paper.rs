@@ -1,0 +1,104 @@
+//! `flotilla paper`: the paper's experiments, its figures and its claims, measured here.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use super::{Error, Overrides, RunOptions, backend, print, say};
+use crate::record::RecordError;
+use crate::record::disk::Disk;
+use crate::report::curves::PRINT;
+use crate::report::paper::{self, Measured, Summary};
+use crate::report::progress::Progress;
+use crate::trainer::Trainer;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folder for the figures, the claims and the curves
+    #[arg(long, value_name = "DIR", default_value = "paper")]
+    out: PathBuf,
+    /// Independent repetitions [default: 5]
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    trials: Option<i64>,
+    /// Generations after the random start [default: 100]
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    generations: Option<i64>,
+    /// Start of all randomness [default: 0]
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    seed: Option<i64>,
+    /// No progress on standard error
+    #[arg(long)]
+    quiet: bool,
+    #[command(flatten)]
+    run: RunOptions,
+}
+
+/// Trains every experiment side by side, and writes what came out.
+pub fn run(args: Args) -> Result<(), Error> {
+    let Args { out, trials, generations, seed, quiet, run } = args;
+    let overrides = Overrides { seed, trials, generations, ..Overrides::default() };
+    let mut arms = paper::arms(&overrides.list())?;
+    let (mut backend, _) = backend::open(&run)?;
+    // Before training: a folder that cannot be written should not cost the time.
+    let disk = Disk::default();
+    let failed = |path: &PathBuf| {
+        let path = path.clone();
+        |error| RecordError::Write { path, error }
+    };
+    disk.create_folder(&out).map_err(failed(&out))?;
+    let learning = arms[0].config.learning.clone();
+    if !quiet {
+        let trials = learning.trials;
+        say(format_args!("training {} experiments of {trials} trials each on {}", arms.len(), backend.describe()));
+    }
+
+    let since = Instant::now();
+    let mut trainer = Trainer::new(arms.iter().map(|arm| arm.config.clone()).collect());
+    let names = arms.iter().map(|arm| (arm.name(), arm.pois())).collect();
+    let mut progress = Progress::new(names, 0, learning.generations, quiet);
+    while !trainer.is_done() {
+        let rows = trainer.advance(&mut *backend)?;
+        rows.iter().for_each(|row| arms[row.arm].add(row));
+        progress.show(trainer.generation(), &rows);
+    }
+    progress.clear();
+    let seconds = since.elapsed().as_secs_f64();
+
+    let write = |name: String, content: &[u8]| -> Result<(), Error> {
+        let path = out.join(name);
+        Ok(disk.replace(&path, |output| output.write_all(content)).map_err(failed(&path))?)
+    };
+    for layout in paper::LAYOUTS {
+        let scene = paper::figure(&arms, &layout).scene();
+        write(format!("figure{}.svg", layout.figure), scene.svg().as_bytes())?;
+        let name = format!("figure{}.png", layout.figure);
+        let png = scene.png(PRINT).map_err(failed(&out.join(&name)))?;
+        write(name, &png)?;
+    }
+    let claims = paper::claims(&arms);
+    let table = paper::table(&claims);
+    let heading = format!(
+        "{}. Means over {} trials of each generation's best team (± standard error), in POIs; {} generations, seed {}.",
+        paper::count(&claims),
+        learning.trials,
+        learning.generations,
+        learning.seed
+    );
+    write("claims.md".into(), format!("# What the paper says, measured\n\n{heading}\n\n{table}").as_bytes())?;
+    let summary = Summary {
+        version: env!("CARGO_PKG_VERSION"),
+        backend: backend.describe(),
+        seconds,
+        seed: learning.seed,
+        trials: learning.trials,
+        generations: learning.generations,
+        arms: arms.iter().map(Measured::of).collect(),
+        claims: &claims,
+    };
+    let summary = serde_json::to_string(&summary).expect("plain fields are JSON") + "\n";
+    write("summary.json".into(), summary.as_bytes())?;
+    print(&format!(
+        "{table}\n{heading}\n\nTrained in {seconds:.1} s. Files in {}: figure4, figure5, figure6 (.svg, .png), claims.md, \
+         summary.json\n",
+        out.display()
+    ))
+}

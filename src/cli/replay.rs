@@ -1,0 +1,115 @@
+//! `flotilla replay`: the episode of the best team of any trial and generation, to look at.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+
+use super::{Error, RunOptions, backend, print, say};
+use crate::record::RecordError;
+use crate::record::disk::Disk;
+use crate::report::curves::PRINT;
+use crate::report::replay::{self, Played, Rows};
+use crate::report::runs;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folder that `flotilla train` made
+    #[arg(value_name = "RUN")]
+    folder: PathBuf,
+    /// Trial to look at
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    trial: usize,
+    /// Generation whose best team plays [default: the newest]
+    #[arg(long, value_name = "N")]
+    generation: Option<usize>,
+    /// Another generation of the trial, side by side
+    #[arg(long, value_name = "N")]
+    compare: Option<usize>,
+    /// Step to stop at, in a still picture [default: the last]
+    #[arg(long, value_name = "N")]
+    step: Option<usize>,
+    /// File to write: .html to play, .gif moving, .png or .svg still [default: replay.html in RUN]
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    #[command(flatten)]
+    run: RunOptions,
+}
+
+pub fn run(args: Args) -> Result<(), Error> {
+    let Args { folder, trial, generation, compare, step, out, run } = args;
+    let out = out.unwrap_or_else(|| folder.join("replay.html"));
+    let kind = Kind::of(&out)?;
+    let config = runs::config(&folder)?;
+    let steps = config.world.steps;
+    if let Some(step) = step.filter(|&step| step > steps) {
+        return Err(Error::Usage(format!("--step {step}: the episode has steps 0 to {steps}")));
+    }
+    let generation = match generation {
+        Some(generation) => generation,
+        None if trial < config.learning.trials => Rows::read(&folder, &config, trial)?.newest().unwrap_or(0),
+        None => 0,
+    };
+    let generations: Vec<usize> = compare.into_iter().chain([generation]).collect();
+    let (mut backend, _) = backend::open(&run)?;
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register(signal, stop.clone()).map_err(Error::Signals)?;
+    }
+    let mut told = 0;
+    let mut watch = |generation: usize| {
+        // Most runs take no time; the others say that something happens.
+        if generation / 1000 > told {
+            told = generation / 1000;
+            say(format_args!("training trial {trial} again: generation {generation}"));
+        }
+        !stop.load(Relaxed)
+    };
+    let played = replay::replay(&folder, trial, &generations, &mut *backend, &mut watch)?;
+
+    let failed = |error| RecordError::Write { path: out.clone(), error };
+    let name = folder.canonicalize().ok().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
+    let name = name.unwrap_or_else(|| folder.display().to_string());
+    let still = || replay::still(&config, &played, step.unwrap_or(steps));
+    let content = match kind {
+        Kind::Html => replay::page(&name, &config, &played).into_bytes(),
+        Kind::Gif => replay::gif(&config, &played).map_err(failed)?,
+        Kind::Png => still().png(PRINT).map_err(failed)?,
+        Kind::Svg => still().svg().into_bytes(),
+    };
+    Disk::default().replace(&out, |output| output.write_all(&content)).map_err(failed)?;
+    for played in &played {
+        print(&tell(played))?;
+    }
+    print(&format!("{} ({} kB)\n", out.display(), content.len().div_ceil(1000)))
+}
+
+/// What was played, in a line.
+fn tell(played: &Played) -> String {
+    let Played { trial, generation, team, best_g, world, .. } = played;
+    format!(
+        "trial {trial}, generation {generation}: team {team} is the best, G = {best_g} of {} POIs, as metrics.csv says\n",
+        world.pois.len()
+    )
+}
+
+/// What an episode is written as.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Html,
+    Gif,
+    Png,
+    Svg,
+}
+
+impl Kind {
+    fn of(path: &Path) -> Result<Kind, Error> {
+        let extension = path.extension().map(|extension| extension.to_ascii_lowercase());
+        match extension.as_ref().and_then(|extension| extension.to_str()) {
+            Some("html") => Ok(Kind::Html),
+            Some("gif") => Ok(Kind::Gif),
+            Some("png") => Ok(Kind::Png),
+            Some("svg") => Ok(Kind::Svg),
+            _ => Err(Error::Usage(format!("--out {}: its name must end in .html, .gif, .png or .svg", path.display()))),
+        }
+    }
+}

@@ -1,0 +1,306 @@
+//! Learning curves: what the trials came to by generation, and the figure that compares them.
+
+use serde::Serialize;
+
+use super::scene::{Anchor, BLACK, COLORS, Color, Fill, LIGHT, Pen, Scene, WHITE, text_width};
+
+/// A column of a two-column paper, in millimetres.
+pub const COLUMN: f64 = 85.0;
+/// Pixels a millimetre of a PNG: 300 a column inch.
+pub const PRINT: f64 = 300.0 / 25.4;
+/// Most points that a curve is drawn with.
+const MAX_POINTS: usize = 300;
+/// Sizes of letters, 7 and 8 points.
+const SMALL: f64 = 2.47;
+const NORMAL: f64 = 2.82;
+const DASHES: [&[f64]; 5] = [&[], &[1.6, 0.7], &[1.8, 0.6, 0.4, 0.6], &[0.5, 0.5], &[3.0, 0.8]];
+
+/// Mean and standard deviation of any number of values, gathered one by one.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Tally {
+    pub count: u32,
+    pub mean: f64,
+    /// Sum of squared distances from the mean.
+    squares: f64,
+}
+
+impl Tally {
+    pub fn add(&mut self, value: f64) {
+        self.count += 1;
+        let before = value - self.mean;
+        self.mean += before / f64::from(self.count);
+        self.squares += before * (value - self.mean);
+    }
+
+    /// Of the sample; 0 of fewer than two values.
+    pub fn deviation(&self) -> f64 {
+        if self.count < 2 { 0.0 } else { (self.squares / f64::from(self.count - 1)).sqrt() }
+    }
+
+    /// Of the mean.
+    pub fn error(&self) -> f64 {
+        if self.count == 0 { 0.0 } else { self.deviation() / f64::from(self.count).sqrt() }
+    }
+}
+
+/// Mean and standard error over trials, at some generations.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Curve {
+    pub generation: Vec<f64>,
+    pub mean: Vec<f64>,
+    pub error: Vec<f64>,
+}
+
+impl Curve {
+    /// One tally a generation, from generation 0; generations without values are left out.
+    pub fn new(tallies: &[Tally]) -> Curve {
+        let mut curve = Curve::default();
+        for (generation, tally) in tallies.iter().enumerate().filter(|(_, tally)| tally.count > 0) {
+            curve.generation.push(generation as f64);
+            curve.mean.push(tally.mean);
+            curve.error.push(tally.error());
+        }
+        curve
+    }
+
+    /// The same values times a number: shares of POIs become POIs.
+    pub fn scaled(mut self, by: f64) -> Curve {
+        self.mean.iter_mut().chain(&mut self.error).for_each(|value| *value *= by);
+        self
+    }
+
+    /// A curve of few enough points to draw, each the average of as many generations as the second value says.
+    pub fn thinned(&self) -> (Curve, usize) {
+        let each = self.mean.len().div_ceil(MAX_POINTS).max(1);
+        let average = |values: &[f64]| -> Vec<f64> {
+            values.chunks(each).map(|values| values.iter().sum::<f64>() / values.len() as f64).collect()
+        };
+        let [generation, mean, error] = [&self.generation, &self.mean, &self.error].map(|values| average(values));
+        (Curve { generation, mean, error }, each)
+    }
+}
+
+/// One set of axes.
+#[derive(Clone, Debug, Default)]
+pub struct Panel {
+    pub title: String,
+    /// Each with its place in the legend, which gives it its look.
+    pub curves: Vec<(usize, Curve)>,
+}
+
+/// Panels side by side that share a legend and the y axis.
+#[derive(Clone, Debug, Default)]
+pub struct Figure {
+    pub panels: Vec<Panel>,
+    pub legend: Vec<String>,
+    pub y_label: String,
+    /// The y axis runs from 0 to this.
+    pub y_max: f64,
+}
+
+impl Figure {
+    /// The figure at the width of a column.
+    pub fn scene(&self) -> Scene {
+        const LEFT: f64 = 10.0;
+        const RIGHT: f64 = 3.0;
+        const GAP: f64 = 5.5;
+        const BELOW: f64 = 9.0;
+        let rows = self.legend_rows();
+        let titles = if self.panels.iter().any(|panel| !panel.title.is_empty()) { 4.5 } else { 1.5 };
+        let above = 1.0 + rows.len() as f64 * 3.8 + titles;
+        let columns = self.panels.len().max(1) as f64;
+        let height = if columns > 1.0 { 36.0 } else { 46.0 };
+        let width = (COLUMN - LEFT - RIGHT - GAP * (columns - 1.0)) / columns;
+        let mut scene = Scene::new(COLUMN, above + height + BELOW);
+
+        for (row, entries) in rows.iter().enumerate() {
+            let y = 1.0 + 3.8 * row as f64 + 2.0;
+            for &(index, x) in entries {
+                let look = Look::of(index);
+                scene.line(vec![[x, y], [x + 8.0, y]], look.pen());
+                look.mark(&mut scene, [x + 4.0, y]);
+                scene.text(
+                    [x + 9.0, y + 0.9],
+                    shorten(&self.legend[index], COLUMN - 20.0),
+                    SMALL,
+                    Anchor::Start,
+                    BLACK,
+                );
+            }
+        }
+        scene.upright([2.6, above + height / 2.0], &*self.y_label, NORMAL, BLACK);
+
+        let thinned: Vec<Vec<_>> = self
+            .panels
+            .iter()
+            .map(|panel| panel.curves.iter().map(|(index, curve)| (*index, curve.thinned())).collect())
+            .collect();
+        let each = thinned.iter().flatten().map(|(_, (_, each))| *each).max().unwrap_or(1);
+        let last =
+            |panel: &Panel| panel.curves.iter().filter_map(|(_, c)| c.generation.last().copied()).fold(1.0, f64::max);
+        let x_max = self.panels.iter().map(last).fold(1.0, f64::max);
+        for (column, (panel, curves)) in self.panels.iter().zip(&thinned).enumerate() {
+            let left = LEFT + (width + GAP) * column as f64;
+            let axes = Axes { left, above, width, height, x_max, y_max: self.y_max * 1.04 };
+            scene.bold([left + width / 2.0, above - 1.3], &*panel.title, NORMAL, Anchor::Middle, BLACK);
+            axes.draw(&mut scene, column == 0, self.y_max);
+            if column == 0 {
+                let label = match each {
+                    1 => "Generation".to_string(),
+                    each => format!("Generation (each point the mean of {each})"),
+                };
+                let middle = LEFT + (COLUMN - LEFT - RIGHT) / 2.0;
+                scene.text([middle, above + height + 7.4], label, NORMAL, Anchor::Middle, BLACK);
+            }
+            scene.clipped([left - 0.8, above - 0.8, width + 1.6, height + 1.6], |scene| {
+                for (index, (curve, _)) in curves {
+                    axes.band(scene, curve, Look::of(*index).color);
+                }
+                for (index, (curve, _)) in curves {
+                    axes.curve(scene, curve, *index, self.legend.len());
+                }
+            });
+        }
+        scene
+    }
+
+    /// The entries of each row of the legend, with where each starts.
+    fn legend_rows(&self) -> Vec<Vec<(usize, f64)>> {
+        const START: f64 = 10.0;
+        let mut rows: Vec<Vec<(usize, f64)>> = Vec::new();
+        let mut x = f64::INFINITY;
+        for (index, label) in self.legend.iter().enumerate() {
+            let width = 9.0 + text_width(&shorten(label, COLUMN - 20.0), SMALL) + 4.0;
+            if x + width > COLUMN + 3.0 {
+                rows.push(Vec::new());
+                x = START;
+            }
+            rows.last_mut().expect("the first entry starts a row").push((index, x));
+            x += width;
+        }
+        rows
+    }
+}
+
+/// A panel's place in the picture, and its ranges.
+struct Axes {
+    left: f64,
+    above: f64,
+    width: f64,
+    height: f64,
+    x_max: f64,
+    y_max: f64,
+}
+
+impl Axes {
+    fn at(&self, generation: f64, value: f64) -> [f64; 2] {
+        let y = (value / self.y_max).clamp(0.0, 1.0);
+        [self.left + self.width * generation / self.x_max, self.above + self.height * (1.0 - y)]
+    }
+
+    fn draw(&self, scene: &mut Scene, numbered: bool, y_end: f64) {
+        let Axes { left, above, width, height, .. } = *self;
+        let (right, below) = (left + width, above + height);
+        for tick in ticks(y_end, 4) {
+            let [_, y] = self.at(0.0, tick);
+            scene.line(vec![[left, y], [right, y]], Pen::new(LIGHT, 0.15));
+            scene.line(vec![[left - 0.9, y], [left, y]], Pen::new(BLACK, 0.2));
+            if numbered {
+                scene.text([left - 1.5, y + 0.9], number(tick), SMALL, Anchor::End, BLACK);
+            }
+        }
+        for tick in ticks(self.x_max, if width > 50.0 { 8 } else { 4 }) {
+            let [x, _] = self.at(tick, 0.0);
+            scene.line(vec![[x, below], [x, below + 0.9]], Pen::new(BLACK, 0.2));
+            let label = number(tick);
+            let inside = COLUMN - 0.3 - text_width(&label, SMALL) / 2.0;
+            scene.text([x.min(inside), below + 3.5], label, SMALL, Anchor::Middle, BLACK);
+        }
+        scene.line(vec![[left, above], [left, below], [right, below]], Pen::new(BLACK, 0.2));
+    }
+
+    /// The standard error to both sides of the mean.
+    fn band(&self, scene: &mut Scene, curve: &Curve, color: Color) {
+        let side = |sign: f64| {
+            let values = curve.mean.iter().zip(&curve.error).map(move |(mean, error)| mean + sign * error);
+            curve.generation.iter().zip(values).map(|(&generation, value)| self.at(generation, value))
+        };
+        let outline: Vec<_> = side(1.0).chain(side(-1.0).rev()).collect();
+        if curve.error.iter().any(|&error| error > 0.0) {
+            scene.polygon(outline, Some(Fill { color, opacity: 0.2 }), None);
+        }
+    }
+
+    /// The mean, with a few marks; those of different curves stand apart, since curves may run into each other.
+    fn curve(&self, scene: &mut Scene, curve: &Curve, index: usize, of: usize) {
+        const MARKS: usize = 5;
+        let look = Look::of(index);
+        let points: Vec<_> = curve.generation.iter().zip(&curve.mean).map(|(&x, &y)| self.at(x, y)).collect();
+        scene.line(points.clone(), look.pen());
+        let last = points.len().saturating_sub(1) as f64;
+        let shift = (index as f64 + 0.5) / of.max(1) as f64;
+        for mark in 0..MARKS {
+            let place = (last * (mark as f64 + shift) / MARKS as f64).round() as usize;
+            if let Some(&point) = points.get(place) {
+                look.mark(scene, point);
+            }
+        }
+    }
+}
+
+/// What tells one curve from the next: colour, dashes and marks, each by itself for the first five.
+#[derive(Clone, Copy)]
+struct Look {
+    color: Color,
+    dash: &'static [f64],
+    shape: usize,
+}
+
+impl Look {
+    fn of(index: usize) -> Look {
+        Look { color: COLORS[index % COLORS.len()], dash: DASHES[index % DASHES.len()], shape: index % 4 }
+    }
+
+    fn pen(&self) -> Pen {
+        Pen { dash: self.dash, ..Pen::new(self.color, 0.4) }
+    }
+
+    fn mark(&self, scene: &mut Scene, [x, y]: [f64; 2]) {
+        let (fill, pen) = (Some(Fill::from(self.color)), Some(Pen::new(WHITE, 0.15)));
+        let corners = |offsets: &[[f64; 2]]| offsets.iter().map(|[dx, dy]| [x + dx, y + dy]).collect::<Vec<_>>();
+        match self.shape {
+            0 => scene.circle([x, y], 0.8, fill, pen),
+            1 => scene.rectangle([x - 0.7, y - 0.7, 1.4, 1.4], fill, pen),
+            2 => scene.polygon(corners(&[[0.0, -1.0], [0.95, 0.7], [-0.95, 0.7]]), fill, pen),
+            _ => scene.polygon(corners(&[[0.0, -1.05], [1.05, 0.0], [0.0, 1.05], [-1.05, 0.0]]), fill, pen),
+        }
+    }
+}
+
+/// Round numbers from 0 to an end, about so many steps apart.
+fn ticks(end: f64, steps: usize) -> Vec<f64> {
+    let rough = end / steps as f64;
+    let power = 10f64.powf(rough.log10().floor());
+    let step = [1.0, 2.0, 2.5, 5.0, 10.0].into_iter().map(|s| s * power).find(|&s| s >= rough * 0.999).unwrap_or(rough);
+    (0..).map(|index| index as f64 * step).take_while(|&tick| tick <= end * 1.0001).take(20).collect()
+}
+
+fn number(value: f64) -> String {
+    let text = format!("{value:.3}");
+    text.trim_end_matches('0').trim_end_matches('.').to_string()
+}
+
+/// A label cut to a width.
+fn shorten(label: &str, width: f64) -> String {
+    if text_width(label, SMALL) <= width {
+        return label.to_string();
+    }
+    let mut short = String::new();
+    for c in label.chars() {
+        if text_width(&short, SMALL) > width - 3.0 {
+            break;
+        }
+        short.push(c);
+    }
+    short + "…"
+}

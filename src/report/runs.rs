@@ -1,0 +1,183 @@
+//! Finished and unfinished runs, read back for their curves.
+
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+use super::curves::{Curve, Figure, Panel, Tally};
+use crate::config::{Config, ConfigError};
+use crate::record::RecordError;
+use crate::record::folder::{CONFIG, METRICS};
+use crate::record::metrics;
+
+/// Most runs that one figure can tell apart.
+pub const MAX_RUNS: usize = 24;
+
+/// Why a run could not be shown.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    #[error("{0}: no such folder; `flotilla train CONFIG --out {0}` makes a run there")]
+    Missing(PathBuf),
+    #[error("{0} is a file; name the folder of a run, which `flotilla train` makes")]
+    NoFolder(PathBuf),
+    #[error("{folder} is no run's folder: it has no {name}; `flotilla train CONFIG --out DIR` makes one that has")]
+    Foreign { folder: PathBuf, name: &'static str },
+    #[error(
+        "{folder}: {error}\nfind a config that is whole, and repeat the run with `flotilla train CONFIG --out DIR`"
+    )]
+    Config { folder: PathBuf, error: ConfigError },
+    #[error("{folder}: {reason}; finish the run with `flotilla train {folder}/{CONFIG} --out {folder} --resume`")]
+    Unfinished { folder: PathBuf, reason: String },
+    #[error(transparent)]
+    Record(#[from] RecordError),
+}
+
+/// A run's config.
+///
+/// # Errors
+/// The folder is not there, is no run's, or its config is damaged.
+pub fn config(folder: &Path) -> Result<Config, RunError> {
+    let kind = std::fs::metadata(folder).map_err(|error| match error.kind() {
+        ErrorKind::NotFound => RunError::Missing(folder.into()),
+        _ => RunError::Record(RecordError::Read { path: folder.into(), error }),
+    })?;
+    if !kind.is_dir() {
+        return Err(RunError::NoFolder(folder.into()));
+    }
+    let path = folder.join(CONFIG);
+    if !path.exists() {
+        return Err(RunError::Foreign { folder: folder.into(), name: CONFIG });
+    }
+    Config::load(&path).map_err(|error| RunError::Config { folder: folder.into(), error })
+}
+
+/// A run's metrics, row by row as far as they are whole; what is cut off at the end is still being written.
+///
+/// # Errors
+/// There are none yet, or they are not this run's.
+pub fn metrics(folder: &Path, config: &Config, mut each: impl FnMut(&metrics::Row)) -> Result<(), RunError> {
+    let path = folder.join(METRICS);
+    let unfinished = |reason: String| RunError::Unfinished { folder: folder.into(), reason };
+    if !path.exists() {
+        return Err(unfinished(format!("it has no {METRICS} yet")));
+    }
+    let damaged = |reason: String| RunError::Record(RecordError::Damaged { path: path.clone(), reason });
+    let mut count = 0;
+    for row in metrics::open(&path)? {
+        let row = match row {
+            Ok((row, _)) => row,
+            // A line that is cut short is the last one, of a run that goes on or was killed.
+            Err(reason) if reason.contains("cut short") => break,
+            Err(reason) => return Err(damaged(reason)),
+        };
+        let (trials, generations) = (config.learning.trials, config.learning.generations);
+        if row.trial >= trials || row.generation > generations {
+            let (trial, generation) = (row.trial, row.generation);
+            return Err(damaged(format!(
+                "line {} is trial {trial}, generation {generation}, which the run's {CONFIG} does not have",
+                count + 2
+            )));
+        }
+        each(&row);
+        count += 1;
+    }
+    if count == 0 { Err(unfinished(format!("its {METRICS} has no rows yet"))) } else { Ok(()) }
+}
+
+/// What a run's metrics came to, by generation: shares of the POIs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Courses {
+    pub best: Vec<Tally>,
+    pub mean: Vec<Tally>,
+    pub champion: Vec<Tally>,
+}
+
+impl Courses {
+    /// Reads a run's metrics; memory grows with generations alone.
+    ///
+    /// # Errors
+    /// See [`metrics`].
+    pub fn read(folder: &Path, config: &Config) -> Result<Courses, RunError> {
+        let mut courses = Courses { best: vec![], mean: vec![], champion: vec![] };
+        metrics(folder, config, |row| {
+            for (course, g) in [
+                (&mut courses.best, row.best_g),
+                (&mut courses.mean, row.mean_g),
+                (&mut courses.champion, row.champion_g),
+            ] {
+                if course.len() <= row.generation {
+                    course.resize(row.generation + 1, Tally::default());
+                }
+                course[row.generation].add(g);
+            }
+        })?;
+        Ok(courses)
+    }
+}
+
+/// The curves of one run (best, mean and champion), or the best teams of several, by what differs between them.
+///
+/// # Errors
+/// A run cannot be read.
+pub fn figure(folders: &[PathBuf]) -> Result<Figure, RunError> {
+    let configs = folders.iter().map(|folder| config(folder)).collect::<Result<Vec<_>, _>>()?;
+    let all = folders.iter().zip(&configs).map(|(folder, config)| Courses::read(folder, config));
+    let all = all.collect::<Result<Vec<_>, _>>()?;
+    let pois = configs.first().map_or(1, |config| config.world.pois.len());
+    let same = configs.iter().all(|config| config.world.pois.len() == pois);
+    let scale = if same { pois as f64 } else { 1.0 };
+    let curve = |tallies: &[Tally]| Curve::new(tallies).scaled(scale);
+    let (legend, curves): (Vec<String>, Vec<Curve>) = match &*all {
+        [Courses { best, mean, champion }] => [("best team", best), ("champion", champion), ("mean team", mean)]
+            .map(|(label, tallies)| (label.to_string(), curve(tallies)))
+            .into_iter()
+            .unzip(),
+        all => labels(folders, &configs).into_iter().zip(all.iter().map(|courses| curve(&courses.best))).unzip(),
+    };
+    let what = if all.len() == 1 { "" } else { " by the best team" };
+    Ok(Figure {
+        panels: vec![Panel { title: String::new(), curves: curves.into_iter().enumerate().collect() }],
+        legend,
+        y_label: if same { format!("POIs observed{what}") } else { format!("Share of POIs observed{what}") },
+        y_max: scale,
+    })
+}
+
+/// Labels runs by the config keys that differ between them, or by their folders where none do.
+pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
+    let tables: Vec<toml::Table> = configs.iter().map(|config| config.to_toml().parse().unwrap_or_default()).collect();
+    let Some(first) = tables.first() else { return vec![] };
+    let value = |table: &toml::Table, section: &str, key: &str| {
+        let text = table.get(section).and_then(|section| section.get(key)).map_or("-".into(), toml::Value::to_string);
+        text.trim_matches('"').to_string()
+    };
+    let mut keys = Vec::new();
+    for (section, entries) in first {
+        // How often a run is saved has no say in its results.
+        for key in entries.as_table().into_iter().flat_map(toml::Table::keys).filter(|_| section != "checkpoint") {
+            let differs = tables.iter().any(|table| value(table, section, key) != value(first, section, key));
+            if differs {
+                keys.push((section, key));
+            }
+        }
+    }
+    let label = |(folder, table): (&PathBuf, &toml::Table)| {
+        let parts: Vec<String> = keys
+            .iter()
+            .map(|(section, key)| {
+                let value = value(table, section, key);
+                // Positions are too long to tell apart.
+                if value.len() > 24 { String::new() } else { format!("{key} {value}") }
+            })
+            .filter(|part| !part.is_empty())
+            .collect();
+        if parts.is_empty() { folder.display().to_string() } else { parts.join(", ") }
+    };
+    let labels: Vec<String> = folders.iter().zip(&tables).map(label).collect();
+    // Runs that are labelled alike differ in something long: say where they are, too.
+    let twice = |label: &String| labels.iter().filter(|other| *other == label).count() > 1;
+    let full = |(label, folder): (&String, &PathBuf)| {
+        let name = folder.display().to_string();
+        if twice(label) && *label != name { format!("{label} ({name})") } else { label.clone() }
+    };
+    labels.iter().zip(folders).map(full).collect()
+}

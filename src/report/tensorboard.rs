@@ -1,0 +1,212 @@
+//! Event files for TensorBoard: `best_g`, `mean_g` and `champion_g` by generation, a TensorBoard run a trial.
+//!
+//! A file is a sequence of records (length, its checksum, content, its checksum, as TFRecord has it), each a protocol
+//! buffer `Event`. Of the latter only the few fields are written that scalars need, by hand. The numbers are f64, the
+//! same as in `metrics.csv`.
+
+use std::fs::{self, OpenOptions};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use crate::record::metrics::Row;
+
+/// How often what is new is written.
+const FLUSH: Duration = Duration::from_secs(2);
+/// What TensorBoard knows event files by.
+const MARK: &str = "tfevents";
+
+/// The event files of one run.
+pub struct Events {
+    /// One file a trial.
+    files: Vec<PathBuf>,
+    /// What is not in the files yet.
+    new: Vec<Vec<u8>>,
+    flushed: Instant,
+}
+
+impl Events {
+    /// Starts event files in `folder/trial-N`, a folder a trial. A run that starts afresh removes those of any run
+    /// before it; a resumed one adds to them, and TensorBoard drops what was trained twice.
+    ///
+    /// # Errors
+    /// They cannot be written.
+    pub fn create(folder: &Path, trials: usize, fresh: bool) -> io::Result<Events> {
+        let seconds = now() as u64;
+        let digits = trials.saturating_sub(1).to_string().len();
+        let mut files = Vec::with_capacity(trials);
+        for trial in 0..trials {
+            let folder = folder.join(format!("trial-{trial:0digits$}"));
+            fs::create_dir_all(&folder)?;
+            if fresh {
+                for entry in fs::read_dir(&folder)? {
+                    let path = entry?.path();
+                    if path.file_name().is_some_and(|name| name.to_string_lossy().contains(MARK)) {
+                        fs::remove_file(path)?;
+                    }
+                }
+            }
+            // Files are read in the order of their names, and nobody else's is continued.
+            let file = (0..)
+                .map(|count| folder.join(format!("events.out.{MARK}.{seconds:010}.flotilla.{count}")))
+                .find(|path| !path.exists());
+            files.extend(file);
+        }
+        let first = record(&event(now(), 0, &Content::Version));
+        let mut events = Events { files, new: vec![first; trials], flushed: Instant::now() };
+        events.flush()?;
+        Ok(events)
+    }
+
+    /// Takes in rows that became complete; from time to time they are written.
+    ///
+    /// # Errors
+    /// They cannot be written.
+    pub fn add(&mut self, rows: &[Row]) -> io::Result<()> {
+        for row in rows {
+            if let Some(new) = self.new.get_mut(row.trial) {
+                new.extend(record(&event(now(), row.generation as u64, &Content::Row(row))));
+            }
+        }
+        if self.flushed.elapsed() >= FLUSH { self.flush() } else { Ok(()) }
+    }
+
+    /// Writes all that is new.
+    ///
+    /// # Errors
+    /// It cannot be written.
+    pub fn flush(&mut self) -> io::Result<()> {
+        for (file, new) in self.files.iter().zip(&mut self.new).filter(|(_, new)| !new.is_empty()) {
+            // Opened each time: there may be more trials than a process may have files.
+            OpenOptions::new().create(true).append(true).open(file)?.write_all(new)?;
+            new.clear();
+        }
+        self.flushed = Instant::now();
+        Ok(())
+    }
+}
+
+/// Seconds since 1970.
+fn now() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64()
+}
+
+enum Content<'a> {
+    /// The first event of a file.
+    Version,
+    Row(&'a Row),
+}
+
+/// An `Event`.
+fn event(wall_time: f64, step: u64, content: &Content<'_>) -> Vec<u8> {
+    let mut event = Message::default();
+    event.double(1, wall_time);
+    event.varint(2, step);
+    match content {
+        Content::Version => event.bytes(3, b"brain.Event:2"),
+        Content::Row(row) => {
+            let mut summary = Message::default();
+            for (tag, value) in [("best_g", row.best_g), ("mean_g", row.mean_g), ("champion_g", row.champion_g)] {
+                summary.bytes(1, &scalar(tag, value));
+            }
+            event.bytes(5, &summary.0);
+        }
+    }
+    event.0
+}
+
+/// A `Summary.Value` that the scalars plugin shows: a tensor without dimensions.
+fn scalar(tag: &str, value: f64) -> Vec<u8> {
+    const DOUBLE: u64 = 2;
+    const SCALAR: u64 = 1;
+    let (mut plugin, mut metadata, mut tensor, mut scalar) =
+        (Message::default(), Message::default(), Message::default(), Message::default());
+    plugin.bytes(1, b"scalars");
+    metadata.bytes(1, &plugin.0);
+    metadata.varint(4, SCALAR);
+    tensor.varint(1, DOUBLE);
+    tensor.bytes(2, &[]);
+    tensor.bytes(6, &value.to_le_bytes());
+    scalar.bytes(1, tag.as_bytes());
+    scalar.bytes(8, &tensor.0);
+    scalar.bytes(9, &metadata.0);
+    scalar.0
+}
+
+/// A protocol buffer, field by field.
+#[derive(Default)]
+struct Message(Vec<u8>);
+
+impl Message {
+    fn number(&mut self, mut value: u64) {
+        while value >= 0x80 {
+            self.0.push(value as u8 | 0x80);
+            value >>= 7;
+        }
+        self.0.push(value as u8);
+    }
+
+    fn varint(&mut self, field: u64, value: u64) {
+        self.number(field << 3);
+        self.number(value);
+    }
+
+    fn double(&mut self, field: u64, value: f64) {
+        self.number(field << 3 | 1);
+        self.0.extend(value.to_le_bytes());
+    }
+
+    fn bytes(&mut self, field: u64, bytes: &[u8]) {
+        self.number(field << 3 | 2);
+        self.number(bytes.len() as u64);
+        self.0.extend(bytes);
+    }
+}
+
+/// A TFRecord.
+fn record(content: &[u8]) -> Vec<u8> {
+    let length = (content.len() as u64).to_le_bytes();
+    let parts: [&[u8]; 4] = [&length, &masked_checksum(&length), content, &masked_checksum(content)];
+    parts.concat()
+}
+
+/// CRC-32C, rotated and shifted, so that a checksum of checksums is no weaker.
+fn masked_checksum(bytes: &[u8]) -> [u8; 4] {
+    crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8).to_le_bytes()
+}
+
+/// Castagnoli's checksum, a byte a time.
+fn crc32c(bytes: &[u8]) -> u32 {
+    const TABLE: [u32; 256] = {
+        let mut table = [0; 256];
+        let mut index = 0;
+        while index < 256 {
+            let mut word = index as u32;
+            let mut bit = 0;
+            while bit < 8 {
+                word = if word & 1 == 1 { word >> 1 ^ 0x82f6_3b78 } else { word >> 1 };
+                bit += 1;
+            }
+            table[index] = word;
+            index += 1;
+        }
+        table
+    };
+    !bytes.iter().fold(u32::MAX, |crc, &byte| crc >> 8 ^ TABLE[((crc ^ u32::from(byte)) & 0xff) as usize])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::crc32c;
+
+    /// RFC 3720, appendix B.4.
+    #[test]
+    fn crc32c_has_its_published_values() {
+        let ascending: Vec<u8> = (0..32).collect();
+        let descending: Vec<u8> = (0..32).rev().collect();
+        assert_eq!(crc32c(&[0; 32]), 0x8a91_36aa);
+        assert_eq!(crc32c(&[0xff; 32]), 0x62a8_ab43);
+        assert_eq!(crc32c(&ascending), 0x46dd_794e);
+        assert_eq!(crc32c(&descending), 0x113f_db5c);
+    }
+}

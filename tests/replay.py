@@ -1,0 +1,254 @@
+"""Opens replay pages in headless Chromium: they load, play, scrub, and show what `flotilla rollout --trace` traces.
+
+    python3 tests/replay.py target/release/flotilla [FOLDER for screenshots]
+
+Python's standard library and a Chromium (named by $CHROMIUM, or found by its usual names) are all that is needed:
+the browser is driven by the DevTools protocol over a pipe.
+"""
+
+import base64
+import itertools
+import json
+import os
+import pathlib
+import select
+import shutil
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+
+CONFIG = """
+[world]
+map = [30.0, 20.0]
+leaders = [[8.0, 5.0], [20.0, 5.0]]
+followers = [[9.0, 3.0], [7.0, 3.0], [21.0, 3.0], [19.0, 3.0]]
+pois = [[8.0, 10.0], [20.0, 10.0]]
+coupling = 2
+steps = 25
+[learning]
+population = 2
+generations = 30
+trials = 1
+"""
+STEPS, AGENTS = 25, 6
+
+
+class Browser:
+    """Chromium with one page."""
+
+    def __init__(self, profile):
+        names = ["chromium", "chromium-browser", "google-chrome"]
+        program = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+        if program is None:
+            sys.exit("no Chromium found; install one, or name it by $CHROMIUM")
+        read_commands, self.commands = os.pipe()
+        self.answers, write_answers = os.pipe()
+
+        def pipes():
+            # Chromium reads commands from 3 and answers on 4; first out of the way of each other.
+            low, high = os.dup(read_commands), os.dup(write_answers)
+            low, high = (os.dup(low), os.dup(high)) if 3 in (low, high) or 4 in (low, high) else (low, high)
+            os.dup2(low, 3)
+            os.dup2(high, 4)
+
+        arguments = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--remote-debugging-pipe"]
+        self.process = subprocess.Popen(
+            [program, *arguments, f"--user-data-dir={profile}", "about:blank"],
+            preexec_fn=pipes, close_fds=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )
+        os.close(read_commands)
+        os.close(write_answers)
+        self.buffer, self.count, self.events = b"", 0, []
+        self.session = None
+        pages = [page for page in self.call("Target.getTargets")["targetInfos"] if page["type"] == "page"]
+        target = {"targetId": pages[0]["targetId"], "flatten": True}
+        self.session = self.call("Target.attachToTarget", **target)["sessionId"]
+        for domain in ["Page", "Runtime", "Log", "Network"]:
+            self.call(f"{domain}.enable")
+
+    def message(self, seconds=30):
+        deadline = time.monotonic() + seconds
+        while b"\0" not in self.buffer:
+            ready, _, _ = select.select([self.answers], [], [], max(0, deadline - time.monotonic()))
+            chunk = os.read(self.answers, 1 << 16) if ready else b""
+            if not chunk:
+                raise TimeoutError("Chromium does not answer")
+            self.buffer += chunk
+        text, self.buffer = self.buffer.split(b"\0", 1)
+        return json.loads(text)
+
+    def call(self, method, **parameters):
+        self.count += 1
+        command = {"id": self.count, "method": method, "params": parameters}
+        if self.session:
+            command["sessionId"] = self.session
+        os.write(self.commands, json.dumps(command).encode() + b"\0")
+        while (message := self.message()).get("id") != self.count:
+            self.events.append(message)
+        if "error" in message:
+            raise RuntimeError(f"{method}: {message['error']}")
+        return message["result"]
+
+    def open(self, url):
+        # By way of an empty page, since going to another place of the same page loads nothing.
+        for place in ["about:blank", url]:
+            self.events.clear()
+            self.call("Page.navigate", url=place)
+            while not any(event["method"] == "Page.loadEventFired" for event in self.events):
+                self.events.append(self.message())
+
+    def evaluate(self, script):
+        result = self.call("Runtime.evaluate", expression=script, returnByValue=True)
+        assert "exceptionDetails" not in result, result
+        return result["result"].get("value")
+
+    def press(self, key, code):
+        for kind in ["keyDown", "keyUp"]:
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=code, text=" " if key == " " and kind == "keyDown" else "")
+
+    def click(self, selector):
+        box = f"(() => {{ const b = document.querySelector('{selector}').getBoundingClientRect();"
+        x, y = self.evaluate(box + " return [b.x + b.width / 2, b.y + b.height / 2]; })()")
+        for kind in ["mousePressed", "mouseReleased"]:
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def wait(self, script, seconds=20):
+        deadline = time.monotonic() + seconds
+        while not self.evaluate(script):
+            assert time.monotonic() < deadline, f"never came true: {script}"
+            time.sleep(0.02)
+
+    def window(self, width, height, dark):
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 500)
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.call("Emulation.setEmulatedMedia", features=[scheme])
+
+    def screenshot(self, path):
+        content = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True)
+        path.write_bytes(base64.b64decode(content["data"]))
+
+    def complaints(self):
+        """What went wrong on the page, and what it asked the network for."""
+        for event in self.events:
+            method, parameters = event.get("method"), event.get("params", {})
+            if method == "Runtime.exceptionThrown":
+                yield parameters["exceptionDetails"]["text"]
+            elif method == "Runtime.consoleAPICalled" and parameters["type"] in ("error", "warning", "assert"):
+                yield str(parameters["args"])
+            elif method == "Log.entryAdded" and parameters["entry"]["level"] in ("error", "warning"):
+                yield parameters["entry"]["text"]
+            elif method == "Network.requestWillBeSent":
+                url = parameters["request"]["url"]
+                if not url.startswith(("file:", "data:")):
+                    yield f"asked for {url}"
+
+    def close(self):
+        self.call("Browser.close")
+        self.process.wait(20)
+
+
+def every_team(source, target):
+    """A policies file whose teams are all that can be made of the policies of two leaders with two each."""
+    content = source.read_bytes()
+    (length,) = struct.unpack("<Q", content[:8])
+    header, body = json.loads(content[8 : 8 + length]), content[8 + length :]
+    tensor = header["weights.0"]
+    leaders, policies, parameters = tensor["shape"]
+    start, size = tensor["data_offsets"][0], 4 * parameters
+    teams = list(itertools.product(range(policies), repeat=leaders))
+    weights = b""
+    for leader in range(leaders):
+        for team in teams:
+            at = start + (leader * policies + team[leader]) * size
+            weights += body[at : at + size]
+    shape = [leaders, len(teams), parameters]
+    header = json.dumps({"weights": {"dtype": "F32", "shape": shape, "data_offsets": [0, len(weights)]}}).encode()
+    target.write_bytes(struct.pack("<Q", len(header)) + header + weights)
+
+
+def traces(path):
+    """Positions by team: [steps + 1][agents] of (x, y), as f32."""
+    single = lambda text: struct.unpack("<f", struct.pack("<f", float(text)))[0]
+    teams = {}
+    for line in path.read_text().splitlines()[1:]:
+        team, step, agent, _, x, y, *_ = line.split(",")
+        steps = teams.setdefault(int(team), [[None] * AGENTS for _ in range(STEPS + 1)])
+        steps[int(step)][int(agent)] = [single(x), single(y)]
+    return list(teams.values())
+
+
+def main():
+    flotilla = str(pathlib.Path(sys.argv[1]).resolve())
+    with tempfile.TemporaryDirectory() as folder:
+        folder = pathlib.Path(folder)
+        pictures = pathlib.Path(sys.argv[2]) if len(sys.argv) > 2 else folder
+        pictures.mkdir(parents=True, exist_ok=True)
+        run, config = folder / "run", folder / "small.toml"
+        config.write_text(CONFIG)
+
+        def call(*arguments):
+            subprocess.run([flotilla, *map(str, arguments), "--backend", "cpu"], check=True, stdout=subprocess.DEVNULL)
+
+        call("train", config, "--out", run, "--quiet")
+        call("replay", run)
+        call("replay", run, "--compare", "0", "--out", folder / "compare.html")
+        every_team(run / "policies.safetensors", folder / "all.safetensors")
+        call("rollout", run / "config.toml", "--policies", folder / "all.safetensors", "--trace", folder / "trace.csv")
+
+        browser = Browser(folder / "profile")
+        browser.window(1280, 900, dark=False)
+        browser.open((run / "replay.html").as_uri())
+        browser.wait("document.readyState === 'complete' && replay.step === 0")
+
+        # Scrubbing through all steps, what is on the screen is the trace of a team, to the bit.
+        scrub = "(() => {{ const s = document.querySelector('#scrub'); s.value = {}; s.dispatchEvent(new Event('input')); }})()"
+        shown, counts = [], []
+        for step in range(STEPS + 1):
+            browser.evaluate(scrub.format(step))
+            assert browser.evaluate("replay.step") == step
+            shown.append(browser.evaluate("replay.positions[0]"))
+            counts.append(int(browser.evaluate("document.querySelector('.episode header p').textContent").split()[0]))
+        assert shown in traces(folder / "trace.csv"), "no team's trace is what the page shows"
+        assert counts == sorted(counts) and counts[0] == 0, counts
+        assert counts[-1] == 2 * browser.evaluate("replay.data.episodes[0].g") > 0, counts
+
+        # Keys.
+        browser.press("Home", "Home")
+        assert browser.evaluate("replay.step") == 0
+        browser.press("ArrowRight", "ArrowRight")
+        assert browser.evaluate("replay.step") == 1
+        browser.press("ArrowLeft", "ArrowLeft")
+        assert browser.evaluate("replay.step") == 0
+        browser.press("+", "Equal")
+        assert browser.evaluate("document.querySelector('#speed').value") == "2"
+        browser.press(" ", "Space")
+        assert browser.evaluate("replay.playing")
+        browser.wait("replay.step > 3")
+
+        # Playing moves, pausing stops, and the end is the end.
+        browser.click("#play")
+        assert not browser.evaluate("replay.playing")
+        step = browser.evaluate("replay.step")
+        time.sleep(0.3)
+        assert browser.evaluate("replay.step") == step
+        browser.click("#play")
+        browser.wait(f"replay.step === {STEPS} && !replay.playing")
+        assert not list(browser.complaints()), list(browser.complaints())
+
+        # Two generations, in windows of all kinds.
+        for page, name in [(run / "replay.html", "one"), (folder / "compare.html", "two")]:
+            for (width, height), dark in itertools.product([(1280, 900), (390, 844)], [False, True]):
+                browser.window(width, height, dark)
+                browser.open(page.as_uri() + "#step=18")
+                browser.wait("document.readyState === 'complete' && replay.step === 18")
+                assert browser.evaluate("document.documentElement.scrollWidth") <= width, "the page is wider than the window"
+                assert browser.evaluate("document.querySelectorAll('canvas').length") == (2 if name == "two" else 1)
+                assert not list(browser.complaints()), list(browser.complaints())
+                browser.screenshot(pictures / f"{name}-{width}-{'dark' if dark else 'light'}.png")
+        browser.close()
+        print("pages load without complaint, play, scrub, and show what rollout traces")
+
+
+main()
