@@ -1,0 +1,130 @@
+//! The paper's geometry for any number of groups and of followers in each.
+//!
+//! Group g = 1, 2, … has its leader at (10 g, 5) and a POI ten units ahead of it, at (10 g, 15), on a map 50 high and
+//! 10 (groups + 1) wide, 50 at least. Its followers stand around the leader on the first of 64 [`places`]: the paper's
+//! (±2, −3), then its chaotic layout's (±2, +2), then whichever place of the unit lattice within 5 of the leader is
+//! farthest from all that are taken. So a smaller ratio is a larger one with some followers left out; no two agents
+//! start at one point, or nearer than 1 to each other; and none starts within 5 of a POI.
+
+use toml::{Table, Value};
+
+use super::{Grid, axis_name, problem};
+use crate::config::{Override, Problem};
+
+/// Followers of each leader (0 to 64; 2 where only the other axis is given).
+pub const FOLLOWERS: &str = "followers_per_leader";
+/// Leaders, each with its followers and a POI (1 to 256; 4 where only the other axis is given).
+pub const GROUPS: &str = "groups";
+pub const AXES: [&str; 2] = [FOLLOWERS, GROUPS];
+const DEFAULT_FOLLOWERS: usize = 2;
+const DEFAULT_GROUPS: usize = 4;
+/// Most followers that a leader has places for.
+pub const MAX_FOLLOWERS: usize = 64;
+/// Most groups, one for each of the POIs a world may have.
+pub const MAX_GROUPS: usize = crate::config::MAX_POIS;
+/// Between neighbouring groups, and from each leader to its POI.
+const SPACING: i32 = 10;
+const LEADER_Y: i32 = 5;
+
+/// Where followers stand, as offsets from their leader, in the order in which they are taken.
+pub fn places() -> Vec<[i32; 2]> {
+    let mut places = vec![[2, -3], [-2, -3], [2, 2], [-2, 2]];
+    let squared = |[x, y]: [i32; 2], [u, v]: [i32; 2]| (x - u).pow(2) + (y - v).pow(2);
+    // Rows 1 to 9 of the map: within 5 of the leader, beyond 5 of any POI, and clear of the wall.
+    let lattice: Vec<_> =
+        (-4..=4).flat_map(|x| (-4..=4).map(move |y| [x, y])).filter(|&place| squared(place, [0, 0]) <= 25).collect();
+    while places.len() < MAX_FOLLOWERS {
+        let room = |place: [i32; 2]| {
+            // The neighbours' leader and followers stand a group's spacing to either side.
+            let taken = places.iter().copied().chain([[0, 0]]);
+            let copies = taken.flat_map(|[x, y]| [[x, y], [x - SPACING, y], [x + SPACING, y]]);
+            copies.map(|other| squared(place, other)).min()
+        };
+        // Of equal room the nearer to the leader, then the one behind, then the right one.
+        let best = lattice.iter().max_by_key(|&&[x, y]| (room([x, y]), -squared([x, y], [0, 0]), -y, x));
+        places.extend(best);
+    }
+    places
+}
+
+/// What is wrong with the values of one of [`AXES`].
+pub(super) fn blame<'a>(key: &str, values: &'a [Value]) -> impl Iterator<Item = String> + 'a {
+    let allowed = if key == FOLLOWERS { 0..=MAX_FOLLOWERS } else { 1..=MAX_GROUPS };
+    let fits = move |value: &Value| count(value).is_some_and(|count| allowed.contains(&count));
+    let (low, high) = if key == FOLLOWERS { (0, MAX_FOLLOWERS) } else { (1, MAX_GROUPS) };
+    values
+        .iter()
+        .filter(move |value| !fits(value))
+        .map(move |value| format!("found {value}, allowed whole numbers {low} to {high}"))
+}
+
+fn count(value: &Value) -> Option<usize> {
+    usize::try_from(value.as_integer()?).ok()
+}
+
+/// Whether the sweep itself says this key.
+fn says(grid: &Grid, base: &Table, key: &str) -> bool {
+    let (section, leaf) = key.split_once('.').unwrap_or((key, ""));
+    base.get(section).and_then(|section| section.get(leaf)).is_some()
+        || grid.axes.iter().any(|(axis, _)| axis.key == key)
+}
+
+/// Positions given beside the axes that would lay them out.
+pub(super) fn conflicts(grid: &Grid, base: &Table) -> Vec<Problem> {
+    let Some((axis, line)) = grid.axes.iter().find(|(axis, _)| AXES.contains(&&*axis.key)) else { return vec![] };
+    let given = ["world.leaders", "world.followers"].into_iter().filter(|key| says(grid, base, key));
+    given
+        .map(|key| {
+            let message = format!("it lays out {key}, which is given too; leave one of them out");
+            problem(Some(*line), &axis_name(&axis.key), message)
+        })
+        .collect()
+}
+
+/// How a sweep's points are laid out.
+pub(super) struct Layout {
+    axes: Option<[Option<usize>; 2]>,
+    places: Vec<[i32; 2]>,
+    pois: bool,
+    map: bool,
+}
+
+impl Layout {
+    pub(super) fn of(grid: &Grid, base: &Table) -> Layout {
+        let axes = AXES.map(|key| grid.axes.iter().position(|(axis, _)| axis.key == key));
+        let used = axes.iter().any(Option::is_some);
+        Layout {
+            axes: used.then_some(axes),
+            places: if used { places() } else { vec![] },
+            pois: !says(grid, base, "world.pois"),
+            map: !says(grid, base, "world.map"),
+        }
+    }
+
+    /// The positions of one combination; nothing where no axis lays them out.
+    pub(super) fn overrides(&self, grid: &Grid, values: &[usize]) -> Vec<Override> {
+        let Some(axes) = self.axes else { return vec![] };
+        let value = |axis: Option<usize>| axis.and_then(|axis| count(&grid.axes[axis].0.values[values[axis]]));
+        let followers = value(axes[0]).unwrap_or(DEFAULT_FOLLOWERS);
+        let groups = value(axes[1]).unwrap_or(DEFAULT_GROUPS) as i32;
+        let leaders: Vec<_> = (1..=groups).map(|group| [SPACING * group, LEADER_Y]).collect();
+        let around = |&[x, y]: &[i32; 2]| self.places[..followers].iter().map(move |[dx, dy]| [x + dx, y + dy]);
+        let positions =
+            |list: Vec<[i32; 2]>| Value::Array(list.into_iter().map(|place| place.to_vec().into()).collect());
+        let named = axes.iter().flatten().next().map_or(0, |&axis| axis);
+        let name = format!("{}[{}]", axis_name(&grid.axes[named].0.key), values[named]);
+        let set = |key: &str, value: Value| Override::new(format!("world.{key}"), value, &*name);
+        let mut overrides = vec![
+            set("leaders", positions(leaders.clone())),
+            set("followers", positions(leaders.iter().flat_map(around).collect())),
+        ];
+        if self.pois {
+            let ahead = leaders.iter().map(|[x, y]| [*x, y + SPACING]).collect();
+            overrides.push(set("pois", positions(ahead)));
+        }
+        if self.map {
+            overrides.push(set("map", vec![(SPACING * (groups + 1)).max(50), 50].into()));
+        }
+        overrides
+    }
+}

@@ -1,0 +1,186 @@
+//! What a sweep came to, put together from its points' folders: the same bytes whoever ran them, and in which order.
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use super::{Point, Sweep};
+use crate::config::Config;
+use crate::record::RecordError;
+use crate::record::disk::Disk;
+use crate::record::metrics::{self, Row};
+
+/// What [`write`] makes of the points that are complete.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Options {
+    /// Every how many generations `results.csv` has a row; the last always has one.
+    pub every: usize,
+    /// The G (in 0..1) whose first generation is told.
+    pub reach: f64,
+}
+
+/// What a point's trials came to, by the best team.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Outcome {
+    /// Best G in the last generation of every trial, and its champion's.
+    pub best: Vec<f64>,
+    pub champion: Vec<f64>,
+    /// The first generation of every trial whose best G is at least [`Options::reach`].
+    pub reached: Vec<Option<usize>>,
+    /// Generation, mean and standard error over the trials of the best G, as often as `results.csv` has rows.
+    pub curve: Vec<(usize, f64, f64)>,
+}
+
+impl Outcome {
+    /// The median over the trials of the generations to reach G, where trials that never do count as later than all;
+    /// none where it is one of these.
+    pub fn median_reached(&self) -> Option<f64> {
+        let mut reached: Vec<usize> = self.reached.iter().map(|reached| reached.unwrap_or(usize::MAX)).collect();
+        reached.sort_unstable();
+        let middle = [reached[(reached.len() - 1) / 2], reached[reached.len() / 2]];
+        (middle[1] < usize::MAX).then(|| (middle[0] + middle[1]) as f64 / 2.0)
+    }
+}
+
+/// Mean and standard error of the mean (0 for a single value).
+pub fn mean_and_error(values: &[f64]) -> (f64, f64) {
+    let count = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / count;
+    let squares: f64 = values.iter().map(|value| (value - mean) * (value - mean)).sum();
+    (mean, if values.len() > 1 { (squares / (count - 1.0) / count).sqrt() } else { 0.0 })
+}
+
+/// Where a point's run is in a sweep's folder.
+pub fn point_folder(out: &Path, point: &Point) -> PathBuf {
+    out.join("points").join(format!("{:04}", point.index))
+}
+
+/// A point that cannot be put together, and why.
+#[derive(Debug, thiserror::Error)]
+pub enum Missing {
+    #[error("it was not run")]
+    NotRun,
+    #[error("it has come to generation {0} of {1}")]
+    Unfinished(usize, usize),
+    #[error("{0}")]
+    Damaged(String),
+}
+
+/// Writes `results.csv` and `points.csv` of the points that are complete; gives what every point came to.
+///
+/// # Errors
+/// The files cannot be written.
+pub fn write(sweep: &Sweep, out: &Path, options: &Options) -> Result<Vec<Result<Outcome, Missing>>, RecordError> {
+    let disk = Disk::default();
+    let mut outcomes = Vec::new();
+    let path = out.join("results.csv");
+    let rows = |output: &mut dyn Write| {
+        let mut table = csv::Writer::from_writer(output);
+        let columns = ["point", "trial", "generation", "best_g", "mean_g", "champion_g"];
+        table.write_record(sweep.axes.iter().map(|axis| &*axis.key).chain(columns))?;
+        for point in &sweep.points {
+            outcomes.push(match read(point, out, options) {
+                Ok((rows, outcome)) => {
+                    for row in rows {
+                        let Row { trial, generation, best_g, mean_g, champion_g, .. } = row;
+                        let counts = [point.index, trial, generation].map(|count| count.to_string());
+                        let shares = [best_g, mean_g, champion_g].map(|share| share.to_string());
+                        table.write_record(labels(sweep, point).into_iter().chain(counts).chain(shares))?;
+                    }
+                    Ok(outcome)
+                }
+                Err(missing) => Err(missing),
+            });
+        }
+        table.flush()
+    };
+    disk.replace(&path, rows).map_err(|error| RecordError::Write { path, error })?;
+
+    let path = out.join("points.csv");
+    let summary = |output: &mut dyn Write| summary(sweep, &outcomes, options, output);
+    disk.replace(&path, summary).map_err(|error| RecordError::Write { path, error })?;
+    Ok(outcomes)
+}
+
+fn labels(sweep: &Sweep, point: &Point) -> Vec<String> {
+    sweep.axes.iter().zip(&point.values).map(|(axis, &value)| axis.label(value)).collect()
+}
+
+/// `points.csv`: one row a point.
+fn summary(
+    sweep: &Sweep,
+    outcomes: &[Result<Outcome, Missing>],
+    options: &Options,
+    output: &mut dyn Write,
+) -> io::Result<()> {
+    let mut table = csv::Writer::from_writer(output);
+    let columns =
+        ["point", "trials", "generations", "best_g", "best_g_error", "champion_g", "reach", "reached", "median"];
+    table.write_record(sweep.axes.iter().map(|axis| &*axis.key).chain(columns))?;
+    for (point, outcome) in sweep.points.iter().zip(outcomes) {
+        let Ok(outcome) = outcome else { continue };
+        let (best, error) = mean_and_error(&outcome.best);
+        let fields = [
+            point.index.to_string(),
+            outcome.best.len().to_string(),
+            point.config.learning.generations.to_string(),
+            best.to_string(),
+            error.to_string(),
+            mean_and_error(&outcome.champion).0.to_string(),
+            options.reach.to_string(),
+            outcome.reached.iter().flatten().count().to_string(),
+            outcome.median_reached().map_or(String::new(), |median| median.to_string()),
+        ];
+        table.write_record(labels(sweep, point).into_iter().chain(fields))?;
+    }
+    table.flush()
+}
+
+/// A complete point's rows for `results.csv`, by trial and generation, and what it came to.
+fn read(point: &Point, out: &Path, options: &Options) -> Result<(Vec<Row>, Outcome), Missing> {
+    let folder = point_folder(out, point);
+    let damaged = |error: &dyn std::fmt::Display| Missing::Damaged(error.to_string());
+    if !folder.join("metrics.csv").exists() {
+        return Err(Missing::NotRun);
+    }
+    let config = Config::load(&folder.join("config.toml")).map_err(|error| damaged(&error))?;
+    if config != point.config {
+        return Err(Missing::Damaged(format!("{}: it is of another config", folder.display())));
+    }
+    let (trials, last) = (config.learning.trials, config.learning.generations);
+    let mut rows: Vec<Vec<Row>> = vec![Vec::new(); trials];
+    let mut reached = vec![None; trials];
+    let mut next = 0;
+    let path = folder.join("metrics.csv");
+    for row in metrics::open(&path).map_err(|error| damaged(&error))? {
+        let (row, _) = row.map_err(|error| damaged(&format!("{}: {error}", path.display())))?;
+        let Row { trial, generation, best_g, .. } = row;
+        if (generation, trial) != (next / trials, next % trials) || generation > last {
+            return Err(Missing::Damaged(format!(
+                "{}: trial {trial} of generation {generation} is out of turn",
+                path.display()
+            )));
+        }
+        next += 1;
+        if best_g >= options.reach && reached[trial].is_none() {
+            reached[trial] = Some(generation);
+        }
+        if generation % options.every == 0 || generation == last {
+            rows[trial].push(row);
+        }
+    }
+    if next < trials * (last + 1) {
+        return Err(Missing::Unfinished(next / trials, last));
+    }
+    let ends = || rows.iter().filter_map(|rows| rows.last());
+    let curve = (0..rows[0].len()).map(|at| {
+        let (mean, error) = mean_and_error(&rows.iter().map(|rows| rows[at].best_g).collect::<Vec<_>>());
+        (rows[0][at].generation, mean, error)
+    });
+    let outcome = Outcome {
+        best: ends().map(|row| row.best_g).collect(),
+        champion: ends().map(|row| row.champion_g).collect(),
+        reached,
+        curve: curve.collect(),
+    };
+    Ok((rows.concat(), outcome))
+}

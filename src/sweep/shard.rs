@@ -1,0 +1,121 @@
+//! Which points each of many processes takes: a pure function of the sweep, so that they need not talk to each other.
+
+use std::fmt::{self, Display};
+use std::str::FromStr;
+
+use super::Point;
+use crate::world::World;
+
+/// Most shards of a sweep.
+pub const MAX_SHARDS: usize = 1 << 16;
+
+/// Shard `index` (from 1) of `count`; written `1/4` to `4/4`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Shard {
+    pub index: usize,
+    pub count: usize,
+}
+
+impl Shard {
+    /// All of it.
+    pub const WHOLE: Shard = Shard { index: 1, count: 1 };
+
+    /// # Errors
+    /// No such shard, in words.
+    pub fn new(index: usize, count: usize) -> Result<Shard, String> {
+        match count {
+            1..=MAX_SHARDS if (1..=count).contains(&index) => Ok(Shard { index, count }),
+            1..=MAX_SHARDS => {
+                Err(format!("there is no shard {index} of {count}; they are 1/{count} to {count}/{count}"))
+            }
+            _ => Err(format!("found {count} shards, allowed 1 to {MAX_SHARDS}")),
+        }
+    }
+
+    /// The shard that a job array gives this process, none outside of one; `get` looks up an environment variable.
+    ///
+    /// Slurm's array tells all that is needed (its ids may start anywhere); a Kubernetes indexed job tells its index
+    /// in `JOB_COMPLETION_INDEX`, and `FLOTILLA_SHARDS` has to tell its `completions`.
+    ///
+    /// # Errors
+    /// Variables that do not fit together, in words.
+    pub fn from_env(get: impl Fn(&str) -> Option<String>) -> Result<Option<Shard>, String> {
+        let number = |name: &str| match get(name) {
+            None => Ok(None),
+            Some(text) => {
+                text.trim().parse::<usize>().map(Some).map_err(|_| format!("{name}={text} is no whole number"))
+            }
+        };
+        let (index, count, names) = if let Some(id) = number("SLURM_ARRAY_TASK_ID")? {
+            let count =
+                number("SLURM_ARRAY_TASK_COUNT")?.ok_or("SLURM_ARRAY_TASK_ID is set without SLURM_ARRAY_TASK_COUNT")?;
+            let first = number("SLURM_ARRAY_TASK_MIN")?.unwrap_or(1);
+            let step = number("SLURM_ARRAY_TASK_STEP")?.unwrap_or(1).max(1);
+            let past = id.checked_sub(first).filter(|past| past % step == 0).ok_or_else(|| {
+                format!(
+                    "SLURM_ARRAY_TASK_ID={id} does not fit SLURM_ARRAY_TASK_MIN={first}, SLURM_ARRAY_TASK_STEP={step}"
+                )
+            })?;
+            (past / step, count, "SLURM_ARRAY_TASK_ID and SLURM_ARRAY_TASK_COUNT")
+        } else if let Some(index) = number("JOB_COMPLETION_INDEX")? {
+            let count = number("FLOTILLA_SHARDS")?.ok_or(
+                "JOB_COMPLETION_INDEX is set, but not FLOTILLA_SHARDS, which has to be the job's `completions`; \
+                 or say --shard I/N",
+            )?;
+            (index, count, "JOB_COMPLETION_INDEX and FLOTILLA_SHARDS")
+        } else {
+            return Ok(None);
+        };
+        let shard = Shard::new(index.saturating_add(1), count);
+        shard.map(Some).map_err(|error| format!("{names}: {error}; say --shard I/N where the array has gaps"))
+    }
+
+    /// This shard's points: dealt out dearest first, each to the shard with the least to do.
+    pub fn take<'a>(&self, points: &'a [Point]) -> Vec<&'a Point> {
+        let mut order: Vec<(u128, &Point)> = points.iter().map(|point| (cost(point), point)).collect();
+        order.sort_by_key(|(cost, point)| (std::cmp::Reverse(*cost), point.index));
+        let mut loads = vec![0; self.count];
+        let mut mine = Vec::new();
+        for (cost, point) in order {
+            let least = (0..self.count).min_by_key(|&shard| (loads[shard], shard)).unwrap_or(0);
+            loads[least] += cost;
+            if least + 1 == self.index {
+                mine.push(point);
+            }
+        }
+        mine.sort_by_key(|point| point.index);
+        mine
+    }
+}
+
+impl FromStr for Shard {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Shard, String> {
+        let part = |text: &str| text.parse::<usize>().ok();
+        let parts = text.split_once('/').and_then(|(index, count)| part(index).zip(part(count)));
+        let (index, count) = parts.ok_or("allowed I/N, shard I of N: 1/4 to 4/4")?;
+        Shard::new(index, count)
+    }
+}
+
+impl Display for Shard {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}/{}", self.index, self.count)
+    }
+}
+
+/// About how many operations a point takes: teams played, times steps, times what an agent does in one, with the
+/// counts of a step's arithmetic (networks, pairs of agents, sensing, coupling).
+pub fn cost(point: &Point) -> u128 {
+    let learning = &point.config.learning;
+    let world = World::new(&point.config);
+    let wide = |count: usize| count as u128;
+    let teams = wide(learning.trials)
+        * wide(learning.generations + 1)
+        * wide(learning.population + 1)
+        * wide(learning.episodes_per_team);
+    let (agents, leaders, pois) = (wide(world.agents()), wide(world.leaders()), wide(world.pois.len()));
+    let step = leaders * (2 * wide(world.parameters()) + 25 * pois) + agents * (4 * agents + 6 * pois + 100);
+    teams * wide(world.steps()) * step
+}

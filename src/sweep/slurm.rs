@@ -1,0 +1,81 @@
+//! The batch script of a Slurm job array that runs a sweep, a shard a task.
+
+use std::path::Path;
+
+/// What the script asks for.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Job<'a> {
+    /// The sweep's name.
+    pub name: &'a str,
+    /// The command line that runs a shard, without `--shard` and `--resume`.
+    pub command: Vec<String>,
+    pub out: &'a Path,
+    pub shards: usize,
+    /// Time limit of a task, as Slurm reads it: `01:00:00`.
+    pub time: &'a str,
+    pub gpus: usize,
+    pub cpus: usize,
+    /// More `#SBATCH` options: `--partition=…`, `--account=…`.
+    pub options: &'a [String],
+}
+
+impl Job<'_> {
+    /// The script.
+    pub fn script(&self) -> String {
+        let Job { name, command, out, shards, time, gpus, cpus, options } = self;
+        let name: String =
+            name.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '-' }).collect();
+        let command: Vec<_> = command.iter().map(|word| quoted(word)).collect();
+        let out = out.display().to_string();
+        let log = quoted(&format!("{}/slurm-%a.log", out.replace('%', "%%")));
+        let gpus =
+            if *gpus > 0 { format!("#SBATCH --gpus-per-task={gpus}\n#SBATCH --ntasks=1\n") } else { String::new() };
+        let options: String = options.iter().map(|option| format!("#SBATCH {option}\n")).collect();
+        format!(
+            r#"#!/bin/bash
+#SBATCH --job-name={name}
+#SBATCH --array=1-{shards}
+#SBATCH --time={time}
+#SBATCH --cpus-per-task={cpus}
+{gpus}#SBATCH --signal=B:USR1@60
+#SBATCH --requeue
+#SBATCH --open-mode=append
+#SBATCH --output={log}
+{options}
+# A minute before the time limit Slurm sends USR1 to this shell. The run is told to save and stop, and the task goes
+# back into the queue, to go on from there. So it does when Slurm itself preempts the task or loses its node.
+# When all tasks are done: {collect}
+run=
+warned=
+warn() {{ warned=1; [ -z "$run" ] || kill -TERM "$run"; }}
+trap warn USR1 TERM
+
+{command} --shard "$SLURM_ARRAY_TASK_ID/{shards}" --resume &
+run=$!
+wait "$run"
+code=$?
+# A trapped signal ends `wait` early; the run itself is still saving.
+while kill -0 "$run" 2>/dev/null; do
+    wait "$run"
+    code=$?
+done
+if [ -n "$warned" ] && [ "$code" -ne 0 ]; then
+    echo "time is nearly up: back into the queue"
+    exec scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_$SLURM_ARRAY_TASK_ID"
+fi
+exit "$code"
+"#,
+            collect = [&command[..], &["--collect".to_string()]].concat().join(" "),
+            command = command.join(" "),
+        )
+    }
+}
+
+/// A word as a shell reads it back.
+fn quoted(word: &str) -> String {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+%@".contains(c);
+    match word.chars().all(plain) && !word.is_empty() {
+        true => word.into(),
+        false => format!("'{}'", word.replace('\'', r"'\''")),
+    }
+}
