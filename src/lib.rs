@@ -29,6 +29,7 @@ pub mod record;
 pub mod report;
 pub mod run;
 pub mod sample;
+pub mod sweep;
 pub mod trainer;
 pub mod verify;
 pub mod world;

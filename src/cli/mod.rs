@@ -23,6 +23,7 @@ mod paper;
 mod plot;
 mod replay;
 mod rollout;
+mod sweep;
 mod train;
 mod verify;
 
@@ -62,6 +63,8 @@ commands! {
     Verify(verify),
     /// List what can be trained on.
     Devices(devices),
+    /// Train every point of a grid side by side; share the grid out over many machines.
+    Sweep(sweep),
 }
 
 /// Trains cooperative teams by coevolution on any GPU, with the same bits on a CPU.
@@ -107,6 +110,9 @@ pub enum Error {
     /// What was to be equal is not.
     #[error("{0}")]
     Different(String),
+    /// Results that are not there yet.
+    #[error("{0}")]
+    Missing(String),
     /// Stopped by a signal, with everything saved.
     #[error("{0}")]
     Stopped(String),

@@ -190,15 +190,15 @@ fn command_to_resume(folder: &Path) -> String {
 }
 
 /// Signals that ask for something.
-struct Signals {
-    stop: Arc<AtomicBool>,
-    save: Arc<AtomicBool>,
+pub(super) struct Signals {
+    pub(super) stop: Arc<AtomicBool>,
+    pub(super) save: Arc<AtomicBool>,
 }
 
 impl Signals {
     /// From here on SIGINT and SIGTERM set `stop`, and end the process at once where it is set already; SIGUSR1 sets
     /// `save`.
-    fn listen() -> Result<Signals, Error> {
+    pub(super) fn listen() -> Result<Signals, Error> {
         use signal_hook::consts::{SIGINT, SIGTERM};
         use signal_hook::flag;
         let signals = Signals { stop: Arc::default(), save: Arc::default() };
