@@ -13,6 +13,7 @@ use crate::config::{self, ConfigError, Problem};
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{CONFIG, Start};
+use crate::sweep::pictures;
 use crate::sweep::results::{self, Missing, Outcome};
 use crate::sweep::run::{self, Ended, Progress};
 use crate::sweep::shard::{self, MAX_SHARDS, Shard};
@@ -297,7 +298,7 @@ fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(),
     let mut text = summary(sweep, &outcomes, &options);
     let _ = write!(
         text,
-        "\nFiles in {}:\n  results.csv   every point and trial, {}\n  points.csv    what each point came to\n  points/       the runs themselves\n",
+        "\nFiles in {}:\n  points/      the runs themselves\n  results.csv  every point and trial, {}\n  points.csv   what each point came to\n",
         out.display(),
         if options.every == 1 {
             "generation by generation".into()
@@ -305,7 +306,11 @@ fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(),
             format!("every {} generations", options.every)
         },
     );
-    let _ = (axes, Disk::default());
+    let (names, note) = pictures::draw(sweep, &outcomes, &options, axes, out)?;
+    if !names.is_empty() {
+        text += "  final, reach, curves (.svg, .png)   G at the end, generations to reach one, and learning curves\n";
+    }
+    text.extend(note.map(|note| note + "\n"));
     print(&text)?;
     let missing: Vec<(&Point, &Missing)> = sweep
         .points

@@ -5,12 +5,14 @@
 //! | [`scene`] | a picture described once, written as SVG or PNG |
 //! | [`curves`] | learning curves: mean and standard error over trials, and the figure that shows them |
 //! | [`runs`] | what runs' folders say of their curves, and what is wrong with them |
+//! | [`grid`] | heat maps and curves over the axes of a sweep |
 //! | [`paper`] | the paper's experiments, its figures and its claims, one by one |
 //! | [`replay`] | episodes of any trial and generation, as a page or a picture |
 //! | [`tensorboard`] | event files for TensorBoard |
 //! | [`progress`] | every arm's curve on the terminal while it grows |
 
 pub mod curves;
+pub mod grid;
 pub mod paper;
 pub mod progress;
 pub mod replay;

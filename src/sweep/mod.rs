@@ -10,6 +10,7 @@
 //! | [`shard`] | which points a process of many takes: by cost, the same on every machine |
 //! | [`run`] | trains a shard's points side by side |
 //! | [`results`] | `results.csv` and `points.csv`, put together from the points' folders |
+//! | [`pictures`] | heat maps and curves of them |
 //! | [`slurm`] | the batch script of a job array |
 
 use std::collections::BTreeMap;
@@ -22,6 +23,7 @@ use toml::{Spanned, Table, Value};
 use crate::config::{Config, ConfigError, Override, Problem, read_file};
 
 pub mod layout;
+pub mod pictures;
 pub mod results;
 pub mod run;
 pub mod shard;

@@ -1,0 +1,272 @@
+//! Figures of a grid of results: heat maps over two axes, and curves by the values of an axis.
+
+use super::curves::Curve;
+use super::scene::{Anchor, BLACK, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
+
+/// Widest a figure gets before its panels go to the next row, in millimetres.
+const WIDEST: f64 = 180.0;
+const SMALL: f64 = 2.47;
+const NORMAL: f64 = 2.82;
+const GAP: f64 = 5.0;
+
+/// A sequential palette whose lightness falls all the way (ColorBrewer's YlGnBu): it keeps its order for the
+/// colour-blind and in grey.
+const PALETTE: [Color; 9] = [
+    [255, 255, 217],
+    [237, 248, 177],
+    [199, 233, 180],
+    [127, 205, 187],
+    [65, 182, 196],
+    [29, 145, 192],
+    [34, 94, 168],
+    [37, 52, 148],
+    [8, 29, 88],
+];
+
+/// The colour of a value in 0..1.
+pub fn shade(value: f64) -> Color {
+    let place = value.clamp(0.0, 1.0) * (PALETTE.len() - 1) as f64;
+    let low = (place as usize).min(PALETTE.len() - 2);
+    let part = place - low as f64;
+    let mix = |a: u8, b: u8| (f64::from(a) + part * (f64::from(b) - f64::from(a))).round() as u8;
+    std::array::from_fn(|channel| mix(PALETTE[low][channel], PALETTE[low + 1][channel]))
+}
+
+/// White or black, whichever is read more easily on a colour (sRGB's weights of the channels).
+fn ink(on: Color) -> Color {
+    let [r, g, b] = on.map(f64::from);
+    if 0.299 * r + 0.587 * g + 0.114 * b > 140.0 { BLACK } else { WHITE }
+}
+
+/// The values of one axis.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Scale {
+    pub label: String,
+    pub values: Vec<String>,
+}
+
+/// What a cell shows.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub enum Cell {
+    /// Nothing ran there.
+    #[default]
+    Empty,
+    /// A shade in 0..1, and what is written on it.
+    Value(f64, String),
+    /// There is no value, and this is why.
+    Word(String),
+}
+
+/// A value for each pair of values of two axes, in a panel for each value of the rest.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct HeatMap {
+    pub title: String,
+    pub x: Scale,
+    /// Without values: a single row.
+    pub y: Scale,
+    /// Title and cells `[y][x]`.
+    pub panels: Vec<(String, Vec<Cell>)>,
+    /// What the shades stand for: places in 0..1 with their values.
+    pub key: Vec<(f64, String)>,
+}
+
+impl HeatMap {
+    pub fn scene(&self) -> Scene {
+        const HIGH: f64 = 7.5;
+        let longest = |labels: &[String]| labels.iter().map(|label| text_width(label, SMALL)).fold(0.0, f64::max);
+        let titles = self.panels.iter().map(|(title, _)| text_width(title, NORMAL)).fold(0.0, f64::max);
+        let columns = self.x.values.len();
+        let wide = (longest(&self.x.values) + 3.0).clamp(11.0, 40.0).max((titles + 2.0) / columns as f64);
+        let rows = self.y.values.len().max(1);
+        let left = if self.y.values.is_empty() { 3.0 } else { 8.0 + longest(&self.y.values) };
+        let (width, height) = (wide * columns as f64, HIGH * rows as f64);
+        let panels = Panels::new(self.panels.len(), width, height, left, 15.0);
+        let (key_width, key_above) = (55.0, panels.above + panels.height() + 3.0);
+        let whole = panels.width().max(text_width(&self.title, 3.2) * 1.1 + 6.0).max(key_width + left + 6.0);
+        let mut scene = Scene::new(whole, key_above + 9.5);
+        scene.bold([3.0, 5.0], &*self.title, 3.2, Anchor::Start, BLACK);
+
+        for (index, (title, cells)) in self.panels.iter().enumerate() {
+            let [x, y] = panels.place(index);
+            scene.text([x + width / 2.0, y - 1.6], &**title, NORMAL, Anchor::Middle, BLACK);
+            for (at, cell) in cells.iter().enumerate() {
+                let area = [x + wide * (at % columns) as f64, y + HIGH * (at / columns) as f64, wide, HIGH];
+                let (fill, text, color) = match cell {
+                    Cell::Empty => (WHITE, "", GREY),
+                    Cell::Value(value, text) => (shade(*value), &**text, ink(shade(*value))),
+                    Cell::Word(text) => (LIGHT, &**text, BLACK),
+                };
+                scene.rectangle(area, Some(fill.into()), Some(Pen::new(WHITE, 0.3)));
+                let middle = [area[0] + wide / 2.0, area[1] + HIGH / 2.0 + 0.9];
+                if *cell == Cell::Empty {
+                    // A place that cannot be: crossed out, so that it is not taken for a low value.
+                    let [x, y] = [area[0], area[1]];
+                    scene.line(vec![[x + 1.0, y + HIGH - 1.0], [x + wide - 1.0, y + 1.0]], Pen::new(LIGHT, 0.3));
+                }
+                scene.text(middle, text, SMALL, Anchor::Middle, color);
+            }
+            scene.rectangle([x, y, width, height], None, Some(Pen::new(GREY, 0.2)));
+            for (at, label) in self.x.values.iter().enumerate() {
+                let place = [x + wide * (at as f64 + 0.5), y + height + 3.4];
+                scene.text(place, &**label, SMALL, Anchor::Middle, BLACK);
+            }
+            scene.text([x + width / 2.0, y + height + 7.4], &*self.x.label, NORMAL, Anchor::Middle, BLACK);
+            if panels.is_first(index) {
+                for (at, label) in self.y.values.iter().enumerate() {
+                    let place = [x - 1.3, y + HIGH * (at as f64 + 0.5) + 0.9];
+                    scene.text(place, &**label, SMALL, Anchor::End, BLACK);
+                }
+                if !self.y.values.is_empty() {
+                    scene.upright([3.8, y + height / 2.0], &*self.y.label, NORMAL, BLACK);
+                }
+            }
+        }
+        let steps = 64;
+        for step in 0..steps {
+            let part = key_width / f64::from(steps);
+            let color = shade((f64::from(step) + 0.5) / f64::from(steps));
+            // Each overlaps the next a little, or a renderer shows seams.
+            let area = [left + part * f64::from(step), key_above, part + 0.05, 2.6];
+            scene.rectangle(area, Some(color.into()), None);
+        }
+        scene.rectangle([left, key_above, key_width, 2.6], None, Some(Pen::new(GREY, 0.2)));
+        for (place, label) in &self.key {
+            let x = left + place * key_width;
+            scene.line(vec![[x, key_above + 2.6], [x, key_above + 3.4]], Pen::new(BLACK, 0.2));
+            scene.text([x, key_above + 6.3], &**label, SMALL, Anchor::Middle, BLACK);
+        }
+        scene
+    }
+}
+
+/// Curves of G in 0..1 by generation, one for each value of an axis, in a panel for each value of the rest.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Curves {
+    pub title: String,
+    pub y_label: String,
+    pub by: Scale,
+    /// Panels in a row, as many as fit where it is 0.
+    pub columns: usize,
+    /// Title, and curves by the index of their value.
+    pub panels: Vec<(String, Vec<(usize, Curve)>)>,
+}
+
+impl Curves {
+    pub fn scene(&self) -> Scene {
+        const HEIGHT: f64 = 26.0;
+        const LEFT: f64 = 14.0;
+        let titles = self.panels.iter().map(|(title, _)| text_width(title, SMALL)).fold(0.0, f64::max);
+        let width = titles.max(38.0) + 1.0;
+        let entries: Vec<f64> = self.by.values.iter().map(|value| 9.0 + text_width(value, SMALL)).collect();
+        let legend = text_width(&self.by.label, NORMAL) + 6.0;
+        let mut panels = Panels::new(self.panels.len(), width, HEIGHT, LEFT, 12.0);
+        if self.columns > 0 {
+            panels.columns = panels.columns.min(self.columns);
+        }
+        let whole = panels.width().max(text_width(&self.title, 3.2) * 1.1 + 6.0).max(legend + entries.iter().fold(0.0, |a, &b| f64::max(a, b)));
+        // The legend takes as many rows as it needs.
+        let mut places = Vec::new();
+        let (mut x, mut y) = (legend, 10.0);
+        for entry in entries {
+            if x + entry > whole && x > legend {
+                (x, y) = (legend, y + 4.2);
+            }
+            places.push([x, y]);
+            x += entry + 1.5;
+        }
+        panels.above += y;
+        let mut scene = Scene::new(whole, panels.above + panels.height() - 2.0);
+        scene.bold([3.0, 5.0], &*self.title, 3.2, Anchor::Start, BLACK);
+        scene.text([3.0, 10.9], &*self.by.label, NORMAL, Anchor::Start, BLACK);
+        for (at, (label, [x, y])) in self.by.values.iter().zip(places).enumerate() {
+            scene.line(vec![[x, y], [x + 6.0, y]], self.pen(at));
+            scene.text([x + 7.0, y + 0.9], &**label, SMALL, Anchor::Start, BLACK);
+        }
+        let generations = self.panels.iter().flat_map(|(_, curves)| curves).filter_map(|(_, c)| c.generation.last());
+        let last = generations.fold(1.0, |a: f64, &b| a.max(b));
+        for (index, (title, curves)) in self.panels.iter().enumerate() {
+            let [left, above] = panels.place(index);
+            let at = |generation: f64, g: f64| [left + width * generation / last, above + HEIGHT * (1.0 - g / 1.04).clamp(0.0, 1.0)];
+            for (tick, label) in [(0.0, "0"), (0.5, "0.5"), (1.0, "1")] {
+                let [_, y] = at(0.0, tick);
+                scene.line(vec![[left, y], [left + width, y]], Pen::new(LIGHT, 0.15));
+                if panels.is_first(index) {
+                    scene.text([left - 1.3, y + 0.9], label, SMALL, Anchor::End, BLACK);
+                }
+            }
+            scene.line(vec![[left, above], [left, above + HEIGHT], [left + width, above + HEIGHT]], Pen::new(BLACK, 0.2));
+            for (generation, anchor) in [(0.0, Anchor::Middle), (last, Anchor::End)] {
+                let [x, y] = at(generation, 0.0);
+                scene.text([x, y + 3.4], generation.to_string(), SMALL, anchor, BLACK);
+            }
+            scene.text([left + width / 2.0, above + HEIGHT + 3.4], "generation", SMALL, Anchor::Middle, BLACK);
+            scene.text([left + width / 2.0, above - 1.6], &**title, SMALL, Anchor::Middle, BLACK);
+            if panels.is_first(index) {
+                scene.upright([4.0, above + HEIGHT / 2.0], &*self.y_label, SMALL, BLACK);
+            }
+            scene.clipped([left - 0.4, above - 0.4, width + 0.8, HEIGHT + 0.8], |scene| {
+                let curves: Vec<_> = curves.iter().map(|(value, curve)| (*value, curve.thinned().0)).collect();
+                for (value, curve) in &curves {
+                    let side = |sign: f64| {
+                        let values = curve.mean.iter().zip(&curve.error).map(move |(mean, error)| mean + sign * error);
+                        curve.generation.iter().zip(values).map(|(&x, y)| at(x, y.clamp(0.0, 1.0)))
+                    };
+                    if curve.error.iter().any(|&error| error > 0.0) {
+                        let fill = Fill { color: self.pen(*value).color, opacity: 0.15 };
+                        scene.polygon(side(1.0).chain(side(-1.0).rev()).collect(), Some(fill), None);
+                    }
+                }
+                for (value, curve) in &curves {
+                    let points = curve.generation.iter().zip(&curve.mean).map(|(&x, &y)| at(x, y)).collect();
+                    scene.line(points, self.pen(*value));
+                }
+            });
+        }
+        scene
+    }
+
+    /// A value's line: darker the later it stands on its axis, and dashed in turn.
+    fn pen(&self, value: usize) -> Pen {
+        const DASHES: [&[f64]; 3] = [&[], &[1.8, 0.7], &[0.7, 0.6]];
+        let last = self.by.values.len().saturating_sub(1).max(1) as f64;
+        Pen { dash: DASHES[value % 3], ..Pen::new(shade(0.35 + 0.65 * value as f64 / last), 0.45) }
+    }
+}
+
+/// Where panels of one size stand: in rows, the first of each with its labels to the left.
+struct Panels {
+    count: usize,
+    columns: usize,
+    width: f64,
+    height: f64,
+    left: f64,
+    above: f64,
+    below: f64,
+}
+
+impl Panels {
+    fn new(count: usize, width: f64, height: f64, left: f64, below: f64) -> Panels {
+        let fit = ((WIDEST - left) / (width + GAP)) as usize;
+        Panels { count, columns: fit.clamp(1, count.max(1)), width, height, left, above: 12.0, below }
+    }
+
+    fn place(&self, index: usize) -> [f64; 2] {
+        let (row, column) = (index / self.columns, index % self.columns);
+        [
+            self.left + (self.width + GAP) * column as f64,
+            self.above + (self.height + self.below) * row as f64,
+        ]
+    }
+
+    fn is_first(&self, index: usize) -> bool {
+        index.is_multiple_of(self.columns)
+    }
+
+    fn width(&self) -> f64 {
+        self.left + (self.width + GAP) * self.columns as f64
+    }
+
+    fn height(&self) -> f64 {
+        (self.height + self.below) * self.count.div_ceil(self.columns) as f64 - self.below + 9.0
+    }
+}

@@ -1,0 +1,186 @@
+//! What a sweep came to, as figures: `final`, `reach` and `curves`, each as SVG and PNG.
+
+use std::path::Path;
+
+use super::results::{Missing, Options, Outcome, mean_and_error};
+use super::{Axis, Point, Sweep};
+use crate::record::RecordError;
+use crate::record::disk::Disk;
+use crate::report::curves::Curve;
+use crate::report::grid::{Cell, Curves, HeatMap, Scale};
+use crate::report::scene::Scene;
+
+/// Pixels a millimetre of a PNG.
+const PIXELS: f64 = 8.0;
+/// Most values of an axis, and most panels, that a figure has room for.
+const MAX_VALUES: usize = 40;
+const MAX_PANELS: usize = 48;
+
+/// The points by the values of two axes, with a panel for each combination of the others.
+struct Grid<'a> {
+    x: &'a Axis,
+    y: Option<&'a Axis>,
+    /// Title, and the points `[y][x]`, with what they came to.
+    panels: Vec<(String, Vec<Option<(&'a Point, &'a Outcome)>>)>,
+}
+
+/// Draws the figures of the points that are done, over one or two axes; gives the files' names, and what was left out.
+///
+/// # Errors
+/// A file cannot be written.
+pub fn draw(
+    sweep: &Sweep,
+    outcomes: &[Result<Outcome, Missing>],
+    options: &Options,
+    axes: &[usize],
+    out: &Path,
+) -> Result<(Vec<String>, Option<String>), RecordError> {
+    let grid = match Grid::new(sweep, outcomes, axes) {
+        Ok(grid) => grid,
+        Err(reason) => return Ok((vec![], Some(reason))),
+    };
+    let disk = Disk::default();
+    let mut names = Vec::new();
+    for (name, scene) in
+        [("final", grid.last().scene()), ("reach", grid.reach(options).scene()), ("curves", grid.curves(sweep).scene())]
+    {
+        for (extension, bytes) in [("svg", Scene::svg(&scene).into_bytes()), ("png", png(&scene, out)?)] {
+            let name = format!("{name}.{extension}");
+            let path = out.join(&name);
+            let write = disk.replace(&path, |output| output.write_all(&bytes));
+            write.map_err(|error| RecordError::Write { path, error })?;
+            names.push(name);
+        }
+    }
+    Ok((names, None))
+}
+
+fn png(scene: &Scene, out: &Path) -> Result<Vec<u8>, RecordError> {
+    scene.png(PIXELS).map_err(|error| RecordError::Write { path: out.into(), error })
+}
+
+impl<'a> Grid<'a> {
+    /// The points by the axes asked for, or by the first two that have more than one value.
+    fn new(sweep: &'a Sweep, outcomes: &'a [Result<Outcome, Missing>], asked: &[usize]) -> Result<Grid<'a>, String> {
+        let varied = (0..sweep.axes.len()).filter(|&axis| sweep.axes[axis].values.len() > 1 && !asked.contains(&axis));
+        let wanted = if asked.is_empty() { 2 } else { asked.len() };
+        let mut axes: Vec<usize> = asked.iter().copied().chain(varied).take(wanted).collect();
+        if axes.is_empty() {
+            axes.push(0);
+        }
+        let (x, y) = (axes[0], axes.get(1).copied());
+        let counts = |axis: usize| sweep.axes[axis].values.len();
+        for axis in axes {
+            if counts(axis) > MAX_VALUES {
+                let key = &sweep.axes[axis].key;
+                return Err(format!("no pictures: {key} has {} values, they have room for {MAX_VALUES}", counts(axis)));
+            }
+        }
+        let others: Vec<usize> = (0..sweep.axes.len()).filter(|&axis| axis != x && Some(axis) != y).collect();
+        let count = others.iter().fold(1_usize, |product, &axis| product.saturating_mul(counts(axis)));
+        if count > MAX_PANELS {
+            return Err(format!("no pictures: they would have {count} panels, there is room for {MAX_PANELS}"));
+        }
+        let title = |mut panel: usize| {
+            let mut parts = Vec::new();
+            for &axis in others.iter().rev() {
+                let (value, axis) = (panel % counts(axis), &sweep.axes[axis]);
+                panel /= axis.values.len();
+                parts.push(format!("{} = {}", axis.leaf(), axis.label(value)));
+            }
+            parts.reverse();
+            parts.join(", ")
+        };
+        let mut panels: Vec<_> =
+            (0..count).map(|panel| (title(panel), vec![None; counts(x) * y.map_or(1, counts)])).collect();
+        for (point, outcome) in sweep.points.iter().zip(outcomes) {
+            let Ok(outcome) = outcome else { continue };
+            let panel = others.iter().fold(0, |panel, &axis| panel * counts(axis) + point.values[axis]);
+            panels[panel].1[y.map_or(0, |y| point.values[y]) * counts(x) + point.values[x]] = Some((point, outcome));
+        }
+        Ok(Grid { x: &sweep.axes[x], y: y.map(|y| &sweep.axes[y]), panels })
+    }
+
+    fn heat_map(
+        &self,
+        title: String,
+        key: Vec<(f64, String)>,
+        cell: impl Fn(&Point, &Outcome) -> Cell,
+    ) -> HeatMap {
+        let cells = |points: &Vec<Option<(&Point, &Outcome)>>| {
+            points.iter().map(|at| at.map_or(Cell::Empty, |(point, outcome)| cell(point, outcome))).collect()
+        };
+        HeatMap {
+            title,
+            x: scale(self.x),
+            y: self.y.map(scale).unwrap_or_default(),
+            panels: self.panels.iter().map(|(title, points)| (title.clone(), cells(points))).collect(),
+            key,
+        }
+    }
+
+    /// The best team's G in the last generation.
+    fn last(&self) -> HeatMap {
+        let key = [0.0, 0.25, 0.5, 0.75, 1.0].map(|g| (g, g.to_string())).to_vec();
+        self.heat_map("G of the best team, last generation, mean over trials".into(), key, |_, outcome| {
+            let (mean, _) = mean_and_error(&outcome.best);
+            Cell::Value(mean, format!("{mean:.2}"))
+        })
+    }
+
+    /// Generations to reach a G, shaded by their logarithm.
+    fn reach(&self, options: &Options) -> HeatMap {
+        let all = self.panels.iter().flat_map(|(_, points)| points).flatten();
+        let last = all.map(|(point, _)| point.config.learning.generations).max().unwrap_or(0).max(1) as f64;
+        let place = |generation: f64| generation.ln_1p() / last.ln_1p();
+        let mut ticks = vec![0.0];
+        ticks.extend([1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e5].into_iter().filter(|&tick| tick < last * 0.75));
+        ticks.push(last);
+        let key = ticks.into_iter().map(|tick| (place(tick), tick.to_string())).collect();
+        let title = format!("Generations until the best team's G is {}, median over trials", options.reach);
+        self.heat_map(title, key, |_, outcome| match outcome.median_reached() {
+            Some(median) => Cell::Value(place(median), median.to_string()),
+            None => Cell::Word("never".into()),
+        })
+    }
+
+    /// Learning curves, one a value of the x axis.
+    fn curves(&self, sweep: &Sweep) -> Curves {
+        let width = self.x.values.len();
+        let mut panels = Vec::new();
+        for row in 0..self.y.map_or(1, |y| y.values.len()) {
+            for (title, points) in &self.panels {
+                let curve = |(value, at): (usize, &Option<(&Point, &Outcome)>)| {
+                    let mut curve = Curve::default();
+                    for &(generation, mean, error) in &(*at)?.1.curve {
+                        curve.generation.push(generation as f64);
+                        curve.mean.push(mean);
+                        curve.error.push(error);
+                    }
+                    Some((value, curve))
+                };
+                let curves = points[row * width..(row + 1) * width].iter().enumerate().filter_map(curve).collect();
+                let row = self.y.map(|y| format!("{} = {}", y.leaf(), y.label(row)));
+                let title: Vec<_> = row.into_iter().chain((!title.is_empty()).then(|| title.clone())).collect();
+                panels.push((title.join(", "), curves));
+            }
+        }
+        Curves {
+            title: format!("{}: G of the best team, mean and standard error over trials", sweep.name),
+            y_label: "G, best team".into(),
+            by: scale(self.x),
+            columns: if self.panels.len() > 1 { self.panels.len() } else { 0 },
+            panels,
+        }
+    }
+}
+
+fn scale(axis: &Axis) -> Scale {
+    const LONGEST: usize = 24;
+    let short = |label: String| match label.char_indices().nth(LONGEST) {
+        Some((end, _)) => label[..end].to_string() + "...",
+        None => label,
+    };
+    let values = (0..axis.values.len()).map(|value| short(axis.label(value))).collect();
+    Scale { label: axis.leaf().replace('_', " "), values }
+}
