@@ -219,7 +219,11 @@ fn claim(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let write = || -> io::Result<()> {
         std::fs::create_dir_all(out)?;
         if !path.exists() {
-            let mut file = tempfile::NamedTempFile::new_in(out)?;
+            let mut builder = tempfile::Builder::new();
+            // As any other file: others may collect.
+            #[cfg(unix)]
+            builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+            let mut file = builder.tempfile_in(out)?;
             file.write_all(sweep.text.as_bytes())?;
             file.as_file().sync_all()?;
             file.persist(&path).map_err(|error| error.error)?;

@@ -163,7 +163,10 @@ impl Curves {
         if self.columns > 0 {
             panels.columns = panels.columns.min(self.columns);
         }
-        let whole = panels.width().max(text_width(&self.title, 3.2) * 1.1 + 6.0).max(legend + entries.iter().fold(0.0, |a, &b| f64::max(a, b)));
+        let whole = panels
+            .width()
+            .max(text_width(&self.title, 3.2) * 1.1 + 6.0)
+            .max(legend + entries.iter().fold(0.0, |a, &b| f64::max(a, b)));
         // The legend takes as many rows as it needs.
         let mut places = Vec::new();
         let (mut x, mut y) = (legend, 10.0);
@@ -186,7 +189,9 @@ impl Curves {
         let last = generations.fold(1.0, |a: f64, &b| a.max(b));
         for (index, (title, curves)) in self.panels.iter().enumerate() {
             let [left, above] = panels.place(index);
-            let at = |generation: f64, g: f64| [left + width * generation / last, above + HEIGHT * (1.0 - g / 1.04).clamp(0.0, 1.0)];
+            let at = |generation: f64, g: f64| {
+                [left + width * generation / last, above + HEIGHT * (1.0 - g / 1.04).clamp(0.0, 1.0)]
+            };
             for (tick, label) in [(0.0, "0"), (0.5, "0.5"), (1.0, "1")] {
                 let [_, y] = at(0.0, tick);
                 scene.line(vec![[left, y], [left + width, y]], Pen::new(LIGHT, 0.15));
@@ -194,7 +199,10 @@ impl Curves {
                     scene.text([left - 1.3, y + 0.9], label, SMALL, Anchor::End, BLACK);
                 }
             }
-            scene.line(vec![[left, above], [left, above + HEIGHT], [left + width, above + HEIGHT]], Pen::new(BLACK, 0.2));
+            scene.line(
+                vec![[left, above], [left, above + HEIGHT], [left + width, above + HEIGHT]],
+                Pen::new(BLACK, 0.2),
+            );
             for (generation, anchor) in [(0.0, Anchor::Middle), (last, Anchor::End)] {
                 let [x, y] = at(generation, 0.0);
                 scene.text([x, y + 3.4], generation.to_string(), SMALL, anchor, BLACK);
@@ -252,10 +260,7 @@ impl Panels {
 
     fn place(&self, index: usize) -> [f64; 2] {
         let (row, column) = (index / self.columns, index % self.columns);
-        [
-            self.left + (self.width + GAP) * column as f64,
-            self.above + (self.height + self.below) * row as f64,
-        ]
+        [self.left + (self.width + GAP) * column as f64, self.above + (self.height + self.below) * row as f64]
     }
 
     fn is_first(&self, index: usize) -> bool {

@@ -16,7 +16,6 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use rayon::prelude::*;
 use toml::de::{DeTable, DeValue};
 use toml::{Spanned, Table, Value};
 
@@ -123,7 +122,6 @@ impl Sweep {
 
         let layout = layout::Layout::of(&grid, &base);
         let tried: Vec<_> = (0..total)
-            .into_par_iter()
             .map(|index| {
                 let values = grid.values(index);
                 let overrides = [flags, &grid.overrides(&values), &layout.overrides(&grid, &values)].concat();

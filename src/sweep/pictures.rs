@@ -101,12 +101,7 @@ impl<'a> Grid<'a> {
         Ok(Grid { x: &sweep.axes[x], y: y.map(|y| &sweep.axes[y]), panels })
     }
 
-    fn heat_map(
-        &self,
-        title: String,
-        key: Vec<(f64, String)>,
-        cell: impl Fn(&Point, &Outcome) -> Cell,
-    ) -> HeatMap {
+    fn heat_map(&self, title: String, key: Vec<(f64, String)>, cell: impl Fn(&Point, &Outcome) -> Cell) -> HeatMap {
         let cells = |points: &Vec<Option<(&Point, &Outcome)>>| {
             points.iter().map(|at| at.map_or(Cell::Empty, |(point, outcome)| cell(point, outcome))).collect()
         };

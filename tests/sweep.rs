@@ -1,0 +1,660 @@
+//! Sweeps: what a file expands to, how points are shared out, and that neither sharing, batching nor killing shows in
+//! the results.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use flotilla::backend::cpu::Cpu;
+use flotilla::config::{Config, Coupling};
+use flotilla::sweep::shard::{Shard, cost};
+use flotilla::sweep::{Sweep, layout, run};
+use flotilla::trainer::Trainer;
+use proptest::prelude::*;
+use tempfile::TempDir;
+
+/// Six points of different sizes, couplings, steps and lengths.
+const SMALL: &str = "\
+[world]
+leaders = [[10, 5], [20, 5]]
+followers = [[12, 2], [8, 2], [22, 2], [18, 2]]
+pois = [[10, 15], [20, 15]]
+[learning]
+population = 10
+trials = 2
+seed = 5
+[checkpoint]
+generations = 2
+seconds = 0
+[grid]
+\"world.coupling\" = [1, 3]
+\"world.steps\" = [8, 25]
+\"learning.generations\" = [3, 12]
+";
+
+fn sweep_of(text: &str) -> Sweep {
+    Sweep::read(text, "x.toml", &[], false).unwrap_or_else(|error| panic!("{error}"))
+}
+
+fn refusal(text: &str) -> String {
+    Sweep::read(text, "x.toml", &[], false).unwrap_err().to_string()
+}
+
+/// A folder with a sweep file in it.
+fn written(text: &str) -> (TempDir, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.toml");
+    fs::write(&path, text).unwrap();
+    (folder, path)
+}
+
+fn command(sweep: &Path, out: &Path, flags: &[&str]) -> Command {
+    let mut command = Command::new(assert_cmd::cargo::cargo_bin!("flotilla"));
+    command.arg("sweep").arg(sweep).arg("--out").arg(out).args(["--backend", "cpu"]).args(flags);
+    for name in ["SLURM_ARRAY_TASK_ID", "JOB_COMPLETION_INDEX", "FLOTILLA_SHARDS"] {
+        command.env_remove(name);
+    }
+    command
+}
+
+fn flotilla(sweep: &Path, out: &Path, flags: &[&str]) -> Output {
+    command(sweep, out, flags).output().unwrap()
+}
+
+fn done(output: Output) -> String {
+    let error = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(0), "{error}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn failed(output: Output, code: i32) -> String {
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(code), "{error}");
+    error
+}
+
+/// Everything that a sweep's folder holds, but the runs themselves.
+fn results(out: &Path) -> Vec<(String, Vec<u8>)> {
+    let mut files: Vec<_> = fs::read_dir(out)
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.is_file())
+        .map(|path| (path.file_name().unwrap().to_str().unwrap().to_string(), fs::read(&path).unwrap()))
+        .collect();
+    files.sort();
+    files
+}
+
+/// Every point's policies.
+fn policies(out: &Path) -> Vec<Vec<u8>> {
+    let mut points: Vec<_> = fs::read_dir(out.join("points")).unwrap().map(|entry| entry.unwrap().path()).collect();
+    points.sort();
+    points.iter().map(|point| fs::read(point.join("policies.safetensors")).unwrap()).collect()
+}
+
+/// Metrics without the column that tells the time.
+fn timeless(metrics: &Path) -> Vec<String> {
+    let text = fs::read_to_string(metrics).unwrap();
+    text.lines().map(|line| line.rsplit_once(',').unwrap().0.to_string()).collect()
+}
+
+#[test]
+fn the_first_axis_changes_slowest_and_every_point_has_its_values() {
+    let sweep = sweep_of(SMALL);
+    let found: Vec<_> = sweep
+        .points
+        .iter()
+        .map(|point| {
+            let Coupling::Same(coupling) = point.config.world.coupling else { panic!("one number was given") };
+            (coupling, point.config.world.steps, point.config.learning.generations)
+        })
+        .collect();
+    let wanted = [(1, 8, 3), (1, 8, 12), (1, 25, 3), (1, 25, 12), (3, 8, 3), (3, 8, 12), (3, 25, 3), (3, 25, 12)];
+    assert_eq!(found, wanted);
+    assert_eq!(sweep.describe(&sweep.points[5]), "world.coupling = 3, world.steps = 8, learning.generations = 12");
+    // What is written into the folder is the same sweep again.
+    let again = sweep_of(&sweep.text);
+    assert_eq!((again.text.as_str(), &again.points), (sweep.text.as_str(), &sweep.points));
+}
+
+#[test]
+fn keys_need_no_quotes_and_values_may_be_lists() {
+    let text = "[world]\nleaders = [[1, 1]]\npois = [[5, 5], [9, 9]]\n[grid]\nworld.coupling = [1, [1, 1]]\n\
+                policy.hidden = [[4], [6, 5]]\n";
+    let sweep = sweep_of(text);
+    assert_eq!(sweep.points.len(), 4);
+    assert_eq!(sweep.points[2].config.world.coupling, Coupling::Each(vec![1, 1]));
+    assert_eq!(sweep.points[3].config.policy.hidden, [6, 5]);
+}
+
+fn laid_out(followers: usize, groups: usize) -> Config {
+    let text = format!(
+        "[world]\ncoupling = 1\n[learning]\npopulation = 2\n[grid]\nfollowers_per_leader = [{followers}]\ngroups = [{groups}]\n"
+    );
+    sweep_of(&text).points.remove(0).config
+}
+
+#[test]
+fn the_paper_s_layouts_are_points_of_the_axes() {
+    for (name, followers) in [("generally_forward", 2), ("chaotic", 4)] {
+        let paper = Config::load(Path::new(&format!("configs/{name}.toml"))).unwrap().world;
+        let world = laid_out(followers, 4).world;
+        let set = |places: &[[f64; 2]]| places.iter().map(|place| place.map(f64::to_bits)).collect::<BTreeSet<_>>();
+        assert_eq!((world.map, &world.leaders, &world.pois), (paper.map, &paper.leaders, &paper.pois), "{name}");
+        assert_eq!(set(&world.followers), set(&paper.followers), "{name}");
+        assert_eq!(world.followers.len(), paper.followers.len(), "{name}");
+    }
+}
+
+#[test]
+fn any_layout_keeps_agents_apart_and_on_the_map() {
+    let reach = laid_out(0, 1).follow.attraction_radius;
+    for groups in [1, 2, 4, 15] {
+        for followers in 0..=layout::MAX_FOLLOWERS {
+            let world = laid_out(followers, groups).world;
+            assert_eq!(world.followers.len(), groups * followers);
+            assert_eq!(world.pois.len(), groups);
+            let distance = |a: &[f64; 2], b: &[f64; 2]| (a[0] - b[0]).hypot(a[1] - b[1]);
+            let agents = [&world.leaders[..], &world.followers[..]].concat();
+            for (index, agent) in agents.iter().enumerate() {
+                assert!(agents[..index].iter().all(|other| distance(agent, other) >= 1.0), "{followers} × {groups}");
+                assert!(agent.iter().zip(&world.map).all(|(&at, &side)| at >= 1.0 && at <= side - 1.0));
+                assert!(world.pois.iter().all(|poi| distance(agent, poi) > world.observation_radius));
+            }
+            for (index, follower) in world.followers.iter().enumerate() {
+                let own = &world.leaders[index / followers];
+                assert!(distance(follower, own) <= reach, "a follower starts where its leader attracts it");
+                assert!(world.leaders.iter().all(|leader| distance(follower, own) <= distance(follower, leader)));
+            }
+        }
+    }
+}
+
+#[test]
+fn fewer_followers_are_more_with_some_left_out() {
+    let places = layout::places();
+    assert_eq!(places.len(), layout::MAX_FOLLOWERS);
+    assert_eq!(places[..4], [[2, -3], [-2, -3], [2, 2], [-2, 2]]);
+    let ten = laid_out(10, 1).world.followers;
+    assert_eq!(laid_out(7, 1).world.followers, ten[..7]);
+}
+
+#[test]
+fn wrong_sweeps_are_told_with_their_lines() {
+    let with = |grid: &str| refusal(&SMALL.replace("\"world.coupling\" = [1, 3]", grid));
+    for (grid, wanted) in [
+        (
+            "\"world.copling\" = [1, 3]",
+            "x.toml:13: grid.\"world.copling\"[0]: unknown key, did you mean `world.coupling`?",
+        ),
+        ("\"world.coupling\" = []", "x.toml:13: grid.\"world.coupling\": found no values"),
+        ("\"world.coupling\" = 3", "x.toml:13: grid.\"world.coupling\": found 3, allowed a list of values: [3]"),
+        ("\"world.coupling\" = [1, 2, 1]", "x.toml:13: grid.\"world.coupling\": found 1 twice, at [0] and at [2]"),
+        ("\"world.coupling\" = [1, \"many\"]", "grid.\"world.coupling\"[1]: found \"many\", allowed"),
+        ("groups = [0, 2.5]", "x.toml:13: grid.groups: found 0, allowed whole numbers 1 to 256"),
+        ("groups = [0, 2.5]", "x.toml:13: grid.groups: found 2.5, allowed whole numbers 1 to 256"),
+        ("followers_per_leader = [65]", "grid.followers_per_leader: found 65, allowed whole numbers 0 to 64"),
+        ("followers_per_leader = [2]", "it lays out world.leaders, which is given too"),
+        ("skip_impossible = 1", "grid.skip_impossible: found 1, allowed true or false"),
+        ("\"world.dt\" = [nan]", "grid.\"world.dt\"[0]: found nan"),
+        ("\"world.dt\" = [0.2", "array"),
+        ("\"checkpoint.folder\" = ['/']", "grid.\"checkpoint.folder\"[0]: unknown key"),
+    ] {
+        let error = with(grid);
+        assert!(error.contains(wanted), "{grid}: {error}");
+    }
+    let without = SMALL.split("[grid]").next().unwrap();
+    assert!(refusal(without).contains("missing, a sweep has a section [grid]"));
+    assert!(refusal(&format!("{without}[grid]\n")).contains("it has no axis"));
+    assert!(refusal(&format!("grid = 3\n{without}")).contains("x.toml:1: grid: allowed a section [grid]"));
+    let many: Vec<_> = (0..100).map(|value| value.to_string()).collect();
+    let axis = |key: &str| format!("\"{key}\" = [{}]\n", many.join(", "));
+    let huge =
+        [without, "[grid]\n", &axis("learning.seed"), &axis("world.steps"), &axis("learning.population")].concat();
+    assert!(refusal(&huge).contains("found 100 × 100 × 100 points, allowed 1 to 65536"), "{}", refusal(&huge));
+}
+
+#[test]
+fn impossible_points_are_told_together_or_left_out_on_request() {
+    let text = SMALL.replace("[1, 3]", "[1, 6, 7, 8]").replace("\"world.steps\" = [8, 25]", "");
+    let error = refusal(&text);
+    for line in ["[2]: found 7, allowed 1 to 6 (the number of agents)", "[3]: found 8, allowed 1 to 6"] {
+        assert!(error.contains(line), "{error}");
+    }
+    assert!(error.contains("at 2 of 8 points, the first world.coupling = 7, learning.generations = 3"), "{error}");
+    // A value that works nowhere is a slip even then.
+    let error = Sweep::read(&text, "x.toml", &[], true).unwrap_err().to_string();
+    assert!(error.contains("found 7") && error.contains("found 8"), "{error}");
+
+    let triangle =
+        "[learning]\npopulation = 2\n[grid]\nfollowers_per_leader = [0, 1, 2]\n\"world.coupling\" = [4, 8, 12]\n";
+    assert!(refusal(triangle).contains("--skip-impossible leaves such points out"), "{}", refusal(triangle));
+    for sweep in
+        [Sweep::read(triangle, "x.toml", &[], true).unwrap(), sweep_of(&format!("{triangle}skip_impossible = true\n"))]
+    {
+        assert_eq!((sweep.points.len(), sweep.skipped), (6, 3));
+        assert_eq!(sweep.points.iter().map(|point| point.index).collect::<Vec<_>>(), [0, 3, 4, 6, 7, 8]);
+    }
+}
+
+#[test]
+fn every_sweep_of_the_repository_can_run() {
+    let mut found = 0;
+    for entry in fs::read_dir("configs/sweeps").unwrap() {
+        let path = entry.unwrap().path();
+        let sweep = Sweep::load(&path, &[], false).unwrap_or_else(|error| panic!("{error}"));
+        assert!(!sweep.points.is_empty(), "{}", path.display());
+        assert!(fs::read_to_string(&path).unwrap().starts_with("# "), "{} opens by what it shows", path.display());
+        found += 1;
+    }
+    assert!(found >= 7);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    #[test]
+    fn shards_part_the_points_evenly(
+        steps in prop::collection::btree_set(1usize..2000, 1..12),
+        populations in prop::collection::btree_set(2usize..200, 1..6),
+        count in 1usize..20,
+    ) {
+        let text = SMALL.split("[grid]").next().unwrap().to_string()
+            + &format!("[grid]\n\"world.steps\" = {steps:?}\n\"learning.population\" = {populations:?}\n")
+                .replace('{', "[").replace('}', "]");
+        let sweep = sweep_of(&text);
+        let shards: Vec<_> = (1..=count).map(|index| Shard::new(index, count).unwrap().take(&sweep.points)).collect();
+        let mut taken: Vec<_> = shards.iter().flatten().map(|point| point.index).collect();
+        taken.sort_unstable();
+        prop_assert_eq!(taken, (0..sweep.points.len()).collect::<Vec<_>>());
+        // Dealt out greedily, no shard is ahead of another by more than one point.
+        let dearest = sweep.points.iter().map(cost).max().unwrap();
+        let loads: Vec<u128> = shards.iter().map(|points| points.iter().map(|point| cost(point)).sum()).collect();
+        prop_assert!(loads.iter().max().unwrap() - loads.iter().min().unwrap() <= dearest);
+    }
+
+    #[test]
+    fn no_text_makes_a_sweep_panic(text in "(\\[grid\\]\n)?([a-z.\"]{0,12} ?= ?[\\[\\]0-9a-z,.\"{}]{0,20}\n){0,6}") {
+        let _ = Sweep::read(&text, "x.toml", &[], true);
+    }
+}
+
+#[test]
+fn job_arrays_tell_the_shard() {
+    let shard = |pairs: &[(&str, &str)]| {
+        let pairs = pairs.to_vec();
+        Shard::from_env(move |name| pairs.iter().find(|(key, _)| *key == name).map(|(_, value)| value.to_string()))
+    };
+    let slurm = |id, min, step| {
+        shard(&[
+            ("SLURM_ARRAY_TASK_ID", id),
+            ("SLURM_ARRAY_TASK_COUNT", "4"),
+            ("SLURM_ARRAY_TASK_MIN", min),
+            ("SLURM_ARRAY_TASK_STEP", step),
+        ])
+    };
+    assert_eq!(shard(&[]), Ok(None));
+    assert_eq!(slurm("1", "1", "1"), Ok(Some(Shard { index: 1, count: 4 })));
+    assert_eq!(slurm("0", "0", "1"), Ok(Some(Shard { index: 1, count: 4 })));
+    assert_eq!(slurm("16", "10", "2"), Ok(Some(Shard { index: 4, count: 4 })));
+    assert!(slurm("17", "10", "2").unwrap_err().contains("does not fit"));
+    assert!(slurm("9", "1", "1").unwrap_err().contains("there is no shard 9 of 4"));
+    let kubernetes = [("JOB_COMPLETION_INDEX", "2"), ("FLOTILLA_SHARDS", "3")];
+    assert_eq!(shard(&kubernetes), Ok(Some(Shard { index: 3, count: 3 })));
+    assert!(shard(&kubernetes[..1]).unwrap_err().contains("FLOTILLA_SHARDS"));
+    assert!(shard(&[("JOB_COMPLETION_INDEX", "x"), ("FLOTILLA_SHARDS", "3")]).unwrap_err().contains("no whole number"));
+}
+
+#[test]
+fn points_come_out_of_one_batch_as_they_do_alone() {
+    let sweep = sweep_of(SMALL);
+    let train = |configs: Vec<Config>| {
+        let arms = configs.len();
+        let mut trainer = Trainer::new(configs);
+        let mut rows = Vec::new();
+        while !trainer.is_done() {
+            rows.extend(trainer.advance(&mut Cpu::default()).unwrap());
+        }
+        (0..arms)
+            .map(|arm| {
+                let rows = rows.iter().filter(|row| row.arm == arm);
+                let rows: Vec<_> = rows.map(|r| (r.trial, r.generation, r.best_g, r.mean_g, r.champion_g)).collect();
+                (rows, trainer.policies(arm))
+            })
+            .collect::<Vec<_>>()
+    };
+    let together = train(sweep.points.iter().map(|point| point.config.clone()).collect());
+    for (point, together) in sweep.points.iter().zip(together) {
+        assert_eq!(train(vec![point.config.clone()]), [together], "{}", sweep.describe(point));
+    }
+}
+
+#[test]
+fn batches_fit_in_memory() {
+    let sweep = sweep_of(SMALL);
+    let points: Vec<_> = sweep.points.iter().collect();
+    let one = run::bytes(&points[0].config);
+    assert!(one > points[0].config.policy_bytes());
+    for memory in [0, one, 2 * one, 3 * one, usize::MAX] {
+        let batches = run::batches(&points, memory);
+        assert_eq!(batches.concat().iter().map(|point| point.index).collect::<Vec<_>>(), (0..8).collect::<Vec<_>>());
+        for batch in batches {
+            let used: usize = batch.iter().map(|point| run::bytes(&point.config)).sum();
+            assert!(used <= memory || batch.len() == 1);
+        }
+    }
+}
+
+#[test]
+fn the_union_of_any_shards_is_the_unsharded_run() {
+    let (folder, sweep) = written(SMALL);
+    let whole = folder.path().join("whole");
+    let told = done(flotilla(&sweep, &whole, &["--quiet"]));
+    assert!(told.contains("8 of 8 points are done"), "{told}");
+    let wanted = results(&whole);
+    assert_eq!(
+        wanted.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>(),
+        [
+            "curves.png",
+            "curves.svg",
+            "final.png",
+            "final.svg",
+            "points.csv",
+            "reach.png",
+            "reach.svg",
+            "results.csv",
+            "sweep.toml"
+        ]
+    );
+    let text = fs::read_to_string(whole.join("results.csv")).unwrap();
+    let head = "world.coupling,world.steps,learning.generations,point,trial,generation,best_g,mean_g,champion_g";
+    assert_eq!(text.lines().next(), Some(head));
+    // 4 points of 3 generations and 4 of 12, two trials each, and every run's random start.
+    assert_eq!(text.lines().count(), 1 + 2 * (4 * 4 + 4 * 13));
+
+    for count in [2, 3, 11] {
+        let out = folder.path().join(format!("{count}"));
+        for index in (1..=count).rev() {
+            if index == 1 {
+                let error = failed(flotilla(&sweep, &out, &["--collect"]), 1);
+                assert!(error.contains("points are missing") && error.contains("it was not run"), "{error}");
+            }
+            // Each also in batches of another size.
+            let memory = if index % 2 == 0 { "0.00001" } else { "1" };
+            done(flotilla(&sweep, &out, &["--quiet", "--shard", &format!("{index}/{count}"), "--memory", memory]));
+        }
+        done(flotilla(&sweep, &out, &["--collect"]));
+        assert!(results(&out) == wanted, "{count} shards");
+        assert!(policies(&out) == policies(&whole), "{count} shards");
+    }
+
+    // A job array's tasks are the same shards.
+    let out = folder.path().join("array");
+    for task in 0..2 {
+        let mut command = command(&sweep, &out, &["--quiet"]);
+        command.env("SLURM_ARRAY_TASK_ID", task.to_string()).env("SLURM_ARRAY_TASK_COUNT", "2");
+        done(command.env("SLURM_ARRAY_TASK_MIN", "0").output().unwrap());
+    }
+    done(flotilla(&sweep, &out, &["--collect"]));
+    assert!(results(&out) == wanted, "a job array");
+
+    // A point is a run like any other.
+    let point = whole.join("points/0003");
+    let alone = folder.path().join("alone");
+    let mut train = Command::new(assert_cmd::cargo::cargo_bin!("flotilla"));
+    train.arg("train").arg(point.join("config.toml")).arg("--out").arg(&alone).args(["--quiet", "--backend", "cpu"]);
+    done(train.output().unwrap());
+    assert_eq!(timeless(&alone.join("metrics.csv")), timeless(&point.join("metrics.csv")));
+    assert!(
+        fs::read(alone.join("policies.safetensors")).unwrap() == fs::read(point.join("policies.safetensors")).unwrap()
+    );
+}
+
+#[test]
+fn every_few_generations_are_kept_and_the_last() {
+    let (folder, sweep) = written(SMALL);
+    let out = folder.path().join("out");
+    done(flotilla(&sweep, &out, &["--quiet", "--every", "5", "--reach", "0.5", "--axes", "steps"]));
+    let mut table = csv::Reader::from_path(out.join("results.csv")).unwrap();
+    let rows: Vec<(usize, usize, usize)> = table
+        .records()
+        .map(|row| row.unwrap())
+        .map(|row| (row[3].parse().unwrap(), row[4].parse().unwrap(), row[5].parse().unwrap()))
+        .collect();
+    let first: Vec<_> = rows.iter().filter(|row| row.0 <= 1 && row.1 == 0).map(|row| row.2).collect();
+    assert_eq!(first, [0, 3, 0, 5, 10, 12]);
+
+    // points.csv says of each point what its rows and metrics say.
+    let mut points = csv::Reader::from_path(out.join("points.csv")).unwrap();
+    for point in points.records() {
+        let point = point.unwrap();
+        let index: usize = point[3].parse().unwrap();
+        let metrics = fs::read_to_string(out.join(format!("points/{index:04}/metrics.csv"))).unwrap();
+        let rows: Vec<Vec<f64>> =
+            metrics.lines().skip(1).map(|line| line.split(',').map(|field| field.parse().unwrap()).collect()).collect();
+        let last = rows.iter().map(|row| row[1]).fold(0.0, f64::max);
+        let best: Vec<f64> = rows.iter().filter(|row| row[1] == last).map(|row| row[2]).collect();
+        assert_eq!(point[6].parse::<f64>().unwrap(), (best[0] + best[1]) / 2.0, "{point:?}");
+        let first = |trial: f64| rows.iter().find(|row| row[0] == trial && row[2] >= 0.5).map(|row| row[1]);
+        let reached = [first(0.0), first(1.0)];
+        assert_eq!(point[10].parse::<usize>().unwrap(), reached.iter().flatten().count());
+        let median = reached[0].zip(reached[1]).map(|(a, b)| (a + b) / 2.0);
+        assert_eq!(point[11].parse::<f64>().ok(), median, "{point:?}");
+    }
+    let error = failed(flotilla(&sweep, &out, &["--collect", "--axes", "radius"]), 2);
+    assert!(error.contains("it has world.coupling, world.steps, learning.generations"), "{error}");
+}
+
+/// Longer, so that there is a half-way.
+fn long() -> String {
+    SMALL.replace("[3, 12]", "[40, 120]").replace("[8, 25]", "[100, 101]")
+}
+
+/// Every checkpoint in a sweep's folder.
+fn checkpoints(out: &Path) -> BTreeSet<PathBuf> {
+    let points = fs::read_dir(out.join("points")).into_iter().flatten().flatten();
+    let files = points.flat_map(|point| fs::read_dir(point.path().join("checkpoints")).into_iter().flatten().flatten());
+    let whole = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "safetensors");
+    files.map(|file| file.path()).filter(whole).collect()
+}
+
+/// Starts a shard and waits until it has made checkpoints of its own, or is done.
+fn started(sweep: &Path, out: &Path, flags: &[&str]) -> Child {
+    let before = checkpoints(out);
+    let mut child = command(sweep, out, flags).stderr(Stdio::null()).stdout(Stdio::null()).spawn().unwrap();
+    let start = Instant::now();
+    while checkpoints(out).is_subset(&before) && child.try_wait().unwrap().is_none() {
+        assert!(start.elapsed() < Duration::from_secs(60), "no checkpoint in a minute");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    child
+}
+
+#[test]
+fn killed_shards_resume_to_the_same_bytes() {
+    let (folder, sweep) = written(&long());
+    let whole = folder.path().join("whole");
+    done(flotilla(&sweep, &whole, &["--quiet"]));
+
+    let out = folder.path().join("out");
+    let shards = ["1/2", "2/2"];
+    for (at, shard) in shards.into_iter().enumerate() {
+        // Killed three times at different places, the second shard politely.
+        for pause in [0, 15, 40] {
+            let mut child = started(&sweep, &out, &["--quiet", "--resume", "--shard", shard]);
+            std::thread::sleep(Duration::from_millis(pause));
+            if at == 0 {
+                let _ = child.kill();
+                child.wait().unwrap();
+            } else {
+                let id = child.id().to_string();
+                let _ = Command::new("kill").args(["-TERM", &id]).status().unwrap();
+                let code = child.wait().unwrap().code();
+                assert!(matches!(code, Some(75 | 0)), "{code:?}");
+            }
+        }
+    }
+    failed(flotilla(&sweep, &out, &["--quiet", "--shard", "1/2"]), 1);
+    for shard in shards {
+        done(flotilla(&sweep, &out, &["--quiet", "--resume", "--shard", shard]));
+    }
+    done(flotilla(&sweep, &out, &["--collect"]));
+    assert!(results(&out) == results(&whole));
+    assert!(policies(&out) == policies(&whole));
+    // What is done is not done again.
+    let before = fs::read(out.join("points/0000/run.json")).unwrap();
+    done(flotilla(&sweep, &out, &["--quiet", "--resume"]));
+    assert!(fs::read(out.join("points/0000/run.json")).unwrap() == before);
+}
+
+#[test]
+fn points_killed_at_different_generations_go_on_apart() {
+    let (folder, sweep) = written(&long());
+    let (whole, out) = (folder.path().join("whole"), folder.path().join("out"));
+    done(flotilla(&sweep, &whole, &["--quiet"]));
+    let mut child = started(&sweep, &out, &["--quiet"]);
+    std::thread::sleep(Duration::from_millis(60));
+    child.kill().unwrap();
+    child.wait().unwrap();
+    // One point loses its checkpoints, another all but its config.
+    fs::remove_dir_all(out.join("points/0001/checkpoints")).unwrap();
+    fs::remove_dir_all(out.join("points/0002")).unwrap();
+    done(flotilla(&sweep, &out, &["--quiet", "--resume"]));
+    assert!(results(&out) == results(&whole));
+    assert!(policies(&out) == policies(&whole));
+}
+
+#[test]
+fn wrong_usage_is_refused_before_any_work() {
+    let (folder, sweep) = written(SMALL);
+    let out = folder.path().join("out");
+    for (shard, wanted) in [
+        ("5/4", "there is no shard 5 of 4; they are 1/4 to 4/4"),
+        ("0/4", "there is no shard 0 of 4"),
+        ("1/0", "found 0 shards"),
+        ("x", "allowed I/N"),
+        ("1/99999999999", "allowed 1 to 65536"),
+    ] {
+        let error = failed(flotilla(&sweep, &out, &["--shard", shard]), 2);
+        assert!(error.contains(wanted), "{shard}: {error}");
+    }
+    let error = failed(flotilla(&sweep, &out, &["--seed", "3", "--skip-impossible", "--generations", "3"]), 1);
+    assert!(error.contains("--generations: the grid has learning.generations already"), "{error}");
+    let mut array = command(&sweep, &out, &[]);
+    let error = failed(array.env("JOB_COMPLETION_INDEX", "1").output().unwrap(), 2);
+    assert!(error.contains("FLOTILLA_SHARDS"), "{error}");
+    let error = failed(flotilla(&sweep, &out, &["--collect"]), 2);
+    assert!(error.contains("holds no sweep"), "{error}");
+    let (_other, wrong) = written(&SMALL.replace("[1, 3]", "[1, 9]"));
+    let error = failed(flotilla(&wrong, &out, &[]), 1);
+    assert!(error.contains("x.toml:13: ") && error.contains("found 9, allowed 1 to 6"), "{error}");
+    let (_other, empty) = written(&SMALL.replace("[1, 3]", "[]"));
+    assert!(failed(flotilla(&empty, &out, &[]), 1).contains("found no values"));
+    assert!(failed(flotilla(&out, &out, &[]), 1).contains("cannot be read"));
+    assert!(!out.exists(), "nothing was written");
+}
+
+#[test]
+fn a_folder_of_something_else_is_refused() {
+    let (folder, sweep) = written(SMALL);
+    let out = folder.path().join("out");
+    done(flotilla(&sweep, &out, &["--quiet"]));
+    let before = results(&out);
+    let (_other, another) = written(&SMALL.replace("[1, 3]", "[1, 2, 3]"));
+    for flags in [&["--resume"][..], &["--force"], &["--collect"], &["--shard", "1/3"], &[]] {
+        let error = failed(flotilla(&another, &out, flags), 1);
+        assert!(error.contains("holds another sweep"), "{error}");
+        assert!(error.contains("there: \"world.coupling\" = [1, 3]"), "{error}");
+        assert!(error.contains("here: \"world.coupling\" = [1, 2, 3]"), "{error}");
+    }
+    // Other seeds are another sweep, other comments are not.
+    assert!(failed(flotilla(&sweep, &out, &["--seed", "6", "--resume"]), 1).contains("there: seed = 5"));
+    let (_other, same) = written(&format!("# The same.\n{SMALL}"));
+    done(flotilla(&same, &out, &["--quiet", "--resume"]));
+    assert!(results(&out) == before);
+    // Neither is a run's folder a sweep's.
+    let error = failed(flotilla(&sweep, &out.join("points/0000"), &[]), 1);
+    assert!(error.contains("holds a run, not a sweep"), "{error}");
+    // Twice needs a word, and --force writes over what is there, to the same results.
+    assert!(failed(flotilla(&sweep, &out, &["--quiet"]), 1).contains("--resume"));
+    done(flotilla(&sweep, &out, &["--quiet", "--force"]));
+    assert!(results(&out) == before);
+}
+
+#[test]
+fn damaged_points_are_missing_not_wrong() {
+    let (folder, sweep) = written(SMALL);
+    let out = folder.path().join("out");
+    done(flotilla(&sweep, &out, &["--quiet"]));
+    let wanted = results(&out);
+    let metrics = |point: usize| out.join(format!("points/{point:04}/metrics.csv"));
+    let text = fs::read_to_string(metrics(1)).unwrap();
+    let lines: Vec<&str> = text.lines().collect();
+    fs::write(metrics(1), lines[..5].join("\n") + "\n").unwrap();
+    let text = fs::read_to_string(metrics(2)).unwrap();
+    fs::write(metrics(2), text.replacen("\n0,0,", "\n0,0,7", 1)).unwrap();
+    fs::remove_file(metrics(3)).unwrap();
+    fs::copy(out.join("points/0000/config.toml"), out.join("points/0004/config.toml")).unwrap();
+    let error = failed(flotilla(&sweep, &out, &["--collect"]), 1);
+    for wanted in [
+        "4 of 8 points are missing",
+        "point 0001 (world.coupling = 1, world.steps = 8, learning.generations = 12): it has come to generation 2 of 12",
+        "point 0002",
+        "metrics.csv: line 2 is not",
+        "it was not run",
+        "it is of another config",
+    ] {
+        assert!(error.contains(wanted), "{wanted}: {error}");
+    }
+    // Resuming mends what can be mended; another config is for a person to look at.
+    assert!(failed(flotilla(&sweep, &out, &["--quiet", "--resume"]), 1).contains("another config"));
+    fs::remove_dir_all(out.join("points/0004")).unwrap();
+    done(flotilla(&sweep, &out, &["--quiet", "--resume"]));
+    assert!(results(&out) == wanted);
+}
+
+#[test]
+fn the_list_tells_costs_and_shards() {
+    let (folder, sweep) = written(SMALL);
+    let told = done(flotilla(&sweep, &folder.path().join("out"), &["--list", "--shards", "3"]));
+    assert_eq!(told.lines().count(), 10, "{told}");
+    let parts: f64 =
+        told.lines().skip(1).take(8).map(|line| line.split_whitespace().nth(1).unwrap().parse::<f64>().unwrap()).sum();
+    assert!((parts - 100.0).abs() < 0.1, "{told}");
+    assert!(!folder.path().join("out").exists());
+}
+
+#[test]
+fn the_batch_script_is_one_that_bash_takes() {
+    let (folder, sweep) = written(SMALL);
+    let out = folder.path().join("a folder's");
+    let flags = ["--slurm", "--shards", "3", "--time", "02:00:00", "--threads", "4", "--seed", "7"];
+    let script = done(flotilla(&sweep, &out, &[&flags[..], &["--sbatch=--partition=long"]].concat()));
+    for line in [
+        "#SBATCH --array=1-3",
+        "#SBATCH --time=02:00:00",
+        "#SBATCH --cpus-per-task=4",
+        "#SBATCH --signal=B:USR1@60",
+        "#SBATCH --requeue",
+        "#SBATCH --partition=long",
+    ] {
+        assert!(script.lines().any(|found| found == line), "{line}: {script}");
+    }
+    assert!(!script.contains("--gpus"), "the CPU was asked for: {script}");
+    assert!(
+        script.contains("--seed 7 --backend cpu --threads 4 --shard \"$SLURM_ARRAY_TASK_ID/3\" --resume"),
+        "{script}"
+    );
+    // Run by hand as a task of the array, it runs its shard; the folder's name is a hard one.
+    let path = folder.path().join("job.sh");
+    done(flotilla(&sweep, &out, &[&flags[..1], &flags[1..]].concat()));
+    let file = format!("--slurm={}", path.display());
+    done(flotilla(&sweep, &out, &[&[&*file], &flags[1..]].concat()));
+    for task in ["1", "2", "3"] {
+        let output = Command::new("bash").arg(&path).env("SLURM_ARRAY_TASK_ID", task).output().unwrap();
+        done(output);
+    }
+    done(flotilla(&sweep, &out, &["--collect", "--seed", "7"]));
+}
