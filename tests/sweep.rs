@@ -658,3 +658,32 @@ fn the_batch_script_is_one_that_bash_takes() {
     }
     done(flotilla(&sweep, &out, &["--collect", "--seed", "7"]));
 }
+
+/// `cargo test --release --test sweep -- --ignored --nocapture` on an idle machine; the figures are in
+/// `benches/README.md`.
+#[test]
+#[ignore = "a measurement"]
+fn a_batch_of_unequal_points_costs_what_its_parts_do() {
+    let text = "[learning]\ngenerations = 20\ntrials = 2\n[grid]\nfollowers_per_leader = [0, 1, 4, 16]\n\
+                \"world.coupling\" = [1, 4]\n\"world.steps\" = [10, 25, 100]\n";
+    let sweep = sweep_of(text);
+    let seconds = |configs: Vec<Config>| {
+        let mut trainer = Trainer::new(configs);
+        let mut backend = Cpu::default();
+        let start = Instant::now();
+        while !trainer.is_done() {
+            trainer.advance(&mut backend).unwrap();
+        }
+        start.elapsed().as_secs_f64()
+    };
+    let mut best = [f64::INFINITY; 2];
+    for _ in 0..3 {
+        let parts: f64 = sweep.points.iter().map(|point| seconds(vec![point.config.clone()])).sum();
+        let batch = seconds(sweep.points.iter().map(|point| point.config.clone()).collect());
+        best = [best[0].min(parts), best[1].min(batch)];
+        println!("{} points: {parts:.2} s one by one, {batch:.2} s in one batch", sweep.points.len());
+    }
+    let ratio = best[1] / best[0];
+    println!("batch / parts = {ratio:.2}");
+    assert!(ratio <= 1.3, "{ratio}");
+}
