@@ -125,8 +125,9 @@ impl HeatMap {
         for step in 0..steps {
             let part = key_width / f64::from(steps);
             let color = shade((f64::from(step) + 0.5) / f64::from(steps));
-            // Each overlaps the next a little, or a renderer shows seams.
-            let area = [left + part * f64::from(step), key_above, part + 0.05, 2.6];
+            // Each to the end, under the next: side by side they would show seams.
+            let start = part * f64::from(step);
+            let area = [left + start, key_above, key_width - start, 2.6];
             scene.rectangle(area, Some(color.into()), None);
         }
         scene.rectangle([left, key_above, key_width, 2.6], None, Some(Pen::new(GREY, 0.2)));
