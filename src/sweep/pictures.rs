@@ -16,12 +16,15 @@ const PIXELS: f64 = 8.0;
 const MAX_VALUES: usize = 40;
 const MAX_PANELS: usize = 48;
 
+/// A point that is done and what it came to, none where there is none.
+type Place<'a> = Option<(&'a Point, &'a Outcome)>;
+
 /// The points by the values of two axes, with a panel for each combination of the others.
 struct Grid<'a> {
     x: &'a Axis,
     y: Option<&'a Axis>,
     /// Title, and the points `[y][x]`, with what they came to.
-    panels: Vec<(String, Vec<Option<(&'a Point, &'a Outcome)>>)>,
+    panels: Vec<(String, Vec<Place<'a>>)>,
 }
 
 /// Draws the figures of the points that are done, over one or two axes; gives the files' names, and what was left out.
@@ -102,7 +105,7 @@ impl<'a> Grid<'a> {
     }
 
     fn heat_map(&self, title: String, key: Vec<(f64, String)>, cell: impl Fn(&Point, &Outcome) -> Cell) -> HeatMap {
-        let cells = |points: &Vec<Option<(&Point, &Outcome)>>| {
+        let cells = |points: &Vec<Place<'_>>| {
             points.iter().map(|at| at.map_or(Cell::Empty, |(point, outcome)| cell(point, outcome))).collect()
         };
         HeatMap {
@@ -145,7 +148,7 @@ impl<'a> Grid<'a> {
         let mut panels = Vec::new();
         for row in 0..self.y.map_or(1, |y| y.values.len()) {
             for (title, points) in &self.panels {
-                let curve = |(value, at): (usize, &Option<(&Point, &Outcome)>)| {
+                let curve = |(value, at): (usize, &Place<'_>)| {
                     let mut curve = Curve::default();
                     for &(generation, mean, error) in &(*at)?.1.curve {
                         curve.generation.push(generation as f64);
