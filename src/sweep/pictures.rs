@@ -89,7 +89,10 @@ impl<'a> Grid<'a> {
             for &axis in others.iter().rev() {
                 let (value, axis) = (panel % counts(axis), &sweep.axes[axis]);
                 panel /= axis.values.len();
-                parts.push(format!("{} = {}", axis.leaf(), axis.label(value)));
+                // What is the same in every panel tells none from another.
+                if axis.values.len() > 1 {
+                    parts.push(format!("{} = {}", axis.leaf(), axis.label(value)));
+                }
             }
             parts.reverse();
             parts.join(", ")
