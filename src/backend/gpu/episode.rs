@@ -124,6 +124,9 @@ struct Share {
     steps_a_dispatch: usize,
 }
 
+/// Gets a task with the record and the moments of its batch.
+type Done<'a> = dyn Fn(&Share, &[u32], &[Moment]) + Sync + 'a;
+
 impl Share {
     /// The task's part in one round of dispatches; none when it is done.
     fn round(&self, round: usize) -> Option<Task> {
@@ -344,7 +347,7 @@ impl GpuEpisodes {
         &mut self,
         groups: &[Group<'_>],
         trace: bool,
-        done: &(dyn Fn(&Share, &[u32], &[Moment]) + Sync),
+        done: &Done<'_>,
     ) -> Result<(), BackendError> {
         let batches = plan(groups, trace, self.room())?;
         for index in 0..=batches.len() {
@@ -448,7 +451,7 @@ impl GpuEpisodes {
         lane: usize,
         work: &Work,
         trace: bool,
-        done: &(dyn Fn(&Share, &[u32], &[Moment]) + Sync),
+        done: &Done<'_>,
     ) -> Result<(), DeviceError> {
         let buffers = &self.lanes[lane];
         self.gpu.wait_for(buffers.submitted.clone())?;
