@@ -22,7 +22,7 @@ pub struct Scores {
     pub d: Vec<f32>,
     /// G less G without the leader and its followers (paper, section 4.2; "leader-follower trajectory assignment").
     pub df: Vec<f32>,
-    /// D, or what copies of the leader would add, each its share (Rahmattalabi et al., the paper's [12]).
+    /// D, or what copies of the leader would add, each its share (Rahmattalabi et al., the paper's reference 12).
     pub dpp: Vec<f32>,
 }
 

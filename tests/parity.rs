@@ -54,7 +54,8 @@ fn checked_shaders_and_default_limits_agree() {
 /// The canary of the twins: one constant of one shader changed is found, in the stage that it belongs to.
 #[test]
 fn a_changed_twin_is_named_by_its_stage() {
-    let edits: [(Stage, fn(String) -> String); 6] = [
+    type Edit = fn(String) -> String;
+    let edits: [(Stage, Edit); 6] = [
         (Stage::Sense, |text| replaced(text, "return 1.0 - root(d2)", "return 1.0000001 - root(d2)")),
         (Stage::Policy, |text| replaced(text, "14.7163315", "14.716334")),
         (Stage::Follow, |text| replaced(text, "return push * world.wall_gain", "return push * 1.01 * world.wall_gain")),

@@ -95,7 +95,7 @@ impl Courses {
     /// Reads a run's metrics; memory grows with generations alone.
     ///
     /// # Errors
-    /// See [`metrics`].
+    /// See [`metrics()`].
     pub fn read(folder: &Path, config: &Config) -> Result<Courses, RunError> {
         let mut courses = Courses { best: vec![], mean: vec![], champion: vec![] };
         metrics(folder, config, |row| {

@@ -9,7 +9,7 @@ use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::metrics::{self, Row};
 
-/// What [`write`] makes of the points that are complete.
+/// What [`write()`] makes of the points that are complete.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
     /// Every how many generations `results.csv` has a row; the last always has one.

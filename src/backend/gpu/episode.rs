@@ -343,12 +343,7 @@ impl GpuEpisodes {
     }
 
     /// Plays all tasks; `done` gets each with the batch's record and moments.
-    fn play(
-        &mut self,
-        groups: &[Group<'_>],
-        trace: bool,
-        done: &Done<'_>,
-    ) -> Result<(), BackendError> {
+    fn play(&mut self, groups: &[Group<'_>], trace: bool, done: &Done<'_>) -> Result<(), BackendError> {
         let batches = plan(groups, trace, self.room())?;
         for index in 0..=batches.len() {
             if let Some(work) = batches.get(index) {
@@ -446,13 +441,7 @@ impl GpuEpisodes {
     }
 
     /// Waits for one batch and hands its record on.
-    fn collect(
-        &mut self,
-        lane: usize,
-        work: &Work,
-        trace: bool,
-        done: &Done<'_>,
-    ) -> Result<(), DeviceError> {
+    fn collect(&mut self, lane: usize, work: &Work, trace: bool, done: &Done<'_>) -> Result<(), DeviceError> {
         let buffers = &self.lanes[lane];
         self.gpu.wait_for(buffers.submitted.clone())?;
         let share_out = |record: &[u8], moments: &[Moment]| {
