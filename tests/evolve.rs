@@ -36,6 +36,11 @@ fn learning(mutation: Mutation, probability: f64, sigma: f64) -> Learning {
     config(GENERALLY_FORWARD, change).learning
 }
 
+/// With scratch that another policy has been through.
+fn mutate(level: Level, key: Key, learning: &Learning, weights: &mut [f32]) {
+    evolve::mutate(level, key, learning, weights, &mut vec![7; 9]);
+}
+
 #[track_caller]
 fn near(what: &str, found: f64, expected: f64, deviation: f64) {
     assert!((found - expected).abs() <= 5.0 * deviation, "{what}: {found}, expected {expected} ± {deviation}");
@@ -209,7 +214,7 @@ fn mutation_touches_its_share_of_weights_with_its_noise() {
         for probability in [0.0, 0.15, 1.0] {
             let what = format!("{mutation}, probability {probability}, sigma {sigma}");
             let mut new = old.clone();
-            evolve::mutate(Level::new(), key, &learning(mutation, probability, sigma), &mut new, &mut Vec::new());
+            mutate(Level::new(), key, &learning(mutation, probability, sigma), &mut new);
             let noise = |(old, new): (&f32, &f32)| {
                 let gain = f64::from(*new) - f64::from(*old);
                 (old != new).then(|| gain / sigma / if mutation == Mutation::Scaled { f64::from(*old) } else { 1.0 })
@@ -227,7 +232,7 @@ fn mutation_touches_its_share_of_weights_with_its_noise() {
         }
     }
     let mut new = old.clone();
-    evolve::mutate(Level::new(), key, &learning(Mutation::Additive, 1.0, 0.0), &mut new, &mut Vec::new());
+    mutate(Level::new(), key, &learning(Mutation::Additive, 1.0, 0.0), &mut new);
     assert_eq!(bits(&new), bits(&old), "noise of no size");
 }
 
@@ -247,17 +252,12 @@ fn weights_follow_from_their_own_counters() {
         assert!((f64::from(weight) - deviate(a, b)).abs() < 1e-5, "weight {index}: {weight}");
     }
     for mutation in [Mutation::Scaled, Mutation::Additive] {
+        let key = mutations.at(4, 5, 6);
         let mut second = first.clone();
-        evolve::mutate(
-            Level::new(),
-            mutations.at(4, 5, 6),
-            &learning(mutation, 0.15, 0.1),
-            &mut second,
-            &mut Vec::new(),
-        );
+        mutate(Level::new(), key, &learning(mutation, 0.15, 0.1), &mut second);
         for (index, (&old, &new)) in first.iter().zip(&second).enumerate() {
-            let key = mutations.at(4, 5, 6);
-            let chance = key.draw((index / 64 * 16 + index % 16) as u32)[index % 64 / 16];
+            // One draw decides for four weights, 16 apart.
+            let chance = key.draw((index / 64 * 16 + index % 16) as u32)[index / 16 % 4];
             let [a, b, ..] = key.fork().draw(index as u32);
             let scale = if mutation == Mutation::Scaled { f64::from(old) } else { 1.0 };
             let noise = if uniform(chance) < 0.15 { 0.1 * deviate(a, b) * scale } else { 0.0 };
@@ -276,7 +276,7 @@ fn weights_stay_in_bounds() {
             let mut weights: Vec<f32> = starts.into_iter().cycle().take(4000).collect();
             for generation in 0..60 {
                 let key = Key::new(2, 0, Purpose::Mutation).at(generation, 0, 0);
-                evolve::mutate(Level::new(), key, &learning(mutation, 0.5, sigma), &mut weights, &mut Vec::new());
+                mutate(Level::new(), key, &learning(mutation, 0.5, sigma), &mut weights);
                 for &weight in &weights {
                     assert!(weight == 0.0 || (MIN_WEIGHT..=MAX_WEIGHT).contains(&weight.abs()), "{mutation}, {sigma}");
                     zeros += usize::from(weight == 0.0);
@@ -395,7 +395,7 @@ fn policies_depend_on_no_instruction_set() {
             learning(Mutation::Scaled, 1.0, 100.0),
         ] {
             let mut child = all.last().unwrap().clone();
-            evolve::mutate(level, key(Purpose::Mutation), &learning, &mut child, &mut Vec::new());
+            mutate(level, key(Purpose::Mutation), &learning, &mut child);
             all.push(child);
         }
         all
@@ -563,7 +563,7 @@ impl Plain<'_> {
                     let key = self.key(Purpose::Tournament).at(generation, leader, slot);
                     let mut child = policies[evolve::tournament(key, &fitness[leader])].clone();
                     let key = self.key(Purpose::Mutation).at(generation, leader, slot);
-                    evolve::mutate(Level::baseline(), key, &self.config.learning, &mut child, &mut Vec::new());
+                    mutate(Level::baseline(), key, &self.config.learning, &mut child);
                     self.policies[leader][slot] = child;
                 }
             }
