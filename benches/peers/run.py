@@ -73,6 +73,8 @@ def contenders(options, folder):
                 f"no {options.flotilla}: build it with `cargo build --release`, or name it with --flotilla"
             )
         flags = ["--teams", options.teams, "--backend", options.backend, "--json"]
+        if options.instructions:
+            flags += ["--instructions", options.instructions]
         return lambda layout, _: [options.flotilla, "bench", ROOT / "configs" / f"{layout}.toml", *flags]
 
     def cpp():
@@ -212,6 +214,7 @@ def main():
         "--repeats", type=int, default=3, help="rollouts a peer times in one round; their median counts"
     )
     parser.add_argument("--backend", default="auto", help="flotilla's backend: auto, cpu or gpu")
+    parser.add_argument("--instructions", help="instruction set of flotilla's CPU backend, as SSE2, AVX2 or AVX-512")
     parser.add_argument("--flotilla", type=Path, default=ROOT / "target" / "release" / "flotilla")
     parser.add_argument("--python", default=sys.executable, help="an interpreter with JAX and NumPy")
     parser.add_argument("--paper", action="store_true", help="time the complete paper instead")
