@@ -7,8 +7,8 @@ use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::record::metrics::Row;
 
-/// Letters that a curve takes.
-const CURVE: usize = 32;
+/// Letters that a curve takes; with the longest name and the value it fits the usual 80.
+const CURVE: usize = 24;
 /// Curves that a terminal has lines for.
 const MOST: usize = 24;
 /// How often a line is written where there is no terminal, and how often a terminal changes.
@@ -73,10 +73,14 @@ impl Growing {
         self.parts.iter().map(level).collect()
     }
 
-    fn value(&self) -> String {
+    /// What the newest generation came to, over trials: in POIs of the best team, or also in words.
+    fn value(&self, in_words: bool) -> String {
         let Newest { best, mean, trials, .. } = self.newest;
         let pois = |sum: f64| sum / f64::from(trials.max(1)) * self.pois as f64;
-        format!("best {:.2}, mean {:.2} of {} POIs", pois(best), pois(mean), self.pois)
+        match in_words {
+            true => format!("best {:.2}, mean {:.2} of {} POIs", pois(best), pois(mean), self.pois),
+            false => format!("{:.2}/{}", pois(best), self.pois),
+        }
     }
 }
 
@@ -114,13 +118,13 @@ impl Progress {
                 terminal.generation.set_position(next.min(self.last) as u64);
                 terminal.generation.set_message(format!("{rate:.1} generations/s"));
                 for (bar, arm) in terminal.curves.iter().zip(&self.arms) {
-                    bar.set_message(format!("{}  {}", arm.spark(), arm.value()));
+                    bar.set_message(format!("{}  {}", arm.spark(), arm.value(self.arms.len() == 1)));
                 }
             }
             None => {
                 let left = (self.last + 1).saturating_sub(next) as f64 / rate.max(1e-9);
                 let values: Vec<String> = match &*self.arms {
-                    [arm] => vec![arm.value()],
+                    [arm] => vec![arm.value(true)],
                     arms => vec![format!("{} experiments", arms.len())],
                 };
                 // With standard error gone there is nobody left to tell.
