@@ -3,7 +3,7 @@
 //! The loops here may skip whatever adds nothing (an agent out of reach of every lane), since sums start at +0 and
 //! keep their order; the formulas are [`crate::kernels`]'.
 
-use fearless_simd::{Level, Select, Simd, SimdMask, dispatch, prelude::*};
+use fearless_simd::{Level, Select, Simd, SimdMask, dispatch, f32x4, prelude::*};
 use glam::Vec2;
 use rayon::prelude::*;
 
@@ -127,10 +127,10 @@ fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
                 _ => block.insert(Block::new(simd, run.world)),
             };
             let teams = width.min(run.teams - first);
-            block.load(run, first, teams);
             simd.vectorize(
                 #[inline(always)]
                 || {
+                    block.load(run, first, teams);
                     for step in 0..run.world.steps() {
                         block.step(run.world, step);
                     }
@@ -186,20 +186,22 @@ struct Block<S: Simd> {
     speed: Vec<S::f32s>,
     /// What each agent wants next: heading and speed.
     next: Vec<[S::f32s; 3]>,
-    /// `[leaders]`, per layer and unit the input weights, then the bias.
+    /// `[leaders]`, layer by layer, units that are weighed together (see [`together`]) a row an input, then the biases.
     weights: Vec<S::f32s>,
+    /// Where in there each weight of a policy belongs.
+    places: Vec<usize>,
     inputs: Vec<S::f32s>,
+    /// A layer's units and the next one's, `[leaders][units]`.
     hidden: [Vec<S::f32s>; 2],
     outputs: Vec<S::f32s>,
     forces: Vec<[S::f32s; 2]>,
+    influenced: Vec<S::mask32s>,
     /// A bit for each pair of agents that may be in reach in some lane: `[agents][near_words]`.
     near: Vec<u64>,
     near_words: usize,
     /// `[steps][pois][words][lanes]` and `[followers][leaders][lanes]`.
     sets: Vec<u32>,
     seen: Vec<u32>,
-    /// Index in a policy file's order of every weight of `weights`.
-    order: Vec<u32>,
 }
 
 impl<S: Simd> Block<S> {
@@ -209,12 +211,18 @@ impl<S: Simd> Block<S> {
         let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
         let widest = constants.widths.into_iter().max().unwrap_or(0) as usize;
         let near_words = agents.div_ceil(64);
-        let mut order = Vec::with_capacity(world.parameters());
-        let mut first = 0;
-        for layer in 0..constants.layers as usize {
-            let (rows, columns) = (constants.widths[layer] + 1, constants.widths[layer + 1]);
-            for column in 0..columns {
-                order.extend((0..rows).map(|row| first + row * columns + column));
+        let mut places = vec![0; world.parameters()];
+        let (mut first, mut place) = (0, 0);
+        for widths in constants.widths[..=constants.layers as usize].windows(2) {
+            let (rows, columns) = (widths[0] as usize + 1, widths[1] as usize);
+            let mut column = 0;
+            while column < columns {
+                let block = together(columns - column);
+                for (row, unit) in (0..rows).flat_map(|row| (0..block).map(move |unit| (row, unit))) {
+                    places[first + row * columns + column + unit] = place;
+                    place += 1;
+                }
+                column += block;
             }
             first += rows * columns;
         }
@@ -228,35 +236,52 @@ impl<S: Simd> Block<S> {
             speed: vec![zero; agents],
             next: vec![[zero; 3]; agents],
             weights: vec![zero; leaders * world.parameters()],
+            places,
             inputs: vec![zero; leaders * INPUTS],
-            hidden: [vec![zero; widest], vec![zero; widest]],
+            hidden: [vec![zero; leaders * widest], vec![zero; leaders * widest]],
             outputs: vec![zero; leaders * OUTPUTS],
             forces: vec![[zero; 2]; followers],
+            influenced: vec![S::mask32s::splat(simd, false); followers],
             near: vec![0; agents * near_words],
             near_words,
             sets: vec![0; world.set_words() * S::f32s::LEN],
             seen: vec![0; followers * leaders * S::f32s::LEN],
-            order,
         }
     }
 
     /// Puts `teams` teams of the run, from `first` on, at their start; lanes left over repeat the first.
+    #[inline(always)]
     fn load(&mut self, run: &Run<'_>, first: usize, teams: usize) {
         let (leaders, parameters) = (self.world.leaders as usize, self.world.parameters as usize);
-        for lane in 0..S::f32s::LEN {
-            let (group, team) = run.locate(first + if lane < teams { lane } else { 0 });
-            let group = &run.groups[group];
-            for (agent, start) in group.starts.iter().enumerate() {
-                self.x[agent][lane] = start.x;
-                self.y[agent][lane] = start.y;
+        // Four lanes at a time, the narrowest vector: four policies' weights are turned into four weights' lanes.
+        for quad in (0..S::f32s::LEN).step_by(4) {
+            let places: [_; 4] =
+                std::array::from_fn(|i| run.locate(first + if quad + i < teams { quad + i } else { 0 }));
+            for (lane, (group, _)) in (quad..).zip(places) {
+                for (agent, start) in run.groups[group].starts.iter().enumerate() {
+                    self.x[agent][lane] = start.x;
+                    self.y[agent][lane] = start.y;
+                }
             }
             for leader in 0..leaders {
-                let policy = group.teams[team * leaders + leader] as usize;
-                let from = (leader * group.policies + policy) * parameters;
-                let from = &group.weights[from..from + parameters];
+                let policies = places.map(|(group, team)| {
+                    let group = &run.groups[group];
+                    let policy = group.teams[team * leaders + leader] as usize;
+                    &group.weights[(leader * group.policies + policy) * parameters..][..parameters]
+                });
                 let to = &mut self.weights[leader * parameters..(leader + 1) * parameters];
-                for (to, &index) in to.iter_mut().zip(&self.order) {
-                    to[lane] = from[index as usize];
+                let mut put = |place: usize, lanes: &[f32]| {
+                    to[place].as_mut_slice()[quad..quad + 4].copy_from_slice(lanes);
+                };
+                let (fours, rest) = self.places.as_chunks::<4>();
+                for (at, places) in (0..).step_by(4).zip(fours) {
+                    let rows = policies.map(|policy| f32x4::from_slice(self.simd, &policy[at..at + 4]));
+                    for (&place, lanes) in places.iter().zip(transposed(rows)) {
+                        put(place, lanes.as_slice());
+                    }
+                }
+                for (at, &place) in (fours.len() * 4..).zip(rest) {
+                    put(place, &policies.map(|policy| policy[at]));
                 }
             }
         }
@@ -284,18 +309,18 @@ impl<S: Simd> Block<S> {
         let (sensed, drawn) = (self.world.agent_range2, self.world.attraction_radius2);
         self.near.fill(0);
         for i in 0..agents {
-            let (x, y) = (self.x[i], self.y[i]);
-            for j in i + 1..agents {
-                let reach2 = match (i < leaders, j < leaders) {
-                    (true, true) => sensed,
-                    (true, false) => sensed.max(drawn),
-                    _ => drawn,
-                };
-                let dx = self.x[j] - x;
-                let dy = self.y[j] - y;
-                if (dx * dx + dy * dy).simd_le(reach2).any_true() {
-                    self.near[i * self.near_words + j / 64] |= 1 << (j % 64);
-                    self.near[j * self.near_words + i / 64] |= 1 << (i % 64);
+            let split = leaders.max(i + 1);
+            let to_leaders = (i + 1..split, sensed);
+            let to_followers = (split..agents, if i < leaders { sensed.max(drawn) } else { drawn });
+            for (others, reach2) in [to_leaders, to_followers] {
+                let (x, y) = (self.x[i], self.y[i]);
+                for ((j, &other_x), &other_y) in others.clone().zip(&self.x[others.clone()]).zip(&self.y[others]) {
+                    let dx = other_x - x;
+                    let dy = other_y - y;
+                    if (dx * dx + dy * dy).simd_le(reach2).any_true() {
+                        self.near[i * self.near_words + j / 64] |= 1 << (j % 64);
+                        self.near[j * self.near_words + i / 64] |= 1 << (i % 64);
+                    }
                 }
             }
         }
@@ -318,41 +343,57 @@ impl<S: Simd> Block<S> {
                 *input = sum * world.poi_share;
             }
             let mut sums = [splat(self.simd, 0.0); 4];
-            for agent in bits(&self.near[leader * self.near_words..(leader + 1) * self.near_words]) {
-                let dx = self.x[agent] - x;
-                let dy = self.y[agent] - y;
-                sense::sense::<S>(world, world.agent_range2, dx, dy, hx, hy, &mut sums);
-            }
+            let near = &self.near[leader * self.near_words..(leader + 1) * self.near_words];
+            let (xs, ys) = (&self.x, &self.y);
+            each_bit(
+                near,
+                #[inline(always)]
+                |agent| {
+                    sense::sense::<S>(world, world.agent_range2, xs[agent] - x, ys[agent] - y, hx, hy, &mut sums);
+                },
+            );
             for (input, sum) in inputs[4..].iter_mut().zip(sums) {
                 *input = sum * world.agent_share;
             }
         }
     }
 
-    /// Leaders decide where to turn and how fast to go.
+    /// Leaders decide where to turn and how fast to go: layer by layer, all leaders' sums first, then all their tanh,
+    /// which keeps the processor's units full.
     #[inline(always)]
     fn decide(&mut self) {
         let world = &self.world;
-        let parameters = world.parameters as usize;
-        for leader in 0..world.leaders as usize {
-            let mut weights = &self.weights[leader * parameters..(leader + 1) * parameters];
-            let [mut from, mut to] = self.hidden.each_mut().map(|hidden| &mut hidden[..]);
-            from[..INPUTS].copy_from_slice(&self.inputs[leader * INPUTS..(leader + 1) * INPUTS]);
-            for layer in 0..world.layers as usize {
-                let (inputs, units) = (world.widths[layer] as usize, world.widths[layer + 1] as usize);
-                for (unit, weights) in to[..units].iter_mut().zip(weights.chunks_exact(inputs + 1)) {
-                    *unit = policy::weigh::<S>(&from[..inputs], weights);
+        let (leaders, parameters) = (world.leaders as usize, world.parameters as usize);
+        let [mut from, mut to] = self.hidden.each_mut().map(|units| &mut units[..]);
+        from[..leaders * INPUTS].copy_from_slice(&self.inputs);
+        let mut first = 0;
+        for layer in 0..world.layers as usize {
+            let (inputs, units) = (world.widths[layer] as usize, world.widths[layer + 1] as usize);
+            for leader in 0..leaders {
+                let from = &from[leader * inputs..(leader + 1) * inputs];
+                let to = &mut to[leader * units..(leader + 1) * units];
+                let weights = &self.weights[leader * parameters + first..];
+                let mut unit = 0;
+                while unit < units {
+                    let (to, weights) = (&mut to[unit..], &weights[unit * (inputs + 1)..]);
+                    unit += match together(units - unit) {
+                        4 => put(to, policy::weigh::<S, 4>(from, weights)),
+                        2 => put(to, policy::weigh::<S, 2>(from, weights)),
+                        _ => put(to, policy::weigh::<S, 1>(from, weights)),
+                    };
                 }
-                for unit in &mut to[..units] {
-                    *unit = policy::activate::<S>(*unit);
-                }
-                weights = &weights[(inputs + 1) * units..];
-                std::mem::swap(&mut from, &mut to);
             }
-            self.outputs[leader * OUTPUTS..(leader + 1) * OUTPUTS].copy_from_slice(&from[..OUTPUTS]);
-            let turn = policy::wanted_turn::<S>(from[0]);
+            for unit in &mut to[..leaders * units] {
+                *unit = policy::activate::<S>(*unit);
+            }
+            first += (inputs + 1) * units;
+            std::mem::swap(&mut from, &mut to);
+        }
+        self.outputs.copy_from_slice(&from[..leaders * OUTPUTS]);
+        for (leader, outputs) in from[..leaders * OUTPUTS].chunks_exact(OUTPUTS).enumerate() {
+            let turn = policy::wanted_turn::<S>(outputs[0]);
             let (hx, hy) = motion::turn::<S>(world, self.hx[leader], self.hy[leader], turn);
-            self.next[leader] = [hx, hy, policy::wanted_speed::<S>(from[1], world.max_speed)];
+            self.next[leader] = [hx, hy, policy::wanted_speed::<S>(outputs[1], world.max_speed)];
         }
     }
 
@@ -363,24 +404,32 @@ impl<S: Simd> Block<S> {
         let (leaders, lanes) = (world.leaders as usize, S::f32s::LEN);
         for follower in 0..world.followers as usize {
             let agent = leaders + follower;
-            let (x, y, hx, hy) = (self.x[agent], self.y[agent], self.hx[agent], self.hy[agent]);
+            let (x, y) = (self.x[agent], self.y[agent]);
             let mut sums = follow::Sums::new(self.simd);
-            for other in bits(&self.near[agent * self.near_words..(agent + 1) * self.near_words]) {
-                let dx = self.x[other] - x;
-                let dy = self.y[other] - y;
-                let seen = follow::influence::<S>(world, dx, dy, &mut sums);
-                if other < leaders {
-                    let counts = &mut self.seen[(follower * leaders + other) * lanes..][..lanes];
-                    let count = S::u32s::from_slice(self.simd, counts);
-                    seen.select(count + 1, count).store_slice(counts);
-                }
-            }
+            let near = &self.near[agent * self.near_words..(agent + 1) * self.near_words];
+            let (xs, ys, counts) = (&self.x, &self.y, &mut self.seen);
+            each_bit(
+                near,
+                #[inline(always)]
+                |other| {
+                    let seen = follow::influence::<S>(world, xs[other] - x, ys[other] - y, &mut sums);
+                    if other < leaders {
+                        let counts = &mut counts[(follower * leaders + other) * lanes..][..lanes];
+                        let count = S::u32s::from_slice(self.simd, counts);
+                        seen.select(count + 1, count).store_slice(counts);
+                    }
+                },
+            );
             let (force_x, force_y) = follow::force::<S>(world, &sums, x, y);
-            let influenced = (sums.repel_count + sums.attract_count).simd_gt(0.0)
+            self.forces[follower] = [force_x, force_y];
+            self.influenced[follower] = (sums.repel_count + sums.attract_count).simd_gt(0.0)
                 | follow::wall_near::<S>(world, x, world.map_x)
                 | follow::wall_near::<S>(world, y, world.map_y);
-            self.forces[follower] = [force_x, force_y];
-            let (hx, hy, wanted) = follow::steer::<S>(world, force_x, force_y, influenced, hx, hy, self.speed[agent]);
+        }
+        for (follower, (&[force_x, force_y], &influenced)) in self.forces.iter().zip(&self.influenced).enumerate() {
+            let agent = leaders + follower;
+            let (hx, hy, speed) = (self.hx[agent], self.hy[agent], self.speed[agent]);
+            let (hx, hy, wanted) = follow::steer::<S>(world, force_x, force_y, influenced, hx, hy, speed);
             self.next[agent] = [hx, hy, wanted];
         }
     }
@@ -445,11 +494,39 @@ impl<S: Simd> Block<S> {
     }
 }
 
-/// The indices of set bits, ascending.
+/// Rows turned into columns.
 #[inline(always)]
-fn bits(words: &[u64]) -> impl Iterator<Item = usize> {
-    words.iter().enumerate().flat_map(|(index, &word)| {
-        std::iter::successors((word != 0).then_some(word), |word| Some(word & (word - 1)).filter(|&rest| rest != 0))
-            .map(move |word| index * 64 + word.trailing_zeros() as usize)
-    })
+fn transposed<S: Simd>([a, b, c, d]: [f32x4<S>; 4]) -> [f32x4<S>; 4] {
+    let (low, high) = (a.zip_low(c), a.zip_high(c));
+    let (other_low, other_high) = (b.zip_low(d), b.zip_high(d));
+    [low.zip_low(other_low), low.zip_high(other_low), high.zip_low(other_high), high.zip_high(other_high)]
+}
+
+/// Units that are weighed together, of those left in a layer: inputs are read once for all.
+#[inline(always)]
+fn together(left: usize) -> usize {
+    match left {
+        4.. => 4,
+        2 | 3 => 2,
+        _ => 1,
+    }
+}
+
+/// Puts some units where they belong, and tells how many.
+#[inline(always)]
+fn put<V: Copy, const UNITS: usize>(to: &mut [V], units: [V; UNITS]) -> usize {
+    to[..UNITS].copy_from_slice(&units);
+    UNITS
+}
+
+/// Calls `f` with the indices of set bits, ascending.
+#[inline(always)]
+fn each_bit(words: &[u64], mut f: impl FnMut(usize)) {
+    for (index, &word) in words.iter().enumerate() {
+        let mut word = word;
+        while word != 0 {
+            f(index * 64 + word.trailing_zeros() as usize);
+            word &= word - 1;
+        }
+    }
 }

@@ -4,15 +4,19 @@ use fearless_simd::{Simd, prelude::*};
 
 use super::{math, splat};
 
-/// One unit before its tanh: the bias (the last of `weights`) and the weighted inputs, added in order.
+/// Some units before their tanh: the bias (the last of a unit's weights) and the weighted inputs, added in order.
+///
+/// `weights` holds a row an input, and the biases, of `UNITS` weights each.
 #[inline(always)]
-pub fn weigh<S: Simd>(inputs: &[S::f32s], weights: &[S::f32s]) -> S::f32s {
-    let (bias, weights) = weights.split_last().expect("a unit has a bias");
-    let mut sum = *bias;
-    for (&input, &weight) in inputs.iter().zip(weights) {
-        sum += input * weight;
+pub fn weigh<S: Simd, const UNITS: usize>(inputs: &[S::f32s], weights: &[S::f32s]) -> [S::f32s; UNITS] {
+    let (rows, _) = weights.as_chunks::<UNITS>();
+    let mut sums = rows[inputs.len()];
+    for (&input, row) in inputs.iter().zip(rows) {
+        for (sum, &weight) in sums.iter_mut().zip(row) {
+            *sum += input * weight;
+        }
     }
-    sum
+    sums
 }
 
 /// The unit's activation; sums too small to matter become 0, which keeps the next layer away from denormals.
