@@ -88,6 +88,11 @@ impl Trainer {
     /// # Errors
     /// When the backend fails; the trainer then still stands before this generation.
     pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
+        // Once inside the thread pool, for a small generation is over sooner than a thread is woken.
+        rayon::scope(|_| self.play_generation(backend))
+    }
+
+    fn play_generation(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
         let (generation, level) = (self.generation, self.level);
         let playing = self.arms.iter_mut().enumerate().filter(|(_, arm)| generation <= arm.last() + 1);
         let mut playing: Vec<(usize, &mut Arm)> = playing.collect();
@@ -99,10 +104,11 @@ impl Trainer {
             // The first generation has no champion before it.
             first..population + usize::from(generation > 0)
         })?;
-        let mut rows = Vec::new();
-        for (index, arm) in &mut playing {
-            rows.extend(if generation > arm.last() { arm.finish() } else { arm.conclude(*index, generation) });
-        }
+        let conclude = |(index, arm): &mut (usize, &mut Arm)| match generation > arm.last() {
+            true => arm.finish(),
+            false => arm.conclude(*index, generation),
+        };
+        let mut rows = playing.par_iter_mut().flat_map_iter(conclude).collect::<Vec<_>>();
         playing.retain(|(_, arm)| generation < arm.last());
         playing.par_iter_mut().for_each(|(_, arm)| arm.breed(generation, level));
         rows.sort_by_key(|row| (row.arm, row.trial, row.generation));

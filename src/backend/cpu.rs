@@ -3,6 +3,8 @@
 //! The loops here may skip whatever adds nothing (an agent out of reach of every lane), since sums start at +0 and
 //! keep their order; the formulas are [`crate::kernels`]'.
 
+use std::sync::{Mutex, PoisonError};
+
 use fearless_simd::{Level, Select, Simd, SimdMask, dispatch, f32x4, prelude::*};
 use glam::Vec2;
 use rayon::prelude::*;
@@ -119,29 +121,35 @@ fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
     let runs = runs(groups);
     let blocks: Vec<(&Run<'_>, usize)> =
         runs.iter().flat_map(|run| (0..run.teams).step_by(width).map(move |team| (run, team))).collect();
-    blocks.par_iter().with_max_len(1).for_each_init(
-        || None,
-        |block: &mut Option<Block<S>>, &(run, first)| {
-            let block = match block {
-                Some(block) if block.world == run.world.constants => block,
-                _ => block.insert(Block::new(simd, run.world)),
-            };
-            let teams = width.min(run.teams - first);
-            simd.vectorize(
-                #[inline(always)]
-                || {
-                    block.load(run, first, teams);
-                    for step in 0..run.world.steps() {
-                        block.step(run.world, step);
-                    }
-                },
-            );
-            for lane in 0..teams {
-                let (group, team) = run.locate(first + lane);
-                visit(block.episode(lane, run.first + group, team));
-            }
-        },
-    );
+    // A thread takes whatever block lies idle: as many are made as threads play at once.
+    let idle: Mutex<Vec<Block<S>>> = Mutex::default();
+    let take = |world: &World| {
+        let mut idle = idle.lock().unwrap_or_else(PoisonError::into_inner);
+        let fits = idle.iter().position(|block| block.world == world.constants);
+        if fits.is_none() {
+            // Left over from a world that is done.
+            idle.clear();
+        }
+        fits.map(|index| idle.swap_remove(index))
+    };
+    blocks.par_iter().with_max_len(1).for_each(|&(run, first)| {
+        let mut block = take(run.world).unwrap_or_else(|| Block::new(simd, run.world));
+        let teams = width.min(run.teams - first);
+        simd.vectorize(
+            #[inline(always)]
+            || {
+                block.load(run, first, teams);
+                for step in 0..run.world.steps() {
+                    block.step(run.world, step);
+                }
+            },
+        );
+        for lane in 0..teams {
+            let (group, team) = run.locate(first + lane);
+            visit(block.episode(lane, run.first + group, team));
+        }
+        idle.lock().unwrap_or_else(PoisonError::into_inner).push(block);
+    });
 }
 
 fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
