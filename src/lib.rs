@@ -16,8 +16,11 @@
 //! 5. [`credit`] turns that record into G, D, Df and D++.
 //! 6. [`evolve`] selects and mutates; [`run`] keeps what came out by [`record`]; [`report`] draws it.
 //!
-//! Imports run one way: `main ▸ cli ▸ run ▸ trainer ▸ {evolve, credit, backend, record}`, `backend ▸ kernels`.
-//! Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
+//! Around that: [`run`] keeps a trainer, its folder and its checkpoints together, [`sweep`] makes many runs of a grid,
+//! [`verify`] compares two backends on the random worlds of [`sample`], and [`cli`] turns what was typed into all this.
+//!
+//! Imports run one way: `main ▸ cli ▸ {run, sweep, report, verify} ▸ trainer ▸ {evolve, credit, backend}`,
+//! `backend ▸ kernels`. Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
 
 pub mod backend;
 pub mod cli;
