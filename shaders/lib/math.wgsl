@@ -34,13 +34,21 @@ fn rough_twice_recip(x: f32) -> f32 {
     return y * (2.8286855 - x * y);
 }
 
-fn hyperbolic_tangent(unclamped: f32) -> f32 {
+// n and d with tanh(x/2) = n/d.
+fn half_tangent(unclamped: f32) -> vec2<f32> {
     let limit = 7.5501223;
     var x = select(limit, unclamped, unclamped < limit);
     x = select(-limit, x, x > -limit);
     let z = x * x;
     let n = x * ((z * 0.02999907 + 14.7163315) * z + 544.93274);
     let d = (z + 120.25281) * z + 1089.8662;
+    return vec2<f32>(n, d);
+}
+
+// tanh x of its half_tangent.
+fn whole_tangent(half: vec2<f32>) -> f32 {
+    let n = half.x;
+    let d = half.y;
     let s = n * n + d * d;
     let y = rough_twice_recip(s);
     return n * d * (y * (2.0 - s * 0.5 * y));

@@ -10,7 +10,7 @@ use glam::Vec2;
 use rayon::prelude::*;
 
 use super::{Backend, BackendError, Episode, Group, Moment, Strided, Trace, Visit};
-use crate::kernels::{couple, follow, motion, policy, sense, splat};
+use crate::kernels::{couple, follow, math, motion, policy, sense, splat};
 use crate::world::{Constants, INPUTS, OUTPUTS, World};
 
 /// Plays episodes on the processor, at the widest instruction set it has, on the threads of the current rayon pool.
@@ -197,10 +197,14 @@ struct Block<S: Simd> {
     /// `[leaders]`, layer by layer, units that are weighed together (see [`together`]) a row an input, then the biases.
     weights: Vec<S::f32s>,
     /// Where in there each weight of a policy belongs.
-    places: Vec<usize>,
+    slots: Vec<usize>,
+    /// Group and team of each lane.
+    places: Vec<(usize, usize)>,
     inputs: Vec<S::f32s>,
     /// A layer's units and the next one's, `[leaders][units]`.
     hidden: [Vec<S::f32s>; 2],
+    /// What some units' tanh will be made of.
+    halves: [(S::f32s, S::f32s); 16],
     outputs: Vec<S::f32s>,
     forces: Vec<[S::f32s; 2]>,
     influenced: Vec<S::mask32s>,
@@ -219,16 +223,16 @@ impl<S: Simd> Block<S> {
         let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
         let widest = constants.widths.into_iter().max().unwrap_or(0) as usize;
         let near_words = agents.div_ceil(64);
-        let mut places = vec![0; world.parameters()];
-        let (mut first, mut place) = (0, 0);
+        let mut slots = vec![0; world.parameters()];
+        let (mut first, mut slot) = (0, 0);
         for widths in constants.widths[..=constants.layers as usize].windows(2) {
             let (rows, columns) = (widths[0] as usize + 1, widths[1] as usize);
             let mut column = 0;
             while column < columns {
                 let block = together(columns - column);
                 for (row, unit) in (0..rows).flat_map(|row| (0..block).map(move |unit| (row, unit))) {
-                    places[first + row * columns + column + unit] = place;
-                    place += 1;
+                    slots[first + row * columns + column + unit] = slot;
+                    slot += 1;
                 }
                 column += block;
             }
@@ -244,9 +248,11 @@ impl<S: Simd> Block<S> {
             speed: vec![zero; agents],
             next: vec![[zero; 3]; agents],
             weights: vec![zero; leaders * world.parameters()],
-            places,
+            slots,
+            places: Vec::with_capacity(S::f32s::LEN),
             inputs: vec![zero; leaders * INPUTS],
             hidden: [vec![zero; leaders * widest], vec![zero; leaders * widest]],
+            halves: [(zero, zero); 16],
             outputs: vec![zero; leaders * OUTPUTS],
             forces: vec![[zero; 2]; followers],
             influenced: vec![S::mask32s::splat(simd, false); followers],
@@ -260,36 +266,38 @@ impl<S: Simd> Block<S> {
     /// Puts `teams` teams of the run, from `first` on, at their start; lanes left over repeat the first.
     #[inline(always)]
     fn load(&mut self, run: &Run<'_>, first: usize, teams: usize) {
-        let (leaders, parameters) = (self.world.leaders as usize, self.world.parameters as usize);
-        // Four lanes at a time, the narrowest vector: four policies' weights are turned into four weights' lanes.
-        for quad in (0..S::f32s::LEN).step_by(4) {
-            let places: [_; 4] =
-                std::array::from_fn(|i| run.locate(first + if quad + i < teams { quad + i } else { 0 }));
-            for (lane, (group, _)) in (quad..).zip(places) {
-                for (agent, start) in run.groups[group].starts.iter().enumerate() {
-                    self.x[agent][lane] = start.x;
-                    self.y[agent][lane] = start.y;
-                }
+        let (leaders, parameters, lanes) = (self.world.leaders as usize, self.world.parameters as usize, S::f32s::LEN);
+        self.places.clear();
+        self.places.extend((0..lanes).map(|lane| run.locate(first + if lane < teams { lane } else { 0 })));
+        for (lane, &(group, _)) in self.places.iter().enumerate() {
+            for (agent, start) in run.groups[group].starts.iter().enumerate() {
+                self.x[agent][lane] = start.x;
+                self.y[agent][lane] = start.y;
             }
-            for leader in 0..leaders {
-                let policies = places.map(|(group, team)| {
-                    let group = &run.groups[group];
-                    let policy = group.teams[team * leaders + leader] as usize;
-                    &group.weights[(leader * group.policies + policy) * parameters..][..parameters]
-                });
-                let to = &mut self.weights[leader * parameters..(leader + 1) * parameters];
+        }
+        for leader in 0..leaders {
+            let policy = |&(group, team): &(usize, usize)| {
+                let group = &run.groups[group];
+                let policy = group.teams[team * leaders + leader] as usize;
+                &group.weights[(leader * group.policies + policy) * parameters..][..parameters]
+            };
+            // Policies lie all over memory: when all are asked for at once, their way to the processor overlaps.
+            // Four lanes at a time, the narrowest vector: four policies' weights are turned into four weights' lanes.
+            let to = &mut self.weights[leader * parameters..(leader + 1) * parameters];
+            for (quad, places) in self.places.as_chunks::<4>().0.iter().enumerate() {
+                let policies = places.each_ref().map(policy);
                 let mut put = |place: usize, lanes: &[f32]| {
-                    to[place].as_mut_slice()[quad..quad + 4].copy_from_slice(lanes);
+                    to[place].as_mut_slice()[quad * 4..quad * 4 + 4].copy_from_slice(lanes);
                 };
-                let (fours, rest) = self.places.as_chunks::<4>();
-                for (at, places) in (0..).step_by(4).zip(fours) {
+                let (fours, rest) = self.slots.as_chunks::<4>();
+                for (at, slots) in (0..).step_by(4).zip(fours) {
                     let rows = policies.map(|policy| f32x4::from_slice(self.simd, &policy[at..at + 4]));
-                    for (&place, lanes) in places.iter().zip(transposed(rows)) {
-                        put(place, lanes.as_slice());
+                    for (&slot, lanes) in slots.iter().zip(transposed(rows)) {
+                        put(slot, lanes.as_slice());
                     }
                 }
-                for (at, &place) in (fours.len() * 4..).zip(rest) {
-                    put(place, &policies.map(|policy| policy[at]));
+                for (at, &slot) in (fours.len() * 4..).zip(rest) {
+                    put(slot, &policies.map(|policy| policy[at]));
                 }
             }
         }
@@ -366,8 +374,7 @@ impl<S: Simd> Block<S> {
         }
     }
 
-    /// Leaders decide where to turn and how fast to go: layer by layer, all leaders' sums first, then all their tanh,
-    /// which keeps the processor's units full.
+    /// Leaders decide where to turn and how fast to go: layer by layer, all leaders' sums first, then all their tanh.
     #[inline(always)]
     fn decide(&mut self) {
         let world = &self.world;
@@ -385,14 +392,21 @@ impl<S: Simd> Block<S> {
                 while unit < units {
                     let (to, weights) = (&mut to[unit..], &weights[unit * (inputs + 1)..]);
                     unit += match together(units - unit) {
+                        10 => put(to, policy::weigh::<S, 10>(from, weights)),
                         4 => put(to, policy::weigh::<S, 4>(from, weights)),
                         2 => put(to, policy::weigh::<S, 2>(from, weights)),
                         _ => put(to, policy::weigh::<S, 1>(from, weights)),
                     };
                 }
             }
-            for unit in &mut to[..leaders * units] {
-                *unit = policy::activate::<S>(*unit);
+            // In short loops the processor sees far enough ahead to keep its units busy.
+            for units in to[..leaders * units].chunks_mut(self.halves.len()) {
+                for (half, &unit) in self.halves.iter_mut().zip(&*units) {
+                    *half = policy::activate::<S>(unit);
+                }
+                for (unit, &half) in units.iter_mut().zip(&self.halves) {
+                    *unit = math::whole_tangent::<S>(half);
+                }
             }
             first += (inputs + 1) * units;
             std::mem::swap(&mut from, &mut to);
@@ -514,6 +528,7 @@ fn transposed<S: Simd>([a, b, c, d]: [f32x4<S>; 4]) -> [f32x4<S>; 4] {
 #[inline(always)]
 fn together(left: usize) -> usize {
     match left {
+        10 => 10,
         4.. => 4,
         2 | 3 => 2,
         _ => 1,

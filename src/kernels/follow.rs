@@ -5,7 +5,7 @@ use fearless_simd::{Simd, prelude::*};
 use super::{
     math::{flush, recip, rsqrt},
     motion::rotate,
-    select, splat,
+    only, select, splat,
 };
 use crate::world::Constants;
 
@@ -36,17 +36,17 @@ impl<S: Simd> Sums<S> {
 #[inline(always)]
 pub fn influence<S: Simd>(world: &Constants, dx: S::f32s, dy: S::f32s, sums: &mut Sums<S>) -> S::mask32s {
     let simd = dx.token();
-    let (zero, one) = (splat(simd, 0.0), splat(simd, 1.0));
+    let one = splat(simd, 1.0);
     let d2 = dx * dx + dy * dy;
     let near = d2.simd_le(world.repulsion_radius2);
     let seen = d2.simd_le(world.attraction_radius2);
     let far = seen & !near;
-    sums.repel_x += select::<S>(zero, dx, near);
-    sums.repel_y += select::<S>(zero, dy, near);
-    sums.repel_count += select::<S>(zero, one, near);
-    sums.attract_x += select::<S>(zero, dx, far);
-    sums.attract_y += select::<S>(zero, dy, far);
-    sums.attract_count += select::<S>(zero, one, far);
+    sums.repel_x += only::<S>(dx, near);
+    sums.repel_y += only::<S>(dy, near);
+    sums.repel_count += only::<S>(one, near);
+    sums.attract_x += only::<S>(dx, far);
+    sums.attract_y += only::<S>(dy, far);
+    sums.attract_count += only::<S>(one, far);
     seen
 }
 
@@ -57,7 +57,7 @@ pub fn wall_push<S: Simd>(world: &Constants, at: S::f32s, size: f32) -> S::f32s 
     let (zero, radius) = (splat(simd, 0.0), splat(simd, world.repulsion_radius));
     let low = radius - at;
     let high = radius - (splat(simd, size) - at);
-    let push = select::<S>(zero, low, low.simd_gt(zero)) - select::<S>(zero, high, high.simd_gt(zero));
+    let push = only::<S>(low, low.simd_gt(zero)) - only::<S>(high, high.simd_gt(zero));
     push * world.wall_gain
 }
 
@@ -116,6 +116,6 @@ pub fn steer<S: Simd>(
     let next_x = select::<S>(hx, select::<S>(turned_x, ux, reached), pulled);
     let next_y = select::<S>(hy, select::<S>(turned_y, uy, reached), pulled);
     let ahead = select::<S>(splat(simd, world.min_speed), force2 * inverse, along.simd_gt(zero));
-    let wanted = select::<S>(speed, select::<S>(zero, ahead, pulled), influenced);
+    let wanted = select::<S>(speed, only::<S>(ahead, pulled), influenced);
     (next_x, next_y, wanted)
 }

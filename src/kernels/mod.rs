@@ -19,6 +19,20 @@ pub fn select<S: Simd>(if_false: S::f32s, if_true: S::f32s, condition: S::mask32
     condition.select(if_true, if_false)
 }
 
+/// `select(0.0, x, condition)` in one operation: masks of whole lanes are spared the test of their sign.
+#[inline(always)]
+pub fn only<S: Simd>(x: S::f32s, condition: S::mask32s) -> S::f32s {
+    let bits: S::i32s = x.bitcast();
+    (bits & condition.to_vector()).bitcast()
+}
+
+/// `select(x, 0.0, condition)`, likewise.
+#[inline(always)]
+pub fn except<S: Simd>(x: S::f32s, condition: S::mask32s) -> S::f32s {
+    let bits: S::i32s = x.bitcast();
+    (bits & !condition.to_vector()).bitcast()
+}
+
 /// The same number in every lane.
 #[inline(always)]
 pub fn splat<S: Simd>(simd: S, value: f32) -> S::f32s {

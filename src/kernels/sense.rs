@@ -3,8 +3,9 @@
 use fearless_simd::{Simd, prelude::*};
 
 use super::{
+    except,
     math::{root, rsqrt},
-    select, splat,
+    only, select, splat,
 };
 use crate::world::Constants;
 
@@ -39,13 +40,13 @@ pub fn sense<S: Simd>(
     let d2 = dx * dx + dy * dy;
     let fx = dx * hx + dy * hy;
     let fy = dy * hx - dx * hy;
-    let value = select::<S>(zero, density::<S>(world, d2), d2.simd_le(range2));
+    let value = only::<S>(density::<S>(world, d2), d2.simd_le(range2));
     let left = fy.simd_gt(zero) | (fy.simd_ge(zero) & fx.simd_ge(zero));
     let front = fx.simd_gt(zero) | (fx.simd_ge(zero) & fy.simd_le(zero));
-    let value_left = select::<S>(zero, value, left);
-    let value_right = select::<S>(value, zero, left);
-    sums[0] += select::<S>(value_right, zero, front);
-    sums[1] += select::<S>(zero, value_right, front);
-    sums[2] += select::<S>(zero, value_left, front);
-    sums[3] += select::<S>(value_left, zero, front);
+    let value_left = only::<S>(value, left);
+    let value_right = except::<S>(value, left);
+    sums[0] += except::<S>(value_right, front);
+    sums[1] += only::<S>(value_right, front);
+    sums[2] += only::<S>(value_left, front);
+    sums[3] += except::<S>(value_left, front);
 }
