@@ -3,6 +3,7 @@
 //! The loops here may skip whatever adds nothing (an agent out of reach of every lane), since sums start at +0 and
 //! keep their order; the formulas are [`crate::kernels`]'.
 
+use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
 
 use fearless_simd::{Level, Select, Simd, SimdMask, dispatch, f32x4, prelude::*};
@@ -139,9 +140,7 @@ fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
             #[inline(always)]
             || {
                 block.load(run, first, teams);
-                for step in 0..run.world.steps() {
-                    block.step(run.world, step);
-                }
+                block.play(run.world, 0..run.world.steps());
             },
         );
         for lane in 0..teams {
@@ -166,7 +165,7 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
             if step > 0 {
                 simd.vectorize(
                     #[inline(always)]
-                    || block.step(world, step - 1),
+                    || block.play(world, step - 1..step),
                 );
             }
             for lane in 0..lanes {
@@ -183,37 +182,49 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
     Trace { teams, agents, moments, sets, seen }
 }
 
-/// The state of one vector of teams, everything a lane a team. Agents are leaders first.
+/// The state of one vector of teams, everything a lane a team.
 struct Block<S: Simd> {
     simd: S,
     world: Constants,
-    x: Vec<S::f32s>,
-    y: Vec<S::f32s>,
-    hx: Vec<S::f32s>,
-    hy: Vec<S::f32s>,
-    speed: Vec<S::f32s>,
-    /// What each agent wants next: heading and speed.
-    next: Vec<[S::f32s; 3]>,
+    /// Leaders first.
+    agents: Vec<Agent<S>>,
     /// `[leaders]`, layer by layer, units that are weighed together (see [`together`]) a row an input, then the biases.
     weights: Vec<S::f32s>,
     /// Where in there each weight of a policy belongs.
     slots: Vec<usize>,
     /// Group and team of each lane.
     places: Vec<(usize, usize)>,
-    inputs: Vec<S::f32s>,
+    inputs: Vec<[S::f32s; INPUTS]>,
     /// A layer's units and the next one's, `[leaders][units]`.
     hidden: [Vec<S::f32s>; 2],
-    /// What some units' tanh will be made of.
-    halves: [(S::f32s, S::f32s); 16],
-    outputs: Vec<S::f32s>,
-    forces: Vec<[S::f32s; 2]>,
-    influenced: Vec<S::mask32s>,
-    /// A bit for each pair of agents that may be in reach in some lane: `[agents][near_words]`.
+    outputs: Vec<[S::f32s; OUTPUTS]>,
+    followers: Vec<Follower<S>>,
+    /// At how many steps each follower saw each leader, `[followers][leaders]`.
+    counts: Vec<S::u32s>,
+    /// A bit for each pair of agents that may be in reach in some lane: `[words][agents]`.
     near: Vec<u64>,
-    near_words: usize,
-    /// `[steps][pois][words][lanes]` and `[followers][leaders][lanes]`.
+    /// `[steps][pois][words][lanes]`, and the counts when they are complete, `[followers][leaders][lanes]`.
     sets: Vec<u32>,
     seen: Vec<u32>,
+}
+
+#[derive(Clone, Copy)]
+struct Agent<S: Simd> {
+    x: S::f32s,
+    y: S::f32s,
+    hx: S::f32s,
+    hy: S::f32s,
+    speed: S::f32s,
+    /// The speed it wants next.
+    wanted: S::f32s,
+}
+
+#[derive(Clone, Copy)]
+struct Follower<S: Simd> {
+    force_x: S::f32s,
+    force_y: S::f32s,
+    /// Whether anyone or any wall is near.
+    influenced: S::mask32s,
 }
 
 impl<S: Simd> Block<S> {
@@ -222,7 +233,6 @@ impl<S: Simd> Block<S> {
         let zero = splat(simd, 0.0);
         let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
         let widest = constants.widths.into_iter().max().unwrap_or(0) as usize;
-        let near_words = agents.div_ceil(64);
         let mut slots = vec![0; world.parameters()];
         let (mut first, mut slot) = (0, 0);
         for widths in constants.widths[..=constants.layers as usize].windows(2) {
@@ -238,26 +248,20 @@ impl<S: Simd> Block<S> {
             }
             first += rows * columns;
         }
+        let influenced = S::mask32s::splat(simd, false);
         Block {
             simd,
             world: constants,
-            x: vec![zero; agents],
-            y: vec![zero; agents],
-            hx: vec![zero; agents],
-            hy: vec![zero; agents],
-            speed: vec![zero; agents],
-            next: vec![[zero; 3]; agents],
+            agents: vec![Agent { x: zero, y: zero, hx: zero, hy: zero, speed: zero, wanted: zero }; agents],
             weights: vec![zero; leaders * world.parameters()],
             slots,
             places: Vec::with_capacity(S::f32s::LEN),
-            inputs: vec![zero; leaders * INPUTS],
+            inputs: vec![[zero; INPUTS]; leaders],
             hidden: [vec![zero; leaders * widest], vec![zero; leaders * widest]],
-            halves: [(zero, zero); 16],
-            outputs: vec![zero; leaders * OUTPUTS],
-            forces: vec![[zero; 2]; followers],
-            influenced: vec![S::mask32s::splat(simd, false); followers],
-            near: vec![0; agents * near_words],
-            near_words,
+            outputs: vec![[zero; OUTPUTS]; leaders],
+            followers: vec![Follower { force_x: zero, force_y: zero, influenced }; followers],
+            counts: vec![S::u32s::splat(simd, 0); followers * leaders],
+            near: vec![0; agents.div_ceil(64) * agents],
             sets: vec![0; world.set_words() * S::f32s::LEN],
             seen: vec![0; followers * leaders * S::f32s::LEN],
         }
@@ -266,32 +270,35 @@ impl<S: Simd> Block<S> {
     /// Puts `teams` teams of the run, from `first` on, at their start; lanes left over repeat the first.
     #[inline(always)]
     fn load(&mut self, run: &Run<'_>, first: usize, teams: usize) {
-        let (leaders, parameters, lanes) = (self.world.leaders as usize, self.world.parameters as usize, S::f32s::LEN);
-        self.places.clear();
-        self.places.extend((0..lanes).map(|lane| run.locate(first + if lane < teams { lane } else { 0 })));
-        for (lane, &(group, _)) in self.places.iter().enumerate() {
-            for (agent, start) in run.groups[group].starts.iter().enumerate() {
-                self.x[agent][lane] = start.x;
-                self.y[agent][lane] = start.y;
+        let Block { simd, world, agents, weights, slots, places, counts, .. } = self;
+        let (leaders, parameters) = (world.leaders as usize, world.parameters as usize);
+        places.clear();
+        places.extend((0..S::f32s::LEN).map(|lane| run.locate(first + if lane < teams { lane } else { 0 })));
+        for (lane, &(group, _)) in places.iter().enumerate() {
+            for (agent, start) in agents.iter_mut().zip(run.groups[group].starts) {
+                agent.x[lane] = start.x;
+                agent.y[lane] = start.y;
             }
         }
-        for leader in 0..leaders {
-            let policy = |&(group, team): &(usize, usize)| {
-                let group = &run.groups[group];
-                let policy = group.teams[team * leaders + leader] as usize;
-                &group.weights[(leader * group.policies + policy) * parameters..][..parameters]
-            };
-            // Policies lie all over memory: when all are asked for at once, their way to the processor overlaps.
+        for agent in agents {
+            agent.hx = splat(*simd, world.heading_x);
+            agent.hy = splat(*simd, world.heading_y);
+            agent.speed = splat(*simd, world.speed);
+        }
+        for (leader, weights) in weights.chunks_exact_mut(parameters).enumerate() {
             // Four lanes at a time, the narrowest vector: four policies' weights are turned into four weights' lanes.
-            let to = &mut self.weights[leader * parameters..(leader + 1) * parameters];
-            for (quad, places) in self.places.as_chunks::<4>().0.iter().enumerate() {
-                let policies = places.each_ref().map(policy);
-                let mut put = |place: usize, lanes: &[f32]| {
-                    to[place].as_mut_slice()[quad * 4..quad * 4 + 4].copy_from_slice(lanes);
+            for (quad, places) in places.as_chunks::<4>().0.iter().enumerate() {
+                let policies = places.map(|(group, team)| {
+                    let group = &run.groups[group];
+                    let policy = group.teams[team * leaders + leader] as usize;
+                    &group.weights[(leader * group.policies + policy) * parameters..][..parameters]
+                });
+                let mut put = |slot: usize, lanes: &[f32]| {
+                    weights[slot].as_mut_slice()[quad * 4..quad * 4 + 4].copy_from_slice(lanes);
                 };
-                let (fours, rest) = self.slots.as_chunks::<4>();
+                let (fours, rest) = slots.as_chunks::<4>();
                 for (at, slots) in (0..).step_by(4).zip(fours) {
-                    let rows = policies.map(|policy| f32x4::from_slice(self.simd, &policy[at..at + 4]));
+                    let rows = policies.map(|policy| f32x4::from_slice(*simd, &policy[at..at + 4]));
                     for (&slot, lanes) in slots.iter().zip(transposed(rows)) {
                         put(slot, lanes.as_slice());
                     }
@@ -301,43 +308,48 @@ impl<S: Simd> Block<S> {
                 }
             }
         }
-        self.hx.fill(splat(self.simd, self.world.heading_x));
-        self.hy.fill(splat(self.simd, self.world.heading_y));
-        self.speed.fill(splat(self.simd, self.world.speed));
-        self.seen.fill(0);
+        counts.fill(S::u32s::splat(*simd, 0));
     }
 
-    /// One step of all agents; every read is of the state before it.
+    /// Plays some steps; every read in a step is of the state before it.
     #[inline(always)]
-    fn step(&mut self, world: &World, step: usize) {
-        self.find_near();
-        self.sense(&world.pois);
-        self.decide();
-        self.follow();
-        self.advance();
-        self.couple(&world.pois, step);
+    fn play(&mut self, world: &World, steps: Range<usize>) {
+        for step in steps {
+            self.find_near();
+            self.sense(&world.pois);
+            self.decide();
+            self.follow();
+            self.advance();
+            self.couple(&world.pois, step);
+        }
+        for (words, count) in self.seen.chunks_exact_mut(S::f32s::LEN).zip(&self.counts) {
+            count.store_slice(words);
+        }
     }
 
     /// Marks the pairs of agents that one of them may sense or be drawn to, in any lane.
     #[inline(always)]
     fn find_near(&mut self) {
-        let (agents, leaders) = (self.x.len(), self.world.leaders as usize);
-        let (sensed, drawn) = (self.world.agent_range2, self.world.attraction_radius2);
-        self.near.fill(0);
-        for i in 0..agents {
-            let split = leaders.max(i + 1);
-            let to_leaders = (i + 1..split, sensed);
-            let to_followers = (split..agents, if i < leaders { sensed.max(drawn) } else { drawn });
-            for (others, reach2) in [to_leaders, to_followers] {
-                let (x, y) = (self.x[i], self.y[i]);
-                for ((j, &other_x), &other_y) in others.clone().zip(&self.x[others.clone()]).zip(&self.y[others]) {
-                    let dx = other_x - x;
-                    let dy = other_y - y;
+        let Block { world, agents, near, .. } = self;
+        let (count, leaders) = (agents.len(), world.leaders as usize);
+        let drawn = world.attraction_radius2;
+        let sensed = world.agent_range2.max(drawn);
+        near.fill(0);
+        for (word, others) in agents.chunks(64).enumerate() {
+            let first = word * 64;
+            for (i, agent) in agents[..first + others.len()].iter().enumerate() {
+                let reach2 = if i < leaders { sensed } else { drawn };
+                let mirrored = &mut near[i / 64 * count + first..][..others.len()];
+                let mut row = 0;
+                for j in (i + 1).saturating_sub(first)..others.len() {
+                    let dx = others[j].x - agent.x;
+                    let dy = others[j].y - agent.y;
                     if (dx * dx + dy * dy).simd_le(reach2).any_true() {
-                        self.near[i * self.near_words + j / 64] |= 1 << (j % 64);
-                        self.near[j * self.near_words + i / 64] |= 1 << (i % 64);
+                        row |= 1 << j;
+                        mirrored[j] |= 1 << (i % 64);
                     }
                 }
+                near[word * count + i] |= row;
             }
         }
     }
@@ -345,114 +357,111 @@ impl<S: Simd> Block<S> {
     /// Leaders sense: all POIs, then the other agents, each in ascending order.
     #[inline(always)]
     fn sense(&mut self, pois: &[Vec2]) {
-        let world = &self.world;
-        for leader in 0..world.leaders as usize {
-            let (x, y, hx, hy) = (self.x[leader], self.y[leader], self.hx[leader], self.hy[leader]);
-            let mut sums = [splat(self.simd, 0.0); 4];
+        let Block { simd, world, agents, near, inputs, .. } = self;
+        for (leader, (agent, inputs)) in agents.iter().zip(inputs).enumerate() {
+            let &Agent { x, y, hx, hy, .. } = agent;
+            let mut sums = [splat(*simd, 0.0); 4];
             for poi in pois {
-                let dx = splat(self.simd, poi.x) - x;
-                let dy = splat(self.simd, poi.y) - y;
+                let dx = splat(*simd, poi.x) - x;
+                let dy = splat(*simd, poi.y) - y;
                 sense::sense::<S>(world, world.poi_range2, dx, dy, hx, hy, &mut sums);
             }
-            let inputs = &mut self.inputs[leader * INPUTS..(leader + 1) * INPUTS];
-            for (input, sum) in inputs.iter_mut().zip(sums) {
+            let (of_pois, of_agents) = inputs.split_at_mut(4);
+            for (input, sum) in of_pois.iter_mut().zip(sums) {
                 *input = sum * world.poi_share;
             }
-            let mut sums = [splat(self.simd, 0.0); 4];
-            let near = &self.near[leader * self.near_words..(leader + 1) * self.near_words];
-            let (xs, ys) = (&self.x, &self.y);
-            each_bit(
+            let mut sums = [splat(*simd, 0.0); 4];
+            each_near(
                 near,
+                agents,
+                leader,
                 #[inline(always)]
-                |agent| {
-                    sense::sense::<S>(world, world.agent_range2, xs[agent] - x, ys[agent] - y, hx, hy, &mut sums);
+                |_, other| {
+                    sense::sense::<S>(world, world.agent_range2, other.x - x, other.y - y, hx, hy, &mut sums);
                 },
             );
-            for (input, sum) in inputs[4..].iter_mut().zip(sums) {
+            for (input, sum) in of_agents.iter_mut().zip(sums) {
                 *input = sum * world.agent_share;
             }
         }
     }
 
-    /// Leaders decide where to turn and how fast to go: layer by layer, all leaders' sums first, then all their tanh.
+    /// Leaders decide where to turn and how fast to go.
     #[inline(always)]
     fn decide(&mut self) {
-        let world = &self.world;
-        let (leaders, parameters) = (world.leaders as usize, world.parameters as usize);
-        let [mut from, mut to] = self.hidden.each_mut().map(|units| &mut units[..]);
-        from[..leaders * INPUTS].copy_from_slice(&self.inputs);
+        let Block { world, agents, weights, inputs, hidden, outputs, .. } = self;
         let mut first = 0;
-        for layer in 0..world.layers as usize {
-            let (inputs, units) = (world.widths[layer] as usize, world.widths[layer + 1] as usize);
-            for leader in 0..leaders {
-                let from = &from[leader * inputs..(leader + 1) * inputs];
-                let to = &mut to[leader * units..(leader + 1) * units];
-                let weights = &self.weights[leader * parameters + first..];
-                let mut unit = 0;
-                while unit < units {
-                    let (to, weights) = (&mut to[unit..], &weights[unit * (inputs + 1)..]);
-                    unit += match together(units - unit) {
-                        10 => put(to, policy::weigh::<S, 10>(from, weights)),
-                        4 => put(to, policy::weigh::<S, 4>(from, weights)),
-                        2 => put(to, policy::weigh::<S, 2>(from, weights)),
-                        _ => put(to, policy::weigh::<S, 1>(from, weights)),
-                    };
+        let [mut to, mut from] = hidden.each_mut().map(|units| &mut units[..]);
+        for (layer, widths) in world.widths[..=world.layers as usize].windows(2).enumerate() {
+            let [rows, columns] = [widths[0] as usize, widths[1] as usize];
+            let from_inputs = inputs.as_flattened();
+            let inputs = if layer == 0 { from_inputs } else { &*from };
+            let count = (rows + 1) * columns;
+            let units = &mut to[..world.leaders as usize * columns];
+            let policies =
+                weights.chunks_exact(world.parameters as usize).map(|weights| &weights[first..first + count]);
+            let leaders = inputs.chunks_exact(rows).zip(units.chunks_exact_mut(columns)).zip(policies);
+            for ((inputs, units), weights) in leaders {
+                // The first layer's inputs are as many as everyone's, which the compiler makes use of.
+                match <&[S::f32s; INPUTS]>::try_from(inputs) {
+                    Ok(inputs) => weigh::<S>(inputs, units, weights),
+                    Err(_) => weigh::<S>(inputs, units, weights),
                 }
             }
-            // In short loops the processor sees far enough ahead to keep its units busy.
-            for units in to[..leaders * units].chunks_mut(self.halves.len()) {
-                for (half, &unit) in self.halves.iter_mut().zip(&*units) {
+            // All leaders' tanh at once, and in short loops: the processor sees far enough ahead to keep its units busy.
+            let (eights, rest) = units.as_chunks_mut::<8>();
+            for units in eights {
+                let mut halves = [(units[0], units[0]); 8];
+                for (half, &unit) in halves.iter_mut().zip(&*units) {
                     *half = policy::activate::<S>(unit);
                 }
-                for (unit, &half) in units.iter_mut().zip(&self.halves) {
+                for (unit, &half) in units.iter_mut().zip(&halves) {
                     *unit = math::whole_tangent::<S>(half);
                 }
             }
-            first += (inputs + 1) * units;
+            for unit in rest {
+                *unit = math::whole_tangent::<S>(policy::activate::<S>(*unit));
+            }
+            first += count;
             std::mem::swap(&mut from, &mut to);
         }
-        self.outputs.copy_from_slice(&from[..leaders * OUTPUTS]);
-        for (leader, outputs) in from[..leaders * OUTPUTS].chunks_exact(OUTPUTS).enumerate() {
-            let turn = policy::wanted_turn::<S>(outputs[0]);
-            let (hx, hy) = motion::turn::<S>(world, self.hx[leader], self.hy[leader], turn);
-            self.next[leader] = [hx, hy, policy::wanted_speed::<S>(outputs[1], world.max_speed)];
+        for (agent, (output, units)) in agents.iter_mut().zip(outputs.iter_mut().zip(from.as_chunks::<OUTPUTS>().0)) {
+            *output = *units;
+            let turn = policy::wanted_turn::<S>(units[0]);
+            (agent.hx, agent.hy) = motion::turn::<S>(world, agent.hx, agent.hy, turn);
+            agent.wanted = policy::wanted_speed::<S>(units[1], world.max_speed);
         }
     }
 
     /// Followers count the leaders they see and follow whoever is near.
     #[inline(always)]
     fn follow(&mut self) {
-        let world = &self.world;
-        let (leaders, lanes) = (world.leaders as usize, S::f32s::LEN);
-        for follower in 0..world.followers as usize {
-            let agent = leaders + follower;
-            let (x, y) = (self.x[agent], self.y[agent]);
-            let mut sums = follow::Sums::new(self.simd);
-            let near = &self.near[agent * self.near_words..(agent + 1) * self.near_words];
-            let (xs, ys, counts) = (&self.x, &self.y, &mut self.seen);
-            each_bit(
+        let Block { simd, world, agents, near, followers, counts, .. } = self;
+        let leaders = world.leaders as usize;
+        for (index, (follower, counts)) in followers.iter_mut().zip(counts.chunks_exact_mut(leaders)).enumerate() {
+            let &Agent { x, y, .. } = &agents[leaders + index];
+            let mut sums = follow::Sums::new(*simd);
+            each_near(
                 near,
+                agents,
+                leaders + index,
                 #[inline(always)]
-                |other| {
-                    let seen = follow::influence::<S>(world, xs[other] - x, ys[other] - y, &mut sums);
-                    if other < leaders {
-                        let counts = &mut counts[(follower * leaders + other) * lanes..][..lanes];
-                        let count = S::u32s::from_slice(self.simd, counts);
-                        seen.select(count + 1, count).store_slice(counts);
+                |index, other| {
+                    let seen = follow::influence::<S>(world, other.x - x, other.y - y, &mut sums);
+                    if let Some(count) = counts.get_mut(index) {
+                        *count = seen.select(*count + 1, *count);
                     }
                 },
             );
-            let (force_x, force_y) = follow::force::<S>(world, &sums, x, y);
-            self.forces[follower] = [force_x, force_y];
-            self.influenced[follower] = (sums.repel_count + sums.attract_count).simd_gt(0.0)
+            (follower.force_x, follower.force_y) = follow::force::<S>(world, &sums, x, y);
+            follower.influenced = (sums.repel_count + sums.attract_count).simd_gt(0.0)
                 | follow::wall_near::<S>(world, x, world.map_x)
                 | follow::wall_near::<S>(world, y, world.map_y);
         }
-        for (follower, (&[force_x, force_y], &influenced)) in self.forces.iter().zip(&self.influenced).enumerate() {
-            let agent = leaders + follower;
-            let (hx, hy, speed) = (self.hx[agent], self.hy[agent], self.speed[agent]);
-            let (hx, hy, wanted) = follow::steer::<S>(world, force_x, force_y, influenced, hx, hy, speed);
-            self.next[agent] = [hx, hy, wanted];
+        for (agent, follower) in agents[leaders..].iter_mut().zip(&*followers) {
+            let &mut Agent { hx, hy, speed, .. } = agent;
+            let &Follower { force_x, force_y, influenced } = follower;
+            (agent.hx, agent.hy, agent.wanted) = follow::steer::<S>(world, force_x, force_y, influenced, hx, hy, speed);
         }
     }
 
@@ -460,35 +469,31 @@ impl<S: Simd> Block<S> {
     #[inline(always)]
     fn advance(&mut self) {
         let world = &self.world;
-        for (agent, &[hx, hy, wanted]) in self.next.iter().enumerate() {
-            let (hx, hy) = motion::straighten::<S>(hx, hy);
-            let speed = motion::accelerate::<S>(world, self.speed[agent], wanted);
-            let step = speed * world.dt;
-            self.x[agent] = motion::advance::<S>(self.x[agent], step, hx, world.map_x);
-            self.y[agent] = motion::advance::<S>(self.y[agent], step, hy, world.map_y);
-            self.hx[agent] = hx;
-            self.hy[agent] = hy;
-            self.speed[agent] = speed;
+        for agent in &mut self.agents {
+            (agent.hx, agent.hy) = motion::straighten::<S>(agent.hx, agent.hy);
+            agent.speed = motion::accelerate::<S>(world, agent.speed, agent.wanted);
+            let step = agent.speed * world.dt;
+            agent.x = motion::advance::<S>(agent.x, step, agent.hx, world.map_x);
+            agent.y = motion::advance::<S>(agent.y, step, agent.hy, world.map_y);
         }
     }
 
     /// Records who is near each POI.
     #[inline(always)]
     fn couple(&mut self, pois: &[Vec2], step: usize) {
-        let world = &self.world;
+        let Block { simd, world, agents, sets, .. } = self;
         let (words, lanes) = (world.words as usize, S::f32s::LEN);
-        let zero = S::u32s::simd_from(self.simd, 0);
-        for (index, poi) in pois.iter().enumerate() {
-            let (x, y) = (splat(self.simd, poi.x), splat(self.simd, poi.y));
-            for word in 0..words {
-                let mut set = zero;
-                let agents = word * 32..self.x.len().min(word * 32 + 32);
-                for (bit, agent) in agents.enumerate() {
-                    let near = couple::observes::<S>(world, x - self.x[agent], y - self.y[agent]);
-                    set |= near.select(S::u32s::simd_from(self.simd, 1 << bit), zero);
+        let sets = sets[step * pois.len() * words * lanes..].chunks_exact_mut(words * lanes);
+        for (poi, sets) in pois.iter().zip(sets) {
+            let (x, y) = (splat(*simd, poi.x), splat(*simd, poi.y));
+            for (agents, set) in agents.chunks(32).zip(sets.chunks_exact_mut(lanes)) {
+                let (mut near, mut bit) = (S::u32s::splat(*simd, 0), S::u32s::splat(*simd, 1));
+                for agent in agents {
+                    let observes = couple::observes::<S>(world, x - agent.x, y - agent.y);
+                    near |= observes.select(bit, S::u32s::splat(*simd, 0));
+                    bit += bit;
                 }
-                let at = ((step * pois.len() + index) * words + word) * lanes;
-                set.store_slice(&mut self.sets[at..at + lanes]);
+                near.store_slice(set);
             }
         }
     }
@@ -501,17 +506,18 @@ impl<S: Simd> Block<S> {
 
     /// One lane's agents as they stand; before the first step nothing has been sensed yet.
     fn moments(&self, lane: usize, sensed: bool, moments: &mut [Moment]) {
-        let leaders = self.world.leaders as usize;
-        for (agent, moment) in moments.iter_mut().enumerate() {
-            if sensed && agent < leaders {
-                moment.inputs = std::array::from_fn(|i| self.inputs[agent * INPUTS + i][lane]);
-                moment.outputs = std::array::from_fn(|i| self.outputs[agent * OUTPUTS + i][lane]);
+        let leaders = self.outputs.len();
+        for (index, (agent, moment)) in self.agents.iter().zip(moments).enumerate() {
+            if sensed && index < leaders {
+                moment.inputs = self.inputs[index].map(|input| input[lane]);
+                moment.outputs = self.outputs[index].map(|output| output[lane]);
             } else if sensed {
-                moment.force = self.forces[agent - leaders].map(|component| component[lane]);
+                let follower = &self.followers[index - leaders];
+                moment.force = [follower.force_x[lane], follower.force_y[lane]];
             }
-            moment.position = [self.x[agent][lane], self.y[agent][lane]];
-            moment.heading = [self.hx[agent][lane], self.hy[agent][lane]];
-            moment.speed = self.speed[agent][lane];
+            moment.position = [agent.x[lane], agent.y[lane]];
+            moment.heading = [agent.hx[lane], agent.hy[lane]];
+            moment.speed = agent.speed[lane];
         }
     }
 }
@@ -535,21 +541,32 @@ fn together(left: usize) -> usize {
     }
 }
 
-/// Puts some units where they belong, and tells how many.
+/// One leader's units of one layer, before their tanh.
 #[inline(always)]
-fn put<V: Copy, const UNITS: usize>(to: &mut [V], units: [V; UNITS]) -> usize {
-    to[..UNITS].copy_from_slice(&units);
-    UNITS
+fn weigh<S: Simd>(inputs: &[S::f32s], mut units: &mut [S::f32s], mut weights: &[S::f32s]) {
+    while !units.is_empty() {
+        let count = together(units.len());
+        let (these, weights_of_these);
+        (these, units) = units.split_at_mut(count);
+        (weights_of_these, weights) = weights.split_at((inputs.len() + 1) * count);
+        match count {
+            10 => these.copy_from_slice(&policy::weigh::<S, 10>(inputs, weights_of_these)),
+            4 => these.copy_from_slice(&policy::weigh::<S, 4>(inputs, weights_of_these)),
+            2 => these.copy_from_slice(&policy::weigh::<S, 2>(inputs, weights_of_these)),
+            _ => these.copy_from_slice(&policy::weigh::<S, 1>(inputs, weights_of_these)),
+        }
+    }
 }
 
-/// Calls `f` with the indices of set bits, ascending.
+/// Calls `f` with each agent that may be in reach of this one, and its index, ascending.
 #[inline(always)]
-fn each_bit(words: &[u64], mut f: impl FnMut(usize)) {
-    for (index, &word) in words.iter().enumerate() {
-        let mut word = word;
-        while word != 0 {
-            f(index * 64 + word.trailing_zeros() as usize);
-            word &= word - 1;
+fn each_near<T>(near: &[u64], agents: &[T], agent: usize, mut f: impl FnMut(usize, &T)) {
+    for (word, near) in near.chunks_exact(agents.len()).enumerate() {
+        let mut bits = near[agent];
+        while bits != 0 {
+            let index = word * 64 + bits.trailing_zeros() as usize;
+            f(index, &agents[index]);
+            bits &= bits - 1;
         }
     }
 }
