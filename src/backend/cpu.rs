@@ -394,8 +394,7 @@ impl<S: Simd> Block<S> {
         let [mut to, mut from] = hidden.each_mut().map(|units| &mut units[..]);
         for (layer, widths) in world.widths[..=world.layers as usize].windows(2).enumerate() {
             let [rows, columns] = [widths[0] as usize, widths[1] as usize];
-            let from_inputs = inputs.as_flattened();
-            let inputs = if layer == 0 { from_inputs } else { &*from };
+            let inputs = if layer == 0 { inputs.as_flattened() } else { &*from };
             let count = (rows + 1) * columns;
             let units = &mut to[..world.leaders as usize * columns];
             let policies =
