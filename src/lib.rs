@@ -23,6 +23,7 @@
 //! `backend ▸ kernels`. Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
 
 pub mod backend;
+pub mod bench;
 pub mod cli;
 pub mod config;
 pub mod credit;

@@ -11,23 +11,31 @@ use crate::run::{Machine, Player};
 /// # Errors
 /// There is no such backend here, or no threads.
 pub fn open(options: &RunOptions) -> Result<Player, Error> {
+    Ok(open_gpu(options)?.map_or_else(cpu, player))
+}
+
+/// The GPU that was asked for, if any; `--threads` holds for the whole process.
+///
+/// # Errors
+/// There is no such GPU here, or no threads.
+pub fn open_gpu(options: &RunOptions) -> Result<Option<GpuEpisodes>, Error> {
     start_threads(options)?;
     let named = options.adapter.clone().map(Choice::Named);
     match (options.backend, named) {
         (BackendChoice::Cpu, Some(_)) => {
             Err(Error::Usage("--adapter names a GPU, --backend cpu uses none; leave out one of the two".into()))
         }
-        (BackendChoice::Cpu, None) => Ok(cpu()),
+        (BackendChoice::Cpu, None) => Ok(None),
         (BackendChoice::Auto, None) => match gpu(Choice::Real) {
-            Err(DeviceError::NoAdapter | DeviceError::NoRealAdapter { .. }) => Ok(cpu()),
+            Err(DeviceError::NoAdapter | DeviceError::NoRealAdapter { .. }) => Ok(None),
             Err(error) => {
                 say(format_args!("note: no GPU is used: {error}"));
-                Ok(cpu())
+                Ok(None)
             }
-            opened => Ok(opened?),
+            opened => Ok(Some(opened?)),
         },
-        (BackendChoice::Auto | BackendChoice::Gpu, Some(named)) => Ok(gpu(named)?),
-        (BackendChoice::Gpu, None) => Ok(gpu(Choice::Any)?),
+        (BackendChoice::Auto | BackendChoice::Gpu, Some(named)) => Ok(Some(gpu(named)?)),
+        (BackendChoice::Gpu, None) => Ok(Some(gpu(Choice::Any)?)),
     }
 }
 
@@ -41,16 +49,24 @@ pub fn start_threads(options: &RunOptions) -> Result<(), Error> {
     started.map_err(|error| Error::Usage(format!("--threads {threads} cannot be started: {error}")))
 }
 
-fn gpu(choice: Choice) -> Result<Player, DeviceError> {
-    let backend = GpuEpisodes::new(device::open(choice)?)?;
+fn gpu(choice: Choice) -> Result<GpuEpisodes, DeviceError> {
+    GpuEpisodes::new(device::open(choice)?)
+}
+
+fn player(backend: GpuEpisodes) -> Player {
+    let machine = machine(&backend);
+    (Box::new(backend), machine)
+}
+
+/// What a GPU backend runs on.
+pub fn machine(backend: &GpuEpisodes) -> Machine {
     let adapter = &backend.gpu().adapter;
-    let machine = Machine {
+    Machine {
         backend: "gpu".into(),
         adapter: Some(adapter.name.clone()),
         driver: Some(adapter.driver.clone()),
         threads: rayon::current_num_threads(),
-    };
-    Ok((Box::new(backend), machine))
+    }
 }
 
 /// The backend that is always there.

@@ -1,29 +1,19 @@
 //! `flotilla bench`: how fast teams are played, alone and within whole generations.
 
-use std::cell::RefCell;
-use std::hint::black_box;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::time::{Duration, Instant};
 
 use fearless_simd::Level;
 use serde_json::json;
 
 use super::{BackendChoice, Error, Overrides, RunOptions, backend, print};
 use crate::backend::cpu::{Cpu, level_name};
-use crate::backend::{Backend, Group};
+use crate::bench::{self, Measure, Player};
 use crate::config::{self, Config};
-use crate::credit::Credit;
-use crate::evolve::{Key, Purpose, form_teams, random_policy};
 use crate::run::Machine;
-use crate::trainer::Trainer;
-use crate::world::World;
 
-/// Team counts of the table.
+/// Team counts of the table, and of the JSON object.
 const TEAMS: [u32; 3] = [50, 4096, 131_072];
-/// Timed repeats, of which the median counts, and the least time that each takes.
-const REPEATS: usize = 5;
-const LEAST: Duration = Duration::from_millis(200);
+const JSON_TEAMS: u32 = 4096;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -33,35 +23,31 @@ pub struct Args {
     overrides: Overrides,
     #[command(flatten)]
     run: RunOptions,
-    /// Teams of a generation [default: 50, 4096 and 131072; with --json, 4096]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=config::MAX_POPULATION as i64))]
-    teams: Option<u32>,
+    /// Teams of a generation, one or several [default: 50,4096,131072; with --json, 4096]
+    #[arg(long, value_name = "N,…", value_delimiter = ',',
+        value_parser = clap::value_parser!(u32).range(2..=config::MAX_POPULATION as i64))]
+    teams: Vec<u32>,
+    /// Steps of an episode, one or several [default: the config's]
+    #[arg(long, value_name = "N,…", value_delimiter = ',',
+        value_parser = clap::value_parser!(u32).range(1..=config::MAX_STEPS as i64))]
+    steps: Vec<u32>,
+    /// Agents of a team, one or several: leaders and followers in the config's ratio, in groups of one leader and one
+    /// POI [default: the config's]
+    #[arg(long, value_name = "N,…", value_delimiter = ',',
+        value_parser = clap::value_parser!(u32).range(1..=config::MAX_AGENTS as i64))]
+    agents: Vec<u32>,
+    /// Leave whole generations out
+    #[arg(long)]
+    rollout_only: bool,
     /// Instruction set of the CPU backend, of those that this processor has [default: the widest]
     #[arg(long, value_name = "NAME")]
     instructions: Option<String>,
-    /// Print one JSON object
+    /// Print JSON objects, one a line
     #[arg(long)]
     json: bool,
 }
 
-/// What was measured at one number of teams.
-struct Measure {
-    teams: usize,
-    agents: usize,
-    steps: usize,
-    /// Seconds of one rollout (episodes, record and scores) and of one generation (that, selection and mutation).
-    rollout: f64,
-    generation: f64,
-    mean_g: f64,
-}
-
-impl Measure {
-    fn team_steps(&self) -> f64 {
-        (self.teams * self.steps) as f64
-    }
-}
-
-/// Prints a table, a line a number of teams, or one JSON object.
+/// Prints a table, or JSON objects: a line for every combination of teams, steps and agents.
 pub fn run(args: Args) -> Result<(), Error> {
     let (name, text) = match &args.config {
         Some(path) => (path.display().to_string(), config::read_file(path)?),
@@ -70,128 +56,122 @@ pub fn run(args: Args) -> Result<(), Error> {
             ("configs/generally_forward.toml".into(), text.into())
         }
     };
-    let mut config = Config::read(&text, &name, &[], &args.overrides.list())?;
-    config.learning.trials = 1;
-    config.learning.generations = config::MAX_GENERATIONS;
-    let (mut backend, machine) = open(&args)?;
-    let counts = match args.teams {
-        Some(teams) => vec![teams],
-        None if args.json => vec![TEAMS[1]],
-        None => TEAMS.to_vec(),
-    };
+    let config = Config::read(&text, &name, &[], &args.overrides.list())?;
+    let configs = combinations(&config, &args)?;
+    let (mut player, machine) = open(&args)?;
     if !args.json {
-        print(&format!(
-            "{} on {}\n{:>8} {:>14} {:>14} {:>16} {:>16}\n",
-            name,
-            backend.describe(),
-            "teams",
-            "rollouts/s",
-            "generations/s",
-            "team-steps/s",
-            "of rollout alone"
-        ))?;
+        print(&format!("{name} on {}\n{HEADER}\n", player.backend().describe()))?;
     }
-    for teams in counts {
-        let measure = measure(&config, teams as usize, &mut *backend)?;
+    for config in configs {
+        let measure = bench::measure(&config, &mut player, !args.rollout_only)?;
         print(&if args.json { json(&measure, &machine) } else { line(&measure) })?;
     }
-    Ok(())
+    if args.json { Ok(()) } else { print(LEGEND) }
 }
 
-fn open(args: &Args) -> Result<(Box<dyn Backend>, Machine), Error> {
-    let Some(name) = &args.instructions else { return backend::open(&args.run) };
-    if args.run.backend == BackendChoice::Gpu {
-        return Err(Error::Usage("--instructions is for the CPU backend; leave out --backend gpu".into()));
-    }
-    let levels = Cpu::levels();
-    let chosen = levels.iter().find(|level| level_name(**level).eq_ignore_ascii_case(name));
-    let Some(&level) = chosen else {
-        let names: Vec<_> = levels.iter().map(|level| level_name(*level)).collect();
-        return Err(Error::Usage(format!("--instructions: found {name}, this processor has {}", names.join(", "))));
+/// The config of every row.
+fn combinations(config: &Config, args: &Args) -> Result<Vec<Config>, Error> {
+    let own_agents = [config.clone()];
+    let laid_out = |&agents: &u32| {
+        bench::with_agents(config, agents as usize).map_err(|message| Error::Usage(format!("--agents: {message}")))
     };
-    backend::start_threads(&args.run)?;
-    let (_, machine) = backend::cpu();
-    Ok((Box::new(Cpu::at_level(level)), machine))
-}
-
-fn measure(config: &Config, teams: usize, backend: &mut dyn Backend) -> Result<Measure, Error> {
-    let mut config = config.clone();
-    config.learning.population = teams;
-    config.learning.elites = config.learning.elites.min(teams);
-    let world = World::new(&config);
-    let (rollout, mean_g) = rollout(&config, &world, backend)?;
-    let mut trainer = Trainer::new(vec![config]);
-    let generation = median_seconds(|| trainer.advance(backend).map(drop))?;
-    Ok(Measure { teams, agents: world.agents(), steps: world.steps(), rollout, generation, mean_g })
-}
-
-/// Seconds of one rollout of random policies, scored as in training, and the mean G.
-fn rollout(config: &Config, world: &World, backend: &mut dyn Backend) -> Result<(f64, f64), Error> {
-    thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
-    let (population, leaders, seed) = (config.learning.population, world.leaders(), config.learning.seed);
-    let mut weights = vec![0.0; leaders * population * world.parameters()];
-    let key = Key::new(seed, 0, Purpose::Weights);
-    for (policy, weights) in weights.chunks_exact_mut(world.parameters()).enumerate() {
-        random_policy(Level::new(), key.at(0, policy / population, policy % population), weights);
-    }
-    let mut teams = vec![0; population * leaders];
-    form_teams(Key::new(seed, 0, Purpose::Teams), 0, leaders, &mut teams);
-    let group = Group { world, starts: &world.starts, weights: &weights, policies: population, teams: &teams };
-    let observed = AtomicU64::new(0);
-    let seconds = median_seconds(|| {
-        observed.store(0, Relaxed);
-        backend.rollout(&[group], &|episode| {
-            CREDIT.with_borrow_mut(|(credit, scores)| {
-                scores.resize(leaders, 0.0);
-                let pois = credit.score(&episode, world, config.learning.fitness, scores);
-                observed.fetch_add(u64::from(pois), Relaxed);
-                black_box(scores);
-            });
-        })
-    })?;
-    Ok((seconds, observed.into_inner() as f64 / (population * world.pois.len()) as f64))
-}
-
-/// The median over [`REPEATS`] of the time of one call, each repeat calling for [`LEAST`] at least.
-fn median_seconds<E: Into<Error>>(mut call: impl FnMut() -> Result<(), E>) -> Result<f64, Error> {
-    call().map_err(Into::into)?;
-    let mut seconds = Vec::with_capacity(REPEATS);
-    for _ in 0..REPEATS {
-        let (start, mut calls) = (Instant::now(), 0);
-        while calls == 0 || start.elapsed() < LEAST {
-            call().map_err(Into::into)?;
-            calls += 1;
+    let laid_out = args.agents.iter().map(laid_out).collect::<Result<Vec<_>, _>>()?;
+    let worlds = if laid_out.is_empty() { &own_agents[..] } else { &laid_out };
+    let own_steps = [config.world.steps as u32];
+    let steps = if args.steps.is_empty() { &own_steps[..] } else { &args.steps };
+    let teams = match (&args.teams[..], args.json) {
+        ([], false) => &TEAMS[..],
+        ([], true) => &[JSON_TEAMS],
+        (teams, _) => teams,
+    };
+    let mut configs = Vec::with_capacity(worlds.len() * steps.len() * teams.len());
+    for world in worlds {
+        for &steps in steps {
+            for &teams in teams {
+                let mut config = world.clone();
+                config.world.steps = steps as usize;
+                config.learning.population = teams as usize;
+                config.learning.elites = config.learning.elites.min(teams as usize);
+                config.learning.trials = 1;
+                config.learning.generations = config::MAX_GENERATIONS;
+                configs.push(config);
+            }
         }
-        seconds.push(start.elapsed().as_secs_f64() / f64::from(calls));
     }
-    seconds.sort_by(f64::total_cmp);
-    Ok(seconds[REPEATS / 2])
+    Ok(configs)
 }
+
+fn open(args: &Args) -> Result<(Player, Machine), Error> {
+    let level = match &args.instructions {
+        None => Level::new(),
+        Some(_) if args.run.backend == BackendChoice::Gpu => {
+            return Err(Error::Usage("--instructions is for the CPU backend; leave out --backend gpu".into()));
+        }
+        Some(name) => {
+            let levels = Cpu::levels();
+            let Some(&level) = levels.iter().find(|level| level_name(**level).eq_ignore_ascii_case(name)) else {
+                let names: Vec<_> = levels.iter().map(|level| level_name(*level)).collect();
+                let names = names.join(", ");
+                return Err(Error::Usage(format!("--instructions: found {name}, this processor has {names}")));
+            };
+            backend::start_threads(&args.run)?;
+            return Ok((Player::Cpu(Cpu::at_level(level), level), backend::cpu().1));
+        }
+    };
+    Ok(match backend::open_gpu(&args.run)? {
+        Some(gpu) => {
+            let machine = backend::machine(&gpu);
+            (Player::Gpu(Box::new(gpu)), machine)
+        }
+        None => (Player::Cpu(Cpu::at_level(level), level), backend::cpu().1),
+    })
+}
+
+const HEADER: &str = "   teams  agents  steps   rollouts/s  team-steps/s  ns/agent-step  generations  of ceiling";
+const LEGEND: &str = "\
+A rollout plays and scores all teams once; generations also select and mutate: their rate, of rollouts alone.
+The ceiling is what chains of f32 sums and products in registers reach, none fused; benches/README.md says what counts.
+";
 
 fn line(measure: &Measure) -> String {
+    let Measure { teams, steps, rollout, generation, .. } = measure;
+    let agents = measure.agents();
+    let generations = generation.map_or("-".into(), |generation| format!("{:.0}%", 100.0 * rollout / generation));
     format!(
-        "{:>8} {:>14.2} {:>14.2} {:>16.4e} {:>15.0}%\n",
-        measure.teams,
-        1.0 / measure.rollout,
-        1.0 / measure.generation,
-        measure.team_steps() / measure.rollout,
-        100.0 * measure.rollout / measure.generation,
+        "{teams:>8} {agents:>7} {steps:>6} {:>12.3} {:>13.4e} {:>14.2} {generations:>12} {:>10.0}%\n",
+        1.0 / rollout,
+        measure.team_steps() / rollout,
+        1e9 * rollout / (measure.team_steps() * agents as f64),
+        100.0 * measure.ceiling_share(),
     )
 }
 
 fn json(measure: &Measure, machine: &Machine) -> String {
-    let Measure { teams, agents, steps, rollout, generation, mean_g } = measure;
-    let object = json!({
+    let Measure { teams, leaders, followers, pois, steps, rollout, mean_g, reach, operations, ceiling, .. } = measure;
+    let agents = measure.agents();
+    let mut object = json!({
         "backend": machine.backend,
         "adapter": machine.adapter,
         "threads": machine.threads,
         "teams": teams,
         "agents": agents,
+        "leaders": leaders,
+        "followers": followers,
+        "pois": pois,
         "steps": steps,
+        "rollouts_per_s": 1.0 / rollout,
         "team_steps_per_s": measure.team_steps() / rollout,
-        "generations_per_s": 1.0 / generation,
-        "generation_team_steps_per_s": measure.team_steps() / generation,
+        "ns_per_agent_step": 1e9 * rollout / (measure.team_steps() * agents as f64),
         "mean_g": mean_g,
+        "pairs_in_reach": reach.pairs,
+        "operations_per_team_step": operations,
+        "ceiling_operations_per_s": ceiling,
+        "ceiling_share": measure.ceiling_share(),
     });
+    if let Some(generation) = measure.generation {
+        object["generations_per_s"] = json!(1.0 / generation);
+        object["generation_team_steps_per_s"] = json!(measure.team_steps() / generation);
+        object["generation_share"] = json!(rollout / generation);
+    }
     format!("{object}\n")
 }

@@ -47,6 +47,27 @@ pub fn places() -> Vec<[i32; 2]> {
     places
 }
 
+/// Where everything stands.
+pub struct Positions {
+    pub leaders: Vec<[i32; 2]>,
+    /// Group by group.
+    pub followers: Vec<[i32; 2]>,
+    pub pois: Vec<[i32; 2]>,
+    pub map: [i32; 2],
+}
+
+/// Lays out groups with so many followers each, on the first of the [`places`].
+pub fn positions(places: &[[i32; 2]], followers: &[usize]) -> Positions {
+    let leaders: Vec<_> = (1..).zip(followers).map(|(group, _)| [SPACING * group, LEADER_Y]).collect();
+    let around = |(&[x, y], &count): (&[i32; 2], &usize)| places[..count].iter().map(move |[dx, dy]| [x + dx, y + dy]);
+    Positions {
+        followers: leaders.iter().zip(followers).flat_map(around).collect(),
+        pois: leaders.iter().map(|[x, y]| [*x, y + SPACING]).collect(),
+        map: [(SPACING * (leaders.len() as i32 + 1)).max(50), 50],
+        leaders,
+    }
+}
+
 /// What is wrong with the values of one of [`AXES`].
 pub(super) fn blame<'a>(key: &str, values: &'a [Value]) -> impl Iterator<Item = String> + 'a {
     let allowed = if key == FOLLOWERS { 0..=MAX_FOLLOWERS } else { 1..=MAX_GROUPS };
@@ -106,24 +127,18 @@ impl Layout {
         let Some(axes) = self.axes else { return vec![] };
         let value = |axis: Option<usize>| axis.and_then(|axis| count(&grid.axes[axis].0.values[values[axis]]));
         let followers = value(axes[0]).unwrap_or(DEFAULT_FOLLOWERS);
-        let groups = value(axes[1]).unwrap_or(DEFAULT_GROUPS) as i32;
-        let leaders: Vec<_> = (1..=groups).map(|group| [SPACING * group, LEADER_Y]).collect();
-        let around = |&[x, y]: &[i32; 2]| self.places[..followers].iter().map(move |[dx, dy]| [x + dx, y + dy]);
-        let positions =
-            |list: Vec<[i32; 2]>| Value::Array(list.into_iter().map(|place| place.to_vec().into()).collect());
+        let groups = value(axes[1]).unwrap_or(DEFAULT_GROUPS);
+        let Positions { leaders, followers, pois, map } = positions(&self.places, &vec![followers; groups]);
+        let list = |list: Vec<[i32; 2]>| Value::Array(list.into_iter().map(|place| place.to_vec().into()).collect());
         let named = axes.iter().flatten().next().map_or(0, |&axis| axis);
         let name = format!("{}[{}]", axis_name(&grid.axes[named].0.key), values[named]);
         let set = |key: &str, value: Value| Override::new(format!("world.{key}"), value, &*name);
-        let mut overrides = vec![
-            set("leaders", positions(leaders.clone())),
-            set("followers", positions(leaders.iter().flat_map(around).collect())),
-        ];
+        let mut overrides = vec![set("leaders", list(leaders)), set("followers", list(followers))];
         if self.pois {
-            let ahead = leaders.iter().map(|[x, y]| [*x, y + SPACING]).collect();
-            overrides.push(set("pois", positions(ahead)));
+            overrides.push(set("pois", list(pois)));
         }
         if self.map {
-            overrides.push(set("map", vec![(SPACING * (groups + 1)).max(50), 50].into()));
+            overrides.push(set("map", map.to_vec().into()));
         }
         overrides
     }

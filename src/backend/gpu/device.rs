@@ -6,6 +6,7 @@
 use std::fmt;
 use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 use bytemuck::Pod;
 use pollster::block_on;
@@ -225,8 +226,9 @@ impl fmt::Debug for Gpu {
 pub fn open(request: impl Into<Request>) -> Result<Gpu, DeviceError> {
     let request = request.into();
     let (adapter, info) = choose(&request.choice)?;
-    let features = adapter.features() & wgpu::Features::PASSTHROUGH_SHADERS;
-    let own = adapter.get_info().backend == wgpu::Backend::Vulkan && !features.is_empty();
+    let (passthrough, timestamps) = (wgpu::Features::PASSTHROUGH_SHADERS, wgpu::Features::TIMESTAMP_QUERY);
+    let features = adapter.features() & (passthrough | timestamps);
+    let own = adapter.get_info().backend == wgpu::Backend::Vulkan && features.contains(passthrough);
     let candidates = match request.pass {
         Some(Pass::NoContraction) if !own => {
             let reason = "the no-contraction pass needs Vulkan".into();
@@ -541,17 +543,99 @@ impl Gpu {
         buffers: &wgpu::BindGroup,
         workgroups: [u32; 3],
     ) -> Result<(), DeviceError> {
-        let [x, y, z] = workgroups;
+        self.submit(what, pipeline, buffers, workgroups, None)
+    }
+
+    fn submit(
+        &self,
+        what: &str,
+        pipeline: &wgpu::ComputePipeline,
+        buffers: &wgpu::BindGroup,
+        [x, y, z]: [u32; 3],
+        watch: Option<&Stopwatch>,
+    ) -> Result<(), DeviceError> {
         self.scoped(what, || {
             let mut encoder = self.device.create_command_encoder(&Default::default());
-            let mut pass = encoder.begin_compute_pass(&Default::default());
+            let mut pass = encoder.begin_compute_pass(&timed(watch));
             pass.set_pipeline(pipeline);
             pass.set_bind_group(0, buffers, &[]);
             pass.dispatch_workgroups(x, y, z);
             drop(pass);
+            watch.inspect(|watch| watch.stop(&mut encoder));
             self.queue.submit([encoder.finish()]);
         })
     }
+
+    /// How long one dispatch takes: by the device's clock where it has one that can be asked, else from submitting it
+    /// to seeing it done.
+    pub fn time(
+        &self,
+        what: &str,
+        pipeline: &wgpu::ComputePipeline,
+        buffers: &wgpu::BindGroup,
+        workgroups: [u32; 3],
+    ) -> Result<Duration, DeviceError> {
+        let watch = self.stopwatch()?;
+        self.wait()?;
+        let start = Instant::now();
+        self.submit(what, pipeline, buffers, workgroups, watch.as_ref())?;
+        self.wait()?;
+        let elapsed = start.elapsed();
+        match watch {
+            // A clock that stands still (some software drivers) tells nothing.
+            Some(watch) => Ok(Some(watch.read(self)?).filter(|time| !time.is_zero()).unwrap_or(elapsed)),
+            None => Ok(elapsed),
+        }
+    }
+
+    /// A stopwatch, if the device's clock can be asked.
+    pub fn stopwatch(&self) -> Result<Option<Stopwatch>, DeviceError> {
+        if !self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY) {
+            return Ok(None);
+        }
+        let bytes = 2 * u64::from(wgpu::QUERY_SIZE);
+        let queries = self.scoped("timestamps", || {
+            let (label, ty) = (Some("timestamps"), wgpu::QueryType::Timestamp);
+            self.device.create_query_set(&wgpu::QuerySetDescriptor { label, ty, count: 2 })
+        })?;
+        use wgpu::BufferUsages as Usage;
+        let ticks = self.buffer("timestamps", bytes, Usage::QUERY_RESOLVE | Usage::COPY_SRC)?;
+        let landing = self.buffer("timestamps, read back", bytes, Usage::COPY_DST | Usage::MAP_READ)?;
+        Ok(Some(Stopwatch { queries, ticks, landing }))
+    }
+}
+
+/// Times one compute pass by the device's clock.
+pub struct Stopwatch {
+    queries: wgpu::QuerySet,
+    ticks: wgpu::Buffer,
+    landing: wgpu::Buffer,
+}
+
+impl Stopwatch {
+    /// Hands the times of the pass over, after it.
+    pub fn stop(&self, encoder: &mut wgpu::CommandEncoder) {
+        encoder.resolve_query_set(&self.queries, 0..2, &self.ticks, 0);
+        encoder.copy_buffer_to_buffer(&self.ticks, 0, &self.landing, 0, self.ticks.size());
+    }
+
+    /// How long the pass took that was submitted, and waited for, last.
+    pub fn read(&self, gpu: &Gpu) -> Result<Duration, DeviceError> {
+        let read = |bytes: &[u8]| bytemuck::pod_collect_to_vec::<u8, u64>(bytes);
+        let ticks = gpu.mapped(&self.landing, 0..self.landing.size(), read)?;
+        let period = f64::from(gpu.queue.get_timestamp_period());
+        Ok(Duration::from_nanos((ticks[1].saturating_sub(ticks[0]) as f64 * period) as u64))
+    }
+}
+
+/// A compute pass, timed if there is a stopwatch.
+pub fn timed(watch: Option<&Stopwatch>) -> wgpu::ComputePassDescriptor<'_> {
+    let timestamp_writes = watch.map(|watch| wgpu::ComputePassTimestampWrites {
+        query_set: &watch.queries,
+        beginning_of_pass_write_index: Some(0),
+        end_of_pass_write_index: Some(1),
+    });
+    wgpu::ComputePassDescriptor { label: None, timestamp_writes }
 }
 
 /// An error with all its causes.

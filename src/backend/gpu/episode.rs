@@ -4,12 +4,13 @@
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
+use std::time::{Duration, Instant};
 
 use bytemuck::{Pod, Zeroable};
 use glam::Vec2;
 use rayon::prelude::*;
 
-use super::device::{Binding, DeviceError, Gpu, Layout};
+use super::device::{Binding, DeviceError, Gpu, Layout, Stopwatch, timed};
 use super::exact;
 use crate::backend::{Backend, BackendError, Episode, Group, Moment, Strided, Trace, Visit};
 use crate::world::{Constants, World};
@@ -261,6 +262,24 @@ pub struct GpuEpisodes {
     batch_bytes: u64,
     /// Changes the shader's text, so that tests can show that a change is noticed.
     edit: fn(String) -> String,
+    stages: Stages,
+}
+
+/// Where the time of rollouts went. The CPU's stages follow each other; the GPU works beside all of them.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Stages {
+    /// Cutting the batch up and gathering its weights.
+    pub gather: Duration,
+    /// Handing everything to the driver.
+    pub upload: Duration,
+    /// Waiting for the GPU.
+    pub wait: Duration,
+    /// Mapping the record.
+    pub read_back: Duration,
+    /// Reading and scoring the record.
+    pub score: Duration,
+    /// Playing, by the GPU's own clock; 0 where that was not asked for or there is none.
+    pub gpu: Duration,
 }
 
 /// The device's side of one batch; buffers only grow.
@@ -275,6 +294,7 @@ struct Buffers {
     states: Option<wgpu::Buffer>,
     record_back: Option<wgpu::Buffer>,
     moments_back: Option<wgpu::Buffer>,
+    watch: Option<Stopwatch>,
     /// What to wait for.
     submitted: Option<wgpu::SubmissionIndex>,
 }
@@ -314,6 +334,7 @@ impl GpuEpisodes {
             staging: Vec::new(),
             batch_bytes: BATCH_BYTES,
             edit: |text| text,
+            stages: Stages::default(),
         })
     }
 
@@ -326,6 +347,22 @@ impl GpuEpisodes {
     #[doc(hidden)]
     pub fn edited(self, edit: fn(String) -> String) -> GpuEpisodes {
         GpuEpisodes { edit, ..self }
+    }
+
+    /// Asks the GPU's clock too from now on, if it has one.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn use_clock(&mut self) -> Result<(), DeviceError> {
+        for lane in &mut self.lanes {
+            lane.watch = self.gpu.stopwatch()?;
+        }
+        Ok(())
+    }
+
+    /// Where the time went since this was last asked.
+    pub fn take_stages(&mut self) -> Stages {
+        std::mem::take(&mut self.stages)
     }
 
     /// The device it plays on.
@@ -344,7 +381,9 @@ impl GpuEpisodes {
 
     /// Plays all tasks; `done` gets each with the batch's record and moments.
     fn play(&mut self, groups: &[Group<'_>], trace: bool, done: &Done<'_>) -> Result<(), BackendError> {
+        let start = Instant::now();
         let batches = plan(groups, trace, self.room())?;
+        self.stages.gather += start.elapsed();
         for index in 0..=batches.len() {
             if let Some(work) = batches.get(index) {
                 self.submit(index % 2, groups, work, trace)?;
@@ -359,7 +398,10 @@ impl GpuEpisodes {
     /// Hands one batch to the device.
     fn submit(&mut self, lane: usize, groups: &[Group<'_>], work: &Work, trace: bool) -> Result<(), DeviceError> {
         use wgpu::BufferUsages as Usage;
+        let start = Instant::now();
         self.fill_staging(groups, work);
+        let gathered = Instant::now();
+        self.stages.gather += gathered - start;
         // Round by round, each shape's tasks stand together, from where a binding may start.
         let mut tasks: Vec<Task> = Vec::new();
         let mut dispatches: Vec<(Shape, usize, [u32; 3])> = Vec::new();
@@ -421,15 +463,17 @@ impl GpuEpisodes {
                 gpu.bind("episode", &self.layout, &[worlds, tasks, places, weights, record, moments, states])?;
             bound.push((&self.pipelines[&shape], group, grid));
         }
+        let watch = buffers.watch.as_ref();
         let submitted = gpu.scoped("episodes", || {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            let mut pass = encoder.begin_compute_pass(&Default::default());
+            let mut pass = encoder.begin_compute_pass(&timed(watch));
             for (pipeline, group, [x, y, z]) in &bound {
                 pass.set_pipeline(pipeline);
                 pass.set_bind_group(0, group, &[]);
                 pass.dispatch_workgroups(*x, *y, *z);
             }
             drop(pass);
+            watch.inspect(|watch| watch.stop(&mut encoder));
             encoder.copy_buffer_to_buffer(record, 0, record_back, 0, record_bytes);
             if let Some(moments_back) = moments_back {
                 encoder.copy_buffer_to_buffer(moments, 0, moments_back, 0, moment_bytes);
@@ -437,28 +481,38 @@ impl GpuEpisodes {
             gpu.queue.submit([encoder.finish()])
         })?;
         buffers.submitted = Some(submitted);
+        self.stages.upload += gathered.elapsed();
         Ok(())
     }
 
     /// Waits for one batch and hands its record on.
     fn collect(&mut self, lane: usize, work: &Work, trace: bool, done: &Done<'_>) -> Result<(), DeviceError> {
         let buffers = &self.lanes[lane];
+        let start = Instant::now();
         self.gpu.wait_for(buffers.submitted.clone())?;
+        let done_waiting = Instant::now();
         let share_out = |record: &[u8], moments: &[Moment]| {
+            let start = Instant::now();
             let record = bytemuck::cast_slice(record);
             work.shares.par_iter().for_each(|share| done(share, record, moments));
+            start.elapsed()
         };
         let record_bytes = (work.record * size_of::<u32>()) as u64;
         let moment_bytes = (work.moments * size_of::<Moment>()) as u64;
-        match (&buffers.record_back, &buffers.moments_back) {
+        let score = match (&buffers.record_back, &buffers.moments_back) {
             (Some(record), Some(moments)) if trace => self.gpu.mapped(record, 0..record_bytes, |record| {
-                self.gpu.mapped(moments, 0..moment_bytes, |moments| {
-                    share_out(record, bytemuck::cast_slice(moments));
-                })
-            })?,
-            (Some(record), _) => self.gpu.mapped(record, 0..record_bytes, |record| share_out(record, &[])),
+                self.gpu.mapped(moments, 0..moment_bytes, |moments| share_out(record, bytemuck::cast_slice(moments)))
+            })??,
+            (Some(record), _) => self.gpu.mapped(record, 0..record_bytes, |record| share_out(record, &[]))?,
             _ => unreachable!("a batch was submitted"),
+        };
+        if let Some(watch) = &buffers.watch {
+            self.stages.gpu += watch.read(&self.gpu)?;
         }
+        self.stages.wait += done_waiting - start;
+        self.stages.score += score;
+        self.stages.read_back += done_waiting.elapsed().saturating_sub(score);
+        Ok(())
     }
 
     /// Gathers the weights of every task.

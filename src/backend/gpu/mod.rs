@@ -10,5 +10,5 @@ pub mod probe;
 
 /// The whole text of every shader, with a name for each: what the lints and the exactness tests walk over.
 pub fn shaders() -> Vec<(&'static str, String)> {
-    [vec![("probe", probe::SHADER.into())], episode::shaders()].concat()
+    [vec![("probe", probe::SHADER.into()), ("ceiling", probe::CEILING.into())], episode::shaders()].concat()
 }

@@ -1,7 +1,8 @@
-//! The self-test of a device: small computations whose bits must be the CPU's.
+//! The self-test of a device: small computations whose bits must be the CPU's. And its measure: how fast it computes.
 
 use std::borrow::Cow;
 use std::fmt;
+use std::time::Duration;
 
 use wgpu::BufferUsages;
 
@@ -10,6 +11,7 @@ use super::episode::GpuEpisodes;
 use crate::backend::compare::first_mismatch;
 use crate::backend::cpu::Cpu;
 use crate::backend::{Backend, BackendError, Group};
+use crate::bench::median;
 use crate::config::Config;
 use crate::sample;
 use crate::world::World;
@@ -132,6 +134,47 @@ fn episode(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
         cpu: mismatch.expected,
         gpu: mismatch.found,
     }))
+}
+
+/// The shader of [`ceiling`].
+pub const CEILING: &str = include_str!("../../../shaders/ceiling.wgsl");
+/// Lane operations of a turn of its loop: 8 times 6 products and 6 sums.
+const TURN: u64 = 8 * 12;
+/// Turns of its loop at most: see the episode's `TURNS`.
+const MOST_TURNS: u32 = 4096;
+/// A dispatch that takes so long is long enough to be timed, and short enough for any driver's patience.
+const LEAST: Duration = Duration::from_millis(20);
+
+/// f32 sums and products a second, not fused, that the device does at most under its pass: the median of a few repeats.
+///
+/// # Errors
+/// When the device fails.
+pub fn ceiling(gpu: &Gpu) -> Result<f64, DeviceError> {
+    let layout = gpu.layout("ceiling", &[Binding::Read, Binding::Read, Binding::Write])?;
+    let pipeline = gpu.pipeline("ceiling", CEILING, "ceiling", &layout)?;
+    let numbers = gpu.upload("ceiling's numbers", &[1.000_000_1f32, 0.25, -1.0, 0.0], BufferUsages::STORAGE)?;
+    let result = gpu.buffer("ceiling's result", (WORKGROUP * size_of::<f32>()) as u64, BufferUsages::STORAGE)?;
+    let run = |turns: u32, workgroups: u32| -> Result<(Duration, f64), DeviceError> {
+        let turns_buffer = gpu.upload("ceiling's turns", &[turns; 4], BufferUsages::STORAGE)?;
+        let bound = [&numbers, &turns_buffer, &result].map(|buffer| buffer.as_entire_buffer_binding());
+        let buffers = gpu.bind("ceiling", &layout, &bound)?;
+        let time = gpu.time("ceiling", &pipeline, &buffers, [workgroups, 1, 1])?;
+        let operations = u64::from(turns) * TURN * u64::from(workgroups) * WORKGROUP as u64;
+        Ok((time, operations as f64 / time.as_secs_f64()))
+    };
+    // As many threads as fill any GPU a few times over, and longer, and then more of them, until it takes a while.
+    let (mut turns, mut workgroups) = (64, 4096);
+    while run(turns, workgroups)?.0 < LEAST {
+        if turns < MOST_TURNS {
+            turns *= 2;
+        } else if workgroups * 2 <= gpu.limits.max_compute_workgroups_per_dimension {
+            workgroups *= 2;
+        } else {
+            break;
+        }
+    }
+    let rates: Result<_, _> = (0..5).map(|_| run(turns, workgroups).map(|(_, rate)| rate)).collect();
+    Ok(median(rates?))
 }
 
 /// Reproducible values that make rounding show: zeros, equal pairs, small integers, sums that nearly cancel, and full

@@ -1,0 +1,243 @@
+//! How fast episodes are played, alone and within whole generations, and how much of what a machine can do that takes.
+
+use std::cell::RefCell;
+use std::hint::black_box;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+
+use fearless_simd::Level;
+
+use crate::backend::cpu::Cpu;
+use crate::backend::gpu::episode::GpuEpisodes;
+use crate::backend::gpu::probe;
+use crate::backend::{Backend, BackendError, Group};
+use crate::config::{Config, Coupling};
+use crate::credit::Credit;
+use crate::evolve::{Key, Purpose, form_teams, random_policy};
+use crate::sweep::layout::{self, MAX_FOLLOWERS, MAX_GROUPS};
+use crate::trainer::Trainer;
+use crate::world::World;
+
+pub mod ceiling;
+pub mod operations;
+
+use operations::Reach;
+
+/// Timed repeats, of which the median counts, and the least time that each takes.
+const REPEATS: usize = 5;
+const LEAST: Duration = Duration::from_millis(200);
+/// Repeats of what takes longer than this at a time.
+const FEW_REPEATS: usize = 3;
+const LONG: Duration = Duration::from_secs(2);
+/// Teams that are traced to see who is in reach of whom, and how many pairs are looked at, as far as one team allows.
+const TRACED_TEAMS: usize = 64;
+const TRACED_PAIRS: usize = 1 << 28;
+
+/// What is measured.
+pub enum Player {
+    Cpu(Cpu, Level),
+    Gpu(Box<GpuEpisodes>),
+}
+
+impl Player {
+    pub fn backend(&mut self) -> &mut dyn Backend {
+        match self {
+            Player::Cpu(cpu, _) => cpu,
+            Player::Gpu(gpu) => &mut **gpu,
+        }
+    }
+
+    /// f32 sums and products a second, none fused, that it can do at most: measured now.
+    ///
+    /// # Errors
+    /// When the GPU fails.
+    pub fn ceiling(&self) -> Result<f64, BackendError> {
+        match self {
+            Player::Cpu(_, level) => Ok(ceiling::measure(*level)),
+            Player::Gpu(gpu) => Ok(probe::ceiling(gpu.gpu())?),
+        }
+    }
+}
+
+/// What was measured of one config.
+pub struct Measure {
+    pub teams: usize,
+    pub leaders: usize,
+    pub followers: usize,
+    pub pois: usize,
+    pub steps: usize,
+    /// Seconds of one rollout (episodes, record and scores).
+    pub rollout: f64,
+    /// Seconds of one generation (that, selection and mutation), where it was asked for.
+    pub generation: Option<f64>,
+    /// Mean G of the random teams of the rollout.
+    pub mean_g: f64,
+    pub reach: Reach,
+    /// Lane operations of a team-step, and how many a second the machine can do.
+    pub operations: f64,
+    pub ceiling: f64,
+}
+
+impl Measure {
+    pub fn agents(&self) -> usize {
+        self.leaders + self.followers
+    }
+
+    pub fn team_steps(&self) -> f64 {
+        (self.teams * self.steps) as f64
+    }
+
+    /// The part of the arithmetic ceiling that rollouts reach.
+    pub fn ceiling_share(&self) -> f64 {
+        self.operations * self.team_steps() / self.rollout / self.ceiling
+    }
+}
+
+/// The config with other numbers of agents, leaders and followers in its own ratio as nearly as whole numbers allow,
+/// laid out in the groups of [`layout`], each with a POI.
+///
+/// # Errors
+/// More leaders than groups, or more followers of one leader than there are places for.
+pub fn with_agents(config: &Config, agents: usize) -> Result<Config, String> {
+    let (leaders, followers) = (config.world.leaders.len(), config.world.followers.len());
+    let groups = ((agents * leaders) as f64 / (leaders + followers) as f64).round().max(1.0) as usize;
+    let followers = agents - groups;
+    if groups > MAX_GROUPS || followers.div_ceil(groups) > MAX_FOLLOWERS {
+        return Err(format!(
+            "{agents} agents in the config's ratio are {groups} leaders and {followers} followers; \
+             allowed {MAX_GROUPS} leaders of {MAX_FOLLOWERS} followers"
+        ));
+    }
+    let shares: Vec<_> = (0..groups).map(|g| followers / groups + usize::from(g < followers % groups)).collect();
+    let positions = layout::positions(&layout::places(), &shares);
+    let list = |list: Vec<[i32; 2]>| list.into_iter().map(|place| place.map(f64::from)).collect();
+    let mut config = config.clone();
+    config.world.map = positions.map.map(f64::from);
+    config.world.leaders = list(positions.leaders);
+    config.world.followers = list(positions.followers);
+    config.world.pois = list(positions.pois);
+    let coupling = match &config.world.coupling {
+        Coupling::Same(count) => *count,
+        Coupling::Each(counts) => counts.iter().copied().max().unwrap_or(1),
+    };
+    config.world.coupling = Coupling::Same(coupling.min(agents));
+    Ok(config)
+}
+
+/// Times rollouts of one trial's random teams, and generations of it unless only `rollouts` are wanted.
+///
+/// # Errors
+/// When the backend fails.
+pub fn measure(config: &Config, player: &mut Player, generations: bool) -> Result<Measure, BackendError> {
+    let world = World::new(config);
+    let ceiling = player.ceiling()?;
+    let (rollout, mean_g, reach) = rollout(config, &world, player.backend())?;
+    let generation = match generations {
+        true => {
+            let mut trainer = Trainer::new(vec![config.clone()]);
+            Some(median_seconds(|| trainer.advance(player.backend()).map(drop))?)
+        }
+        false => None,
+    };
+    Ok(Measure {
+        teams: config.learning.population,
+        leaders: world.leaders(),
+        followers: world.followers(),
+        pois: world.pois.len(),
+        steps: world.steps(),
+        rollout,
+        generation,
+        mean_g,
+        operations: operations::per_team_step(&world, &reach),
+        reach,
+        ceiling,
+    })
+}
+
+/// Seconds of one rollout of random policies, scored as in training, the mean G, and who was in reach of whom.
+fn rollout(config: &Config, world: &World, backend: &mut dyn Backend) -> Result<(f64, f64, Reach), BackendError> {
+    thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
+    let (population, leaders, seed) = (config.learning.population, world.leaders(), config.learning.seed);
+    let mut weights = vec![0.0; leaders * population * world.parameters()];
+    let key = Key::new(seed, 0, Purpose::Weights);
+    for (policy, weights) in weights.chunks_exact_mut(world.parameters()).enumerate() {
+        random_policy(Level::new(), key.at(0, policy / population, policy % population), weights);
+    }
+    let mut teams = vec![0; population * leaders];
+    form_teams(Key::new(seed, 0, Purpose::Teams), 0, leaders, &mut teams);
+    let group = Group { world, starts: &world.starts, weights: &weights, policies: population, teams: &teams };
+    let observed = AtomicU64::new(0);
+    let seconds = median_seconds(|| {
+        observed.store(0, Relaxed);
+        backend.rollout(&[group], &|episode| {
+            CREDIT.with_borrow_mut(|(credit, scores)| {
+                scores.resize(leaders, 0.0);
+                let pois = credit.score(&episode, world, config.learning.fitness, scores);
+                observed.fetch_add(u64::from(pois), Relaxed);
+                black_box(scores);
+            });
+        })
+    })?;
+    let mean_g = observed.into_inner() as f64 / (population * world.pois.len()) as f64;
+    let pairs = world.steps() * world.agents() * world.agents();
+    let traced = (TRACED_PAIRS / pairs).clamp(1, TRACED_TEAMS).min(population);
+    // The CPU's, since every backend's is the same.
+    let trace = Cpu::default().trace(&Group { teams: &teams[..traced * leaders], ..group })?;
+    Ok((seconds, mean_g, Reach::of(world, &trace)))
+}
+
+/// The median over a few repeats of the time of one call, each repeat calling for [`LEAST`] at least.
+fn median_seconds<E>(mut call: impl FnMut() -> Result<(), E>) -> Result<f64, E> {
+    let start = Instant::now();
+    call()?;
+    let repeats = if start.elapsed() > LONG { FEW_REPEATS } else { REPEATS };
+    let mut seconds = Vec::with_capacity(repeats);
+    for _ in 0..repeats {
+        let (start, mut calls) = (Instant::now(), 0);
+        while calls == 0 || start.elapsed() < LEAST {
+            call()?;
+            calls += 1;
+        }
+        seconds.push(start.elapsed().as_secs_f64() / f64::from(calls));
+    }
+    Ok(median(seconds))
+}
+
+/// The middle of some (finite) values, of an even number the upper of two.
+pub fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::*;
+
+    fn config() -> Config {
+        let text = include_str!("../../configs/generally_forward.toml");
+        Config::parse(text, "generally_forward.toml").expect("the project's own config")
+    }
+
+    #[test]
+    fn its_own_number_of_agents_is_the_papers_layout() {
+        assert_eq!(World::new(&with_agents(&config(), 12).unwrap()), World::new(&config()));
+    }
+
+    #[test]
+    fn any_number_of_agents_keeps_the_ratio_and_nobody_shares_a_start() {
+        for agents in [1, 2, 3, 12, 24, 100, 256, 768] {
+            let config = with_agents(&config(), agents).unwrap();
+            let world = World::new(&config);
+            assert_eq!(world.agents(), agents);
+            assert!((world.leaders() as f64 - agents as f64 / 3.0).abs() <= 1.0, "{} of {agents}", world.leaders());
+            let starts: HashSet<_> = world.starts.iter().map(|start| start.to_array().map(f32::to_bits)).collect();
+            assert_eq!(starts.len(), agents);
+            // As if it had been read from a file.
+            Config::parse(&config.to_toml(), "laid out").unwrap();
+        }
+        let refusal = with_agents(&config(), 1024).unwrap_err();
+        assert!(refusal.contains("341 leaders and 683 followers"), "{refusal}");
+    }
+}
