@@ -9,21 +9,17 @@ use std::time::{Duration, Instant};
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
-use super::median;
-
 /// Chains of products, and as many of sums: with factor and term they fill 16 registers. Two units of either kind with a
 /// latency of 3 need 6; where there are 32 registers, there may be 4 units.
 const CHAINS: usize = if cfg!(target_arch = "aarch64") { 14 } else { 7 };
 /// Links of every chain between two looks at the clock.
 const LINKS: usize = 20_000;
-/// Time of one repeat, and repeats.
+/// Time that one measurement takes.
 const LEAST: Duration = Duration::from_millis(20);
-const REPEATS: usize = 5;
 
-/// Lane operations a second of all threads of the current rayon pool: the median of a few repeats.
+/// Lane operations a second, all threads of the current rayon pool together.
 pub fn measure(level: Level) -> f64 {
-    let repeat = || rayon::broadcast(|_| dispatch!(level, simd => thread(simd))).into_iter().sum();
-    median((0..REPEATS).map(|_| repeat()).collect())
+    rayon::broadcast(|_| dispatch!(level, simd => thread(simd))).into_iter().sum()
 }
 
 /// Lane operations a second of one thread.

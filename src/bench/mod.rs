@@ -47,17 +47,22 @@ impl Player {
         }
     }
 
-    /// f32 sums and products a second, none fused, that it can do at most: measured now.
+    /// Readies what measures how many f32 sums and products a second, none fused, it can do at most.
     ///
     /// # Errors
     /// When the GPU fails.
-    pub fn ceiling(&self) -> Result<f64, BackendError> {
-        match self {
-            Player::Cpu(_, level) => Ok(ceiling::measure(*level)),
-            Player::Gpu(gpu) => Ok(probe::ceiling(gpu.gpu())?),
-        }
+    fn ceiling(&self) -> Result<Box<Ceiling>, BackendError> {
+        Ok(match self {
+            &Player::Cpu(_, level) => Box::new(move || Ok(ceiling::measure(level))),
+            Player::Gpu(gpu) => {
+                let ceiling = probe::Ceiling::new(gpu.gpu())?;
+                Box::new(move || Ok(ceiling.measure()?))
+            }
+        })
     }
 }
+
+type Ceiling = dyn FnMut() -> Result<f64, BackendError>;
 
 /// What was measured of one config.
 pub struct Measure {
@@ -130,12 +135,12 @@ pub fn with_agents(config: &Config, agents: usize) -> Result<Config, String> {
 /// When the backend fails.
 pub fn measure(config: &Config, player: &mut Player, generations: bool) -> Result<Measure, BackendError> {
     let world = World::new(config);
-    let ceiling = player.ceiling()?;
-    let (rollout, mean_g, reach) = rollout(config, &world, player.backend())?;
+    let ceiling = &mut player.ceiling()?;
+    let ([rollout, ceiling], mean_g, reach) = rollout(config, &world, player.backend(), ceiling)?;
     let generation = match generations {
         true => {
             let mut trainer = Trainer::new(vec![config.clone()]);
-            Some(median_seconds(|| trainer.advance(player.backend()).map(drop))?)
+            Some(time(|| trainer.advance(player.backend()).map(drop), || Ok(0.0))?[0])
         }
         false => None,
     };
@@ -154,8 +159,14 @@ pub fn measure(config: &Config, player: &mut Player, generations: bool) -> Resul
     })
 }
 
-/// Seconds of one rollout of random policies, scored as in training, the mean G, and who was in reach of whom.
-fn rollout(config: &Config, world: &World, backend: &mut dyn Backend) -> Result<(f64, f64, Reach), BackendError> {
+/// Seconds of one rollout of random policies, scored as in training, with the ceiling meanwhile; the mean G; and who was
+/// in reach of whom.
+fn rollout(
+    config: &Config,
+    world: &World,
+    backend: &mut dyn Backend,
+    ceiling: &mut Ceiling,
+) -> Result<([f64; 2], f64, Reach), BackendError> {
     thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
     let (population, leaders, seed) = (config.learning.population, world.leaders(), config.learning.seed);
     let mut weights = vec![0.0; leaders * population * world.parameters()];
@@ -167,7 +178,7 @@ fn rollout(config: &Config, world: &World, backend: &mut dyn Backend) -> Result<
     form_teams(Key::new(seed, 0, Purpose::Teams), 0, leaders, &mut teams);
     let group = Group { world, starts: &world.starts, weights: &weights, policies: population, teams: &teams };
     let observed = AtomicU64::new(0);
-    let seconds = median_seconds(|| {
+    let play = || {
         observed.store(0, Relaxed);
         backend.rollout(&[group], &|episode| {
             CREDIT.with_borrow_mut(|(credit, scores)| {
@@ -177,22 +188,28 @@ fn rollout(config: &Config, world: &World, backend: &mut dyn Backend) -> Result<
                 black_box(scores);
             });
         })
-    })?;
+    };
+    let times = time(play, ceiling)?;
     let mean_g = observed.into_inner() as f64 / (population * world.pois.len()) as f64;
     let pairs = world.steps() * world.agents() * world.agents();
     let traced = (TRACED_PAIRS / pairs).clamp(1, TRACED_TEAMS).min(population);
     // The CPU's, since every backend's is the same.
     let trace = Cpu::default().trace(&Group { teams: &teams[..traced * leaders], ..group })?;
-    Ok((seconds, mean_g, Reach::of(world, &trace)))
+    Ok((times, mean_g, Reach::of(world, &trace)))
 }
 
-/// The median over a few repeats of the time of one call, each repeat calling for [`LEAST`] at least.
-fn median_seconds<E>(mut call: impl FnMut() -> Result<(), E>) -> Result<f64, E> {
+/// Medians over a few repeats: seconds of one call, each repeat calling for [`LEAST`] at least, and what was measured
+/// between them, so that a slow spell of the machine meets both.
+fn time<E>(
+    mut call: impl FnMut() -> Result<(), E>,
+    mut between: impl FnMut() -> Result<f64, E>,
+) -> Result<[f64; 2], E> {
     let start = Instant::now();
     call()?;
     let repeats = if start.elapsed() > LONG { FEW_REPEATS } else { REPEATS };
-    let mut seconds = Vec::with_capacity(repeats);
+    let (mut seconds, mut others) = (Vec::with_capacity(repeats), Vec::with_capacity(repeats));
     for _ in 0..repeats {
+        others.push(between()?);
         let (start, mut calls) = (Instant::now(), 0);
         while calls == 0 || start.elapsed() < LEAST {
             call()?;
@@ -200,11 +217,11 @@ fn median_seconds<E>(mut call: impl FnMut() -> Result<(), E>) -> Result<f64, E> 
         }
         seconds.push(start.elapsed().as_secs_f64() / f64::from(calls));
     }
-    Ok(median(seconds))
+    Ok([median(seconds), median(others)])
 }
 
 /// The middle of some (finite) values, of an even number the upper of two.
-pub fn median(mut values: Vec<f64>) -> f64 {
+fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values[values.len() / 2]
 }

@@ -11,7 +11,6 @@ use super::episode::GpuEpisodes;
 use crate::backend::compare::first_mismatch;
 use crate::backend::cpu::Cpu;
 use crate::backend::{Backend, BackendError, Group};
-use crate::bench::median;
 use crate::config::Config;
 use crate::sample;
 use crate::world::World;
@@ -136,45 +135,74 @@ fn episode(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
     }))
 }
 
-/// The shader of [`ceiling`].
+/// The shader of [`Ceiling`].
 pub const CEILING: &str = include_str!("../../../shaders/ceiling.wgsl");
 /// Lane operations of a turn of its loop: 8 times 6 products and 6 sums.
-const TURN: u64 = 8 * 12;
+const TURN: f64 = 8.0 * 12.0;
 /// Turns of its loop at most: see the episode's `TURNS`.
 const MOST_TURNS: u32 = 4096;
 /// A dispatch that takes so long is long enough to be timed, and short enough for any driver's patience.
 const LEAST: Duration = Duration::from_millis(20);
 
-/// f32 sums and products a second, not fused, that the device does at most under its pass: the median of a few repeats.
-///
-/// # Errors
-/// When the device fails.
-pub fn ceiling(gpu: &Gpu) -> Result<f64, DeviceError> {
-    let layout = gpu.layout("ceiling", &[Binding::Read, Binding::Read, Binding::Write])?;
-    let pipeline = gpu.pipeline("ceiling", CEILING, "ceiling", &layout)?;
-    let numbers = gpu.upload("ceiling's numbers", &[1.000_000_1f32, 0.25, -1.0, 0.0], BufferUsages::STORAGE)?;
-    let result = gpu.buffer("ceiling's result", (WORKGROUP * size_of::<f32>()) as u64, BufferUsages::STORAGE)?;
-    let run = |turns: u32, workgroups: u32| -> Result<(Duration, f64), DeviceError> {
-        let turns_buffer = gpu.upload("ceiling's turns", &[turns; 4], BufferUsages::STORAGE)?;
-        let bound = [&numbers, &turns_buffer, &result].map(|buffer| buffer.as_entire_buffer_binding());
+/// Measures how many f32 sums and products a second, not fused, a device does at most under its pass.
+pub struct Ceiling {
+    gpu: Gpu,
+    pipeline: wgpu::ComputePipeline,
+    buffers: wgpu::BindGroup,
+    turns: wgpu::Buffer,
+    workgroups: u32,
+    operations: f64,
+}
+
+impl Ceiling {
+    /// Readies the measurement: finds out how much keeps the device busy for a while.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn new(gpu: &Gpu) -> Result<Ceiling, DeviceError> {
+        let layout = gpu.layout("ceiling", &[Binding::Read, Binding::Read, Binding::Write])?;
+        let pipeline = gpu.pipeline("ceiling", CEILING, "ceiling", &layout)?;
+        let numbers = gpu.upload("ceiling's numbers", &[1.000_000_1f32, 0.25, -1.0, 0.0], BufferUsages::STORAGE)?;
+        let turns = gpu.upload("ceiling's turns", &[0u32; 4], BufferUsages::STORAGE)?;
+        let result = gpu.buffer("ceiling's result", (WORKGROUP * size_of::<f32>()) as u64, BufferUsages::STORAGE)?;
+        let bound = [&numbers, &turns, &result].map(|buffer| buffer.as_entire_buffer_binding());
         let buffers = gpu.bind("ceiling", &layout, &bound)?;
-        let time = gpu.time("ceiling", &pipeline, &buffers, [workgroups, 1, 1])?;
-        let operations = u64::from(turns) * TURN * u64::from(workgroups) * WORKGROUP as u64;
-        Ok((time, operations as f64 / time.as_secs_f64()))
-    };
-    // As many threads as fill any GPU a few times over, and longer, and then more of them, until it takes a while.
-    let (mut turns, mut workgroups) = (64, 4096);
-    while run(turns, workgroups)?.0 < LEAST {
-        if turns < MOST_TURNS {
-            turns *= 2;
-        } else if workgroups * 2 <= gpu.limits.max_compute_workgroups_per_dimension {
-            workgroups *= 2;
-        } else {
-            break;
+        let mut ceiling = Ceiling { gpu: gpu.clone(), pipeline, buffers, turns, workgroups: 0, operations: 0.0 };
+        // As many threads as fill any GPU a few times over; longer, and then more of them, until it takes a while.
+        let (mut turns, mut workgroups) = (64, 4096);
+        loop {
+            ceiling.set(turns, workgroups)?;
+            let seconds = ceiling.operations / ceiling.measure()?;
+            if seconds >= LEAST.as_secs_f64() {
+                return Ok(ceiling);
+            } else if turns < MOST_TURNS {
+                turns *= 2;
+            } else if workgroups * 2 <= gpu.limits.max_compute_workgroups_per_dimension {
+                workgroups *= 2;
+            } else {
+                return Ok(ceiling);
+            }
         }
     }
-    let rates: Result<_, _> = (0..5).map(|_| run(turns, workgroups).map(|(_, rate)| rate)).collect();
-    Ok(median(rates?))
+
+    fn set(&mut self, turns: u32, workgroups: u32) -> Result<(), DeviceError> {
+        let words = [turns; 4];
+        self.gpu.scoped("ceiling's turns", || {
+            self.gpu.queue.write_buffer(&self.turns, 0, bytemuck::cast_slice(&words));
+        })?;
+        self.workgroups = workgroups;
+        self.operations = f64::from(turns) * TURN * f64::from(workgroups) * WORKGROUP as f64;
+        Ok(())
+    }
+
+    /// Lane operations a second, now.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn measure(&self) -> Result<f64, DeviceError> {
+        let time = self.gpu.time("ceiling", &self.pipeline, &self.buffers, [self.workgroups, 1, 1])?;
+        Ok(self.operations / time.as_secs_f64())
+    }
 }
 
 /// Reproducible values that make rounding show: zeros, equal pairs, small integers, sums that nearly cancel, and full
