@@ -1,11 +1,13 @@
 """The complete paper in vectorised NumPy: both paradigms, three layouts, fitness G, D and Df, trials, generations.
 
-    python paper_numpy.py [--trials 5] [--generations 100] [--fraction 0.1] [--seed 0] [--layouts ...] [--json]
+    python paper_numpy.py [--batch all|run] [--trials 5] [--generations 100] [--fraction 0.1] [--seed 0] [--json]
     python paper_numpy.py --rollout LAYOUT --teams N [--repeats R] [--seed 0]
 
-One process. All teams of a generation, of all trials and fitnesses of one layout and paradigm, play side by side: the
-team is the last axis of every array. --fraction runs that part of the generations and scales the measured time up to
-all of them. --rollout times and scores random teams only, as the other peers do.
+One process. The teams of a generation play side by side: the team is the last axis of every array. With --batch all
+those of all trials of an arm (one layout, paradigm and fitness), 250 of the paper's, about what a core's cache holds;
+with --batch run those of one training run at a time, 50. Only the credit that the fitness needs is worked out.
+--fraction runs that part of the generations and scales the measured time up to all of them. --rollout times and scores
+random teams only, as the other peers do.
 """
 
 import argparse
@@ -24,142 +26,177 @@ from layouts import (
 FITNESSES = ["G", "D", "Df"]
 
 
-def sense(rx, ry, d, hx, hy, included):
-    """Summed value [4, L, B] by quadrant of the included entities at offsets [L, entities, B]."""
-    fx, fy = rx * hx[:, None] + ry * hy[:, None], ry * hx[:, None] - rx * hy[:, None]
+def sense(offsets, heading, pois):
+    """Summed value [8, L, B] by kind and quadrant of the entities at offsets [2, L, pois + agents, B]."""
+    rx, ry = offsets
+    hx, hy = heading[:, :, None]
+    d2 = rx * rx
+    d2 += ry * ry
+    value = np.sqrt(d2)
+    value *= np.float32(-1 / DIAGONAL)
+    value += 1
+    value[:, pois:] *= d2[:, pois:] <= AGENT_RANGE**2
+    for leader in range(len(value)):
+        value[leader, pois + leader] = 0  # oneself
+    fx, fy = rx * hx, ry * hx
+    fx += ry * hy
+    fy -= rx * hy
     left = (fy > 0) | ((fy == 0) & (fx >= 0))
     front = (fx > 0) | ((fx == 0) & (fy <= 0))
-    value = 1 - d / np.float32(DIAGONAL)
-    if included is not None:
-        value *= included
-    front_value = value * front
-    back_value = value - front_value
-    front_left, back_left = front_value * left, back_value * left
-    quadrants = [back_value - back_left, front_value - front_left, front_left, back_left]
-    return np.stack([quadrant.sum(1) for quadrant in quadrants])
+    quadrants = np.empty((4, *value.shape), np.float32)
+    back_right, front_right, front_left, back_left = quadrants
+    np.multiply(value, front, out=front_right)
+    np.subtract(value, front_right, out=back_right)
+    np.multiply(front_right, left, out=front_left)
+    np.multiply(back_right, left, out=back_left)
+    front_right -= front_left
+    back_right -= back_left
+    sums = quadrants[:, :, :pois].sum(2), quadrants[:, :, pois:].sum(2)
+    return np.concatenate([sums[0] / np.float32(pois), sums[1] / np.float32(value.shape[1] - pois)])
 
 
 def policy(first, second, inputs):
     """Outputs [L, 2, B] of the nets with weights first [L, 9, 10, B] and second [L, 11, 2, B] on inputs [8, L, B]."""
-    hidden = first[:, -1].copy()
-    for k in range(INPUTS):
-        hidden += inputs[k][:, None] * first[:, k]
+    hidden = np.einsum("klb,lkhb->lhb", inputs, first[:, :-1])
+    hidden += first[:, -1]
     np.tanh(hidden, out=hidden)
-    outputs = second[:, -1].copy()
-    for k in range(HIDDEN):
-        outputs += hidden[:, k, None] * second[:, k]
+    outputs = np.einsum("lhb,lhob->lob", hidden, second[:, :-1])
+    outputs += second[:, -1]
     return np.tanh(outputs, out=outputs)
 
 
-def rollout(world, weights):
-    """G [B], D [L, B] and Df [L, B] of teams with weights [L, WEIGHTS, B]."""
+def rollout(world, weights, wanted_scores):
+    """Of teams with weights [L, WEIGHTS, B]: G [B], D [L, B] and Df [L, B], the latter two where they are wanted."""
     L, N, F, P, B = world.leaders, world.agents, world.followers, len(world.pois), weights.shape[-1]
     first = weights[:, : (INPUTS + 1) * HIDDEN].reshape(L, INPUTS + 1, HIDDEN, B)
     second = weights[:, (INPUTS + 1) * HIDDEN :].reshape(L, HIDDEN + 1, OUTPUTS, B)
-    x, y = (np.repeat(world.starts[:, axis, None], B, axis=1) for axis in (0, 1))
-    hx, hy, speed = np.zeros((N, B), np.float32), np.ones((N, B), np.float32), np.zeros((N, B), np.float32)
-    poi_x, poi_y = world.pois[:, 0, None], world.pois[:, 1, None]
-    others = ~np.eye(N, dtype=bool)[:, :, None]
-    seen = np.zeros((F, L, B), np.int32)
-    turn, wanted = np.empty_like(x), np.empty_like(x)
+    at = np.repeat(world.starts.T[:, :, None], B, axis=2)  # [2, N, B]
+    heading, speed = np.zeros((2, N, B), np.float32), np.zeros((N, B), np.float32)
+    heading[1] = 1
+    pois = world.pois.T[:, None, :, None]
+    sensed, followed = np.empty((2, L, P + N, B), np.float32), np.empty((2, F, N, B), np.float32)
+    turn, wanted = np.empty_like(speed), np.empty_like(speed)
 
+    # Without followers, leaving out a leader and its followers is leaving out a leader.
+    want_df = bool(F) and "Df" in wanted_scores
+    want_d = "D" in wanted_scores or "Df" in wanted_scores and not want_df
     observed = np.zeros((P, B), bool)
     without = np.zeros((L, P, B), bool)  # observed with one leader taken out
-    sets = np.empty((world.steps, N, P, B), bool)
+    seen = np.zeros((F, L, B), np.uint16)
+    sets = np.empty((world.steps if want_df else 0, N, P, B), bool)
     for step in range(world.steps):
-        rx, ry = x[None] - x[:, None], y[None] - y[:, None]
-        d = np.sqrt(rx * rx + ry * ry)
-
-        px, py = poi_x - x[:L, None], poi_y - y[:L, None]
-        pois = sense(px, py, np.sqrt(px * px + py * py), hx[:L], hy[:L], None) / np.float32(P)
-        agents = sense(rx[:L], ry[:L], d[:L], hx[:L], hy[:L], (d[:L] <= AGENT_RANGE) & others[:L]) / np.float32(N)
-        outputs = policy(first, second, np.concatenate([pois, agents]))
+        np.subtract(pois, at[:, :L, None], out=sensed[:, :, :P])
+        np.subtract(at[:, None], at[:, :L, None], out=sensed[:, :, P:])
+        outputs = policy(first, second, sense(sensed, heading[:, :L], P))
         turn[:L] = np.float32(np.pi) * outputs[:, 0]
         wanted[:L] = (outputs[:, 1] + 1) * np.float32(0.5 * MAX_SPEED)
 
         if F:
-            attracted = (d[L:] <= ATTRACTION_RADIUS) & others[L:]
-            near = (d[L:] <= REPULSION_RADIUS) & others[L:]
-            seen += attracted[:, :L]
-            near_count, count = near.sum(1), attracted.sum(1)
+            np.subtract(at[:, None], at[:, L:, None], out=followed)
+            d2 = followed[0] * followed[0]
+            d2 += followed[1] * followed[1]
+            attracted, near = d2 <= ATTRACTION_RADIUS**2, d2 <= REPULSION_RADIUS**2
+            if want_df:
+                seen += attracted[:, :L]
+            far = attracted ^ near
+            # Everyone is near oneself, at an offset of 0.
+            near_count = near.view(np.uint8).sum(1, dtype=np.uint8) - np.uint8(1)
+            far_count = far.view(np.uint8).sum(1, dtype=np.uint8)
             near_scale = np.float32(REPULSION_GAIN / REPULSION_RADIUS) / np.maximum(near_count, 1).astype(np.float32)
-            far_scale = np.float32(ATTRACTION_GAIN / ATTRACTION_RADIUS) / np.maximum(count - near_count, 1).astype(
-                np.float32
-            )
-            far = attracted & ~near
-            forces, walls = [], []
-            for r, at in ((rx, x), (ry, y)):
-                low, high = REPULSION_RADIUS - at[L:], REPULSION_RADIUS - (np.float32(MAP) - at[L:])
-                walls.append((low >= 0) | (high >= 0))
-                push = np.float32(WALL_GAIN) * (np.maximum(low, 0) - np.maximum(high, 0))
-                forces.append(push + (r[L:] * far).sum(1) * far_scale - (r[L:] * near).sum(1) * near_scale)
-            sx, sy = forces
+            far_scale = np.float32(ATTRACTION_GAIN / ATTRACTION_RADIUS) / np.maximum(far_count, 1).astype(np.float32)
+            low = np.float32(REPULSION_RADIUS) - at[:, L:]
+            high = at[:, L:] - np.float32(MAP - REPULSION_RADIUS)
+            alone = (near_count == 0) & (far_count == 0) & ~((low >= 0) | (high >= 0)).any(0)
+            force = np.float32(WALL_GAIN) * (np.maximum(low, 0) - np.maximum(high, 0))
+            force += (followed * far).sum(2) * far_scale
+            force -= (followed * near).sum(2) * near_scale
+            (sx, sy), (hx, hy) = force, heading[:, L:]
             size = np.sqrt(sx * sx + sy * sy)
-            along, across = sx * hx[L:] + sy * hy[L:], sy * hx[L:] - sx * hy[L:]
-            alone = (count == 0) & ~walls[0] & ~walls[1]
+            along, across = sx * hx + sy * hy, sy * hx - sx * hy
             turn[L:] = np.where(alone | (size == 0), 0, np.arctan2(across, along))
             wanted[L:] = np.where(alone, speed[L:], np.where((along > 0) | (size == 0), size, np.float32(MIN_SPEED)))
 
         np.clip(turn, -MAX_TURN, MAX_TURN, out=turn)
         c, s = np.cos(turn), np.sin(turn)
-        hx, hy = hx * c - hy * s, hx * s + hy * c
-        speed += np.clip(wanted - speed, -MAX_SPEED_CHANGE, MAX_SPEED_CHANGE)
+        hx, hy = heading
+        heading = np.stack([hx * c - hy * s, hx * s + hy * c])
+        wanted -= speed
+        speed += np.clip(wanted, -MAX_SPEED_CHANGE, MAX_SPEED_CHANGE, out=wanted)
         np.clip(speed, MIN_SPEED, MAX_SPEED, out=speed)
-        x = np.clip(x + speed * np.float32(DT) * hx, 0, MAP)
-        y = np.clip(y + speed * np.float32(DT) * hy, 0, MAP)
+        at += speed * np.float32(DT) * heading
+        np.clip(at, 0, MAP, out=at)
 
-        px, py = poi_x - x[:, None], poi_y - y[:, None]
-        sets[step] = px * px + py * py <= OBSERVATION_RADIUS**2
-        counts = sets[step].sum(0, dtype=np.int8)
+        px, py = pois - at[:, :, None]
+        inside = px * px + py * py <= OBSERVATION_RADIUS**2  # [N, P, B]
+        counts = inside.view(np.uint8).sum(0, dtype=np.uint8)
         observed |= counts >= world.coupling
-        without |= counts - sets[step, :L] >= world.coupling
+        if want_d:
+            without |= counts >= inside[:L] + np.uint8(world.coupling)
+        if want_df:
+            sets[step] = inside
 
     g = observed.mean(0, dtype=np.float32)
-    d = g - without.mean(1, dtype=np.float32)
-    if not F:
+    d = g - without.mean(1, dtype=np.float32) if want_d else None
+    if not want_df:
         return g, d, d
+    df = np.empty((L, B), np.float32)
     owner = np.where(seen.max(1) > 0, seen.argmax(1), -1)  # [F, B]
-    counts = sets.sum(1, dtype=np.int8)
-    df = np.empty_like(d)
+    counts = sets.view(np.uint8).sum(1, dtype=np.uint8)
     for leader in range(L):
-        taken = (sets[:, L:] & (owner == leader)[:, None]).sum(1, dtype=np.int8) + sets[:, leader]
-        df[leader] = g - (counts - taken >= world.coupling).any(0).mean(0, dtype=np.float32)
+        taken = (sets[:, L:] & (owner == leader)[:, None]).view(np.uint8).sum(1, dtype=np.uint8)
+        taken += sets[:, leader]
+        df[leader] = g - (counts >= taken + np.uint8(world.coupling)).any(0).mean(0, dtype=np.float32)
     return g, d, df
 
 
 def evolve(random, weights, fitness):
-    """The next policies [k, WEIGHTS] of a population: the best one, and mutated winners of binary tournaments."""
-    k = len(weights)
-    one = random.integers(k, size=k - 1)
-    other = random.integers(k - 1, size=k - 1)
+    """The next policies [runs, L, k, WEIGHTS]: each population's best, and mutated winners of binary tournaments."""
+    runs, leaders, k = fitness.shape
+    one = random.integers(k, size=(runs, leaders, k - 1))
+    other = random.integers(k - 1, size=one.shape)
     other += other >= one  # two distinct policies
     low, high = np.minimum(one, other), np.maximum(one, other)
-    children = weights[np.where(fitness[low] >= fitness[high], low, high)]
-    mutated = random.random(children.shape, np.float32) < MUTATION_PROBABILITY
-    children *= 1 + mutated * (np.float32(MUTATION_SIGMA) * random.standard_normal(children.shape, np.float32))
-    return np.concatenate([weights[np.argmax(fitness)][None], children])
+    first = np.take_along_axis(fitness, low, 2) >= np.take_along_axis(fitness, high, 2)
+    parents = np.concatenate([fitness.argmax(2)[..., None], np.where(first, low, high)], axis=2)
+    children = chosen(weights, parents)
+    mutated = random.random((runs, leaders, k - 1, WEIGHTS), np.float32) < MUTATION_PROBABILITY
+    noise = random.standard_normal(np.count_nonzero(mutated), np.float32)
+    children[:, :, 1:][mutated] *= 1 + np.float32(MUTATION_SIGMA) * noise
+    return children
 
 
-def train(world, trials, generations, policies, seed):
-    """Best team's G in POIs [fitnesses, trials, generations + 1]; generation 0 is the random start."""
-    random = np.random.default_rng(seed)
-    L, runs = world.leaders, len(FITNESSES) * trials
-    populations = random.standard_normal((runs, L, policies, WEIGHTS), np.float32)
-    best = np.empty((runs, generations + 1), np.float32)
+def chosen(weights, policies):
+    """Policies [runs, L, k, WEIGHTS] by their index in each population."""
+    runs, leaders = policies.shape[:2]
+    return weights[np.arange(runs)[:, None, None], np.arange(leaders)[:, None], policies]
+
+
+def train(world, fitness, trials, generations, policies, random):
+    """Best team's G in POIs [trials, generations + 1] of trials side by side; generation 0 is the random start."""
+    L = world.leaders
+    populations = random.standard_normal((trials, L, policies, WEIGHTS), np.float32)
+    best = np.empty((trials, generations + 1), np.float32)
     for generation in range(generations + 1):
-        order = random.permuted(np.broadcast_to(np.arange(policies), (runs, L, policies)), axis=2)
-        teams = np.take_along_axis(populations, order[..., None], 2)  # [runs, L, policies, WEIGHTS]
-        g, d, df = rollout(world, np.ascontiguousarray(teams.transpose(1, 3, 0, 2)).reshape(L, WEIGHTS, -1))
-        best[:, generation] = g.reshape(runs, policies).max(1) * len(world.pois)
+        order = random.permuted(np.broadcast_to(np.arange(policies), (trials, L, policies)), axis=2)
+        weights = chosen(populations, order).transpose(1, 3, 0, 2).reshape(L, WEIGHTS, -1)
+        g, d, df = rollout(world, weights, [fitness])
+        best[:, generation] = g.reshape(trials, policies).max(1) * len(world.pois)
         if generation == generations:
             break
-        scores = [score.reshape(L, runs, policies) for score in (np.broadcast_to(g, d.shape), d, df)]
-        for run in range(runs):
-            for leader in range(L):
-                fitness = np.empty(policies, np.float32)
-                fitness[order[run, leader]] = scores[run // trials][leader, run]
-                populations[run, leader] = evolve(random, populations[run, leader], fitness)
-    return best.reshape(len(FITNESSES), trials, generations + 1)
+        scores = np.broadcast_to({"G": g, "D": d, "Df": df}[fitness], (L, len(g)))
+        ratings = np.empty((trials, L, policies), np.float32)
+        np.put_along_axis(ratings, order, scores.reshape(L, trials, policies).transpose(1, 0, 2), 2)
+        populations = evolve(random, populations, ratings)
+    return best
+
+
+def curves_of(world, fitness, arguments, generations):
+    """Best team's G in POIs [trials, generations + 1] of all trials, side by side or one after another."""
+    parts = arguments.trials if arguments.batch == "run" else 1
+    seeds = np.random.SeedSequence((arguments.seed, FITNESSES.index(fitness))).spawn(parts)
+    randoms = [np.random.default_rng(seed) for seed in seeds]
+    trials, policies = arguments.trials // parts, arguments.population
+    return np.concatenate([train(world, fitness, trials, generations, policies, random) for random in randoms])
 
 
 def paper(arguments):
@@ -169,7 +206,7 @@ def paper(arguments):
         for paradigm in ("leader-follower", "all-leaders"):
             world = make_world(layout, paradigm == "all-leaders")
             begin = time.perf_counter()
-            best = train(world, arguments.trials, generations, arguments.population, arguments.seed)
+            best = [curves_of(world, fitness, arguments, generations) for fitness in FITNESSES]
             elapsed = time.perf_counter() - begin
             seconds += elapsed
             for fitness, curves in zip(FITNESSES, best):
@@ -190,6 +227,7 @@ def paper(arguments):
     estimate = seconds * (arguments.generations + 1) / (generations + 1)
     summary = {
         "peer": "numpy",
+        "batch": arguments.batch,
         "trials": arguments.trials,
         "generations": generations,
         "seconds": round(seconds, 3),
@@ -206,7 +244,7 @@ def random_teams(arguments):
     chunks = [np.ascontiguousarray(weights[at : at + chunk].transpose(1, 2, 0)) for at in range(0, len(weights), chunk)]
     for _ in range(arguments.repeats):
         begin = time.perf_counter()
-        scores = [rollout(world, part) for part in chunks]
+        scores = [rollout(world, part, FITNESSES) for part in chunks]
         rates.append(arguments.teams * world.steps / (time.perf_counter() - begin))
     g, d, df = (np.concatenate(score, axis=-1) for score in zip(*scores))
     line = {
@@ -228,6 +266,7 @@ def main():
     parser.add_argument("--generations", type=int, default=100)
     parser.add_argument("--population", type=int, default=50)
     parser.add_argument("--fraction", type=float, default=1.0, help="part of the generations to run and time")
+    parser.add_argument("--batch", choices=["run", "all"], default="all", help="what plays side by side: one training run, or all trials")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--layouts", nargs="+", choices=NAMES, default=NAMES)
     parser.add_argument("--json", action="store_true", help="one JSON object with every curve")

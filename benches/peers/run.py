@@ -180,29 +180,25 @@ def table(layout, results, options):
 
 def paper(options):
     """The complete paper: flotilla's whole command by the clock, against the NumPy program scaled up from a tenth."""
-    ours, theirs = [], []
+    batches = {"all": "all trials of an arm side by side", "run": "one training run at a time"}
+    ours, theirs = [], {batch: [] for batch in batches}
     for number in range(options.rounds):
         with tempfile.TemporaryDirectory() as out:
-            command = [
-                options.flotilla,
-                "paper",
-                "--trials",
-                5,
-                "--backend",
-                options.backend,
-                "--out",
-                Path(out) / "paper",
-            ]
+            command = [options.flotilla, "paper", "--trials", 5, "--backend", options.backend]
             begin = time.perf_counter()
-            call(command)
+            call([*command, "--out", Path(out) / "paper"])
             ours.append(time.perf_counter() - begin)
-        command = [options.python, HERE / "paper_numpy.py", "--trials", 5, "--fraction", options.fraction]
-        theirs.append(measure([*command, "--seed", number, "--json"])["paper_seconds"])
-        tell(f"paper, round {number + 1} of {options.rounds}: flotilla {ours[-1]:.2f} s, NumPy {theirs[-1]:.1f} s")
-    times = statistics.median(b / a for a, b in zip(ours, theirs))
+        for batch, seconds in theirs.items():
+            command = [options.python, HERE / "paper_numpy.py", "--trials", 5, "--fraction", options.fraction]
+            seconds.append(measure([*command, "--batch", batch, "--seed", number, "--json"])["paper_seconds"])
+        numpy = ", ".join(f"{seconds[-1]:.1f} s ({batch})" for batch, seconds in theirs.items())
+        tell(f"paper, round {number + 1} of {options.rounds}: flotilla {ours[-1]:.2f} s, NumPy {numpy}")
     print("\n| the complete paper | seconds | flotilla is × |\n|---|---|---|")
     print(f"| flotilla paper, start-up and pictures included | {statistics.median(ours):.2f} | |")
-    print(f"| NumPy, from {options.fraction:g} of the generations | {statistics.median(theirs):.1f} | {times:.1f} |")
+    for batch, seconds in theirs.items():
+        times = statistics.median(b / a for a, b in zip(ours, seconds))
+        name = f"NumPy, {batches[batch]}, from {options.fraction:g} of the generations"
+        print(f"| {name} | {statistics.median(seconds):.1f} | {times:.1f} |")
 
 
 def main():
