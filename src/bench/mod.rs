@@ -99,7 +99,7 @@ impl Measure {
 }
 
 /// The config with other numbers of agents, leaders and followers in its own ratio as nearly as whole numbers allow,
-/// laid out in the groups of [`layout`], each with a POI.
+/// laid out in the groups of [`layout`]; POIs stay as many, ahead of the first groups.
 ///
 /// # Errors
 /// More leaders than groups, or more followers of one leader than there are places for.
@@ -113,19 +113,20 @@ pub fn with_agents(config: &Config, agents: usize) -> Result<Config, String> {
              allowed {MAX_GROUPS} leaders of {MAX_FOLLOWERS} followers"
         ));
     }
+    let places = layout::places();
     let shares: Vec<_> = (0..groups).map(|g| followers / groups + usize::from(g < followers % groups)).collect();
-    let positions = layout::positions(&layout::places(), &shares);
+    let agents_at = layout::positions(&places, &shares);
+    let pois_at = layout::positions(&places, &vec![0; config.world.pois.len()]);
     let list = |list: Vec<[i32; 2]>| list.into_iter().map(|place| place.map(f64::from)).collect();
     let mut config = config.clone();
-    config.world.map = positions.map.map(f64::from);
-    config.world.leaders = list(positions.leaders);
-    config.world.followers = list(positions.followers);
-    config.world.pois = list(positions.pois);
-    let coupling = match &config.world.coupling {
-        Coupling::Same(count) => *count,
-        Coupling::Each(counts) => counts.iter().copied().max().unwrap_or(1),
-    };
-    config.world.coupling = Coupling::Same(coupling.min(agents));
+    config.world.map = agents_at.map.max(pois_at.map).map(f64::from);
+    config.world.leaders = list(agents_at.leaders);
+    config.world.followers = list(agents_at.followers);
+    config.world.pois = list(pois_at.pois);
+    match &mut config.world.coupling {
+        Coupling::Same(count) => *count = agents.min(*count),
+        Coupling::Each(counts) => counts.iter_mut().for_each(|count| *count = agents.min(*count)),
+    }
     Ok(config)
 }
 

@@ -31,8 +31,8 @@ pub struct Args {
     #[arg(long, value_name = "N,…", value_delimiter = ',',
         value_parser = clap::value_parser!(u32).range(1..=config::MAX_STEPS as i64))]
     steps: Vec<u32>,
-    /// Agents of a team, one or several: leaders and followers in the config's ratio, in groups of one leader and one
-    /// POI [default: the config's]
+    /// Agents of a team, one or several: leaders and followers in the config's ratio, laid out in groups as by
+    /// `flotilla sweep` [default: the config's]
     #[arg(long, value_name = "N,…", value_delimiter = ',',
         value_parser = clap::value_parser!(u32).range(1..=config::MAX_AGENTS as i64))]
     agents: Vec<u32>,
