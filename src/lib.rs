@@ -17,9 +17,10 @@
 //! 6. [`evolve`] selects and mutates; [`run`] keeps what came out by [`record`]; [`report`] draws it.
 //!
 //! Around that: [`run`] keeps a trainer, its folder and its checkpoints together, [`sweep`] makes many runs of a grid,
-//! [`verify`] compares two backends on the random worlds of [`sample`], and [`cli`] turns what was typed into all this.
+//! [`verify`] compares two backends on the random worlds of [`sample`], [`bench`] times a backend against what the machine
+//! can do at most, and [`cli`] turns what was typed into all this.
 //!
-//! Imports run one way: `main ▸ cli ▸ {run, sweep, report, verify} ▸ trainer ▸ {evolve, credit, backend}`,
+//! Imports run one way: `main ▸ cli ▸ {run, sweep, report, verify, bench} ▸ trainer ▸ {evolve, credit, backend}`,
 //! `backend ▸ kernels`. Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
 
 pub mod backend;

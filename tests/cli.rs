@@ -347,3 +347,58 @@ fn a_reader_that_leaves_early_is_no_failure() {
     let output = child.spawn().unwrap().wait_with_output().unwrap();
     assert_eq!((output.status.code(), String::from_utf8_lossy(&output.stderr).as_ref()), (Some(0), ""));
 }
+
+/// The JSON objects that `bench` prints of rollouts at these numbers, one a line.
+fn benched(flags: &[&str]) -> Vec<serde_json::Value> {
+    let output = flotilla(&[&["bench", "--backend", "cpu", "--json"], flags].concat());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let text = String::from_utf8(output.stdout).unwrap();
+    text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+#[test]
+fn bench_keeps_to_its_contract() {
+    let objects = benched(&["--teams", "20"]);
+    let [object] = &objects[..] else { panic!("one combination, {} objects", objects.len()) };
+    assert_eq!(object["backend"], "cpu");
+    assert!(object["adapter"].is_null());
+    assert_eq!([&object["teams"], &object["agents"], &object["steps"]], [20, 12, 25]);
+    for rate in ["team_steps_per_s", "generations_per_s", "generation_team_steps_per_s", "ceiling_operations_per_s"] {
+        assert!(object[rate].as_f64().is_some_and(|rate| rate > 0.0), "{rate} of {object}");
+    }
+    // Neither fused nor skipped: what must be done takes time, and no more of the machine than there is.
+    assert!(object["operations_per_team_step"].as_f64().is_some_and(|count| (4e3..8e3).contains(&count)), "{object}");
+    assert!(object["ceiling_share"].as_f64().is_some_and(|share| share > 0.0 && share <= 1.0), "{object}");
+}
+
+#[test]
+fn bench_measures_every_combination() {
+    let objects = benched(&["--teams", "2,3", "--steps", "1,2", "--agents", "3,7", "--rollout-only"]);
+    let found: Vec<_> =
+        objects.iter().map(|o| ["agents", "steps", "teams"].map(|key| o[key].as_u64().unwrap())).collect();
+    let expected: Vec<_> = [3, 7]
+        .into_iter()
+        .flat_map(|agents| [1, 2].into_iter().flat_map(move |steps| [2, 3].map(|teams| [agents, steps, teams])))
+        .collect();
+    assert_eq!(found, expected);
+    for object in &objects {
+        assert_eq!(object["pois"], 4, "as many as the config has: {object}");
+        assert!(object.get("generations_per_s").is_none(), "left out: {object}");
+    }
+}
+
+#[test]
+fn bench_refuses_what_it_cannot_lay_out() {
+    for (flags, blamed) in [
+        (["--agents", "1024"], "341 leaders and 683 followers"),
+        (["--agents", "0"], "1..=1024"),
+        (["--teams", "1"], "2..="),
+        (["--steps", "25,10001"], "10001"),
+    ] {
+        let output = flotilla(&[&["bench", "--backend", "cpu"][..], &flags].concat());
+        let error = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{error}");
+        assert!(error.contains(blamed), "{error}");
+        assert!(output.stdout.is_empty());
+    }
+}

@@ -44,8 +44,8 @@ fn chains<S: Simd>(simd: S) {
             let mut sums: [S::f32s; CHAINS] = std::array::from_fn(|i| lanes(2.0 + i as f32));
             for _ in 0..LINKS {
                 for (product, sum) in products.iter_mut().zip(&mut sums) {
-                    *product = *product * factor;
-                    *sum = *sum + term;
+                    *product *= factor;
+                    *sum += term;
                 }
             }
             black_box((products, sums));

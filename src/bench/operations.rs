@@ -9,11 +9,12 @@
 use crate::backend::Trace;
 use crate::world::{Constants, OUTPUTS, World};
 
-/// Stated by the functions themselves in [`crate::kernels::math`].
+/// The functions of [`crate::kernels::math`].
 const RSQRT: u32 = 12;
 const ROOT: u32 = 12;
 const RECIP: u32 = 8;
-const TANH: u32 = 26;
+/// A bound, a square, 5 and 3 for numerator and denominator; their squares' sum, its rough reciprocal (4) and 6 more.
+const TANH: u32 = BOUND + 1 + 5 + 3 + 3 + 4 + 6;
 const SIN_COS: u32 = 26;
 const FLUSH: u32 = 3;
 
@@ -160,7 +161,7 @@ mod tests {
         let reach = reach(&world, 3);
         assert_eq!(reach, Reach { sensed_pois: 2.0, ..Reach::default() });
         // 2 POIs sensed; 8 inputs; 10 units of 8 inputs and 2 of 10; the turn and the speed; the move; 2 POIs tested.
-        let units = 10.0 * (16.0 + 29.0) + 2.0 * (20.0 + 29.0);
+        let units = 10.0 * (16.0 + 27.0) + 2.0 * (20.0 + 27.0);
         assert_eq!(per_team_step(&world, &reach), 2.0 * 47.0 + 8.0 + units + 38.0 + 36.0 + 2.0 * 8.0);
     }
 
