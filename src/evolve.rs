@@ -5,6 +5,7 @@
 
 use fearless_simd::{Level, Simd, SimdMask, dispatch, prelude::*};
 use glam::Vec2;
+use rayon::prelude::*;
 
 use crate::config::{Learning, Mutation};
 use crate::kernels::{bound, math, splat};
@@ -120,6 +121,33 @@ pub fn tournament(key: Key, scores: &[f32]) -> usize {
     let b = if b >= a { b + 1 } else { b };
     let (low, high) = (a.min(b), a.max(b));
     if scores[high] > scores[low] { high } else { low }
+}
+
+/// Set in a slot's entry of the plan of [`draw_parents`] where the slot keeps its parent's weights as they are.
+pub const UNCHANGED: u32 = 1 << 31;
+
+/// Plans one population's next generation: the policy from which each slot comes, `[policies + 1]`, with [`UNCHANGED`]
+/// where it does not mutate.
+///
+/// The first slots are the elites', best first; the last, the champion's, stays. `key` is of purpose
+/// [`Purpose::Tournament`], `scores` are `[policies]`.
+pub fn draw_parents(
+    key: Key,
+    generation: usize,
+    population: usize,
+    elites: usize,
+    scores: &[f32],
+    parents: &mut [u32],
+) {
+    let policies = scores.len();
+    let draw = |(slot, parent): (usize, &mut u32)| {
+        *parent = tournament(key.at(generation, population, slot), scores) as u32;
+    };
+    parents[..policies].par_iter_mut().with_min_len(1024).enumerate().skip(elites).for_each(draw);
+    for (parent, elite) in parents.iter_mut().zip(best(scores, elites)) {
+        *parent = elite as u32 | UNCHANGED;
+    }
+    parents[policies] = policies as u32 | UNCHANGED;
 }
 
 /// Weights N(0, 1) for a new policy; `key` is a slot's of purpose [`Purpose::Weights`].

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use crate::backend::{Backend, BackendError, Episode, Group};
 use crate::config::{Config, Learning};
 use crate::credit::Credit;
-use crate::evolve::{self, Key, Purpose};
+use crate::evolve::{self, Key, Purpose, UNCHANGED};
 pub use crate::record::checkpoint::Snapshot;
 pub use crate::record::metrics::Row;
 use crate::world::World;
@@ -49,6 +49,8 @@ struct Trial {
     scores: Vec<AtomicU32>,
     /// Mean score of every policy, `[leaders][policies]`.
     fitness: Vec<f32>,
+    /// The plan of the next generation, see [`evolve::draw_parents`], `[leaders][policies + 1]`.
+    parents: Vec<u32>,
     /// The last generation's row, whose champion has yet to play.
     pending: Option<Row>,
 }
@@ -110,7 +112,10 @@ impl Trainer {
         };
         let mut rows = playing.par_iter_mut().flat_map_iter(conclude).collect::<Vec<_>>();
         playing.retain(|(_, arm)| generation < arm.last());
-        playing.par_iter_mut().for_each(|(_, arm)| arm.breed(generation, level));
+        playing.par_iter_mut().for_each(|(_, arm)| {
+            arm.draw_parents(generation);
+            arm.breed(generation, level);
+        });
         rows.sort_by_key(|row| (row.arm, row.trial, row.generation));
         self.generation += 1;
         Ok(rows)
@@ -281,33 +286,37 @@ impl Arm {
         self.trials.iter_mut().filter_map(row).collect()
     }
 
-    /// Makes the next generation: the elites untouched, every other slot a mutated winner of a tournament.
+    /// Plans the next generation: which policy each slot comes from, and whether it mutates.
+    fn draw_parents(&mut self, generation: usize) {
+        let Learning { seed, population, elites, .. } = self.config.learning;
+        self.trials.par_iter_mut().for_each(|trial| {
+            let key = Key::new(seed, trial.index, Purpose::Tournament);
+            let plans = trial.parents.par_chunks_exact_mut(population + 1);
+            plans.zip(trial.fitness.par_chunks_exact(population)).enumerate().for_each(|(leader, (plan, fitness))| {
+                evolve::draw_parents(key, generation, leader, elites, fitness, plan);
+            });
+        });
+    }
+
+    /// Makes the next generation by its plan.
     fn breed(&mut self, generation: usize, level: Level) {
         let Arm { config, world, trials } = self;
-        let Learning { seed, population, elites, .. } = config.learning;
+        let Learning { seed, population, .. } = config.learning;
         let parameters = world.parameters();
+        let stride = (population + 1) * parameters;
         trials.par_iter_mut().for_each(|trial| {
-            let tournaments = Key::new(seed, trial.index, Purpose::Tournament);
-            let mutations = Key::new(seed, trial.index, Purpose::Mutation);
-            let stride = (population + 1) * parameters;
-            let parents = trial.weights.par_chunks_exact(stride).zip(trial.fitness.par_chunks_exact(population));
-            let children = trial.children.par_chunks_exact_mut(stride);
-            parents.zip(children).enumerate().for_each(|(leader, ((parents, fitness), children))| {
-                let best = evolve::best(fitness, elites);
-                let policy = |index: usize| &parents[index * parameters..(index + 1) * parameters];
-                let slots = children.par_chunks_exact_mut(parameters).with_min_len(64).enumerate();
-                slots.for_each_init(Vec::new, |chosen, (slot, child)| match best.get(slot) {
-                    Some(&elite) => child.copy_from_slice(policy(elite)),
-                    None if slot == population => child.copy_from_slice(policy(population)),
-                    None => {
-                        let winner = evolve::tournament(tournaments.at(generation, leader, slot), fitness);
-                        child.copy_from_slice(policy(winner));
-                        let key = mutations.at(generation, leader, slot);
-                        evolve::mutate(level, key, &config.learning, child, chosen);
-                    }
-                });
+            let key = Key::new(seed, trial.index, Purpose::Mutation);
+            let Trial { weights, children, parents, .. } = trial;
+            let children = children.par_chunks_exact_mut(parameters).with_min_len(64);
+            children.zip(&*parents).enumerate().for_each_init(Vec::new, |chosen, (index, (child, &parent))| {
+                let (leader, slot) = (index / (population + 1), index % (population + 1));
+                let from = leader * stride + (parent & !UNCHANGED) as usize * parameters;
+                child.copy_from_slice(&weights[from..from + parameters]);
+                if parent & UNCHANGED == 0 {
+                    evolve::mutate(level, key.at(generation, leader, slot), &config.learning, child, chosen);
+                }
             });
-            std::mem::swap(&mut trial.weights, &mut trial.children);
+            std::mem::swap(weights, &mut trial.children);
         });
     }
 
@@ -349,6 +358,7 @@ impl Trial {
             observed: std::iter::repeat_with(AtomicU32::default).take(slots).collect(),
             scores: std::iter::repeat_with(AtomicU32::default).take(slots * leaders).collect(),
             fitness: vec![0.0; leaders * population],
+            parents: vec![0; leaders * (population + 1)],
             pending: None,
         }
     }
