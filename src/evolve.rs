@@ -15,6 +15,8 @@ use crate::world::{World, on_grid};
 pub const MIN_WEIGHT: f32 = 1.0 / 1_073_741_824.0;
 /// Weights of larger size (2^20) stay at it.
 pub const MAX_WEIGHT: f32 = 1_048_576.0;
+/// Lanes of the widest vectors.
+const WIDEST: usize = 16;
 
 /// What a random number is for; no two purposes share any.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,6 +55,15 @@ impl Key {
         Key(self.draw(u32::MAX))
     }
 
+    /// [`Key::at`] for a slot a lane.
+    #[inline(always)]
+    fn at_lanes<S: Simd>(self, generation: usize, population: usize, slot: S::u32s) -> [S::u32s; 4] {
+        let simd = slot.token();
+        let Key([x, y, z, w]) = self;
+        let word = |word| S::u32s::simd_from(simd, word);
+        math::draw::<S>(word(x ^ generation as u32), word(y ^ population as u32), slot ^ z, word(w))
+    }
+
     /// [`Key::draw`] for a counter a lane.
     #[inline(always)]
     fn draw_lanes<S: Simd>(self, counter: S::u32s) -> [S::u32s; 4] {
@@ -72,14 +83,28 @@ fn pick(word: u32, below: usize) -> usize {
 ///
 /// Writes the policy of each leader, `[teams][leaders]`; `key` is of purpose [`Purpose::Teams`].
 pub fn form_teams(key: Key, generation: usize, leaders: usize, teams: &mut [u32]) {
-    let population = teams.len() / leaders;
+    let mut order = vec![0; teams.len() / leaders];
     for leader in 0..leaders {
-        let key = key.at(generation, leader, 0);
-        for team in 0..population {
+        shuffle(Level::new(), key, generation, leader, &mut order);
+        teams.iter_mut().skip(leader).step_by(leaders).zip(&order).for_each(|(policy, &shuffled)| *policy = shuffled);
+    }
+}
+
+/// What [`form_teams`] has of one population: its policy in each team.
+pub fn shuffle(level: Level, key: Key, generation: usize, population: usize, order: &mut [u32]) {
+    let key = key.at(generation, population, 0);
+    dispatch!(level, simd => shuffle_lanes(simd, key, order));
+}
+
+#[inline(always)]
+fn shuffle_lanes<S: Simd>(simd: S, key: Key, order: &mut [u32]) {
+    for first in (0..order.len()).step_by(S::f32s::LEN) {
+        let [words, ..] = key.draw_lanes::<S>(S::u32s::from_fn(simd, |lane| (first + lane) as u32));
+        for (newcomer, &word) in (first..order.len()).zip(words.as_slice()) {
             // Fisher and Yates, inside out: the newcomer takes a random place, whoever was there moves to the end.
-            let place = pick(key.draw(team as u32)[0], team + 1);
-            teams[team * leaders + leader] = teams[place * leaders + leader];
-            teams[place * leaders + leader] = team as u32;
+            let place = pick(word, newcomer + 1);
+            order[newcomer] = order[place];
+            order[place] = newcomer as u32;
         }
     }
 }
@@ -104,8 +129,20 @@ pub fn jitter_starts(key: Key, generation: usize, episode: usize, world: &World,
 /// The indices of the `count` best scores, best first; ties go to the lower index.
 pub fn best(scores: &[f32], count: usize) -> Vec<usize> {
     let better = |a: &usize, b: &usize| scores[*b].total_cmp(&scores[*a]).then(a.cmp(b));
-    let mut order: Vec<usize> = (0..scores.len()).collect();
-    if count < order.len() && count > 0 {
+    let mut order: Vec<usize>;
+    if count <= FEW {
+        // The best so far, in order; hardly any other score comes near them.
+        order = Vec::with_capacity(count + 1);
+        for (index, score) in scores.iter().enumerate() {
+            if order.len() < count || order.last().is_some_and(|&last| score.total_cmp(&scores[last]).is_gt()) {
+                order.insert(order.partition_point(|&other| scores[other].total_cmp(score).is_ge()), index);
+                order.truncate(count);
+            }
+        }
+        return order;
+    }
+    order = (0..scores.len()).collect();
+    if count < order.len() {
         order.select_nth_unstable_by(count - 1, better);
     }
     order.truncate(count);
@@ -113,9 +150,18 @@ pub fn best(scores: &[f32], count: usize) -> Vec<usize> {
     order
 }
 
+/// So few best scores are found without sorting.
+const FEW: usize = 16;
+
 /// The winner of the binary tournament of one slot: two distinct policies, the higher score, ties to the lower index.
 pub fn tournament(key: Key, scores: &[f32]) -> usize {
     let [first, second, ..] = key.draw(0);
+    winner(first, second, scores)
+}
+
+/// The winner between the policies that two random words pick.
+#[inline(always)]
+fn winner(first: u32, second: u32, scores: &[f32]) -> usize {
     let a = pick(first, scores.len());
     let b = pick(second, scores.len() - 1);
     let b = if b >= a { b + 1 } else { b };
@@ -129,9 +175,10 @@ pub const UNCHANGED: u32 = 1 << 31;
 /// Plans one population's next generation: the policy from which each slot comes, `[policies + 1]`, with [`UNCHANGED`]
 /// where it does not mutate.
 ///
-/// The first slots are the elites', best first; the last, the champion's, stays. `key` is of purpose
-/// [`Purpose::Tournament`], `scores` are `[policies]`.
+/// The first slots are the elites', best first, the others' parents win [`tournament`]s; the last slot, the
+/// champion's, stays. `key` is of purpose [`Purpose::Tournament`], `scores` are `[policies]`.
 pub fn draw_parents(
+    level: Level,
     key: Key,
     generation: usize,
     population: usize,
@@ -140,14 +187,37 @@ pub fn draw_parents(
     parents: &mut [u32],
 ) {
     let policies = scores.len();
-    let draw = |(slot, parent): (usize, &mut u32)| {
-        *parent = tournament(key.at(generation, population, slot), scores) as u32;
-    };
-    parents[..policies].par_iter_mut().with_min_len(1024).enumerate().skip(elites).for_each(draw);
+    parents[..policies].par_chunks_mut(DRAWN_TOGETHER).enumerate().for_each(|(chunk, parents)| {
+        let first = chunk * DRAWN_TOGETHER;
+        dispatch!(level, simd => draw_parents_lanes(simd, key, generation, population, first, scores, parents));
+    });
     for (parent, elite) in parents.iter_mut().zip(best(scores, elites)) {
         *parent = elite as u32 | UNCHANGED;
     }
     parents[policies] = policies as u32 | UNCHANGED;
+}
+
+/// Slots whose parents one thread draws at a time.
+const DRAWN_TOGETHER: usize = 4096;
+
+#[inline(always)]
+fn draw_parents_lanes<S: Simd>(
+    simd: S,
+    key: Key,
+    generation: usize,
+    population: usize,
+    first: usize,
+    scores: &[f32],
+    parents: &mut [u32],
+) {
+    for (slot, parents) in (first..).step_by(S::f32s::LEN).zip(parents.chunks_mut(S::f32s::LEN)) {
+        let slots = S::u32s::from_fn(simd, |lane| (slot + lane) as u32);
+        let [x, y, z, w] = key.at_lanes::<S>(generation, population, slots);
+        let [firsts, seconds, ..] = math::draw::<S>(x, y, z, w);
+        for ((parent, &first), &second) in parents.iter_mut().zip(firsts.as_slice()).zip(seconds.as_slice()) {
+            *parent = winner(first, second, scores) as u32;
+        }
+    }
 }
 
 /// Weights N(0, 1) for a new policy; `key` is a slot's of purpose [`Purpose::Weights`].
@@ -169,60 +239,191 @@ fn random_lanes<S: Simd>(simd: S, key: Key, weights: &mut [f32]) {
 
 /// Mutates a policy: every weight, with the configured probability, gains noise, `N(0, sigma)` times itself or plainly.
 ///
-/// `key` is a slot's of purpose [`Purpose::Mutation`]; `chosen` is scratch.
-pub fn mutate(level: Level, key: Key, learning: &Learning, weights: &mut [f32], chosen: &mut Vec<u32>) {
-    dispatch!(level, simd => mutate_lanes(simd, key, learning, weights, chosen));
+/// `key` is a slot's of purpose [`Purpose::Mutation`]; `scratch` may hold anything.
+pub fn mutate(level: Level, key: Key, learning: &Learning, weights: &mut [f32], scratch: &mut Vec<u32>) {
+    dispatch!(level, simd => mutate_lanes(simd, key, learning, weights, scratch));
 }
 
 #[inline(always)]
-fn mutate_lanes<S: Simd>(simd: S, key: Key, learning: &Learning, weights: &mut [f32], chosen: &mut Vec<u32>) {
-    choose(simd, key, learning.mutation_probability, weights.len(), chosen);
-    let noises = key.fork();
-    let sigma = learning.mutation_sigma as f32;
-    for chosen in chosen.chunks(S::f32s::LEN) {
-        let (mut index, mut weight) = (S::u32s::simd_from(simd, 0), splat(simd, 0.0));
-        for (lane, &chosen) in chosen.iter().enumerate() {
-            index.as_mut_slice()[lane] = chosen;
-            weight.as_mut_slice()[lane] = weights[chosen as usize];
+fn mutate_lanes<S: Simd>(simd: S, key: Key, learning: &Learning, weights: &mut [f32], scratch: &mut Vec<u32>) {
+    let mut chosen = Chosen::new(scratch, weights.len());
+    chosen.choose(simd, key, key.fork(), learning.mutation_probability, 0, weights.len());
+    chosen.mutate(simd, learning, weights);
+}
+
+/// The slots of one population to be filled by a plan.
+#[derive(Clone, Copy, Debug)]
+pub struct Brood<'a> {
+    /// Of purpose [`Purpose::Mutation`].
+    pub key: Key,
+    /// The generation that ends, and the population.
+    pub generation: usize,
+    pub population: usize,
+    /// The first of the slots, and each one's entry of the plan of [`draw_parents`].
+    pub first: usize,
+    pub parents: &'a [u32],
+    /// `[policies + 1][parameters]`.
+    pub policies: &'a [f32],
+}
+
+/// Fills slots, `[slots][parameters]`: each gets its parent's weights and [`mutate`]s. `scratch` may hold anything.
+pub fn breed(level: Level, learning: &Learning, brood: Brood<'_>, children: &mut [f32], scratch: &mut Vec<u32>) {
+    let parameters = children.len() / brood.parents.len();
+    // As many as stay in the innermost cache.
+    let together = (BRED_TOGETHER / parameters).clamp(1, WIDEST);
+    for (batch, (children, parents)) in
+        children.chunks_mut(together * parameters).zip(brood.parents.chunks(together)).enumerate()
+    {
+        // One after another, with nothing between: the processor then waits for many parents at once.
+        for (child, parent) in children.chunks_exact_mut(parameters).zip(parents) {
+            let from = (parent & !UNCHANGED) as usize * parameters;
+            child.copy_from_slice(&brood.policies[from..from + parameters]);
         }
-        let [a, b, ..] = noises.draw_lanes::<S>(index);
-        let noise = math::normal::<S>(a, b) * sigma;
-        let noise = if learning.mutation == Mutation::Scaled { noise * weight } else { noise };
-        let mutated = within_limits(simd, weight + noise);
-        for (lane, &chosen) in chosen.iter().enumerate() {
-            weights[chosen as usize] = mutated.as_slice()[lane];
+        let batch = Brood { first: brood.first + batch * together, parents, ..brood };
+        dispatch!(level, simd => mutate_brood(simd, learning, batch, children, scratch));
+    }
+}
+
+/// Weights that are copied, then mutated.
+const BRED_TOGETHER: usize = 2048;
+
+#[inline(always)]
+fn mutate_brood<S: Simd>(simd: S, learning: &Learning, brood: Brood<'_>, children: &mut [f32], scratch: &mut Vec<u32>) {
+    let parameters = children.len() / brood.parents.len();
+    let mut chosen = Chosen::new(scratch, children.len());
+    for (batch, parents) in brood.parents.chunks(S::f32s::LEN).enumerate() {
+        let first = batch * S::f32s::LEN;
+        let slots = S::u32s::from_fn(simd, |lane| (brood.first + first + lane) as u32);
+        let keys = brood.key.at_lanes::<S>(brood.generation, brood.population, slots);
+        let [x, y, z, w] = keys;
+        let forks = math::draw::<S>(x, y, z, w ^ u32::MAX);
+        for (lane, _) in parents.iter().enumerate().filter(|(_, parent)| *parent & UNCHANGED == 0) {
+            let key = Key([keys[0][lane], keys[1][lane], keys[2][lane], keys[3][lane]]);
+            let noises = Key([forks[0][lane], forks[1][lane], forks[2][lane], forks[3][lane]]);
+            let policy = (first + lane) * parameters;
+            chosen.choose(simd, key, noises, learning.mutation_probability, policy, parameters);
+        }
+    }
+    chosen.mutate(simd, learning, children);
+}
+
+/// The weights that mutate in one policy or several, so many that no lane idles.
+struct Chosen<'a> {
+    count: usize,
+    /// Each one's index in its policy and among all weights, its bits, and the key of its noise.
+    indices: &'a mut [u32],
+    places: &'a mut [u32],
+    bits: &'a mut [u32],
+    keys: [&'a mut [u32]; 4],
+}
+
+impl<'a> Chosen<'a> {
+    /// None of `most` weights.
+    #[inline(always)]
+    fn new(scratch: &'a mut Vec<u32>, most: usize) -> Chosen<'a> {
+        // Whole vectors are written from any place on.
+        let room = most + WIDEST;
+        if scratch.len() < 7 * room {
+            scratch.resize(7 * room, 0);
+        }
+        let mut fields = scratch.chunks_exact_mut(room);
+        let mut field = || fields.next().expect("there is room for seven");
+        Chosen {
+            count: 0,
+            indices: field(),
+            places: field(),
+            bits: field(),
+            keys: [field(), field(), field(), field()],
+        }
+    }
+
+    /// Adds those that mutate of the `count` weights from place `first` on: each by a random word of its own, of which
+    /// a draw makes four.
+    ///
+    /// Weight 64·block + 16·word + place takes its word from counter 16·block + place: no lane width shows in that.
+    #[inline(always)]
+    fn choose<S: Simd>(&mut self, simd: S, key: Key, noises: Key, probability: f64, first: usize, count: usize) {
+        let before = self.count;
+        if probability >= 1.0 {
+            for (index, to) in self.indices[before..before + count].iter_mut().enumerate() {
+                *to = index as u32;
+            }
+            self.count += count;
+        } else {
+            let threshold = (probability * (1u64 << 32) as f64) as u32;
+            for block in 0..count.div_ceil(64) {
+                let mut mutates = 0u64;
+                for place in (0..16).step_by(S::f32s::LEN) {
+                    let counter = S::u32s::from_fn(simd, |lane| (16 * block + place + lane) as u32);
+                    for (index, word) in (0..).zip(key.draw_lanes::<S>(counter)) {
+                        mutates |= word.simd_lt(threshold).to_bitmask() << (16 * index + place);
+                    }
+                }
+                let left = count - 64 * block;
+                if left < 64 {
+                    mutates &= (1 << left) - 1;
+                }
+                for (index, byte) in (64 * block as u32..).step_by(8).zip(mutates.to_le_bytes()).take(left.div_ceil(8))
+                {
+                    let to = &mut self.indices[self.count..self.count + 8];
+                    for (to, &bit) in to.iter_mut().zip(&BITS[byte as usize]) {
+                        *to = index + u32::from(bit);
+                    }
+                    self.count += byte.count_ones() as usize;
+                }
+            }
+        }
+        for at in (before..self.count).step_by(S::f32s::LEN) {
+            let vector = at..at + S::f32s::LEN;
+            let index = S::u32s::from_slice(simd, &self.indices[vector.clone()]);
+            (index + first as u32).store_slice(&mut self.places[vector.clone()]);
+            for (to, word) in self.keys.iter_mut().zip(noises.0) {
+                S::u32s::simd_from(simd, word).store_slice(&mut to[vector.clone()]);
+            }
+        }
+    }
+
+    /// Adds its noise to each.
+    #[inline(always)]
+    fn mutate<S: Simd>(self, simd: S, learning: &Learning, weights: &mut [f32]) {
+        let Chosen { count, indices, places, bits, keys: [x, y, z, w] } = self;
+        let sigma = learning.mutation_sigma as f32;
+        for (bits, &place) in bits[..count].iter_mut().zip(&*places) {
+            *bits = weights[place as usize].to_bits();
+        }
+        for at in (0..count).step_by(S::f32s::LEN) {
+            let vector = at..at + S::f32s::LEN;
+            let load = |from: &[u32]| S::u32s::from_slice(simd, &from[vector.clone()]);
+            let weight: S::f32s = load(bits).bitcast();
+            let [a, b, ..] = math::draw::<S>(load(x), load(y), load(z), load(w) ^ load(indices));
+            let noise = math::normal::<S>(a, b) * sigma;
+            let noise = if learning.mutation == Mutation::Scaled { noise * weight } else { noise };
+            let mutated: S::u32s = within_limits(simd, weight + noise).bitcast();
+            mutated.store_slice(&mut bits[vector]);
+        }
+        for (&bits, &place) in bits[..count].iter().zip(&*places) {
+            weights[place as usize] = f32::from_bits(bits);
         }
     }
 }
 
-/// Which of `count` weights mutate: each by a random word of its own, of which a draw makes four.
-///
-/// Weight 64·block + 16·word + place takes its word from counter 16·block + place: no lane width shows in that.
-#[inline(always)]
-fn choose<S: Simd>(simd: S, key: Key, probability: f64, count: usize, chosen: &mut Vec<u32>) {
-    chosen.clear();
-    if probability >= 1.0 {
-        chosen.extend(0..count as u32);
-        return;
-    }
-    let threshold = (probability * (1u64 << 32) as f64) as u32;
-    for block in 0..count.div_ceil(64) as u32 {
-        let mut mutates = 0u64;
-        for place in (0..16).step_by(S::f32s::LEN) {
-            let counter = S::u32s::from_fn(simd, |lane| 16 * block + place + lane as u32);
-            for (index, word) in (0..).zip(key.draw_lanes::<S>(counter)) {
-                mutates |= word.simd_lt(threshold).to_bitmask() << (16 * index + place);
+/// The bits that are set in each byte, ascending, then zeros.
+const BITS: [[u8; 8]; 256] = {
+    let mut bits = [[0; 8]; 256];
+    let mut byte = 0;
+    while byte < 256 {
+        let (mut bit, mut count) = (0, 0);
+        while bit < 8 {
+            if byte >> bit & 1 == 1 {
+                bits[byte][count] = bit;
+                count += 1;
             }
+            bit += 1;
         }
-        while mutates != 0 {
-            let index = 64 * block + mutates.trailing_zeros();
-            if index < count as u32 {
-                chosen.push(index);
-            }
-            mutates &= mutates - 1;
-        }
+        byte += 1;
     }
-}
+    bits
+};
 
 /// A weight brought within the sizes that policies may have.
 #[inline(always)]

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use crate::backend::{Backend, BackendError, Episode, Group};
 use crate::config::{Config, Learning};
 use crate::credit::Credit;
-use crate::evolve::{self, Key, Purpose, UNCHANGED};
+use crate::evolve::{self, Key, Purpose};
 pub use crate::record::checkpoint::Snapshot;
 pub use crate::record::metrics::Row;
 use crate::world::World;
@@ -40,7 +40,8 @@ struct Trial {
     /// `[leaders][policies + 1][parameters]`, this generation's and the next.
     weights: Vec<f32>,
     children: Vec<f32>,
-    /// Policies of each team, `[policies + 1][leaders]`.
+    /// Policies of each team, `[leaders][policies]`, and as the backend wants them, `[policies + 1][leaders]`.
+    orders: Vec<u32>,
     teams: Vec<u32>,
     /// Start positions, `[episodes][agents]`.
     starts: Vec<Vec<Vec2>>,
@@ -99,7 +100,7 @@ impl Trainer {
         let playing = self.arms.iter_mut().enumerate().filter(|(_, arm)| generation <= arm.last() + 1);
         let mut playing: Vec<(usize, &mut Arm)> = playing.collect();
 
-        playing.par_iter_mut().for_each(|(_, arm)| arm.prepare(generation));
+        playing.par_iter_mut().for_each(|(_, arm)| arm.prepare(generation, level));
         play(backend, &playing, |arm| {
             let population = arm.config.learning.population;
             let first = if generation > arm.last() { population } else { 0 };
@@ -113,7 +114,7 @@ impl Trainer {
         let mut rows = playing.par_iter_mut().flat_map_iter(conclude).collect::<Vec<_>>();
         playing.retain(|(_, arm)| generation < arm.last());
         playing.par_iter_mut().for_each(|(_, arm)| {
-            arm.draw_parents(generation);
+            arm.draw_parents(generation, level);
             arm.breed(generation, level);
         });
         rows.sort_by_key(|row| (row.arm, row.trial, row.generation));
@@ -243,13 +244,21 @@ impl Arm {
     }
 
     /// Forms the teams of a generation and draws its starts.
-    fn prepare(&mut self, generation: usize) {
+    fn prepare(&mut self, generation: usize, level: Level) {
         let Arm { config, world, trials } = self;
         let Learning { seed, population, start_jitter, .. } = config.learning;
         let leaders = world.leaders();
         trials.par_iter_mut().for_each(|trial| {
             let key = Key::new(seed, trial.index, Purpose::Teams);
-            evolve::form_teams(key, generation, leaders, &mut trial.teams[..population * leaders]);
+            let orders = trial.orders.par_chunks_exact_mut(population).with_min_len(few(population)).enumerate();
+            orders.for_each(|(leader, order)| evolve::shuffle(level, key, generation, leader, order));
+            let orders = &trial.orders;
+            let teams = trial.teams[..population * leaders].par_chunks_exact_mut(leaders).with_min_len(CHUNK);
+            teams.enumerate().for_each(|(team, policies)| {
+                for (policy, order) in policies.iter_mut().zip(orders.chunks_exact(population)) {
+                    *policy = order[team];
+                }
+            });
             let key = Key::new(seed, trial.index, Purpose::Starts);
             for (episode, starts) in trial.starts.iter_mut().enumerate() {
                 evolve::jitter_starts(key, generation, episode, world, start_jitter, starts);
@@ -268,6 +277,7 @@ impl Arm {
             trial.pending = Some(Row { arm, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
             trial.rate(world.leaders(), population);
             let policies = trial.weights.par_chunks_exact_mut((population + 1) * world.parameters());
+            let policies = policies.with_min_len(few(population));
             policies.zip(trial.fitness.par_chunks_exact(population)).for_each(|(policies, fitness)| {
                 let best = evolve::best(fitness, 1)[0] * world.parameters();
                 policies.copy_within(best..best + world.parameters(), population * world.parameters());
@@ -287,19 +297,20 @@ impl Arm {
     }
 
     /// Plans the next generation: which policy each slot comes from, and whether it mutates.
-    fn draw_parents(&mut self, generation: usize) {
+    fn draw_parents(&mut self, generation: usize, level: Level) {
         let Learning { seed, population, elites, .. } = self.config.learning;
         self.trials.par_iter_mut().for_each(|trial| {
             let key = Key::new(seed, trial.index, Purpose::Tournament);
-            let plans = trial.parents.par_chunks_exact_mut(population + 1);
+            let plans = trial.parents.par_chunks_exact_mut(population + 1).with_min_len(few(population));
             plans.zip(trial.fitness.par_chunks_exact(population)).enumerate().for_each(|(leader, (plan, fitness))| {
-                evolve::draw_parents(key, generation, leader, elites, fitness, plan);
+                evolve::draw_parents(level, key, generation, leader, elites, fitness, plan);
             });
         });
     }
 
     /// Makes the next generation by its plan.
     fn breed(&mut self, generation: usize, level: Level) {
+        thread_local! { static SCRATCH: RefCell<Vec<u32>> = const { RefCell::new(Vec::new()) }; }
         let Arm { config, world, trials } = self;
         let Learning { seed, population, .. } = config.learning;
         let parameters = world.parameters();
@@ -307,14 +318,17 @@ impl Arm {
         trials.par_iter_mut().for_each(|trial| {
             let key = Key::new(seed, trial.index, Purpose::Mutation);
             let Trial { weights, children, parents, .. } = trial;
-            let children = children.par_chunks_exact_mut(parameters).with_min_len(64);
-            children.zip(&*parents).enumerate().for_each_init(Vec::new, |chosen, (index, (child, &parent))| {
-                let (leader, slot) = (index / (population + 1), index % (population + 1));
-                let from = leader * stride + (parent & !UNCHANGED) as usize * parameters;
-                child.copy_from_slice(&weights[from..from + parameters]);
-                if parent & UNCHANGED == 0 {
-                    evolve::mutate(level, key.at(generation, leader, slot), &config.learning, child, chosen);
-                }
+            let populations = weights.par_chunks_exact(stride).zip(parents.par_chunks_exact(population + 1));
+            let children = children.par_chunks_exact_mut(stride);
+            populations.zip(children).enumerate().for_each(|(leader, ((policies, parents), children))| {
+                let broods = parents.par_chunks(BROOD).zip(children.par_chunks_mut(BROOD * parameters));
+                broods.enumerate().for_each(|(index, (parents, children))| {
+                    let first = index * BROOD;
+                    let brood = evolve::Brood { key, generation, population: leader, first, parents, policies };
+                    SCRATCH.with_borrow_mut(|scratch| {
+                        evolve::breed(level, &config.learning, brood, children, scratch);
+                    });
+                });
             });
             std::mem::swap(weights, &mut trial.children);
         });
@@ -352,6 +366,7 @@ impl Trial {
             index,
             children: vec![0.0; weights.len()],
             weights,
+            orders: vec![0; leaders * population],
             // The champion's team, the last, is made of every population's last slot.
             teams: vec![population as u32; (population + 1) * leaders],
             starts: vec![Vec::new(); episodes_per_team],
@@ -378,16 +393,27 @@ impl Trial {
     /// Hands each team's scores, averaged over its episodes, back to its policies.
     fn rate(&mut self, leaders: usize, population: usize) {
         let episodes = self.starts.len();
-        let Trial { teams, scores, fitness, .. } = self;
-        for (team, policies) in teams[..population * leaders].chunks_exact(leaders).enumerate() {
-            for (leader, &policy) in policies.iter().enumerate() {
+        let Trial { orders, scores, fitness, .. } = self;
+        let populations = fitness.par_chunks_exact_mut(population).zip(orders.par_chunks_exact(population));
+        populations.with_min_len(few(population)).enumerate().for_each(|(leader, (fitness, order))| {
+            for (team, &policy) in order.iter().enumerate() {
                 let score = |episode: usize| {
                     let at = (episode * (population + 1) + team) * leaders + leader;
                     f64::from(f32::from_bits(scores[at].load(Relaxed)))
                 };
                 let total: f64 = (0..episodes).map(score).sum();
-                fitness[leader * population + policy as usize] = (total / episodes as f64) as f32;
+                fitness[policy as usize] = (total / episodes as f64) as f32;
             }
-        }
+        });
     }
+}
+
+/// Slots that one thread fills at a time.
+const BROOD: usize = 64;
+/// Policies of whom a thread does something short, at least: it has to be worth waking another.
+const CHUNK: usize = 2048;
+
+/// Populations that make a [`CHUNK`].
+fn few(population: usize) -> usize {
+    CHUNK.div_ceil(population)
 }
