@@ -17,8 +17,8 @@
 //! 6. [`evolve`] selects and mutates; [`run`] keeps what came out by [`record`]; [`report`] draws it.
 //!
 //! Around that: [`run`] keeps a trainer, its folder and its checkpoints together, [`sweep`] makes many runs of a grid,
-//! [`verify`] compares two backends on the random worlds of [`sample`], [`bench`] times a backend against what the machine
-//! can do at most, and [`cli`] turns what was typed into all this.
+//! [`memory`] tells what a run will take, [`verify`] compares two backends on the random worlds of [`sample`], [`bench`]
+//! times a backend against what the machine can do at most, and [`cli`] turns what was typed into all this.
 //!
 //! Imports run one way: `main ▸ cli ▸ {run, sweep, report, verify, bench} ▸ trainer ▸ {evolve, credit, backend}`,
 //! `backend ▸ kernels`. Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
@@ -30,6 +30,7 @@ pub mod config;
 pub mod credit;
 pub mod evolve;
 pub mod kernels;
+pub mod memory;
 pub mod record;
 pub mod report;
 pub mod run;

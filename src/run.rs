@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::backend::{Backend, BackendError};
 use crate::config::Config;
+use crate::memory::{self, TooLittle};
 use crate::record::RecordError;
 use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule};
 use crate::record::disk::Disk;
@@ -22,6 +23,8 @@ const FLUSH: Duration = Duration::from_secs(1);
 pub enum RunError {
     #[error(transparent)]
     Record(#[from] RecordError),
+    #[error(transparent)]
+    TooLittle(#[from] TooLittle),
     #[error("{error}\ngeneration {generation} could not be played{}", after(saved))]
     Backend { error: BackendError, generation: usize, saved: Result<(), Box<RunError>> },
     #[error(
@@ -118,11 +121,11 @@ impl Session {
     /// # Errors
     /// The folder cannot be used (see [`Folder::open`]), or there is no memory for the populations.
     pub fn open(config: Config, path: &Path, start: Start, disk: Disk) -> Result<(Opened, Vec<String>), RunError> {
-        // This generation, the next one and a checkpoint; asked for first, since later a refusal would be an abort.
-        let bytes = 3 * config.policy_bytes();
+        // This generation and the next one; asked for first, since later a refusal would be an abort.
+        let bytes = 2 * config.policy_bytes();
         Vec::<u8>::new()
             .try_reserve_exact(bytes)
-            .map_err(|_| RunError::Memory { what: "three times the policies of all trials", bytes })?;
+            .map_err(|_| RunError::Memory { what: "twice the policies of all trials", bytes })?;
         let (folder, found) = Folder::open(path, start, &config, disk.clone())?;
         let run = found.run.unwrap_or_else(|| Run::new(&config));
         if let Some((story, digest)) = found.finished.zip(run.digest.clone()) {
@@ -207,12 +210,17 @@ impl Session {
         self.run = Run { description: backend.describe(), ..run };
     }
 
-    /// Starts writing a checkpoint, once the one before is written: there is memory for one.
+    /// Starts writing a checkpoint, once the one before is written: there is memory for one. A large one is written
+    /// before training goes on, for there may not be memory for any.
     fn save(&mut self) -> Result<(), RunError> {
         self.keeper.wait()?;
         let since = Instant::now();
         let (metrics, output) = self.metrics.mark().map_err(self.metrics_failed())?;
         let bytes = self.config.policy_bytes();
+        if !memory::copies_checkpoint([&self.config]) {
+            let (config, seconds, snapshot) = (checkpoint::digest(&self.config), self.seconds(), self.trainer.view());
+            return Ok(self.keeper.save_now(&Checkpoint { config, seconds, metrics, snapshot }, &output, since)?);
+        }
         let snapshot =
             self.trainer.snapshot().map_err(|_| RunError::Memory { what: "a checkpoint beside training", bytes })?;
         let (config, seconds) = (checkpoint::digest(&self.config), self.seconds());
@@ -234,7 +242,7 @@ impl Session {
         self.keeper.wait()?;
         let (_, output) = self.metrics.mark().map_err(self.metrics_failed())?;
         output.sync().map_err(self.metrics_failed())?;
-        let trials = self.trainer.policies(0);
+        let trials = self.trainer.best_policies(0);
         policies::write(&self.folder.disk, &self.folder.file(POLICIES), &self.config, &trials)?;
         let (story, digest) = self.folder.digest(&self.config, &trials)?;
         self.write_run(State::Done, Some(digest.clone()))?;

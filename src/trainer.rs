@@ -126,7 +126,24 @@ impl Trainer {
     /// a trial.
     pub fn policies(&self, arm: usize) -> Vec<Vec<f32>> {
         let arm = &self.arms[arm];
-        arm.trials.iter().map(|trial| arm.best_first(trial)).collect()
+        let sort = |trial: &Trial| {
+            let mut policies = vec![0.0; arm.world.leaders() * arm.config.learning.population * arm.world.parameters()];
+            arm.sort(&trial.weights, &trial.fitness, &mut policies);
+            policies
+        };
+        arm.trials.iter().map(sort).collect()
+    }
+
+    /// [`Trainer::policies`], in the room of the next generation.
+    pub fn best_policies(&mut self, arm: usize) -> Vec<&[f32]> {
+        let arm = &mut self.arms[arm];
+        let count = arm.world.leaders() * arm.config.learning.population * arm.world.parameters();
+        for index in 0..arm.trials.len() {
+            let mut policies = std::mem::take(&mut arm.trials[index].children);
+            arm.sort(&arm.trials[index].weights, &arm.trials[index].fitness, &mut policies[..count]);
+            arm.trials[index].children = policies;
+        }
+        arm.trials.iter().map(|trial| &trial.children[..count]).collect()
     }
 
     /// The populations of a trial about to play, `[leaders][policies + 1][parameters]`; a population's last slot is
@@ -140,26 +157,35 @@ impl Trainer {
         &self.arms[arm].world
     }
 
+    /// What [`Trainer::restore`] needs, where it lies.
+    pub fn view(&self) -> Snapshot<&[f32]> {
+        let each = |numbers: fn(&Trial) -> &[f32]| {
+            self.arms.iter().map(|arm| arm.trials.iter().map(numbers).collect()).collect()
+        };
+        Snapshot {
+            generation: self.generation,
+            weights: each(|trial| &trial.weights),
+            fitness: each(|trial| &trial.fitness),
+            pending: self.arms.iter().map(|arm| arm.trials.iter().map(|trial| trial.pending).collect()).collect(),
+        }
+    }
+
     /// What [`Trainer::restore`] needs, in memory of its own.
     ///
     /// # Errors
     /// There is not so much memory.
     pub fn snapshot(&self) -> Result<Snapshot, TryReserveError> {
-        let copy = |numbers: &Vec<f32>| {
+        let copy = |numbers: &[f32]| {
             let mut copy = Vec::new();
             copy.try_reserve_exact(numbers.len())?;
             copy.extend_from_slice(numbers);
             Ok(copy)
         };
-        let each = |numbers: fn(&Trial) -> &Vec<f32>| -> Result<_, TryReserveError> {
-            self.arms.iter().map(|arm| arm.trials.iter().map(|trial| copy(numbers(trial))).collect()).collect()
+        let each = |arms: Vec<Vec<&[f32]>>| -> Result<Vec<Vec<_>>, TryReserveError> {
+            arms.into_iter().map(|trials| trials.into_iter().map(copy).collect()).collect()
         };
-        Ok(Snapshot {
-            generation: self.generation,
-            weights: each(|trial| &trial.weights)?,
-            fitness: each(|trial| &trial.fitness)?,
-            pending: self.arms.iter().map(|arm| arm.trials.iter().map(|trial| trial.pending).collect()).collect(),
-        })
+        let Snapshot { generation, weights, fitness, pending } = self.view();
+        Ok(Snapshot { generation, weights: each(weights)?, fitness: each(fitness)?, pending })
     }
 
     /// Goes on from a snapshot of a trainer of the same configs; false where its sizes do not fit them.
@@ -334,17 +360,17 @@ impl Arm {
         });
     }
 
-    /// A trial's policies without the champion's slot, best first in each population.
-    fn best_first(&self, trial: &Trial) -> Vec<f32> {
+    /// Copies policies, without the champions' slots, best first in each population.
+    fn sort(&self, weights: &[f32], fitness: &[f32], policies: &mut [f32]) {
         let (population, parameters) = (self.config.learning.population, self.world.parameters());
-        let mut policies = Vec::with_capacity(self.world.leaders() * population * parameters);
-        let populations = trial.weights.chunks_exact((population + 1) * parameters);
-        for (weights, fitness) in populations.zip(trial.fitness.chunks_exact(population)) {
-            for index in evolve::best(fitness, population) {
-                policies.extend_from_slice(&weights[index * parameters..(index + 1) * parameters]);
+        let populations = weights.par_chunks_exact((population + 1) * parameters);
+        let sorted = policies.par_chunks_exact_mut(population * parameters);
+        populations.zip(fitness.par_chunks_exact(population)).zip(sorted).for_each(|((weights, fitness), sorted)| {
+            let best = evolve::best(fitness, population);
+            for (policy, index) in sorted.chunks_exact_mut(parameters).zip(best) {
+                policy.copy_from_slice(&weights[index * parameters..(index + 1) * parameters]);
             }
-        }
-        policies
+        });
     }
 }
 

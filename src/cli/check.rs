@@ -4,6 +4,7 @@ use serde::Serialize;
 
 use super::{ConfigArgs, Error, print};
 use crate::config::Config;
+use crate::memory::Plan;
 use crate::world::World;
 
 #[derive(clap::Args)]
@@ -30,6 +31,12 @@ struct Cost {
     policy_bytes: usize,
     /// Bytes of one team's record: who was near which POI at which step, and which leader each follower saw.
     record_bytes: usize,
+    /// Peak of the process where the CPU plays, and how much of it only while a checkpoint is written.
+    host_bytes: u64,
+    checkpoint_bytes: u64,
+    /// Peak of the process where a GPU plays, and of the GPU's buffers.
+    gpu_host_bytes: u64,
+    adapter_bytes: u64,
 }
 
 impl Cost {
@@ -42,6 +49,7 @@ impl Cost {
             * wide(learning.population + 1)
             * wide(learning.episodes_per_team);
         let team_steps = teams * wide(world.steps());
+        let plan = Plan::of([config], rayon::current_num_threads());
         Cost {
             agents: world.agents(),
             learners: config.learners(),
@@ -51,6 +59,10 @@ impl Cost {
             parameters: config.parameters(),
             policy_bytes: config.policy_bytes(),
             record_bytes: (world.set_words() + world.followers() * world.leaders()) * size_of::<u32>(),
+            host_bytes: plan.host,
+            checkpoint_bytes: plan.checkpoint,
+            gpu_host_bytes: plan.gpu_host,
+            adapter_bytes: plan.adapter,
         }
     }
 }
@@ -69,7 +81,8 @@ pub fn run(args: Args) -> Result<(), Error> {
         let report = Report { config: &config, cost: &cost };
         return print(&(serde_json::to_string(&report).expect("plain fields are JSON") + "\n"));
     }
-    let Cost { agents, learners, teams, team_steps, agent_steps, parameters, policy_bytes, record_bytes } = cost;
+    let Cost { agents, learners, teams, team_steps, agent_steps, parameters, policy_bytes, record_bytes, .. } = cost;
+    let Cost { host_bytes, checkpoint_bytes, gpu_host_bytes, adapter_bytes, .. } = cost;
     print(&format!(
         "{}
 # A run of this plays {teams} teams, champions included:
@@ -79,6 +92,8 @@ pub fn run(args: Args) -> Result<(), Error> {
 #   parameters a policy   {parameters}
 #   policies, all trials  {policy_bytes} bytes
 #   record of a team      {record_bytes} bytes
+#   memory at the peak    {host_bytes} bytes on the CPU, {checkpoint_bytes} of them only while a checkpoint is written
+#     with a GPU          {gpu_host_bytes} bytes, and {adapter_bytes} of the adapter's
 ",
         config.to_toml()
     ))

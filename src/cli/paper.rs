@@ -4,11 +4,13 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use super::{Error, Overrides, RunOptions, backend, print, say};
+use crate::memory;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::report::curves::PRINT;
 use crate::report::paper::{self, Measured, Summary};
 use crate::report::progress::Progress;
+use crate::run::RunError;
 use crate::trainer::Trainer;
 
 #[derive(clap::Args)]
@@ -37,7 +39,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let Args { out, trials, generations, seed, quiet, run } = args;
     let overrides = Overrides { seed, trials, generations, ..Overrides::default() };
     let mut arms = paper::arms(&overrides.list())?;
-    let (mut backend, _) = backend::open(&run)?;
+    let (mut backend, machine) = backend::open(&run)?;
     // Before training: a folder that cannot be written should not cost the time.
     let disk = Disk::default();
     let failed = |path: &PathBuf| {
@@ -52,6 +54,8 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
 
     let since = Instant::now();
+    let plan = memory::Plan::of(arms.iter().map(|arm| &arm.config), rayon::current_num_threads());
+    plan.check(machine.backend == "gpu").map_err(RunError::from)?;
     let mut trainer = Trainer::new(arms.iter().map(|arm| arm.config.clone()).collect());
     let names = arms.iter().map(|arm| (arm.name(), arm.pois())).collect();
     let mut progress = Progress::new(names, 0, learning.generations, quiet);

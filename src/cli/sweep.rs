@@ -10,6 +10,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use super::train::Signals;
 use super::{Error, Overrides, RunOptions, backend, print, say};
 use crate::config::{self, ConfigError, Problem};
+use crate::memory;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{CONFIG, Start};
@@ -289,10 +290,7 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
 
 /// Half of the memory that is free now, or 2 GiB where the system does not tell.
 fn free_memory() -> usize {
-    let told = std::fs::read_to_string("/proc/meminfo").ok();
-    let line = told.as_deref().and_then(|text| text.lines().find_map(|line| line.strip_prefix("MemAvailable:")));
-    let kib = line.and_then(|line| line.split_whitespace().next()?.parse::<usize>().ok());
-    kib.map_or(2 << 30, |kib| kib.saturating_mul(1024) / 2)
+    memory::available().map_or(2 << 30, |bytes| (bytes / 2) as usize)
 }
 
 /// Puts together what is there, draws it, and fails where something is missing.

@@ -11,6 +11,7 @@ use clap::ValueEnum;
 
 use super::{ConfigArgs, Error, RunOptions, backend, print, say};
 use crate::config::{Config, Override};
+use crate::memory::Plan;
 use crate::record::checkpoint::Schedule;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, METRICS, POLICIES, Start};
@@ -18,7 +19,7 @@ use crate::record::metrics::Row;
 use crate::report::progress::Progress;
 use crate::report::runs;
 use crate::report::tensorboard::Events;
-use crate::run::{Opened, Options, Outcome, Results, Session};
+use crate::run::{Opened, Options, Outcome, Results, RunError, Session};
 
 /// Where runs without `--out` go.
 const RUNS: &str = "runs";
@@ -99,6 +100,7 @@ impl Args {
 pub fn run(args: Args) -> Result<(), Error> {
     let config = args.load()?;
     let (backend, machine) = backend::open(&args.run)?;
+    Plan::of([&config], rayon::current_num_threads()).check(machine.backend == "gpu").map_err(RunError::from)?;
     let runs_on = backend.describe();
     let (folder, start) = args.folder()?;
     if !args.quiet {

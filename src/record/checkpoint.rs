@@ -31,26 +31,28 @@ const KEPT: usize = 2;
 const SHARE: u32 = 20;
 
 /// What training needs to go on from where it was: the populations about to play, and each trial's unfinished row.
+///
+/// Its numbers are its own, or (`N` a slice) a trainer's.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Snapshot {
+pub struct Snapshot<N = Vec<f32>> {
     /// The generation that plays next.
     pub generation: usize,
     /// `[arms][trials]` of weights `[leaders][policies + 1][parameters]`.
-    pub weights: Vec<Vec<Vec<f32>>>,
+    pub weights: Vec<Vec<N>>,
     /// `[arms][trials]` of the scores of the generation before, `[leaders][policies]`.
-    pub fitness: Vec<Vec<Vec<f32>>>,
+    pub fitness: Vec<Vec<N>>,
     pub pending: Vec<Vec<Option<Row>>>,
 }
 
 /// A run at one moment.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Checkpoint {
+pub struct Checkpoint<N = Vec<f32>> {
     /// [`digest`] of the run's config.
     pub config: String,
     /// Time trained.
     pub seconds: f64,
     pub metrics: Mark,
-    pub snapshot: Snapshot,
+    pub snapshot: Snapshot<N>,
 }
 
 /// SHA-256 of all of a config that has a say in the results.
@@ -63,7 +65,7 @@ pub fn without_checkpoint(config: &Config) -> Config {
     Config { checkpoint: config::Checkpoint::default(), ..config.clone() }
 }
 
-impl Checkpoint {
+impl<N: AsRef<[f32]>> Checkpoint<N> {
     /// Writes it, whole or not at all.
     ///
     /// # Errors
@@ -95,19 +97,21 @@ impl Checkpoint {
             list.push(Tensor::floats(
                 format!("weights.{arm}"),
                 weights.into(),
-                snapshot.weights[arm].iter().map(Vec::as_slice),
+                snapshot.weights[arm].iter().map(AsRef::as_ref),
             ));
             list.push(Tensor::floats(
                 format!("fitness.{arm}"),
                 fitness.into(),
-                snapshot.fitness[arm].iter().map(Vec::as_slice),
+                snapshot.fitness[arm].iter().map(AsRef::as_ref),
             ));
         }
         // Numbers of 8 bytes first, so that all are aligned.
         list.sort_by_key(|tensor| tensor.dtype != Dtype::F64);
         tensors::write(disk, path, KIND, &metadata, &list)
     }
+}
 
+impl Checkpoint {
     /// Reads a checkpoint of a trainer of these configs.
     ///
     /// # Errors
@@ -271,6 +275,25 @@ impl Keeper {
         Ok(())
     }
 
+    /// [`Keeper::save`], here and now, of numbers that are not its own.
+    ///
+    /// # Errors
+    /// This checkpoint or the one before it could not be written.
+    pub fn save_now(
+        &mut self,
+        checkpoint: &Checkpoint<&[f32]>,
+        metrics: &Output,
+        since: Instant,
+    ) -> Result<(), RecordError> {
+        self.wait()?;
+        let generation = checkpoint.snapshot.generation;
+        let path = path(&self.folder, generation);
+        metrics.sync().map_err(RecordError::write(metrics.path()))?;
+        checkpoint.write(&self.disk, &path, &self.configs).map_err(RecordError::write(&path))?;
+        self.last = (generation, Instant::now(), since.elapsed());
+        self.keep(generation)
+    }
+
     /// Waits until all is written, and removes what is not kept.
     ///
     /// # Errors
@@ -279,6 +302,11 @@ impl Keeper {
         let Some(writing) = self.writing.take() else { return Ok(()) };
         let (generation, cost) = writing.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
         self.last.2 = cost;
+        self.keep(generation)
+    }
+
+    /// Counts a checkpoint as whole, and removes what is not kept.
+    fn keep(&mut self, generation: usize) -> Result<(), RecordError> {
         self.kept.retain(|&kept| kept != generation);
         self.kept.push(generation);
         while self.kept.len() > KEPT {

@@ -280,7 +280,7 @@ impl Folder {
     ///
     /// # Errors
     /// The metrics cannot be read, or have not one row for every trial and generation.
-    pub fn digest(&self, config: &Config, policies: &[Vec<f32>]) -> Result<(Story, String), RecordError> {
+    pub fn digest(&self, config: &Config, policies: &[impl AsRef<[f32]>]) -> Result<(Story, String), RecordError> {
         let path = self.file(METRICS);
         let damaged = |reason: String| RecordError::damaged(&path, reason);
         let mut rows = metrics::open(&path)?;
@@ -305,7 +305,7 @@ impl Folder {
             return Err(damaged(format!("it has {count} rows, not {}", trials * (last + 1))));
         }
         let mut hash: Sha256 = rows.digest();
-        policies.iter().for_each(|weights| hash.update(bytemuck::cast_slice::<f32, u8>(weights)));
+        policies.iter().for_each(|weights| hash.update(bytemuck::cast_slice::<f32, u8>(weights.as_ref())));
         Ok((story, hex(&hash.finalize())))
     }
 

@@ -38,10 +38,10 @@ pub fn layers(config: &Config) -> String {
 ///
 /// # Errors
 /// The file cannot be written; the one before it is then still there.
-pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[Vec<f32>]) -> Result<(), RecordError> {
+pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f32]>]) -> Result<(), RecordError> {
     let shape = vec![config.learners(), config.learning.population, config.parameters()];
     let tensor = |(trial, weights)| Tensor::floats(format!("weights.{trial}"), shape.clone(), [weights]);
-    let tensors: Vec<_> = trials.iter().map(Vec::as_slice).enumerate().map(tensor).collect();
+    let tensors: Vec<_> = trials.iter().map(AsRef::as_ref).enumerate().map(tensor).collect();
     let metadata = BTreeMap::from([("layers".to_string(), layers(config))]);
     tensors::write(disk, path, KIND, &metadata, &tensors).map_err(RecordError::write(path))
 }

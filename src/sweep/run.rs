@@ -208,7 +208,7 @@ impl<'a> Member<'a> {
     }
 
     /// Writes what came out.
-    fn finish(&mut self, trials: &[Vec<f32>], seconds: f64) -> Result<(), RecordError> {
+    fn finish(&mut self, trials: &[&[f32]], seconds: f64) -> Result<(), RecordError> {
         self.keeper.wait()?;
         let (_, output) = self.metrics.mark().map_err(self.metrics_failed())?;
         output.sync().map_err(self.metrics_failed())?;
@@ -326,7 +326,7 @@ impl<'a> Batch<'a> {
         let seconds = self.since.elapsed().as_secs_f64();
         for (arm, member) in self.members.iter_mut().enumerate() {
             if !member.done && member.generation > member.last() + 1 {
-                member.finish(&self.trainer.policies(arm), seconds)?;
+                member.finish(&self.trainer.best_policies(arm), seconds)?;
             }
         }
         Ok(())

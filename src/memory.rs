@@ -1,0 +1,216 @@
+//! What a run takes in memory at its peak, told before it starts.
+//!
+//! Every array that grows with the run is counted as it is laid out where it lives: [`crate::trainer`] for what every
+//! run has, [`crate::backend::cpu`] and [`crate::backend::gpu::episode`] for what episodes take. What does not grow is
+//! [`PROGRAM`]. Nothing else is as large: checkpoints and policies are written straight from the populations, or from
+//! one copy, see [`copies_checkpoint`].
+
+use std::fs;
+
+use fearless_simd::{Level, Simd, dispatch, prelude::*};
+
+use crate::config::Config;
+use crate::world::{INPUTS, OUTPUTS, World};
+
+/// Bytes of the program itself: its code, its threads' stacks and what it reads. A GPU's driver comes on top.
+pub const PROGRAM: u64 = 14 << 20;
+/// Most bytes of populations of which a checkpoint takes a copy, to be written while training goes on.
+const COPIED: u64 = 64 << 20;
+/// Bytes of one buffer that a batch on a GPU aims for.
+const BATCH: u64 = 256 << 20;
+
+/// Peaks, in bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Plan {
+    /// Of the process, where the CPU plays; and how much of that only while a checkpoint is written.
+    pub host: u64,
+    pub checkpoint: u64,
+    /// Of the process, where a GPU plays, without what its driver keeps there.
+    pub gpu_host: u64,
+    /// Of the GPU's buffers; of those that are read back, the adapter's side.
+    pub adapter: u64,
+}
+
+/// There is less memory than a run needs.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "this needs {} of memory at its peak, and {} is available; choose a smaller population, fewer trials{} or another \
+     machine (flotilla check tells what a config needs)",
+    human(*needed), human(*available),
+    if *checkpoint > 0 { format!(", no checkpoints (they take {} of it)", human(*checkpoint)) } else { String::new() }
+)]
+pub struct TooLittle {
+    pub needed: u64,
+    pub available: u64,
+    /// How much of what is needed is for checkpoints.
+    pub checkpoint: u64,
+}
+
+impl Plan {
+    /// What it takes to train these (valid) configs side by side, on so many threads.
+    pub fn of<'a>(configs: impl IntoIterator<Item = &'a Config>, threads: usize) -> Plan {
+        let lanes = lanes(Level::new());
+        let [mut training, mut checkpoint, mut queue, mut weights, mut record] = [0_u64; 5];
+        let [mut block, mut order, mut populations] = [0_u64; 3];
+        for config in configs {
+            let world = World::new(config);
+            let sizes = Sizes::of(config);
+            training += sizes.training();
+            checkpoint += sizes.checkpoint(config);
+            queue += (sizes.trials * sizes.episodes * sizes.slots).div_ceil(lanes) * 16;
+            block = block.max(block_bytes(&world, lanes));
+            order = order.max(sizes.policies * size_of::<usize>() as u64);
+            populations += sizes.trials * sizes.leaders;
+            let teams = sizes.trials * sizes.episodes * sizes.slots;
+            weights = weights.saturating_add(teams * sizes.leaders * sizes.parameters * 4);
+            let words = (world.set_words() + world.followers() * world.leaders()) as u64;
+            record = teams.saturating_mul(4 * words).saturating_add(record);
+        }
+        // Episodes and the final sorting of each population take turns.
+        let playing = threads as u64 * block + queue;
+        let sorting = populations.min(threads as u64) * order;
+        let always = PROGRAM + training + checkpoint;
+        // A batch ends where the larger of its two large buffers is full; two are under way.
+        let share = |bytes: u64, batches: u64| {
+            let batch = u128::from(bytes) * u128::from(BATCH) / u128::from(weights.max(record).max(1));
+            bytes.min(batch as u64 * batches)
+        };
+        Plan {
+            host: always + playing.max(sorting),
+            checkpoint,
+            // A batch is gathered, and two are on their way to the adapter or back.
+            gpu_host: always + (share(weights, 1) + share(weights, 2) + share(record, 2)).max(sorting),
+            adapter: share(weights, 2) + share(record, 2),
+        }
+    }
+
+    /// Refuses what does not fit in the memory that is available now; lets pass where the system does not tell.
+    ///
+    /// # Errors
+    /// There is less.
+    pub fn check(&self, gpu: bool) -> Result<(), TooLittle> {
+        let (needed, checkpoint) = (if gpu { self.gpu_host } else { self.host }, self.checkpoint);
+        match available() {
+            Some(available) if available < needed => Err(TooLittle { needed, available, checkpoint }),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Whether a checkpoint of these configs' trainer is a copy, written while training goes on. Larger ones are written
+/// from the populations themselves, and training waits.
+pub fn copies_checkpoint<'a>(configs: impl IntoIterator<Item = &'a Config>) -> bool {
+    configs.into_iter().map(|config| Sizes::of(config).snapshot()).sum::<u64>() <= COPIED
+}
+
+/// Counts of a config, for arithmetic.
+struct Sizes {
+    trials: u64,
+    leaders: u64,
+    policies: u64,
+    /// The policies and the champion.
+    slots: u64,
+    parameters: u64,
+    episodes: u64,
+}
+
+impl Sizes {
+    fn of(config: &Config) -> Sizes {
+        let learning = &config.learning;
+        Sizes {
+            trials: learning.trials as u64,
+            leaders: config.learners() as u64,
+            policies: learning.population as u64,
+            slots: learning.population as u64 + 1,
+            parameters: config.parameters() as u64,
+            episodes: learning.episodes_per_team as u64,
+        }
+    }
+
+    /// A trainer's trials.
+    fn training(&self) -> u64 {
+        let Sizes { trials, leaders, policies, slots, parameters, episodes } = self;
+        let weights = 2 * leaders * slots * parameters;
+        let orders_and_fitness = 2 * leaders * policies;
+        let teams_and_parents = 2 * leaders * slots;
+        let observed_and_scores = episodes * slots * (1 + leaders);
+        4 * trials * (weights + orders_and_fitness + teams_and_parents + observed_and_scores)
+    }
+
+    /// The numbers of a snapshot.
+    fn snapshot(&self) -> u64 {
+        4 * self.trials * self.leaders * (self.slots * self.parameters + self.policies)
+    }
+
+    /// What a checkpoint copies.
+    fn checkpoint(&self, config: &Config) -> u64 {
+        let due = config.checkpoint.generations > 0 || config.checkpoint.seconds > 0.0;
+        if due && self.snapshot() <= COPIED { self.snapshot() } else { 0 }
+    }
+}
+
+/// The CPU backend's state of one vector of teams.
+fn block_bytes(world: &World, lanes: u64) -> u64 {
+    let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
+    let widest = world.constants.widths.into_iter().max().unwrap_or(0) as usize;
+    let policies = leaders * (world.parameters() + INPUTS + 2 * widest + OUTPUTS);
+    let words = 8 * agents + policies + 3 * followers + world.set_words() + followers * leaders;
+    words as u64 * lanes * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8) as u64
+}
+
+/// Lanes of the vectors that the CPU backend plays on.
+fn lanes(level: Level) -> u64 {
+    fn count<S: Simd>(_: S) -> u64 {
+        S::f32s::LEN as u64
+    }
+    dispatch!(level, simd => count(simd))
+}
+
+/// Bytes that this process may still take: what the system has free or can free, within the limit of its control
+/// group. None where the system does not tell.
+pub fn available() -> Option<u64> {
+    let free =
+        field(&fs::read_to_string("/proc/meminfo").ok()?, "MemAvailable:").map(|kib| kib.saturating_mul(1024))?;
+    let group = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
+    let group = group.lines().find_map(|line| line.strip_prefix("0::")).unwrap_or("/");
+    let limits = ["/", group].into_iter().filter_map(|group| {
+        let read = |file: &str| fs::read_to_string(format!("/sys/fs/cgroup{group}/{file}")).ok();
+        let most: u64 = read("memory.max")?.trim().parse().ok()?;
+        // Files that are kept in memory give way.
+        let used = field(&read("memory.stat")?, "anon ").unwrap_or(0);
+        Some(most.saturating_sub(used))
+    });
+    limits.chain([free]).min()
+}
+
+/// The number after a name at the start of a line.
+fn field(text: &str, name: &str) -> Option<u64> {
+    text.lines().find_map(|line| line.strip_prefix(name)?.split_whitespace().next()?.parse().ok())
+}
+
+/// "3.6 GiB"
+fn human(bytes: u64) -> String {
+    let mib = bytes as f64 / f64::from(1 << 20);
+    if mib < 1024.0 { format!("{mib:.1} MiB") } else { format!("{:.1} GiB", mib / 1024.0) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fields_are_found_by_name() {
+        let text = "MemTotal:       25000000 kB\nMemAvailable:   12 kB\nanon 7\nanon_thp 9\n";
+        assert_eq!(field(text, "MemAvailable:"), Some(12));
+        assert_eq!(field(text, "anon "), Some(7));
+        assert_eq!(field(text, "none"), None);
+    }
+
+    #[test]
+    fn what_is_too_large_says_what_to_do() {
+        let text = TooLittle { needed: 3 << 30, available: 5 << 20, checkpoint: 1 << 20 }.to_string();
+        for part in ["3.0 GiB", "5.0 MiB", "smaller population", "no checkpoints (they take 1.0 MiB"] {
+            assert!(text.contains(part), "{text}");
+        }
+    }
+}

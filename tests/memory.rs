@@ -1,0 +1,159 @@
+//! What a run takes in memory is what `flotilla check` foretold, and a run that would take more than there is does not
+//! start.
+
+use std::fs;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use assert_cmd::cargo::cargo_bin;
+use flotilla::backend::cpu::Cpu;
+use flotilla::config::Config;
+use flotilla::memory::{self, Plan};
+use flotilla::record::checkpoint::{self, Checkpoint, Keeper};
+use flotilla::record::disk::Disk;
+use flotilla::record::metrics;
+use flotilla::trainer::Trainer;
+
+const GENERALLY_FORWARD: &str = include_str!("../configs/generally_forward.toml");
+
+/// A run of generally forward with other sizes and checkpoints.
+fn text(population: usize, trials: usize, generations: usize, checkpoint: &str) -> String {
+    let change = |line: &str| match line.split(" = ").next() {
+        Some("population") => format!("population = {population}"),
+        Some("trials") => format!("trials = {trials}"),
+        Some("generations") => format!("generations = {generations}"),
+        _ => line.to_string(),
+    };
+    let lines: Vec<_> = GENERALLY_FORWARD.lines().map(change).collect();
+    format!("{}\n\n[checkpoint]\n{checkpoint}\n", lines.join("\n"))
+}
+
+/// The most memory that a process had resident while it ran, None where the system does not tell.
+fn peak(command: &mut Command) -> Option<u64> {
+    let mut child = command.stdout(Stdio::null()).spawn().unwrap();
+    let mut peak = None;
+    loop {
+        // The system keeps the peak; it is gone with the process, so it is asked for to the end.
+        let status = fs::read_to_string(format!("/proc/{}/status", child.id())).unwrap_or_default();
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+        let kib = line.and_then(|line| line.split_whitespace().next()?.parse::<u64>().ok());
+        peak = peak.max(kib.map(|kib| kib * 1024));
+        if let Some(status) = child.try_wait().unwrap() {
+            assert!(status.success());
+            return peak;
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+fn foretold(config: &std::path::Path) -> u64 {
+    let output = Command::new(cargo_bin!("flotilla")).arg("check").arg(config).arg("--json").output().unwrap();
+    let json: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    json["cost"]["host_bytes"].as_u64().unwrap()
+}
+
+#[test]
+fn a_run_takes_what_was_foretold() {
+    for (population, trials, checkpoint) in [
+        (1 << 15, 1, "generations = 0\nseconds = 0.0"),
+        // Small enough for a copy, and too large.
+        (1 << 15, 1, "generations = 1"),
+        (1 << 15, 2, "generations = 1"),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let config = folder.path().join("config.toml");
+        fs::write(&config, text(population, trials, 2, checkpoint)).unwrap();
+        let mut train = Command::new(cargo_bin!("flotilla"));
+        train.arg("train").arg(&config).args(["--backend", "cpu", "--quiet", "--out"]).arg(folder.path().join("run"));
+        let Some(peak) = peak(&mut train) else {
+            println!("skipped: this system does not tell what a process takes");
+            return;
+        };
+        let foretold = foretold(&config);
+        let share = peak as f64 / foretold as f64;
+        println!("{trials} trials of {population} policies: foretold {foretold} bytes, took {peak}: {share:.3}");
+        assert!(
+            (0.9..=1.1).contains(&share),
+            "{trials} × {population}, {checkpoint}: {foretold} foretold, {peak} taken"
+        );
+    }
+}
+
+#[test]
+fn a_run_that_does_not_fit_does_not_start() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, out) = (folder.path().join("config.toml"), folder.path().join("run"));
+    let text = text(1 << 20, 140, 1, "generations = 0\nseconds = 0.0");
+    let needed = Plan::of([&Config::parse(&text, "config").unwrap()], 1).host;
+    if memory::available().is_none_or(|available| available >= needed) {
+        println!("skipped: this system does not tell what is free, or has {needed} bytes");
+        return;
+    }
+    fs::write(&path, text).unwrap();
+    let mut train = Command::new(cargo_bin!("flotilla"));
+    let output = train.arg("train").arg(&path).args(["--backend", "cpu", "--out"]).arg(&out).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let told = String::from_utf8(output.stderr).unwrap();
+    for part in ["GiB of memory at its peak", "is available", "smaller population", "fewer trials"] {
+        assert!(told.contains(part), "{told}");
+    }
+    assert!(!told.contains("checkpoints"), "there are none to leave out: {told}");
+    assert!(!out.exists(), "nothing is written");
+}
+
+/// Of configs side by side, what lives in turn counts once, and the rest adds up.
+#[test]
+fn plans_add_up() {
+    let config = |population| Config::parse(&text(population, 2, 1, "generations = 1"), "config").unwrap();
+    let [small, large] = [config(1000), config(9000)];
+    let [one, other, both] = [vec![&small], vec![&large], vec![&small, &large]].map(|configs| Plan::of(configs, 3));
+    let growing = |plan: Plan| plan.host - memory::PROGRAM;
+    assert_eq!(both.checkpoint, one.checkpoint + other.checkpoint);
+    assert!(growing(both) > growing(other) && growing(both) <= growing(one) + growing(other));
+    assert!(both.adapter > other.adapter && both.gpu_host > both.host - both.checkpoint);
+    assert!(memory::copies_checkpoint([&small, &large]));
+    assert!(!memory::copies_checkpoint(&[config(40_000)]));
+}
+
+/// What is written from the populations is what would be written from a copy of them.
+#[test]
+fn checkpoints_need_no_copy() {
+    let config = Config::parse(&text(60, 2, 9, "generations = 1"), "config").unwrap();
+    let mut trainer = Trainer::new(vec![config.clone()]);
+    for _ in 0..3 {
+        trainer.advance(&mut Cpu::default()).unwrap();
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let disk = Disk::default();
+    let mut metrics = metrics::Writer::create(&disk, &folder.path().join("metrics.csv")).unwrap();
+    let files = ["copy", "view"].map(|name| {
+        let path = folder.path().join(name);
+        fs::create_dir(&path).unwrap();
+        let mut keeper = Keeper::new(disk.clone(), path.clone(), vec![config.clone()], vec![0, 1], 1);
+        let (config, seconds) = (checkpoint::digest(&config), 2.5);
+        let (metrics, output) = metrics.mark().unwrap();
+        match name {
+            "copy" => {
+                let snapshot = trainer.snapshot().unwrap();
+                let checkpoint = Checkpoint { config, seconds, metrics, snapshot };
+                keeper.save(checkpoint, output, Instant::now()).unwrap();
+                keeper.wait().unwrap();
+            }
+            _ => {
+                let checkpoint = Checkpoint { config, seconds, metrics, snapshot: trainer.view() };
+                keeper.save_now(&checkpoint, &output, Instant::now()).unwrap();
+            }
+        }
+        assert_eq!(keeper.newest(), Some(3));
+        fs::read(checkpoint::path(&path, 3)).unwrap()
+    });
+    assert!(files[0].len() > config.policy_bytes() && files[0] == files[1]);
+    let read = checkpoint::read(&checkpoint::path(&folder.path().join("view"), 3), &[config.clone()]).unwrap();
+    assert_eq!(read.snapshot, trainer.snapshot().unwrap());
+    let mut other = Trainer::new(vec![config]);
+    assert!(other.restore(read.snapshot));
+    let rows = |trainer: &mut Trainer| trainer.advance(&mut Cpu::default()).unwrap();
+    assert_eq!(rows(&mut other), rows(&mut trainer));
+    assert_eq!(other.policies(0), trainer.policies(0));
+    assert_eq!(other.policies(0), other.best_policies(0));
+}
