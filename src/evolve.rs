@@ -3,6 +3,8 @@
 //! Everything random is a pure function of counters, so that it depends on neither threads, batch size, backend nor
 //! on having been interrupted.
 
+use std::ops::Range;
+
 use fearless_simd::{Level, Simd, SimdMask, dispatch, prelude::*};
 use glam::Vec2;
 use rayon::prelude::*;
@@ -246,8 +248,9 @@ pub fn mutate(level: Level, key: Key, learning: &Learning, weights: &mut [f32], 
 
 #[inline(always)]
 fn mutate_lanes<S: Simd>(simd: S, key: Key, learning: &Learning, weights: &mut [f32], scratch: &mut Vec<u32>) {
-    let mut chosen = Chosen::new(scratch, weights.len());
-    chosen.choose(simd, key, key.fork(), learning.mutation_probability, 0, weights.len());
+    let mut chosen = Chosen::new(scratch, 1, weights.len());
+    chosen.choose(simd, 0, key, learning.mutation_probability);
+    chosen.list(simd, 0, key.fork());
     chosen.mutate(simd, learning, weights);
 }
 
@@ -290,18 +293,24 @@ const BRED_TOGETHER: usize = 2048;
 #[inline(always)]
 fn mutate_brood<S: Simd>(simd: S, learning: &Learning, brood: Brood<'_>, children: &mut [f32], scratch: &mut Vec<u32>) {
     let parameters = children.len() / brood.parents.len();
-    let mut chosen = Chosen::new(scratch, children.len());
+    let mut chosen = Chosen::new(scratch, brood.parents.len(), parameters);
     for (batch, parents) in brood.parents.chunks(S::f32s::LEN).enumerate() {
         let first = batch * S::f32s::LEN;
         let slots = S::u32s::from_fn(simd, |lane| (brood.first + first + lane) as u32);
         let keys = brood.key.at_lanes::<S>(brood.generation, brood.population, slots);
         let [x, y, z, w] = keys;
         let forks = math::draw::<S>(x, y, z, w ^ u32::MAX);
-        for (lane, _) in parents.iter().enumerate().filter(|(_, parent)| *parent & UNCHANGED == 0) {
-            let key = Key([keys[0][lane], keys[1][lane], keys[2][lane], keys[3][lane]]);
-            let noises = Key([forks[0][lane], forks[1][lane], forks[2][lane], forks[3][lane]]);
-            let policy = (first + lane) * parameters;
-            chosen.choose(simd, key, noises, learning.mutation_probability, policy, parameters);
+        let key = |of: &[S::u32s; 4], lane: usize| Key([of[0][lane], of[1][lane], of[2][lane], of[3][lane]]);
+        // In loops of their own, so that the processor draws for several policies at once.
+        for lane in 0..parents.len() {
+            if parents[lane] & UNCHANGED == 0 {
+                chosen.choose(simd, first + lane, key(&keys, lane), learning.mutation_probability);
+            }
+        }
+        for lane in 0..parents.len() {
+            if parents[lane] & UNCHANGED == 0 {
+                chosen.list(simd, first + lane, key(&forks, lane));
+            }
         }
     }
     chosen.mutate(simd, learning, children);
@@ -309,6 +318,11 @@ fn mutate_brood<S: Simd>(simd: S, learning: &Learning, brood: Brood<'_>, childre
 
 /// The weights that mutate in one policy or several, so many that no lane idles.
 struct Chosen<'a> {
+    /// Weights of a policy.
+    parameters: usize,
+    /// A bit for each weight that mutates, [`Chosen::words`] a policy.
+    masks: &'a mut [u32],
+    /// How many are listed.
     count: usize,
     /// Each one's index in its policy and among all weights, its bits, and the key of its noise.
     indices: &'a mut [u32],
@@ -318,65 +332,73 @@ struct Chosen<'a> {
 }
 
 impl<'a> Chosen<'a> {
-    /// None of `most` weights.
+    /// None of so many policies' weights.
     #[inline(always)]
-    fn new(scratch: &'a mut Vec<u32>, most: usize) -> Chosen<'a> {
+    fn new(scratch: &'a mut Vec<u32>, policies: usize, parameters: usize) -> Chosen<'a> {
         // Whole vectors are written from any place on.
-        let room = most + WIDEST;
-        if scratch.len() < 7 * room {
-            scratch.resize(7 * room, 0);
+        let room = policies * parameters.next_multiple_of(64) + WIDEST;
+        if scratch.len() < 8 * room {
+            scratch.resize(8 * room, 0);
         }
         let mut fields = scratch.chunks_exact_mut(room);
-        let mut field = || fields.next().expect("there is room for seven");
-        Chosen {
-            count: 0,
-            indices: field(),
-            places: field(),
-            bits: field(),
-            keys: [field(), field(), field(), field()],
-        }
+        let mut field = || fields.next().expect("there is room for eight");
+        let (masks, indices, places, bits) = (field(), field(), field(), field());
+        Chosen { parameters, masks, count: 0, indices, places, bits, keys: [field(), field(), field(), field()] }
     }
 
-    /// Adds those that mutate of the `count` weights from place `first` on: each by a random word of its own, of which
-    /// a draw makes four.
+    /// Where a policy's masks are.
+    #[inline(always)]
+    fn words(&self, policy: usize) -> Range<usize> {
+        let words = 2 * self.parameters.div_ceil(64);
+        policy * words..(policy + 1) * words
+    }
+
+    /// Chooses which weights of a policy mutate: each by a random word of its own, of which a draw makes four.
     ///
     /// Weight 64·block + 16·word + place takes its word from counter 16·block + place: no lane width shows in that.
     #[inline(always)]
-    fn choose<S: Simd>(&mut self, simd: S, key: Key, noises: Key, probability: f64, first: usize, count: usize) {
-        let before = self.count;
-        if probability >= 1.0 {
-            for (index, to) in self.indices[before..before + count].iter_mut().enumerate() {
-                *to = index as u32;
+    fn choose<S: Simd>(&mut self, simd: S, policy: usize, key: Key, probability: f64) {
+        let threshold = (probability * (1u64 << 32) as f64) as u32;
+        let words = self.words(policy);
+        for (block, masks) in self.masks[words].as_chunks_mut::<2>().0.iter_mut().enumerate() {
+            let mut mutates = 0u64;
+            for place in (0..16).step_by(S::f32s::LEN) {
+                let counter = S::u32s::from_fn(simd, |lane| (16 * block + place + lane) as u32);
+                for (index, word) in (0..).zip(key.draw_lanes::<S>(counter)) {
+                    mutates |= word.simd_lt(threshold).to_bitmask() << (16 * index + place);
+                }
             }
-            self.count += count;
-        } else {
-            let threshold = (probability * (1u64 << 32) as f64) as u32;
-            for block in 0..count.div_ceil(64) {
-                let mut mutates = 0u64;
-                for place in (0..16).step_by(S::f32s::LEN) {
-                    let counter = S::u32s::from_fn(simd, |lane| (16 * block + place + lane) as u32);
-                    for (index, word) in (0..).zip(key.draw_lanes::<S>(counter)) {
-                        mutates |= word.simd_lt(threshold).to_bitmask() << (16 * index + place);
-                    }
+            if probability >= 1.0 {
+                mutates = u64::MAX;
+            }
+            let left = self.parameters - 64 * block;
+            if left < 64 {
+                mutates &= (1 << left) - 1;
+            }
+            *masks = [mutates as u32, (mutates >> 32) as u32];
+        }
+    }
+
+    /// Lists the chosen weights of a policy, whose noise has this key.
+    #[inline(always)]
+    fn list<S: Simd>(&mut self, simd: S, policy: usize, noises: Key) {
+        let before = self.count;
+        let mut count = before;
+        for (word, &mask) in (0..).step_by(32).zip(&self.masks[self.words(policy)]) {
+            for (index, byte) in (word..).step_by(8).zip(mask.to_le_bytes()) {
+                let to = &mut self.indices[count..count + 8];
+                for (to, &bit) in to.iter_mut().zip(&BITS[byte as usize]) {
+                    *to = index + u32::from(bit);
                 }
-                let left = count - 64 * block;
-                if left < 64 {
-                    mutates &= (1 << left) - 1;
-                }
-                for (index, byte) in (64 * block as u32..).step_by(8).zip(mutates.to_le_bytes()).take(left.div_ceil(8))
-                {
-                    let to = &mut self.indices[self.count..self.count + 8];
-                    for (to, &bit) in to.iter_mut().zip(&BITS[byte as usize]) {
-                        *to = index + u32::from(bit);
-                    }
-                    self.count += byte.count_ones() as usize;
-                }
+                count += byte.count_ones() as usize;
             }
         }
-        for at in (before..self.count).step_by(S::f32s::LEN) {
+        self.count = count;
+        let first = (policy * self.parameters) as u32;
+        for at in (before..count).step_by(S::f32s::LEN) {
             let vector = at..at + S::f32s::LEN;
             let index = S::u32s::from_slice(simd, &self.indices[vector.clone()]);
-            (index + first as u32).store_slice(&mut self.places[vector.clone()]);
+            (index + first).store_slice(&mut self.places[vector.clone()]);
             for (to, word) in self.keys.iter_mut().zip(noises.0) {
                 S::u32s::simd_from(simd, word).store_slice(&mut to[vector.clone()]);
             }
@@ -386,7 +408,7 @@ impl<'a> Chosen<'a> {
     /// Adds its noise to each.
     #[inline(always)]
     fn mutate<S: Simd>(self, simd: S, learning: &Learning, weights: &mut [f32]) {
-        let Chosen { count, indices, places, bits, keys: [x, y, z, w] } = self;
+        let Chosen { count, indices, places, bits, keys: [x, y, z, w], .. } = self;
         let sigma = learning.mutation_sigma as f32;
         for (bits, &place) in bits[..count].iter_mut().zip(&*places) {
             *bits = weights[place as usize].to_bits();

@@ -13,7 +13,7 @@ use crate::config::Config;
 use crate::world::{INPUTS, OUTPUTS, World};
 
 /// Bytes of the program itself: its code, its threads' stacks and what it reads. A GPU's driver comes on top.
-pub const PROGRAM: u64 = 14 << 20;
+pub const PROGRAM: u64 = 8 << 20;
 /// Most bytes of populations of which a checkpoint takes a copy, to be written while training goes on.
 const COPIED: u64 = 64 << 20;
 /// Bytes of one buffer that a batch on a GPU aims for.
