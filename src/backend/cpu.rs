@@ -203,6 +203,7 @@ struct Block<S: Simd> {
     counts: Vec<S::u32s>,
     /// A bit for each pair of agents that may be in reach in some lane: `[words][agents]`.
     near: Vec<u64>,
+    bounds: Bounds<S>,
     /// `[steps][pois][words][lanes]`, and the counts when they are complete, `[followers][leaders][lanes]`.
     sets: Vec<u32>,
     seen: Vec<u32>,
@@ -262,6 +263,7 @@ impl<S: Simd> Block<S> {
             followers: vec![Follower { force_x: zero, force_y: zero, influenced }; followers],
             counts: vec![S::u32s::splat(simd, 0); followers * leaders],
             near: vec![0; agents.div_ceil(64) * agents],
+            bounds: Bounds::new(simd, agents),
             sets: vec![0; world.set_words() * S::f32s::LEN],
             seen: vec![0; followers * leaders * S::f32s::LEN],
         }
@@ -330,26 +332,39 @@ impl<S: Simd> Block<S> {
     /// Marks the pairs of agents that one of them may sense or be drawn to, in any lane.
     #[inline(always)]
     fn find_near(&mut self) {
+        self.near.fill(0);
         let Block { world, agents, near, .. } = self;
         let (count, leaders) = (agents.len(), world.leaders as usize);
         let drawn = world.attraction_radius2;
         let sensed = world.agent_range2.max(drawn);
-        near.fill(0);
-        for (word, others) in agents.chunks(64).enumerate() {
-            let first = word * 64;
-            for (i, agent) in agents[..first + others.len()].iter().enumerate() {
-                let reach2 = if i < leaders { sensed } else { drawn };
-                let mirrored = &mut near[i / 64 * count + first..][..others.len()];
+        let reach2 = |agent: usize| if agent < leaders { sensed } else { drawn };
+        if count > MANY {
+            self.bounds.enclose(agents);
+            for (i, agent) in agents.iter().enumerate() {
+                self.bounds.each_within(
+                    i,
+                    reach2(i),
+                    #[inline(always)]
+                    |j| {
+                        if within::<S>(agent, &agents[j], reach2(i)) {
+                            near[j / 64 * count + i] |= 1 << (j % 64);
+                            near[i / 64 * count + j] |= 1 << (i % 64);
+                        }
+                    },
+                );
+            }
+        } else {
+            let near = &mut near[..count];
+            for (i, agent) in agents.iter().enumerate() {
+                let reach2 = reach2(i);
                 let mut row = 0;
-                for j in (i + 1).saturating_sub(first)..others.len() {
-                    let dx = others[j].x - agent.x;
-                    let dy = others[j].y - agent.y;
-                    if (dx * dx + dy * dy).simd_le(reach2).any_true() {
+                for j in i + 1..count {
+                    if within::<S>(agent, &agents[j], reach2) {
                         row |= 1 << j;
-                        mirrored[j] |= 1 << (i % 64);
+                        near[j] |= 1 << i;
                     }
                 }
-                near[word * count + i] |= row;
+                near[i] |= row;
             }
         }
     }
@@ -556,6 +571,69 @@ fn weigh<S: Simd>(inputs: &[S::f32s], mut units: &mut [S::f32s], mut weights: &[
         }
     }
 }
+
+/// Whether the squared distance of two agents is `reach2` at most, in any lane.
+#[inline(always)]
+fn within<S: Simd>(agent: &Agent<S>, other: &Agent<S>, reach2: f32) -> bool {
+    let dx = other.x - agent.x;
+    let dy = other.y - agent.y;
+    (dx * dx + dy * dy).simd_le(reach2).any_true()
+}
+
+/// The box around each agent's places in all lanes, an agent a lane.
+struct Bounds<S: Simd> {
+    low_x: Vec<S::f32s>,
+    high_x: Vec<S::f32s>,
+    low_y: Vec<S::f32s>,
+    high_y: Vec<S::f32s>,
+}
+
+impl<S: Simd> Bounds<S> {
+    fn new(simd: S, agents: usize) -> Bounds<S> {
+        // Lanes left over hold boxes that nothing is near.
+        let vectors = agents.div_ceil(S::f32s::LEN);
+        let (low, high) = (vec![splat(simd, f32::INFINITY); vectors], vec![splat(simd, f32::NEG_INFINITY); vectors]);
+        Bounds { low_x: low.clone(), high_x: high.clone(), low_y: low, high_y: high }
+    }
+
+    #[inline(always)]
+    fn enclose(&mut self, agents: &[Agent<S>]) {
+        for (vector, agents) in agents.chunks(S::f32s::LEN).enumerate() {
+            for (lane, agent) in agents.iter().enumerate() {
+                self.low_x[vector][lane] = agent.x.reduce_min();
+                self.high_x[vector][lane] = agent.x.reduce_max();
+                self.low_y[vector][lane] = agent.y.reduce_min();
+                self.high_y[vector][lane] = agent.y.reduce_max();
+            }
+        }
+    }
+
+    /// Calls `f` with every later agent whose box is within reach of this one's, and perhaps some more.
+    #[inline(always)]
+    fn each_within(&self, agent: usize, reach2: f32, mut f: impl FnMut(usize)) {
+        // No pair may be lost to a rounding.
+        let reach = reach2.sqrt() * 1.001;
+        let lanes = S::f32s::LEN;
+        let (own, lane) = (agent / lanes, agent % lanes);
+        let (low_x, high_x) = (self.low_x[own][lane] - reach, self.high_x[own][lane] + reach);
+        let (low_y, high_y) = (self.low_y[own][lane] - reach, self.high_y[own][lane] + reach);
+        for vector in own..self.low_x.len() {
+            let near_x = self.low_x[vector].simd_le(high_x) & self.high_x[vector].simd_ge(low_x);
+            let near_y = self.low_y[vector].simd_le(high_y) & self.high_y[vector].simd_ge(low_y);
+            let mut bits = (near_x & near_y).to_bitmask();
+            if vector == own {
+                bits &= u64::MAX << lane << 1;
+            }
+            while bits != 0 {
+                f(vector * lanes + bits.trailing_zeros() as usize);
+                bits &= bits - 1;
+            }
+        }
+    }
+}
+
+/// Agents from which on pairs are first looked for by their bounds.
+const MANY: usize = 32;
 
 /// Calls `f` with each agent that may be in reach of this one, and its index, ascending.
 #[inline(always)]
