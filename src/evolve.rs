@@ -301,16 +301,13 @@ fn mutate_brood<S: Simd>(simd: S, learning: &Learning, brood: Brood<'_>, childre
         let [x, y, z, w] = keys;
         let forks = math::draw::<S>(x, y, z, w ^ u32::MAX);
         let key = |of: &[S::u32s; 4], lane: usize| Key([of[0][lane], of[1][lane], of[2][lane], of[3][lane]]);
+        let mutating = || (0..).zip(parents).filter(|(_, parent)| *parent & UNCHANGED == 0).map(|(lane, _)| lane);
         // In loops of their own, so that the processor draws for several policies at once.
-        for lane in 0..parents.len() {
-            if parents[lane] & UNCHANGED == 0 {
-                chosen.choose(simd, first + lane, key(&keys, lane), learning.mutation_probability);
-            }
+        for lane in mutating() {
+            chosen.choose(simd, first + lane, key(&keys, lane), learning.mutation_probability);
         }
-        for lane in 0..parents.len() {
-            if parents[lane] & UNCHANGED == 0 {
-                chosen.list(simd, first + lane, key(&forks, lane));
-            }
+        for lane in mutating() {
+            chosen.list(simd, first + lane, key(&forks, lane));
         }
     }
     chosen.mutate(simd, learning, children);
