@@ -277,11 +277,6 @@ pub fn breed(level: Level, learning: &Learning, brood: Brood<'_>, children: &mut
     for (batch, (children, parents)) in
         children.chunks_mut(together * parameters).zip(brood.parents.chunks(together)).enumerate()
     {
-        // One after another, with nothing between: the processor then waits for many parents at once.
-        for (child, parent) in children.chunks_exact_mut(parameters).zip(parents) {
-            let from = (parent & !UNCHANGED) as usize * parameters;
-            child.copy_from_slice(&brood.policies[from..from + parameters]);
-        }
         let batch = Brood { first: brood.first + batch * together, parents, ..brood };
         dispatch!(level, simd => mutate_brood(simd, learning, batch, children, scratch));
     }
@@ -303,7 +298,13 @@ fn mutate_brood<S: Simd>(simd: S, learning: &Learning, brood: Brood<'_>, childre
         let key = |of: &[S::u32s; 4], lane: usize| Key([of[0][lane], of[1][lane], of[2][lane], of[3][lane]]);
         let mutating = || (0..).zip(parents).filter(|(_, parent)| *parent & UNCHANGED == 0).map(|(lane, _)| lane);
         // In loops of their own, so that the processor draws for several policies at once.
-        for lane in mutating() {
+        for (lane, &parent) in parents.iter().enumerate() {
+            // The processor waits for the next parents while it draws.
+            let (to, from) = ((first + lane) * parameters, (parent & !UNCHANGED) as usize * parameters);
+            copy(simd, &brood.policies[from..from + parameters], &mut children[to..to + parameters]);
+            if parent & UNCHANGED != 0 {
+                continue;
+            }
             chosen.choose(simd, first + lane, key(&keys, lane), learning.mutation_probability);
         }
         for lane in mutating() {
@@ -311,6 +312,16 @@ fn mutate_brood<S: Simd>(simd: S, learning: &Learning, brood: Brood<'_>, childre
         }
     }
     chosen.mutate(simd, learning, children);
+}
+
+/// Copies a policy by vectors.
+#[inline(always)]
+fn copy<S: Simd>(simd: S, from: &[f32], to: &mut [f32]) {
+    let whole = from.len() / S::f32s::LEN * S::f32s::LEN;
+    for at in (0..whole).step_by(S::f32s::LEN) {
+        S::f32s::from_slice(simd, &from[at..at + S::f32s::LEN]).store_slice(&mut to[at..at + S::f32s::LEN]);
+    }
+    to[whole..].copy_from_slice(&from[whole..]);
 }
 
 /// The weights that mutate in one policy or several, so many that no lane idles.

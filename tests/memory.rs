@@ -148,7 +148,8 @@ fn checkpoints_need_no_copy() {
         fs::read(checkpoint::path(&path, 3)).unwrap()
     });
     assert!(files[0].len() > config.policy_bytes() && files[0] == files[1]);
-    let read = checkpoint::read(&checkpoint::path(&folder.path().join("view"), 3), &[config.clone()]).unwrap();
+    let read =
+        checkpoint::read(&checkpoint::path(&folder.path().join("view"), 3), std::slice::from_ref(&config)).unwrap();
     assert_eq!(read.snapshot, trainer.snapshot().unwrap());
     let mut other = Trainer::new(vec![config]);
     assert!(other.restore(read.snapshot));
