@@ -31,22 +31,20 @@ pub struct Scores {
 pub struct Credit {
     /// Was the POI observed? `[pois]`
     observed: Vec<bool>,
-    /// The agents without any one of whom (D), or of whose groups (Df), an observed POI is lost: `[pois][words]`.
+    /// The leaders without any one of whom (D), or of whose groups (Df), an observed POI is lost: `[pois][words]`.
     critical: Vec<u32>,
     /// POIs lost without the leader, `[leaders]`.
     lost: Vec<u32>,
     /// The leader in whose group an agent is, itself for a leader, or [`NOBODY`]: `[agents]`.
     owner: Vec<u32>,
-    /// Members of each leader's group in one set (zero between sets), `[leaders]`.
-    members: Vec<u32>,
-    /// The leaders whose groups one set cannot spare, `[words]`.
-    needed: Vec<u32>,
+    /// The agents of each leader's group, or nothing before they are needed, `[leaders][words]`.
+    groups: Vec<u32>,
     /// Most agents near the POI at a step with the leader among them, `[pois][leaders]`.
     company: Vec<u32>,
     /// Unobserved POIs that a number of copies of one leader would just complete, `[copies]`.
     completed: Vec<u32>,
-    /// One set, `[words]`.
-    set: Vec<u32>,
+    /// One set and the one before it, `[2][words]`.
+    sets: Vec<u32>,
 }
 
 impl Credit {
@@ -93,58 +91,45 @@ impl Credit {
 
     /// Which POIs were observed.
     fn observe(&mut self, episode: &Episode<'_>, world: &World) {
-        let Credit { observed, set, .. } = self;
-        each_set(&episode.sets, world, set, |poi, size, _| observed[poi] |= size >= world.coupling[poi]);
+        let Credit { observed, sets, .. } = self;
+        each_set(&episode.sets, world, sets, |poi| world.coupling[poi], |poi, _, _| observed[poi] = true);
     }
 
     /// A POI is lost without an agent who was in every set that was large enough, each without one to spare.
     fn lose_leaders(&mut self, episode: &Episode<'_>, world: &World) {
         self.all_critical(world);
-        let Credit { observed, critical, set, .. } = self;
-        each_set(&episode.sets, world, set, |poi, size, set| {
-            if size >= world.coupling[poi] {
-                observed[poi] = true;
-                let critical = &mut critical[poi * set.len()..][..set.len()];
-                narrow(critical, set, size == world.coupling[poi]);
-            }
+        let Credit { observed, critical, sets, .. } = self;
+        let least = |poi: usize| world.coupling[poi];
+        each_set(&episode.sets, world, sets, least, |poi, size, set| {
+            observed[poi] = true;
+            narrow(&mut critical[poi * set.len()..][..set.len()], set, size == world.coupling[poi]);
         });
     }
 
     /// A POI is lost without a group of whom every set that was large enough had more members than agents to spare.
     fn lose_groups(&mut self, episode: &Episode<'_>, world: &World) {
         self.all_critical(world);
-        self.members.clear();
-        self.members.resize(world.leaders(), 0);
-        self.needed.resize(world.constants.words as usize, 0);
-        let Credit { observed, critical, owner, members, needed, set, .. } = self;
-        owner.clear();
-        each_set(&episode.sets, world, set, |poi, size, set| {
-            if size < world.coupling[poi] {
-                return;
-            }
-            let critical = &mut critical[poi * set.len()..][..set.len()];
-            if observed[poi] && critical.iter().all(|&word| word == 0) {
-                return;
-            }
+        let Credit { observed, critical, owner, groups, sets, .. } = self;
+        let words = world.constants.words as usize;
+        groups.clear();
+        let least = |poi: usize| world.coupling[poi];
+        each_set(&episode.sets, world, sets, least, |poi, size, set| {
             observed[poi] = true;
-            if owner.is_empty() {
-                assign(&episode.seen, world, owner);
-            }
             let spare = size - world.coupling[poi];
-            needed.fill(0);
-            for agent in bits(set) {
-                let leader = owner[agent] as usize;
-                if let Some(count) = members.get_mut(leader) {
-                    *count += 1;
-                    if *count == spare + 1 {
-                        needed[leader / 32] |= 1 << (leader % 32);
-                    }
+            for (index, critical) in critical[poi * words..][..words].iter_mut().enumerate() {
+                let mut suspects = *critical;
+                if suspects != 0 && groups.is_empty() {
+                    assign(&episode.seen, world, owner);
+                    gather(owner, world, groups);
                 }
-            }
-            narrow(critical, needed, true);
-            for agent in bits(set) {
-                if let Some(count) = members.get_mut(owner[agent] as usize) {
-                    *count = 0;
+                while suspects != 0 {
+                    let leader = index * 32 + suspects.trailing_zeros() as usize;
+                    let group = &groups[leader * words..][..words];
+                    let members: u32 = group.iter().zip(set).map(|(group, set)| (group & set).count_ones()).sum();
+                    if members <= spare {
+                        *critical &= !(1 << (leader % 32));
+                    }
+                    suspects &= suspects - 1;
                 }
             }
         });
@@ -156,19 +141,24 @@ impl Credit {
         let leaders = world.leaders();
         self.company.clear();
         self.company.resize(world.pois.len() * leaders, 0);
-        let Credit { observed, critical, company, set, .. } = self;
-        each_set(&episode.sets, world, set, |poi, size, set| {
-            if size >= world.coupling[poi] {
-                observed[poi] = true;
-                let critical = &mut critical[poi * set.len()..][..set.len()];
-                narrow(critical, set, size == world.coupling[poi]);
-            } else if !observed[poi] {
-                for leader in bits(set).take_while(|&agent| agent < leaders) {
-                    let most = &mut company[poi * leaders + leader];
-                    *most = size.max(*most);
+        let Credit { observed, critical, company, sets, .. } = self;
+        each_set(
+            &episode.sets,
+            world,
+            sets,
+            |_| 1,
+            |poi, size, set| {
+                if size >= world.coupling[poi] {
+                    observed[poi] = true;
+                    narrow(&mut critical[poi * set.len()..][..set.len()], set, size == world.coupling[poi]);
+                } else if !observed[poi] {
+                    for leader in bits(set).take_while(|&agent| agent < leaders) {
+                        let most = &mut company[poi * leaders + leader];
+                        *most = size.max(*most);
+                    }
                 }
-            }
-        });
+            },
+        );
     }
 
     /// D++ of one leader. With `D++(n) = (POIs that n copies complete) / n`: D if it is at least D++(C), C being the
@@ -201,10 +191,14 @@ impl Credit {
         share(gain, pois * most)
     }
 
-    /// Before any large enough set, anyone may be critical.
+    /// Before any large enough set, every leader may be critical.
     fn all_critical(&mut self, world: &World) {
+        let (leaders, words) = (world.leaders(), world.constants.words as usize);
+        // Bits past the last leader stay out.
+        let of_word =
+            |word: usize| u32::MAX.checked_shl(leaders.saturating_sub(word * 32) as u32).map_or(u32::MAX, |v| !v);
         self.critical.clear();
-        self.critical.resize(world.pois.len() * world.constants.words as usize, u32::MAX);
+        self.critical.extend((0..world.pois.len() * words).map(|index| of_word(index % words)));
     }
 
     /// Counts the observed POIs to which each leader was critical.
@@ -213,7 +207,7 @@ impl Credit {
         self.lost.clear();
         self.lost.resize(leaders, 0);
         for (critical, _) in self.critical.chunks_exact(words).zip(&self.observed).filter(|&(_, &observed)| observed) {
-            bits(critical).take_while(|&agent| agent < leaders).for_each(|leader| self.lost[leader] += 1);
+            bits(critical).for_each(|leader| self.lost[leader] += 1);
         }
     }
 }
@@ -223,30 +217,42 @@ fn share(count: u32, of: usize) -> f32 {
     count as f32 / of as f32
 }
 
-/// Calls `visit(poi, size, set)` in order of steps for every set that has agents and is not that POI's set of the
-/// step before: repetition changes no fitness.
+/// Calls `visit(poi, size, set)`, POI by POI and in order of steps, for every set of at least `least(poi)` agents, and
+/// at least one, that is not that POI's set of the step before: repetition changes no fitness.
 #[inline(always)]
-fn each_set(sets: &Strided<'_>, world: &World, set: &mut Vec<u32>, mut visit: impl FnMut(usize, u32, &[u32])) {
+fn each_set(
+    sets: &Strided<'_>,
+    world: &World,
+    scratch: &mut Vec<u32>,
+    least: impl Fn(usize) -> u32,
+    mut visit: impl FnMut(usize, u32, &[u32]),
+) {
     let (pois, words) = (world.pois.len(), world.constants.words as usize);
-    if words == 1 {
-        for step in 0..world.steps() {
-            for poi in 0..pois {
-                let index = step * pois + poi;
-                let word = sets.get(index);
-                if word != 0 && (step == 0 || word != sets.get(index - pois)) {
-                    visit(poi, word.count_ones(), &[word]);
+    scratch.clear();
+    scratch.resize(2 * words, 0);
+    for poi in 0..pois {
+        let least = least(poi);
+        let steps = sets.words[poi * words * sets.stride + sets.offset..].chunks(pois * words * sets.stride);
+        if words == 1 {
+            let mut before = 0;
+            for step in steps {
+                let set = step[0];
+                if set != before && set.count_ones() >= least {
+                    visit(poi, set.count_ones(), &[set]);
                 }
+                before = set;
             }
+            continue;
         }
-        return;
-    }
-    for index in 0..world.steps() * pois {
-        let word = |index: usize, word| sets.get(index * words + word);
-        set.clear();
-        set.extend((0..words).map(|w| word(index, w)));
-        let size = set.iter().map(|word| word.count_ones()).sum();
-        if size > 0 && (index < pois || set.iter().enumerate().any(|(w, &now)| now != word(index - pois, w))) {
-            visit(index % pois, size, set);
+        let (mut set, mut before) = scratch.split_at_mut(words);
+        before.fill(0);
+        for step in steps {
+            set.iter_mut().zip(step.iter().step_by(sets.stride)).for_each(|(word, now)| *word = *now);
+            let size = set.iter().map(|word| word.count_ones()).sum();
+            if set != before && size >= least {
+                visit(poi, size, set);
+            }
+            std::mem::swap(&mut set, &mut before);
         }
     }
 }
@@ -267,6 +273,15 @@ pub fn assign(seen: &Strided<'_>, world: &World, owner: &mut Vec<u32>) {
         }
         best
     }));
+}
+
+/// The agents that belong to each leader, a bit an agent, `[leaders][words]`.
+fn gather(owner: &[u32], world: &World, groups: &mut Vec<u32>) {
+    let words = world.constants.words as usize;
+    groups.resize(world.leaders() * words, 0);
+    for (agent, &leader) in owner.iter().enumerate().filter(|&(_, &leader)| leader != NOBODY) {
+        groups[leader as usize * words + agent / 32] |= 1 << (agent % 32);
+    }
 }
 
 /// Leaves the agents of `critical` that are in `set`, if any of that set was needed, or none.
