@@ -3,12 +3,6 @@
 // Positions lie on a grid of 2^-18 (or on a wall): their differences are exact, and their squares far from denormal.
 const GRID: f32 = 262144.0;
 
-// `x` moved into `low..=high`.
-fn bound(x: f32, low: f32, high: f32) -> f32 {
-    let raised = select(x, low, x < low);
-    return select(raised, high, raised > high);
-}
-
 // The heading turned by the angle of this cosine and sine, to the left.
 fn rotate(hx: f32, hy: f32, cosine: f32, sine: f32) -> vec2<f32> {
     return vec2(hx * cosine - hy * sine, hx * sine + hy * cosine);

@@ -42,8 +42,14 @@ impl Key {
 
     /// The key of one slot of one population of a generation.
     pub fn at(self, generation: usize, population: usize, slot: usize) -> Key {
+        let [x, y, z, w] = self.of_population(generation, population);
+        Key(math::draw_scalar([x, y, z ^ slot as u32, w]))
+    }
+
+    /// The counters of [`Key::at`], to which a slot is yet to be xored in the third place.
+    pub fn of_population(self, generation: usize, population: usize) -> [u32; 4] {
         let Key([x, y, z, w]) = self;
-        Key(math::draw_scalar([x ^ generation as u32, y ^ population as u32, z ^ slot as u32, w]))
+        [x ^ generation as u32, y ^ population as u32, z, w]
     }
 
     /// Four random words.
@@ -177,8 +183,8 @@ pub const UNCHANGED: u32 = 1 << 31;
 /// Plans one population's next generation: the policy from which each slot comes, `[policies + 1]`, with [`UNCHANGED`]
 /// where it does not mutate.
 ///
-/// The first slots are the elites', best first, the others' parents win [`tournament`]s; the last slot, the
-/// champion's, stays. `key` is of purpose [`Purpose::Tournament`], `scores` are `[policies]`.
+/// The first slots are the elites', best first, the others' parents win [`tournament`]s; the last slot gets the best of
+/// all, the champion. `key` is of purpose [`Purpose::Tournament`], `scores` are `[policies]`.
 pub fn draw_parents(
     level: Level,
     key: Key,
@@ -193,10 +199,19 @@ pub fn draw_parents(
         let first = chunk * DRAWN_TOGETHER;
         dispatch!(level, simd => draw_parents_lanes(simd, key, generation, population, first, scores, parents));
     });
-    for (parent, elite) in parents.iter_mut().zip(best(scores, elites)) {
-        *parent = elite as u32 | UNCHANGED;
+    let best = best(scores, elites.max(1));
+    for (parent, elite) in parents.iter_mut().zip(&best[..elites]) {
+        *parent = *elite as u32 | UNCHANGED;
     }
-    parents[policies] = policies as u32 | UNCHANGED;
+    parents[policies] = best[0] as u32 | UNCHANGED;
+}
+
+/// The plan that leaves all policies where they are, after the last generation; only the champion gets its slot.
+pub fn keep_parents(scores: &[f32], parents: &mut [u32]) {
+    for (slot, parent) in parents.iter_mut().enumerate() {
+        *parent = slot as u32 | UNCHANGED;
+    }
+    parents[scores.len()] = best(scores, 1)[0] as u32 | UNCHANGED;
 }
 
 /// Slots whose parents one thread draws at a time.
@@ -366,17 +381,17 @@ impl<'a> Chosen<'a> {
     /// Weight 64·block + 16·word + place takes its word from counter 16·block + place: no lane width shows in that.
     #[inline(always)]
     fn choose<S: Simd>(&mut self, simd: S, policy: usize, key: Key, probability: f64) {
-        let threshold = (probability * (1u64 << 32) as f64) as u32;
+        let threshold = mutation_threshold(probability);
         let words = self.words(policy);
         for (block, masks) in self.masks[words].as_chunks_mut::<2>().0.iter_mut().enumerate() {
             let mut mutates = 0u64;
             for place in (0..16).step_by(S::f32s::LEN) {
                 let counter = S::u32s::from_fn(simd, |lane| (16 * block + place + lane) as u32);
                 for (index, word) in (0..).zip(key.draw_lanes::<S>(counter)) {
-                    mutates |= word.simd_lt(threshold).to_bitmask() << (16 * index + place);
+                    mutates |= word.simd_lt(threshold.unwrap_or_default()).to_bitmask() << (16 * index + place);
                 }
             }
-            if probability >= 1.0 {
+            if threshold.is_none() {
                 mutates = u64::MAX;
             }
             let left = self.parameters - 64 * block;
@@ -435,6 +450,11 @@ impl<'a> Chosen<'a> {
             weights[place as usize] = f32::from_bits(bits);
         }
     }
+}
+
+/// A weight mutates where its random word is below this; none where all do.
+pub fn mutation_threshold(probability: f64) -> Option<u32> {
+    (probability < 1.0).then_some((probability * (1u64 << 32) as f64) as u32)
 }
 
 /// The bits that are set in each byte, ascending, then zeros.

@@ -14,14 +14,15 @@
 //! 4. The backend plays each team's whole episode: by [`kernels`] on the CPU, by their twins under `shaders/` on a GPU.
 //!    It reports who was near which POI at which step, and which leader each follower saw.
 //! 5. [`credit`] turns that record into G, D, Df and D++.
-//! 6. [`evolve`] selects and mutates; [`run`] keeps what came out by [`record`]; [`report`] draws it.
+//! 6. [`evolve`] selects and mutates, or has a GPU that holds the populations do the latter; [`run`] keeps what came out
+//!    by [`record`]; [`report`] draws it.
 //!
 //! Around that: [`run`] keeps a trainer, its folder and its checkpoints together, [`sweep`] makes many runs of a grid,
 //! [`memory`] tells what a run will take, [`verify`] compares two backends on the random worlds of [`sample`], [`bench`]
 //! times a backend against what the machine can do at most, and [`cli`] turns what was typed into all this.
 //!
 //! Imports run one way: `main ▸ cli ▸ {run, sweep, report, verify, bench} ▸ trainer ▸ {evolve, credit, backend}`,
-//! `backend ▸ kernels`. Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
+//! `backend ▸ {evolve, kernels}`. Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
 
 pub mod backend;
 pub mod bench;

@@ -13,7 +13,7 @@ use crate::record::disk::Disk;
 use crate::record::folder::{self, Folder, METRICS, POLICIES, Run, Start, State, Story};
 use crate::record::metrics::{self, Row};
 use crate::record::policies;
-use crate::trainer::Trainer;
+use crate::trainer::{SnapshotError, Trainer};
 
 /// How often a run hands its metrics to the system.
 const FLUSH: Duration = Duration::from_secs(1);
@@ -31,6 +31,19 @@ pub enum RunError {
         "there is no memory for {what}, {bytes} bytes; choose a smaller population, fewer trials or another machine"
     )]
     Memory { what: &'static str, bytes: usize },
+    /// Populations cannot be brought to the host to be saved.
+    #[error("no checkpoint could be made: {0}")]
+    Held(BackendError),
+}
+
+impl RunError {
+    /// There is no snapshot of so many bytes of policies.
+    pub fn of_snapshot(error: SnapshotError, what: &'static str, bytes: usize) -> RunError {
+        match error {
+            SnapshotError::Memory(_) => RunError::Memory { what, bytes },
+            SnapshotError::Backend(error) => RunError::Held(error),
+        }
+    }
 }
 
 fn after(saved: &Result<(), Box<RunError>>) -> String {
@@ -196,7 +209,11 @@ impl Session {
             }
             let asked = options.save.swap(false, Relaxed);
             if !self.trainer.is_done() && (asked || self.keeper.is_due(&options.schedule, self.generation())) {
-                self.save()?;
+                match self.save() {
+                    // The device failed, which the next generation makes up for or stops at.
+                    Err(RunError::Held(_)) => {}
+                    saved => saved?,
+                }
             }
         }
         self.finish().map(Outcome::Done)
@@ -218,11 +235,12 @@ impl Session {
         let (metrics, output) = self.metrics.mark().map_err(self.metrics_failed())?;
         let bytes = self.config.policy_bytes();
         if !memory::copies_checkpoint([&self.config]) {
-            let (config, seconds, snapshot) = (checkpoint::digest(&self.config), self.seconds(), self.trainer.view());
+            let (config, seconds) = (checkpoint::digest(&self.config), self.seconds());
+            let snapshot = self.trainer.view().map_err(RunError::Held)?;
             return Ok(self.keeper.save_now(&Checkpoint { config, seconds, metrics, snapshot }, &output, since)?);
         }
-        let snapshot =
-            self.trainer.snapshot().map_err(|_| RunError::Memory { what: "a checkpoint beside training", bytes })?;
+        let of_snapshot = |error| RunError::of_snapshot(error, "a checkpoint beside training", bytes);
+        let snapshot = self.trainer.snapshot().map_err(of_snapshot)?;
         let (config, seconds) = (checkpoint::digest(&self.config), self.seconds());
         Ok(self.keeper.save(Checkpoint { config, seconds, metrics, snapshot }, output, since)?)
     }

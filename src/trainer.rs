@@ -9,7 +9,7 @@ use fearless_simd::Level;
 use glam::Vec2;
 use rayon::prelude::*;
 
-use crate::backend::{Backend, BackendError, Episode, Group};
+use crate::backend::{Backend, BackendError, Breeding, Episode, Group, Held, Weights};
 use crate::config::{Config, Learning};
 use crate::credit::Credit;
 use crate::evolve::{self, Key, Purpose};
@@ -29,6 +29,25 @@ struct Arm {
     config: Config,
     world: World,
     trials: Vec<Trial>,
+    /// The generation of the populations that are about to play: behind the trainer's after they were lost with the
+    /// device that held them, two past the last when all is done.
+    age: usize,
+    /// The generation of the weights on the host: an earlier one while a backend holds the populations.
+    host_age: usize,
+    /// The populations, one a trial, while a backend holds them.
+    held: Vec<Box<dyn Held>>,
+    /// Whether the populations were offered to a backend.
+    offered: bool,
+}
+
+/// Why there is no snapshot.
+#[derive(Debug, thiserror::Error)]
+pub enum SnapshotError {
+    #[error(transparent)]
+    Memory(#[from] TryReserveError),
+    /// The populations cannot be brought to the host.
+    #[error(transparent)]
+    Backend(#[from] BackendError),
 }
 
 /// One trial's populations and the room its generations are worked out in.
@@ -80,7 +99,7 @@ impl Trainer {
 
     /// Whether every arm has played its last generation, and the champions of that.
     pub fn is_done(&self) -> bool {
-        self.arms.iter().all(|arm| arm.last() + 1 < self.generation)
+        self.arms.iter().all(Arm::is_done)
     }
 
     /// Plays one generation of every arm that has one left, scores, selects and mutates.
@@ -88,18 +107,45 @@ impl Trainer {
     /// Returns the rows that became complete, by arm, trial and generation: a generation's champion plays along with
     /// the next one, and alone after the last.
     ///
+    /// A backend that wants to may hold the populations. Those that are lost with it are made again, by playing on from
+    /// where they were last on the host.
+    ///
     /// # Errors
     /// When the backend fails; the trainer then still stands before this generation.
     pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
         // Once inside the thread pool, for a small generation is over sooner than a thread is woken.
-        rayon::scope(|_| self.play_generation(backend))
+        rayon::scope(|_| match self.catch_up(backend) {
+            // A device may have room for the populations or for the episodes, but not for both.
+            Err(_) if self.bring_home() => self.catch_up(backend),
+            played => played,
+        })
     }
 
-    fn play_generation(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
-        let (generation, level) = (self.generation, self.level);
-        let playing = self.arms.iter_mut().enumerate().filter(|(_, arm)| generation <= arm.last() + 1);
+    /// Plays every arm from where its populations are to the end of this generation; gives the rows of that alone, since
+    /// all before were given when those generations first played.
+    fn catch_up(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
+        let behind = |arms: &[Arm]| arms.iter().filter(|arm| !arm.is_done()).map(|arm| arm.age).min();
+        while let Some(age) = behind(&self.arms).filter(|&age| age < self.generation) {
+            self.play_generation(age, backend)?;
+        }
+        let rows = self.play_generation(self.generation, backend)?;
+        self.generation += 1;
+        Ok(rows)
+    }
+
+    /// Takes all populations back from the backend that failed; false where there were none or they are lost.
+    fn bring_home(&mut self) -> bool {
+        let held = |arm: &&mut Arm| !arm.held.is_empty();
+        let home: Vec<bool> = self.arms.iter_mut().filter(held).map(|arm| arm.release().is_ok()).collect();
+        !home.is_empty() && home.iter().all(|&home| home)
+    }
+
+    fn play_generation(&mut self, generation: usize, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
+        let level = self.level;
+        let playing = self.arms.iter_mut().enumerate().filter(|(_, arm)| arm.age == generation && !arm.is_done());
         let mut playing: Vec<(usize, &mut Arm)> = playing.collect();
 
+        playing.iter_mut().try_for_each(|(_, arm)| arm.offer(backend))?;
         playing.par_iter_mut().for_each(|(_, arm)| arm.prepare(generation, level));
         play(backend, &playing, |arm| {
             let population = arm.config.learning.population;
@@ -107,23 +153,24 @@ impl Trainer {
             // The first generation has no champion before it.
             first..population + usize::from(generation > 0)
         })?;
+        let mut over = playing.iter_mut().filter(|(_, arm)| generation > arm.last());
+        over.try_for_each(|(_, arm)| arm.fetch())?;
         let conclude = |(index, arm): &mut (usize, &mut Arm)| match generation > arm.last() {
             true => arm.finish(),
             false => arm.conclude(*index, generation),
         };
         let mut rows = playing.par_iter_mut().flat_map_iter(conclude).collect::<Vec<_>>();
-        playing.retain(|(_, arm)| generation < arm.last());
+        playing.retain(|(_, arm)| generation <= arm.last());
         playing.par_iter_mut().for_each(|(_, arm)| {
             arm.draw_parents(generation, level);
             arm.breed(generation, level);
         });
         rows.sort_by_key(|row| (row.arm, row.trial, row.generation));
-        self.generation += 1;
         Ok(rows)
     }
 
-    /// The policies of the last generation played, best first in each population, one `[leaders][policies][parameters]`
-    /// a trial.
+    /// The policies of the last generation of an arm that has played it, best first in each population, one
+    /// `[leaders][policies][parameters]` a trial.
     pub fn policies(&self, arm: usize) -> Vec<Vec<f32>> {
         let arm = &self.arms[arm];
         let sort = |trial: &Trial| {
@@ -148,8 +195,13 @@ impl Trainer {
 
     /// The populations of a trial about to play, `[leaders][policies + 1][parameters]`; a population's last slot is
     /// the champion's of the generation before.
-    pub fn weights(&self, arm: usize, trial: usize) -> &[f32] {
-        &self.arms[arm].trials[trial].weights
+    ///
+    /// # Errors
+    /// The backend that holds them does not give them back.
+    pub fn weights(&mut self, arm: usize, trial: usize) -> Result<&[f32], BackendError> {
+        let arm = &mut self.arms[arm];
+        arm.stand_at(self.generation)?;
+        Ok(&arm.trials[trial].weights)
     }
 
     /// The world that an arm trains in.
@@ -158,23 +210,27 @@ impl Trainer {
     }
 
     /// What [`Trainer::restore`] needs, where it lies.
-    pub fn view(&self) -> Snapshot<&[f32]> {
+    ///
+    /// # Errors
+    /// The backend that holds the populations does not give them back.
+    pub fn view(&mut self) -> Result<Snapshot<&[f32]>, BackendError> {
+        self.arms.iter_mut().try_for_each(|arm| arm.stand_at(self.generation))?;
         let each = |numbers: fn(&Trial) -> &[f32]| {
             self.arms.iter().map(|arm| arm.trials.iter().map(numbers).collect()).collect()
         };
-        Snapshot {
+        Ok(Snapshot {
             generation: self.generation,
             weights: each(|trial| &trial.weights),
             fitness: each(|trial| &trial.fitness),
             pending: self.arms.iter().map(|arm| arm.trials.iter().map(|trial| trial.pending).collect()).collect(),
-        }
+        })
     }
 
     /// What [`Trainer::restore`] needs, in memory of its own.
     ///
     /// # Errors
-    /// There is not so much memory.
-    pub fn snapshot(&self) -> Result<Snapshot, TryReserveError> {
+    /// There is not so much memory, or the backend that holds the populations does not give them back.
+    pub fn snapshot(&mut self) -> Result<Snapshot, SnapshotError> {
         let copy = |numbers: &[f32]| {
             let mut copy = Vec::new();
             copy.try_reserve_exact(numbers.len())?;
@@ -184,7 +240,7 @@ impl Trainer {
         let each = |arms: Vec<Vec<&[f32]>>| -> Result<Vec<Vec<_>>, TryReserveError> {
             arms.into_iter().map(|trials| trials.into_iter().map(copy).collect()).collect()
         };
-        let Snapshot { generation, weights, fitness, pending } = self.view();
+        let Snapshot { generation, weights, fitness, pending } = self.view()?;
         Ok(Snapshot { generation, weights: each(weights)?, fitness: each(fitness)?, pending })
     }
 
@@ -206,6 +262,12 @@ impl Trainer {
             );
         if fits {
             self.generation = generation;
+            for arm in &mut self.arms {
+                arm.held.clear();
+                arm.age = generation.min(arm.last() + 2);
+                arm.host_age = arm.age;
+                arm.offered = false;
+            }
             let trials = self.arms.iter_mut().flat_map(|arm| &mut arm.trials);
             let saved =
                 weights.into_iter().flatten().zip(fitness.into_iter().flatten()).zip(pending.into_iter().flatten());
@@ -229,16 +291,11 @@ fn play(
     for (_, arm) in arms {
         let (population, leaders) = (arm.config.learning.population, arm.world.leaders());
         let range = range(arm);
-        for trial in &arm.trials {
+        for (index, trial) in arm.trials.iter().enumerate() {
+            let weights = arm.held.get(index).map_or(trial.weights[..].into(), |held| Weights::Held(&**held));
             let teams = &trial.teams[range.start * leaders..range.end * leaders];
             for (episode, starts) in trial.starts.iter().enumerate() {
-                groups.push(Group {
-                    world: &arm.world,
-                    starts,
-                    weights: &trial.weights,
-                    policies: population + 1,
-                    teams,
-                });
+                groups.push(Group { world: &arm.world, starts, weights, policies: population + 1, teams });
                 places.push((&**arm, trial, episode * (population + 1) + range.start));
             }
         }
@@ -261,7 +318,7 @@ impl Arm {
     fn new(config: Config, trials: Range<usize>, level: Level) -> Arm {
         let world = World::new(&config);
         let trials = trials.into_par_iter().map(|index| Trial::new(&config, &world, index, level));
-        Arm { trials: trials.collect(), world, config }
+        Arm { trials: trials.collect(), world, config, age: 0, host_age: 0, held: vec![], offered: false }
     }
 
     /// The last generation.
@@ -269,9 +326,66 @@ impl Arm {
         self.config.learning.generations
     }
 
+    /// Whether its last champions have played.
+    fn is_done(&self) -> bool {
+        self.age > self.last() + 1
+    }
+
+    /// Offers the populations to a backend, once: it takes those of all trials or none.
+    fn offer(&mut self, backend: &mut dyn Backend) -> Result<(), BackendError> {
+        if std::mem::replace(&mut self.offered, true) {
+            return Ok(());
+        }
+        let sizes = [self.world.leaders(), self.config.learning.population + 1, self.world.parameters()];
+        let held: Option<Vec<_>> =
+            self.trials.iter().map(|trial| backend.hold(&trial.weights, sizes).transpose()).collect::<Option<_>>();
+        self.held = held.map_or(Ok(vec![]), |held| held.into_iter().collect())?;
+        Ok(())
+    }
+
+    /// Brings the host's weights up to date, all of them or none.
+    fn fetch(&mut self) -> Result<(), BackendError> {
+        if self.host_age == self.age {
+            return Ok(());
+        }
+        for (held, trial) in self.held.iter().zip(&mut self.trials) {
+            held.fetch(&mut trial.children)?;
+        }
+        for Trial { weights, children, .. } in &mut self.trials {
+            std::mem::swap(weights, children);
+        }
+        self.host_age = self.age;
+        Ok(())
+    }
+
+    /// Takes the populations back from the backend, or what the host has of them.
+    fn release(&mut self) -> Result<(), BackendError> {
+        let fetched = self.fetch();
+        self.let_go();
+        fetched
+    }
+
+    /// Leaves what the host has as all there is.
+    fn let_go(&mut self) {
+        self.held.clear();
+        self.age = self.host_age;
+    }
+
+    /// Sees to it that the host's weights are those of the trainer's generation.
+    fn stand_at(&mut self, generation: usize) -> Result<(), BackendError> {
+        if !self.is_done() && self.age < generation {
+            return Err(BackendError::Gone);
+        }
+        let fetched = self.fetch();
+        if fetched.is_err() {
+            self.let_go();
+        }
+        fetched
+    }
+
     /// Forms the teams of a generation and draws its starts.
     fn prepare(&mut self, generation: usize, level: Level) {
-        let Arm { config, world, trials } = self;
+        let Arm { config, world, trials, .. } = self;
         let Learning { seed, population, start_jitter, .. } = config.learning;
         let leaders = world.leaders();
         trials.par_iter_mut().for_each(|trial| {
@@ -292,9 +406,9 @@ impl Arm {
         });
     }
 
-    /// Turns what was observed into fitness and rows, and takes the champion's policies aside.
+    /// Turns what was observed into fitness and rows.
     fn conclude(&mut self, arm: usize, generation: usize) -> Vec<Row> {
-        let Arm { config, world, trials } = self;
+        let Arm { config, world, trials, .. } = self;
         let population = config.learning.population;
         let mut rows = Vec::with_capacity(trials.len());
         for trial in trials {
@@ -302,12 +416,6 @@ impl Arm {
             rows.extend(trial.pending.map(|row| Row { champion_g, ..row }));
             trial.pending = Some(Row { arm, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
             trial.rate(world.leaders(), population);
-            let policies = trial.weights.par_chunks_exact_mut((population + 1) * world.parameters());
-            let policies = policies.with_min_len(few(population));
-            policies.zip(trial.fitness.par_chunks_exact(population)).for_each(|(policies, fitness)| {
-                let best = evolve::best(fitness, 1)[0] * world.parameters();
-                policies.copy_within(best..best + world.parameters(), population * world.parameters());
-            });
         }
         rows
     }
@@ -319,17 +427,26 @@ impl Arm {
             let [_, _, champion_g] = trial.summary(pois, population);
             trial.pending.take().map(|row| Row { champion_g, ..row })
         };
-        self.trials.iter_mut().filter_map(row).collect()
+        let rows = self.trials.iter_mut().filter_map(row).collect();
+        self.held.clear();
+        self.age += 1;
+        self.host_age = self.age;
+        rows
     }
 
-    /// Plans the next generation: which policy each slot comes from, and whether it mutates.
+    /// Plans the next generation: which policy each slot comes from, and whether it mutates. After the last, policies
+    /// stay, and the champion plays.
     fn draw_parents(&mut self, generation: usize, level: Level) {
         let Learning { seed, population, elites, .. } = self.config.learning;
+        let last = generation == self.last();
         self.trials.par_iter_mut().for_each(|trial| {
             let key = Key::new(seed, trial.index, Purpose::Tournament);
             let plans = trial.parents.par_chunks_exact_mut(population + 1).with_min_len(few(population));
             plans.zip(trial.fitness.par_chunks_exact(population)).enumerate().for_each(|(leader, (plan, fitness))| {
-                evolve::draw_parents(level, key, generation, leader, elites, fitness, plan);
+                match last {
+                    true => evolve::keep_parents(fitness, plan),
+                    false => evolve::draw_parents(level, key, generation, leader, elites, fitness, plan),
+                }
             });
         });
     }
@@ -337,8 +454,22 @@ impl Arm {
     /// Makes the next generation by its plan.
     fn breed(&mut self, generation: usize, level: Level) {
         thread_local! { static SCRATCH: RefCell<Vec<u32>> = const { RefCell::new(Vec::new()) }; }
-        let Arm { config, world, trials } = self;
+        let Arm { config, world, trials, held, .. } = self;
         let Learning { seed, population, .. } = config.learning;
+        self.age += 1;
+        if !held.is_empty() {
+            let mut pairs = held.iter_mut().zip(trials);
+            let bred = pairs.try_for_each(|(held, trial)| {
+                let key = Key::new(seed, trial.index, Purpose::Mutation);
+                held.breed(&Breeding { parents: &trial.parents, key, generation, learning: &config.learning })
+            });
+            if bred.is_err() {
+                // This generation is told by now: the next makes up for the loss, or fails.
+                self.let_go();
+            }
+            return;
+        }
+        self.host_age = self.age;
         let parameters = world.parameters();
         let stride = (population + 1) * parameters;
         trials.par_iter_mut().for_each(|trial| {

@@ -1,12 +1,13 @@
-//! Whether a backend agrees with the CPU, bit for bit: random worlds stage by stage, all of them as one batch, and
-//! short training runs.
+//! Whether a backend agrees with the CPU, bit for bit: random worlds stage by stage, all of them as one batch, breeding
+//! where the backend holds populations, and short training runs.
 
 use std::ops::Range;
 use std::sync::Mutex;
 
 use crate::backend::compare::{Mismatch, first_mismatch};
-use crate::backend::{Backend, BackendError, Group};
+use crate::backend::{Backend, BackendError, Breeding, Group};
 use crate::config::Config;
+use crate::evolve::{Key, Purpose, UNCHANGED};
 use crate::sample;
 use crate::trainer::{Row, Trainer};
 use crate::world::World;
@@ -65,7 +66,7 @@ impl Teams {
 
     fn group(&self) -> Group<'_> {
         let Teams { world, policies, weights, choice } = self;
-        Group { world, starts: &world.starts, weights, policies: *policies, teams: choice }
+        Group { world, starts: &world.starts, weights: weights[..].into(), policies: *policies, teams: choice }
     }
 }
 
@@ -100,6 +101,12 @@ pub fn compare(
     }
     outcome.agent_steps *= 2;
     progress(&outcome);
+    for ((name, config), teams) in plan.worlds.iter().zip(&all) {
+        if let Some(mismatch) = compare_breeding(config, teams, backend)? {
+            outcome.mismatch = Some(format!("{name}: {mismatch}"));
+            return Ok(outcome);
+        }
+    }
     outcome.mismatch = compare_training(plan, reference, backend)?;
     Ok(outcome)
 }
@@ -137,6 +144,34 @@ fn compare_batch(
     let teams =
         groups.iter().enumerate().flat_map(|(index, group)| (0..group.team_count()).map(move |team| (index, team)));
     Ok(teams.into_iter().find(differs))
+}
+
+/// Breeds a world's policies where the backend holds them; the first weight that differs.
+fn compare_breeding(config: &Config, teams: &Teams, backend: &mut dyn Backend) -> Result<Option<String>, BackendError> {
+    let Teams { world, policies, weights, .. } = teams;
+    let (slots, parameters) = (*policies, world.parameters());
+    let sizes = [world.leaders(), slots, parameters];
+    let Some(mut held) = backend.hold(weights, sizes)? else { return Ok(None) };
+    // Each slot's parent is the slot after it, every fourth is kept as it is.
+    let planned = |place: usize| ((place + 1) % slots) as u32 | if place % 4 == 3 { UNCHANGED } else { 0 };
+    let parents: Vec<u32> = (0..world.leaders()).flat_map(|_| (0..slots).map(planned)).collect();
+    let (key, learning) = (Key::new(config.learning.seed, 0, Purpose::Mutation), &config.learning);
+    let breeding = Breeding { parents: &parents, key, generation: 0, learning };
+    held.breed(&breeding)?;
+    let mut found = vec![0.0; weights.len()];
+    held.fetch(&mut found)?;
+    let expected = breeding.on_host(sizes, weights);
+    let differs = |index: &usize| expected[*index].to_bits() != found[*index].to_bits();
+    Ok((0..found.len()).find(differs).map(|index| {
+        let (leader, slot, weight) = (index / parameters / slots, index / parameters % slots, index % parameters);
+        let (expected, found) = (expected[index], found[index]);
+        format!(
+            "stage breed, leader {leader}, slot {slot}, weight {weight}: expected {:#010x} ({expected:?}), \
+             found {:#010x} ({found:?})",
+            expected.to_bits(),
+            found.to_bits()
+        )
+    }))
 }
 
 /// Trains the first few worlds for a few generations side by side.

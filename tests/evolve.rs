@@ -498,7 +498,8 @@ impl Plain<'_> {
             let key = self.key(Purpose::Starts);
             evolve::jitter_starts(key, generation, episode, &self.world, start_jitter, &mut starts);
             let teams = vec![0; team.len()];
-            let group = Group { world: &self.world, starts: &starts, weights: &weights, policies: 1, teams: &teams };
+            let group =
+                Group { world: &self.world, starts: &starts, weights: weights[..].into(), policies: 1, teams: &teams };
             let found = std::sync::Mutex::new(None);
             let visit = |episode: flotilla::backend::Episode<'_>| {
                 let scores = Credit::default().all(&episode, &self.world);

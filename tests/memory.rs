@@ -140,7 +140,7 @@ fn checkpoints_need_no_copy() {
                 keeper.wait().unwrap();
             }
             _ => {
-                let checkpoint = Checkpoint { config, seconds, metrics, snapshot: trainer.view() };
+                let checkpoint = Checkpoint { config, seconds, metrics, snapshot: trainer.view().unwrap() };
                 keeper.save_now(&checkpoint, &output, Instant::now()).unwrap();
             }
         }

@@ -346,7 +346,7 @@ fn check(cpu: &mut Cpu, world: &Config, model: &Model, seed: u64) -> Tally {
         .map(|start| start + Vec2::new(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0)) * jitter)
         .map(|start| on_grid(start, model.map.as_vec2()))
         .collect();
-    let group = Group { world: &compiled, starts: &starts, weights: &weights, policies, teams: &teams };
+    let group = Group { world: &compiled, starts: &starts, weights: weights[..].into(), policies, teams: &teams };
     let trace = cpu.trace(&group).unwrap();
     assert_eq!((trace.teams, trace.agents), (TEAMS, model.agents));
     let mut tally = Tally::default();

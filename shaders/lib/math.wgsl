@@ -89,6 +89,12 @@ fn normal(a: u32, b: u32) -> f32 {
     return flush(radius * cosine, 9.094947e-13);
 }
 
+// `x` moved into `low..=high`.
+fn bound(x: f32, low: f32, high: f32) -> f32 {
+    let raised = select(x, low, x < low);
+    return select(raised, high, raised > high);
+}
+
 // +0 where |x| < limit, else x.
 fn flush(x: f32, limit: f32) -> f32 {
     return select(x, 0.0, abs(x) < limit);

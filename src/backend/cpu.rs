@@ -10,7 +10,7 @@ use fearless_simd::{Level, Select, Simd, SimdMask, dispatch, f32x4, prelude::*};
 use glam::Vec2;
 use rayon::prelude::*;
 
-use super::{Backend, BackendError, Episode, Group, Moment, Strided, Trace, Visit};
+use super::{Backend, BackendError, Episode, Group, Moment, Strided, Trace, Visit, Weights};
 use crate::kernels::{couple, follow, math, motion, policy, sense, splat};
 use crate::world::{Constants, INPUTS, OUTPUTS, World};
 
@@ -68,12 +68,14 @@ pub fn level_name(level: Level) -> &'static str {
 
 impl Backend for Cpu {
     fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
+        groups.iter().try_for_each(|group| group.weights.on_host().map(drop))?;
         let level = self.level;
         dispatch!(level, simd => rollout(simd, groups, visit));
         Ok(())
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
+        group.weights.on_host()?;
         let level = self.level;
         Ok(dispatch!(level, simd => trace(simd, group)))
     }
@@ -293,7 +295,8 @@ impl<S: Simd> Block<S> {
                 let policies = places.map(|(group, team)| {
                     let group = &run.groups[group];
                     let policy = group.teams[team * leaders + leader] as usize;
-                    &group.weights[(leader * group.policies + policy) * parameters..][..parameters]
+                    let Weights::OnHost(weights) = group.weights else { unreachable!("seen before playing") };
+                    &weights[(leader * group.policies + policy) * parameters..][..parameters]
                 });
                 let mut put = |slot: usize, lanes: &[f32]| {
                     weights[slot].as_mut_slice()[quad * 4..quad * 4 + 4].copy_from_slice(lanes);

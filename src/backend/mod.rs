@@ -1,7 +1,13 @@
 //! The seam between training and the hardware: whole episodes of many teams.
 
+use std::any::Any;
+use std::fmt::Debug;
+
+use fearless_simd::Level;
 use glam::Vec2;
 
+use crate::config::Learning;
+use crate::evolve::{self, Key, UNCHANGED};
 use crate::world::World;
 
 pub mod compare;
@@ -14,8 +20,7 @@ pub struct Group<'a> {
     pub world: &'a World,
     /// Start positions `[agents]`, leaders first.
     pub starts: &'a [Vec2],
-    /// Weights `[leaders][policies][parameters]`: 0 or of size 2^-30 to 2^20.
-    pub weights: &'a [f32],
+    pub weights: Weights<'a>,
     /// Policies a leader has to choose from.
     pub policies: usize,
     /// The policy each leader plays in each team, `[teams][leaders]`.
@@ -26,6 +31,72 @@ impl Group<'_> {
     /// How many teams play.
     pub fn team_count(&self) -> usize {
         self.teams.len() / self.world.leaders()
+    }
+}
+
+/// What the policies of a group are, `[leaders][policies][parameters]`: each number 0 or of size 2^-30 to 2^20.
+#[derive(Clone, Copy, Debug)]
+pub enum Weights<'a> {
+    OnHost(&'a [f32]),
+    /// In the memory of the backend that plays.
+    Held(&'a (dyn Held + 'static)),
+}
+
+impl<'a> From<&'a [f32]> for Weights<'a> {
+    fn from(weights: &'a [f32]) -> Weights<'a> {
+        Weights::OnHost(weights)
+    }
+}
+
+impl<'a> Weights<'a> {
+    /// The numbers, where they are at hand.
+    ///
+    /// # Errors
+    /// Another backend holds them.
+    pub fn on_host(self) -> Result<&'a [f32], BackendError> {
+        match self {
+            Weights::OnHost(weights) => Ok(weights),
+            Weights::Held(_) => Err(BackendError::HeldElsewhere),
+        }
+    }
+}
+
+/// The populations of one trial in a backend's own memory; dropped, they leave it.
+///
+/// After an error they may be of any generation.
+pub trait Held: Any + Debug + Send + Sync {
+    /// Makes the next generation, to the bits of [`crate::evolve::mutate`].
+    fn breed(&mut self, breeding: &Breeding<'_>) -> Result<(), BackendError>;
+
+    /// Copies all weights to the host, `[leaders][slots][parameters]`.
+    fn fetch(&self, weights: &mut [f32]) -> Result<(), BackendError>;
+}
+
+/// How the next generation of a trial's populations comes from this one.
+#[derive(Clone, Debug)]
+pub struct Breeding<'a> {
+    /// The plan, `[leaders][slots]`, see [`crate::evolve::draw_parents`].
+    pub parents: &'a [u32],
+    /// The trial's key of [`crate::evolve::Purpose::Mutation`], and the generation to draw for.
+    pub key: Key,
+    pub generation: usize,
+    pub learning: &'a Learning,
+}
+
+impl Breeding<'_> {
+    /// The next generation of these weights, worked out on the host: what [`Held::breed`] must come to.
+    pub fn on_host(&self, [_, slots, parameters]: [usize; 3], weights: &[f32]) -> Vec<f32> {
+        let (mut children, mut scratch) = (Vec::with_capacity(weights.len()), Vec::new());
+        for (place, planned) in self.parents.iter().enumerate() {
+            let (leader, slot, first) = (place / slots, place % slots, children.len());
+            let parent = leader * slots + (planned & !UNCHANGED) as usize;
+            children.extend_from_slice(&weights[parent * parameters..(parent + 1) * parameters]);
+            if planned & UNCHANGED == 0 {
+                let key = self.key.at(self.generation, leader, slot);
+                evolve::mutate(Level::new(), key, self.learning, &mut children[first..], &mut scratch);
+            }
+        }
+        children
     }
 }
 
@@ -115,6 +186,12 @@ pub trait Backend: Send {
     /// Plays one group and keeps every stage of every step.
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError>;
 
+    /// Takes the populations of one trial, `[leaders][slots][parameters]`, into memory of its own, to breed them there;
+    /// none where they had better stay on the host.
+    fn hold(&mut self, _weights: &[f32], _sizes: [usize; 3]) -> Result<Option<Box<dyn Held>>, BackendError> {
+        Ok(None)
+    }
+
     /// What it runs on, for people: "cpu (AVX2, 2 threads)".
     fn describe(&self) -> String;
 }
@@ -128,4 +205,12 @@ pub enum BackendError {
     /// What was asked does not fit the device.
     #[error("{0}")]
     TooLarge(String),
+    /// Populations of one backend were handed to another.
+    #[error("the populations are held by another device; bring them to the host first")]
+    HeldElsewhere,
+    /// Nobody has the populations of the present generation any more.
+    #[error(
+        "the populations were lost with the device that held them; --resume goes on from the last checkpoint or the start"
+    )]
+    Gone,
 }

@@ -10,7 +10,7 @@ use fearless_simd::Level;
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu::episode::GpuEpisodes;
 use crate::backend::gpu::probe;
-use crate::backend::{Backend, BackendError, Group};
+use crate::backend::{Backend, BackendError, Group, Weights};
 use crate::config::{Config, Coupling};
 use crate::credit::Credit;
 use crate::evolve::{Key, Purpose, form_teams, random_policy};
@@ -177,7 +177,10 @@ fn rollout(
     }
     let mut teams = vec![0; population * leaders];
     form_teams(Key::new(seed, 0, Purpose::Teams), 0, leaders, &mut teams);
-    let group = Group { world, starts: &world.starts, weights: &weights, policies: population, teams: &teams };
+    // Where generations play from the device's memory, so do rollouts.
+    let held = backend.hold(&weights, [leaders, population, world.parameters()])?;
+    let played = held.as_deref().map_or(weights[..].into(), Weights::Held);
+    let group = Group { world, starts: &world.starts, weights: played, policies: population, teams: &teams };
     let observed = AtomicU64::new(0);
     let play = || {
         observed.store(0, Relaxed);
@@ -195,7 +198,8 @@ fn rollout(
     let pairs = world.steps() * world.agents() * world.agents();
     let traced = (TRACED_PAIRS / pairs).clamp(1, TRACED_TEAMS).min(population);
     // The CPU's, since every backend's is the same.
-    let trace = Cpu::default().trace(&Group { teams: &teams[..traced * leaders], ..group })?;
+    let traced = Group { weights: weights[..].into(), teams: &teams[..traced * leaders], ..group };
+    let trace = Cpu::default().trace(&traced)?;
     Ok((times, mean_g, Reach::of(world, &trace)))
 }
 

@@ -151,7 +151,7 @@ mod tests {
     fn reach(world: &World, teams: usize) -> Reach {
         let weights = sample::weights(world, teams, 0);
         let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; world.leaders()]).collect();
-        let group = Group { world, starts: &world.starts, weights: &weights, policies: teams, teams: &order };
+        let group = Group { world, starts: &world.starts, weights: weights[..].into(), policies: teams, teams: &order };
         Reach::of(world, &Cpu::default().trace(&group).expect("the CPU plays"))
     }
 

@@ -1,9 +1,9 @@
 //! Opens what episodes are played on.
 
-use super::{BackendChoice, Error, RunOptions, say};
+use super::{BackendChoice, Breed, Error, RunOptions, say};
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu::device::{self, Choice, DeviceError};
-use crate::backend::gpu::episode::GpuEpisodes;
+use crate::backend::gpu::episode::{GpuEpisodes, Holding};
 use crate::run::{Machine, Player};
 
 /// Opens the backend that was asked for; `--threads` holds for the whole process.
@@ -21,12 +21,19 @@ pub fn open(options: &RunOptions) -> Result<Player, Error> {
 pub fn open_gpu(options: &RunOptions) -> Result<Option<GpuEpisodes>, Error> {
     start_threads(options)?;
     let named = options.adapter.clone().map(Choice::Named);
+    let gpu = |choice| gpu(choice, options.breed);
+    if (options.backend, options.breed) == (BackendChoice::Cpu, Breed::Device) {
+        return Err(Error::Usage(
+            "--breed device needs a GPU, --backend cpu uses none; leave out one of the two".into(),
+        ));
+    }
     match (options.backend, named) {
         (BackendChoice::Cpu, Some(_)) => {
             Err(Error::Usage("--adapter names a GPU, --backend cpu uses none; leave out one of the two".into()))
         }
         (BackendChoice::Cpu, None) => Ok(None),
         (BackendChoice::Auto, None) => match gpu(Choice::Real) {
+            Err(error) if options.breed == Breed::Device => Err(error.into()),
             Err(DeviceError::NoAdapter | DeviceError::NoRealAdapter { .. }) => Ok(None),
             Err(error) => {
                 say(format_args!("note: no GPU is used: {error}"));
@@ -49,8 +56,13 @@ pub fn start_threads(options: &RunOptions) -> Result<(), Error> {
     started.map_err(|error| Error::Usage(format!("--threads {threads} cannot be started: {error}")))
 }
 
-fn gpu(choice: Choice) -> Result<GpuEpisodes, DeviceError> {
-    GpuEpisodes::new(device::open(choice)?)
+fn gpu(choice: Choice, breed: Breed) -> Result<GpuEpisodes, DeviceError> {
+    let backend = GpuEpisodes::new(device::open(choice)?)?;
+    Ok(match breed {
+        Breed::Auto => backend,
+        Breed::Host => backend.holding(Holding::Never),
+        Breed::Device => backend.holding(Holding::Always),
+    })
 }
 
 fn player(backend: GpuEpisodes) -> Player {

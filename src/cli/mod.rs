@@ -225,6 +225,9 @@ pub struct RunOptions {
     /// GPU whose name contains this, as `flotilla devices` lists it
     #[arg(long, help_heading = WHERE, value_name = "NAME")]
     pub adapter: Option<String>,
+    /// Where populations are kept and the next generation is bred
+    #[arg(long, help_heading = WHERE, value_enum, default_value_t = Breed::Auto)]
+    pub breed: Breed,
     /// CPU threads [default: all]
     #[arg(long, help_heading = WHERE, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub threads: Option<u16>,
@@ -239,4 +242,15 @@ pub enum BackendChoice {
     Cpu,
     /// A GPU, or fail
     Gpu,
+}
+
+/// Where populations are kept between generations.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Breed {
+    /// With a GPU, in its memory from 1 MiB a trial on and where they fit (an estimate, not measured); else in the host's
+    Auto,
+    /// In the host's memory
+    Host,
+    /// In the GPU's memory, or fail
+    Device,
 }

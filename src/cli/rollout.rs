@@ -47,7 +47,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let group = Group {
         world: &world,
         starts: &world.starts,
-        weights: &policies.weights,
+        weights: policies.weights[..].into(),
         policies: policies.policies,
         teams: &teams,
     };

@@ -7,7 +7,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::{Error, print};
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu::device::{self, AdapterInfo, Choice, DeviceError, Request};
-use crate::backend::gpu::episode::GpuEpisodes;
+use crate::backend::gpu::episode::{GpuEpisodes, Holding};
 use crate::backend::gpu::exact::Pass;
 use crate::config::Config;
 use crate::verify::{Outcome, Plan, compare};
@@ -126,7 +126,7 @@ fn verify(plan: &Plan, request: Request, info: &AdapterInfo) -> Result<Outcome, 
     if let Some(mismatch) = gpu.self_test()? {
         return Ok(Outcome { mismatch: Some(mismatch.to_string()), ..Outcome::default() });
     }
-    let mut gpu = GpuEpisodes::new(gpu)?;
+    let mut gpu = GpuEpisodes::new(gpu)?.holding(Holding::Always);
     let outcome = compare(plan, &mut Cpu::default(), &mut gpu, |outcome| bar.set_position(outcome.worlds as u64))?;
     bar.finish_and_clear();
     Ok(outcome)

@@ -147,7 +147,7 @@ pub fn replay(
             }
             trainer.advance(backend)?;
         }
-        let found = play_best(&config, &trainer, trial, backend)?;
+        let found = play_best(&config, &mut trainer, trial, backend)?;
         let expected = rows.get(generation).unwrap_or(f64::NAN);
         if found.best_g != expected {
             let found = found.best_g;
@@ -184,7 +184,7 @@ fn nearest(
 /// Plays the teams of the generation before which a trial's trainer stands, and traces the best.
 fn play_best(
     config: &Config,
-    trainer: &Trainer,
+    trainer: &mut Trainer,
     trial: usize,
     backend: &mut dyn Backend,
 ) -> Result<Played, ReplayError> {
@@ -192,7 +192,7 @@ fn play_best(
     let learning = &config.learning;
     let (generation, world) = (trainer.generation(), trainer.world(0).clone());
     let (leaders, population) = (world.leaders(), learning.population);
-    let weights = trainer.weights(0, 0);
+    let weights = trainer.weights(0, 0)?.into();
 
     let mut teams = vec![0; population * leaders];
     evolve::form_teams(Key::new(learning.seed, trial, Purpose::Teams), generation, leaders, &mut teams);

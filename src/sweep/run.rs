@@ -346,8 +346,8 @@ impl<'a> Batch<'a> {
     fn save(&mut self) -> Result<(), RunError> {
         let seconds = self.since.elapsed().as_secs_f64();
         let bytes = self.members.iter().map(|member| member.point.config.policy_bytes()).sum();
-        let snapshot =
-            self.trainer.snapshot().map_err(|_| RunError::Memory { what: "checkpoints beside training", bytes })?;
+        let of_snapshot = |error| RunError::of_snapshot(error, "checkpoints beside training", bytes);
+        let snapshot = self.trainer.snapshot().map_err(of_snapshot)?;
         let Snapshot { generation, weights, fitness, pending } = snapshot;
         let parts = weights.into_iter().zip(fitness).zip(pending);
         let waiting = self.members.iter_mut().zip(parts).filter(|(member, _)| !member.done);

@@ -2,17 +2,20 @@
 //!
 //! While the GPU plays one batch, the CPU reads the record of the batch before it.
 
+use std::any::Any;
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytemuck::{Pod, Zeroable};
 use glam::Vec2;
 use rayon::prelude::*;
 
-use super::device::{Binding, DeviceError, Gpu, Layout, Stopwatch, timed};
+use super::device::{Binding, DeviceError, Gpu, Kind, Layout, Stopwatch, timed};
 use super::exact;
-use crate::backend::{Backend, BackendError, Episode, Group, Moment, Strided, Trace, Visit};
+use super::population::{Kernels, Population, Stretch, TOGETHER, parts};
+use crate::backend::{Backend, BackendError, Episode, Group, Held, Moment, Strided, Trace, Visit, Weights};
 use crate::world::{Constants, World};
 
 /// Threads that share a warp on most GPUs; leaders and followers are kept apart by as many (`ROLE` in the shader).
@@ -29,7 +32,7 @@ const MAX_OFFSET: u64 = 1 << 33;
 /// after 65 535, and drivers stop a dispatch that runs for seconds: longer episodes take several dispatches.
 const TURNS: usize = 60_000;
 /// Offsets of bindings are multiples of this on every WebGPU device.
-const BINDING_ALIGNMENT: usize = 256;
+pub(super) const BINDING_ALIGNMENT: usize = 256;
 
 /// One workgroup's share of the work (`struct Task` in `shaders/lib/layout.wgsl`); offsets count elements.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
@@ -129,6 +132,12 @@ struct Share {
 type Done<'a> = dyn Fn(&Share, &[u32], &[Moment]) + Sync + 'a;
 
 impl Share {
+    /// How many weights its teams have.
+    fn weights(&self, groups: &[Group<'_>]) -> usize {
+        let world = groups[self.group].world;
+        self.task.teams as usize * world.leaders() * world.parameters()
+    }
+
     /// The task's part in one round of dispatches; none when it is done.
     fn round(&self, round: usize) -> Option<Task> {
         let first = (round * self.steps_a_dispatch) as u32;
@@ -237,23 +246,42 @@ fn plan(groups: &[Group<'_>], trace: bool, room: Room) -> Result<Vec<Work>, Back
 }
 
 /// A task's weights, `[parameters][teams][leaders]`: neighbouring threads read neighbouring weights.
-fn gather(group: &Group<'_>, first_team: usize, teams: usize, to: &mut [f32]) {
+fn gather(group: &Group<'_>, weights: &[f32], first_team: usize, teams: usize, to: &mut [f32]) {
     let (leaders, parameters) = (group.world.leaders(), group.world.parameters());
     let lanes = teams * leaders;
     let policies = &group.teams[first_team * leaders..(first_team + teams) * leaders];
     for (lane, &policy) in policies.iter().enumerate() {
         let from = ((lane % leaders) * group.policies + policy as usize) * parameters;
-        for (index, &weight) in group.weights[from..from + parameters].iter().enumerate() {
+        for (index, &weight) in weights[from..from + parameters].iter().enumerate() {
             to[index * lanes + lane] = weight;
         }
     }
 }
+
+/// Which populations a device holds in its own memory between generations; no result depends on that.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Holding {
+    /// None.
+    Never,
+    /// Those that take at least so many bytes a trial and fit.
+    From(u64),
+    /// All; what does not fit is an error.
+    Always,
+}
+
+/// Populations of a trial that take so many bytes are held where nothing else is asked for, but never by a software
+/// renderer: about what goes over the bus in the time of the few dispatches that holding costs. An estimate, not a
+/// measurement.
+pub const HELD_FROM: u64 = 1 << 20;
 
 /// Plays episodes on a GPU.
 pub struct GpuEpisodes {
     gpu: Gpu,
     layout: Layout,
     pipelines: HashMap<Shape, wgpu::ComputePipeline>,
+    holding: Holding,
+    /// Compiled once something is to be held.
+    kernels: Option<Arc<Kernels>>,
     /// Two sets, so that one batch plays while the other is read.
     lanes: [Buffers; 2],
     /// Weights on their way to the device.
@@ -282,12 +310,17 @@ pub struct Stages {
     pub gpu: Duration,
 }
 
+/// What is to be gathered from populations on the device, and the choices of those teams, `[teams][leaders]` each.
+type Gathering<'a> = (Vec<(Stretch, &'a Population)>, Vec<u32>);
+
 /// The device's side of one batch; buffers only grow.
 #[derive(Default)]
 struct Buffers {
     worlds: Option<wgpu::Buffer>,
     tasks: Option<wgpu::Buffer>,
     places: Option<wgpu::Buffer>,
+    stretches: Option<wgpu::Buffer>,
+    choices: Option<wgpu::Buffer>,
     weights: Option<wgpu::Buffer>,
     record: Option<wgpu::Buffer>,
     moments: Option<wgpu::Buffer>,
@@ -325,11 +358,14 @@ impl GpuEpisodes {
     /// When the device does not take the episode's bindings.
     pub fn new(gpu: Gpu) -> Result<GpuEpisodes, DeviceError> {
         use Binding::{Read, Write};
+        let software = gpu.adapter.kind == Kind::Software;
         let layout = gpu.layout("episode", &[Read, Read, Read, Read, Write, Write, Write])?;
         Ok(GpuEpisodes {
             gpu,
             layout,
             pipelines: HashMap::new(),
+            holding: if software { Holding::Never } else { Holding::From(HELD_FROM) },
+            kernels: None,
             lanes: Default::default(),
             staging: Vec::new(),
             batch_bytes: BATCH_BYTES,
@@ -343,7 +379,12 @@ impl GpuEpisodes {
         GpuEpisodes { batch_bytes: bytes, ..self }
     }
 
-    /// The same with a changed shader, for tests that show that a change is noticed.
+    /// The same with other populations held than by default.
+    pub fn holding(self, holding: Holding) -> GpuEpisodes {
+        GpuEpisodes { holding, ..self }
+    }
+
+    /// The same with changed shaders, for tests that show that a change is noticed.
     #[doc(hidden)]
     pub fn edited(self, edit: fn(String) -> String) -> GpuEpisodes {
         GpuEpisodes { edit, ..self }
@@ -396,9 +437,10 @@ impl GpuEpisodes {
     }
 
     /// Hands one batch to the device.
-    fn submit(&mut self, lane: usize, groups: &[Group<'_>], work: &Work, trace: bool) -> Result<(), DeviceError> {
+    fn submit(&mut self, lane: usize, groups: &[Group<'_>], work: &Work, trace: bool) -> Result<(), BackendError> {
         use wgpu::BufferUsages as Usage;
         let start = Instant::now();
+        let (stretches, choices) = self.stretches(groups, work)?;
         self.fill_staging(groups, work);
         let gathered = Instant::now();
         self.stages.gather += gathered - start;
@@ -439,7 +481,25 @@ impl GpuEpisodes {
         let worlds = upload(&mut buffers.worlds, "worlds", bytemuck::cast_slice(&work.worlds))?;
         let all_tasks = upload(&mut buffers.tasks, "tasks", bytemuck::cast_slice(&tasks))?;
         let places = upload(&mut buffers.places, "places", bytemuck::cast_slice(&work.places))?;
-        let weights = upload(&mut buffers.weights, "weights", bytemuck::cast_slice(&self.staging))?;
+        let weight_bytes = (work.weights * size_of::<f32>()) as u64;
+        let weights = grown(gpu, &mut buffers.weights, "weights", weight_bytes, input)?.clone();
+        for run in work.shares.chunk_by(|a, b| is_on_host(groups, a) == is_on_host(groups, b)) {
+            if is_on_host(groups, &run[0]) {
+                let (first, last) = (run[0].task.weights as usize, &run[run.len() - 1]);
+                let end = last.task.weights as usize + last.weights(groups);
+                let bytes = bytemuck::cast_slice(&self.staging[first..end]);
+                gpu.scoped("weights", || gpu.queue.write_buffer(&weights, (first * size_of::<f32>()) as u64, bytes))?;
+            }
+        }
+        let mut gathers = Vec::with_capacity(stretches.len());
+        if let Some(kernels) = self.kernels.as_ref().filter(|_| !stretches.is_empty()) {
+            let structs: Vec<Stretch> = stretches.iter().map(|(stretch, _)| *stretch).collect();
+            let structs = upload(&mut buffers.stretches, "stretches", &parts(&structs))?;
+            let choices = upload(&mut buffers.choices, "choices", bytemuck::cast_slice(&choices))?;
+            for (part, (stretch, population)) in stretches.iter().enumerate() {
+                gathers.push(kernels.gather((&structs, part), stretch, &choices, population, &weights)?);
+            }
+        }
         let record = grown(gpu, &mut buffers.record, "record", record_bytes, output)?;
         let moments = grown(gpu, &mut buffers.moments, "moments", moment_bytes, output)?;
         let state_bytes = (work.states * size_of::<State>()) as u64;
@@ -467,7 +527,7 @@ impl GpuEpisodes {
         let submitted = gpu.scoped("episodes", || {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             let mut pass = encoder.begin_compute_pass(&timed(watch));
-            for (pipeline, group, [x, y, z]) in &bound {
+            for (pipeline, group, [x, y, z]) in gathers.iter().chain(&bound) {
                 pass.set_pipeline(pipeline);
                 pass.set_bind_group(0, group, &[]);
                 pass.dispatch_workgroups(*x, *y, *z);
@@ -515,20 +575,52 @@ impl GpuEpisodes {
         Ok(())
     }
 
-    /// Gathers the weights of every task.
+    /// What a batch has to gather.
+    fn stretches<'a>(&self, groups: &[Group<'a>], work: &Work) -> Result<Gathering<'a>, BackendError> {
+        let (mut stretches, mut choices) = (Vec::new(), Vec::new());
+        for shares in work.shares.chunk_by(|a, b| a.group == b.group) {
+            let group = &groups[shares[0].group];
+            let Weights::Held(held) = group.weights else { continue };
+            let ours = |population: &&Population| self.kernels.as_ref().is_some_and(|k| population.is_of(k));
+            let population = (held as &dyn Any).downcast_ref().filter(ours).ok_or(BackendError::HeldElsewhere)?;
+            let leaders = group.world.leaders();
+            let teams: u32 = shares.iter().map(|share| share.task.teams).sum();
+            for first in (0..leaders).step_by(TOGETHER) {
+                let stretch = Stretch {
+                    leaders: leaders as u32,
+                    first: first as u32,
+                    count: TOGETHER.min(leaders - first) as u32,
+                    parameters: group.world.constants.parameters,
+                    teams,
+                    teams_a_task: shares[0].task.teams,
+                    choices: choices.len() as u32,
+                    weights: shares[0].task.weights,
+                };
+                stretches.push((stretch, population));
+            }
+            choices.extend(&group.teams[shares[0].first_team * leaders..][..teams as usize * leaders]);
+        }
+        Ok((stretches, choices))
+    }
+
+    /// Gathers the weights of every task whose policies are on the host; leaves room for the others'.
     fn fill_staging(&mut self, groups: &[Group<'_>], work: &Work) {
+        if !work.shares.iter().any(|share| is_on_host(groups, share)) {
+            return;
+        }
         self.staging.resize(work.weights, 0.0);
         let mut rest = &mut self.staging[..];
         let mut parts = Vec::with_capacity(work.shares.len());
         for share in &work.shares {
             let group = &groups[share.group];
-            let size = share.task.teams as usize * group.world.leaders() * group.world.parameters();
-            let (part, tail) = rest.split_at_mut(size);
+            let (part, tail) = rest.split_at_mut(share.weights(groups));
             rest = tail;
-            parts.push((share, group, part));
+            if let Weights::OnHost(weights) = group.weights {
+                parts.push((share, group, weights, part));
+            }
         }
-        parts.into_par_iter().for_each(|(share, group, part)| {
-            gather(group, share.first_team, share.task.teams as usize, part);
+        parts.into_par_iter().for_each(|(share, group, weights, part)| {
+            gather(group, weights, share.first_team, share.task.teams as usize, part);
         });
     }
 
@@ -540,8 +632,12 @@ impl GpuEpisodes {
     }
 }
 
+fn is_on_host(groups: &[Group<'_>], share: &Share) -> bool {
+    matches!(groups[share.group].weights, Weights::OnHost(_))
+}
+
 /// A dispatch of at least `tasks` workgroups, within the device's limit on each side.
-fn grid(tasks: usize, limits: &wgpu::Limits) -> [u32; 3] {
+pub(super) fn grid(tasks: usize, limits: &wgpu::Limits) -> [u32; 3] {
     let rows = tasks.div_ceil(limits.max_compute_workgroups_per_dimension as usize).max(1);
     [tasks.div_ceil(rows) as u32, rows as u32, 1]
 }
@@ -629,7 +725,46 @@ impl Backend for GpuEpisodes {
         Ok(trace.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
     }
 
+    fn hold(&mut self, weights: &[f32], sizes: [usize; 3]) -> Result<Option<Box<dyn Held>>, BackendError> {
+        let [leaders, slots, parameters] = sizes;
+        let allowed = self.room().buffer;
+        let bytes = (slots * parameters * size_of::<f32>()) as u64;
+        let least = match self.holding {
+            Holding::Never => return Ok(None),
+            Holding::From(least) => least,
+            Holding::Always => 0,
+        };
+        if leaders as u64 * bytes < least {
+            return Ok(None);
+        }
+        if bytes > allowed {
+            return match self.holding {
+                Holding::Always => Err(BackendError::TooLarge(format!(
+                    "the policies of one leader take {bytes} bytes, this adapter holds {allowed} in one buffer; \
+                     use --breed host, or a smaller population"
+                ))),
+                _ => Ok(None),
+            };
+        }
+        let kernels = match &self.kernels {
+            Some(kernels) => kernels,
+            None => self.kernels.insert(Arc::new(Kernels::new(self.gpu.clone(), self.edit)?)),
+        };
+        match kernels.hold(weights, sizes) {
+            Ok(population) => Ok(Some(Box::new(population))),
+            Err(DeviceError::OutOfMemory { .. } | DeviceError::TooLarge { .. }) if self.holding != Holding::Always => {
+                Ok(None)
+            }
+            Err(error) => Err(error.into()),
+        }
+    }
+
     fn describe(&self) -> String {
-        format!("gpu ({}, {} pass)", self.gpu.adapter, self.gpu.pass)
+        let held = match self.holding {
+            Holding::Never => String::new(),
+            Holding::From(bytes) => format!(", holds populations of {} MiB or more", bytes >> 20),
+            Holding::Always => ", holds all populations".into(),
+        };
+        format!("gpu ({}, {} pass{held})", self.gpu.adapter, self.gpu.pass)
     }
 }

@@ -2,16 +2,19 @@
 
 use std::borrow::Cow;
 use std::fmt;
+use std::sync::Arc;
 use std::time::Duration;
 
 use wgpu::BufferUsages;
 
 use super::device::{Binding, DeviceError, Gpu};
 use super::episode::GpuEpisodes;
+use super::population::Kernels;
 use crate::backend::compare::first_mismatch;
 use crate::backend::cpu::Cpu;
-use crate::backend::{Backend, BackendError, Group};
-use crate::config::Config;
+use crate::backend::{Backend, BackendError, Breeding, Group, Held};
+use crate::config::{Config, Learning};
+use crate::evolve::{Key, Purpose};
 use crate::sample;
 use crate::world::World;
 
@@ -47,7 +50,7 @@ pub type Probe = fn(&Gpu) -> Result<Option<Mismatch>, DeviceError>;
 /// All probes that a pass must survive, the quickest first.
 ///
 /// A new one is a function here: it compiles through `gpu.pipeline`, so that the pass under test applies to it.
-pub const ALL: &[Probe] = &[arithmetic, episode];
+pub const ALL: &[Probe] = &[arithmetic, episode, breeding];
 
 /// Computations of `arithmetic`, in the order of `shaders/probe.wgsl`.
 const NAMES: [&str; 36] = [
@@ -89,6 +92,9 @@ const NAMES: [&str; 36] = [
     "bit casts",
 ];
 
+/// The paper's first layout.
+const CONFIG: &str = include_str!("../../../configs/generally_forward.toml");
+
 /// Groups of four values that [`arithmetic`] tries.
 const ITEMS: usize = 4096;
 const WORKGROUP: usize = 64;
@@ -115,16 +121,13 @@ fn arithmetic(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
 /// A whole episode of the paper's first layout, stage by stage.
 fn episode(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
     const TEAMS: usize = 8;
-    let config = include_str!("../../../configs/generally_forward.toml");
-    let config = Config::parse(config, "generally_forward.toml").expect("the project's own config");
+    let config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
     let world = World::new(&config);
     let weights = sample::weights(&world, TEAMS, 0);
     let teams: Vec<u32> = (0..TEAMS as u32).flat_map(|team| vec![team; world.leaders()]).collect();
-    let group = Group { world: &world, starts: &world.starts, weights: &weights, policies: TEAMS, teams: &teams };
-    let traced = |error| match error {
-        BackendError::Gpu(error) => error,
-        error => DeviceError::Refused { adapter: gpu.adapter.to_string(), reason: error.to_string() },
-    };
+    let group =
+        Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies: TEAMS, teams: &teams };
+    let traced = |error| refused(gpu, error);
     let expected = Cpu::default().trace(&group).map_err(traced)?;
     let found = GpuEpisodes::new(gpu.clone())?.trace(&group).map_err(traced)?;
     Ok(first_mismatch(&world, &expected, &found).map(|mismatch| Mismatch {
@@ -133,6 +136,37 @@ fn episode(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
         cpu: mismatch.expected,
         gpu: mismatch.found,
     }))
+}
+
+/// The next generation of two populations.
+fn breeding(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
+    const SLOTS: usize = 64;
+    let config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
+    let world = World::new(&config);
+    let sizes = [2, SLOTS, world.parameters()];
+    let weights = &sample::weights(&world, SLOTS, 0)[..sizes.iter().product()];
+    let parents: Vec<u32> = (0..2 * SLOTS).map(|place| (place * 5 % SLOTS) as u32).collect();
+    let learning = Learning { mutation_probability: 0.5, ..config.learning };
+    let key = Key::new(0, 0, Purpose::Mutation);
+    let breeding = Breeding { parents: &parents, key, generation: 0, learning: &learning };
+    let mut held = Arc::new(Kernels::new(gpu.clone(), |text| text)?).hold(weights, sizes)?;
+    let mut found = vec![0.0; weights.len()];
+    held.breed(&breeding).and_then(|()| held.fetch(&mut found)).map_err(|error| refused(gpu, error))?;
+    let expected = breeding.on_host(sizes, weights);
+    let differs = |index: &usize| expected[*index].to_bits() != found[*index].to_bits();
+    Ok((0..found.len()).find(differs).map(|index| Mismatch {
+        probe: format!("breeding, weight {}", index % world.parameters()).into(),
+        values: Vec::new(),
+        cpu: expected[index].to_bits(),
+        gpu: found[index].to_bits(),
+    }))
+}
+
+fn refused(gpu: &Gpu, error: BackendError) -> DeviceError {
+    match error {
+        BackendError::Gpu(error) => error,
+        error => DeviceError::Refused { adapter: gpu.adapter.to_string(), reason: error.to_string() },
+    }
 }
 
 /// The shader of [`Ceiling`].

@@ -1,0 +1,172 @@
+// Populations that stay on the device: `breed` makes a leader's next generation by the plan that the CPU drew, `gather`
+// lays out the weights of a batch's teams as an episode reads them. One buffer holds one leader's policies,
+// `[slots][parameters]`.
+//
+// The host puts this constant in front:
+//   WORKGROUP  threads of a workgroup, a multiple of TILE
+
+// Weights are 0 or of this size at least, and stay at the largest.
+const MIN_WEIGHT: f32 = 0x1p-30f;
+const MAX_WEIGHT: f32 = 1048576.0;
+
+const UNCHANGED: u32 = 0x80000000u;
+
+// How one leader's next generation is made. `Brood` in src/backend/gpu/population.rs.
+struct Brood {
+    // The slots' key, which has the generation and the population in it but not the slot.
+    key: array<u32, 4>,
+    slots: u32,
+    parameters: u32,
+    // Where the leader's parents start in the plan.
+    parents: u32,
+    // Weights whose word is below `threshold` mutate, or all of them.
+    threshold: u32,
+    all: u32,
+    // Whether noise is of a weight's own size.
+    scaled: u32,
+    sigma: f32,
+}
+
+// Some leaders' policies in some teams of one group, which tasks share. `Stretch` in src/backend/gpu/population.rs.
+struct Stretch {
+    // Leaders of a team; those gathered, from `first` on, are `count`, up to four.
+    leaders: u32,
+    first: u32,
+    count: u32,
+    parameters: u32,
+    teams: u32,
+    // Every task has so many, the last what is left.
+    teams_a_task: u32,
+    // Where the stretch starts in its buffers.
+    choices: u32,
+    weights: u32,
+}
+
+@group(0) @binding(1) var<storage, read> brood: Brood;
+// The slot that each slot's policy is copied from, with UNCHANGED set where it does not mutate.
+@group(0) @binding(2) var<storage, read> plan: array<u32>;
+@group(0) @binding(3) var<storage, read> policies: array<f32>;
+@group(0) @binding(4) var<storage, read_write> children: array<f32>;
+
+@group(0) @binding(1) var<storage, read> stretch: Stretch;
+// The policy that each leader plays in each team, `[teams][leaders]`.
+@group(0) @binding(2) var<storage, read> choices: array<u32>;
+// Of each task `[parameters][teams][leaders]`.
+@group(0) @binding(4) var<storage, read_write> weights: array<f32>;
+// The policies of the leaders after the first.
+@group(0) @binding(5) var<storage, read> policies_1: array<f32>;
+@group(0) @binding(6) var<storage, read> policies_2: array<f32>;
+@group(0) @binding(7) var<storage, read> policies_3: array<f32>;
+
+// Four random words of a slot for a counter: `Key::draw`.
+fn words(key: vec4<u32>, counter: u32) -> vec4<u32> {
+    return draw(vec4(key.xyz, key.w ^ counter));
+}
+
+// A weight brought within the sizes that policies may have.
+fn within_limits(weight: f32) -> f32 {
+    return flush(bound(weight, -MAX_WEIGHT, MAX_WEIGHT), MIN_WEIGHT);
+}
+
+// A weight with noise of its own: `index` is its place in the policy, `noises` the policy's key of noise.
+fn mutated(noises: vec4<u32>, index: u32, weight: f32) -> f32 {
+    let words = words(noises, index);
+    let plain = normal(words.x, words.y) * brood.sigma;
+    let noise = select(plain, plain * weight, brood.scaled != 0u);
+    return within_limits(weight + noise);
+}
+
+// One thread a slot and draw, which decides on four weights: 64·block + 16·word + place is the weight that the word of
+// counter 16·block + place decides on. Neighbouring threads have neighbouring weights.
+@compute @workgroup_size(WORKGROUP)
+fn breed(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let counters = (brood.parameters + 63u) / 64u * 16u;
+    let item = (workgroup.y * workgroups.x + workgroup.x) * WORKGROUP + thread;
+    let slot = item / counters;
+    let counter = item % counters;
+    if slot >= brood.slots {
+        return;
+    }
+    let planned = plan[brood.parents + slot];
+    let parent = (planned & ~UNCHANGED) * brood.parameters;
+    let child = slot * brood.parameters;
+    let first = counter / 16u * 64u + counter % 16u;
+    for (var word = 0u; word < 4u && first + 16u * word < brood.parameters; word++) {
+        let index = first + 16u * word;
+        children[child + index] = policies[parent + index];
+    }
+    if (planned & UNCHANGED) != 0u {
+        return;
+    }
+    let key = draw(vec4(brood.key[0], brood.key[1], brood.key[2] ^ slot, brood.key[3]));
+    let below = words(key, counter) < vec4(brood.threshold);
+    let bits = select(vec4(0u), vec4(1u, 2u, 4u, 8u), below);
+    // Threads side by side go through as many mutations as the one with the most, so each goes from one to the next.
+    var left = select(bits.x | bits.y | bits.z | bits.w, 15u, brood.all != 0u);
+    let noises = words(key, 0xffffffffu);
+    while left != 0u {
+        let index = first + 16u * firstTrailingBit(left);
+        if index < brood.parameters {
+            children[child + index] = mutated(noises, index, policies[parent + index]);
+        }
+        left &= left - 1u;
+    }
+}
+
+const TILE: u32 = 32u;
+
+// Weights of some teams' leaders, `[teams][leaders][parameters]`, rows apart by one more word so that columns spread over
+// all banks.
+var<workgroup> tile: array<f32, TILE * (TILE + 1u)>;
+
+// A weight of one of the leaders gathered.
+fn weight_of(leader: u32, index: u32) -> f32 {
+    switch leader {
+        case 0u: { return policies[index]; }
+        case 1u: { return policies_1[index]; }
+        case 2u: { return policies_2[index]; }
+        default: { return policies_3[index]; }
+    }
+}
+
+// One workgroup turns a tile of weights: it reads along policies and writes along leaders and teams, whole lines of
+// memory where four leaders are all.
+@compute @workgroup_size(WORKGROUP)
+fn gather(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let across = (stretch.parameters + TILE - 1u) / TILE;
+    let index = workgroup.y * workgroups.x + workgroup.x;
+    let first_lane = index / across * TILE;
+    let lanes = stretch.teams * stretch.count;
+    let first_parameter = index % across * TILE;
+    let column = thread % TILE;
+    for (var row = thread / TILE; row < TILE; row += WORKGROUP / TILE) {
+        let lane = first_lane + row;
+        let parameter = first_parameter + column;
+        if lane < lanes && parameter < stretch.parameters {
+            let leader = lane % stretch.count;
+            let policy = choices[stretch.choices + lane / stretch.count * stretch.leaders + stretch.first + leader];
+            tile[row * (TILE + 1u) + column] = weight_of(leader, policy * stretch.parameters + parameter);
+        }
+    }
+    workgroupBarrier();
+    let lane = first_lane + column;
+    let team = lane / stretch.count;
+    let before = team / stretch.teams_a_task * stretch.teams_a_task;
+    let teams = min(stretch.teams_a_task, stretch.teams - before);
+    let task = stretch.weights + before * stretch.leaders * stretch.parameters;
+    for (var row = thread / TILE; row < TILE && lane < lanes; row += WORKGROUP / TILE) {
+        let parameter = first_parameter + row;
+        if parameter < stretch.parameters {
+            let place = (parameter * teams + team - before) * stretch.leaders + stretch.first + lane % stretch.count;
+            weights[task + place] = tile[column * (TILE + 1u) + row];
+        }
+    }
+}

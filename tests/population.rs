@@ -1,0 +1,369 @@
+//! Populations that a GPU holds against populations on the host, bit for bit: bred, gathered, trained, saved and lost.
+
+mod common;
+
+use std::any::Any;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::SeqCst};
+
+use fearless_simd::Level;
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::gpu::device::{self, DeviceError, Kind};
+use flotilla::backend::gpu::episode::{GpuEpisodes, HELD_FROM, Holding};
+use flotilla::backend::{Backend, BackendError, Breeding, Group, Held, Trace, Visit, Weights};
+use flotilla::config::{Config, Fitness, Learning, Mutation, Paradigm};
+use flotilla::evolve::{self, Key, Purpose, UNCHANGED};
+use flotilla::record::checkpoint::Schedule;
+use flotilla::record::disk::Disk;
+use flotilla::record::folder::{METRICS, Start};
+use flotilla::run::{Machine, Opened, Options, Outcome, Player, Session};
+use flotilla::trainer::{Row, Snapshot, SnapshotError, Trainer};
+
+fn learning() -> Learning {
+    Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap().learning
+}
+
+/// Weights `[leaders][slots][parameters]`, of all sizes that there may be.
+fn population([leaders, slots, parameters]: [usize; 3], seed: u64) -> Vec<f32> {
+    let key = Key::new(seed, 0, Purpose::Weights);
+    let mut weights = vec![0.0; leaders * slots * parameters];
+    for (policy, weights) in weights.chunks_exact_mut(parameters).enumerate() {
+        evolve::random_policy(Level::new(), key.at(0, policy / slots, policy % slots), weights);
+        for (index, weight) in weights.iter_mut().enumerate() {
+            match (index + policy) % 11 {
+                0 => *weight = 0.0,
+                1 => *weight = evolve::MAX_WEIGHT.copysign(*weight),
+                2 => *weight = evolve::MIN_WEIGHT.copysign(*weight),
+                _ => {}
+            }
+        }
+    }
+    weights
+}
+
+fn bits(weights: &[f32]) -> &[u32] {
+    bytemuck::cast_slice(weights)
+}
+
+/// Some parent for every slot; every fifth is kept as it is.
+fn parents([leaders, slots, _]: [usize; 3], generation: usize) -> Vec<u32> {
+    let parent = |place: usize| ((place * 7 + generation * 3 + 1) % slots) as u32;
+    (0..leaders * slots).map(|place| parent(place) | if place % 5 == 2 { UNCHANGED } else { 0 }).collect()
+}
+
+#[test]
+fn breeding_gives_the_same_bits() {
+    for (request, info) in common::adapters("breeding_gives_the_same_bits") {
+        let mut backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap().holding(Holding::Always);
+        let mut mutated = 0;
+        for sizes in [[1, 2, 1], [3, 5, 97], [4, 51, 112], [2, 301, 64], [2, 17, 1000], [1, 300, 65], [257, 2, 18]] {
+            for (case, probability) in [0.0, 0.1, 0.999, 1.0].into_iter().enumerate() {
+                let mutation = [Mutation::Scaled, Mutation::Additive][case % 2];
+                let mut learning = Learning { mutation_probability: probability, mutation, ..learning() };
+                let mut expected = population(sizes, case as u64);
+                let mut held = backend.hold(&expected, sizes).unwrap().expect("all are held");
+                for generation in 0..5 {
+                    learning.mutation = if generation % 2 == 0 { Mutation::Scaled } else { Mutation::Additive };
+                    learning.mutation_sigma = [0.1, 3.0, 100.0, 1e-6, 0.0][generation];
+                    let parents = parents(sizes, generation);
+                    let key = Key::new(9, case, Purpose::Mutation);
+                    let breeding = Breeding { parents: &parents, key, generation, learning: &learning };
+                    let before = expected.clone();
+                    expected = breeding.on_host(sizes, &before);
+                    mutated += expected.iter().zip(&before).filter(|(a, b)| a != b).count();
+                    held.breed(&breeding).unwrap();
+                    let mut found = vec![f32::NAN; expected.len()];
+                    held.fetch(&mut found).unwrap();
+                    assert!(
+                        bits(&found) == bits(&expected),
+                        "{info}, {sizes:?}, {probability}, generation {generation}"
+                    );
+                }
+            }
+        }
+        assert!(mutated > 1_000_000, "{mutated}");
+    }
+}
+
+/// Experiments that differ in all that breeding and gathering depend on, and in length.
+fn arms() -> Vec<Config> {
+    let parse = |text| Config::parse(text, "config").unwrap();
+    let mut first = parse(include_str!("../configs/generally_forward.toml"));
+    (first.learning.trials, first.learning.generations, first.learning.population) = (2, 5, 21);
+    let mut second = parse(include_str!("../configs/chaotic.toml"));
+    (second.learning.trials, second.learning.generations, second.learning.population) = (1, 3, 40);
+    (second.learning.start_jitter, second.learning.episodes_per_team) = (0.5, 2);
+    (second.learning.fitness, second.learning.elites) = (Fitness::D, 0);
+    second.learning.mutation = Mutation::Additive;
+    let mut third = parse(include_str!("../configs/strictly_forward.toml"));
+    (third.learning.trials, third.learning.generations, third.learning.population) = (1, 6, 7);
+    (third.learning.paradigm, third.learning.mutation_probability) = (Paradigm::AllLeaders, 1.0);
+    third.policy.hidden = vec![5, 30, 3];
+    vec![first, second, third]
+}
+
+/// What a trainer of [`arms`] comes to, and what it would save before each generation.
+#[derive(Debug, PartialEq)]
+struct Story {
+    rows: Vec<Row>,
+    policies: Vec<Vec<Vec<f32>>>,
+}
+
+fn policies(trainer: &Trainer) -> Vec<Vec<Vec<f32>>> {
+    (0..arms().len()).map(|arm| trainer.policies(arm)).collect()
+}
+
+fn train(trainer: &mut Trainer, backend: &mut dyn Backend) -> Story {
+    let mut rows = Vec::new();
+    while !trainer.is_done() {
+        rows.extend(trainer.advance(backend).unwrap());
+    }
+    Story { rows, policies: policies(trainer) }
+}
+
+/// What the CPU comes to, and its snapshots before each generation.
+fn reference() -> (Story, Vec<Snapshot>) {
+    let (mut trainer, mut rows, mut snapshots) = (Trainer::new(arms()), Vec::new(), Vec::new());
+    while !trainer.is_done() {
+        snapshots.push(trainer.snapshot().unwrap());
+        rows.extend(trainer.advance(&mut Cpu::default()).unwrap());
+    }
+    (Story { rows, policies: policies(&trainer) }, snapshots)
+}
+
+#[test]
+fn training_comes_to_the_same_wherever_populations_are() {
+    let (expected, snapshots) = reference();
+    assert!(expected.rows.iter().any(|row| row.best_g > 0.0), "nothing was observed");
+    for (request, info) in common::adapters("training_comes_to_the_same_wherever_populations_are") {
+        let gpu = device::open(request).unwrap();
+        let open = |holding| GpuEpisodes::new(gpu.clone()).unwrap().holding(holding);
+        // The populations of some arms take more than this, of others less.
+        let some = Holding::From(4 * 30 * 112 * 4);
+        for holding in [Holding::Always, Holding::Never, some] {
+            assert_eq!(train(&mut Trainer::new(arms()), &mut open(holding)), expected, "{info}, {holding:?}");
+        }
+        // Batches of some teams each.
+        let mut small = open(Holding::Always).batched(1 << 14);
+        assert_eq!(train(&mut Trainer::new(arms()), &mut small), expected, "{info}, small batches");
+        // What is saved is the same, and goes on anywhere.
+        let (mut device, mut again) = (open(Holding::Always), open(Holding::Always));
+        let (mut trainer, mut rows) = (Trainer::new(arms()), Vec::new());
+        for (generation, snapshot) in snapshots.iter().enumerate() {
+            assert_eq!(&trainer.snapshot().unwrap(), snapshot, "{info}, before generation {generation}");
+            for other in [&mut Cpu::default() as &mut dyn Backend, &mut again] {
+                let mut resumed = Trainer::new(arms());
+                assert!(resumed.restore(snapshot.clone()));
+                let rest = train(&mut resumed, other);
+                assert_eq!(rest.policies, expected.policies, "{info}, from generation {generation}");
+                assert!(expected.rows.ends_with(&rest.rows) || generation == 0, "{info}, from generation {generation}");
+            }
+            rows.extend(trainer.advance(&mut device).unwrap());
+        }
+        assert_eq!((&rows, policies(&trainer)), (&expected.rows, expected.policies.clone()), "{info}");
+        // A trainer that moves from one device to another takes its populations along.
+        let (mut trainer, mut rows) = (Trainer::new(arms()), Vec::new());
+        let mut backends: [Box<dyn Backend>; 3] =
+            [Box::new(open(Holding::Always)), Box::new(open(Holding::Always)), Box::new(Cpu::default())];
+        while !trainer.is_done() {
+            let backend = &mut backends[trainer.generation() % 3];
+            rows.extend(trainer.advance(&mut **backend).unwrap());
+        }
+        assert_eq!((&rows, policies(&trainer)), (&expected.rows, expected.policies.clone()), "{info}");
+    }
+}
+
+/// Leaders' populations over the size of a buffer stay on the host, unless that is ruled out.
+#[test]
+fn what_does_not_fit_the_device_is_declined() {
+    for (request, info) in common::adapters("what_does_not_fit_the_device_is_declined") {
+        let gpu = device::open(device::Request { default_limits: true, ..request }).unwrap();
+        // The least over WebGPU's 128 MiB; a backend that declines does not look at the weights.
+        let sizes = [1, (128 << 20) / 4 / 112 + 1, 112];
+        let open = |holding| GpuEpisodes::new(gpu.clone()).unwrap().holding(holding);
+        assert!(open(Holding::From(1)).hold(&[], sizes).unwrap().is_none(), "{info}");
+        let error = open(Holding::Always).hold(&[], sizes).unwrap_err().to_string();
+        assert!(error.contains("134217") && error.contains("--breed host"), "{info}: {error}");
+        assert!(open(Holding::Never).hold(&[], [1, 2, 1]).unwrap().is_none(), "{info}");
+        // Nothing is asked for.
+        let weights = vec![0.0; HELD_FROM as usize / 4];
+        let mut backend = GpuEpisodes::new(gpu.clone()).unwrap();
+        let held = backend.hold(&weights, [2, weights.len() / 2, 1]).unwrap();
+        assert_eq!(held.is_some(), info.kind != Kind::Software, "{info}");
+        assert!(backend.hold(&weights[1..], [1, weights.len() - 1, 1]).unwrap().is_none(), "{info}");
+    }
+}
+
+/// A device that holds populations, in the host's memory, and fails at its nth call: for good, or that once.
+struct Device {
+    cpu: Cpu,
+    state: Arc<State>,
+}
+
+struct State {
+    left: AtomicUsize,
+    for_good: bool,
+    lost: AtomicBool,
+}
+
+impl State {
+    fn call(&self) -> Result<(), BackendError> {
+        let left = self.left.fetch_update(SeqCst, SeqCst, |left| Some(left.saturating_sub(1))).unwrap();
+        if left == 1 {
+            self.lost.store(self.for_good, SeqCst);
+        }
+        match left == 1 || self.lost.load(SeqCst) {
+            true => Err(DeviceError::Lost { adapter: "test".into(), reason: "pulled out".into() }.into()),
+            false => Ok(()),
+        }
+    }
+}
+
+impl Device {
+    /// One that fails at call `nth`, from 1 on.
+    fn failing_at(nth: usize, for_good: bool) -> Device {
+        let state = State { left: AtomicUsize::new(nth), for_good, lost: AtomicBool::new(false) };
+        Device { cpu: Cpu::default(), state: Arc::new(state) }
+    }
+
+    /// Whether it has failed.
+    fn failed(&self) -> bool {
+        self.state.left.load(SeqCst) == 0
+    }
+}
+
+struct OnDevice {
+    state: Arc<State>,
+    weights: Vec<f32>,
+    sizes: [usize; 3],
+}
+
+impl std::fmt::Debug for OnDevice {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("OnDevice").field("sizes", &self.sizes).finish_non_exhaustive()
+    }
+}
+
+impl Held for OnDevice {
+    fn breed(&mut self, breeding: &Breeding<'_>) -> Result<(), BackendError> {
+        self.state.call()?;
+        self.weights = breeding.on_host(self.sizes, &self.weights);
+        Ok(())
+    }
+
+    fn fetch(&self, weights: &mut [f32]) -> Result<(), BackendError> {
+        // Half the weights have come when it fails.
+        let half = weights.len() / 2;
+        weights[..half].copy_from_slice(&self.weights[..half]);
+        self.state.call()?;
+        weights.copy_from_slice(&self.weights);
+        Ok(())
+    }
+}
+
+impl Backend for Device {
+    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
+        self.state.call()?;
+        // Groups from the host come once populations were brought home.
+        let weights = |group: &Group<'_>| match group.weights {
+            Weights::OnHost(weights) => weights.to_vec(),
+            Weights::Held(held) => (held as &dyn Any).downcast_ref::<OnDevice>().expect("held here").weights.clone(),
+        };
+        let weights: Vec<Vec<f32>> = groups.iter().map(weights).collect();
+        let groups: Vec<Group<'_>> = groups
+            .iter()
+            .zip(&weights)
+            .map(|(group, weights)| Group { weights: weights[..].into(), ..*group })
+            .collect();
+        self.cpu.rollout(&groups, visit)
+    }
+
+    fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
+        self.cpu.trace(group)
+    }
+
+    fn hold(&mut self, weights: &[f32], sizes: [usize; 3]) -> Result<Option<Box<dyn Held>>, BackendError> {
+        Ok(Some(Box::new(OnDevice { state: self.state.clone(), weights: weights.to_vec(), sizes })))
+    }
+
+    fn describe(&self) -> String {
+        "a device about to be lost".into()
+    }
+}
+
+/// Whatever call a device is lost at, the rest is played on the CPU to the same rows and policies; each row comes once.
+/// Where it fails but once, it does so itself.
+#[test]
+fn populations_lost_with_their_device_are_made_again() {
+    let (expected, _) = reference();
+    for (for_good, saves_every) in [(true, 1), (true, 3), (true, 100), (false, 3), (false, 100)] {
+        for nth in 1.. {
+            let case = format!("fails at call {nth}, for good: {for_good}, saved every {saves_every} generations");
+            let (mut trainer, mut rows) = (Trainer::new(arms()), Vec::new());
+            let mut device = Device::failing_at(nth, for_good);
+            while !trainer.is_done() {
+                if trainer.generation() % saves_every == 0 {
+                    match trainer.snapshot() {
+                        Err(SnapshotError::Backend(_)) => assert!(device.failed(), "{case}"),
+                        taken => assert_eq!(taken.unwrap().generation, trainer.generation(), "{case}"),
+                    }
+                }
+                let advanced = match trainer.advance(&mut device) {
+                    Ok(advanced) => advanced,
+                    Err(error) => {
+                        assert!(device.failed() && for_good, "{case}: {error}");
+                        trainer.advance(&mut Cpu::default()).unwrap()
+                    }
+                };
+                rows.extend(advanced);
+            }
+            assert_eq!(rows, expected.rows, "{case}");
+            assert_eq!(policies(&trainer), expected.policies, "{case}");
+            if !device.failed() {
+                assert!(nth > 20, "a run makes more calls than {nth}");
+                break;
+            }
+        }
+    }
+}
+
+/// A run whose device is lost goes on with the CPU, or says that the last checkpoint is all there is and goes on from it.
+#[test]
+fn a_run_survives_the_loss_of_the_device_that_holds_its_populations() {
+    let config = arms().remove(0);
+    let folder = tempfile::tempdir().unwrap();
+    let run = |name: &str, start: Start, device: Option<Device>, change: bool| {
+        let path = folder.path().join(name);
+        let (opened, _) = Session::open(config.clone(), &path, start, Disk::default()).unwrap();
+        let Opened::Ready(mut session) = opened else { panic!("nothing to do") };
+        let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
+        let cpu = || -> Player { (Box::new(Cpu::default()), Machine::default()) };
+        let options = Options {
+            schedule: Schedule { generations: 2, seconds: 0.0 },
+            stop: &stop,
+            save: &save,
+            instead: &mut |_| change.then(cpu),
+            watch: &mut |_| {},
+        };
+        let player = device.map_or_else(cpu, |device| (Box::new(device), Machine::default()));
+        let ended = session.train(player, options);
+        let metrics = std::fs::read_to_string(path.join(METRICS)).unwrap();
+        let rows = metrics.lines().map(|line| line.rsplit_once(',').unwrap().0.to_string()).collect::<Vec<_>>();
+        (ended, rows)
+    };
+    let (expected, rows) = run("cpu", Start::Fresh, None, false);
+    let Ok(Outcome::Done(expected)) = expected else { panic!("{expected:?}") };
+    let mut gone = 0;
+    for nth in 1..20 {
+        let (ended, found) = run(&format!("change-{nth}"), Start::Fresh, Some(Device::failing_at(nth, true)), true);
+        assert_eq!((ended.unwrap(), &found), (Outcome::Done(expected.clone()), &rows), "call {nth}");
+        let name = format!("stop-{nth}");
+        let (ended, _) = run(&name, Start::Fresh, Some(Device::failing_at(nth, true)), false);
+        let error = ended.unwrap_err().to_string();
+        assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
+        gone += usize::from(error.contains("the populations were lost"));
+        let (ended, found) = run(&name, Start::Resume, None, false);
+        assert_eq!((ended.unwrap(), &found), (Outcome::Done(expected.clone()), &rows), "call {nth}");
+    }
+    assert!(gone > 0);
+}
