@@ -9,6 +9,7 @@ use std::fs;
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
+use crate::backend::gpu::episode::HELD_FROM;
 use crate::config::Config;
 use crate::world::{INPUTS, OUTPUTS, World};
 
@@ -51,7 +52,7 @@ impl Plan {
     pub fn of<'a>(configs: impl IntoIterator<Item = &'a Config>, threads: usize) -> Plan {
         let lanes = lanes(Level::new());
         let [mut training, mut checkpoint, mut queue, mut weights, mut record] = [0_u64; 5];
-        let [mut block, mut order, mut populations] = [0_u64; 3];
+        let [mut block, mut order, mut populations, mut held] = [0_u64; 4];
         for config in configs {
             let world = World::new(config);
             let sizes = Sizes::of(config);
@@ -61,6 +62,7 @@ impl Plan {
             block = block.max(block_bytes(&world, lanes));
             order = order.max(sizes.policies * size_of::<usize>() as u64);
             populations += sizes.trials * sizes.leaders;
+            held += sizes.held();
             let teams = sizes.trials * sizes.episodes * sizes.slots;
             weights = weights.saturating_add(teams * sizes.leaders * sizes.parameters * 4);
             let words = (world.set_words() + world.followers() * world.leaders()) as u64;
@@ -80,7 +82,7 @@ impl Plan {
             checkpoint,
             // A batch is gathered, and two are on their way to the adapter or back.
             gpu_host: always + (share(weights, 1) + share(weights, 2) + share(record, 2)).max(sorting),
-            adapter: share(weights, 2) + share(record, 2),
+            adapter: share(weights, 2) + share(record, 2) + held,
         }
     }
 
@@ -135,6 +137,14 @@ impl Sizes {
         let teams_and_parents = 2 * leaders * slots;
         let observed_and_scores = episodes * slots * (1 + leaders);
         4 * trials * (weights + orders_and_fitness + teams_and_parents + observed_and_scores)
+    }
+
+    /// What a GPU holds of the populations by itself: a buffer a leader and one more, and every slot's parent.
+    fn held(&self) -> u64 {
+        let Sizes { trials, leaders, slots, parameters, .. } = self;
+        let population = 4 * slots * parameters;
+        let parents = 4 * leaders * slots;
+        if leaders * population < HELD_FROM { 0 } else { trials * ((leaders + 1) * population + parents) }
     }
 
     /// The numbers of a snapshot.
