@@ -4,6 +4,7 @@ use std::cell::RefCell;
 use std::collections::TryReserveError;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+use std::time::{Duration, Instant};
 
 use fearless_simd::Level;
 use glam::Vec2;
@@ -22,6 +23,20 @@ pub struct Trainer {
     arms: Vec<Arm>,
     generation: usize,
     level: Level,
+    times: Times,
+}
+
+/// Where the time of generations went.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Times {
+    /// Forming teams and drawing starts.
+    pub prepare: Duration,
+    /// Rollouts with their scores.
+    pub play: Duration,
+    /// Fitness, rows and champions.
+    pub conclude: Duration,
+    /// Selection and mutation.
+    pub breed: Duration,
 }
 
 /// One experiment and its trials.
@@ -83,18 +98,23 @@ impl Trainer {
             let trials = 0..config.learning.trials;
             Arm::new(config, trials, level)
         };
-        Trainer { arms: configs.into_iter().map(arm).collect(), generation: 0, level }
+        Trainer { arms: configs.into_iter().map(arm).collect(), generation: 0, level, times: Times::default() }
     }
 
     /// Fresh populations for one trial of a (valid) config; it comes to the rows that it comes to among the others.
     pub fn of_trial(config: Config, trial: usize) -> Trainer {
         let level = Level::new();
-        Trainer { arms: vec![Arm::new(config, trial..trial + 1, level)], generation: 0, level }
+        Trainer { arms: vec![Arm::new(config, trial..trial + 1, level)], generation: 0, level, times: Times::default() }
     }
 
     /// The generation that plays next.
     pub fn generation(&self) -> usize {
         self.generation
+    }
+
+    /// Where the time of generations went since this was last asked.
+    pub fn take_times(&mut self) -> Times {
+        std::mem::take(&mut self.times)
     }
 
     /// Whether every arm has played its last generation, and the champions of that.
@@ -145,8 +165,10 @@ impl Trainer {
         let playing = self.arms.iter_mut().enumerate().filter(|(_, arm)| arm.age == generation && !arm.is_done());
         let mut playing: Vec<(usize, &mut Arm)> = playing.collect();
 
+        let start = Instant::now();
         playing.iter_mut().try_for_each(|(_, arm)| arm.offer(backend))?;
         playing.par_iter_mut().for_each(|(_, arm)| arm.prepare(generation, level));
+        let prepared = Instant::now();
         play(backend, &playing, |arm| {
             let population = arm.config.learning.population;
             let first = if generation > arm.last() { population } else { 0 };
@@ -155,17 +177,23 @@ impl Trainer {
         })?;
         let mut over = playing.iter_mut().filter(|(_, arm)| generation > arm.last());
         over.try_for_each(|(_, arm)| arm.fetch())?;
+        let played = Instant::now();
         let conclude = |(index, arm): &mut (usize, &mut Arm)| match generation > arm.last() {
             true => arm.finish(),
             false => arm.conclude(*index, generation),
         };
         let mut rows = playing.par_iter_mut().flat_map_iter(conclude).collect::<Vec<_>>();
+        let concluded = Instant::now();
         playing.retain(|(_, arm)| generation <= arm.last());
         playing.par_iter_mut().for_each(|(_, arm)| {
             arm.draw_parents(generation, level);
             arm.breed(generation, level);
         });
         rows.sort_by_key(|row| (row.arm, row.trial, row.generation));
+        self.times.prepare += prepared - start;
+        self.times.play += played - prepared;
+        self.times.conclude += concluded - played;
+        self.times.breed += concluded.elapsed();
         Ok(rows)
     }
 

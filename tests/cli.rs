@@ -388,6 +388,18 @@ fn bench_measures_every_combination() {
 }
 
 #[test]
+fn bench_tells_where_a_generation_goes() {
+    let [object] = &benched(&["--teams", "50", "--profile"])[..] else { panic!("one combination") };
+    let profile = object["profile"].as_object().unwrap();
+    let ms = |stage: &str| profile[stage].as_f64().filter(|&ms| ms > 0.0).unwrap_or_else(|| panic!("{stage}"));
+    let [rollout, rest @ ..] =
+        ["rollout_and_scores_ms", "teams_and_starts_ms", "fitness_and_champions_ms", "selection_and_mutation_ms"]
+            .map(ms);
+    assert_eq!(profile.len(), 1 + rest.len(), "the CPU has no other stages: {object}");
+    assert!(rollout > rest.into_iter().fold(0.0, f64::max), "what takes longest: {object}");
+}
+
+#[test]
 fn bench_refuses_what_it_cannot_lay_out() {
     for (flags, blamed) in [
         (["--agents", "1024"], "341 leaders and 683 followers"),

@@ -8,14 +8,14 @@ use std::time::{Duration, Instant};
 use fearless_simd::Level;
 
 use crate::backend::cpu::Cpu;
-use crate::backend::gpu::episode::GpuEpisodes;
+use crate::backend::gpu::episode::{GpuEpisodes, Stages};
 use crate::backend::gpu::probe;
 use crate::backend::{Backend, BackendError, Group, Weights};
 use crate::config::{Config, Coupling};
 use crate::credit::Credit;
 use crate::evolve::{Key, Purpose, form_teams, random_policy};
 use crate::sweep::layout::{self, MAX_FOLLOWERS, MAX_GROUPS};
-use crate::trainer::Trainer;
+use crate::trainer::{Times, Trainer};
 use crate::world::World;
 
 pub mod ceiling;
@@ -75,12 +75,29 @@ pub struct Measure {
     pub rollout: f64,
     /// Seconds of one generation (that, selection and mutation), where it was asked for.
     pub generation: Option<f64>,
+    pub profile: Option<Profile>,
     /// Mean G of the random teams of the rollout.
     pub mean_g: f64,
     pub reach: Reach,
     /// Lane operations of a team-step, and how many a second the machine can do.
     pub operations: f64,
     pub ceiling: f64,
+}
+
+/// Where the time of some generations went.
+pub struct Profile {
+    pub generations: usize,
+    pub times: Times,
+    /// What a GPU's rollouts are made of.
+    pub stages: Option<Stages>,
+}
+
+/// What to measure of whole generations.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Generations {
+    LeftOut,
+    Timed,
+    Profiled,
 }
 
 impl Measure {
@@ -130,20 +147,24 @@ pub fn with_agents(config: &Config, agents: usize) -> Result<Config, String> {
     Ok(config)
 }
 
-/// Times rollouts of one trial's random teams, and generations of it unless only `rollouts` are wanted.
+/// Times rollouts of one trial's random teams, and its generations.
 ///
 /// # Errors
 /// When the backend fails.
-pub fn measure(config: &Config, player: &mut Player, generations: bool) -> Result<Measure, BackendError> {
+pub fn measure(config: &Config, player: &mut Player, generations: Generations) -> Result<Measure, BackendError> {
     let world = World::new(config);
     let ceiling = &mut player.ceiling()?;
     let ([rollout, ceiling], mean_g, reach) = rollout(config, &world, player.backend(), ceiling)?;
-    let generation = match generations {
-        true => {
-            let mut trainer = Trainer::new(vec![config.clone()]);
-            Some(time(|| trainer.advance(player.backend()).map(drop), || Ok(0.0))?[0])
+    let (generation, profile) = match generations {
+        Generations::LeftOut => (None, None),
+        Generations::Timed => (Some(self::generations(config, player)?.0), None),
+        Generations::Profiled => {
+            if let Player::Gpu(gpu) = player {
+                gpu.use_clock()?;
+            }
+            let (generation, profile) = self::generations(config, player)?;
+            (Some(generation), Some(profile))
         }
-        false => None,
     };
     Ok(Measure {
         teams: config.learning.population,
@@ -153,11 +174,29 @@ pub fn measure(config: &Config, player: &mut Player, generations: bool) -> Resul
         steps: world.steps(),
         rollout,
         generation,
+        profile,
         mean_g,
         operations: operations::per_team_step(&world, &reach),
         reach,
         ceiling,
     })
+}
+
+/// Seconds of one generation, and where they went; the first, which readies what the others use, does not count.
+fn generations(config: &Config, player: &mut Player) -> Result<(f64, Profile), BackendError> {
+    let mut trainer = Trainer::new(vec![config.clone()]);
+    trainer.advance(player.backend())?;
+    let take = |trainer: &mut Trainer, player: &mut Player| {
+        let stages = match player {
+            Player::Cpu(..) => None,
+            Player::Gpu(gpu) => Some(gpu.take_stages()),
+        };
+        Profile { generations: trainer.generation(), times: trainer.take_times(), stages }
+    };
+    let before = take(&mut trainer, player).generations;
+    let [seconds, _] = time(|| trainer.advance(player.backend()).map(drop), || Ok(0.0))?;
+    let profile = take(&mut trainer, player);
+    Ok((seconds, Profile { generations: profile.generations - before, ..profile }))
 }
 
 /// Seconds of one rollout of random policies, scored as in training, with the ceiling meanwhile; the mean G; and who was

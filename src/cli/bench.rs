@@ -1,13 +1,15 @@
 //! `flotilla bench`: how fast teams are played, alone and within whole generations.
 
+use std::fmt::Write;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use fearless_simd::Level;
 use serde_json::json;
 
 use super::{BackendChoice, Error, Overrides, RunOptions, backend, print};
 use crate::backend::cpu::{Cpu, level_name};
-use crate::bench::{self, Measure, Player};
+use crate::bench::{self, Generations, Measure, Player, Profile};
 use crate::config::{self, Config};
 use crate::run::Machine;
 
@@ -39,6 +41,9 @@ pub struct Args {
     /// Leave whole generations out
     #[arg(long)]
     rollout_only: bool,
+    /// Also tell where a generation's time goes
+    #[arg(long, conflicts_with = "rollout_only")]
+    profile: bool,
     /// Instruction set of the CPU backend, of those that this processor has [default: the widest]
     #[arg(long, value_name = "NAME")]
     instructions: Option<String>,
@@ -62,8 +67,13 @@ pub fn run(args: Args) -> Result<(), Error> {
     if !args.json {
         print(&format!("{name} on {}\n{HEADER}\n", player.backend().describe()))?;
     }
+    let generations = match (args.rollout_only, args.profile) {
+        (true, _) => Generations::LeftOut,
+        (false, false) => Generations::Timed,
+        (false, true) => Generations::Profiled,
+    };
     for config in configs {
-        let measure = bench::measure(&config, &mut player, !args.rollout_only)?;
+        let measure = bench::measure(&config, &mut player, generations)?;
         print(&if args.json { json(&measure, &machine) } else { line(&measure) })?;
     }
     if args.json { Ok(()) } else { print(LEGEND) }
@@ -137,13 +147,43 @@ fn line(measure: &Measure) -> String {
     let Measure { teams, steps, rollout, generation, .. } = measure;
     let agents = measure.agents();
     let generations = generation.map_or("-".into(), |generation| format!("{:.0}%", 100.0 * rollout / generation));
-    format!(
+    let mut line = format!(
         "{teams:>8} {agents:>7} {steps:>6} {:>12.3} {:>13.4e} {:>14.2} {generations:>12} {:>10.0}%\n",
         1.0 / rollout,
         measure.team_steps() / rollout,
         1e9 * rollout / (measure.team_steps() * agents as f64),
         100.0 * measure.ceiling_share(),
-    )
+    );
+    if let Some(profile) = &measure.profile {
+        let stages = stages(profile);
+        let whole: f64 = stages.iter().filter(|(_, part, _)| !part).map(|(.., ms)| ms).sum();
+        for (name, part, ms) in stages {
+            let name = format!("{}{}", if part { "  of it, " } else { "" }, name.replace('_', " "));
+            let _ = writeln!(line, "{:>8} {name:<24} {ms:>12.4} ms {:>5.1}%", "", 100.0 * ms / whole);
+        }
+    }
+    line
+}
+
+/// Each stage of a generation in ms, in order; some are a part of the rollout before them.
+fn stages(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
+    let Profile { generations, times, stages } = profile;
+    let mut rows = vec![("teams_and_starts", false, times.prepare), ("rollout_and_scores", false, times.play)];
+    if let Some(stages) = stages {
+        rows.extend([
+            ("gather", true, stages.gather),
+            ("upload", true, stages.upload),
+            ("wait", true, stages.wait),
+            ("read_back", true, stages.read_back),
+            ("score", true, stages.score),
+        ]);
+        if !stages.gpu.is_zero() {
+            rows.push(("gpu_by_its_clock", true, stages.gpu));
+        }
+    }
+    rows.extend([("fitness_and_champions", false, times.conclude), ("selection_and_mutation", false, times.breed)]);
+    let ms = |time: Duration| 1e3 * time.as_secs_f64() / *generations as f64;
+    rows.into_iter().map(|(name, part, time)| (name, part, ms(time))).collect()
 }
 
 fn json(measure: &Measure, machine: &Machine) -> String {
@@ -175,6 +215,10 @@ fn json(measure: &Measure, machine: &Machine) -> String {
         object["generations_per_s"] = json!(1.0 / generation);
         object["generation_team_steps_per_s"] = json!(measure.team_steps() / generation);
         object["generation_share"] = json!(rollout / generation);
+    }
+    if let Some(profile) = &measure.profile {
+        let stages = stages(profile).into_iter().map(|(name, _, ms)| (format!("{name}_ms"), json!(ms)));
+        object["profile"] = serde_json::Value::Object(stages.collect());
     }
     format!("{object}\n")
 }
