@@ -500,16 +500,18 @@ impl<S: Simd> Block<S> {
     fn couple(&mut self, pois: &[Vec2], step: usize) {
         let Block { simd, world, agents, sets, .. } = self;
         let (words, lanes) = (world.words as usize, S::f32s::LEN);
-        let sets = sets[step * pois.len() * words * lanes..].chunks_exact_mut(words * lanes);
-        for (poi, sets) in pois.iter().zip(sets) {
+        let mut sets = &mut sets[step * pois.len() * words * lanes..];
+        for poi in pois {
             let (x, y) = (splat(*simd, poi.x), splat(*simd, poi.y));
-            for (agents, set) in agents.chunks(32).zip(sets.chunks_exact_mut(lanes)) {
+            for agents in agents.chunks(32) {
                 let (mut near, mut bit) = (S::u32s::splat(*simd, 0), S::u32s::splat(*simd, 1));
                 for agent in agents {
                     let observes = couple::observes::<S>(world, x - agent.x, y - agent.y);
                     near |= observes.select(bit, S::u32s::splat(*simd, 0));
                     bit += bit;
                 }
+                let set;
+                (set, sets) = sets.split_at_mut(lanes);
                 near.store_slice(set);
             }
         }
@@ -641,12 +643,14 @@ const MANY: usize = 32;
 /// Calls `f` with each agent that may be in reach of this one, and its index, ascending.
 #[inline(always)]
 fn each_near<T>(near: &[u64], agents: &[T], agent: usize, mut f: impl FnMut(usize, &T)) {
-    for (word, near) in near.chunks_exact(agents.len()).enumerate() {
-        let mut bits = near[agent];
+    let (mut at, mut first) = (agent, 0);
+    while let Some(&near) = near.get(at) {
+        let mut bits = near;
         while bits != 0 {
-            let index = word * 64 + bits.trailing_zeros() as usize;
+            let index = first + bits.trailing_zeros() as usize;
             f(index, &agents[index]);
             bits &= bits - 1;
         }
+        (at, first) = (at + agents.len(), first + 64);
     }
 }
