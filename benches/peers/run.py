@@ -163,7 +163,8 @@ def mean_g(lines):
 def table(layout, results, options):
     ours = results.get("flotilla", [])
     if ours:
-        print(f"\n{layout}, {options.teams} teams; flotilla on {ours[0].get('backend')} ({ours[0].get('adapter')})\n")
+        where = ours[0].get("adapter") or options.instructions or "its widest instructions"
+        print(f"\n{layout}, {options.teams} teams; flotilla on {ours[0].get('backend')} ({where})\n")
     else:
         print(f"\n{layout}, {options.teams} teams; without flotilla\n")
     print(
