@@ -185,10 +185,7 @@ impl Trainer {
         let mut rows = playing.par_iter_mut().flat_map_iter(conclude).collect::<Vec<_>>();
         let concluded = Instant::now();
         playing.retain(|(_, arm)| generation <= arm.last());
-        playing.par_iter_mut().for_each(|(_, arm)| {
-            arm.draw_parents(generation, level);
-            arm.breed(generation, level);
-        });
+        playing.par_iter_mut().for_each(|(_, arm)| arm.breed(generation, level));
         rows.sort_by_key(|row| (row.arm, row.trial, row.generation));
         self.times.prepare += prepared - start;
         self.times.play += played - prepared;
@@ -462,30 +459,28 @@ impl Arm {
         rows
     }
 
-    /// Plans the next generation: which policy each slot comes from, and whether it mutates. After the last, policies
-    /// stay, and the champion plays.
-    fn draw_parents(&mut self, generation: usize, level: Level) {
-        let Learning { seed, population, elites, .. } = self.config.learning;
-        let last = generation == self.last();
-        self.trials.par_iter_mut().for_each(|trial| {
-            let key = Key::new(seed, trial.index, Purpose::Tournament);
-            let plans = trial.parents.par_chunks_exact_mut(population + 1).with_min_len(few(population));
-            plans.zip(trial.fitness.par_chunks_exact(population)).enumerate().for_each(|(leader, (plan, fitness))| {
-                match last {
-                    true => evolve::keep_parents(fitness, plan),
-                    false => evolve::draw_parents(level, key, generation, leader, elites, fitness, plan),
-                }
-            });
-        });
-    }
-
-    /// Makes the next generation by its plan.
+    /// Makes the next generation: plans which policy each slot comes from and whether it mutates, and carries that out.
+    /// After the last, policies stay, and the champion plays.
     fn breed(&mut self, generation: usize, level: Level) {
         thread_local! { static SCRATCH: RefCell<Vec<u32>> = const { RefCell::new(Vec::new()) }; }
+        let last = generation == self.last();
         let Arm { config, world, trials, held, .. } = self;
-        let Learning { seed, population, .. } = config.learning;
+        let Learning { seed, population, elites, .. } = config.learning;
+        let draw_parents = |key: Key, leader: usize, fitness: &[f32], parents: &mut [u32]| match last {
+            true => evolve::keep_parents(fitness, parents),
+            false => evolve::draw_parents(level, key, generation, leader, elites, fitness, parents),
+        };
         self.age += 1;
         if !held.is_empty() {
+            trials.par_iter_mut().for_each(|trial| {
+                let key = Key::new(seed, trial.index, Purpose::Tournament);
+                let plans = trial.parents.par_chunks_exact_mut(population + 1);
+                plans.zip(trial.fitness.par_chunks_exact(population)).enumerate().for_each(
+                    |(leader, (parents, fitness))| {
+                        draw_parents(key, leader, fitness, parents);
+                    },
+                );
+            });
             let mut pairs = held.iter_mut().zip(trials);
             let bred = pairs.try_for_each(|(held, trial)| {
                 let key = Key::new(seed, trial.index, Purpose::Mutation);
@@ -501,13 +496,16 @@ impl Arm {
         let parameters = world.parameters();
         let stride = (population + 1) * parameters;
         trials.par_iter_mut().for_each(|trial| {
+            let tournaments = Key::new(seed, trial.index, Purpose::Tournament);
             let key = Key::new(seed, trial.index, Purpose::Mutation);
-            let Trial { weights, children, parents, .. } = trial;
-            let populations = weights.par_chunks_exact(stride).zip(parents.par_chunks_exact(population + 1));
-            let children = children.par_chunks_exact_mut(stride);
-            populations.zip(children).enumerate().for_each(|(leader, ((policies, parents), children))| {
+            let Trial { weights, children, parents, fitness, .. } = trial;
+            let plans = fitness.par_chunks_exact(population).zip(parents.par_chunks_exact_mut(population + 1));
+            let populations = weights.par_chunks_exact(stride).zip(children.par_chunks_exact_mut(stride));
+            plans.zip(populations).enumerate().for_each(|(leader, ((fitness, parents), (policies, children)))| {
+                draw_parents(tournaments, leader, fitness, parents);
                 let broods = parents.par_chunks(BROOD).zip(children.par_chunks_mut(BROOD * parameters));
-                broods.enumerate().for_each(|(index, (parents, children))| {
+                // Small shares, so that no thread is left with a long one at the end.
+                broods.with_max_len(4).enumerate().for_each(|(index, (parents, children))| {
                     let first = index * BROOD;
                     let brood = evolve::Brood { key, generation, population: leader, first, parents, policies };
                     SCRATCH.with_borrow_mut(|scratch| {
