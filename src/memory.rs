@@ -6,6 +6,7 @@
 //! one copy, see [`copies_checkpoint`].
 
 use std::fs;
+use std::path::Path;
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
@@ -17,6 +18,8 @@ use crate::world::{INPUTS, OUTPUTS, World};
 pub const PROGRAM: u64 = 8 << 20;
 /// Most bytes of populations of which a checkpoint takes a copy, to be written while training goes on.
 const COPIED: u64 = 64 << 20;
+/// Words that an episode of a trial takes in a batch, whoever plays it.
+const EPISODE: u64 = 40;
 /// Bytes of one buffer that a batch on a GPU aims for.
 const BATCH: u64 = 256 << 20;
 
@@ -113,6 +116,7 @@ struct Sizes {
     /// The policies and the champion.
     slots: u64,
     parameters: u64,
+    agents: u64,
     episodes: u64,
 }
 
@@ -125,18 +129,21 @@ impl Sizes {
             policies: learning.population as u64,
             slots: learning.population as u64 + 1,
             parameters: config.parameters() as u64,
+            agents: (config.world.leaders.len() + config.world.followers.len()) as u64,
             episodes: learning.episodes_per_team as u64,
         }
     }
 
     /// A trainer's trials.
     fn training(&self) -> u64 {
-        let Sizes { trials, leaders, policies, slots, parameters, episodes } = self;
+        let Sizes { trials, leaders, policies, slots, parameters, agents, episodes } = self;
         let weights = 2 * leaders * slots * parameters;
         let orders_and_fitness = 2 * leaders * policies;
         let teams_and_parents = 2 * leaders * slots;
         let observed_and_scores = episodes * slots * (1 + leaders);
-        4 * trials * (weights + orders_and_fitness + teams_and_parents + observed_and_scores)
+        // Each episode's start positions, and its place in a batch.
+        let starts = episodes * (2 * agents + EPISODE);
+        4 * trials * (weights + orders_and_fitness + teams_and_parents + observed_and_scores + starts)
     }
 
     /// What a GPU holds of the populations by itself: a buffer a leader and one more, and every slot's parent.
@@ -183,8 +190,10 @@ pub fn available() -> Option<u64> {
         field(&fs::read_to_string("/proc/meminfo").ok()?, "MemAvailable:").map(|kib| kib.saturating_mul(1024))?;
     let group = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
     let group = group.lines().find_map(|line| line.strip_prefix("0::")).unwrap_or("/");
-    let limits = ["/", group].into_iter().filter_map(|group| {
-        let read = |file: &str| fs::read_to_string(format!("/sys/fs/cgroup{group}/{file}")).ok();
+    // Any group above may be the one with a limit.
+    let limits = Path::new(group).ancestors().filter_map(|group| {
+        let group = Path::new("/sys/fs/cgroup").join(group.strip_prefix("/").unwrap_or(group));
+        let read = |file: &str| fs::read_to_string(group.join(file)).ok();
         let most: u64 = read("memory.max")?.trim().parse().ok()?;
         // Files that are kept in memory give way.
         let used = field(&read("memory.stat")?, "anon ").unwrap_or(0);

@@ -204,14 +204,17 @@ impl Session {
             (options.watch)(&Progress { generation: self.generation(), rows: &in_order });
             self.keeper.poll()?;
             if options.stop.load(Relaxed) && !self.trainer.is_done() {
-                self.stop()?;
+                match self.stop() {
+                    // The device failed, which the next generation makes up for or ends at.
+                    Err(RunError::Held(_)) => continue,
+                    stopped => stopped?,
+                }
                 return Ok(Outcome::Stopped { generation: self.generation() });
             }
             let asked = options.save.swap(false, Relaxed);
             if !self.trainer.is_done() && (asked || self.keeper.is_due(&options.schedule, self.generation())) {
                 match self.save() {
-                    // The device failed, which the next generation makes up for or stops at.
-                    Err(RunError::Held(_)) => {}
+                    Err(RunError::Held(_)) => options.save.store(true, Relaxed),
                     saved => saved?,
                 }
             }
@@ -248,11 +251,12 @@ impl Session {
     /// Saves and waits until all is on the disk.
     fn stop(&mut self) -> Result<(), RunError> {
         self.keeper.wait()?;
-        if self.keeper.newest() != Some(self.generation()) {
-            self.save()?;
-            self.keeper.wait()?;
-        }
-        self.write_run(State::Stopped, None)
+        let saved = match self.keeper.newest() == Some(self.generation()) {
+            true => Ok(()),
+            false => self.save().and_then(|()| Ok(self.keeper.wait()?)),
+        };
+        let written = self.write_run(State::Stopped, None);
+        saved.and(written)
     }
 
     /// Writes what came out.

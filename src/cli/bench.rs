@@ -7,11 +7,12 @@ use std::time::Duration;
 use fearless_simd::Level;
 use serde_json::json;
 
-use super::{BackendChoice, Error, Overrides, RunOptions, backend, print};
+use super::{BackendChoice, Breed, Error, Overrides, RunOptions, backend, print};
 use crate::backend::cpu::{Cpu, level_name};
 use crate::bench::{self, Generations, Measure, Player, Profile};
 use crate::config::{self, Config};
-use crate::run::Machine;
+use crate::memory::Plan;
+use crate::run::{Machine, RunError};
 
 /// Team counts of the table, and of the JSON object.
 const TEAMS: [u32; 3] = [50, 4096, 131_072];
@@ -64,6 +65,10 @@ pub fn run(args: Args) -> Result<(), Error> {
     let config = Config::read(&text, &name, &[], &args.overrides.list())?;
     let configs = combinations(&config, &args)?;
     let (mut player, machine) = open(&args)?;
+    for config in &configs {
+        let plan = Plan::of([config], rayon::current_num_threads());
+        plan.check(machine.backend == "gpu").map_err(RunError::from)?;
+    }
     if !args.json {
         print(&format!("{name} on {}\n{HEADER}\n", player.backend().describe()))?;
     }
@@ -124,6 +129,11 @@ fn open(args: &Args) -> Result<(Player, Machine), Error> {
                 let names = names.join(", ");
                 return Err(Error::Usage(format!("--instructions: found {name}, this processor has {names}")));
             };
+            if args.run.adapter.is_some() || args.run.breed == Breed::Device {
+                return Err(Error::Usage(
+                    "--instructions is for the CPU backend; leave out --adapter and --breed device".into(),
+                ));
+            }
             backend::start_threads(&args.run)?;
             return Ok((Player::Cpu(Cpu::at_level(level), level), backend::cpu().1));
         }

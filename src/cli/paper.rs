@@ -39,6 +39,8 @@ pub fn run(args: Args) -> Result<(), Error> {
     let Args { out, trials, generations, seed, quiet, run } = args;
     let overrides = Overrides { seed, trials, generations, ..Overrides::default() };
     let mut arms = paper::arms(&overrides.list())?;
+    // Seconds of training leave nothing to go on from.
+    arms.iter_mut().for_each(|arm| (arm.config.checkpoint.generations, arm.config.checkpoint.seconds) = (0, 0.0));
     let (mut backend, machine) = backend::open(&run)?;
     // Before training: a folder that cannot be written should not cost the time.
     let disk = Disk::default();

@@ -287,7 +287,11 @@ impl<'a> Batch<'a> {
                 return Ok(Ended::Stopped);
             }
             if options.save.swap(false, Relaxed) || self.is_due() {
-                self.save()?;
+                match self.save() {
+                    // The device failed, which the next generation makes up for or ends at.
+                    Err(RunError::Held(_)) => options.save.store(true, Relaxed),
+                    saved => saved?,
+                }
             }
             let rows = match self.trainer.advance(backend) {
                 Ok(rows) => rows,
