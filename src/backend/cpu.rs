@@ -11,7 +11,7 @@ use glam::Vec2;
 use rayon::prelude::*;
 
 use super::{Backend, BackendError, Episode, Group, Moment, Strided, Trace, Visit, Weights};
-use crate::kernels::{couple, follow, math, motion, policy, sense, splat};
+use crate::kernels::{Lanes, couple, follow, math, motion, policy, sense, splat};
 use crate::world::{Constants, INPUTS, OUTPUTS, World};
 
 /// Plays episodes on the processor, at the widest instruction set it has, on the threads of the current rayon pool.
@@ -128,7 +128,7 @@ fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
     let idle: Mutex<Vec<Block<S>>> = Mutex::default();
     let take = |world: &World| {
         let mut idle = idle.lock().unwrap_or_else(PoisonError::into_inner);
-        let fits = idle.iter().position(|block| block.world == world.constants);
+        let fits = idle.iter().position(|block| block.world.constants == world.constants);
         if fits.is_none() {
             // Left over from a world that is done.
             idle.clear();
@@ -187,7 +187,7 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
 /// The state of one vector of teams, everything a lane a team.
 struct Block<S: Simd> {
     simd: S,
-    world: Constants,
+    world: Lanes<S>,
     /// Leaders first.
     agents: Vec<Agent<S>>,
     /// `[leaders]`, layer by layer, units that are weighed together (see [`together`]) a row an input, then the biases.
@@ -254,7 +254,7 @@ impl<S: Simd> Block<S> {
         let influenced = S::mask32s::splat(simd, false);
         Block {
             simd,
-            world: constants,
+            world: Lanes::new(simd, constants),
             agents: vec![Agent { x: zero, y: zero, hx: zero, hy: zero, speed: zero, wanted: zero }; agents],
             weights: vec![zero; leaders * world.parameters()],
             slots,
@@ -275,7 +275,7 @@ impl<S: Simd> Block<S> {
     #[inline(always)]
     fn load(&mut self, run: &Run<'_>, first: usize, teams: usize) {
         let Block { simd, world, agents, weights, slots, places, counts, .. } = self;
-        let (leaders, parameters) = (world.leaders as usize, world.parameters as usize);
+        let (leaders, parameters) = (run.world.leaders(), run.world.parameters());
         places.clear();
         places.extend((0..S::f32s::LEN).map(|lane| run.locate(first + if lane < teams { lane } else { 0 })));
         for (lane, &(group, _)) in places.iter().enumerate() {
@@ -285,9 +285,9 @@ impl<S: Simd> Block<S> {
             }
         }
         for agent in agents {
-            agent.hx = splat(*simd, world.heading_x);
-            agent.hy = splat(*simd, world.heading_y);
-            agent.speed = splat(*simd, world.speed);
+            agent.hx = splat(*simd, world.constants.heading_x);
+            agent.hy = splat(*simd, world.constants.heading_y);
+            agent.speed = splat(*simd, world.constants.speed);
         }
         for (leader, weights) in weights.chunks_exact_mut(parameters).enumerate() {
             // Four lanes at a time, the narrowest vector: four policies' weights are turned into four weights' lanes.
@@ -337,9 +337,9 @@ impl<S: Simd> Block<S> {
     fn find_near(&mut self) {
         self.near.fill(0);
         let Block { world, agents, near, .. } = self;
-        let (count, leaders) = (agents.len(), world.leaders as usize);
-        let drawn = world.attraction_radius2;
-        let sensed = world.agent_range2.max(drawn);
+        let (count, leaders) = (agents.len(), world.constants.leaders as usize);
+        let drawn = world.constants.attraction_radius2;
+        let sensed = world.constants.agent_range2.max(drawn);
         let reach2 = |agent: usize| if agent < leaders { sensed } else { drawn };
         if count > MANY {
             self.bounds.enclose(agents);
@@ -408,22 +408,19 @@ impl<S: Simd> Block<S> {
     #[inline(always)]
     fn decide(&mut self) {
         let Block { world, agents, weights, inputs, hidden, outputs, .. } = self;
+        let Constants { leaders, layers, widths, parameters, .. } = world.constants;
         let mut first = 0;
         let [mut to, mut from] = hidden.each_mut().map(|units| &mut units[..]);
-        for (layer, widths) in world.widths[..=world.layers as usize].windows(2).enumerate() {
+        for (layer, widths) in widths[..=layers as usize].windows(2).enumerate() {
             let [rows, columns] = [widths[0] as usize, widths[1] as usize];
             let inputs = if layer == 0 { inputs.as_flattened() } else { &*from };
-            let count = (rows + 1) * columns;
-            let units = &mut to[..world.leaders as usize * columns];
-            let policies =
-                weights.chunks_exact(world.parameters as usize).map(|weights| &weights[first..first + count]);
-            let leaders = inputs.chunks_exact(rows).zip(units.chunks_exact_mut(columns)).zip(policies);
-            for ((inputs, units), weights) in leaders {
-                // The first layer's inputs are as many as everyone's, which the compiler makes use of.
-                match <&[S::f32s; INPUTS]>::try_from(inputs) {
-                    Ok(inputs) => weigh::<S>(inputs, units, weights),
-                    Err(_) => weigh::<S>(inputs, units, weights),
-                }
+            let units = &mut to[..leaders as usize * columns];
+            let weights = weights.chunks_exact(parameters as usize).map(|weights| &weights[first..]);
+            match (rows, columns) {
+                // The paper's network, whose sizes the compiler makes use of.
+                (INPUTS, 10) => weigh::<S>(inputs, units, weights, INPUTS, 10),
+                (10, OUTPUTS) => weigh::<S>(inputs, units, weights, 10, OUTPUTS),
+                _ => weigh::<S>(inputs, units, weights, rows, columns),
             }
             // All leaders' tanh at once, and in short loops: the processor sees far enough ahead to keep its units busy.
             let (eights, rest) = units.as_chunks_mut::<8>();
@@ -439,14 +436,14 @@ impl<S: Simd> Block<S> {
             for unit in rest {
                 *unit = math::whole_tangent::<S>(policy::activate::<S>(*unit));
             }
-            first += count;
+            first += (rows + 1) * columns;
             std::mem::swap(&mut from, &mut to);
         }
         for (agent, (output, units)) in agents.iter_mut().zip(outputs.iter_mut().zip(from.as_chunks::<OUTPUTS>().0)) {
             *output = *units;
             let turn = policy::wanted_turn::<S>(units[0]);
             (agent.hx, agent.hy) = motion::turn::<S>(world, agent.hx, agent.hy, turn);
-            agent.wanted = policy::wanted_speed::<S>(units[1], world.max_speed);
+            agent.wanted = policy::wanted_speed::<S>(world, units[1]);
         }
     }
 
@@ -454,7 +451,7 @@ impl<S: Simd> Block<S> {
     #[inline(always)]
     fn follow(&mut self) {
         let Block { simd, world, agents, near, followers, counts, .. } = self;
-        let leaders = world.leaders as usize;
+        let leaders = world.constants.leaders as usize;
         for (index, (follower, counts)) in followers.iter_mut().zip(counts.chunks_exact_mut(leaders)).enumerate() {
             let &Agent { x, y, .. } = &agents[leaders + index];
             let mut sums = follow::Sums::new(*simd);
@@ -499,7 +496,7 @@ impl<S: Simd> Block<S> {
     #[inline(always)]
     fn couple(&mut self, pois: &[Vec2], step: usize) {
         let Block { simd, world, agents, sets, .. } = self;
-        let (words, lanes) = (world.words as usize, S::f32s::LEN);
+        let (words, lanes) = (world.constants.words as usize, S::f32s::LEN);
         let mut sets = &mut sets[step * pois.len() * words * lanes..];
         for poi in pois {
             let (x, y) = (splat(*simd, poi.x), splat(*simd, poi.y));
@@ -560,19 +557,29 @@ fn together(left: usize) -> usize {
     }
 }
 
-/// One leader's units of one layer, before their tanh.
+/// Every leader's units of one layer, before their tanh: of its `rows` inputs, `columns` units.
 #[inline(always)]
-fn weigh<S: Simd>(inputs: &[S::f32s], mut units: &mut [S::f32s], mut weights: &[S::f32s]) {
-    while !units.is_empty() {
-        let count = together(units.len());
-        let (these, weights_of_these);
-        (these, units) = units.split_at_mut(count);
-        (weights_of_these, weights) = weights.split_at((inputs.len() + 1) * count);
-        match count {
-            10 => these.copy_from_slice(&policy::weigh::<S, 10>(inputs, weights_of_these)),
-            4 => these.copy_from_slice(&policy::weigh::<S, 4>(inputs, weights_of_these)),
-            2 => these.copy_from_slice(&policy::weigh::<S, 2>(inputs, weights_of_these)),
-            _ => these.copy_from_slice(&policy::weigh::<S, 1>(inputs, weights_of_these)),
+fn weigh<'a, S: Simd>(
+    inputs: &[S::f32s],
+    units: &mut [S::f32s],
+    weights: impl Iterator<Item = &'a [S::f32s]>,
+    rows: usize,
+    columns: usize,
+) {
+    for ((inputs, mut units), mut weights) in inputs.chunks_exact(rows).zip(units.chunks_exact_mut(columns)).zip(weights) {
+        let mut left = columns;
+        while left > 0 {
+            let count = together(left);
+            let (these, weights_of_these);
+            (these, units) = units.split_at_mut(count);
+            (weights_of_these, weights) = weights.split_at((rows + 1) * count);
+            match count {
+                10 => these.copy_from_slice(&policy::weigh::<S, 10>(inputs, weights_of_these)),
+                4 => these.copy_from_slice(&policy::weigh::<S, 4>(inputs, weights_of_these)),
+                2 => these.copy_from_slice(&policy::weigh::<S, 2>(inputs, weights_of_these)),
+                _ => these.copy_from_slice(&policy::weigh::<S, 1>(inputs, weights_of_these)),
+            }
+            left -= count;
         }
     }
 }

@@ -2,11 +2,11 @@
 
 use fearless_simd::{Simd, prelude::*};
 
-use crate::world::Constants;
+use super::Lanes;
 
 /// In which lanes the POI at offset (`dx`, `dy`) is within its observation radius.
 #[inline(always)]
-pub fn observes<S: Simd>(world: &Constants, dx: S::f32s, dy: S::f32s) -> S::mask32s {
+pub fn observes<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::mask32s {
     let d2 = dx * dx + dy * dy;
     d2.simd_le(world.observation_radius2)
 }

@@ -3,11 +3,11 @@
 use fearless_simd::{Simd, prelude::*};
 
 use super::{
+    Lanes,
     math::{flush, recip, rsqrt},
     motion::rotate,
     only, select, splat,
 };
-use crate::world::Constants;
 
 /// Forces under this size (2^-30) count as 0.
 pub const TINY: f32 = 1.0 / 1_073_741_824.0;
@@ -34,7 +34,7 @@ impl<S: Simd> Sums<S> {
 
 /// Adds the agent at offset (`dx`, `dy`); tells in which lanes it is within the attraction radius.
 #[inline(always)]
-pub fn influence<S: Simd>(world: &Constants, dx: S::f32s, dy: S::f32s, sums: &mut Sums<S>) -> S::mask32s {
+pub fn influence<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s, sums: &mut Sums<S>) -> S::mask32s {
     let simd = dx.token();
     let one = splat(simd, 1.0);
     let d2 = dx * dx + dy * dy;
@@ -52,25 +52,25 @@ pub fn influence<S: Simd>(world: &Constants, dx: S::f32s, dy: S::f32s, sums: &mu
 
 /// The push of the two walls of one axis, at 0 and at `size`.
 #[inline(always)]
-pub fn wall_push<S: Simd>(world: &Constants, at: S::f32s, size: f32) -> S::f32s {
+pub fn wall_push<S: Simd>(world: &Lanes<S>, at: S::f32s, size: S::f32s) -> S::f32s {
     let simd = at.token();
-    let (zero, radius) = (splat(simd, 0.0), splat(simd, world.repulsion_radius));
+    let (zero, radius) = (splat(simd, 0.0), world.repulsion_radius);
     let low = radius - at;
-    let high = radius - (splat(simd, size) - at);
+    let high = radius - (size - at);
     let push = only::<S>(low, low.simd_gt(zero)) - only::<S>(high, high.simd_gt(zero));
     push * world.wall_gain
 }
 
 /// In which lanes a wall of one axis is within the repulsion radius.
 #[inline(always)]
-pub fn wall_near<S: Simd>(world: &Constants, at: S::f32s, size: f32) -> S::mask32s {
-    let high = splat(at.token(), size) - at;
+pub fn wall_near<S: Simd>(world: &Lanes<S>, at: S::f32s, size: S::f32s) -> S::mask32s {
+    let high = size - at;
     at.simd_le(world.repulsion_radius) | high.simd_le(world.repulsion_radius)
 }
 
 /// The sum of repulsion, attraction and wall push at a place: mean offsets, scaled by gain over radius.
 #[inline(always)]
-pub fn force<S: Simd>(world: &Constants, sums: &Sums<S>, x: S::f32s, y: S::f32s) -> (S::f32s, S::f32s) {
+pub fn force<S: Simd>(world: &Lanes<S>, sums: &Sums<S>, x: S::f32s, y: S::f32s) -> (S::f32s, S::f32s) {
     let one = splat(x.token(), 1.0);
     let repel = recip::<S>(select::<S>(one, sums.repel_count, sums.repel_count.simd_gt(one))) * world.repulsion_scale;
     let attract =
@@ -87,7 +87,7 @@ pub fn force<S: Simd>(world: &Constants, sums: &Sums<S>, x: S::f32s, y: S::f32s)
 #[inline(always)]
 #[allow(clippy::too_many_arguments)]
 pub fn steer<S: Simd>(
-    world: &Constants,
+    world: &Lanes<S>,
     force_x: S::f32s,
     force_y: S::f32s,
     influenced: S::mask32s,
@@ -103,11 +103,10 @@ pub fn steer<S: Simd>(
     let uy = force_y * inverse;
     let along = hx * ux + hy * uy;
     let across = hx * uy - hy * ux;
-    let sine = splat(simd, world.max_turn_sin);
-    let sine = select::<S>(zero - sine, sine, across.simd_ge(zero));
-    let (turned_x, turned_y) = rotate::<S>(hx, hy, splat(simd, world.max_turn_cos), sine);
+    let sine = select::<S>(zero - world.max_turn_sin, world.max_turn_sin, across.simd_ge(zero));
+    let (turned_x, turned_y) = rotate::<S>(hx, hy, world.max_turn_cos, sine);
     // A cosine near 1 cannot tell small angles apart, a sine near 1 cannot tell large ones.
-    let reached = if world.max_turn_cos > 0.7 {
+    let reached = if world.constants.max_turn_cos > 0.7 {
         along.simd_gt(zero) & across.abs().simd_le(world.max_turn_sin)
     } else {
         along.simd_ge(world.max_turn_cos)
@@ -115,7 +114,7 @@ pub fn steer<S: Simd>(
     let pulled = force2.simd_gt(zero);
     let next_x = select::<S>(hx, select::<S>(turned_x, ux, reached), pulled);
     let next_y = select::<S>(hy, select::<S>(turned_y, uy, reached), pulled);
-    let ahead = select::<S>(splat(simd, world.min_speed), force2 * inverse, along.simd_gt(zero));
+    let ahead = select::<S>(world.min_speed, force2 * inverse, along.simd_gt(zero));
     let wanted = select::<S>(speed, only::<S>(ahead, pulled), influenced);
     (next_x, next_y, wanted)
 }

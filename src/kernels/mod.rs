@@ -6,6 +6,8 @@
 
 use fearless_simd::{Select, Simd, prelude::*};
 
+use crate::world::Constants;
+
 pub mod couple;
 pub mod follow;
 pub mod math;
@@ -44,4 +46,27 @@ pub fn splat<S: Simd>(simd: S, value: f32) -> S::f32s {
 #[inline(always)]
 pub fn bound<S: Simd>(x: S::f32s, low: S::f32s, high: S::f32s) -> S::f32s {
     x.max(low).min(high)
+}
+
+/// The world's constants, each in every lane: read from memory by the operation that needs it.
+macro_rules! lanes {
+    ($($field:ident)*) => {
+        #[derive(Clone, Copy)]
+        pub struct Lanes<S: Simd> {
+            pub constants: Constants,
+            $(pub $field: S::f32s,)*
+        }
+
+        impl<S: Simd> Lanes<S> {
+            pub fn new(simd: S, constants: Constants) -> Lanes<S> {
+                Lanes { constants, $($field: splat(simd, constants.$field),)* }
+            }
+        }
+    };
+}
+
+lanes! {
+    map_x map_y dt min_speed max_speed max_speed_change max_turn max_turn_cos max_turn_sin observation_radius2
+    attraction_radius2 repulsion_radius2 poi_range2 agent_range2 repulsion_radius attraction_scale repulsion_scale wall_gain
+    poi_share agent_share inverse_diagonal
 }

@@ -3,11 +3,11 @@
 use fearless_simd::{Simd, prelude::*};
 
 use super::{
-    bound,
+    Lanes, bound,
     math::{flush, sin_cos},
     splat,
 };
-use crate::world::{Constants, GRID};
+use crate::world::GRID;
 
 /// Heading components under this size (2^-30) count as 0.
 pub const TINY: f32 = 1.0 / 1_073_741_824.0;
@@ -20,9 +20,8 @@ pub fn rotate<S: Simd>(hx: S::f32s, hy: S::f32s, cosine: S::f32s, sine: S::f32s)
 
 /// The heading turned by a wanted angle (radians, to the left), as far as one step allows.
 #[inline(always)]
-pub fn turn<S: Simd>(world: &Constants, hx: S::f32s, hy: S::f32s, wanted: S::f32s) -> (S::f32s, S::f32s) {
-    let simd = hx.token();
-    let angle = bound::<S>(wanted, splat(simd, -world.max_turn), splat(simd, world.max_turn));
+pub fn turn<S: Simd>(world: &Lanes<S>, hx: S::f32s, hy: S::f32s, wanted: S::f32s) -> (S::f32s, S::f32s) {
+    let angle = bound::<S>(wanted, -world.max_turn, world.max_turn);
     let (sine, cosine) = sin_cos::<S>(angle);
     rotate::<S>(hx, hy, cosine, sine)
 }
@@ -36,18 +35,16 @@ pub fn straighten<S: Simd>(hx: S::f32s, hy: S::f32s) -> (S::f32s, S::f32s) {
 
 /// The speed brought towards the wanted one, as far as one step and the limits allow.
 #[inline(always)]
-pub fn accelerate<S: Simd>(world: &Constants, speed: S::f32s, wanted: S::f32s) -> S::f32s {
-    let simd = speed.token();
+pub fn accelerate<S: Simd>(world: &Lanes<S>, speed: S::f32s, wanted: S::f32s) -> S::f32s {
     let limit = world.max_speed_change;
-    let change = bound::<S>(wanted - speed, splat(simd, -limit), splat(simd, limit));
-    bound::<S>(speed + change, splat(simd, world.min_speed), splat(simd, world.max_speed))
+    let change = bound::<S>(wanted - speed, -limit, limit);
+    bound::<S>(speed + change, world.min_speed, world.max_speed)
 }
 
 /// One coordinate after a step along the new heading, on the map and on the grid.
 #[inline(always)]
-pub fn advance<S: Simd>(at: S::f32s, step: S::f32s, heading: S::f32s, size: f32) -> S::f32s {
-    let simd = at.token();
-    bound::<S>(snap::<S>(at + step * heading), splat(simd, 0.0), splat(simd, size))
+pub fn advance<S: Simd>(at: S::f32s, step: S::f32s, heading: S::f32s, size: S::f32s) -> S::f32s {
+    bound::<S>(snap::<S>(at + step * heading), splat(at.token(), 0.0), size)
 }
 
 /// The nearest place on the grid.

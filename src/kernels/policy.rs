@@ -1,8 +1,8 @@
 //! A leader's policy: a fully connected network with a bias and tanh in every layer (Sections 2.4 and 3.1).
 
-use fearless_simd::{Simd, prelude::*};
+use fearless_simd::Simd;
 
-use super::{math, splat};
+use super::{Lanes, math};
 
 /// Some units before their tanh: the bias (the last of a unit's weights) and the weighted inputs, added in order.
 ///
@@ -37,6 +37,6 @@ pub fn wanted_turn<S: Simd>(output: S::f32s) -> S::f32s {
 
 /// The wanted speed of the policy's second output in -1..1.
 #[inline(always)]
-pub fn wanted_speed<S: Simd>(output: S::f32s, max_speed: f32) -> S::f32s {
-    (output + 1.0) * 0.5 * splat(output.token(), max_speed)
+pub fn wanted_speed<S: Simd>(world: &Lanes<S>, output: S::f32s) -> S::f32s {
+    (output + 1.0) * 0.5 * world.max_speed
 }

@@ -3,18 +3,17 @@
 use fearless_simd::{Simd, prelude::*};
 
 use super::{
-    except,
+    Lanes, except,
     math::{root, rsqrt},
     only, select, splat,
 };
-use crate::world::Constants;
 
 /// What an entity at squared distance `d2` adds to a density.
 #[inline(always)]
-pub fn density<S: Simd>(world: &Constants, d2: S::f32s) -> S::f32s {
+pub fn density<S: Simd>(world: &Lanes<S>, d2: S::f32s) -> S::f32s {
     let simd = d2.token();
     let one = splat(simd, 1.0);
-    if world.density == 0 {
+    if world.constants.density == 0 {
         one - root::<S>(d2) * world.inverse_diagonal
     } else {
         rsqrt::<S>(select::<S>(one, d2, d2.simd_gt(one)))
@@ -28,8 +27,8 @@ pub fn density<S: Simd>(world: &Constants, d2: S::f32s) -> S::f32s {
 /// clockwise, so that each boundary belongs to exactly one quadrant.
 #[inline(always)]
 pub fn sense<S: Simd>(
-    world: &Constants,
-    range2: f32,
+    world: &Lanes<S>,
+    range2: S::f32s,
     dx: S::f32s,
     dy: S::f32s,
     hx: S::f32s,
@@ -42,7 +41,7 @@ pub fn sense<S: Simd>(
     let fy = dy * hx - dx * hy;
     let value = only::<S>(density::<S>(world, d2), d2.simd_le(range2));
     let left = fy.simd_gt(zero) | (fy.simd_ge(zero) & fx.simd_ge(zero));
-    let front = fx.simd_gt(zero) | (fx.simd_ge(zero) & fy.simd_le(zero));
+    let front = fx.simd_gt(zero) | (fx.simd_ge(zero) & !fy.simd_gt(zero));
     let value_left = only::<S>(value, left);
     let value_right = except::<S>(value, left);
     sums[0] += except::<S>(value_right, front);
