@@ -375,14 +375,31 @@ impl<S: Simd> Block<S> {
     /// Leaders sense: all POIs, then the other agents, each in ascending order.
     #[inline(always)]
     fn sense(&mut self, pois: &[Vec2]) {
+        if self.world.constants.density == 0 { self.sense_by::<true>(pois) } else { self.sense_by::<false>(pois) }
+    }
+
+    #[inline(always)]
+    fn sense_by<const LINEAR: bool>(&mut self, pois: &[Vec2]) {
         let Block { simd, world, agents, near, inputs, .. } = self;
         for (leader, (agent, inputs)) in agents.iter().zip(inputs).enumerate() {
             let &Agent { x, y, hx, hy, .. } = agent;
             let mut sums = [splat(*simd, 0.0); 4];
-            for poi in pois {
-                let dx = splat(*simd, poi.x) - x;
-                let dy = splat(*simd, poi.y) - y;
-                sense::sense::<S>(world, world.poi_range2, dx, dy, hx, hy, &mut sums);
+            let (fours, rest) = pois.as_chunks::<4>();
+            for pois in fours {
+                let mut densities = [x; 4];
+                for (density, poi) in densities.iter_mut().zip(pois) {
+                    let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
+                    *density = sense::density::<S, LINEAR>(world, world.poi_range2, dx, dy);
+                }
+                for (&density, poi) in densities.iter().zip(pois) {
+                    let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
+                    sense::sense::<S>(density, dx, dy, hx, hy, &mut sums);
+                }
+            }
+            for poi in rest {
+                let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
+                let density = sense::density::<S, LINEAR>(world, world.poi_range2, dx, dy);
+                sense::sense::<S>(density, dx, dy, hx, hy, &mut sums);
             }
             let (of_pois, of_agents) = inputs.split_at_mut(4);
             for (input, sum) in of_pois.iter_mut().zip(sums) {
@@ -395,7 +412,9 @@ impl<S: Simd> Block<S> {
                 leader,
                 #[inline(always)]
                 |_, other| {
-                    sense::sense::<S>(world, world.agent_range2, other.x - x, other.y - y, hx, hy, &mut sums);
+                    let (dx, dy) = (other.x - x, other.y - y);
+                    let density = sense::density::<S, LINEAR>(world, world.agent_range2, dx, dy);
+                    sense::sense::<S>(density, dx, dy, hx, hy, &mut sums);
                 },
             );
             for (input, sum) in of_agents.iter_mut().zip(sums) {
