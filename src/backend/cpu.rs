@@ -224,10 +224,9 @@ struct Agent<S: Simd> {
 
 #[derive(Clone, Copy)]
 struct Follower<S: Simd> {
-    force_x: S::f32s,
-    force_y: S::f32s,
-    /// Whether anyone or any wall is near.
-    influenced: S::mask32s,
+    sums: follow::Sums<S>,
+    pull: follow::Pull<S>,
+    sizes: (S::f32s, S::f32s),
 }
 
 impl<S: Simd> Block<S> {
@@ -251,7 +250,7 @@ impl<S: Simd> Block<S> {
             }
             first += rows * columns;
         }
-        let influenced = S::mask32s::splat(simd, false);
+        let pull = follow::Pull { x: zero, y: zero, influenced: S::mask32s::splat(simd, false) };
         Block {
             simd,
             world: Lanes::new(simd, constants),
@@ -262,7 +261,7 @@ impl<S: Simd> Block<S> {
             inputs: vec![[zero; INPUTS]; leaders],
             hidden: [vec![zero; leaders * widest], vec![zero; leaders * widest]],
             outputs: vec![[zero; OUTPUTS]; leaders],
-            followers: vec![Follower { force_x: zero, force_y: zero, influenced }; followers],
+            followers: vec![Follower { sums: follow::Sums::new(simd), pull, sizes: (zero, zero) }; followers],
             counts: vec![S::u32s::splat(simd, 0); followers * leaders],
             near: vec![0; agents.div_ceil(64) * agents],
             bounds: Bounds::new(simd, agents),
@@ -482,19 +481,17 @@ impl<S: Simd> Block<S> {
                 |index, other| {
                     let seen = follow::influence::<S>(world, other.x - x, other.y - y, &mut sums);
                     if let Some(count) = counts.get_mut(index) {
-                        *count = seen.select(*count + 1, *count);
+                        *count -= seen.to_vector().bitcast::<S::u32s>();
                     }
                 },
             );
-            (follower.force_x, follower.force_y) = follow::force::<S>(world, &sums, x, y);
-            follower.influenced = (sums.repel_count + sums.attract_count).simd_gt(0.0)
-                | follow::wall_near::<S>(world, x, world.map_x)
-                | follow::wall_near::<S>(world, y, world.map_y);
+            follower.sums = sums;
         }
-        for (agent, follower) in agents[leaders..].iter_mut().zip(&*followers) {
-            let &mut Agent { hx, hy, speed, .. } = agent;
-            let &Follower { force_x, force_y, influenced } = follower;
-            (agent.hx, agent.hy, agent.wanted) = follow::steer::<S>(world, force_x, force_y, influenced, hx, hy, speed);
+        let agents = &mut agents[leaders..];
+        if world.constants.max_turn_cos > 0.7 {
+            steer::<S, true>(world, agents, followers);
+        } else {
+            steer::<S, false>(world, agents, followers);
         }
     }
 
@@ -505,6 +502,8 @@ impl<S: Simd> Block<S> {
         for agent in &mut self.agents {
             (agent.hx, agent.hy) = motion::straighten::<S>(agent.hx, agent.hy);
             agent.speed = motion::accelerate::<S>(world, agent.speed, agent.wanted);
+        }
+        for agent in &mut self.agents {
             let step = agent.speed * world.dt;
             agent.x = motion::advance::<S>(agent.x, step, agent.hx, world.map_x);
             agent.y = motion::advance::<S>(agent.y, step, agent.hy, world.map_y);
@@ -548,7 +547,7 @@ impl<S: Simd> Block<S> {
                 moment.outputs = self.outputs[index].map(|output| output[lane]);
             } else if sensed {
                 let follower = &self.followers[index - leaders];
-                moment.force = [follower.force_x[lane], follower.force_y[lane]];
+                moment.force = [follower.pull.x[lane], follower.pull.y[lane]];
             }
             moment.position = [agent.x[lane], agent.y[lane]];
             moment.heading = [agent.hx[lane], agent.hy[lane]];
@@ -600,6 +599,22 @@ fn weigh<'a, S: Simd>(
             }
             left -= count;
         }
+    }
+}
+
+/// Turns followers to where they are pulled. In short loops: the processor sees far enough ahead to keep its units busy.
+#[inline(always)]
+fn steer<S: Simd, const BY_SINE: bool>(world: &Lanes<S>, agents: &mut [Agent<S>], followers: &mut [Follower<S>]) {
+    for (agent, follower) in agents.iter().zip(&mut *followers) {
+        follower.pull = follow::force::<S>(world, &follower.sums, agent.x, agent.y);
+    }
+    for follower in &mut *followers {
+        follower.sizes = follow::sizes::<S>(&follower.pull);
+    }
+    for (agent, follower) in agents.iter_mut().zip(followers) {
+        let &mut Agent { hx, hy, speed, .. } = agent;
+        let &mut Follower { pull, sizes, .. } = follower;
+        (agent.hx, agent.hy, agent.wanted) = follow::steer::<S, BY_SINE>(world, &pull, sizes, hx, hy, speed);
     }
 }
 
