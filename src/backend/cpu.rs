@@ -6,7 +6,7 @@
 use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
 
-use fearless_simd::{Level, Select, Simd, SimdMask, dispatch, f32x4, prelude::*};
+use fearless_simd::{Level, Simd, SimdMask, dispatch, f32x4, prelude::*};
 use glam::Vec2;
 use rayon::prelude::*;
 
@@ -513,22 +513,14 @@ impl<S: Simd> Block<S> {
     /// Records who is near each POI.
     #[inline(always)]
     fn couple(&mut self, pois: &[Vec2], step: usize) {
-        let Block { simd, world, agents, sets, .. } = self;
-        let (words, lanes) = (world.constants.words as usize, S::f32s::LEN);
-        let mut sets = &mut sets[step * pois.len() * words * lanes..];
-        for poi in pois {
-            let (x, y) = (splat(*simd, poi.x), splat(*simd, poi.y));
-            for agents in agents.chunks(32) {
-                let (mut near, mut bit) = (S::u32s::splat(*simd, 0), S::u32s::splat(*simd, 1));
-                for agent in agents {
-                    let observes = couple::observes::<S>(world, x - agent.x, y - agent.y);
-                    near |= observes.select(bit, S::u32s::splat(*simd, 0));
-                    bit += bit;
-                }
-                let set;
-                (set, sets) = sets.split_at_mut(lanes);
-                near.store_slice(set);
-            }
+        let size = self.world.constants.words as usize * S::f32s::LEN;
+        let mut sets = &mut self.sets[step * pois.len() * size..];
+        let (fours, rest) = pois.as_chunks::<4>();
+        for pois in fours {
+            sets = observe(self.simd, &self.world, &self.agents, pois, sets);
+        }
+        for poi in rest {
+            sets = observe(self.simd, &self.world, &self.agents, std::array::from_ref(poi), sets);
         }
     }
 
@@ -600,6 +592,36 @@ fn weigh<'a, S: Simd>(
             left -= count;
         }
     }
+}
+
+/// Puts the agents near some POIs into their sets, `[N][words][lanes]`; gives back the sets after these.
+#[inline(always)]
+fn observe<'a, S: Simd, const N: usize>(
+    simd: S,
+    world: &Lanes<S>,
+    agents: &[Agent<S>],
+    pois: &[Vec2; N],
+    sets: &'a mut [u32],
+) -> &'a mut [u32] {
+    let mut places = [[splat(simd, 0.0); 2]; N];
+    for (place, poi) in places.iter_mut().zip(pois) {
+        *place = [splat(simd, poi.x), splat(simd, poi.y)];
+    }
+    let words = world.constants.words as usize;
+    for (word, agents) in agents.chunks(32).enumerate() {
+        let (mut near, mut bit) = ([S::u32s::splat(simd, 0); N], S::u32s::splat(simd, 1));
+        for agent in agents {
+            for (near, &[x, y]) in near.iter_mut().zip(&places) {
+                let observes = couple::observes::<S>(world, agent.x - x, agent.y - y);
+                *near |= observes.to_vector().bitcast::<S::u32s>() & bit;
+            }
+            bit += bit;
+        }
+        for (poi, near) in near.iter().enumerate() {
+            near.store_slice(&mut sets[(poi * words + word) * S::f32s::LEN..][..S::f32s::LEN]);
+        }
+    }
+    &mut sets[N * words * S::f32s::LEN..]
 }
 
 /// Turns followers to where they are pulled. In short loops: the processor sees far enough ahead to keep its units busy.
