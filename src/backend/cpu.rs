@@ -433,12 +433,17 @@ impl<S: Simd> Block<S> {
             let [rows, columns] = [widths[0] as usize, widths[1] as usize];
             let inputs = if layer == 0 { inputs.as_flattened() } else { &*from };
             let units = &mut to[..leaders as usize * columns];
-            let weights = weights.chunks_exact(parameters as usize).map(|weights| &weights[first..]);
+            let weights = (0..leaders as usize).map(|leader| &weights[leader * parameters as usize + first..]);
             match (rows, columns) {
                 // The paper's network, whose sizes the compiler makes use of.
-                (INPUTS, 10) => weigh::<S>(inputs, units, weights, INPUTS, 10),
-                (10, OUTPUTS) => weigh::<S>(inputs, units, weights, 10, OUTPUTS),
-                _ => weigh::<S>(inputs, units, weights, rows, columns),
+                (INPUTS, 10) => weigh_layer::<S, INPUTS, 10>(inputs, units, weights),
+                (10, OUTPUTS) => weigh_layer::<S, 10, OUTPUTS>(inputs, units, weights),
+                _ => {
+                    let leaders = inputs.chunks_exact(rows).zip(units.chunks_exact_mut(columns));
+                    for ((inputs, units), weights) in leaders.zip(weights) {
+                        weigh::<S>(inputs, units, weights);
+                    }
+                }
             }
             // All leaders' tanh at once, and in short loops: the processor sees far enough ahead to keep its units busy.
             let (eights, rest) = units.as_chunks_mut::<8>();
@@ -567,29 +572,32 @@ fn together(left: usize) -> usize {
     }
 }
 
-/// Every leader's units of one layer, before their tanh: of its `rows` inputs, `columns` units.
+/// Every leader's units of one layer, before their tanh.
 #[inline(always)]
-fn weigh<'a, S: Simd>(
+fn weigh_layer<'a, S: Simd, const INPUTS: usize, const UNITS: usize>(
     inputs: &[S::f32s],
     units: &mut [S::f32s],
     weights: impl Iterator<Item = &'a [S::f32s]>,
-    rows: usize,
-    columns: usize,
 ) {
-    for ((inputs, mut units), mut weights) in inputs.chunks_exact(rows).zip(units.chunks_exact_mut(columns)).zip(weights) {
-        let mut left = columns;
-        while left > 0 {
-            let count = together(left);
-            let (these, weights_of_these);
-            (these, units) = units.split_at_mut(count);
-            (weights_of_these, weights) = weights.split_at((rows + 1) * count);
-            match count {
-                10 => these.copy_from_slice(&policy::weigh::<S, 10>(inputs, weights_of_these)),
-                4 => these.copy_from_slice(&policy::weigh::<S, 4>(inputs, weights_of_these)),
-                2 => these.copy_from_slice(&policy::weigh::<S, 2>(inputs, weights_of_these)),
-                _ => these.copy_from_slice(&policy::weigh::<S, 1>(inputs, weights_of_these)),
-            }
-            left -= count;
+    let leaders = inputs.as_chunks::<INPUTS>().0.iter().zip(units.as_chunks_mut::<UNITS>().0);
+    for ((inputs, units), weights) in leaders.zip(weights) {
+        *units = policy::weigh::<S, UNITS>(inputs, &weights[..(INPUTS + 1) * UNITS]);
+    }
+}
+
+/// One leader's units of one layer, before their tanh.
+#[inline(always)]
+fn weigh<S: Simd>(inputs: &[S::f32s], mut units: &mut [S::f32s], mut weights: &[S::f32s]) {
+    while !units.is_empty() {
+        let count = together(units.len());
+        let (these, weights_of_these);
+        (these, units) = units.split_at_mut(count);
+        (weights_of_these, weights) = weights.split_at((inputs.len() + 1) * count);
+        match count {
+            10 => these.copy_from_slice(&policy::weigh::<S, 10>(inputs, weights_of_these)),
+            4 => these.copy_from_slice(&policy::weigh::<S, 4>(inputs, weights_of_these)),
+            2 => these.copy_from_slice(&policy::weigh::<S, 2>(inputs, weights_of_these)),
+            _ => these.copy_from_slice(&policy::weigh::<S, 1>(inputs, weights_of_these)),
         }
     }
 }
