@@ -93,7 +93,8 @@ fn lead(task: Task, me: ptr<function, Agent>) {
         let columns = world.widths[layer + 1u];
         var units: array<f32, WIDEST>;
         for (var column = 0u; column < columns; column++) {
-            units[column] = whole_tangent(activate(weigh(&inputs, rows, first + column * stride, columns * stride)));
+            let sum = tame(weigh(&inputs, rows, first + column * stride, columns * stride));
+            units[column] = whole_tangent(half_tangent(sum));
         }
         inputs = units;
         first += (rows + 1u) * columns * stride;

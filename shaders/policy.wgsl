@@ -14,9 +14,9 @@ fn weigh(inputs: ptr<function, array<f32, WIDEST>>, rows: u32, first: u32, strid
     return sum;
 }
 
-// The unit's activation, up to whole_tangent; sums too small to matter become 0, which keeps the next layer away from denormals.
-fn activate(sum: f32) -> vec2<f32> {
-    return half_tangent(flush(sum, TINY));
+// The sum, ready for its tanh; sums too small to matter become 0, which keeps the next layer away from denormals.
+fn tame(sum: f32) -> f32 {
+    return limit_tangent(flush(sum, TINY));
 }
 
 // The wanted turn, in radians to the left, of the policy's first output in -1..1.

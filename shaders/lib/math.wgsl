@@ -34,11 +34,15 @@ fn rough_twice_recip(x: f32) -> f32 {
     return y * (2.8286855 - x * y);
 }
 
-// n and d with tanh(x/2) = n/d.
-fn half_tangent(unclamped: f32) -> vec2<f32> {
+// x, brought to where tanh comes to 1 if it is beyond.
+fn limit_tangent(x: f32) -> f32 {
     let limit = 7.5501223;
-    var x = select(limit, unclamped, unclamped < limit);
-    x = select(-limit, x, x > -limit);
+    let low = select(limit, x, x < limit);
+    return select(-limit, low, low > -limit);
+}
+
+// n and d with tanh(x/2) = n/d, for an x from limit_tangent.
+fn half_tangent(x: f32) -> vec2<f32> {
     let z = x * x;
     let n = x * ((z * 0.02999907 + 14.7163315) * z + 544.93274);
     let d = (z + 120.25281) * z + 1089.8662;

@@ -446,18 +446,21 @@ impl<S: Simd> Block<S> {
                 }
             }
             // All leaders' tanh at once, and in short loops: the processor sees far enough ahead to keep its units busy.
+            for unit in &mut *units {
+                *unit = policy::tame::<S>(*unit);
+            }
             let (eights, rest) = units.as_chunks_mut::<8>();
             for units in eights {
                 let mut halves = [(units[0], units[0]); 8];
                 for (half, &unit) in halves.iter_mut().zip(&*units) {
-                    *half = policy::activate::<S>(unit);
+                    *half = math::half_tangent::<S>(unit);
                 }
                 for (unit, &half) in units.iter_mut().zip(&halves) {
                     *unit = math::whole_tangent::<S>(half);
                 }
             }
             for unit in rest {
-                *unit = math::whole_tangent::<S>(policy::activate::<S>(*unit));
+                *unit = math::whole_tangent::<S>(math::half_tangent::<S>(*unit));
             }
             first += (rows + 1) * columns;
             std::mem::swap(&mut from, &mut to);

@@ -19,11 +19,10 @@ pub fn weigh<S: Simd, const UNITS: usize>(inputs: &[S::f32s], weights: &[S::f32s
     sums
 }
 
-/// The unit's activation, up to [`math::whole_tangent`]; sums too small to matter become 0, which keeps the next layer
-/// away from denormals.
+/// The sum, ready for its tanh; sums too small to matter become 0, which keeps the next layer away from denormals.
 #[inline(always)]
-pub fn activate<S: Simd>(sum: S::f32s) -> (S::f32s, S::f32s) {
-    math::half_tangent::<S>(math::flush::<S>(sum, TINY))
+pub fn tame<S: Simd>(sum: S::f32s) -> S::f32s {
+    math::limit_tangent::<S>(math::flush::<S>(sum, TINY))
 }
 
 /// Sums under this size (2^-30) count as 0.
