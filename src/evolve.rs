@@ -265,7 +265,8 @@ pub fn mutate(level: Level, key: Key, learning: &Learning, weights: &mut [f32], 
 fn mutate_lanes<S: Simd>(simd: S, key: Key, learning: &Learning, weights: &mut [f32], scratch: &mut Vec<u32>) {
     let mut chosen = Chosen::new(scratch, 1, weights.len());
     chosen.choose(simd, 0, key, learning.mutation_probability);
-    chosen.list(simd, 0, key.fork());
+    let listed = chosen.list(0);
+    chosen.address(simd, 0, listed, key.fork());
     chosen.mutate(simd, learning, weights);
 }
 
@@ -322,8 +323,12 @@ fn mutate_brood<S: Simd>(simd: S, learning: &Learning, brood: Brood<'_>, childre
             }
             chosen.choose(simd, first + lane, key(&keys, lane), learning.mutation_probability);
         }
+        let mut listed = [(0, 0); WIDEST];
         for lane in mutating() {
-            chosen.list(simd, first + lane, key(&forks, lane));
+            listed[lane] = chosen.list(first + lane);
+        }
+        for lane in mutating() {
+            chosen.address(simd, first + lane, listed[lane], key(&forks, lane));
         }
     }
     chosen.mutate(simd, learning, children);
@@ -336,7 +341,9 @@ fn copy<S: Simd>(simd: S, from: &[f32], to: &mut [f32]) {
     for at in (0..whole).step_by(S::f32s::LEN) {
         S::f32s::from_slice(simd, &from[at..at + S::f32s::LEN]).store_slice(&mut to[at..at + S::f32s::LEN]);
     }
-    to[whole..].copy_from_slice(&from[whole..]);
+    if whole < from.len() {
+        to[whole..].copy_from_slice(&from[whole..]);
+    }
 }
 
 /// The weights that mutate in one policy or several, so many that no lane idles.
@@ -383,10 +390,11 @@ impl<'a> Chosen<'a> {
     fn choose<S: Simd>(&mut self, simd: S, policy: usize, key: Key, probability: f64) {
         let threshold = mutation_threshold(probability);
         let words = self.words(policy);
+        let lanes = S::u32s::from_fn(simd, |lane| lane as u32);
         for (block, masks) in self.masks[words].as_chunks_mut::<2>().0.iter_mut().enumerate() {
             let mut mutates = 0u64;
             for place in (0..16).step_by(S::f32s::LEN) {
-                let counter = S::u32s::from_fn(simd, |lane| (16 * block + place + lane) as u32);
+                let counter = lanes + (16 * block + place) as u32;
                 for (index, word) in (0..).zip(key.draw_lanes::<S>(counter)) {
                     mutates |= word.simd_lt(threshold.unwrap_or_default()).to_bitmask() << (16 * index + place);
                 }
@@ -402,9 +410,9 @@ impl<'a> Chosen<'a> {
         }
     }
 
-    /// Lists the chosen weights of a policy, whose noise has this key.
+    /// Lists the chosen weights of a policy; tells where.
     #[inline(always)]
-    fn list<S: Simd>(&mut self, simd: S, policy: usize, noises: Key) {
+    fn list(&mut self, policy: usize) -> (usize, usize) {
         let before = self.count;
         let mut count = before;
         for (word, &mask) in (0..).step_by(32).zip(&self.masks[self.words(policy)]) {
@@ -417,11 +425,19 @@ impl<'a> Chosen<'a> {
             }
         }
         self.count = count;
-        let first = (policy * self.parameters) as u32;
-        for at in (before..count).step_by(S::f32s::LEN) {
+        (before, count)
+    }
+
+    /// Says of the listed weights of a policy where they are, and that their noise has this key.
+    ///
+    /// Not at once as they are listed: what was written in pieces can be read as a whole only after a while.
+    #[inline(always)]
+    fn address<S: Simd>(&mut self, simd: S, policy: usize, (first, end): (usize, usize), noises: Key) {
+        let place = (policy * self.parameters) as u32;
+        for at in (first..end).step_by(S::f32s::LEN) {
             let vector = at..at + S::f32s::LEN;
             let index = S::u32s::from_slice(simd, &self.indices[vector.clone()]);
-            (index + first).store_slice(&mut self.places[vector.clone()]);
+            (index + place).store_slice(&mut self.places[vector.clone()]);
             for (to, word) in self.keys.iter_mut().zip(noises.0) {
                 S::u32s::simd_from(simd, word).store_slice(&mut to[vector.clone()]);
             }
@@ -436,15 +452,26 @@ impl<'a> Chosen<'a> {
         for (bits, &place) in bits[..count].iter_mut().zip(&*places) {
             *bits = weights[place as usize].to_bits();
         }
-        for at in (0..count).step_by(S::f32s::LEN) {
-            let vector = at..at + S::f32s::LEN;
-            let load = |from: &[u32]| S::u32s::from_slice(simd, &from[vector.clone()]);
-            let weight: S::f32s = load(bits).bitcast();
-            let [a, b, ..] = math::draw::<S>(load(x), load(y), load(z), load(w) ^ load(indices));
-            let noise = math::normal::<S>(a, b) * sigma;
+        let vectors = || (0..count).step_by(S::f32s::LEN).map(|at| at..at + S::f32s::LEN);
+        let load = |from: &[u32]| S::u32s::from_slice(simd, from);
+        // In short loops: the processor sees far enough ahead to keep its units busy.
+        for at in vectors() {
+            let counter = load(&w[at.clone()]) ^ load(&indices[at.clone()]);
+            let [a, b, ..] = math::draw::<S>(load(&x[at.clone()]), load(&y[at.clone()]), load(&z[at.clone()]), counter);
+            a.store_slice(&mut x[at.clone()]);
+            b.store_slice(&mut y[at]);
+        }
+        for at in vectors() {
+            let radius: S::u32s = math::normal_radius::<S>(load(&x[at.clone()])).bitcast();
+            radius.store_slice(&mut x[at]);
+        }
+        for at in vectors() {
+            let weight: S::f32s = load(&bits[at.clone()]).bitcast();
+            let radius: S::f32s = load(&x[at.clone()]).bitcast();
+            let noise = math::normal_of::<S>(radius, math::normal_cosine::<S>(load(&y[at.clone()]))) * sigma;
             let noise = if learning.mutation == Mutation::Scaled { noise * weight } else { noise };
             let mutated: S::u32s = within_limits(simd, weight + noise).bitcast();
-            mutated.store_slice(&mut bits[vector]);
+            mutated.store_slice(&mut bits[at]);
         }
         for (&bits, &place) in bits[..count].iter().zip(&*places) {
             weights[place as usize] = f32::from_bits(bits);

@@ -122,15 +122,30 @@ pub fn ln<S: Simd>(x: S::f32s) -> S::f32s {
 
 /// A standard normal deviate from two uniform words (Box and Muller 1958), 0 or of size 2^-40 to 5.8.
 /// 62 operations.
-///
-/// The top 24 bits of `a` make a uniform number in (0, 1], those of `b` an angle in [-π, π).
 #[inline(always)]
 pub fn normal<S: Simd>(a: S::u32s, b: S::u32s) -> S::f32s {
-    let u = ((a >> 8) + 1).to_float::<S::f32s>() * 5.9604645e-8;
-    let angle = ((b >> 8).to_float::<S::f32s>() - 8388608.0) * 3.7450704e-7;
-    let radius = root::<S>(ln::<S>(u) * -2.0);
-    let (_, cosine) = sin_cos::<S>(angle);
+    normal_of::<S>(normal_radius::<S>(a), normal_cosine::<S>(b))
+}
+
+/// [`normal`] of its two parts.
+#[inline(always)]
+pub fn normal_of<S: Simd>(radius: S::f32s, cosine: S::f32s) -> S::f32s {
     flush::<S>(radius * cosine, 9.094947e-13)
+}
+
+/// The radius of [`normal`]: the top 24 bits of `a` make a uniform number in (0, 1].
+#[inline(always)]
+pub fn normal_radius<S: Simd>(a: S::u32s) -> S::f32s {
+    let u = ((a >> 8) + 1).to_float::<S::f32s>() * 5.9604645e-8;
+    root::<S>(ln::<S>(u) * -2.0)
+}
+
+/// The cosine of [`normal`]: the top 24 bits of `b` make an angle in [-π, π).
+#[inline(always)]
+pub fn normal_cosine<S: Simd>(b: S::u32s) -> S::f32s {
+    let angle = ((b >> 8).to_float::<S::f32s>() - 8388608.0) * 3.7450704e-7;
+    let (_, cosine) = sin_cos::<S>(angle);
+    cosine
 }
 
 /// +0 where |x| < `limit`, else x. 3 operations.
