@@ -8,6 +8,10 @@ use std::process::Output;
 use assert_cmd::Command;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
+use flotilla::backend::cpu::Cpu;
+use flotilla::config::{Config, Override};
+use flotilla::report::paper;
+use flotilla::trainer::Trainer;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -384,6 +388,26 @@ fn long_runs_plot_into_small_files() {
     let svg = fs::read_to_string(run.file("curves.svg")).unwrap();
     assert!(svg.len() < 100_000, "{} bytes", svg.len());
     assert!(svg.contains("each point the mean of"));
+}
+
+#[test]
+fn what_is_trained_once_for_two_arms_is_the_same_for_both() {
+    let few = [("learning.generations", 4), ("learning.trials", 2), ("learning.population", 12)];
+    let few = few.map(|(key, value)| Override::new(key, value, key));
+    let arms = paper::arms(&few).unwrap();
+    let (configs, places) = paper::trained(&arms);
+    assert_eq!((configs.len(), places.len()), (15, 18));
+    let course = |config: &Config| {
+        let mut trainer = Trainer::new(vec![config.clone()]);
+        let mut rows = Vec::new();
+        while !trainer.is_done() {
+            rows.extend(trainer.advance(&mut Cpu::default()).unwrap());
+        }
+        rows
+    };
+    for (arm, &place) in arms.iter().zip(&places).filter(|(arm, place)| arm.config != configs[**place]) {
+        assert_eq!(course(&arm.config), course(&configs[place]), "{}", arm.name());
+    }
 }
 
 #[test]

@@ -7,6 +7,7 @@ use super::{Error, Overrides, RunOptions, backend, print, say};
 use crate::memory;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
+use crate::record::metrics::Row;
 use crate::report::curves::PRINT;
 use crate::report::paper::{self, Measured, Summary};
 use crate::report::progress::Progress;
@@ -56,13 +57,19 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
 
     let since = Instant::now();
-    let plan = memory::Plan::of(arms.iter().map(|arm| &arm.config), rayon::current_num_threads());
+    let (configs, places) = paper::trained(&arms);
+    let plan = memory::Plan::of(&configs, rayon::current_num_threads());
     plan.check(machine.backend == "gpu").map_err(RunError::from)?;
-    let mut trainer = Trainer::new(arms.iter().map(|arm| arm.config.clone()).collect());
+    let mut trainer = Trainer::new(configs);
     let names = arms.iter().map(|arm| (arm.name(), arm.pois())).collect();
     let mut progress = Progress::new(names, 0, learning.generations, quiet);
     while !trainer.is_done() {
         let rows = trainer.advance(&mut *backend)?;
+        let of_arms = |row: &Row| {
+            let (row, places) = (*row, places.iter().enumerate());
+            places.filter(move |&(_, &place)| place == row.arm).map(move |(arm, _)| Row { arm, ..row })
+        };
+        let rows: Vec<Row> = rows.iter().flat_map(of_arms).collect();
         rows.iter().for_each(|row| arms[row.arm].add(row));
         progress.show(trainer.generation(), &rows);
     }

@@ -58,6 +58,23 @@ pub fn arms(overrides: &[Override]) -> Result<Vec<Arm>, ConfigError> {
     Ok(arms)
 }
 
+/// The configs to train for all arms, and which of these each arm is: where everyone leads, nobody follows, and Df is D.
+pub fn trained(arms: &[Arm]) -> (Vec<Config>, Vec<usize>) {
+    let mut configs: Vec<Config> = Vec::new();
+    let place = |arm: &Arm| {
+        let mut config = arm.config.clone();
+        if (arm.paradigm, arm.fitness) == (Paradigm::AllLeaders, Fitness::Df) {
+            config.learning.fitness = Fitness::D;
+        }
+        configs.iter().position(|other| *other == config).unwrap_or_else(|| {
+            configs.push(config);
+            configs.len() - 1
+        })
+    };
+    let places = arms.iter().map(place).collect();
+    (configs, places)
+}
+
 impl Arm {
     /// Takes in a row; a trial's rows come in order of generations.
     pub fn add(&mut self, row: &Row) {
