@@ -124,11 +124,10 @@ fn follow(task: Task, me: ptr<function, Agent>) {
         }
     }
     let pull = force(sums, x, y);
-    let influenced = sums.repel_count + sums.attract_count > 0.0 || wall_near(x, world.map_x) || wall_near(y, world.map_y);
     if TRACE {
-        (*me).force = pull;
+        (*me).force = vec2(pull.x, pull.y);
     }
-    (*me).next = steer(pull.x, pull.y, influenced, (*me).hx, (*me).hy, (*me).speed);
+    (*me).next = steer(pull, sizes(pull), (*me).hx, (*me).hy, (*me).speed);
 }
 
 // Everyone moves.

@@ -32,52 +32,62 @@ fn influence(dx: f32, dy: f32, sums: ptr<function, Sums>) -> bool {
     return seen;
 }
 
-// The push of the two walls of one axis, at 0 and at `size`.
-fn wall_push(at: f32, size: f32) -> f32 {
-    let radius = world.repulsion_radius;
-    let low = radius - at;
-    let high = radius - (size - at);
-    let push = select(0.0, low, low > 0.0) - select(0.0, high, high > 0.0);
-    return push * world.wall_gain;
+// What acts on a follower: the force, and whether any agent or wall is near.
+struct Pull {
+    x: f32,
+    y: f32,
+    influenced: bool,
 }
 
-// Whether a wall of one axis is within the repulsion radius.
-fn wall_near(at: f32, size: f32) -> bool {
-    let high = size - at;
-    return at <= world.repulsion_radius || high <= world.repulsion_radius;
+// The push of the two walls of one axis, at 0 and at `size`, and a number that is not negative if either is within the
+// repulsion radius.
+fn walls(at: f32, size: f32) -> vec2<f32> {
+    let low = world.repulsion_radius - at;
+    let high = world.repulsion_radius - (size - at);
+    let push = select(0.0, low, low > 0.0) - select(0.0, high, high > 0.0);
+    return vec2(push * world.wall_gain, select(high, low, low > high));
 }
 
 // The sum of repulsion, attraction and wall push at a place: mean offsets, scaled by gain over radius.
-fn force(sums: Sums, x: f32, y: f32) -> vec2<f32> {
+fn force(sums: Sums, x: f32, y: f32) -> Pull {
     let repel = recip(select(1.0, sums.repel_count, sums.repel_count > 1.0)) * world.repulsion_scale;
     let attract = recip(select(1.0, sums.attract_count, sums.attract_count > 1.0)) * world.attraction_scale;
-    let force_x = sums.attract_x * attract - sums.repel_x * repel + wall_push(x, world.map_x);
-    let force_y = sums.attract_y * attract - sums.repel_y * repel + wall_push(y, world.map_y);
-    return vec2(flush(force_x, TINY), flush(force_y, TINY));
+    let walls_x = walls(x, world.map_x);
+    let walls_y = walls(y, world.map_y);
+    let force_x = sums.attract_x * attract - sums.repel_x * repel + walls_x.x;
+    let force_y = sums.attract_y * attract - sums.repel_y * repel + walls_y.x;
+    let influenced = sums.repel_count + sums.attract_count > 0.0 || walls_x.y >= 0.0 || walls_y.y >= 0.0;
+    return Pull(flush(force_x, TINY), flush(force_y, TINY), influenced);
 }
 
-// The heading turned towards the force by at most the largest turn, and the wanted speed.
+// The squared size of a force, and 1 over its size.
+fn sizes(pull: Pull) -> vec2<f32> {
+    let force2 = pull.x * pull.x + pull.y * pull.y;
+    return vec2(force2, rsqrt(force2));
+}
+
+// The heading turned towards the force, of these sizes, by at most the largest turn, and the wanted speed.
 //
 // No angle is needed: the force's direction is taken where it lies within the largest turn (by its sine or cosine),
 // else the heading turns by that much, to the side of the force.
-fn steer(force_x: f32, force_y: f32, influenced: bool, hx: f32, hy: f32, speed: f32) -> Course {
-    let force2 = force_x * force_x + force_y * force_y;
-    let inverse = rsqrt(force2);
-    let ux = force_x * inverse;
-    let uy = force_y * inverse;
+fn steer(pull: Pull, sizes: vec2<f32>, hx: f32, hy: f32, speed: f32) -> Course {
+    let force2 = sizes.x;
+    let inverse = sizes.y;
+    let ux = pull.x * inverse;
+    let uy = pull.y * inverse;
     let along = hx * ux + hy * uy;
     let across = hx * uy - hy * ux;
     let sine = select(0.0 - world.max_turn_sin, world.max_turn_sin, across >= 0.0);
     let turned = rotate(hx, hy, world.max_turn_cos, sine);
-    // A cosine near 1 cannot tell small angles apart, a sine near 1 cannot tell large ones.
-    var reached = along >= world.max_turn_cos;
+    let pulled = force2 > 0.0;
+    // A cosine near 1 cannot tell small angles apart, a sine near 1 cannot tell large ones. Without a force, `along` is 0.
+    var reached = along >= world.max_turn_cos && pulled;
     if world.max_turn_cos > 0.7 {
         reached = along > 0.0 && abs(across) <= world.max_turn_sin;
     }
-    let pulled = force2 > 0.0;
-    let next_x = select(hx, select(turned.x, ux, reached), pulled);
-    let next_y = select(hy, select(turned.y, uy, reached), pulled);
+    let next_x = select(select(hx, turned.x, pulled), ux, reached);
+    let next_y = select(select(hy, turned.y, pulled), uy, reached);
     let ahead = select(world.min_speed, force2 * inverse, along > 0.0);
-    let wanted = select(speed, select(0.0, ahead, pulled), influenced);
+    let wanted = select(speed, select(0.0, ahead, pulled), pull.influenced);
     return Course(next_x, next_y, wanted);
 }

@@ -422,9 +422,18 @@ fn numbers(source: &str, function: &str) -> Vec<f64> {
 
 #[test]
 fn twins_have_the_same_numbers() {
-    for function in
-        ["rsqrt", "root", "rough_rsqrt", "recip", "rough_twice_recip", "limit_tangent", "half_tangent", "whole_tangent", "sin_cos", "ln"]
-    {
+    for function in [
+        "rsqrt",
+        "root",
+        "rough_rsqrt",
+        "recip",
+        "rough_twice_recip",
+        "limit_tangent",
+        "half_tangent",
+        "whole_tangent",
+        "sin_cos",
+        "ln",
+    ] {
         let twin = numbers(WGSL, &format!("{function}("));
         assert!(!twin.is_empty(), "{function}");
         assert_eq!(numbers(RUST, &format!("{function}<")), twin, "{function}");

@@ -60,7 +60,7 @@ fn a_changed_twin_is_named_by_its_stage() {
     let edits: [(&str, Edit); 7] = [
         ("sense", |text| replaced(text, "return 1.0 - root(d2)", "return 1.0000001 - root(d2)")),
         ("policy", |text| replaced(text, "14.7163315", "14.716334")),
-        ("follow", |text| replaced(text, "return push * world.wall_gain", "return push * 1.01 * world.wall_gain")),
+        ("follow", |text| replaced(text, "vec2(push * world.wall_gain", "vec2(push * 1.01 * world.wall_gain")),
         ("move", |text| replaced(text, "let scale = 1.5", "let scale = 1.5000001")),
         ("couple", |text| replaced(text, "d2 <= world.observation_radius2", "d2 <= 0.99 * world.observation_radius2")),
         ("influence", |text| replaced(text, "* task.teams + team] += 1u", "* task.teams + team] += 2u")),

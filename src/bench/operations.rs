@@ -25,9 +25,9 @@ const ROTATE: u32 = 6;
 /// A clamp: minimum and maximum.
 const BOUND: u32 = 2;
 
-/// A leader senses an entity: the range's test and selection, the quadrant's tests (5 on either axis), 2 selections by
-/// the side and 4 by the front, 4 sums; and the density, see [`density`].
-const SENSE: u32 = SQUARED_DISTANCE + ROTATE + 2 + 2 * 5 + 2 + 4 + 4;
+/// A leader senses an entity: the range's test and selection, the quadrant's 4 tests and what joins them (4), 2 selections
+/// by the side and 4 by the front, 4 sums; and the density, see [`density`].
+const SENSE: u32 = SQUARED_DISTANCE + ROTATE + 2 + 4 + 4 + 2 + 4 + 4;
 /// A density is weighed by the share of its kind, 8 times a leader.
 const INPUTS: u32 = 8;
 /// A unit's activation.
@@ -35,15 +35,16 @@ const ACTIVATE: u32 = FLUSH + TANH;
 /// A policy's outputs become a turned heading (scaled, bounded, rotated) and a wanted speed.
 const DECIDE: u32 = 1 + BOUND + SIN_COS + ROTATE + 3;
 
-/// A follower meets an agent within its attraction radius: 2 tests and their difference, 6 selections, 6 sums.
-const INFLUENCE: u32 = SQUARED_DISTANCE + 3 + 6 + 6;
-/// That agent is a leader: counted under a mask.
-const SEEN: u32 = 2;
+/// A follower meets an agent within its attraction radius: 2 tests and their difference, 4 selections, 4 sums, 2
+/// counts.
+const INFLUENCE: u32 = SQUARED_DISTANCE + 3 + 4 + 4 + 2;
+/// That agent is a leader: counted.
+const SEEN: u32 = 1;
 /// A follower's force: 2 means (a reciprocal of a count of at least 1, scaled), and on each axis the two weighed sums
-/// (4), the walls (3 differences, 2 tests, 2 selections, a difference, a gain) and a flush.
-const FORCE: u32 = 2 * (RECIP + 3) + 2 * (4 + 9 + FLUSH);
-/// Whether anything is near: the counts' sum and test, 2 walls on each axis, and joining them.
-const INFLUENCED: u32 = 2 + 2 * 3 + 2;
+/// (4), the walls (3 differences, 2 maxima, a difference, a gain) and a flush.
+const FORCE: u32 = 2 * (RECIP + 3) + 2 * (4 + 7 + FLUSH);
+/// Whether anything is near: the counts' sum and test, the nearest of 4 walls and its test, and joining them.
+const INFLUENCED: u32 = 2 + 3 + 1 + 1;
 /// A follower steers: the force's square and direction (3, an inverse root, 2), along and across (6), the largest turn
 /// to its side (2 and a rotation), whether the force lies within it, 4 selections of the heading, the speed ahead (2)
 /// and 3 selections of the speed, 2 tests of the force.
@@ -162,7 +163,7 @@ mod tests {
         assert_eq!(reach, Reach { sensed_pois: 2.0, ..Reach::default() });
         // 2 POIs sensed; 8 inputs; 10 units of 8 inputs and 2 of 10; the turn and the speed; the move; 2 POIs tested.
         let units = 10.0 * (16.0 + 27.0) + 2.0 * (20.0 + 27.0);
-        assert_eq!(per_team_step(&world, &reach), 2.0 * 47.0 + 8.0 + units + 38.0 + 36.0 + 2.0 * 8.0);
+        assert_eq!(per_team_step(&world, &reach), 2.0 * 45.0 + 8.0 + units + 38.0 + 36.0 + 2.0 * 8.0);
     }
 
     #[test]

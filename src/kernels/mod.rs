@@ -48,9 +48,9 @@ pub fn bound<S: Simd>(x: S::f32s, low: S::f32s, high: S::f32s) -> S::f32s {
     x.max(low).min(high)
 }
 
-/// The world's constants, each in every lane: read from memory by the operation that needs it.
 macro_rules! lanes {
     ($($field:ident)*) => {
+        /// The world's constants, each in every lane: the operation that needs one takes it from memory.
         #[derive(Clone, Copy)]
         pub struct Lanes<S: Simd> {
             pub constants: Constants,
