@@ -205,7 +205,7 @@ struct Block<S: Simd> {
     counts: Vec<S::u32s>,
     /// A bit for each pair of agents that may be in reach in some lane: `[words][agents]`.
     near: Vec<u64>,
-    bounds: Bounds<S>,
+    bounds: Vec<Bounds<S>>,
     /// `[steps][pois][words][lanes]`, and the counts when they are complete, `[followers][leaders][lanes]`.
     sets: Vec<u32>,
     seen: Vec<u32>,
@@ -264,7 +264,7 @@ impl<S: Simd> Block<S> {
             followers: vec![Follower { sums: follow::Sums::new(simd), pull, sizes: (zero, zero) }; followers],
             counts: vec![S::u32s::splat(simd, 0); followers * leaders],
             near: vec![0; agents.div_ceil(64) * agents],
-            bounds: Bounds::new(simd, agents),
+            bounds: vec![Bounds::nowhere(simd); agents.div_ceil(S::f32s::LEN)],
             sets: vec![0; world.set_words() * S::f32s::LEN],
             seen: vec![0; followers * leaders * S::f32s::LEN],
         }
@@ -335,25 +335,36 @@ impl<S: Simd> Block<S> {
     #[inline(always)]
     fn find_near(&mut self) {
         self.near.fill(0);
-        let Block { world, agents, near, .. } = self;
+        let Block { world, agents, near, bounds, .. } = self;
         let (count, leaders) = (agents.len(), world.constants.leaders as usize);
         let drawn = world.constants.attraction_radius2;
         let sensed = world.constants.agent_range2.max(drawn);
         let reach2 = |agent: usize| if agent < leaders { sensed } else { drawn };
         if count > MANY {
-            self.bounds.enclose(agents);
+            let lanes = S::f32s::LEN;
+            for (bounds, agents) in bounds.iter_mut().zip(agents.chunks(lanes)) {
+                bounds.enclose(agents);
+            }
             for (i, agent) in agents.iter().enumerate() {
-                self.bounds.each_within(
-                    i,
-                    reach2(i),
-                    #[inline(always)]
-                    |j| {
-                        if within::<S>(agent, &agents[j], reach2(i)) {
-                            near[j / 64 * count + i] |= 1 << (j % 64);
-                            near[i / 64 * count + j] |= 1 << (i % 64);
-                        }
-                    },
-                );
+                let reach2 = reach2(i);
+                let own = bounds[i / lanes].around(i % lanes, reach2);
+                for (vector, bounds) in bounds.iter().enumerate().skip(i / lanes) {
+                    let first = vector * lanes;
+                    let mut bits = bounds.meet(own);
+                    if first <= i {
+                        bits &= u64::MAX << (i - first) << 1;
+                    }
+                    let mut row = 0;
+                    while bits != 0 {
+                        let j = first + bits.trailing_zeros() as usize;
+                        // Without a branch: of those whose boxes are near, the processor cannot guess who is.
+                        let within = u64::from(within::<S>(agent, &agents[j], reach2));
+                        row |= within << (j % 64);
+                        near[i / 64 * count + j] |= within << (i % 64);
+                        bits &= bits - 1;
+                    }
+                    near[first / 64 * count + i] |= row;
+                }
             }
         } else {
             let near = &mut near[..count];
@@ -659,55 +670,52 @@ fn within<S: Simd>(agent: &Agent<S>, other: &Agent<S>, reach2: f32) -> bool {
     (dx * dx + dy * dy).simd_le(reach2).any_true()
 }
 
-/// The box around each agent's places in all lanes, an agent a lane.
+/// The boxes around some agents' places in all lanes, an agent a lane.
+#[derive(Clone, Copy)]
 struct Bounds<S: Simd> {
-    low_x: Vec<S::f32s>,
-    high_x: Vec<S::f32s>,
-    low_y: Vec<S::f32s>,
-    high_y: Vec<S::f32s>,
+    low_x: S::f32s,
+    high_x: S::f32s,
+    low_y: S::f32s,
+    high_y: S::f32s,
 }
 
 impl<S: Simd> Bounds<S> {
-    fn new(simd: S, agents: usize) -> Bounds<S> {
-        // Lanes left over hold boxes that nothing is near.
-        let vectors = agents.div_ceil(S::f32s::LEN);
-        let (low, high) = (vec![splat(simd, f32::INFINITY); vectors], vec![splat(simd, f32::NEG_INFINITY); vectors]);
-        Bounds { low_x: low.clone(), high_x: high.clone(), low_y: low, high_y: high }
+    /// Boxes that nothing is near, as lanes left over hold.
+    fn nowhere(simd: S) -> Bounds<S> {
+        let (low, high) = (splat(simd, f32::INFINITY), splat(simd, f32::NEG_INFINITY));
+        Bounds { low_x: low, high_x: high, low_y: low, high_y: high }
     }
 
     #[inline(always)]
     fn enclose(&mut self, agents: &[Agent<S>]) {
-        for (vector, agents) in agents.chunks(S::f32s::LEN).enumerate() {
-            for (lane, agent) in agents.iter().enumerate() {
-                self.low_x[vector][lane] = agent.x.reduce_min();
-                self.high_x[vector][lane] = agent.x.reduce_max();
-                self.low_y[vector][lane] = agent.y.reduce_min();
-                self.high_y[vector][lane] = agent.y.reduce_max();
-            }
+        for (lane, agent) in agents.iter().enumerate() {
+            self.low_x[lane] = agent.x.reduce_min();
+            self.high_x[lane] = agent.x.reduce_max();
+            self.low_y[lane] = agent.y.reduce_min();
+            self.high_y[lane] = agent.y.reduce_max();
         }
     }
 
-    /// Calls `f` with every later agent whose box is within reach of this one's, and perhaps some more.
+    /// One agent's box in every lane, widened by its reach.
     #[inline(always)]
-    fn each_within(&self, agent: usize, reach2: f32, mut f: impl FnMut(usize)) {
+    fn around(&self, lane: usize, reach2: f32) -> Bounds<S> {
+        let simd = self.low_x.token();
         // No pair may be lost to a rounding.
         let reach = reach2.sqrt() * 1.001;
-        let lanes = S::f32s::LEN;
-        let (own, lane) = (agent / lanes, agent % lanes);
-        let (low_x, high_x) = (self.low_x[own][lane] - reach, self.high_x[own][lane] + reach);
-        let (low_y, high_y) = (self.low_y[own][lane] - reach, self.high_y[own][lane] + reach);
-        for vector in own..self.low_x.len() {
-            let near_x = self.low_x[vector].simd_le(high_x) & self.high_x[vector].simd_ge(low_x);
-            let near_y = self.low_y[vector].simd_le(high_y) & self.high_y[vector].simd_ge(low_y);
-            let mut bits = (near_x & near_y).to_bitmask();
-            if vector == own {
-                bits &= u64::MAX << lane << 1;
-            }
-            while bits != 0 {
-                f(vector * lanes + bits.trailing_zeros() as usize);
-                bits &= bits - 1;
-            }
+        Bounds {
+            low_x: splat(simd, self.low_x[lane] - reach),
+            high_x: splat(simd, self.high_x[lane] + reach),
+            low_y: splat(simd, self.low_y[lane] - reach),
+            high_y: splat(simd, self.high_y[lane] + reach),
         }
+    }
+
+    /// A bit for each agent whose box meets this one.
+    #[inline(always)]
+    fn meet(&self, other: Bounds<S>) -> u64 {
+        let near_x = self.low_x.simd_le(other.high_x) & self.high_x.simd_ge(other.low_x);
+        let near_y = self.low_y.simd_le(other.high_y) & self.high_y.simd_ge(other.low_y);
+        (near_x & near_y).to_bitmask()
     }
 }
 
