@@ -66,7 +66,9 @@ fn lead(task: Task, me: ptr<function, Agent>) {
     var sums = array<f32, 4>(0.0, 0.0, 0.0, 0.0);
     for (var poi = 0u; poi < world.pois; poi++) {
         let place = places[task.pois + poi];
-        sense(world.poi_range2, place.x - x, place.y - y, hx, hy, &sums);
+        let dx = place.x - x;
+        let dy = place.y - y;
+        sense(density(world.poi_range2, dx, dy), dx, dy, hx, hy, &sums);
     }
     for (var quadrant = 0u; quadrant < 4u; quadrant++) {
         inputs[quadrant] = sums[quadrant] * world.poi_share;
@@ -75,7 +77,9 @@ fn lead(task: Task, me: ptr<function, Agent>) {
     for (var other = 0u; other < agents; other++) {
         let place = positions[team * agents + other];
         if other != leader {
-            sense(world.agent_range2, place.x - x, place.y - y, hx, hy, &sums);
+            let dx = place.x - x;
+            let dy = place.y - y;
+            sense(density(world.agent_range2, dx, dy), dx, dy, hx, hy, &sums);
         }
     }
     for (var quadrant = 0u; quadrant < 4u; quadrant++) {

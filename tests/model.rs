@@ -7,8 +7,9 @@
 
 use std::f64::consts::PI;
 
-use flotilla::backend::cpu::Cpu;
+use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group, Moment, Trace};
+use flotilla::bench::with_agents;
 use flotilla::config::{Config, Coupling, Density, Paradigm};
 use flotilla::sample;
 use flotilla::world::World;
@@ -471,6 +472,26 @@ fn kernels_follow_the_mission() {
     assert!(wrong.is_empty(), "{} differences, the first:\n{}", wrong.len(), wrong[..wrong.len().min(10)].join("\n"));
     assert!(agent_steps >= 1_000_000, "{agent_steps} agent-steps");
     assert!(borderline * 1000 < agent_steps, "{borderline} of {agent_steps} agent-steps are borderline");
+}
+
+/// So do crowds, whose pairs are found by bounds: of just more than 32 agents, and around the ends of words and vectors.
+#[test]
+fn crowds_follow_the_mission() {
+    let layout = Config::parse(include_str!("../configs/generally_forward.toml"), "generally_forward.toml").unwrap();
+    for agents in [33, 63, 64, 65, 127, 130] {
+        let mut config = with_agents(&layout, agents).unwrap();
+        config.world.steps = 8;
+        for agent_range in [4.0, f64::INFINITY] {
+            config.sense.agent_range = agent_range;
+            for level in Cpu::levels() {
+                let tally = check(&mut Cpu::at_level(level), &config, &Model::new(&config), agents as u64);
+                let Tally { agent_steps, borderline, wrong, .. } = tally;
+                let crowd = format!("{agents} agents, range {agent_range}, {}", level_name(level));
+                assert!(wrong.is_empty(), "{crowd}: {} differences, the first: {}", wrong.len(), wrong[0]);
+                assert!(borderline * 20 < agent_steps, "{crowd}: {borderline} of {agent_steps} are borderline");
+            }
+        }
+    }
 }
 
 /// The comparison can fail: a model with one constant changed by a thousandth, or one rule changed, is told apart.

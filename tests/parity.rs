@@ -58,7 +58,7 @@ fn checked_shaders_and_default_limits_agree() {
 fn a_changed_twin_is_named_by_its_stage() {
     type Edit = fn(String) -> String;
     let edits: [(&str, Edit); 7] = [
-        ("sense", |text| replaced(text, "return 1.0 - root(d2)", "return 1.0000001 - root(d2)")),
+        ("sense", |text| replaced(text, "density = 1.0 - root(d2)", "density = 1.0000001 - root(d2)")),
         ("policy", |text| replaced(text, "14.7163315", "14.716334")),
         ("follow", |text| replaced(text, "vec2(push * world.wall_gain", "vec2(push * 1.01 * world.wall_gain")),
         ("move", |text| replaced(text, "let scale = 1.5", "let scale = 1.5000001")),

@@ -719,7 +719,7 @@ impl<S: Simd> Bounds<S> {
     }
 }
 
-/// Agents from which on pairs are first looked for by their bounds.
+/// Pairs of more agents than this are first looked for by their bounds.
 const MANY: usize = 32;
 
 /// Calls `f` with each agent that may be in reach of this one, and its index, ascending.

@@ -51,13 +51,16 @@ pub fn run(args: Args) -> Result<(), Error> {
     };
     disk.create_folder(&out).map_err(failed(&out))?;
     let learning = arms[0].config.learning.clone();
+    let (configs, places) = paper::trained(&arms);
     if !quiet {
-        let trials = learning.trials;
-        say(format_args!("training {} experiments of {trials} trials each on {}", arms.len(), backend.describe()));
+        let (count, different, trials) = (arms.len(), configs.len(), learning.trials);
+        let on = backend.describe();
+        say(format_args!(
+            "training {count} experiments, {different} of them different, of {trials} trials each on {on}"
+        ));
     }
 
     let since = Instant::now();
-    let (configs, places) = paper::trained(&arms);
     let plan = memory::Plan::of(&configs, rayon::current_num_threads());
     plan.check(machine.backend == "gpu").map_err(RunError::from)?;
     let mut trainer = Trainer::new(configs);
