@@ -118,8 +118,8 @@ impl World {
             max_speed: motion.max_speed as f32,
             max_speed_change: (motion.max_acceleration * world.dt) as f32,
             max_turn: turn as f32,
-            max_turn_cos: if any_turn { -2.0 } else { turn.cos() as f32 },
-            max_turn_sin: if any_turn { 0.0 } else { turn.sin() as f32 },
+            max_turn_cos: if any_turn { -2.0 } else { libm::cos(turn) as f32 },
+            max_turn_sin: if any_turn { 0.0 } else { libm::sin(turn) as f32 },
             observation_radius2: squared(world.observation_radius),
             attraction_radius2: squared(follow.attraction_radius),
             repulsion_radius2: squared(follow.repulsion_radius),
@@ -184,7 +184,9 @@ pub fn on_grid(place: Vec2, map: Vec2) -> Vec2 {
 }
 
 /// The unit vector of an angle; a component under 1e-6 in size is 0, so that layouts full of exact ties keep them.
+///
+/// Sines and cosines here are [`libm`]'s: those of the platform may differ in the last bit from one system to another.
 fn unit(angle: f64) -> (f32, f32) {
     let tidy = |component: f64| if component.abs() < 1e-6 { 0.0 } else { component as f32 };
-    (tidy(angle.cos()), tidy(angle.sin()))
+    (tidy(libm::cos(angle)), tidy(libm::sin(angle)))
 }

@@ -127,6 +127,25 @@ fn a_foreign_operation_inside_a_function_and_a_loop_is_found() {
     assert_eq!(exact::foreign_operations(&module), ["deep: float Divide"]);
 }
 
+/// Functions that Rust takes from the platform's mathematical library, which rounds them as it likes.
+#[test]
+fn nothing_that_decides_results_asks_the_platform() {
+    const PLATFORM: [&str; 20] = [
+        "sin", "cos", "tan", "sin_cos", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2",
+        "exp_m1", "ln", "ln_1p", "log2", "log10", "powf", "cbrt",
+    ];
+    let decides = ["backend", "kernels"].map(|folder| files(&Path::new("src").join(folder))).concat();
+    let single = ["world", "credit", "evolve", "trainer"].map(|name| PathBuf::from(format!("src/{name}.rs")));
+    for path in decides.into_iter().chain(single) {
+        let text = std::fs::read_to_string(&path).unwrap();
+        for name in PLATFORM {
+            for call in [format!(".{name}("), format!("f32::{name}("), format!("f64::{name}(")] {
+                assert!(!text.contains(&call), "{}: {call}…) is the platform's, take libm's", path.display());
+            }
+        }
+    }
+}
+
 #[test]
 fn every_float_result_is_decorated() {
     for (name, text) in shaders() {
