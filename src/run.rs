@@ -268,10 +268,12 @@ impl Session {
                     options.save.store(!stop, Relaxed);
                     setback = Some(error);
                 }
-                saved => saved?,
-            }
-            if stop && setback.is_none() {
-                return Ok(Outcome::Stopped);
+                saved => {
+                    saved?;
+                    if stop {
+                        return Ok(Outcome::Stopped);
+                    }
+                }
             }
         }
         tell(setback);

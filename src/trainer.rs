@@ -305,7 +305,8 @@ impl Trainer {
         }
         arm.held.clear();
         arm.offered = false;
-        for (trial, ((weights, fitness), pending)) in arm.trials.iter_mut().zip(weights.into_iter().zip(fitness).zip(pending))
+        for (trial, ((weights, fitness), pending)) in
+            arm.trials.iter_mut().zip(weights.into_iter().zip(fitness).zip(pending))
         {
             (trial.weights, trial.fitness) = (weights, fitness);
             trial.pending = pending.map(|row| Row { arm: index, ..row });
@@ -361,7 +362,16 @@ impl Arm {
     fn new(config: Config, trials: Range<usize>, level: Level) -> Arm {
         let world = World::new(&config);
         let trials = trials.into_par_iter().map(|index| Trial::new(&config, &world, index, level));
-        Arm { trials: trials.collect(), world, config, generation: 0, age: 0, host_age: 0, held: vec![], offered: false }
+        Arm {
+            trials: trials.collect(),
+            world,
+            config,
+            generation: 0,
+            age: 0,
+            host_age: 0,
+            held: vec![],
+            offered: false,
+        }
     }
 
     /// The last generation.

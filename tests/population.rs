@@ -202,7 +202,8 @@ fn arms_of_different_ages_train_side_by_side() {
             assert_eq!(policies(&trainer), expected.policies, "from {from:?}, lost at {nth:?}");
             for (arm, &from) in from.iter().enumerate() {
                 let of_arm = |rows: &[Row]| rows.iter().filter(|row| row.arm == arm).copied().collect::<Vec<_>>();
-                let due = of_arm(&expected.rows).into_iter().filter(|row| row.generation + 1 >= from).collect::<Vec<_>>();
+                let due =
+                    of_arm(&expected.rows).into_iter().filter(|row| row.generation + 1 >= from).collect::<Vec<_>>();
                 assert_eq!(of_arm(&rows), due, "arm {arm} from {from}, lost at {nth:?}");
             }
         }

@@ -170,6 +170,178 @@ fn a_run_that_is_done_is_not_run_again() {
     }
 }
 
+/// The same config for so many generations.
+fn of_length(config: &Config, generations: usize) -> Config {
+    let mut config = config.clone();
+    config.learning.generations = generations;
+    config
+}
+
+#[test]
+fn a_run_of_any_length_is_extended_to_the_same_results() {
+    let config = small();
+    let expected = reference(&config);
+    // Checkpoints of its own, or none but the one that it ends with.
+    for every in [0, 1, 4] {
+        for length in 1..config.learning.generations {
+            let mut short = of_length(&config, length);
+            short.checkpoint.generations = every;
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("run");
+            session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+            let (results, told) = resume(&config, &path);
+            assert_eq!(told.start, length + 1, "{:?}", told.notes);
+            assert_eq!((results, what_came_out(&path)), expected, "from {length} generations");
+            assert_eq!(fs::read_to_string(path.join("config.toml")).unwrap(), config.to_toml());
+            // And it is done.
+            assert_eq!(resume(&config, &path).1.reached, 0);
+        }
+    }
+}
+
+#[test]
+fn a_run_is_extended_from_whatever_is_left_of_it() {
+    let config = small();
+    let expected = reference(&config);
+    let short = of_length(&config, 7);
+    let run = || {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run");
+        session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+        let checkpoints = path.join("checkpoints");
+        assert_eq!(checkpoint::list(&checkpoints).unwrap(), [7, 8]);
+        (folder, path, [7, 8].map(|generation| checkpoint::path(&checkpoints, generation)))
+    };
+    let goes_on = |path: &Path, start: usize| {
+        let (results, told) = resume(&config, path);
+        assert_eq!(told.start, start, "{:?}", told.notes);
+        assert_eq!((results, what_came_out(path)), expected);
+    };
+    // As runs of earlier versions are, which left nothing at their end.
+    let (_folder, path, [_, end]) = run();
+    fs::remove_file(&end).unwrap();
+    goes_on(&path, 7);
+    let (_folder, path, ends) = run();
+    ends.iter().for_each(|end| fs::remove_file(end).unwrap());
+    goes_on(&path, 0);
+    // Its policies are another run's, or damaged, or gone.
+    let other = of_length(&config, 6);
+    let other_folder = tempfile::tempdir().unwrap();
+    session(&other, other_folder.path(), Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+    let others = fs::read(other_folder.path().join(POLICIES)).unwrap();
+    for (damage, policies) in [Some(others), Some(b"none".to_vec()), None].iter().enumerate() {
+        let (_folder, path, _) = run();
+        match policies {
+            Some(bytes) => fs::write(path.join(POLICIES), bytes).unwrap(),
+            None => fs::remove_file(path.join(POLICIES)).unwrap(),
+        }
+        let (results, told) = resume(&config, &path);
+        assert_eq!((told.start, told.notes.len()), (7, 1), "{damage}: {:?}", told.notes);
+        assert_eq!((results, what_came_out(&path)), expected);
+    }
+    // A checkpoint from after the last generation that has its weights.
+    let stopped = tempfile::tempdir().unwrap();
+    session(&short, stopped.path(), Start::Fresh, Disk::default(), cpu(), Some(8)).end.unwrap();
+    goes_on(stopped.path(), 8);
+
+    // It cannot become shorter, and what is refused is left as it is.
+    let (_folder, path, _) = run();
+    let whole = what_came_out(&path);
+    let told = session(&of_length(&config, 6), &path, Start::Resume, Disk::default(), cpu(), None);
+    let error = told.end.unwrap_err().to_string();
+    assert!(error.contains("is a run of 7 generations, which cannot become one of 6"), "{error}");
+    assert_eq!(what_came_out(&path), whole);
+    // Nor does anything else change with its length.
+    let mut other = config.clone();
+    other.learning.seed = 3;
+    let error = session(&other, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err().to_string();
+    assert!(
+        error.contains("learning.seed: 0 there, 3 here") && error.contains("learning.generations: 7 there"),
+        "{error}"
+    );
+}
+
+/// Every operation of an extension fails once, alone or with all after it.
+#[test]
+fn no_failing_disk_operation_costs_an_extension() {
+    let config = of_length(&small(), 9);
+    let mut short = of_length(&config, 5);
+    short.checkpoint.generations = 3;
+    let expected = reference(&config);
+    let attempt = |fails: Box<dyn Fn(usize) -> bool + Send + Sync>| {
+        let folder = in_memory();
+        let path = folder.path().join("run");
+        session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+        let count = Arc::new(AtomicUsize::new(0));
+        let disk = Disk::failing({
+            let count = count.clone();
+            move |_, _| match fails(count.fetch_add(1, SeqCst)) {
+                true => Err(io::Error::from(io::ErrorKind::StorageFull)),
+                false => Ok(()),
+            }
+        });
+        let mut rare = config.clone();
+        rare.checkpoint.generations = 0;
+        let told = session(&rare, &path, Start::Resume, disk, cpu(), None);
+        (folder, path, told, count.load(SeqCst))
+    };
+    let (_, _, told, operations) = attempt(Box::new(|_| false));
+    assert_eq!(told.results, Some(expected.0.clone()));
+    assert!(operations > 20, "{operations}");
+    for at in 0..operations {
+        for all_after in [false, true] {
+            let (_folder, path, _, _) =
+                attempt(Box::new(move |operation| operation == at || all_after && operation > at));
+            let (results, again) = resume(&config, &path);
+            assert_eq!((results, what_came_out(&path)), expected, "operation {at}");
+            assert!(again.notes.len() <= 1, "operation {at}: {:?}", again.notes);
+            // It goes on from the end of the run that was extended, or is over.
+            assert!(again.start >= 6 || again.reached == 0, "operation {at}: {:?}", again.notes);
+            assert_eq!(leftovers(&path), Vec::<PathBuf>::new(), "operation {at}");
+        }
+    }
+}
+
+/// Runs of different lengths, sizes and ages, driven together, come to what each comes to alone.
+#[test]
+fn runs_side_by_side_come_to_what_they_come_to_alone() {
+    let mut configs = [small(), of_length(&small(), 5), of_length(&small(), 9), small()];
+    configs[2].learning.population = 9;
+    configs[3].learning.seed = 4;
+    configs[3].checkpoint.generations = 0;
+    let expected: Vec<_> = configs.iter().map(reference).collect();
+    let folder = tempfile::tempdir().unwrap();
+    let path = |run: usize| folder.path().join(run.to_string());
+    // One has come far, one is done, the others have not started.
+    session(&configs[0], &path(0), Start::Fresh, Disk::default(), cpu(), Some(11)).end.unwrap();
+    session(&configs[1], &path(1), Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+    let open = || {
+        let runs = configs.iter().enumerate().map(|(run, config)| (config.clone(), path(run))).collect();
+        Session::open(runs, Start::Resume, &Disk::default()).unwrap()
+    };
+    let (mut session, notes) = open();
+    assert_eq!(session.generations(), [11, 7, 0, 0]);
+    assert_eq!(notes.iter().map(|(run, _)| *run).collect::<Vec<_>>(), [0, 2, 3]);
+    let stopped = train(&mut session, cpu(), &mut |_| None, &mut |next| next[2] >= 3);
+    assert_eq!((stopped.unwrap(), session.generations()), (Outcome::Stopped, &[14, 7, 3, 3][..]));
+    drop(session);
+    let (mut session, _) = open();
+    let done = train(&mut session, cpu(), &mut |_| None, &mut |_| false);
+    assert_eq!((done.unwrap(), session.generations()), (Outcome::Done, &[16, 7, 11, 16][..]));
+    for (run, expected) in expected.iter().enumerate() {
+        assert_eq!(
+            (session.results(run), what_came_out(&path(run))),
+            (Some(&expected.0), expected.1.clone()),
+            "run {run}"
+        );
+    }
+    // Where one of the folders cannot be taken, none is touched.
+    drop(session);
+    let runs = [(configs[0].clone(), folder.path().join("new")), (configs[1].clone(), path(1))];
+    assert!(Session::open(runs.to_vec(), Start::Fresh, &Disk::default()).is_err());
+    assert!(!folder.path().join("new").exists());
+}
+
 /// Every operation of a run fails once, alone or with all after it; a write that fails leaves its first half.
 #[test]
 fn no_failing_disk_operation_costs_a_run() {
@@ -526,11 +698,15 @@ fn a_killed_run_goes_on_to_the_same_results() {
     while killed < kills {
         let out = folder.path().join(format!("run-{runs}"));
         runs += 1;
+        // Every other run is at first a shorter one, which comes to its end.
+        let mut lengths = if runs % 2 == 0 { vec!["60"] } else { vec!["60", "25"] };
         loop {
             let recorded = generations_recorded(&out);
             // Another number of threads each time.
             let threads = (1 + random.random_range(0..3)).to_string();
-            let mut child = flotilla_train(&file, &out, &["--resume", "--threads", &threads]).spawn().unwrap();
+            let length = lengths.last().expect("there is one to go");
+            let flags = ["--resume", "--threads", &threads, "--generations", length];
+            let mut child = flotilla_train(&file, &out, &flags).spawn().unwrap();
             let moment = Instant::now() + Duration::from_micros(random.random_range(0..150_000));
             let over = loop {
                 match child.try_wait().unwrap() {
@@ -559,7 +735,10 @@ fn a_killed_run_goes_on_to_the_same_results() {
                 }
                 Some(status) => {
                     assert_eq!(status.code(), Some(0), "{told}");
-                    break;
+                    lengths.pop();
+                    if lengths.is_empty() {
+                        break;
+                    }
                 }
             }
         }
@@ -642,6 +821,7 @@ mod unix {
             let (status, told) = ended(child);
             assert_eq!(status.code(), Some(75), "{told}");
             let (_, command) = told.split_once("go on with\n  flotilla ").expect(&told);
+            assert!(told.starts_with("stopped: before generation") && command.contains("--backend cpu"), "{told}");
             let again = flotilla().args(command.split_whitespace()).output().unwrap();
             assert_eq!(again.status.code(), Some(0), "{}", stderr(&again));
             assert!(stderr(&again).contains("going on before generation"), "{}", stderr(&again));
@@ -712,6 +892,10 @@ mod unix {
     fn a_folder_that_cannot_be_is_told() {
         let folder = tempfile::tempdir().unwrap();
         let file = config_file(folder.path(), SMALL);
+        let output = flotilla_train(&file, &file, &[]).output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        let told = stderr(&output);
+        assert!(told.starts_with("error: ") && told.contains("is a file; choose a folder"), "{told}");
         // A file stands where the folder should be.
         let output = flotilla_train(&file, &file.join("run"), &[]).output().unwrap();
         assert_eq!(output.status.code(), Some(1));

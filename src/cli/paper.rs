@@ -95,7 +95,8 @@ pub fn run(args: Args) -> Result<(), Error> {
 
     let folders: Vec<PathBuf> = arms.iter().map(|arm| out.join(ARMS).join(arm_name(arm))).collect();
     // The first arm of each training is trained, the others are the same.
-    let trained: Vec<usize> = (0..configs.len()).filter_map(|place| places.iter().position(|at| *at == place)).collect();
+    let trained: Vec<usize> =
+        (0..configs.len()).filter_map(|place| places.iter().position(|at| *at == place)).collect();
     let runs: Vec<_> = configs.iter().cloned().zip(trained.iter().map(|&arm| folders[arm].clone())).collect();
     let signals = Signals::listen()?;
     let (mut session, notes) = Session::open(runs, start, &disk)?;

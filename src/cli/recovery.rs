@@ -94,17 +94,16 @@ pub fn quoted(path: &Path) -> String {
     shell::quoted(&path.display().to_string())
 }
 
-/// Most bytes of a command line that are kept.
+/// Most characters of a command line that are kept.
 const MOST: usize = 1 << 13;
 
 /// What was typed, as a shell reads it.
 pub fn typed() -> String {
-    let mut line = shell::command(std::env::args_os().map(|word| word.to_string_lossy().into_owned()));
-    if line.len() > MOST {
-        line.truncate(line.floor_char_boundary(MOST));
-        line += " …";
+    let line = shell::command(std::env::args_os().map(|word| word.to_string_lossy().into_owned()));
+    match line.char_indices().nth(MOST) {
+        Some((end, _)) => format!("{} …", &line[..end]),
+        None => line,
     }
-    line
 }
 
 /// Signals that ask for something.

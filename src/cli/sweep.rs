@@ -144,7 +144,8 @@ impl Args {
 
     /// The command that does this sweep again, without what differs from process to process.
     fn words(&self, sweep: &Path, out: &Path) -> Vec<String> {
-        let mut words = ["sweep".into(), sweep.display().to_string(), "--out".into(), out.display().to_string()].to_vec();
+        let mut words =
+            ["sweep".into(), sweep.display().to_string(), "--out".into(), out.display().to_string()].to_vec();
         words.extend(recovery::words_of(&self.overrides.list()));
         words.extend(recovery::words_of_machine(&self.run, self.loss));
         words.extend(self.memory.into_iter().flat_map(|gib| ["--memory".into(), gib.to_string()]));
@@ -323,7 +324,9 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
             let mut more: Vec<&str> = shard.iter().flat_map(|shard| ["--shard", shard]).collect();
             let (every, reach, axes) = (args.every.to_string(), args.reach.to_string(), args.axes.join(","));
             if shard.is_none() {
-                for (flag, value, default) in [("--every", &every, "1"), ("--reach", &reach, "0.75"), ("--axes", &axes, "")] {
+                for (flag, value, default) in
+                    [("--every", &every, "1"), ("--reach", &reach, "0.75"), ("--axes", &axes, "")]
+                {
                     if value != default {
                         more.extend([flag, value]);
                     }
@@ -401,7 +404,8 @@ fn as_json(
 ) -> serde_json::Value {
     let path = |name: &str| out.join(name).display().to_string();
     let point = |(point, outcome): (&Point, &Result<Outcome, Missing>)| {
-        let values = sweep.axes.iter().zip(&point.values).map(|(axis, &value)| (axis.key.clone(), json!(axis.values[value])));
+        let values =
+            sweep.axes.iter().zip(&point.values).map(|(axis, &value)| (axis.key.clone(), json!(axis.values[value])));
         let folder = results::point_folder(out, point);
         let mut told = json!({
             "point": point.index,

@@ -104,7 +104,8 @@ pub fn run(args: Args) -> Result<(), Error> {
         say(note);
     }
     let path = folder.join(TENSORBOARD);
-    let events_failed = |error| say(format_args!("{}: cannot be written: {error}; there are no event files", path.display()));
+    let events_failed =
+        |error| say(format_args!("{}: cannot be written: {error}; there are no event files", path.display()));
     let events = || Events::create(&path, config.learning.trials, &folder.join(METRICS)).map_err(events_failed).ok();
     let mut events = args.tensorboard.then(events).flatten();
     let told = Told { config: &config, name: args.config.name(), folder: &folder, runs_on: &runs_on };
@@ -183,15 +184,16 @@ impl Told<'_> {
     /// Prints what a run came to; `trained` is none where it was done already.
     fn print(&self, session: &Session, trained: Option<Trained>, json: bool) -> Result<(), Error> {
         let results = session.results(0).expect("the run is done");
+        let done_already = trained.is_none();
         let (generations, seconds) =
             trained.map_or((0, 0.0), |trained| (trained.generations, trained.since.elapsed().as_secs_f64()));
         if json {
             return print(&format!("{}\n", self.json(results, generations, seconds)));
         }
         let learning = &self.config.learning;
-        let trained = match generations {
-            0 => "This run was done already".into(),
-            _ => format!(
+        let trained = match done_already {
+            true => "This run was done already".into(),
+            false => format!(
                 "Trained {} trials of {} teams, {} generations, in {seconds:.1} s ({:.1} generations/s) on {}",
                 learning.trials,
                 learning.population,

@@ -67,7 +67,10 @@ pub fn read(path: &Path, config: &Config, trial: Option<usize>) -> Result<Polici
 pub fn read_all(path: &Path, config: &Config) -> Result<Vec<Vec<f32>>, RecordError> {
     let mut file = tensors::open(path)?;
     let trial = |trial| Ok(from_file(&mut file, config, Some(trial))?.weights);
-    (0..config.learning.trials).map(trial).collect::<Result<_, String>>().map_err(|reason| RecordError::damaged(path, reason))
+    (0..config.learning.trials)
+        .map(trial)
+        .collect::<Result<_, String>>()
+        .map_err(|reason| RecordError::damaged(path, reason))
 }
 
 /// [`read`], from anything.

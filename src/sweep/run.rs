@@ -79,12 +79,7 @@ pub fn batches<'a>(points: &'a [&'a Point], memory: usize) -> Vec<&'a [&'a Point
 ///
 /// # Errors
 /// A folder cannot be used or written, there is too little memory, or the backend fails; what came before is saved.
-pub fn run(
-    points: &[&Point],
-    out: &Path,
-    player: &mut Player,
-    options: &mut Options<'_>,
-) -> Result<Outcome, RunError> {
+pub fn run(points: &[&Point], out: &Path, player: &mut Player, options: &mut Options<'_>) -> Result<Outcome, RunError> {
     let total = points.iter().map(|point| team_steps(&point.config)).sum();
     let mut progress = Progress { done: 0, points: points.len(), batch: 0, generation: 0, last: 0, played: 0, total };
     for batch in batches(points, options.memory) {
