@@ -17,7 +17,7 @@
 //! 6. [`evolve`] selects and mutates, or has a GPU that holds the populations do the latter; [`run`] keeps what came out
 //!    by [`record`]; [`report`] draws it.
 //!
-//! Around that: [`run`] keeps a trainer, its folder and its checkpoints together, [`sweep`] makes many runs of a grid,
+//! Around that: [`run`] keeps a trainer and its runs' folders and checkpoints together, [`sweep`] makes many runs of a grid,
 //! [`memory`] tells what a run will take, [`verify`] compares two backends on the random worlds of [`sample`], [`mod@bench`]
 //! times a backend against what the machine can do at most, and [`cli`] turns what was typed into all this.
 //!
@@ -36,6 +36,7 @@ pub mod record;
 pub mod report;
 pub mod run;
 pub mod sample;
+pub mod shell;
 pub mod sweep;
 pub mod trainer;
 pub mod verify;

@@ -3,7 +3,7 @@
 //! Every array that grows with the run is counted as it is laid out where it lives: [`crate::trainer`] for what every
 //! run has, [`crate::backend::cpu`] and [`crate::backend::gpu::episode`] for what episodes take. What does not grow is
 //! [`PROGRAM`]. Nothing else is as large: checkpoints and policies are written straight from the populations, or from
-//! one copy, see [`copies_checkpoint`]. A sweep always copies, and keeps its batches to half of what is available.
+//! one copy, see [`copies_checkpoint`]. A sweep keeps its batches to half of what is available.
 
 use std::fs;
 use std::path::Path;

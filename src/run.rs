@@ -1,22 +1,26 @@
-//! One recorded run: a trainer, its folder and its checkpoints together.
+//! Recorded runs, side by side: one trainer, and for each run its folder and its checkpoints. One run is a batch of one.
 
-use std::path::Path;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use crate::backend::{Backend, BackendError};
-use crate::config::Config;
+use crate::config::{self, Config};
 use crate::memory::{self, TooLittle};
 use crate::record::RecordError;
-use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule};
+use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule, Snapshot};
 use crate::record::disk::Disk;
-use crate::record::folder::{self, Folder, METRICS, POLICIES, Run, Start, State, Story};
-use crate::record::metrics::{self, Row};
+use crate::record::folder::{self, Folder, METRICS, Note, POLICIES, Run, Start, State, Story};
+use crate::record::metrics::{self, Mark, Row};
 use crate::record::policies;
 use crate::trainer::{SnapshotError, Trainer};
 
-/// How often a run hands its metrics to the system.
+/// How often runs hand their metrics to the system.
 const FLUSH: Duration = Duration::from_secs(1);
+/// Most runs that have files flushed to the disk at a time, each by a thread of its own.
+const MAX_WRITERS: usize = 32;
+/// The commit that this program was built from.
+const COMMIT: Option<&str> = option_env!("FLOTILLA_COMMIT");
 
 /// Why a run could not go on.
 #[derive(Debug, thiserror::Error)]
@@ -68,24 +72,27 @@ pub struct Machine {
 /// A backend and what it is.
 pub type Player = (Box<dyn Backend>, Machine);
 
-/// What others may want of a run while it runs.
+/// What others may want of runs while they run.
 pub struct Options<'a> {
-    pub schedule: Schedule,
-    /// Set by whoever wants the run to finish its generation, save and stop.
+    /// What was typed to start this, for `run.json`.
+    pub command: &'a str,
+    /// Set by whoever wants the runs to finish their generation, save and stop.
     pub stop: &'a AtomicBool,
-    /// Set by whoever wants a checkpoint now.
+    /// Set by whoever wants a checkpoint of each now.
     pub save: &'a AtomicBool,
     /// Asked for another backend when one fails.
     pub instead: &'a mut dyn FnMut(&BackendError) -> Option<Player>,
+    /// Told once of an error of a backend that held populations, where it was made up for: they are the host's then.
+    pub setback: &'a mut dyn FnMut(&BackendError),
     /// Told of every generation played.
     pub watch: &'a mut dyn FnMut(&Progress<'_>),
 }
 
 /// A generation just played.
 pub struct Progress<'a> {
-    /// The generation that plays next.
-    pub generation: usize,
-    /// Rows that became complete.
+    /// The generation that each run plays next, two past its last when it is done.
+    pub generations: &'a [usize],
+    /// Rows that became complete, by run (their arm), generation and trial.
     pub rows: &'a [Row],
 }
 
@@ -97,193 +104,437 @@ pub struct Results {
     pub digest: String,
 }
 
-/// How a run ended.
-#[derive(Clone, Debug, PartialEq)]
+/// How a session ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outcome {
-    Done(Results),
-    /// Saved before this generation.
-    Stopped {
-        generation: usize,
-    },
+    Done,
+    /// Everything is saved.
+    Stopped,
 }
 
-/// A run that was found or made.
-pub enum Opened {
-    /// It has something left to do.
-    Ready(Box<Session>),
-    /// It was done already.
-    Done(Results),
-}
-
-/// A run in its folder, whose lock is the last to go.
+/// Runs in their folders, whose locks are the last to go.
 pub struct Session {
-    config: Config,
+    members: Vec<Member>,
+    /// See [`Progress::generations`].
+    generations: Vec<usize>,
     trainer: Trainer,
-    metrics: metrics::Writer,
-    keeper: Keeper,
-    folder: Folder,
-    run: Run,
-    /// Time trained in earlier sessions, and the start of this.
-    before: f64,
+    /// The run of each of the trainer's arms: those that had something left to do.
+    arms: Vec<usize>,
     since: Instant,
 }
 
+/// A run in its folder.
+struct Member {
+    config: Config,
+    going: Option<Going>,
+    folder: Folder,
+    run: Run,
+    results: Option<Results>,
+    /// Time trained in earlier sessions.
+    before: f64,
+}
+
+/// What a run has while there is something left to do.
+struct Going {
+    arm: usize,
+    metrics: metrics::Writer,
+    keeper: Keeper,
+    /// Where the metrics were before the last generation's rows.
+    ending: Option<Mark>,
+}
+
 impl Session {
-    /// Starts or resumes a run; also gives what the user should be told about its folder.
+    /// Starts or resumes runs, each a config and its folder; also gives what there is to tell about their folders.
     ///
     /// # Errors
-    /// The folder cannot be used (see [`Folder::open`]), or there is no memory for the populations.
-    pub fn open(config: Config, path: &Path, start: Start, disk: Disk) -> Result<(Opened, Vec<String>), RunError> {
+    /// A folder cannot be used (see [`Folder::open`]), or there is no memory for the populations.
+    pub fn open(
+        runs: Vec<(Config, PathBuf)>,
+        start: Start,
+        disk: &Disk,
+    ) -> Result<(Session, Vec<(usize, Note)>), RunError> {
         // This generation and the next one; asked for first, since later a refusal would be an abort.
-        let bytes = 2 * config.policy_bytes();
+        let bytes = 2 * runs.iter().map(|(config, _)| config.policy_bytes()).sum::<usize>();
         Vec::<u8>::new()
             .try_reserve_exact(bytes)
             .map_err(|_| RunError::Memory { what: "twice the policies of all trials", bytes })?;
-        let (folder, found) = Folder::open(path, start, &config, disk.clone())?;
-        let run = found.run.unwrap_or_else(|| Run::new(&config));
-        if let Some((story, digest)) = found.finished.zip(run.digest.clone()) {
-            return Ok((Opened::Done(Results { story, digest }), found.notes));
+        // Before any of them is touched.
+        if let Some((_, path)) = runs.iter().find(|(_, path)| start == Start::Fresh && folder::holds_run(path)) {
+            return Err(RecordError::Exists { path: path.clone() }.into());
         }
-        let mut trainer = Trainer::new(vec![config.clone()]);
-        let (metrics, before) = match found.checkpoint {
-            Some((Checkpoint { snapshot, seconds, .. }, metrics)) => {
-                if !trainer.restore(snapshot) {
-                    unreachable!("a checkpoint is read in the sizes of its config");
-                }
-                (metrics, seconds)
+        let opened = side_by_side(runs, |(config, path)| Member::open(config, path, start, disk))?;
+        let (mut members, mut snapshots, mut notes) = (Vec::new(), Vec::new(), Vec::new());
+        for (member, snapshot, told) in opened {
+            notes.extend(told.into_iter().map(|note| (members.len(), note)));
+            members.push(member);
+            snapshots.push(snapshot);
+        }
+        let going = members.iter().filter(|member| member.going.is_some());
+        let mut trainer = Trainer::new(going.map(|member| member.config.clone()).collect());
+        let mut generations = Vec::with_capacity(members.len());
+        let mut arms = Vec::new();
+        for (run, (member, snapshot)) in members.iter_mut().zip(snapshots).enumerate() {
+            let Some(going) = &mut member.going else {
+                generations.push(member.config.learning.generations + 2);
+                continue;
+            };
+            going.arm = arms.len();
+            arms.push(run);
+            if snapshot.is_some_and(|snapshot| !trainer.restore(going.arm, snapshot)) {
+                unreachable!("a checkpoint is read in the sizes of its config");
             }
-            None => {
-                let path = folder.file(METRICS);
-                (metrics::Writer::create(&disk, &path).map_err(|error| RecordError::Write { path, error })?, 0.0)
-            }
-        };
-        let checkpoints = folder.file(folder::CHECKPOINTS);
-        let keeper = Keeper::new(disk, checkpoints, vec![config.clone()], found.kept, trainer.generation());
-        let since = Instant::now();
-        let session = Session { config, folder, trainer, metrics, keeper, run, before, since };
-        Ok((Opened::Ready(Box::new(session)), found.notes))
+            generations.push(trainer.generation(going.arm));
+        }
+        Ok((Session { members, generations, trainer, arms, since: Instant::now() }, notes))
     }
 
-    /// The generation that plays next.
-    pub fn generation(&self) -> usize {
-        self.trainer.generation()
+    /// Whether there is nothing left to do.
+    pub fn is_done(&self) -> bool {
+        self.members.iter().all(|member| member.going.is_none())
     }
 
-    /// Trains to the end, or until stopped.
+    /// See [`Progress::generations`].
+    pub fn generations(&self) -> &[usize] {
+        &self.generations
+    }
+
+    /// What a run came to, once it is done.
+    pub fn results(&self, run: usize) -> Option<&Results> {
+        self.members[run].results.as_ref()
+    }
+
+    /// What `run.json` says of a run.
+    pub fn run(&self, run: usize) -> &Run {
+        &self.members[run].run
+    }
+
+    /// Trains all to the end, or until stopped.
     ///
     /// # Errors
     /// The backend fails (what came before is saved then), or something cannot be written.
-    pub fn train(&mut self, (mut backend, machine): Player, options: Options<'_>) -> Result<Outcome, RunError> {
+    pub fn train(&mut self, player: &mut Player, options: &mut Options<'_>) -> Result<Outcome, RunError> {
         self.since = Instant::now();
-        self.run.sessions = self.run.sessions.saturating_add(1);
-        self.settle_on(&*backend, machine);
-        self.write_run(State::Running, None)?;
-        let mut flushed = Instant::now();
+        for member in self.members.iter_mut().filter(|member| member.going.is_some()) {
+            member.run.sessions = member.run.sessions.saturating_add(1);
+            member.run.command = options.command.into();
+        }
+        self.settle_on(player);
+        self.write_runs(State::Running)?;
+        let (mut flushed, mut setback, mut told) = (Instant::now(), None, false);
+        // Once, and only what a generation has made up for: a device that is gone for good is told of as such.
+        let mut tell = |error: Option<BackendError>| {
+            if let Some(error) = error.filter(|_| !told) {
+                told = true;
+                (options.setback)(&error);
+            }
+        };
         while !self.trainer.is_done() {
-            let rows = match self.trainer.advance(&mut *backend) {
+            let rows = match self.trainer.advance(&mut *player.0) {
                 Ok(rows) => rows,
                 Err(error) => match (options.instead)(&error) {
-                    Some((other, machine)) => {
-                        backend = other;
-                        self.settle_on(&*backend, machine);
+                    Some(other) => {
+                        setback = None;
+                        *player = other;
+                        self.settle_on(player);
                         continue;
                     }
                     None => {
-                        let generation = self.generation();
+                        let generation = self.going().map(|run| self.generations[run]).min().unwrap_or(0);
                         return Err(RunError::Backend { error, generation, saved: self.stop().map_err(Box::new) });
                     }
                 },
             };
-            let mut in_order = rows;
-            in_order.sort_by_key(|row| (row.generation, row.trial));
-            self.metrics.add(&in_order, self.seconds()).map_err(self.metrics_failed())?;
+            tell(std::mem::replace(&mut setback, self.trainer.take_setback()));
+            let rows = self.add(rows)?;
             if flushed.elapsed() >= FLUSH {
-                self.metrics.flush().map_err(self.metrics_failed())?;
+                self.members.iter_mut().try_for_each(Member::flush)?;
                 flushed = Instant::now();
             }
-            (options.watch)(&Progress { generation: self.generation(), rows: &in_order });
-            self.keeper.poll()?;
-            if options.stop.load(Relaxed) && !self.trainer.is_done() {
-                match self.stop() {
-                    // The device failed, which the next generation makes up for or ends at.
-                    Err(RunError::Held(_)) => continue,
-                    stopped => stopped?,
-                }
-                return Ok(Outcome::Stopped { generation: self.generation() });
+            self.finish()?;
+            (options.watch)(&Progress { generations: &self.generations, rows: &rows });
+            self.members.iter_mut().try_for_each(Member::poll)?;
+            if self.trainer.is_done() {
+                break;
             }
-            let asked = options.save.swap(false, Relaxed);
-            if !self.trainer.is_done() && (asked || self.keeper.is_due(&options.schedule, self.generation())) {
-                match self.save() {
-                    Err(RunError::Held(_)) => options.save.store(true, Relaxed),
-                    saved => saved?,
+            let (stop, asked) = (options.stop.load(Relaxed), options.save.swap(false, Relaxed));
+            let saved = match () {
+                () if stop => self.stop(),
+                () if asked || self.is_due() => self.save(),
+                () => continue,
+            };
+            match saved {
+                // The device failed, which the next generation makes up for or ends at.
+                Err(RunError::Held(error)) => {
+                    options.save.store(!stop, Relaxed);
+                    setback = Some(error);
+                }
+                saved => {
+                    saved?;
+                    if stop {
+                        return Ok(Outcome::Stopped);
+                    }
                 }
             }
         }
-        self.finish().map(Outcome::Done)
+        tell(setback);
+        Ok(Outcome::Done)
     }
 
-    /// What it runs on from now on.
-    fn settle_on(&mut self, backend: &dyn Backend, machine: Machine) {
-        let Machine { backend: kind, adapter, driver, threads } = machine;
-        let version = env!("CARGO_PKG_VERSION").to_string();
-        let run = Run { version, backend: kind, adapter, driver, threads, ..self.run.clone() };
-        self.run = Run { description: backend.describe(), ..run };
+    /// The runs that have something left to do.
+    fn going(&self) -> impl Iterator<Item = usize> {
+        self.members.iter().enumerate().filter(|(_, member)| member.going.is_some()).map(|(run, _)| run)
     }
 
-    /// Starts writing a checkpoint, once the one before is written: there is memory for one. A large one is written
-    /// before training goes on, for there may not be memory for any.
+    /// What they run on from now on.
+    fn settle_on(&mut self, (backend, machine): &Player) {
+        for run in self.members.iter_mut().filter(|member| member.going.is_some()).map(|member| &mut member.run) {
+            let Machine { backend: kind, adapter, driver, threads } = machine.clone();
+            let (version, commit) = (env!("CARGO_PKG_VERSION").into(), COMMIT.map(String::from));
+            let description = backend.describe();
+            *run = Run { version, commit, description, backend: kind, adapter, driver, threads, ..run.clone() };
+        }
+    }
+
+    /// Adds complete rows to the metrics; gives them by run, generation and trial.
+    fn add(&mut self, mut rows: Vec<Row>) -> Result<Vec<Row>, RunError> {
+        rows.iter_mut().for_each(|row| row.arm = self.arms[row.arm]);
+        rows.sort_by_key(|row| (row.arm, row.generation, row.trial));
+        let seconds = self.seconds();
+        rows.chunk_by(|a, b| a.arm == b.arm).try_for_each(|rows| self.members[rows[0].arm].add(rows, seconds))?;
+        for (arm, &run) in self.arms.iter().enumerate() {
+            self.generations[run] = self.trainer.generation(arm);
+        }
+        Ok(rows)
+    }
+
+    /// Writes what came out of the runs that have just played their last champions.
+    fn finish(&mut self) -> Result<(), RunError> {
+        let seconds = self.seconds();
+        let over = self.members.iter_mut().zip(&self.generations);
+        let over = over.filter(|(member, next)| **next > member.config.learning.generations + 1);
+        let (arms, over): (Vec<usize>, Vec<&mut Member>) =
+            over.filter_map(|(member, _)| Some((member.going.as_ref()?.arm, member))).unzip();
+        if over.is_empty() {
+            return Ok(());
+        }
+        let ends = over.into_iter().zip(self.trainer.ends(&arms)).collect();
+        side_by_side(ends, |(member, (policies, end))| member.finish(&policies, end, seconds)).map(drop)
+    }
+
+    /// Whether any run wants a checkpoint; then all make one.
+    fn is_due(&self) -> bool {
+        self.members.iter().zip(&self.generations).any(|(member, &next)| member.is_due(next))
+    }
+
+    /// Starts writing a checkpoint of every run that is not done.
     fn save(&mut self) -> Result<(), RunError> {
-        self.keeper.wait()?;
-        let since = Instant::now();
-        let (metrics, output) = self.metrics.mark().map_err(self.metrics_failed())?;
-        let bytes = self.config.policy_bytes();
-        if !memory::copies_checkpoint([&self.config]) {
-            let (config, seconds) = (checkpoint::digest(&self.config), self.seconds());
-            let snapshot = self.trainer.view().map_err(RunError::Held)?;
-            return Ok(self.keeper.save_now(&Checkpoint { config, seconds, metrics, snapshot }, &output, since)?);
+        let seconds = self.seconds();
+        let (mut held, mut writing) = (Ok(()), Vec::new());
+        for run in self.going().collect::<Vec<_>>() {
+            let member = &mut self.members[run];
+            match member.save(&mut self.trainer, self.generations[run], seconds) {
+                // What others have may still be had.
+                Err(error @ RunError::Held(_)) => held = held.and(Err(error)),
+                saved => saved?,
+            }
+            writing.push(run);
+            if writing.len() == MAX_WRITERS {
+                writing.drain(..).try_for_each(|run| self.members[run].wait())?;
+            }
         }
-        let of_snapshot = |error| RunError::of_snapshot(error, "a checkpoint beside training", bytes);
-        let snapshot = self.trainer.snapshot().map_err(of_snapshot)?;
-        let (config, seconds) = (checkpoint::digest(&self.config), self.seconds());
-        Ok(self.keeper.save(Checkpoint { config, seconds, metrics, snapshot }, output, since)?)
+        held
     }
 
     /// Saves and waits until all is on the disk.
     fn stop(&mut self) -> Result<(), RunError> {
-        self.keeper.wait()?;
-        let saved = match self.keeper.newest() == Some(self.generation()) {
-            true => Ok(()),
-            false => self.save().and_then(|()| Ok(self.keeper.wait()?)),
+        let saved = self.save();
+        let waited = self.members.iter_mut().try_for_each(Member::wait);
+        let written = self.write_runs(State::Stopped);
+        saved.and(waited).and(written)
+    }
+
+    /// Writes `run.json` of every run that is not done.
+    fn write_runs(&mut self, state: State) -> Result<(), RunError> {
+        let seconds = self.seconds();
+        let going = self.members.iter_mut().zip(&self.generations).filter(|(member, _)| member.going.is_some());
+        side_by_side(going.collect(), |(member, &next)| member.write_run(state, next, seconds, None)).map(drop)
+    }
+
+    /// Time trained in this session.
+    fn seconds(&self) -> f64 {
+        self.since.elapsed().as_secs_f64()
+    }
+}
+
+impl Member {
+    /// A run, where it goes on, and what there is to tell about its folder.
+    fn open(
+        config: Config,
+        path: PathBuf,
+        start: Start,
+        disk: &Disk,
+    ) -> Result<(Member, Option<Snapshot>, Vec<Note>), RunError> {
+        let (folder, found) = Folder::open(&path, start, &config, disk.clone())?;
+        let run = found.run.unwrap_or_else(|| Run::new(&config));
+        let member = Member { config, going: None, folder, run, results: None, before: 0.0 };
+        if let Some((story, digest)) = found.finished.zip(member.run.digest.clone()) {
+            return Ok((Member { results: Some(Results { story, digest }), ..member }, None, found.notes));
+        }
+        let (metrics, before, snapshot) = match found.checkpoint {
+            Some((Checkpoint { snapshot, seconds, .. }, metrics)) => (metrics, seconds, Some(snapshot)),
+            None => {
+                let metrics = metrics::Writer::create(disk, &member.folder.file(METRICS));
+                (metrics.map_err(member.metrics_failed())?, 0.0, None)
+            }
         };
-        let written = self.write_run(State::Stopped, None);
-        saved.and(written)
+        let generation = snapshot.as_ref().map_or(0, |snapshot| snapshot.generation);
+        let checkpoints = member.folder.file(folder::CHECKPOINTS);
+        let keeper = Keeper::new(disk.clone(), checkpoints, member.config.clone(), found.kept, generation);
+        let going = Some(Going { arm: 0, metrics, keeper, ending: None });
+        Ok((Member { going, before, ..member }, snapshot, found.notes))
     }
 
-    /// Writes what came out.
-    fn finish(&mut self) -> Result<Results, RunError> {
-        self.keeper.wait()?;
-        let (_, output) = self.metrics.mark().map_err(self.metrics_failed())?;
-        output.sync().map_err(self.metrics_failed())?;
-        let trials = self.trainer.best_policies(0);
-        policies::write(&self.folder.disk, &self.folder.file(POLICIES), &self.config, &trials)?;
-        let (story, digest) = self.folder.digest(&self.config, &trials)?;
-        self.write_run(State::Done, Some(digest.clone()))?;
-        Ok(Results { story, digest })
+    fn flush(&mut self) -> Result<(), RunError> {
+        let failed = self.metrics_failed();
+        self.going.as_mut().map_or(Ok(()), |going| going.metrics.flush().map_err(failed))
     }
 
-    fn write_run(&mut self, state: State, digest: Option<String>) -> Result<(), RunError> {
-        let generations = self.generation().min(self.config.learning.generations + 1);
-        let (updated, seconds) = (folder::now(), self.seconds());
+    fn poll(&mut self) -> Result<(), RunError> {
+        Ok(self.going.as_mut().map_or(Ok(()), |going| going.keeper.poll())?)
+    }
+
+    fn wait(&mut self) -> Result<(), RunError> {
+        Ok(self.going.as_mut().map_or(Ok(()), |going| going.keeper.wait())?)
+    }
+
+    fn is_due(&self, next: usize) -> bool {
+        let config::Checkpoint { generations, seconds } = self.config.checkpoint;
+        self.going.as_ref().is_some_and(|going| going.keeper.is_due(&Schedule { generations, seconds }, next))
+    }
+
+    /// Adds complete rows of one generation.
+    fn add(&mut self, rows: &[Row], seconds: f64) -> Result<(), RunError> {
+        let failed = self.metrics_failed();
+        let Some(Going { metrics, ending, .. }) = &mut self.going else { return Ok(()) };
+        let mut add = || {
+            if rows.iter().any(|row| row.generation == self.config.learning.generations) {
+                *ending = Some(metrics.mark()?.0);
+            }
+            metrics.add(rows, self.before + seconds)
+        };
+        add().map_err(failed)
+    }
+
+    /// Starts writing a checkpoint, once the one before is written: there is memory for one. A large one is written
+    /// before training goes on, for there may not be memory for any.
+    fn save(&mut self, trainer: &mut Trainer, next: usize, seconds: f64) -> Result<(), RunError> {
+        let failed = self.metrics_failed();
+        let Some(Going { arm, metrics, keeper, .. }) = &mut self.going else { return Ok(()) };
+        keeper.wait()?;
+        if keeper.newest() == Some(next) {
+            return Ok(());
+        }
+        let since = Instant::now();
+        let (metrics, output) = metrics.mark().map_err(failed)?;
+        let (config, seconds) = (checkpoint::digest(&self.config), self.before + seconds);
+        if !memory::copies_checkpoint([&self.config]) {
+            let snapshot = trainer.view(*arm).map_err(RunError::Held)?;
+            return Ok(keeper.save_now(&Checkpoint { config, seconds, metrics, snapshot }, &output, since)?);
+        }
+        let bytes = self.config.policy_bytes();
+        let of_snapshot = |error| RunError::of_snapshot(error, "a checkpoint beside training", bytes);
+        let snapshot = trainer.snapshot(*arm).map_err(of_snapshot)?;
+        Ok(keeper.save(Checkpoint { config, seconds, metrics, snapshot }, output, since)?)
+    }
+
+    /// Writes what came out, so that at any moment there is something whole to go on from.
+    fn finish(&mut self, policies: &[&[f32]], end: Snapshot<&[f32]>, seconds: f64) -> Result<(), RunError> {
+        let failed = self.metrics_failed();
+        let Some(Going { metrics, keeper, ending, .. }) = &mut self.going else { return Ok(()) };
+        let (mark, output) = metrics.mark().map_err(failed)?;
+        let config = checkpoint::digest(&self.config);
+        let metrics = ending.take().unwrap_or(mark);
+        let end = Checkpoint { config, seconds: self.before + seconds, metrics, snapshot: end };
+        let next = end.snapshot.generation;
+        keeper.save_now(&end, &output, Instant::now())?;
+        policies::write(&self.folder.disk, &self.folder.file(POLICIES), &self.config, policies)?;
+        let (story, digest) = self.folder.digest(&self.config, policies)?;
+        self.write_run(State::Done, next, seconds, Some(digest.clone()))?;
+        self.results = Some(Results { story, digest });
+        self.going = None;
+        Ok(())
+    }
+
+    fn write_run(&mut self, state: State, next: usize, seconds: f64, digest: Option<String>) -> Result<(), RunError> {
+        let generations = next.min(self.config.learning.generations + 1);
+        let (updated, seconds) = (folder::now(), self.before + seconds);
         self.run = Run { state, updated, seconds, generations, digest, ..self.run.clone() };
         Ok(self.folder.write_run(&self.run)?)
-    }
-
-    fn seconds(&self) -> f64 {
-        self.before + self.since.elapsed().as_secs_f64()
     }
 
     fn metrics_failed(&self) -> impl FnOnce(std::io::Error) -> RunError + use<> {
         let path = self.folder.file(METRICS);
         move |error| RecordError::Write { path, error }.into()
     }
+}
+
+/// A run that is the same training as another, under another config.
+pub struct Twin {
+    /// The folder of the other, which is done, and its config.
+    pub of: PathBuf,
+    pub of_config: Config,
+    pub folder: PathBuf,
+    pub config: Config,
+}
+
+/// Records runs that others stand for, as if they had been trained: the others' metrics and policies, under their own
+/// config. Those that are there already are left alone.
+///
+/// # Errors
+/// A folder cannot be used (see [`Folder::open`]), read or written.
+pub fn record_twins(twins: Vec<Twin>, start: Start, disk: &Disk) -> Result<(), RunError> {
+    side_by_side(twins, |twin| twin.record(start, disk)).map(drop)
+}
+
+impl Twin {
+    fn record(self, start: Start, disk: &Disk) -> Result<(), RunError> {
+        let Twin { of, of_config, folder, config } = self;
+        let run = Run::read(&of.join(folder::RUN))?;
+        let (folder, found) = Folder::open(&folder, start, &config, disk.clone())?;
+        let there = found.run.filter(|_| found.finished.is_some());
+        if there.is_some_and(|there| there.digest == run.digest) {
+            return Ok(());
+        }
+        let (from, path) = (of.join(METRICS), folder.file(METRICS));
+        let copy = disk.replace(&path, |output| std::io::copy(&mut std::fs::File::open(&from)?, output).map(drop));
+        copy.map_err(|error| RecordError::Write { path, error })?;
+        let policies = of.join(POLICIES);
+        let policies = policies::read_all(&policies, &of_config)?;
+        policies::write(disk, &folder.file(POLICIES), &config, &policies)?;
+        let (_, digest) = folder.digest(&config, &policies)?;
+        Ok(folder.write_run(&Run { digest: Some(digest), ..run })?)
+    }
+}
+
+/// Does something slow (files are flushed to the disk) with each, side by side.
+fn side_by_side<T: Send, R: Send>(
+    all: Vec<T>,
+    each: impl Fn(T) -> Result<R, RunError> + Sync,
+) -> Result<Vec<R>, RunError> {
+    if all.len() == 1 {
+        return all.into_iter().map(each).collect();
+    }
+    let (share, mut all, each) = (all.len().div_ceil(MAX_WRITERS), all.into_iter(), &each);
+    std::thread::scope(|scope| {
+        let some = || Some(all.by_ref().take(share).collect::<Vec<T>>()).filter(|some| !some.is_empty());
+        let shares = std::iter::from_fn(some);
+        let threads: Vec<_> = shares
+            .map(|some| scope.spawn(move || some.into_iter().map(each).collect::<Result<Vec<R>, RunError>>()))
+            .collect();
+        let shares = threads
+            .into_iter()
+            .map(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+            .collect::<Result<Vec<_>, _>>();
+        Ok(shares?.into_iter().flatten().collect())
+    })
 }

@@ -1,4 +1,4 @@
-//! The generation loop: all trials of all arms advance together, one batch a generation.
+//! The generation loop: all trials of all arms advance together, one batch a generation, each arm at its own age.
 
 use std::cell::RefCell;
 use std::collections::TryReserveError;
@@ -21,9 +21,9 @@ use crate::world::World;
 /// Trains any number of arms (one experiment each) side by side.
 pub struct Trainer {
     arms: Vec<Arm>,
-    generation: usize,
     level: Level,
     times: Times,
+    setback: Option<BackendError>,
 }
 
 /// Where the time of generations went.
@@ -44,8 +44,10 @@ struct Arm {
     config: Config,
     world: World,
     trials: Vec<Trial>,
-    /// The generation of the populations that are about to play: behind the trainer's after they were lost with the
-    /// device that held them, two past the last when all is done.
+    /// The generation that plays next, two past the last when all is done.
+    generation: usize,
+    /// The generation of the populations that are about to play: an earlier one after they were lost with the device
+    /// that held them.
     age: usize,
     /// The generation of the weights on the host: an earlier one while a backend holds the populations.
     host_age: usize,
@@ -98,18 +100,25 @@ impl Trainer {
             let trials = 0..config.learning.trials;
             Arm::new(config, trials, level)
         };
-        Trainer { arms: configs.into_iter().map(arm).collect(), generation: 0, level, times: Times::default() }
+        Trainer { arms: configs.into_iter().map(arm).collect(), level, times: Times::default(), setback: None }
     }
 
     /// Fresh populations for one trial of a (valid) config; it comes to the rows that it comes to among the others.
     pub fn of_trial(config: Config, trial: usize) -> Trainer {
         let level = Level::new();
-        Trainer { arms: vec![Arm::new(config, trial..trial + 1, level)], generation: 0, level, times: Times::default() }
+        let arms = vec![Arm::new(config, trial..trial + 1, level)];
+        Trainer { arms, level, times: Times::default(), setback: None }
     }
 
-    /// The generation that plays next.
-    pub fn generation(&self) -> usize {
-        self.generation
+    /// The generation that an arm plays next, two past its last when it is done.
+    pub fn generation(&self, arm: usize) -> usize {
+        self.arms[arm].generation
+    }
+
+    /// The error of a backend that held populations and that was made up for since this was last asked: the populations
+    /// are on the host from then on.
+    pub fn take_setback(&mut self) -> Option<BackendError> {
+        self.setback.take()
     }
 
     /// Where the time of generations went since this was last asked.
@@ -136,20 +145,23 @@ impl Trainer {
         // Once inside the thread pool, for a small generation is over sooner than a thread is woken.
         rayon::scope(|_| match self.catch_up(backend) {
             // A device may have room for the populations or for the episodes, but not for both.
-            Err(_) if self.bring_home() => self.catch_up(backend),
+            Err(error) if self.bring_home() => {
+                let rows = self.catch_up(backend)?;
+                self.setback = Some(error);
+                Ok(rows)
+            }
             played => played,
         })
     }
 
-    /// Plays every arm from where its populations are to the end of this generation; gives the rows of that alone, since
-    /// all before were given when those generations first played.
+    /// Plays every arm from where its populations are to the end of its next generation; gives the rows of that alone,
+    /// since all before were given when those generations first played.
     fn catch_up(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
-        let behind = |arms: &[Arm]| arms.iter().filter(|arm| !arm.is_done()).map(|arm| arm.age).min();
-        while let Some(age) = behind(&self.arms).filter(|&age| age < self.generation) {
-            self.play_generation(age, backend)?;
+        while self.arms.iter().any(Arm::is_behind) {
+            self.play_generation(Arm::is_behind, backend)?;
         }
-        let rows = self.play_generation(self.generation, backend)?;
-        self.generation += 1;
+        let rows = self.play_generation(|arm| !arm.is_done(), backend)?;
+        self.arms.iter_mut().filter(|arm| !arm.is_done()).for_each(|arm| arm.generation += 1);
         Ok(rows)
     }
 
@@ -160,32 +172,38 @@ impl Trainer {
         !home.is_empty() && home.iter().all(|&home| home)
     }
 
-    fn play_generation(&mut self, generation: usize, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
+    /// Plays the generation that is at hand of some arms.
+    fn play_generation(
+        &mut self,
+        plays: impl Fn(&Arm) -> bool,
+        backend: &mut dyn Backend,
+    ) -> Result<Vec<Row>, BackendError> {
         let level = self.level;
-        let playing = self.arms.iter_mut().enumerate().filter(|(_, arm)| arm.age == generation && !arm.is_done());
+        let playing = self.arms.iter_mut().enumerate().filter(|(_, arm)| plays(arm));
         let mut playing: Vec<(usize, &mut Arm)> = playing.collect();
 
         let start = Instant::now();
         playing.iter_mut().try_for_each(|(_, arm)| arm.offer(backend))?;
-        playing.par_iter_mut().for_each(|(_, arm)| arm.prepare(generation, level));
+        playing.par_iter_mut().for_each(|(_, arm)| arm.prepare(level));
         let prepared = Instant::now();
         play(backend, &playing, |arm| {
             let population = arm.config.learning.population;
-            let first = if generation > arm.last() { population } else { 0 };
+            let first = if arm.is_over() { population } else { 0 };
             // The first generation has no champion before it.
-            first..population + usize::from(generation > 0)
+            first..population + usize::from(arm.age > 0)
         })?;
-        let mut over = playing.iter_mut().filter(|(_, arm)| generation > arm.last());
+        let mut over = playing.iter_mut().filter(|(_, arm)| arm.is_over());
         over.try_for_each(|(_, arm)| arm.fetch())?;
         let played = Instant::now();
-        let conclude = |(index, arm): &mut (usize, &mut Arm)| match generation > arm.last() {
+        let conclude = |(index, arm): &mut (usize, &mut Arm)| match arm.is_over() {
             true => arm.finish(),
-            false => arm.conclude(*index, generation),
+            false => arm.conclude(*index),
         };
         let mut rows = playing.par_iter_mut().flat_map_iter(conclude).collect::<Vec<_>>();
         let concluded = Instant::now();
-        playing.retain(|(_, arm)| generation <= arm.last());
-        playing.par_iter_mut().for_each(|(_, arm)| arm.breed(generation, level));
+        playing.retain(|(_, arm)| !arm.is_over());
+        let setbacks: Vec<_> = playing.par_iter_mut().filter_map(|(_, arm)| arm.breed(level).err()).collect();
+        self.setback = setbacks.into_iter().next().or(self.setback.take());
         rows.sort_by_key(|row| (row.arm, row.trial, row.generation));
         self.times.prepare += prepared - start;
         self.times.play += played - prepared;
@@ -199,7 +217,7 @@ impl Trainer {
     pub fn policies(&self, arm: usize) -> Vec<Vec<f32>> {
         let arm = &self.arms[arm];
         let sort = |trial: &Trial| {
-            let mut policies = vec![0.0; arm.world.leaders() * arm.config.learning.population * arm.world.parameters()];
+            let mut policies = vec![0.0; arm.policies()];
             arm.sort(&trial.weights, &trial.fitness, &mut policies);
             policies
         };
@@ -208,14 +226,26 @@ impl Trainer {
 
     /// [`Trainer::policies`], in the room of the next generation.
     pub fn best_policies(&mut self, arm: usize) -> Vec<&[f32]> {
-        let arm = &mut self.arms[arm];
-        let count = arm.world.leaders() * arm.config.learning.population * arm.world.parameters();
-        for index in 0..arm.trials.len() {
-            let mut policies = std::mem::take(&mut arm.trials[index].children);
-            arm.sort(&arm.trials[index].weights, &arm.trials[index].fitness, &mut policies[..count]);
-            arm.trials[index].children = policies;
+        self.ends(&[arm]).remove(0).0
+    }
+
+    /// What came out of arms that are done: [`Trainer::best_policies`], and the snapshot after the last generation, whose
+    /// weights are left out since they are the same in another order.
+    pub fn ends(&mut self, arms: &[usize]) -> Vec<(Vec<&[f32]>, Snapshot<&[f32]>)> {
+        for &arm in arms {
+            let arm = &mut self.arms[arm];
+            for index in 0..arm.trials.len() {
+                let mut policies = std::mem::take(&mut arm.trials[index].children);
+                arm.sort(&arm.trials[index].weights, &arm.trials[index].fitness, &mut policies[..arm.policies()]);
+                arm.trials[index].children = policies;
+            }
         }
-        arm.trials.iter().map(|trial| &trial.children[..count]).collect()
+        let end = |&arm: &usize| {
+            let arm = &self.arms[arm];
+            let sorted = arm.trials.iter().map(|trial| &trial.children[..arm.policies()]).collect();
+            (sorted, Snapshot { generation: arm.last() + 1, weights: vec![], ..arm.snapshot() })
+        };
+        arms.iter().map(end).collect()
     }
 
     /// The populations of a trial about to play, `[leaders][policies + 1][parameters]`; a population's last slot is
@@ -225,7 +255,7 @@ impl Trainer {
     /// The backend that holds them does not give them back.
     pub fn weights(&mut self, arm: usize, trial: usize) -> Result<&[f32], BackendError> {
         let arm = &mut self.arms[arm];
-        arm.stand_at(self.generation)?;
+        arm.stand()?;
         Ok(&arm.trials[trial].weights)
     }
 
@@ -234,73 +264,62 @@ impl Trainer {
         &self.arms[arm].world
     }
 
-    /// What [`Trainer::restore`] needs, where it lies.
+    /// What [`Trainer::restore`] needs of an arm, where it lies.
     ///
     /// # Errors
     /// The backend that holds the populations does not give them back.
-    pub fn view(&mut self) -> Result<Snapshot<&[f32]>, BackendError> {
-        self.arms.iter_mut().try_for_each(|arm| arm.stand_at(self.generation))?;
-        let each = |numbers: fn(&Trial) -> &[f32]| {
-            self.arms.iter().map(|arm| arm.trials.iter().map(numbers).collect()).collect()
-        };
-        Ok(Snapshot {
-            generation: self.generation,
-            weights: each(|trial| &trial.weights),
-            fitness: each(|trial| &trial.fitness),
-            pending: self.arms.iter().map(|arm| arm.trials.iter().map(|trial| trial.pending).collect()).collect(),
-        })
+    pub fn view(&mut self, arm: usize) -> Result<Snapshot<&[f32]>, BackendError> {
+        let arm = &mut self.arms[arm];
+        arm.stand()?;
+        Ok(arm.snapshot())
     }
 
-    /// What [`Trainer::restore`] needs, in memory of its own.
+    /// What [`Trainer::restore`] needs of an arm, in memory of its own.
     ///
     /// # Errors
     /// There is not so much memory, or the backend that holds the populations does not give them back.
-    pub fn snapshot(&mut self) -> Result<Snapshot, SnapshotError> {
+    pub fn snapshot(&mut self, arm: usize) -> Result<Snapshot, SnapshotError> {
         let copy = |numbers: &[f32]| {
             let mut copy = Vec::new();
             copy.try_reserve_exact(numbers.len())?;
             copy.extend_from_slice(numbers);
             Ok(copy)
         };
-        let each = |arms: Vec<Vec<&[f32]>>| -> Result<Vec<Vec<_>>, TryReserveError> {
-            arms.into_iter().map(|trials| trials.into_iter().map(copy).collect()).collect()
-        };
-        let Snapshot { generation, weights, fitness, pending } = self.view()?;
-        Ok(Snapshot { generation, weights: each(weights)?, fitness: each(fitness)?, pending })
+        let each = |trials: Vec<&[f32]>| -> Result<Vec<_>, TryReserveError> { trials.into_iter().map(copy).collect() };
+        let Snapshot { generation, last, weights, fitness, pending } = self.view(arm)?;
+        Ok(Snapshot { generation, last, weights: each(weights)?, fitness: each(fitness)?, pending })
     }
 
-    /// Goes on from a snapshot of a trainer of the same configs; false where its sizes do not fit them.
+    /// Goes on with an arm from a snapshot of an arm of the same config, but for its number of generations, which may have
+    /// been smaller; false where the sizes do not fit.
     #[must_use]
-    pub fn restore(&mut self, snapshot: Snapshot) -> bool {
-        let Snapshot { generation, weights, fitness, pending } = snapshot;
+    pub fn restore(&mut self, arm: usize, snapshot: Snapshot) -> bool {
+        let (index, level, arm) = (arm, self.level, &mut self.arms[arm]);
+        let Snapshot { generation, last, weights, fitness, pending } = snapshot;
         let counts = [weights.len(), fitness.len(), pending.len()];
-        let fits = |trial: &Trial, weights: &Vec<f32>, fitness: &Vec<f32>| {
+        let fits = |((trial, weights), fitness): ((&Trial, &Vec<f32>), &Vec<f32>)| {
             trial.weights.len() == weights.len() && trial.fitness.len() == fitness.len()
         };
-        let fits = counts == [self.arms.len(); 3]
-            && self.arms.iter().zip(&weights).zip(&fitness).zip(&pending).all(
-                |(((arm, weights), fitness), pending)| {
-                    let counts = [weights.len(), fitness.len(), pending.len()];
-                    counts == [arm.trials.len(); 3]
-                        && arm.trials.iter().zip(weights).zip(fitness).all(|((trial, w), f)| fits(trial, w, f))
-                },
-            );
-        if fits {
-            self.generation = generation;
-            for arm in &mut self.arms {
-                arm.held.clear();
-                arm.age = generation.min(arm.last() + 2);
-                arm.host_age = arm.age;
-                arm.offered = false;
-            }
-            let trials = self.arms.iter_mut().flat_map(|arm| &mut arm.trials);
-            let saved =
-                weights.into_iter().flatten().zip(fitness.into_iter().flatten()).zip(pending.into_iter().flatten());
-            for (trial, ((weights, fitness), pending)) in trials.zip(saved) {
-                (trial.weights, trial.fitness, trial.pending) = (weights, fitness, pending);
-            }
+        if counts != [arm.trials.len(); 3] || !arm.trials.iter().zip(&weights).zip(&fitness).all(fits) {
+            return false;
         }
-        fits
+        arm.held.clear();
+        arm.offered = false;
+        for (trial, ((weights, fitness), pending)) in
+            arm.trials.iter_mut().zip(weights.into_iter().zip(fitness).zip(pending))
+        {
+            (trial.weights, trial.fitness) = (weights, fitness);
+            trial.pending = pending.map(|row| Row { arm: index, ..row });
+        }
+        arm.generation = generation.min(arm.last() + 2);
+        (arm.age, arm.host_age) = (arm.generation, arm.generation);
+        if generation == last + 1 && last < arm.last() {
+            // There the policies stayed, here they have a next generation.
+            (arm.age, arm.host_age) = (last, last);
+            // Nobody holds them, so nobody can fail.
+            let _ = arm.breed(level);
+        }
+        true
     }
 }
 
@@ -343,7 +362,16 @@ impl Arm {
     fn new(config: Config, trials: Range<usize>, level: Level) -> Arm {
         let world = World::new(&config);
         let trials = trials.into_par_iter().map(|index| Trial::new(&config, &world, index, level));
-        Arm { trials: trials.collect(), world, config, age: 0, host_age: 0, held: vec![], offered: false }
+        Arm {
+            trials: trials.collect(),
+            world,
+            config,
+            generation: 0,
+            age: 0,
+            host_age: 0,
+            held: vec![],
+            offered: false,
+        }
     }
 
     /// The last generation.
@@ -353,7 +381,33 @@ impl Arm {
 
     /// Whether its last champions have played.
     fn is_done(&self) -> bool {
-        self.age > self.last() + 1
+        self.generation > self.last() + 1
+    }
+
+    /// Whether its populations are of a generation that was played already.
+    fn is_behind(&self) -> bool {
+        self.age < self.generation && !self.is_done()
+    }
+
+    /// Whether its populations are past the last generation, and only champions play.
+    fn is_over(&self) -> bool {
+        self.age > self.last()
+    }
+
+    /// Numbers in the policies of one trial.
+    fn policies(&self) -> usize {
+        self.world.leaders() * self.config.learning.population * self.world.parameters()
+    }
+
+    /// What it is as far as the host knows.
+    fn snapshot(&self) -> Snapshot<&[f32]> {
+        Snapshot {
+            generation: self.generation,
+            last: self.last(),
+            weights: self.trials.iter().map(|trial| &trial.weights[..]).collect(),
+            fitness: self.trials.iter().map(|trial| &trial.fitness[..]).collect(),
+            pending: self.trials.iter().map(|trial| trial.pending).collect(),
+        }
     }
 
     /// Offers the populations to a backend, once: it takes those of all trials or none.
@@ -396,9 +450,9 @@ impl Arm {
         self.age = self.host_age;
     }
 
-    /// Sees to it that the host's weights are those of the trainer's generation.
-    fn stand_at(&mut self, generation: usize) -> Result<(), BackendError> {
-        if !self.is_done() && self.age < generation {
+    /// Sees to it that the host's weights are those of the generation that plays next.
+    fn stand(&mut self) -> Result<(), BackendError> {
+        if self.is_behind() {
             return Err(BackendError::Gone);
         }
         let fetched = self.fetch();
@@ -409,8 +463,9 @@ impl Arm {
     }
 
     /// Forms the teams of a generation and draws its starts.
-    fn prepare(&mut self, generation: usize, level: Level) {
-        let Arm { config, world, trials, .. } = self;
+    fn prepare(&mut self, level: Level) {
+        let Arm { config, world, trials, age: generation, .. } = self;
+        let generation = *generation;
         let Learning { seed, population, start_jitter, .. } = config.learning;
         let leaders = world.leaders();
         trials.par_iter_mut().for_each(|trial| {
@@ -432,8 +487,9 @@ impl Arm {
     }
 
     /// Turns what was observed into fitness and rows.
-    fn conclude(&mut self, arm: usize, generation: usize) -> Vec<Row> {
-        let Arm { config, world, trials, .. } = self;
+    fn conclude(&mut self, arm: usize) -> Vec<Row> {
+        let Arm { config, world, trials, age: generation, .. } = self;
+        let generation = *generation;
         let population = config.learning.population;
         let mut rows = Vec::with_capacity(trials.len());
         for trial in trials {
@@ -450,7 +506,7 @@ impl Arm {
         let (pois, population) = (self.world.pois.len(), self.config.learning.population);
         let row = |trial: &mut Trial| {
             let [_, _, champion_g] = trial.summary(pois, population);
-            trial.pending.take().map(|row| Row { champion_g, ..row })
+            trial.pending.map(|row| Row { champion_g, ..row })
         };
         let rows = self.trials.iter_mut().filter_map(row).collect();
         self.held.clear();
@@ -461,8 +517,13 @@ impl Arm {
 
     /// Makes the next generation: plans which policy each slot comes from and whether it mutates, and carries that out.
     /// After the last, policies stay, and the champion plays.
-    fn breed(&mut self, generation: usize, level: Level) {
+    ///
+    /// # Errors
+    /// The backend that holds the populations failed. This generation is told by now: the next makes up for the loss, or
+    /// fails.
+    fn breed(&mut self, level: Level) -> Result<(), BackendError> {
         thread_local! { static SCRATCH: RefCell<Vec<u32>> = const { RefCell::new(Vec::new()) }; }
+        let generation = self.age;
         let last = generation == self.last();
         let Arm { config, world, trials, held, .. } = self;
         let Learning { seed, population, elites, .. } = config.learning;
@@ -487,10 +548,9 @@ impl Arm {
                 held.breed(&Breeding { parents: &trial.parents, key, generation, learning: &config.learning })
             });
             if bred.is_err() {
-                // This generation is told by now: the next makes up for the loss, or fails.
                 self.let_go();
             }
-            return;
+            return bred;
         }
         self.host_age = self.age;
         let parameters = world.parameters();
@@ -515,6 +575,7 @@ impl Arm {
             });
             std::mem::swap(weights, &mut trial.children);
         });
+        Ok(())
     }
 
     /// Copies policies, without the champions' slots, best first in each population.

@@ -9,13 +9,13 @@ use std::time::{Duration, Instant};
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::Config;
 use flotilla::evolve::{MAX_WEIGHT, MIN_WEIGHT};
-use flotilla::record::checkpoint::{self, Checkpoint, Schedule};
+use flotilla::record::checkpoint::{self, Checkpoint};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, POLICIES, RUN, Run, Start};
 use flotilla::record::metrics::Rows;
 use flotilla::record::tensors::MAX_HEADER_BYTES;
 use flotilla::record::{hex, policies};
-use flotilla::run::{Machine, Opened, Options, Session};
+use flotilla::run::{Machine, Options, Session};
 use flotilla::trainer::Trainer;
 use rand::{RngExt, SeedableRng, rngs::ChaCha8Rng};
 use sha2::{Digest, Sha256};
@@ -44,36 +44,38 @@ fn config() -> Config {
     Config::parse(CONFIG, "config.toml").unwrap()
 }
 
-/// The files of a real run: config, run.json, metrics, policies, checkpoint.
+/// The files of a real run: config, run.json, metrics, policies, its last checkpoint and the one that it ended with.
 struct Files {
     run: Vec<u8>,
     metrics: Vec<u8>,
     policies: Vec<u8>,
-    checkpoint: Vec<u8>,
+    checkpoints: [Vec<u8>; 2],
 }
 
 fn files() -> Files {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run");
-    let (opened, _) = Session::open(config(), &path, Start::Fresh, Disk::default()).unwrap();
-    let Opened::Ready(mut session) = opened else { panic!("nothing to do") };
+    let mut config = config();
+    config.checkpoint.generations = 1;
+    let (mut session, _) = Session::open(vec![(config, path.clone())], Start::Fresh, &Disk::default()).unwrap();
     let (stop, save) = Default::default();
-    let options = Options {
-        schedule: Schedule { generations: 1, seconds: 0.0 },
+    let mut options = Options {
+        command: "flotilla train",
         stop: &stop,
         save: &save,
         instead: &mut |_| None,
+        setback: &mut |_| {},
         watch: &mut |_| {},
     };
-    session.train((Box::new(Cpu::default()), Machine::default()), options).unwrap();
+    session.train(&mut (Box::new(Cpu::default()), Machine::default()), &mut options).unwrap();
     let read = |name: &str| fs::read(path.join(name)).unwrap();
     let checkpoints = path.join("checkpoints");
-    let newest = *checkpoint::list(&checkpoints).unwrap().last().unwrap();
+    let [before, end] = checkpoint::list(&checkpoints).unwrap()[..] else { panic!("two are kept") };
     Files {
         run: read(RUN),
         metrics: read(METRICS),
         policies: read(POLICIES),
-        checkpoint: fs::read(checkpoint::path(&checkpoints, newest)).unwrap(),
+        checkpoints: [before, end].map(|generation| fs::read(checkpoint::path(&checkpoints, generation)).unwrap()),
     }
 }
 
@@ -275,11 +277,20 @@ fn policies_files() {
 fn checkpoints() {
     let (config, files) = (config(), files());
     let mut backend = Cpu::default();
-    fuzz("checkpoint", &[&files.checkpoint], |bytes| {
-        let Ok(read) = Checkpoint::read(Cursor::new(bytes), std::slice::from_ref(&config)) else { return false };
+    let mut longer = config.clone();
+    longer.learning.generations += 2;
+    let [before, end] = &files.checkpoints;
+    fuzz("checkpoint", &[before, end], |bytes| {
+        let Ok(read) = Checkpoint::read(Cursor::new(bytes), &longer) else { return false };
+        let mut trainer = Trainer::new(vec![longer.clone()]);
+        if read.snapshot.weights.is_empty() {
+            // They are the policies', and those are read with as much care.
+            assert_eq!(read.snapshot.generation, read.snapshot.last + 1);
+            assert!(!trainer.restore(0, read.snapshot));
+            return true;
+        }
         // Whatever is taken can be trained on.
-        let mut trainer = Trainer::new(vec![config.clone()]);
-        assert!(trainer.restore(read.snapshot));
+        assert!(trainer.restore(0, read.snapshot));
         while !trainer.is_done() {
             let rows = trainer.advance(&mut backend).unwrap();
             assert!(rows.iter().all(|row| (0.0..=1.0).contains(&row.mean_g)));
@@ -329,7 +340,7 @@ fn headers_made_to_cost() {
         let bytes = [&(header.len() as u64).to_le_bytes(), header.as_bytes()].concat();
         let start = Instant::now();
         assert!(policies::from_source(Cursor::new(&bytes), &config, None).is_err());
-        assert!(Checkpoint::read(Cursor::new(&bytes), std::slice::from_ref(&config)).is_err());
+        assert!(Checkpoint::read(Cursor::new(&bytes), &config).is_err());
         assert!(start.elapsed() < LONGEST, "{}", &header[..40]);
     }
     // A header that says it is larger than memory.
@@ -347,5 +358,5 @@ fn lines_made_to_cost() {
     let endless = "1".repeat(64 << 20);
     assert!(Rows::new(endless.as_bytes()).is_err());
     let long = format!("{}\n{endless}", flotilla::record::metrics::HEADER);
-    assert!(Rows::new(long.as_bytes()).unwrap().next().unwrap().unwrap_err().contains("longer than"));
+    assert!(Rows::new(long.as_bytes()).unwrap().next().unwrap().unwrap_err().to_string().contains("longer than"));
 }

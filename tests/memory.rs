@@ -2,6 +2,7 @@
 //! start.
 
 use std::fs;
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -129,18 +130,18 @@ fn checkpoints_need_no_copy() {
     let files = ["copy", "view"].map(|name| {
         let path = folder.path().join(name);
         fs::create_dir(&path).unwrap();
-        let mut keeper = Keeper::new(disk.clone(), path.clone(), vec![config.clone()], vec![0, 1], 1);
+        let mut keeper = Keeper::new(disk.clone(), path.clone(), config.clone(), vec![0, 1], 1);
         let (config, seconds) = (checkpoint::digest(&config), 2.5);
         let (metrics, output) = metrics.mark().unwrap();
         match name {
             "copy" => {
-                let snapshot = trainer.snapshot().unwrap();
+                let snapshot = trainer.snapshot(0).unwrap();
                 let checkpoint = Checkpoint { config, seconds, metrics, snapshot };
                 keeper.save(checkpoint, output, Instant::now()).unwrap();
                 keeper.wait().unwrap();
             }
             _ => {
-                let checkpoint = Checkpoint { config, seconds, metrics, snapshot: trainer.view().unwrap() };
+                let checkpoint = Checkpoint { config, seconds, metrics, snapshot: trainer.view(0).unwrap() };
                 keeper.save_now(&checkpoint, &output, Instant::now()).unwrap();
             }
         }
@@ -148,11 +149,11 @@ fn checkpoints_need_no_copy() {
         fs::read(checkpoint::path(&path, 3)).unwrap()
     });
     assert!(files[0].len() > config.policy_bytes() && files[0] == files[1]);
-    let read =
-        checkpoint::read(&checkpoint::path(&folder.path().join("view"), 3), std::slice::from_ref(&config)).unwrap();
-    assert_eq!(read.snapshot, trainer.snapshot().unwrap());
+    let read = checkpoint::read(&checkpoint::path(&folder.path().join("view"), 3), Path::new("none"), &config);
+    let read = read.unwrap().expect("it has its weights");
+    assert_eq!(read.snapshot, trainer.snapshot(0).unwrap());
     let mut other = Trainer::new(vec![config]);
-    assert!(other.restore(read.snapshot));
+    assert!(other.restore(0, read.snapshot));
     let rows = |trainer: &mut Trainer| trainer.advance(&mut Cpu::default()).unwrap();
     assert_eq!(rows(&mut other), rows(&mut trainer));
     assert_eq!(other.policies(0), trainer.policies(0));

@@ -13,10 +13,9 @@ use flotilla::backend::gpu::episode::{GpuEpisodes, HELD_FROM, Holding};
 use flotilla::backend::{Backend, BackendError, Breeding, Group, Held, Trace, Visit, Weights};
 use flotilla::config::{Config, Fitness, Learning, Mutation, Paradigm};
 use flotilla::evolve::{self, Key, Purpose, UNCHANGED};
-use flotilla::record::checkpoint::Schedule;
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, Start};
-use flotilla::run::{Machine, Opened, Options, Outcome, Player, Session};
+use flotilla::run::{Machine, Options, Outcome, Player, Session};
 use flotilla::trainer::{Row, Snapshot, SnapshotError, Trainer};
 
 fn learning() -> Learning {
@@ -113,6 +112,19 @@ fn policies(trainer: &Trainer) -> Vec<Vec<Vec<f32>>> {
     (0..arms().len()).map(|arm| trainer.policies(arm)).collect()
 }
 
+/// Of all arms.
+fn snapshots_of(trainer: &mut Trainer) -> Result<Vec<Snapshot>, SnapshotError> {
+    (0..arms().len()).map(|arm| trainer.snapshot(arm)).collect()
+}
+
+fn restored(snapshots: &[Snapshot]) -> Trainer {
+    let mut trainer = Trainer::new(arms());
+    for (arm, snapshot) in snapshots.iter().enumerate() {
+        assert!(trainer.restore(arm, snapshot.clone()));
+    }
+    trainer
+}
+
 fn train(trainer: &mut Trainer, backend: &mut dyn Backend) -> Story {
     let mut rows = Vec::new();
     while !trainer.is_done() {
@@ -122,10 +134,10 @@ fn train(trainer: &mut Trainer, backend: &mut dyn Backend) -> Story {
 }
 
 /// What the CPU comes to, and its snapshots before each generation.
-fn reference() -> (Story, Vec<Snapshot>) {
+fn reference() -> (Story, Vec<Vec<Snapshot>>) {
     let (mut trainer, mut rows, mut snapshots) = (Trainer::new(arms()), Vec::new(), Vec::new());
     while !trainer.is_done() {
-        snapshots.push(trainer.snapshot().unwrap());
+        snapshots.push(snapshots_of(&mut trainer).unwrap());
         rows.extend(trainer.advance(&mut Cpu::default()).unwrap());
     }
     (Story { rows, policies: policies(&trainer) }, snapshots)
@@ -150,11 +162,9 @@ fn training_comes_to_the_same_wherever_populations_are() {
         let (mut device, mut again) = (open(Holding::Always), open(Holding::Always));
         let (mut trainer, mut rows) = (Trainer::new(arms()), Vec::new());
         for (generation, snapshot) in snapshots.iter().enumerate() {
-            assert_eq!(&trainer.snapshot().unwrap(), snapshot, "{info}, before generation {generation}");
+            assert_eq!(&snapshots_of(&mut trainer).unwrap(), snapshot, "{info}, before generation {generation}");
             for other in [&mut Cpu::default() as &mut dyn Backend, &mut again] {
-                let mut resumed = Trainer::new(arms());
-                assert!(resumed.restore(snapshot.clone()));
-                let rest = train(&mut resumed, other);
+                let rest = train(&mut restored(snapshot), other);
                 assert_eq!(rest.policies, expected.policies, "{info}, from generation {generation}");
                 assert!(expected.rows.ends_with(&rest.rows) || generation == 0, "{info}, from generation {generation}");
             }
@@ -166,10 +176,54 @@ fn training_comes_to_the_same_wherever_populations_are() {
         let mut backends: [Box<dyn Backend>; 3] =
             [Box::new(open(Holding::Always)), Box::new(open(Holding::Always)), Box::new(Cpu::default())];
         while !trainer.is_done() {
-            let backend = &mut backends[trainer.generation() % 3];
+            let backend = &mut backends[trainer.generation(2) % 3];
             rows.extend(trainer.advance(&mut **backend).unwrap());
         }
         assert_eq!((&rows, policies(&trainer)), (&expected.rows, expected.policies.clone()), "{info}");
+    }
+}
+
+/// Each arm of a trainer may stand at a generation of its own: what it comes to is the same.
+#[test]
+fn arms_of_different_ages_train_side_by_side() {
+    let (expected, snapshots) = reference();
+    for first in 0..snapshots.len() {
+        let from = [first, (first + 3) % snapshots.len(), snapshots.len() - 1 - first];
+        let mixed: Vec<Snapshot> = (0..3).map(|arm| snapshots[from[arm]][arm].clone()).collect();
+        // Also where a device holds them, and is lost on the way.
+        for nth in [None, Some(2), Some(5), Some(8)] {
+            let mut trainer = restored(&mixed);
+            let mut device = nth.map_or_else(|| Device::failing_at(0, false), |nth| Device::failing_at(nth, true));
+            let mut rows = Vec::new();
+            while !trainer.is_done() {
+                let advanced = trainer.advance(&mut device);
+                rows.extend(advanced.unwrap_or_else(|_| trainer.advance(&mut Cpu::default()).unwrap()));
+            }
+            assert_eq!(policies(&trainer), expected.policies, "from {from:?}, lost at {nth:?}");
+            for (arm, &from) in from.iter().enumerate() {
+                let of_arm = |rows: &[Row]| rows.iter().filter(|row| row.arm == arm).copied().collect::<Vec<_>>();
+                let due =
+                    of_arm(&expected.rows).into_iter().filter(|row| row.generation + 1 >= from).collect::<Vec<_>>();
+                assert_eq!(of_arm(&rows), due, "arm {arm} from {from}, lost at {nth:?}");
+            }
+        }
+    }
+}
+
+/// An error that was made up for is told, once, by whoever asks.
+#[test]
+fn a_setback_is_told() {
+    for nth in 1.. {
+        let (mut trainer, mut device, mut told) = (Trainer::new(arms()), Device::failing_at(nth, false), 0);
+        while !trainer.is_done() {
+            trainer.advance(&mut device).unwrap();
+            told += usize::from(trainer.take_setback().is_some_and(|error| error.to_string().contains("pulled out")));
+        }
+        assert_eq!(told, usize::from(device.failed()), "call {nth}");
+        if !device.failed() {
+            assert!(nth > 20, "a run makes more calls than {nth}");
+            break;
+        }
     }
 }
 
@@ -302,10 +356,10 @@ fn populations_lost_with_their_device_are_made_again() {
             let (mut trainer, mut rows) = (Trainer::new(arms()), Vec::new());
             let mut device = Device::failing_at(nth, for_good);
             while !trainer.is_done() {
-                if trainer.generation() % saves_every == 0 {
-                    match trainer.snapshot() {
+                if trainer.generation(2) % saves_every == 0 {
+                    match snapshots_of(&mut trainer) {
                         Err(SnapshotError::Backend(_)) => assert!(device.failed(), "{case}"),
-                        taken => assert_eq!(taken.unwrap().generation, trainer.generation(), "{case}"),
+                        taken => assert_eq!(taken.unwrap()[2].generation, trainer.generation(2), "{case}"),
                     }
                 }
                 let advanced = match trainer.advance(&mut device) {
@@ -330,40 +384,44 @@ fn populations_lost_with_their_device_are_made_again() {
 /// A run whose device is lost goes on with the CPU, or says that the last checkpoint is all there is and goes on from it.
 #[test]
 fn a_run_survives_the_loss_of_the_device_that_holds_its_populations() {
-    let config = arms().remove(0);
+    let mut config = arms().remove(0);
+    config.checkpoint = flotilla::config::Checkpoint { generations: 2, seconds: 0.0 };
     let folder = tempfile::tempdir().unwrap();
     let run = |name: &str, start: Start, device: Option<Device>, change: bool| {
         let path = folder.path().join(name);
-        let (opened, _) = Session::open(config.clone(), &path, start, Disk::default()).unwrap();
-        let Opened::Ready(mut session) = opened else { panic!("nothing to do") };
+        let (mut session, _) = Session::open(vec![(config.clone(), path.clone())], start, &Disk::default()).unwrap();
         let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
         let cpu = || -> Player { (Box::new(Cpu::default()), Machine::default()) };
-        let options = Options {
-            schedule: Schedule { generations: 2, seconds: 0.0 },
+        let mut options = Options {
+            command: "",
             stop: &stop,
             save: &save,
             instead: &mut |_| change.then(cpu),
+            setback: &mut |_| {},
             watch: &mut |_| {},
         };
-        let player = device.map_or_else(cpu, |device| (Box::new(device), Machine::default()));
-        let ended = session.train(player, options);
+        let mut player = device.map_or_else(cpu, |device| (Box::new(device), Machine::default()));
+        let ended = session.train(&mut player, &mut options).map(|outcome| {
+            assert_eq!(outcome, Outcome::Done);
+            session.results(0).cloned().unwrap()
+        });
         let metrics = std::fs::read_to_string(path.join(METRICS)).unwrap();
         let rows = metrics.lines().map(|line| line.rsplit_once(',').unwrap().0.to_string()).collect::<Vec<_>>();
         (ended, rows)
     };
     let (expected, rows) = run("cpu", Start::Fresh, None, false);
-    let Ok(Outcome::Done(expected)) = expected else { panic!("{expected:?}") };
+    let expected = expected.unwrap();
     let mut gone = 0;
     for nth in 1..20 {
         let (ended, found) = run(&format!("change-{nth}"), Start::Fresh, Some(Device::failing_at(nth, true)), true);
-        assert_eq!((ended.unwrap(), &found), (Outcome::Done(expected.clone()), &rows), "call {nth}");
+        assert_eq!((ended.unwrap(), &found), (expected.clone(), &rows), "call {nth}");
         let name = format!("stop-{nth}");
         let (ended, _) = run(&name, Start::Fresh, Some(Device::failing_at(nth, true)), false);
         let error = ended.unwrap_err().to_string();
         assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
         gone += usize::from(error.contains("the populations were lost"));
         let (ended, found) = run(&name, Start::Resume, None, false);
-        assert_eq!((ended.unwrap(), &found), (Outcome::Done(expected.clone()), &rows), "call {nth}");
+        assert_eq!((ended.unwrap(), &found), (expected.clone(), &rows), "call {nth}");
     }
     assert!(gone > 0);
 }

@@ -17,11 +17,11 @@ use flotilla::backend::gpu::device::{self, DeviceError};
 use flotilla::backend::gpu::episode::GpuEpisodes;
 use flotilla::backend::{Backend, BackendError, Group, Trace, Visit};
 use flotilla::config::Config;
-use flotilla::record::checkpoint::{self, Checkpoint, Schedule};
+use flotilla::record::checkpoint::{self, Checkpoint};
 use flotilla::record::disk::{Disk, Operation};
-use flotilla::record::folder::{Folder, METRICS, POLICIES, Run, Start, State};
+use flotilla::record::folder::{Folder, METRICS, Note, POLICIES, Run, Start, State};
 use flotilla::record::{RecordError, policies};
-use flotilla::run::{Machine, Opened, Options, Outcome, Player, Results, RunError, Session};
+use flotilla::run::{Machine, Options, Outcome, Player, Results, RunError, Session};
 use rand::{RngExt, SeedableRng, rngs::ChaCha8Rng};
 use tempfile::TempDir;
 
@@ -52,44 +52,55 @@ fn cpu() -> Player {
     (Box::new(Cpu::default()), Machine::default())
 }
 
-/// What one session came to: how it ended, what was told of the folder, and the generations it started before and
-/// reached.
+/// What one session came to: how it ended and with what, what was told of the folder, and the generations it started
+/// before and reached.
 struct Told {
     end: Result<Outcome, RunError>,
-    notes: Vec<String>,
+    results: Option<Results>,
+    notes: Vec<Note>,
     start: usize,
     reached: usize,
 }
 
 fn session(config: &Config, path: &Path, start: Start, disk: Disk, player: Player, stop_at: Option<usize>) -> Told {
-    let (opened, notes) = match Session::open(config.clone(), path, start, disk) {
+    let (mut session, notes) = match Session::open(vec![(config.clone(), path.into())], start, &disk) {
         Ok(opened) => opened,
-        Err(error) => return Told { end: Err(error), notes: vec![], start: 0, reached: 0 },
+        Err(error) => return Told { end: Err(error), results: None, notes: vec![], start: 0, reached: 0 },
     };
-    let mut session = match opened {
-        Opened::Ready(session) => session,
-        Opened::Done(results) => return Told { end: Ok(Outcome::Done(results)), notes, start: 0, reached: 0 },
-    };
-    let start = session.generation();
+    let notes = notes.into_iter().map(|(_, note)| note).collect();
+    if session.is_done() {
+        let results = session.results(0).cloned();
+        return Told { end: Ok(Outcome::Done), results, notes, start: 0, reached: 0 };
+    }
+    let start = session.generations()[0];
+    let end = train(&mut session, player, &mut |_| None, &mut |next| stop_at.is_some_and(|at| next[0] >= at));
+    Told { end, results: session.results(0).cloned(), notes, start, reached: session.generations()[0] }
+}
+
+/// Trains until told to stop.
+fn train(
+    session: &mut Session,
+    mut player: Player,
+    instead: &mut dyn FnMut(&BackendError) -> Option<Player>,
+    stops: &mut dyn FnMut(&[usize]) -> bool,
+) -> Result<Outcome, RunError> {
     let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
-    let options = Options {
-        schedule: Schedule { generations: config.checkpoint.generations, seconds: config.checkpoint.seconds },
+    let mut options = Options {
+        command: "",
         stop: &stop,
         save: &save,
-        instead: &mut |_| None,
-        watch: &mut |progress| stop.store(stop_at.is_some_and(|at| progress.generation >= at), SeqCst),
+        instead,
+        setback: &mut |_| {},
+        watch: &mut |now| stop.store(stops(now.generations), SeqCst),
     };
-    let end = session.train(player, options);
-    Told { end, notes, start, reached: session.generation() }
+    session.train(&mut player, &mut options)
 }
 
 /// Goes on to the end on a good disk.
 fn resume(config: &Config, path: &Path) -> (Results, Told) {
     let told = session(config, path, Start::Resume, Disk::default(), cpu(), None);
-    match &told.end {
-        Ok(Outcome::Done(results)) => (results.clone(), told),
-        other => panic!("{other:?}"),
-    }
+    assert!(matches!(told.end, Ok(Outcome::Done)), "{:?}", told.end);
+    (told.results.clone().unwrap(), told)
 }
 
 /// The metrics without the seconds, and the policies.
@@ -104,8 +115,8 @@ fn reference(config: &Config) -> (Results, (String, Vec<u8>)) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run");
     let told = session(config, &path, Start::Fresh, Disk::default(), cpu(), None);
-    let Ok(Outcome::Done(results)) = told.end else { panic!("{:?}", told.end) };
-    (results, what_came_out(&path))
+    assert!(matches!(told.end, Ok(Outcome::Done)), "{:?}", told.end);
+    (told.results.unwrap(), what_came_out(&path))
 }
 
 #[test]
@@ -126,10 +137,8 @@ fn a_run_stopped_before_any_generation_goes_on_to_the_same_results() {
         let told = session(&config, &path, Start::Fresh, Disk::default(), cpu(), Some(stop_at));
         // The last step completes the run, so there is nothing left to stop.
         let done = stop_at == config.learning.generations + 2;
-        match told.end.unwrap() {
-            Outcome::Stopped { generation } => assert_eq!((generation, done), (stop_at, false)),
-            Outcome::Done(_) => assert!(done),
-        }
+        assert_eq!(told.end.unwrap(), if done { Outcome::Done } else { Outcome::Stopped });
+        assert_eq!(told.reached, stop_at);
         let (results, told) = resume(&config, &path);
         assert_eq!(told.start, if done { 0 } else { stop_at });
         assert_eq!((results, what_came_out(&path)), expected, "stopped before generation {stop_at}");
@@ -149,7 +158,7 @@ fn a_run_that_is_done_is_not_run_again() {
         _ => panic!("{operation:?} {}", path.display()),
     });
     let told = session(&config, &path, Start::Resume, disk, cpu(), None);
-    assert_eq!(told.end.unwrap(), Outcome::Done(expected.0.clone()));
+    assert_eq!((told.end.unwrap(), told.results), (Outcome::Done, Some(expected.0.clone())));
     assert_eq!(fs::read(path.join(METRICS)).unwrap(), before);
     // With one of its results damaged, it goes on from its last checkpoint to restore it.
     for (name, at) in [(POLICIES, 500), (METRICS, 60)] {
@@ -159,6 +168,178 @@ fn a_run_that_is_done_is_not_run_again() {
         let (results, _) = resume(&config, &path);
         assert_eq!((results, what_came_out(&path)), expected, "{name}");
     }
+}
+
+/// The same config for so many generations.
+fn of_length(config: &Config, generations: usize) -> Config {
+    let mut config = config.clone();
+    config.learning.generations = generations;
+    config
+}
+
+#[test]
+fn a_run_of_any_length_is_extended_to_the_same_results() {
+    let config = small();
+    let expected = reference(&config);
+    // Checkpoints of its own, or none but the one that it ends with.
+    for every in [0, 1, 4] {
+        for length in 1..config.learning.generations {
+            let mut short = of_length(&config, length);
+            short.checkpoint.generations = every;
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("run");
+            session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+            let (results, told) = resume(&config, &path);
+            assert_eq!(told.start, length + 1, "{:?}", told.notes);
+            assert_eq!((results, what_came_out(&path)), expected, "from {length} generations");
+            assert_eq!(fs::read_to_string(path.join("config.toml")).unwrap(), config.to_toml());
+            // And it is done.
+            assert_eq!(resume(&config, &path).1.reached, 0);
+        }
+    }
+}
+
+#[test]
+fn a_run_is_extended_from_whatever_is_left_of_it() {
+    let config = small();
+    let expected = reference(&config);
+    let short = of_length(&config, 7);
+    let run = || {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run");
+        session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+        let checkpoints = path.join("checkpoints");
+        assert_eq!(checkpoint::list(&checkpoints).unwrap(), [7, 8]);
+        (folder, path, [7, 8].map(|generation| checkpoint::path(&checkpoints, generation)))
+    };
+    let goes_on = |path: &Path, start: usize| {
+        let (results, told) = resume(&config, path);
+        assert_eq!(told.start, start, "{:?}", told.notes);
+        assert_eq!((results, what_came_out(path)), expected);
+    };
+    // As runs of earlier versions are, which left nothing at their end.
+    let (_folder, path, [_, end]) = run();
+    fs::remove_file(&end).unwrap();
+    goes_on(&path, 7);
+    let (_folder, path, ends) = run();
+    ends.iter().for_each(|end| fs::remove_file(end).unwrap());
+    goes_on(&path, 0);
+    // Its policies are another run's, or damaged, or gone.
+    let other = of_length(&config, 6);
+    let other_folder = tempfile::tempdir().unwrap();
+    session(&other, other_folder.path(), Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+    let others = fs::read(other_folder.path().join(POLICIES)).unwrap();
+    for (damage, policies) in [Some(others), Some(b"none".to_vec()), None].iter().enumerate() {
+        let (_folder, path, _) = run();
+        match policies {
+            Some(bytes) => fs::write(path.join(POLICIES), bytes).unwrap(),
+            None => fs::remove_file(path.join(POLICIES)).unwrap(),
+        }
+        let (results, told) = resume(&config, &path);
+        assert_eq!((told.start, told.notes.len()), (7, 1), "{damage}: {:?}", told.notes);
+        assert_eq!((results, what_came_out(&path)), expected);
+    }
+    // A checkpoint from after the last generation that has its weights.
+    let stopped = tempfile::tempdir().unwrap();
+    session(&short, stopped.path(), Start::Fresh, Disk::default(), cpu(), Some(8)).end.unwrap();
+    goes_on(stopped.path(), 8);
+
+    // It cannot become shorter, and what is refused is left as it is.
+    let (_folder, path, _) = run();
+    let whole = what_came_out(&path);
+    let told = session(&of_length(&config, 6), &path, Start::Resume, Disk::default(), cpu(), None);
+    let error = told.end.unwrap_err().to_string();
+    assert!(error.contains("is a run of 7 generations, which cannot become one of 6"), "{error}");
+    assert_eq!(what_came_out(&path), whole);
+    // Nor does anything else change with its length.
+    let mut other = config.clone();
+    other.learning.seed = 3;
+    let error = session(&other, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err().to_string();
+    assert!(
+        error.contains("learning.seed: 0 there, 3 here") && error.contains("learning.generations: 7 there"),
+        "{error}"
+    );
+}
+
+/// Every operation of an extension fails once, alone or with all after it.
+#[test]
+fn no_failing_disk_operation_costs_an_extension() {
+    let config = of_length(&small(), 9);
+    let mut short = of_length(&config, 5);
+    short.checkpoint.generations = 3;
+    let expected = reference(&config);
+    let attempt = |fails: Box<dyn Fn(usize) -> bool + Send + Sync>| {
+        let folder = in_memory();
+        let path = folder.path().join("run");
+        session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+        let count = Arc::new(AtomicUsize::new(0));
+        let disk = Disk::failing({
+            let count = count.clone();
+            move |_, _| match fails(count.fetch_add(1, SeqCst)) {
+                true => Err(io::Error::from(io::ErrorKind::StorageFull)),
+                false => Ok(()),
+            }
+        });
+        let mut rare = config.clone();
+        rare.checkpoint.generations = 0;
+        let told = session(&rare, &path, Start::Resume, disk, cpu(), None);
+        (folder, path, told, count.load(SeqCst))
+    };
+    let (_, _, told, operations) = attempt(Box::new(|_| false));
+    assert_eq!(told.results, Some(expected.0.clone()));
+    assert!(operations > 20, "{operations}");
+    for at in 0..operations {
+        for all_after in [false, true] {
+            let (_folder, path, _, _) =
+                attempt(Box::new(move |operation| operation == at || all_after && operation > at));
+            let (results, again) = resume(&config, &path);
+            assert_eq!((results, what_came_out(&path)), expected, "operation {at}");
+            assert!(again.notes.len() <= 1, "operation {at}: {:?}", again.notes);
+            // It goes on from the end of the run that was extended, or is over.
+            assert!(again.start >= 6 || again.reached == 0, "operation {at}: {:?}", again.notes);
+            assert_eq!(leftovers(&path), Vec::<PathBuf>::new(), "operation {at}");
+        }
+    }
+}
+
+/// Runs of different lengths, sizes and ages, driven together, come to what each comes to alone.
+#[test]
+fn runs_side_by_side_come_to_what_they_come_to_alone() {
+    let mut configs = [small(), of_length(&small(), 5), of_length(&small(), 9), small()];
+    configs[2].learning.population = 9;
+    configs[3].learning.seed = 4;
+    configs[3].checkpoint.generations = 0;
+    let expected: Vec<_> = configs.iter().map(reference).collect();
+    let folder = tempfile::tempdir().unwrap();
+    let path = |run: usize| folder.path().join(run.to_string());
+    // One has come far, one is done, the others have not started.
+    session(&configs[0], &path(0), Start::Fresh, Disk::default(), cpu(), Some(11)).end.unwrap();
+    session(&configs[1], &path(1), Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+    let open = || {
+        let runs = configs.iter().enumerate().map(|(run, config)| (config.clone(), path(run))).collect();
+        Session::open(runs, Start::Resume, &Disk::default()).unwrap()
+    };
+    let (mut session, notes) = open();
+    assert_eq!(session.generations(), [11, 7, 0, 0]);
+    assert_eq!(notes.iter().map(|(run, _)| *run).collect::<Vec<_>>(), [0, 2, 3]);
+    let stopped = train(&mut session, cpu(), &mut |_| None, &mut |next| next[2] >= 3);
+    assert_eq!((stopped.unwrap(), session.generations()), (Outcome::Stopped, &[14, 7, 3, 3][..]));
+    drop(session);
+    let (mut session, _) = open();
+    let done = train(&mut session, cpu(), &mut |_| None, &mut |_| false);
+    assert_eq!((done.unwrap(), session.generations()), (Outcome::Done, &[16, 7, 11, 16][..]));
+    for (run, expected) in expected.iter().enumerate() {
+        assert_eq!(
+            (session.results(run), what_came_out(&path(run))),
+            (Some(&expected.0), expected.1.clone()),
+            "run {run}"
+        );
+    }
+    // Where one of the folders cannot be taken, none is touched.
+    drop(session);
+    let runs = [(configs[0].clone(), folder.path().join("new")), (configs[1].clone(), path(1))];
+    assert!(Session::open(runs.to_vec(), Start::Fresh, &Disk::default()).is_err());
+    assert!(!folder.path().join("new").exists());
 }
 
 /// Every operation of a run fails once, alone or with all after it; a write that fails leaves its first half.
@@ -186,7 +367,7 @@ fn no_failing_disk_operation_costs_a_run() {
         (folder, path, told, count.load(SeqCst), failed)
     };
     let (_, _, told, operations, _) = attempt(Box::new(|_| false));
-    assert_eq!(told.end.unwrap(), Outcome::Done(expected.0.clone()));
+    assert_eq!((told.end.unwrap(), told.results), (Outcome::Done, Some(expected.0.clone())));
     assert!(operations > 14 * 5, "{operations}");
     let mut kinds = Vec::new();
     for at in 0..operations {
@@ -266,9 +447,9 @@ fn every_damaged_byte_of_a_checkpoint_is_found() {
     let config = small();
     let (_folder, _, paths) = stopped_run(&config);
     let whole = fs::read(&paths[1]).unwrap();
-    Checkpoint::read(Cursor::new(&whole), std::slice::from_ref(&config)).unwrap();
+    Checkpoint::read(Cursor::new(&whole), &config).unwrap();
     for (damage, bytes) in damaged(&whole) {
-        let read = Checkpoint::read(Cursor::new(&bytes), std::slice::from_ref(&config));
+        let read = Checkpoint::read(Cursor::new(&bytes), &config);
         assert!(read.is_err(), "{damage}");
     }
 }
@@ -300,7 +481,8 @@ fn a_damaged_checkpoint_is_named_and_the_one_before_is_used() {
         fs::write(&paths[1], bytes).unwrap();
         let told = session(&config, &path, Start::Resume, Disk::default(), cpu(), Some(10));
         assert_eq!(told.start, 8, "{damage}");
-        assert!(told.notes[0].contains("000000009.safetensors: "), "{damage}: {:?}", told.notes);
+        let note = told.notes[0].to_string();
+        assert!(told.notes[0].is_damage() && note.contains("000000009.safetensors: "), "{damage}: {note}");
         assert_eq!(checkpoint::list(&path.join("checkpoints")).unwrap(), [9, 10]);
         for generation in [9, 10] {
             fs::remove_file(checkpoint::path(&path.join("checkpoints"), generation)).unwrap();
@@ -419,21 +601,15 @@ fn a_lost_device_costs_nothing() {
 
         // It goes on with the CPU.
         let path = folder.path().join("cpu");
-        let (opened, _) = Session::open(config.clone(), &path, Start::Fresh, Disk::default()).unwrap();
-        let Opened::Ready(mut session) = opened else { panic!("nothing to do") };
-        let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
+        let runs = vec![(config.clone(), path.clone())];
+        let (mut session, _) = Session::open(runs, Start::Fresh, &Disk::default()).unwrap();
         let mut asked = 0;
-        let options = Options {
-            schedule: Schedule { generations: 0, seconds: 0.0 },
-            stop: &stop,
-            save: &save,
-            instead: &mut |_| {
-                asked += 1;
-                Some(cpu())
-            },
-            watch: &mut |_| {},
+        let mut instead = |_: &_| {
+            asked += 1;
+            Some(cpu())
         };
-        assert_eq!(session.train(failing(), options).unwrap(), Outcome::Done(expected.0.clone()));
+        assert_eq!(train(&mut session, failing(), &mut instead, &mut |_| false).unwrap(), Outcome::Done);
+        assert_eq!(session.results(0), Some(&expected.0));
         assert_eq!((asked, what_came_out(&path)), (1, expected.1.clone()));
     }
 }
@@ -451,10 +627,10 @@ fn a_run_may_change_to_another_processor_and_back() {
         let path = folder.path().join("run");
         for (stop_at, player) in [(4, cpu()), (9, gpu()), (12, cpu())] {
             let told = session(&config, &path, Start::Resume, Disk::default(), player, Some(stop_at));
-            assert_eq!(told.end.unwrap(), Outcome::Stopped { generation: stop_at });
+            assert_eq!((told.end.unwrap(), told.reached), (Outcome::Stopped, stop_at));
         }
         let told = session(&config, &path, Start::Resume, Disk::default(), gpu(), None);
-        assert_eq!(told.end.unwrap(), Outcome::Done(expected.0.clone()), "{info}");
+        assert_eq!((told.end.unwrap(), told.results), (Outcome::Done, Some(expected.0.clone())), "{info}");
         assert_eq!(what_came_out(&path), expected.1, "{info}");
     }
 }
@@ -467,7 +643,7 @@ fn flotilla() -> Command {
 }
 
 /// A command that trains in a folder.
-fn train(config: &Path, out: &Path, flags: &[&str]) -> Command {
+fn flotilla_train(config: &Path, out: &Path, flags: &[&str]) -> Command {
     let mut command = flotilla();
     // No time is lost on looking for GPUs.
     command.arg("train").arg(config).arg("--out").arg(out).args(["--backend", "cpu"]).args(flags);
@@ -522,11 +698,15 @@ fn a_killed_run_goes_on_to_the_same_results() {
     while killed < kills {
         let out = folder.path().join(format!("run-{runs}"));
         runs += 1;
+        // Every other run is at first a shorter one, which comes to its end.
+        let mut lengths = if runs % 2 == 0 { vec!["60"] } else { vec!["60", "25"] };
         loop {
             let recorded = generations_recorded(&out);
             // Another number of threads each time.
             let threads = (1 + random.random_range(0..3)).to_string();
-            let mut child = train(&file, &out, &["--resume", "--threads", &threads]).spawn().unwrap();
+            let length = lengths.last().expect("there is one to go");
+            let flags = ["--resume", "--threads", &threads, "--generations", length];
+            let mut child = flotilla_train(&file, &out, &flags).spawn().unwrap();
             let moment = Instant::now() + Duration::from_micros(random.random_range(0..150_000));
             let over = loop {
                 match child.try_wait().unwrap() {
@@ -555,7 +735,10 @@ fn a_killed_run_goes_on_to_the_same_results() {
                 }
                 Some(status) => {
                     assert_eq!(status.code(), Some(0), "{told}");
-                    break;
+                    lengths.pop();
+                    if lengths.is_empty() {
+                        break;
+                    }
                 }
             }
         }
@@ -586,22 +769,22 @@ fn a_second_process_is_refused_until_the_first_is_gone() {
     let folder = tempfile::tempdir().unwrap();
     let file = config_file(folder.path(), &HEAVY.replace("generations = 60", "generations = 100000"));
     let out = folder.path().join("run");
-    let mut first = train(&file, &out, &[]).spawn().unwrap();
+    let mut first = flotilla_train(&file, &out, &[]).spawn().unwrap();
     until("the run starts", || generations_recorded(&out) > 0);
     for flags in [&["--resume"][..], &["--force"]] {
-        let second = train(&file, &out, flags).output().unwrap();
+        let second = flotilla_train(&file, &out, flags).output().unwrap();
         assert_eq!(second.status.code(), Some(1));
         assert!(stderr(&second).contains("error: another process is training in"), "{}", stderr(&second));
     }
-    let third = train(&file, &out, &[]).output().unwrap();
+    let third = flotilla_train(&file, &out, &[]).output().unwrap();
     assert_eq!(third.status.code(), Some(1));
     assert!(stderr(&third).contains("holds a run already; go on with it by --resume"), "{}", stderr(&third));
     first.kill().unwrap();
     first.wait().unwrap();
-    let changed = train(&file, &out, &["--resume", "--seed", "3"]).output().unwrap();
+    let changed = flotilla_train(&file, &out, &["--resume", "--seed", "3"]).output().unwrap();
     assert_eq!(changed.status.code(), Some(1));
     assert!(stderr(&changed).contains("learning.seed: 0 there, 3 here"), "{}", stderr(&changed));
-    let mut again = train(&file, &out, &["--resume"]).spawn().unwrap();
+    let mut again = flotilla_train(&file, &out, &["--resume"]).spawn().unwrap();
     let recorded = generations_recorded(&out);
     until("the run goes on", || generations_recorded(&out) > recorded + 2);
     again.kill().unwrap();
@@ -632,12 +815,13 @@ mod unix {
         let flags = ["--checkpoint-generations", "0", "--checkpoint-seconds", "0", "--quiet"];
         for name in ["TERM", "INT"] {
             let out = folder.path().join(name);
-            let child = train(&file, &out, &flags).spawn().unwrap();
+            let child = flotilla_train(&file, &out, &flags).spawn().unwrap();
             until("the run starts", || out.join("run.json").exists());
             signal(&child, name);
             let (status, told) = ended(child);
             assert_eq!(status.code(), Some(75), "{told}");
             let (_, command) = told.split_once("go on with\n  flotilla ").expect(&told);
+            assert!(told.starts_with("stopped: before generation") && command.contains("--backend cpu"), "{told}");
             let again = flotilla().args(command.split_whitespace()).output().unwrap();
             assert_eq!(again.status.code(), Some(0), "{}", stderr(&again));
             assert!(stderr(&again).contains("going on before generation"), "{}", stderr(&again));
@@ -652,7 +836,7 @@ mod unix {
         let text = HEAVY.replace("population = 60", "population = 2000").replace("steps = 4", "steps = 10000");
         let file = config_file(folder.path(), &text);
         let out = folder.path().join("run");
-        let child = train(&file, &out, &["--threads", "1"]).spawn().unwrap();
+        let child = flotilla_train(&file, &out, &["--threads", "1"]).spawn().unwrap();
         until("the run starts", || out.join("run.json").exists());
         let start = Instant::now();
         signal(&child, "TERM");
@@ -668,7 +852,7 @@ mod unix {
         let file = config_file(folder.path(), &HEAVY.replace("generations = 60", "generations = 100000"));
         let out = folder.path().join("run");
         let flags = ["--checkpoint-generations", "0", "--checkpoint-seconds", "0"];
-        let child = train(&file, &out, &flags).spawn().unwrap();
+        let child = flotilla_train(&file, &out, &flags).spawn().unwrap();
         until("the run starts", || out.join("run.json").exists());
         let checkpoints = out.join("checkpoints");
         assert!(checkpoint::list(&checkpoints).unwrap().is_empty());
@@ -699,7 +883,7 @@ mod unix {
         let refused = limited("100");
         assert_eq!(refused.status.code(), Some(1), "{}", stderr(&refused));
         assert!(stderr(&refused).contains(".safetensors: cannot be written"), "{}", stderr(&refused));
-        let again = train(&file, &out, &["--resume"]).output().unwrap();
+        let again = flotilla_train(&file, &out, &["--resume"]).output().unwrap();
         assert_eq!(again.status.code(), Some(0), "{}", stderr(&again));
         assert_eq!(what_came_out(&out), expected.1);
     }
@@ -708,8 +892,12 @@ mod unix {
     fn a_folder_that_cannot_be_is_told() {
         let folder = tempfile::tempdir().unwrap();
         let file = config_file(folder.path(), SMALL);
+        let output = flotilla_train(&file, &file, &[]).output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        let told = stderr(&output);
+        assert!(told.starts_with("error: ") && told.contains("is a file; choose a folder"), "{told}");
         // A file stands where the folder should be.
-        let output = train(&file, &file.join("run"), &[]).output().unwrap();
+        let output = flotilla_train(&file, &file.join("run"), &[]).output().unwrap();
         assert_eq!(output.status.code(), Some(1));
         assert!(stderr(&output).contains("cannot be written"), "{}", stderr(&output));
     }

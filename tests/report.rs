@@ -445,8 +445,205 @@ fn the_papers_figures_come_with_its_claims() {
             assert_eq!(arm[curve].as_array().unwrap().len(), 4, "{curve}");
         }
     }
+    // Every arm is a run, also those that another one stands for.
+    let folders: Vec<PathBuf> = fs::read_dir(out.join("arms")).unwrap().map(|entry| entry.unwrap().path()).collect();
+    assert_eq!(folders.len(), 18);
+    let last = |folder: &str| {
+        let is_it = |arm: &&Value| {
+            let [layout, paradigm, fitness] = ["layout", "paradigm", "fitness"].map(|key| arm[key].as_str().unwrap());
+            folder == format!("{}-{paradigm}-{fitness}", layout.replace(' ', "-"))
+        };
+        let arm = arms.iter().find(is_it).unwrap();
+        arm["mean"][3].as_f64().unwrap() / arm["pois"].as_f64().unwrap()
+    };
+    for folder in &folders {
+        let text = fs::read_to_string(folder.join("metrics.csv")).unwrap();
+        let best: Vec<f64> = text
+            .lines()
+            .filter(|line| line.split(',').nth(1) == Some("3"))
+            .map(|line| line.split(',').nth(2).unwrap().parse().unwrap())
+            .collect();
+        let name = folder.file_name().unwrap().to_str().unwrap();
+        assert!((best.iter().sum::<f64>() / 2.0 - last(name)).abs() < 1e-9, "{name}");
+    }
+    let twin = out.join("arms/chaotic-all-leaders-Df");
+    let again = folder.path().join("again");
+    let path = |path: &Path| path.to_str().unwrap().to_string();
+    succeed(&["train", &path(&twin.join("config.toml")), "--out", &path(&again), "--backend", "cpu", "--quiet"]);
+    assert!(
+        fs::read(again.join("policies.safetensors")).unwrap() == fs::read(twin.join("policies.safetensors")).unwrap()
+    );
+    let digest = |folder: &Path| {
+        let run: Value = serde_json::from_str(&fs::read_to_string(folder.join("run.json")).unwrap()).unwrap();
+        assert_eq!(run["state"], "done");
+        run["digest"].clone()
+    };
+    assert_eq!(digest(&again), digest(&twin));
+    succeed(&["replay", &path(&twin), "--trial", "1", "--backend", "cpu"]);
+    succeed(&[
+        "plot",
+        &path(&twin),
+        &path(&out.join("arms/chaotic-leader-follower-Df")),
+        "--out",
+        &path(&out.join("x.svg")),
+    ]);
     // Three generations cannot say what happens after 100, and the table says that.
     assert!(said.contains("open: "), "{said}");
     let claims = fs::read_to_string(out.join("claims.md")).unwrap();
     assert_eq!(claims.lines().filter(|line| line.starts_with("| ")).count(), 2 + 10);
+}
+
+/// A paper's folder and what it holds.
+fn paper(out: &Path, flags: &[&str]) -> Output {
+    let all = ["paper", "--out", out.to_str().unwrap(), "--trials", "2", "--backend", "cpu", "--quiet"];
+    flotilla(&[&all[..], flags].concat())
+}
+
+/// All that a paper draws and learns: names and bytes.
+fn outcome(out: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let entries = |folder: &Path| fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect::<Vec<_>>();
+    let arms = entries(&out.join("arms")).into_iter().map(|arm| arm.join("policies.safetensors"));
+    let files: Vec<PathBuf> = entries(out).into_iter().filter(|path| path.is_file()).chain(arms).collect();
+    let bytes = |path: PathBuf| {
+        let bytes = fs::read(&path).unwrap();
+        let name = path.strip_prefix(out).unwrap().to_path_buf();
+        match name.to_str() {
+            // It tells the time.
+            Some("summary.json") => {
+                let mut summary: Value = serde_json::from_slice(&bytes).unwrap();
+                summary["seconds"] = 0.into();
+                (name, summary.to_string().into_bytes())
+            }
+            _ => (name, bytes),
+        }
+    };
+    files.into_iter().map(bytes).collect()
+}
+
+#[test]
+fn a_paper_is_written_over_only_when_that_is_asked_for() {
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("paper");
+    let refused = |out: &Path, flags: &[&str], said: &[&str]| {
+        let output = paper(out, flags);
+        let told = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{told}");
+        said.iter().for_each(|said| assert!(told.contains(said), "{told}"));
+    };
+    let output = paper(&out, &["--generations", "4", "--json"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let said: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((&said["trials"], &said["generations"], &said["seed"]), (&2.into(), &4.into(), &0.into()));
+    for arm in said["arms"].as_array().unwrap() {
+        let folder = Path::new(arm["folder"].as_str().unwrap());
+        let run: Value = serde_json::from_str(&fs::read_to_string(folder.join("run.json")).unwrap()).unwrap();
+        assert_eq!(run["digest"], arm["digest"]);
+    }
+    let whole = outcome(&out);
+    refused(&out, &["--generations", "4"], &["holds a paper already", "--resume", "--force"]);
+    refused(&out, &["--generations", "3", "--resume"], &["another paper", "generations: 4 there, 3 here"]);
+    refused(&out, &["--generations", "4", "--seed", "1", "--resume"], &["another paper", "seed: 0 there, 1 here"]);
+    assert!(outcome(&out) == whole);
+
+    // Drawn again from the runs, without training; what is gone comes back.
+    let run = out.join("arms/chaotic-leader-follower-G/run.json");
+    let before = fs::read(&run).unwrap();
+    for gone in ["figure5.svg", "claims.md", "arms/chaotic-all-leaders-Df/policies.safetensors"] {
+        fs::remove_file(out.join(gone)).unwrap();
+    }
+    assert!(paper(&out, &["--generations", "4", "--resume"]).status.success());
+    assert!(outcome(&out) == whole && fs::read(&run).unwrap() == before);
+
+    // Extended, it is what a longer one is.
+    assert!(paper(&out, &["--generations", "6", "--resume"]).status.success());
+    let longer = folder.path().join("longer");
+    assert!(paper(&longer, &["--generations", "6"]).status.success());
+    assert!(outcome(&out) == outcome(&longer));
+
+    // Nothing but its own files is written over, and it is no home for other things.
+    fs::write(out.join("notes.txt"), "mine").unwrap();
+    assert!(paper(&out, &["--generations", "4", "--force"]).status.success());
+    assert_eq!(fs::read(out.join("notes.txt")).unwrap(), b"mine");
+    fs::remove_file(out.join("notes.txt")).unwrap();
+    assert!(outcome(&out) == whole);
+    let run = Run::new(CONFIG, &[]);
+    for flags in [&[][..], &["--resume"]] {
+        refused(&run.path(), &[&["--generations", "4"], flags].concat(), &["holds a run, no paper"]);
+    }
+    let sweep = folder.path().join("sweep");
+    fs::create_dir(&sweep).unwrap();
+    fs::write(sweep.join("sweep.toml"), "").unwrap();
+    refused(&sweep, &[], &["holds a sweep, no paper"]);
+    let old = folder.path().join("old");
+    fs::create_dir(&old).unwrap();
+    fs::write(old.join("figure4.svg"), "").unwrap();
+    refused(&old, &[], &["holds a paper already"]);
+    refused(&old, &["--resume"], &["nothing to go on with"]);
+    refused(&sweep.join("sweep.toml"), &[], &["is a file"]);
+}
+
+#[cfg(unix)]
+#[test]
+fn a_signal_stops_a_paper_and_it_goes_on_to_the_same_files() {
+    use std::process::{Command, Stdio};
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("a paper");
+    let program = assert_cmd::cargo::cargo_bin!("flotilla");
+    let flags = ["--trials", "1", "--generations", "150", "--backend", "cpu", "--quiet"];
+    let mut child = Command::new(program);
+    let child = child.args(["paper", "--out"]).arg(&out).args(flags).stderr(Stdio::piped()).spawn().unwrap();
+    let metrics = out.join("arms/chaotic-leader-follower-Df/run.json");
+    let start = std::time::Instant::now();
+    while !metrics.exists() {
+        assert!(start.elapsed().as_secs() < 60, "it does not start");
+        std::thread::sleep(std::time::Duration::from_millis(2));
+    }
+    assert!(Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap().success());
+    let output = child.wait_with_output().unwrap();
+    let told = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(75), "{told}");
+    assert!(told.starts_with("stopped: before generation"), "{told}");
+    let command = told.lines().last().unwrap().trim();
+    assert!(command.starts_with("flotilla paper --out '") && command.ends_with("--resume --backend cpu"), "{command}");
+    assert!(!out.join("claims.md").exists());
+    let path = format!("{}:{}", program.parent().unwrap().display(), std::env::var("PATH").unwrap());
+    let again = Command::new("sh").args(["-c", command]).env("PATH", path).output().unwrap();
+    assert!(again.status.success(), "{}", String::from_utf8_lossy(&again.stderr));
+    let whole = folder.path().join("whole");
+    succeed(&[&["paper", "--out", whole.to_str().unwrap()], &flags[..]].concat());
+    assert!(outcome(&out) == outcome(&whole));
+}
+
+#[test]
+fn event_files_of_a_run_that_is_there_are_written_by_resuming_it() {
+    let run = Run::new(CONFIG, &[]);
+    let config = run.folder.path().join("small.toml");
+    let (config, text) = (config.to_str().unwrap().to_string(), run.text());
+    let train = ["train", &config, "--out", &text, "--backend", "cpu", "--quiet"];
+    let records = |trial: usize| {
+        let folder = run.file("tensorboard").join(format!("trial-{trial}"));
+        let files: Vec<_> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+        assert_eq!(files.len(), 1, "{files:?}");
+        let bytes = fs::read(&files[0]).unwrap();
+        let (mut rest, mut steps) = (&bytes[..], Vec::new());
+        while !rest.is_empty() {
+            let length = u64::from_le_bytes(rest[..8].try_into().unwrap()) as usize;
+            // The time takes 9 bytes, then comes the step.
+            assert_eq!(rest[12 + 9], 2 << 3);
+            steps.push(rest[12 + 10]);
+            rest = &rest[12 + length + 4..];
+        }
+        steps
+    };
+    fail(&[&train[..], &["--tensorboard"]].concat(), &["holds a run already", "--resume --tensorboard"]);
+    succeed(&[&train[..], &["--resume", "--tensorboard"]].concat());
+    for trial in 0..3 {
+        assert_eq!(records(trial), [0, 0, 1, 2, 3, 4, 5, 6], "the version, and generations 0 to 6");
+    }
+    // One that goes on has all of it once, also what was trained without event files.
+    succeed(&[&train[..], &["--resume", "--generations", "8"]].concat());
+    succeed(&[&train[..], &["--resume", "--generations", "10", "--tensorboard"]].concat());
+    for trial in 0..3 {
+        assert_eq!(records(trial), [0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10]);
+    }
 }

@@ -463,7 +463,7 @@ fn checkpoints(out: &Path) -> BTreeSet<PathBuf> {
 /// Starts a shard and waits until it has made checkpoints of its own, or is done.
 fn started(sweep: &Path, out: &Path, flags: &[&str]) -> Child {
     let before = checkpoints(out);
-    let mut child = command(sweep, out, flags).stderr(Stdio::null()).stdout(Stdio::null()).spawn().unwrap();
+    let mut child = command(sweep, out, flags).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
     let start = Instant::now();
     while checkpoints(out).is_subset(&before) && child.try_wait().unwrap().is_none() {
         assert!(start.elapsed() < Duration::from_secs(60), "no checkpoint in a minute");
@@ -491,8 +491,14 @@ fn killed_shards_resume_to_the_same_bytes() {
             } else {
                 let id = child.id().to_string();
                 let _ = Command::new("kill").args(["-TERM", &id]).status().unwrap();
-                let code = child.wait().unwrap().code();
-                assert!(matches!(code, Some(75 | 0)), "{code:?}");
+                let output = child.wait_with_output().unwrap();
+                let told = String::from_utf8(output.stderr).unwrap();
+                assert!(matches!(output.status.code(), Some(75 | 0)), "{told}");
+                if output.status.code() == Some(75) {
+                    let command = told.lines().last().unwrap();
+                    assert!(told.starts_with("stopped: everything is saved; go on with"), "{told}");
+                    assert!(command.contains("--backend cpu --shard 2/2 --resume"), "{told}");
+                }
             }
         }
     }
@@ -616,6 +622,43 @@ fn damaged_points_are_missing_not_wrong() {
 }
 
 #[test]
+fn a_summary_may_be_json() {
+    let (folder, sweep) = written(SMALL);
+    let out = folder.path().join("out");
+    let told = done(flotilla(&sweep, &out, &["--quiet", "--json", "--shard", "1/2"]));
+    let said: serde_json::Value = serde_json::from_str(&told).unwrap();
+    assert_eq!((&said["shard"], &said["folder"]), (&"1/2".into(), &out.to_str().unwrap().into()));
+    assert!(said["collect"].as_str().unwrap().ends_with("--collect"));
+    let output = flotilla(&sweep, &out, &["--collect", "--json"]);
+    assert_eq!(output.status.code(), Some(1));
+    let said: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let missing =
+        said["points"].as_array().unwrap().iter().filter(|point| point["missing"] == "it was not run").count();
+    assert!((1..8).contains(&missing), "{said}");
+    let said: serde_json::Value =
+        serde_json::from_str(&done(flotilla(&sweep, &out, &["--quiet", "--json", "--resume"]))).unwrap();
+    let mut table = csv::Reader::from_path(said["files"]["points"].as_str().unwrap()).unwrap();
+    for (row, point) in table.records().map(|row| row.unwrap()).zip(said["points"].as_array().unwrap()) {
+        assert_eq!(row[0], point["values"]["world.coupling"].to_string());
+        assert_eq!(row[3], point["point"].to_string());
+        assert_eq!(row[6].parse::<f64>().unwrap(), point["best_g"].as_f64().unwrap());
+        assert_eq!(row[10], point["reached"].to_string());
+        let run = fs::read_to_string(Path::new(point["folder"].as_str().unwrap()).join("run.json")).unwrap();
+        assert!(run.contains(point["digest"].as_str().unwrap()));
+    }
+    for picture in said["files"]["pictures"].as_array().unwrap() {
+        assert!(Path::new(picture.as_str().unwrap()).exists(), "{picture}");
+    }
+}
+
+#[test]
+fn a_file_is_no_folder() {
+    let (_folder, sweep) = written(SMALL);
+    let told = failed(flotilla(&sweep, &sweep, &[]), 1);
+    assert!(told.starts_with("error: ") && told.contains("is a file; choose a folder"), "{told}");
+}
+
+#[test]
 fn the_list_tells_costs_and_shards() {
     let (folder, sweep) = written(SMALL);
     let told = done(flotilla(&sweep, &folder.path().join("out"), &["--list", "--shards", "3"]));
@@ -643,6 +686,9 @@ fn the_batch_script_is_one_that_bash_takes() {
         assert!(script.lines().any(|found| found == line), "{line}: {script}");
     }
     assert!(!script.contains("--gpus"), "the CPU was asked for: {script}");
+    let host = ["--slurm", "--breed", "host", "--on-device-loss", "cpu"];
+    let script_of_host = done(flotilla(&sweep, &out, &host));
+    assert!(script_of_host.contains("--backend cpu --breed host --on-device-loss cpu --shard"), "{script_of_host}");
     assert!(
         script.contains("--seed 7 --backend cpu --threads 4 --shard \"$SLURM_ARRAY_TASK_ID/3\" --resume"),
         "{script}"

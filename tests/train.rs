@@ -317,3 +317,102 @@ fn rollout_takes_other_programs_files_and_refuses_what_it_cannot_play() {
     place.refused("rollout small.toml --policies good.safetensors --scores no/such/folder.csv", 1);
     assert_eq!(place.run("rollout small.toml").status.code(), Some(2));
 }
+
+#[test]
+fn a_finished_run_is_extended() {
+    let place = Place::new();
+    place.good("train small.toml --out whole --generations 11 --quiet");
+    place.good("train small.toml --out run --quiet");
+    let error = place.refused("train small.toml --out run --resume --generations 5", 1);
+    assert!(error.contains("run is a run of 6 generations, which cannot become one of 5"), "{error}");
+    let (summary, told) = place.good("train small.toml --out run --resume --generations 11");
+    assert!(told.contains("going on before generation 7"), "{told}");
+    assert!(summary.starts_with("Trained 3 trials"), "{summary}");
+    for name in ["policies.safetensors", "config.toml"] {
+        assert!(fs::read(place.path("run").join(name)).unwrap() == fs::read(place.path("whole").join(name)).unwrap());
+    }
+    let timeless = |name: &str| -> Vec<String> {
+        place.read(name).lines().map(|line| line.rsplit_once(',').unwrap().0.to_string()).collect()
+    };
+    assert_eq!(timeless("run/metrics.csv"), timeless("whole/metrics.csv"));
+    let digest = |name: &str| serde_json::from_str::<serde_json::Value>(&place.read(name)).unwrap()["digest"].clone();
+    assert_eq!(digest("run/run.json"), digest("whole/run.json"));
+    // The generations of before are still there to be looked at.
+    place.good("replay run --trial 1 --generation 6");
+    place.good("replay run --trial 1 --generation 9");
+}
+
+/// A command as a shell runs it, on the CPU, with the program on its path.
+#[cfg(unix)]
+fn shell(place: &Place, line: &str) -> Output {
+    let program = assert_cmd::cargo::cargo_bin!("flotilla");
+    let path = format!("{}:{}", program.parent().unwrap().display(), std::env::var("PATH").unwrap());
+    std::process::Command::new("sh").args(["-c", line]).env("PATH", path).current_dir(place.0.path()).output().unwrap()
+}
+
+#[cfg(unix)]
+#[test]
+fn commands_that_are_told_run_as_they_are_told() {
+    let place = Place::new();
+    let typed = r#"flotilla train small.toml --backend cpu --quiet --out "it's my \$HOME; run""#;
+    let output = shell(&place, typed);
+    let said = String::from_utf8(output.stdout).unwrap();
+    let (_, next) = said.split_once("Next:\n").expect(&said);
+    let commands: Vec<&str> = next.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
+    assert_eq!(commands.len(), 2, "{said}");
+    for command in commands {
+        let output = shell(&place, &format!("{command} --backend cpu"));
+        assert!(output.status.success(), "{command}: {}", String::from_utf8_lossy(&output.stderr));
+    }
+    // The run's record says what was typed, so that a shell reads it as it was.
+    let record: serde_json::Value = serde_json::from_str(&place.read("it's my $HOME; run/run.json")).unwrap();
+    let again = record["command"].as_str().unwrap().to_string() + " --force";
+    let output = shell(&place, &again);
+    assert!(output.status.success(), "{again}: {}", String::from_utf8_lossy(&output.stderr));
+    assert!(record.get("commit").is_some());
+    // What is refused says what to type, too.
+    let output = shell(&place, &format!("{typed} --tensorboard"));
+    let told = String::from_utf8(output.stderr).unwrap();
+    let command = told.lines().last().unwrap();
+    assert!(told.contains("holds a run already") && command.contains("--resume --tensorboard"), "{told}");
+    assert!(shell(&place, command).status.success(), "{command}");
+    assert!(place.path("it's my $HOME; run/tensorboard/trial-0").exists());
+}
+
+#[test]
+fn a_summary_may_be_json() {
+    let place = Place::new();
+    let (said, told) = place.good("train small.toml --out run --json --quiet");
+    assert_eq!(told, "");
+    let found: serde_json::Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(said.lines().count(), 1);
+    for (key, value) in [("folder", "run"), ("config", "small")] {
+        assert_eq!(found[key], value);
+    }
+    for (key, value) in
+        [("seed", 0), ("trials", 3), ("population", 8), ("generations", 6), ("pois", 2), ("trained_generations", 7)]
+    {
+        assert_eq!(found[key], value, "{key}");
+    }
+    let run: serde_json::Value = serde_json::from_str(&place.read("run/run.json")).unwrap();
+    assert_eq!(found["digest"], run["digest"]);
+    for file in found["files"].as_object().unwrap().values() {
+        assert!(place.path(file.as_str().unwrap()).exists(), "{file}");
+    }
+    // Its figures are the metrics'.
+    let metrics = place.read("run/metrics.csv");
+    let (_, rows) = rows(&metrics);
+    for (moment, generation) in [("first", "0"), ("last", "6")] {
+        for (column, name) in [(2, "best_g"), (3, "mean_g"), (4, "champion_g")] {
+            let of = rows.iter().filter(|row| row[1] == generation).map(|row| row[column].parse::<f64>().unwrap());
+            let all: Vec<f64> = of.collect();
+            let told = |key: &str| found[moment][name][key].as_f64().unwrap();
+            assert!((told("mean") - all.iter().sum::<f64>() / 3.0).abs() < 1e-12);
+            assert_eq!(told("lowest"), all.iter().copied().fold(f64::INFINITY, f64::min));
+            assert_eq!(told("highest"), all.iter().copied().fold(0.0, f64::max));
+        }
+    }
+    let (again, _) = place.good("train small.toml --out run --json --resume");
+    let again: serde_json::Value = serde_json::from_str(&again).unwrap();
+    assert_eq!((&again["digest"], &again["trained_generations"]), (&found["digest"], &0.into()));
+}

@@ -191,7 +191,7 @@ fn generations(config: &Config, player: &mut Player) -> Result<(f64, Profile), B
             Player::Cpu(..) => None,
             Player::Gpu(gpu) => Some(gpu.take_stages()),
         };
-        Profile { generations: trainer.generation(), times: trainer.take_times(), stages }
+        Profile { generations: trainer.generation(0), times: trainer.take_times(), stages }
     };
     let before = take(&mut trainer, player).generations;
     let [seconds, _] = time(|| trainer.advance(player.backend()).map(drop), || Ok(0.0))?;

@@ -21,6 +21,7 @@ mod check;
 mod devices;
 mod paper;
 mod plot;
+mod recovery;
 mod replay;
 mod rollout;
 mod sweep;
@@ -110,6 +111,9 @@ pub enum Error {
     /// What was to be equal is not.
     #[error("{0}")]
     Different(String),
+    /// What is there must stay.
+    #[error("{0}")]
+    Refused(String),
     /// Results that are not there yet.
     #[error("{0}")]
     Missing(String),
@@ -159,6 +163,11 @@ pub struct ConfigArgs {
 }
 
 impl ConfigArgs {
+    /// What the file is called, without folder and extension.
+    pub fn name(&self) -> String {
+        self.config.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+    }
+
     /// The config that was meant.
     ///
     /// # Errors

@@ -1,18 +1,29 @@
 //! `flotilla paper`: the paper's experiments, its figures and its claims, measured here.
 
-use std::path::PathBuf;
-use std::time::Instant;
+use std::path::{Path, PathBuf};
 
+use serde_json::json;
+
+use super::recovery::{self, Checkpoints, Loss, Signals};
 use super::{Error, Overrides, RunOptions, backend, print, say};
+use crate::config::{self, Override};
 use crate::memory;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
+use crate::record::folder::{self, Start};
 use crate::record::metrics::Row;
 use crate::report::curves::PRINT;
-use crate::report::paper::{self, Measured, Summary};
+use crate::report::paper::{self, Arm, Measured, Summary};
 use crate::report::progress::Progress;
-use crate::run::RunError;
-use crate::trainer::Trainer;
+use crate::report::runs;
+use crate::run::{self, Options, Outcome, RunError, Session, Twin};
+use crate::shell;
+
+/// What a paper's folder holds: of which trials, generations and seed its arms are, and the arms themselves.
+const PAPER: &str = "paper.toml";
+const ARMS: &str = "arms";
+const CLAIMS: &str = "claims.md";
+const SUMMARY: &str = "summary.json";
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -28,57 +39,131 @@ pub struct Args {
     /// Start of all randomness [default: 0]
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     seed: Option<i64>,
+    /// Go on with the paper in the folder, or start it; of one that is done, draw figures and claims again
+    #[arg(long, conflicts_with = "force")]
+    resume: bool,
+    /// Write over the paper in the folder
+    #[arg(long)]
+    force: bool,
     /// No progress on standard error
     #[arg(long)]
     quiet: bool,
+    /// Print what came out as one JSON object (docs/json.md)
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    checkpoints: Checkpoints,
+    #[command(flatten)]
+    loss: Loss,
     #[command(flatten)]
     run: RunOptions,
 }
 
-/// Trains every experiment side by side, and writes what came out.
-pub fn run(args: Args) -> Result<(), Error> {
-    let Args { out, trials, generations, seed, quiet, run } = args;
-    let overrides = Overrides { seed, trials, generations, ..Overrides::default() };
-    let mut arms = paper::arms(&overrides.list())?;
-    // Seconds of training leave nothing to go on from.
-    arms.iter_mut().for_each(|arm| (arm.config.checkpoint.generations, arm.config.checkpoint.seconds) = (0, 0.0));
-    let (mut backend, machine) = backend::open(&run)?;
-    // Before training: a folder that cannot be written should not cost the time.
-    let disk = Disk::default();
-    let failed = |path: &PathBuf| {
-        let path = path.clone();
-        |error| RecordError::Write { path, error }
-    };
-    disk.create_folder(&out).map_err(failed(&out))?;
-    let learning = arms[0].config.learning.clone();
-    let (configs, places) = paper::trained(&arms);
-    if !quiet {
-        let (count, different, trials) = (arms.len(), configs.len(), learning.trials);
-        let on = backend.describe();
-        say(format_args!(
-            "training {count} experiments, {different} of them different, of {trials} trials each on {on}"
-        ));
+impl Args {
+    fn overrides(&self) -> Vec<Override> {
+        let &Args { seed, trials, generations, .. } = self;
+        let overrides = Overrides { seed, trials, generations, ..Overrides::default() };
+        [overrides.list(), self.checkpoints.list()].concat()
     }
 
-    let since = Instant::now();
+    /// What to type to go on.
+    fn command_to_resume(&self) -> String {
+        let (overrides, out) = (self.overrides(), self.out.display().to_string());
+        let words = ["flotilla", "paper", "--out", &out].map(String::from).into_iter();
+        let machine = recovery::words_of_machine(&self.run, self.loss);
+        shell::command(words.chain(recovery::words_of(&overrides)).chain(["--resume".into()]).chain(machine))
+    }
+}
+
+/// Trains every experiment side by side, each as a run, and writes what came out.
+pub fn run(args: Args) -> Result<(), Error> {
+    let Args { ref out, quiet, .. } = args;
+    let mut arms = paper::arms(&args.overrides())?;
+    let start = match (args.resume, args.force) {
+        (true, _) => Start::Resume,
+        (_, true) => Start::Force,
+        _ => Start::Fresh,
+    };
+    let marks = Marks::of(&arms[0].config.learning);
+    marks.compare(out, start)?;
+    let mut player = backend::open(&args.run)?;
+    let (configs, places) = paper::trained(&arms);
     let plan = memory::Plan::of(&configs, rayon::current_num_threads());
-    plan.check(machine.backend == "gpu").map_err(RunError::from)?;
-    let mut trainer = Trainer::new(configs);
-    let names = arms.iter().map(|arm| (arm.name(), arm.pois())).collect();
-    let mut progress = Progress::new(names, 0, learning.generations, quiet);
-    while !trainer.is_done() {
-        let rows = trainer.advance(&mut *backend)?;
+    plan.check(player.1.backend == "gpu").map_err(RunError::from)?;
+    let disk = Disk::default();
+    marks.claim(out, start, &disk)?;
+
+    let folders: Vec<PathBuf> = arms.iter().map(|arm| out.join(ARMS).join(arm_name(arm))).collect();
+    // The first arm of each training is trained, the others are the same.
+    let trained: Vec<usize> =
+        (0..configs.len()).filter_map(|place| places.iter().position(|at| *at == place)).collect();
+    let runs: Vec<_> = configs.iter().cloned().zip(trained.iter().map(|&arm| folders[arm].clone())).collect();
+    let signals = Signals::listen()?;
+    let (mut session, notes) = Session::open(runs, start, &disk)?;
+    for (run, note) in notes.iter().filter(|(_, note)| note.is_damage()) {
+        say(format_args!("{}: {note}", arms[trained[*run]].name()));
+    }
+    let learning = arms[0].config.learning.clone();
+    if !session.is_done() {
+        if !quiet {
+            let (count, different, trials) = (arms.len(), configs.len(), learning.trials);
+            let on = player.0.describe();
+            say(format_args!(
+                "training {count} experiments, {different} of them different, of {trials} trials each on {on}, into {}",
+                out.display()
+            ));
+        }
+        let names = arms.iter().map(|arm| (arm.name(), arm.pois())).collect();
+        let next = |generations: &[usize]| generations.iter().min().copied().unwrap_or(0);
+        let mut progress = Progress::new(names, next(session.generations()), learning.generations, quiet);
         let of_arms = |row: &Row| {
             let (row, places) = (*row, places.iter().enumerate());
             places.filter(move |&(_, &place)| place == row.arm).map(move |(arm, _)| Row { arm, ..row })
         };
-        let rows: Vec<Row> = rows.iter().flat_map(of_arms).collect();
-        rows.iter().for_each(|row| arms[row.arm].add(row));
-        progress.show(trainer.generation(), &rows);
+        let ended = session.train(
+            &mut player,
+            &mut Options {
+                command: &recovery::typed(),
+                stop: &signals.stop,
+                save: &signals.save,
+                instead: &mut |error| args.loss.instead(error),
+                setback: &mut recovery::setback,
+                watch: &mut |now| {
+                    let rows: Vec<Row> = now.rows.iter().flat_map(of_arms).collect();
+                    progress.show(next(now.generations), &rows);
+                },
+            },
+        );
+        progress.clear();
+        if ended? == Outcome::Stopped {
+            return Err(Error::Stopped(format!(
+                "before generation {} of {}, with everything saved; go on with\n  {}",
+                next(session.generations()),
+                learning.generations,
+                args.command_to_resume()
+            )));
+        }
     }
-    progress.clear();
-    let seconds = since.elapsed().as_secs_f64();
+    let twins = (0..arms.len()).filter(|&arm| trained[places[arm]] != arm);
+    let twins = twins.map(|arm| Twin {
+        of: folders[trained[places[arm]]].clone(),
+        of_config: configs[places[arm]].clone(),
+        folder: folders[arm].clone(),
+        config: arms[arm].config.clone(),
+    });
+    let fresh = if start == Start::Fresh { Start::Resume } else { start };
+    run::record_twins(twins.collect(), fresh, &disk)?;
+    for (arm, folder) in arms.iter_mut().zip(&folders) {
+        let config = arm.config.clone();
+        runs::metrics(folder, &config, |row| arm.add(row))?;
+    }
+    let ran = (0..configs.len()).map(|run| session.run(run));
+    let seconds = ran.map(|run| run.seconds).fold(0.0, f64::max);
 
+    let failed = |path: &Path| {
+        let path = path.to_path_buf();
+        |error| RecordError::Write { path, error }
+    };
     let write = |name: String, content: &[u8]| -> Result<(), Error> {
         let path = out.join(name);
         Ok(disk.replace(&path, |output| output.write_all(content)).map_err(failed(&path))?)
@@ -99,10 +184,10 @@ pub fn run(args: Args) -> Result<(), Error> {
         learning.generations,
         learning.seed
     );
-    write("claims.md".into(), format!("# What the paper says, measured\n\n{heading}\n\n{table}").as_bytes())?;
+    write(CLAIMS.into(), format!("# What the paper says, measured\n\n{heading}\n\n{table}").as_bytes())?;
     let summary = Summary {
         version: env!("CARGO_PKG_VERSION"),
-        backend: backend.describe(),
+        backend: session.run(0).description.clone(),
         seconds,
         seed: learning.seed,
         trials: learning.trials,
@@ -111,10 +196,133 @@ pub fn run(args: Args) -> Result<(), Error> {
         claims: &claims,
     };
     let summary = serde_json::to_string(&summary).expect("plain fields are JSON") + "\n";
-    write("summary.json".into(), summary.as_bytes())?;
+    write(SUMMARY.into(), summary.as_bytes())?;
+    if args.json {
+        let arm = |(index, arm): (usize, &Arm)| {
+            let last = arm.best.iter().filter_map(|trial| trial.last()).sum::<f64>() / arm.best.len() as f64;
+            json!({
+                "name": arm_name(arm),
+                "folder": folders[index].display().to_string(),
+                "layout": arm.layout.name,
+                "paradigm": arm.paradigm,
+                "fitness": arm.fitness,
+                "pois": arm.pois(),
+                "digest": session.results(places[index]).map(|results| &results.digest),
+                "best_g": last,
+            })
+        };
+        let path = |name: &str| out.join(name).display().to_string();
+        let told = json!({
+            "folder": out.display().to_string(),
+            "seed": learning.seed,
+            "trials": learning.trials,
+            "generations": learning.generations,
+            "backend": session.run(0).description,
+            "seconds": seconds,
+            "arms": arms.iter().enumerate().map(arm).collect::<Vec<_>>(),
+            "claims": &claims,
+            "files": { "claims": path(CLAIMS), "summary": path(SUMMARY), "figures": FIGURES.map(path) },
+        });
+        return print(&format!("{told}\n"));
+    }
     print(&format!(
         "{table}\n{heading}\n\nTrained in {seconds:.1} s. Files in {}: figure4, figure5, figure6 (.svg, .png), claims.md, \
-         summary.json\n",
+         summary.json, and a run each in {ARMS}/\n",
         out.display()
     ))
+}
+
+/// Figures, as files.
+const FIGURES: [&str; 6] = ["figure4.svg", "figure4.png", "figure5.svg", "figure5.png", "figure6.svg", "figure6.png"];
+
+/// An arm's folder: "chaotic-all-leaders-Df".
+fn arm_name(arm: &Arm) -> String {
+    format!("{}-{}-{}", arm.layout.name.replace(' ', "-"), arm.paradigm, arm.fitness)
+}
+
+/// What all arms of a paper have in common, as its folder says it.
+struct Marks([(&'static str, u64); 3]);
+
+impl Marks {
+    fn of(learning: &config::Learning) -> Marks {
+        let generations = learning.generations as u64;
+        Marks([("seed", learning.seed), ("trials", learning.trials as u64), ("generations", generations)])
+    }
+
+    fn text(&self) -> String {
+        self.0.iter().map(|(key, value)| format!("{key} = {value}\n")).collect()
+    }
+
+    /// Refuses a folder that holds something else.
+    fn compare(&self, out: &Path, start: Start) -> Result<(), Error> {
+        if out.is_file() {
+            return Err(RecordError::NoFolder { path: out.into() }.into());
+        }
+        let (name, holds) = (out.display(), |name: &str| out.join(name).exists());
+        let paper = [PAPER, ARMS, CLAIMS, SUMMARY].iter().chain(&FIGURES).any(|name| holds(name));
+        let what = match () {
+            () if paper => "a paper",
+            () if ["sweep.toml", "points"].into_iter().any(holds) => "a sweep",
+            () if folder::holds_run(out) => "a run",
+            () => return Ok(()),
+        };
+        match start {
+            Start::Force => Ok(()),
+            Start::Fresh if what == "a paper" => Err(Error::Refused(format!(
+                "{name} holds a paper already; go on with it by --resume, write over it by --force, or choose another --out"
+            ))),
+            Start::Resume if what == "a paper" => self.compare_paper(out),
+            _ => Err(Error::Refused(format!("{name} holds {what}, no paper; choose another --out"))),
+        }
+    }
+
+    /// Refuses to go on with another paper, but for more generations.
+    fn compare_paper(&self, out: &Path) -> Result<(), Error> {
+        let path = out.join(PAPER);
+        if !path.exists() {
+            let name = out.display();
+            return Err(Error::Refused(format!(
+                "{name} holds figures without the runs that they are of: there is nothing to go on with; write over them \
+                 by --force, or choose another --out"
+            )));
+        }
+        let text = config::read_file(&path)?;
+        let there: toml::Table = text.parse().map_err(|error: toml::de::Error| RecordError::Damaged {
+            path: path.clone(),
+            reason: format!("it is damaged: {}; write over the paper by --force", error.message()),
+        })?;
+        let differs = |&(key, here): &(&str, u64)| {
+            let there = there.get(key).and_then(toml::Value::as_integer).and_then(|there| u64::try_from(there).ok());
+            match there {
+                Some(there) if there == here || key == "generations" && there < here => None,
+                Some(there) => Some(format!("\n  {key}: {there} there, {here} here")),
+                None => Some(format!("\n  {key}: nothing there, {here} here")),
+            }
+        };
+        let differences: String = self.0.iter().filter_map(differs).collect();
+        if differences.is_empty() {
+            return Ok(());
+        }
+        Err(Error::Refused(format!(
+            "{} holds another paper; what differs:{differences}\ngo on with its own flags (generations may be more), or choose \
+             another --out",
+            out.display()
+        )))
+    }
+
+    /// Marks the folder as this paper's, without what is drawn of another.
+    fn claim(&self, out: &Path, start: Start, disk: &Disk) -> Result<(), Error> {
+        let failed = |path: &Path| {
+            let path = path.to_path_buf();
+            |error| RecordError::Write { path, error }
+        };
+        disk.create_folder(out).map_err(failed(out))?;
+        if start == Start::Force {
+            for path in [CLAIMS, SUMMARY].iter().chain(&FIGURES).map(|name| out.join(name)) {
+                disk.remove(&path).map_err(failed(&path))?;
+            }
+        }
+        let path = out.join(PAPER);
+        Ok(disk.replace(&path, |output| output.write_all(self.text().as_bytes())).map_err(failed(&path))?)
+    }
 }

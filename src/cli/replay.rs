@@ -1,14 +1,14 @@
 //! `flotilla replay`: the episode of the best team of any trial and generation, to look at.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::atomic::Ordering::Relaxed;
 
+use super::recovery::Signals;
 use super::{Error, RunOptions, backend, print, say};
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::report::curves::PRINT;
-use crate::report::replay::{self, Played, Rows};
+use crate::report::replay::{self, Played, ReplayError, Rows};
 use crate::report::runs;
 
 #[derive(clap::Args)]
@@ -51,10 +51,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     };
     let generations: Vec<usize> = compare.into_iter().chain([generation]).collect();
     let (mut backend, _) = backend::open(&run)?;
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, stop.clone()).map_err(Error::Signals)?;
-    }
+    let signals = Signals::listen()?;
     let mut told = 0;
     let mut watch = |generation: usize| {
         // Most runs take no time; the others say that something happens.
@@ -62,9 +59,13 @@ pub fn run(args: Args) -> Result<(), Error> {
             told = generation / 1000;
             say(format_args!("training trial {trial} again: generation {generation}"));
         }
-        !stop.load(Relaxed)
+        !signals.stop.load(Relaxed)
     };
-    let played = replay::replay(&folder, trial, &generations, &mut *backend, &mut watch)?;
+    let played = replay::replay(&folder, trial, &generations, &mut *backend, &mut watch);
+    let played = played.map_err(|error| match error {
+        ReplayError::Stopped => Error::Stopped("before the episode was played; nothing was written".into()),
+        error => error.into(),
+    })?;
 
     let failed = |error| RecordError::Write { path: out.clone(), error };
     let name = folder.canonicalize().ok().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));

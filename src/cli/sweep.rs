@@ -7,16 +7,20 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use super::train::Signals;
+use serde_json::json;
+
+use super::recovery::{self, Loss, Signals};
 use super::{Error, Overrides, RunOptions, backend, print, say};
 use crate::config::{self, ConfigError, Problem};
 use crate::memory;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
-use crate::record::folder::{CONFIG, Start};
+use crate::record::folder::{CONFIG, RUN, Run, Start};
+use crate::run::{Options, Outcome as Ended};
+use crate::shell;
 use crate::sweep::pictures;
 use crate::sweep::results::{self, Missing, Outcome};
-use crate::sweep::run::{self, Ended, Progress};
+use crate::sweep::run::{self, Progress};
 use crate::sweep::shard::{self, MAX_SHARDS, Shard};
 use crate::sweep::slurm::Job;
 use crate::sweep::{Point, Sweep};
@@ -57,6 +61,11 @@ pub struct Args {
     /// No progress on standard error
     #[arg(long)]
     quiet: bool,
+    /// Print what came out as one JSON object (docs/json.md)
+    #[arg(long, conflicts_with_all = ["list", "slurm"])]
+    json: bool,
+    #[command(flatten)]
+    loss: Loss,
 
     /// Run shard I of N, dealt out by cost; else what a Slurm array or a Kubernetes indexed job says
     #[arg(long, value_name = "I/N", help_heading = SCALE_OUT)]
@@ -133,6 +142,25 @@ impl Args {
         self.out.clone().unwrap_or_else(|| Path::new("runs").join(&sweep.name))
     }
 
+    /// The command that does this sweep again, without what differs from process to process.
+    fn words(&self, sweep: &Path, out: &Path) -> Vec<String> {
+        let mut words =
+            ["sweep".into(), sweep.display().to_string(), "--out".into(), out.display().to_string()].to_vec();
+        words.extend(recovery::words_of(&self.overrides.list()));
+        words.extend(recovery::words_of_machine(&self.run, self.loss));
+        words.extend(self.memory.into_iter().flat_map(|gib| ["--memory".into(), gib.to_string()]));
+        if self.skip_impossible {
+            words.push("--skip-impossible".into());
+        }
+        words
+    }
+
+    /// A command line of this sweep with more flags.
+    fn command(&self, out: &Path, more: &[&str]) -> String {
+        let words = self.words(&self.sweep, out);
+        shell::command(["flotilla"].into_iter().chain(words.iter().map(String::as_str)).chain(more.iter().copied()))
+    }
+
     /// The grid's axes that pictures have across and down.
     fn picture_axes(&self, sweep: &Sweep) -> Result<Vec<usize>, Error> {
         let find = |name: &String| {
@@ -162,10 +190,8 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
     if args.collect {
         if !out.join(SWEEP).exists() {
-            let (out, file) = (out.display(), args.sweep.display());
-            return Err(Error::Usage(format!(
-                "{out} holds no sweep; run its shards first: flotilla sweep {file} --out {out} --shard 1/N"
-            )));
+            let command = args.command(&out, &["--shard", "1/N"]);
+            return Err(Error::Usage(format!("{} holds no sweep; run its shards first: {command}", out.display())));
         }
         same_sweep(&sweep, &out)?;
         return collect(&args, &sweep, &out, &axes);
@@ -175,17 +201,30 @@ pub fn run(args: Args) -> Result<(), Error> {
     train(&args, &sweep, &out, shard.unwrap_or(Shard::WHOLE))?;
     match shard.filter(|shard| shard.count > 1) {
         None => collect(&args, &sweep, &out, &axes),
-        Some(_) => print(&format!(
-            "When all shards are done: flotilla sweep {} --out {} --collect\n",
-            args.sweep.display(),
-            out.display()
-        )),
+        Some(shard) => {
+            let command = args.command(&out, &["--collect"]);
+            match args.json {
+                true => print(&format!(
+                    "{}\n",
+                    json!({
+                        "folder": out.display().to_string(),
+                        "sweep": sweep.name,
+                        "shard": shard.to_string(),
+                        "collect": command,
+                    })
+                )),
+                false => print(&format!("When all shards are done: {command}\n")),
+            }
+        }
     }
 }
 
 /// Refuses a folder that holds something else.
 fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let path = out.join(SWEEP);
+    if out.is_file() {
+        return Err(RecordError::NoFolder { path: out.into() }.into());
+    }
     let refuse = |message: String| {
         let problems = vec![Problem { line: None, key: String::new(), message }];
         Err(ConfigError::Invalid { name: path.display().to_string(), problems, unlisted: 0 }.into())
@@ -237,7 +276,8 @@ fn claim(sweep: &Sweep, out: &Path) -> Result<(), Error> {
 
 fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Error> {
     let points = shard.take(&sweep.points);
-    let (mut backend, machine) = backend::open(&args.run)?;
+    let mut player = backend::open(&args.run)?;
+    claim(sweep, out)?;
     let memory = args.memory.map_or_else(free_memory, |gib| (gib * f64::from(1 << 30)) as usize);
     if !args.quiet {
         let skipped =
@@ -247,9 +287,8 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
         let (all, taken) = (sweep.points.len(), points.len());
         let part =
             if shard.count > 1 { format!("shard {shard}: {taken} of {all} points") } else { format!("{all} points") };
-        say(format_args!("{part}{skipped}{batches}, on {}, into {}", backend.describe(), out.display()));
+        say(format_args!("{part}{skipped}{batches}, on {}, into {}", player.0.describe(), out.display()));
     }
-    claim(sweep, out)?;
     let signals = Signals::listen()?;
     let start = match (args.resume, args.force) {
         (true, _) => Start::Resume,
@@ -257,33 +296,45 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
         _ => Start::Fresh,
     };
     let mut ticker = Ticker::new(args.quiet);
-    let ended = {
-        let mut options = run::Options {
-            start,
-            memory,
-            machine,
+    let mut options = run::Options {
+        start,
+        memory,
+        runs: Options {
+            command: &recovery::typed(),
             stop: &signals.stop,
             save: &signals.save,
-            watch: &mut |progress| ticker.tick(progress),
-            note: &mut |point, note| {
-                // What every resumed point says is no news.
-                if note.contains("set aside") || note.contains("anew") {
-                    say(format_args!("{}: {note}", sweep.describe(point)));
-                }
-            },
-        };
-        run::run(&points, out, &mut *backend, &mut options)
+            instead: &mut |error| args.loss.instead(error),
+            setback: &mut recovery::setback,
+            watch: &mut |_| {},
+        },
+        watch: &mut |progress| ticker.tick(progress),
+        note: &mut |point, note| {
+            // What every resumed point says is no news.
+            if note.is_damage() {
+                say(format_args!("{}: {note}", sweep.describe(point)));
+            }
+        },
     };
+    let ended = run::run(&points, out, &mut player, &mut options);
     ticker.clear();
     match ended? {
         Ended::Done => Ok(()),
         Ended::Stopped => {
-            let part = if shard.count > 1 { format!(" --shard {shard}") } else { String::new() };
-            let (file, out) = (args.sweep.display(), out.display());
-            let resume = format!("flotilla sweep {file} --out {out}{part} --resume");
-            Err(Error::Stopped(format!(
-                "stopped, with everything saved; go on with the same flags and --resume:\n  {resume}"
-            )))
+            let shard = (shard.count > 1).then(|| shard.to_string());
+            let mut more: Vec<&str> = shard.iter().flat_map(|shard| ["--shard", shard]).collect();
+            let (every, reach, axes) = (args.every.to_string(), args.reach.to_string(), args.axes.join(","));
+            if shard.is_none() {
+                for (flag, value, default) in
+                    [("--every", &every, "1"), ("--reach", &reach, "0.75"), ("--axes", &axes, "")]
+                {
+                    if value != default {
+                        more.extend([flag, value]);
+                    }
+                }
+            }
+            more.push("--resume");
+            let command = args.command(out, &more);
+            Err(Error::Stopped(format!("everything is saved; go on with\n  {command}")))
         }
     }
 }
@@ -297,23 +348,28 @@ fn free_memory() -> usize {
 fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(), Error> {
     let options = results::Options { every: args.every as usize, reach: args.reach };
     let outcomes = results::write(sweep, out, &options)?;
-    let mut text = summary(sweep, &outcomes, &options);
-    let _ = write!(
-        text,
-        "\nFiles in {}:\n  points/      the runs themselves\n  results.csv  every point and trial, {}\n  points.csv   what each point came to\n",
-        out.display(),
-        if options.every == 1 {
-            "generation by generation".into()
-        } else {
-            format!("every {} generations", options.every)
-        },
-    );
     let (names, note) = pictures::draw(sweep, &outcomes, &options, axes, out)?;
-    if !names.is_empty() {
-        text += "  final, reach, curves (.svg, .png)   G at the end, generations to reach one, and learning curves\n";
+    match args.json {
+        true => print(&format!("{}\n", as_json(sweep, &outcomes, &options, out, &names)))?,
+        false => {
+            let mut text = summary(sweep, &outcomes, &options);
+            let _ = write!(
+                text,
+                "\nFiles in {}:\n  points/      the runs themselves\n  results.csv  every point and trial, {}\n  points.csv   what each point came to\n",
+                out.display(),
+                if options.every == 1 {
+                    "generation by generation".into()
+                } else {
+                    format!("every {} generations", options.every)
+                },
+            );
+            if !names.is_empty() {
+                text += "  final, reach, curves (.svg, .png)   G at the end, generations to reach one, and learning curves\n";
+            }
+            text.extend(note.map(|note| note + "\n"));
+            print(&text)?;
+        }
     }
-    text.extend(note.map(|note| note + "\n"));
-    print(&text)?;
     let missing: Vec<(&Point, &Missing)> = sweep
         .points
         .iter()
@@ -330,13 +386,58 @@ fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(),
         .collect();
     let more = if missing.len() > lines.len() { "\n  …" } else { "" };
     Err(Error::Missing(format!(
-        "{} of {} points are missing from the results:{}{more}\nrun them with: flotilla sweep {} --out {} --resume",
+        "{} of {} points are missing from the results:{}{more}\nrun them with: {}",
         missing.len(),
         sweep.points.len(),
         lines.concat(),
-        args.sweep.display(),
-        out.display(),
+        args.command(out, &["--resume"]),
     )))
+}
+
+/// What a program wants to know at the end.
+fn as_json(
+    sweep: &Sweep,
+    outcomes: &[Result<Outcome, Missing>],
+    options: &results::Options,
+    out: &Path,
+    pictures: &[String],
+) -> serde_json::Value {
+    let path = |name: &str| out.join(name).display().to_string();
+    let point = |(point, outcome): (&Point, &Result<Outcome, Missing>)| {
+        let values =
+            sweep.axes.iter().zip(&point.values).map(|(axis, &value)| (axis.key.clone(), json!(axis.values[value])));
+        let folder = results::point_folder(out, point);
+        let mut told = json!({
+            "point": point.index,
+            "folder": folder.display().to_string(),
+            "values": serde_json::Map::from_iter(values),
+        });
+        match outcome {
+            Err(missing) => told["missing"] = json!(missing.to_string()),
+            Ok(outcome) => {
+                let (best_g, error) = results::mean_and_error(&outcome.best);
+                told["digest"] = json!(Run::read(&folder.join(RUN)).ok().and_then(|run| run.digest));
+                told["best_g"] = json!(best_g);
+                told["best_g_error"] = json!(error);
+                told["champion_g"] = json!(results::mean_and_error(&outcome.champion).0);
+                told["reached"] = json!(outcome.reached.iter().flatten().count());
+                told["median"] = json!(outcome.median_reached());
+            }
+        }
+        told
+    };
+    json!({
+        "folder": out.display().to_string(),
+        "sweep": sweep.name,
+        "reach": options.reach,
+        "points": sweep.points.iter().zip(outcomes).map(point).collect::<Vec<_>>(),
+        "files": {
+            "sweep": path(SWEEP),
+            "results": path("results.csv"),
+            "points": path("points.csv"),
+            "pictures": pictures.iter().map(|name| path(name)).collect::<Vec<_>>(),
+        },
+    })
 }
 
 /// What a person wants to know at the end: the best and the worst points.
@@ -404,26 +505,8 @@ fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> 
     let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.into());
     let program = std::env::current_exe().unwrap_or_else(|_| "flotilla".into());
     let out = absolute(out);
-    let words = |path: &Path| path.display().to_string();
-    let mut command = vec![words(&program), "sweep".into(), words(&absolute(&args.sweep)), "--out".into(), words(&out)];
-    for set in args.overrides.list() {
-        let value = set.text.trim_matches(['"', '\'']).to_string();
-        command.extend([set.name, value]);
-    }
     let cpu = args.run.backend == super::BackendChoice::Cpu;
-    if args.run.backend != super::BackendChoice::Auto {
-        command.extend(["--backend".into(), if cpu { "cpu".into() } else { "gpu".into() }]);
-    }
-    for (flag, value) in [
-        ("--adapter", args.run.adapter.clone()),
-        ("--threads", args.run.threads.map(|threads| threads.to_string())),
-        ("--memory", args.memory.map(|gib| gib.to_string())),
-    ] {
-        command.extend(value.into_iter().flat_map(|value| [flag.to_string(), value]));
-    }
-    if args.skip_impossible {
-        command.push("--skip-impossible".into());
-    }
+    let command = [program.display().to_string()].into_iter().chain(args.words(&absolute(&args.sweep), &out)).collect();
     let job = Job {
         name: &sweep.name,
         command,

@@ -1,25 +1,24 @@
 //! `flotilla train`: a run from its config to its policies.
 
 use std::fmt::Write;
-use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-use clap::ValueEnum;
+use serde_json::json;
 
+use super::recovery::{self, Checkpoints, Loss, Signals, quoted};
 use super::{ConfigArgs, Error, RunOptions, backend, print, say};
-use crate::config::{Config, Override};
+use crate::config::Config;
 use crate::memory::Plan;
-use crate::record::checkpoint::Schedule;
+use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, METRICS, POLICIES, Start};
 use crate::record::metrics::Row;
 use crate::report::progress::Progress;
 use crate::report::runs;
 use crate::report::tensorboard::Events;
-use crate::run::{Opened, Options, Outcome, Results, RunError, Session};
+use crate::run::{Options, Outcome, Results, RunError, Session};
+use crate::shell;
 
 /// Where runs without `--out` go.
 const RUNS: &str = "runs";
@@ -46,37 +45,26 @@ pub struct Args {
     /// No progress on standard error
     #[arg(long)]
     quiet: bool,
-    /// Also write event files for TensorBoard, in OUT/tensorboard
+    /// Print what came out as one JSON object (docs/json.md)
+    #[arg(long)]
+    json: bool,
+    /// Also write event files for TensorBoard, in OUT/tensorboard; with --resume also of what was trained before
     #[arg(long)]
     tensorboard: bool,
-    /// Save what --resume needs after so many generations; 0 is never
-    #[arg(long, value_name = "N", allow_negative_numbers = true)]
-    checkpoint_generations: Option<i64>,
-    /// Save what --resume needs after so many seconds; 0 is never
-    #[arg(long, value_name = "S", allow_negative_numbers = true)]
-    checkpoint_seconds: Option<f64>,
-    /// What to do when the device fails in mid-run
-    #[arg(long, value_enum, value_name = "WHAT", default_value_t = OnLoss::Stop)]
-    on_device_loss: OnLoss,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum OnLoss {
-    /// Save and fail, to be resumed
-    Stop,
-    /// Go on with the CPU, to the same results
-    Cpu,
+    #[command(flatten)]
+    checkpoints: Checkpoints,
+    #[command(flatten)]
+    loss: Loss,
 }
 
 impl Args {
-    fn load(&self) -> Result<Config, Error> {
-        let generations = self.checkpoint_generations.map(toml::Value::from);
-        let seconds = self.checkpoint_seconds.map(toml::Value::from);
-        let set = |(name, value): (&str, Option<toml::Value>)| {
-            Some(Override::new(format!("checkpoint.{name}"), value?, format!("--checkpoint-{name}")))
-        };
-        self.config
-            .load_with([("generations", generations), ("seconds", seconds)].into_iter().filter_map(set).collect())
+    /// What to type to go on.
+    fn command_to_resume(&self, folder: &Path) -> String {
+        let words = ["flotilla".into(), "train".into(), folder.join(folder::CONFIG).display().to_string()];
+        let out = ["--out".into(), folder.display().to_string(), "--resume".into()];
+        let events = self.tensorboard.then(|| "--tensorboard".into());
+        let machine = recovery::words_of_machine(&self.run, self.loss);
+        shell::command(words.into_iter().chain(out).chain(events).chain(machine))
     }
 
     /// The run's folder, and what to do with a run in it.
@@ -86,88 +74,81 @@ impl Args {
             (_, true) => Start::Force,
             _ => Start::Fresh,
         };
-        let stem = self.config.config.file_stem().unwrap_or_default().to_string_lossy();
+        let stem = self.config.name();
         let runs = Path::new(RUNS);
         Ok(match (&self.out, start) {
             (Some(out), _) => (out.clone(), start),
             (None, Start::Resume) => (folder::latest(runs, &stem), start),
-            (None, Start::Force) => (runs.join(&*stem), start),
+            (None, Start::Force) => (runs.join(&stem), start),
             (None, Start::Fresh) => (folder::next_free(runs, &stem)?, start),
         })
     }
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let config = args.load()?;
-    let (backend, machine) = backend::open(&args.run)?;
-    Plan::of([&config], rayon::current_num_threads()).check(machine.backend == "gpu").map_err(RunError::from)?;
-    let runs_on = backend.describe();
+    let config = args.config.load_with(args.checkpoints.list())?;
+    let mut player = backend::open(&args.run)?;
+    Plan::of([&config], rayon::current_num_threads()).check(player.1.backend == "gpu").map_err(RunError::from)?;
+    let runs_on = player.0.describe();
     let (folder, start) = args.folder()?;
+    let signals = Signals::listen()?;
+    let opened = Session::open(vec![(config.clone(), folder.clone())], start, &Disk::default());
+    let (mut session, notes) = opened.map_err(|error| match error {
+        RunError::Record(RecordError::Exists { .. }) if args.tensorboard => Error::Refused(format!(
+            "{error}\nfor event files of the run that is there:\n  {}",
+            args.command_to_resume(&folder)
+        )),
+        error => error.into(),
+    })?;
+    for (_, note) in notes {
+        say(note);
+    }
+    let path = folder.join(TENSORBOARD);
+    let events_failed =
+        |error| say(format_args!("{}: cannot be written: {error}; there are no event files", path.display()));
+    let events = || Events::create(&path, config.learning.trials, &folder.join(METRICS)).map_err(events_failed).ok();
+    let mut events = args.tensorboard.then(events).flatten();
+    let told = Told { config: &config, name: args.config.name(), folder: &folder, runs_on: &runs_on };
+    if session.is_done() {
+        return told.print(&session, None, args.json);
+    }
     if !args.quiet {
         say(format_args!("training on {runs_on}, into {}", folder.display()));
     }
-    let signals = Signals::listen()?;
-    let (opened, notes) = Session::open(config.clone(), &folder, start, Disk::default())?;
-    for note in notes {
-        say(note);
-    }
-    let report = |results: &Results, trained: &str| report(&config, &folder, results, trained);
-    let mut session = match opened {
-        Opened::Ready(session) => session,
-        Opened::Done(results) => return print(&report(&results, "This run was done already")),
-    };
 
-    let (since, from, last) = (Instant::now(), session.generation(), config.learning.generations);
+    let (since, from, last) = (Instant::now(), session.generations()[0], config.learning.generations);
     let mut shown = Progress::new(vec![(String::new(), config.world.pois.len())], from, last, args.quiet);
-    let path = folder.join(TENSORBOARD);
-    let events_failed = |error| {
-        say(format_args!("{}: cannot be written: {error}; training goes on without event files", path.display()));
-    };
-    let mut events = match args.tensorboard.then(|| Events::create(&path, config.learning.trials, from == 0)) {
-        Some(events) => events.map_err(events_failed).ok(),
-        None => None,
-    };
-    let mut instead = |error: &_| {
-        (args.on_device_loss == OnLoss::Cpu).then(|| {
-            let (backend, machine) = backend::cpu();
-            say(format_args!("{error}\ngoing on with {}, to the same results", backend.describe()));
-            (backend, machine)
-        })
-    };
-    let options = Options {
-        schedule: Schedule { generations: config.checkpoint.generations, seconds: config.checkpoint.seconds },
-        stop: &signals.stop,
-        save: &signals.save,
-        instead: &mut instead,
-        watch: &mut |progress| {
-            shown.show(progress.generation, progress.rows);
-            if let Some(Err(error)) = events.as_mut().map(|events| events.add(progress.rows)) {
-                events_failed(error);
-                events = None;
-            }
+    let ended = session.train(
+        &mut player,
+        &mut Options {
+            command: &recovery::typed(),
+            stop: &signals.stop,
+            save: &signals.save,
+            instead: &mut |error| args.loss.instead(error),
+            setback: &mut recovery::setback,
+            watch: &mut |progress| {
+                shown.show(progress.generations[0], progress.rows);
+                if let Some(Err(error)) = events.as_mut().map(|events| events.add(progress.rows)) {
+                    events_failed(error);
+                    events = None;
+                }
+            },
         },
-    };
-    let outcome = session.train((backend, machine), options);
+    );
     shown.clear();
     if let Some(Err(error)) = events.as_mut().map(Events::flush) {
         events_failed(error);
     }
-    match outcome? {
-        Outcome::Done(results) => {
-            let seconds = since.elapsed().as_secs_f64();
-            let rate = (session.generation().min(last + 1) - from.min(last + 1)) as f64 / seconds.max(1e-9);
+    let next = session.generations()[0];
+    match ended? {
+        Outcome::Done => {
             draw(&folder);
-            let learning = &config.learning;
-            let trained = format!(
-                "Trained {} trials of {} teams, {} generations, in {seconds:.1} s ({rate:.1} generations/s) on {runs_on}",
-                learning.trials, learning.population, learning.generations
-            );
-            print(&report(&results, &trained))
+            let trained = Trained { generations: next.min(last + 1) - from.min(last + 1), since };
+            told.print(&session, Some(trained), args.json)
         }
-        Outcome::Stopped { generation } => Err(Error::Stopped(format!(
-            "before generation {generation} of {}, with everything saved; go on with\n  {}",
-            config.learning.generations,
-            command_to_resume(&folder)
+        Outcome::Stopped => Err(Error::Stopped(format!(
+            "before generation {next} of {last}, with everything saved; go on with\n  {}",
+            args.command_to_resume(&folder)
         ))),
     }
 }
@@ -185,67 +166,127 @@ fn draw(folder: &Path) {
     }
 }
 
-/// What to type to go on.
-fn command_to_resume(folder: &Path) -> String {
-    let folder = folder.display();
-    format!("flotilla train {folder}/{} --out {folder} --resume", folder::CONFIG)
+/// What was trained just now.
+struct Trained {
+    generations: usize,
+    since: Instant,
 }
 
-/// Signals that ask for something.
-pub(super) struct Signals {
-    pub(super) stop: Arc<AtomicBool>,
-    pub(super) save: Arc<AtomicBool>,
+/// What a run is told by.
+struct Told<'a> {
+    config: &'a Config,
+    name: String,
+    folder: &'a Path,
+    runs_on: &'a str,
 }
 
-impl Signals {
-    /// From here on SIGINT and SIGTERM set `stop`, and end the process at once where it is set already; SIGUSR1 sets
-    /// `save`.
-    pub(super) fn listen() -> Result<Signals, Error> {
-        use signal_hook::consts::{SIGINT, SIGTERM};
-        use signal_hook::flag;
-        let signals = Signals { stop: Arc::default(), save: Arc::default() };
-        let listen = || -> io::Result<()> {
-            for signal in [SIGINT, SIGTERM] {
-                flag::register_conditional_shutdown(signal, 128 + signal, signals.stop.clone())?;
-                flag::register(signal, signals.stop.clone())?;
-            }
-            #[cfg(unix)]
-            flag::register(signal_hook::consts::SIGUSR1, signals.save.clone())?;
-            Ok(())
+impl Told<'_> {
+    /// Prints what a run came to; `trained` is none where it was done already.
+    fn print(&self, session: &Session, trained: Option<Trained>, json: bool) -> Result<(), Error> {
+        let results = session.results(0).expect("the run is done");
+        let done_already = trained.is_none();
+        let (generations, seconds) =
+            trained.map_or((0, 0.0), |trained| (trained.generations, trained.since.elapsed().as_secs_f64()));
+        if json {
+            return print(&format!("{}\n", self.json(results, generations, seconds)));
+        }
+        let learning = &self.config.learning;
+        let trained = match done_already {
+            true => "This run was done already".into(),
+            false => format!(
+                "Trained {} trials of {} teams, {} generations, in {seconds:.1} s ({:.1} generations/s) on {}",
+                learning.trials,
+                learning.population,
+                learning.generations,
+                generations as f64 / seconds.max(1e-9),
+                self.runs_on
+            ),
         };
-        listen().map_err(Error::Signals)?;
-        Ok(signals)
+        print(&report(self.config, self.folder, results, &trained))
+    }
+
+    fn json(&self, results: &Results, trained: usize, seconds: f64) -> serde_json::Value {
+        let learning = &self.config.learning;
+        let course = |rows: &[Row]| {
+            let [best, mean, champion] = SCORES.map(|(_, share)| {
+                let Spread { mean, lowest, highest } = Spread::of(rows.iter().map(share));
+                json!({ "mean": mean, "lowest": lowest, "highest": highest })
+            });
+            json!({ "best_g": best, "mean_g": mean, "champion_g": champion })
+        };
+        let file = |name: &str| self.folder.join(name).display().to_string();
+        json!({
+            "folder": self.folder.display().to_string(),
+            "config": self.name,
+            "digest": results.digest,
+            "seed": learning.seed,
+            "trials": learning.trials,
+            "population": learning.population,
+            "generations": learning.generations,
+            "pois": self.config.world.pois.len(),
+            "trained_generations": trained,
+            "seconds": seconds,
+            "backend": self.runs_on,
+            "first": course(&results.story.first),
+            "last": course(&results.story.last),
+            "files": {
+                "config": file(folder::CONFIG),
+                "run": file(folder::RUN),
+                "metrics": file(METRICS),
+                "policies": file(POLICIES),
+                "curves": file(CURVES),
+            },
+        })
     }
 }
 
-/// One of a row's scores.
+/// One of a row's scores, G in 0..1.
 type Score = fn(&Row) -> f64;
+/// All of them.
+const SCORES: [(&str, Score); 3] =
+    [("best team", |row| row.best_g), ("mean team", |row| row.mean_g), ("champion", |row| row.champion_g)];
+
+/// Where trials are.
+struct Spread {
+    mean: f64,
+    lowest: f64,
+    highest: f64,
+}
+
+impl Spread {
+    fn of(shares: impl Iterator<Item = f64>) -> Spread {
+        let (mut count, mut spread) = (0.0, Spread { mean: 0.0, lowest: f64::INFINITY, highest: 0.0 });
+        for share in shares {
+            count += 1.0;
+            spread.mean += share;
+            spread.lowest = spread.lowest.min(share);
+            spread.highest = spread.highest.max(share);
+        }
+        Spread { mean: spread.mean / count, ..spread }
+    }
+}
 
 /// What a person wants to know at the end.
 fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> String {
     let Results { story, digest } = results;
     let pois = config.world.pois.len();
     let mut text = format!("{trained}.\n\nPOIs observed, of {pois}: mean over trials (lowest to highest trial)\n");
-    let scores: [(&str, Score); 3] =
-        [("best team", |row| row.best_g), ("mean team", |row| row.mean_g), ("champion", |row| row.champion_g)];
-    let _ = writeln!(text, "  {:<16}{:<22}{:<22}{}", "", scores[0].0, scores[1].0, scores[2].0);
+    let _ = writeln!(text, "  {:<16}{:<22}{:<22}{}", "", SCORES[0].0, SCORES[1].0, SCORES[2].0);
     for (name, rows) in
         [("start", &story.first), (&*format!("generation {}", config.learning.generations), &story.last)]
     {
-        let spread = |share: Score| {
-            let mut all: Vec<f64> = rows.iter().map(|row| share(row) * pois as f64).collect();
-            all.sort_by(f64::total_cmp);
-            let mean = all.iter().sum::<f64>() / all.len() as f64;
-            format!("{mean:.2} ({:.2} to {:.2})", all[0], all[all.len() - 1])
-        };
-        let [best, mean, champion] = scores.map(|(_, share)| spread(share));
+        let [best, mean, champion] = SCORES.map(|(_, share)| {
+            let Spread { mean, lowest, highest } = Spread::of(rows.iter().map(|row| share(row) * pois as f64));
+            format!("{mean:.2} ({lowest:.2} to {highest:.2})")
+        });
         let _ = writeln!(text, "  {name:<16}{best:<22}{mean:<22}{champion}");
     }
-    let folder = folder.display();
+    let [replayed, config, policies] =
+        [folder.into(), folder.join(folder::CONFIG), folder.join(POLICIES)].map(|path: PathBuf| quoted(&path));
     let _ = write!(
         text,
         "
-Files in {folder}:
+Files in {}:
   {METRICS:<22}every trial, generation by generation
   {POLICIES:<22}what was learned, best policy first
   {CURVES:<22}its learning curves, to look at
@@ -253,12 +294,12 @@ Files in {folder}:
   {:<22}what it ran on; digest {digest}
 
 Next:
-  flotilla replay {folder}
-  flotilla rollout {folder}/{} --policies {folder}/{POLICIES} --scores scores.csv
+  flotilla replay {replayed}
+  flotilla rollout {config} --policies {policies} --scores scores.csv
 ",
+        folder.display(),
         folder::CONFIG,
         folder::RUN,
-        folder::CONFIG,
     );
     text
 }

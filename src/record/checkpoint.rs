@@ -2,6 +2,9 @@
 //!
 //! A [`Keeper`] writes them on a thread of its own and keeps the last two. Each says which config it belongs to and up
 //! to where `metrics.csv` had come, and stands under the checksum of [`super::tensors`].
+//!
+//! A finished run leaves one more, to be extended from: its weights are those of `policies.safetensors`, put back into
+//! the order that their fitness tells.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -16,12 +19,19 @@ use sha2::{Digest, Sha256};
 
 use super::disk::{self, Disk, Output};
 use super::metrics::{Mark, Row};
-use super::policies::admit;
+use super::policies::{self, admit};
 use super::tensors::{self, Tensor, TensorFile};
 use super::{RecordError, hex};
 use crate::config::{self, Config};
+use crate::evolve;
 
 const KIND: &str = "checkpoint 1";
+/// Tensors, of all trials together.
+const WEIGHTS: &str = "weights.0";
+const FITNESS: &str = "fitness.0";
+const PENDING: &str = "pending.0";
+/// Metadata: [`Snapshot::last`].
+const LAST: &str = "generations";
 const EXTENSION: &str = ".safetensors";
 /// Digits of the generation in a checkpoint's name.
 const DIGITS: usize = 9;
@@ -30,18 +40,21 @@ const KEPT: usize = 2;
 /// Of a run's time, checkpoints by the clock take one part in this at most.
 const SHARE: u32 = 20;
 
-/// What training needs to go on from where it was: the populations about to play, and each trial's unfinished row.
+/// What an arm needs to go on from where it was: the populations about to play, and each trial's unfinished row.
 ///
 /// Its numbers are its own, or (`N` a slice) a trainer's.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Snapshot<N = Vec<f32>> {
     /// The generation that plays next.
     pub generation: usize,
-    /// `[arms][trials]` of weights `[leaders][policies + 1][parameters]`.
-    pub weights: Vec<Vec<N>>,
-    /// `[arms][trials]` of the scores of the generation before, `[leaders][policies]`.
-    pub fitness: Vec<Vec<N>>,
-    pub pending: Vec<Vec<Option<Row>>>,
+    /// The run's last generation, after which policies stay as they are.
+    pub last: usize,
+    /// A trial's weights, `[leaders][policies + 1][parameters]`.
+    pub weights: Vec<N>,
+    /// A trial's scores of the generation before, `[leaders][policies]`.
+    pub fitness: Vec<N>,
+    /// A trial's row of the generation before.
+    pub pending: Vec<Option<Row>>,
 }
 
 /// A run at one moment.
@@ -52,6 +65,7 @@ pub struct Checkpoint<N = Vec<f32>> {
     /// Time trained.
     pub seconds: f64,
     pub metrics: Mark,
+    /// Without weights where these are kept in `policies.safetensors`.
     pub snapshot: Snapshot<N>,
 }
 
@@ -65,58 +79,63 @@ pub fn without_checkpoint(config: &Config) -> Config {
     Config { checkpoint: config::Checkpoint::default(), ..config.clone() }
 }
 
+impl<N> Checkpoint<N> {
+    /// Whether it is of a run of this config, or of the same that was to be shorter.
+    pub fn is_of(&self, config: &Config) -> bool {
+        let last = self.snapshot.last;
+        last <= config.learning.generations && self.config == digest(&of_length(config, last))
+    }
+}
+
+/// The config of a run that is as long as this.
+fn of_length(config: &Config, last: usize) -> Config {
+    let mut config = config.clone();
+    config.learning.generations = last;
+    config
+}
+
 impl<N: AsRef<[f32]>> Checkpoint<N> {
     /// Writes it, whole or not at all.
     ///
     /// # Errors
     /// The file cannot be written; nothing else was touched then.
-    pub fn write(&self, disk: &Disk, path: &Path, configs: &[Config]) -> std::io::Result<()> {
+    pub fn write(&self, disk: &Disk, path: &Path, of: &Config) -> std::io::Result<()> {
         let Checkpoint { config, seconds, metrics, snapshot } = self;
         let metadata = BTreeMap::from(
             [
                 ("config", config.clone()),
                 ("generation", snapshot.generation.to_string()),
+                (LAST, snapshot.last.to_string()),
                 ("seconds", seconds.to_string()),
                 ("metrics_bytes", metrics.bytes.to_string()),
                 ("metrics_sha256", metrics.sha256.clone()),
             ]
             .map(|(key, value)| (key.to_string(), value)),
         );
-        let pending: Vec<Vec<[f64; 2]>> = snapshot
-            .pending
-            .iter()
-            .map(|trials| trials.iter().flatten().map(|row| [row.best_g, row.mean_g]).collect())
-            .collect();
+        let Shapes { weights, fitness, .. } = Shapes::of(of);
+        let pending: Vec<[f64; 2]> = snapshot.pending.iter().flatten().map(|row| [row.best_g, row.mean_g]).collect();
         let mut list = Vec::new();
-        for (arm, config) in configs.iter().enumerate() {
-            let Shapes { weights, fitness, .. } = Shapes::of(config);
-            if !pending[arm].is_empty() {
-                let (shape, parts) = (vec![pending[arm].len(), 2], vec![bytemuck::cast_slice(&pending[arm])]);
-                list.push(Tensor { name: format!("pending.{arm}"), dtype: Dtype::F64, shape, parts });
-            }
-            list.push(Tensor::floats(
-                format!("weights.{arm}"),
-                weights.into(),
-                snapshot.weights[arm].iter().map(AsRef::as_ref),
-            ));
-            list.push(Tensor::floats(
-                format!("fitness.{arm}"),
-                fitness.into(),
-                snapshot.fitness[arm].iter().map(AsRef::as_ref),
-            ));
-        }
         // Numbers of 8 bytes first, so that all are aligned.
-        list.sort_by_key(|tensor| tensor.dtype != Dtype::F64);
+        if !pending.is_empty() {
+            let (shape, parts) = (vec![pending.len(), 2], vec![bytemuck::cast_slice(&pending)]);
+            list.push(Tensor { name: PENDING.into(), dtype: Dtype::F64, shape, parts });
+        }
+        if !snapshot.weights.is_empty() {
+            let trials = snapshot.weights.iter().map(AsRef::as_ref);
+            list.push(Tensor::floats(WEIGHTS.into(), weights.into(), trials));
+        }
+        let trials = snapshot.fitness.iter().map(AsRef::as_ref);
+        list.push(Tensor::floats(FITNESS.into(), fitness.into(), trials));
         tensors::write(disk, path, KIND, &metadata, &list)
     }
 }
 
 impl Checkpoint {
-    /// Reads a checkpoint of a trainer of these configs.
+    /// Reads a checkpoint of a run of a config.
     ///
     /// # Errors
     /// What is wrong with it, in words.
-    pub fn read(source: impl Read + Seek, configs: &[Config]) -> Result<Checkpoint, String> {
+    pub fn read(source: impl Read + Seek, of: &Config) -> Result<Checkpoint, String> {
         let mut file = TensorFile::open(source)?;
         if file.kind() != Some(KIND) {
             return Err(format!("it holds {:?}, not {KIND:?}", file.kind().unwrap_or("something else")));
@@ -129,44 +148,77 @@ impl Checkpoint {
         let seconds = text("seconds")?.parse().ok().filter(|seconds: &f64| seconds.is_finite() && *seconds >= 0.0);
         let metrics = Mark { bytes: number("metrics_bytes")?, sha256: text("metrics_sha256")? };
         let generation = number("generation")? as usize;
-        let last = configs.iter().map(|config| config.learning.generations).max().unwrap_or(0);
-        if generation > last + 2 {
+        let learning = &of.learning;
+        // Those of an earlier version do not say it, and are of runs that were not extended.
+        let last = file.metadata(LAST).map_or(Ok(learning.generations as u64), |_| number(LAST))? as usize;
+        if generation > last + 1 {
             return Err(format!("its generation is {generation}, past the last, {last}"));
         }
-        let mut snapshot = Snapshot { generation, weights: vec![], fitness: vec![], pending: vec![] };
-        for (arm, config) in configs.iter().enumerate() {
-            let shapes = Shapes::of(config);
-            let mut floats = |name: String, shape: &[usize]| -> Result<Vec<Vec<f32>>, String> {
-                let mut trials: Vec<Vec<f32>> = file.read(&name, Dtype::F32, shape, shape[0])?;
-                match trials.iter_mut().any(|numbers| admit(numbers).is_some()) {
-                    true => Err(format!("{name} has numbers that cannot be")),
-                    false => Ok(trials),
-                }
-            };
-            snapshot.weights.push(floats(format!("weights.{arm}"), &shapes.weights)?);
-            snapshot.fitness.push(floats(format!("fitness.{arm}"), &shapes.fitness)?);
-            let name = format!("pending.{arm}");
-            // An arm's rows wait from its first generation until its champions have played.
-            let waiting = (1..=config.learning.generations + 1).contains(&generation);
-            let pending: Vec<[f64; 2]> = match waiting {
-                true => file.read(&name, Dtype::F64, &[config.learning.trials, 2], 1)?.pop().unwrap_or_default(),
-                false => vec![],
-            };
-            if pending.iter().flatten().any(|share| !(0.0..=1.0).contains(share)) {
-                return Err(format!("{name} has numbers that cannot be"));
+        let shapes = Shapes::of(of);
+        // What comes after the last generation may be kept elsewhere.
+        let elsewhere = generation == last + 1 && file.info(WEIGHTS).is_none();
+        let mut floats = |name: &str, shape: &[usize]| -> Result<Vec<Vec<f32>>, String> {
+            let mut trials: Vec<Vec<f32>> = file.read(name, Dtype::F32, shape, shape[0])?;
+            match trials.iter_mut().any(|numbers| admit(numbers).is_some()) {
+                true => Err(format!("{name} has numbers that cannot be")),
+                false => Ok(trials),
             }
-            let row = |trial: usize| {
-                let &[best_g, mean_g] = pending.get(trial)?;
-                Some(Row { arm, trial, generation: generation - 1, best_g, mean_g, champion_g: 0.0 })
-            };
-            snapshot.pending.push((0..config.learning.trials).map(row).collect());
+        };
+        let weights = if elsewhere { vec![] } else { floats(WEIGHTS, &shapes.weights)? };
+        let fitness = floats(FITNESS, &shapes.fitness)?;
+        // Rows wait from the first generation on until the champions have played.
+        let pending: Vec<[f64; 2]> = match generation {
+            0 => vec![],
+            _ => file.read(PENDING, Dtype::F64, &[learning.trials, 2], 1)?.pop().unwrap_or_default(),
+        };
+        if pending.iter().flatten().any(|share| !(0.0..=1.0).contains(share)) {
+            return Err(format!("{PENDING} has numbers that cannot be"));
         }
+        let row = |trial: usize| {
+            let &[best_g, mean_g] = pending.get(trial)?;
+            Some(Row { arm: 0, trial, generation: generation - 1, best_g, mean_g, champion_g: 0.0 })
+        };
+        let pending = (0..learning.trials).map(row).collect();
         let seconds = seconds.ok_or("its seconds are no number that can be")?;
+        let snapshot = Snapshot { generation, last, weights, fitness, pending };
         Ok(Checkpoint { config, seconds, metrics, snapshot })
+    }
+
+    /// Takes the weights that it lacks from `policies.safetensors`; false where that is not of the same run.
+    #[must_use]
+    fn complete(&mut self, policies: &Path, of: &Config) -> bool {
+        let Ok(mut file) = tensors::open(policies) else { return false };
+        // One without a kind has no checksum either: another program's.
+        if file.kind().is_none() || file.metadata(policies::CONFIG) != Some(&self.config) {
+            return false;
+        }
+        let (population, parameters) = (of.learning.population, of.parameters());
+        let mut weights = Vec::new();
+        for (trial, fitness) in self.snapshot.fitness.iter().enumerate() {
+            let sorted = match policies::from_file(&mut file, of, Some(trial)) {
+                Ok(sorted) if sorted.policies == population => sorted.weights,
+                _ => return false,
+            };
+            let mut slots = vec![0.0; of.learners() * (population + 1) * parameters];
+            let populations = slots.chunks_exact_mut((population + 1) * parameters);
+            let sorted = sorted.chunks_exact(population * parameters);
+            for ((slots, sorted), fitness) in populations.zip(sorted).zip(fitness.chunks_exact(population)) {
+                let mut put = |slot: usize, policy: &[f32]| {
+                    slots[slot * parameters..(slot + 1) * parameters].copy_from_slice(policy);
+                };
+                // The best of all is the champion.
+                put(population, &sorted[..parameters]);
+                let order = evolve::best(fitness, population);
+                order.into_iter().zip(sorted.chunks_exact(parameters)).for_each(|(slot, policy)| put(slot, policy));
+            }
+            weights.push(slots);
+        }
+        self.snapshot.weights = weights;
+        true
     }
 }
 
-/// Shapes of an arm's tensors, all trials together.
+/// Shapes of the tensors, all trials together.
 struct Shapes {
     weights: [usize; 4],
     fitness: [usize; 3],
@@ -208,13 +260,16 @@ pub fn path(folder: &Path, generation: usize) -> PathBuf {
     folder.join(format!("{generation:0DIGITS$}{EXTENSION}"))
 }
 
-/// Opens one and reads it.
+/// Opens one and reads it, with the weights that a finished run keeps in its `policies`; none where these are of
+/// another run by now.
 ///
 /// # Errors
 /// It cannot be read, or is damaged.
-pub fn read(path: &Path, configs: &[Config]) -> Result<Checkpoint, RecordError> {
+pub fn read(path: &Path, policies: &Path, config: &Config) -> Result<Option<Checkpoint>, RecordError> {
     let file = File::open(path).map_err(RecordError::read(path))?;
-    Checkpoint::read(file, configs).map_err(|reason| RecordError::damaged(path, reason))
+    let mut found = Checkpoint::read(file, config).map_err(|reason| RecordError::damaged(path, reason))?;
+    let whole = !found.snapshot.weights.is_empty() || found.complete(policies, config);
+    Ok(whole.then_some(found))
 }
 
 /// When a run's checkpoints are due; 0 is never.
@@ -230,7 +285,7 @@ pub struct Schedule {
 pub struct Keeper {
     disk: Disk,
     folder: PathBuf,
-    configs: Arc<Vec<Config>>,
+    config: Arc<Config>,
     /// Generations of the checkpoints that are whole, oldest first.
     kept: Vec<usize>,
     writing: Option<JoinHandle<Result<(usize, Duration), RecordError>>>,
@@ -240,9 +295,9 @@ pub struct Keeper {
 
 impl Keeper {
     /// Keeps checkpoints in a folder, which exists and has these already.
-    pub fn new(disk: Disk, folder: PathBuf, configs: Vec<Config>, kept: Vec<usize>, generation: usize) -> Keeper {
+    pub fn new(disk: Disk, folder: PathBuf, config: Config, kept: Vec<usize>, generation: usize) -> Keeper {
         let last = (generation, Instant::now(), Duration::ZERO);
-        Keeper { disk, folder, configs: Arc::new(configs), kept, writing: None, last }
+        Keeper { disk, folder, config: Arc::new(config), kept, writing: None, last }
     }
 
     /// Whether a checkpoint should be made before a generation plays.
@@ -265,11 +320,11 @@ impl Keeper {
         self.wait()?;
         let generation = checkpoint.snapshot.generation;
         self.last = (generation, Instant::now(), since.elapsed());
-        let (disk, configs) = (self.disk.clone(), self.configs.clone());
+        let (disk, config) = (self.disk.clone(), self.config.clone());
         let path = path(&self.folder, generation);
         self.writing = Some(std::thread::spawn(move || {
             metrics.sync().map_err(RecordError::write(metrics.path()))?;
-            checkpoint.write(&disk, &path, &configs).map_err(RecordError::write(&path))?;
+            checkpoint.write(&disk, &path, &config).map_err(RecordError::write(&path))?;
             Ok((generation, since.elapsed()))
         }));
         Ok(())
@@ -289,7 +344,7 @@ impl Keeper {
         let generation = checkpoint.snapshot.generation;
         let path = path(&self.folder, generation);
         metrics.sync().map_err(RecordError::write(metrics.path()))?;
-        checkpoint.write(&self.disk, &path, &self.configs).map_err(RecordError::write(&path))?;
+        checkpoint.write(&self.disk, &path, &self.config).map_err(RecordError::write(&path))?;
         self.last = (generation, Instant::now(), since.elapsed());
         self.keep(generation)
     }

@@ -1,5 +1,6 @@
 //! A run's folder: who may write in it, what is in it, and where a run in it goes on.
 
+use std::fmt;
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -11,7 +12,7 @@ use sha2::{Digest, Sha256};
 use super::checkpoint::{self, Checkpoint};
 use super::disk::Disk;
 use super::metrics::{self, Row};
-use super::{RecordError, hex, policies, read_text, tensors};
+use super::{RecordError, hex, policies, read_text};
 use crate::config::Config;
 
 pub const CONFIG: &str = "config.toml";
@@ -61,6 +62,12 @@ pub struct Run {
     pub generations: usize,
     /// See [`Folder::digest`]; once the run is done.
     pub digest: Option<String>,
+    /// What the last session was started by, as a shell reads it.
+    #[serde(default)]
+    pub command: String,
+    /// The commit that the program was built from, where it was built from one.
+    #[serde(default)]
+    pub commit: Option<String>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -91,6 +98,8 @@ impl Run {
             sessions: 0,
             generations: 0,
             digest: None,
+            command: String::new(),
+            commit: None,
         }
     }
 
@@ -128,8 +137,43 @@ pub struct Found {
     pub run: Option<Run>,
     /// What the run came to, where it is done and all its files are as it left them; nothing else is looked at then.
     pub finished: Option<Story>,
-    /// For the user: what was damaged, and what is done about it.
-    pub notes: Vec<String>,
+    /// What there is to tell.
+    pub notes: Vec<Note>,
+}
+
+/// What was found in a folder, and what is done about it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Note {
+    /// A checkpoint that cannot be used, for this reason.
+    SetAside(String),
+    /// A small file that cannot be read, for this reason.
+    WrittenAnew(String),
+    GoingOn {
+        generation: usize,
+    },
+    /// None of the checkpoints can be used.
+    StartingOver,
+    /// There are none.
+    Starting,
+}
+
+impl Note {
+    /// Whether something was damaged; else it is what every resumed run has to tell.
+    pub fn is_damage(&self) -> bool {
+        matches!(self, Note::SetAside(_) | Note::WrittenAnew(_) | Note::StartingOver)
+    }
+}
+
+impl fmt::Display for Note {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Note::SetAside(reason) => write!(f, "{reason}; set aside, going back to the one before"),
+            Note::WrittenAnew(reason) => write!(f, "{reason}; it is written anew"),
+            Note::GoingOn { generation } => write!(f, "going on before generation {generation}"),
+            Note::StartingOver => f.write_str("no checkpoint can be used: starting over, to the same results"),
+            Note::Starting => f.write_str("no checkpoint yet: starting from the beginning"),
+        }
+    }
 }
 
 /// Where a run came from and to, `[trials]` each.
@@ -146,14 +190,16 @@ impl Folder {
     /// It holds a run that must not be written over, is in use, belongs to another config or cannot be written.
     pub fn open(path: &Path, start: Start, config: &Config, disk: Disk) -> Result<(Folder, Found), RecordError> {
         let checkpoints = path.join(CHECKPOINTS);
-        let holds_run = || [CONFIG, RUN, METRICS, POLICIES, CHECKPOINTS].iter().any(|name| path.join(name).exists());
-        if start == Start::Fresh && holds_run() {
+        if path.is_file() {
+            return Err(RecordError::NoFolder { path: path.into() });
+        }
+        if start == Start::Fresh && holds_run(path) {
             return Err(RecordError::Exists { path: path.into() });
         }
         disk.create_folder(path).map_err(RecordError::write(path))?;
         let lock = lock(path)?;
         // Only now is nobody else writing here.
-        if start == Start::Fresh && holds_run() {
+        if start == Start::Fresh && holds_run(path) {
             return Err(RecordError::Exists { path: path.into() });
         }
         disk.create_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
@@ -188,26 +234,22 @@ impl Folder {
     fn find(&self, config: &Config, found: &mut Found) -> Result<(), RecordError> {
         let checkpoints = self.file(CHECKPOINTS);
         let mut kept = checkpoint::tidy(&self.disk, &checkpoints)?;
-        self.compare(config, found, !kept.is_empty())?;
+        let before = self.compare(config, found, !kept.is_empty())?;
         match Run::read(&self.file(RUN)) {
             Ok(run) => found.run = Some(run),
             Err(RecordError::Read { error, .. }) if error.kind() == ErrorKind::NotFound => {}
-            Err(error) => found.notes.push(format!("{error}; it is written anew")),
+            Err(error) => found.notes.push(Note::WrittenAnew(error.to_string())),
         }
         found.finished = found.run.as_ref().and_then(|run| self.finished(run, config));
         if found.finished.is_some() {
             return Ok(());
         }
-        let digest = checkpoint::digest(config);
         let any = !kept.is_empty();
         while let Some(&generation) = kept.last() {
             let path = checkpoint::path(&checkpoints, generation);
-            let reason = match checkpoint::read(&path, std::slice::from_ref(config)) {
-                Ok(checkpoint) if checkpoint.config != digest => {
-                    let differences = vec![format!("  {} says so, without saying what", path.display())];
-                    return Err(RecordError::ConfigDiffers { path: self.path.clone(), differences });
-                }
-                Ok(checkpoint) => {
+            // Those of an earlier version do not say how long their run was to be, but the config there does.
+            let reason = match checkpoint::read(&path, &self.file(POLICIES), before.as_ref().unwrap_or(config)) {
+                Ok(Some(checkpoint)) if checkpoint.is_of(config) => {
                     let metrics = self.file(METRICS);
                     let resumed = metrics::Writer::resume(&self.disk, &metrics, &checkpoint.metrics);
                     match resumed.map_err(RecordError::write(&metrics))? {
@@ -218,40 +260,58 @@ impl Folder {
                         None => format!("{}: {} is not as this left it", path.display(), metrics.display()),
                     }
                 }
+                Ok(Some(_)) if before.is_some() => format!("{}: it is of another run", path.display()),
+                Ok(Some(_)) => {
+                    let differences = vec![format!("  {} says so, without saying what", path.display())];
+                    return Err(RecordError::ConfigDiffers { path: self.path.clone(), differences });
+                }
+                Ok(None) => {
+                    // Only the end of a run leaves one, before the policies that belong to it or after others.
+                    self.disk.remove(&path).map_err(RecordError::write(&path))?;
+                    kept.pop();
+                    continue;
+                }
                 Err(error @ RecordError::Damaged { .. }) => error.to_string(),
                 Err(error) => return Err(error),
             };
-            found.notes.push(format!("{reason}; set aside, going back to the one before"));
+            found.notes.push(Note::SetAside(reason));
             let aside = checkpoint::aside(&path);
             self.disk.rename(&path, &aside).map_err(RecordError::write(&aside))?;
             kept.pop();
         }
-        match &found.checkpoint {
-            Some((checkpoint, _)) => {
-                let generation = checkpoint.snapshot.generation;
-                found.notes.push(format!("going on before generation {generation}"));
-            }
-            None if any => found.notes.push("no checkpoint can be used: starting over, to the same results".into()),
-            None => found.notes.push("no checkpoint yet: starting from the beginning".into()),
-        }
+        found.notes.push(match &found.checkpoint {
+            Some((checkpoint, _)) => Note::GoingOn { generation: checkpoint.snapshot.generation },
+            None if any => Note::StartingOver,
+            None => Note::Starting,
+        });
         found.kept = kept;
         Ok(())
     }
 
-    /// Refuses another config than the one the run was started with.
-    fn compare(&self, config: &Config, found: &mut Found, has_checkpoints: bool) -> Result<(), RecordError> {
+    /// Refuses another config than the one the run was started with, but for more generations; gives that one, where it
+    /// is there.
+    fn compare(&self, config: &Config, found: &mut Found, checkpoints: bool) -> Result<Option<Config>, RecordError> {
         let path = self.file(CONFIG);
         match Config::load(&path) {
-            Ok(old) => {
-                let differences = differences(&old, config);
+            Ok(before) => {
+                let (there, here) = (before.learning.generations, config.learning.generations);
+                let mut as_long = before.clone();
+                as_long.learning.generations = here;
+                if there > here && differences(&as_long, config).is_empty() {
+                    return Err(RecordError::Shorter { path: self.path.clone(), there, here });
+                }
+                let differences = differences(if there < here { &as_long } else { &before }, config);
                 if !differences.is_empty() {
                     return Err(RecordError::ConfigDiffers { path: self.path.clone(), differences });
                 }
+                Ok(Some(before))
             }
-            Err(_) if !path.exists() && !has_checkpoints => {}
-            Err(error) => found.notes.push(format!("{error}; it is written anew")),
+            Err(_) if !path.exists() && !checkpoints => Ok(None),
+            Err(error) => {
+                found.notes.push(Note::WrittenAnew(error.to_string()));
+                Ok(None)
+            }
         }
-        Ok(())
     }
 
     /// Writes a small text file, whole or not at all.
@@ -288,7 +348,7 @@ impl Folder {
         let mut story = Story { first: vec![], last: vec![] };
         let mut count = 0;
         for row in &mut rows {
-            let (row, _) = row.map_err(damaged)?;
+            let (row, _) = row.map_err(|error| RecordError::damaged(&path, error))?;
             if (row.generation, row.trial) != (count / trials, count % trials) {
                 let (generation, trial) = (count / trials, count % trials);
                 return Err(damaged(format!("line {} is not trial {trial}, generation {generation}", count + 2)));
@@ -312,13 +372,18 @@ impl Folder {
     /// What a run that is done came to; none where its files are not all as it left them.
     fn finished(&self, run: &Run, config: &Config) -> Option<Story> {
         let digest = run.digest.as_ref().filter(|_| run.state == State::Done)?;
-        let mut file = tensors::open(&self.file(POLICIES)).ok()?;
-        let all: Result<Vec<_>, String> = (0..config.learning.trials)
-            .map(|trial| Ok(policies::from_file(&mut file, config, Some(trial))?.weights))
-            .collect();
-        let (story, found) = self.digest(config, &all.ok()?).ok()?;
+        if run.generations != config.learning.generations + 1 {
+            return None;
+        }
+        let policies = policies::read_all(&self.file(POLICIES), config).ok()?;
+        let (story, found) = self.digest(config, &policies).ok()?;
         (found == *digest).then_some(story)
     }
+}
+
+/// Whether a folder holds anything of a run.
+pub fn holds_run(path: &Path) -> bool {
+    [CONFIG, RUN, METRICS, POLICIES, CHECKPOINTS].iter().any(|name| path.join(name).exists())
 }
 
 impl Drop for Folder {

@@ -104,6 +104,18 @@ impl Writer {
     }
 }
 
+/// What is wrong with a file's rows.
+#[derive(Debug, thiserror::Error)]
+pub enum RowsError {
+    /// As the last line of a file that is still being written.
+    #[error("line {0} is cut short or longer than {MAX_LINE} bytes")]
+    CutShort(usize),
+    #[error("line {line} is not {what}")]
+    Wrong { line: usize, what: String },
+    #[error("cannot be read: {0}")]
+    Read(#[from] io::Error),
+}
+
 /// The rows of a file one by one, with the seconds of each; stops at the first that is wrong.
 pub struct Rows<R> {
     source: R,
@@ -116,32 +128,36 @@ pub struct Rows<R> {
 impl<R: BufRead> Rows<R> {
     /// # Errors
     /// The first line is not the header.
-    pub fn new(source: R) -> Result<Rows<R>, String> {
+    pub fn new(source: R) -> Result<Rows<R>, RowsError> {
         let mut rows = Rows { source, line: 0, done: false, hash: Sha256::new() };
-        match rows.line()? {
-            Some(header) if header == HEADER => Ok(rows),
-            _ => Err(format!("line 1 is not {HEADER}")),
+        match rows.line() {
+            Ok(Some(header)) if header == HEADER => Ok(rows),
+            Err(error @ RowsError::Read(_)) => Err(error),
+            _ => Err(RowsError::Wrong { line: 1, what: HEADER.into() }),
         }
     }
 
-    fn line(&mut self) -> Result<Option<String>, String> {
+    fn line(&mut self) -> Result<Option<String>, RowsError> {
         self.line += 1;
         let mut line = Vec::new();
-        let read = (&mut self.source).take(MAX_LINE).read_until(b'\n', &mut line);
-        if read.map_err(|error| format!("cannot be read: {error}"))? == 0 {
+        if (&mut self.source).take(MAX_LINE).read_until(b'\n', &mut line)? == 0 {
             return Ok(None);
         }
         if line.pop() != Some(b'\n') {
-            return Err(format!("line {} is cut short or longer than {MAX_LINE} bytes", self.line));
+            return Err(RowsError::CutShort(self.line));
         }
-        let line = String::from_utf8(line).map_err(|_| format!("line {} is not UTF-8 text", self.line))?;
+        let line = String::from_utf8(line).map_err(|_| self.wrong("UTF-8 text"))?;
         let shared = line.rsplit_once(',').map_or("", |(shared, _)| shared);
         self.hash.update(shared);
         self.hash.update("\n");
         Ok(Some(line))
     }
 
-    fn row(&mut self) -> Result<Option<(Row, f64)>, String> {
+    fn wrong(&self, what: impl Into<String>) -> RowsError {
+        RowsError::Wrong { line: self.line, what: what.into() }
+    }
+
+    fn row(&mut self) -> Result<Option<(Row, f64)>, RowsError> {
         let Some(line) = self.line()? else { return Ok(None) };
         let parse = || {
             let mut fields = line.split(',');
@@ -157,7 +173,7 @@ impl<R: BufRead> Rows<R> {
             let seconds = field()?.parse().ok().filter(|seconds: &f64| seconds.is_finite() && *seconds >= 0.0)?;
             fields.next().is_none().then_some((row, seconds))
         };
-        parse().map(Some).ok_or_else(|| format!("line {} is not {HEADER} with every G in 0..1", self.line))
+        parse().map(Some).ok_or_else(|| self.wrong(format!("{HEADER} with every G in 0..1")))
     }
 
     /// SHA-256 over all that was read, without the seconds.
@@ -171,7 +187,7 @@ fn share(text: &str) -> Option<f64> {
 }
 
 impl<R: BufRead> Iterator for Rows<R> {
-    type Item = Result<(Row, f64), String>;
+    type Item = Result<(Row, f64), RowsError>;
 
     fn next(&mut self) -> Option<Self::Item> {
         if self.done {

@@ -36,6 +36,13 @@ pub enum RecordError {
     Damaged { path: PathBuf, reason: String },
     #[error("{path} holds a run already; go on with it by --resume, write over it by --force, or choose another --out")]
     Exists { path: PathBuf },
+    #[error("{path} is a file; choose a folder by --out")]
+    NoFolder { path: PathBuf },
+    #[error(
+        "{path} is a run of {there} generations, which cannot become one of {here}; resume with --generations {there} or \
+         more, or choose another --out"
+    )]
+    Shorter { path: PathBuf, there: usize, here: usize },
     #[error("another process is training in {path}; wait for it, stop it, or choose another --out")]
     Locked { path: PathBuf },
     #[error(

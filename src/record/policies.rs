@@ -1,7 +1,8 @@
 //! `policies.safetensors`: what a run learned.
 //!
 //! One f32 tensor `weights.N` a trial, `[leaders, policies, parameters]`, best policy first in each population, so
-//! that the team of all first policies is the trial's champion; metadata `layers` is the policies' network, "8,10,2".
+//! that the team of all first policies is the trial's champion; metadata `layers` is the policies' network, "8,10,2",
+//! and `config` the digest of the config that they were trained by.
 //! Other programs may write such files too, also with a single tensor `weights`.
 
 use std::collections::BTreeMap;
@@ -11,6 +12,7 @@ use std::path::Path;
 use safetensors::tensor::Dtype;
 
 use super::RecordError;
+use super::checkpoint;
 use super::disk::Disk;
 use super::tensors::{self, Tensor, TensorFile};
 use crate::config::{Config, MAX_POPULATION};
@@ -18,6 +20,8 @@ use crate::evolve::{MAX_WEIGHT, MIN_WEIGHT};
 use crate::world::{INPUTS, OUTPUTS};
 
 const KIND: &str = "policies 1";
+/// Metadata: [`checkpoint::digest`] of the config.
+pub(super) const CONFIG: &str = "config";
 
 /// Policies of one trial.
 #[derive(Clone, Debug, PartialEq)]
@@ -42,7 +46,8 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
     let shape = vec![config.learners(), config.learning.population, config.parameters()];
     let tensor = |(trial, weights)| Tensor::floats(format!("weights.{trial}"), shape.clone(), [weights]);
     let tensors: Vec<_> = trials.iter().map(AsRef::as_ref).enumerate().map(tensor).collect();
-    let metadata = BTreeMap::from([("layers".to_string(), layers(config))]);
+    let metadata =
+        BTreeMap::from([("layers".to_string(), layers(config)), (CONFIG.to_string(), checkpoint::digest(config))]);
     tensors::write(disk, path, KIND, &metadata, &tensors).map_err(RecordError::write(path))
 }
 
@@ -53,6 +58,19 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
 pub fn read(path: &Path, config: &Config, trial: Option<usize>) -> Result<Policies, RecordError> {
     let mut file = tensors::open(path)?;
     from_file(&mut file, config, trial).map_err(|reason| RecordError::damaged(path, reason))
+}
+
+/// [`read`] of all trials of a config.
+///
+/// # Errors
+/// See [`read`].
+pub fn read_all(path: &Path, config: &Config) -> Result<Vec<Vec<f32>>, RecordError> {
+    let mut file = tensors::open(path)?;
+    let trial = |trial| Ok(from_file(&mut file, config, Some(trial))?.weights);
+    (0..config.learning.trials)
+        .map(trial)
+        .collect::<Result<_, String>>()
+        .map_err(|reason| RecordError::damaged(path, reason))
 }
 
 /// [`read`], from anything.

@@ -18,8 +18,7 @@ use crate::config::Config;
 use crate::credit::{self, Credit, Scores};
 use crate::evolve::{self, Key, Purpose};
 use crate::record::checkpoint::{self, Snapshot};
-use crate::record::folder::CHECKPOINTS;
-use crate::record::metrics::Row;
+use crate::record::folder::{CHECKPOINTS, POLICIES};
 use crate::trainer::Trainer;
 use crate::world::World;
 
@@ -137,12 +136,12 @@ pub fn replay(
     let mut trainer = Trainer::of_trial(config.clone(), trial);
     for index in order {
         let generation = generations[index];
-        if let Some(snapshot) = nearest(folder, &config, trial, trainer.generation() + 1..=generation) {
+        if let Some(snapshot) = nearest(folder, &config, trial, trainer.generation(0) + 1..=generation) {
             // A checkpoint of other sizes is of another config: training on from the start does without.
-            let _ = trainer.restore(snapshot);
+            let _ = trainer.restore(0, snapshot);
         }
-        while trainer.generation() < generation {
-            if !watch(trainer.generation()) {
+        while trainer.generation(0) < generation {
+            if !watch(trainer.generation(0)) {
                 return Err(ReplayError::Stopped);
             }
             trainer.advance(backend)?;
@@ -169,14 +168,17 @@ fn nearest(
     let found = checkpoint::list(&checkpoints).ok()?.into_iter().rev().filter(|found| generations.contains(found));
     found.into_iter().find_map(|generation| {
         let path = checkpoint::path(&checkpoints, generation);
-        let found = checkpoint::read(&path, std::slice::from_ref(config)).ok()?;
-        let Snapshot { generation: at, mut weights, mut fitness, mut pending } = found.snapshot;
-        let same = found.config == checkpoint::digest(config) && at == generation;
-        same.then(|| Snapshot {
+        let found = checkpoint::read(&path, &folder.join(POLICIES), config).ok()??;
+        if !found.is_of(config) || found.snapshot.generation != generation {
+            return None;
+        }
+        let Snapshot { last, mut weights, mut fitness, mut pending, .. } = found.snapshot;
+        Some(Snapshot {
             generation,
-            weights: vec![vec![weights[0].swap_remove(trial)]],
-            fitness: vec![vec![fitness[0].swap_remove(trial)]],
-            pending: vec![vec![pending[0].swap_remove(trial).map(|row: Row| Row { arm: 0, ..row })]],
+            last,
+            weights: vec![weights.swap_remove(trial)],
+            fitness: vec![fitness.swap_remove(trial)],
+            pending: vec![pending.swap_remove(trial)],
         })
     })
 }
@@ -190,7 +192,7 @@ fn play_best(
 ) -> Result<Played, ReplayError> {
     use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
     let learning = &config.learning;
-    let (generation, world) = (trainer.generation(), trainer.world(0).clone());
+    let (generation, world) = (trainer.generation(0), trainer.world(0).clone());
     let (leaders, population) = (world.leaders(), learning.population);
     let weights = trainer.weights(0, 0)?.into();
 

@@ -7,7 +7,7 @@ use super::curves::{Curve, Figure, Panel, Tally};
 use crate::config::{Config, ConfigError};
 use crate::record::RecordError;
 use crate::record::folder::{CONFIG, METRICS};
-use crate::record::metrics;
+use crate::record::metrics::{self, RowsError};
 
 /// Most runs that one figure can tell apart.
 pub const MAX_RUNS: usize = 24;
@@ -66,8 +66,8 @@ pub fn metrics(folder: &Path, config: &Config, mut each: impl FnMut(&metrics::Ro
         let row = match row {
             Ok((row, _)) => row,
             // A line that is cut short is the last one, of a run that goes on or was killed.
-            Err(reason) if reason.contains("cut short") => break,
-            Err(reason) => return Err(damaged(reason)),
+            Err(RowsError::CutShort(_)) => break,
+            Err(error) => return Err(damaged(error.to_string())),
         };
         let (trials, generations) = (config.learning.trials, config.learning.generations);
         if row.trial >= trials || row.generation > generations {

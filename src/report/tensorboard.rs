@@ -9,8 +9,10 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use crate::record::metrics::Row;
+use crate::record::metrics::{self, Row};
 
+/// Most bytes of a trial that wait to be written.
+const MOST: usize = 1 << 16;
 /// How often what is new is written.
 const FLUSH: Duration = Duration::from_secs(2);
 /// What TensorBoard knows event files by.
@@ -26,36 +28,45 @@ pub struct Events {
 }
 
 impl Events {
-    /// Starts event files in `folder/trial-N`, a folder a trial. A run that starts afresh removes those of any run
-    /// before it; a resumed one adds to them, and TensorBoard drops what was trained twice.
+    /// Starts event files in `folder/trial-N`, a folder a trial, with all that is in `metrics` so far; they take the place
+    /// of any others.
     ///
     /// # Errors
     /// They cannot be written.
-    pub fn create(folder: &Path, trials: usize, fresh: bool) -> io::Result<Events> {
+    pub fn create(folder: &Path, trials: usize, metrics: &Path) -> io::Result<Events> {
         let seconds = now() as u64;
         let digits = trials.saturating_sub(1).to_string().len();
         let mut files = Vec::with_capacity(trials);
         for trial in 0..trials {
             let folder = folder.join(format!("trial-{trial:0digits$}"));
             fs::create_dir_all(&folder)?;
-            if fresh {
-                for entry in fs::read_dir(&folder)? {
-                    let path = entry?.path();
-                    if path.file_name().is_some_and(|name| name.to_string_lossy().contains(MARK)) {
-                        fs::remove_file(path)?;
-                    }
+            for entry in fs::read_dir(&folder)? {
+                let path = entry?.path();
+                if path.file_name().is_some_and(|name| name.to_string_lossy().contains(MARK)) {
+                    fs::remove_file(path)?;
                 }
             }
-            // Files are read in the order of their names, and nobody else's is continued.
-            let file = (0..)
-                .map(|count| folder.join(format!("events.out.{MARK}.{seconds:010}.flotilla.{count}")))
-                .find(|path| !path.exists());
-            files.extend(file);
+            files.push(folder.join(format!("events.out.{MARK}.{seconds:010}.flotilla")));
         }
         let first = record(&event(now(), 0, &Content::Version));
         let mut events = Events { files, new: vec![first; trials], flushed: Instant::now() };
+        let rows = || metrics::open(metrics).map_err(io::Error::other).map(|rows| rows.map_while(Result::ok));
+        // As if they had been written when they became complete, all sessions in one.
+        let start = now() - rows()?.last().map_or(0.0, |(_, seconds)| seconds);
+        for (row, seconds) in rows()? {
+            events.add_at(&row, start + seconds);
+            if events.new.get(row.trial).is_some_and(|new| new.len() > MOST) {
+                events.flush()?;
+            }
+        }
         events.flush()?;
         Ok(events)
+    }
+
+    fn add_at(&mut self, row: &Row, time: f64) {
+        if let Some(new) = self.new.get_mut(row.trial) {
+            new.extend(record(&event(time, row.generation as u64, &Content::Row(row))));
+        }
     }
 
     /// Takes in rows that became complete; from time to time they are written.
@@ -63,11 +74,7 @@ impl Events {
     /// # Errors
     /// They cannot be written.
     pub fn add(&mut self, rows: &[Row]) -> io::Result<()> {
-        for row in rows {
-            if let Some(new) = self.new.get_mut(row.trial) {
-                new.extend(record(&event(now(), row.generation as u64, &Content::Row(row))));
-            }
-        }
+        rows.iter().for_each(|row| self.add_at(row, now()));
         if self.flushed.elapsed() >= FLUSH { self.flush() } else { Ok(()) }
     }
 

@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use crate::shell::quoted;
+
 /// What the script asks for.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Job<'a> {
@@ -68,14 +70,5 @@ exit "$code"
             collect = [&command[..], &["--collect".to_string()]].concat().join(" "),
             command = command.join(" "),
         )
-    }
-}
-
-/// A word as a shell reads it back.
-fn quoted(word: &str) -> String {
-    let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+%@".contains(c);
-    match word.chars().all(plain) && !word.is_empty() {
-        true => word.into(),
-        false => format!("'{}'", word.replace('\'', r"'\''")),
     }
 }

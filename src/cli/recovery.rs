@@ -1,0 +1,137 @@
+//! What the commands that train recorded runs have in common: flags, signals, and what is told when a device fails.
+
+use std::io;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use clap::ValueEnum;
+
+use super::{Error, RunOptions, backend, say};
+use crate::backend::BackendError;
+use crate::config::Override;
+use crate::run::Player;
+use crate::shell;
+
+/// What to do about a failing device.
+#[derive(clap::Args, Clone, Copy)]
+pub struct Loss {
+    /// What to do when the device fails in mid-run
+    #[arg(long, value_enum, value_name = "WHAT", default_value_t = OnLoss::Stop)]
+    on_device_loss: OnLoss,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum OnLoss {
+    /// Save and fail, to be resumed
+    Stop,
+    /// Go on with the CPU, to the same results
+    Cpu,
+}
+
+impl Loss {
+    /// The backend to go on with after another failed, if that was asked for.
+    pub fn instead(self, error: &BackendError) -> Option<Player> {
+        (self.on_device_loss == OnLoss::Cpu).then(|| {
+            let (backend, machine) = backend::cpu();
+            say(format_args!("{error}\ngoing on with {}, to the same results", backend.describe()));
+            (backend, machine)
+        })
+    }
+}
+
+/// Tells that populations moved to the host.
+pub fn setback(error: &BackendError) {
+    say(format_args!("{error}\nthe populations are kept by the host from here on, to the same results"));
+}
+
+/// How often runs are saved, instead of what their config says.
+#[derive(clap::Args)]
+pub struct Checkpoints {
+    /// Save what --resume needs after so many generations; 0 is never
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    checkpoint_generations: Option<i64>,
+    /// Save what --resume needs after so many seconds; 0 is never
+    #[arg(long, value_name = "S", allow_negative_numbers = true)]
+    checkpoint_seconds: Option<f64>,
+}
+
+impl Checkpoints {
+    /// The keys that were set, each named as its flag.
+    pub fn list(&self) -> Vec<Override> {
+        let generations = self.checkpoint_generations.map(toml::Value::from);
+        let seconds = self.checkpoint_seconds.map(toml::Value::from);
+        let set = |(name, value): (&str, Option<toml::Value>)| {
+            Some(Override::new(format!("checkpoint.{name}"), value?, format!("--checkpoint-{name}")))
+        };
+        [("generations", generations), ("seconds", seconds)].into_iter().filter_map(set).collect()
+    }
+}
+
+/// Flags that set config keys, as typed.
+pub fn words_of(overrides: &[Override]) -> impl Iterator<Item = String> {
+    overrides.iter().flat_map(|set| [set.name.clone(), set.text.trim_matches(['"', '\'']).to_string()])
+}
+
+/// The flags that say what to run on, as typed, those left out left out.
+pub fn words_of_machine(run: &RunOptions, loss: Loss) -> Vec<String> {
+    fn word<T: ValueEnum + PartialEq>(value: T, default: T) -> Option<String> {
+        (value != default).then(|| value.to_possible_value()).flatten().map(|value| value.get_name().to_string())
+    }
+    let RunOptions { backend, adapter, breed, threads } = run.clone();
+    let flags = [
+        ("--backend", word(backend, super::BackendChoice::Auto)),
+        ("--adapter", adapter),
+        ("--breed", word(breed, super::Breed::Auto)),
+        ("--threads", threads.map(|threads| threads.to_string())),
+        ("--on-device-loss", word(loss.on_device_loss, OnLoss::Stop)),
+    ];
+    flags.into_iter().filter_map(|(flag, value)| Some([flag.to_string(), value?])).flatten().collect()
+}
+
+/// A path as a shell reads it back.
+pub fn quoted(path: &Path) -> String {
+    shell::quoted(&path.display().to_string())
+}
+
+/// Most characters of a command line that are kept.
+const MOST: usize = 1 << 13;
+
+/// What was typed, as a shell reads it.
+pub fn typed() -> String {
+    let line = shell::command(std::env::args_os().map(|word| word.to_string_lossy().into_owned()));
+    match line.char_indices().nth(MOST) {
+        Some((end, _)) => format!("{} …", &line[..end]),
+        None => line,
+    }
+}
+
+/// Signals that ask for something.
+pub struct Signals {
+    pub stop: Arc<AtomicBool>,
+    pub save: Arc<AtomicBool>,
+}
+
+impl Signals {
+    /// From here on SIGINT and SIGTERM set `stop`, and end the process at once where it is set already; SIGUSR1 sets
+    /// `save`.
+    ///
+    /// # Errors
+    /// The system does not let them.
+    pub fn listen() -> Result<Signals, Error> {
+        use signal_hook::consts::{SIGINT, SIGTERM};
+        use signal_hook::flag;
+        let signals = Signals { stop: Arc::default(), save: Arc::default() };
+        let listen = || -> io::Result<()> {
+            for signal in [SIGINT, SIGTERM] {
+                flag::register_conditional_shutdown(signal, 128 + signal, signals.stop.clone())?;
+                flag::register(signal, signals.stop.clone())?;
+            }
+            #[cfg(unix)]
+            flag::register(signal_hook::consts::SIGUSR1, signals.save.clone())?;
+            Ok(())
+        };
+        listen().map_err(Error::Signals)?;
+        Ok(signals)
+    }
+}
