@@ -5,6 +5,7 @@
 use std::fmt::Display;
 use std::io::{self, Write};
 use std::path::PathBuf;
+use std::sync::LazyLock;
 
 use clap::builder::PossibleValuesParser as Words;
 use clap::{Parser, Subcommand, ValueEnum};
@@ -69,11 +70,17 @@ commands! {
 
 /// Trains cooperative teams by coevolution on any GPU, with the same bits on a CPU.
 #[derive(Parser)]
-#[command(version, arg_required_else_help = true)]
+#[command(version, long_version = VERSION.as_str(), arg_required_else_help = true)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
 }
+
+/// What `--version` tells: also what this was built from, and for what.
+static VERSION: LazyLock<String> = LazyLock::new(|| {
+    let commit = crate::COMMIT.unwrap_or("not recorded");
+    format!("{}\ncommit  {commit}\ntarget  {}", env!("CARGO_PKG_VERSION"), env!("FLOTILLA_TARGET"))
+});
 
 /// Does what was typed; wrong usage ends the program here, with exit code 2.
 ///
@@ -149,11 +156,30 @@ pub fn print(text: &str) -> Result<(), Error> {
 const IN_CONFIG: &str = "Instead of the config's";
 const WHERE: &str = "Where to run (the results are the same)";
 
+/// A config file.
+#[derive(clap::Args)]
+pub struct ConfigFile {
+    /// Config file (TOML), or - for standard input
+    #[arg(value_name = "CONFIG")]
+    pub path: PathBuf,
+}
+
+impl ConfigFile {
+    /// The config in it, with some keys set by a command's own flags.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the file and the flags.
+    pub fn load(&self, overrides: &[Override]) -> Result<Config, Error> {
+        let text = config::read_file(&self.path)?;
+        Ok(Config::read(&text, &config::name(&self.path), &[], overrides)?)
+    }
+}
+
 /// A config file and the flags that change it.
 #[derive(clap::Args)]
 pub struct ConfigArgs {
-    /// Config file (TOML)
-    pub config: PathBuf,
+    #[command(flatten)]
+    pub file: ConfigFile,
     #[command(flatten)]
     pub overrides: Overrides,
 }
@@ -172,9 +198,7 @@ impl ConfigArgs {
     /// # Errors
     /// Everything that is wrong with the file and the flags.
     pub fn load_with(&self, more: Vec<Override>) -> Result<Config, Error> {
-        let text = config::read_file(&self.config)?;
-        let overrides = [self.overrides.list(), more].concat();
-        Ok(Config::read(&text, &self.config.display().to_string(), &[], &overrides)?)
+        self.file.load(&[self.overrides.list(), more].concat())
     }
 }
 

@@ -17,7 +17,7 @@ use crate::trainer::Trainer;
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder for the figures, the claims and the curves
-    #[arg(long, value_name = "DIR", default_value = "paper")]
+    #[arg(long, short, value_name = "DIR", default_value = "paper")]
     out: PathBuf,
     /// Independent repetitions [default: 5]
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
@@ -29,7 +29,7 @@ pub struct Args {
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     seed: Option<i64>,
     /// No progress on standard error
-    #[arg(long)]
+    #[arg(long, short)]
     quiet: bool,
     #[command(flatten)]
     run: RunOptions,

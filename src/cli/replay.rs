@@ -4,10 +4,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
-use super::{Error, RunOptions, backend, print, say};
+use serde_json::json;
+
+use super::{Error, RunOptions, backend, print};
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::report::curves::PRINT;
+use crate::report::progress::Meter;
 use crate::report::replay::{self, Played, Rows};
 use crate::report::runs;
 
@@ -29,14 +32,20 @@ pub struct Args {
     #[arg(long, value_name = "N")]
     step: Option<usize>,
     /// File to write: .html to play, .gif moving, .png or .svg still [default: replay.html in RUN]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+    /// No progress on standard error
+    #[arg(long, short)]
+    quiet: bool,
     #[command(flatten)]
     run: RunOptions,
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { folder, trial, generation, compare, step, out, run } = args;
+    let Args { folder, trial, generation, compare, step, out, json, quiet, run } = args;
     let out = out.unwrap_or_else(|| folder.join("replay.html"));
     let kind = Kind::of(&out)?;
     let config = runs::config(&folder)?;
@@ -55,16 +64,15 @@ pub fn run(args: Args) -> Result<(), Error> {
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         signal_hook::flag::register(signal, stop.clone()).map_err(Error::Signals)?;
     }
-    let mut told = 0;
+    let (mut meter, last) = (Meter::new(quiet), generations.iter().max().copied().unwrap_or(0));
     let mut watch = |generation: usize| {
-        // Most runs take no time; the others say that something happens.
-        if generation / 1000 > told {
-            told = generation / 1000;
-            say(format_args!("training trial {trial} again: generation {generation}"));
-        }
+        let part = generation as f64 / (last + 1) as f64;
+        meter.show(part, || format!("training trial {trial} again: generation {generation} of {last}"));
         !stop.load(Relaxed)
     };
-    let played = replay::replay(&folder, trial, &generations, &mut *backend, &mut watch)?;
+    let played = replay::replay(&folder, trial, &generations, &mut *backend, &mut watch);
+    meter.clear();
+    let played = played?;
 
     let failed = |error| RecordError::Write { path: out.clone(), error };
     let name = folder.canonicalize().ok().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
@@ -77,6 +85,12 @@ pub fn run(args: Args) -> Result<(), Error> {
         Kind::Svg => still().svg().into_bytes(),
     };
     Disk::default().replace(&out, |output| output.write_all(&content)).map_err(failed)?;
+    if json {
+        let episode = |Played { trial, generation, team, best_g, .. }: &Played| json!({ "trial": trial, "generation": generation, "team": team, "best_g": best_g });
+        let episodes: Vec<_> = played.iter().map(episode).collect();
+        let object = json!({ "out": out.display().to_string(), "bytes": content.len(), "episodes": episodes });
+        return print(&format!("{object}\n"));
+    }
     for played in &played {
         print(&tell(played))?;
     }

@@ -1,11 +1,8 @@
 //! `flotilla sweep`: a grid of runs, on one machine or many.
 
 use std::fmt::Write as _;
-use std::io::{self, IsTerminal, Write as _};
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
-
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use super::train::Signals;
 use super::{Error, Overrides, RunOptions, backend, print, say};
@@ -14,6 +11,7 @@ use crate::memory;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{CONFIG, Start};
+use crate::report::progress::Meter;
 use crate::sweep::pictures;
 use crate::sweep::results::{self, Missing, Outcome};
 use crate::sweep::run::{self, Ended, Progress};
@@ -25,8 +23,6 @@ use crate::sweep::{Point, Sweep};
 const SWEEP: &str = "sweep.toml";
 const SCALE_OUT: &str = "Many processes (docs/sweeps.md)";
 const RESULTS: &str = "Results";
-/// How often a line is written where there is no terminal to draw on.
-const LINES: Duration = Duration::from_secs(10);
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -37,7 +33,7 @@ pub struct Args {
     #[command(flatten)]
     run: RunOptions,
     /// Folder for what comes out, the same for all shards [default: runs/NAME of the sweep]
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Go on with the points in the folder, and start those that are not there
     #[arg(long, conflicts_with = "force")]
@@ -55,7 +51,7 @@ pub struct Args {
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory: Option<f64>,
     /// No progress on standard error
-    #[arg(long)]
+    #[arg(long, short)]
     quiet: bool,
 
     /// Run shard I of N, dealt out by cost; else what a Slurm array or a Kubernetes indexed job says
@@ -447,46 +443,22 @@ fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> 
     }
 }
 
-/// Shows how the points come on: a bar on a terminal, a line from time to time elsewhere.
-struct Ticker {
-    bar: Option<ProgressBar>,
-    quiet: bool,
-    start: Instant,
-    shown: Instant,
-}
+/// Shows how the points come on.
+struct Ticker(Meter);
 
 impl Ticker {
     fn new(quiet: bool) -> Ticker {
-        let bar = (!quiet && io::stderr().is_terminal()).then(|| {
-            let style = ProgressStyle::with_template("{bar:24} {percent}%  {msg}  {eta} left");
-            let style = style.unwrap_or_else(|_| ProgressStyle::default_bar());
-            ProgressBar::with_draw_target(Some(1000), ProgressDrawTarget::stderr()).with_style(style)
-        });
-        Ticker { bar, quiet, start: Instant::now(), shown: Instant::now() }
+        Ticker(Meter::new(quiet))
     }
 
     fn tick(&mut self, progress: &Progress) {
         let Progress { done, points, batch, generation, last, played, total } = *progress;
-        let part = played as f64 / total.max(1) as f64;
-        let told =
-            format!("{done}/{points} points done, {batch} side by side at generation {}/{last}", generation.min(last));
-        match &self.bar {
-            Some(bar) => {
-                bar.set_position((part * 1000.0) as u64);
-                bar.set_message(told);
-            }
-            None if !self.quiet && self.shown.elapsed() >= LINES => {
-                let left = self.start.elapsed().as_secs_f64() * (1.0 - part) / part.max(1e-9);
-                say(format_args!("{told}, {:.0} %, {left:.0} s left", part * 100.0));
-                self.shown = Instant::now();
-            }
-            None => {}
-        }
+        self.0.show(played as f64 / total.max(1) as f64, || {
+            format!("{done}/{points} points done, {batch} side by side at generation {}/{last}", generation.min(last))
+        });
     }
 
     fn clear(&self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
+        self.0.clear();
     }
 }

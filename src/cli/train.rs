@@ -10,7 +10,7 @@ use std::time::Instant;
 use clap::ValueEnum;
 
 use super::{ConfigArgs, Error, RunOptions, backend, print, say};
-use crate::config::{Config, Override};
+use crate::config::{self, Config, Override};
 use crate::memory::Plan;
 use crate::record::checkpoint::Schedule;
 use crate::record::disk::Disk;
@@ -34,8 +34,9 @@ pub struct Args {
     config: ConfigArgs,
     #[command(flatten)]
     run: RunOptions,
-    /// Folder for what comes out [default: runs/NAME of the config, or the next free runs/NAME-2, …]
-    #[arg(long, value_name = "DIR")]
+    /// Folder for what comes out [default: runs/NAME of the config (runs/config of standard input), or the next free
+    /// runs/NAME-2, …]
+    #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Go on with the run in the folder (without --out the latest of this config's name), or start it if there is none
     #[arg(long, conflicts_with = "force")]
@@ -44,7 +45,7 @@ pub struct Args {
     #[arg(long)]
     force: bool,
     /// No progress on standard error
-    #[arg(long)]
+    #[arg(long, short)]
     quiet: bool,
     /// Also write event files for TensorBoard, in OUT/tensorboard
     #[arg(long)]
@@ -86,7 +87,10 @@ impl Args {
             (_, true) => Start::Force,
             _ => Start::Fresh,
         };
-        let stem = self.config.config.file_stem().unwrap_or_default().to_string_lossy();
+        let stem = match &self.config.file.path {
+            path if config::is_standard_input(path) => "config".into(),
+            path => path.file_stem().unwrap_or_default().to_string_lossy(),
+        };
         let runs = Path::new(RUNS);
         Ok(match (&self.out, start) {
             (Some(out), _) => (out.clone(), start),
