@@ -19,7 +19,10 @@ use crate::run::RunError;
 mod backend;
 mod bench;
 mod check;
+mod completions;
 mod devices;
+mod init;
+mod man;
 mod paper;
 mod plot;
 mod replay;
@@ -46,6 +49,8 @@ macro_rules! commands {
 }
 
 commands! {
+    /// Write a commented config to start from.
+    Init(init),
     /// Check a config; print it with every default written out, and what a run of it costs.
     Check(check),
     /// Train the teams of a config, and save what they learned.
@@ -66,6 +71,10 @@ commands! {
     Devices(devices),
     /// Train every point of a grid side by side; share the grid out over many machines.
     Sweep(sweep),
+    /// Print the script by which a shell completes commands and flags.
+    Completions(completions),
+    /// Write manual pages.
+    Man(man),
 }
 
 /// Trains cooperative teams by coevolution on any GPU, with the same bits on a CPU.
