@@ -4,9 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
-use super::{Error, RunOptions, backend, print, say};
+use super::{Error, RunOptions, backend, output, print, say};
 use crate::record::RecordError;
-use crate::record::disk::Disk;
 use crate::report::curves::PRINT;
 use crate::report::replay::{self, Played, Rows};
 use crate::report::runs;
@@ -76,7 +75,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         Kind::Png => still().png(PRINT).map_err(failed)?,
         Kind::Svg => still().svg().into_bytes(),
     };
-    Disk::default().replace(&out, |output| output.write_all(&content)).map_err(failed)?;
+    output::write(&out, |output| output.write_all(&content))?;
     for played in &played {
         print(&tell(played))?;
     }
@@ -85,10 +84,13 @@ pub fn run(args: Args) -> Result<(), Error> {
 
 /// What was played, in a line.
 fn tell(played: &Played) -> String {
-    let Played { trial, generation, team, best_g, world, .. } = played;
+    let Played { trial, generation, team, best_g, episodes, world, .. } = played;
+    let (pois, digits) = (world.pois.len(), if *episodes > 1 { 2 } else { 0 });
     format!(
-        "trial {trial}, generation {generation}: team {team} is the best, G = {best_g} of {} POIs, as metrics.csv says\n",
-        world.pois.len()
+        "trial {trial}, generation {generation}: team {team} is the best, it observed {:.digits$} of {pois} POIs{}, as \
+         metrics.csv says\n",
+        best_g * pois as f64,
+        if *episodes > 1 { format!(" (mean of {episodes} episodes)") } else { String::new() }
     )
 }
 

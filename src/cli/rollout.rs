@@ -1,12 +1,11 @@
 //! `flotilla rollout`: plays teams of policies from a file, and scores every leader.
 
 use std::cell::RefCell;
-use std::fs::File;
-use std::io::{self, BufWriter, Write};
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
-use super::{ConfigArgs, Error, RunOptions, backend, print, say};
+use super::{ConfigArgs, Error, RunOptions, backend, output, print, say};
 use crate::backend::{Backend, Group};
 use crate::credit::Credit;
 use crate::record::policies;
@@ -37,6 +36,8 @@ pub struct Args {
 
 /// Team j is made of the policies with index j of every leader, and starts where the config says.
 pub fn run(args: Args) -> Result<(), Error> {
+    let outputs = [("--scores", args.scores.as_deref()), ("--trace", args.trace.as_deref())];
+    output::check(&outputs, &[&args.config.config, &args.policies])?;
     let config = args.config.load()?;
     let policies = policies::read(&args.policies, &config, args.trial)?;
     let world = World::new(&config);
@@ -54,7 +55,7 @@ pub fn run(args: Args) -> Result<(), Error> {
 
     let scores = score(&mut *backend, &group)?;
     if let Some(path) = &args.scores {
-        write(path, |file| write_scores(file, &scores, world.leaders()))?;
+        output::write(path, |file| write_scores(file, &scores, world.leaders()))?;
     }
     if let Some(path) = &args.trace {
         write_trace(path, &mut *backend, &group)?;
@@ -101,14 +102,14 @@ fn write_trace(path: &Path, backend: &mut dyn Backend, group: &Group<'_>) -> Res
     let team_bytes = (steps + 1) * agents * size_of::<crate::backend::Moment>() + group.world.set_words() * 4;
     let teams = (TRACE_BYTES / team_bytes).max(1);
     let mut failed = None;
-    write(path, |file| {
+    let written = output::write(path, |file| {
         writeln!(file, "team,step,agent,role,x,y,heading_x,heading_y,speed")?;
         for (part, chosen) in group.teams.chunks(teams * leaders).enumerate() {
             let trace = match backend.trace(&Group { teams: chosen, ..*group }) {
                 Ok(trace) => trace,
                 Err(error) => {
                     failed = Some(error);
-                    return Ok(());
+                    return Err(io::ErrorKind::Other.into());
                 }
             };
             for team in 0..trace.teams {
@@ -123,16 +124,6 @@ fn write_trace(path: &Path, backend: &mut dyn Backend, group: &Group<'_>) -> Res
             }
         }
         Ok(())
-    })?;
-    failed.map_or(Ok(()), |error| Err(error.into()))
-}
-
-/// Writes a file in place of any other.
-fn write(path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Error> {
-    let write = || {
-        let mut file = BufWriter::with_capacity(1 << 18, File::create(path)?);
-        content(&mut file)?;
-        file.flush()
-    };
-    write().map_err(|error| crate::record::RecordError::Write { path: path.into(), error }.into())
+    });
+    failed.map_or(written, |error| Err(error.into()))
 }
