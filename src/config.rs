@@ -15,6 +15,7 @@ use serde::Serialize;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
+use crate::file;
 use crate::world::{INPUTS, OUTPUTS};
 
 /// Most agents (leaders and followers) in a team.
@@ -41,6 +42,8 @@ const _: () = assert!(MAX_STEPS * MAX_POIS * MAX_AGENTS.div_ceil(32) * size_of::
 pub const MAX_POLICY_BYTES: usize = 1 << 38;
 /// Most bytes in a config file.
 pub const MAX_FILE_BYTES: u64 = 1 << 20;
+/// The section that makes a config a sweep.
+pub const GRID: &str = "grid";
 /// Most problems listed of one file.
 const MAX_LISTED: usize = 50;
 /// Longest map side, radius or range: squares of distances stay far from the ends of f32.
@@ -293,6 +296,15 @@ impl Config {
             let at = at.map_or(String::new(), |at| format!(" (at `{}`)", shorten(at)));
             let message = error.message().trim().replace('\n', ", ") + &at;
             reader.blame(Place::Offset(span.start), "", message);
+        }
+        if reader.problems.is_empty() && !foreign.contains(&GRID) {
+            // Of a sweep taken for a config nothing else is worth saying.
+            let section = |key: &Spanned<_>| key.get_ref() == GRID;
+            let grid = document.get_ref().keys().find(|key| section(key)).map(|key| key.span().start);
+            if let Some(start) = grid {
+                let message = "this makes the file a sweep, of many configs; use `flotilla sweep`";
+                reader.blame(Place::Offset(start), GRID, message.into());
+            }
         }
         if reader.problems.is_empty() {
             reader.fill(document.into_inner(), text, foreign, overrides);
@@ -609,7 +621,7 @@ pub fn read_file(path: &Path) -> Result<String, ConfigError> {
     } else if path.is_dir() {
         return Err(fail("it is a directory; name a config file in it".into()));
     } else {
-        Box::new(std::fs::File::open(path).map_err(|error| fail(error.to_string()))?)
+        Box::new(file::open(path).map_err(|error| fail(error.to_string()))?)
     };
     file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes).map_err(|error| fail(error.to_string()))?;
     if bytes.len() as u64 > MAX_FILE_BYTES {
@@ -648,6 +660,16 @@ pub enum ConfigError {
     /// All that is wrong, by line; what came from outside the file (see [`Override`]) last.
     #[error("{}", list(name, problems, *unlisted))]
     Invalid { name: String, problems: Vec<Problem>, unlisted: usize },
+}
+
+impl ConfigError {
+    /// Whether nothing in the file is wrong, but flags given beside it are.
+    pub fn is_usage(&self) -> bool {
+        match self {
+            ConfigError::Unreadable { .. } => false,
+            ConfigError::Invalid { problems, .. } => problems.iter().all(|problem| problem.key.starts_with("--")),
+        }
+    }
 }
 
 /// One thing wrong with a config.

@@ -175,7 +175,7 @@ fn flags_stand_in_the_resolved_config_and_quiet_is_quiet() {
         assert!(config.contains(line), "{line}: {config}");
     }
     assert_eq!(place.read("runs/small/metrics.csv").lines().count(), 1 + 3);
-    let error = place.refused("train small.toml --checkpoint-seconds -1", 1);
+    let error = place.refused("train small.toml --checkpoint-seconds -1", 2);
     assert!(error.contains("--checkpoint-seconds: found -1"), "{error}");
     // A config that is refused leaves no folder.
     assert!(!place.path("runs/small-2").exists());
@@ -308,7 +308,7 @@ fn rollout_takes_other_programs_files_and_refuses_what_it_cannot_play() {
     assert!(place.refused(&line("bad"), 1).contains("layers \"8,4,1,2\", but the config's have \"8,5,2\""));
     place.tensor("bad.safetensors", "w", Dtype::F32, &[2, 3, PARAMETERS], bytes, None);
     assert!(place.refused(&line("bad"), 1).contains("it has no tensor weights.0; it has w"));
-    assert!(place.refused(&(line("good") + " --trial 2"), 1).contains("it has no tensor weights.2; it has weights"));
+    assert!(place.refused(&(line("good") + " --trial 2"), 2).contains("it has no tensor weights.2; it has weights"));
     // Every learner needs policies.
     assert!(place.refused(&(line("good") + " --paradigm all-leaders"), 1).contains("needs F32 [5, "));
 

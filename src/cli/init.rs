@@ -6,10 +6,9 @@ use std::path::{Path, PathBuf};
 
 use toml::{Table, Value};
 
-use super::{Error, print};
+use super::{Error, output, print};
 use crate::config::{self, Config, Key};
 use crate::record::RecordError;
-use crate::record::disk::Disk;
 use crate::report::paper::LAYOUTS;
 
 /// What [`LAYOUTS`] are called here.
@@ -35,14 +34,12 @@ pub fn run(args: Args) -> Result<(), Error> {
     let (layout, name) = layout.expect("the command line allows these names alone");
     let text = commented(layout.config, &Config::parse(layout.config, name)?);
     let Some(path) = args.out else { return print(&text) };
-    let written = match args.force {
-        true => Disk::default().replace(&path, |output| output.write_all(text.as_bytes())),
-        false => write_new(&path, &text),
-    };
-    match written {
-        Ok(()) => print(&format!("{}\n", path.display())),
-        Err(error) => Err(RecordError::Write { path, error }.into()),
+    output::check(&[("--out", Some(&path))], &[])?;
+    match args.force {
+        true => output::write(&path, |output| output.write_all(text.as_bytes()))?,
+        false => write_new(&path, &text).map_err(|error| RecordError::Write { path: path.clone(), error })?,
     }
+    print(&format!("{}\n", path.display()))
 }
 
 /// Writes a file that is not there yet.

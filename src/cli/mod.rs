@@ -2,18 +2,21 @@
 //!
 //! A command's file holds `Args` (its flags) and `run(Args) -> Result<(), Error>`; the list `commands!` below names it.
 
+use std::ffi::OsString;
 use std::fmt::Display;
 use std::io::{self, Write};
 use std::path::PathBuf;
 use std::sync::LazyLock;
 
 use clap::builder::PossibleValuesParser as Words;
-use clap::{Parser, Subcommand, ValueEnum};
+use clap::{CommandFactory, Parser, Subcommand, ValueEnum};
 
 use crate::backend::BackendError;
 use crate::backend::gpu::device::DeviceError;
 use crate::config::{self, Choice, Config, ConfigError, Fitness, Override, Paradigm};
+use crate::escape;
 use crate::record::RecordError;
+use crate::report::replay::ReplayError;
 use crate::run::RunError;
 
 mod backend;
@@ -23,6 +26,7 @@ mod completions;
 mod devices;
 mod init;
 mod man;
+mod output;
 mod paper;
 mod plot;
 mod replay;
@@ -96,7 +100,27 @@ static VERSION: LazyLock<String> = LazyLock::new(|| {
 /// # Errors
 /// The command failed.
 pub fn run() -> Result<(), Error> {
+    refuse_steering(std::env::args_os().skip(1))?;
     Cli::parse().command.run()
+}
+
+/// The command line, to be parsed or described without being run.
+pub fn command() -> clap::Command {
+    Cli::command()
+}
+
+/// Refuses names and values that hold line breaks or escape sequences: none is needed, and any could end up in a
+/// script, a table or on a terminal as something else than a name.
+fn refuse_steering(words: impl Iterator<Item = OsString>) -> Result<(), Error> {
+    for word in words {
+        if word.to_string_lossy().contains(escape::steers) {
+            return Err(Error::Usage(format!(
+                "'{}' holds a line break or another control character, which no name or value may have",
+                escape::line(&word.to_string_lossy())
+            )));
+        }
+    }
+    Ok(())
 }
 
 /// Why a command failed.
@@ -108,14 +132,14 @@ pub enum Error {
     Backend(#[from] BackendError),
     #[error(transparent)]
     Device(#[from] DeviceError),
-    #[error(transparent)]
+    #[error("{}{}", .0, remedy(.0, "run it again"))]
     Record(#[from] RecordError),
-    #[error(transparent)]
+    #[error("{}{}", .0, resumable(.0))]
     Run(#[from] RunError),
     #[error(transparent)]
     Shown(#[from] crate::report::runs::RunError),
     #[error(transparent)]
-    Replayed(#[from] crate::report::replay::ReplayError),
+    Replayed(#[from] ReplayError),
     #[error("standard output cannot be written: {0}")]
     Output(io::Error),
     #[error("signals cannot be listened for: {0}")]
@@ -136,27 +160,56 @@ pub enum Error {
 
 impl Error {
     /// The process's exit code: 1 failed, 2 wrong usage, 75 stopped and ready to be resumed.
+    ///
+    /// A value given by a flag is wrong usage wherever that is found: also one that does not fit the file or the machine
+    /// that it is used with. Where the file is wrong as well, the run failed.
     pub fn exit_code(&self) -> u8 {
         match self {
-            Error::Usage(_) => 2,
+            Error::Usage(_)
+            | Error::Device(DeviceError::UnknownAdapter { .. })
+            | Error::Record(RecordError::NoTrial { .. })
+            | Error::Replayed(ReplayError::NoTrial { .. } | ReplayError::NoGeneration { .. }) => 2,
+            Error::Config(error) if error.is_usage() => 2,
             Error::Stopped(_) => 75,
             _ => 1,
         }
     }
 }
 
-/// Tells something on standard error; with that gone there is nobody left to tell.
-pub fn say(text: impl Display) {
-    let _ = writeln!(io::stderr(), "{text}");
+/// What to do about a file that could not be written, before `again`.
+fn remedy(error: &RecordError, again: &str) -> String {
+    use io::ErrorKind::{FileTooLarge, PermissionDenied, QuotaExceeded, ReadOnlyFilesystem, StorageFull};
+    let RecordError::Write { error, .. } = error else { return String::new() };
+    match error.kind() {
+        StorageFull | QuotaExceeded => format!("; free some space, then {again}"),
+        FileTooLarge => format!("; the system allows no larger file here (see `ulimit -f`): raise that, then {again}"),
+        PermissionDenied | ReadOnlyFilesystem => "; choose a place you may write to".into(),
+        _ => String::new(),
+    }
 }
 
-/// Writes a result to standard output. A reader that has heard enough (`| head`) is no failure.
+/// What to do about a run that could not be written.
+fn resumable(error: &RunError) -> String {
+    match error {
+        RunError::Record(error) => remedy(error, "go on with --resume"),
+        _ => String::new(),
+    }
+}
+
+/// Tells something on standard error, with whatever would steer a terminal written out; with standard error gone there
+/// is nobody left to tell.
+pub fn say(text: impl Display) {
+    let _ = writeln!(io::stderr(), "{}", escape::lines(&text.to_string()));
+}
+
+/// Writes a result to standard output, with whatever would steer a terminal written out. A reader that has heard enough
+/// (`| head`) is no failure.
 ///
 /// # Errors
 /// Standard output is closed or full.
 pub fn print(text: &str) -> Result<(), Error> {
     let mut stdout = io::stdout().lock();
-    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+    match stdout.write_all(escape::lines(text).as_bytes()).and_then(|()| stdout.flush()) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Error::Output(error)),
         _ => Ok(()),
     }
@@ -255,7 +308,7 @@ pub struct RunOptions {
     /// Processor
     #[arg(long, help_heading = WHERE, value_enum, default_value_t = BackendChoice::Auto)]
     pub backend: BackendChoice,
-    /// GPU whose name contains this, as `flotilla devices` lists it
+    /// GPU of this number in `flotilla devices`, or whose name contains this; also one that is a software renderer
     #[arg(long, help_heading = WHERE, value_name = "NAME")]
     pub adapter: Option<String>,
     /// Where populations are kept and the next generation is bred
@@ -273,7 +326,7 @@ pub enum BackendChoice {
     Auto,
     /// All cores, or `--threads`
     Cpu,
-    /// A GPU, or fail
+    /// A GPU, or fail; a software renderer is none, and taken only by --adapter
     Gpu,
 }
 

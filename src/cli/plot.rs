@@ -2,9 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{Error, print};
+use super::{Error, output, print};
 use crate::record::RecordError;
-use crate::record::disk::Disk;
 use crate::report::curves::PRINT;
 use crate::report::runs::{self, MAX_RUNS};
 use crate::report::scene::Scene;
@@ -69,5 +68,5 @@ fn write(scene: &Scene, kind: Kind, path: &Path) -> Result<(), Error> {
         Kind::Svg => scene.svg().into_bytes(),
         Kind::Png => scene.png(PRINT).map_err(failed)?,
     };
-    Ok(Disk::default().replace(path, |output| output.write_all(&content)).map_err(failed)?)
+    output::write(path, |output| output.write_all(&content))
 }

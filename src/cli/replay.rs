@@ -6,9 +6,8 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
 use serde_json::json;
 
-use super::{Error, RunOptions, backend, print};
+use super::{Error, RunOptions, backend, output, print};
 use crate::record::RecordError;
-use crate::record::disk::Disk;
 use crate::report::curves::PRINT;
 use crate::report::progress::Meter;
 use crate::report::replay::{self, Played, Rows};
@@ -84,9 +83,12 @@ pub fn run(args: Args) -> Result<(), Error> {
         Kind::Png => still().png(PRINT).map_err(failed)?,
         Kind::Svg => still().svg().into_bytes(),
     };
-    Disk::default().replace(&out, |output| output.write_all(&content)).map_err(failed)?;
+    output::write(&out, |output| output.write_all(&content))?;
     if json {
-        let episode = |Played { trial, generation, team, best_g, .. }: &Played| json!({ "trial": trial, "generation": generation, "team": team, "best_g": best_g });
+        let episode = |played: &Played| {
+            let Played { trial, generation, team, best_g, .. } = played;
+            json!({ "trial": trial, "generation": generation, "team": team, "best_g": best_g })
+        };
         let episodes: Vec<_> = played.iter().map(episode).collect();
         let object = json!({ "out": out.display().to_string(), "bytes": content.len(), "episodes": episodes });
         return print(&format!("{object}\n"));
@@ -99,10 +101,13 @@ pub fn run(args: Args) -> Result<(), Error> {
 
 /// What was played, in a line.
 fn tell(played: &Played) -> String {
-    let Played { trial, generation, team, best_g, world, .. } = played;
+    let Played { trial, generation, team, best_g, episodes, world, .. } = played;
+    let (pois, digits) = (world.pois.len(), if *episodes > 1 { 2 } else { 0 });
     format!(
-        "trial {trial}, generation {generation}: team {team} is the best, G = {best_g} of {} POIs, as metrics.csv says\n",
-        world.pois.len()
+        "trial {trial}, generation {generation}: team {team} is the best, it observed {:.digits$} of {pois} POIs{}, as \
+         metrics.csv says\n",
+        best_g * pois as f64,
+        if *episodes > 1 { format!(" (mean of {episodes} episodes)") } else { String::new() }
     )
 }
 

@@ -1,14 +1,13 @@
 //! `flotilla rollout`: plays teams of policies from a file, and scores every leader.
 
-use std::fs::File;
-use std::io::{self, BufWriter, Write};
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
 use clap::builder::PossibleValuesParser as Words;
 use serde_json::json;
 
-use super::{ConfigFile, Error, RunOptions, backend, print, say};
+use super::{ConfigFile, Error, RunOptions, backend, output, print, say};
 use crate::backend::{Backend, Group, Moment};
 use crate::config::{Choice, Override, Paradigm};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Spread, Starts};
@@ -82,6 +81,8 @@ impl Args {
 
 /// Team j is made of the policies with index j of every leader.
 pub fn run(args: Args) -> Result<(), Error> {
+    let outputs = [("--scores", args.scores.as_deref()), ("--trace", args.trace.as_deref())];
+    output::check(&outputs, &[&args.config.path, &args.policies])?;
     let set = |key: &str, value: Option<toml::Value>| {
         Some(Override::new(format!("learning.{key}"), value?, format!("--{}", key.replace('_', "-"))))
     };
@@ -119,7 +120,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     meter.clear();
     let evaluation = evaluation?;
     if let Some(path) = &args.scores {
-        write(path, |file| write_scores(file, &evaluation))?;
+        output::write(path, |file| write_scores(file, &evaluation))?;
     }
     if let Some(path) = &args.trace {
         write_trace(path, &mut *backend, &group, &starts, &mut meter)?;
@@ -162,7 +163,10 @@ fn in_words(evaluation: &Evaluation, starts: &Starts) -> String {
 }
 
 fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> String {
-    let spread = |Spread { mean, deviation, interval }: Spread| json!({ "mean": mean, "standard_deviation": deviation, "interval_95": interval });
+    let spread = |spread: Spread| {
+        let Spread { mean, deviation, interval } = spread;
+        json!({ "mean": mean, "standard_deviation": deviation, "interval_95": interval })
+    };
     let best = evaluation.best();
     let mut object = json!({
         "teams": evaluation.observed.len(),
@@ -217,7 +221,7 @@ fn write_trace(
     let teams = (TRACE_BYTES / team_bytes).max(1);
     let (whole, episodes) = (group.team_count(), starts.episodes());
     let mut failed = None;
-    write(path, |file| {
+    let written = output::write(path, |file| {
         writeln!(file, "{STATES},{SENSED}{}", if episodes > 1 { ",episode" } else { "" })?;
         for episode in 0..episodes {
             let starts = starts.of(episode, group.world);
@@ -227,7 +231,7 @@ fn write_trace(
                     Ok(trace) => trace,
                     Err(error) => {
                         failed = Some(error);
-                        return Ok(());
+                        return Err(io::ErrorKind::Other.into());
                     }
                 };
                 for team in 0..trace.teams {
@@ -255,17 +259,7 @@ fn write_trace(
             }
         }
         Ok(())
-    })?;
+    });
     meter.clear();
-    failed.map_or(Ok(()), |error| Err(error.into()))
-}
-
-/// Writes a file in place of any other.
-fn write(path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Error> {
-    let write = || {
-        let mut file = BufWriter::with_capacity(1 << 18, File::create(path)?);
-        content(&mut file)?;
-        file.flush()
-    };
-    write().map_err(|error| crate::record::RecordError::Write { path: path.into(), error }.into())
+    failed.map_or(written, |error| Err(error.into()))
 }

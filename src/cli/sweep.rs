@@ -5,12 +5,11 @@ use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use super::train::Signals;
-use super::{Error, Overrides, RunOptions, backend, print, say};
+use super::{Error, Overrides, RunOptions, backend, output, print, say};
 use crate::config::{self, ConfigError, Problem};
 use crate::memory;
 use crate::record::RecordError;
-use crate::record::disk::Disk;
-use crate::record::folder::{CONFIG, Start};
+use crate::record::folder::{CONFIG, SWEEP, Start};
 use crate::report::progress::Meter;
 use crate::sweep::pictures;
 use crate::sweep::results::{self, Missing, Outcome};
@@ -19,8 +18,6 @@ use crate::sweep::shard::{self, MAX_SHARDS, Shard};
 use crate::sweep::slurm::Job;
 use crate::sweep::{Point, Sweep};
 
-/// The sweep as it was run, in its folder.
-const SWEEP: &str = "sweep.toml";
 const SCALE_OUT: &str = "Many processes (docs/sweeps.md)";
 const RESULTS: &str = "Results";
 
@@ -73,7 +70,7 @@ pub struct Args {
     #[arg(long, value_name = "N", help_heading = SCALE_OUT)]
     gpus: Option<usize>,
     /// One more option of the batch script: --sbatch=--partition=long; may be given more than once
-    #[arg(long, value_name = "OPTION", allow_hyphen_values = true, value_parser = one_line, help_heading = SCALE_OUT)]
+    #[arg(long, value_name = "OPTION", allow_hyphen_values = true, value_parser = an_option, help_heading = SCALE_OUT)]
     sbatch: Vec<String>,
 
     /// A row of results.csv every N generations, and one for the last
@@ -110,8 +107,8 @@ fn time_limit(text: &str) -> Result<String, String> {
     }
 }
 
-fn one_line(text: &str) -> Result<String, String> {
-    match text.starts_with('-') && !text.contains(['\n', '\r']) {
+fn an_option(text: &str) -> Result<String, String> {
+    match text.starts_with('-') {
         true => Ok(text.into()),
         false => Err("allowed an option of sbatch: --partition=long".into()),
     }
@@ -397,6 +394,7 @@ fn list(sweep: &Sweep, shards: usize) -> Result<(), Error> {
 }
 
 fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> Result<(), Error> {
+    output::check(&[("--slurm", file)], &[&args.sweep])?;
     let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.into());
     let program = std::env::current_exe().unwrap_or_else(|_| "flotilla".into());
     let out = absolute(out);
@@ -430,13 +428,13 @@ fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> 
         cpus: args.run.threads.map_or(2, usize::from),
         options: &args.sbatch,
     };
+    let script = job.script().map_err(Error::Usage)?;
     // The tasks' logs go there, and Slurm creates no folder.
     claim(sweep, &out)?;
     match file {
-        None => print(&job.script()),
+        None => print(&script),
         Some(path) => {
-            let write = Disk::default().replace(path, |output| output.write_all(job.script().as_bytes()));
-            write.map_err(|error| RecordError::Write { path: path.into(), error })?;
+            output::write(path, |output| output.write_all(script.as_bytes()))?;
             say(format_args!("submit it with: sbatch {}", path.display()));
             Ok(())
         }

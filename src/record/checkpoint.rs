@@ -4,7 +4,7 @@
 //! to where `metrics.csv` had come, and stands under the checksum of [`super::tensors`].
 
 use std::collections::BTreeMap;
-use std::fs::{self, File};
+use std::fs;
 use std::io::{Read, Seek};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -20,6 +20,7 @@ use super::policies::admit;
 use super::tensors::{self, Tensor, TensorFile};
 use super::{RecordError, hex};
 use crate::config::{self, Config};
+use crate::file;
 
 const KIND: &str = "checkpoint 1";
 const EXTENSION: &str = ".safetensors";
@@ -213,7 +214,7 @@ pub fn path(folder: &Path, generation: usize) -> PathBuf {
 /// # Errors
 /// It cannot be read, or is damaged.
 pub fn read(path: &Path, configs: &[Config]) -> Result<Checkpoint, RecordError> {
-    let file = File::open(path).map_err(RecordError::read(path))?;
+    let file = file::open(path).map_err(RecordError::read(path))?;
     Checkpoint::read(file, configs).map_err(|reason| RecordError::damaged(path, reason))
 }
 

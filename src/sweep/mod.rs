@@ -19,7 +19,8 @@ use std::path::Path;
 use toml::de::{DeTable, DeValue};
 use toml::{Spanned, Table, Value};
 
-use crate::config::{Config, ConfigError, Override, Problem, read_file};
+use crate::config::{Config, ConfigError, GRID, Override, Problem, read_file};
+use crate::escape;
 
 pub mod layout;
 pub mod pictures;
@@ -28,8 +29,6 @@ pub mod run;
 pub mod shard;
 pub mod slurm;
 
-/// The section of a sweep file that is not a config's.
-const GRID: &str = "grid";
 /// The key of `[grid]` that is no axis.
 const SKIP: &str = "skip_impossible";
 /// Most points in a sweep.
@@ -157,11 +156,11 @@ struct Tried {
 fn describe<'a>(axes: impl Iterator<Item = &'a Axis>, values: &[usize]) -> String {
     let pairs: Vec<_> =
         axes.zip(values).map(|(axis, &value)| format!("{} = {}", axis.key, axis.label(value))).collect();
-    pairs.join(", ")
+    escape::line(&pairs.join(", ")).into()
 }
 
 fn problem(line: Option<usize>, key: &str, message: impl Into<String>) -> Problem {
-    Problem { line, key: key.into(), message: message.into() }
+    Problem { line, key: escape::line(key).into(), message: escape::line(&message.into()).into() }
 }
 
 fn invalid(name: &str, mut problems: Vec<Problem>) -> ConfigError {
