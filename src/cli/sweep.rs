@@ -23,7 +23,7 @@ const RESULTS: &str = "Results";
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Sweep file: a config with a section [grid] of lists of values
+    /// Sweep file: a config with a section [grid] of lists of values; - is standard input
     sweep: PathBuf,
     #[command(flatten)]
     overrides: Overrides,
@@ -143,9 +143,13 @@ impl Args {
     }
 }
 
-pub fn run(args: Args) -> Result<(), Error> {
+pub fn run(mut args: Args) -> Result<(), Error> {
     let sweep = Sweep::load(&args.sweep, &args.overrides.list(), args.skip_impossible)?;
     let out = args.out(&sweep);
+    if config::is_standard_input(&args.sweep) {
+        // Whoever goes on with it finds it where it is kept.
+        args.sweep = out.join(SWEEP);
+    }
     let axes = args.picture_axes(&sweep)?;
     if let Some(file) = &args.slurm {
         return write_script(&args, &sweep, &out, file.as_deref());

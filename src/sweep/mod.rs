@@ -19,7 +19,7 @@ use std::path::Path;
 use toml::de::{DeTable, DeValue};
 use toml::{Spanned, Table, Value};
 
-use crate::config::{Config, ConfigError, GRID, Override, Problem, read_file};
+use crate::config::{self, Config, ConfigError, GRID, Override, Problem, read_file};
 use crate::escape;
 
 pub mod layout;
@@ -89,7 +89,11 @@ impl Sweep {
     /// # Errors
     /// A file that cannot be read, or everything that is wrong with it and with any of its points.
     pub fn load(path: &Path, flags: &[Override], skip: bool) -> Result<Sweep, ConfigError> {
-        Sweep::read(&read_file(path)?, &path.display().to_string(), flags, skip)
+        let mut sweep = Sweep::read(&read_file(path)?, &config::name(path), flags, skip)?;
+        if config::is_standard_input(path) {
+            sweep.name = "sweep".into();
+        }
+        Ok(sweep)
     }
 
     /// Reads a sweep from its text; `name` stands for the file in errors.
