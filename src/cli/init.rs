@@ -75,19 +75,25 @@ fn commented(from: &str, config: &Config) -> String {
     text
 }
 
+/// Meaning and facts, on a line of their own each where one does not hold both.
 fn comment(Key { unit, kind, range, default, meaning, .. }: &Key) -> String {
     let unit = if unit.is_empty() { String::new() } else { format!("{unit}; ") };
     let default = default.as_ref().map_or("has to be given".into(), |default| format!("default {default}"));
-    let mut text = String::new();
-    let mut line = String::from("#");
-    for word in format!("{meaning} ({unit}{kind}, {range}; {default})").split(' ') {
-        if line.chars().count() + word.chars().count() >= WIDTH {
-            text += &format!("{line}\n");
+    let facts = format!("({unit}{kind}, {range}; {default})");
+    let one = format!("{meaning} {facts}");
+    if one.chars().count() <= WIDTH { wrapped(&one) } else { wrapped(meaning) + &wrapped(&facts) }
+}
+
+fn wrapped(text: &str) -> String {
+    let (mut lines, mut line) = (String::new(), String::from("#"));
+    for word in text.split(' ') {
+        if line.chars().count() + word.chars().count() > WIDTH {
+            lines += &format!("{line}\n");
             line = "#".into();
         }
         line += &format!(" {word}");
     }
-    text + &line + "\n"
+    lines + &line + "\n"
 }
 
 /// A value as TOML, a list of positions in rows of four where it is long.
