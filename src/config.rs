@@ -15,6 +15,7 @@ use serde::Serialize;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
+use crate::file;
 use crate::world::{INPUTS, OUTPUTS};
 
 /// Most agents (leaders and followers) in a team.
@@ -41,12 +42,51 @@ const _: () = assert!(MAX_STEPS * MAX_POIS * MAX_AGENTS.div_ceil(32) * size_of::
 pub const MAX_POLICY_BYTES: usize = 1 << 38;
 /// Most bytes in a config file.
 pub const MAX_FILE_BYTES: u64 = 1 << 20;
+/// The section that makes a config a sweep.
+pub const GRID: &str = "grid";
 /// Most problems listed of one file.
 const MAX_LISTED: usize = 50;
 /// Longest map side, radius or range: squares of distances stay far from the ends of f32.
 const LONGEST: f64 = 1e4;
 /// Least size of a length or speed that is not 0: its square stays far from the denormals of f32.
 const LEAST: f64 = 1e-6;
+
+/// What is to be known of one key: the table behind `docs/reference.md` and every commented config.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Key {
+    /// Dotted: `world.dt`.
+    pub name: &'static str,
+    /// Empty where it has none.
+    pub unit: &'static str,
+    /// What kind of value it takes: `number`, `word`, `list of positions [x, y]`.
+    pub kind: String,
+    /// The values it takes; bounds that other keys set go by these keys' names.
+    pub range: String,
+    /// As TOML; none where the key has to be given.
+    pub default: Option<String>,
+    /// Without a full stop.
+    pub meaning: &'static str,
+    /// Section and equation of the paper; empty where it says nothing of this.
+    pub paper: &'static str,
+}
+
+/// Every key of a config, in the order of [`Config::to_toml`].
+pub fn keys() -> Vec<Key> {
+    let mut reader = Reader { table: Some(vec![]), ..Reader::default() };
+    let config = Config::experiment(&mut reader);
+    let mut keys = reader.table.unwrap_or_default();
+    let mut order = Vec::new();
+    let text = config.to_toml();
+    let mut section = "";
+    for line in text.lines() {
+        match line.split_once(" = ") {
+            Some((leaf, _)) => order.push(format!("{section}.{leaf}")),
+            None => section = line.trim_matches(['[', ']']),
+        }
+    }
+    keys.sort_by_key(|key| order.iter().position(|name| name == key.name));
+    keys
+}
 
 /// One experiment, as written in a config file.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -149,7 +189,7 @@ impl Default for Checkpoint {
 }
 
 /// A key whose value is one of a few words.
-pub trait Choice: Copy + 'static {
+pub trait Choice: Copy + Serialize + 'static {
     /// Every word with what it stands for.
     const ALL: &'static [(&'static str, Self)];
 
@@ -230,7 +270,7 @@ impl Config {
     /// # Errors
     /// A file that cannot be read, or everything that is wrong with what it says.
     pub fn load(path: &Path) -> Result<Config, ConfigError> {
-        Config::parse(&read_file(path)?, &path.display().to_string())
+        Config::parse(&read_file(path)?, &name(path))
     }
 
     /// Reads a config from its text; `name` stands for the file in errors.
@@ -256,6 +296,15 @@ impl Config {
             let at = at.map_or(String::new(), |at| format!(" (at `{}`)", shorten(at)));
             let message = error.message().trim().replace('\n', ", ") + &at;
             reader.blame(Place::Offset(span.start), "", message);
+        }
+        if reader.problems.is_empty() && !foreign.contains(&GRID) {
+            // Of a sweep taken for a config nothing else is worth saying.
+            let section = |key: &Spanned<_>| key.get_ref() == GRID;
+            let grid = document.get_ref().keys().find(|key| section(key)).map(|key| key.span().start);
+            if let Some(start) = grid {
+                let message = "this makes the file a sweep, of many configs; use `flotilla sweep`";
+                reader.blame(Place::Offset(start), GRID, message.into());
+            }
         }
         if reader.problems.is_empty() {
             reader.fill(document.into_inner(), text, foreign, overrides);
@@ -300,13 +349,31 @@ impl Config {
         self.learning.trials * self.learners() * self.learning.population * self.parameters() * size_of::<f32>()
     }
 
-    /// Every key with what it allows and its default. A faulty number reads as the most that is allowed, a faulty
-    /// list as none, so that what depends on it is not blamed as well.
+    /// Every key with its unit, its meaning, where the paper has it, what it allows and its default. A faulty number
+    /// reads as the most that is allowed, a faulty list as none, so that what depends on it is not blamed as well.
     fn experiment(r: &mut Reader<'_>) -> Config {
-        let map = r.pair("world.map", between(1.0, LONGEST), [50.0, 50.0]);
-        let leaders = r.points("world.leaders", 1..=MAX_AGENTS, map, None);
-        let followers = r.points("world.followers", 0..=MAX_AGENTS - 1, map, Some(vec![]));
-        let pois = r.points("world.pois", 1..=MAX_POIS, map, None);
+        let map = r
+            .key("world.map", "units", "width and height; positions stay within 0 to these", "3.1")
+            .pair(between(1.0, LONGEST), [50.0, 50.0]);
+        let leaders = r
+            .key("world.leaders", "units", "start positions of the leaders, which are agents 0 to L − 1", "4.1, Fig. 3")
+            .points(1..=MAX_AGENTS, map, None);
+        let followers = r
+            .key(
+                "world.followers",
+                "units",
+                "start positions of the followers, agents L to N − 1; in the all-leaders paradigm leaders stand there",
+                "4.1, Fig. 3",
+            )
+            .points(0..=MAX_AGENTS - 1, map, Some(vec![]));
+        let pois = r
+            .key(
+                "world.pois",
+                "units",
+                "positions of the P points of interest, which stay where they are",
+                "3.1, Fig. 3",
+            )
+            .points(1..=MAX_POIS, map, None);
         let agents = leaders.as_ref().zip(followers.as_ref()).map_or(MAX_AGENTS, |(l, f)| l.len() + f.len());
         if agents > MAX_AGENTS {
             let message = format!("found {agents} agents with the leaders, allowed 1 to {MAX_AGENTS}");
@@ -314,69 +381,197 @@ impl Config {
         }
         let needed = between(1, agents.min(MAX_AGENTS)).because("the number of agents");
 
-        let max_speed = r.number("motion.max_speed", between(LEAST, 1e3).or_zero(), 3.0);
+        let max_speed = r
+            .key(
+                "motion.max_speed",
+                "units/s",
+                "largest speed of any agent, and a leader's wanted speed at most",
+                "3.1",
+            )
+            .number(between(LEAST, 1e3).or_zero(), 3.0);
         let slowest = between(LEAST, max_speed).or_zero().because("motion.max_speed");
         let before = r.problems.len();
-        let min_speed = r.number("motion.min_speed", slowest, 0.0);
+        let min_speed = r
+            .key("motion.min_speed", "units/s", "smallest speed of any agent: above 0, nobody can stop", "3.1")
+            .number(slowest, 0.0);
         let least = if r.problems.len() > before { 0.0 } else { min_speed };
         let start_speed = between(least.max(LEAST), max_speed).because("motion.min_speed to motion.max_speed");
         let start_speed = if least == 0.0 { start_speed.or_zero() } else { start_speed };
-        let attraction_radius = r.number("follow.attraction_radius", between(0.01, LONGEST), 5.0);
+        let attraction_radius = r
+            .key(
+                "follow.attraction_radius",
+                "units",
+                "within it a follower sees others: it is drawn to them, and counts the leaders among them for Df",
+                "4.1, 4.2",
+            )
+            .number(between(0.01, LONGEST), 5.0);
         let closest = between(0.01, attraction_radius).because("follow.attraction_radius");
         let gain = between(1e-3, 1e3).or_zero();
-        let population = r.number("learning.population", between(2, MAX_POPULATION), 50);
+        let population = r
+            .key("learning.population", "policies", "k: policies of each learner, and teams of a generation", "4.3")
+            .number(between(2, MAX_POPULATION), 50);
 
         let config = Config {
             world: World {
                 map,
-                coupling: r.coupling(needed, pois.as_ref().map(Vec::len)),
+                coupling: r
+                    .key(
+                        "world.coupling",
+                        "agents",
+                        "C: how many must be at a POI at the same step for it to be observed; one number for all \
+                         POIs, or one per POI",
+                        "3.2, Eq. 2",
+                    )
+                    .coupling(needed, pois.as_ref().map(Vec::len)),
                 leaders: leaders.unwrap_or_default(),
                 followers: followers.unwrap_or_default(),
                 pois: pois.unwrap_or_default(),
-                observation_radius: r.number("world.observation_radius", between(0.01, LONGEST), 5.0),
-                steps: r.number("world.steps", between(1, MAX_STEPS), 25),
-                dt: r.number("world.dt", between(1e-4, 10.0), 0.2),
-                heading: r.number("world.heading", between(-1e3, 1e3), FRAC_PI_2),
-                speed: r.number("world.speed", start_speed, 0.0),
+                observation_radius: r
+                    .key("world.observation_radius", "units", "σ₀: an agent this near to a POI is at it", "3.2, Eq. 3")
+                    .number(between(0.01, LONGEST), 5.0),
+                steps: r
+                    .key("world.steps", "steps", "T: length of an episode", "3.2, Eq. 2")
+                    .number(between(1, MAX_STEPS), 25),
+                dt: r.key("world.dt", "s", "time that a step takes", "").number(between(1e-4, 10.0), 0.2),
+                heading: r
+                    .key(
+                        "world.heading",
+                        "rad",
+                        "every agent's heading at the start, from the x axis towards the y axis: π/2 faces the POIs",
+                        "3.1, Fig. 3",
+                    )
+                    .number(between(-1e3, 1e3), FRAC_PI_2),
+                speed: r
+                    .key("world.speed", "units/s", "every agent's speed at the start", "3.1")
+                    .number(start_speed, 0.0),
             },
             motion: Motion {
                 min_speed,
                 max_speed,
-                max_acceleration: r.number("motion.max_acceleration", between(1e-3, 1e3).or_zero(), 5.0),
-                max_turn_rate: r.number("motion.max_turn_rate", between(1e-3, 1e3).or_zero(), FRAC_PI_2),
+                max_acceleration: r
+                    .key(
+                        "motion.max_acceleration",
+                        "units/s²",
+                        "an agent's speed changes by at most this times dt",
+                        "3.1",
+                    )
+                    .number(between(1e-3, 1e3).or_zero(), 5.0),
+                max_turn_rate: r
+                    .key("motion.max_turn_rate", "rad/s", "an agent's heading turns by at most this times dt", "3.1")
+                    .number(between(1e-3, 1e3).or_zero(), FRAC_PI_2),
             },
             follow: Follow {
                 attraction_radius,
-                repulsion_radius: r.number("follow.repulsion_radius", closest, 1.0),
-                attraction_gain: r.number("follow.attraction_gain", gain, 5.0),
-                repulsion_gain: r.number("follow.repulsion_gain", gain, 1.0),
-                wall_gain: r.number("follow.wall_gain", gain, 1.0),
+                repulsion_radius: r
+                    .key("follow.repulsion_radius", "units", "within it others, and walls, push a follower away", "4.1")
+                    .number(closest, 1.0),
+                attraction_gain: r
+                    .key("follow.attraction_gain", "units/s", "pull of others at the attraction radius", "4.1, Fig. 2b")
+                    .number(gain, 5.0),
+                repulsion_gain: r
+                    .key("follow.repulsion_gain", "units/s", "push of others at the repulsion radius", "4.1, Fig. 2b")
+                    .number(gain, 1.0),
+                wall_gain: r
+                    .key("follow.wall_gain", "1/s", "push of a wall for each unit nearer than the repulsion radius", "")
+                    .number(gain, 1.0),
             },
             sense: Sense {
-                poi_range: r.number("sense.poi_range", between(0.01, LONGEST).or_unlimited(), f64::INFINITY),
-                agent_range: r.number("sense.agent_range", between(0.01, LONGEST).or_unlimited(), 5.0),
-                density: r.choice("sense.density", Density::Linear),
+                poi_range: r
+                    .key("sense.poi_range", "units", "how far leaders sense POIs", "3.1")
+                    .number(between(0.01, LONGEST).or_unlimited(), f64::INFINITY),
+                agent_range: r
+                    .key("sense.agent_range", "units", "how far leaders sense other agents", "3.1")
+                    .number(between(0.01, LONGEST).or_unlimited(), 5.0),
+                density: r
+                    .key(
+                        "sense.density",
+                        "",
+                        "what something at distance d adds to its quadrant's density: 1 − d/(√2·max(map)) if linear, \
+                         1/max(d, 1) if inverse",
+                        "3.1",
+                    )
+                    .choice(Density::Linear),
             },
             policy: Policy {
-                hidden: r.numbers("policy.hidden", 0..=MAX_HIDDEN_LAYERS, between(1, MAX_HIDDEN_UNITS), vec![10]),
+                hidden: r
+                    .key(
+                        "policy.hidden",
+                        "units of a layer",
+                        "hidden layers of a policy, between 8 inputs and 2 outputs",
+                        "2.4, 3.1",
+                    )
+                    .numbers(0..=MAX_HIDDEN_LAYERS, between(1, MAX_HIDDEN_UNITS), vec![10]),
             },
             learning: Learning {
-                paradigm: r.choice("learning.paradigm", Paradigm::LeaderFollower),
-                fitness: r.choice("learning.fitness", Fitness::Df),
+                paradigm: r
+                    .key("learning.paradigm", "", "who learns: the leaders, or every agent", "4.1, 4.4")
+                    .choice(Paradigm::LeaderFollower),
+                fitness: r
+                    .key(
+                        "learning.fitness",
+                        "",
+                        "what policies are selected by: the team's score G, D without a leader, Df without a leader \
+                         and its followers, or D++ with copies of a leader",
+                        "3.2, Eq. 1; 4.2, Eq. 5; 2.2",
+                    )
+                    .choice(Fitness::Df),
                 population,
-                generations: r.number("learning.generations", between(0, MAX_GENERATIONS), 100),
-                trials: r.number("learning.trials", between(1, MAX_TRIALS), 5),
-                elites: r.number("learning.elites", between(0, population).because("learning.population"), 1),
-                mutation: r.choice("learning.mutation", Mutation::Scaled),
-                mutation_probability: r.number("learning.mutation_probability", between(LEAST, 1.0).or_zero(), 0.15),
-                mutation_sigma: r.number("learning.mutation_sigma", between(LEAST, 100.0).or_zero(), 0.1),
-                episodes_per_team: r.number("learning.episodes_per_team", between(1, MAX_EPISODES), 1),
-                start_jitter: r.number("learning.start_jitter", between(LEAST, LONGEST).or_zero(), 0.0),
-                seed: r.number("learning.seed", between(0, i64::MAX as u64), 0),
+                generations: r
+                    .key("learning.generations", "generations", "how many follow the random start", "4.3, Alg. 1")
+                    .number(between(0, MAX_GENERATIONS), 100),
+                trials: r
+                    .key("learning.trials", "trials", "independent repetitions", "5")
+                    .number(between(1, MAX_TRIALS), 5),
+                elites: r
+                    .key(
+                        "learning.elites",
+                        "policies",
+                        "n: the best of a population, which survive unchanged",
+                        "4.3, Alg. 1",
+                    )
+                    .number(between(0, population).because("learning.population"), 1),
+                mutation: r
+                    .key(
+                        "learning.mutation",
+                        "",
+                        "what a mutated weight w gains: w·N(0, σ) if scaled, N(0, σ) if additive",
+                        "2.4, 4.3",
+                    )
+                    .choice(Mutation::Scaled),
+                mutation_probability: r
+                    .key("learning.mutation_probability", "", "of each weight of a new policy, to mutate", "2.4, 4.3")
+                    .number(between(LEAST, 1.0).or_zero(), 0.15),
+                mutation_sigma: r
+                    .key("learning.mutation_sigma", "", "σ: standard deviation of a mutation", "2.4, 4.3")
+                    .number(between(LEAST, 100.0).or_zero(), 0.1),
+                episodes_per_team: r
+                    .key("learning.episodes_per_team", "episodes", "over which a team's scores are averaged", "")
+                    .number(between(1, MAX_EPISODES), 1),
+                start_jitter: r
+                    .key(
+                        "learning.start_jitter",
+                        "units",
+                        "j: in every episode each agent's start is moved by a uniform offset in −j to j on both axes, \
+                         the same for all teams of a generation",
+                        "",
+                    )
+                    .number(between(LEAST, LONGEST).or_zero(), 0.0),
+                seed: r
+                    .key("learning.seed", "", "start of all randomness: config and seed decide every bit", "")
+                    .number(between(0, i64::MAX as u64), 0),
             },
             checkpoint: Checkpoint {
-                generations: r.number("checkpoint.generations", between(0, MAX_GENERATIONS), 0),
-                seconds: r.number("checkpoint.seconds", between(0.01, 1e9).or_zero(), Checkpoint::default().seconds),
+                generations: r
+                    .key(
+                        "checkpoint.generations",
+                        "generations",
+                        "between checkpoints, which change no result; 0 is never",
+                        "",
+                    )
+                    .number(between(0, MAX_GENERATIONS), 0),
+                seconds: r
+                    .key("checkpoint.seconds", "s", "between checkpoints, which change no result; 0 is never", "")
+                    .number(between(0.01, 1e9).or_zero(), Checkpoint::default().seconds),
             },
         };
         if r.problems.is_empty() && config.policy_bytes() > MAX_POLICY_BYTES {
@@ -404,17 +599,30 @@ fn first_slips<'e>(text: &str, errors: &'e [toml::de::Error]) -> impl Iterator<I
     })
 }
 
-/// The text of a config or sweep file.
+/// Whether a config is to come from standard input, not from a file.
+pub fn is_standard_input(path: &Path) -> bool {
+    path == "-"
+}
+
+/// What errors call a config or sweep file.
+pub fn name(path: &Path) -> String {
+    if is_standard_input(path) { "standard input".into() } else { path.display().to_string() }
+}
+
+/// The text of a config or sweep file; of standard input, where that is what `-` means.
 ///
 /// # Errors
 /// No such file, not a file, larger than [`MAX_FILE_BYTES`], not UTF-8.
 pub fn read_file(path: &Path) -> Result<String, ConfigError> {
-    let fail = |reason: String| ConfigError::Unreadable { name: path.display().to_string(), reason };
-    if path.is_dir() {
-        return Err(fail("it is a directory; name a config file in it".into()));
-    }
+    let fail = |reason: String| ConfigError::Unreadable { name: name(path), reason };
     let mut bytes = Vec::new();
-    let file = std::fs::File::open(path).map_err(|error| fail(error.to_string()))?;
+    let file: Box<dyn Read> = if is_standard_input(path) {
+        Box::new(std::io::stdin())
+    } else if path.is_dir() {
+        return Err(fail("it is a directory; name a config file in it".into()));
+    } else {
+        Box::new(file::open(path).map_err(|error| fail(error.to_string()))?)
+    };
     file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes).map_err(|error| fail(error.to_string()))?;
     if bytes.len() as u64 > MAX_FILE_BYTES {
         return Err(fail(format!("it is larger than {MAX_FILE_BYTES} bytes, the most a config file may have")));
@@ -452,6 +660,16 @@ pub enum ConfigError {
     /// All that is wrong, by line; what came from outside the file (see [`Override`]) last.
     #[error("{}", list(name, problems, *unlisted))]
     Invalid { name: String, problems: Vec<Problem>, unlisted: usize },
+}
+
+impl ConfigError {
+    /// Whether nothing in the file is wrong, but flags given beside it are.
+    pub fn is_usage(&self) -> bool {
+        match self {
+            ConfigError::Unreadable { .. } => false,
+            ConfigError::Invalid { problems, .. } => problems.iter().all(|problem| problem.key.starts_with("--")),
+        }
+    }
 }
 
 /// One thing wrong with a config.
@@ -527,6 +745,17 @@ impl<T: Number> Allowed<T> {
     }
 }
 
+impl<T: Number> Allowed<T> {
+    /// What is allowed in any config: a bound that other keys set goes by their names.
+    fn in_general(&self) -> String {
+        match self.because {
+            "" => self.to_string(),
+            both if both.contains(" to ") => both.into(),
+            most => format!("{}{} to {most}", if self.zero { "0 or " } else { "" }, self.low),
+        }
+    }
+}
+
 impl<T: Number> Display for Allowed<T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Allowed { low, high, .. } = self;
@@ -547,7 +776,7 @@ impl<T: Number> Display for Allowed<T> {
 }
 
 /// A type that keys have numbers of.
-trait Number: Copy + PartialOrd + Display {
+trait Number: Copy + PartialOrd + Display + Serialize {
     const ZERO: Self;
     const KIND: &'static str;
 
@@ -648,6 +877,17 @@ struct Reader<'a> {
     known: BTreeMap<&'static str, Option<(Place, String)>>,
     /// Place, name and message of each.
     problems: Vec<(Place, String, String)>,
+    /// All there is to know of the keys asked for, where somebody wants to.
+    table: Option<Vec<Key>>,
+}
+
+/// A key that is being asked for; what it allows and its default are yet to be said.
+struct Asked<'r, 'a> {
+    reader: &'r mut Reader<'a>,
+    name: &'static str,
+    unit: &'static str,
+    meaning: &'static str,
+    paper: &'static str,
 }
 
 impl<'a> Reader<'a> {
@@ -688,9 +928,20 @@ impl<'a> Reader<'a> {
         entry
     }
 
-    /// A number, or its default where the key was left out.
-    fn number<T: Number>(&mut self, key: &'static str, allowed: Allowed<T>, default: T) -> T {
-        self.take(key).map_or_else(|| allowed.nearest(default), |entry| self.check(&entry, allowed))
+    /// Asks for a key.
+    fn key<'r>(
+        &'r mut self,
+        name: &'static str,
+        unit: &'static str,
+        meaning: &'static str,
+        paper: &'static str,
+    ) -> Asked<'r, 'a> {
+        Asked { reader: self, name, unit, meaning, paper }
+    }
+
+    /// A number, or its default where there is none.
+    fn number<T: Number>(&mut self, entry: Option<Entry<'_>>, allowed: Allowed<T>, default: T) -> T {
+        entry.map_or_else(|| allowed.nearest(default), |entry| self.check(&entry, allowed))
     }
 
     fn check<T: Number>(&mut self, entry: &Entry<'_>, allowed: Allowed<T>) -> T {
@@ -701,23 +952,6 @@ impl<'a> Reader<'a> {
         };
         self.blame(entry.place(), &entry.name, format!("found {}, allowed {kind}{allowed}", entry.found()));
         allowed.high
-    }
-
-    fn choice<T: Choice>(&mut self, key: &'static str, default: T) -> T {
-        let Some(entry) = self.take(key) else { return default };
-        let word = entry.value.get_ref().as_str();
-        T::ALL.iter().find(|choice| Some(choice.0) == word).map_or_else(
-            || {
-                let words: Vec<_> = T::names().map(|word| format!("{word:?}")).collect();
-                self.blame(
-                    entry.place(),
-                    &entry.name,
-                    format!("found {}, allowed {}", entry.found(), words.join(" or ")),
-                );
-                default
-            },
-            |choice| choice.1,
-        )
     }
 
     /// The items of a list, or none of a list of another length or of another thing.
@@ -737,11 +971,6 @@ impl<'a> Reader<'a> {
         }
     }
 
-    fn pair(&mut self, key: &'static str, allowed: Allowed<f64>, default: [f64; 2]) -> [f64; 2] {
-        let Some(entry) = self.take(key) else { return default };
-        self.two(entry, [allowed; 2])
-    }
-
     fn two(&mut self, entry: Entry<'a>, allowed: [Allowed<f64>; 2]) -> [f64; 2] {
         let most = allowed.map(|side| side.high);
         let Some(items) = self.items(entry, 2..=2, "numbers") else { return most };
@@ -752,49 +981,9 @@ impl<'a> Reader<'a> {
         values
     }
 
-    /// Positions on the map.
-    fn points(
-        &mut self,
-        key: &'static str,
-        counts: RangeInclusive<usize>,
-        map: [f64; 2],
-        default: Option<Vec<[f64; 2]>>,
-    ) -> Option<Vec<[f64; 2]>> {
-        const WHAT: &str = "positions [x, y]";
-        let Some(entry) = self.take(key) else {
-            if default.is_none() {
-                let counts = between(*counts.start(), *counts.end());
-                self.blame_key(key, format!("missing, allowed a list of {counts} {WHAT}"));
-            }
-            return default;
-        };
-        let sides = map.map(|side| between(LEAST, side).or_zero().because("the map"));
-        let items = self.items(entry, counts, WHAT)?;
-        Some(items.into_iter().map(|item| self.two(item, sides)).collect())
-    }
-
-    fn numbers<T: Number>(
-        &mut self,
-        key: &'static str,
-        counts: RangeInclusive<usize>,
-        allowed: Allowed<T>,
-        default: Vec<T>,
-    ) -> Vec<T> {
-        let Some(entry) = self.take(key) else { return default };
+    fn numbers<T: Number>(&mut self, entry: Entry<'a>, counts: RangeInclusive<usize>, allowed: Allowed<T>) -> Vec<T> {
         let items = self.items(entry, counts, &format!("numbers, each {allowed}")).unwrap_or_default();
         items.iter().map(|item| self.check(item, allowed)).collect()
-    }
-
-    /// One number, or one for each of the POIs (whose count is none where it is unknown).
-    fn coupling(&mut self, allowed: Allowed<usize>, pois: Option<usize>) -> Coupling {
-        const KEY: &str = "world.coupling";
-        match self.entries.get(KEY).map(|entry| entry.value.get_ref().is_array()) {
-            Some(true) => {
-                let counts = pois.map_or(0..=usize::MAX, |pois| pois..=pois);
-                Coupling::Each(self.numbers(KEY, counts, allowed, vec![]))
-            }
-            _ => Coupling::Same(self.number(KEY, allowed, 3)),
-        }
     }
 
     fn blame(&mut self, place: Place, name: &str, message: String) {
@@ -847,6 +1036,98 @@ impl<'a> Reader<'a> {
         });
         ConfigError::Invalid { name: name.to_string(), problems: problems.collect(), unlisted }
     }
+}
+
+impl<'a> Asked<'_, 'a> {
+    /// What was written in the config. Where somebody wants to know of the key, its kind, range and default are noted.
+    fn take(&mut self, about: impl FnOnce() -> (String, String, Option<String>)) -> Option<Entry<'a>> {
+        if let Some(table) = &mut self.reader.table {
+            let Asked { name, unit, meaning, paper, .. } = *self;
+            let (kind, range, default) = about();
+            table.push(Key { name, unit, kind, range, default, meaning, paper });
+        }
+        self.reader.take(self.name)
+    }
+
+    /// A number, or its default where the key was left out.
+    fn number<T: Number>(mut self, allowed: Allowed<T>, default: T) -> T {
+        let entry = self.take(|| (kind::<T>().into(), allowed.in_general(), Some(written(&default))));
+        self.reader.number(entry, allowed, default)
+    }
+
+    fn choice<T: Choice>(mut self, default: T) -> T {
+        let words = || T::names().map(|word| format!("{word:?}")).collect::<Vec<_>>().join(" or ");
+        let Some(entry) = self.take(|| ("word".into(), words(), Some(written(&default)))) else { return default };
+        let word = entry.value.get_ref().as_str();
+        T::ALL.iter().find(|choice| Some(choice.0) == word).map_or_else(
+            || {
+                let message = format!("found {}, allowed {}", entry.found(), words());
+                self.reader.blame(entry.place(), &entry.name, message);
+                default
+            },
+            |choice| choice.1,
+        )
+    }
+
+    fn pair(mut self, allowed: Allowed<f64>, default: [f64; 2]) -> [f64; 2] {
+        let about = || ("two numbers".into(), format!("each {}", allowed.in_general()), Some(written(&default)));
+        let Some(entry) = self.take(about) else { return default };
+        self.reader.two(entry, [allowed; 2])
+    }
+
+    /// Positions on the map.
+    fn points(
+        mut self,
+        counts: RangeInclusive<usize>,
+        map: [f64; 2],
+        default: Option<Vec<[f64; 2]>>,
+    ) -> Option<Vec<[f64; 2]>> {
+        const WHAT: &str = "positions [x, y]";
+        let (fewest, most) = (*counts.start(), *counts.end());
+        let range = || format!("{} of them, on the map", between(fewest, most));
+        let Some(entry) = self.take(|| (format!("list of {WHAT}"), range(), default.as_ref().map(written))) else {
+            if default.is_none() {
+                let message = format!("missing, allowed a list of {} {WHAT}", between(fewest, most));
+                self.reader.blame_key(self.name, message);
+            }
+            return default;
+        };
+        let sides = map.map(|side| between(LEAST, side).or_zero().because("the map"));
+        let items = self.reader.items(entry, counts, WHAT)?;
+        Some(items.into_iter().map(|item| self.reader.two(item, sides)).collect())
+    }
+
+    fn numbers<T: Number>(mut self, counts: RangeInclusive<usize>, allowed: Allowed<T>, default: Vec<T>) -> Vec<T> {
+        let range = || format!("{} of them, each {}", between(*counts.start(), *counts.end()), allowed.in_general());
+        let about = || (format!("list of {}s", kind::<T>()), range(), Some(written(&default)));
+        match self.take(about) {
+            Some(entry) => self.reader.numbers(entry, counts, allowed),
+            None => default,
+        }
+    }
+
+    /// One number, or one for each of the POIs (whose count is none where it is unknown).
+    fn coupling(mut self, allowed: Allowed<usize>, pois: Option<usize>) -> Coupling {
+        const DEFAULT: usize = 3;
+        let about = || ("whole number, or a list of them".into(), allowed.in_general(), Some(written(&DEFAULT)));
+        match self.take(about) {
+            Some(entry) if entry.value.get_ref().is_array() => {
+                let counts = pois.map_or(0..=usize::MAX, |pois| pois..=pois);
+                Coupling::Each(self.reader.numbers(entry, counts, allowed))
+            }
+            entry => Coupling::Same(self.reader.number(entry, allowed, DEFAULT)),
+        }
+    }
+}
+
+/// A kind of number without its article.
+fn kind<T: Number>() -> &'static str {
+    T::KIND.trim_start_matches("a ")
+}
+
+/// A value as TOML has it.
+fn written<T: Serialize>(value: &T) -> String {
+    toml::Value::try_from(value).expect("numbers, words and lists of them are TOML").to_string()
 }
 
 /// The section of a dotted key.

@@ -18,18 +18,28 @@
 //!    by [`record`]; [`report`] draws it.
 //!
 //! Around that: [`run`] keeps a trainer and its runs' folders and checkpoints together, [`sweep`] makes many runs of a grid,
-//! [`memory`] tells what a run will take, [`verify`] compares two backends on the random worlds of [`sample`], [`mod@bench`]
-//! times a backend against what the machine can do at most, and [`cli`] turns what was typed into all this.
+//! [`evaluate`] plays trained teams from starts that no training saw, [`memory`] tells what a run will take, [`verify`]
+//! compares two backends on the random worlds of [`sample`], [`mod@bench`] times a backend against what the machine can do
+//! at most, and [`cli`] turns what was typed into all this.
 //!
-//! Imports run one way: `main ▸ cli ▸ {run, sweep, report, verify, bench} ▸ trainer ▸ {evolve, credit, backend}`,
-//! `backend ▸ {evolve, kernels}`. Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
+//! Imports run one way: `main ▸ cli ▸ {run, sweep, report, evaluate, verify, bench} ▸ trainer ▸ {evolve, credit,
+//! backend}`, `backend ▸ {evolve, kernels}`. Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
+
+/// The commit that this was built from, where that is known; a debug build does not know it.
+pub const COMMIT: Option<&str> = {
+    let commit = env!("FLOTILLA_COMMIT");
+    if commit.is_empty() { None } else { Some(commit) }
+};
 
 pub mod backend;
 pub mod bench;
 pub mod cli;
 pub mod config;
 pub mod credit;
+pub mod escape;
+pub mod evaluate;
 pub mod evolve;
+pub mod file;
 pub mod kernels;
 pub mod memory;
 pub mod record;

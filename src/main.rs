@@ -3,7 +3,8 @@ use std::process::ExitCode;
 use flotilla::cli::{self, Error};
 
 fn main() -> ExitCode {
-    match cli::run() {
+    calm_drivers();
+    match fail_large_files().and_then(|()| cli::run()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             let word = if matches!(error, Error::Stopped(_)) { "stopped" } else { "error" };
@@ -11,4 +12,29 @@ fn main() -> ExitCode {
             ExitCode::from(error.exit_code())
         }
     }
+}
+
+/// Vulkan's layers look for a Wayland display, and its library complains on standard error where XDG_RUNTIME_DIR does
+/// not say in which folder. Nobody's display is wanted here, so it is given a folder that cannot be.
+fn calm_drivers() {
+    let name = "XDG_RUNTIME_DIR";
+    let valid = std::env::var_os(name).is_some_and(|folder| std::path::Path::new(&folder).is_absolute());
+    if cfg!(target_os = "linux") && !valid {
+        // SAFETY: the process has no other thread yet that could read the environment.
+        #[allow(unsafe_code)]
+        unsafe {
+            std::env::set_var(name, "/dev/null");
+        }
+    }
+}
+
+/// Where the system limits the size of files (`ulimit -f`), writing beyond it is an error to be told, not the end.
+fn fail_large_files() -> Result<(), Error> {
+    #[cfg(unix)]
+    signal_hook::flag::register(
+        signal_hook::consts::SIGXFSZ,
+        std::sync::Arc::<std::sync::atomic::AtomicBool>::default(),
+    )
+    .map_err(Error::Signals)?;
+    Ok(())
 }

@@ -159,8 +159,10 @@ impl Session {
             .try_reserve_exact(bytes)
             .map_err(|_| RunError::Memory { what: "twice the policies of all trials", bytes })?;
         // Before any of them is touched.
-        if let Some((_, path)) = runs.iter().find(|(_, path)| start == Start::Fresh && folder::holds_run(path)) {
-            return Err(RecordError::Exists { path: path.clone() }.into());
+        for (_, path) in runs.iter().filter(|_| start == Start::Fresh) {
+            if folder::holds_run(path)? {
+                return Err(RecordError::Exists { path: path.clone() }.into());
+            }
         }
         let opened = side_by_side(runs, |(config, path)| Member::open(config, path, start, disk))?;
         let (mut members, mut snapshots, mut notes) = (Vec::new(), Vec::new(), Vec::new());

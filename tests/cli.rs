@@ -50,10 +50,15 @@ fn check(text: impl AsRef<[u8]>, flags: &[&str]) -> Output {
     flotilla(&[&["check", path.to_str().unwrap()], flags].concat())
 }
 
-/// What standard error says of a failed run, without the folder's name; nothing may be on standard output.
+/// What standard error says of a failed run, without the folder's name.
 fn refusal(output: Output) -> String {
+    assert_eq!(output.status.code(), Some(1), "{}", String::from_utf8_lossy(&output.stderr));
+    told(output)
+}
+
+/// What standard error says, without the folder's name; nothing may be on standard output.
+fn told(output: Output) -> String {
     let error = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(1), "{error}");
     assert!(output.stdout.is_empty(), "{}", String::from_utf8_lossy(&output.stdout));
     let error = error.strip_prefix("error: ").expect(&error).trim_end();
     let name = |line: &str| line.find("x.toml").map_or(line.to_string(), |at| line[at..].to_string());
@@ -310,7 +315,9 @@ fn overrides_out_of_range_name_the_flag() {
         (["--generations", "-1"], "--generations: found -1, allowed 0 to 1000000"),
         (["--seed", "-1"], &format!("--seed: found -1, {whole}")),
     ] {
-        assert_eq!(refusal(check(GOOD, &flags)), expected);
+        let output = check(GOOD, &flags);
+        assert_eq!(output.status.code(), Some(2), "wrong usage, though only the config's ranges tell");
+        assert_eq!(told(output), expected);
     }
     // A flag mends what the file has wrong.
     assert_eq!(check(with_line(23, "trials = 0"), &["--trials", "3"]).status.code(), Some(0));

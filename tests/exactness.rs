@@ -4,7 +4,7 @@ mod common;
 
 use std::path::{Path, PathBuf};
 
-use flotilla::backend::gpu::device::{self, Binding, Choice, DeviceError, Kind, Request};
+use flotilla::backend::gpu::device::{self, AdapterInfo, Binding, Choice, DeviceError, Kind, Request};
 use flotilla::backend::gpu::exact::{self, Pass, ShaderError};
 use flotilla::backend::gpu::{probe, shaders};
 use wgpu::BufferUsages;
@@ -333,6 +333,41 @@ fn an_unknown_adapter_lists_those_there_are() {
         let gpu = device::open(Request { choice: by_name, ..request }).unwrap_or_else(|error| panic!("{error}"));
         assert_eq!(gpu.adapter.name, info.name);
     }
+}
+
+/// Two adapters whose names are full of digits.
+fn two() -> Vec<AdapterInfo> {
+    let named = |name: &str, kind| AdapterInfo {
+        name: name.into(),
+        driver: "Mesa 22.3.6".into(),
+        backend: "vulkan".into(),
+        kind,
+    };
+    vec![named("GeForce RTX 4090", Kind::Discrete), named("llvmpipe (LLVM 15.0.6, 256 bits)", Kind::Software)]
+}
+
+#[test]
+fn a_number_is_an_index_and_nothing_is_no_name() {
+    let find = |name: &str| device::position(&Choice::Named(name.into()), &two());
+    for (name, index) in [("0", 0), ("1", 1), ("rtx 4090", 0), ("LLVM", 1), ("LLVM 15", 1)] {
+        assert_eq!(find(name).expect(name), index, "{name}");
+    }
+    for name in ["5", "15", "4090", "-1", "99999999999999999999999", "", " ", "7)"] {
+        let error = find(name).expect_err(name).to_string();
+        assert!(error.contains(&format!("\"{name}\"")) && error.contains("1: llvmpipe"), "{error}");
+    }
+}
+
+#[test]
+fn a_software_renderer_is_taken_by_name_alone() {
+    let software = &two()[1..];
+    let error = device::position(&Choice::Real, software).expect_err("there is no GPU").to_string();
+    assert!(
+        error.contains("0: llvmpipe") && error.contains("--adapter 0") && error.contains("--backend cpu"),
+        "{error}"
+    );
+    assert_eq!(device::position(&Choice::Real, &two()).unwrap(), 0);
+    assert!(matches!(device::position(&Choice::Real, &[]), Err(DeviceError::NoAdapter)));
 }
 
 #[test]

@@ -14,6 +14,7 @@ use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::population::{Brood, Stretch};
 use flotilla::backend::{Backend, Group, Moment};
 use flotilla::config::{Config, Fitness};
+use flotilla::evaluate::{Starts, evaluate};
 use flotilla::trainer::Trainer;
 use flotilla::verify::{Outcome, Plan, compare};
 use flotilla::world::{Constants, World};
@@ -244,4 +245,43 @@ fn structs_lie_alike_on_both_sides() {
     check!("Brood", Brood, key, slots, parameters, parents, threshold, all, scaled, sigma);
     check!("Stretch", Stretch, leaders, first, count, parameters, teams, teams_a_task, choices, weights);
     check!("Moment", Moment, inputs, outputs, force, position, heading, speed);
+}
+
+/// Drawn starts make one group an episode: batches of many groups, of which each has a few teams.
+#[test]
+fn held_out_episodes_come_to_the_same_on_every_backend() {
+    let mut config = Config::parse(include_str!("../configs/generally_forward.toml"), "generally forward").unwrap();
+    // Agents see each other at steps of their own.
+    config.world.steps = 40;
+    let world = World::new(&config);
+    let (policies, leaders) = (5, world.leaders());
+    let weights = sample::weights(&world, policies, 11);
+    let teams: Vec<u32> = (0..policies as u32).flat_map(|policy| std::iter::repeat_n(policy, leaders)).collect();
+    let group = Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams };
+    let starts = Starts::Drawn { episodes: 300, seed: 5, jitter: 6.0 };
+    let expected = evaluate(&mut Cpu::default(), &group, &starts, &|_| ()).unwrap();
+    let spreads: Vec<_> = (0..policies).map(|team| expected.team(team)).collect();
+    assert!(spreads.iter().any(|spread| spread.deviation > Some(0.0)), "nobody observes anything: {spreads:?}");
+    for (request, info) in common::adapters("held_out_episodes_come_to_the_same_on_every_backend") {
+        let found = evaluate(&mut open(&request, Pass::Guarded), &group, &starts, &|_| ()).unwrap();
+        assert_eq!(found, expected, "{info}");
+    }
+}
+
+#[test]
+fn verify_tells_as_json_what_it_compared() {
+    for (index, (_, info)) in common::adapters("verify_tells_as_json_what_it_compared").into_iter().enumerate() {
+        let adapter = index.to_string();
+        let line = ["verify", "--worlds", "2", "--teams", "3", "--json", "-q", "--adapter", &adapter];
+        let output = assert_cmd::cargo::cargo_bin_cmd!("flotilla").args(line).output().unwrap();
+        assert!(output.status.success(), "{info}: {}", String::from_utf8_lossy(&output.stderr));
+        let object: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        let comparisons = object["comparisons"].as_array().unwrap();
+        assert_eq!((&object["equal"], comparisons.is_empty()), (&true.into(), false));
+        for comparison in comparisons {
+            assert_eq!(comparison["adapter"], info.to_string());
+            assert_eq!((&comparison["worlds"], &comparison["equal"]), (&2.into(), &true.into()));
+            assert!(comparison["agent_steps"].as_u64().unwrap() > 0 && comparison["failure"].is_null());
+        }
+    }
 }

@@ -377,7 +377,8 @@ fn no_failing_disk_operation_costs_a_run() {
             let (operation, file) = failed.expect("the operation was reached");
             let context = format!("operation {at}: {operation:?} {}", file.display());
             if let Err(error) = told.end {
-                assert!(error.to_string().contains("free some space, then go on with --resume"), "{context}: {error}");
+                let error = flotilla::cli::Error::from(error).to_string();
+                assert!(error.contains("free some space, then go on with --resume"), "{context}: {error}");
                 kinds.push(operation);
             }
             let (results, again) = resume(&config, &path);

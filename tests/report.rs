@@ -27,9 +27,13 @@ fn succeed(arguments: &[&str]) -> String {
 
 /// Fails with exit code 1 and gives the message, which must name all of `said` and no panic.
 fn fail(arguments: &[&str], said: &[&str]) {
+    fail_with(1, arguments, said);
+}
+
+fn fail_with(code: i32, arguments: &[&str], said: &[&str]) {
     let output = flotilla(arguments);
     let message = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(1), "{arguments:?}: {message}");
+    assert_eq!(output.status.code(), Some(code), "{arguments:?}: {message}");
     assert!(message.starts_with("error: "), "{message}");
     for word in said {
         assert!(message.contains(word), "{arguments:?}: {message:?} does not say {word:?}");
@@ -235,7 +239,7 @@ fn a_half_written_run_plots_and_replays_as_far_as_it_came() {
     succeed(&["plot", &run.text()]);
     let said = succeed(&["replay", &run.text(), "--backend", "cpu"]);
     assert!(said.contains("generation 3"), "{said}");
-    fail(&["replay", &run.text(), "--generation", "5", "--backend", "cpu"], &["generation 5", "newest is 3"]);
+    fail_with(2, &["replay", &run.text(), "--generation", "5", "--backend", "cpu"], &["generation 5", "newest is 3"]);
 }
 
 #[test]
@@ -246,7 +250,7 @@ fn every_generation_replays_with_the_score_it_had() {
         let (trial_text, generation_text) = (trial.to_string(), generation.to_string());
         let arguments = ["replay", &run.text(), "--trial", &trial_text, "--generation", &generation_text];
         let said = succeed(&[&arguments[..], &["--backend", "cpu"]].concat());
-        assert!(said.contains(&format!("G = {best} of")), "{said}");
+        assert!(said.contains(&format!("it observed {} of 2 POIs, as", 2.0 * best)), "{said}");
         let page = data(&run.file("replay.html"));
         let episode = &page["episodes"][0];
         assert_eq!(episode["g"].as_f64().unwrap(), best);
@@ -324,7 +328,7 @@ fn a_replay_of_other_metrics_is_refused() {
         .collect();
     fs::write(run.file("metrics.csv"), forged).unwrap();
     fail(&["replay", &run.text(), "--backend", "cpu"], &["generation 6", "metrics.csv says"]);
-    fail(&["replay", &run.text(), "--trial", "3", "--backend", "cpu"], &["no trial 3", "0 to 2"]);
+    fail_with(2, &["replay", &run.text(), "--trial", "3", "--backend", "cpu"], &["no trial 3", "0 to 2"]);
 }
 
 #[test]

@@ -546,7 +546,7 @@ fn wrong_usage_is_refused_before_any_work() {
         let error = failed(flotilla(&sweep, &out, &["--shard", shard]), 2);
         assert!(error.contains(wanted), "{shard}: {error}");
     }
-    let error = failed(flotilla(&sweep, &out, &["--seed", "3", "--skip-impossible", "--generations", "3"]), 1);
+    let error = failed(flotilla(&sweep, &out, &["--seed", "3", "--skip-impossible", "--generations", "3"]), 2);
     assert!(error.contains("--generations: the grid has learning.generations already"), "{error}");
     let mut array = command(&sweep, &out, &[]);
     let error = failed(array.env("JOB_COMPLETION_INDEX", "1").output().unwrap(), 2);

@@ -66,6 +66,13 @@ impl Place {
         told[told.find("error: ").unwrap_or_else(|| panic!("{line}: {told}"))..].to_string()
     }
 
+    /// The error of a command that must fail, by whatever code.
+    fn refused_somehow(&self, line: &str) -> String {
+        let output = self.run(line);
+        assert!(!output.status.success(), "{line}");
+        String::from_utf8(output.stderr).unwrap()
+    }
+
     fn read(&self, name: &str) -> String {
         fs::read_to_string(self.path(name)).unwrap()
     }
@@ -168,7 +175,7 @@ fn flags_stand_in_the_resolved_config_and_quiet_is_quiet() {
         assert!(config.contains(line), "{line}: {config}");
     }
     assert_eq!(place.read("runs/small/metrics.csv").lines().count(), 1 + 3);
-    let error = place.refused("train small.toml --checkpoint-seconds -1", 1);
+    let error = place.refused("train small.toml --checkpoint-seconds -1", 2);
     assert!(error.contains("--checkpoint-seconds: found -1"), "{error}");
     // A config that is refused leaves no folder.
     assert!(!place.path("runs/small-2").exists());
@@ -235,16 +242,16 @@ fn the_first_team_of_a_rollout_is_the_trials_champion() {
     }
     let trace = place.read("trace.csv");
     let (header, trace) = rows(&trace);
-    assert_eq!(header, "team,step,agent,role,x,y,heading_x,heading_y,speed");
+    assert!(header.starts_with("team,step,agent,role,x,y,heading_x,heading_y,speed,"), "{header}");
     assert_eq!(trace.len(), 8 * 10 * 5);
     for (index, row) in trace.iter().enumerate() {
         let (team, step, agent) = (index / 50, index / 5 % 10, index % 5);
         assert_eq!((row[0].parse(), row[1].parse(), row[2].parse()), (Ok(team), Ok(step), Ok(agent)));
         assert_eq!(row[3], if agent < 2 { "leader" } else { "follower" });
     }
-    assert_eq!(trace[2][4..], ["12", "2", "0", "1", "0"]);
+    assert_eq!(trace[2][4..9], ["12", "2", "0", "1", "0"]);
     // Printed floats read back to the same bits.
-    let float = |text: &str| text.parse::<f32>().unwrap().to_string() == *text;
+    let float = |text: &str| text.is_empty() || text.parse::<f32>().unwrap().to_string() == *text;
     assert!(trace.iter().all(|row| row[4..].iter().all(|text| float(text))));
 }
 
@@ -301,7 +308,7 @@ fn rollout_takes_other_programs_files_and_refuses_what_it_cannot_play() {
     assert!(place.refused(&line("bad"), 1).contains("layers \"8,4,1,2\", but the config's have \"8,5,2\""));
     place.tensor("bad.safetensors", "w", Dtype::F32, &[2, 3, PARAMETERS], bytes, None);
     assert!(place.refused(&line("bad"), 1).contains("it has no tensor weights.0; it has w"));
-    assert!(place.refused(&(line("good") + " --trial 2"), 1).contains("it has no tensor weights.2; it has weights"));
+    assert!(place.refused(&(line("good") + " --trial 2"), 2).contains("it has no tensor weights.2; it has weights"));
     // Every learner needs policies.
     assert!(place.refused(&(line("good") + " --paradigm all-leaders"), 1).contains("needs F32 [5, "));
 
@@ -415,4 +422,271 @@ fn a_summary_may_be_json() {
     let (again, _) = place.good("train small.toml --out run --json --resume");
     let again: serde_json::Value = serde_json::from_str(&again).unwrap();
     assert_eq!((&again["digest"], &again["trained_generations"]), (&found["digest"], &0.into()));
+}
+
+/// A config whose starts move far enough that teams do not always do the same.
+const JITTERY: &str = "rollout small.toml --policies run/policies.safetensors --start-jitter 2.5";
+
+/// Trained policies in `run/`.
+fn trained() -> Place {
+    let place = Place::new();
+    place.good("train small.toml --out run --generations 4 --trials 1 --quiet");
+    place
+}
+
+/// A trace's numbers by episode, team, step and agent: the state, then what was sensed and answered.
+fn traced(text: &str, episodes: usize) -> Vec<Vec<Vec<Vec<Vec<f64>>>>> {
+    let (teams, steps, agents) = (8, 10, 5);
+    let mut rows = text.lines().skip(1);
+    let mut row = |episode: usize, team: usize, step: usize, agent: usize| {
+        let row: Vec<&str> = rows.next().unwrap().split(',').collect();
+        assert_eq!(row[..3], [team, step, agent].map(|number| number.to_string()));
+        assert!(episodes == 1 || row[19] == episode.to_string(), "{row:?}");
+        row[4..19].iter().filter(|text| !text.is_empty()).map(|text| text.parse().unwrap()).collect()
+    };
+    let of_step =
+        |e, t, s, row: &mut dyn FnMut(_, _, _, _) -> _| (0..agents).map(|a| row(e, t, s, a)).collect::<Vec<_>>();
+    let of_team = |e, t, row: &mut dyn FnMut(_, _, _, _) -> _| (0..steps).map(|s| of_step(e, t, s, row)).collect();
+    let all = (0..episodes).map(|e| (0..teams).map(|t| of_team(e, t, &mut row)).collect()).collect();
+    assert!(rows.next().is_none());
+    all
+}
+
+/// POIs of [`CONFIG`] that a traced team observed.
+fn observed(steps: &[Vec<Vec<f64>>]) -> f64 {
+    let near = |agent: &[f64], [x, y]: [f64; 2]| (agent[0] - x).powi(2) + (agent[1] - y).powi(2) <= 25.0;
+    let seen = |poi| steps[1..].iter().any(|agents| agents.iter().filter(|agent| near(agent, poi)).count() >= 2);
+    [[10.0, 9.0], [20.0, 9.0]].into_iter().filter(|&poi| seen(poi)).count() as f64
+}
+
+#[test]
+fn held_out_episodes_are_told_by_mean_spread_and_interval() {
+    let place = trained();
+    let flags = "--episodes 12 --seed 3 --scores scores.csv --trace trace.csv";
+    let (summary, told) = place.good(&format!("{JITTERY} {flags}"));
+    assert!(told.starts_with("playing on cpu ("), "{told}");
+    let (scores, trace) = (place.read("scores.csv"), place.read("trace.csv"));
+    let episodes = traced(&trace, 12);
+
+    // All teams start alike, near where the config says, and elsewhere in every episode.
+    let start = |episode: &[Vec<Vec<Vec<f64>>>]| -> Vec<Vec<f64>> {
+        let start = |team: &Vec<Vec<Vec<f64>>>| team[0].iter().map(|agent| agent[..2].to_vec()).collect::<Vec<_>>();
+        assert!(episode.iter().all(|team| start(team) == start(&episode[0])));
+        start(&episode[0])
+    };
+    let starts: Vec<_> = episodes.iter().map(|episode| start(episode)).collect();
+    let own = [[10.0, 5.0], [20.0, 5.0], [12.0, 2.0], [22.0, 2.0], [30.0, 2.0]];
+    for (index, start) in starts.iter().enumerate() {
+        assert!(!starts[..index].contains(start));
+        for (agent, own) in start.iter().zip(own) {
+            assert!(agent.iter().zip(own).all(|(at, own)| (at - own).abs() <= 2.5 && *at >= 0.0), "{start:?}");
+        }
+    }
+
+    // What the file and the summary say, worked out from the trace.
+    let spread = |values: &[f64]| {
+        let n = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / n;
+        let deviation = (values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / (n - 1.0)).sqrt();
+        // Student's t with 11 degrees of freedom.
+        let half = 2.200985 * deviation / n.sqrt();
+        [mean, deviation, (mean - half).max(0.0), (mean + half).min(2.0)]
+    };
+    let close = |found: &[f64], expected: &[f64]| {
+        assert_eq!(found.len(), expected.len());
+        assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-4), "{found:?} is not {expected:?}");
+    };
+    let teams: Vec<Vec<f64>> =
+        (0..8).map(|team| episodes.iter().map(|episode| observed(&episode[team])).collect()).collect();
+    let (header, rows) = rows(&scores);
+    assert_eq!(header, "team,leader,g,d,df,dpp,episodes,pois,pois_deviation,pois_low,pois_high");
+    assert_eq!(rows.len(), 8 * 2);
+    let mut spreads = 0;
+    for (index, row) in rows.iter().enumerate() {
+        let expected = spread(&teams[index / 2]);
+        assert_eq!(row[6], "12");
+        close(&[7, 8, 9, 10].map(|column| row[column].parse().unwrap()), &expected);
+        close(&[row[2].parse().unwrap()], &[expected[0] / 2.0]);
+        spreads += usize::from(expected[1] > 0.0);
+    }
+    assert!(spreads > 0, "teams that always do the same test nothing");
+    let means: Vec<f64> = teams.iter().map(|team| spread(team)[0]).collect();
+    let best = (0..8).rev().max_by(|&a, &b| means[a].total_cmp(&means[b])).unwrap();
+    let of_all: Vec<f64> = (0..12).map(|episode| teams.iter().map(|team| team[episode]).sum::<f64>() / 8.0).collect();
+    let lines: Vec<&str> = summary.lines().collect();
+    assert_eq!(lines[0], "8 teams, 12 episodes each, starts moved by up to 2.5 (seed 3). POIs observed, of 2:");
+    let (json, told) = place.good(&format!("{JITTERY} {flags} --json -q"));
+    assert_eq!(told, "");
+    let json: serde_json::Value = serde_json::from_str(&json).unwrap();
+    assert_eq!([&json["teams"], &json["pois"], &json["episodes"], &json["seed"]], [8, 2, 12, 3]);
+    assert_eq!((json["start_jitter"].as_f64(), json["best"]["team"].as_u64()), (Some(2.5), Some(best as u64)));
+    for (line, name, key, values) in [
+        (2, "team 0".to_string(), "team_0", &teams[0]),
+        (3, format!("best (team {best})"), "best", &teams[best]),
+        (4, "mean of all teams".to_string(), "mean", &of_all),
+    ] {
+        let expected = spread(values);
+        let numbers = lines[line].trim_start().strip_prefix(&name).unwrap().replace("to", " ");
+        let told: Vec<f64> = numbers.split_whitespace().map(|text| text.parse().unwrap()).collect();
+        assert!(told.iter().zip(expected).all(|(a, b)| (a - b).abs() <= 0.0051), "{summary} is not {expected:?}");
+        let numbers = &json[key];
+        let found =
+            [&numbers["mean"], &numbers["standard_deviation"], &numbers["interval_95"][0], &numbers["interval_95"][1]];
+        close(&found.map(|number| number.as_f64().unwrap()), &expected);
+    }
+
+    // The same bits with other threads, other starts by another seed.
+    place.good(&format!("{JITTERY} {flags} --threads 1"));
+    assert_eq!((place.read("scores.csv"), place.read("trace.csv")), (scores.clone(), trace));
+    place.good(&format!("{JITTERY} --episodes 12 --seed 4 --trace trace.csv"));
+    let others: Vec<_> = traced(&place.read("trace.csv"), 12).iter().map(|episode| start(episode)).collect();
+    assert!(others.iter().all(|start| !starts.contains(start)));
+
+    // A score is the mean of what single episodes from these starts score.
+    let mut sums = vec![[0.0; 4]; 16];
+    for start in &starts {
+        let moved = CONFIG
+            .replace("[[10, 5], [20, 5]]", &format!("{:?}", &start[..2]))
+            .replace("[[12, 2], [22, 2], [30, 2]]", &format!("{:?}", &start[2..]));
+        fs::write(place.path("moved.toml"), moved).unwrap();
+        place.good("rollout moved.toml --policies run/policies.safetensors --scores one.csv");
+        for (sums, row) in sums.iter_mut().zip(self::rows(&place.read("one.csv")).1) {
+            sums.iter_mut().zip(&row[2..]).for_each(|(sum, text)| *sum += text.parse::<f32>().unwrap() as f64);
+        }
+    }
+    for (sums, row) in sums.iter().zip(&rows) {
+        let found: Vec<f32> = row[2..6].iter().map(|text| text.parse().unwrap()).collect();
+        assert!(found.iter().zip(sums).all(|(found, sum)| (found - (sum / 12.0) as f32).abs() < 1e-7), "{row:?}");
+    }
+}
+
+#[test]
+fn one_episode_of_rollout_keeps_its_columns_and_says_so_in_json() {
+    let place = trained();
+    place.good(&format!("{JITTERY} --episodes 1 --scores scores.csv --trace trace.csv"));
+    assert!(place.read("scores.csv").starts_with("team,leader,g,d,df,dpp\n0,0,"));
+    let moved = place.read("trace.csv");
+    place.good("rollout small.toml --policies run/policies.safetensors --trace trace.csv");
+    assert_ne!(place.read("trace.csv"), moved, "--episodes draws even one start");
+    let (json, _) = place.good("rollout small.toml --policies run/policies.safetensors --json");
+    let json: serde_json::Value = serde_json::from_str(&json).unwrap();
+    assert_eq!((&json["episodes"], &json["backend"]), (&1.into(), &"cpu".into()));
+    for nothing in [&json["seed"], &json["start_jitter"], &json["adapter"], &json["best"]["standard_deviation"]] {
+        assert!(nothing.is_null(), "{json}");
+    }
+    assert!(json["mean"]["mean"].as_f64().unwrap() <= json["best"]["mean"].as_f64().unwrap());
+}
+
+#[test]
+fn rollout_refuses_flags_that_would_change_nothing() {
+    let place = trained();
+    let line = "rollout small.toml --policies run/policies.safetensors";
+    for flags in ["--trials 2", "--generations 3", "--population 4", "--fitness D", "--seed 5", "--start-jitter 1"] {
+        place.refused(&format!("{line} {flags}"), 2);
+    }
+    for flags in ["--episodes 2", "--episodes 1 --seed 5", "--episodes 2 --start-jitter 0"] {
+        let error = place.refused(&format!("{line} {flags}"), 2);
+        assert!(error.contains("learning.start_jitter is 0, so all episodes are the same"), "{error}");
+        assert!(error.contains("--start-jitter"), "what to do: {error}");
+    }
+    place.refused(&format!("{line} --episodes 0"), 2);
+    let error = place.refused_somehow(&format!("{line} --episodes 2 --start-jitter -1"));
+    assert!(error.contains("--start-jitter: found -1"), "{error}");
+    place.good(&format!("{line} --episodes 1"));
+    // Where the config moves starts, no flag is needed.
+    fs::write(place.path("small.toml"), CONFIG.to_string() + "start_jitter = 1.5\n").unwrap();
+    let (summary, _) = place.good(&format!("{line} --episodes 3"));
+    assert!(summary.contains("starts moved by up to 1.5 (seed 0)"), "{summary}");
+}
+
+#[test]
+fn a_trace_tells_what_leaders_sense_and_answer() {
+    let place = trained();
+    place.good("rollout small.toml --policies run/policies.safetensors --trace trace.csv");
+    let trace = place.read("trace.csv");
+    assert_eq!(
+        trace.lines().next().unwrap(),
+        "team,step,agent,role,x,y,heading_x,heading_y,speed,\
+         pois_back_right,pois_front_right,pois_front_left,pois_back_left,\
+         agents_back_right,agents_front_right,agents_front_left,agents_back_left,turn_output,speed_output"
+    );
+    let bytes = fs::read(place.path("run/policies.safetensors")).unwrap();
+    let file = SafeTensors::deserialize(&bytes).unwrap();
+    let tensor = file.tensor("weights.0").unwrap();
+    let weights: Vec<f64> =
+        tensor.data().chunks_exact(4).map(|bytes| f32::from_le_bytes(bytes.try_into().unwrap()).into()).collect();
+    let mut answered = 0;
+    for (index, team) in traced(&trace, 1)[0].iter().enumerate() {
+        for (step, agents) in team.iter().enumerate() {
+            for (agent, row) in agents.iter().enumerate() {
+                if agent >= 2 || step == 9 {
+                    assert_eq!(row.len(), 5, "nothing is sensed: {row:?}");
+                    continue;
+                }
+                let &[x, y, hx, hy, _] = &row[..5] else { panic!("a state") };
+                let sense = |others: &[[f64; 2]], range: f64, share: f64| {
+                    let mut sums = [0.0; 4];
+                    for [dx, dy] in others.iter().map(|other| [other[0] - x, other[1] - y]) {
+                        let (ahead, left, distance) = (dx * hx + dy * hy, dy * hx - dx * hy, dx.hypot(dy));
+                        let density = if distance <= range { 1.0 - distance / (2f64.sqrt() * 50.0) } else { 0.0 };
+                        let is_left = left > 0.0 || left == 0.0 && ahead >= 0.0;
+                        let is_front = ahead > 0.0 || ahead == 0.0 && left <= 0.0;
+                        sums[match (is_left, is_front) {
+                            (false, false) => 0,
+                            (false, true) => 1,
+                            (true, true) => 2,
+                            (true, false) => 3,
+                        }] += density / share;
+                    }
+                    sums
+                };
+                let others = |other: &(usize, &Vec<f64>)| other.0 != agent;
+                let others: Vec<[f64; 2]> =
+                    agents.iter().enumerate().filter(others).map(|(_, other)| [other[0], other[1]]).collect();
+                let inputs = [sense(&[[10.0, 9.0], [20.0, 9.0]], 1e9, 2.0), sense(&others, 5.0, 5.0)].concat();
+                let mut units = row[5..13].to_vec();
+                assert!(inputs.iter().zip(&units).all(|(a, b)| (a - b).abs() < 1e-5), "{inputs:?} is not {row:?}");
+                let mut policy = &weights[(agent * 8 + index) * PARAMETERS..][..PARAMETERS];
+                for width in [5, 2] {
+                    units.push(1.0);
+                    let unit = |unit: usize| {
+                        units.iter().enumerate().map(|(row, x)| x * policy[row * width + unit]).sum::<f64>().tanh()
+                    };
+                    let next = (0..width).map(unit).collect();
+                    policy = &policy[units.len() * width..];
+                    units = next;
+                }
+                assert!(units.iter().zip(&row[13..]).all(|(a, b)| (a - b).abs() < 1e-4), "{units:?} is not {row:?}");
+                answered += 1;
+            }
+        }
+    }
+    assert_eq!(answered, 8 * 9 * 2);
+}
+
+#[test]
+fn no_training_starts_where_teams_are_evaluated() {
+    use flotilla::config::Config;
+    use flotilla::evaluate::Starts;
+    use flotilla::evolve::{Key, Purpose, jitter_starts};
+    use flotilla::world::World;
+
+    let world = World::new(&Config::parse(CONFIG, "small").unwrap());
+    let bits = |starts: &[glam::Vec2]| -> Vec<u32> {
+        starts.iter().flat_map(|start| [start.x.to_bits(), start.y.to_bits()]).collect()
+    };
+    let mut held_out = std::collections::HashSet::new();
+    for seed in 0..4 {
+        let starts = Starts::Drawn { episodes: 64, seed, jitter: 2.0 };
+        held_out.extend((0..64).map(|episode| bits(&starts.of(episode, &world))));
+    }
+    assert_eq!(held_out.len(), 4 * 64);
+    let mut starts = Vec::new();
+    for (seed, trial) in (0..4).flat_map(|seed| (0..3).map(move |trial| (seed, trial))) {
+        let key = Key::new(seed, trial, Purpose::Starts);
+        for (generation, episode) in (0..64).flat_map(|generation| (0..4).map(move |episode| (generation, episode))) {
+            jitter_starts(key, generation, episode, &world, 2.0, &mut starts);
+            assert!(!held_out.contains(&bits(&starts)), "seed {seed}, generation {generation}");
+        }
+    }
 }

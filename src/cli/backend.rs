@@ -42,7 +42,7 @@ pub fn open_gpu(options: &RunOptions) -> Result<Option<GpuEpisodes>, Error> {
             opened => Ok(Some(opened?)),
         },
         (BackendChoice::Auto | BackendChoice::Gpu, Some(named)) => Ok(Some(gpu(named)?)),
-        (BackendChoice::Gpu, None) => Ok(Some(gpu(Choice::Any)?)),
+        (BackendChoice::Gpu, None) => Ok(Some(gpu(Choice::Real)?)),
     }
 }
 

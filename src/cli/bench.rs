@@ -20,7 +20,7 @@ const JSON_TEAMS: u32 = 4096;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Config file (TOML) [default: the paper's generally forward layout]
+    /// Config file (TOML), or - for standard input [default: the paper's generally forward layout]
     config: Option<PathBuf>,
     #[command(flatten)]
     overrides: Overrides,
@@ -56,7 +56,7 @@ pub struct Args {
 /// Prints a table, or JSON objects: a line for every combination of teams, steps and agents.
 pub fn run(args: Args) -> Result<(), Error> {
     let (name, text) = match &args.config {
-        Some(path) => (path.display().to_string(), config::read_file(path)?),
+        Some(path) => (config::name(path), config::read_file(path)?),
         None => {
             let text = include_str!("../../configs/generally_forward.toml");
             ("configs/generally_forward.toml".into(), text.into())

@@ -2,23 +2,31 @@
 //!
 //! A command's file holds `Args` (its flags) and `run(Args) -> Result<(), Error>`; the list `commands!` below names it.
 
+use std::ffi::OsString;
 use std::fmt::Display;
 use std::io::{self, Write};
 use std::path::PathBuf;
+use std::sync::LazyLock;
 
 use clap::builder::PossibleValuesParser as Words;
-use clap::{Parser, Subcommand, ValueEnum};
+use clap::{CommandFactory, Parser, Subcommand, ValueEnum};
 
 use crate::backend::BackendError;
 use crate::backend::gpu::device::DeviceError;
 use crate::config::{self, Choice, Config, ConfigError, Fitness, Override, Paradigm};
+use crate::escape;
 use crate::record::RecordError;
+use crate::report::replay::ReplayError;
 use crate::run::RunError;
 
 mod backend;
 mod bench;
 mod check;
+mod completions;
 mod devices;
+mod init;
+mod man;
+mod output;
 mod paper;
 mod plot;
 mod recovery;
@@ -46,6 +54,8 @@ macro_rules! commands {
 }
 
 commands! {
+    /// Write a commented config to start from.
+    Init(init),
     /// Check a config; print it with every default written out, and what a run of it costs.
     Check(check),
     /// Train the teams of a config, and save what they learned.
@@ -66,22 +76,52 @@ commands! {
     Devices(devices),
     /// Train every point of a grid side by side; share the grid out over many machines.
     Sweep(sweep),
+    /// Print the script by which a shell completes commands and flags.
+    Completions(completions),
+    /// Write manual pages.
+    Man(man),
 }
 
 /// Trains cooperative teams by coevolution on any GPU, with the same bits on a CPU.
 #[derive(Parser)]
-#[command(version, arg_required_else_help = true)]
+#[command(version, long_version = VERSION.as_str(), arg_required_else_help = true)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
 }
+
+/// What `--version` tells: also what this was built from, and for what.
+static VERSION: LazyLock<String> = LazyLock::new(|| {
+    let commit = crate::COMMIT.unwrap_or("not recorded");
+    format!("{}\ncommit  {commit}\ntarget  {}", env!("CARGO_PKG_VERSION"), env!("FLOTILLA_TARGET"))
+});
 
 /// Does what was typed; wrong usage ends the program here, with exit code 2.
 ///
 /// # Errors
 /// The command failed.
 pub fn run() -> Result<(), Error> {
+    refuse_steering(std::env::args_os().skip(1))?;
     Cli::parse().command.run()
+}
+
+/// The command line, to be parsed or described without being run.
+pub fn command() -> clap::Command {
+    Cli::command()
+}
+
+/// Refuses names and values that hold line breaks or escape sequences: none is needed, and any could end up in a
+/// script, a table or on a terminal as something else than a name.
+fn refuse_steering(words: impl Iterator<Item = OsString>) -> Result<(), Error> {
+    for word in words {
+        if word.to_string_lossy().contains(escape::steers) {
+            return Err(Error::Usage(format!(
+                "'{}' holds a line break or another control character, which no name or value may have",
+                escape::line(&word.to_string_lossy())
+            )));
+        }
+    }
+    Ok(())
 }
 
 /// Why a command failed.
@@ -93,14 +133,14 @@ pub enum Error {
     Backend(#[from] BackendError),
     #[error(transparent)]
     Device(#[from] DeviceError),
-    #[error(transparent)]
+    #[error("{}{}", .0, remedy(.0, "run it again"))]
     Record(#[from] RecordError),
-    #[error(transparent)]
+    #[error("{}{}", .0, resumable(.0))]
     Run(#[from] RunError),
     #[error(transparent)]
     Shown(#[from] crate::report::runs::RunError),
     #[error(transparent)]
-    Replayed(#[from] crate::report::replay::ReplayError),
+    Replayed(#[from] ReplayError),
     #[error("standard output cannot be written: {0}")]
     Output(io::Error),
     #[error("signals cannot be listened for: {0}")]
@@ -124,27 +164,56 @@ pub enum Error {
 
 impl Error {
     /// The process's exit code: 1 failed, 2 wrong usage, 75 stopped and ready to be resumed.
+    ///
+    /// A value given by a flag is wrong usage wherever that is found: also one that does not fit the file or the machine
+    /// that it is used with. Where the file is wrong as well, the run failed.
     pub fn exit_code(&self) -> u8 {
         match self {
-            Error::Usage(_) => 2,
+            Error::Usage(_)
+            | Error::Device(DeviceError::UnknownAdapter { .. })
+            | Error::Record(RecordError::NoTrial { .. })
+            | Error::Replayed(ReplayError::NoTrial { .. } | ReplayError::NoGeneration { .. }) => 2,
+            Error::Config(error) if error.is_usage() => 2,
             Error::Stopped(_) => 75,
             _ => 1,
         }
     }
 }
 
-/// Tells something on standard error; with that gone there is nobody left to tell.
-pub fn say(text: impl Display) {
-    let _ = writeln!(io::stderr(), "{text}");
+/// What to do about a file that could not be written, before `again`.
+fn remedy(error: &RecordError, again: &str) -> String {
+    use io::ErrorKind::{FileTooLarge, PermissionDenied, QuotaExceeded, ReadOnlyFilesystem, StorageFull};
+    let RecordError::Write { error, .. } = error else { return String::new() };
+    match error.kind() {
+        StorageFull | QuotaExceeded => format!("; free some space, then {again}"),
+        FileTooLarge => format!("; the system allows no larger file here (see `ulimit -f`): raise that, then {again}"),
+        PermissionDenied | ReadOnlyFilesystem => "; choose a place you may write to".into(),
+        _ => String::new(),
+    }
 }
 
-/// Writes a result to standard output. A reader that has heard enough (`| head`) is no failure.
+/// What to do about a run that could not be written.
+fn resumable(error: &RunError) -> String {
+    match error {
+        RunError::Record(error) => remedy(error, "go on with --resume"),
+        _ => String::new(),
+    }
+}
+
+/// Tells something on standard error, with whatever would steer a terminal written out; with standard error gone there
+/// is nobody left to tell.
+pub fn say(text: impl Display) {
+    let _ = writeln!(io::stderr(), "{}", escape::lines(&text.to_string()));
+}
+
+/// Writes a result to standard output, with whatever would steer a terminal written out. A reader that has heard enough
+/// (`| head`) is no failure.
 ///
 /// # Errors
 /// Standard output is closed or full.
 pub fn print(text: &str) -> Result<(), Error> {
     let mut stdout = io::stdout().lock();
-    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+    match stdout.write_all(escape::lines(text).as_bytes()).and_then(|()| stdout.flush()) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Error::Output(error)),
         _ => Ok(()),
     }
@@ -153,19 +222,41 @@ pub fn print(text: &str) -> Result<(), Error> {
 const IN_CONFIG: &str = "Instead of the config's";
 const WHERE: &str = "Where to run (the results are the same)";
 
+/// A config file.
+#[derive(clap::Args)]
+pub struct ConfigFile {
+    /// Config file (TOML), or - for standard input
+    #[arg(value_name = "CONFIG")]
+    pub path: PathBuf,
+}
+
+impl ConfigFile {
+    /// The config in it, with some keys set by a command's own flags.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the file and the flags.
+    pub fn load(&self, overrides: &[Override]) -> Result<Config, Error> {
+        let text = config::read_file(&self.path)?;
+        Ok(Config::read(&text, &config::name(&self.path), &[], overrides)?)
+    }
+}
+
 /// A config file and the flags that change it.
 #[derive(clap::Args)]
 pub struct ConfigArgs {
-    /// Config file (TOML)
-    pub config: PathBuf,
+    #[command(flatten)]
+    pub file: ConfigFile,
     #[command(flatten)]
     pub overrides: Overrides,
 }
 
 impl ConfigArgs {
-    /// What the file is called, without folder and extension.
+    /// What the file is called, without folder and extension; `config` on standard input.
     pub fn name(&self) -> String {
-        self.config.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+        match &self.file.path {
+            path if config::is_standard_input(path) => "config".into(),
+            path => path.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
+        }
     }
 
     /// The config that was meant.
@@ -181,9 +272,7 @@ impl ConfigArgs {
     /// # Errors
     /// Everything that is wrong with the file and the flags.
     pub fn load_with(&self, more: Vec<Override>) -> Result<Config, Error> {
-        let text = config::read_file(&self.config)?;
-        let overrides = [self.overrides.list(), more].concat();
-        Ok(Config::read(&text, &self.config.display().to_string(), &[], &overrides)?)
+        self.file.load(&[self.overrides.list(), more].concat())
     }
 }
 
@@ -231,7 +320,7 @@ pub struct RunOptions {
     /// Processor
     #[arg(long, help_heading = WHERE, value_enum, default_value_t = BackendChoice::Auto)]
     pub backend: BackendChoice,
-    /// GPU whose name contains this, as `flotilla devices` lists it
+    /// GPU of this number in `flotilla devices`, or whose name contains this; also one that is a software renderer
     #[arg(long, help_heading = WHERE, value_name = "NAME")]
     pub adapter: Option<String>,
     /// Where populations are kept and the next generation is bred
@@ -249,7 +338,7 @@ pub enum BackendChoice {
     Auto,
     /// All cores, or `--threads`
     Cpu,
-    /// A GPU, or fail
+    /// A GPU, or fail; a software renderer is none, and taken only by --adapter
     Gpu,
 }
 

@@ -28,7 +28,7 @@ const SUMMARY: &str = "summary.json";
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder for the figures, the claims and the curves
-    #[arg(long, value_name = "DIR", default_value = "paper")]
+    #[arg(long, short, value_name = "DIR", default_value = "paper")]
     out: PathBuf,
     /// Independent repetitions [default: 5]
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
@@ -46,7 +46,7 @@ pub struct Args {
     #[arg(long)]
     force: bool,
     /// No progress on standard error
-    #[arg(long)]
+    #[arg(long, short)]
     quiet: bool,
     /// Print what came out as one JSON object (docs/json.md)
     #[arg(long)]
@@ -263,7 +263,7 @@ impl Marks {
         let what = match () {
             () if paper => "a paper",
             () if ["sweep.toml", "points"].into_iter().any(holds) => "a sweep",
-            () if folder::holds_run(out) => "a run",
+            () if folder::holds_run(out)? => "a run",
             () => return Ok(()),
         };
         match start {

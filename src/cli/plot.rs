@@ -2,9 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{Error, print};
+use super::{Error, output, print};
 use crate::record::RecordError;
-use crate::record::disk::Disk;
 use crate::report::curves::PRINT;
 use crate::report::runs::{self, MAX_RUNS};
 use crate::report::scene::Scene;
@@ -15,12 +14,15 @@ pub struct Args {
     #[arg(required = true, value_name = "RUN")]
     runs: Vec<PathBuf>,
     /// Picture to write, .svg or .png [default: curves.svg in the folder of one run, comparison.svg here of several]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { runs, out } = args;
+    let Args { runs, out, json } = args;
     if runs.len() > MAX_RUNS {
         let count = runs.len();
         return Err(Error::Usage(format!("{count} runs are too many to tell apart; name {MAX_RUNS} at most")));
@@ -32,7 +34,14 @@ pub fn run(args: Args) -> Result<(), Error> {
     let kind = Kind::of(&out)?;
     let scene = runs::figure(&runs)?.scene();
     write(&scene, kind, &out)?;
-    print(&format!("{}\n", out.display()))
+    let out = out.display().to_string();
+    match json {
+        true => {
+            let runs: Vec<_> = runs.iter().map(|run| run.display().to_string()).collect();
+            print(&format!("{}\n", serde_json::json!({ "out": out, "runs": runs })))
+        }
+        false => print(&format!("{out}\n")),
+    }
 }
 
 /// What a picture is written as.
@@ -59,5 +68,5 @@ fn write(scene: &Scene, kind: Kind, path: &Path) -> Result<(), Error> {
         Kind::Svg => scene.svg().into_bytes(),
         Kind::Png => scene.png(PRINT).map_err(failed)?,
     };
-    Ok(Disk::default().replace(path, |output| output.write_all(&content)).map_err(failed)?)
+    output::write(path, |output| output.write_all(&content))
 }

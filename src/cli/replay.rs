@@ -3,11 +3,13 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering::Relaxed;
 
+use serde_json::json;
+
 use super::recovery::Signals;
-use super::{Error, RunOptions, backend, print, say};
+use super::{Error, RunOptions, backend, output, print};
 use crate::record::RecordError;
-use crate::record::disk::Disk;
 use crate::report::curves::PRINT;
+use crate::report::progress::Meter;
 use crate::report::replay::{self, Played, ReplayError, Rows};
 use crate::report::runs;
 
@@ -29,14 +31,20 @@ pub struct Args {
     #[arg(long, value_name = "N")]
     step: Option<usize>,
     /// File to write: .html to play, .gif moving, .png or .svg still [default: replay.html in RUN]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+    /// No progress on standard error
+    #[arg(long, short)]
+    quiet: bool,
     #[command(flatten)]
     run: RunOptions,
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { folder, trial, generation, compare, step, out, run } = args;
+    let Args { folder, trial, generation, compare, step, out, json, quiet, run } = args;
     let out = out.unwrap_or_else(|| folder.join("replay.html"));
     let kind = Kind::of(&out)?;
     let config = runs::config(&folder)?;
@@ -52,16 +60,14 @@ pub fn run(args: Args) -> Result<(), Error> {
     let generations: Vec<usize> = compare.into_iter().chain([generation]).collect();
     let (mut backend, _) = backend::open(&run)?;
     let signals = Signals::listen()?;
-    let mut told = 0;
+    let (mut meter, last) = (Meter::new(quiet), generations.iter().max().copied().unwrap_or(0));
     let mut watch = |generation: usize| {
-        // Most runs take no time; the others say that something happens.
-        if generation / 1000 > told {
-            told = generation / 1000;
-            say(format_args!("training trial {trial} again: generation {generation}"));
-        }
+        let part = generation as f64 / (last + 1) as f64;
+        meter.show(part, || format!("training trial {trial} again: generation {generation} of {last}"));
         !signals.stop.load(Relaxed)
     };
     let played = replay::replay(&folder, trial, &generations, &mut *backend, &mut watch);
+    meter.clear();
     let played = played.map_err(|error| match error {
         ReplayError::Stopped => Error::Stopped("before the episode was played; nothing was written".into()),
         error => error.into(),
@@ -77,7 +83,16 @@ pub fn run(args: Args) -> Result<(), Error> {
         Kind::Png => still().png(PRINT).map_err(failed)?,
         Kind::Svg => still().svg().into_bytes(),
     };
-    Disk::default().replace(&out, |output| output.write_all(&content)).map_err(failed)?;
+    output::write(&out, |output| output.write_all(&content))?;
+    if json {
+        let episode = |played: &Played| {
+            let Played { trial, generation, team, best_g, .. } = played;
+            json!({ "trial": trial, "generation": generation, "team": team, "best_g": best_g })
+        };
+        let episodes: Vec<_> = played.iter().map(episode).collect();
+        let object = json!({ "out": out.display().to_string(), "bytes": content.len(), "episodes": episodes });
+        return print(&format!("{object}\n"));
+    }
     for played in &played {
         print(&tell(played))?;
     }
@@ -86,10 +101,13 @@ pub fn run(args: Args) -> Result<(), Error> {
 
 /// What was played, in a line.
 fn tell(played: &Played) -> String {
-    let Played { trial, generation, team, best_g, world, .. } = played;
+    let Played { trial, generation, team, best_g, episodes, world, .. } = played;
+    let (pois, digits) = (world.pois.len(), if *episodes > 1 { 2 } else { 0 });
     format!(
-        "trial {trial}, generation {generation}: team {team} is the best, G = {best_g} of {} POIs, as metrics.csv says\n",
-        world.pois.len()
+        "trial {trial}, generation {generation}: team {team} is the best, it observed {:.digits$} of {pois} POIs{}, as \
+         metrics.csv says\n",
+        best_g * pois as f64,
+        if *episodes > 1 { format!(" (mean of {episodes} episodes)") } else { String::new() }
     )
 }
 

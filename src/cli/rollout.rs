@@ -1,24 +1,36 @@
 //! `flotilla rollout`: plays teams of policies from a file, and scores every leader.
 
-use std::cell::RefCell;
-use std::fs::File;
-use std::io::{self, BufWriter, Write};
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
-use super::{ConfigArgs, Error, RunOptions, backend, print, say};
-use crate::backend::{Backend, Group};
-use crate::credit::Credit;
+use clap::builder::PossibleValuesParser as Words;
+use serde_json::json;
+
+use super::{ConfigFile, Error, RunOptions, backend, output, print, say};
+use crate::backend::{Backend, Group, Moment};
+use crate::config::{Choice, Override, Paradigm};
+use crate::evaluate::{self, Evaluation, MAX_EPISODES, Spread, Starts};
 use crate::record::policies;
+use crate::report::progress::Meter;
+use crate::run::Machine;
 use crate::world::World;
 
 /// Most bytes of a trace in memory at once.
 const TRACE_BYTES: usize = 1 << 26;
+const HELD_OUT: &str = "Starts that no training saw";
+/// Columns of a trace, and what leaders add to them: the eight inputs and two outputs of their policies.
+const STATES: &str = "team,step,agent,role,x,y,heading_x,heading_y,speed";
+const SENSED: &str = "pois_back_right,pois_front_right,pois_front_left,pois_back_left,\
+                      agents_back_right,agents_front_right,agents_front_left,agents_back_left,turn_output,speed_output";
 
 #[derive(clap::Args)]
 pub struct Args {
     #[command(flatten)]
-    config: ConfigArgs,
+    config: ConfigFile,
+    /// Who learned, instead of the config's
+    #[arg(long, value_name = "NAME", value_parser = Words::new(Paradigm::names()))]
+    paradigm: Option<String>,
     #[command(flatten)]
     run: RunOptions,
     /// Safetensors file with a tensor `weights` or `weights.N`, f32 [leaders, policies, parameters]
@@ -27,21 +39,65 @@ pub struct Args {
     /// Take the tensor `weights.N` [default: `weights`, or else `weights.0`]
     #[arg(long, value_name = "N")]
     trial: Option<usize>,
-    /// Write every agent's state after every step: team,step,agent,role,x,y,heading_x,heading_y,speed
+    /// Write every agent's state after every step, and what leaders sense and answer there
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
-    /// Write every leader's scores: team,leader,g,d,df,dpp
+    /// Write every leader's scores: team,leader,g,d,df,dpp; of several episodes their means, and the spread of POIs
     #[arg(long, value_name = "FILE")]
     scores: Option<PathBuf>,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+    /// No progress on standard error
+    #[arg(long, short)]
+    quiet: bool,
+
+    /// Play every team from so many jittered starts [default: once, from the config's own]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_EPISODES)),
+        help_heading = HELD_OUT)]
+    episodes: Option<u32>,
+    /// Start of these starts' randomness [default: 0, so that policies of any run meet the same starts]
+    #[arg(long, value_name = "S", requires = "episodes", value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64),
+        help_heading = HELD_OUT)]
+    seed: Option<u64>,
+    /// How far a start is moved at most, on each axis [default: the config's learning.start_jitter]
+    #[arg(long, value_name = "J", requires = "episodes", allow_negative_numbers = true, help_heading = HELD_OUT)]
+    start_jitter: Option<f64>,
 }
 
-/// Team j is made of the policies with index j of every leader, and starts where the config says.
+impl Args {
+    /// Where episodes start, given the config's jitter.
+    fn starts(&self, jitter: f64) -> Result<Starts, Error> {
+        let (Some(episodes), seed) = (self.episodes, self.seed.unwrap_or(0)) else { return Ok(Starts::Own) };
+        if jitter == 0.0 && (episodes > 1 || self.seed.is_some()) {
+            return Err(Error::Usage(format!(
+                "--episodes {episodes}: learning.start_jitter is 0, so all episodes are the same; \
+                 set it in the config, or give --start-jitter"
+            )));
+        }
+        Ok(Starts::Drawn { episodes, seed, jitter })
+    }
+}
+
+/// Team j is made of the policies with index j of every leader.
 pub fn run(args: Args) -> Result<(), Error> {
-    let config = args.config.load()?;
+    let outputs = [("--scores", args.scores.as_deref()), ("--trace", args.trace.as_deref())];
+    output::check(&outputs, &[&args.config.path, &args.policies])?;
+    let set = |key: &str, value: Option<toml::Value>| {
+        Some(Override::new(format!("learning.{key}"), value?, format!("--{}", key.replace('_', "-"))))
+    };
+    let overrides = [
+        set("paradigm", args.paradigm.clone().map(toml::Value::from)),
+        set("start_jitter", args.start_jitter.map(toml::Value::from)),
+    ];
+    let config = args.config.load(&overrides.into_iter().flatten().collect::<Vec<_>>())?;
+    let starts = args.starts(config.learning.start_jitter)?;
     let policies = policies::read(&args.policies, &config, args.trial)?;
     let world = World::new(&config);
-    let (mut backend, _) = backend::open(&args.run)?;
-    say(format_args!("playing on {}", backend.describe()));
+    let (mut backend, machine) = backend::open(&args.run)?;
+    if !args.quiet {
+        say(format_args!("playing on {}", backend.describe()));
+    }
     let teams: Vec<u32> =
         (0..policies.policies as u32).flat_map(|policy| std::iter::repeat_n(policy, world.leaders())).collect();
     let group = Group {
@@ -52,87 +108,158 @@ pub fn run(args: Args) -> Result<(), Error> {
         teams: &teams,
     };
 
-    let scores = score(&mut *backend, &group)?;
+    let meter = Mutex::new(Meter::new(args.quiet));
+    let evaluation = evaluate::evaluate(&mut *backend, &group, &starts, &|part| {
+        // Whoever comes while another shows something has nothing newer to tell.
+        if let Ok(mut meter) = meter.try_lock() {
+            let (teams, episodes) = (policies.policies, starts.episodes());
+            meter.show(part, || format!("playing {}", counted(teams, episodes)));
+        }
+    });
+    let mut meter = meter.into_inner().unwrap_or_else(|poisoned| poisoned.into_inner());
+    meter.clear();
+    let evaluation = evaluation?;
     if let Some(path) = &args.scores {
-        write(path, |file| write_scores(file, &scores, world.leaders()))?;
+        output::write(path, |file| write_scores(file, &evaluation))?;
     }
     if let Some(path) = &args.trace {
-        write_trace(path, &mut *backend, &group)?;
+        write_trace(path, &mut *backend, &group, &starts, &mut meter)?;
     }
-    let g = |team: &[[f32; 4]]| f64::from(team[0][0]);
-    let pois = world.pois.len();
-    let all: Vec<f64> = scores.chunks_exact(world.leaders()).map(|team| g(team) * pois as f64).collect();
-    let best = (0..all.len()).fold(0, |best, team| if all[team] > all[best] { team } else { best });
-    let mean = all.iter().sum::<f64>() / all.len() as f64;
-    print(&format!(
-        "{} teams, POIs observed of {pois}: team 0 {:.2}, best {:.2} (team {best}), mean {mean:.2}\n",
-        all.len(),
-        all[0],
-        all[best]
-    ))
+    print(&if args.json { in_json(&evaluation, &starts, &machine) } else { in_words(&evaluation, &starts) })
 }
 
-/// G, D, Df and D++ of every leader of every team, `[teams][leaders]`.
-fn score(backend: &mut dyn Backend, group: &Group<'_>) -> Result<Vec<[f32; 4]>, Error> {
-    thread_local! { static CREDIT: RefCell<Credit> = RefCell::default(); }
-    let leaders = group.world.leaders();
-    let all = Mutex::new(vec![[0.0; 4]; group.teams.len()]);
-    backend.rollout(std::slice::from_ref(group), &|episode| {
-        let scores = CREDIT.with_borrow_mut(|credit| credit.all(&episode, group.world));
-        let mut all = all.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-        for (leader, to) in all[episode.team * leaders..][..leaders].iter_mut().enumerate() {
-            *to = [scores.g, scores.d[leader], scores.df[leader], scores.dpp[leader]];
-        }
-    })?;
-    Ok(all.into_inner().unwrap_or_else(|poisoned| poisoned.into_inner()))
+fn counted(teams: usize, episodes: usize) -> String {
+    match episodes {
+        1 => format!("{teams} teams"),
+        _ => format!("{teams} teams, {episodes} episodes each"),
+    }
+}
+
+fn in_words(evaluation: &Evaluation, starts: &Starts) -> String {
+    let Evaluation { observed, pois, episodes, .. } = evaluation;
+    let best = evaluation.best();
+    let told = [evaluation.team(0), evaluation.team(best), evaluation.mean()];
+    let counted = counted(observed.len(), *episodes);
+    if *episodes == 1 {
+        let [team, most, mean] = told.map(|spread| spread.mean);
+        return format!(
+            "{counted}, POIs observed of {pois}: team 0 {team:.2}, best {most:.2} (team {best}), mean {mean:.2}\n"
+        );
+    }
+    let from = match starts {
+        Starts::Drawn { seed, jitter, .. } => format!(", starts moved by up to {jitter} (seed {seed})"),
+        Starts::Own => String::new(),
+    };
+    let names = ["team 0".into(), format!("best (team {best})"), "mean of all teams".into()];
+    let mut text = format!(
+        "{counted}{from}. POIs observed, of {pois}:\n  {:<20}{:>6}{:>22}   95 % interval of the mean\n",
+        "", "mean", "standard deviation"
+    );
+    for (name, Spread { mean, deviation, interval }) in names.iter().zip(told) {
+        let (deviation, [low, high]) = (deviation.unwrap_or(f64::NAN), interval.unwrap_or([f64::NAN; 2]));
+        text += &format!("  {name:<20}{mean:>6.2}{deviation:>22.2}   {low:.2} to {high:.2}\n");
+    }
+    text
+}
+
+fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> String {
+    let spread = |spread: Spread| {
+        let Spread { mean, deviation, interval } = spread;
+        json!({ "mean": mean, "standard_deviation": deviation, "interval_95": interval })
+    };
+    let best = evaluation.best();
+    let mut object = json!({
+        "teams": evaluation.observed.len(),
+        "leaders": evaluation.leaders,
+        "pois": evaluation.pois,
+        "episodes": evaluation.episodes,
+        "seed": null,
+        "start_jitter": null,
+        "backend": machine.backend,
+        "adapter": machine.adapter,
+        "team_0": spread(evaluation.team(0)),
+        "best": spread(evaluation.team(best)),
+        "mean": spread(evaluation.mean()),
+    });
+    object["best"]["team"] = json!(best);
+    if let Starts::Drawn { seed, jitter, .. } = starts {
+        (object["seed"], object["start_jitter"]) = (json!(seed), json!(jitter));
+    }
+    format!("{object}\n")
 }
 
 /// Floats are printed in the fewest digits that read back to the same bits.
-fn write_scores(file: &mut dyn Write, scores: &[[f32; 4]], leaders: usize) -> io::Result<()> {
-    writeln!(file, "team,leader,g,d,df,dpp")?;
-    for (index, [g, d, df, dpp]) in scores.iter().enumerate() {
-        writeln!(file, "{},{},{g},{d},{df},{dpp}", index / leaders, index % leaders)?;
+fn write_scores(file: &mut dyn Write, evaluation: &Evaluation) -> io::Result<()> {
+    let Evaluation { episodes, leaders, observed, .. } = evaluation;
+    let several = if *episodes > 1 { ",episodes,pois,pois_deviation,pois_low,pois_high" } else { "" };
+    writeln!(file, "team,leader,g,d,df,dpp{several}")?;
+    for team in 0..observed.len() {
+        let several = match evaluation.team(team) {
+            Spread { mean, deviation: Some(deviation), interval: Some([low, high]) } => {
+                format!(",{episodes},{mean},{deviation},{low},{high}")
+            }
+            _ => String::new(),
+        };
+        for leader in 0..*leaders {
+            let [g, d, df, dpp] = evaluation.scores(team, leader);
+            writeln!(file, "{team},{leader},{g},{d},{df},{dpp}{several}")?;
+        }
     }
     Ok(())
 }
 
-fn write_trace(path: &Path, backend: &mut dyn Backend, group: &Group<'_>) -> Result<(), Error> {
+/// A row for every agent at every step of every team, episode after episode.
+fn write_trace(
+    path: &Path,
+    backend: &mut dyn Backend,
+    group: &Group<'_>,
+    starts: &Starts,
+    meter: &mut Meter,
+) -> Result<(), Error> {
     let (leaders, agents, steps) = (group.world.leaders(), group.world.agents(), group.world.steps());
-    let team_bytes = (steps + 1) * agents * size_of::<crate::backend::Moment>() + group.world.set_words() * 4;
+    let team_bytes = (steps + 1) * agents * size_of::<Moment>() + group.world.set_words() * 4;
     let teams = (TRACE_BYTES / team_bytes).max(1);
+    let (whole, episodes) = (group.team_count(), starts.episodes());
     let mut failed = None;
-    write(path, |file| {
-        writeln!(file, "team,step,agent,role,x,y,heading_x,heading_y,speed")?;
-        for (part, chosen) in group.teams.chunks(teams * leaders).enumerate() {
-            let trace = match backend.trace(&Group { teams: chosen, ..*group }) {
-                Ok(trace) => trace,
-                Err(error) => {
-                    failed = Some(error);
-                    return Ok(());
-                }
-            };
-            for team in 0..trace.teams {
-                for step in 0..=steps {
-                    for agent in 0..agents {
-                        let moment = trace.moment(step, team, agent);
-                        let role = if agent < leaders { "leader" } else { "follower" };
-                        let ([x, y], [hx, hy], speed) = (moment.position, moment.heading, moment.speed);
-                        writeln!(file, "{},{step},{agent},{role},{x},{y},{hx},{hy},{speed}", part * teams + team)?;
+    let written = output::write(path, |file| {
+        writeln!(file, "{STATES},{SENSED}{}", if episodes > 1 { ",episode" } else { "" })?;
+        for episode in 0..episodes {
+            let starts = starts.of(episode, group.world);
+            let last = if episodes > 1 { format!(",{episode}") } else { String::new() };
+            for (part, chosen) in group.teams.chunks(teams * leaders).enumerate() {
+                let trace = match backend.trace(&Group { teams: chosen, starts: &starts, ..*group }) {
+                    Ok(trace) => trace,
+                    Err(error) => {
+                        failed = Some(error);
+                        return Err(io::ErrorKind::Other.into());
+                    }
+                };
+                for team in 0..trace.teams {
+                    for step in 0..=steps {
+                        for agent in 0..agents {
+                            let moment = trace.moment(step, team, agent);
+                            let ([x, y], [hx, hy], speed) = (moment.position, moment.heading, moment.speed);
+                            let role = if agent < leaders { "leader" } else { "follower" };
+                            let index = part * teams + team;
+                            write!(file, "{index},{step},{agent},{role},{x},{y},{hx},{hy},{speed}")?;
+                            // What a leader senses in a state moves it on to the next.
+                            let next = (agent < leaders && step < steps).then(|| trace.moment(step + 1, team, agent));
+                            match next {
+                                Some(Moment { inputs, outputs, .. }) => {
+                                    inputs.iter().chain(outputs).try_for_each(|value| write!(file, ",{value}"))?;
+                                }
+                                None => write!(file, ",,,,,,,,,,")?,
+                            }
+                            writeln!(file, "{last}")?;
+                        }
                     }
                 }
+                let done = episode * whole + part * teams + trace.teams;
+                meter.show(done as f64 / (whole * episodes) as f64, || format!("tracing {}", counted(whole, episodes)));
             }
         }
         Ok(())
-    })?;
-    failed.map_or(Ok(()), |error| Err(error.into()))
-}
-
-/// Writes a file in place of any other.
-fn write(path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Error> {
-    let write = || {
-        let mut file = BufWriter::with_capacity(1 << 18, File::create(path)?);
-        content(&mut file)?;
-        file.flush()
-    };
-    write().map_err(|error| crate::record::RecordError::Write { path: path.into(), error }.into())
+    });
+    meter.clear();
+    failed.map_or(written, |error| Err(error.into()))
 }

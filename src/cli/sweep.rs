@@ -1,21 +1,18 @@
 //! `flotilla sweep`: a grid of runs, on one machine or many.
 
 use std::fmt::Write as _;
-use std::io::{self, IsTerminal, Write as _};
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
-
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use serde_json::json;
 
 use super::recovery::{self, Loss, Signals};
-use super::{Error, Overrides, RunOptions, backend, print, say};
+use super::{Error, Overrides, RunOptions, backend, output, print, say};
 use crate::config::{self, ConfigError, Problem};
 use crate::memory;
 use crate::record::RecordError;
-use crate::record::disk::Disk;
-use crate::record::folder::{CONFIG, RUN, Run, Start};
+use crate::record::folder::{CONFIG, RUN, Run, SWEEP, Start};
+use crate::report::progress::Meter;
 use crate::run::{Options, Outcome as Ended};
 use crate::shell;
 use crate::sweep::pictures;
@@ -25,23 +22,19 @@ use crate::sweep::shard::{self, MAX_SHARDS, Shard};
 use crate::sweep::slurm::Job;
 use crate::sweep::{Point, Sweep};
 
-/// The sweep as it was run, in its folder.
-const SWEEP: &str = "sweep.toml";
 const SCALE_OUT: &str = "Many processes (docs/sweeps.md)";
 const RESULTS: &str = "Results";
-/// How often a line is written where there is no terminal to draw on.
-const LINES: Duration = Duration::from_secs(10);
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Sweep file: a config with a section [grid] of lists of values
+    /// Sweep file: a config with a section [grid] of lists of values; - is standard input
     sweep: PathBuf,
     #[command(flatten)]
     overrides: Overrides,
     #[command(flatten)]
     run: RunOptions,
     /// Folder for what comes out, the same for all shards [default: runs/NAME of the sweep]
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Go on with the points in the folder, and start those that are not there
     #[arg(long, conflicts_with = "force")]
@@ -59,7 +52,7 @@ pub struct Args {
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory: Option<f64>,
     /// No progress on standard error
-    #[arg(long)]
+    #[arg(long, short)]
     quiet: bool,
     /// Print what came out as one JSON object (docs/json.md)
     #[arg(long, conflicts_with_all = ["list", "slurm"])]
@@ -86,7 +79,7 @@ pub struct Args {
     #[arg(long, value_name = "N", help_heading = SCALE_OUT)]
     gpus: Option<usize>,
     /// One more option of the batch script: --sbatch=--partition=long; may be given more than once
-    #[arg(long, value_name = "OPTION", allow_hyphen_values = true, value_parser = one_line, help_heading = SCALE_OUT)]
+    #[arg(long, value_name = "OPTION", allow_hyphen_values = true, value_parser = an_option, help_heading = SCALE_OUT)]
     sbatch: Vec<String>,
 
     /// A row of results.csv every N generations, and one for the last
@@ -123,8 +116,8 @@ fn time_limit(text: &str) -> Result<String, String> {
     }
 }
 
-fn one_line(text: &str) -> Result<String, String> {
-    match text.starts_with('-') && !text.contains(['\n', '\r']) {
+fn an_option(text: &str) -> Result<String, String> {
+    match text.starts_with('-') {
         true => Ok(text.into()),
         false => Err("allowed an option of sbatch: --partition=long".into()),
     }
@@ -178,9 +171,13 @@ impl Args {
     }
 }
 
-pub fn run(args: Args) -> Result<(), Error> {
+pub fn run(mut args: Args) -> Result<(), Error> {
     let sweep = Sweep::load(&args.sweep, &args.overrides.list(), args.skip_impossible)?;
     let out = args.out(&sweep);
+    if config::is_standard_input(&args.sweep) {
+        // Whoever goes on with it finds it where it is kept.
+        args.sweep = out.join(SWEEP);
+    }
     let axes = args.picture_axes(&sweep)?;
     if let Some(file) = &args.slurm {
         return write_script(&args, &sweep, &out, file.as_deref());
@@ -502,6 +499,7 @@ fn list(sweep: &Sweep, shards: usize) -> Result<(), Error> {
 }
 
 fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> Result<(), Error> {
+    output::check(&[("--slurm", file)], &[&args.sweep])?;
     let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.into());
     let program = std::env::current_exe().unwrap_or_else(|_| "flotilla".into());
     let out = absolute(out);
@@ -517,59 +515,35 @@ fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> 
         cpus: args.run.threads.map_or(2, usize::from),
         options: &args.sbatch,
     };
+    let script = job.script().map_err(Error::Usage)?;
     // The tasks' logs go there, and Slurm creates no folder.
     claim(sweep, &out)?;
     match file {
-        None => print(&job.script()),
+        None => print(&script),
         Some(path) => {
-            let write = Disk::default().replace(path, |output| output.write_all(job.script().as_bytes()));
-            write.map_err(|error| RecordError::Write { path: path.into(), error })?;
+            output::write(path, |output| output.write_all(script.as_bytes()))?;
             say(format_args!("submit it with: sbatch {}", path.display()));
             Ok(())
         }
     }
 }
 
-/// Shows how the points come on: a bar on a terminal, a line from time to time elsewhere.
-struct Ticker {
-    bar: Option<ProgressBar>,
-    quiet: bool,
-    start: Instant,
-    shown: Instant,
-}
+/// Shows how the points come on.
+struct Ticker(Meter);
 
 impl Ticker {
     fn new(quiet: bool) -> Ticker {
-        let bar = (!quiet && io::stderr().is_terminal()).then(|| {
-            let style = ProgressStyle::with_template("{bar:24} {percent}%  {msg}  {eta} left");
-            let style = style.unwrap_or_else(|_| ProgressStyle::default_bar());
-            ProgressBar::with_draw_target(Some(1000), ProgressDrawTarget::stderr()).with_style(style)
-        });
-        Ticker { bar, quiet, start: Instant::now(), shown: Instant::now() }
+        Ticker(Meter::new(quiet))
     }
 
     fn tick(&mut self, progress: &Progress) {
         let Progress { done, points, batch, generation, last, played, total } = *progress;
-        let part = played as f64 / total.max(1) as f64;
-        let told =
-            format!("{done}/{points} points done, {batch} side by side at generation {}/{last}", generation.min(last));
-        match &self.bar {
-            Some(bar) => {
-                bar.set_position((part * 1000.0) as u64);
-                bar.set_message(told);
-            }
-            None if !self.quiet && self.shown.elapsed() >= LINES => {
-                let left = self.start.elapsed().as_secs_f64() * (1.0 - part) / part.max(1e-9);
-                say(format_args!("{told}, {:.0} %, {left:.0} s left", part * 100.0));
-                self.shown = Instant::now();
-            }
-            None => {}
-        }
+        self.0.show(played as f64 / total.max(1) as f64, || {
+            format!("{done}/{points} points done, {batch} side by side at generation {}/{last}", generation.min(last))
+        });
     }
 
     fn clear(&self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
+        self.0.clear();
     }
 }

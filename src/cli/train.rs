@@ -33,8 +33,9 @@ pub struct Args {
     config: ConfigArgs,
     #[command(flatten)]
     run: RunOptions,
-    /// Folder for what comes out [default: runs/NAME of the config, or the next free runs/NAME-2, …]
-    #[arg(long, value_name = "DIR")]
+    /// Folder for what comes out [default: runs/NAME of the config (runs/config of standard input), or the next free
+    /// runs/NAME-2, …]
+    #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Go on with the run in the folder (without --out the latest of this config's name), or start it if there is none
     #[arg(long, conflicts_with = "force")]
@@ -43,7 +44,7 @@ pub struct Args {
     #[arg(long)]
     force: bool,
     /// No progress on standard error
-    #[arg(long)]
+    #[arg(long, short)]
     quiet: bool,
     /// Print what came out as one JSON object (docs/json.md)
     #[arg(long)]

@@ -2,19 +2,20 @@
 
 use std::path::PathBuf;
 
-use indicatif::{ProgressBar, ProgressStyle};
+use serde_json::json;
 
 use super::{Error, print};
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu::device::{self, AdapterInfo, Choice, DeviceError, Request};
 use crate::backend::gpu::episode::{GpuEpisodes, Holding};
 use crate::backend::gpu::exact::Pass;
-use crate::config::Config;
+use crate::config::{self, Config};
+use crate::report::progress::Meter;
 use crate::verify::{Outcome, Plan, compare};
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Compare this experiment alone, instead of random worlds of every kind
+    /// Compare this experiment alone (- is standard input), instead of random worlds of every kind
     config: Option<PathBuf>,
     /// Random teams of each world
     #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u32).range(1..=65_536))]
@@ -31,6 +32,12 @@ pub struct Args {
     /// Only this pass, instead of all exact ones that the adapter takes; `plain` shows what the passes are for
     #[arg(long, value_name = "PASS", value_parser = ["no-contraction", "guarded", "plain"])]
     pass: Option<String>,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+    /// No progress on standard error
+    #[arg(long, short)]
+    quiet: bool,
 }
 
 /// One line of the table; an error of the device counts as a failure.
@@ -41,8 +48,17 @@ struct Line {
 }
 
 impl Line {
-    fn failed(&self) -> bool {
-        !matches!(&self.result, Ok(Outcome { mismatch: None, .. }))
+    /// What differs, or went wrong.
+    fn failure(&self) -> Option<String> {
+        match &self.result {
+            Ok(outcome) => outcome.mismatch.clone(),
+            Err(error) => Some(error.to_string()),
+        }
+    }
+
+    /// Worlds and agent-steps compared.
+    fn compared(&self) -> (usize, u64) {
+        self.result.as_ref().map_or((0, 0), |outcome| (outcome.worlds, outcome.agent_steps))
     }
 }
 
@@ -54,25 +70,11 @@ pub fn run(args: Args) -> Result<(), Error> {
     for (choice, info) in adapters {
         for pass in passes(args.pass.as_deref(), &info) {
             let request = Request { pass: Some(pass), ..choice.clone().into() };
-            lines.push(Line { adapter: info.to_string(), pass, result: verify(&plan, request, &info) });
+            lines.push(Line { adapter: info.to_string(), pass, result: verify(&plan, request, &info, args.quiet) });
         }
     }
-    let mut text = format!("{:<15} {:>7} {:>13} {:<10} adapter\n", "pass", "worlds", "agent-steps", "result");
-    for line in &lines {
-        let (worlds, agent_steps) =
-            line.result.as_ref().map_or((0, 0), |outcome| (outcome.worlds, outcome.agent_steps));
-        let result = if line.failed() { "DIFFERENT" } else { "equal" };
-        text += &format!("{:<15} {worlds:>7} {agent_steps:>13} {result:<10} {}\n", line.pass, line.adapter);
-    }
-    for line in lines.iter().filter(|line| line.failed()) {
-        let what = match &line.result {
-            Ok(outcome) => outcome.mismatch.clone().unwrap_or_default(),
-            Err(error) => error.to_string(),
-        };
-        text += &format!("\n{}, {} pass:\n  {what}\n", line.adapter, line.pass);
-    }
-    print(&text)?;
-    match lines.iter().filter(|line| line.failed()).count() {
+    print(&if args.json { in_json(&lines) } else { in_words(&lines) })?;
+    match lines.iter().filter(|line| line.failure().is_some()).count() {
         0 => Ok(()),
         failed => Err(Error::Different(format!(
             "{failed} of {} comparisons found other bits than the CPU's; until that is mended, use --backend cpu",
@@ -81,12 +83,44 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
 }
 
+/// A table, and below it what differs.
+fn in_words(lines: &[Line]) -> String {
+    let mut text = format!("{:<15} {:>7} {:>13} {:<10} adapter\n", "pass", "worlds", "agent-steps", "result");
+    let mut failures = String::new();
+    for line in lines {
+        let Line { adapter, pass, .. } = line;
+        let (worlds, agent_steps) = line.compared();
+        let failure = line.failure();
+        let result = if failure.is_some() { "DIFFERENT" } else { "equal" };
+        text += &format!("{pass:<15} {worlds:>7} {agent_steps:>13} {result:<10} {adapter}\n");
+        failures.extend(failure.map(|what| format!("\n{adapter}, {pass} pass:\n  {what}\n")));
+    }
+    text + &failures
+}
+
+fn in_json(lines: &[Line]) -> String {
+    let comparison = |line: &Line| {
+        let ((worlds, agent_steps), failure) = (line.compared(), line.failure());
+        json!({
+            "adapter": line.adapter,
+            "pass": line.pass.to_string(),
+            "worlds": worlds,
+            "agent_steps": agent_steps,
+            "equal": failure.is_none(),
+            "failure": failure,
+        })
+    };
+    let equal = lines.iter().all(|line| line.failure().is_none());
+    let comparisons: Vec<_> = lines.iter().map(comparison).collect();
+    format!("{}\n", json!({ "equal": equal, "comparisons": comparisons }))
+}
+
 fn plan(args: &Args) -> Result<Plan, Error> {
     let (seed, teams) = (u64::from(args.seed), args.teams as usize);
     Ok(match &args.config {
         None => Plan::random(seed..seed + u64::from(args.worlds), teams),
         Some(path) => {
-            let worlds = vec![(path.display().to_string(), Config::load(path)?)];
+            let worlds = vec![(config::name(path), Config::load(path)?)];
             Plan { worlds, teams, seed, generations: 5 }
         }
     })
@@ -116,18 +150,18 @@ fn passes(name: Option<&str>, info: &AdapterInfo) -> Vec<Pass> {
     }
 }
 
-fn verify(plan: &Plan, request: Request, info: &AdapterInfo) -> Result<Outcome, Error> {
+fn verify(plan: &Plan, request: Request, info: &AdapterInfo, quiet: bool) -> Result<Outcome, Error> {
     let pass = request.pass.map_or_else(String::new, |pass| format!(", {pass} pass"));
-    let bar = ProgressBar::new(plan.worlds.len() as u64).with_message(format!("{}{pass}", info.name));
-    bar.set_style(
-        ProgressStyle::with_template("{msg}: {pos}/{len} worlds {wide_bar} {eta}").expect("a valid template"),
-    );
+    let mut meter = Meter::new(quiet);
     let gpu = device::open(request)?;
     if let Some(mismatch) = gpu.self_test()? {
         return Ok(Outcome { mismatch: Some(mismatch.to_string()), ..Outcome::default() });
     }
     let mut gpu = GpuEpisodes::new(gpu)?.holding(Holding::Always);
-    let outcome = compare(plan, &mut Cpu::default(), &mut gpu, |outcome| bar.set_position(outcome.worlds as u64))?;
-    bar.finish_and_clear();
-    Ok(outcome)
+    let compared = compare(plan, &mut Cpu::default(), &mut gpu, |outcome| {
+        let (done, all) = (outcome.worlds, plan.worlds.len());
+        meter.show(done as f64 / all as f64, || format!("{}{pass}: {done} of {all} worlds", info.name));
+    });
+    meter.clear();
+    Ok(compared?)
 }

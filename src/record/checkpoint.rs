@@ -7,7 +7,7 @@
 //! the order that their fitness tells.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File};
+use std::fs;
 use std::io::{Read, Seek};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -24,6 +24,7 @@ use super::tensors::{self, Tensor, TensorFile};
 use super::{RecordError, hex};
 use crate::config::{self, Config};
 use crate::evolve;
+use crate::file;
 
 const KIND: &str = "checkpoint 1";
 /// Tensors, of all trials together.
@@ -266,7 +267,7 @@ pub fn path(folder: &Path, generation: usize) -> PathBuf {
 /// # Errors
 /// It cannot be read, or is damaged.
 pub fn read(path: &Path, policies: &Path, config: &Config) -> Result<Option<Checkpoint>, RecordError> {
-    let file = File::open(path).map_err(RecordError::read(path))?;
+    let file = file::open(path).map_err(RecordError::read(path))?;
     let mut found = Checkpoint::read(file, config).map_err(|reason| RecordError::damaged(path, reason))?;
     let whole = !found.snapshot.weights.is_empty() || found.complete(policies, config);
     Ok(whole.then_some(found))

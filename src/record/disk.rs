@@ -6,6 +6,8 @@ use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use crate::file;
+
 /// One thing done to a disk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Operation {
@@ -40,7 +42,12 @@ impl Disk {
     /// Creates a folder and those above it.
     pub fn create_folder(&self, path: &Path) -> io::Result<()> {
         self.pass(Operation::CreateFolder, path)?;
-        fs::create_dir_all(path)
+        fs::create_dir_all(path).map_err(|error| match error.kind() {
+            kind @ (io::ErrorKind::AlreadyExists | io::ErrorKind::NotADirectory) => {
+                io::Error::new(kind, "a file stands where a folder is needed; choose another name")
+            }
+            _ => error,
+        })
     }
 
     /// A new file in the place of any other; a link that stands there is replaced, never followed.
@@ -78,11 +85,48 @@ impl Disk {
         })
     }
 
+    /// Writes a file that the user named, whole or not at all; a link to a file is followed. What is no file (a device, a
+    /// pipe, `/dev/stdout`) is written to as it stands.
+    pub fn deliver(&self, path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
+        let there = fs::metadata(path);
+        if there.as_ref().is_ok_and(|there| !there.is_file() && !there.is_dir()) {
+            let mut output = BufWriter::new(OpenOptions::new().write(true).open(path)?);
+            content(&mut output)?;
+            return output.flush();
+        }
+        if there.is_ok() {
+            // A file that may not be written is not replaced either.
+            OpenOptions::new().write(true).open(path)?;
+        }
+        let path = &file::resolved(path);
+        self.pass(Operation::Create, path)?;
+        // A name that nobody has: beside the user's own files none can be taken for a leftover.
+        let mut builder = tempfile::Builder::new();
+        #[cfg(unix)]
+        builder.permissions(match &there {
+            Ok(there) => there.permissions(),
+            Err(_) => std::os::unix::fs::PermissionsExt::from_mode(0o666),
+        });
+        let temporary = builder.prefix(".flotilla-").suffix(".tmp").tempfile_in(file::folder(path));
+        let temporary = temporary.map_err(|error| match error.get_ref() {
+            // Without the temporary's path, which is nobody's business.
+            Some(_) => error.kind().into(),
+            None => error,
+        })?;
+        let mut output = BufWriter::with_capacity(1 << 20, temporary);
+        content(&mut output)?;
+        let temporary = output.into_inner().map_err(|error| error.into_error())?;
+        temporary.as_file().sync_all()?;
+        self.pass(Operation::Rename, path)?;
+        temporary.persist(path).map_err(|error| error.error)?;
+        self.sync_folder(file::folder(path))
+    }
+
     /// Renames within a folder, for good.
     pub fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
         self.pass(Operation::Rename, to)?;
         fs::rename(from, to)?;
-        self.sync_folder(to.parent().unwrap_or(Path::new(".")))
+        self.sync_folder(file::folder(to))
     }
 
     /// Removes a file, if it is there.

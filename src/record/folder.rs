@@ -14,12 +14,17 @@ use super::disk::Disk;
 use super::metrics::{self, Row};
 use super::{RecordError, hex, policies, read_text};
 use crate::config::Config;
+use crate::file;
 
 pub const CONFIG: &str = "config.toml";
 pub const RUN: &str = "run.json";
 pub const METRICS: &str = "metrics.csv";
 pub const POLICIES: &str = "policies.safetensors";
 pub const CHECKPOINTS: &str = "checkpoints";
+/// In a sweep's folder: the sweep as it was run, and its tables.
+pub const SWEEP: &str = "sweep.toml";
+pub const RESULTS: &str = "results.csv";
+pub const POINTS: &str = "points.csv";
 /// Locked by whoever trains in the folder. The lock is the system's: it goes with the process, however that ends.
 const LOCK: &str = ".lock";
 /// Pictures made of a run, gone with it.
@@ -193,13 +198,13 @@ impl Folder {
         if path.is_file() {
             return Err(RecordError::NoFolder { path: path.into() });
         }
-        if start == Start::Fresh && holds_run(path) {
+        if start == Start::Fresh && holds_run(path)? {
             return Err(RecordError::Exists { path: path.into() });
         }
         disk.create_folder(path).map_err(RecordError::write(path))?;
         let lock = lock(path)?;
         // Only now is nobody else writing here.
-        if start == Start::Fresh && holds_run(path) {
+        if start == Start::Fresh && holds_run(path)? {
             return Err(RecordError::Exists { path: path.into() });
         }
         disk.create_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
@@ -382,8 +387,17 @@ impl Folder {
 }
 
 /// Whether a folder holds anything of a run.
-pub fn holds_run(path: &Path) -> bool {
-    [CONFIG, RUN, METRICS, POLICIES, CHECKPOINTS].iter().any(|name| path.join(name).exists())
+///
+/// # Errors
+/// The folder cannot be looked into.
+pub fn holds_run(path: &Path) -> Result<bool, RecordError> {
+    for name in [CONFIG, RUN, METRICS, POLICIES, CHECKPOINTS] {
+        let name = path.join(name);
+        if file::exists(&name).map_err(RecordError::read(&name))? {
+            return Ok(true);
+        }
+    }
+    Ok(false)
 }
 
 impl Drop for Folder {
@@ -398,6 +412,9 @@ impl Drop for Folder {
 /// Locks a folder for this process; none where the file system has no locks.
 fn lock(path: &Path) -> Result<Option<File>, RecordError> {
     let name = path.join(LOCK);
+    if fs::metadata(&name).is_ok_and(|there| !there.is_file()) {
+        return Err(RecordError::damaged(&name, "it is no file, as a lock has to be; remove it"));
+    }
     let file =
         OpenOptions::new().create(true).truncate(false).write(true).open(&name).map_err(RecordError::write(&name))?;
     match file.try_lock() {
@@ -405,6 +422,22 @@ fn lock(path: &Path) -> Result<Option<File>, RecordError> {
         Err(TryLockError::WouldBlock) => Err(RecordError::Locked { path: path.into() }),
         Err(TryLockError::Error(error)) if error.kind() == ErrorKind::Unsupported => Ok(None),
         Err(TryLockError::Error(error)) => Err(RecordError::write(&name)(error)),
+    }
+}
+
+/// The folder of the run or sweep that a file is needed by, if it is one of theirs; pictures are not needed.
+pub fn owner(path: &Path) -> Option<PathBuf> {
+    let path = file::resolved(path);
+    let (folder, name) = (file::folder(&path), path.file_name()?.to_str()?);
+    let has = |folder: &Path, names: &[&str]| names.iter().any(|name| folder.join(name).exists());
+    let is_run = |folder: &Path| has(folder, &[CONFIG]) && has(folder, &[RUN, METRICS, CHECKPOINTS]);
+    let of_run = [CONFIG, RUN, METRICS, POLICIES, LOCK].contains(&name) && is_run(folder);
+    let of_sweep = [SWEEP, RESULTS, POINTS].contains(&name) && has(folder, &[SWEEP]);
+    let checkpoint = folder.ends_with(CHECKPOINTS) && is_run(file::folder(folder));
+    match (of_run || of_sweep, checkpoint) {
+        (true, _) => Some(folder.into()),
+        (_, true) => Some(file::folder(folder).into()),
+        _ => None,
     }
 }
 

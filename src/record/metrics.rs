@@ -13,6 +13,7 @@ use sha2::{Digest, Sha256};
 use super::disk::{Disk, Output};
 use super::{RecordError, hex};
 use crate::config::{MAX_GENERATIONS, MAX_TRIALS};
+use crate::file;
 
 pub const HEADER: &str = "trial,generation,best_g,mean_g,champion_g,seconds";
 /// Most bytes in one line.
@@ -58,7 +59,7 @@ impl Writer {
     /// Goes on from a mark, dropping what was written after it; none where the file no longer is what was marked.
     pub fn resume(disk: &Disk, path: &Path, mark: &Mark) -> io::Result<Option<Writer>> {
         let mut hash = Sha256::new();
-        let mut file = match File::open(path) {
+        let mut file = match file::open(path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
             file => file?.take(mark.bytes),
         };
@@ -204,6 +205,6 @@ impl<R: BufRead> Iterator for Rows<R> {
 /// # Errors
 /// No such file, or another first line.
 pub fn open(path: &Path) -> Result<Rows<BufReader<File>>, RecordError> {
-    let file = File::open(path).map_err(RecordError::read(path))?;
+    let file = file::open(path).map_err(RecordError::read(path))?;
     Rows::new(BufReader::new(file)).map_err(|reason| RecordError::damaged(path, reason))
 }

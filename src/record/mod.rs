@@ -13,9 +13,10 @@
 //! before it is used, and nothing in it names another file.
 
 use std::fmt::Display;
-use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
+
+use crate::file;
 
 pub mod checkpoint;
 pub mod disk;
@@ -27,13 +28,17 @@ pub mod tensors;
 /// Why a run's files could not be written, read or used.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    #[error("{path}: cannot be written: {error}{}", remedy(error))]
+    /// What to do about it depends on the command.
+    #[error("{path}: cannot be written: {error}")]
     Write { path: PathBuf, error: io::Error },
     #[error("{path}: cannot be read: {error}")]
     Read { path: PathBuf, error: io::Error },
     /// The file is not what it should be; `reason` says in what.
     #[error("{path}: {reason}")]
     Damaged { path: PathBuf, reason: String },
+    /// Policies of a trial that the file does not have.
+    #[error("{path}: {reason}")]
+    NoTrial { path: PathBuf, reason: String },
     #[error("{path} holds a run already; go on with it by --resume, write over it by --force, or choose another --out")]
     Exists { path: PathBuf },
     #[error("{path} is a file; choose a folder by --out")]
@@ -67,19 +72,10 @@ impl RecordError {
     }
 }
 
-/// What to do about a failed write.
-fn remedy(error: &io::Error) -> &'static str {
-    match error.kind() {
-        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => "; free some space, then go on with --resume",
-        io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem => "; choose a folder you may write to",
-        _ => "",
-    }
-}
-
 /// A small text file, refused where it is larger than `most` bytes.
 fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
     let mut bytes = Vec::new();
-    let file = File::open(path).map_err(RecordError::read(path))?;
+    let file = file::open(path).map_err(RecordError::read(path))?;
     file.take(most + 1).read_to_end(&mut bytes).map_err(RecordError::read(path))?;
     if bytes.len() as u64 > most {
         return Err(RecordError::damaged(

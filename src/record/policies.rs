@@ -16,6 +16,7 @@ use super::checkpoint;
 use super::disk::Disk;
 use super::tensors::{self, Tensor, TensorFile};
 use crate::config::{Config, MAX_POPULATION};
+use crate::escape;
 use crate::evolve::{MAX_WEIGHT, MIN_WEIGHT};
 use crate::world::{INPUTS, OUTPUTS};
 
@@ -30,6 +31,11 @@ pub struct Policies {
     pub policies: usize,
     /// `[leaders][policies][parameters]`.
     pub weights: Vec<f32>,
+}
+
+/// What the tensor of a trial is called.
+fn tensor(trial: usize) -> String {
+    format!("weights.{trial}")
 }
 
 /// Widths of a config's policies, "8,10,2".
@@ -57,7 +63,12 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
 /// No such file, damage, another shape than the config's, or weights that no policy may have.
 pub fn read(path: &Path, config: &Config, trial: Option<usize>) -> Result<Policies, RecordError> {
     let mut file = tensors::open(path)?;
-    from_file(&mut file, config, trial).map_err(|reason| RecordError::damaged(path, reason))
+    from_file(&mut file, config, trial).map_err(|reason| match trial {
+        Some(trial) if file.kind().is_none_or(|kind| kind == KIND) && file.info(&tensor(trial)).is_none() => {
+            RecordError::NoTrial { path: path.into(), reason }
+        }
+        _ => RecordError::damaged(path, reason),
+    })
 }
 
 /// [`read`] of all trials of a config.
@@ -95,12 +106,13 @@ pub fn from_file(
     }
     let name = match trial {
         None if file.info("weights").is_some() => "weights".to_string(),
-        trial => format!("weights.{}", trial.unwrap_or(0)),
+        trial => tensor(trial.unwrap_or(0)),
     };
     let Some(info) = file.info(&name) else {
         let mut names = file.names();
         let more = if names.len() > 8 { ", …" } else { "" };
         names.truncate(8);
+        names.iter_mut().for_each(|name| *name = escape::line(name).into());
         return Err(format!("it has no tensor {name}; it has {}{more}", names.join(", ")));
     };
     let (leaders, parameters) = (config.learners(), config.parameters());

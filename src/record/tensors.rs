@@ -14,6 +14,7 @@ use sha2::{Digest, Sha256};
 
 use super::disk::Disk;
 use super::{RecordError, hex};
+use crate::file;
 
 /// Most bytes in the header of a file.
 pub const MAX_HEADER_BYTES: u64 = 1 << 20;
@@ -200,6 +201,6 @@ impl<R: Read + Seek> TensorFile<R> {
 /// # Errors
 /// No such file, or what is wrong with it.
 pub fn open(path: &Path) -> Result<TensorFile<std::fs::File>, RecordError> {
-    let file = std::fs::File::open(path).map_err(RecordError::read(path))?;
+    let file = file::open(path).map_err(RecordError::read(path))?;
     TensorFile::open(file).map_err(|reason| RecordError::damaged(path, reason))
 }

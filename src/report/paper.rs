@@ -12,7 +12,8 @@ pub struct Layout {
     pub name: &'static str,
     /// The paper's figure with its results.
     pub figure: usize,
-    config: &'static str,
+    /// The text of its config file.
+    pub config: &'static str,
 }
 
 /// The paper's layouts, in its order.

@@ -1,4 +1,5 @@
-//! How training comes on: every arm's curve as it grows on a terminal, a line from time to time elsewhere.
+//! How work comes on: on a terminal a bar, or of training every arm's curve as it grows; elsewhere a line from time to
+//! time.
 
 use std::io::{self, IsTerminal, Write};
 use std::time::{Duration, Instant};
@@ -14,16 +15,101 @@ const MOST: usize = 24;
 /// How often a line is written where there is no terminal, and how often a terminal changes.
 const LINES: Duration = Duration::from_secs(10);
 const DRAWS: Duration = Duration::from_millis(100);
+/// What a bar's length is divided into.
+const PARTS: u64 = 1000;
+
+/// How progress is shown, and when the next time.
+struct Pace {
+    quiet: bool,
+    terminal: bool,
+    since: Instant,
+    shown: Instant,
+    pause: Duration,
+}
+
+impl Pace {
+    fn new(quiet: bool) -> Pace {
+        let terminal = !quiet && is_capable(io::stderr().is_terminal(), std::env::var("TERM").ok().as_deref());
+        let now = Instant::now();
+        Pace { quiet, terminal, since: now, shown: now, pause: if terminal { DRAWS } else { LINES } }
+    }
+
+    /// Whether it is time to show something, as is then done.
+    fn is_due(&mut self) -> bool {
+        let due = !self.quiet && self.shown.elapsed() >= self.pause;
+        if due {
+            self.shown = Instant::now();
+        }
+        due
+    }
+
+    fn seconds(&self) -> f64 {
+        self.since.elapsed().as_secs_f64().max(1e-9)
+    }
+}
+
+/// Whether what was drawn can be drawn over, on a terminal of this name.
+fn is_capable(terminal: bool, name: Option<&str>) -> bool {
+    terminal && name.map_or(cfg!(windows), |name| name != "dumb")
+}
+
+/// Writes a line; with standard error gone there is nobody left to tell.
+fn line(to: &mut dyn Write, text: &str) {
+    let _ = writeln!(to, "{text}");
+}
+
+/// Shows on standard error how much of one thing is done.
+pub struct Meter {
+    pace: Pace,
+    bar: Option<ProgressBar>,
+    lines: Box<dyn Write + Send>,
+}
+
+impl Meter {
+    /// A meter that starts now, and never shows anything where `quiet`.
+    pub fn new(quiet: bool) -> Meter {
+        let pace = Pace::new(quiet);
+        let bar = pace.terminal.then(|| {
+            let style = ProgressStyle::with_template("{bar:24} {percent}%  {msg}  {eta} left");
+            let style = style.unwrap_or_else(|_| ProgressStyle::default_bar());
+            ProgressBar::with_draw_target(Some(PARTS), ProgressDrawTarget::stderr()).with_style(style)
+        });
+        Meter { pace, bar, lines: Box::new(io::stderr()) }
+    }
+
+    /// So much is done, of a whole of 1; `told` says what is under way.
+    pub fn show(&mut self, part: f64, told: impl FnOnce() -> String) {
+        if !self.pace.is_due() {
+            return;
+        }
+        match &self.bar {
+            Some(bar) => {
+                bar.set_message(told());
+                bar.set_position((part * PARTS as f64) as u64);
+            }
+            None => {
+                let left = self.pace.seconds() * (1.0 - part) / part.max(1e-9);
+                let left = if part > 0.0 { format!(", {left:.0} s left") } else { String::new() };
+                line(&mut self.lines, &format!("{}, {:.0} %{left}", told(), part * 100.0));
+            }
+        }
+    }
+
+    /// Clears the terminal for what follows.
+    pub fn clear(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
 
 /// Shows on standard error how arms train side by side.
 pub struct Progress {
     arms: Vec<Growing>,
     last: usize,
-    /// Where this session started, and when.
+    /// Where this session started.
     from: usize,
-    since: Instant,
-    shown: Instant,
-    quiet: bool,
+    pace: Pace,
     terminal: Option<Terminal>,
 }
 
@@ -92,27 +178,22 @@ impl Progress {
             .into_iter()
             .map(|(name, pois)| Growing { name, pois, parts: parts.clone(), newest: Newest::default() })
             .collect();
-        let terminal = (!quiet && io::stderr().is_terminal()).then(|| Terminal::new(&arms, from, last));
-        let now = Instant::now();
-        Progress { arms, last, from, since: now, shown: now, quiet, terminal }
+        let pace = Pace::new(quiet);
+        let terminal = pace.terminal.then(|| Terminal::new(&arms, from, last));
+        Progress { arms, last, from, pace, terminal }
     }
 
     /// Takes in the rows that became complete; `next` is the generation that plays next.
     pub fn show(&mut self, next: usize, rows: &[Row]) {
-        if self.quiet {
-            return;
-        }
         for row in rows {
             if let Some(arm) = self.arms.get_mut(row.arm) {
                 arm.add(row, self.last);
             }
         }
-        let pause = if self.terminal.is_some() { DRAWS } else { LINES };
-        if self.shown.elapsed() < pause {
+        if !self.pace.is_due() {
             return;
         }
-        self.shown = Instant::now();
-        let rate = (next - self.from.min(next)) as f64 / self.since.elapsed().as_secs_f64().max(1e-9);
+        let rate = (next - self.from.min(next)) as f64 / self.pace.seconds();
         match &self.terminal {
             Some(terminal) => {
                 terminal.generation.set_position(next.min(self.last) as u64);
@@ -127,14 +208,10 @@ impl Progress {
                     [arm] => vec![arm.value(true)],
                     arms => vec![format!("{} experiments", arms.len())],
                 };
-                // With standard error gone there is nobody left to tell.
-                let _ = writeln!(
-                    io::stderr(),
-                    "generation {}/{}  {}  {rate:.1} generations/s  {left:.0} s left",
-                    next.saturating_sub(1).min(self.last),
-                    self.last,
-                    values.concat()
-                );
+                let (generation, last, values) = (next.saturating_sub(1).min(self.last), self.last, values.concat());
+                let text =
+                    format!("generation {generation}/{last}  {values}  {rate:.1} generations/s  {left:.0} s left");
+                line(&mut io::stderr(), &text);
             }
         }
     }
@@ -161,5 +238,56 @@ impl Terminal {
         let generation = all.add(ProgressBar::new(last as u64));
         generation.set_style(style("{bar:32} generation {pos}/{len}  {msg}  {eta} left"));
         Terminal { curves, generation: generation.with_position(from as u64), all }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc;
+
+    use super::*;
+
+    #[test]
+    fn bars_are_for_terminals_that_can_draw_over_them() {
+        assert!(is_capable(true, Some("xterm-256color")));
+        assert!(!is_capable(true, Some("dumb")));
+        assert!(!is_capable(false, Some("xterm")));
+        assert_eq!(is_capable(true, None), cfg!(windows));
+    }
+
+    /// Sends what is written in pieces.
+    struct Sent(mpsc::Sender<String>);
+
+    impl Write for Sent {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.0.send(String::from_utf8_lossy(bytes).into_owned()).map_err(io::Error::other)?;
+            Ok(bytes.len())
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn elsewhere_a_line_is_written_now_and_then() {
+        let (sender, lines) = mpsc::channel();
+        let pause = Duration::from_millis(50);
+        let meter = |quiet| {
+            let now = Instant::now();
+            let pace = Pace { quiet, terminal: false, since: now, shown: now, pause };
+            Meter { pace, bar: None, lines: Box::new(Sent(sender.clone())) }
+        };
+        let (mut meter, mut quiet) = (meter(false), meter(true));
+        let shown = || lines.try_iter().collect::<String>();
+        meter.show(0.1, || panic!("too soon for words"));
+        std::thread::sleep(pause);
+        meter.show(0.0, || "1 of 4 worlds".into());
+        assert_eq!(shown(), "1 of 4 worlds, 0 %\n");
+        std::thread::sleep(pause);
+        meter.show(1.0, || "4 of 4 worlds".into());
+        meter.show(1.0, || panic!("too soon again"));
+        quiet.show(0.5, || panic!("never"));
+        assert_eq!(shown(), "4 of 4 worlds, 100 %, 0 s left\n");
     }
 }

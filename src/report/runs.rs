@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use super::curves::{Curve, Figure, Panel, Tally};
 use crate::config::{Config, ConfigError};
+use crate::file;
 use crate::record::RecordError;
 use crate::record::folder::{CONFIG, METRICS};
 use crate::record::metrics::{self, RowsError};
@@ -44,10 +45,15 @@ pub fn config(folder: &Path) -> Result<Config, RunError> {
         return Err(RunError::NoFolder(folder.into()));
     }
     let path = folder.join(CONFIG);
-    if !path.exists() {
+    if !seen(&path)? {
         return Err(RunError::Foreign { folder: folder.into(), name: CONFIG });
     }
     Config::load(&path).map_err(|error| RunError::Config { folder: folder.into(), error })
+}
+
+/// Whether a file is there; an error where that cannot be seen.
+fn seen(path: &Path) -> Result<bool, RecordError> {
+    file::exists(path).map_err(|error| RecordError::Read { path: path.into(), error })
 }
 
 /// A run's metrics, row by row as far as they are whole; what is cut off at the end is still being written.
@@ -57,7 +63,7 @@ pub fn config(folder: &Path) -> Result<Config, RunError> {
 pub fn metrics(folder: &Path, config: &Config, mut each: impl FnMut(&metrics::Row)) -> Result<(), RunError> {
     let path = folder.join(METRICS);
     let unfinished = |reason: String| RunError::Unfinished { folder: folder.into(), reason };
-    if !path.exists() {
+    if !seen(&path)? {
         return Err(unfinished(format!("it has no {METRICS} yet")));
     }
     let damaged = |reason: String| RunError::Record(RecordError::Damaged { path: path.clone(), reason });

@@ -19,7 +19,8 @@ use std::path::Path;
 use toml::de::{DeTable, DeValue};
 use toml::{Spanned, Table, Value};
 
-use crate::config::{Config, ConfigError, Override, Problem, read_file};
+use crate::config::{self, Config, ConfigError, GRID, Override, Problem, read_file};
+use crate::escape;
 
 pub mod layout;
 pub mod pictures;
@@ -28,8 +29,6 @@ pub mod run;
 pub mod shard;
 pub mod slurm;
 
-/// The section of a sweep file that is not a config's.
-const GRID: &str = "grid";
 /// The key of `[grid]` that is no axis.
 const SKIP: &str = "skip_impossible";
 /// Most points in a sweep.
@@ -90,7 +89,11 @@ impl Sweep {
     /// # Errors
     /// A file that cannot be read, or everything that is wrong with it and with any of its points.
     pub fn load(path: &Path, flags: &[Override], skip: bool) -> Result<Sweep, ConfigError> {
-        Sweep::read(&read_file(path)?, &path.display().to_string(), flags, skip)
+        let mut sweep = Sweep::read(&read_file(path)?, &config::name(path), flags, skip)?;
+        if config::is_standard_input(path) {
+            sweep.name = "sweep".into();
+        }
+        Ok(sweep)
     }
 
     /// Reads a sweep from its text; `name` stands for the file in errors.
@@ -157,11 +160,11 @@ struct Tried {
 fn describe<'a>(axes: impl Iterator<Item = &'a Axis>, values: &[usize]) -> String {
     let pairs: Vec<_> =
         axes.zip(values).map(|(axis, &value)| format!("{} = {}", axis.key, axis.label(value))).collect();
-    pairs.join(", ")
+    escape::line(&pairs.join(", ")).into()
 }
 
 fn problem(line: Option<usize>, key: &str, message: impl Into<String>) -> Problem {
-    Problem { line, key: key.into(), message: message.into() }
+    Problem { line, key: escape::line(key).into(), message: escape::line(&message.into()).into() }
 }
 
 fn invalid(name: &str, mut problems: Vec<Problem>) -> ConfigError {

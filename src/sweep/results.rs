@@ -5,8 +5,10 @@ use std::path::{Path, PathBuf};
 
 use super::{Point, Sweep};
 use crate::config::Config;
+use crate::file;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
+use crate::record::folder::{CONFIG, METRICS, POINTS, RESULTS};
 use crate::record::metrics::{self, Row};
 
 /// What [`write()`] makes of the points that are complete.
@@ -72,7 +74,7 @@ pub enum Missing {
 pub fn write(sweep: &Sweep, out: &Path, options: &Options) -> Result<Vec<Result<Outcome, Missing>>, RecordError> {
     let disk = Disk::default();
     let mut outcomes = Vec::new();
-    let path = out.join("results.csv");
+    let path = out.join(RESULTS);
     let rows = |output: &mut dyn Write| {
         let mut table = csv::Writer::from_writer(output);
         let columns = ["point", "trial", "generation", "best_g", "mean_g", "champion_g"];
@@ -95,7 +97,7 @@ pub fn write(sweep: &Sweep, out: &Path, options: &Options) -> Result<Vec<Result<
     };
     disk.replace(&path, rows).map_err(|error| RecordError::Write { path, error })?;
 
-    let path = out.join("points.csv");
+    let path = out.join(POINTS);
     let summary = |output: &mut dyn Write| summary(sweep, &outcomes, options, output);
     disk.replace(&path, summary).map_err(|error| RecordError::Write { path, error })?;
     Ok(outcomes)
@@ -139,10 +141,11 @@ fn summary(
 fn read(point: &Point, out: &Path, options: &Options) -> Result<(Vec<Row>, Outcome), Missing> {
     let folder = point_folder(out, point);
     let damaged = |error: &dyn std::fmt::Display| Missing::Damaged(error.to_string());
-    if !folder.join("metrics.csv").exists() {
+    let path = folder.join(METRICS);
+    if !file::exists(&path).map_err(|error| damaged(&format!("{}: cannot be read: {error}", path.display())))? {
         return Err(Missing::NotRun);
     }
-    let config = Config::load(&folder.join("config.toml")).map_err(|error| damaged(&error))?;
+    let config = Config::load(&folder.join(CONFIG)).map_err(|error| damaged(&error))?;
     if config != point.config {
         return Err(Missing::Damaged(format!("{}: it is of another config", folder.display())));
     }
@@ -150,7 +153,6 @@ fn read(point: &Point, out: &Path, options: &Options) -> Result<(Vec<Row>, Outco
     let mut rows: Vec<Vec<Row>> = vec![Vec::new(); trials];
     let mut reached = vec![None; trials];
     let mut next = 0;
-    let path = folder.join("metrics.csv");
     for row in metrics::open(&path).map_err(|error| damaged(&error))? {
         let (row, _) = row.map_err(|error| damaged(&format!("{}: {error}", path.display())))?;
         let Row { trial, generation, best_g, .. } = row;

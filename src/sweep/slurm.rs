@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use crate::shell::quoted;
+use crate::{escape, shell};
 
 /// What the script asks for.
 #[derive(Clone, Debug, PartialEq)]
@@ -23,17 +23,29 @@ pub struct Job<'a> {
 
 impl Job<'_> {
     /// The script.
-    pub fn script(&self) -> String {
+    ///
+    /// # Errors
+    /// A word that a line of a script cannot hold, or a folder whose logs Slurm could not name.
+    pub fn script(&self) -> Result<String, String> {
+        let words = self.command.iter().chain(self.options).map(String::as_str).chain([self.time]);
+        // A path that is not UTF-8 was written with this in the place of what it is.
+        if let Some(word) = words.into_iter().find(|word| word.contains(escape::steers) || word.contains('\u{fffd}')) {
+            let word = escape::line(word);
+            return Err(format!("a batch script cannot hold '{word}'; choose names in UTF-8, without line breaks"));
+        }
         let Job { name, command, out, shards, time, gpus, cpus, options } = self;
         let name: String =
             name.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '-' }).collect();
-        let command: Vec<_> = command.iter().map(|word| quoted(word)).collect();
+        let command = shell::command(command);
         let out = out.display().to_string();
-        let log = quoted(&format!("{}/slurm-%a.log", out.replace('%', "%%")));
+        if out.contains('\\') {
+            return Err(format!("Slurm numbers no logs in a folder with a backslash, {out}; choose another --out"));
+        }
+        let log = shell::quoted(&format!("{}/slurm-%a.log", out.replace('%', "%%")));
         let gpus =
             if *gpus > 0 { format!("#SBATCH --gpus-per-task={gpus}\n#SBATCH --ntasks=1\n") } else { String::new() };
         let options: String = options.iter().map(|option| format!("#SBATCH {option}\n")).collect();
-        format!(
+        Ok(format!(
             r#"#!/bin/bash
 #SBATCH --job-name={name}
 #SBATCH --array=1-{shards}
@@ -67,8 +79,7 @@ if [ -n "$warned" ] && [ "$code" -ne 0 ]; then
 fi
 exit "$code"
 "#,
-            collect = [&command[..], &["--collect".to_string()]].concat().join(" "),
-            command = command.join(" "),
-        )
+            collect = format_args!("{command} --collect"),
+        ))
     }
 }

@@ -14,6 +14,7 @@ use wgpu::util::DeviceExt;
 
 use super::exact::{self, Pass, ShaderError};
 use super::probe;
+use crate::escape;
 
 /// Names of renderers that run on the CPU, for drivers that do not admit it in their device type.
 const SOFTWARE: [&str; 5] = ["llvmpipe", "lavapipe", "swiftshader", "microsoft basic render", "software"];
@@ -83,8 +84,9 @@ impl From<&wgpu::AdapterInfo> for AdapterInfo {
         };
         let driver = [info.driver.as_str(), info.driver_info.as_str()];
         AdapterInfo {
-            name: info.name.clone(),
-            driver: driver.iter().filter(|part| !part.is_empty()).copied().collect::<Vec<_>>().join(" "),
+            name: escape::line(&info.name).into(),
+            driver: escape::line(&driver.iter().filter(|part| !part.is_empty()).copied().collect::<Vec<_>>().join(" "))
+                .into(),
             backend: info.backend.to_str().to_string(),
             kind,
         }
@@ -96,9 +98,13 @@ impl From<&wgpu::AdapterInfo> for AdapterInfo {
 pub enum DeviceError {
     #[error("no GPU adapter found (is a Vulkan, Metal or DirectX 12 driver installed?); use --backend cpu")]
     NoAdapter,
-    #[error("no GPU among the adapters, only {}; name one with --adapter, or use --backend cpu", list(.found))]
+    #[error(
+        "no GPU among the adapters, only {}; what may be a software renderer is taken by --adapter alone (--adapter 0); \
+         --backend cpu is faster than one",
+        list(.found)
+    )]
     NoRealAdapter { found: Vec<AdapterInfo> },
-    #[error("no adapter matches \"{name}\"; there {}", there_are(.found))]
+    #[error("no adapter {} \"{name}\"; there {}", if is_index(name) { "has the number" } else { "matches" }, there_are(.found))]
     UnknownAdapter { name: String, found: Vec<AdapterInfo> },
     #[error("{adapter}: cannot be opened: {reason}; choose another with --adapter, or use --backend cpu")]
     Refused { adapter: String, reason: String },
@@ -123,6 +129,12 @@ pub enum DeviceError {
 
 fn list(found: &[AdapterInfo]) -> String {
     found.iter().enumerate().map(|(index, info)| format!("{index}: {info}")).collect::<Vec<_>>().join(", ")
+}
+
+/// Whether this can only be an adapter's index: a number, or what would have been one.
+fn is_index(name: &str) -> bool {
+    let digits = name.trim().trim_start_matches(['+', '-']);
+    !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit())
 }
 
 fn there_are(found: &[AdapterInfo]) -> String {
@@ -169,9 +181,8 @@ fn found() -> Vec<(wgpu::Adapter, AdapterInfo)> {
 pub enum Choice {
     /// A GPU, never a software renderer.
     Real,
-    /// A GPU if there is one, else whatever there is.
-    Any,
-    /// By its index in [`adapters`], or by a part of its name in any case (the first that matches).
+    /// By its index in [`adapters`], which is what a number is, or else by a part of its name in any case (the first
+    /// that matches).
     Named(String),
 }
 
@@ -266,18 +277,21 @@ fn choose(choice: &Choice) -> Result<(wgpu::Adapter, AdapterInfo), DeviceError> 
 pub fn position(choice: &Choice, infos: &[AdapterInfo]) -> Result<usize, DeviceError> {
     match choice {
         Choice::Named(name) => {
-            let part = name.to_lowercase();
-            let by_index = name.parse().ok().filter(|&index: &usize| index < infos.len());
-            let by_name = || infos.iter().position(|info| info.name.to_lowercase().contains(&part));
-            let unknown = || DeviceError::UnknownAdapter { name: name.clone(), found: infos.to_vec() };
-            by_index.or_else(by_name).ok_or_else(unknown)
+            let part = name.trim().to_lowercase();
+            let found = match is_index(&part) {
+                true => part.parse().ok().filter(|&index: &usize| index < infos.len()),
+                // Nothing is a part of every name.
+                false if part.is_empty() => None,
+                false => infos.iter().position(|info| info.name.to_lowercase().contains(&part)),
+            };
+            found.ok_or_else(|| DeviceError::UnknownAdapter { name: name.clone(), found: infos.to_vec() })
         }
         // The most wanted adapter is the first.
         Choice::Real if infos.first().is_some_and(|info| !info.kind.is_real()) => {
             Err(DeviceError::NoRealAdapter { found: infos.to_vec() })
         }
-        Choice::Real | Choice::Any if infos.is_empty() => Err(DeviceError::NoAdapter),
-        Choice::Real | Choice::Any => Ok(0),
+        Choice::Real if infos.is_empty() => Err(DeviceError::NoAdapter),
+        Choice::Real => Ok(0),
     }
 }
 

@@ -1,0 +1,53 @@
+//! Tells the program what it is built from: `FLOTILLA_TARGET`, and `FLOTILLA_COMMIT`, empty where it is not known.
+//!
+//! Only release builds are told the commit: whoever embeds it is compiled anew at every commit.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+fn main() {
+    let variable = |name| std::env::var(name).unwrap_or_default();
+    println!("cargo::rerun-if-changed=build.rs");
+    println!("cargo::rustc-env=FLOTILLA_TARGET={}", variable("TARGET"));
+    let (commit, files) = match variable("PROFILE").as_str() {
+        "release" => commit(Path::new(&variable("CARGO_MANIFEST_DIR"))),
+        _ => Default::default(),
+    };
+    files.iter().for_each(|file| println!("cargo::rerun-if-changed={}", file.display()));
+    println!("cargo::rustc-env=FLOTILLA_COMMIT={}", commit.unwrap_or_default());
+}
+
+/// The commit of a source tree, and the files that say so: of a checkout (whole, shallow or a worktree) what HEAD names,
+/// of a crate's archive what cargo wrote into it.
+pub fn commit(root: &Path) -> (Option<String>, Vec<PathBuf>) {
+    let archive = root.join(".cargo_vcs_info.json");
+    if let Ok(text) = fs::read_to_string(&archive) {
+        let hash = text.split('"').skip_while(|word| *word != "sha1").nth(2).and_then(hash);
+        return (hash, vec![archive]);
+    }
+    let mut git = root.join(".git");
+    if let Ok(text) = fs::read_to_string(&git) {
+        // A worktree's own part is elsewhere.
+        git = root.join(text.trim_start_matches("gitdir:").trim());
+    }
+    let head = git.join("HEAD");
+    let Ok(text) = fs::read_to_string(&head) else { return (None, vec![]) };
+    let Some(name) = text.strip_prefix("ref:").map(str::trim) else { return (hash(&text), vec![head]) };
+    let shared = fs::read_to_string(git.join("commondir")).map_or(git.clone(), |path| git.join(path.trim()));
+    let loose = shared.join(name);
+    if let Ok(text) = fs::read_to_string(&loose) {
+        return (hash(&text), vec![head, loose]);
+    }
+    let packed = shared.join("packed-refs");
+    let text = fs::read_to_string(&packed).unwrap_or_default();
+    let found = text.lines().find_map(|line| line.strip_suffix(name)?.strip_suffix(' ').and_then(hash));
+    // The next commit makes the loose file: until then, it is the folder that changes. No file is named that is not
+    // there, for cargo takes that for a change.
+    let folder = loose.ancestors().skip(1).find(|folder| folder.exists()).map(PathBuf::from);
+    (found, [head, packed].into_iter().filter(|file| file.exists()).chain(folder).collect())
+}
+
+fn hash(text: &str) -> Option<String> {
+    let text = text.trim();
+    ([40, 64].contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_hexdigit())).then(|| text.to_string())
+}

@@ -1,0 +1,111 @@
+//! `flotilla init`: a config to start from, every key with what there is to know of it.
+
+use std::fs::OpenOptions;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use toml::{Table, Value};
+
+use super::{Error, output, print};
+use crate::config::{self, Config, Key};
+use crate::record::RecordError;
+use crate::report::paper::LAYOUTS;
+
+/// What [`LAYOUTS`] are called here.
+const NAMES: [&str; LAYOUTS.len()] = ["generally-forward", "strictly-forward", "chaotic"];
+/// Letters of a line at most.
+const WIDTH: usize = 110;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// The paper's layout to start from
+    #[arg(default_value = NAMES[0], value_parser = NAMES)]
+    layout: String,
+    /// File to write, which must not be there yet [default: standard output]
+    #[arg(long, short, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Write over the file
+    #[arg(long, requires = "out")]
+    force: bool,
+}
+
+pub fn run(args: Args) -> Result<(), Error> {
+    let layout = LAYOUTS.iter().zip(NAMES).find(|(_, name)| *name == args.layout);
+    let (layout, name) = layout.expect("the command line allows these names alone");
+    let text = commented(layout.config, &Config::parse(layout.config, name)?);
+    let Some(path) = args.out else { return print(&text) };
+    output::check(&[("--out", Some(&path))], &[])?;
+    match args.force {
+        true => output::write(&path, |output| output.write_all(text.as_bytes()))?,
+        false => write_new(&path, &text).map_err(|error| RecordError::Write { path: path.clone(), error })?,
+    }
+    print(&format!("{}\n", path.display()))
+}
+
+/// Writes a file that is not there yet.
+fn write_new(path: &Path, text: &str) -> io::Result<()> {
+    let mut file = OpenOptions::new().write(true).create_new(true).open(path).map_err(|error| match error.kind() {
+        io::ErrorKind::AlreadyExists => io::Error::other("it is there already; choose another --out, or --force"),
+        _ => error,
+    })?;
+    file.write_all(text.as_bytes()).inspect_err(|_| {
+        // Half a config is worse than none.
+        let _ = std::fs::remove_file(path);
+    })
+}
+
+/// The config file that says what `config` does, opened by the comment of the file that it is from; every key stands
+/// there, with its meaning, unit, kind, range and default as a comment.
+fn commented(from: &str, config: &Config) -> String {
+    let values: Table = config.to_toml().parse().expect("it was just written");
+    let opening: String =
+        from.lines().take_while(|line| line.starts_with('#')).map(|line| format!("{line}\n")).collect();
+    let mut text =
+        opening + "#\n# Every key stands below, with what it means and (its unit; what it allows; its default).\n";
+    let mut section = "";
+    for key in config::keys() {
+        let (of, leaf) = key.name.split_once('.').expect("keys are dotted");
+        if of != section {
+            section = of;
+            text += &format!("\n[{section}]\n");
+        }
+        text += &comment(&key);
+        text += &format!("{leaf} = {}\n", written(&values[section][leaf]));
+    }
+    text
+}
+
+/// Meaning and facts, on a line of their own each where one does not hold both.
+fn comment(Key { unit, kind, range, default, meaning, .. }: &Key) -> String {
+    let unit = if unit.is_empty() { String::new() } else { format!("{unit}; ") };
+    let default = default.as_ref().map_or("has to be given".into(), |default| format!("default {default}"));
+    let facts = format!("({unit}{kind}, {range}; {default})");
+    let one = format!("{meaning} {facts}");
+    if one.chars().count() <= WIDTH { wrapped(&one) } else { wrapped(meaning) + &wrapped(&facts) }
+}
+
+fn wrapped(text: &str) -> String {
+    let (mut lines, mut line) = (String::new(), String::from("#"));
+    for word in text.split(' ') {
+        if line.chars().count() + word.chars().count() > WIDTH {
+            lines += &format!("{line}\n");
+            line = "#".into();
+        }
+        line += &format!(" {word}");
+    }
+    lines + &line + "\n"
+}
+
+/// A value as TOML, a list of positions in rows of four where it is long.
+fn written(value: &Value) -> String {
+    match value {
+        Value::Array(items) if items.len() > 4 => {
+            let rows = items.chunks(4).map(|row| {
+                let row: Vec<_> = row.iter().map(Value::to_string).collect();
+                format!("    {},\n", row.join(", "))
+            });
+            format!("[\n{}]", rows.collect::<String>())
+        }
+        value => value.to_string(),
+    }
+}

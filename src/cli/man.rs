@@ -1,0 +1,34 @@
+//! `flotilla man`: manual pages, one a command.
+
+use std::path::PathBuf;
+
+use clap::CommandFactory;
+use clap_mangen::Man;
+
+use super::{Cli, Error, print};
+use crate::record::RecordError;
+use crate::record::disk::Disk;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folder for the pages, flotilla.1, flotilla-train.1, …
+    #[arg(long, short, value_name = "DIR", default_value = "man")]
+    out: PathBuf,
+}
+
+/// Writes the pages in place of any others of their names.
+pub fn run(args: Args) -> Result<(), Error> {
+    let disk = Disk::default();
+    let failed = |path: PathBuf| move |error| RecordError::Write { path, error };
+    disk.create_folder(&args.out).map_err(failed(args.out.clone()))?;
+    let mut all = Cli::command().disable_help_subcommand(true);
+    all.build();
+    let commands: Vec<_> = std::iter::once(&all).chain(all.get_subcommands()).cloned().collect();
+    for page in
+        commands.into_iter().map(|command| Man::new(command).source(concat!("flotilla ", env!("CARGO_PKG_VERSION"))))
+    {
+        let path = args.out.join(page.get_filename());
+        disk.replace(&path, |output| page.render(output)).map_err(failed(path))?;
+    }
+    print(&format!("{}\n", args.out.display()))
+}

@@ -1,0 +1,203 @@
+//! How well teams do: every team plays from the same starts, its own or drawn ones, and is told by mean and spread.
+
+use std::cell::RefCell;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+
+use glam::Vec2;
+
+use crate::backend::{Backend, BackendError, Group};
+use crate::credit::Credit;
+use crate::evolve::{self, Key, Purpose};
+use crate::world::World;
+
+/// Most episodes of one evaluation.
+pub const MAX_EPISODES: u32 = 1_000_000;
+/// Most bytes of scores that wait to be summed, and most episodes that play as one batch.
+const BATCH_BYTES: usize = 1 << 26;
+const BATCH_EPISODES: usize = 256;
+
+/// Where the agents of each episode start.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Starts {
+    /// One episode, from where the config says.
+    Own,
+    /// So many episodes, every start moved by a uniform offset in `-jitter..jitter` on both axes, drawn from the seed.
+    /// No training draws from where these are drawn, whatever its seed.
+    Drawn { episodes: u32, seed: u64, jitter: f64 },
+}
+
+impl Starts {
+    pub fn episodes(&self) -> usize {
+        match *self {
+            Starts::Own => 1,
+            Starts::Drawn { episodes, .. } => episodes as usize,
+        }
+    }
+
+    /// Start positions of an episode, `[agents]`, the same for all teams.
+    pub fn of(&self, episode: usize, world: &World) -> Vec<Vec2> {
+        let mut starts = world.starts.clone();
+        if let Starts::Drawn { seed, jitter, .. } = *self {
+            let key = Key::new(seed, 0, Purpose::HeldOut);
+            evolve::jitter_starts(key, 0, episode, world, jitter, &mut starts);
+        }
+        starts
+    }
+}
+
+/// What a whole number came to over episodes; sums are exact, whatever their order.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Tally {
+    count: u64,
+    sum: u64,
+    squares: u128,
+}
+
+/// Mean, spread and what the mean would be over all episodes there could be, of a [`Tally`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Spread {
+    pub mean: f64,
+    /// Sample standard deviation over episodes, and the 95 % interval of the mean (Student's t); none of one episode.
+    pub deviation: Option<f64>,
+    pub interval: Option<[f64; 2]>,
+}
+
+impl Tally {
+    pub fn add(&mut self, value: u64) {
+        self.count += 1;
+        self.sum += value;
+        self.squares += u128::from(value) * u128::from(value);
+    }
+
+    pub fn mean(&self) -> f64 {
+        self.sum as f64 / self.count as f64
+    }
+
+    /// Of values that are counted in parts of which `unit` make one, and none is above `most`.
+    pub fn spread(&self, unit: usize, most: usize) -> Spread {
+        let (count, unit) = (self.count as f64, unit as f64);
+        let mean = self.mean() / unit;
+        let deviation = (self.count > 1).then(|| {
+            let sum = u128::from(self.sum);
+            let squares = u128::from(self.count) * self.squares - sum * sum;
+            (squares as f64 / (count * (count - 1.0))).sqrt() / unit
+        });
+        let interval = deviation.map(|deviation| {
+            let half = student(self.count - 1) * deviation / count.sqrt();
+            [(mean - half).max(0.0), (mean + half).min(most as f64)]
+        });
+        Spread { mean, deviation, interval }
+    }
+}
+
+/// What teams came to over all episodes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Evaluation {
+    pub episodes: usize,
+    pub leaders: usize,
+    pub pois: usize,
+    /// POIs observed, `[teams]`.
+    pub observed: Vec<Tally>,
+    /// POIs observed by all teams of an episode together.
+    pub together: Tally,
+    /// Sums over episodes of D, Df and D++, `[teams][leaders]`.
+    credits: Vec<[f64; 3]>,
+}
+
+impl Evaluation {
+    /// POIs observed by a team.
+    pub fn team(&self, team: usize) -> Spread {
+        self.observed[team].spread(1, self.pois)
+    }
+
+    /// POIs observed by the mean team, its spread from episode to episode.
+    pub fn mean(&self) -> Spread {
+        self.together.spread(self.observed.len(), self.pois)
+    }
+
+    /// The team that observes most, ties to the lower index.
+    pub fn best(&self) -> usize {
+        let sum = |team: usize| self.observed[team].sum;
+        (1..self.observed.len()).fold(0, |best, team| if sum(team) > sum(best) { team } else { best })
+    }
+
+    /// Means over episodes of G, D, Df and D++ of a leader of a team.
+    pub fn scores(&self, team: usize, leader: usize) -> [f32; 4] {
+        let g = self.observed[team].mean() / self.pois as f64;
+        let [d, df, dpp] = self.credits[team * self.leaders + leader].map(|sum| sum / self.episodes as f64);
+        [g, d, df, dpp].map(|score| score as f32)
+    }
+}
+
+/// Plays every team of a group from every start, in batches of as many episodes as memory bears; `watch` is told
+/// the share that is done, from any thread.
+///
+/// # Errors
+/// When the backend fails.
+pub fn evaluate(
+    backend: &mut dyn Backend,
+    group: &Group<'_>,
+    starts: &Starts,
+    watch: &(dyn Fn(f64) + Sync),
+) -> Result<Evaluation, BackendError> {
+    thread_local! { static CREDIT: RefCell<Credit> = RefCell::default(); }
+    let world = group.world;
+    let (teams, leaders, episodes) = (group.team_count(), world.leaders(), starts.episodes());
+    let at_once = BATCH_BYTES / (teams * leaders * size_of::<[f32; 3]>()).max(1);
+    let at_once = at_once.clamp(1, BATCH_EPISODES).min(episodes);
+    let mut evaluation = Evaluation {
+        episodes,
+        leaders,
+        pois: world.pois.len(),
+        observed: vec![Tally::default(); teams],
+        together: Tally::default(),
+        credits: vec![[0.0; 3]; teams * leaders],
+    };
+    let done = AtomicUsize::new(0);
+    for first in (0..episodes).step_by(at_once) {
+        let batch: Vec<Vec<Vec2>> =
+            (first..episodes.min(first + at_once)).map(|episode| starts.of(episode, world)).collect();
+        let groups: Vec<Group<'_>> = batch.iter().map(|starts| Group { starts, ..*group }).collect();
+        let scored = Mutex::new((vec![0; batch.len() * teams], vec![[0_f32; 3]; batch.len() * teams * leaders]));
+        backend.rollout(&groups, &|episode| {
+            let scores = CREDIT.with_borrow_mut(|credit| credit.all(&episode, world));
+            let place = episode.group * teams + episode.team;
+            let mut scored = scored.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+            scored.0[place] = scores.observed;
+            for (leader, to) in scored.1[place * leaders..][..leaders].iter_mut().enumerate() {
+                *to = [scores.d[leader], scores.df[leader], scores.dpp[leader]];
+            }
+            drop(scored);
+            watch((done.fetch_add(1, Relaxed) + 1) as f64 / (teams * episodes) as f64);
+        })?;
+        let (observed, credits) = scored.into_inner().unwrap_or_else(|poisoned| poisoned.into_inner());
+        // Episode after episode, so that sums of floats do not depend on who played first.
+        for observed in observed.chunks_exact(teams) {
+            evaluation.together.add(observed.iter().map(|&observed| u64::from(observed)).sum());
+            evaluation.observed.iter_mut().zip(observed).for_each(|(tally, &observed)| tally.add(observed.into()));
+        }
+        for credits in credits.chunks_exact(teams * leaders) {
+            for (sums, scores) in evaluation.credits.iter_mut().zip(credits) {
+                sums.iter_mut().zip(scores).for_each(|(sum, &score)| *sum += f64::from(score));
+            }
+        }
+    }
+    Ok(evaluation)
+}
+
+/// The 97.5 % quantile of Student's t: exact to the digits given up to 10 degrees of freedom, to 1e-5 beyond.
+pub fn student(degrees: u64) -> f64 {
+    const FEW: [f64; 10] =
+        [12.706205, 4.302653, 3.182446, 2.776445, 2.570582, 2.446912, 2.364624, 2.306004, 2.262157, 2.228139];
+    if let Some(&t) = degrees.checked_sub(1).and_then(|index| FEW.get(index as usize)) {
+        return t;
+    }
+    // Cornish and Fisher's expansion around the normal distribution's quantile.
+    let (z, n) = (1.959_963_984_540_054_f64, degrees as f64);
+    let polynomial = |factors: &[f64]| z * factors.iter().rev().fold(0.0, |sum, factor| sum * z * z + factor);
+    z + polynomial(&[1.0, 1.0]) / (4.0 * n)
+        + polynomial(&[3.0, 16.0, 5.0]) / (96.0 * n * n)
+        + polynomial(&[-15.0, 17.0, 19.0, 3.0]) / (384.0 * n * n * n)
+        + polynomial(&[-945.0, -1920.0, 1482.0, 776.0, 79.0]) / (92160.0 * n * n * n * n)
+}

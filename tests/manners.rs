@@ -1,0 +1,328 @@
+//! What makes the program at home on a machine: its version, configs to start from, standard input, shells and manuals.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use assert_cmd::cargo::cargo_bin_cmd;
+use flotilla::config::{self, Config};
+use tempfile::TempDir;
+
+#[allow(dead_code, reason = "its main is cargo's")]
+#[path = "../build.rs"]
+mod build;
+
+fn told(flag: &str) -> String {
+    let output = cargo_bin_cmd!("flotilla").arg(flag).output().unwrap();
+    assert!(output.status.success());
+    String::from_utf8(output.stdout).unwrap()
+}
+
+#[test]
+fn the_version_is_told_in_a_line_or_with_commit_and_target() {
+    let name = concat!("flotilla ", env!("CARGO_PKG_VERSION"));
+    assert_eq!(told("-V"), format!("{name}\n"));
+    let long = told("--version");
+    let lines: Vec<&str> = long.lines().collect();
+    assert_eq!(lines[0], name, "{long}");
+    assert!(lines[1].starts_with("commit  "), "{long}");
+    let target = lines[2].strip_prefix("target  ").expect(&long);
+    assert!(target.starts_with(std::env::consts::ARCH) && target.contains('-'), "{long}");
+    // A debug build is not told, so as not to be compiled anew at every commit.
+    let commit = build::commit(Path::new(env!("CARGO_MANIFEST_DIR"))).0.filter(|_| !cfg!(debug_assertions));
+    assert_eq!(flotilla::COMMIT, commit.as_deref());
+    assert!(lines[1].ends_with(&commit.unwrap_or("not recorded".into())), "{long}");
+}
+
+#[test]
+fn the_commit_is_read_as_git_reads_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let git = |place: &Path, line: &str| {
+        let output = Command::new("git")
+            .args(["-c", "user.name=x", "-c", "user.email=x@example.org", "-c", "init.defaultBranch=trunk"])
+            .args(line.split(' '))
+            .current_dir(place)
+            .output();
+        output.ok().map(|output| {
+            assert!(output.status.success(), "{line}: {}", String::from_utf8_lossy(&output.stderr));
+            String::from_utf8(output.stdout).unwrap().trim().to_string()
+        })
+    };
+    let tree = folder.path().join("tree");
+    fs::create_dir(&tree).unwrap();
+    if git(&tree, "init -q").is_none() {
+        eprintln!("skipped: there is no git");
+        return;
+    }
+    // Every file named as a reason to look again must be there: cargo takes a missing one for one that changed.
+    let read = |place: &Path| {
+        let (commit, files) = build::commit(place);
+        assert!(files.iter().all(|file| file.exists()), "{files:?}");
+        (commit, files)
+    };
+    let same = |place: &Path| {
+        let (commit, files) = read(place);
+        assert_eq!(commit, git(place, "rev-parse HEAD"));
+        files
+    };
+    assert_eq!(read(&tree).0, None, "nothing is committed yet");
+    git(&tree, "commit -q --allow-empty -m one");
+    let files = same(&tree);
+    assert!(files.iter().any(|file| file.ends_with("refs/heads/trunk")), "{files:?}");
+    git(&tree, "pack-refs --all");
+    assert!(!tree.join(".git/refs/heads/trunk").exists());
+    same(&tree);
+    git(&tree, "commit -q --allow-empty -m two");
+    same(&tree);
+    git(&tree, "worktree add -q ../side -b topic/side");
+    let side = folder.path().join("side");
+    git(&side, "commit -q --allow-empty -m three");
+    let files = same(&side);
+    assert_ne!(read(&side).0, read(&tree).0);
+    assert!(files.iter().any(|file| file.ends_with("refs/heads/topic/side")), "{files:?}");
+    git(&tree, "checkout -q --detach HEAD~1");
+    same(&tree);
+    let url = format!("clone -q --depth 1 file://{} ../shallow", tree.display());
+    git(&tree, &url);
+    same(&folder.path().join("shallow"));
+}
+
+#[test]
+fn without_git_the_commit_is_what_the_archive_says_or_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    assert_eq!(build::commit(folder.path()), (None, vec![]));
+    let hash = "0123456789abcdef0123456789abcdef01234567";
+    // As cargo package writes it.
+    let text = format!("{{\n  \"git\": {{\n    \"sha1\": \"{hash}\"\n  }},\n  \"path_in_vcs\": \"\"\n}}");
+    fs::write(folder.path().join(".cargo_vcs_info.json"), text).unwrap();
+    assert_eq!(build::commit(folder.path()).0.as_deref(), Some(hash));
+    fs::remove_file(folder.path().join(".cargo_vcs_info.json")).unwrap();
+    fs::create_dir(folder.path().join(".git")).unwrap();
+    fs::write(folder.path().join(".git/HEAD"), "no hash\n").unwrap();
+    assert_eq!(build::commit(folder.path()).0, None);
+}
+
+/// Runs a command in a folder, with something on standard input.
+fn run(folder: &TempDir, line: &str, input: &str) -> Output {
+    let mut command = cargo_bin_cmd!("flotilla");
+    command.args(line.split_whitespace()).current_dir(folder.path()).write_stdin(input).output().unwrap()
+}
+
+/// Standard output and standard error of a command that must succeed.
+fn good(folder: &TempDir, line: &str, input: &str) -> (String, String) {
+    let output = run(folder, line, input);
+    let told = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(0), "{line}: {told}");
+    (String::from_utf8(output.stdout).unwrap(), told)
+}
+
+const LAYOUTS: [&str; 3] = ["generally_forward", "strictly_forward", "chaotic"];
+
+#[test]
+fn a_config_to_start_from_says_every_key_and_is_its_layouts() {
+    let folder = tempfile::tempdir().unwrap();
+    for layout in LAYOUTS {
+        let (text, told) = good(&folder, &format!("init {}", layout.replace('_', "-")), "");
+        assert_eq!(told, "");
+        assert!(text.lines().all(|line| line.chars().count() <= 120), "{text}");
+        let from =
+            fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("configs/{layout}.toml"))).unwrap();
+        assert_eq!(text.lines().next(), from.lines().next(), "what it is, to begin with");
+        let checked = |text: &str| good(&folder, "check -", text).0;
+        assert_eq!(checked(&text), checked(&from));
+        // Each key once, below all that there is to know of it.
+        let mut told = String::new();
+        let mut said = std::collections::BTreeMap::new();
+        let mut section = "";
+        for line in text.lines() {
+            match (line.strip_prefix("# "), line.split_once(" = ")) {
+                (Some(comment), _) => told += &format!("{comment} "),
+                (_, Some((leaf, _))) => {
+                    let before = said.insert(format!("{section}.{leaf}"), std::mem::take(&mut told));
+                    assert_eq!(before, None, "{line}");
+                }
+                _ if line.starts_with('[') => (section, told) = (line.trim_matches(['[', ']']), String::new()),
+                _ => {}
+            }
+        }
+        let keys = config::keys();
+        assert_eq!(said.len(), keys.len());
+        for key in keys {
+            let default = key.default.map_or("has to be given".into(), |default| format!("default {default}"));
+            for part in [key.meaning, key.unit, &key.kind, &key.range, &default] {
+                assert!(said[key.name].contains(part), "{part} of {}: {}", key.name, said[key.name]);
+            }
+        }
+    }
+    assert_eq!(good(&folder, "init", ""), good(&folder, "init generally-forward", ""));
+    assert_eq!(run(&folder, "init spiral", "").status.code(), Some(2));
+    assert_eq!(run(&folder, "init --force", "").status.code(), Some(2), "there is no file to write over");
+}
+
+#[test]
+fn a_config_to_start_from_trains_and_writes_over_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    assert_eq!(good(&folder, "init -o my.toml", "").0, "my.toml\n");
+    let there = fs::read_to_string(folder.path().join("my.toml")).unwrap();
+    assert_eq!(there, good(&folder, "init", "").0);
+    good(&folder, "train my.toml --backend cpu --generations 1 --trials 1 -q -o run", "");
+    let again = run(&folder, "init chaotic --out my.toml", "");
+    let told = String::from_utf8(again.stderr).unwrap();
+    assert_eq!(
+        (again.status.code(), told.contains("it is there already; choose another --out, or --force")),
+        (Some(1), true),
+        "{told}"
+    );
+    assert_eq!(fs::read_to_string(folder.path().join("my.toml")).unwrap(), there);
+    good(&folder, "init chaotic --out my.toml --force", "");
+    assert_eq!(fs::read_to_string(folder.path().join("my.toml")).unwrap(), good(&folder, "init chaotic", "").0);
+}
+
+const SMALL: &str = "
+[world]
+leaders = [[10, 5]]
+followers = [[12, 2]]
+pois = [[10, 9]]
+coupling = 2
+steps = 4
+[learning]
+population = 4
+generations = 2
+trials = 1
+";
+
+#[test]
+fn every_command_that_reads_a_config_reads_standard_input() {
+    let folder = tempfile::tempdir().unwrap();
+    let read = |name: &str| fs::read(folder.path().join(name)).unwrap();
+    let (_, told) = good(&folder, "train - --backend cpu --seed 3", SMALL);
+    assert!(told.contains("into runs/config\n"), "{told}");
+    // What is kept is a config like any other: training from it repeats the run.
+    assert!(Config::load(&folder.path().join("runs/config/config.toml")).is_ok());
+    good(&folder, "train runs/config/config.toml --backend cpu -q -o again", "");
+    assert_eq!(read("again/policies.safetensors"), read("runs/config/policies.safetensors"));
+    let (done, _) = good(&folder, "train - --backend cpu --seed 3 --resume", SMALL);
+    assert!(done.contains("runs/config"), "{done}");
+    let policies = "--policies again/policies.safetensors";
+    let small = folder.path().join("small.toml");
+    fs::write(&small, SMALL).unwrap();
+    for line in ["check FILE", "check FILE --json", &format!("rollout FILE --backend cpu {policies} --json")] {
+        let [from_file, from_input] =
+            ["small.toml", "-"].map(|name| good(&folder, &line.replace("FILE", name), SMALL).0);
+        assert_eq!(from_file, from_input, "{line}");
+    }
+    good(&folder, "bench - --backend cpu --teams 2 --rollout-only --json", SMALL);
+    let wrong = SMALL.replace("steps = 4", "steps = 0");
+    for line in ["check -", "train -", &format!("rollout - {policies}"), "verify -", "bench -", "sweep -"] {
+        let output = run(
+            &folder,
+            line,
+            &(wrong.clone() + "[grid]\n")
+                .replace("[grid]\n", if line == "sweep -" { "[grid]\n'learning.seed' = [1]\n" } else { "" }),
+        );
+        let told = String::from_utf8(output.stderr).unwrap();
+        assert!(told.contains("standard input:7: world.steps: found 0, allowed 1 to 10000"), "{line}: {told}");
+        assert_eq!(output.status.code(), Some(1));
+    }
+}
+
+#[test]
+fn a_sweep_from_standard_input_is_gone_on_with_from_its_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let sweep = SMALL.to_string() + "[grid]\n'learning.seed' = [1, 2]\n";
+    let (told, _) = good(&folder, "sweep - --backend cpu -q --shard 1/2", &sweep);
+    assert!(told.contains("flotilla sweep runs/sweep/sweep.toml --out runs/sweep --collect"), "{told}");
+    good(&folder, "sweep runs/sweep/sweep.toml --out runs/sweep --backend cpu -q --shard 2/2", "");
+    let (all, _) = good(&folder, "sweep - --collect", &sweep);
+    assert!(all.starts_with("2 of 2 points are done."), "{all}");
+    let (script, _) = good(&folder, "sweep - --slurm", &sweep);
+    assert!(script.contains("/runs/sweep/sweep.toml"), "{script}");
+}
+
+#[test]
+fn shells_complete_commands_and_flags() {
+    let folder = tempfile::tempdir().unwrap();
+    for shell in ["bash", "elvish", "fish", "powershell", "zsh"] {
+        let (script, _) = good(&folder, &format!("completions {shell}"), "");
+        for word in ["rollout", "start-jitter", "completions"] {
+            assert!(script.contains(word), "{word} in {shell}");
+        }
+    }
+    assert_eq!(run(&folder, "completions tcsh", "").status.code(), Some(2));
+    // As a shell would use it.
+    fs::write(folder.path().join("flotilla.bash"), good(&folder, "completions bash", "").0).unwrap();
+    let complete = |line: &str| {
+        let words: Vec<&str> = line.split(' ').collect();
+        let (last, before) = (words[words.len() - 1], words[words.len() - 2]);
+        let script = format!(
+            "source flotilla.bash; COMP_WORDS=({line}); COMP_CWORD={}; _flotilla flotilla '{last}' '{before}'; \
+             echo \"${{COMPREPLY[@]}}\"",
+            words.len() - 1
+        );
+        let output = Command::new("bash").args(["-c", &script]).current_dir(folder.path()).output().unwrap();
+        assert!(output.stderr.is_empty(), "{}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8(output.stdout).unwrap().trim().to_string()
+    };
+    assert_eq!(complete("flotilla tr"), "train");
+    assert_eq!(complete("flotilla rollout --sc"), "--scores");
+    assert_eq!(complete("flotilla train --paradigm le"), "leader-follower");
+}
+
+#[test]
+fn every_command_has_a_manual_page() {
+    let folder = tempfile::tempdir().unwrap();
+    good(&folder, "man -o pages", "");
+    let page = |name: &str| fs::read_to_string(folder.path().join("pages").join(name)).unwrap();
+    let first = page("flotilla.1");
+    let mut commands = 0;
+    for command in flotilla::cli::command().get_subcommands() {
+        let name = format!("flotilla-{}", command.get_name());
+        let page = page(&format!("{name}.1"));
+        assert!(page.contains(&format!(".TH {name} 1 ")), "{page}");
+        // Hyphens are written so that they can be copied.
+        for flag in command.get_arguments().filter_map(|flag| flag.get_long()) {
+            assert!(page.contains(&format!("\\-\\-{}", flag.replace('-', "\\-"))), "{flag} of {name}");
+        }
+        assert!(first.contains(&name.replace('-', "\\-")), "{name} in {first}");
+        commands += 1;
+    }
+    assert_eq!(fs::read_dir(folder.path().join("pages")).unwrap().count(), commands + 1);
+}
+
+/// Every command that writes a file takes it by `-o`, and every one that shows progress can be made quiet by `-q`.
+#[test]
+fn the_same_letters_mean_the_same_everywhere() {
+    let mut found = [0; 2];
+    for command in flotilla::cli::command().get_subcommands() {
+        for flag in command.get_arguments() {
+            for (place, (long, short)) in [("out", 'o'), ("quiet", 'q')].into_iter().enumerate() {
+                assert_eq!(flag.get_long() == Some(long), flag.get_short() == Some(short), "{}", command.get_name());
+                found[place] += usize::from(flag.get_long() == Some(long));
+            }
+        }
+    }
+    assert!(found[0] >= 7 && found[1] >= 6, "{found:?}");
+}
+
+#[test]
+fn pictures_and_replays_are_told_as_json() {
+    let folder = tempfile::tempdir().unwrap();
+    good(&folder, "train - --backend cpu -q -o run", SMALL);
+    let json = |line: &str| -> serde_json::Value {
+        let (text, told) = good(&folder, line, "");
+        assert_eq!(told, "", "{line}");
+        serde_json::from_str(&text).unwrap()
+    };
+    let object = json("plot run --json -o curves.svg");
+    assert_eq!((&object["out"], &object["runs"][0]), (&"curves.svg".into(), &"run".into()));
+    let object = json("replay run --json -q --backend cpu --compare 0 -o replay.svg");
+    let bytes = fs::metadata(folder.path().join("replay.svg")).unwrap().len();
+    assert_eq!((&object["out"], &object["bytes"]), (&"replay.svg".into(), &bytes.into()));
+    let metrics = fs::read_to_string(folder.path().join("run/metrics.csv")).unwrap();
+    for (episode, generation) in [(0, 0), (1, 2)] {
+        let episode = &object["episodes"][episode];
+        assert_eq!((&episode["trial"], &episode["generation"]), (&0.into(), &generation.into()));
+        let row = metrics.lines().find(|line| line.starts_with(&format!("0,{generation},"))).unwrap();
+        assert_eq!(episode["best_g"].as_f64().unwrap(), row.split(',').nth(2).unwrap().parse::<f64>().unwrap());
+    }
+}

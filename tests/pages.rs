@@ -1,0 +1,272 @@
+//! Every command of README.md and docs/*.md, as it stands there.
+//!
+//! The blocks of a page are run in order, in a folder of its own that is empty but for the repository's `configs/`:
+//!
+//! - A fenced block without a language (or `sh`), and an indented one, holds commands, each a line of its own (`\` goes on
+//!   in the next). What is printed, and what is not for a shell, has a language: `text`, `toml`, `yaml`.
+//! - A `toml` block is a file where the paragraph before it names one (`` `sweep.toml` ``).
+//! - `<!-- not run: WHY -->` before a block leaves it out; `<!-- long: WHY -->` leaves it to `FLOTILLA_LONG=1`.
+//!
+//! Commands that are not run, and those inside a text (`` `flotilla …` ``), have to be such that the program takes their
+//! flags; a word in capitals stands for a value there.
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+use tempfile::TempDir;
+
+/// What one command may take.
+const PATIENCE: Duration = Duration::from_secs(300);
+
+fn pages() -> Vec<PathBuf> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let docs = fs::read_dir(root.join("docs")).unwrap().map(|entry| entry.unwrap().path());
+    let mut pages: Vec<_> = docs.filter(|path| path.extension().is_some_and(|extension| extension == "md")).collect();
+    pages.sort();
+    pages.insert(0, root.join("README.md"));
+    pages
+}
+
+/// A block of code, its lines each with its number in the page.
+#[derive(Debug, Default, PartialEq)]
+struct Block {
+    language: String,
+    /// Why it is left out, always or unless there is time.
+    not_run: Option<String>,
+    long: Option<String>,
+    /// The file that a `toml` block is.
+    file: Option<String>,
+    lines: Vec<(usize, String)>,
+}
+
+impl Block {
+    /// The commands, each with its line's number.
+    fn commands(&self) -> Vec<(usize, String)> {
+        let mut commands: Vec<(usize, String)> = Vec::new();
+        let mut goes_on = false;
+        for (number, line) in &self.lines {
+            match commands.last_mut().filter(|_| goes_on) {
+                Some((_, command)) => *command += line,
+                None => commands.push((*number, line.clone())),
+            }
+            goes_on = line.ends_with('\\');
+            if let Some((_, command)) = commands.last_mut().filter(|_| goes_on) {
+                command.pop();
+            }
+        }
+        commands.retain(|(_, command)| !command.trim().is_empty() && !command.trim_start().starts_with('#'));
+        commands
+    }
+}
+
+/// The blocks of a page, and its commands in back-ticks.
+fn read(text: &str) -> (Vec<Block>, Vec<(usize, String)>) {
+    let (mut blocks, mut inline): (Vec<Block>, _) = (vec![], vec![]);
+    let (mut next, mut paragraph, mut in_list) = (Block::default(), String::new(), false);
+    let mut lines = (1..).zip(text.lines()).peekable();
+    let mut after_blank = true;
+    while let Some((number, line)) = lines.next() {
+        let comment = line.trim().strip_prefix("<!--").and_then(|line| line.strip_suffix("-->")).map(str::trim);
+        if let Some(comment) = comment {
+            let why = |kind: &str| comment.strip_prefix(kind).map(|why| why.trim().to_string());
+            (next.not_run, next.long) = (why("not run:").or(next.not_run), why("long:").or(next.long));
+        } else if let Some(fence) = line.trim_start().strip_prefix("```") {
+            let mut block = Block { language: fence.trim().into(), ..std::mem::take(&mut next) };
+            let named =
+                paragraph.split('`').skip(1).step_by(2).filter(|name| name.ends_with(".toml") && !name.contains('/'));
+            block.file = named.last().filter(|_| block.language == "toml").map(String::from);
+            while let Some((number, line)) = lines.next().filter(|(_, line)| !line.trim_start().starts_with("```")) {
+                block.lines.push((number, line.into()));
+            }
+            blocks.push(block);
+        } else if line.starts_with("    ") && after_blank && !in_list {
+            let mut block = std::mem::take(&mut next);
+            block.lines.push((number, line.trim().into()));
+            while let Some((number, line)) = lines.next_if(|(_, line)| line.starts_with("    ")) {
+                block.lines.push((number, line.trim().into()));
+            }
+            blocks.push(block);
+        } else {
+            if !line.trim().is_empty() {
+                next = Block::default();
+                in_list = line.starts_with("- ") || line.starts_with("1. ") || in_list && line.starts_with(' ');
+                paragraph = if after_blank { String::new() } else { paragraph } + line + " ";
+            }
+            let spans = line.split('`').skip(1).step_by(2).filter(|span| span.starts_with("flotilla "));
+            inline.extend(spans.map(|span| (number, span.to_string())));
+        }
+        after_blank = line.trim().is_empty();
+    }
+    (blocks, inline)
+}
+
+/// What is wrong with the flags of a command of the program's.
+fn misread(command: &str) -> Option<String> {
+    let (mut words, mut quote) = (vec![String::new()], None);
+    for c in command.chars() {
+        match quote {
+            Some(open) if open == c => quote = None,
+            None if c == '\'' || c == '"' => quote = Some(c),
+            None if c.is_whitespace() => words.push(String::new()),
+            _ => words.last_mut().unwrap().push(c),
+        }
+    }
+    words.retain(|word| !word.is_empty());
+    let error = flotilla::cli::command().try_get_matches_from(words).err()?;
+    let stands_for_a_value = |value: &str| {
+        value.contains(['$', '{', '…']) || value.contains(char::is_uppercase) && !value.contains(char::is_lowercase)
+    };
+    match (error.kind(), error.get(ContextKind::InvalidValue)) {
+        // In a text not all that a command needs has to be said.
+        (ErrorKind::DisplayHelp | ErrorKind::DisplayVersion | ErrorKind::MissingRequiredArgument, _) => None,
+        (_, Some(ContextValue::String(value))) if stands_for_a_value(value) => None,
+        _ => Some(error.to_string()),
+    }
+}
+
+/// The program's commands in a line for a shell.
+fn calls(line: &str) -> Vec<String> {
+    let line = line.split(" #").next().unwrap_or_default().replace("cargo run --release -- ", "flotilla ");
+    let parts = line.split([';', '|', '&']).filter_map(|part| Some(part[part.find("flotilla ")?..].trim().to_string()));
+    parts.collect()
+}
+
+/// Runs a command as a shell does; its output where it failed.
+fn run(command: &str, folder: &Path) -> Result<(), String> {
+    let program = assert_cmd::cargo::cargo_bin!("flotilla");
+    let path = std::env::var("PATH").unwrap_or_default();
+    let path = format!("{}:{path}", program.parent().unwrap().display());
+    let said = folder.join(".said");
+    let output = fs::File::create(&said).unwrap();
+    let mut bash = Command::new("bash");
+    bash.args(["-c", command]).current_dir(folder).env("PATH", path).stdin(Stdio::null());
+    for name in ["SLURM_ARRAY_TASK_ID", "JOB_COMPLETION_INDEX", "FLOTILLA_SHARDS"] {
+        bash.env_remove(name);
+    }
+    let mut child = bash.stderr(output.try_clone().unwrap()).stdout(output).spawn().unwrap();
+    let start = Instant::now();
+    let status = loop {
+        match child.try_wait().unwrap() {
+            Some(status) => break status.to_string(),
+            None if start.elapsed() > PATIENCE => {
+                let _ = child.kill();
+                let _ = child.wait();
+                break format!("it was ended after {PATIENCE:?}");
+            }
+            None => std::thread::sleep(Duration::from_millis(5)),
+        }
+    };
+    if status == "exit status: 0" {
+        return Ok(());
+    }
+    Err(format!("{status}\n{}", fs::read_to_string(&said).unwrap_or_default()))
+}
+
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).unwrap();
+    for entry in fs::read_dir(from).unwrap().map(Result::unwrap) {
+        let to = to.join(entry.file_name());
+        match entry.file_type().unwrap().is_dir() {
+            true => copy(&entry.path(), &to),
+            false => drop(fs::copy(entry.path(), to).unwrap()),
+        }
+    }
+}
+
+/// What a page came to.
+#[derive(Default)]
+struct Tried {
+    ran: usize,
+    parsed: usize,
+    left_out: Vec<String>,
+    failed: Vec<String>,
+}
+
+fn try_page(name: &str, text: &str, long: bool) -> Tried {
+    let folder: TempDir = tempfile::tempdir().unwrap();
+    copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("configs"), &folder.path().join("configs"));
+    let mut tried = Tried::default();
+    let (blocks, inline) = read(text);
+    let parse = |tried: &mut Tried, number: usize, command: &str| {
+        tried.parsed += 1;
+        if let Some(error) = misread(command) {
+            tried.failed.push(format!("{name}:{number}: {command}\n{error}"));
+        }
+    };
+    inline.iter().for_each(|(number, command)| parse(&mut tried, *number, command));
+    let mut broken = false;
+    for block in blocks {
+        let text = || block.lines.iter().map(|(_, line)| line.clone() + "\n").collect::<String>();
+        match &*block.language {
+            "toml" => {
+                let line = block.lines.first().map_or(0, |(number, _)| *number);
+                if let Err(error) = text().parse::<toml::Table>() {
+                    tried.failed.push(format!("{name}:{line}: it is not TOML: {error}"));
+                }
+                if let Some(file) = &block.file {
+                    fs::write(folder.path().join(file), text()).unwrap();
+                }
+                continue;
+            }
+            "" | "sh" | "bash" => {}
+            _ => continue,
+        }
+        let why = block.not_run.as_ref().or(block.long.as_ref().filter(|_| !long));
+        for (number, command) in block.commands() {
+            if let Some(why) = why {
+                calls(&command).iter().for_each(|call| parse(&mut tried, number, call));
+                tried.left_out.push(format!("{name}:{number}: {command}  ({why})"));
+            } else if !broken {
+                tried.ran += 1;
+                if let Err(output) = run(&command, folder.path()) {
+                    tried.failed.push(format!("{name}:{number}: {command}\n{output}"));
+                    // What follows would fail for want of this.
+                    broken = true;
+                }
+            }
+        }
+    }
+    tried
+}
+
+#[test]
+fn every_command_of_the_pages_does_what_it_says() {
+    let long = std::env::var("FLOTILLA_LONG").is_ok_and(|long| long == "1");
+    let (mut failed, mut told) = (Vec::new(), String::new());
+    let mut all = 0;
+    for page in pages() {
+        let name = page.strip_prefix(env!("CARGO_MANIFEST_DIR")).unwrap().display().to_string();
+        let mut tried = try_page(&name, &fs::read_to_string(&page).unwrap(), long);
+        all += tried.ran;
+        told += &format!(
+            "{name}: {} commands run, {} only read, {} left out\n",
+            tried.ran,
+            tried.parsed,
+            tried.left_out.len()
+        );
+        tried.left_out.iter().for_each(|line| told += &format!("  left out {line}\n"));
+        failed.append(&mut tried.failed);
+    }
+    // Straight to the stream: what a passing test prints by macro is not shown.
+    write!(std::io::stderr(), "\n{told}").unwrap();
+    assert!(failed.is_empty(), "{} commands of the pages fail:\n\n{}", failed.len(), failed.join("\n\n"));
+    assert!(all >= 10, "only {all} commands were found");
+}
+
+#[test]
+fn what_fails_in_a_page_is_told_with_its_place() {
+    let page = "# Page\n\n`few.toml` is\n\n```toml\n[x]\n```\n\n```\ncat few.toml # it is there\ntrue \\\n  && ls configs\n\
+                flotilla chekc x\n```\n\n    false\n\n<!-- not run: WHY -->\n\n```\nflotilla check --sed 1\n```\n\
+                Text `flotilla train CONFIG --trials N`, `flotilla plot --ot x`.\n\n```text\nno command\n```\n";
+    let Tried { ran, failed, left_out, parsed } = try_page("p.md", page, false);
+    assert_eq!((ran, parsed), (3, 3), "{failed:?}");
+    assert_eq!(left_out, ["p.md:20: flotilla check --sed 1  (WHY)"]);
+    let places: Vec<_> = failed.iter().map(|failed| failed.lines().next().unwrap()).collect();
+    let expected = ["p.md:22: flotilla plot --ot x", "p.md:13: flotilla chekc x", "p.md:20: flotilla check --sed 1"];
+    assert_eq!(places, expected, "{failed:?}");
+    assert!(failed[1].contains("exit status: 2\n") && failed[1].contains("chekc"), "{failed:?}");
+}
