@@ -30,7 +30,7 @@ const LINES: Duration = Duration::from_secs(10);
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Sweep file: a config with a section [grid] of lists of values
+    /// Sweep file: a config with a section [grid] of lists of values, or [vary] of keys to change one at a time
     sweep: PathBuf,
     #[command(flatten)]
     overrides: Overrides,
@@ -142,6 +142,9 @@ impl Args {
                 Error::Usage(format!("--axes: {name} is no axis of the grid; it has {}", keys.join(", ")))
             })
         };
+        if !self.axes.is_empty() && sweep.axes.iter().any(|axis| axis.varied) {
+            return Err(Error::Usage("--axes: a sweep with [vary] has one picture, of all its keys".into()));
+        }
         let axes: Vec<usize> = self.axes.iter().map(find).collect::<Result<_, _>>()?;
         match axes[..] {
             [a, b] if a == b => Err(Error::Usage(format!("--axes: {} twice", sweep.axes[a].key))),
@@ -309,7 +312,9 @@ fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(),
         },
     );
     let (names, note) = pictures::draw(sweep, &outcomes, &options, axes, out)?;
-    if !names.is_empty() {
+    if names.len() == 2 {
+        text += "  final (.svg, .png)   G at the end, by each value of each varied key\n";
+    } else if !names.is_empty() {
         text += "  final, reach, curves (.svg, .png)   G at the end, generations to reach one, and learning curves\n";
     }
     text.extend(note.map(|note| note + "\n"));
