@@ -15,8 +15,8 @@ fn density(range2: f32, dx: f32, dy: f32) -> f32 {
 // Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant, in the order of the policy's inputs:
 // back-right, front-right, front-left, back-left.
 //
-// The quadrant is read off the signs of the offset along the heading and to its left; a tie goes one quarter turn
-// clockwise, so that each boundary belongs to exactly one quadrant.
+// The quadrant is read off the signs of the offset along the heading and to its left; a tie goes to the quadrant
+// counterclockwise of it, so that each boundary belongs to exactly one quadrant.
 fn sense(density: f32, dx: f32, dy: f32, hx: f32, hy: f32, sums: ptr<function, array<f32, 4>>) {
     let fx = dx * hx + dy * hy;
     let fy = dy * hx - dx * hy;

@@ -42,8 +42,9 @@ const _: () = assert!(MAX_STEPS * MAX_POIS * MAX_AGENTS.div_ceil(32) * size_of::
 pub const MAX_POLICY_BYTES: usize = 1 << 38;
 /// Most bytes in a config file.
 pub const MAX_FILE_BYTES: u64 = 1 << 20;
-/// The section that makes a config a sweep.
+/// The sections that make a config a sweep: values to combine, and values to try one at a time.
 pub const GRID: &str = "grid";
+pub const VARY: &str = "vary";
 /// Most problems listed of one file.
 const MAX_LISTED: usize = 50;
 /// Longest map side, radius or range: squares of distances stay far from the ends of f32.
@@ -299,11 +300,11 @@ impl Config {
         }
         if reader.problems.is_empty() && !foreign.contains(&GRID) {
             // Of a sweep taken for a config nothing else is worth saying.
-            let section = |key: &Spanned<_>| key.get_ref() == GRID;
-            let grid = document.get_ref().keys().find(|key| section(key)).map(|key| key.span().start);
-            if let Some(start) = grid {
+            let sections = document.get_ref().keys();
+            let mut of_sweeps = sections.filter(|key| [GRID, VARY].contains(&key.get_ref().as_ref()));
+            if let Some(section) = of_sweeps.next() {
                 let message = "this makes the file a sweep, of many configs; use `flotilla sweep`";
-                reader.blame(Place::Offset(start), GRID, message.into());
+                reader.blame(Place::Offset(section.span().start), section.get_ref(), message.into());
             }
         }
         if reader.problems.is_empty() {

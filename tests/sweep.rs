@@ -8,7 +8,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::config::{Config, Coupling};
+use flotilla::config::{Config, Coupling, Override};
 use flotilla::sweep::shard::{Shard, cost};
 use flotilla::sweep::{Sweep, layout, run};
 use flotilla::trainer::Trainer;
@@ -239,6 +239,120 @@ fn impossible_points_are_told_together_or_left_out_on_request() {
     }
 }
 
+/// Two fitnesses, and with each of them two keys changed one at a time.
+fn varied() -> String {
+    let base = SMALL.split("[grid]").next().unwrap().replace("seed = 5", "seed = 5\ngenerations = 6");
+    let grid = "[grid]\n\"learning.fitness\" = [\"G\", \"Df\"]\n";
+    base + grid + "[vary]\n\"learning.generations\" = [3, 12]\nworld.coupling = [1, 7]\n"
+}
+
+#[test]
+fn varied_keys_change_one_at_a_time() {
+    let text = varied().replace("[1, 7]", "[1, 2]");
+    let sweep = sweep_of(&text);
+    let told: Vec<_> = sweep.points.iter().map(|point| sweep.describe(point)).collect();
+    let changes = [
+        "",
+        ", learning.generations = 3",
+        ", learning.generations = 12",
+        ", world.coupling = 1",
+        ", world.coupling = 2",
+    ];
+    let wanted: Vec<_> =
+        ["G", "Df"].iter().flat_map(|f| changes.map(|change| format!("learning.fitness = {f}{change}"))).collect();
+    assert_eq!(told, wanted);
+    for (index, point) in sweep.points.iter().enumerate() {
+        let (generations, coupling) = [(6, 3), (3, 3), (12, 3), (6, 1), (6, 2)][index % 5];
+        assert_eq!(point.config.learning.generations, generations);
+        assert_eq!(point.config.world.coupling, Coupling::Same(coupling));
+    }
+    // The first value of a varied key is the file's own, written there or not.
+    assert_eq!((sweep.axes[1].label(0), sweep.axes[2].label(0)), ("6".into(), "3".into()));
+    let again = sweep_of(&sweep.text);
+    assert_eq!((again.text.as_str(), &again.points), (sweep.text.as_str(), &sweep.points));
+
+    // No grid is one combination.
+    let alone = text.replace("[grid]\n\"learning.fitness\" = [\"G\", \"Df\"]\n", "");
+    let alone = sweep_of(&alone);
+    assert_eq!((alone.points.len(), alone.describe(&alone.points[0]).as_str()), (5, "as in the file"));
+    assert_eq!(alone.describe(&alone.points[4]), "world.coupling = 2");
+    assert_eq!(sweep_of(&alone.text).points, alone.points);
+}
+
+#[test]
+fn wrong_varied_keys_are_told_with_their_lines() {
+    let with = |keys: &str| refusal(&varied().replace("world.coupling = [1, 7]", keys));
+    for (keys, wanted) in [
+        ("\"learning.fitness\" = [\"D\"]", "x.toml:17: vary.\"learning.fitness\": it stands in [grid] too"),
+        (
+            "\"world.coupling\" = [1, 3]",
+            "x.toml:17: vary.\"world.coupling\"[1]: found 3, which is the file's own value",
+        ),
+        ("\"motion.max_speed\" = [3]", "vary.\"motion.max_speed\"[0]: found 3, which is the file's own value"),
+        ("\"world.coupling\" = []", "x.toml:17: vary.\"world.coupling\": found no values"),
+        ("\"world.coupling\" = 1", "x.toml:17: vary.\"world.coupling\": found 1, allowed a list of values: [1]"),
+        (
+            "\"world.copling\" = [1]",
+            "x.toml:17: vary.\"world.copling\"[0]: unknown key, did you mean `world.coupling`?",
+        ),
+        ("\"world.coupling\" = [1, 1]", "x.toml:17: vary.\"world.coupling\": found 1 twice"),
+        (
+            "\"world.coupling\" = [1, 7]",
+            "vary.\"world.coupling\"[1]: found 7, allowed 1 to 6 (the number of agents); at 2",
+        ),
+        ("followers_per_leader = [3]", "x.toml:17: vary.followers_per_leader: it lays out whole teams"),
+        ("skip_impossible = true", "x.toml:17: vary.skip_impossible: found true, allowed a list of values"),
+    ] {
+        let error = with(keys);
+        assert!(error.contains(wanted), "{keys}: {error}");
+    }
+    let base = SMALL.split("[grid]").next().unwrap();
+    assert!(refusal(&format!("{base}[vary]\n")).contains("x.toml:12: vary: it has no key"));
+    assert!(refusal(&format!("vary = 3\n{base}")).contains("x.toml:1: vary: allowed a section [vary]"));
+    let flag = Override::new("learning.generations", 5, "--generations");
+    let error = Sweep::read(&varied(), "x.toml", &[flag], true).unwrap_err().to_string();
+    assert!(error.contains("--generations: [vary] has learning.generations already"), "{error}");
+    // One impossible value of two leaves the other.
+    let grid = varied().replace(
+        "[\"G\", \"Df\"]",
+        "[\"G\"]\n\"world.followers\" = [[[12, 2]], [[12, 2], [8, 2], [9, 2], [7, 2], [6, 2]]]",
+    );
+    let sweep = Sweep::read(&grid, "x.toml", &[], true).unwrap_or_else(|error| panic!("{error}"));
+    assert_eq!((sweep.points.len(), sweep.skipped), (9, 1));
+}
+
+#[test]
+fn a_varied_sweep_has_columns_and_a_picture_of_its_keys() {
+    let (folder, sweep) = written(&varied());
+    let (whole, sharded) = (folder.path().join("whole"), folder.path().join("sharded"));
+    let skip = "--skip-impossible";
+    assert!(failed(flotilla(&sweep, &whole, &[]), 1).contains("found 7"));
+    fs::write(&sweep, varied().replace("[1, 7]", "[1, 2]")).unwrap();
+    let listed = done(flotilla(&sweep, &whole, &["--list"]));
+    assert!(listed.contains("learning.fitness = Df, world.coupling = 2\n"), "{listed}");
+    let told = done(flotilla(&sweep, &whole, &["--quiet", skip]));
+    assert!(told.contains("10 of 10 points are done") && told.contains("  final (.svg, .png)"), "{told}");
+
+    let table = fs::read_to_string(whole.join("points.csv")).unwrap();
+    let rows: Vec<Vec<&str>> = table.lines().map(|line| line.split(',').collect()).collect();
+    assert_eq!(rows[0][..4], ["learning.fitness", "learning.generations", "world.coupling", "point"]);
+    let axes: Vec<&[&str]> = rows[1..].iter().map(|row| &row[..3]).collect();
+    assert_eq!(axes[..3], [["G", "6", "3"], ["G", "3", "3"], ["G", "12", "3"]]);
+    assert_eq!(axes[8..], [["Df", "6", "1"], ["Df", "6", "2"]]);
+    let names: Vec<String> = results(&whole).into_iter().map(|(name, _)| name).collect();
+    assert_eq!(names, ["final.png", "final.svg", "points.csv", "results.csv", "sweep.toml"]);
+
+    // A dot for each value; the files' own values are lines.
+    assert_eq!(fs::read_to_string(whole.join("final.svg")).unwrap().matches("<circle").count(), 8);
+
+    for shard in ["1/2", "2/2"] {
+        done(flotilla(&sweep, &sharded, &["--quiet", skip, "--shard", shard]));
+    }
+    done(flotilla(&sweep, &sharded, &["--collect", skip]));
+    assert_eq!(results(&whole), results(&sharded));
+    assert!(failed(flotilla(&sweep, &whole, &["--collect", "--axes", "coupling"]), 2).contains("one picture"));
+}
+
 #[test]
 fn every_sweep_of_the_repository_can_run() {
     let mut found = 0;
@@ -249,7 +363,7 @@ fn every_sweep_of_the_repository_can_run() {
         assert!(fs::read_to_string(&path).unwrap().starts_with("# "), "{} opens by what it shows", path.display());
         found += 1;
     }
-    assert!(found >= 7);
+    assert!(found >= 9);
 }
 
 proptest! {

@@ -27,7 +27,8 @@ const RESULTS: &str = "Results";
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Sweep file: a config with a section [grid] of lists of values; - is standard input
+    /// Sweep file: a config with a section [grid] of lists of values, or [vary] of keys to change one at a time; - is
+    /// standard input
     sweep: PathBuf,
     #[command(flatten)]
     overrides: Overrides,
@@ -163,6 +164,9 @@ impl Args {
                 Error::Usage(format!("--axes: {name} is no axis of the grid; it has {}", keys.join(", ")))
             })
         };
+        if !self.axes.is_empty() && sweep.axes.iter().any(|axis| axis.varied) {
+            return Err(Error::Usage("--axes: a sweep with [vary] has one picture, of all its keys".into()));
+        }
         let axes: Vec<usize> = self.axes.iter().map(find).collect::<Result<_, _>>()?;
         match axes[..] {
             [a, b] if a == b => Err(Error::Usage(format!("--axes: {} twice", sweep.axes[a].key))),
@@ -360,7 +364,10 @@ fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(),
                     format!("every {} generations", options.every)
                 },
             );
-            if !names.is_empty() {
+            if names.is_empty() {
+            } else if sweep.axes.iter().any(|axis| axis.varied) {
+                text += "  final (.svg, .png)   G at the end, by each value of each varied key\n";
+            } else {
                 text += "  final, reach, curves (.svg, .png)   G at the end, generations to reach one, and learning curves\n";
             }
             text.extend(note.map(|note| note + "\n"));

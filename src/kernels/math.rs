@@ -5,8 +5,8 @@
 //! abs, 32-bit integer operations, bit casts and conversions of integers up to 2^24 occur. Within the stated ranges
 //! every intermediate value is 0 or of size 2^-120 to 2^120, so flushed denormals change nothing, and the sign of an
 //! intermediate zero shows in no result. Stated errors are the largest over every float of the range, as
-//! `tests/math.rs` finds them; one ULP is the spacing of floats at the exact value. Counts are of lane operations,
-//! constants free.
+//! `tests/math.rs` finds them; one ULP is the spacing of floats at the exact value. `tests/fit.rs` fits the polynomials
+//! anew. Counts are of lane operations, constants free.
 
 #![allow(clippy::approx_constant, reason = "the twin has the same literals")]
 

@@ -24,8 +24,8 @@ pub fn density<S: Simd, const LINEAR: bool>(world: &Lanes<S>, range2: S::f32s, d
 /// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant, in the order of the policy's inputs:
 /// back-right, front-right, front-left, back-left.
 ///
-/// The quadrant is read off the signs of the offset along the heading and to its left; a tie goes one quarter turn
-/// clockwise, so that each boundary belongs to exactly one quadrant.
+/// The quadrant is read off the signs of the offset along the heading and to its left; a tie goes to the quadrant
+/// counterclockwise of it, so that each boundary belongs to exactly one quadrant.
 #[inline(always)]
 pub fn sense<S: Simd>(density: S::f32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, hy: S::f32s, sums: &mut [S::f32s; 4]) {
     let zero = splat(dx.token(), 0.0);

@@ -1,4 +1,5 @@
-//! Figures of a grid of results: heat maps over two axes, and curves by the values of an axis.
+//! Figures of a grid of results: heat maps over two axes, curves by the values of an axis, and dots for keys that are
+//! varied one at a time.
 
 use super::curves::Curve;
 use super::scene::{Anchor, BLACK, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
@@ -239,6 +240,79 @@ impl Curves {
         const DASHES: [&[f64]; 3] = [&[], &[1.8, 0.7], &[0.7, 0.6]];
         let last = self.by.values.len().saturating_sub(1).max(1) as f64;
         Pen { dash: DASHES[value % 3], ..Pen::new(shade(0.35 + 0.65 * value as f64 / last), 0.45) }
+    }
+}
+
+/// A share in 0..1 with the ends of its interval.
+pub type Spread = [f64; 3];
+
+/// One value with its interval for each value of each of several keys, beside that of what was not varied, in a panel for
+/// each of several settings.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Dots {
+    pub title: String,
+    pub x_label: String,
+    /// Down the side: a key with its own value, and its other values.
+    pub groups: Vec<(String, Vec<String>)>,
+    /// Title, what comes out with every key's own value, and for each row of all groups what comes out there.
+    pub panels: Vec<(String, Option<Spread>, Vec<Option<Spread>>)>,
+}
+
+impl Dots {
+    pub fn scene(&self) -> Scene {
+        const HIGH: f64 = 4.0;
+        const RADIUS: f64 = 0.75;
+        // Room for what is written beside each row.
+        const WRITTEN: f64 = 8.5;
+        let values = self.groups.iter().flat_map(|(_, values)| values).map(|value| text_width(value, SMALL) + 4.0);
+        let names = self.groups.iter().map(|(name, _)| text_width(name, SMALL) * 1.1);
+        let left = 5.0 + values.chain(names).fold(0.0, f64::max);
+        let titles = self.panels.iter().map(|(title, ..)| text_width(title, SMALL)).fold(0.0, f64::max);
+        let rows: f64 = self.groups.iter().map(|(_, values)| 1.25 + values.len() as f64).sum();
+        let (plot, height) = (titles.max(34.0), HIGH * rows);
+        let panels = Panels::new(self.panels.len(), plot + WRITTEN, height, left, 15.0);
+        let whole = panels.width().max(text_width(&self.title, 3.2) * 1.1 + 6.0);
+        let mut scene = Scene::new(whole, panels.above + panels.height());
+        scene.bold([3.0, 5.0], &*self.title, 3.2, Anchor::Start, BLACK);
+
+        let (accent, own) = (shade(0.7), Pen { dash: &[1.2, 0.8], ..Pen::new(BLACK, 0.25) });
+        for (index, (title, base, found)) in self.panels.iter().enumerate() {
+            let [x, y] = panels.place(index);
+            let at = |g: f64| x + plot * g.clamp(0.0, 1.0);
+            scene.text([x + plot / 2.0, y - 1.6], &**title, SMALL, Anchor::Middle, BLACK);
+            if let Some([mean, low, high]) = *base {
+                let fill = Fill { color: GREY, opacity: 0.25 };
+                scene.rectangle([at(low), y, (at(high) - at(low)).max(0.3), height], Some(fill), None);
+                scene.line(vec![[at(mean), y], [at(mean), y + height]], own.clone());
+            }
+            for (tick, label) in [(0.0, "0"), (0.5, "0.5"), (1.0, "1")] {
+                scene.line(vec![[at(tick), y], [at(tick), y + height]], Pen::new(LIGHT, 0.15));
+                scene.text([at(tick), y + height + 3.4], label, SMALL, Anchor::Middle, BLACK);
+            }
+            scene.rectangle([x, y, plot, height], None, Some(Pen::new(GREY, 0.2)));
+            scene.text([x + plot / 2.0, y + height + 7.4], &*self.x_label, SMALL, Anchor::Middle, BLACK);
+            let (mut row, mut found) = (0.0, found.iter());
+            for (name, values) in &self.groups {
+                let line = |row: f64| y + HIGH * row + HIGH / 2.0;
+                if panels.is_first(index) {
+                    scene.bold([3.0, line(row) + 1.3], &**name, SMALL, Anchor::Start, BLACK);
+                }
+                row += 1.25;
+                for value in values {
+                    if panels.is_first(index) {
+                        scene.text([x - 1.5, line(row) + 0.9], &**value, SMALL, Anchor::End, BLACK);
+                    }
+                    if let Some([mean, low, high]) = found.next().copied().flatten() {
+                        scene.line(vec![[at(low), line(row)], [at(high), line(row)]], Pen::new(accent, 0.5));
+                        scene.circle([at(mean), line(row)], RADIUS, Some(accent.into()), None);
+                        let place = [x + plot + 1.2, line(row) + 0.9];
+                        scene.text(place, format!("{mean:.2}"), SMALL, Anchor::Start, BLACK);
+                    }
+                    row += 1.0;
+                }
+            }
+        }
+        scene
     }
 }
 

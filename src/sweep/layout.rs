@@ -8,7 +8,7 @@
 
 use toml::{Table, Value};
 
-use super::{Grid, axis_name, problem};
+use super::{Grid, problem};
 use crate::config::{Override, Problem};
 
 /// Followers of each leader (0 to 64; 2 where only the other axis is given).
@@ -97,7 +97,7 @@ pub(super) fn conflicts(grid: &Grid, base: &Table) -> Vec<Problem> {
     given
         .map(|key| {
             let message = format!("it lays out {key}, which is given too; leave one of them out");
-            problem(Some(*line), &axis_name(&axis.key), message)
+            problem(Some(*line), &axis.name(), message)
         })
         .collect()
 }
@@ -131,7 +131,7 @@ impl Layout {
         let Positions { leaders, followers, pois, map } = positions(&self.places, &vec![followers; groups]);
         let list = |list: Vec<[i32; 2]>| Value::Array(list.into_iter().map(|place| place.to_vec().into()).collect());
         let named = axes.iter().flatten().next().map_or(0, |&axis| axis);
-        let name = format!("{}[{}]", axis_name(&grid.axes[named].0.key), values[named]);
+        let name = grid.axes[named].0.name_of(values[named]);
         let set = |key: &str, value: Value| Override::new(format!("world.{key}"), value, &*name);
         let mut overrides = vec![set("leaders", list(leaders)), set("followers", list(followers))];
         if self.pois {

@@ -1,8 +1,10 @@
 //! A grid of runs: what a sweep file says, and how its points are shared out, run and put together again.
 //!
-//! A sweep file is a config with one section more, `[grid]`, whose keys are dotted config keys with lists of values,
-//! or the special axes of [`layout`]. Every combination of values is a [`Point`]: one config, trained as a run of its
-//! own in `points/NNNN`, whose results do not depend on which other points trained beside it.
+//! A sweep file is a config with a section `[grid]`, whose keys are dotted config keys with lists of values, or the
+//! special axes of [`layout`]. Every combination of values is a [`Point`]: one config, trained as a run of its own in
+//! `points/NNNN`, whose results do not depend on which other points trained beside it. A section `[vary]` has keys that
+//! are changed one at a time: for every combination of `[grid]` there is a point with the file's own values, and one for
+//! each value of each key of `[vary]`.
 //!
 //! | module | holds |
 //! |---|---|
@@ -19,7 +21,7 @@ use std::path::Path;
 use toml::de::{DeTable, DeValue};
 use toml::{Spanned, Table, Value};
 
-use crate::config::{self, Config, ConfigError, GRID, Override, Problem, read_file};
+use crate::config::{self, Config, ConfigError, GRID, Override, Problem, VARY, read_file};
 use crate::escape;
 
 pub mod layout;
@@ -41,7 +43,7 @@ const MAX_LISTED: usize = 50;
 pub struct Sweep {
     /// What its file is called, without folder and extension.
     pub name: String,
-    /// In the order of the file; the first changes slowest from point to point.
+    /// Those of the grid, then those varied, each in the order of the file; the first changes slowest from point to point.
     pub axes: Vec<Axis>,
     pub points: Vec<Point>,
     /// Combinations left out because they cannot run.
@@ -50,15 +52,28 @@ pub struct Sweep {
     pub text: String,
 }
 
-/// A key of `[grid]` and the values it takes.
+/// A key of `[grid]` or `[vary]` and the values it takes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Axis {
     /// A dotted config key, or one of [`layout::AXES`].
     pub key: String,
+    /// Of a varied key the first is the file's own.
     pub values: Vec<Value>,
+    /// Changed one at a time: of a point's varied keys, at most one has another than its first value.
+    pub varied: bool,
 }
 
 impl Axis {
+    /// What errors call it.
+    fn name(&self) -> String {
+        format!("{}.{}", if self.varied { VARY } else { GRID }, quoted(&self.key))
+    }
+
+    /// What errors call a value, by its place in the file's list.
+    fn name_of(&self, value: usize) -> String {
+        format!("{}[{}]", self.name(), value - usize::from(self.varied))
+    }
+
     /// A value for people and tables: words without quotes, all else as TOML.
     pub fn label(&self, value: usize) -> String {
         match &self.values[value] {
@@ -102,20 +117,26 @@ impl Sweep {
     /// Everything that is wrong with the text and with any of its points.
     pub fn read(text: &str, name: &str, flags: &[Override], skip: bool) -> Result<Sweep, ConfigError> {
         let (Ok(document), Ok(mut base)) = (DeTable::parse(text), text.parse::<Table>()) else {
-            Config::read(text, name, &[GRID], &[])?;
+            Config::read(text, name, &[GRID, VARY], &[])?;
             return Err(invalid(name, vec![problem(None, "", "it is not TOML")]));
         };
-        let grid = Grid::read(text, document.into_inner(), base.remove(GRID)).map_err(|list| invalid(name, list))?;
+        let sections = [GRID, VARY].map(|section| base.remove(section));
+        let mut grid = Grid::read(text, document.into_inner(), sections).map_err(|list| invalid(name, list))?;
         let skip = skip || grid.skip;
         let mut problems: Vec<Problem> = flags
             .iter()
-            .filter(|flag| grid.axes.iter().any(|(axis, _)| axis.key == flag.key))
-            .map(|flag| problem(None, &flag.name, format!("the grid has {} already; leave one of them out", flag.key)))
+            .filter_map(|flag| Some((flag, grid.axes.iter().find(|(axis, _)| axis.key == flag.key)?)))
+            .map(|(flag, (axis, _))| {
+                let section = if axis.varied { "[vary]" } else { "the grid" };
+                problem(None, &flag.name, format!("{section} has {} already; leave one of them out", flag.key))
+            })
             .collect();
         problems.extend(layout::conflicts(&grid, &base));
-        let total = grid.axes.iter().try_fold(1, |total: usize, (axis, _)| total.checked_mul(axis.values.len()));
+        let mut counts: Vec<_> = grid.of_grid().map(|axis| axis.values.len()).collect();
+        counts.extend(Some(grid.variations()).filter(|&variations| variations > 1));
+        let total = counts.iter().try_fold(1, |total: usize, &count| total.checked_mul(count));
         let Some(total) = total.filter(|&total| total <= MAX_POINTS) else {
-            let counts: Vec<_> = grid.axes.iter().map(|(axis, _)| axis.values.len().to_string()).collect();
+            let counts: Vec<_> = counts.iter().map(usize::to_string).collect();
             let message = format!("found {} points, allowed 1 to {MAX_POINTS}", counts.join(" × "));
             return Err(invalid(name, vec![problem(Some(grid.line), GRID, message)]));
         };
@@ -128,11 +149,12 @@ impl Sweep {
             .map(|index| {
                 let values = grid.values(index);
                 let overrides = [flags, &grid.overrides(&values), &layout.overrides(&grid, &values)].concat();
-                let config = Config::read(text, name, &[GRID], &overrides);
+                let config = Config::read(text, name, &[GRID, VARY], &overrides);
                 Tried { index, values, config }
             })
             .collect();
-        let problems = grid.blame(&tried, skip);
+        let mut problems = grid.blame(&tried, skip);
+        problems.extend(grid.take_own_values(&tried));
         if !problems.is_empty() {
             return Err(invalid(name, problems));
         }
@@ -158,9 +180,9 @@ struct Tried {
 }
 
 fn describe<'a>(axes: impl Iterator<Item = &'a Axis>, values: &[usize]) -> String {
-    let pairs: Vec<_> =
-        axes.zip(values).map(|(axis, &value)| format!("{} = {}", axis.key, axis.label(value))).collect();
-    escape::line(&pairs.join(", ")).into()
+    let told = axes.zip(values).filter(|(axis, value)| !axis.varied || **value > 0);
+    let pairs: Vec<_> = told.map(|(axis, &value)| format!("{} = {}", axis.key, axis.label(value))).collect();
+    if pairs.is_empty() { "as in the file".into() } else { escape::line(&pairs.join(", ")).into() }
 }
 
 fn problem(line: Option<usize>, key: &str, message: impl Into<String>) -> Problem {
@@ -174,86 +196,159 @@ fn invalid(name: &str, mut problems: Vec<Problem>) -> ConfigError {
     ConfigError::Invalid { name: name.into(), problems, unlisted }
 }
 
-/// `[grid]` as written: every axis with its line.
+/// `[grid]` and `[vary]` as written: every axis with its line.
 struct Grid {
     line: usize,
+    /// Those of the grid first.
     axes: Vec<(Axis, usize)>,
     skip: bool,
 }
 
 impl Grid {
-    fn read(text: &str, document: DeTable<'_>, values: Option<Value>) -> Result<Grid, Vec<Problem>> {
+    /// Of a varied axis the first value is yet to be found (see [`Grid::take_own_values`]).
+    fn read(text: &str, document: DeTable<'_>, values: [Option<Value>; 2]) -> Result<Grid, Vec<Problem>> {
         let line = |at: usize| text.bytes().take(at).filter(|&byte| byte == b'\n').count() + 1;
-        let Some((start, section)) =
-            document.into_iter().find_map(|(key, value)| (key.get_ref() == GRID).then(|| (key.span().start, value)))
-        else {
+        let mut grid = Grid { line: 0, axes: vec![], skip: false };
+        let mut problems = Vec::new();
+        let mut spans: BTreeMap<_, _> = document
+            .into_iter()
+            .filter(|(key, _)| [GRID, VARY].contains(&key.get_ref().as_ref()))
+            .map(|(key, value)| (key.get_ref().to_string(), (key.span().start, value)))
+            .collect();
+        for (name, values) in [GRID, VARY].into_iter().zip(values) {
+            let Some((start, section)) = spans.remove(name) else { continue };
+            let line_of_section = line(start);
+            grid.line = if grid.line == 0 { line_of_section } else { grid.line };
+            let (DeValue::Table(section), Some(Value::Table(values))) = (section.into_inner(), values) else {
+                problems.push(problem(Some(line_of_section), name, format!("allowed a section [{name}]")));
+                continue;
+            };
+            // The spans know the order in the file, the plain values are easier to pass on.
+            let mut starts = BTreeMap::new();
+            flatten_spans(section, "", &mut starts);
+            let mut flat = BTreeMap::new();
+            flatten(values, "", &mut flat);
+            let mut keys: Vec<_> =
+                flat.into_iter().map(|(key, value)| (starts.get(&key).copied(), key, value)).collect();
+            keys.sort_by_key(|(start, ..)| *start);
+            let (before, faults) = (grid.axes.len(), problems.len());
+            for (start, key, value) in keys {
+                grid.read_key(name == VARY, start.map_or(line_of_section, line), key, value, &mut problems);
+            }
+            if name == VARY && grid.axes.len() == before && problems.len() == faults {
+                let message = "it has no key; give a list of values for at least one: \"motion.max_speed\" = [2, 5]";
+                problems.push(problem(Some(line_of_section), VARY, message));
+            }
+        }
+        if grid.line == 0 {
             let message = "missing, a sweep has a section [grid] with a list of values for each key: \
                            \"world.coupling\" = [1, 2, 3]; to train one config, use `flotilla train`";
             return Err(vec![problem(None, GRID, message)]);
-        };
-        let line_of_grid = line(start);
-        let (DeValue::Table(section), Some(Value::Table(values))) = (section.into_inner(), values) else {
-            return Err(vec![problem(Some(line_of_grid), GRID, "allowed a section [grid]")]);
-        };
-        // The spans know the order in the file, the plain values are easier to pass on.
-        let mut starts = BTreeMap::new();
-        flatten_spans(section, "", &mut starts);
-        let mut flat = BTreeMap::new();
-        flatten(values, "", &mut flat);
-        let mut keys: Vec<_> = flat.into_iter().map(|(key, value)| (starts.get(&key).copied(), key, value)).collect();
-        keys.sort_by_key(|(start, ..)| *start);
-
-        let mut grid = Grid { line: line_of_grid, axes: vec![], skip: false };
-        let mut problems = Vec::new();
-        for (start, key, value) in keys {
-            let line = start.map_or(line_of_grid, line);
-            let mut blame = |message: String| problems.push(problem(Some(line), &axis_name(&key), message));
-            match value {
-                Value::Boolean(skip) if key == SKIP => grid.skip = skip,
-                other if key == SKIP => blame(format!("found {other}, allowed true or false")),
-                Value::Array(values) if values.is_empty() => {
-                    blame("found no values, allowed a list of at least one; or leave the key out".into());
-                }
-                Value::Array(values) => {
-                    for (at, value) in values.iter().enumerate() {
-                        if let Some(first) = values[..at].iter().position(|other| other == value) {
-                            blame(format!("found {value} twice, at [{first}] and at [{at}]"));
-                        }
-                    }
-                    if layout::AXES.contains(&&*key) {
-                        layout::blame(&key, &values).for_each(blame);
-                    }
-                    grid.axes.push((Axis { key, values }, line));
-                }
-                other => blame(format!("found {other}, allowed a list of values: [{other}]")),
-            }
         }
         if grid.axes.is_empty() && problems.is_empty() {
-            problems.push(problem(
-                Some(line_of_grid),
-                GRID,
-                "it has no axis; give a list of values for at least one key: \"world.coupling\" = [1, 2, 3]",
-            ));
+            let message = "it has no axis; give a list of values for at least one key: \"world.coupling\" = [1, 2, 3]";
+            problems.push(problem(Some(grid.line), GRID, message));
         }
         if problems.is_empty() { Ok(grid) } else { Err(problems) }
     }
 
-    /// The value on each axis of a combination.
-    fn values(&self, mut index: usize) -> Vec<usize> {
+    fn read_key(&mut self, varied: bool, line: usize, key: String, value: Value, problems: &mut Vec<Problem>) {
+        let mut axis = Axis { key, values: vec![], varied };
+        let (key, name) = (&*axis.key, axis.name());
+        let mut blame = |message: String| problems.push(problem(Some(line), &name, message));
+        match value {
+            Value::Boolean(skip) if key == SKIP && !varied => self.skip = skip,
+            other if key == SKIP && !varied => blame(format!("found {other}, allowed true or false")),
+            _ if varied && layout::AXES.contains(&key) => {
+                blame("it lays out whole teams, of which the file has none of its own; allowed in [grid]".into());
+            }
+            _ if varied && self.axes.iter().any(|(other, _)| other.key == key) => {
+                blame("it stands in [grid] too; leave one of them out".into());
+            }
+            Value::Array(values) if values.is_empty() => {
+                blame("found no values, allowed a list of at least one; or leave the key out".into());
+            }
+            Value::Array(values) => {
+                for (at, value) in values.iter().enumerate() {
+                    if let Some(first) = values[..at].iter().position(|other| other == value) {
+                        blame(format!("found {value} twice, at [{first}] and at [{at}]"));
+                    }
+                }
+                if layout::AXES.contains(&key) {
+                    layout::blame(key, &values).for_each(blame);
+                }
+                axis.values.extend(varied.then(|| Value::from("")));
+                axis.values.extend(values);
+                self.axes.push((axis, line));
+            }
+            other => blame(format!("found {other}, allowed a list of values: [{other}]")),
+        }
+    }
+
+    fn of_grid(&self) -> impl DoubleEndedIterator<Item = &Axis> {
+        self.axes.iter().map(|(axis, _)| axis).filter(|axis| !axis.varied)
+    }
+
+    /// Points of each combination of the grid: the file's own values, and each varied one.
+    fn variations(&self) -> usize {
+        let varied = self.axes.iter().filter(|(axis, _)| axis.varied);
+        1 + varied.map(|(axis, _)| axis.values.len() - 1).sum::<usize>()
+    }
+
+    /// Finds the first value of every varied axis: what the points that do not change it have. A value that is no other
+    /// than that is a problem.
+    fn take_own_values(&mut self, tried: &[Tried]) -> Vec<Problem> {
+        let mut problems = Vec::new();
+        for combination in tried.chunks(self.variations()) {
+            let Ok(own) = &combination[0].config else { continue };
+            for Tried { values, config, .. } in combination[1..].iter().filter(|tried| tried.config.as_ref() == Ok(own))
+            {
+                let changed = self.axes.iter().zip(values).find(|((axis, _), value)| axis.varied && **value > 0);
+                let Some(((axis, line), &value)) = changed.filter(|_| config.is_ok()) else { continue };
+                let found = axis.label(value);
+                let message = format!("found {found}, which is the file's own value: that runs anyway; leave it out");
+                problems.push(problem(Some(*line), &axis.name_of(value), message));
+            }
+        }
+        problems.dedup();
+        let variations = self.variations();
+        let own = |key: &str| {
+            let configs = tried.chunks(variations).filter_map(|of| of[0].config.as_ref().ok());
+            let mut values = configs.filter_map(|config| value_of(config, key));
+            let first = values.next().unwrap_or_else(|| Value::from(""));
+            // A default may depend on what the grid changes.
+            if values.all(|value| value == first) { first } else { Value::from("the file's") }
+        };
+        for (axis, _) in self.axes.iter_mut().filter(|(axis, _)| axis.varied) {
+            axis.values[0] = own(&axis.key);
+        }
+        problems
+    }
+
+    /// The value on each axis of a point: a combination of the grid's, the last changing fastest, and of each the
+    /// variations.
+    fn values(&self, index: usize) -> Vec<usize> {
+        let (mut combination, mut variation) = (index / self.variations(), index % self.variations());
         let mut values = vec![0; self.axes.len()];
-        for (value, (axis, _)) in values.iter_mut().zip(&self.axes).rev() {
-            *value = index % axis.values.len();
-            index /= axis.values.len();
+        for (value, (axis, _)) in values.iter_mut().zip(&self.axes).rev().filter(|(_, (axis, _))| !axis.varied) {
+            *value = combination % axis.values.len();
+            combination /= axis.values.len();
+        }
+        for (value, (axis, _)) in values.iter_mut().zip(&self.axes).filter(|(_, (axis, _))| axis.varied) {
+            let others = axis.values.len() - 1;
+            *value = if variation <= others { variation } else { 0 };
+            variation = if variation <= others { 0 } else { variation - others };
         }
         values
     }
 
     fn overrides(&self, values: &[usize]) -> Vec<Override> {
-        let axes = self.axes.iter().zip(values).filter(|((axis, _), _)| !layout::AXES.contains(&&*axis.key));
-        axes.map(|((Axis { key, values }, _), &value)| {
-            Override::new(key, values[value].clone(), format!("{}[{value}]", axis_name(key)))
-        })
-        .collect()
+        let axes = self.axes.iter().map(|(axis, _)| axis).zip(values.iter().copied());
+        let set = axes.filter(|(axis, value)| {
+            let own = axis.varied && *value == 0;
+            !own && !layout::AXES.contains(&&*axis.key)
+        });
+        set.map(|(axis, value)| Override::new(&axis.key, axis.values[value].clone(), axis.name_of(value))).collect()
     }
 
     /// All that keeps points from running, each problem once. With `skip`, points may fail, but not every point of
@@ -274,7 +369,7 @@ impl Grid {
             }
         }
         let line_of = |key: &str| {
-            let axis = self.axes.iter().find(|(axis, _)| key.starts_with(&axis_name(&axis.key)));
+            let axis = self.axes.iter().find(|(axis, _)| key.starts_with(&axis.name()));
             axis.map(|(_, line)| *line)
         };
         let mut problems = Vec::new();
@@ -302,24 +397,35 @@ impl Grid {
                 section.insert(leaf.into(), value);
             }
         }
-        let mut text = format!("{}\n[{GRID}]\n", toml::to_string(&base).unwrap_or_default()).trim_start().to_string();
-        for (Axis { key, values }, _) in &self.axes {
-            text += &format!("{} = {}\n", quoted(key), Value::Array(values.clone()));
+        let mut text = toml::to_string(&base).unwrap_or_default();
+        for (section, varied) in [(GRID, false), (VARY, true)] {
+            let axes: Vec<&Axis> =
+                self.axes.iter().map(|(axis, _)| axis).filter(|axis| axis.varied == varied).collect();
+            let skip = skip && !varied;
+            if axes.is_empty() && !skip {
+                continue;
+            }
+            text += &format!("\n[{section}]\n");
+            for Axis { key, values, .. } in axes {
+                let values = values[usize::from(varied)..].to_vec();
+                text += &format!("{} = {}\n", quoted(key), Value::Array(values));
+            }
+            if skip {
+                text += &format!("{SKIP} = true\n");
+            }
         }
-        if skip {
-            text += &format!("{SKIP} = true\n");
-        }
-        text
+        text.trim_start().to_string()
     }
+}
+
+/// What a config says of a dotted key.
+fn value_of(config: &Config, key: &str) -> Option<Value> {
+    let (section, leaf) = key.split_once('.')?;
+    config.to_toml().parse::<Table>().ok()?.get(section)?.get(leaf).cloned()
 }
 
 fn quoted(key: &str) -> String {
     if key.contains('.') { format!("{key:?}") } else { key.into() }
-}
-
-/// What errors call an axis.
-fn axis_name(key: &str) -> String {
-    format!("{GRID}.{}", quoted(key))
 }
 
 /// `world.coupling = […]` without quotes is a table in a table; both ways mean the same key.

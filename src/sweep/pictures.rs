@@ -1,4 +1,5 @@
-//! What a sweep came to, as figures: `final`, `reach` and `curves`, each as SVG and PNG.
+//! What a sweep came to, as figures: `final`, `reach` and `curves`, or where keys are varied `final` alone, each as SVG
+//! and PNG.
 
 use std::path::Path;
 
@@ -7,7 +8,7 @@ use super::{Axis, Point, Sweep};
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::report::curves::Curve;
-use crate::report::grid::{Cell, Curves, HeatMap, Scale};
+use crate::report::grid::{Cell, Curves, Dots, HeatMap, Scale, Spread};
 use crate::report::scene::Scene;
 
 /// Pixels a millimetre of a PNG.
@@ -15,6 +16,8 @@ const PIXELS: f64 = 8.0;
 /// Most values of an axis, and most panels, that a figure has room for.
 const MAX_VALUES: usize = 40;
 const MAX_PANELS: usize = 48;
+/// Most values of all varied keys together.
+const MAX_ROWS: usize = 100;
 
 /// A point that is done and what it came to, none where there is none.
 type Place<'a> = Option<(&'a Point, &'a Outcome)>;
@@ -38,15 +41,22 @@ pub fn draw(
     axes: &[usize],
     out: &Path,
 ) -> Result<(Vec<String>, Option<String>), RecordError> {
-    let grid = match Grid::new(sweep, outcomes, axes) {
-        Ok(grid) => grid,
+    let scenes = if sweep.axes.iter().any(|axis| axis.varied) {
+        dots(sweep, outcomes).map(|dots| vec![("final", dots.scene())])
+    } else {
+        let of_grid = |grid: Grid<'_>| {
+            let (last, reach) = (grid.last().scene(), grid.reach(options).scene());
+            vec![("final", last), ("reach", reach), ("curves", grid.curves(sweep).scene())]
+        };
+        Grid::new(sweep, outcomes, axes).map(of_grid)
+    };
+    let scenes = match scenes {
+        Ok(scenes) => scenes,
         Err(reason) => return Ok((vec![], Some(reason))),
     };
     let disk = Disk::default();
     let mut names = Vec::new();
-    for (name, scene) in
-        [("final", grid.last().scene()), ("reach", grid.reach(options).scene()), ("curves", grid.curves(sweep).scene())]
-    {
+    for (name, scene) in scenes {
         for (extension, bytes) in [("svg", Scene::svg(&scene).into_bytes()), ("png", png(&scene, out)?)] {
             let name = format!("{name}.{extension}");
             let path = out.join(&name);
@@ -60,6 +70,52 @@ pub fn draw(
 
 fn png(scene: &Scene, out: &Path) -> Result<Vec<u8>, RecordError> {
     scene.png(PIXELS).map_err(|error| RecordError::Write { path: out.into(), error })
+}
+
+/// The best team's G in the last generation for every value of every varied key, with a panel for each combination of the
+/// grid.
+fn dots(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>]) -> Result<Dots, String> {
+    let (varied, grid): (Vec<usize>, Vec<usize>) = (0..sweep.axes.len()).partition(|&axis| sweep.axes[axis].varied);
+    let rows: usize = varied.iter().map(|&axis| sweep.axes[axis].values.len() - 1).sum();
+    let count = grid.iter().fold(1_usize, |count, &axis| count.saturating_mul(sweep.axes[axis].values.len()));
+    if count > MAX_PANELS || rows > MAX_ROWS {
+        return Err(format!(
+            "no picture: it would have {count} panels of {rows} rows, there is room for {MAX_PANELS} of {MAX_ROWS}"
+        ));
+    }
+    let mut dots = Dots {
+        title: "G of the best team, last generation: mean over trials, two standard errors either way".into(),
+        x_label: "G (line and band: as in the file)".into(),
+        groups: varied.iter().map(|&axis| group(&sweep.axes[axis])).collect(),
+        panels: vec![(String::new(), None, vec![None; rows]); count],
+    };
+    for (point, outcome) in sweep.points.iter().zip(outcomes) {
+        let panel = grid.iter().fold(0, |panel, &axis| panel * sweep.axes[axis].values.len() + point.values[axis]);
+        let (title, base, found) = &mut dots.panels[panel];
+        if title.is_empty() {
+            let several = grid.iter().filter(|&&axis| sweep.axes[axis].values.len() > 1);
+            let words = several.map(|&axis| sweep.axes[axis].label(point.values[axis]));
+            *title = words.collect::<Vec<_>>().join(", ");
+        }
+        let Ok(outcome) = outcome else { continue };
+        let (mean, error) = mean_and_error(&outcome.best);
+        let spread: Spread = [mean, mean - 2.0 * error, mean + 2.0 * error];
+        let mut row = 0;
+        let changed = varied.iter().find_map(|&axis| {
+            let value = point.values[axis];
+            let found = (value > 0).then(|| row + value - 1);
+            row += sweep.axes[axis].values.len() - 1;
+            found
+        });
+        *changed.map_or(base, |row| &mut found[row]) = Some(spread);
+    }
+    Ok(dots)
+}
+
+/// A varied key with its own value, and the others.
+fn group(axis: &Axis) -> (String, Vec<String>) {
+    let Scale { label, values } = scale(axis);
+    (format!("{label} ({})", values[0]), values[1..].to_vec())
 }
 
 impl<'a> Grid<'a> {
