@@ -337,7 +337,7 @@ impl Grid {
         for (value, (axis, _)) in values.iter_mut().zip(&self.axes).filter(|(_, (axis, _))| axis.varied) {
             let others = axis.values.len() - 1;
             *value = if variation <= others { variation } else { 0 };
-            variation = if variation <= others { 0 } else { variation - others };
+            variation = variation.saturating_sub(others);
         }
         values
     }
