@@ -443,6 +443,8 @@ fn a_wrong_value_by_flag_is_wrong_usage_wherever_it_is_found() {
         &["train", "small.toml", "--adapter", ""],
         &["verify", "--adapter", "99"],
         &["verify", "--adapter", ""],
+        &["verify", "--worlds", "4294967295"],
+        &["sweep", "grid.toml", "--slurm", "--time", ":"],
         &["bench", "--adapter", "nonsense", "--json"],
     ] {
         place.refused(2, words);
@@ -469,6 +471,13 @@ fn nothing_of_a_drivers_noise_is_heard() {
         assert_eq!(output.status.code(), Some(0));
         assert_eq!(String::from_utf8_lossy(&output.stderr), "", "XDG_RUNTIME_DIR {folder:?}");
     }
+}
+
+#[test]
+fn as_many_shards_as_there_may_be_are_listed_in_no_time() {
+    let place = Place::new();
+    let list = place.good(&["sweep", "grid.toml", "--list", "--shards", "65536"]);
+    assert_eq!(list.lines().count(), 1 + 4 + 1, "{list}");
 }
 
 #[test]

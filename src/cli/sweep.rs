@@ -103,8 +103,9 @@ fn shard_count(text: &str) -> Result<usize, String> {
 
 /// Slurm's ways to write a time: minutes, M:S, H:M:S, days-hours and so on.
 fn time_limit(text: &str) -> Result<String, String> {
-    let plain = !text.is_empty() && text.chars().all(|c| c.is_ascii_digit() || ":-".contains(c));
-    if plain {
+    let number = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    let (days, clock) = text.split_once('-').unwrap_or(("0", text));
+    if number(days) && clock.split(':').all(number) && clock.split(':').count() <= 3 {
         Ok(text.into())
     } else {
         Err("allowed a Slurm time limit: 01:30:00, or 2-12 for 2 days and 12 hours".into())
@@ -364,16 +365,9 @@ fn summary(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>], options: &resul
 
 fn list(sweep: &Sweep, shards: usize) -> Result<(), Error> {
     let total: u128 = sweep.points.iter().map(shard::cost).sum();
-    let mut of = vec![0; sweep.points.len()];
-    let mut loads = Vec::new();
-    for index in 1..=shards {
-        let points = Shard { index, count: shards }.take(&sweep.points);
-        loads.push(points.iter().map(|point| shard::cost(point)).sum::<u128>());
-        for point in points {
-            let at = sweep.points.partition_point(|other| other.index < point.index);
-            of[at] = index;
-        }
-    }
+    let of = shard::deal(&sweep.points, shards);
+    let mut loads = vec![0; shards];
+    sweep.points.iter().zip(&of).for_each(|(point, shard)| loads[shard - 1] += shard::cost(point));
     let part = |cost: u128| cost as f64 * 100.0 / total.max(1) as f64;
     let mut text = String::from("point  cost %  shard  \n");
     for (point, shard) in sweep.points.iter().zip(of) {

@@ -99,6 +99,9 @@ impl Disk {
             OpenOptions::new().write(true).open(path)?;
         }
         let path = &file::resolved(path);
+        if !file::folder(path).is_dir() {
+            return Err(io::Error::new(io::ErrorKind::NotFound, "there is no such folder; make it first"));
+        }
         self.pass(Operation::Create, path)?;
         // A name that nobody has: beside the user's own files none can be taken for a leftover.
         let mut builder = tempfile::Builder::new();
