@@ -280,6 +280,11 @@ fn what_cannot_be_seen_is_not_said_to_be_missing() {
     hide("metrics.csv");
     let told = place.refused(1, &["plot", "run"]);
     assert!(told.contains("run/metrics.csv: cannot be read") && !told.contains("has no"), "{told}");
+    std::os::unix::fs::symlink("sweep.toml", place.path("run/sweep.toml")).unwrap();
+    for flags in [&[][..], &["--collect"]] {
+        let told = place.refused(1, &[&["sweep", "grid.toml", "--out", "run"], flags].concat());
+        assert!(told.contains("run/sweep.toml: cannot be read") && told.lines().count() == 1, "{told}");
+    }
     hide("config.toml");
     for command in ["plot", "replay"] {
         let told = place.refused(1, &[command, "run"]);

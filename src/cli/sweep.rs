@@ -10,8 +10,10 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use super::train::Signals;
 use super::{Error, Overrides, RunOptions, backend, output, print, say};
 use crate::config::{self, ConfigError, Problem};
+use crate::file;
 use crate::memory;
 use crate::record::RecordError;
+use crate::record::disk;
 use crate::record::folder::{CONFIG, SWEEP, Start};
 use crate::sweep::pictures;
 use crate::sweep::results::{self, Missing, Outcome};
@@ -159,7 +161,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         return list(&sweep, args.shards);
     }
     if args.collect {
-        if !out.join(SWEEP).exists() {
+        if !there(&out.join(SWEEP))? {
             let (out, file) = (out.display(), args.sweep.display());
             return Err(Error::Usage(format!(
                 "{out} holds no sweep; run its shards first: flotilla sweep {file} --out {out} --shard 1/N"
@@ -181,6 +183,11 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
 }
 
+/// Whether a file is there; an error where that cannot be seen.
+fn there(path: &Path) -> Result<bool, RecordError> {
+    file::exists(path).map_err(|error| RecordError::Read { path: path.into(), error })
+}
+
 /// Refuses a folder that holds something else.
 fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let path = out.join(SWEEP);
@@ -188,8 +195,8 @@ fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         let problems = vec![Problem { line: None, key: String::new(), message }];
         Err(ConfigError::Invalid { name: path.display().to_string(), problems, unlisted: 0 }.into())
     };
-    if !path.exists() {
-        return match out.join(CONFIG).exists() {
+    if !there(&path)? {
+        return match there(&out.join(CONFIG))? {
             true => refuse(format!("{} holds a run, not a sweep; choose another --out", out.display())),
             false => Ok(()),
         };
@@ -229,7 +236,7 @@ fn claim(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         }
         Ok(())
     };
-    write().map_err(|error| RecordError::Write { path: path.clone(), error })?;
+    write().map_err(|error| RecordError::Write { path: path.clone(), error: disk::without_path(error) })?;
     same_sweep(sweep, out)
 }
 
