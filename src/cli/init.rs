@@ -83,7 +83,7 @@ fn comment(Key { unit, kind, range, default, meaning, .. }: &Key) -> String {
     let default = default.as_ref().map_or("has to be given".into(), |default| format!("default {default}"));
     let facts = format!("({unit}{kind}, {range}; {default})");
     let one = format!("{meaning} {facts}");
-    if one.chars().count() <= WIDTH { wrapped(&one) } else { wrapped(meaning) + &wrapped(&facts) }
+    if one.chars().count() + 2 <= WIDTH { wrapped(&one) } else { wrapped(meaning) + &wrapped(&facts) }
 }
 
 fn wrapped(text: &str) -> String {
