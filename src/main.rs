@@ -31,10 +31,6 @@ fn calm_drivers() {
 /// Where the system limits the size of files (`ulimit -f`), writing beyond it is an error to be told, not the end.
 fn fail_large_files() -> Result<(), Error> {
     #[cfg(unix)]
-    signal_hook::flag::register(
-        signal_hook::consts::SIGXFSZ,
-        std::sync::Arc::<std::sync::atomic::AtomicBool>::default(),
-    )
-    .map_err(Error::Signals)?;
+    signal_hook::flag::register(signal_hook::consts::SIGXFSZ, std::sync::Arc::default()).map_err(Error::Signals)?;
     Ok(())
 }

@@ -7,8 +7,10 @@ use std::path::{Path, PathBuf};
 use super::train::Signals;
 use super::{Error, Overrides, RunOptions, backend, output, print, say};
 use crate::config::{self, ConfigError, Problem};
+use crate::file;
 use crate::memory;
 use crate::record::RecordError;
+use crate::record::disk;
 use crate::record::folder::{CONFIG, SWEEP, Start};
 use crate::report::progress::Meter;
 use crate::sweep::pictures;
@@ -99,8 +101,9 @@ fn shard_count(text: &str) -> Result<usize, String> {
 
 /// Slurm's ways to write a time: minutes, M:S, H:M:S, days-hours and so on.
 fn time_limit(text: &str) -> Result<String, String> {
-    let plain = !text.is_empty() && text.chars().all(|c| c.is_ascii_digit() || ":-".contains(c));
-    if plain {
+    let number = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    let (days, clock) = text.split_once('-').unwrap_or(("0", text));
+    if number(days) && clock.split(':').all(number) && clock.split(':').count() <= 3 {
         Ok(text.into())
     } else {
         Err("allowed a Slurm time limit: 01:30:00, or 2-12 for 2 days and 12 hours".into())
@@ -158,7 +161,7 @@ pub fn run(mut args: Args) -> Result<(), Error> {
         return list(&sweep, args.shards);
     }
     if args.collect {
-        if !out.join(SWEEP).exists() {
+        if !there(&out.join(SWEEP))? {
             let (out, file) = (out.display(), args.sweep.display());
             return Err(Error::Usage(format!(
                 "{out} holds no sweep; run its shards first: flotilla sweep {file} --out {out} --shard 1/N"
@@ -180,6 +183,11 @@ pub fn run(mut args: Args) -> Result<(), Error> {
     }
 }
 
+/// Whether a file is there; an error where that cannot be seen.
+fn there(path: &Path) -> Result<bool, RecordError> {
+    file::exists(path).map_err(|error| RecordError::Read { path: path.into(), error })
+}
+
 /// Refuses a folder that holds something else.
 fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let path = out.join(SWEEP);
@@ -187,8 +195,8 @@ fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         let problems = vec![Problem { line: None, key: String::new(), message }];
         Err(ConfigError::Invalid { name: path.display().to_string(), problems, unlisted: 0 }.into())
     };
-    if !path.exists() {
-        return match out.join(CONFIG).exists() {
+    if !there(&path)? {
+        return match there(&out.join(CONFIG))? {
             true => refuse(format!("{} holds a run, not a sweep; choose another --out", out.display())),
             false => Ok(()),
         };
@@ -228,7 +236,7 @@ fn claim(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         }
         Ok(())
     };
-    write().map_err(|error| RecordError::Write { path: path.clone(), error })?;
+    write().map_err(|error| RecordError::Write { path: path.clone(), error: disk::without_path(error) })?;
     same_sweep(sweep, out)
 }
 
@@ -364,16 +372,9 @@ fn summary(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>], options: &resul
 
 fn list(sweep: &Sweep, shards: usize) -> Result<(), Error> {
     let total: u128 = sweep.points.iter().map(shard::cost).sum();
-    let mut of = vec![0; sweep.points.len()];
-    let mut loads = Vec::new();
-    for index in 1..=shards {
-        let points = Shard { index, count: shards }.take(&sweep.points);
-        loads.push(points.iter().map(|point| shard::cost(point)).sum::<u128>());
-        for point in points {
-            let at = sweep.points.partition_point(|other| other.index < point.index);
-            of[at] = index;
-        }
-    }
+    let of = shard::deal(&sweep.points, shards);
+    let mut loads = vec![0; shards];
+    sweep.points.iter().zip(&of).for_each(|(point, shard)| loads[shard - 1] += shard::cost(point));
     let part = |cost: u128| cost as f64 * 100.0 / total.max(1) as f64;
     let mut text = String::from("point  cost %  shard  \n");
     for (point, shard) in sweep.points.iter().zip(of) {

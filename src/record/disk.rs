@@ -99,6 +99,9 @@ impl Disk {
             OpenOptions::new().write(true).open(path)?;
         }
         let path = &file::resolved(path);
+        if !file::folder(path).is_dir() {
+            return Err(io::Error::new(io::ErrorKind::NotFound, "there is no such folder; make it first"));
+        }
         self.pass(Operation::Create, path)?;
         // A name that nobody has: beside the user's own files none can be taken for a leftover.
         let mut builder = tempfile::Builder::new();
@@ -108,15 +111,10 @@ impl Disk {
             Err(_) => std::os::unix::fs::PermissionsExt::from_mode(0o666),
         });
         let temporary = builder.prefix(".flotilla-").suffix(".tmp").tempfile_in(file::folder(path));
-        let temporary = temporary.map_err(|error| match error.get_ref() {
-            // Without the temporary's path, which is nobody's business.
-            Some(_) => error.kind().into(),
-            None => error,
-        })?;
-        let mut output = BufWriter::with_capacity(1 << 20, temporary);
+        let temporary = temporary.map_err(without_path)?;
+        let mut output = BufWriter::with_capacity(1 << 20, temporary.as_file());
         content(&mut output)?;
-        let temporary = output.into_inner().map_err(|error| error.into_error())?;
-        temporary.as_file().sync_all()?;
+        output.into_inner().map_err(|error| error.into_error())?.sync_all()?;
         self.pass(Operation::Rename, path)?;
         temporary.persist(path).map_err(|error| error.error)?;
         self.sync_folder(file::folder(path))
@@ -151,6 +149,11 @@ impl Disk {
         }
         Ok(())
     }
+}
+
+/// An error of a temporary file without its path, which is nobody's business.
+pub fn without_path(error: io::Error) -> io::Error {
+    if error.get_ref().is_some() { error.kind().into() } else { error }
 }
 
 /// Where a file's next content is written until it is whole.

@@ -1,5 +1,7 @@
 //! Which points each of many processes takes: a pure function of the sweep, so that they need not talk to each other.
 
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
 use std::fmt::{self, Display};
 use std::str::FromStr;
 
@@ -70,22 +72,26 @@ impl Shard {
         shard.map(Some).map_err(|error| format!("{names}: {error}; say --shard I/N where the array has gaps"))
     }
 
-    /// This shard's points: dealt out dearest first, each to the shard with the least to do.
+    /// This shard's points, in order (see [`deal`]).
     pub fn take<'a>(&self, points: &'a [Point]) -> Vec<&'a Point> {
-        let mut order: Vec<(u128, &Point)> = points.iter().map(|point| (cost(point), point)).collect();
-        order.sort_by_key(|(cost, point)| (std::cmp::Reverse(*cost), point.index));
-        let mut loads = vec![0; self.count];
-        let mut mine = Vec::new();
-        for (cost, point) in order {
-            let least = (0..self.count).min_by_key(|&shard| (loads[shard], shard)).unwrap_or(0);
-            loads[least] += cost;
-            if least + 1 == self.index {
-                mine.push(point);
-            }
-        }
-        mine.sort_by_key(|point| point.index);
-        mine
+        let of = deal(points, self.count);
+        points.iter().zip(of).filter(|(_, of)| *of == self.index).map(|(point, _)| point).collect()
     }
+}
+
+/// The shard (from 1) of every point, of so many: dealt out dearest first, each to the shard with the least to do.
+pub fn deal(points: &[Point], count: usize) -> Vec<usize> {
+    let mut order: Vec<(u128, usize)> = points.iter().map(cost).zip(0..).collect();
+    order.sort_by_key(|&(cost, at)| (Reverse(cost), points[at].index));
+    let mut loads: BinaryHeap<_> = (1..=count).map(|shard| Reverse((0, shard))).collect();
+    let mut of = vec![0; points.len()];
+    for (cost, at) in order {
+        if let Some(mut least) = loads.peek_mut() {
+            of[at] = least.0.1;
+            least.0.0 += cost;
+        }
+    }
+    of
 }
 
 impl FromStr for Shard {

@@ -1,0 +1,499 @@
+//! The binary on what a careless or hostile user types and leaves in files: one clear line, nothing lost, no waiting.
+#![cfg(unix)]
+
+use std::ffi::OsStr;
+use std::fs;
+use std::os::unix::ffi::OsStrExt;
+use std::path::PathBuf;
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use tempfile::TempDir;
+
+/// Takes milliseconds.
+const SMALL: &str = "\
+[world]
+leaders = [[10, 5], [20, 5]]
+followers = [[12, 2], [22, 2]]
+pois = [[10, 9], [20, 9]]
+coupling = 2
+steps = 8
+[policy]
+hidden = [3]
+[learning]
+population = 6
+generations = 4
+trials = 2
+";
+const SWEEP: &str = "[grid]\n\"world.coupling\" = [1, 2]\n\"learning.fitness\" = [\"G\", \"Df\"]\n";
+
+/// A folder to type in, with `small.toml` and `grid.toml`.
+struct Place(TempDir);
+
+impl Place {
+    fn new() -> Place {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join("small.toml"), SMALL).unwrap();
+        fs::write(folder.path().join("grid.toml"), format!("{SMALL}{SWEEP}")).unwrap();
+        Place(folder)
+    }
+
+    /// With a run in `run`.
+    fn with_run() -> Place {
+        let place = Place::new();
+        place.good(&["train", "small.toml", "--out", "run", "--quiet"]);
+        place
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    fn read(&self, name: &str) -> String {
+        fs::read_to_string(self.path(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
+    }
+
+    fn command(&self) -> Command {
+        let mut command = Command::new(assert_cmd::cargo::cargo_bin!("flotilla"));
+        command.current_dir(self.0.path()).stdin(Stdio::null());
+        for name in ["SLURM_ARRAY_TASK_ID", "JOB_COMPLETION_INDEX", "FLOTILLA_SHARDS"] {
+            command.env_remove(name);
+        }
+        command
+    }
+
+    fn run(&self, words: &[impl AsRef<OsStr>]) -> Output {
+        in_time(self.command().args(words))
+    }
+
+    fn good(&self, words: &[impl AsRef<OsStr>]) -> String {
+        let output = self.run(words);
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(0), "{told}");
+        String::from_utf8(output.stdout).unwrap()
+    }
+
+    /// What is said of a command that is refused or fails with this code.
+    fn refused(&self, code: i32, words: &[impl AsRef<OsStr>]) -> String {
+        let output = self.run(words);
+        let told = String::from_utf8(output.stderr).unwrap();
+        let words: Vec<_> = words.iter().map(AsRef::as_ref).collect();
+        assert_eq!(output.status.code(), Some(code), "{words:?}: {told}");
+        assert!(output.stdout.is_empty(), "{words:?}");
+        assert!(told.contains("error: ") && !told.contains("panicked"), "{words:?}: {told}");
+        told
+    }
+
+    /// A shell in the folder that knows the program as `$flotilla`.
+    fn shell(&self, script: &str) -> Output {
+        let mut bash = Command::new("bash");
+        bash.args(["-c", script]).current_dir(self.0.path()).stdin(Stdio::null());
+        in_time(bash.env("flotilla", assert_cmd::cargo::cargo_bin!("flotilla")))
+    }
+
+    /// Everything in the folder.
+    fn names(&self) -> Vec<String> {
+        let entries = fs::read_dir(self.0.path()).unwrap();
+        let mut names: Vec<_> =
+            entries.map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned()).collect();
+        names.sort();
+        names
+    }
+}
+
+/// The output of a command that must not wait for anything.
+fn in_time(command: &mut Command) -> Output {
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let start = Instant::now();
+    while child.try_wait().unwrap().is_none() {
+        if start.elapsed() > Duration::from_secs(60) {
+            child.kill().unwrap();
+            panic!("{command:?} waits for something");
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.wait_with_output().unwrap()
+}
+
+#[test]
+fn a_bare_name_is_a_file_in_the_present_folder() {
+    let place = Place::with_run();
+    place.good(&["train", "small.toml", "--out", "other", "--seed", "1", "--quiet"]);
+    place.good(&["plot", "run", "--out", "curves.png"]);
+    place.good(&["plot", "run", "other"]);
+    for name in ["replay.html", "replay.svg", "replay.png", "replay.gif"] {
+        assert_eq!(place.good(&["replay", "run", "--out", name]).lines().last().unwrap().split(' ').next(), Some(name));
+    }
+    place.good(&["sweep", "grid.toml", "--out", "sweep", "--slurm=job.sh"]);
+    place.good(&[
+        "rollout",
+        "small.toml",
+        "--policies",
+        "run/policies.safetensors",
+        "--scores",
+        "s.csv",
+        "--trace",
+        "t.csv",
+    ]);
+    for name in ["curves.png", "comparison.svg", "replay.html", "replay.gif", "job.sh", "s.csv", "t.csv"] {
+        assert!(fs::metadata(place.path(name)).unwrap().len() > 100, "{name}");
+    }
+}
+
+#[test]
+fn no_output_is_written_over_what_is_needed() {
+    let place = Place::with_run();
+    std::os::unix::fs::symlink("run/metrics.csv", place.path("link.csv")).unwrap();
+    let before: Vec<_> = ["run/policies.safetensors", "run/metrics.csv", "run/config.toml", "small.toml", "grid.toml"]
+        .map(|name| (name, fs::read(place.path(name)).unwrap()))
+        .into();
+    let rollout = ["rollout", "small.toml", "--policies", "run/policies.safetensors"];
+    for (flags, why) in [
+        (&["--scores", "run/policies.safetensors"][..], "is read from"),
+        (&["--trace", "run/../run/policies.safetensors"], "is read from"),
+        (&["--scores", "./small.toml"], "is read from"),
+        (&["--scores", "run/metrics.csv"], "belongs to what is in"),
+        (&["--trace", "link.csv"], "belongs to what is in"),
+        (&["--trace", "run/run.json"], "belongs to what is in"),
+        (&["--trace", "run/.lock"], "belongs to what is in"),
+        (&["--trace", "run/checkpoints/x"], "belongs to what is in"),
+        (&["--scores", "x.csv", "--trace", "./x.csv"], "is written by --scores"),
+    ] {
+        let told = place.refused(2, &[&rollout[..], flags].concat());
+        assert!(told.contains(why) && told.contains(flags[flags.len() - 1]) && told.lines().count() == 1, "{told}");
+    }
+    assert!(place.refused(2, &["sweep", "grid.toml", "--out", "o", "--slurm=grid.toml"]).contains("is read from"));
+    for (name, content) in before {
+        assert_eq!(fs::read(place.path(name)).unwrap(), content, "{name}");
+    }
+    // Pictures and tables of one's own beside a run are no harm.
+    place.good(&[&rollout[..], &["--scores", "run/scores.csv", "--trace", "/dev/null"]].concat());
+    assert!(place.read("run/scores.csv").starts_with("team,leader,g"));
+    assert!(!fs::metadata("/dev/null").unwrap().is_file());
+}
+
+#[test]
+fn outputs_are_whole_or_not_there_and_devices_stay_devices() {
+    let place = Place::with_run();
+    let rollout = ["rollout", "small.toml", "--policies", "run/policies.safetensors"];
+    if fs::metadata("/dev/full").is_ok() {
+        let told = place.refused(1, &[&rollout[..], &["--scores", "/dev/full"]].concat());
+        assert!(
+            told.contains("/dev/full: cannot be written") && told.contains("free some space, then run it again"),
+            "{told}"
+        );
+        assert!(!told.contains("--resume"), "rollout has none: {told}");
+        assert!(!fs::metadata("/dev/full").unwrap().is_file());
+    }
+    let scores = place.good(&[&rollout[..], &["--scores", "/dev/stdout"]].concat());
+    assert!(scores.starts_with("team,leader,g,d,df,dpp\n0,0,"), "{scores}");
+    // A file that is cut off leaves the one before.
+    fs::write(place.path("trace.csv"), "before").unwrap();
+    let names = place.names();
+    let output = place.shell(
+        "ulimit -f 1; exec \"$flotilla\" rollout small.toml --policies run/policies.safetensors --trace trace.csv",
+    );
+    let told = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{:?} {told}", output.status);
+    assert!(told.contains("trace.csv: cannot be written") && told.contains("ulimit -f"), "{told}");
+    assert_eq!(place.read("trace.csv"), "before");
+    assert_eq!(place.names(), names);
+    // A link is followed, so that it stays one.
+    std::os::unix::fs::symlink("trace.csv", place.path("link")).unwrap();
+    place.good(&[&rollout[..], &["--trace", "link"]].concat());
+    assert!(place.read("trace.csv").starts_with("team,step"));
+    assert!(fs::symlink_metadata(place.path("link")).unwrap().is_symlink());
+}
+
+#[test]
+fn a_limit_on_files_is_a_full_disk_and_the_run_goes_on_after_it() {
+    let place = Place::new();
+    let output = place.shell("ulimit -f 1; exec \"$flotilla\" train small.toml --out run --quiet");
+    let told = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{:?} {told}", output.status);
+    assert!(told.contains("cannot be written") && told.contains("ulimit -f") && told.contains("--resume"), "{told}");
+    assert_eq!(told.lines().count(), 1, "{told}");
+    place.good(&["train", "small.toml", "--out", "run", "--resume", "--quiet"]);
+    place.good(&["train", "small.toml", "--out", "whole", "--quiet"]);
+    assert_eq!(
+        fs::read(place.path("run/policies.safetensors")).unwrap(),
+        fs::read(place.path("whole/policies.safetensors")).unwrap()
+    );
+}
+
+#[test]
+fn what_is_no_file_is_not_waited_for() {
+    let place = Place::with_run();
+    let pipe = place.path("pipe");
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    for command in [
+        &["check", "pipe"][..],
+        &["train", "pipe"],
+        &["sweep", "pipe"],
+        &["verify", "pipe"],
+        &["rollout", "small.toml", "--policies", "pipe"],
+        &["check", "/dev/zero"],
+        &["rollout", "small.toml", "--policies", "/dev/zero"],
+    ] {
+        let told = place.refused(1, command);
+        assert!(told.contains("it is a pipe or a device, where a file is needed"), "{told}");
+    }
+    for name in ["config.toml", "metrics.csv", ".lock"] {
+        let place = Place::with_run();
+        fs::remove_file(place.path("run").join(name)).unwrap();
+        fs::rename(place.path("small.toml"), place.path("s.toml")).unwrap();
+        assert!(Command::new("mkfifo").arg(place.path("run").join(name)).status().unwrap().success());
+        // A damaged config is written anew; what else cannot be read is told.
+        let output = place.run(&["train", "s.toml", "--out", "run", "--resume", "--quiet"]);
+        assert!(matches!(output.status.code(), Some(0 | 1)), "{:?}", output.status);
+        let output = place.run(&["plot", "run"]);
+        assert!(matches!(output.status.code(), Some(0 | 1)), "{:?}", output.status);
+    }
+    // What the shell hands over is there to be read.
+    let output = place.shell("\"$flotilla\" check /dev/stdin < small.toml && \"$flotilla\" check <(cat small.toml)");
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    let output = place.shell("cat small.toml | \"$flotilla\" check /dev/stdin");
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+#[test]
+fn a_sweep_and_a_config_are_told_apart() {
+    let place = Place::new();
+    for command in ["check", "train", "verify"] {
+        let told = place.refused(1, &[command, "grid.toml"]);
+        assert!(told.contains("grid.toml:13: grid: ") && told.contains("`flotilla sweep`"), "{told}");
+        assert_eq!(told.lines().count(), 1, "{told}");
+    }
+    let told = place.refused(1, &["sweep", "small.toml"]);
+    assert!(told.contains("grid: missing") && told.contains("`flotilla train`") && told.lines().count() == 1, "{told}");
+}
+
+#[test]
+fn what_cannot_be_seen_is_not_said_to_be_missing() {
+    let place = Place::with_run();
+    let hide = |name: &str| {
+        let path = place.path("run").join(name);
+        fs::remove_file(&path).unwrap();
+        // Not to be resolved by anybody, the superuser included.
+        std::os::unix::fs::symlink(name, path).unwrap();
+    };
+    hide("metrics.csv");
+    let told = place.refused(1, &["plot", "run"]);
+    assert!(told.contains("run/metrics.csv: cannot be read") && !told.contains("has no"), "{told}");
+    std::os::unix::fs::symlink("sweep.toml", place.path("run/sweep.toml")).unwrap();
+    for flags in [&[][..], &["--collect"]] {
+        let told = place.refused(1, &[&["sweep", "grid.toml", "--out", "run"], flags].concat());
+        assert!(told.contains("run/sweep.toml: cannot be read") && told.lines().count() == 1, "{told}");
+    }
+    hide("config.toml");
+    for command in ["plot", "replay"] {
+        let told = place.refused(1, &[command, "run"]);
+        assert!(told.contains("run/config.toml: cannot be read") && !told.contains("has no"), "{told}");
+    }
+    let told = place.refused(1, &["train", "small.toml", "--out", "small.toml"]);
+    assert!(!told.contains("File exists") && told.contains("small.toml"), "{told}");
+}
+
+#[test]
+fn a_replay_counts_pois() {
+    let place = Place::with_run();
+    let told = place.good(&["replay", "run", "--out", "r.svg"]);
+    assert!(!told.contains("G = ") && told.contains(" of 2 POIs"), "{told}");
+    let nine: Vec<_> = (1..=9).map(|at| format!("[{}, 9]", 5 * at)).collect();
+    let config =
+        SMALL.replace("[[10, 9], [20, 9]]", &format!("[{}]", nine.join(", "))).replace("coupling = 2", "coupling = 1");
+    fs::write(place.path("nine.toml"), &config).unwrap();
+    place.good(&["train", "nine.toml", "--out", "nine", "--quiet"]);
+    let told = place.good(&["replay", "nine", "--out", "r.svg"]);
+    let count = told.split("it observed ").nth(1).and_then(|told| told.split(' ').next()).unwrap();
+    assert!(count.parse::<u32>().is_ok_and(|count| (1..=9).contains(&count)), "{told}");
+    fs::write(place.path("mean.toml"), config + "episodes_per_team = 3\nstart_jitter = 2.0\n").unwrap();
+    place.good(&["train", "mean.toml", "--out", "mean", "--quiet"]);
+    let told = place.good(&["replay", "mean", "--out", "r.svg"]);
+    assert!(told.contains(" of 9 POIs (mean of 3 episodes)") && !told.contains("3333"), "{told}");
+}
+
+#[test]
+fn names_cannot_leave_their_line() {
+    let place = Place::with_run();
+    let long = "a\ntouch b";
+    for words in [
+        &["sweep", "grid.toml", "--out", long, "--slurm=job.sh"][..],
+        &["sweep", "grid.toml", "--out", "o", "--slurm", "--sbatch=--comment=x\nrm y"],
+        &["sweep", "grid.toml", "--out", "o", "--slurm", "--adapter", "x\r"],
+        &["sweep", "grid.toml", "--axes", "\u{1b}[31m"],
+        &["train", "small.toml", "--out", long],
+        &["train", long],
+        &["plot", "run", "--out", "x\u{1b}]0;title\u{7}.svg"],
+        &["replay", "run\n"],
+        &["plot", "run\u{202e}"],
+        &["train", "small.toml", "--fitness", "\u{1b}[2J"],
+        &["\u{1b}[2J"],
+    ] {
+        let told = place.refused(2, words);
+        assert_eq!(told.lines().count(), 1, "{told}");
+        assert!(!told.trim_end().contains(char::is_control), "{told:?}");
+    }
+    assert_eq!(place.names(), ["grid.toml", "run", "small.toml"]);
+    // The folder that one is in may have any name; a script names it.
+    let odd = place.path(long);
+    fs::create_dir(&odd).unwrap();
+    fs::copy(place.path("grid.toml"), odd.join("grid.toml")).unwrap();
+    let output =
+        in_time(place.command().current_dir(&odd).args(["sweep", "grid.toml", "--out", "o", "--slurm=job.sh"]));
+    assert_eq!(output.status.code(), Some(2));
+    assert!(!odd.join("job.sh").exists());
+    let output = in_time(place.command().current_dir(&odd).args(["sweep", "grid.toml", "--out", "o", "--quiet"]));
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+#[test]
+fn hard_names_stay_names_in_scripts_pages_pictures_and_tables() {
+    let place = Place::new();
+    let hard = "it's \"a\" </script><b>|,%#`touch x`$(touch y);&{}";
+    // No folder of this name can be made with a slash.
+    let hard = hard.replace('/', "");
+    place.good(&["train", "small.toml", "--out", &hard, "--quiet"]);
+    place.good(&["train", "small.toml", "--out", "other", "--seed", "2", "--quiet"]);
+    place.good(&["replay", &hard, "--out", "page.html"]);
+    let page = place.read("page.html");
+    let data = page.split("id=\"data\">").nth(1).unwrap().split("</script>").next().unwrap();
+    let data: serde_json::Value = serde_json::from_str(data).unwrap();
+    assert_eq!(data["run"], hard.as_str());
+    assert!(!page.contains("<b>"));
+    // A picture labels what differs by nothing else by its folder.
+    place.good(&["train", "small.toml", "--out", "same", "--quiet"]);
+    place.good(&["plot", &hard, "same", "--out", "both.svg"]);
+    let svg = place.read("both.svg");
+    assert!(!svg.contains("<b>") && svg.contains("</svg>"));
+    // A sweep of that name, as a script that runs.
+    let sweep = format!("{hard}.toml");
+    fs::copy(place.path("grid.toml"), place.path(&sweep)).unwrap();
+    place.good(&[
+        "sweep",
+        &*sweep,
+        "--out",
+        &format!("sweep {hard}"),
+        "--backend",
+        "cpu",
+        "--shards",
+        "1",
+        "--slurm=job.sh",
+    ]);
+    let output = place.shell("SLURM_ARRAY_TASK_ID=1 bash job.sh");
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(!place.path("x").exists() && !place.path("y").exists());
+    place.good(&["sweep", &*sweep, "--out", &format!("sweep {hard}"), "--collect"]);
+    let mut table = csv::Reader::from_path(place.path(&format!("sweep {hard}")).join("results.csv")).unwrap();
+    assert_eq!(table.headers().unwrap().iter().take(2).collect::<Vec<_>>(), ["world.coupling", "learning.fitness"]);
+    assert_eq!(table.records().map(Result::unwrap).count(), 4 * 2 * 5);
+    let svg = fs::read_to_string(place.path(&format!("sweep {hard}")).join("curves.svg")).unwrap();
+    assert!(!svg.contains("<b>"));
+}
+
+#[test]
+fn files_cannot_steer_a_terminal() {
+    let place = Place::with_run();
+    for (text, code) in [
+        ("[world]\n\"\\u001b[31m\\u0007\" = 1\n", 1),
+        ("[\"\\u001b[2J\\n\"]\nx = 1\n", 1),
+        ("\"a\\nerror: b\" = 3\n", 1),
+        ("[learning]\nfitness = \"\\u001b[31mG\\nx\"\n", 1),
+        ("[world]\nleaders = \u{1b}[31m\n", 1),
+    ] {
+        fs::write(place.path("bad.toml"), text).unwrap();
+        let told = place.refused(code, &["check", "bad.toml"]);
+        assert!(!told.contains('\u{1b}') && !told.contains('\u{7}'), "{told:?}");
+        assert!(told.lines().skip(1).all(|line| line.starts_with("bad.toml:")), "{told:?}");
+    }
+    for grid in [
+        "\"a\\n\\u001b[31m\" = [1]",
+        "\"learning.fitness\" = [\"x\\n\\u001b[31m\", \"G\"]",
+        "\"learning.fitness\" = [\"x\\ny\", \"x\\ny\"]",
+        "\"learning.fitness\" = \"x\\ny\"",
+    ] {
+        fs::write(place.path("bad.toml"), format!("{SMALL}[grid]\n{grid}\n")).unwrap();
+        let told = place.refused(1, &["sweep", "bad.toml"]);
+        assert!(!told.contains('\u{1b}') && told.lines().count() == 1, "{told:?}");
+    }
+    // A tensor's name.
+    let header = "{\"w\\u001b[31m\\nx\":{\"dtype\":\"F32\",\"shape\":[1],\"data_offsets\":[0,4]}}";
+    let bytes = [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), &[0; 4]].concat();
+    fs::write(place.path("w.safetensors"), bytes).unwrap();
+    let told = place.refused(1, &["rollout", "small.toml", "--policies", "w.safetensors"]);
+    assert!(!told.contains('\u{1b}') && told.lines().count() == 1, "{told:?}");
+}
+
+#[test]
+fn a_wrong_value_by_flag_is_wrong_usage_wherever_it_is_found() {
+    let place = Place::with_run();
+    let rollout = ["rollout", "small.toml", "--policies", "run/policies.safetensors"];
+    for words in [
+        &["train", "small.toml", "--seed", "-1"][..],
+        &["train", "small.toml", "--population", "1"],
+        &["train", "small.toml", "--checkpoint-seconds", "-1"],
+        &["check", "small.toml", "--trials", "0"],
+        &["sweep", "grid.toml", "--seed", "-1"],
+        &["sweep", "grid.toml", "--fitness", "G"],
+        &["sweep", "grid.toml", "--axes", "steps"],
+        &["paper", "--trials", "0"],
+        &["replay", "run", "--trial", "2"],
+        &["replay", "run", "--generation", "5"],
+        &["replay", "run", "--compare", "5"],
+        &["replay", "run", "--step", "9"],
+        &["replay", "run", "--out", "x.txt"],
+        &[&rollout[..], &["--trial", "2"]].concat(),
+        &["train", "small.toml", "--adapter", "no such adapter"],
+        &["train", "small.toml", "--adapter", "99"],
+        &["train", "small.toml", "--adapter", ""],
+        &["verify", "--adapter", "99"],
+        &["verify", "--adapter", ""],
+        &["verify", "--worlds", "4294967295"],
+        &["sweep", "grid.toml", "--slurm", "--time", ":"],
+        &["bench", "--adapter", "nonsense", "--json"],
+    ] {
+        place.refused(2, words);
+    }
+    // A file that is wrong is a failure, alone or with a flag.
+    fs::write(place.path("wrong.toml"), SMALL.replace("steps = 8", "steps = 0")).unwrap();
+    place.refused(1, &["check", "wrong.toml"]);
+    place.refused(1, &["check", "wrong.toml", "--seed", "-1"]);
+    place.refused(1, &["check", "missing.toml", "--seed", "-1"]);
+    assert_eq!(place.names(), ["grid.toml", "run", "small.toml", "wrong.toml"]);
+}
+
+#[test]
+fn nothing_of_a_drivers_noise_is_heard() {
+    let place = Place::new();
+    for folder in [None, Some(""), Some("relative"), Some("/no/such/folder")] {
+        let mut command = place.command();
+        command.arg("devices");
+        match folder {
+            Some(folder) => command.env("XDG_RUNTIME_DIR", folder),
+            None => command.env_remove("XDG_RUNTIME_DIR"),
+        };
+        let output = in_time(&mut command);
+        assert_eq!(output.status.code(), Some(0));
+        assert_eq!(String::from_utf8_lossy(&output.stderr), "", "XDG_RUNTIME_DIR {folder:?}");
+    }
+}
+
+#[test]
+fn as_many_shards_as_there_may_be_are_listed_in_no_time() {
+    let place = Place::new();
+    let list = place.good(&["sweep", "grid.toml", "--list", "--shards", "65536"]);
+    assert_eq!(list.lines().count(), 1 + 4 + 1, "{list}");
+}
+
+#[test]
+fn names_that_are_no_text_work_but_for_scripts() {
+    let place = Place::with_run();
+    let name = OsStr::from_bytes(b"caf\xe9");
+    place.good(&[OsStr::new("train"), OsStr::new("small.toml"), OsStr::new("--out"), name, OsStr::new("--quiet")]);
+    place.good(&[OsStr::new("plot"), name]);
+    place.good(&[OsStr::new("replay"), name]);
+    assert!(place.0.path().join(name).join("replay.html").exists());
+    let words = [OsStr::new("sweep"), OsStr::new("grid.toml"), OsStr::new("--out"), name, OsStr::new("--slurm=job.sh")];
+    assert!(place.refused(2, &words).contains("UTF-8"));
+    assert!(!place.path("job.sh").exists());
+}
