@@ -187,7 +187,7 @@ pub fn evaluate(
 }
 
 /// The 97.5 % quantile of Student's t: exact to the digits given up to 10 degrees of freedom, to 1e-5 beyond.
-pub fn student(degrees: u64) -> f64 {
+fn student(degrees: u64) -> f64 {
     const FEW: [f64; 10] =
         [12.706205, 4.302653, 3.182446, 2.776445, 2.570582, 2.446912, 2.364624, 2.306004, 2.262157, 2.228139];
     if let Some(&t) = degrees.checked_sub(1).and_then(|index| FEW.get(index as usize)) {

@@ -30,7 +30,7 @@ pub enum Purpose {
     Tournament = 4,
     Mutation = 5,
     /// Starts that teams are evaluated from, not trained.
-    HeldOut = 6,
+    HeldOut = 7,
 }
 
 /// A place in the space of all randomness; [`Key::draw`] gives its numbers, by a counter.

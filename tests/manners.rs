@@ -326,3 +326,10 @@ fn pictures_and_replays_are_told_as_json() {
         assert_eq!(episode["best_g"].as_f64().unwrap(), row.split(',').nth(2).unwrap().parse::<f64>().unwrap());
     }
 }
+
+#[test]
+fn what_to_cite_names_this_version() {
+    let text = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("CITATION.cff")).unwrap();
+    assert!(text.contains(&format!("\nversion: {}\n", env!("CARGO_PKG_VERSION"))), "{text}");
+    assert!(text.contains("title: Structural Credit Assignment for Multiagent Leader-Based Learning"), "{text}");
+}

@@ -66,13 +66,6 @@ impl Place {
         told[told.find("error: ").unwrap_or_else(|| panic!("{line}: {told}"))..].to_string()
     }
 
-    /// The error of a command that must fail, by whatever code.
-    fn refused_somehow(&self, line: &str) -> String {
-        let output = self.run(line);
-        assert!(!output.status.success(), "{line}");
-        String::from_utf8(output.stderr).unwrap()
-    }
-
     fn read(&self, name: &str) -> String {
         fs::read_to_string(self.path(name)).unwrap()
     }
@@ -590,7 +583,7 @@ fn rollout_refuses_flags_that_would_change_nothing() {
         assert!(error.contains("--start-jitter"), "what to do: {error}");
     }
     place.refused(&format!("{line} --episodes 0"), 2);
-    let error = place.refused_somehow(&format!("{line} --episodes 2 --start-jitter -1"));
+    let error = place.refused(&format!("{line} --episodes 2 --start-jitter -1"), 2);
     assert!(error.contains("--start-jitter: found -1"), "{error}");
     place.good(&format!("{line} --episodes 1"));
     // Where the config moves starts, no flag is needed.

@@ -9,17 +9,20 @@ use toml::{Table, Value};
 use super::{Error, output, print};
 use crate::config::{self, Config, Key};
 use crate::record::RecordError;
-use crate::report::paper::LAYOUTS;
 
-/// What [`LAYOUTS`] are called here.
-const NAMES: [&str; LAYOUTS.len()] = ["generally-forward", "strictly-forward", "chaotic"];
+/// The paper's layouts, with the text of each one's config file.
+const LAYOUTS: [(&str, &str); 3] = [
+    ("generally-forward", include_str!("../../configs/generally_forward.toml")),
+    ("strictly-forward", include_str!("../../configs/strictly_forward.toml")),
+    ("chaotic", include_str!("../../configs/chaotic.toml")),
+];
 /// Letters of a line at most.
 const WIDTH: usize = 110;
 
 #[derive(clap::Args)]
 pub struct Args {
     /// The paper's layout to start from
-    #[arg(default_value = NAMES[0], value_parser = NAMES)]
+    #[arg(default_value = LAYOUTS[0].0, value_parser = LAYOUTS.map(|(name, _)| name))]
     layout: String,
     /// File to write, which must not be there yet [default: standard output]
     #[arg(long, short, value_name = "FILE")]
@@ -30,9 +33,8 @@ pub struct Args {
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let layout = LAYOUTS.iter().zip(NAMES).find(|(_, name)| *name == args.layout);
-    let (layout, name) = layout.expect("the command line allows these names alone");
-    let text = commented(layout.config, &Config::parse(layout.config, name)?);
+    let (name, from) = LAYOUTS.into_iter().find(|(name, _)| *name == args.layout).expect("no other is taken");
+    let text = commented(from, &Config::parse(from, name)?);
     let Some(path) = args.out else { return print(&text) };
     output::check(&[("--out", Some(&path))], &[])?;
     match args.force {
@@ -81,7 +83,7 @@ fn comment(Key { unit, kind, range, default, meaning, .. }: &Key) -> String {
     let default = default.as_ref().map_or("has to be given".into(), |default| format!("default {default}"));
     let facts = format!("({unit}{kind}, {range}; {default})");
     let one = format!("{meaning} {facts}");
-    if one.chars().count() <= WIDTH { wrapped(&one) } else { wrapped(meaning) + &wrapped(&facts) }
+    if one.chars().count() + 2 <= WIDTH { wrapped(&one) } else { wrapped(meaning) + &wrapped(&facts) }
 }
 
 fn wrapped(text: &str) -> String {

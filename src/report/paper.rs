@@ -12,8 +12,7 @@ pub struct Layout {
     pub name: &'static str,
     /// The paper's figure with its results.
     pub figure: usize,
-    /// The text of its config file.
-    pub config: &'static str,
+    config: &'static str,
 }
 
 /// The paper's layouts, in its order.
