@@ -11,6 +11,7 @@ use crate::record::metrics::Row;
 use crate::report::curves::PRINT;
 use crate::report::paper::{self, Measured, Summary};
 use crate::report::progress::Progress;
+use crate::report::scene::Kind;
 use crate::run::RunError;
 use crate::trainer::Trainer;
 
@@ -85,10 +86,11 @@ pub fn run(args: Args) -> Result<(), Error> {
     };
     for layout in paper::LAYOUTS {
         let scene = paper::figure(&arms, &layout).scene();
-        write(format!("figure{}.svg", layout.figure), scene.svg().as_bytes())?;
-        let name = format!("figure{}.png", layout.figure);
-        let png = scene.png(PRINT).map_err(failed(&out.join(&name)))?;
-        write(name, &png)?;
+        for kind in Kind::ALL {
+            let name = format!("figure{}.{}", layout.figure, kind.extension());
+            let picture = scene.file(kind, PRINT).map_err(failed(&out.join(&name)))?;
+            write(name, &picture)?;
+        }
     }
     let claims = paper::claims(&arms);
     let table = paper::table(&claims);
@@ -113,7 +115,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let summary = serde_json::to_string(&summary).expect("plain fields are JSON") + "\n";
     write("summary.json".into(), summary.as_bytes())?;
     print(&format!(
-        "{table}\n{heading}\n\nTrained in {seconds:.1} s. Files in {}: figure4, figure5, figure6 (.svg, .png), claims.md, \
+        "{table}\n{heading}\n\nTrained in {seconds:.1} s. Files in {}: figure4, figure5, figure6 (.svg, .png, .pdf), claims.md, \
          summary.json\n",
         out.display()
     ))

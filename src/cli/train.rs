@@ -228,10 +228,9 @@ fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> S
     let mut text = format!("{trained}.\n\nPOIs observed, of {pois}: mean over trials (lowest to highest trial)\n");
     let scores: [(&str, Score); 3] =
         [("best team", |row| row.best_g), ("mean team", |row| row.mean_g), ("champion", |row| row.champion_g)];
-    let _ = writeln!(text, "  {:<16}{:<22}{:<22}{}", "", scores[0].0, scores[1].0, scores[2].0);
-    for (name, rows) in
-        [("start", &story.first), (&*format!("generation {}", config.learning.generations), &story.last)]
-    {
+    let last = format!("generation {}", config.learning.generations);
+    let mut table = vec![["", scores[0].0, scores[1].0, scores[2].0].map(String::from)];
+    for (name, rows) in [("start", &story.first), (&*last, &story.last)] {
         let spread = |share: Score| {
             let mut all: Vec<f64> = rows.iter().map(|row| share(row) * pois as f64).collect();
             all.sort_by(f64::total_cmp);
@@ -239,7 +238,14 @@ fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> S
             format!("{mean:.2} ({:.2} to {:.2})", all[0], all[all.len() - 1])
         };
         let [best, mean, champion] = scores.map(|(_, share)| spread(share));
-        let _ = writeln!(text, "  {name:<16}{best:<22}{mean:<22}{champion}");
+        table.push([name.into(), best, mean, champion]);
+    }
+    // As wide as what stands in them: 100 POIs take more room than 4.
+    let width = |column: usize| table.iter().map(|row| row[column].len()).max().unwrap_or(0);
+    for [name, best, mean, champion] in &table {
+        let line =
+            format!("  {name:<a$}  {best:<b$}   {mean:<c$}   {champion}", a = width(0), b = width(1), c = width(2));
+        let _ = writeln!(text, "{}", line.trim_end());
     }
     let folder = folder.display();
     let _ = write!(
