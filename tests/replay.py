@@ -1,4 +1,5 @@
-"""Opens replay pages in headless Chromium: they load, play, scrub, and show what `flotilla rollout --trace` traces.
+"""Opens replay pages in headless Chromium: they load, play, scrub, show what `flotilla rollout --trace` traces, and can be
+read in light and dark (WCAG AA).
 
     python3 tests/replay.py target/release/flotilla [FOLDER for screenshots]
 
@@ -149,6 +150,51 @@ class Browser:
         self.process.wait(20)
 
 
+# Every text's colour with what lies under it, and every border of what can be used; then the canvas's colours.
+COLOURS = """(() => {
+  const parse = text => text.match(/[\\d.]+/g).map(Number);
+  const ground = element => {
+    for (let at = element; at; at = at.parentElement) {
+      const color = parse(getComputedStyle(at).backgroundColor);
+      if (color.length === 3 || color[3] === 1) return color.slice(0, 3);
+    }
+    return [255, 255, 255];
+  };
+  const found = [];
+  for (const element of document.querySelectorAll("body *")) {
+    if (!element.checkVisibility() || element.closest("script")) continue;
+    const style = getComputedStyle(element);
+    const text = [...element.childNodes].filter(node => node.nodeType === 3).map(node => node.data.trim()).join("");
+    if (text) found.push([4.5, text.slice(0, 30), parse(style.color).slice(0, 3), ground(element)]);
+    if (element.matches("button, select")) {
+      found.push([3, "border of " + text, parse(style.borderTopColor).slice(0, 3), ground(element.parentElement)]);
+    }
+  }
+  const root = getComputedStyle(document.documentElement);
+  const hex = text => [1, 3, 5].map(at => parseInt(text.slice(at, at + 2), 16));
+  const named = name => {
+    const text = root.getPropertyValue(name).trim();
+    return hex(text.length === 4 ? "#" + [...text.slice(1)].map(c => c + c).join("") : text);
+  };
+  const sea = named("--sea");
+  found.push([4.5, "labels on the map", named("--ink"), sea]);
+  for (const name of ["--seen", "--poi", "--ink"]) found.push([3, name, named(name), sea]);
+  const scheme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
+  for (const color of replay.data.colors[scheme]) found.push([3, "leader " + color, hex(color), sea]);
+  return found;
+})()"""
+
+
+def contrast(a, b):
+    """WCAG's contrast of two colours of sRGB."""
+    def light(color):
+        shares = [channel / 255 for channel in color]
+        linear = [share / 12.92 if share <= 0.04045 else ((share + 0.055) / 1.055) ** 2.4 for share in shares]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+    low, high = sorted([light(a), light(b)])
+    return (high + 0.05) / (low + 0.05)
+
+
 def every_team(source, target):
     """A policies file whose teams are all that can be made of the policies of two leaders with two each."""
     content = source.read_bytes()
@@ -214,6 +260,15 @@ def main():
         assert counts == sorted(counts) and counts[0] == 0, counts
         assert counts[-1] == 2 * browser.evaluate("replay.data.episodes[0].g") > 0, counts
 
+        # The table of POIs says what the map does: who is near now, and when each was observed.
+        near = "[...document.querySelectorAll('table:last-of-type td:nth-child(3)')].map(cell => Number(cell.textContent))"
+        last = STEPS * 2
+        assert browser.evaluate(near) == browser.evaluate(f"[...replay.data.episodes[0].near.slice({last}, {last} + 2)]")
+        for poi in range(2):
+            x, y = browser.evaluate(f"replay.place(0, {poi})")
+            browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+            browser.wait(f"replay.pointed[0] === {poi}")
+
         # Keys.
         browser.press("Home", "Home")
         assert browser.evaluate("replay.step") == 0
@@ -246,6 +301,12 @@ def main():
                 assert browser.evaluate("document.documentElement.scrollWidth") <= width, "the page is wider than the window"
                 assert browser.evaluate("document.querySelectorAll('canvas').length") == (2 if name == "two" else 1)
                 assert not list(browser.complaints()), list(browser.complaints())
+                colours = browser.evaluate(COLOURS)
+                assert len(colours) > 60, colours
+                for least, what, ink, ground in colours:
+                    assert contrast(ink, ground) >= least, (what, ink, ground, contrast(ink, ground), dark)
+                described = browser.evaluate("document.querySelector('canvas').getAttribute('aria-label')")
+                assert described.startswith("Map of generation ") and "step 18: " in described, described
                 browser.screenshot(pictures / f"{name}-{width}-{'dark' if dark else 'light'}.png")
         browser.close()
         print("pages load without complaint, play, scrub, and show what rollout traces")

@@ -10,7 +10,9 @@ use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::{Config, Fitness, Override};
-use flotilla::report::paper;
+use flotilla::report::curves::{distinct, poi_ticks};
+use flotilla::report::scene::{Color, text_width};
+use flotilla::report::{map, paper};
 use flotilla::trainer::Trainer;
 use serde_json::Value;
 use tempfile::TempDir;
@@ -127,8 +129,11 @@ fn a_run_plots_as_svg_and_png() {
     succeed(&["plot", &run.text(), "--out", picture.to_str().unwrap()]);
     let png = fs::read(picture).unwrap();
     assert_eq!(png[..8], *b"\x89PNG\r\n\x1a\n");
-    // A column of a paper at 300 dots an inch.
+    // A column of a paper at 300 dots an inch, which are 11811 a metre.
     assert_eq!(u32::from_be_bytes(png[16..20].try_into().unwrap()), 1004);
+    let physical = png.windows(4).position(|window| window == b"pHYs").expect("it says how large it is");
+    let field = |at: usize| u32::from_be_bytes(png[physical + at..physical + at + 4].try_into().unwrap());
+    assert!(field(4).abs_diff(11_811) <= 12 && field(8) == field(4) && png[physical + 12] == 1);
 }
 
 #[test]
@@ -181,7 +186,7 @@ fn several_runs_are_labelled_by_what_differs() {
     let out = one.file("both.svg");
     succeed(&["plot", &one.text(), &other.text(), "--out", out.to_str().unwrap()]);
     let svg = fs::read_to_string(out).unwrap();
-    assert!(svg.contains(">fitness G<") && svg.contains(">fitness D++<"), "{svg}");
+    assert!(svg.contains("\"fitness G\"") && svg.contains("\"fitness D++\""), "{svg}");
     assert!(!svg.contains("population"));
 }
 
@@ -190,7 +195,7 @@ fn runs_that_differ_in_nothing_are_labelled_by_their_folders() {
     let run = Run::new(CONFIG, &[]);
     let out = run.file("both.svg");
     succeed(&["plot", &run.text(), &run.text(), "--out", out.to_str().unwrap()]);
-    assert!(fs::read_to_string(out).unwrap().contains("run<"));
+    assert!(fs::read_to_string(out).unwrap().contains("run\""));
 }
 
 #[test]
@@ -344,13 +349,356 @@ fn pictures_of_replays_are_whole() {
     // Six agents in each of two episodes.
     assert!(count(&svg, "polygon") >= 12);
     assert_eq!(write("still.png")[..4], *b"\x89PNG");
-    let gif = write("moving.gif");
-    let mut decoder = gif::DecodeOptions::new().read_info(&gif[..]).unwrap();
-    let mut frames = 0;
-    while decoder.read_next_frame().unwrap().is_some() {
-        frames += 1;
+    assert_eq!(write("still.pdf")[..5], *b"%PDF-");
+}
+
+#[test]
+fn moving_pictures_are_as_large_and_smooth_as_asked_for() {
+    let run = Run::new(&CONFIG.replace("steps = 20", "steps = 5"), &[]);
+    let moving = |name: &str, flags: &[&str]| {
+        let out = run.file(name);
+        let arguments = ["replay", &run.text(), "--compare", "0", "--out", out.to_str().unwrap(), "--backend", "cpu"];
+        let output = flotilla(&[&arguments[..], flags].concat());
+        (out, output)
+    };
+    // Size, and when each picture ends, in hundredths of a second.
+    let times = |path: &Path| {
+        let bytes = fs::read(path).unwrap();
+        let mut decoder = gif::DecodeOptions::new().read_info(&bytes[..]).unwrap();
+        let size = (decoder.width(), decoder.height());
+        let mut ends = vec![];
+        while let Some(frame) = decoder.read_next_frame().unwrap() {
+            ends.push(ends.last().unwrap_or(&0) + u32::from(frame.delay));
+        }
+        (size, ends)
+    };
+    // Five steps of 0.2 seconds at twenty pictures a second, and two seconds at the end.
+    let (size, ends) = times(&moving("moving.gif", &[]).0);
+    assert!(size.0 == 960 || size.1 == 720, "{size:?}");
+    assert_eq!((ends.len(), ends[19], ends[20]), (21, 100, 300));
+    let (size, ends) = times(&moving("small.gif", &["--width", "333", "--fps", "30"]).0);
+    assert_eq!(size.0, 333);
+    assert_eq!((ends.len(), ends[29]), (31, 100));
+
+    // A film's pictures are numbered, all of them, of the size asked for.
+    let (film, output) = moving("film/%03d.png", &["--fps", "10", "--width", "400"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let mut names: Vec<_> = fs::read_dir(film.parent().unwrap()).unwrap().map(|entry| entry.unwrap().path()).collect();
+    names.sort();
+    assert_eq!(names.len(), 11);
+    assert_eq!(names[10].file_name().unwrap(), "010.png");
+    for name in names {
+        assert_eq!(fs::read(name).unwrap()[16..20], 400_u32.to_be_bytes());
     }
-    assert_eq!(frames, 21);
+
+    // What would say nothing is refused.
+    for (name, flags, said) in [
+        ("a.svg", ["--width", "400"], "--width"),
+        ("a.html", ["--width", "400"], "--width"),
+        ("a.png", ["--fps", "10"], "--fps"),
+        ("a.gif", ["--step", "3"], "--step"),
+    ] {
+        let (path, output) = moving(name, &flags);
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{message}");
+        assert!(message.contains(said) && !path.exists(), "{message}");
+    }
+}
+
+/// The texts of an SVG with what each covers, `[left, above, right, below]` in millimetres.
+fn texts(svg: &str) -> Vec<(String, [f64; 4])> {
+    let attribute = |line: &str, name: &str| {
+        line.split(&format!(" {name}=\"")).nth(1).map(|rest| rest.split('"').next().unwrap().to_string())
+    };
+    let mut found = vec![];
+    for line in svg.lines().filter(|line| line.starts_with("<g aria-label=")) {
+        let text = attribute(line, "aria-label").unwrap();
+        let transform = attribute(line, "transform").unwrap();
+        let numbers: Vec<f64> = transform.split([' ', '(', ')']).filter_map(|part| part.parse().ok()).collect();
+        if transform.contains("rotate") {
+            continue;
+        }
+        let (x, y, size) = (numbers[0] / 10.0, numbers[1] / 10.0, numbers[2] * 2048.0 / 10.0);
+        let first = attribute(line.split("<use").nth(1).unwrap(), "x").unwrap().parse::<f64>().unwrap();
+        let left = x + first * size / 2048.0;
+        found.push((text.clone(), [left, y - 0.72 * size, left + text_width(&text, size), y]));
+    }
+    found
+}
+
+fn assert_apart(what: &str, texts: &[(String, [f64; 4])]) {
+    for (index, (text, a)) in texts.iter().enumerate() {
+        for (other, b) in &texts[..index] {
+            let overlap = a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
+            assert!(!overlap, "{what}: {text:?} at {a:?} runs into {other:?} at {b:?}");
+        }
+    }
+}
+
+/// A square world of so many POIs, and leaders with a follower each.
+fn crowded(pois: usize, leaders: usize) -> String {
+    let columns = (pois as f64).sqrt().ceil() as usize;
+    let place = |index: usize| format!("[{}, {}]", 4 + index % columns * 3, 12 + index / columns * 3);
+    let map = (4 + 3 * columns).max(20 + 3 * leaders);
+    let start = |index: usize, y: f64| format!("[{}.0, {y:.1}]", 3 + index * 3);
+    let list = |count: usize, each: &dyn Fn(usize) -> String| (0..count).map(each).collect::<Vec<_>>().join(", ");
+    format!(
+        "[world]\nmap = [{map}, {map}]\nleaders = [{}]\nfollowers = [{}]\npois = [{}]\ncoupling = 2\nsteps = 15\n\
+         observation_radius = 2.0\n[learning]\npopulation = 2\ngenerations = 1\ntrials = 1\n",
+        list(leaders, &|index| start(index, 5.0)),
+        list(leaders, &|index| start(index, 3.0)),
+        list(pois, &place),
+    )
+}
+
+#[test]
+fn labels_of_many_pois_and_leaders_do_not_run_into_each_other() {
+    for (pois, leaders) in [(1, 1), (4, 2), (20, 6), (64, 20), (256, 40)] {
+        let run = Run::new(&crowded(pois, leaders), &[]);
+        let (still, layout) = (run.file("still.svg"), run.file("layout.svg"));
+        succeed(&["replay", &run.text(), "--out", still.to_str().unwrap(), "--backend", "cpu"]);
+        let config = run.file("config.toml");
+        let config = config.to_str().unwrap();
+        let said = succeed(&["check", config, "--out", layout.to_str().unwrap()]);
+        assert_eq!(said, succeed(&["check", config]));
+        for (what, path) in [("still", still), ("layout", layout)] {
+            let svg = fs::read_to_string(path).unwrap();
+            assert!(svg.len() < 400_000, "{} bytes", svg.len());
+            let all = texts(&svg);
+            assert_apart(&format!("{what} of {pois} POIs"), &all);
+            // Up to a dozen leaders are all numbered, of more as many as have room; POIs are all labelled, or none.
+            let said = |text: &str| all.iter().filter(|(other, _)| other == text).count();
+            let (numbers, labels) = match what {
+                "still" => (leaders, all.iter().filter(|(text, _)| text.contains("/2")).count()),
+                // The scale has numbers, too.
+                _ => (0, pois),
+            };
+            assert!(labels == pois || labels == 0, "{labels} labels of {pois}");
+            let numbered = (0..numbers).filter(|number| said(&number.to_string()) > 0).count();
+            assert!(if numbers <= 12 { numbered == numbers } else { 2 * numbered > numbers }, "{all:?}");
+        }
+    }
+}
+
+#[test]
+fn a_layout_shows_what_the_config_says() {
+    let folder = TempDir::new().unwrap();
+    let config = folder.path().join("small.toml");
+    fs::write(
+        &config,
+        CONFIG.replace("coupling = 2", "coupling = [7, 1]").replace("followers = [", "followers = [[1, 1], "),
+    )
+    .unwrap();
+    for name in ["layout.svg", "layout.png", "layout.pdf"] {
+        let out = folder.path().join(name);
+        succeed(&["check", config.to_str().unwrap(), "--out", out.to_str().unwrap()]);
+        assert!(fs::metadata(out).unwrap().len() > 2_000);
+    }
+    let svg = fs::read_to_string(folder.path().join("layout.svg")).unwrap();
+    let all: Vec<String> = texts(&svg).into_iter().map(|(text, _)| text).collect();
+    for text in ["7", "1", "0", "2 leaders, 5 followers, 2 POIs", "number at a POI: agents it needs, within 5 of it"] {
+        assert!(all.iter().any(|other| other == text), "{text:?} is not in {all:?}");
+    }
+    assert!(svg.contains("Leaders at (8, 5), (20, 5)") && svg.contains("POIs at (8, 10), (20, 10)"));
+    let output = flotilla(&["check", config.to_str().unwrap(), "--out", "layout.gif"]);
+    assert_eq!(output.status.code(), Some(2));
+}
+
+#[test]
+fn pictures_look_the_same_everywhere_and_say_what_they_show() {
+    let run = Run::new(CONFIG, &[]);
+    let config = run.file("config.toml");
+    let svg = |arguments: &[&str]| {
+        let out = run.file("picture.svg");
+        succeed(&[arguments, &["--out", out.to_str().unwrap()]].concat());
+        fs::read_to_string(out).unwrap()
+    };
+    let curves = svg(&["plot", &run.text()]);
+    let still = svg(&["replay", &run.text(), "--backend", "cpu", "--compare", "0"]);
+    for svg in [&curves, &still, &svg(&["check", config.to_str().unwrap()])] {
+        // No letters but those it brings along.
+        assert!(!svg.contains("<text") && !svg.contains("font"), "{svg}");
+        for glyph in svg.split("xlink:href=\"#").skip(1).map(|rest| rest.split('"').next().unwrap()) {
+            assert_eq!(count(svg, &format!("path id=\"{glyph}\"")), 1);
+        }
+        assert!(svg.contains("role=\"img\" aria-labelledby=\"title description\""));
+        for element in ["<title id=\"title\">", "<desc id=\"description\">"] {
+            assert!(svg.split(element).nth(1).unwrap().split('<').next().unwrap().len() > 20, "{svg}");
+        }
+        assert!(svg.len() < 50_000 && svg.lines().count() < 250, "{} bytes", svg.len());
+    }
+    // With the figures that are to be seen.
+    let last: Vec<f64> =
+        run.best().into_iter().filter(|((_, generation), _)| *generation == 6).map(|(_, g)| g).collect();
+    let mean = format!("{:.3}", last.iter().sum::<f64>() / 3.0 * 2.0);
+    let mean = mean.trim_end_matches('0').trim_end_matches('.');
+    let described = curves.split("<desc").nth(1).unwrap().split("</desc").next().unwrap();
+    assert!(described.contains("best team from ") && described.contains(&format!(" to {mean}")), "{mean}: {described}");
+    assert!(curves.contains("mean ± standard error over 3 trials"));
+    assert!(still.contains("Generation 6, step 20 of 20: ") && still.contains(" of 2 POIs observed"));
+    // One trial has no band to explain.
+    let one = Run::new(CONFIG, &["--trials", "1"]);
+    assert!(!svg(&["plot", &one.text()]).contains("standard error"));
+}
+
+#[test]
+fn pdfs_are_whole_and_bring_their_font() {
+    let run = Run::new(CONFIG, &[]);
+    let out = run.file("curves.pdf");
+    succeed(&["plot", &run.text(), "--out", out.to_str().unwrap()]);
+    let pdf = fs::read(out).unwrap();
+    assert!(pdf.len() < 30_000, "{} bytes", pdf.len());
+    let find = |text: &str, from: usize| {
+        pdf[from..].windows(text.len()).position(|window| window == text.as_bytes()).map(|at| at + from)
+    };
+    // Each object stands where the table says.
+    let table = find("\nxref\n", 0).unwrap() + 1;
+    let text = String::from_utf8_lossy(&pdf[table..]).into_owned();
+    let entries: Vec<&str> = text.lines().skip(2).take_while(|line| !line.starts_with("trailer")).collect();
+    assert!(entries.len() > 9, "{entries:?}");
+    for (number, entry) in entries.iter().enumerate().skip(1) {
+        let at: usize = entry[..10].parse().unwrap();
+        assert!(pdf[at..].starts_with(format!("{number} 0 obj").as_bytes()), "{number}: {entry}");
+    }
+    for part in ["/FontFile2", "/ToUnicode", "/Title", "/Subject", "/Lang"] {
+        assert!(find(part, 0).is_some(), "{part}");
+    }
+    // As wide as a column: 85 mm are 240.94 points.
+    assert!(find("/MediaBox [0 0 240.94", 0).is_some());
+}
+
+#[test]
+fn an_axis_of_pois_has_whole_numbers_from_none_to_all() {
+    for pois in 1..=256 {
+        let ticks = poi_ticks(pois);
+        assert_eq!((ticks[0], *ticks.last().unwrap()), (0, pois), "{ticks:?}");
+        assert!(ticks.len() <= 9 && (pois < 3 || ticks.len() >= 4), "{ticks:?}");
+        // With room for a line of letters between two of them.
+        assert!(ticks.windows(2).all(|pair| pair[1] > pair[0] && 12 * (pair[1] - pair[0]) >= pois), "{ticks:?}");
+    }
+    assert_eq!(poi_ticks(9), [0, 3, 6, 9]);
+    assert_eq!(poi_ticks(4), [0, 1, 2, 3, 4]);
+    assert_eq!(poi_ticks(256), [0, 64, 128, 192, 256]);
+}
+
+#[test]
+fn long_labels_keep_what_differs() {
+    let label = |text: &str| text.to_string();
+    let long = "a name that is far too long for any legend of a figure";
+    let names = [format!("{long}/one/run"), format!("{long}/two/run"), format!("{long}/three/run")];
+    let cut = distinct(&names, 30.0, 2.47);
+    assert_eq!(cut, ["…one…", "…two…", "…three…"].map(label));
+    // What differs in the middle alone, too.
+    let names = ["x", "y"].map(|middle| format!("1{long}{middle}{long}2"));
+    let names = [names[0].clone(), names[1].clone(), format!("3{long}4")];
+    let cut = distinct(&names, 30.0, 2.47);
+    assert!(cut.iter().all(|label| text_width(label, 2.47) <= 30.0), "{cut:?}");
+    assert!(cut[0] != cut[1] && cut[1] != cut[2], "{cut:?}");
+    // What has room stays as it is.
+    assert_eq!(distinct(&["fitness G", "fitness D"].map(label), 30.0, 2.47), ["fitness G", "fitness D"].map(label));
+}
+
+#[test]
+fn legends_of_many_runs_have_room() {
+    let run = Run::new(CONFIG, &[]);
+    let names: Vec<String> = (0..24)
+        .map(|index| {
+            let name = run.folder.path().join(format!("a run with a name that goes on and on, and on, number {index}"));
+            fs::create_dir(&name).unwrap();
+            for file in ["config.toml", "metrics.csv"] {
+                fs::copy(run.file(file), name.join(file)).unwrap();
+            }
+            name.to_str().unwrap().to_string()
+        })
+        .collect();
+    let out = run.file("many.svg");
+    let arguments: Vec<&str> = ["plot"].into_iter().chain(names.iter().map(|name| &**name)).collect();
+    succeed(&[&arguments[..], &["--out", out.to_str().unwrap()]].concat());
+    let svg = fs::read_to_string(out).unwrap();
+    let all = texts(&svg);
+    assert_apart("24 runs", &all);
+    assert!((0..24).all(|index| all.iter().any(|(text, _)| *text == format!("…{index}"))), "{all:?}");
+    assert!(all.iter().all(|(_, area)| area[0] >= 0.0 && area[2] <= 85.0), "{all:?}");
+}
+
+/// Red, green and blue as light, in 0..1.
+fn linear(color: Color) -> [f64; 3] {
+    color.map(|channel| {
+        let share = f64::from(channel) / 255.0;
+        if share <= 0.04045 { share / 12.92 } else { ((share + 0.055) / 1.055).powf(2.4) }
+    })
+}
+
+/// WCAG's contrast of two colours.
+fn contrast(a: Color, b: Color) -> f64 {
+    let [a, b] = [a, b].map(linear).map(|[r, g, b]| 0.2126 * r + 0.7152 * g + 0.0722 * b);
+    (a.max(b) + 0.05) / (a.min(b) + 0.05)
+}
+
+/// How far two colours are apart to whoever takes them for least different: normal, red-blind and green-blind eyes
+/// (Machado and others, 2009; distances in Oklab).
+fn apart(a: Color, b: Color) -> f64 {
+    type Matrix = [[f64; 3]; 3];
+    const EYES: [Matrix; 3] = [
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]],
+    ];
+    const CONES: Matrix = [
+        [0.4122214708, 0.5363325363, 0.0514459929],
+        [0.2119034982, 0.6806995451, 0.1073969566],
+        [0.0883024619, 0.2817188376, 0.6299787005],
+    ];
+    const LAB: Matrix = [
+        [0.2104542553, 0.793617785, -0.0040720468],
+        [1.9779984951, -2.428592205, 0.4505937099],
+        [0.0259040371, 0.7827717662, -0.808675766],
+    ];
+    let times = |matrix: &Matrix, v: [f64; 3]| matrix.map(|row| row.iter().zip(v).map(|(a, b)| a * b).sum::<f64>());
+    let lab = |eye: &Matrix, color: Color| {
+        let seen = times(eye, linear(color)).map(|channel| channel.clamp(0.0, 1.0));
+        times(&LAB, times(&CONES, seen).map(f64::cbrt))
+    };
+    let distance = |eye: &Matrix| {
+        let pairs = lab(eye, a).into_iter().zip(lab(eye, b));
+        pairs.map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+    };
+    EYES.iter().map(distance).fold(f64::INFINITY, f64::min)
+}
+
+#[test]
+fn leaders_colours_are_told_apart_on_their_ground() {
+    // The ground, and the colours that mean something else: an observed POI and an agent of no group.
+    for (colors, ground, others) in [
+        (map::GROUPS, [250, 250, 250], [[0, 158, 115], [120, 120, 120]]),
+        (map::GROUPS_DARK, [21, 25, 29], [[42, 199, 154], [150, 150, 150]]),
+    ] {
+        for (index, &color) in colors.iter().enumerate() {
+            assert!(contrast(color, ground) >= 3.0, "{color:?} on its ground: {:.2}", contrast(color, ground));
+            for &other in colors[..index].iter().chain(&others) {
+                assert!(apart(color, other) >= 0.05, "{color:?} and {other:?}: {:.3}", apart(color, other));
+            }
+        }
+    }
+}
+
+#[test]
+fn what_training_tells_has_room_for_many_pois() {
+    // Twelve POIs around two leaders, which need one agent each: all are observed at once.
+    let pois: Vec<String> = (0..12).map(|index| format!("[{}, 6]", 8 + index)).collect();
+    let config = CONFIG.replace("pois = [[8.0, 10.0], [20.0, 10.0]]", &format!("pois = [{}]", pois.join(", ")));
+    let config = config.replace("coupling = 2", "coupling = 1\nobservation_radius = 8.0");
+    let folder = TempDir::new().unwrap();
+    fs::write(folder.path().join("c.toml"), config).unwrap();
+    let [config, out] = ["c.toml", "run"].map(|name| folder.path().join(name).to_str().unwrap().to_string());
+    let said = succeed(&["train", &config, "--out", &out, "--backend", "cpu"]);
+    let rows: Vec<Vec<&str>> = said
+        .lines()
+        .filter(|line| line.starts_with("  ") && line.contains(" to "))
+        .map(|line| line.split("  ").filter(|part| !part.is_empty()).map(str::trim).collect())
+        .collect();
+    assert_eq!(rows.len(), 2, "{said}");
+    assert!(rows.iter().all(|row| row.len() == 4 && row[1] == "12.00 (12.00 to 12.00)"), "{rows:?}");
 }
 
 #[test]
@@ -440,6 +788,7 @@ fn the_papers_figures_come_with_its_claims() {
         let svg = fs::read_to_string(out.join(format!("figure{figure}.svg"))).unwrap();
         assert!(svg.contains("All leaders") && svg.contains("Leaders and followers"));
         assert!(fs::metadata(out.join(format!("figure{figure}.png"))).unwrap().len() > 10_000);
+        assert!(fs::metadata(out.join(format!("figure{figure}.pdf"))).unwrap().len() > 10_000);
     }
     let summary: Value = serde_json::from_str(&fs::read_to_string(out.join("summary.json")).unwrap()).unwrap();
     let arms = summary["arms"].as_array().unwrap();

@@ -471,11 +471,14 @@ fn the_union_of_any_shards_is_the_unsharded_run() {
     assert_eq!(
         wanted.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>(),
         [
+            "curves.pdf",
             "curves.png",
             "curves.svg",
+            "final.pdf",
             "final.png",
             "final.svg",
             "points.csv",
+            "reach.pdf",
             "reach.png",
             "reach.svg",
             "results.csv",

@@ -1,10 +1,13 @@
 //! `flotilla check`: the config as resolved, and what a run of it costs.
 
+use std::path::PathBuf;
+
 use serde::Serialize;
 
-use super::{ConfigArgs, Error, print};
+use super::{ConfigArgs, Error, plot, print};
 use crate::config::Config;
 use crate::memory::Plan;
+use crate::report::map;
 use crate::world::World;
 
 #[derive(clap::Args)]
@@ -14,6 +17,9 @@ pub struct Args {
     /// Print one JSON object with `config` and `cost` (an unlimited range is null)
     #[arg(long)]
     json: bool,
+    /// Draw the layout before any training: .svg, .pdf or .png
+    #[arg(long, short, value_name = "FILE")]
+    out: Option<PathBuf>,
 }
 
 /// What a whole run takes: all trials, all generations and the random start, every team and the champions.
@@ -75,7 +81,12 @@ struct Report<'a> {
 
 /// Prints the config, so that standard output is a config file again, with the cost as comments below it.
 pub fn run(args: Args) -> Result<(), Error> {
+    let kind = args.out.as_deref().map(plot::kind_of).transpose()?;
     let config = args.config.load()?;
+    if let (Some(out), Some(kind)) = (&args.out, kind) {
+        let name = args.config.name();
+        plot::write(&map::layout(&name, &config), kind, out)?;
+    }
     let cost = Cost::of(&config);
     if args.json {
         let report = Report { config: &config, cost: &cost };

@@ -16,6 +16,7 @@ use crate::report::curves::PRINT;
 use crate::report::paper::{self, Arm, Measured, Summary};
 use crate::report::progress::Progress;
 use crate::report::runs;
+use crate::report::scene::Kind;
 use crate::run::{self, Options, Outcome, RunError, Session, Twin};
 use crate::shell;
 
@@ -170,10 +171,11 @@ pub fn run(args: Args) -> Result<(), Error> {
     };
     for layout in paper::LAYOUTS {
         let scene = paper::figure(&arms, &layout).scene();
-        write(format!("figure{}.svg", layout.figure), scene.svg().as_bytes())?;
-        let name = format!("figure{}.png", layout.figure);
-        let png = scene.png(PRINT).map_err(failed(&out.join(&name)))?;
-        write(name, &png)?;
+        for kind in Kind::ALL {
+            let name = format!("figure{}.{}", layout.figure, kind.extension());
+            let picture = scene.file(kind, PRINT).map_err(failed(&out.join(&name)))?;
+            write(name, &picture)?;
+        }
     }
     let claims = paper::claims(&arms);
     let table = paper::table(&claims);
@@ -226,7 +228,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         return print(&format!("{told}\n"));
     }
     print(&format!(
-        "{table}\n{heading}\n\nTrained in {seconds:.1} s. Files in {}: figure4, figure5, figure6 (.svg, .png), claims.md, \
+        "{table}\n{heading}\n\nTrained in {seconds:.1} s. Files in {}: figure4, figure5, figure6 (.svg, .png, .pdf), claims.md, \
          summary.json, and a run each in {ARMS}/\n",
         out.display()
     ))

@@ -6,14 +6,14 @@ use super::{Error, output, print};
 use crate::record::RecordError;
 use crate::report::curves::PRINT;
 use crate::report::runs::{self, MAX_RUNS};
-use crate::report::scene::Scene;
+use crate::report::scene::{Kind, Scene};
 
 #[derive(clap::Args)]
 pub struct Args {
     /// Folders that `flotilla train` made
     #[arg(required = true, value_name = "RUN")]
     runs: Vec<PathBuf>,
-    /// Picture to write, .svg or .png [default: curves.svg in the folder of one run, comparison.svg here of several]
+    /// Picture to write, .svg, .pdf or .png [default: curves.svg in the folder of one run, comparison.svg here of several]
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Print one JSON object
@@ -31,7 +31,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         [run] => run.join("curves.svg"),
         _ => "comparison.svg".into(),
     });
-    let kind = Kind::of(&out)?;
+    let kind = kind_of(&out)?;
     let scene = runs::figure(&runs)?.scene();
     write(&scene, kind, &out)?;
     let out = out.display().to_string();
@@ -44,29 +44,21 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
 }
 
-/// What a picture is written as.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
-    Svg,
-    Png,
-}
-
-impl Kind {
-    fn of(path: &Path) -> Result<Kind, Error> {
-        match path.extension().map(|extension| extension.to_ascii_lowercase()) {
-            Some(extension) if extension == "svg" => Ok(Kind::Svg),
-            Some(extension) if extension == "png" => Ok(Kind::Png),
-            _ => Err(Error::Usage(format!("--out {}: its name must end in .svg or .png", path.display()))),
-        }
-    }
+/// What a picture is written as, by the end of its file's name.
+///
+/// # Errors
+/// Nothing that a picture can be.
+pub(super) fn kind_of(path: &Path) -> Result<Kind, Error> {
+    let wrong = || Error::Usage(format!("--out {}: its name must end in .svg, .pdf or .png", path.display()));
+    Kind::of(path).ok_or_else(wrong)
 }
 
 /// Writes a picture, whole or not at all.
-fn write(scene: &Scene, kind: Kind, path: &Path) -> Result<(), Error> {
+///
+/// # Errors
+/// The file cannot be written.
+pub(super) fn write(scene: &Scene, kind: Kind, path: &Path) -> Result<(), Error> {
     let failed = |error| RecordError::Write { path: path.into(), error };
-    let content = match kind {
-        Kind::Svg => scene.svg().into_bytes(),
-        Kind::Png => scene.png(PRINT).map_err(failed)?,
-    };
+    let content = scene.file(kind, PRINT).map_err(failed)?;
     output::write(path, |output| output.write_all(&content))
 }

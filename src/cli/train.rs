@@ -272,15 +272,21 @@ fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> S
     let Results { story, digest } = results;
     let pois = config.world.pois.len();
     let mut text = format!("{trained}.\n\nPOIs observed, of {pois}: mean over trials (lowest to highest trial)\n");
-    let _ = writeln!(text, "  {:<16}{:<22}{:<22}{}", "", SCORES[0].0, SCORES[1].0, SCORES[2].0);
-    for (name, rows) in
-        [("start", &story.first), (&*format!("generation {}", config.learning.generations), &story.last)]
-    {
+    let last = format!("generation {}", config.learning.generations);
+    let mut table = vec![["", SCORES[0].0, SCORES[1].0, SCORES[2].0].map(String::from)];
+    for (name, rows) in [("start", &story.first), (&*last, &story.last)] {
         let [best, mean, champion] = SCORES.map(|(_, share)| {
             let Spread { mean, lowest, highest } = Spread::of(rows.iter().map(|row| share(row) * pois as f64));
             format!("{mean:.2} ({lowest:.2} to {highest:.2})")
         });
-        let _ = writeln!(text, "  {name:<16}{best:<22}{mean:<22}{champion}");
+        table.push([name.into(), best, mean, champion]);
+    }
+    // As wide as what stands in them: 100 POIs take more room than 4.
+    let width = |column: usize| table.iter().map(|row| row[column].len()).max().unwrap_or(0);
+    for [name, best, mean, champion] in &table {
+        let line =
+            format!("  {name:<a$}  {best:<b$}   {mean:<c$}   {champion}", a = width(0), b = width(1), c = width(2));
+        let _ = writeln!(text, "{}", line.trim_end());
     }
     let [replayed, config, policies] =
         [folder.into(), folder.join(folder::CONFIG), folder.join(POLICIES)].map(|path: PathBuf| quoted(&path));

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::scene::{Anchor, BLACK, COLORS, Color, Fill, LIGHT, Pen, Scene, WHITE, text_width};
+use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
 
 /// A column of a two-column paper, in millimetres.
 pub const COLUMN: f64 = 85.0;
@@ -11,7 +11,7 @@ pub const PRINT: f64 = 300.0 / 25.4;
 /// Most points that a curve is drawn with.
 const MAX_POINTS: usize = 300;
 /// Sizes of letters, 7 and 8 points.
-const SMALL: f64 = 2.47;
+pub const SMALL: f64 = 2.47;
 const NORMAL: f64 = 2.82;
 const DASHES: [&[f64]; 5] = [&[], &[1.6, 0.7], &[1.8, 0.6, 0.4, 0.6], &[0.5, 0.5], &[3.0, 0.8]];
 
@@ -49,6 +49,9 @@ pub struct Curve {
     pub generation: Vec<f64>,
     pub mean: Vec<f64>,
     pub error: Vec<f64>,
+    /// How many trials these are of, at most.
+    #[serde(skip)]
+    pub trials: u32,
 }
 
 impl Curve {
@@ -59,6 +62,7 @@ impl Curve {
             curve.generation.push(generation as f64);
             curve.mean.push(tally.mean);
             curve.error.push(tally.error());
+            curve.trials = curve.trials.max(tally.count);
         }
         curve
     }
@@ -76,7 +80,7 @@ impl Curve {
             values.chunks(each).map(|values| values.iter().sum::<f64>() / values.len() as f64).collect()
         };
         let [generation, mean, error] = [&self.generation, &self.mean, &self.error].map(|values| average(values));
-        (Curve { generation, mean, error }, each)
+        (Curve { generation, mean, error, trials: self.trials }, each)
     }
 }
 
@@ -96,6 +100,8 @@ pub struct Figure {
     pub y_label: String,
     /// The y axis runs from 0 to this.
     pub y_max: f64,
+    /// Shares of the POIs, not their number.
+    pub shares: bool,
 }
 
 impl Figure {
@@ -105,13 +111,17 @@ impl Figure {
         const RIGHT: f64 = 3.0;
         const GAP: f64 = 5.5;
         const BELOW: f64 = 9.0;
-        let rows = self.legend_rows();
+        let labels = distinct(&self.legend, COLUMN - 20.0, SMALL);
+        let rows = legend_rows(&labels);
         let titles = if self.panels.iter().any(|panel| !panel.title.is_empty()) { 4.5 } else { 1.5 };
         let above = 1.0 + rows.len() as f64 * 3.8 + titles;
         let columns = self.panels.len().max(1) as f64;
         let height = if columns > 1.0 { 36.0 } else { 46.0 };
         let width = (COLUMN - LEFT - RIGHT - GAP * (columns - 1.0)) / columns;
-        let mut scene = Scene::new(COLUMN, above + height + BELOW);
+        let banded = band_caption(self.panels.iter().flat_map(|panel| &panel.curves).map(|(_, curve)| curve));
+        let caption = if banded.is_some() { 4.0 } else { 0.0 };
+        let mut scene = Scene::new(COLUMN, above + height + BELOW + caption);
+        (scene.title, scene.description) = (self.title(), self.description());
 
         for (row, entries) in rows.iter().enumerate() {
             let y = 1.0 + 3.8 * row as f64 + 2.0;
@@ -119,13 +129,7 @@ impl Figure {
                 let look = Look::of(index);
                 scene.line(vec![[x, y], [x + 8.0, y]], look.pen());
                 look.mark(&mut scene, [x + 4.0, y]);
-                scene.text(
-                    [x + 9.0, y + 0.9],
-                    shorten(&self.legend[index], COLUMN - 20.0),
-                    SMALL,
-                    Anchor::Start,
-                    BLACK,
-                );
+                scene.text([x + 9.0, y + 0.9], &*labels[index], SMALL, Anchor::Start, BLACK);
             }
         }
         scene.upright([2.6, above + height / 2.0], &*self.y_label, NORMAL, BLACK);
@@ -143,7 +147,7 @@ impl Figure {
             let left = LEFT + (width + GAP) * column as f64;
             let axes = Axes { left, above, width, height, x_max, y_max: self.y_max * 1.04 };
             scene.bold([left + width / 2.0, above - 1.3], &*panel.title, NORMAL, Anchor::Middle, BLACK);
-            axes.draw(&mut scene, column == 0, self.y_max);
+            axes.draw(&mut scene, column == 0, self.y_max, self.shares);
             if column == 0 {
                 let label = match each {
                     1 => "Generation".to_string(),
@@ -151,6 +155,9 @@ impl Figure {
                 };
                 let middle = LEFT + (COLUMN - LEFT - RIGHT) / 2.0;
                 scene.text([middle, above + height + 7.4], label, NORMAL, Anchor::Middle, BLACK);
+            }
+            if let Some(caption) = banded.as_ref().filter(|_| column == 0) {
+                draw_caption(&mut scene, [LEFT, above + height + 11.4], caption);
             }
             scene.clipped([left - 0.8, above - 0.8, width + 1.6, height + 1.6], |scene| {
                 for (index, (curve, _)) in curves {
@@ -164,22 +171,68 @@ impl Figure {
         scene
     }
 
-    /// The entries of each row of the legend, with where each starts.
-    fn legend_rows(&self) -> Vec<Vec<(usize, f64)>> {
-        const START: f64 = 10.0;
-        let mut rows: Vec<Vec<(usize, f64)>> = Vec::new();
-        let mut x = f64::INFINITY;
-        for (index, label) in self.legend.iter().enumerate() {
-            let width = 9.0 + text_width(&shorten(label, COLUMN - 20.0), SMALL) + 4.0;
-            if x + width > COLUMN + 3.0 {
-                rows.push(Vec::new());
-                x = START;
-            }
-            rows.last_mut().expect("the first entry starts a row").push((index, x));
-            x += width;
-        }
-        rows
+    fn title(&self) -> String {
+        let titles: Vec<_> = self.panels.iter().map(|panel| &*panel.title).filter(|title| !title.is_empty()).collect();
+        let of = if titles.is_empty() { String::new() } else { format!(": {}", titles.join(", ")) };
+        format!("{} by generation{of}", self.y_label)
     }
+
+    /// From where to where each curve goes.
+    fn description(&self) -> String {
+        let mut text = format!("Learning curves, on an axis from 0 to {}.", number(self.y_max));
+        for panel in &self.panels {
+            let course = |(index, curve): &(usize, Curve)| {
+                let (label, last) = (self.legend.get(*index)?, curve.mean.len().checked_sub(1)?);
+                let [from, to] = [0, last].map(|at| (curve.generation[at], number(curve.mean[at]), curve.error[at]));
+                let error = if to.2 > 0.0 { format!(" ± {}", number(to.2)) } else { String::new() };
+                Some(format!(
+                    "{label} from {} at generation {} to {}{error} at generation {}",
+                    from.1, from.0, to.1, to.0
+                ))
+            };
+            let courses: Vec<_> = panel.curves.iter().filter_map(course).collect();
+            let title = if panel.title.is_empty() { String::new() } else { format!("{}: ", panel.title) };
+            text += &format!(" {title}{}.", courses.join("; "));
+        }
+        if let Some(caption) = band_caption(self.panels.iter().flat_map(|panel| &panel.curves).map(|(_, curve)| curve))
+        {
+            text += &format!(" Band: {caption}.");
+        }
+        text
+    }
+}
+
+/// What a band is, if any of the curves has one.
+pub fn band_caption<'a>(curves: impl Iterator<Item = &'a Curve>) -> Option<String> {
+    let banded = curves.filter(|curve| curve.error.iter().any(|&error| error > 0.0));
+    let trials: std::collections::BTreeSet<u32> = banded.map(|curve| curve.trials).collect();
+    let (least, most) = (trials.first()?, trials.last()?);
+    let trials = if least == most { most.to_string() } else { format!("{least} to {most}") };
+    Some(format!("mean ± standard error over {trials} trials"))
+}
+
+/// Draws what a band is, from a place on the baseline.
+pub fn draw_caption(scene: &mut Scene, [x, y]: [f64; 2], caption: &str) {
+    scene.rectangle([x, y - 1.9, 6.0, 2.2], Some(Fill { color: GREY, opacity: 0.3 }), None);
+    scene.line(vec![[x, y - 0.8], [x + 6.0, y - 0.8]], Pen::new(GREY, 0.4));
+    scene.text([x + 7.0, y], caption, SMALL, Anchor::Start, BLACK);
+}
+
+/// The entries of each row of the legend, with where each starts.
+fn legend_rows(labels: &[String]) -> Vec<Vec<(usize, f64)>> {
+    const START: f64 = 10.0;
+    let mut rows: Vec<Vec<(usize, f64)>> = Vec::new();
+    let mut x = f64::INFINITY;
+    for (index, label) in labels.iter().enumerate() {
+        let width = 9.0 + text_width(label, SMALL) + 4.0;
+        if x + width > COLUMN + 3.0 {
+            rows.push(Vec::new());
+            x = START;
+        }
+        rows.last_mut().expect("the first entry starts a row").push((index, x));
+        x += width;
+    }
+    rows
 }
 
 /// A panel's place in the picture, and its ranges.
@@ -198,10 +251,14 @@ impl Axes {
         [self.left + self.width * generation / self.x_max, self.above + self.height * (1.0 - y)]
     }
 
-    fn draw(&self, scene: &mut Scene, numbered: bool, y_end: f64) {
+    fn draw(&self, scene: &mut Scene, numbered: bool, y_end: f64, shares: bool) {
         let Axes { left, above, width, height, .. } = *self;
         let (right, below) = (left + width, above + height);
-        for tick in ticks(y_end, 4) {
+        let ticks = match shares {
+            true => [0.0, 0.25, 0.5, 0.75, 1.0].to_vec(),
+            false => poi_ticks(y_end as usize).into_iter().map(|tick| tick as f64).collect(),
+        };
+        for tick in ticks {
             let [_, y] = self.at(0.0, tick);
             scene.line(vec![[left, y], [right, y]], Pen::new(LIGHT, 0.15));
             scene.line(vec![[left - 0.9, y], [left, y]], Pen::new(BLACK, 0.2));
@@ -209,7 +266,7 @@ impl Axes {
                 scene.text([left - 1.5, y + 0.9], number(tick), SMALL, Anchor::End, BLACK);
             }
         }
-        for tick in ticks(self.x_max, if width > 50.0 { 8 } else { 4 }) {
+        for tick in whole_ticks(self.x_max, if width > 50.0 { 8 } else { 4 }) {
             let [x, _] = self.at(tick, 0.0);
             scene.line(vec![[x, below], [x, below + 0.9]], Pen::new(BLACK, 0.2));
             let label = number(tick);
@@ -277,12 +334,26 @@ impl Look {
     }
 }
 
-/// Round numbers from 0 to an end, about so many steps apart.
-fn ticks(end: f64, steps: usize) -> Vec<f64> {
-    let rough = end / steps as f64;
-    let power = 10f64.powf(rough.log10().floor());
-    let step = [1.0, 2.0, 2.5, 5.0, 10.0].into_iter().map(|s| s * power).find(|&s| s >= rough * 0.999).unwrap_or(rough);
-    (0..).map(|index| index as f64 * step).take_while(|&tick| tick <= end * 1.0001).take(20).collect()
+/// The least round number (1, 2 or 5 times a power of ten) that is no less than another.
+pub fn round_step(least: f64) -> f64 {
+    let power = 10f64.powf(least.log10().floor());
+    [1.0, 2.0, 5.0].into_iter().map(|step| step * power).find(|&step| step >= least * 0.999).unwrap_or(10.0 * power)
+}
+
+/// Whole round numbers from 0 up to an end, in about so many steps.
+fn whole_ticks(end: f64, steps: usize) -> Vec<f64> {
+    let step = round_step((end / steps as f64).max(1.0));
+    (0..).map(|index| f64::from(index) * step).take_while(|&tick| tick <= end * 1.0001).collect()
+}
+
+/// Numbers of POIs for an axis from none to all of them, both included.
+pub fn poi_ticks(pois: usize) -> Vec<usize> {
+    // Steps that come out even, round ones first; else round ones up to what leaves room for the last.
+    let fits = |step: &usize| pois.is_multiple_of(*step) && (3..=6).contains(&(pois / step));
+    let even = [1, 2, 5, 10, 20, 25, 50].into_iter().find(fits).or_else(|| (1..=pois).find(fits));
+    let step = if pois <= 8 { 1 } else { even.unwrap_or(round_step(pois as f64 / 6.0) as usize) };
+    let ticks = (0..pois).step_by(step).filter(|tick| *tick == 0 || 2 * (pois - tick) >= step);
+    ticks.chain([pois]).collect()
 }
 
 fn number(value: f64) -> String {
@@ -290,17 +361,47 @@ fn number(value: f64) -> String {
     text.trim_end_matches('0').trim_end_matches('.').to_string()
 }
 
-/// A label cut to a width.
-fn shorten(label: &str, width: f64) -> String {
-    if text_width(label, SMALL) <= width {
-        return label.to_string();
+/// Labels cut to a width, so that what tells one from the others stays.
+pub fn distinct(labels: &[String], width: f64, size: f64) -> Vec<String> {
+    let fits = |label: &String| text_width(label, size) <= width;
+    if labels.iter().all(fits) {
+        return labels.to_vec();
     }
-    let mut short = String::new();
-    for c in label.chars() {
-        if text_width(&short, SMALL) > width - 3.0 {
-            break;
-        }
-        short.push(c);
+    // What all begin and end with tells none from another.
+    let letters: Vec<Vec<char>> = labels.iter().map(|label| label.chars().collect()).collect();
+    let least = letters.iter().map(Vec::len).min().unwrap_or(0);
+    let alike = |at: &dyn Fn(&[char]) -> char| letters.windows(2).all(|pair| at(&pair[0]) == at(&pair[1]));
+    let head = if labels.len() > 1 { (0..least).take_while(|&i| alike(&|label| label[i])).count() } else { 0 };
+    let room = if labels.len() > 1 { least - head } else { 0 };
+    let tail = (0..room).take_while(|&i| alike(&|label| label[label.len() - 1 - i])).count();
+    // A few letters are worth no ellipsis.
+    let (head, tail) = (if head < 4 { 0 } else { head }, if tail < 4 { 0 } else { tail });
+    let cut = |label: &Vec<char>| {
+        let middle: String = label[head..label.len() - tail].iter().collect();
+        let [before, after] = [head, tail].map(|length| if length > 0 { "…" } else { "" });
+        middle_out(&format!("{before}{middle}{after}"), width, size)
+    };
+    let short: Vec<String> = letters.iter().map(cut).collect();
+    let twice = |label: &String| short.iter().filter(|other| *other == label).count() > 1;
+    // What differs in its middle alone: by number, in the order in which they were named.
+    let numbered = |(index, label): (usize, &String)| match twice(label) {
+        true => middle_out(&format!("{} {label}", index + 1), width, size),
+        false => label.clone(),
+    };
+    short.iter().enumerate().map(numbered).collect()
+}
+
+/// A text without its middle, if it is longer than a width.
+fn middle_out(text: &str, width: f64, size: f64) -> String {
+    let letters: Vec<char> = text.chars().collect();
+    let without = |left: usize| {
+        let (head, tail) = (left.div_ceil(2), left / 2);
+        let [head, tail]: [String; 2] =
+            [letters[..head].iter().collect(), letters[letters.len() - tail..].iter().collect()];
+        format!("{head}…{tail}")
+    };
+    if text_width(text, size) <= width {
+        return text.to_string();
     }
-    short + "…"
+    (0..letters.len()).rev().map(without).find(|short| text_width(short, size) <= width).unwrap_or_else(|| "…".into())
 }

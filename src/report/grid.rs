@@ -1,7 +1,7 @@
 //! Figures of a grid of results: heat maps over two axes, curves by the values of an axis, and dots for keys that are
 //! varied one at a time.
 
-use super::curves::Curve;
+use super::curves::{Curve, band_caption, distinct, draw_caption};
 use super::scene::{Anchor, BLACK, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
 
 /// Widest a figure gets before its panels go to the next row, in millimetres.
@@ -86,6 +86,7 @@ impl HeatMap {
         let whole = panels.width().max(text_width(&self.title, 3.2) * 1.1 + 6.0).max(key_width + left + 6.0);
         let mut scene = Scene::new(whole, key_above + 9.5);
         scene.bold([3.0, 5.0], &*self.title, 3.2, Anchor::Start, BLACK);
+        (scene.title, scene.description) = (self.title.clone(), self.description());
 
         for (index, (title, cells)) in self.panels.iter().enumerate() {
             let [x, y] = panels.place(index);
@@ -139,6 +140,26 @@ impl HeatMap {
         }
         scene
     }
+
+    /// Every cell, row by row.
+    fn description(&self) -> String {
+        let (columns, [x, y]) = (self.x.values.len(), [&self.x.label, &self.y.label]);
+        let mut text = format!("A heat map by {x}{}{y}.", if y.is_empty() { "" } else { " and " });
+        for (title, cells) in &self.panels {
+            for (row, cells) in cells.chunks(columns.max(1)).enumerate() {
+                let row = self.y.values.get(row).map(|value| format!("{y} {value}"));
+                let place: Vec<_> = [title.clone()].into_iter().filter(|title| !title.is_empty()).chain(row).collect();
+                let said = |(value, cell): (&String, &Cell)| match cell {
+                    Cell::Empty => format!("{value}: none"),
+                    Cell::Value(_, word) | Cell::Word(word) => format!("{value}: {word}"),
+                };
+                let said: Vec<_> = self.x.values.iter().zip(cells).map(said).collect();
+                text +=
+                    &format!(" {}{}{}.", place.join(", "), if place.is_empty() { "" } else { ": " }, said.join(", "));
+            }
+        }
+        text
+    }
 }
 
 /// Curves of G in 0..1 by generation, one for each value of an axis, in a panel for each value of the rest.
@@ -159,7 +180,8 @@ impl Curves {
         const LEFT: f64 = 14.0;
         let titles = self.panels.iter().map(|(title, _)| text_width(title, SMALL)).fold(0.0, f64::max);
         let width = titles.max(38.0) + 1.0;
-        let entries: Vec<f64> = self.by.values.iter().map(|value| 9.0 + text_width(value, SMALL)).collect();
+        let labels = distinct(&self.by.values, WIDEST / 3.0, SMALL);
+        let entries: Vec<f64> = labels.iter().map(|value| 9.0 + text_width(value, SMALL)).collect();
         let legend = text_width(&self.by.label, NORMAL) + 6.0;
         let mut panels = Panels::new(self.panels.len(), width, HEIGHT, LEFT, 12.0);
         if self.columns > 0 {
@@ -180,10 +202,17 @@ impl Curves {
             x += entry + 1.5;
         }
         panels.above += y;
-        let mut scene = Scene::new(whole, panels.above + panels.height() - 2.0);
+        let banded = band_caption(self.panels.iter().flat_map(|(_, curves)| curves).map(|(_, curve)| curve));
+        let caption = if banded.is_some() { 4.5 } else { 0.0 };
+        let mut scene = Scene::new(whole, panels.above + panels.height() - 2.0 + caption);
+        (scene.title, scene.description) = (self.title.clone(), self.description());
+        if let Some(caption) = banded {
+            let place = [3.0, scene.height - 2.0];
+            draw_caption(&mut scene, place, &caption);
+        }
         scene.bold([3.0, 5.0], &*self.title, 3.2, Anchor::Start, BLACK);
         scene.text([3.0, 10.9], &*self.by.label, NORMAL, Anchor::Start, BLACK);
-        for (at, (label, [x, y])) in self.by.values.iter().zip(places).enumerate() {
+        for (at, (label, [x, y])) in labels.iter().zip(places).enumerate() {
             scene.line(vec![[x, y], [x + 6.0, y]], self.pen(at));
             scene.text([x + 7.0, y + 0.9], &**label, SMALL, Anchor::Start, BLACK);
         }
@@ -233,6 +262,20 @@ impl Curves {
             });
         }
         scene
+    }
+
+    /// Where each curve ends.
+    fn description(&self) -> String {
+        let mut text = format!("Learning curves by {}, with the mean of the last generation.", self.by.label);
+        for (title, curves) in &self.panels {
+            let end = |(value, curve): &(usize, Curve)| {
+                let (mean, error) = (curve.mean.last()?, curve.error.last()?);
+                Some(format!("{}: {mean:.2} ± {error:.2}", self.by.values.get(*value)?))
+            };
+            let ends: Vec<_> = curves.iter().filter_map(end).collect();
+            text += &format!(" {title}{}{}.", if title.is_empty() { "" } else { ": " }, ends.join(", "));
+        }
+        text
     }
 
     /// A value's line: darker the later it stands on its axis, and dashed in turn.

@@ -2,7 +2,9 @@
 //!
 //! | module | holds |
 //! |---|---|
-//! | [`scene`] | a picture described once, written as SVG or PNG |
+//! | [`scene`] | a picture described once, written as SVG, PDF or PNG |
+//! | [`letters`], [`pdf`] | its letters; how it becomes a PDF |
+//! | [`map`] | a team on its map: agents, POIs, trails |
 //! | [`curves`] | learning curves: mean and standard error over trials, and the figure that shows them |
 //! | [`runs`] | what runs' folders say of their curves, and what is wrong with them |
 //! | [`grid`] | heat maps and curves over the axes of a sweep |
@@ -13,7 +15,10 @@
 
 pub mod curves;
 pub mod grid;
+pub mod letters;
+pub mod map;
 pub mod paper;
+pub mod pdf;
 pub mod progress;
 pub mod replay;
 pub mod runs;

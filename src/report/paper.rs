@@ -116,6 +116,7 @@ pub fn figure(arms: &[Arm], layout: &Layout) -> Figure {
         legend: FITNESSES.map(|fitness| fitness.to_string()).to_vec(),
         y_label: "POIs observed".into(),
         y_max: arms.iter().map(|arm| arm.pois() as f64).fold(1.0, f64::max),
+        ..Figure::default()
     }
 }
 

@@ -11,8 +11,9 @@ use base64::prelude::BASE64_STANDARD;
 use glam::{DVec2, Vec2};
 use serde_json::json;
 
+use super::map::{self, Agent, FAINT, Legend, Poi, Team, View};
 use super::runs::{self, RunError};
-use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE};
+use super::scene::{Anchor, BLACK, Color, Scene};
 use crate::backend::{Backend, BackendError, Episode, Group, Strided, Trace};
 use crate::config::Config;
 use crate::credit::{self, Credit, Scores};
@@ -260,7 +261,60 @@ impl Played {
         self.trace.moment(step, 0, agent).heading
     }
 
-    /// Steps that a page or a moving picture shows, if it has room for so many.
+    /// The team `place` steps from the start, with its trails up to there.
+    fn team(&self, place: f64) -> Team {
+        // Long trails of many agents are drawn by fewer points.
+        const POINTS: usize = 40_000;
+        let (step, part) = (place as usize, place.fract());
+        let world = &self.world;
+        let shown = self.shown((POINTS / world.agents().max(1)).clamp(30, 400));
+        let at = |step: usize, agent: usize| Vec2::from(self.position(step, agent)).as_dvec2();
+        let toward = |step: usize, agent: usize| Vec2::from(self.heading(step, agent)).as_dvec2();
+        let agent = |agent: usize| {
+            let next = (step + 1).min(world.steps());
+            let mut trail: Vec<_> = shown.iter().filter(|&&shown| shown <= step).map(|&step| at(step, agent)).collect();
+            let place = at(step, agent).lerp(at(next, agent), part);
+            trail.push(place);
+            let group = (self.owner[agent] != credit::NOBODY).then_some(self.owner[agent] as usize);
+            Agent { place, heading: toward(step, agent).lerp(toward(next, agent), part), group, trail }
+        };
+        let poi = |(poi, place): (usize, &Vec2)| {
+            let (near, needed) = (self.near(step, poi), world.coupling[poi]);
+            Poi {
+                place: place.as_dvec2(),
+                label: format!("{near}/{needed}"),
+                share: Some(f64::from(near) / f64::from(needed)),
+                observed: self.observed[poi].is_some_and(|observed| observed <= step),
+            }
+        };
+        Team {
+            leaders: world.leaders(),
+            agents: (0..world.agents()).map(agent).collect(),
+            pois: world.pois.iter().enumerate().map(poi).collect(),
+        }
+    }
+
+    /// What is to be seen of it after a step, in words.
+    fn say(&self, step: usize) -> String {
+        const MOST: usize = 12;
+        let (world, pois) = (&self.world, self.world.pois.len());
+        let times = self.observed.iter().enumerate().filter_map(|(poi, observed)| Some((poi, (*observed)?)));
+        let times: Vec<_> = times.filter(|&(_, observed)| observed <= step).collect();
+        let list: Vec<_> = times.iter().take(MOST).map(|(poi, step)| format!("POI {poi} at step {step}")).collect();
+        let more = if times.len() > MOST { " and more" } else { "" };
+        format!(
+            "Generation {}, step {step} of {}: {} of {pois} POIs observed{}{}{more}, by a team of {} and {}.",
+            self.generation,
+            world.steps(),
+            times.len(),
+            if list.is_empty() { "" } else { ": " },
+            list.join(", "),
+            map::count(world.leaders(), "leader"),
+            map::count(world.followers(), "follower"),
+        )
+    }
+
+    /// Steps that a page or a trail shows, if it has room for so many.
     fn shown(&self, most: usize) -> Vec<usize> {
         let steps = self.world.steps();
         let every = steps.div_ceil(most.max(2) - 1).max(1);
@@ -296,11 +350,16 @@ pub fn page(name: &str, config: &Config, played: &[Played]) -> String {
         "dt": world.dt,
         "steps": world.steps,
         "exact": exact,
+        "colors": { "light": hex(&map::GROUPS), "dark": hex(&map::GROUPS_DARK) },
         "episodes": episodes,
     });
     // Inside a script element, only "<" could end it early.
     let data = data.to_string().replace('<', "\\u003c");
     include_str!("replay.html").replacen("\"DATA\"", &data, 1)
+}
+
+fn hex(colors: &[Color]) -> Vec<String> {
+    colors.iter().map(|[r, g, b]| format!("#{r:02x}{g:02x}{b:02x}")).collect()
 }
 
 /// One episode as the page reads it: motion as base64 of little-endian numbers, `[shown][agents]`.
@@ -346,33 +405,70 @@ fn episode(played: &Played, shown: &[usize], exact: bool) -> serde_json::Value {
     })
 }
 
-/// Episodes side by side after a step, each with its trails up to there.
-pub fn still(config: &Config, played: &[Played], step: usize) -> Scene {
+/// Episodes side by side, to be drawn at any of their moments.
+struct Stage<'a> {
+    played: &'a [Played],
+    view: View,
+    width: f64,
+    legend: Legend,
+}
+
+impl<'a> Stage<'a> {
     const SIDE: f64 = 80.0;
     const EDGE: f64 = 2.5;
     const HEAD: f64 = 9.0;
-    let [from, to] = busy(config, played);
-    let span = to - from;
-    let scale = SIDE / span.max_element();
-    let (width, height) = (span.x * scale, span.y * scale);
-    let columns = played.len().max(1) as f64;
-    let mut scene = Scene::new(EDGE + columns * (width.max(50.0) + EDGE), HEAD + height + 8.0);
-    for (column, played) in played.iter().enumerate() {
-        let left = EDGE + column as f64 * (width.max(50.0) + EDGE);
-        let pois = played.world.pois.len();
-        let by_now = played.observed.iter().flatten().filter(|&&observed| observed <= step).count();
-        scene.bold([left, 4.0], format!("Generation {}", played.generation), 3.2, Anchor::Start, BLACK);
-        let said = format!("step {step} of {}   POIs observed: {by_now} of {pois}", played.world.steps());
-        scene.text([left, 7.6], said, 2.6, Anchor::Start, GREY);
-        let view = View { left, above: HEAD, scale, height, from };
-        scene.rectangle([left, HEAD, width, height], Some([250, 250, 250].into()), Some(Pen::new(LIGHT, 0.2)));
-        scene.clipped([left, HEAD, width, height], |scene| {
-            view.draw(scene, config, played, step);
-            view.counts(scene, config, played, step);
-        });
+
+    /// `note` stands below the pictures, among what their signs mean.
+    fn new(config: &Config, played: &'a [Played], note: Option<String>) -> Stage<'a> {
+        let view = View::new(config, busy(config, played), Self::SIDE);
+        let width = view.size()[0].max(60.0);
+        let teams: Vec<Team> = played.iter().map(|played| played.team(played.world.steps() as f64)).collect();
+        // The signs of that episode which has the most of them.
+        let most = teams.iter().max_by_key(|team| team.pois.iter().filter(|poi| poi.observed).count());
+        let mut legend = match most {
+            Some(team) => view.legend(team, "2/3: 2 agents near of 3 needed"),
+            None => Legend::default(),
+        };
+        note.into_iter().for_each(|note| legend.note(note));
+        Stage { played, view, width, legend }
     }
-    legend(&mut scene, [EDGE, HEAD + height + 4.6], played.iter().any(|played| played.world.followers() > 0));
-    scene
+
+    /// The picture `place` steps from the start; between steps, motion is drawn straight.
+    fn scene(&self, place: f64) -> Scene {
+        let step = place as usize;
+        let columns = self.played.len().max(1) as f64;
+        let whole = Self::EDGE + columns * (self.width + Self::EDGE);
+        let room = whole - 2.0 * Self::EDGE;
+        let below = Self::HEAD + self.view.size()[1];
+        let mut scene = Scene::new(whole, below + 1.0 + self.legend.height(room));
+        let mut said = Vec::new();
+        for (column, played) in self.played.iter().enumerate() {
+            let left = Self::EDGE + column as f64 * (self.width + Self::EDGE);
+            let pois = played.world.pois.len();
+            let by_now = played.observed.iter().flatten().filter(|&&observed| observed <= step).count();
+            let steps = played.world.steps();
+            scene.bold([left, 4.0], format!("Generation {}", played.generation), 3.2, Anchor::Start, BLACK);
+            let state = format!("step {step} of {steps}   POIs observed: {by_now} of {pois}");
+            scene.text([left, 7.6], state, 2.6, Anchor::Start, FAINT);
+            self.view.moved_to([left, Self::HEAD]).draw(&mut scene, &played.team(place));
+            said.push(played.say(step));
+        }
+        self.legend.draw(&mut scene, [Self::EDGE, below + 3.8], room);
+        scene.title = match self.played {
+            [one] => format!("The best team of generation {}", one.generation),
+            all => {
+                let generations: Vec<_> = all.iter().map(|played| played.generation.to_string()).collect();
+                format!("The best teams of generations {}, side by side", generations.join(" and "))
+            }
+        };
+        scene.description = said.join(" ");
+        scene
+    }
+}
+
+/// Episodes side by side after a step, each with its trails up to there.
+pub fn still(config: &Config, played: &[Played], step: usize) -> Scene {
+    Stage::new(config, played, None).scene(step as f64)
 }
 
 /// The part of the map, from corner to corner, where anything happens in any of the episodes, at least half as high as
@@ -395,112 +491,66 @@ fn busy(config: &Config, played: &[Played]) -> [DVec2; 2] {
     [from, to]
 }
 
-/// Where a part of the map is drawn.
-struct View {
-    left: f64,
-    above: f64,
-    scale: f64,
-    height: f64,
-    /// The part's lower left corner.
-    from: DVec2,
+/// How a moving picture is made: pixels across, and pictures a second.
+#[derive(Clone, Copy, Debug)]
+pub struct Motion {
+    /// As many as fit into 960 by 720 pixels where it is not given.
+    pub width: Option<u32>,
+    pub fps: u32,
 }
 
-impl View {
-    fn at(&self, [x, y]: [f64; 2]) -> [f64; 2] {
-        [self.left + (x - self.from.x) * self.scale, self.above + self.height - (y - self.from.y) * self.scale]
-    }
+/// Pictures a second, and the longest that a moving picture lasts, in seconds; longer episodes play faster.
+pub const FPS: u32 = 20;
+const LONGEST: f64 = 15.0;
 
-    fn draw(&self, scene: &mut Scene, config: &Config, played: &Played, step: usize) {
-        let world = &played.world;
-        let [x, y] = config.world.map;
-        let walls = [[0.0, 0.0], [x, 0.0], [x, y], [0.0, y]].map(|corner| self.at(corner));
-        scene.polygon(walls.to_vec(), None, Some(Pen::new(BLACK, 0.5)));
-        let size = (self.scale * 1.1).clamp(0.6, 2.2) * if world.agents() > 60 { 0.6 } else { 1.0 };
-        for (poi, &place) in config.world.pois.iter().enumerate() {
-            let place = self.at(place);
-            let observed = played.observed[poi].is_some_and(|observed| observed <= step);
-            let radius = config.world.observation_radius * self.scale;
-            let color = if observed { COLORS[2] } else { GREY };
-            let opacity = if observed { 0.22 } else { 0.06 };
-            let dash: &[f64] = if observed { &[] } else { &[1.0, 0.8] };
-            scene.circle(place, radius, Some(Fill { color, opacity }), Some(Pen { dash, ..Pen::new(color, 0.25) }));
-            let arm = 0.8;
-            for sign in [1.0, -1.0] {
-                let cross = vec![[place[0] - arm, place[1] - sign * arm], [place[0] + arm, place[1] + sign * arm]];
-                scene.line(cross, Pen::new(color, 0.35));
-            }
-        }
-        let shown = played.shown(400);
-        for agent in 0..world.agents() {
-            let steps = shown.iter().copied().filter(|&shown| shown <= step);
-            let mut trail: Vec<_> = steps.map(|step| self.at(played.position(step, agent).map(f64::from))).collect();
-            trail.push(self.at(played.position(step, agent).map(f64::from)));
-            scene.line(trail, Pen { opacity: 0.4, ..Pen::new(self.color(played, agent), 0.3) });
-        }
-        for agent in (0..world.agents()).rev() {
-            let place = self.at(played.position(step, agent).map(f64::from));
-            let [x, y] = played.heading(step, agent).map(f64::from);
-            let leads = agent < world.leaders();
-            let size = if leads { size * 1.35 } else { size };
-            let corner = |ahead: f64, aside: f64| {
-                [place[0] + size * (x * ahead - y * aside), place[1] - size * (y * ahead + x * aside)]
-            };
-            let corners = vec![corner(1.0, 0.0), corner(-0.75, 0.7), corner(-0.4, 0.0), corner(-0.75, -0.7)];
-            let color = self.color(played, agent);
-            match leads {
-                true => scene.polygon(corners, Some(color.into()), Some(Pen::new(BLACK, 0.2))),
-                false => scene.polygon(corners, Some(WHITE.into()), Some(Pen::new(color, 0.35))),
-            }
-        }
-    }
-
-    /// How many agents of those needed are near each POI, above whatever else is there.
-    fn counts(&self, scene: &mut Scene, config: &Config, played: &Played, step: usize) {
-        for (poi, &place) in config.world.pois.iter().enumerate() {
-            let [x, y] = self.at(place);
-            let count = format!("{}/{}", played.near(step, poi), played.world.coupling[poi]);
-            scene.text([x, y - 1.6], count, 2.4, Anchor::Middle, BLACK);
-        }
-    }
-
-    /// A leader's own colour, its followers' too.
-    fn color(&self, played: &Played, agent: usize) -> Color {
-        match played.owner[agent] {
-            credit::NOBODY => GREY,
-            leader => GROUPS[leader as usize % GROUPS.len()],
-        }
-    }
+/// The pictures of a moving picture, one after the other.
+pub struct Frames<'a> {
+    stage: Stage<'a>,
+    /// Steps from the start, of each picture.
+    pub places: Vec<f64>,
+    per_mm: f64,
 }
 
-/// Colours of groups; green is the observed POIs'.
-const GROUPS: [Color; 5] = [COLORS[0], COLORS[1], COLORS[3], COLORS[4], COLORS[5]];
-
-fn legend(scene: &mut Scene, [x, y]: [f64; 2], followers: bool) {
-    let triangle = |x: f64| vec![[x, y - 2.0], [x + 1.0, y + 0.4], [x, y - 0.2], [x - 1.0, y + 0.4]];
-    scene.polygon(triangle(x + 1.0), Some(GROUPS[0].into()), Some(Pen::new(BLACK, 0.2)));
-    scene.text([x + 3.0, y], "leader", 2.4, Anchor::Start, BLACK);
-    let mut next = x + 14.0;
-    if followers {
-        scene.polygon(triangle(next), Some(WHITE.into()), Some(Pen::new(GROUPS[0], 0.35)));
-        scene.text([next + 2.0, y], "its follower", 2.4, Anchor::Start, BLACK);
-        next += 20.0;
+impl<'a> Frames<'a> {
+    pub fn new(config: &Config, played: &'a [Played], motion: Motion) -> Frames<'a> {
+        let steps = played.first().map_or(0, |first| first.world.steps()) as f64;
+        let seconds = steps * config.world.dt;
+        let times = [1.0, 2.0, 4.0, 5.0, 8.0, 10.0, 16.0, 20.0, 32.0, 50.0];
+        let faster = times.into_iter().find(|times| seconds / times <= LONGEST).unwrap_or((seconds / LONGEST).ceil());
+        let each = faster / (f64::from(motion.fps) * config.world.dt);
+        let places = (0..).map(|frame| f64::from(frame) * each).take_while(|&place| place < steps - 1e-6);
+        let places: Vec<f64> = places.chain([steps]).collect();
+        let mut note = if faster > 1.0 { format!("{faster} × as fast as it was") } else { String::new() };
+        if each < 1.0 {
+            note += if note.is_empty() { "" } else { "; " };
+            note += "motion between steps is drawn straight";
+        }
+        let stage = Stage::new(config, played, Some(note).filter(|note| !note.is_empty()));
+        let Scene { width, height, .. } = stage.scene(0.0);
+        let per_mm = motion.width.map_or((960.0 / width).min(720.0 / height), |pixels| f64::from(pixels) / width);
+        Frames { stage, places, per_mm }
     }
-    scene.circle([next, y - 0.8], 1.2, Some(Fill { color: COLORS[2], opacity: 0.22 }), Some(Pen::new(COLORS[2], 0.25)));
-    scene.text([next + 2.2, y], "observed POI", 2.4, Anchor::Start, BLACK);
+
+    /// One of the pictures, with its pixels a millimetre.
+    pub fn scene(&self, place: f64) -> (Scene, f64) {
+        (self.stage.scene(place), self.per_mm)
+    }
 }
 
 /// Episodes side by side as a GIF that repeats.
 ///
 /// # Errors
 /// The encoder refused, which it does for want of memory alone.
-pub fn gif(config: &Config, played: &[Played]) -> std::io::Result<Vec<u8>> {
-    const FRAMES: usize = 100;
-    const PER_MM: f64 = 5.0;
-    let Some(first) = played.first() else { return Ok(vec![]) };
-    let shown = first.shown(FRAMES);
-    let picture = |step: usize| still(config, played, step).pixels(PER_MM);
+pub fn gif(config: &Config, played: &[Played], motion: Motion) -> std::io::Result<Vec<u8>> {
+    let frames = Frames::new(config, played, motion);
+    let picture = |place: f64| {
+        let (scene, per_mm) = frames.scene(place);
+        scene.pixels(per_mm)
+    };
+    let places = &frames.places;
+    let Some(&end) = places.last() else { return Ok(vec![]) };
     // The last picture has all the colours there are.
-    let last = picture(first.world.steps());
+    let last = picture(end);
     let colors = color_quant::NeuQuant::new(10, 255, last.data());
     let mut known = std::collections::HashMap::new();
     let (width, height) = (last.width() as u16, last.height() as u16);
@@ -510,32 +560,30 @@ pub fn gif(config: &Config, played: &[Played]) -> std::io::Result<Vec<u8>> {
         let mut encoder = gif::Encoder::new(&mut file, width, height, &colors.color_map_rgb()).map_err(failed)?;
         encoder.set_repeat(gif::Repeat::Infinite).map_err(failed)?;
         let mut before: Vec<u8> = Vec::new();
-        for (index, &step) in shown.iter().enumerate() {
-            let pixmap = picture(step);
-            let pixels: Vec<u8> = pixmap
-                .data()
-                .chunks_exact(4)
-                .map(|pixel| {
-                    let pixel = [pixel[0], pixel[1], pixel[2], pixel[3]];
-                    *known.entry(pixel).or_insert_with(|| colors.index_of(&pixel) as u8)
-                })
-                .collect();
+        for (index, &place) in places.iter().enumerate() {
+            let pixmap = picture(place);
             // What stays as it was is transparent, which packs well; index 255 is no colour.
-            let changed = |(index, &pixel): (usize, &u8)| if before.get(index) == Some(&pixel) { 255 } else { pixel };
-            let buffer: Vec<u8> = pixels.iter().enumerate().map(changed).collect();
-            let next = shown.get(index + 1).map_or(0, |&next| next - step);
-            let seconds = if next == 0 { 2.0 } else { next as f64 * config.world.dt };
+            let color = |(at, pixel): (usize, &[u8])| {
+                if before.get(4 * at..4 * at + 4) == Some(pixel) {
+                    return 255;
+                }
+                let pixel = [pixel[0], pixel[1], pixel[2], pixel[3]];
+                *known.entry(pixel).or_insert_with(|| colors.index_of(&pixel) as u8)
+            };
+            let buffer: Vec<u8> = pixmap.data().chunks_exact(4).enumerate().map(color).collect();
+            // Hundredths of a second, so that the pictures together take as long as they should.
+            let due = |index: usize| (index as u32 * 100).div_ceil(motion.fps);
+            let delay = if index + 1 == places.len() { 200 } else { due(index + 1) - due(index) };
             let frame = gif::Frame {
                 width,
                 height,
                 buffer: buffer.into(),
                 transparent: Some(255),
-                // Long episodes play faster than they were.
-                delay: ((seconds * 100.0).round() as u16).clamp(4, if next == 0 { 200 } else { 20 }),
+                delay: delay as u16,
                 ..gif::Frame::default()
             };
             encoder.write_frame(&frame).map_err(failed)?;
-            before = pixels;
+            before = pixmap.data().to_vec();
         }
     }
     Ok(file)

@@ -145,6 +145,7 @@ pub fn figure(folders: &[PathBuf]) -> Result<Figure, RunError> {
         legend,
         y_label: if same { format!("POIs observed{what}") } else { format!("Share of POIs observed{what}") },
         y_max: scale,
+        shares: !same,
     })
 }
 

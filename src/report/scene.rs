@@ -1,23 +1,25 @@
-//! A picture described once, in millimetres, and written as SVG, as pixels or as PNG.
+//! A picture described once, in millimetres, and written as SVG, as PDF, as pixels or as PNG.
 //!
-//! Pixels need letters: the font is embedded, so that a bare machine draws the same picture. An SVG names the generic
-//! family and leaves the letters to whoever shows it.
+//! All of them draw the same letters, by the outlines of one embedded font: how long a text is does not depend on who
+//! shows it. What is to be seen stands in the files in words, too, for those who cannot see it.
 
+use std::collections::BTreeSet;
 use std::fmt::Write;
-use std::sync::LazyLock;
 
 use tiny_skia::{
     FillRule, LineCap, LineJoin, Mask, Paint, Path, PathBuilder, Pixmap, Rect, Stroke, StrokeDash, Transform,
 };
-use ttf_parser::{Face, OutlineBuilder};
+
+use super::letters;
+pub use super::letters::text_width;
+use super::pdf;
 
 /// Units of an SVG in a millimetre: letters one unit high would be less than browsers can draw.
 const SVG_UNITS: f64 = 10.0;
+/// How thick the outline of bold letters is, in ems.
+pub(super) const BOLD: f64 = 0.04;
 /// Pixels of the longest side of a picture.
 const MAX_PIXELS: f64 = 8192.0;
-
-static FONT: LazyLock<Face<'static>> =
-    LazyLock::new(|| Face::parse(include_bytes!("font/dejavu-sans.ttf"), 0).expect("the embedded font is whole"));
 
 /// Red, green, blue.
 pub type Color = [u8; 3];
@@ -70,7 +72,7 @@ pub enum Anchor {
 }
 
 #[derive(Clone, Debug)]
-enum Mark {
+pub(super) enum Mark {
     Shape {
         points: Vec<[f64; 2]>,
         closed: bool,
@@ -102,12 +104,42 @@ enum Mark {
 pub struct Scene {
     pub width: f64,
     pub height: f64,
-    marks: Vec<Mark>,
+    /// What the picture is, in a few words.
+    pub title: String,
+    /// What is to be seen in it, in sentences with figures, for those who cannot see it.
+    pub description: String,
+    pub(super) marks: Vec<Mark>,
+}
+
+/// What a picture is written as.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    Svg,
+    Png,
+    Pdf,
+}
+
+impl Kind {
+    pub const ALL: [Kind; 3] = [Kind::Svg, Kind::Png, Kind::Pdf];
+
+    /// By the end of a file's name.
+    pub fn of(path: &std::path::Path) -> Option<Kind> {
+        let extension = path.extension()?.to_ascii_lowercase();
+        Kind::ALL.into_iter().find(|kind| extension == kind.extension())
+    }
+
+    pub fn extension(self) -> &'static str {
+        match self {
+            Kind::Svg => "svg",
+            Kind::Png => "png",
+            Kind::Pdf => "pdf",
+        }
+    }
 }
 
 impl Scene {
     pub fn new(width: f64, height: f64) -> Scene {
-        Scene { width, height, marks: Vec::new() }
+        Scene { width, height, title: String::new(), description: String::new(), marks: Vec::new() }
     }
 
     pub fn line(&mut self, points: Vec<[f64; 2]>, pen: Pen) {
@@ -128,17 +160,23 @@ impl Scene {
 
     /// Text of a size (millimetres an em) from a place on its baseline.
     pub fn text(&mut self, place: [f64; 2], text: impl Into<String>, size: f64, anchor: Anchor, color: Color) {
-        self.marks.push(Mark::Text { place, text: text.into(), size, anchor, color, upright: false, bold: false });
+        self.write(Mark::Text { place, text: text.into(), size, anchor, color, upright: false, bold: false });
     }
 
     pub fn bold(&mut self, place: [f64; 2], text: impl Into<String>, size: f64, anchor: Anchor, color: Color) {
-        self.marks.push(Mark::Text { place, text: text.into(), size, anchor, color, upright: false, bold: true });
+        self.write(Mark::Text { place, text: text.into(), size, anchor, color, upright: false, bold: true });
     }
 
     /// Text that reads upwards, centred at a place.
     pub fn upright(&mut self, place: [f64; 2], text: impl Into<String>, size: f64, color: Color) {
         let text = text.into();
-        self.marks.push(Mark::Text { place, text, size, anchor: Anchor::Middle, color, upright: true, bold: false });
+        self.write(Mark::Text { place, text, size, anchor: Anchor::Middle, color, upright: true, bold: false });
+    }
+
+    fn write(&mut self, mark: Mark) {
+        if !matches!(&mark, Mark::Text { text, .. } if text.is_empty()) {
+            self.marks.push(mark);
+        }
     }
 
     /// Shows what `draw` draws within `[x, y, width, height]` only.
@@ -161,11 +199,22 @@ impl Scene {
         writeln!(
             svg,
             "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{}mm\" height=\"{}mm\" viewBox=\"0 0 {width} {height}\" \
-             font-family=\"Helvetica, Arial, sans-serif\" stroke-linejoin=\"round\">\n\
-             <rect width=\"{width}\" height=\"{height}\" fill=\"#fff\"/>",
+             xmlns:xlink=\"http://www.w3.org/1999/xlink\" stroke-linejoin=\"round\" role=\"img\" \
+             aria-labelledby=\"title description\">\n<title id=\"title\">{}</title>\n<desc id=\"description\">{}</desc>",
             Number(self.width),
             Number(self.height),
+            Escaped(&self.title),
+            Escaped(&self.description),
         )?;
+        // Each letter that occurs is drawn once, and used from there.
+        let texts =
+            self.marks.iter().filter_map(|mark| if let Mark::Text { text, .. } = mark { Some(text) } else { None });
+        let glyphs: BTreeSet<_> = texts.flat_map(|text| letters::set(text).0).map(|(glyph, _, _)| glyph).collect();
+        svg.push_str("<defs>\n");
+        for (glyph, path) in glyphs.iter().filter_map(|&glyph| Some((glyph, letters::outline(glyph)?))) {
+            writeln!(svg, "<path id=\"g{}\" d=\"{path}\"/>", glyph.0)?;
+        }
+        writeln!(svg, "</defs>\n<rect width=\"{width}\" height=\"{height}\" fill=\"#fff\"/>")?;
         let mut clips = 0;
         let mut clipped = false;
         for mark in &self.marks {
@@ -187,31 +236,26 @@ impl Scene {
                     svg.push_str("/>\n");
                 }
                 Mark::Text { place, text, size, anchor, color, upright, bold } => {
-                    let [x, y, size] = [place[0], place[1], *size].map(|at| Number(at * SVG_UNITS));
-                    write!(svg, "<text x=\"{x}\" y=\"{y}\" font-size=\"{size}\" fill=\"{}\"", hex(*color))?;
-                    match anchor {
-                        Anchor::Start => {}
-                        Anchor::Middle => svg.push_str(" text-anchor=\"middle\""),
-                        Anchor::End => svg.push_str(" text-anchor=\"end\""),
-                    }
+                    let (glyphs, length) = letters::set(text);
+                    let [x, y] = place.map(|at| Number(at * SVG_UNITS));
+                    let start = match anchor {
+                        Anchor::Start => 0,
+                        Anchor::Middle => -i64::from(length / 2),
+                        Anchor::End => -i64::from(length),
+                    };
+                    write!(svg, "<g aria-label=\"{}\" fill=\"{}\"", Escaped(text), hex(*color))?;
                     if *bold {
-                        svg.push_str(" font-weight=\"bold\"");
+                        // The font has one weight; an outline makes it the other.
+                        let width = Number(letters::units_per_em() * BOLD);
+                        write!(svg, " stroke=\"{}\" stroke-width=\"{width}\"", hex(*color))?;
                     }
-                    if *upright {
-                        write!(svg, " transform=\"rotate(-90 {x} {y})\"")?;
+                    let turn = if *upright { " rotate(-90)" } else { "" };
+                    let scale = size * SVG_UNITS / letters::units_per_em();
+                    write!(svg, " transform=\"translate({x} {y}){turn} scale({scale:.6})\">")?;
+                    for (glyph, place, _) in glyphs.into_iter().filter(|(_, _, c)| *c != ' ') {
+                        write!(svg, "<use xlink:href=\"#g{}\" x=\"{}\"/>", glyph.0, start + i64::from(place))?;
                     }
-                    svg.push('>');
-                    for c in text.chars() {
-                        match c {
-                            '<' => svg.push_str("&lt;"),
-                            '>' => svg.push_str("&gt;"),
-                            '&' => svg.push_str("&amp;"),
-                            // XML cannot hold most of these, and a picture has no use for any.
-                            c if c.is_control() || matches!(c, '\u{fffe}' | '\u{ffff}') => svg.push(' '),
-                            c => svg.push(c),
-                        }
-                    }
-                    svg.push_str("</text>\n");
+                    svg.push_str("</g>\n");
                 }
                 Mark::Clip(area) => {
                     if std::mem::replace(&mut clipped, area.is_some()) {
@@ -271,9 +315,9 @@ impl Scene {
                     let turn = if *upright { -90.0 } else { 0.0 };
                     let place = transform.pre_translate(*x as f32, *y as f32).pre_concat(Transform::from_rotate(turn));
                     // The embedded font has one weight; an outline makes it the other.
-                    let pen = bold.then(|| Pen::new(*color, size * 0.04));
+                    let pen = bold.then(|| Pen::new(*color, size * BOLD));
                     let pens = (Some(&Fill::from(*color)), pen.as_ref());
-                    let path = letters(text, *size, start);
+                    let path = letters::letters(text, *size, start);
                     paint_pixels(&mut pixmap, path, pens, place, mask.as_ref());
                 }
                 Mark::Clip(area) => {
@@ -289,66 +333,41 @@ impl Scene {
         pixmap
     }
 
-    /// The picture as a PNG file, so many pixels a millimetre.
+    /// The picture as a PNG file, so many pixels a millimetre, which the file says, too: it prints at the scene's size.
     ///
     /// # Errors
     /// The encoder refused, which it does for want of memory alone.
     pub fn png(&self, per_mm: f64) -> std::io::Result<Vec<u8>> {
-        self.pixels(per_mm).encode_png().map_err(std::io::Error::other)
+        let pixmap = self.pixels(per_mm);
+        let mut file = Vec::new();
+        let mut encoder = png::Encoder::new(&mut file, pixmap.width(), pixmap.height());
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_depth(png::BitDepth::Eight);
+        let per_meter = (f64::from(pixmap.width()) / self.width * 1000.0).round() as u32;
+        let unit = png::Unit::Meter;
+        encoder.set_pixel_dims(Some(png::PixelDimensions { xppu: per_meter, yppu: per_meter, unit }));
+        for (key, text) in [("Title", &self.title), ("Description", &self.description)] {
+            encoder.add_itxt_chunk(key.into(), text.clone()).map_err(std::io::Error::other)?;
+        }
+        // Nothing shows through a picture's white ground.
+        let rgb: Vec<u8> = pixmap.data().chunks_exact(4).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
+        let mut writer = encoder.write_header().map_err(std::io::Error::other)?;
+        writer.write_image_data(&rgb).map_err(std::io::Error::other)?;
+        writer.finish().map_err(std::io::Error::other)?;
+        Ok(file)
     }
-}
 
-/// How long a text is, in millimetres, if it is drawn in the embedded font.
-pub fn text_width(text: &str, size: f64) -> f64 {
-    text.chars().map(|c| advance(c) * size).sum()
-}
-
-/// How far a letter moves the next one, in ems.
-fn advance(c: char) -> f64 {
-    let glyph = FONT.glyph_index(c).unwrap_or_default();
-    f64::from(FONT.glyph_hor_advance(glyph).unwrap_or(0)) / f64::from(FONT.units_per_em())
-}
-
-/// The outlines of a text whose baseline starts at `(start, 0)`.
-fn letters(text: &str, size: f64, start: f64) -> Option<Path> {
-    struct Outline {
-        builder: PathBuilder,
-        scale: f32,
-        x: f32,
-    }
-    impl Outline {
-        fn at(&self, x: f32, y: f32) -> (f32, f32) {
-            (self.x + x * self.scale, -y * self.scale)
+    /// The picture as a file; a PNG of so many pixels a millimetre.
+    ///
+    /// # Errors
+    /// An encoder refused, which it does for want of memory alone.
+    pub fn file(&self, kind: Kind, per_mm: f64) -> std::io::Result<Vec<u8>> {
+        match kind {
+            Kind::Svg => Ok(self.svg().into_bytes()),
+            Kind::Png => self.png(per_mm),
+            Kind::Pdf => Ok(pdf::pdf(self)),
         }
     }
-    impl OutlineBuilder for Outline {
-        fn move_to(&mut self, x: f32, y: f32) {
-            let (x, y) = self.at(x, y);
-            self.builder.move_to(x, y);
-        }
-        fn line_to(&mut self, x: f32, y: f32) {
-            let (x, y) = self.at(x, y);
-            self.builder.line_to(x, y);
-        }
-        fn quad_to(&mut self, x1: f32, y1: f32, x: f32, y: f32) {
-            let ((x1, y1), (x, y)) = (self.at(x1, y1), self.at(x, y));
-            self.builder.quad_to(x1, y1, x, y);
-        }
-        fn curve_to(&mut self, x1: f32, y1: f32, x2: f32, y2: f32, x: f32, y: f32) {
-            let ((x1, y1), (x2, y2), (x, y)) = (self.at(x1, y1), self.at(x2, y2), self.at(x, y));
-            self.builder.cubic_to(x1, y1, x2, y2, x, y);
-        }
-        fn close(&mut self) {
-            self.builder.close();
-        }
-    }
-    let scale = (size / f64::from(FONT.units_per_em())) as f32;
-    let mut outline = Outline { builder: PathBuilder::new(), scale, x: start as f32 };
-    for c in text.chars() {
-        FONT.outline_glyph(FONT.glyph_index(c).unwrap_or_default(), &mut outline);
-        outline.x += (advance(c) * size) as f32;
-    }
-    outline.builder.finish()
 }
 
 fn paint_pixels(
@@ -414,5 +433,22 @@ impl std::fmt::Display for Number {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let text = format!("{:.2}", self.0);
         f.write_str(text.trim_end_matches('0').trim_end_matches('.'))
+    }
+}
+
+/// As text or an attribute of XML.
+struct Escaped<'a>(&'a str);
+
+impl std::fmt::Display for Escaped<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.0.chars().try_for_each(|c| match c {
+            '<' => f.write_str("&lt;"),
+            '>' => f.write_str("&gt;"),
+            '&' => f.write_str("&amp;"),
+            '"' => f.write_str("&quot;"),
+            // XML cannot hold most of these, and a picture has no use for any.
+            c if c.is_control() || matches!(c, '\u{fffe}' | '\u{ffff}') => f.write_char(' '),
+            c => f.write_char(c),
+        })
     }
 }

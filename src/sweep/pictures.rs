@@ -1,5 +1,5 @@
-//! What a sweep came to, as figures: `final`, `reach` and `curves`, or where keys are varied `final` alone, each as SVG
-//! and PNG.
+//! What a sweep came to, as figures: `final`, `reach` and `curves`, or where keys are varied `final` alone, each as SVG,
+//! PNG and PDF.
 
 use std::path::Path;
 
@@ -7,17 +7,17 @@ use super::results::{Missing, Options, Outcome, mean_and_error};
 use super::{Axis, Point, Sweep};
 use crate::record::RecordError;
 use crate::record::disk::Disk;
-use crate::report::curves::Curve;
+use crate::report::curves::{Curve, PRINT, SMALL, distinct};
 use crate::report::grid::{Cell, Curves, Dots, HeatMap, Scale, Spread};
-use crate::report::scene::Scene;
+use crate::report::scene::Kind;
 
-/// Pixels a millimetre of a PNG.
-const PIXELS: f64 = 8.0;
 /// Most values of an axis, and most panels, that a figure has room for.
 const MAX_VALUES: usize = 40;
 const MAX_PANELS: usize = 48;
 /// Most values of all varied keys together.
 const MAX_ROWS: usize = 100;
+/// Longest label of a value, in millimetres.
+const LONGEST: f64 = 36.0;
 
 /// A point that is done and what it came to, none where there is none.
 type Place<'a> = Option<(&'a Point, &'a Outcome)>;
@@ -57,19 +57,16 @@ pub fn draw(
     let disk = Disk::default();
     let mut names = Vec::new();
     for (name, scene) in scenes {
-        for (extension, bytes) in [("svg", Scene::svg(&scene).into_bytes()), ("png", png(&scene, out)?)] {
-            let name = format!("{name}.{extension}");
+        for kind in Kind::ALL {
+            let name = format!("{name}.{}", kind.extension());
             let path = out.join(&name);
-            let write = disk.replace(&path, |output| output.write_all(&bytes));
+            let bytes = scene.file(kind, PRINT);
+            let write = bytes.and_then(|bytes| disk.replace(&path, |output| output.write_all(&bytes)));
             write.map_err(|error| RecordError::Write { path, error })?;
             names.push(name);
         }
     }
     Ok((names, None))
-}
-
-fn png(scene: &Scene, out: &Path) -> Result<Vec<u8>, RecordError> {
-    scene.png(PIXELS).map_err(|error| RecordError::Write { path: out.into(), error })
 }
 
 /// The best team's G in the last generation for every value of every varied key, with a panel for each combination of the
@@ -208,8 +205,9 @@ impl<'a> Grid<'a> {
         for row in 0..self.y.map_or(1, |y| y.values.len()) {
             for (title, points) in &self.panels {
                 let curve = |(value, at): (usize, &Place<'_>)| {
-                    let mut curve = Curve::default();
-                    for &(generation, mean, error) in &(*at)?.1.curve {
+                    let outcome = (*at)?.1;
+                    let mut curve = Curve { trials: outcome.best.len() as u32, ..Curve::default() };
+                    for &(generation, mean, error) in &outcome.curve {
                         curve.generation.push(generation as f64);
                         curve.mean.push(mean);
                         curve.error.push(error);
@@ -233,11 +231,6 @@ impl<'a> Grid<'a> {
 }
 
 fn scale(axis: &Axis) -> Scale {
-    const LONGEST: usize = 24;
-    let short = |label: String| match label.char_indices().nth(LONGEST) {
-        Some((end, _)) => label[..end].to_string() + "...",
-        None => label,
-    };
-    let values = (0..axis.values.len()).map(|value| short(axis.label(value))).collect();
-    Scale { label: axis.leaf().replace('_', " "), values }
+    let values: Vec<String> = (0..axis.values.len()).map(|value| axis.label(value)).collect();
+    Scale { label: axis.leaf().replace('_', " "), values: distinct(&values, LONGEST, SMALL) }
 }

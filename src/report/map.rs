@@ -1,0 +1,522 @@
+//! A team on its map at one moment: agents with their trails and numbers, and POIs with what they need.
+
+use glam::DVec2;
+
+use super::curves::round_step;
+use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
+use crate::config::Config;
+use crate::world::World;
+
+/// Colours of leaders and their followers on white. Green is the observed POIs', and grey nobody's.
+///
+/// They were chosen one by one, each as far from all others as can be to normal and to red- or green-blind eyes, among
+/// those that stand out from white by 3 to 1 or more.
+pub const GROUPS: [Color; 16] = [
+    [0x00, 0x72, 0xb2],
+    [0xd5, 0x5e, 0x00],
+    [0x99, 0x33, 0x88],
+    [0x55, 0x22, 0x66],
+    [0x99, 0x77, 0xff],
+    [0x66, 0x55, 0x11],
+    [0x00, 0x00, 0xbb],
+    [0xff, 0x11, 0xdd],
+    [0x88, 0x33, 0x55],
+    [0xbb, 0x77, 0xaa],
+    [0x55, 0x44, 0xbb],
+    [0xcc, 0x22, 0x44],
+    [0x88, 0x00, 0x88],
+    [0xff, 0x11, 0x66],
+    [0x66, 0x00, 0xff],
+    [0x00, 0x44, 0x00],
+];
+/// The same on a dark ground.
+pub const GROUPS_DARK: [Color; 16] = [
+    [0x4a, 0xa8, 0xe0],
+    [0xf0, 0x88, 0x3e],
+    [0xe3, 0x9c, 0xc4],
+    [0xee, 0xdd, 0x00],
+    [0x33, 0x66, 0xff],
+    [0xdd, 0x22, 0x44],
+    [0xbb, 0x33, 0xbb],
+    [0x99, 0xdd, 0xff],
+    [0x00, 0x88, 0x66],
+    [0x99, 0xee, 0xaa],
+    [0xaa, 0x66, 0x99],
+    [0x88, 0x88, 0xff],
+    [0xff, 0xbb, 0x66],
+    [0xff, 0x55, 0xcc],
+    [0xff, 0x44, 0x00],
+    [0x22, 0xcc, 0xff],
+];
+/// Once the colours are used up, they come again in dashes; what these do not tell apart, the numbers do.
+const DASHES: [&[f64]; 3] = [&[], &[0.9, 0.5], &[0.3, 0.35]];
+
+/// Sizes of letters, in millimetres.
+const LABEL: f64 = 2.4;
+const LEAST: f64 = 1.9;
+const PALE: Color = [250, 250, 250];
+pub const FAINT: Color = [95, 95, 95];
+
+/// One agent.
+pub struct Agent {
+    pub place: DVec2,
+    /// Its heading, of any length but 0.
+    pub heading: DVec2,
+    /// The leader in whose group it is.
+    pub group: Option<usize>,
+    /// Where it was, up to its place.
+    pub trail: Vec<DVec2>,
+}
+
+/// One POI.
+pub struct Poi {
+    pub place: DVec2,
+    pub label: String,
+    /// How much of what it needs is there, 0 to 1; none before an episode.
+    pub share: Option<f64>,
+    pub observed: bool,
+}
+
+/// A team at one moment.
+pub struct Team {
+    /// The first of the agents lead.
+    pub leaders: usize,
+    pub agents: Vec<Agent>,
+    pub pois: Vec<Poi>,
+}
+
+/// Where a part of the map is drawn.
+#[derive(Clone, Copy)]
+pub struct View {
+    left: f64,
+    above: f64,
+    /// Millimetres a unit of the map.
+    scale: f64,
+    /// Corners of the part.
+    from: DVec2,
+    to: DVec2,
+    map: DVec2,
+    /// How far a POI sees.
+    radius: f64,
+}
+
+impl View {
+    /// A part of a config's map, from corner to corner, as large as fits into a square of so many millimetres.
+    pub fn new(config: &Config, [from, to]: [DVec2; 2], side: f64) -> View {
+        let scale = side / (to - from).max_element();
+        let (map, radius) = (config.world.map.into(), config.world.observation_radius);
+        View { left: 0.0, above: 0.0, scale, from, to, map, radius }
+    }
+
+    /// The same view from another upper left corner, in millimetres.
+    pub fn moved_to(self, [left, above]: [f64; 2]) -> View {
+        View { left, above, ..self }
+    }
+
+    /// Width and height in millimetres.
+    pub fn size(&self) -> [f64; 2] {
+        ((self.to - self.from) * self.scale).to_array()
+    }
+
+    fn area(&self) -> [f64; 4] {
+        let [width, height] = self.size();
+        [self.left, self.above, width, height]
+    }
+
+    fn at(&self, place: DVec2) -> [f64; 2] {
+        let [x, y] = ((place - self.from) * self.scale).to_array();
+        [self.left + x, self.above + self.size()[1] - y]
+    }
+
+    /// Draws the team on its map.
+    pub fn draw(&self, scene: &mut Scene, team: &Team) {
+        scene.rectangle(self.area(), Some(PALE.into()), Some(Pen::new(LIGHT, 0.2)));
+        let labels = self.poi_labels(team);
+        let ring = labels.is_none().then(|| self.ring(team));
+        // What reaches beyond the part of the map; agents do not.
+        scene.clipped(self.area(), |scene| {
+            let corners = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
+            let walls = corners.map(|corner| self.at(self.map * DVec2::from(corner)));
+            scene.polygon(walls.to_vec(), None, Some(Pen::new(BLACK, 0.5)));
+            team.pois.iter().for_each(|poi| self.poi(scene, poi, ring));
+        });
+        for agent in &team.agents {
+            let trail = agent.trail.iter().map(|&place| self.at(place)).collect();
+            scene.line(trail, Pen { opacity: 0.5, ..group_pen(agent.group, 0.3) });
+        }
+        let size = self.agent_size(team);
+        for (index, agent) in team.agents.iter().enumerate().rev() {
+            let leads = index < team.leaders;
+            let size = if leads { size * 1.35 } else { size };
+            arrow(scene, self.at(agent.place), agent.heading, size, agent.group, leads);
+        }
+        let mut taken = Vec::new();
+        for (poi, ([x, y], size)) in team.pois.iter().zip(labels.into_iter().flatten()) {
+            plate(scene, &mut taken, [x, y], &poi.label, size);
+            scene.text([x, y], &*poi.label, size, Anchor::Middle, BLACK);
+        }
+        self.numbers(scene, team, taken);
+    }
+
+    fn agent_size(&self, team: &Team) -> f64 {
+        (self.scale * 1.1).clamp(0.6, 2.2) * if team.agents.len() > 60 { 0.6 } else { 1.0 }
+    }
+
+    fn poi(&self, scene: &mut Scene, poi: &Poi, ring: Option<f64>) {
+        let [x, y] = self.at(poi.place);
+        let color = if poi.observed { COLORS[2] } else { GREY };
+        let opacity = if poi.observed { 0.22 } else { 0.06 };
+        let dash: &[f64] = match self.radius * self.scale {
+            _ if poi.observed => &[],
+            small if small < 2.5 => &[0.5, 0.4],
+            _ => &[1.0, 0.8],
+        };
+        let fill = Fill { color, opacity };
+        scene.circle([x, y], self.radius * self.scale, Some(fill), Some(Pen { dash, ..Pen::new(color, 0.25) }));
+        let (Some(ring), Some(share)) = (ring, poi.share) else {
+            let arm = ring.unwrap_or(0.8).min(0.8);
+            for sign in [1.0, -1.0] {
+                scene.line(vec![[x - arm, y - sign * arm], [x + arm, y + sign * arm]], Pen::new(color, 0.35));
+            }
+            return;
+        };
+        scene.circle([x, y], ring, Some(WHITE.into()), Some(Pen::new(LIGHT, 0.35 * ring)));
+        if share > 0.0 {
+            let full = (share.min(1.0) * 32.0).ceil();
+            let turn = |step: f64| (std::f64::consts::TAU * share.min(1.0) * step / full).sin_cos();
+            let arc =
+                (0..=full as usize).map(|step| turn(step as f64)).map(|(sin, cos)| [x + ring * sin, y - ring * cos]);
+            scene.line(arc.collect(), Pen::new(color, 0.35 * ring));
+        }
+    }
+
+    /// How large the rings around POIs may be that stand in for labels where these have no room.
+    fn ring(&self, team: &Team) -> f64 {
+        let apart = |index: usize, poi: &Poi| {
+            team.pois[..index].iter().map(|other| other.place.distance(poi.place)).fold(f64::INFINITY, f64::min)
+        };
+        let nearest = team.pois.iter().enumerate().map(|(index, poi)| apart(index, poi)).fold(f64::INFINITY, f64::min);
+        (nearest * self.scale * 0.4).clamp(0.5, 1.3)
+    }
+
+    /// Where each POI's label stands and how large it is; none if they would run into each other.
+    fn poi_labels(&self, team: &Team) -> Option<Vec<([f64; 2], f64)>> {
+        [LABEL, LEAST].into_iter().find_map(|size| {
+            let crosses: Vec<_> = team.pois.iter().map(|poi| around(self.at(poi.place), 0.8)).collect();
+            let mut taken: Vec<[f64; 4]> = Vec::new();
+            let [left, above, width, height] = self.area();
+            let whole = [left, above, left + width, above + height];
+            let place = |poi: &Poi| {
+                let [x, y] = self.at(poi.place);
+                let half = text_width(&poi.label, size) / 2.0;
+                // In large circles at the top, since agents gather in the middle.
+                let top = y - self.radius * self.scale + size + 0.8;
+                let places = [
+                    [x, if top < y - 2.5 { top } else { y - 1.6 }],
+                    [x, y - 1.6],
+                    [x, y + 1.5 + size],
+                    [x + 1.6 + half, y + 0.35 * size],
+                    [x - 1.6 - half, y + 0.35 * size],
+                ];
+                let free = |place: &[f64; 2]| {
+                    let area = label_area(*place, &poi.label, size);
+                    within(area, whole) && !taken.iter().chain(&crosses).any(|other| overlap(area, *other))
+                };
+                let found = places.into_iter().find(free)?;
+                taken.push(label_area(found, &poi.label, size));
+                Some((found, size))
+            };
+            team.pois.iter().map(place).collect()
+        })
+    }
+
+    /// The leaders' numbers beside their arrows, as far as there is room.
+    fn numbers(&self, scene: &mut Scene, team: &Team, mut taken: Vec<[f64; 4]>) {
+        // So many have no room in any case, and to try takes time.
+        const MOST: usize = 256;
+        let arrow = self.agent_size(team) * 1.35;
+        let leaders = &team.agents[..team.leaders.min(MOST)];
+        let arrows: Vec<_> = leaders.iter().map(|leader| around(self.at(leader.place), arrow * 0.6)).collect();
+        let size = if team.leaders > 20 { LEAST } else { LABEL };
+        for (number, leader) in leaders.iter().enumerate() {
+            let [x, y] = self.at(leader.place);
+            let text = number.to_string();
+            let aside = arrow + text_width(&text, size) / 2.0;
+            let low = y + 0.36 * size;
+            let places =
+                [[x + aside, low + 1.2], [x - aside, low + 1.2], [x + aside, low - 1.2], [x - aside, low - 1.2]];
+            let free = |place: &&[f64; 2]| {
+                let area = label_area(**place, &text, size);
+                !taken.iter().any(|other| overlap(area, *other))
+                    && !arrows.iter().enumerate().any(|(at, other)| at != number && overlap(area, *other))
+            };
+            let place = match places.iter().find(free) {
+                Some(place) => *place,
+                None if team.leaders <= 12 => places[0],
+                None => continue,
+            };
+            plate(scene, &mut taken, place, &text, size);
+            scene.bold(place, &*text, size, Anchor::Middle, group_color(leader.group));
+        }
+    }
+
+    /// Marks the map's units at the left and lower edge.
+    pub fn rule(&self, scene: &mut Scene) {
+        let [left, above, width, height] = self.area();
+        let below = above + height;
+        let span = self.to - self.from;
+        let step = round_step(span.max_element() / 6.0);
+        for axis in 0..2 {
+            let first = (self.from[axis] / step).ceil() as usize;
+            for tick in (first..).map(|tick| tick as f64 * step).take_while(|&tick| tick <= self.to[axis] + 1e-9) {
+                let mut place = self.from;
+                place[axis] = tick;
+                let [x, y] = self.at(place);
+                if axis == 0 {
+                    scene.line(vec![[x, below], [x, below + 0.9]], Pen::new(BLACK, 0.2));
+                    scene.text([x, below + 3.4], tick.to_string(), LABEL, Anchor::Middle, BLACK);
+                } else {
+                    scene.line(vec![[left - 0.9, y], [left, y]], Pen::new(BLACK, 0.2));
+                    scene.text([left - 1.4, y + 0.85], tick.to_string(), LABEL, Anchor::End, BLACK);
+                }
+            }
+        }
+        scene.text([left + width / 2.0, below + 6.6], "x, map units", LABEL, Anchor::Middle, BLACK);
+        scene.upright([left - 7.2, above + height / 2.0], "y, map units", LABEL, BLACK);
+    }
+
+    /// What the signs mean: how each is drawn at a place, and the words for it.
+    pub fn legend(&self, team: &Team, counts: &str) -> Legend {
+        let mut entries: Vec<Entry> = Vec::new();
+        let up = DVec2::Y;
+        let numbered = if team.leaders > 1 { "leader, by number" } else { "leader" };
+        entries.push((
+            3.0,
+            numbered.into(),
+            Box::new(move |scene, [x, y]| arrow(scene, [x + 1.2, y - 0.8], up, 1.6, Some(0), true)),
+        ));
+        let followers = &team.agents[team.leaders..];
+        if !followers.is_empty() {
+            let owned = followers.iter().any(|agent| agent.group.is_some());
+            let group = owned.then_some(0);
+            let what = if owned { "its follower" } else { "follower" };
+            entries.push((
+                3.0,
+                what.into(),
+                Box::new(move |scene, [x, y]| arrow(scene, [x + 1.2, y - 0.8], up, 1.4, group, false)),
+            ));
+        }
+        if team.pois.iter().any(|poi| poi.observed) {
+            let (fill, pen) = (Fill { color: COLORS[2], opacity: 0.22 }, Pen::new(COLORS[2], 0.25));
+            entries.push((
+                3.0,
+                "observed POI".into(),
+                Box::new(move |scene, [x, y]| scene.circle([x + 1.2, y - 0.8], 1.2, Some(fill), Some(pen.clone()))),
+            ));
+        }
+        if team.pois.iter().any(|poi| !poi.observed) {
+            let pen = Pen { dash: &[0.7, 0.5], ..Pen::new(GREY, 0.25) };
+            entries.push((
+                3.0,
+                "POI".into(),
+                Box::new(move |scene, [x, y]| scene.circle([x + 1.2, y - 0.8], 1.2, None, Some(pen.clone()))),
+            ));
+        }
+        if !counts.is_empty() {
+            let text = match self.poi_labels(team) {
+                Some(_) => counts.to_string(),
+                None => "ring: share of the agents needed that is near".into(),
+            };
+            entries.push((0.0, text, Box::new(|_, _| ())));
+        }
+        let units = round_step(8.0 / self.scale);
+        let length = units * self.scale;
+        entries.push((
+            length + 1.0,
+            format!("{units} map units"),
+            Box::new(move |scene, [x, y]| {
+                scene.line(vec![[x, y - 1.5], [x, y - 0.1]], Pen::new(BLACK, 0.3));
+                scene.line(vec![[x, y - 0.8], [x + length, y - 0.8]], Pen::new(BLACK, 0.3));
+                scene.line(vec![[x + length, y - 1.5], [x + length, y - 0.1]], Pen::new(BLACK, 0.3));
+            }),
+        ));
+        Legend { entries }
+    }
+}
+
+type Entry = (f64, String, Box<dyn Fn(&mut Scene, [f64; 2])>);
+
+/// What the signs of a map mean.
+#[derive(Default)]
+pub struct Legend {
+    /// A sign's width, its words, and how it is drawn from a place on the baseline.
+    entries: Vec<Entry>,
+}
+
+impl Legend {
+    const ROW: f64 = 4.2;
+
+    /// Adds a remark.
+    pub fn note(&mut self, text: impl Into<String>) {
+        self.entries.push((0.0, text.into(), Box::new(|_, _| ())));
+    }
+
+    /// Where each entry stands, in rows of a width, and the height of all.
+    fn places(&self, width: f64) -> (Vec<[f64; 2]>, f64) {
+        let (mut x, mut y) = (0.0, 0.0);
+        let mut places = Vec::new();
+        for (sign, text, _) in &self.entries {
+            let length = sign + text_width(text, LABEL);
+            if x > 0.0 && x + length > width {
+                (x, y) = (0.0, y + Self::ROW);
+            }
+            places.push([x, y]);
+            x += length + 3.5;
+        }
+        (places, y + Self::ROW)
+    }
+
+    pub fn height(&self, width: f64) -> f64 {
+        self.places(width).1
+    }
+
+    /// Draws it from a place on the first row's baseline.
+    pub fn draw(&self, scene: &mut Scene, [left, first]: [f64; 2], width: f64) {
+        for ((sign, text, draw), [x, y]) in self.entries.iter().zip(self.places(width).0) {
+            draw(scene, [left + x, first + y]);
+            let color = if *sign > 0.0 { BLACK } else { FAINT };
+            scene.text([left + x + sign, first + y], &**text, LABEL, Anchor::Start, color);
+        }
+    }
+}
+
+/// The layout of a config before any training: where everyone starts and looks to, and what each POI needs.
+pub fn layout(name: &str, config: &Config) -> Scene {
+    const LEFT: f64 = 11.0;
+    const EDGE: f64 = 3.0;
+    const HEAD: f64 = 6.5;
+    let world = World::new(config);
+    let heading = DVec2::new(config.world.heading.cos(), config.world.heading.sin());
+    let leaders = world.leaders();
+    let agent = |(index, start): (usize, &glam::Vec2)| Agent {
+        place: start.as_dvec2(),
+        heading,
+        group: (index < leaders).then_some(index),
+        trail: vec![],
+    };
+    let poi = |(&place, needed): (&[f64; 2], &u32)| Poi {
+        place: place.into(),
+        label: needed.to_string(),
+        share: Some(0.0),
+        observed: false,
+    };
+    let team = Team {
+        leaders,
+        agents: world.starts.iter().enumerate().map(agent).collect(),
+        pois: config.world.pois.iter().zip(&world.coupling).map(poi).collect(),
+    };
+    let map = DVec2::from(config.world.map);
+    let view = View::new(config, [DVec2::ZERO, map], 80.0).moved_to([LEFT, HEAD]);
+    let [width, height] = view.size();
+    let radius = config.world.observation_radius;
+    let mut legend = view.legend(&team, "");
+    let alike = world.coupling.windows(2).all(|pair| pair[0] == pair[1]);
+    let needs = match (world.coupling.first(), view.poi_labels(&team)) {
+        (_, Some(_)) => format!("number at a POI: agents it needs, within {radius} of it"),
+        (Some(&needed), None) if alike => {
+            format!("each POI needs {} within {radius} of it", count(needed as usize, "agent"))
+        }
+        _ => format!("what each POI needs has no room here; it counts within {radius} of it"),
+    };
+    legend.note(needs);
+    if config.learning.start_jitter > 0.0 {
+        legend.note(format!("starts move by up to {} on each axis", config.learning.start_jitter));
+    }
+    let whole = LEFT + width.max(50.0) + EDGE;
+    let room = whole - 2.0 * EDGE;
+    let mut scene = Scene::new(whole, HEAD + height + 9.5 + legend.height(room) + 0.5);
+    let followers = world.followers();
+    let said =
+        format!("{}, {}, {}", count(leaders, "leader"), count(followers, "follower"), count(team.pois.len(), "POI"));
+    scene.bold([EDGE, 4.2], said.clone(), 3.0, Anchor::Start, BLACK);
+    view.draw(&mut scene, &team);
+    view.rule(&mut scene);
+    legend.draw(&mut scene, [EDGE, HEAD + height + 11.8], room);
+    scene.title = format!("The layout of {name}: {said}");
+    let couplings = match (world.coupling.iter().min(), world.coupling.iter().max()) {
+        (Some(least), Some(most)) if least == most => {
+            format!("Each POI needs {} near at once", count(*least as usize, "agent"))
+        }
+        (Some(least), Some(most)) => format!("A POI needs {least} to {most} agents near at once"),
+        _ => String::new(),
+    };
+    let places = |what: &str, places: &[DVec2]| {
+        let list: Vec<_> = places.iter().take(12).map(|place| format!("({}, {})", place.x, place.y)).collect();
+        let more = if places.len() > 12 { ", …" } else { "" };
+        format!("{what} at {}{more}. ", list.join(", "))
+    };
+    let starts: Vec<DVec2> = team.agents[..leaders].iter().map(|agent| agent.place).collect();
+    let pois: Vec<DVec2> = team.pois.iter().map(|poi| poi.place).collect();
+    scene.description = format!(
+        "A map of {} by {} units before any training. {}{}{couplings}, within {radius} of it.",
+        map.x,
+        map.y,
+        places("Leaders", &starts),
+        places("POIs", &pois),
+    );
+    scene
+}
+
+/// "1 leader", "2 leaders".
+pub fn count(number: usize, what: &str) -> String {
+    format!("{number} {what}{}", if number == 1 { "" } else { "s" })
+}
+
+/// An agent's arrow: full for a leader, hollow for a follower.
+fn arrow(scene: &mut Scene, [px, py]: [f64; 2], heading: DVec2, size: f64, group: Option<usize>, leads: bool) {
+    let [x, y] = heading.normalize_or(DVec2::Y).to_array();
+    let corner = |ahead: f64, aside: f64| [px + size * (x * ahead - y * aside), py - size * (y * ahead + x * aside)];
+    let corners = vec![corner(1.0, 0.0), corner(-0.75, 0.7), corner(-0.4, 0.0), corner(-0.75, -0.7)];
+    match leads {
+        // Small ones keep more colour than outline.
+        true => scene.polygon(corners, Some(group_color(group).into()), Some(Pen::new(BLACK, (size * 0.1).min(0.2)))),
+        false => scene.polygon(corners, Some(WHITE.into()), Some(group_pen(group, 0.35))),
+    }
+}
+
+/// A leader's own colour, its followers' too.
+fn group_color(group: Option<usize>) -> Color {
+    group.map_or(GREY, |group| GROUPS[group % GROUPS.len()])
+}
+
+fn group_pen(group: Option<usize>, width: f64) -> Pen {
+    let dash = group.map_or(DASHES[0], |group| DASHES[group / GROUPS.len() % DASHES.len()]);
+    Pen { dash, ..Pen::new(group_color(group), width) }
+}
+
+/// What a label covers, `[left, above, right, below]`, that is centred on a place of its baseline.
+fn label_area([x, y]: [f64; 2], text: &str, size: f64) -> [f64; 4] {
+    let half = text_width(text, size) / 2.0 + 0.2;
+    [x - half, y - 0.8 * size, x + half, y + 0.12 * size]
+}
+
+/// Makes what lies under a label pale, so that it can be read, and takes its room.
+fn plate(scene: &mut Scene, taken: &mut Vec<[f64; 4]>, place: [f64; 2], text: &str, size: f64) {
+    let area = label_area(place, text, size);
+    let [left, above, right, below] = area;
+    let fill = Fill { color: WHITE, opacity: 0.75 };
+    scene.rectangle([left, above, right - left, below - above], Some(fill), None);
+    taken.push(area);
+}
+
+fn around([x, y]: [f64; 2], margin: f64) -> [f64; 4] {
+    [x - margin, y - margin, x + margin, y + margin]
+}
+
+fn overlap(a: [f64; 4], b: [f64; 4]) -> bool {
+    a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3]
+}
+
+fn within(inner: [f64; 4], outer: [f64; 4]) -> bool {
+    inner[0] >= outer[0] && inner[1] >= outer[1] && inner[2] <= outer[2] && inner[3] <= outer[3]
+}
