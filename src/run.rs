@@ -453,15 +453,22 @@ impl Member {
     fn finish(&mut self, policies: &[&[f32]], end: Snapshot<&[f32]>, seconds: f64) -> Result<(), RunError> {
         let failed = self.metrics_failed();
         let Some(Going { metrics, keeper, ending, .. }) = &mut self.going else { return Ok(()) };
+        let since = Instant::now();
         let (mark, output) = metrics.mark().map_err(failed)?;
-        let config = checkpoint::digest(&self.config);
-        let metrics = ending.take().unwrap_or(mark);
-        let end = Checkpoint { config, seconds: self.before + seconds, metrics, snapshot: end };
-        let next = end.snapshot.generation;
-        keeper.save_now(&end, &output, Instant::now())?;
-        policies::write(&self.folder.disk, &self.folder.file(POLICIES), &self.config, policies)?;
+        let Snapshot { generation, last, fitness, pending, .. } = end;
+        let fitness = fitness.into_iter().map(<[f32]>::to_vec).collect();
+        let snapshot = Snapshot { generation, last, weights: vec![], fitness, pending };
+        let (config, metrics) = (checkpoint::digest(&self.config), ending.take().unwrap_or(mark));
+        keeper.save(Checkpoint { config, seconds: self.before + seconds, metrics, snapshot }, output, since)?;
+        let path = self.folder.file(POLICIES);
+        if path.exists() {
+            // What this run was extended from goes with them: only now is there something else.
+            keeper.wait()?;
+        }
+        policies::write(&self.folder.disk, &path, &self.config, policies)?;
         let (story, digest) = self.folder.digest(&self.config, policies)?;
-        self.write_run(State::Done, next, seconds, Some(digest.clone()))?;
+        keeper.wait()?;
+        self.write_run(State::Done, generation, seconds, Some(digest.clone()))?;
         self.results = Some(Results { story, digest });
         self.going = None;
         Ok(())

@@ -255,10 +255,7 @@ fn a_run_is_extended_from_whatever_is_left_of_it() {
     let mut other = config.clone();
     other.learning.seed = 3;
     let error = session(&other, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err().to_string();
-    assert!(
-        error.contains("learning.seed: 0 there, 3 here") && error.contains("learning.generations: 7 there"),
-        "{error}"
-    );
+    assert!(error.contains("learning.seed: 0 there, 3 here") && !error.contains("generations:"), "{error}");
 }
 
 /// Every operation of an extension fails once, alone or with all after it.

@@ -942,7 +942,7 @@ fn a_signal_stops_a_paper_and_it_goes_on_to_the_same_files() {
     let folder = TempDir::new().unwrap();
     let out = folder.path().join("a paper");
     let program = assert_cmd::cargo::cargo_bin!("flotilla");
-    let flags = ["--trials", "1", "--generations", "150", "--backend", "cpu", "--quiet"];
+    let flags = ["--trials", "1", "--generations", "60", "--backend", "cpu", "--quiet"];
     let mut child = Command::new(program);
     let child = child.args(["paper", "--out"]).arg(&out).args(flags).stderr(Stdio::piped()).spawn().unwrap();
     let metrics = out.join("arms/chaotic-leader-follower-Df/run.json");
