@@ -130,7 +130,13 @@ fn misread(command: &str) -> Option<String> {
 
 /// The program's commands in a line for a shell.
 fn calls(line: &str) -> Vec<String> {
-    let line = line.split(" #").next().unwrap_or_default().replace("cargo run --release -- ", "flotilla ");
+    let line = line.split(" #").next().unwrap_or_default().split(" ::: ").next().unwrap_or_default();
+    let mut line = line.replace("cargo run --release -- ", "flotilla ");
+    while let Some((start, end)) =
+        line.find("$((").and_then(|start| Some((start, start + line[start..].find("))")? + 2)))
+    {
+        line.replace_range(start..end, "N");
+    }
     let parts = line.split([';', '|', '&']).filter_map(|part| Some(part[part.find("flotilla ")?..].trim().to_string()));
     parts.collect()
 }
@@ -264,9 +270,9 @@ fn what_fails_in_a_page_is_told_with_its_place() {
                 Text `flotilla train CONFIG --trials N`, `flotilla plot --ot x`.\n\n```text\nno command\n```\n";
     let Tried { ran, failed, left_out, parsed } = try_page("p.md", page, false);
     assert_eq!((ran, parsed), (3, 3), "{failed:?}");
-    assert_eq!(left_out, ["p.md:20: flotilla check --sed 1  (WHY)"]);
+    assert_eq!(left_out, ["p.md:21: flotilla check --sed 1  (WHY)"]);
     let places: Vec<_> = failed.iter().map(|failed| failed.lines().next().unwrap()).collect();
-    let expected = ["p.md:22: flotilla plot --ot x", "p.md:13: flotilla chekc x", "p.md:20: flotilla check --sed 1"];
+    let expected = ["p.md:23: flotilla plot --ot x", "p.md:13: flotilla chekc x", "p.md:21: flotilla check --sed 1"];
     assert_eq!(places, expected, "{failed:?}");
     assert!(failed[1].contains("exit status: 2\n") && failed[1].contains("chekc"), "{failed:?}");
 }
