@@ -25,6 +25,7 @@
 //! `backend ▸ {evolve, kernels}`. Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
 
 pub mod backend;
+pub mod baseline;
 pub mod bench;
 pub mod cli;
 pub mod config;
@@ -36,6 +37,7 @@ pub mod record;
 pub mod report;
 pub mod run;
 pub mod sample;
+pub mod statistics;
 pub mod sweep;
 pub mod trainer;
 pub mod verify;

@@ -4,12 +4,13 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use super::{Error, Overrides, RunOptions, backend, print, say};
+use crate::baseline::Baselines;
 use crate::memory;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::metrics::Row;
 use crate::report::curves::PRINT;
-use crate::report::paper::{self, Measured, Summary};
+use crate::report::paper::{self, Measured, Results, Summary, claims, tables};
 use crate::report::progress::Progress;
 use crate::run::RunError;
 use crate::trainer::Trainer;
@@ -76,6 +77,13 @@ pub fn run(args: Args) -> Result<(), Error> {
         rows.iter().for_each(|row| arms[row.arm].add(row));
         progress.show(trainer.generation(), &rows);
     }
+    drop(trainer);
+    let mut baselines = Baselines::new(paper::grounds(&arms));
+    while !baselines.is_done() {
+        baselines.advance(&mut *backend)?;
+    }
+    let baselines = baselines.found();
+    let results = Results { arms: &arms, baselines: &baselines };
     progress.clear();
     let seconds = since.elapsed().as_secs_f64();
 
@@ -83,23 +91,18 @@ pub fn run(args: Args) -> Result<(), Error> {
         let path = out.join(name);
         Ok(disk.replace(&path, |output| output.write_all(content)).map_err(failed(&path))?)
     };
-    for layout in paper::LAYOUTS {
-        let scene = paper::figure(&arms, &layout).scene();
+    for (index, layout) in paper::LAYOUTS.iter().enumerate() {
+        let scene = paper::figure(results, index).scene();
         write(format!("figure{}.svg", layout.figure), scene.svg().as_bytes())?;
         let name = format!("figure{}.png", layout.figure);
         let png = scene.png(PRINT).map_err(failed(&out.join(&name)))?;
         write(name, &png)?;
     }
-    let claims = paper::claims(&arms);
-    let table = paper::table(&claims);
-    let heading = format!(
-        "{}. Means over {} trials of each generation's best team (± standard error), in POIs; {} generations, seed {}.",
-        paper::count(&claims),
-        learning.trials,
-        learning.generations,
-        learning.seed
-    );
-    write("claims.md".into(), format!("# What the paper says, measured\n\n{heading}\n\n{table}").as_bytes())?;
+    let claims = claims::claims(results);
+    let baseline = tables::without_learning(results);
+    let heading = tables::heading(&learning, &claims);
+    let full = tables::full(&claims);
+    write("claims.md".into(), tables::page(&baseline, &heading, &full).as_bytes())?;
     let summary = Summary {
         version: env!("CARGO_PKG_VERSION"),
         backend: backend.describe(),
@@ -107,14 +110,15 @@ pub fn run(args: Args) -> Result<(), Error> {
         seed: learning.seed,
         trials: learning.trials,
         generations: learning.generations,
-        arms: arms.iter().map(Measured::of).collect(),
+        curves: Measured::all(results),
         claims: &claims,
     };
     let summary = serde_json::to_string(&summary).expect("plain fields are JSON") + "\n";
     write("summary.json".into(), summary.as_bytes())?;
     print(&format!(
-        "{table}\n{heading}\n\nTrained in {seconds:.1} s. Files in {}: figure4, figure5, figure6 (.svg, .png), claims.md, \
-         summary.json\n",
+        "{baseline}\n{}\n{heading}\n\nTrained and played in {seconds:.1} s. Files in {}: figure4, figure5, figure6 \
+         (.svg, .png), claims.md (with every figure), summary.json\n",
+        tables::verdicts(&claims),
         out.display()
     ))
 }

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::scene::{Anchor, BLACK, COLORS, Color, Fill, LIGHT, Pen, Scene, WHITE, text_width};
+use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
 
 /// A column of a two-column paper, in millimetres.
 pub const COLUMN: f64 = 85.0;
@@ -13,6 +13,7 @@ const MAX_POINTS: usize = 300;
 /// Sizes of letters, 7 and 8 points.
 const SMALL: f64 = 2.47;
 const NORMAL: f64 = 2.82;
+const REFERENCES: [&[f64]; 2] = [&[2.6, 1.0], &[0.7, 0.7]];
 const DASHES: [&[f64]; 5] = [&[], &[1.6, 0.7], &[1.8, 0.6, 0.4, 0.6], &[0.5, 0.5], &[3.0, 0.8]];
 
 /// Mean and standard deviation of any number of values, gathered one by one.
@@ -93,6 +94,8 @@ pub struct Panel {
 pub struct Figure {
     pub panels: Vec<Panel>,
     pub legend: Vec<String>,
+    /// What curves are held against: the next places in the legend, in grey, with neither bands nor marks.
+    pub references: Vec<String>,
     pub y_label: String,
     /// The y axis runs from 0 to this.
     pub y_max: f64,
@@ -116,12 +119,13 @@ impl Figure {
         for (row, entries) in rows.iter().enumerate() {
             let y = 1.0 + 3.8 * row as f64 + 2.0;
             for &(index, x) in entries {
-                let look = Look::of(index);
-                scene.line(vec![[x, y], [x + 8.0, y]], look.pen());
-                look.mark(&mut scene, [x + 4.0, y]);
+                scene.line(vec![[x, y], [x + 8.0, y]], self.pen(index));
+                if index < self.legend.len() {
+                    Look::of(index).mark(&mut scene, [x + 4.0, y]);
+                }
                 scene.text(
                     [x + 9.0, y + 0.9],
-                    shorten(&self.legend[index], COLUMN - 20.0),
+                    shorten(self.labels().nth(index).unwrap_or_default(), COLUMN - 20.0),
                     SMALL,
                     Anchor::Start,
                     BLACK,
@@ -153,8 +157,13 @@ impl Figure {
                 scene.text([middle, above + height + 7.4], label, NORMAL, Anchor::Middle, BLACK);
             }
             scene.clipped([left - 0.8, above - 0.8, width + 1.6, height + 1.6], |scene| {
-                for (index, (curve, _)) in curves {
+                let (curves, references): (Vec<_>, Vec<_>) =
+                    curves.iter().partition(|(index, _)| *index < self.legend.len());
+                for (index, (curve, _)) in &curves {
                     axes.band(scene, curve, Look::of(*index).color);
+                }
+                for (index, (curve, _)) in references {
+                    scene.line(axes.points(curve), self.pen(*index));
                 }
                 for (index, (curve, _)) in curves {
                     axes.curve(scene, curve, *index, self.legend.len());
@@ -164,12 +173,24 @@ impl Figure {
         scene
     }
 
+    fn labels(&self) -> impl Iterator<Item = &str> {
+        self.legend.iter().chain(&self.references).map(String::as_str)
+    }
+
+    /// What a place in the legend is drawn with.
+    fn pen(&self, index: usize) -> Pen {
+        match index.checked_sub(self.legend.len()) {
+            None => Look::of(index).pen(),
+            Some(reference) => Pen { dash: REFERENCES[reference % REFERENCES.len()], ..Pen::new(GREY, 0.5) },
+        }
+    }
+
     /// The entries of each row of the legend, with where each starts.
     fn legend_rows(&self) -> Vec<Vec<(usize, f64)>> {
         const START: f64 = 10.0;
         let mut rows: Vec<Vec<(usize, f64)>> = Vec::new();
         let mut x = f64::INFINITY;
-        for (index, label) in self.legend.iter().enumerate() {
+        for (index, label) in self.labels().enumerate() {
             let width = 9.0 + text_width(&shorten(label, COLUMN - 20.0), SMALL) + 4.0;
             if x + width > COLUMN + 3.0 {
                 rows.push(Vec::new());
@@ -231,11 +252,15 @@ impl Axes {
         }
     }
 
+    fn points(&self, curve: &Curve) -> Vec<[f64; 2]> {
+        curve.generation.iter().zip(&curve.mean).map(|(&x, &y)| self.at(x, y)).collect()
+    }
+
     /// The mean, with a few marks; those of different curves stand apart, since curves may run into each other.
     fn curve(&self, scene: &mut Scene, curve: &Curve, index: usize, of: usize) {
         const MARKS: usize = 5;
         let look = Look::of(index);
-        let points: Vec<_> = curve.generation.iter().zip(&curve.mean).map(|(&x, &y)| self.at(x, y)).collect();
+        let points = self.points(curve);
         scene.line(points.clone(), look.pen());
         let last = points.len().saturating_sub(1) as f64;
         let shift = (index as f64 + 0.5) / of.max(1) as f64;

@@ -137,6 +137,7 @@ pub fn figure(folders: &[PathBuf]) -> Result<Figure, RunError> {
     Ok(Figure {
         panels: vec![Panel { title: String::new(), curves: curves.into_iter().enumerate().collect() }],
         legend,
+        references: vec![],
         y_label: if same { format!("POIs observed{what}") } else { format!("Share of POIs observed{what}") },
         y_max: scale,
     })
