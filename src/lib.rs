@@ -18,6 +18,7 @@
 //!    by [`record`]; [`report`] draws it.
 //!
 //! Around that: [`run`] keeps a trainer, its folder and its checkpoints together, [`sweep`] makes many runs of a grid,
+//! [`baseline`] plays what needs no learning, [`statistics`] says what chance leaves open,
 //! [`memory`] tells what a run will take, [`verify`] compares two backends on the random worlds of [`sample`], [`mod@bench`]
 //! times a backend against what the machine can do at most, and [`cli`] turns what was typed into all this.
 //!

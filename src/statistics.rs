@@ -22,6 +22,11 @@ impl Estimate {
     pub fn exact(value: f64) -> Estimate {
         Estimate { value, low: value, high: value }
     }
+
+    /// The same of a number that cannot lie beyond these.
+    pub fn within(self, least: f64, most: f64) -> Estimate {
+        Estimate { low: self.low.max(least), high: self.high.min(most), ..self }
+    }
 }
 
 /// The mean of a sample by Student's t; none of fewer than two values.
@@ -49,11 +54,15 @@ pub fn share(count: usize, of: usize) -> Option<Estimate> {
     })
 }
 
-/// The two-sided p of Student's test that the mean of a sample of differences is 0; 1 where all are alike, which
-/// leaves nothing to measure them by.
+/// The two-sided p of Student's test that the mean of a sample of differences is 0; where all are alike, which leaves
+/// nothing to measure them by, that of the sign test.
 pub fn p_value(differences: &[f64]) -> Option<f64> {
     let (mean, error) = moments(differences)?;
-    Some(if error == 0.0 { 1.0 } else { 2.0 * student(differences.len()).cdf(-(mean / error).abs()) })
+    Some(match error {
+        0.0 if mean == 0.0 => 1.0,
+        0.0 => 0.5f64.powi(differences.len() as i32 - 1),
+        _ => 2.0 * student(differences.len()).cdf(-(mean / error).abs()),
+    })
 }
 
 /// How far each value lies from the median of all. Their mean is how far apart the values are; between two arms, the

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{Error, print};
+use super::{Error, print, say};
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::report::curves::PRINT;
@@ -32,6 +32,9 @@ pub fn run(args: Args) -> Result<(), Error> {
     let kind = Kind::of(&out)?;
     let scene = runs::figure(&runs)?.scene();
     write(&scene, kind, &out)?;
+    if runs::paired(&runs)? {
+        say("note: these runs have one seed, so their trials are pairs: compare trial with trial, not only the means");
+    }
     print(&format!("{}\n", out.display()))
 }
 

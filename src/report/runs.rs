@@ -143,6 +143,16 @@ pub fn figure(folders: &[PathBuf]) -> Result<Figure, RunError> {
     })
 }
 
+/// Whether trials of several runs are pairs: with one seed, each trial has the same starts and the same luck in every
+/// draw in all of them and, where sizes agree, the same first populations.
+///
+/// # Errors
+/// A run cannot be read.
+pub fn paired(folders: &[PathBuf]) -> Result<bool, RunError> {
+    let seeds = folders.iter().map(|folder| Ok(config(folder)?.learning.seed)).collect::<Result<Vec<_>, RunError>>()?;
+    Ok(seeds.len() > 1 && seeds.iter().all(|seed| *seed == seeds[0]))
+}
+
 /// Labels runs by the config keys that differ between them, or by their folders where none do.
 pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
     let tables: Vec<toml::Table> = configs.iter().map(|config| config.to_toml().parse().unwrap_or_default()).collect();

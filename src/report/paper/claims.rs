@@ -103,10 +103,11 @@ enum Measure {
 }
 
 impl Measure {
-    fn find(self, column: usize, of: String, certain: bool) -> Option<Finding> {
-        let estimate = |values: &[f64]| match certain {
+    /// Of teams that can observe so many POIs.
+    fn find(self, column: usize, of: String, certain: bool, pois: f64) -> Option<Finding> {
+        let estimate = |values: &[f64], least: f64| match certain {
             true => values.first().copied().map(Estimate::exact),
-            false => statistics::mean(values, 1.0),
+            false => Some(statistics::mean(values, 1.0)?.within(least, pois)),
         };
         let share = |count: usize, of: usize| match certain {
             true => (of > 0).then(|| Estimate::exact((count > 0).into())),
@@ -114,11 +115,11 @@ impl Measure {
         };
         let (estimate, verdict, measured) = match &self {
             Measure::Mean(values, allowed) => {
-                let estimate = estimate(values)?;
+                let estimate = estimate(values, 0.0)?;
                 (estimate, judge(estimate, *allowed), format!("{:.2}", estimate.value))
             }
             Measure::Difference(values, allowed) | Measure::Tested(values, allowed) => {
-                let estimate = estimate(values)?;
+                let estimate = estimate(values, -pois)?;
                 (estimate, judge(estimate, *allowed), format!("{:+.2}", estimate.value))
             }
             &Measure::Share(count, of, allowed) => {
@@ -132,7 +133,10 @@ impl Measure {
                 (estimate, verdict, format!("{count} of {of}"))
             }
         };
-        let p = if let Measure::Tested(values, _) = &self { statistics::p_value(values) } else { None };
+        let p = match &self {
+            Measure::Tested(values, _) if !certain => statistics::p_value(values),
+            _ => None,
+        };
         let interval = if certain { String::new() } else { format!(" [{:.2}, {:.2}]", estimate.low, estimate.high) };
         let test = p.map_or(String::new(), |p| if p < 0.001 { ", p < 0.001".into() } else { format!(", p = {p:.3}") });
         // Minus signs as typeset.
@@ -595,7 +599,7 @@ impl Test {
         if course.trials() < 2 && !course.certain {
             return without(Verdict::Open, "takes 2 trials".into());
         }
-        let found = (self.find)(view)?.find(column, of.clone(), course.certain);
+        let found = (self.find)(view)?.find(column, of.clone(), course.certain, course.pois as f64);
         found.or_else(|| without(Verdict::Undecided, "no pair differs".into()))
     }
 }

@@ -29,7 +29,7 @@ pub fn without_learning(results: Results<'_>) -> String {
                 let Some((course, observed)) = course(source).and_then(|c| Some((c, c.observed(last)?))) else {
                     return String::new();
                 };
-                match statistics::mean(&observed, 1.0) {
+                match statistics::mean(&observed, 1.0).map(|mean| mean.within(0.0, pois as f64)) {
                     Some(mean) if !course.certain => format!("{:.2} [{:.2}, {:.2}]", mean.value, mean.low, mean.high),
                     _ => observed.first().map_or(String::new(), |pois| format!("{pois:.2}")),
                 }
@@ -40,7 +40,8 @@ pub fn without_learning(results: Results<'_>) -> String {
             race.extend(SOURCES[2..].iter().map(|&source| {
                 let evolved = course(source).and_then(|course| course.observed_by(last)).unwrap_or_default();
                 let lead: Vec<f64> = evolved.iter().zip(&random).map(|(evolved, random)| evolved - random).collect();
-                let Some(mean) = statistics::mean(&lead, 1.0) else { return "open: takes 2 trials".into() };
+                let within = |mean: statistics::Estimate| mean.within(-(pois as f64), pois as f64);
+                let Some(mean) = statistics::mean(&lead, 1.0).map(within) else { return "open: takes 2 trials".into() };
                 let word = match mean {
                     _ if mean.low > 0.0 => "ahead",
                     _ if mean.high < 0.0 => "behind",
@@ -60,8 +61,8 @@ pub fn without_learning(results: Results<'_>) -> String {
     } else {
         format!(
             "A team whose weights are all zero goes straight ahead at half speed. Untrained, it observes every POI in: {}. \
-             There the start and the followers' rule solve the task, and that evolved teams do so too is no evidence of \
-             how well they learn.",
+             There the layout gives the task away, and that evolved teams observe every POI is no evidence of how well they \
+             learn.",
             solved.join("; ")
         )
     };
