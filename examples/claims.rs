@@ -7,9 +7,10 @@
 use std::process::ExitCode;
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::config::{Override, Paradigm};
+use flotilla::baseline::Baselines;
+use flotilla::config::Override;
 use flotilla::record::metrics::Row;
-use flotilla::report::paper;
+use flotilla::report::paper::{self, Results, claims, tables};
 use flotilla::trainer::Trainer;
 
 fn main() -> ExitCode {
@@ -44,7 +45,7 @@ fn overrides(words: impl Iterator<Item = String>) -> Result<Vec<Override>, Strin
     Ok(overrides)
 }
 
-/// Trains every experiment of the paper with these keys; the table of claims, and what each arm came to.
+/// Trains every experiment of the paper with these keys; what each came to, and the verdicts on the claims.
 fn measure(keys: &[Override]) -> Result<String, String> {
     let mut arms = paper::arms(keys).map_err(|error| error.to_string())?;
     let (configs, places) = paper::trained(&arms);
@@ -57,15 +58,12 @@ fn measure(keys: &[Override]) -> Result<String, String> {
             }
         }
     }
-    let claims = paper::claims(&arms);
-    let mut text = format!("{}\n{}.\n\n", paper::table(&claims), paper::count(&claims));
-    for arm in &arms {
-        let last: Vec<f64> = arm.best.iter().filter_map(|trial| trial.last()).map(|g| g * arm.pois() as f64).collect();
-        let mean = last.iter().sum::<f64>() / last.len() as f64;
-        // Where everyone leads, Df is D.
-        if (arm.paradigm, arm.fitness.to_string().as_str()) != (Paradigm::AllLeaders, "Df") {
-            text += &format!("{}: {mean:.2} of {} POIs in the last generation\n", arm.name(), arm.pois());
-        }
+    let mut baselines = Baselines::new(paper::grounds(&arms));
+    while !baselines.is_done() {
+        baselines.advance(&mut backend).map_err(|error| error.to_string())?;
     }
-    Ok(text)
+    let results = Results { arms: &arms, baselines: &baselines.found() };
+    let claims = claims::claims(results);
+    let heading = tables::heading(&arms[0].config.learning, &claims);
+    Ok(format!("{}\n{}\n{heading}\n", tables::without_learning(results), tables::verdicts(&claims)))
 }

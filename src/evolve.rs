@@ -29,6 +29,8 @@ pub enum Purpose {
     Starts = 3,
     Tournament = 4,
     Mutation = 5,
+    /// Weights of random teams that evolution is held against.
+    Baseline = 6,
     /// Starts that teams are evaluated from, not trained.
     HeldOut = 7,
 }

@@ -18,9 +18,10 @@
 //!    by [`record`]; [`report`] draws it.
 //!
 //! Around that: [`run`] keeps a trainer and its runs' folders and checkpoints together, [`sweep`] makes many runs of a grid,
-//! [`evaluate`] plays trained teams from starts that no training saw, [`memory`] tells what a run will take, [`verify`]
-//! compares two backends on the random worlds of [`sample`], [`mod@bench`] times a backend against what the machine can do
-//! at most, and [`cli`] turns what was typed into all this.
+//! [`evaluate`] plays trained teams from starts that no training saw, [`baseline`] plays what needs no learning,
+//! [`statistics`] says what chance leaves open, [`memory`] tells what a run will take, [`verify`] compares two backends on
+//! the random worlds of [`sample`], [`mod@bench`] times a backend against what the machine can do at most, and [`cli`]
+//! turns what was typed into all this.
 //!
 //! Imports run one way: `main ▸ cli ▸ {run, sweep, report, evaluate, verify, bench} ▸ trainer ▸ {evolve, credit,
 //! backend}`, `backend ▸ {evolve, kernels}`. Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
@@ -32,6 +33,7 @@ pub const COMMIT: Option<&str> = {
 };
 
 pub mod backend;
+pub mod baseline;
 pub mod bench;
 pub mod cli;
 pub mod config;
@@ -47,6 +49,7 @@ pub mod report;
 pub mod run;
 pub mod sample;
 pub mod shell;
+pub mod statistics;
 pub mod sweep;
 pub mod trainer;
 pub mod verify;

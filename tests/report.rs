@@ -787,12 +787,13 @@ fn the_papers_figures_come_with_its_claims() {
     for figure in 4..=6 {
         let svg = fs::read_to_string(out.join(format!("figure{figure}.svg"))).unwrap();
         assert!(svg.contains("All leaders") && svg.contains("Leaders and followers"));
+        assert!(svg.contains("straight ahead") && svg.contains("best of as many random teams"));
         assert!(fs::metadata(out.join(format!("figure{figure}.png"))).unwrap().len() > 10_000);
         assert!(fs::metadata(out.join(format!("figure{figure}.pdf"))).unwrap().len() > 10_000);
     }
     let summary: Value = serde_json::from_str(&fs::read_to_string(out.join("summary.json")).unwrap()).unwrap();
     let arms = summary["arms"].as_array().unwrap();
-    assert_eq!(arms.len(), 18);
+    assert_eq!(arms.len(), 18 + 12);
     for arm in arms {
         for curve in ["generation", "mean", "error", "deviation"] {
             assert_eq!(arm[curve].as_array().unwrap().len(), 4, "{curve}");
@@ -841,9 +842,16 @@ fn the_papers_figures_come_with_its_claims() {
         &path(&out.join("x.svg")),
     ]);
     // Three generations cannot say what happens after 100, and the table says that.
-    assert!(said.contains("open: "), "{said}");
+    assert!(said.contains(" open (too few generations or trials)"), "{said}");
     let claims = fs::read_to_string(out.join("claims.md")).unwrap();
-    assert_eq!(claims.lines().filter(|line| line.starts_with("| ")).count(), 2 + 10);
+    assert_eq!(claims.lines().filter(|line| line.starts_with("| ")).count(), (2 + 6) + (2 + 6) + (2 + 28));
+    // What needs no learning comes first, wherever something is shown.
+    assert!(claims.find("straight ahead").unwrap() < claims.find("The paper says").unwrap());
+    assert!(said.find("straight ahead").unwrap() < said.find("The paper says").unwrap());
+    let straight = arms.iter().filter(|arm| arm["source"] == "straight ahead");
+    let solved = straight
+        .filter(|arm| arm["mean"].as_array().unwrap().iter().all(|mean| *mean == arm["pois"].as_f64().unwrap()));
+    assert_eq!(solved.count(), 4);
 }
 
 /// A paper's folder and what it holds.

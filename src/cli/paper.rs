@@ -1,11 +1,13 @@
 //! `flotilla paper`: the paper's experiments, its figures and its claims, measured here.
 
 use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering::Relaxed;
 
 use serde_json::json;
 
 use super::recovery::{self, Checkpoints, Loss, Signals};
 use super::{Error, Overrides, RunOptions, backend, print, say};
+use crate::baseline::Baselines;
 use crate::config::{self, Override};
 use crate::memory;
 use crate::record::RecordError;
@@ -13,8 +15,8 @@ use crate::record::disk::Disk;
 use crate::record::folder::{self, Start};
 use crate::record::metrics::Row;
 use crate::report::curves::PRINT;
-use crate::report::paper::{self, Arm, Measured, Summary};
-use crate::report::progress::Progress;
+use crate::report::paper::{self, Arm, Measured, Results, Summary, claims, tables};
+use crate::report::progress::{Meter, Progress};
 use crate::report::runs;
 use crate::report::scene::Kind;
 use crate::run::{self, Options, Outcome, RunError, Session, Twin};
@@ -158,6 +160,24 @@ pub fn run(args: Args) -> Result<(), Error> {
         let config = arm.config.clone();
         runs::metrics(folder, &config, |row| arm.add(row))?;
     }
+    let mut baselines = Baselines::new(paper::grounds(&arms));
+    let mut meter = Meter::new(quiet);
+    while !baselines.is_done() {
+        if signals.stop.load(Relaxed) {
+            meter.clear();
+            return Err(Error::Stopped(format!(
+                "before all that needs no learning was played, with every run done; go on with\n  {}",
+                args.command_to_resume()
+            )));
+        }
+        baselines.advance(&mut *player.0)?;
+        let (generation, last) = (baselines.generation(), learning.generations);
+        let part = generation as f64 / (last + 1) as f64;
+        meter.show(part, || format!("playing random teams: generation {generation} of {last}"));
+    }
+    meter.clear();
+    let baselines = baselines.found();
+    let found = Results { arms: &arms, baselines: &baselines };
     let ran = (0..configs.len()).map(|run| session.run(run));
     let seconds = ran.map(|run| run.seconds).fold(0.0, f64::max);
 
@@ -169,24 +189,19 @@ pub fn run(args: Args) -> Result<(), Error> {
         let path = out.join(name);
         Ok(disk.replace(&path, |output| output.write_all(content)).map_err(failed(&path))?)
     };
-    for layout in paper::LAYOUTS {
-        let scene = paper::figure(&arms, &layout).scene();
+    for (index, layout) in paper::LAYOUTS.iter().enumerate() {
+        let scene = paper::figure(found, index).scene();
         for kind in Kind::ALL {
             let name = format!("figure{}.{}", layout.figure, kind.extension());
             let picture = scene.file(kind, PRINT).map_err(failed(&out.join(&name)))?;
             write(name, &picture)?;
         }
     }
-    let claims = paper::claims(&arms);
-    let table = paper::table(&claims);
-    let heading = format!(
-        "{}. Means over {} trials of each generation's best team (± standard error), in POIs; {} generations, seed {}.",
-        paper::count(&claims),
-        learning.trials,
-        learning.generations,
-        learning.seed
-    );
-    write(CLAIMS.into(), format!("# What the paper says, measured\n\n{heading}\n\n{table}").as_bytes())?;
+    let claims = claims::claims(found);
+    let baseline = tables::without_learning(found);
+    let heading = tables::heading(&learning, &claims);
+    let full = tables::full(&claims);
+    write(CLAIMS.into(), tables::page(&baseline, &heading, &full).as_bytes())?;
     let summary = Summary {
         version: env!("CARGO_PKG_VERSION"),
         backend: session.run(0).description.clone(),
@@ -194,7 +209,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         seed: learning.seed,
         trials: learning.trials,
         generations: learning.generations,
-        arms: arms.iter().map(Measured::of).collect(),
+        curves: Measured::all(found),
         claims: &claims,
     };
     let summary = serde_json::to_string(&summary).expect("plain fields are JSON") + "\n";
@@ -228,14 +243,25 @@ pub fn run(args: Args) -> Result<(), Error> {
         return print(&format!("{told}\n"));
     }
     print(&format!(
-        "{table}\n{heading}\n\nTrained in {seconds:.1} s. Files in {}: figure4, figure5, figure6 (.svg, .png, .pdf), claims.md, \
-         summary.json, and a run each in {ARMS}/\n",
+        "{baseline}\n{}\n{heading}\n\nTrained in {seconds:.1} s. Files in {}: figure4, figure5, figure6 (.svg, .png, .pdf), \
+         claims.md (with every figure), summary.json, and a run each in {ARMS}/\n",
+        tables::verdicts(&claims),
         out.display()
     ))
 }
 
 /// Figures, as files.
-const FIGURES: [&str; 6] = ["figure4.svg", "figure4.png", "figure5.svg", "figure5.png", "figure6.svg", "figure6.png"];
+const FIGURES: [&str; 9] = [
+    "figure4.svg",
+    "figure4.png",
+    "figure4.pdf",
+    "figure5.svg",
+    "figure5.png",
+    "figure5.pdf",
+    "figure6.svg",
+    "figure6.png",
+    "figure6.pdf",
+];
 
 /// An arm's folder: "chaotic-all-leaders-Df".
 fn arm_name(arm: &Arm) -> String {

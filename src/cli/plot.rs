@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{Error, output, print};
+use super::{Error, output, print, say};
 use crate::record::RecordError;
 use crate::report::curves::PRINT;
 use crate::report::runs::{self, MAX_RUNS};
@@ -34,6 +34,9 @@ pub fn run(args: Args) -> Result<(), Error> {
     let kind = kind_of(&out)?;
     let scene = runs::figure(&runs)?.scene();
     write(&scene, kind, &out)?;
+    if runs::paired(&runs)? {
+        say("note: these runs have one seed, so their trials are pairs: compare trial with trial, not only the means");
+    }
     let out = out.display().to_string();
     match json {
         true => {

@@ -13,6 +13,7 @@ const MAX_POINTS: usize = 300;
 /// Sizes of letters, 7 and 8 points.
 pub const SMALL: f64 = 2.47;
 const NORMAL: f64 = 2.82;
+const REFERENCES: [&[f64]; 2] = [&[2.6, 1.0], &[0.7, 0.7]];
 const DASHES: [&[f64]; 5] = [&[], &[1.6, 0.7], &[1.8, 0.6, 0.4, 0.6], &[0.5, 0.5], &[3.0, 0.8]];
 
 /// Mean and standard deviation of any number of values, gathered one by one.
@@ -97,6 +98,8 @@ pub struct Panel {
 pub struct Figure {
     pub panels: Vec<Panel>,
     pub legend: Vec<String>,
+    /// What curves are held against: the next places in the legend, in grey, with neither bands nor marks.
+    pub references: Vec<String>,
     pub y_label: String,
     /// The y axis runs from 0 to this.
     pub y_max: f64,
@@ -111,7 +114,7 @@ impl Figure {
         const RIGHT: f64 = 3.0;
         const GAP: f64 = 5.5;
         const BELOW: f64 = 9.0;
-        let labels = distinct(&self.legend, COLUMN - 20.0, SMALL);
+        let labels = distinct(&[&self.legend[..], &self.references].concat(), COLUMN - 20.0, SMALL);
         let rows = legend_rows(&labels);
         let titles = if self.panels.iter().any(|panel| !panel.title.is_empty()) { 4.5 } else { 1.5 };
         let above = 1.0 + rows.len() as f64 * 3.8 + titles;
@@ -126,9 +129,10 @@ impl Figure {
         for (row, entries) in rows.iter().enumerate() {
             let y = 1.0 + 3.8 * row as f64 + 2.0;
             for &(index, x) in entries {
-                let look = Look::of(index);
-                scene.line(vec![[x, y], [x + 8.0, y]], look.pen());
-                look.mark(&mut scene, [x + 4.0, y]);
+                scene.line(vec![[x, y], [x + 8.0, y]], self.pen(index));
+                if index < self.legend.len() {
+                    Look::of(index).mark(&mut scene, [x + 4.0, y]);
+                }
                 scene.text([x + 9.0, y + 0.9], &*labels[index], SMALL, Anchor::Start, BLACK);
             }
         }
@@ -160,8 +164,13 @@ impl Figure {
                 draw_caption(&mut scene, [LEFT, above + height + 11.4], caption);
             }
             scene.clipped([left - 0.8, above - 0.8, width + 1.6, height + 1.6], |scene| {
-                for (index, (curve, _)) in curves {
+                let (curves, references): (Vec<_>, Vec<_>) =
+                    curves.iter().partition(|(index, _)| *index < self.legend.len());
+                for (index, (curve, _)) in &curves {
                     axes.band(scene, curve, Look::of(*index).color);
+                }
+                for (index, (curve, _)) in references {
+                    scene.line(axes.points(curve), self.pen(*index));
                 }
                 for (index, (curve, _)) in curves {
                     axes.curve(scene, curve, *index, self.legend.len());
@@ -177,12 +186,21 @@ impl Figure {
         format!("{} by generation{of}", self.y_label)
     }
 
+    /// What a place in the legend is drawn with.
+    fn pen(&self, index: usize) -> Pen {
+        match index.checked_sub(self.legend.len()) {
+            None => Look::of(index).pen(),
+            Some(reference) => Pen { dash: REFERENCES[reference % REFERENCES.len()], ..Pen::new(GREY, 0.5) },
+        }
+    }
+
     /// From where to where each curve goes.
     fn description(&self) -> String {
         let mut text = format!("Learning curves, on an axis from 0 to {}.", number(self.y_max));
         for panel in &self.panels {
             let course = |(index, curve): &(usize, Curve)| {
-                let (label, last) = (self.legend.get(*index)?, curve.mean.len().checked_sub(1)?);
+                let label = self.legend.iter().chain(&self.references).nth(*index)?;
+                let last = curve.mean.len().checked_sub(1)?;
                 let [from, to] = [0, last].map(|at| (curve.generation[at], number(curve.mean[at]), curve.error[at]));
                 let error = if to.2 > 0.0 { format!(" ± {}", number(to.2)) } else { String::new() };
                 Some(format!(
@@ -288,11 +306,15 @@ impl Axes {
         }
     }
 
+    fn points(&self, curve: &Curve) -> Vec<[f64; 2]> {
+        curve.generation.iter().zip(&curve.mean).map(|(&x, &y)| self.at(x, y)).collect()
+    }
+
     /// The mean, with a few marks; those of different curves stand apart, since curves may run into each other.
     fn curve(&self, scene: &mut Scene, curve: &Curve, index: usize, of: usize) {
         const MARKS: usize = 5;
         let look = Look::of(index);
-        let points: Vec<_> = curve.generation.iter().zip(&curve.mean).map(|(&x, &y)| self.at(x, y)).collect();
+        let points = self.points(curve);
         scene.line(points.clone(), look.pen());
         let last = points.len().saturating_sub(1) as f64;
         let shift = (index as f64 + 0.5) / of.max(1) as f64;

@@ -143,10 +143,21 @@ pub fn figure(folders: &[PathBuf]) -> Result<Figure, RunError> {
     Ok(Figure {
         panels: vec![Panel { title: String::new(), curves: curves.into_iter().enumerate().collect() }],
         legend,
+        references: vec![],
         y_label: if same { format!("POIs observed{what}") } else { format!("Share of POIs observed{what}") },
         y_max: scale,
         shares: !same,
     })
+}
+
+/// Whether trials of several runs are pairs: with one seed, each trial has the same starts and the same luck in every
+/// draw in all of them and, where sizes agree, the same first populations.
+///
+/// # Errors
+/// A run cannot be read.
+pub fn paired(folders: &[PathBuf]) -> Result<bool, RunError> {
+    let seeds = folders.iter().map(|folder| Ok(config(folder)?.learning.seed)).collect::<Result<Vec<_>, RunError>>()?;
+    Ok(seeds.len() > 1 && seeds.iter().all(|seed| *seed == seeds[0]))
 }
 
 /// Labels runs by the config keys that differ between them, or by their folders where none do.

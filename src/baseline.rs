@@ -1,0 +1,151 @@
+//! What a layout gives without any learning: a team that goes straight ahead, and the best of as many random teams as
+//! evolution evaluates.
+//!
+//! Both are played by a backend like any team, from the starts of the trial that they are held against. Random teams are
+//! drawn as generation 0 draws policies, by a purpose of their own, so that no result of a training changes.
+
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
+use fearless_simd::Level;
+use glam::Vec2;
+use rayon::prelude::*;
+
+use crate::backend::{Backend, BackendError, Episode, Group};
+use crate::config::{Config, Fitness, Learning};
+use crate::credit::Credit;
+use crate::evolve::{self, Key, Purpose};
+use crate::world::World;
+
+/// What came out for one config: G in 0..1, `[trials][generations + 1]`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Baseline {
+    /// A team whose weights are all zero: every leader goes straight ahead at half its highest speed.
+    pub straight: Vec<Vec<f64>>,
+    /// The best of all random teams so far, as many in each generation as the population has.
+    pub random: Vec<Vec<f64>>,
+}
+
+/// Plays the baselines of any number of configs side by side, generation by generation.
+pub struct Baselines {
+    places: Vec<Place>,
+    generation: usize,
+}
+
+/// One config and its trials.
+struct Place {
+    config: Config,
+    world: World,
+    /// `[trials][leaders][population + 1][parameters]`; the last policy is zero.
+    weights: Vec<Vec<f32>>,
+    /// `[trials][episodes][agents]`.
+    starts: Vec<Vec<Vec<Vec2>>>,
+    /// Team j is every leader's policy j, `[population + 1][leaders]`.
+    teams: Vec<u32>,
+    /// POIs observed in all episodes of the present generation, `[trials][population + 1]`.
+    observed: Vec<AtomicU32>,
+    found: Baseline,
+}
+
+impl Baselines {
+    /// Of valid configs; fitness, selection and mutation have no say.
+    pub fn new(configs: Vec<Config>) -> Baselines {
+        Baselines { places: configs.into_iter().map(Place::new).collect(), generation: 0 }
+    }
+
+    /// The generation that plays next.
+    pub fn generation(&self) -> usize {
+        self.generation
+    }
+
+    /// Whether every config's last generation has been played.
+    pub fn is_done(&self) -> bool {
+        self.places.iter().all(|place| place.config.learning.generations < self.generation)
+    }
+
+    /// Plays one generation's teams of every config that has one left.
+    ///
+    /// # Errors
+    /// When the backend fails; this generation can then be played again.
+    pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<(), BackendError> {
+        let generation = self.generation;
+        let mut playing: Vec<_> =
+            self.places.iter_mut().filter(|place| generation <= place.config.learning.generations).collect();
+        playing.iter_mut().for_each(|place| place.prepare(generation));
+        let (mut groups, mut homes) = (Vec::new(), Vec::new());
+        for place in &playing {
+            let policies = place.config.learning.population + 1;
+            for (trial, (weights, starts)) in place.weights.iter().zip(&place.starts).enumerate() {
+                for starts in starts {
+                    let (world, weights, teams) = (&place.world, weights[..].into(), &*place.teams);
+                    groups.push(Group { world, starts, weights, policies, teams });
+                    homes.push((&**place, trial * policies));
+                }
+            }
+        }
+        backend.rollout(&groups, &|episode: Episode<'_>| {
+            let (place, first) = homes[episode.group];
+            // G is the same for every leader, so one place for it would do; a score a leader is what credit writes.
+            let mut scores = vec![0.0; place.world.leaders()];
+            let observed = Credit::default().score(&episode, &place.world, Fitness::G, &mut scores);
+            place.observed[first + episode.team].fetch_add(observed, Relaxed);
+        })?;
+        playing.iter_mut().for_each(|place| place.conclude());
+        self.generation += 1;
+        Ok(())
+    }
+
+    /// What came out, by config.
+    pub fn found(self) -> Vec<Baseline> {
+        self.places.into_iter().map(|place| place.found).collect()
+    }
+}
+
+impl Place {
+    fn new(config: Config) -> Place {
+        let world = World::new(&config);
+        let Learning { trials, population, episodes_per_team, generations, .. } = config.learning;
+        let none = || vec![Vec::with_capacity(generations + 1); trials];
+        Place {
+            weights: vec![vec![0.0; world.leaders() * (population + 1) * world.parameters()]; trials],
+            starts: vec![vec![vec![]; episodes_per_team]; trials],
+            teams: (0..=population as u32).flat_map(|team| vec![team; world.leaders()]).collect(),
+            observed: std::iter::repeat_with(AtomicU32::default).take(trials * (population + 1)).collect(),
+            found: Baseline { straight: none(), random: none() },
+            config,
+            world,
+        }
+    }
+
+    /// Draws a generation's policies and starts.
+    fn prepare(&mut self, generation: usize) {
+        let Place { config, world, weights, starts, observed, .. } = self;
+        let Learning { seed, population, start_jitter, .. } = config.learning;
+        let (level, parameters) = (Level::new(), world.parameters());
+        weights.par_iter_mut().zip(starts).enumerate().for_each(|(trial, (weights, starts))| {
+            let key = Key::new(seed, trial, Purpose::Baseline);
+            let populations = weights.par_chunks_exact_mut((population + 1) * parameters).enumerate();
+            populations.for_each(|(leader, policies)| {
+                let drawn = policies.chunks_exact_mut(parameters).take(population).enumerate();
+                drawn.for_each(|(slot, policy)| evolve::random_policy(level, key.at(generation, leader, slot), policy));
+            });
+            let key = Key::new(seed, trial, Purpose::Starts);
+            for (episode, starts) in starts.iter_mut().enumerate() {
+                evolve::jitter_starts(key, generation, episode, world, start_jitter, starts);
+            }
+        });
+        observed.iter().for_each(|observed| observed.store(0, Relaxed));
+    }
+
+    /// Takes in what the generation's teams observed.
+    fn conclude(&mut self) {
+        let Learning { population, episodes_per_team, .. } = self.config.learning;
+        let whole = (self.world.pois.len() * episodes_per_team) as f64;
+        let Baseline { straight, random } = &mut self.found;
+        let trials = self.observed.chunks_exact(population + 1);
+        for ((straight, random), observed) in straight.iter_mut().zip(random).zip(trials) {
+            let g = |team: &AtomicU32| f64::from(team.load(Relaxed)) / whole;
+            straight.push(g(&observed[population]));
+            random.push(observed[..population].iter().map(g).chain(random.last().copied()).fold(0.0, f64::max));
+        }
+    }
+}

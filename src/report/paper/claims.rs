@@ -1,0 +1,605 @@
+//! Every sentence of the paper that says something measurable of these experiments, held to its own words.
+//!
+//! Each gets one measure and one verdict a source of policies: *yes* where the 95 % interval
+//! lies within what the words allow, *no* where it lies without, *not decided* where it holds the threshold. Where the
+//! paper gives no number, [`SMALL`] and [`FEW`] stand for its words.
+
+use serde::Serialize;
+
+use super::{Course, LAYOUTS, Results, SOURCES, Source};
+use crate::config::Paradigm;
+use crate::statistics::{self, Estimate};
+
+/// Differences up to this share of the POIs are "about similar", "comparable" or "slight".
+pub const SMALL: f64 = 0.1;
+/// A share of trials up to this is "almost never", one above it "some of the time", and all but so many are "all",
+/// unless one is seen that is not.
+pub const FEW: f64 = 0.1;
+/// "After 100 generations": where the paper judges what came out.
+pub const END: usize = 100;
+
+/// Whether a claim came out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub enum Verdict {
+    #[serde(rename = "yes")]
+    Yes,
+    #[serde(rename = "no")]
+    No,
+    /// The interval holds the threshold.
+    #[serde(rename = "not decided")]
+    Undecided,
+    /// There are too few generations or trials to judge.
+    #[serde(rename = "open")]
+    Open,
+}
+
+impl std::fmt::Display for Verdict {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Verdict::Yes => "yes",
+            Verdict::No => "no",
+            Verdict::Undecided => "not decided",
+            Verdict::Open => "open",
+        })
+    }
+}
+
+/// What one claim came to for one source of policies.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Finding {
+    /// The [`SOURCES`] entry in whose column it stands.
+    #[serde(skip)]
+    pub column: usize,
+    /// What was measured: the source, or the two that are compared ("Df − G").
+    pub of: String,
+    pub verdict: Verdict,
+    /// For people: "3.58 [3.43, 3.73]".
+    pub measured: String,
+    #[serde(flatten)]
+    pub estimate: Option<Estimate>,
+    /// Of a test of difference, two-sided.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub p: Option<f64>,
+}
+
+/// One claim of the paper.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Claim {
+    /// Where it stands in the paper.
+    pub place: &'static str,
+    pub layout: &'static str,
+    /// The paper's words.
+    pub words: &'static str,
+    /// What they are taken to say of the best teams.
+    pub measure: &'static str,
+    pub findings: Vec<Finding>,
+}
+
+impl Claim {
+    /// The findings on what evolved: the paper speaks of nothing else.
+    pub fn on_evolution(&self) -> impl Iterator<Item = &Finding> {
+        self.findings.iter().filter(|found| matches!(SOURCES[found.column], Source::Evolved(_)))
+    }
+}
+
+/// The values that the words allow: at least the first, under the second.
+type Allowed = [f64; 2];
+const ABOVE_0: Allowed = [f64::MIN_POSITIVE, f64::INFINITY];
+const BELOW_0: Allowed = [f64::NEG_INFINITY, 0.0];
+const MOST: Allowed = [0.5 + f64::EPSILON, f64::INFINITY];
+
+/// What was measured and what the words allow.
+enum Measure {
+    /// By trial, in POIs.
+    Mean(Vec<f64>, Allowed),
+    /// By pair of trials, in POIs.
+    Difference(Vec<f64>, Allowed),
+    /// The same, with the p of its test.
+    Tested(Vec<f64>, Allowed),
+    /// In how many of so many trials or pairs.
+    Share(usize, usize, Allowed),
+    /// The same, and it should be all.
+    All(usize, usize),
+}
+
+impl Measure {
+    /// Of teams that can observe so many POIs.
+    fn find(self, column: usize, of: String, certain: bool, pois: f64) -> Option<Finding> {
+        let estimate = |values: &[f64], least: f64| match certain {
+            true => values.first().copied().map(Estimate::exact),
+            false => Some(statistics::mean(values, 1.0)?.within(least, pois)),
+        };
+        let share = |count: usize, of: usize| match certain {
+            true => (of > 0).then(|| Estimate::exact((count > 0).into())),
+            false => statistics::share(count, of),
+        };
+        let (estimate, verdict, measured) = match &self {
+            Measure::Mean(values, allowed) => {
+                let estimate = estimate(values, 0.0)?;
+                (estimate, judge(estimate, *allowed), format!("{:.2}", estimate.value))
+            }
+            Measure::Difference(values, allowed) | Measure::Tested(values, allowed) => {
+                let estimate = estimate(values, -pois)?;
+                (estimate, judge(estimate, *allowed), format!("{:+.2}", estimate.value))
+            }
+            &Measure::Share(count, of, allowed) => {
+                let estimate = share(count, of)?;
+                (estimate, judge(estimate, allowed), format!("{count} of {of}"))
+            }
+            &Measure::All(count, of) => {
+                let estimate = share(count, of)?;
+                // One that does not is enough to refute; so many that do have to be seen to believe it of all.
+                let verdict = if count < of { Verdict::No } else { judge(estimate, [1.0 - FEW, f64::INFINITY]) };
+                (estimate, verdict, format!("{count} of {of}"))
+            }
+        };
+        let p = match &self {
+            Measure::Tested(values, _) if !certain => statistics::p_value(values),
+            _ => None,
+        };
+        let interval = if certain { String::new() } else { format!(" [{:.2}, {:.2}]", estimate.low, estimate.high) };
+        let test = p.map_or(String::new(), |p| if p < 0.001 { ", p < 0.001".into() } else { format!(", p = {p:.3}") });
+        // Minus signs as typeset.
+        let measured = format!("{measured}{interval}{test}").replace("-", "−");
+        Some(Finding { column, of, verdict, measured, estimate: Some(estimate), p })
+    }
+}
+
+/// Whether an interval lies within what is allowed.
+fn judge(estimate: Estimate, [from, below]: Allowed) -> Verdict {
+    match estimate {
+        Estimate { low, high, .. } if low >= from && high < below => Verdict::Yes,
+        Estimate { low, high, .. } if high < from || low >= below => Verdict::No,
+        _ => Verdict::Undecided,
+    }
+}
+
+/// Where a claim is looked up.
+#[derive(Clone, Copy)]
+struct View<'a> {
+    results: Results<'a>,
+    layout: usize,
+    source: Source,
+}
+
+impl<'a> View<'a> {
+    fn course(&'a self, paradigm: Paradigm) -> Option<Course<'a>> {
+        self.results.course(self.layout, paradigm, self.source)
+    }
+
+    /// What all-leaders teams came to.
+    fn all(&'a self) -> Option<Course<'a>> {
+        self.course(Paradigm::AllLeaders)
+    }
+
+    /// What leader-follower teams came to.
+    fn led(&'a self) -> Option<Course<'a>> {
+        self.course(Paradigm::LeaderFollower)
+    }
+
+    /// POIs observed after all generations by leader-follower teams less those by all-leaders teams, by pair.
+    fn lead(&self) -> Option<Vec<f64>> {
+        Some(less(&self.led()?.observed(END)?, &self.all()?.observed(END)?))
+    }
+
+    /// The same of two ways to learn.
+    fn between(&self, by: Source, other: Source, measure: fn(&[f64]) -> Vec<f64>) -> Option<Vec<f64>> {
+        let course = |source| self.results.course(self.layout, Paradigm::LeaderFollower, source)?.observed(END);
+        Some(less(&measure(&course(by)?), &measure(&course(other)?)))
+    }
+
+    /// A share of the POIs.
+    fn pois(&self, share: f64) -> f64 {
+        share * self.led().map_or(0, |course| course.pois) as f64
+    }
+}
+
+/// Pair by pair.
+fn less(values: &[f64], others: &[f64]) -> Vec<f64> {
+    values.iter().zip(others).map(|(value, other)| value - other).collect()
+}
+
+impl Course<'_> {
+    /// The generation at which a trial's best team first observes every POI, if any up to a last one.
+    fn solved(&self, last: usize) -> Option<Vec<Option<usize>>> {
+        self.best.iter().map(|trial| Some(trial.get(..=last)?.iter().position(|&g| g >= 1.0))).collect()
+    }
+
+    /// How many trials do so.
+    fn count_solved(&self, last: usize) -> Option<usize> {
+        Some(self.solved(last)?.iter().flatten().count())
+    }
+
+    fn trials(&self) -> usize {
+        self.best.len()
+    }
+}
+
+/// A claim and how to find out.
+struct Test {
+    place: &'static str,
+    layout: usize,
+    words: &'static str,
+    measure: &'static str,
+    /// Generations that the claim speaks of.
+    needs: usize,
+    sources: &'static [Source],
+    find: fn(View<'_>) -> Option<Measure>,
+}
+
+/// Everyone leads: there Df is D, and the same training.
+const ALONE: &[Source] = SOURCES.split_at(4).0;
+const EVOLVED: &[Source] = SOURCES.split_at(2).1;
+const G: Source = SOURCES[2];
+const D: Source = SOURCES[3];
+const DF: Source = SOURCES[4];
+
+const GENERAL: usize = 0;
+const STRICT: usize = 1;
+const CHAOTIC: usize = 2;
+
+const MORE_OPTIMAL: &str = "“a more optimal joint policy” led than alone";
+const MORE_POIS: &str = "POIs at generation 100, leader-follower less all-leaders, by pair: above 0";
+const MUCH_FASTER: &str = "“much faster” led than alone";
+const HALF_THE_TIME: &str =
+    "pairs in which leader-follower first observes all POIs in half of all-leaders' generations or fewer: over half";
+const MORE_RELIABLY: &str = "“more reliably” led than alone";
+const ODD_PAIRS: &str =
+    "of the pairs in which only one observes all POIs at generation 100, leader-follower does in: over half";
+
+fn more_optimal(view: View<'_>) -> Option<Measure> {
+    Some(Measure::Difference(view.lead()?, ABOVE_0))
+}
+
+fn much_faster(view: View<'_>) -> Option<Measure> {
+    let (led, all) = (view.led()?.solved(END)?, view.all()?.solved(END)?);
+    // Who never gets there gets there after the end at the earliest.
+    let sooner = |(led, all): &(&Option<usize>, &Option<usize>)| {
+        led.is_some_and(|led| 2 * led <= all.unwrap_or(END + 1) && Some(led) != **all)
+    };
+    Some(Measure::Share(led.iter().zip(&all).filter(sooner).count(), led.len(), MOST))
+}
+
+fn more_reliably(view: View<'_>) -> Option<Measure> {
+    let pois = view.pois(1.0);
+    let (led, all) = (view.led()?.observed(END)?, view.all()?.observed(END)?);
+    let pairs = || led.iter().zip(&all).map(|(led, all)| (*led >= pois, *all >= pois));
+    let odd = pairs().filter(|(led, all)| led != all).count();
+    Some(Measure::Share(pairs().filter(|pair| *pair == (true, false)).count(), odd, MOST))
+}
+
+/// The other fitness that one is compared with, so that every two are once.
+fn next(source: Source) -> Source {
+    match source {
+        G => D,
+        D => DF,
+        _ => G,
+    }
+}
+
+/// The paper's claims, layout by layout.
+const TESTS: &[Test] = &[
+    Test {
+        place: "§5",
+        layout: GENERAL,
+        words: MORE_OPTIMAL,
+        measure: MORE_POIS,
+        needs: END,
+        sources: &SOURCES,
+        find: more_optimal,
+    },
+    Test {
+        place: "Abstract, §5",
+        layout: GENERAL,
+        words: MUCH_FASTER,
+        measure: HALF_THE_TIME,
+        needs: END,
+        sources: &SOURCES,
+        find: much_faster,
+    },
+    Test {
+        place: "Abstract, §5",
+        layout: GENERAL,
+        words: MORE_RELIABLY,
+        measure: ODD_PAIRS,
+        needs: END,
+        sources: &SOURCES,
+        find: more_reliably,
+    },
+    Test {
+        place: "§5.1",
+        layout: GENERAL,
+        words: "alone, “they struggle to learn to observe all 4 POIs”",
+        measure: "all-leaders, trials that ever observe all 4 up to generation 100: under half",
+        needs: END,
+        sources: ALONE,
+        find: |view| Some(Measure::Share(view.all()?.count_solved(END)?, view.all()?.trials(), [0.0, 0.5])),
+    },
+    Test {
+        place: "§5.1, Fig. 4",
+        layout: GENERAL,
+        words: "alone, “after 100 generations, they average observing less than a single POI”",
+        measure: "all-leaders, POIs at generation 100: under 1",
+        needs: END,
+        sources: ALONE,
+        find: |view| Some(Measure::Mean(view.all()?.observed(END)?, [f64::NEG_INFINITY, 1.0])),
+    },
+    Test {
+        place: "§5.1",
+        layout: GENERAL,
+        words: "led, “in fewer than 20 generations, they all observe at least 3, on average”",
+        measure: "leader-follower, POIs at generation 19: at least 3",
+        needs: 19,
+        sources: &SOURCES,
+        find: |view| Some(Measure::Mean(view.led()?.observed(19)?, [3.0, f64::INFINITY])),
+    },
+    Test {
+        place: "§5.1, Fig. 4",
+        layout: GENERAL,
+        words: "led, “quickly able to learn to observe all of the POIs”",
+        measure: "leader-follower, trials that ever observe all 4 up to generation 40: all",
+        needs: 40,
+        sources: &SOURCES,
+        find: |view| Some(Measure::All(view.led()?.count_solved(40)?, view.led()?.trials())),
+    },
+    Test {
+        place: "§5.1",
+        layout: GENERAL,
+        words: "led, “they all consistently observe all 4 POIs within 40 generations”",
+        measure: "leader-follower, trials that observe all 4 at every generation from 40 to 100: all",
+        needs: END,
+        sources: &SOURCES,
+        find: |view| {
+            let led = view.led()?;
+            let always = |trial: &&Vec<f64>| trial[40..=END].iter().all(|&g| g >= 1.0);
+            Some(Measure::All(led.best.iter().filter(always).count(), led.trials()))
+        },
+    },
+    Test {
+        place: "§5",
+        layout: STRICT,
+        words: MORE_OPTIMAL,
+        measure: MORE_POIS,
+        needs: END,
+        sources: &SOURCES,
+        find: more_optimal,
+    },
+    Test {
+        place: "Abstract, §5",
+        layout: STRICT,
+        words: MUCH_FASTER,
+        measure: HALF_THE_TIME,
+        needs: END,
+        sources: &SOURCES,
+        find: much_faster,
+    },
+    Test {
+        place: "Abstract, §5",
+        layout: STRICT,
+        words: MORE_RELIABLY,
+        measure: ODD_PAIRS,
+        needs: END,
+        sources: &SOURCES,
+        find: more_reliably,
+    },
+    Test {
+        place: "§5.2",
+        layout: STRICT,
+        words: "alone, “almost never able to learn to obtain any reward using any of the reward functions”",
+        measure: "all-leaders, trials that ever observe a POI up to generation 100: under 1 in 10",
+        needs: END,
+        sources: ALONE,
+        find: |view| {
+            let all = view.all()?;
+            let any = all.observed_by(END)?.iter().filter(|&&pois| pois > 0.0).count();
+            Some(Measure::Share(any, all.trials(), [0.0, FEW]))
+        },
+    },
+    Test {
+        place: "Fig. 5",
+        layout: STRICT,
+        words: "alone, failing “is more drastic than in the previous configuration”",
+        measure: "all-leaders, share of the POIs at generation 100, less that in generally forward, by pair: below 0",
+        needs: END,
+        sources: ALONE,
+        find: |view| {
+            let share = |view: View<'_>| {
+                let all = view.all()?;
+                Some(all.observed(END)?.iter().map(|pois| pois / all.pois as f64).collect::<Vec<_>>())
+            };
+            Some(Measure::Difference(less(&share(view)?, &share(View { layout: GENERAL, ..view })?), BELOW_0))
+        },
+    },
+    Test {
+        place: "Fig. 5",
+        layout: STRICT,
+        words: "led, “learning to observe 3 of the 4 POIs on average withing 30 generations”",
+        measure: "leader-follower, POIs at generation 30: at least 1.5 of the 2 that this layout has",
+        needs: 30,
+        sources: &SOURCES,
+        find: |view| Some(Measure::Mean(view.led()?.observed(30)?, [view.pois(0.75), f64::INFINITY])),
+    },
+    Test {
+        place: "§5.2",
+        layout: STRICT,
+        words: "led, “able to use any of the reward functions to successfully solve the task”",
+        measure: "leader-follower, trials that ever observe both POIs up to generation 100: all",
+        needs: END,
+        sources: &SOURCES,
+        find: |view| Some(Measure::All(view.led()?.count_solved(END)?, view.led()?.trials())),
+    },
+    Test {
+        place: "§5.2",
+        layout: STRICT,
+        words: "led, “the impact of the various reward structures is not as readily apparent based solely on the \
+                average reward”",
+        measure: "leader-follower, POIs at generation 100 under one fitness less those under another, by pair: less \
+                  than 0.2 apart",
+        needs: END,
+        sources: EVOLVED,
+        find: |view| {
+            let margin = view.pois(SMALL);
+            let differences = view.between(view.source, next(view.source), <[f64]>::to_vec)?;
+            Some(Measure::Difference(differences, [-margin, margin]))
+        },
+    },
+    Test {
+        place: "§5.2",
+        layout: STRICT,
+        words: "led, under Df “the variance of the performance of the system was significantly higher”",
+        measure: "leader-follower, distance of a trial's POIs at generation 100 from the median trial's, Df less the \
+                  other, by pair (Brown-Forsythe): above 0",
+        needs: END,
+        sources: &[G, D],
+        find: |view| Some(Measure::Tested(view.between(DF, view.source, statistics::distances)?, ABOVE_0)),
+    },
+    Test {
+        place: "§5",
+        layout: CHAOTIC,
+        words: MORE_OPTIMAL,
+        measure: MORE_POIS,
+        needs: END,
+        sources: &SOURCES,
+        find: more_optimal,
+    },
+    Test {
+        place: "Abstract, Fig. 6",
+        layout: CHAOTIC,
+        words: MUCH_FASTER,
+        measure: HALF_THE_TIME,
+        needs: END,
+        sources: &SOURCES,
+        find: much_faster,
+    },
+    Test {
+        place: "Abstract, §5",
+        layout: CHAOTIC,
+        words: MORE_RELIABLY,
+        measure: ODD_PAIRS,
+        needs: END,
+        sources: &SOURCES,
+        find: more_reliably,
+    },
+    Test {
+        place: "§5.3",
+        layout: CHAOTIC,
+        words: "alone, “a high likelihood of random actions successfully causing the agents to observe the POI”",
+        measure: "all-leaders, trials in which one of generation 0's random teams observes a POI: over half",
+        needs: 0,
+        // Before any selection, fitness has no say.
+        sources: &[Source::Random, G],
+        find: |view| {
+            let all = view.all()?;
+            Some(Measure::Share(all.observed(0)?.iter().filter(|&&pois| pois > 0.0).count(), all.trials(), MOST))
+        },
+    },
+    Test {
+        place: "Fig. 6",
+        layout: CHAOTIC,
+        words: "alone, “able to solve the problem some of the time”",
+        measure: "all-leaders, trials that ever observe all 4 up to generation 100: 1 in 10 to 9 in 10",
+        needs: END,
+        sources: ALONE,
+        find: |view| Some(Measure::Share(view.all()?.count_solved(END)?, view.all()?.trials(), [FEW, 1.0 - FEW])),
+    },
+    Test {
+        place: "§5.3",
+        layout: CHAOTIC,
+        words: "alone, “a rather large variance in the average policy performance”",
+        measure: "all-leaders, mean distance of a trial's POIs at generation 100 from the median trial's: at least 0.5, \
+                  as if every second trial were a POI off",
+        needs: END,
+        sources: ALONE,
+        find: |view| Some(Measure::Mean(statistics::distances(&view.all()?.observed(END)?), [0.5, f64::INFINITY])),
+    },
+    Test {
+        place: "§5.3",
+        layout: CHAOTIC,
+        words: "led, “the agents learn about a similar policy”",
+        measure: "POIs at generation 100, leader-follower less all-leaders, by pair: less than 0.4 apart",
+        needs: END,
+        sources: &SOURCES,
+        find: |view| {
+            let margin = view.pois(SMALL);
+            Some(Measure::Difference(view.lead()?, [-margin, margin]))
+        },
+    },
+    Test {
+        place: "Fig. 6",
+        layout: CHAOTIC,
+        words: "led, “at least a comparable policy”",
+        measure: "POIs at generation 100, leader-follower less all-leaders, by pair: above −0.4",
+        needs: END,
+        sources: &SOURCES,
+        find: |view| Some(Measure::Difference(view.lead()?, [-view.pois(SMALL), f64::INFINITY])),
+    },
+    Test {
+        place: "§5.3, Fig. 6",
+        layout: CHAOTIC,
+        words: "led, “more consistently” than alone",
+        measure: "distance of a trial's POIs at generation 100 from the median trial's, leader-follower less \
+                  all-leaders, by pair (Brown-Forsythe): below 0",
+        needs: END,
+        sources: &SOURCES,
+        find: |view| {
+            let distances = |course: Course<'_>| Some(statistics::distances(&course.observed(END)?));
+            Some(Measure::Tested(less(&distances(view.led()?)?, &distances(view.all()?)?), BELOW_0))
+        },
+    },
+    Test {
+        place: "§5.3",
+        layout: CHAOTIC,
+        words: "led, “a slight benefit of using the leader-follower trajectory assignment” over the global reward",
+        measure: "leader-follower, POIs at generation 100 under Df less those under G, by pair: above 0, under 0.4",
+        needs: END,
+        sources: &[G],
+        find: |view| {
+            let differences = view.between(DF, view.source, <[f64]>::to_vec)?;
+            Some(Measure::Difference(differences, [f64::MIN_POSITIVE, view.pois(SMALL)]))
+        },
+    },
+    Test {
+        place: "§5.3",
+        layout: CHAOTIC,
+        words: "led, the global reward is “enough of a learning signal to direct agent to solve the task”",
+        measure: "leader-follower, trials that ever observe all 4 up to generation 100: all",
+        needs: END,
+        sources: &[Source::Straight, Source::Random, G],
+        find: |view| Some(Measure::All(view.led()?.count_solved(END)?, view.led()?.trials())),
+    },
+];
+
+/// Every claim of the paper on these experiments.
+pub fn claims(results: Results<'_>) -> Vec<Claim> {
+    TESTS.iter().map(|test| test.claim(results)).collect()
+}
+
+impl Test {
+    fn claim(&self, results: Results<'_>) -> Claim {
+        let findings = self.sources.iter().filter_map(|&source| self.finding(results, source)).collect();
+        let Test { place, layout, words, measure, .. } = *self;
+        Claim { place, layout: LAYOUTS[layout].name, words, measure, findings }
+    }
+
+    fn finding(&self, results: Results<'_>, source: Source) -> Option<Finding> {
+        let column = SOURCES.iter().position(|&other| other == source)?;
+        let view = View { results, layout: self.layout, source };
+        let course = view.led()?;
+        let of = match self.sources {
+            EVOLVED => format!("{source} − {}", next(source)),
+            [G, D] | [G] => format!("{DF} − {source}"),
+            _ => source.to_string(),
+        };
+        let without = |verdict, measured: String| {
+            Some(Finding { column, of: of.clone(), verdict, measured, estimate: None, p: None })
+        };
+        if course.best.iter().any(|trial| trial.len() <= self.needs) {
+            return without(Verdict::Open, format!("takes {} generations", self.needs));
+        }
+        if course.trials() < 2 && !course.certain {
+            return without(Verdict::Open, "takes 2 trials".into());
+        }
+        let found = (self.find)(view)?.find(column, of.clone(), course.certain, course.pois as f64);
+        found.or_else(|| without(Verdict::Undecided, "no pair differs".into()))
+    }
+}

@@ -1,0 +1,208 @@
+//! Statistics are scipy's, baselines are what a backend plays, and verdicts on the paper's claims follow from them.
+
+use std::sync::Mutex;
+
+use fearless_simd::Level;
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::{Backend, Group};
+use flotilla::baseline::{Baseline, Baselines};
+use flotilla::config::{Fitness, Override, Paradigm};
+use flotilla::credit::Credit;
+use flotilla::evolve::{self, Key, Purpose};
+use flotilla::report::paper::claims::{Claim, Verdict, claims};
+use flotilla::report::paper::{self, Arm, LAYOUTS, Results, SOURCES, Source, tables};
+use flotilla::statistics;
+use flotilla::world::World;
+use serde_json::Value;
+
+fn arms(trials: u32, generations: u32) -> Vec<Arm> {
+    let few = [("learning.trials", trials), ("learning.generations", generations), ("learning.seed", 3)];
+    paper::arms(&few.map(|(key, value)| Override::new(key, value, key))).unwrap()
+}
+
+#[test]
+fn intervals_and_tests_are_those_of_scipy() {
+    let cases: Value = serde_json::from_str(include_str!("statistics.json")).unwrap();
+    let list = |name: &str| cases[name].as_array().unwrap().clone();
+    let numbers = |value: &Value| value.as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect::<Vec<_>>();
+    let near = |ours: f64, theirs: &Value| {
+        let theirs = theirs.as_f64().unwrap();
+        assert!((ours - theirs).abs() <= 1e-9 * theirs.abs() + 1e-12, "{ours} is not {theirs}");
+    };
+    let [means, shares, spreads] = ["means", "shares", "spreads"].map(list);
+    assert!(means.len() > 5 && shares.len() > 20 && spreads.len() > 3);
+    for case in means {
+        let values = numbers(&case["values"]);
+        let mean = statistics::mean(&values, 1.0).unwrap();
+        near(mean.value, &case["mean"]);
+        near(mean.low, &case["low"]);
+        near(mean.high, &case["high"]);
+        near(statistics::p_value(&values).unwrap(), &case["p"]);
+    }
+    for case in shares {
+        let [count, of] = ["count", "of"].map(|key| case[key].as_u64().unwrap() as usize);
+        let share = statistics::share(count, of).unwrap();
+        near(share.value, &(count as f64 / of as f64).into());
+        near(share.low, &case["low"]);
+        near(share.high, &case["high"]);
+    }
+    for case in spreads {
+        let [one, other] = ["one", "other"].map(|key| statistics::distances(&numbers(&case[key])));
+        let less: Vec<f64> = one.iter().zip(&other).map(|(one, other)| one - other).collect();
+        near(statistics::mean(&less, 1.0).unwrap().value, &case["difference"]);
+        near(statistics::p_value(&less).unwrap(), &case["p"]);
+    }
+}
+
+#[test]
+fn values_that_are_all_alike_leave_room_for_what_was_not_seen() {
+    let unseen = statistics::share(0, 30).unwrap().high;
+    let mean = statistics::mean(&[4.0; 30], 1.0).unwrap();
+    assert_eq!((mean.low, mean.value, mean.high), (4.0 - unseen, 4.0, 4.0 + unseen));
+    assert_eq!(mean.within(0.0, 4.0).high, 4.0);
+    assert_eq!(statistics::p_value(&[0.0; 5]), Some(1.0));
+    assert_eq!(statistics::p_value(&[0.5; 5]), Some(2.0 / 32.0));
+    for few in [vec![], vec![1.0]] {
+        assert_eq!((statistics::mean(&few, 1.0), statistics::p_value(&few)), (None, None));
+    }
+    assert_eq!((statistics::share(0, 0), statistics::share(2, 1)), (None, None));
+}
+
+#[test]
+fn straight_ahead_solves_what_the_tables_say_and_random_teams_are_played() {
+    let arms = arms(2, 2);
+    let configs = paper::grounds(&arms);
+    let mut baselines = Baselines::new(configs.clone());
+    while !baselines.is_done() {
+        baselines.advance(&mut Cpu::default()).unwrap();
+    }
+    let found = baselines.found();
+    // All-leaders, then leader-follower, of each layout.
+    let straight: Vec<f64> = found.iter().map(|found| found.straight[1][2]).collect();
+    assert_eq!(straight, [0.0, 1.0, 0.0, 1.0, 1.0, 1.0]);
+    assert!(found.iter().any(|found| found.random[0] != found.random[1]), "trials draw the same");
+    for (config, found) in configs.iter().zip(&found) {
+        let world = World::new(config);
+        let (population, parameters) = (config.learning.population, world.parameters());
+        let mut best = 0.0f64;
+        for generation in 0..=2 {
+            let mut weights = Vec::new();
+            for leader in 0..world.leaders() {
+                for slot in 0..population {
+                    let mut policy = vec![0.0; parameters];
+                    let key = Key::new(3, 1, Purpose::Baseline).at(generation, leader, slot);
+                    evolve::random_policy(Level::new(), key, &mut policy);
+                    weights.extend(policy);
+                }
+            }
+            let teams: Vec<u32> = (0..population as u32).flat_map(|team| vec![team; world.leaders()]).collect();
+            let most = Mutex::new(0);
+            let group = Group {
+                world: &world,
+                starts: &world.starts,
+                weights: weights[..].into(),
+                policies: population,
+                teams: &teams,
+            };
+            let visit = |episode: flotilla::backend::Episode<'_>| {
+                let observed = Credit::default().all(&episode, &world).observed;
+                let mut most = most.lock().unwrap();
+                *most = observed.max(*most);
+            };
+            Cpu::default().rollout(&[group], &visit).unwrap();
+            best = best.max(f64::from(*most.lock().unwrap()) / world.pois.len() as f64);
+            assert_eq!(found.random[1][generation], best, "generation {generation}");
+        }
+    }
+}
+
+/// Claims of arms whose best teams come to a share of the POIs, by layout, paradigm, fitness, trial and generation.
+fn judged(trials: u32, generations: u32, g: impl Fn(&Arm, usize, usize) -> f64) -> Vec<Claim> {
+    let mut arms = arms(trials, generations);
+    for index in 0..arms.len() {
+        let course = |trial| (0..=generations as usize).map(|at| g(&arms[index], trial, at)).collect();
+        let best = (0..trials as usize).map(course).collect();
+        arms[index].best = best;
+    }
+    let none = vec![vec![0.0; generations as usize + 1]; trials as usize];
+    let baselines = vec![Baseline { straight: none.clone(), random: none }; 6];
+    claims(Results { arms: &arms, baselines: &baselines })
+}
+
+/// The verdict on the claim whose words have these, by source.
+fn verdict(claims: &[Claim], layout: usize, words: &str, source: Source) -> Verdict {
+    let is = |claim: &&Claim| claim.layout == LAYOUTS[layout].name && claim.words.contains(words);
+    let claim = claims.iter().find(is).unwrap();
+    claim.findings.iter().find(|found| SOURCES[found.column] == source).unwrap().verdict
+}
+
+const G: Source = Source::Evolved(Fitness::G);
+
+#[test]
+fn verdicts_are_as_strict_as_the_words() {
+    let led = |arm: &Arm| arm.paradigm == Paradigm::LeaderFollower;
+    let all_but = |exceptions: usize| {
+        move |arm: &Arm, trial: usize, at: usize| match led(arm) {
+            true if trial < exceptions && at == 70 => 0.75,
+            true => 1.0,
+            false => 0.0,
+        }
+    };
+    let consistently = |trials, exceptions| verdict(&judged(trials, 100, all_but(exceptions)), 0, "consistently", G);
+    assert_eq!(consistently(40, 0), Verdict::Yes);
+    assert_eq!(consistently(30, 0), Verdict::Undecided, "thirty do not speak for all");
+    assert_eq!(consistently(40, 1), Verdict::No, "one refutes all");
+
+    let perfect = judged(40, 100, all_but(0));
+    for (layout, words, expected) in [
+        (0, "less than a single POI", Verdict::Yes),
+        (0, "at least 3, on average", Verdict::Yes),
+        (1, "almost never", Verdict::Yes),
+        (1, "not as readily apparent", Verdict::Yes),
+        (1, "significantly higher", Verdict::Undecided),
+        (2, "high likelihood of random actions", Verdict::No),
+        (2, "some of the time", Verdict::No),
+        (2, "rather large variance", Verdict::No),
+        (2, "about a similar policy", Verdict::No),
+        (2, "comparable policy", Verdict::Yes),
+        (2, "much faster", Verdict::Yes),
+        (2, "more consistently", Verdict::Undecided),
+        (2, "more reliably", Verdict::Yes),
+        (2, "slight benefit", Verdict::Undecided),
+    ] {
+        assert_eq!(verdict(&perfect, layout, words, G), expected, "{words}");
+    }
+    // Straight ahead is the same in every trial: nothing is left to chance.
+    assert_eq!(verdict(&perfect, 0, "at least 3, on average", Source::Straight), Verdict::No);
+
+    // A mean of 3 with a spread: neither under nor over.
+    let around = judged(30, 100, |arm, trial, _| if led(arm) && trial % 2 == 0 { 1.0 } else { 0.5 });
+    assert_eq!(verdict(&around, 0, "at least 3, on average", G), Verdict::Undecided);
+    // Alone, half the POIs always: better than the paper says.
+    assert_eq!(verdict(&around, 0, "less than a single POI", G), Verdict::No);
+    assert_eq!(verdict(&around, 1, "almost never", G), Verdict::No);
+    assert_eq!(verdict(&around, 1, "more drastic", G), Verdict::Undecided);
+
+    // Df apart from G by a little, by much, and in spread.
+    let df = |arm: &Arm| arm.fitness == Fitness::Df;
+    let slight = judged(40, 100, |arm, trial, _| if df(arm) || trial % 5 > 0 { 1.0 } else { 0.75 });
+    assert_eq!(verdict(&slight, 2, "slight benefit", G), Verdict::Yes);
+    let great = judged(40, 100, |arm, _, _| if df(arm) { 1.0 } else { 0.5 });
+    assert_eq!(verdict(&great, 2, "slight benefit", G), Verdict::No);
+    let wild = judged(40, 100, |arm, trial, _| if df(arm) && trial % 2 > 0 { 0.0 } else { 1.0 });
+    assert_eq!(verdict(&wild, 1, "significantly higher", G), Verdict::Yes);
+    let calm = judged(40, 100, |arm, trial, _| if !df(arm) && trial % 2 > 0 { 0.0 } else { 1.0 });
+    assert_eq!(verdict(&calm, 1, "significantly higher", G), Verdict::No);
+    assert_eq!(verdict(&calm, 2, "some of the time", G), Verdict::Yes);
+    assert_eq!(verdict(&calm, 2, "rather large variance", G), Verdict::Yes);
+}
+
+#[test]
+fn what_a_run_is_too_short_for_stays_open() {
+    let short = judged(30, 39, |_, _, _| 1.0);
+    assert_eq!(verdict(&short, 0, "at least 3, on average", G), Verdict::Yes);
+    assert_eq!(verdict(&short, 0, "consistently", G), Verdict::Open);
+    assert!(tables::count(&short).contains(" open (too few generations or trials)"), "{}", tables::count(&short));
+    let single = judged(1, 100, |_, _, _| 1.0);
+    assert!(single.iter().flat_map(Claim::on_evolution).all(|found| found.verdict == Verdict::Open));
+}
