@@ -57,6 +57,9 @@ struct Arm {
     offered: bool,
 }
 
+/// What an arm came to: the policies of each trial, and the rest of the snapshot.
+pub type End<'a> = (Vec<&'a [f32]>, Snapshot<&'a [f32]>);
+
 /// Why there is no snapshot.
 #[derive(Debug, thiserror::Error)]
 pub enum SnapshotError {
@@ -231,7 +234,7 @@ impl Trainer {
 
     /// What came out of arms that are done: [`Trainer::best_policies`], and the snapshot after the last generation, whose
     /// weights are left out since they are the same in another order.
-    pub fn ends(&mut self, arms: &[usize]) -> Vec<(Vec<&[f32]>, Snapshot<&[f32]>)> {
+    pub fn ends(&mut self, arms: &[usize]) -> Vec<End<'_>> {
         for &arm in arms {
             let arm = &mut self.arms[arm];
             for index in 0..arm.trials.len() {

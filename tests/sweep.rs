@@ -803,7 +803,7 @@ fn the_batch_script_is_one_that_bash_takes() {
         assert!(script.lines().any(|found| found == line), "{line}: {script}");
     }
     assert!(!script.contains("--gpus"), "the CPU was asked for: {script}");
-    let host = ["--slurm", "--breed", "host", "--on-device-loss", "cpu"];
+    let host = ["--slurm", "--seed", "7", "--breed", "host", "--on-device-loss", "cpu"];
     let script_of_host = done(flotilla(&sweep, &out, &host));
     assert!(script_of_host.contains("--backend cpu --breed host --on-device-loss cpu --shard"), "{script_of_host}");
     assert!(
