@@ -407,7 +407,7 @@ pub fn layout(name: &str, config: &Config) -> Scene {
     let poi = |(&place, needed): (&[f64; 2], &u32)| Poi {
         place: place.into(),
         label: needed.to_string(),
-        share: 0.0,
+        share: None,
         observed: false,
     };
     let team = Team {
