@@ -694,7 +694,7 @@ fn what_training_tells_has_room_for_many_pois() {
     let said = succeed(&["train", &config, "--out", &out, "--backend", "cpu"]);
     let rows: Vec<Vec<&str>> = said
         .lines()
-        .filter(|line| line.starts_with("  ") && line.contains(" to "))
+        .filter(|line| line.starts_with("  ") && line.contains(" to 1"))
         .map(|line| line.split("  ").filter(|part| !part.is_empty()).map(str::trim).collect())
         .collect();
     assert_eq!(rows.len(), 2, "{said}");

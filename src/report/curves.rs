@@ -374,7 +374,7 @@ pub fn poi_ticks(pois: usize) -> Vec<usize> {
     let fits = |step: &usize| pois.is_multiple_of(*step) && (3..=6).contains(&(pois / step));
     let even = [1, 2, 5, 10, 20, 25, 50].into_iter().find(fits).or_else(|| (1..=pois).find(fits));
     let step = if pois <= 8 { 1 } else { even.unwrap_or(round_step(pois as f64 / 6.0) as usize) };
-    let ticks = (0..pois).step_by(step).filter(|tick| *tick == 0 || 2 * (pois - tick) >= step);
+    let ticks = (0..pois).step_by(step).filter(|tick| *tick == 0 || 12 * (pois - tick) >= pois);
     ticks.chain([pois]).collect()
 }
 

@@ -15,9 +15,9 @@ pub const GROUPS: [Color; 16] = [
     [0x00, 0x72, 0xb2],
     [0xd5, 0x5e, 0x00],
     [0x99, 0x33, 0x88],
-    [0x55, 0x22, 0x66],
-    [0x99, 0x77, 0xff],
     [0x66, 0x55, 0x11],
+    [0x99, 0x77, 0xff],
+    [0x55, 0x22, 0x66],
     [0x00, 0x00, 0xbb],
     [0xff, 0x11, 0xdd],
     [0x88, 0x33, 0x55],
@@ -286,8 +286,10 @@ impl View {
     }
 
     /// What the signs mean: how each is drawn at a place, and the words for it.
-    pub fn legend(&self, team: &Team, counts: &str) -> Legend {
+    pub fn legend(&self, teams: &[Team], counts: &str) -> Legend {
         let mut entries: Vec<Entry> = Vec::new();
+        let Some(team) = teams.first() else { return Legend::default() };
+        let mut pois = teams.iter().flat_map(|team| &team.pois);
         let up = DVec2::Y;
         let numbered = if team.leaders > 1 { "leader, by number" } else { "leader" };
         entries.push((
@@ -306,7 +308,7 @@ impl View {
                 Box::new(move |scene, [x, y]| arrow(scene, [x + 1.2, y - 0.8], up, 1.4, group, false)),
             ));
         }
-        if team.pois.iter().any(|poi| poi.observed) {
+        if pois.clone().any(|poi| poi.observed) {
             let (fill, pen) = (Fill { color: COLORS[2], opacity: 0.22 }, Pen::new(COLORS[2], 0.25));
             entries.push((
                 3.0,
@@ -314,7 +316,7 @@ impl View {
                 Box::new(move |scene, [x, y]| scene.circle([x + 1.2, y - 0.8], 1.2, Some(fill), Some(pen.clone()))),
             ));
         }
-        if team.pois.iter().any(|poi| !poi.observed) {
+        if pois.any(|poi| !poi.observed) {
             let pen = Pen { dash: &[0.7, 0.5], ..Pen::new(GREY, 0.25) };
             entries.push((
                 3.0,
@@ -407,7 +409,7 @@ pub fn layout(name: &str, config: &Config) -> Scene {
     let poi = |(&place, needed): (&[f64; 2], &u32)| Poi {
         place: place.into(),
         label: needed.to_string(),
-        share: Some(0.0),
+        share: None,
         observed: false,
     };
     let team = Team {
@@ -419,7 +421,7 @@ pub fn layout(name: &str, config: &Config) -> Scene {
     let view = View::new(config, [DVec2::ZERO, map], 80.0).moved_to([LEFT, HEAD]);
     let [width, height] = view.size();
     let radius = config.world.observation_radius;
-    let mut legend = view.legend(&team, "");
+    let mut legend = view.legend(std::slice::from_ref(&team), "");
     let alike = world.coupling.windows(2).all(|pair| pair[0] == pair[1]);
     let needs = match (world.coupling.first(), view.poi_labels(&team)) {
         (_, Some(_)) => format!("number at a POI: agents it needs, within {radius} of it"),

@@ -423,12 +423,7 @@ impl<'a> Stage<'a> {
         let view = View::new(config, busy(config, played), Self::SIDE);
         let width = view.size()[0].max(60.0);
         let teams: Vec<Team> = played.iter().map(|played| played.team(played.world.steps() as f64)).collect();
-        // The signs of that episode which has the most of them.
-        let most = teams.iter().max_by_key(|team| team.pois.iter().filter(|poi| poi.observed).count());
-        let mut legend = match most {
-            Some(team) => view.legend(team, "2/3: 2 agents near of 3 needed"),
-            None => Legend::default(),
-        };
+        let mut legend = view.legend(&teams, "2/3: 2 agents near of 3 needed");
         note.into_iter().for_each(|note| legend.note(note));
         Stage { played, view, width, legend }
     }
