@@ -231,7 +231,7 @@ fn a_sweep_from_standard_input_is_gone_on_with_from_its_folder() {
     let folder = tempfile::tempdir().unwrap();
     let sweep = SMALL.to_string() + "[grid]\n'learning.seed' = [1, 2]\n";
     let (told, _) = good(&folder, "sweep - --backend cpu -q --shard 1/2", &sweep);
-    assert!(told.contains("flotilla sweep runs/sweep/sweep.toml --out runs/sweep --collect"), "{told}");
+    assert!(told.contains("flotilla sweep runs/sweep/sweep.toml --out runs/sweep --backend cpu --collect"), "{told}");
     good(&folder, "sweep runs/sweep/sweep.toml --out runs/sweep --backend cpu -q --shard 2/2", "");
     let (all, _) = good(&folder, "sweep - --collect", &sweep);
     assert!(all.starts_with("2 of 2 points are done."), "{all}");
