@@ -119,10 +119,9 @@ fn straight_ahead_solves_what_the_tables_say_and_random_teams_are_played() {
 /// Claims of arms whose best teams come to a share of the POIs, by layout, paradigm, fitness, trial and generation.
 fn judged(trials: u32, generations: u32, g: impl Fn(&Arm, usize, usize) -> f64) -> Vec<Claim> {
     let mut arms = arms(trials, generations);
-    for index in 0..arms.len() {
-        let course = |trial| (0..=generations as usize).map(|at| g(&arms[index], trial, at)).collect();
-        let best = (0..trials as usize).map(course).collect();
-        arms[index].best = best;
+    for arm in &mut arms {
+        let course = |trial| (0..=generations as usize).map(|at| g(arm, trial, at)).collect();
+        arm.best = (0..trials as usize).map(course).collect();
     }
     let none = vec![vec![0.0; generations as usize + 1]; trials as usize];
     let baselines = vec![Baseline { straight: none.clone(), random: none }; 6];
