@@ -12,8 +12,9 @@ use flotilla::backend::gpu::device::{self, Request};
 use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, State, Task};
 use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::population::{Brood, Stretch};
-use flotilla::backend::{Backend, Group, Moment};
+use flotilla::backend::{Backend, Breeding, Group, Moment, Weights};
 use flotilla::config::{Config, Fitness};
+use flotilla::evolve::{Key, Purpose};
 use flotilla::trainer::Trainer;
 use flotilla::verify::{Outcome, Plan, compare};
 use flotilla::world::{Constants, World};
@@ -244,4 +245,54 @@ fn structs_lie_alike_on_both_sides() {
     check!("Brood", Brood, key, slots, parameters, parents, threshold, all, scaled, sigma);
     check!("Stretch", Stretch, leaders, first, count, parameters, teams, teams_a_task, choices, weights);
     check!("Moment", Moment, inputs, outputs, force, position, heading, speed);
+}
+
+/// What does not fit together is an error that says what, on every backend, before anything is played.
+#[test]
+fn a_wrong_index_is_an_error() {
+    let world = World::new(&Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap());
+    let (policies, leaders) = (3, world.leaders());
+    let weights = sample::weights(&world, policies, 1);
+    let teams: Vec<u32> = (0..2 * leaders as u32).map(|place| place % 3).collect();
+    let good = Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams };
+    let mut wrong = teams.clone();
+    wrong[leaders + 2] = 3;
+    let few = &weights[1..];
+    let bad: [(Group<'_>, &str); 4] = [
+        (Group { teams: &wrong, ..good }, "leader 2 of team 1 plays policy 3 of 3"),
+        (Group { teams: &teams[1..], ..good }, "7 choices"),
+        (Group { starts: &world.starts[1..], ..good }, "11 start positions for 12 agents"),
+        (Group { weights: few.into(), ..good }, "weights"),
+    ];
+    let mut backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::default())];
+    for (request, _) in common::adapters("a_wrong_index_is_an_error") {
+        backends.push(Box::new(GpuEpisodes::new(device::open(request).unwrap()).unwrap().holding(Holding::Always)));
+    }
+    for backend in &mut backends {
+        for (group, named) in &bad {
+            let played = backend.rollout(std::slice::from_ref(group), &|_| panic!("nothing is played"));
+            for error in [played.expect_err(named), backend.trace(group).map(drop).expect_err(named)] {
+                assert!(error.to_string().contains(named), "{}: {error}", backend.describe());
+            }
+        }
+        backend.rollout(&[good], &|_| ()).unwrap();
+        let sizes = [leaders, policies, world.parameters()];
+        let Some(mut held) = backend.hold(&weights, sizes).unwrap() else { continue };
+        let learning = Config::parse(include_str!("../configs/chaotic.toml"), "config").unwrap().learning;
+        let key = Key::new(0, 0, Purpose::Mutation);
+        for (parents, named) in [(vec![0; 11], "11 parents"), ([vec![0; 11], vec![3]].concat(), "policy 3 of 3")] {
+            let breeding = Breeding { parents: &parents, key, generation: 0, learning: &learning };
+            for error in [held.breed(&breeding).expect_err(named), breeding.on_host(sizes, &weights).expect_err(named)]
+            {
+                assert!(error.to_string().contains(named), "{}: {error}", backend.describe());
+            }
+        }
+        // What it holds is as it was, and no stand-in for populations of other sizes.
+        let mut found = vec![0.0; weights.len()];
+        held.fetch(&mut found).unwrap();
+        assert_eq!(found, weights);
+        let other = Group { weights: Weights::Held(&*held), policies: 4, ..good };
+        let error = backend.rollout(&[other], &|_| panic!("nothing is played")).expect_err("there are three");
+        assert!(error.to_string().contains("stand for"), "{error}");
+    }
 }

@@ -584,6 +584,7 @@ impl GpuEpisodes {
             let ours = |population: &&Population| self.kernels.as_ref().is_some_and(|k| population.is_of(k));
             let population = (held as &dyn Any).downcast_ref().filter(ours).ok_or(BackendError::HeldElsewhere)?;
             let leaders = group.world.leaders();
+            population.check([leaders, group.policies, group.world.parameters()])?;
             let teams: u32 = shares.iter().map(|share| share.task.teams).sum();
             for first in (0..leaders).step_by(TOGETHER) {
                 let stretch = Stretch {
@@ -626,7 +627,7 @@ impl GpuEpisodes {
 
     fn prepare_pipeline(&mut self, shape: Shape) -> Result<(), DeviceError> {
         if let Entry::Vacant(entry) = self.pipelines.entry(shape) {
-            entry.insert(self.gpu.pipeline("episode", &(self.edit)(source(shape)), "episode", &self.layout)?);
+            entry.insert(self.gpu.own_pipeline("episode", &(self.edit)(source(shape)), "episode", &self.layout)?);
         }
         Ok(())
     }
@@ -675,6 +676,7 @@ pub fn shaders() -> Vec<(&'static str, String)> {
 
 impl Backend for GpuEpisodes {
     fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
+        groups.iter().try_for_each(Group::check)?;
         self.play(groups, false, &|share, record, _| {
             let world = groups[share.group].world;
             let Task { sets, seen, teams, .. } = share.task;
@@ -693,6 +695,7 @@ impl Backend for GpuEpisodes {
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
+        group.check()?;
         let world = group.world;
         let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
         let (set_words, seen_words) = (world.set_words(), world.leaders() * world.followers());

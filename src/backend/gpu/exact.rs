@@ -498,7 +498,11 @@ fn check_limits(module: &Module, limits: &wgpu::Limits) -> Result<(), ShaderErro
 /// guard) on; errors of the driver go to the device's error scopes.
 ///
 /// Unless `checked`, shaders run without bounds checks, loop bounds, division checks and zeroed workgroup memory.
-pub fn compile(
+///
+/// # Safety
+/// As of [`super::device::Gpu::pipeline`].
+#[allow(unsafe_code)]
+pub(super) unsafe fn compile(
     device: &wgpu::Device,
     label: &str,
     wgsl: &str,
@@ -525,8 +529,7 @@ pub fn compile(
                 ..Default::default()
             };
             // SAFETY: naga validated the module and wrote the SPIR-V, to which only decorations were added; limits were
-            // checked above; the shaders are this crate's own, whose loops end and whose indices are in bounds.
-            #[allow(unsafe_code)]
+            // checked above; the rest is the caller's.
             return Ok(unsafe { device.create_shader_module_passthrough(descriptor) });
         }
         Pass::Guarded => guarded(&module)?,
@@ -537,8 +540,6 @@ pub fn compile(
     if checked {
         return Ok(device.create_shader_module(descriptor));
     }
-    // SAFETY: wgpu validates the module; the shaders are this crate's own, whose loops end and whose indices are in
-    // bounds, as the checked builds in the tests show.
-    #[allow(unsafe_code)]
+    // SAFETY: wgpu validates the module; the rest is the caller's.
     Ok(unsafe { device.create_shader_module_trusted(descriptor, wgpu::ShaderRuntimeChecks::unchecked()) })
 }
