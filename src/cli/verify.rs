@@ -7,7 +7,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::{Error, print};
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu::device::{self, AdapterInfo, Choice, DeviceError, Request};
-use crate::backend::gpu::episode::{GpuEpisodes, Holding};
+use crate::backend::gpu::episode::{GpuEpisodes, Holding, Kernel};
 use crate::backend::gpu::exact::Pass;
 use crate::config::Config;
 use crate::verify::{Outcome, Plan, compare};
@@ -31,12 +31,16 @@ pub struct Args {
     /// Only this pass, instead of all exact ones that the adapter takes; `plain` shows what the passes are for
     #[arg(long, value_name = "PASS", value_parser = ["no-contraction", "guarded", "plain"])]
     pass: Option<String>,
+    /// Only this kernel, instead of both
+    #[arg(long, value_name = "KERNEL", value_parser = ["generic", "specialised"])]
+    kernel: Option<String>,
 }
 
 /// One line of the table; an error of the device counts as a failure.
 struct Line {
     adapter: String,
     pass: Pass,
+    kernel: Kernel,
     result: Result<Outcome, Error>,
 }
 
@@ -46,30 +50,35 @@ impl Line {
     }
 }
 
-/// Prints a table of adapters and passes, and after it what differs.
+/// Prints a table of adapters, passes and kernels, and after it what differs.
 pub fn run(args: Args) -> Result<(), Error> {
     let plan = plan(&args)?;
     let adapters = adapters(args.adapter.as_deref())?;
     let mut lines = Vec::new();
     for (choice, info) in adapters {
         for pass in passes(args.pass.as_deref(), &info) {
-            let request = Request { pass: Some(pass), ..choice.clone().into() };
-            lines.push(Line { adapter: info.to_string(), pass, result: verify(&plan, request, &info) });
+            for kernel in kernels(args.kernel.as_deref()) {
+                let request = Request { pass: Some(pass), ..choice.clone().into() };
+                let result = verify(&plan, request, kernel, &info);
+                lines.push(Line { adapter: info.to_string(), pass, kernel, result });
+            }
         }
     }
-    let mut text = format!("{:<15} {:>7} {:>13} {:<10} adapter\n", "pass", "worlds", "agent-steps", "result");
+    let mut text =
+        format!("{:<15} {:<12} {:>7} {:>13} {:<10} adapter\n", "pass", "kernel", "worlds", "agent-steps", "result");
     for line in &lines {
         let (worlds, agent_steps) =
             line.result.as_ref().map_or((0, 0), |outcome| (outcome.worlds, outcome.agent_steps));
         let result = if line.failed() { "DIFFERENT" } else { "equal" };
-        text += &format!("{:<15} {worlds:>7} {agent_steps:>13} {result:<10} {}\n", line.pass, line.adapter);
+        let Line { adapter, pass, kernel, .. } = line;
+        text += &format!("{pass:<15} {kernel:<12} {worlds:>7} {agent_steps:>13} {result:<10} {adapter}\n");
     }
     for line in lines.iter().filter(|line| line.failed()) {
         let what = match &line.result {
             Ok(outcome) => outcome.mismatch.clone().unwrap_or_default(),
             Err(error) => error.to_string(),
         };
-        text += &format!("\n{}, {} pass:\n  {what}\n", line.adapter, line.pass);
+        text += &format!("\n{}, {} pass, {} kernel:\n  {what}\n", line.adapter, line.pass, line.kernel);
     }
     print(&text)?;
     match lines.iter().filter(|line| line.failed()).count() {
@@ -116,8 +125,13 @@ fn passes(name: Option<&str>, info: &AdapterInfo) -> Vec<Pass> {
     }
 }
 
-fn verify(plan: &Plan, request: Request, info: &AdapterInfo) -> Result<Outcome, Error> {
-    let pass = request.pass.map_or_else(String::new, |pass| format!(", {pass} pass"));
+fn kernels(name: Option<&str>) -> impl Iterator<Item = Kernel> {
+    let all = [Kernel::Generic, Kernel::Specialised];
+    all.into_iter().filter(move |kernel| name.is_none_or(|name| kernel.to_string() == name))
+}
+
+fn verify(plan: &Plan, request: Request, kernel: Kernel, info: &AdapterInfo) -> Result<Outcome, Error> {
+    let pass = request.pass.map_or_else(String::new, |pass| format!(", {pass} pass, {kernel} kernel"));
     let bar = ProgressBar::new(plan.worlds.len() as u64).with_message(format!("{}{pass}", info.name));
     bar.set_style(
         ProgressStyle::with_template("{msg}: {pos}/{len} worlds {wide_bar} {eta}").expect("a valid template"),
@@ -126,7 +140,7 @@ fn verify(plan: &Plan, request: Request, info: &AdapterInfo) -> Result<Outcome, 
     if let Some(mismatch) = gpu.self_test()? {
         return Ok(Outcome { mismatch: Some(mismatch.to_string()), ..Outcome::default() });
     }
-    let mut gpu = GpuEpisodes::new(gpu)?.holding(Holding::Always);
+    let mut gpu = GpuEpisodes::new(gpu)?.playing(kernel).holding(Holding::Always);
     let outcome = compare(plan, &mut Cpu::default(), &mut gpu, |outcome| bar.set_position(outcome.worlds as u64))?;
     bar.finish_and_clear();
     Ok(outcome)

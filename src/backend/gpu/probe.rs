@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use wgpu::BufferUsages;
 
-use super::device::{Binding, DeviceError, Gpu};
-use super::episode::GpuEpisodes;
+use super::device::{Binding, DeviceError, Gpu, Kind};
+use super::episode::{GpuEpisodes, Kernel};
 use super::population::Kernels;
 use crate::backend::compare::first_mismatch;
 use crate::backend::cpu::Cpu;
@@ -129,7 +129,11 @@ fn episode(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
         Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies: TEAMS, teams: &teams };
     let traced = |error| refused(gpu, error);
     let expected = Cpu::default().trace(&group).map_err(traced)?;
-    let found = GpuEpisodes::new(gpu.clone())?.trace(&group).map_err(traced)?;
+    let mut episodes = GpuEpisodes::new(gpu.clone())?;
+    if gpu.adapter.kind != Kind::Software {
+        episodes = episodes.playing(Kernel::Specialised);
+    }
+    let found = episodes.trace(&group).map_err(traced)?;
     Ok(first_mismatch(&world, &expected, &found).map(|mismatch| Mismatch {
         probe: format!("an episode, {mismatch}").into(),
         values: Vec::new(),
