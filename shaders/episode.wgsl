@@ -1,130 +1,138 @@
 // Whole episodes: a workgroup plays some teams from start to end, state in registers and workgroup memory. Long ones
 // take several dispatches, with the state kept in between.
 //
-// The host puts these constants in front:
+// One text for two kernels. In one made for its world all sizes are constants; in the generic one they are read with
+// the task (`generic.wgsl`). The host puts in front:
 //   WORKGROUP  threads of a workgroup
 //   SLOTS      agents a thread plays, one after another
 //   SHARED     agents of a workgroup's teams
-//   WIDEST     widest layer of any policy, inputs included
 //   TRACE      whether every stage of every step is kept
+//   TALLY      whether a follower counts the leaders that it sees in registers (SIGHTS of them), not in the record
+//   shape      the sizes
+//   adopt      readies them
+//   decide     a leader's policy
 //
-// Roles are packed: the leaders of all teams come first, followers start at the next multiple of ROLE threads, so
+// Neighbouring threads play the same agent of neighbouring teams: they do the same, read neighbouring weights, and are
+// often all out of reach of the same agent. Leaders come first, followers start at the next multiple of ROLE threads, so
 // that the two rarely share a warp.
 
 const ROLE: u32 = 32u;
 
+// What is fixed for a whole kernel, or for a task.
+struct Shape {
+    leaders: u32,
+    agents: u32,
+    pois: u32,
+    words: u32,
+    // Teams of a workgroup; a task may have fewer.
+    teams: u32,
+    density: u32,
+    // Whether the largest turn is so small that its sine tells angles apart, not its cosine.
+    by_sine: bool,
+}
+
 // This task's world.
 var<private> world: World;
 
-// Positions of all agents, `[teams][agents]`, as of the last step.
-var<workgroup> positions: array<vec2<f32>, SHARED>;
+// Positions of all agents, `[agents][teams]`, as of the last step, and as of this step: the two take turns, so that one
+// barrier a step is enough.
+var<workgroup> positions: array<vec2<f32>, 2u * SHARED>;
 
 // What one thread plays: an agent of a team, with its state and what it wants next.
 struct Agent {
     plays: bool,
     team: u32,
     agent: u32,
+    // Its place in `positions`.
+    seat: u32,
     x: f32,
     y: f32,
     hx: f32,
     hy: f32,
     speed: f32,
     next: Course,
+    // How often it saw each leader.
+    seen: array<u32, SIGHTS>,
     // For the trace: what was sensed and answered, or the force.
-    inputs: array<f32, 8>,
-    outputs: array<f32, 2>,
+    of_pois: vec4<f32>,
+    of_agents: vec4<f32>,
+    outputs: vec2<f32>,
     force: vec2<f32>,
 }
 
 // The agent that place `index` of the workgroup plays.
-fn seat(index: u32, teams: u32) -> Agent {
+fn find_seat(index: u32, teams: u32) -> Agent {
     var agent: Agent;
-    let leaders = teams * world.leaders;
+    let leaders = shape.teams * shape.leaders;
     let first_follower = (leaders + ROLE - 1u) / ROLE * ROLE;
-    if index < leaders {
-        agent.plays = true;
-        agent.team = index / world.leaders;
-        agent.agent = index % world.leaders;
-    } else if index >= first_follower && index - first_follower < teams * world.followers {
-        agent.plays = true;
-        agent.team = (index - first_follower) / world.followers;
-        agent.agent = world.leaders + (index - first_follower) % world.followers;
-    }
+    let follows = index >= first_follower;
+    agent.seat = select(index, index - first_follower + leaders, follows);
+    agent.team = agent.seat % shape.teams;
+    agent.agent = agent.seat / shape.teams;
+    agent.plays = (follows || index < leaders) && agent.agent < shape.agents && agent.team < teams;
     return agent;
 }
 
-// A leader senses POIs, then the other agents, and decides.
-fn lead(task: Task, me: ptr<function, Agent>) {
-    let agents = world.leaders + world.followers;
-    let team = (*me).team;
+// A leader senses POIs, then the other agents, and decides. Its team's positions start at `first`.
+fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
     let leader = (*me).agent;
     let x = (*me).x;
     let y = (*me).y;
     let hx = (*me).hx;
     let hy = (*me).hy;
-    var inputs: array<f32, WIDEST>;
-    var sums = array<f32, 4>(0.0, 0.0, 0.0, 0.0);
-    for (var poi = 0u; poi < world.pois; poi++) {
+    var sums = vec4(0.0);
+    for (var poi = 0u; poi < shape.pois; poi++) {
         let place = places[task.pois + poi];
         let dx = place.x - x;
         let dy = place.y - y;
         sense(density(world.poi_range2, dx, dy), dx, dy, hx, hy, &sums);
     }
-    for (var quadrant = 0u; quadrant < 4u; quadrant++) {
-        inputs[quadrant] = sums[quadrant] * world.poi_share;
-    }
-    sums = array<f32, 4>(0.0, 0.0, 0.0, 0.0);
-    for (var other = 0u; other < agents; other++) {
-        let place = positions[team * agents + other];
-        if other != leader {
-            let dx = place.x - x;
-            let dy = place.y - y;
+    let of_pois = sums * world.poi_share;
+    sums = vec4(0.0);
+    for (var other = 0u; other < shape.agents; other++) {
+        let place = positions[first + other * shape.teams];
+        let dx = place.x - x;
+        let dy = place.y - y;
+        // Who is out of reach adds 0: a warp goes past whoever is out of reach of all of it.
+        if dx * dx + dy * dy <= world.agent_range2 && other != leader {
             sense(density(world.agent_range2, dx, dy), dx, dy, hx, hy, &sums);
         }
     }
-    for (var quadrant = 0u; quadrant < 4u; quadrant++) {
-        inputs[4u + quadrant] = sums[quadrant] * world.agent_share;
-    }
+    let of_agents = sums * world.agent_share;
+    let lane = task.weights + leader * task.teams + (*me).team;
+    let outputs = decide(lane, shape.leaders * task.teams, of_pois, of_agents);
     if TRACE {
-        for (var input = 0u; input < 8u; input++) {
-            (*me).inputs[input] = inputs[input];
-        }
+        (*me).of_pois = of_pois;
+        (*me).of_agents = of_agents;
+        (*me).outputs = outputs;
     }
-    let stride = task.teams * world.leaders;
-    var first = task.weights + team * world.leaders + leader;
-    for (var layer = 0u; layer < world.layers; layer++) {
-        let rows = world.widths[layer];
-        let columns = world.widths[layer + 1u];
-        var units: array<f32, WIDEST>;
-        for (var column = 0u; column < columns; column++) {
-            let sum = tame(weigh(&inputs, rows, first + column * stride, columns * stride));
-            units[column] = whole_tangent(half_tangent(sum));
-        }
-        inputs = units;
-        first += (rows + 1u) * columns * stride;
-    }
-    if TRACE {
-        (*me).outputs = array<f32, 2>(inputs[0], inputs[1]);
-    }
-    let heading = turn(hx, hy, wanted_turn(inputs[0]));
-    (*me).next = Course(heading.x, heading.y, wanted_speed(inputs[1]));
+    let heading = turn(hx, hy, wanted_turn(outputs.x));
+    (*me).next = Course(heading.x, heading.y, wanted_speed(outputs.y));
 }
 
-// A follower counts the leaders that it sees and follows whoever is near.
-fn follow(task: Task, me: ptr<function, Agent>) {
-    let agents = world.leaders + world.followers;
-    let team = (*me).team;
-    let agent = (*me).agent;
+// Where a follower's count of a leader stands in the record.
+fn sight(task: Task, me: ptr<function, Agent>, leader: u32) -> u32 {
+    return task.seen + (((*me).agent - shape.leaders) * shape.leaders + leader) * task.teams + (*me).team;
+}
+
+// A follower counts the leaders that it sees and follows whoever is near. Its team's positions start at `first`.
+fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
     let x = (*me).x;
     let y = (*me).y;
     var sums = Sums();
-    for (var other = 0u; other < agents; other++) {
-        let place = positions[team * agents + other];
-        if other != agent {
-            let seen = influence(place.x - x, place.y - y, &sums);
-            if seen && other < world.leaders {
-                record[task.seen + ((agent - world.leaders) * world.leaders + other) * task.teams + team] += 1u;
-            }
+    for (var leader = 0u; leader < shape.leaders; leader++) {
+        let place = positions[first + leader * shape.teams];
+        let seen = u32(influence(place.x - x, place.y - y, &sums));
+        if TALLY {
+            (*me).seen[leader] += seen;
+        } else if seen != 0u {
+            record[sight(task, me, leader)] += seen;
+        }
+    }
+    for (var other = shape.leaders; other < shape.agents; other++) {
+        let place = positions[first + other * shape.teams];
+        if other != (*me).agent {
+            influence(place.x - x, place.y - y, &sums);
         }
     }
     let pull = force(sums, x, y);
@@ -147,35 +155,41 @@ fn go(me: ptr<function, Agent>) {
     (*me).speed = speed;
 }
 
-// Records who is near each POI after a step: one thread a POI, word and team.
-fn couple(task: Task, step: u32, thread: u32) {
-    let agents = world.leaders + world.followers;
-    let rows = world.pois * world.words;
-    for (var item = thread; item < rows * task.teams; item += WORKGROUP) {
-        let team = item % task.teams;
-        let row = item / task.teams;
-        let place = places[task.pois + row / world.words];
-        let first = row % world.words * 32u;
-        let last = min(first + 32u, agents);
-        var near = 0u;
-        for (var agent = first; agent < last; agent++) {
-            let at = positions[team * agents + agent];
-            near |= select(0u, 1u << (agent - first), observes(place.x - at.x, place.y - at.y));
+// Records who is near each POI after a step, of positions from `now` on: one thread a POI, word and team, from the last
+// thread on, since followers are done before leaders.
+fn couple(task: Task, step: u32, now: u32, thread: u32) {
+    let rows = shape.pois * shape.words;
+    for (var item = WORKGROUP - 1u - thread; item < rows * shape.teams; item += WORKGROUP) {
+        let team = item % shape.teams;
+        let row = item / shape.teams;
+        if team < task.teams {
+            let place = places[task.pois + row / shape.words];
+            let first = row % shape.words * 32u;
+            let last = min(first + 32u, shape.agents);
+            var near = 0u;
+            for (var agent = first; agent < last; agent++) {
+                let at = positions[now + agent * shape.teams + team];
+                near |= select(0u, 1u << (agent - first), observes(place.x - at.x, place.y - at.y));
+            }
+            record[task.sets + (step * rows + row) * task.teams + team] = near;
         }
-        record[task.sets + step * rows * task.teams + item] = near;
     }
 }
 
 fn trace(task: Task, step: u32, me: ptr<function, Agent>) {
-    let agents = world.leaders + world.followers;
+    let of_pois = (*me).of_pois;
+    let of_agents = (*me).of_agents;
     var moment: Moment;
-    moment.inputs = (*me).inputs;
-    moment.outputs = (*me).outputs;
+    for (var quadrant = 0u; quadrant < 4u; quadrant++) {
+        moment.inputs[quadrant] = of_pois[quadrant];
+        moment.inputs[4u + quadrant] = of_agents[quadrant];
+    }
+    moment.outputs = array<f32, 2>((*me).outputs.x, (*me).outputs.y);
     moment.force = array<f32, 2>((*me).force.x, (*me).force.y);
     moment.position = array<f32, 2>((*me).x, (*me).y);
     moment.heading = array<f32, 2>((*me).hx, (*me).hy);
     moment.speed = (*me).speed;
-    moments[task.moments + (step * task.teams + (*me).team) * agents + (*me).agent] = moment;
+    moments[task.moments + (step * task.teams + (*me).team) * shape.agents + (*me).agent] = moment;
 }
 
 // The start of an episode.
@@ -186,9 +200,8 @@ fn begin(task: Task, me: ptr<function, Agent>) {
     (*me).hx = world.heading_x;
     (*me).hy = world.heading_y;
     (*me).speed = world.speed;
-    for (var leader = 0u; leader < world.leaders && (*me).agent >= world.leaders; leader++) {
-        let pair = ((*me).agent - world.leaders) * world.leaders + leader;
-        record[task.seen + pair * task.teams + (*me).team] = 0u;
+    for (var leader = 0u; !TALLY && leader < shape.leaders && (*me).agent >= shape.leaders; leader++) {
+        record[sight(task, me, leader)] = 0u;
     }
     if TRACE {
         trace(task, 0u, me);
@@ -197,12 +210,26 @@ fn begin(task: Task, me: ptr<function, Agent>) {
 
 // Where the dispatch before this one left off.
 fn resume(task: Task, me: ptr<function, Agent>) {
-    let state = states[task.states + (*me).team * (world.leaders + world.followers) + (*me).agent];
+    let state = states[task.states + (*me).team * shape.agents + (*me).agent];
     (*me).x = state.x;
     (*me).y = state.y;
     (*me).hx = state.hx;
     (*me).hy = state.hy;
     (*me).speed = state.speed;
+    for (var leader = 0u; TALLY && leader < shape.leaders && (*me).agent >= shape.leaders; leader++) {
+        (*me).seen[leader] = record[sight(task, me, leader)];
+    }
+}
+
+// What is left at the end of a dispatch.
+fn leave(task: Task, me: ptr<function, Agent>) {
+    for (var leader = 0u; TALLY && leader < shape.leaders && (*me).agent >= shape.leaders; leader++) {
+        record[sight(task, me, leader)] = (*me).seen[leader];
+    }
+    if task.end < world.steps {
+        let state = State((*me).x, (*me).y, (*me).hx, (*me).hy, (*me).speed);
+        states[task.states + (*me).team * shape.agents + (*me).agent] = state;
+    }
 }
 
 @compute @workgroup_size(WORKGROUP)
@@ -215,52 +242,50 @@ fn episode(
     let index = workgroup.y * workgroups.x + workgroup.x;
     let task = tasks[index];
     world = worlds[task.world];
-    let agents = world.leaders + world.followers;
+    adopt(task);
 
-    var team: array<Agent, SLOTS>;
+    var crew: array<Agent, SLOTS>;
     for (var slot = 0u; slot < SLOTS; slot++) {
-        var me = seat(slot * WORKGROUP + thread, task.teams);
+        var me = find_seat(slot * WORKGROUP + thread, task.teams);
         if me.plays {
             if task.first == 0u {
                 begin(task, &me);
             } else {
                 resume(task, &me);
             }
-            positions[me.team * agents + me.agent] = vec2(me.x, me.y);
+            positions[me.seat] = vec2(me.x, me.y);
         }
-        team[slot] = me;
+        crew[slot] = me;
     }
     workgroupBarrier();
 
+    var now = 0u;
     for (var step = task.first; step < task.end; step++) {
+        let next = SHARED - now;
         for (var slot = 0u; slot < SLOTS; slot++) {
-            var me = team[slot];
+            var me = crew[slot];
             if me.plays {
-                if me.agent < world.leaders {
-                    lead(task, &me);
+                if me.agent < shape.leaders {
+                    lead(task, now + me.team, &me);
                 } else {
-                    follow(task, &me);
+                    follow(task, now + me.team, &me);
                 }
                 go(&me);
+                positions[next + me.seat] = vec2(me.x, me.y);
                 if TRACE {
                     trace(task, step + 1u, &me);
                 }
             }
-            team[slot] = me;
+            crew[slot] = me;
         }
         workgroupBarrier();
-        for (var slot = 0u; slot < SLOTS; slot++) {
-            if team[slot].plays {
-                positions[team[slot].team * agents + team[slot].agent] = vec2(team[slot].x, team[slot].y);
-            }
-        }
-        workgroupBarrier();
-        couple(task, step, thread);
+        couple(task, step, next, thread);
+        now = next;
     }
-    for (var slot = 0u; slot < SLOTS && task.end < world.steps; slot++) {
-        if team[slot].plays {
-            let me = team[slot];
-            states[task.states + me.team * agents + me.agent] = State(me.x, me.y, me.hx, me.hy, me.speed);
+    for (var slot = 0u; slot < SLOTS; slot++) {
+        var me = crew[slot];
+        if me.plays {
+            leave(task, &me);
         }
     }
 }

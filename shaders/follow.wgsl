@@ -4,10 +4,10 @@
 struct Sums {
     repel_x: f32,
     repel_y: f32,
-    repel_count: f32,
+    repel_count: u32,
     attract_x: f32,
     attract_y: f32,
-    attract_count: f32,
+    attract_count: u32,
 }
 
 // A heading and the wanted speed along it.
@@ -20,15 +20,16 @@ struct Course {
 // Adds the agent at offset (`dx`, `dy`); tells whether it is within the attraction radius.
 fn influence(dx: f32, dy: f32, sums: ptr<function, Sums>) -> bool {
     let d2 = dx * dx + dy * dy;
-    let near = d2 <= world.repulsion_radius2;
     let seen = d2 <= world.attraction_radius2;
-    let far = seen && !near;
-    (*sums).repel_x += select(0.0, dx, near);
-    (*sums).repel_y += select(0.0, dy, near);
-    (*sums).repel_count += select(0.0, 1.0, near);
-    (*sums).attract_x += select(0.0, dx, far);
-    (*sums).attract_y += select(0.0, dy, far);
-    (*sums).attract_count += select(0.0, 1.0, far);
+    if seen {
+        let near = d2 <= world.repulsion_radius2;
+        (*sums).repel_x += select(0.0, dx, near);
+        (*sums).repel_y += select(0.0, dy, near);
+        (*sums).repel_count += u32(near);
+        (*sums).attract_x += select(dx, 0.0, near);
+        (*sums).attract_y += select(dy, 0.0, near);
+        (*sums).attract_count += u32(!near);
+    }
     return seen;
 }
 
@@ -50,13 +51,13 @@ fn walls(at: f32, size: f32) -> vec2<f32> {
 
 // The sum of repulsion, attraction and wall push at a place: mean offsets, scaled by gain over radius.
 fn force(sums: Sums, x: f32, y: f32) -> Pull {
-    let repel = recip(select(1.0, sums.repel_count, sums.repel_count > 1.0)) * world.repulsion_scale;
-    let attract = recip(select(1.0, sums.attract_count, sums.attract_count > 1.0)) * world.attraction_scale;
+    let repel = recip(f32(max(sums.repel_count, 1u))) * world.repulsion_scale;
+    let attract = recip(f32(max(sums.attract_count, 1u))) * world.attraction_scale;
     let walls_x = walls(x, world.map_x);
     let walls_y = walls(y, world.map_y);
     let force_x = sums.attract_x * attract - sums.repel_x * repel + walls_x.x;
     let force_y = sums.attract_y * attract - sums.repel_y * repel + walls_y.x;
-    let influenced = sums.repel_count + sums.attract_count > 0.0 || walls_x.y >= 0.0 || walls_y.y >= 0.0;
+    let influenced = sums.repel_count + sums.attract_count > 0u || walls_x.y >= 0.0 || walls_y.y >= 0.0;
     return Pull(flush(force_x, TINY), flush(force_y, TINY), influenced);
 }
 
@@ -82,7 +83,7 @@ fn steer(pull: Pull, sizes: vec2<f32>, hx: f32, hy: f32, speed: f32) -> Course {
     let pulled = force2 > 0.0;
     // A cosine near 1 cannot tell small angles apart, a sine near 1 cannot tell large ones. Without a force, `along` is 0.
     var reached = along >= world.max_turn_cos && pulled;
-    if world.max_turn_cos > 0.7 {
+    if shape.by_sine {
         reached = along > 0.0 && abs(across) <= world.max_turn_sin;
     }
     let next_x = select(select(hx, turned.x, pulled), ux, reached);

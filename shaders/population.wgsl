@@ -51,8 +51,8 @@ struct Stretch {
 @group(0) @binding(1) var<storage, read> stretch: Stretch;
 // The policy that each leader plays in each team, `[teams][leaders]`.
 @group(0) @binding(2) var<storage, read> choices: array<u32>;
-// Of each task `[parameters][teams][leaders]`.
-@group(0) @binding(4) var<storage, read_write> weights: array<f32>;
+// Of each task `[fours of a policy's weights][leaders][teams]`.
+@group(0) @binding(4) var<storage, read_write> weights: array<vec4<f32>>;
 // The policies of the leaders after the first.
 @group(0) @binding(5) var<storage, read> policies_1: array<f32>;
 @group(0) @binding(6) var<storage, read> policies_2: array<f32>;
@@ -119,7 +119,7 @@ fn breed(
 
 const TILE: u32 = 32u;
 
-// Weights of some teams' leaders, `[teams][leaders][parameters]`, rows apart by one more word so that columns spread over
+// Weights of some teams' leaders, `[leaders][teams][parameters]`, rows apart by one more word so that columns spread over
 // all banks.
 var<workgroup> tile: array<f32, TILE * (TILE + 1u)>;
 
@@ -133,8 +133,7 @@ fn weight_of(leader: u32, index: u32) -> f32 {
     }
 }
 
-// One workgroup turns a tile of weights: it reads along policies and writes along leaders and teams, whole lines of
-// memory where four leaders are all.
+// One workgroup turns a tile of weights: it reads along policies, and writes along teams, four weights at a time.
 @compute @workgroup_size(WORKGROUP)
 fn gather(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -144,29 +143,35 @@ fn gather(
     let across = (stretch.parameters + TILE - 1u) / TILE;
     let index = workgroup.y * workgroups.x + workgroup.x;
     let first_lane = index / across * TILE;
-    let lanes = stretch.teams * stretch.count;
+    let lanes = stretch.count * stretch.teams;
     let first_parameter = index % across * TILE;
     let column = thread % TILE;
     for (var row = thread / TILE; row < TILE; row += WORKGROUP / TILE) {
         let lane = first_lane + row;
         let parameter = first_parameter + column;
+        // The last four weights of a policy may be fewer.
+        var weight = 0.0;
         if lane < lanes && parameter < stretch.parameters {
-            let leader = lane % stretch.count;
-            let policy = choices[stretch.choices + lane / stretch.count * stretch.leaders + stretch.first + leader];
-            tile[row * (TILE + 1u) + column] = weight_of(leader, policy * stretch.parameters + parameter);
+            let leader = lane / stretch.teams;
+            let choice = lane % stretch.teams * stretch.leaders + stretch.first + leader;
+            weight = weight_of(leader, choices[stretch.choices + choice] * stretch.parameters + parameter);
         }
+        tile[row * (TILE + 1u) + column] = weight;
     }
     workgroupBarrier();
     let lane = first_lane + column;
-    let team = lane / stretch.count;
+    let team = lane % stretch.teams;
+    let leader = stretch.first + lane / stretch.teams;
     let before = team / stretch.teams_a_task * stretch.teams_a_task;
     let teams = min(stretch.teams_a_task, stretch.teams - before);
-    let task = stretch.weights + before * stretch.leaders * stretch.parameters;
-    for (var row = thread / TILE; row < TILE && lane < lanes; row += WORKGROUP / TILE) {
-        let parameter = first_parameter + row;
-        if parameter < stretch.parameters {
-            let place = (parameter * teams + team - before) * stretch.leaders + stretch.first + lane % stretch.count;
-            weights[task + place] = tile[column * (TILE + 1u) + row];
+    let fours = (stretch.parameters + 3u) / 4u;
+    let task = stretch.weights + before * stretch.leaders * fours;
+    for (var row = thread / TILE; row < TILE / 4u && lane < lanes; row += WORKGROUP / TILE) {
+        let four = first_parameter / 4u + row;
+        if four < fours {
+            let start = column * (TILE + 1u) + 4u * row;
+            let some = vec4(tile[start], tile[start + 1u], tile[start + 2u], tile[start + 3u]);
+            weights[task + (four * stretch.leaders + leader) * teams + team - before] = some;
         }
     }
 }

@@ -4,7 +4,7 @@
 fn density(range2: f32, dx: f32, dy: f32) -> f32 {
     let d2 = dx * dx + dy * dy;
     var density: f32;
-    if world.density == 0u {
+    if shape.density == 0u {
         density = 1.0 - root(d2) * world.inverse_diagonal;
     } else {
         density = rsqrt(select(1.0, d2, d2 > 1.0));
@@ -17,15 +17,13 @@ fn density(range2: f32, dx: f32, dy: f32) -> f32 {
 //
 // The quadrant is read off the signs of the offset along the heading and to its left; a tie goes to the quadrant
 // counterclockwise of it, so that each boundary belongs to exactly one quadrant.
-fn sense(density: f32, dx: f32, dy: f32, hx: f32, hy: f32, sums: ptr<function, array<f32, 4>>) {
+fn sense(density: f32, dx: f32, dy: f32, hx: f32, hy: f32, sums: ptr<function, vec4<f32>>) {
     let fx = dx * hx + dy * hy;
     let fy = dy * hx - dx * hy;
     let left = fy > 0.0 || (fy >= 0.0 && fx >= 0.0);
     let front = fx > 0.0 || (fx >= 0.0 && !(fy > 0.0));
-    let density_left = select(0.0, density, left);
-    let density_right = select(density, 0.0, left);
-    (*sums)[0] += select(density_right, 0.0, front);
-    (*sums)[1] += select(0.0, density_right, front);
-    (*sums)[2] += select(0.0, density_left, front);
-    (*sums)[3] += select(density_left, 0.0, front);
+    (*sums).x += select(0.0, density, !left && !front);
+    (*sums).y += select(0.0, density, !left && front);
+    (*sums).z += select(0.0, density, left && front);
+    (*sums).w += select(0.0, density, left && !front);
 }

@@ -67,7 +67,7 @@ impl Plan {
             populations += sizes.trials * sizes.leaders;
             held += sizes.held();
             let teams = sizes.trials * sizes.episodes * sizes.slots;
-            weights = weights.saturating_add(teams * sizes.leaders * sizes.parameters * 4);
+            weights = weights.saturating_add(teams * sizes.leaders * sizes.parameters.next_multiple_of(4) * 4);
             let words = (world.set_words() + world.followers() * world.leaders()) as u64;
             record = teams.saturating_mul(4 * words).saturating_add(record);
         }

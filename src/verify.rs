@@ -160,7 +160,7 @@ fn compare_breeding(config: &Config, teams: &Teams, backend: &mut dyn Backend) -
     held.breed(&breeding)?;
     let mut found = vec![0.0; weights.len()];
     held.fetch(&mut found)?;
-    let expected = breeding.on_host(sizes, weights);
+    let expected = breeding.on_host(sizes, weights)?;
     let differs = |index: &usize| expected[*index].to_bits() != found[*index].to_bits();
     Ok((0..found.len()).find(differs).map(|index| {
         let (leader, slot, weight) = (index / parameters / slots, index / parameters % slots, index % parameters);

@@ -9,21 +9,25 @@ use std::mem::offset_of;
 
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::device::{self, Request};
-use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, State, Task};
+use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, State, Task};
 use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::population::{Brood, Stretch};
-use flotilla::backend::{Backend, Group, Moment};
+use flotilla::backend::{Backend, Breeding, Group, Moment, Weights};
 use flotilla::config::{Config, Fitness};
 use flotilla::evaluate::{Starts, evaluate};
+use flotilla::evolve::{Key, Purpose};
 use flotilla::trainer::Trainer;
 use flotilla::verify::{Outcome, Plan, compare};
 use flotilla::world::{Constants, World};
 use flotilla::{backend::gpu, sample};
 
+/// The generic one plays more worlds: the other has to be compiled for each, which takes software drivers a second.
+const KERNELS: [Kernel; 2] = [Kernel::Generic, Kernel::Specialised];
+
 /// One that holds all populations.
-fn open(request: &Request, pass: Pass) -> GpuEpisodes {
+fn open(request: &Request, pass: Pass, kernel: Kernel) -> GpuEpisodes {
     let gpu = device::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
-    GpuEpisodes::new(gpu).unwrap().holding(Holding::Always)
+    GpuEpisodes::new(gpu).unwrap().playing(kernel).holding(Holding::Always)
 }
 
 fn check(plan: &Plan, mut backend: GpuEpisodes) -> Outcome {
@@ -32,12 +36,14 @@ fn check(plan: &Plan, mut backend: GpuEpisodes) -> Outcome {
 
 /// Caught an empty slice of moments that was cast at the wrong alignment in rollouts.
 #[test]
-fn random_worlds_agree_under_both_passes() {
-    for (request, info) in common::adapters("random_worlds_agree_under_both_passes") {
+fn random_worlds_agree_under_both_passes_and_kernels() {
+    for (request, info) in common::adapters("random_worlds_agree_under_both_passes_and_kernels") {
         for pass in [Pass::NoContraction, Pass::Guarded] {
-            let outcome = check(&Plan::random(0..40, 9), open(&request, pass));
-            println!("{info}, {pass}: {} worlds, {} agent-steps", outcome.worlds, outcome.agent_steps);
-            assert_eq!(outcome.mismatch, None, "{info}, {pass}");
+            for (kernel, seeds) in KERNELS.into_iter().zip([0..40, 0..12]) {
+                let outcome = check(&Plan::random(seeds, 9), open(&request, pass, kernel));
+                println!("{info}, {pass}, {kernel}: {} worlds, {} agent-steps", outcome.worlds, outcome.agent_steps);
+                assert_eq!(outcome.mismatch, None, "{info}, {pass}, {kernel}");
+            }
         }
     }
 }
@@ -48,8 +54,11 @@ fn checked_shaders_and_default_limits_agree() {
         for request in
             [Request { checked: true, ..request.clone() }, Request { default_limits: true, ..request.clone() }]
         {
-            let backend = GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap().holding(Holding::Always);
-            assert_eq!(check(&Plan::random(100..112, 5), backend).mismatch, None, "{info}, {request:?}");
+            for (kernel, seeds) in KERNELS.into_iter().zip([100..112, 100..103]) {
+                let gpu = device::open(request.clone()).unwrap();
+                let backend = GpuEpisodes::new(gpu).unwrap().playing(kernel).holding(Holding::Always);
+                assert_eq!(check(&Plan::random(seeds, 5), backend).mismatch, None, "{info}, {kernel}, {request:?}");
+            }
         }
     }
 }
@@ -64,12 +73,12 @@ fn a_changed_twin_is_named_by_its_stage() {
         ("follow", |text| replaced(text, "vec2(push * world.wall_gain", "vec2(push * 1.01 * world.wall_gain")),
         ("move", |text| replaced(text, "let scale = 1.5", "let scale = 1.5000001")),
         ("couple", |text| replaced(text, "d2 <= world.observation_radius2", "d2 <= 0.99 * world.observation_radius2")),
-        ("influence", |text| replaced(text, "* task.teams + team] += 1u", "* task.teams + team] += 2u")),
+        ("influence", |text| replaced(text, "seen = u32(", "seen = 2u * u32(")),
         ("breed", |text| replaced(text, "* brood.sigma", "* 1.0000001 * brood.sigma")),
     ];
     for (request, info) in common::adapters("a_changed_twin_is_named_by_its_stage") {
-        for (stage, edit) in edits {
-            let backend = open(&request, Pass::NoContraction).edited(edit);
+        for ((stage, edit), kernel) in edits.into_iter().zip(KERNELS.into_iter().cycle()) {
+            let backend = open(&request, Pass::NoContraction, kernel).edited(edit);
             let mismatch = check(&Plan::random(0..40, 9), backend).mismatch;
             let named = mismatch.as_ref().is_some_and(|text| text.contains(&format!("stage {stage},")));
             assert!(named, "{info}: a change of stage {stage} was reported as {mismatch:?}");
@@ -123,9 +132,11 @@ fn long_episodes_agree() {
                 pois = [[10.0, 15.0], [30.0, 40.0]]\nsteps = 3000\n[learning]\npopulation = 2\ntrials = 1";
     let config = Config::parse(text, "long.toml").unwrap();
     for (request, info) in common::adapters("long_episodes_agree") {
-        let plan = Plan { worlds: vec![("long".into(), config.clone())], teams: 9, seed: 0, generations: 0 };
-        let backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap();
-        assert_eq!(check(&plan, backend).mismatch, None, "{info}");
+        for kernel in KERNELS {
+            let plan = Plan { worlds: vec![("long".into(), config.clone())], teams: 9, seed: 0, generations: 0 };
+            let backend = GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap().playing(kernel);
+            assert_eq!(check(&plan, backend).mismatch, None, "{info}, {kernel}");
+        }
     }
 }
 
@@ -263,7 +274,7 @@ fn held_out_episodes_come_to_the_same_on_every_backend() {
     let spreads: Vec<_> = (0..policies).map(|team| expected.team(team)).collect();
     assert!(spreads.iter().any(|spread| spread.deviation > Some(0.0)), "nobody observes anything: {spreads:?}");
     for (request, info) in common::adapters("held_out_episodes_come_to_the_same_on_every_backend") {
-        let found = evaluate(&mut open(&request, Pass::Guarded), &group, &starts, &|_| ()).unwrap();
+        let found = evaluate(&mut open(&request, Pass::Guarded, Kernel::Best), &group, &starts, &|_| ()).unwrap();
         assert_eq!(found, expected, "{info}");
     }
 }
@@ -283,5 +294,94 @@ fn verify_tells_as_json_what_it_compared() {
             assert_eq!((&comparison["worlds"], &comparison["equal"]), (&2.into(), &true.into()));
             assert!(comparison["agent_steps"].as_u64().unwrap() > 0 && comparison["failure"].is_null());
         }
+    }
+}
+
+/// What does not fit together is an error that says what, on every backend, before anything is played.
+#[test]
+fn a_wrong_index_is_an_error() {
+    let world = World::new(&Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap());
+    let (policies, leaders) = (3, world.leaders());
+    let weights = sample::weights(&world, policies, 1);
+    let teams: Vec<u32> = (0..2 * leaders as u32).map(|place| place % 3).collect();
+    let good = Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams };
+    let mut wrong = teams.clone();
+    wrong[leaders + 2] = 3;
+    let few = &weights[1..];
+    let bad: [(Group<'_>, &str); 4] = [
+        (Group { teams: &wrong, ..good }, "leader 2 of team 1 plays policy 3 of 3"),
+        (Group { teams: &teams[1..], ..good }, "7 choices"),
+        (Group { starts: &world.starts[1..], ..good }, "11 start positions for 12 agents"),
+        (Group { weights: few.into(), ..good }, "weights"),
+    ];
+    let mut backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::default())];
+    for (request, _) in common::adapters("a_wrong_index_is_an_error") {
+        backends.push(Box::new(GpuEpisodes::new(device::open(request).unwrap()).unwrap().holding(Holding::Always)));
+    }
+    for backend in &mut backends {
+        for (group, named) in &bad {
+            let played = backend.rollout(std::slice::from_ref(group), &|_| panic!("nothing is played"));
+            for error in [played.expect_err(named), backend.trace(group).map(drop).expect_err(named)] {
+                assert!(error.to_string().contains(named), "{}: {error}", backend.describe());
+            }
+        }
+        backend.rollout(&[good], &|_| ()).unwrap();
+        let sizes = [leaders, policies, world.parameters()];
+        let Some(mut held) = backend.hold(&weights, sizes).unwrap() else { continue };
+        let learning = Config::parse(include_str!("../configs/chaotic.toml"), "config").unwrap().learning;
+        let key = Key::new(0, 0, Purpose::Mutation);
+        for (parents, named) in [(vec![0; 11], "11 parents"), ([vec![0; 11], vec![3]].concat(), "policy 3 of 3")] {
+            let breeding = Breeding { parents: &parents, key, generation: 0, learning: &learning };
+            for error in [held.breed(&breeding).expect_err(named), breeding.on_host(sizes, &weights).expect_err(named)]
+            {
+                assert!(error.to_string().contains(named), "{}: {error}", backend.describe());
+            }
+        }
+        // What it holds is as it was, and no stand-in for populations of other sizes.
+        let mut found = vec![0.0; weights.len()];
+        held.fetch(&mut found).unwrap();
+        assert_eq!(found, weights);
+        let other = Group { weights: Weights::Held(&*held), policies: 4, ..good };
+        let error = backend.rollout(&[other], &|_| panic!("nothing is played")).expect_err("there are three");
+        assert!(error.to_string().contains("stand for"), "{error}");
+    }
+}
+
+/// Kernels are kept by what differs in their code, and a batch of many different worlds does not compile for minutes.
+#[test]
+fn kernels_are_compiled_for_few_worlds_and_shared() {
+    // Small ones, for the sake of software drivers.
+    let text = "[world]\nleaders = [[10.0, 5.0]]\npois = [[10.0, 15.0]]\nsteps = 2\n[policy]\nhidden = []";
+    let config = Config::parse(text, "small.toml").unwrap();
+    let play = |backend: &mut GpuEpisodes, worlds: &[World]| {
+        let weights: Vec<Vec<f32>> = worlds.iter().map(|world| sample::weights(world, 1, 0)).collect();
+        let groups = worlds.iter().zip(&weights).map(|(world, weights)| Group {
+            world,
+            starts: &world.starts,
+            weights: weights[..].into(),
+            policies: 1,
+            teams: &[0],
+        });
+        backend.rollout(&groups.collect::<Vec<_>>(), &|_| ()).unwrap();
+        backend.compiled()
+    };
+    let gains = (1..5).map(|gain| {
+        let mut config = config.clone();
+        config.follow.wall_gain = f64::from(gain);
+        World::new(&config)
+    });
+    let sizes = (1..=20).map(|pois| {
+        let mut config = config.clone();
+        config.world.pois = (0..pois).map(|poi| [2.0 * f64::from(poi), 15.0]).collect();
+        World::new(&config)
+    });
+    let (gains, sizes): (Vec<_>, Vec<_>) = (gains.collect(), sizes.collect());
+    for (request, info) in common::adapters("kernels_are_compiled_for_few_worlds_and_shared") {
+        let mut backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap().playing(Kernel::Best);
+        assert_eq!(play(&mut backend, &gains), [0, 1], "{info}: only the numbers differ");
+        assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: the other worlds share the generic kernel");
+        assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: nothing is compiled twice");
+        backend = backend.playing(Kernel::Generic);
+        assert_eq!(play(&mut backend, &gains), [1, 16], "{info}: what is there is used");
     }
 }

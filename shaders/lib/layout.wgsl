@@ -77,8 +77,8 @@ struct Moment {
 @group(0) @binding(2) var<storage, read> tasks: array<Task>;
 // Start positions and POIs.
 @group(0) @binding(3) var<storage, read> places: array<vec2<f32>>;
-// Of each task `[parameters][teams][leaders]`: neighbouring threads read neighbouring weights.
-@group(0) @binding(4) var<storage, read> weights: array<f32>;
+// Of each task `[fours of a policy's weights][leaders][teams]`: neighbouring threads read neighbouring weights.
+@group(0) @binding(4) var<storage, read> weights: array<vec4<f32>>;
 // Of each task the sets `[steps][pois][words][teams]` and the counts `[followers][leaders][teams]`.
 @group(0) @binding(5) var<storage, read_write> record: array<u32>;
 // Of each task `[steps + 1][teams][agents]`; written only where TRACE holds.

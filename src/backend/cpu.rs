@@ -68,13 +68,14 @@ pub fn level_name(level: Level) -> &'static str {
 
 impl Backend for Cpu {
     fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
-        groups.iter().try_for_each(|group| group.weights.on_host().map(drop))?;
+        groups.iter().try_for_each(|group| group.check().and(group.weights.on_host().map(drop)))?;
         let level = self.level;
         dispatch!(level, simd => rollout(simd, groups, visit));
         Ok(())
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
+        group.check()?;
         group.weights.on_host()?;
         let level = self.level;
         Ok(dispatch!(level, simd => trace(simd, group)))

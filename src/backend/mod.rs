@@ -32,6 +32,37 @@ impl Group<'_> {
     pub fn team_count(&self) -> usize {
         self.teams.len() / self.world.leaders()
     }
+
+    /// Whether its parts fit each other. Every backend asks this before it plays.
+    ///
+    /// # Errors
+    /// Places, weights or choices are too few or too many, or a team plays a policy that there is not.
+    pub fn check(&self) -> Result<(), BackendError> {
+        let Group { world, starts, weights, policies, teams } = *self;
+        let misfit = |text: String| Err(BackendError::Misfit(text));
+        let (agents, leaders) = (world.agents(), world.leaders());
+        if starts.len() != agents {
+            return misfit(format!("{} start positions for {agents} agents", starts.len()));
+        }
+        if !teams.len().is_multiple_of(leaders) {
+            return misfit(format!("{} choices of policies for teams of {leaders} leaders", teams.len()));
+        }
+        let numbers = leaders * policies * world.parameters();
+        if let Weights::OnHost(weights) = weights
+            && weights.len() != numbers
+        {
+            return misfit(format!("{} weights, but {policies} policies a leader have {numbers}", weights.len()));
+        }
+        match teams.iter().position(|&policy| policy as usize >= policies) {
+            None => Ok(()),
+            Some(place) => misfit(format!(
+                "leader {} of team {} plays policy {} of {policies} (they count from 0)",
+                place % leaders,
+                place / leaders,
+                teams[place]
+            )),
+        }
+    }
 }
 
 /// What the policies of a group are, `[leaders][policies][parameters]`: each number 0 or of size 2^-30 to 2^20.
@@ -84,8 +115,33 @@ pub struct Breeding<'a> {
 }
 
 impl Breeding<'_> {
+    /// Whether the plan is one for populations of these sizes, `[leaders, slots, parameters]`. [`Held::breed`] asks this.
+    ///
+    /// # Errors
+    /// It has too few or too many places, or a parent that there is not.
+    pub fn check(&self, [leaders, slots, _]: [usize; 3]) -> Result<(), BackendError> {
+        let misfit = |text: String| Err(BackendError::Misfit(text));
+        if self.parents.len() != leaders * slots {
+            return misfit(format!("{} parents for {leaders} populations of {slots}", self.parents.len()));
+        }
+        match self.parents.iter().position(|&planned| (planned & !UNCHANGED) as usize >= slots) {
+            None => Ok(()),
+            Some(place) => misfit(format!(
+                "slot {} of population {} has policy {} of {slots} as its parent (they count from 0)",
+                place % slots,
+                place / slots,
+                self.parents[place] & !UNCHANGED
+            )),
+        }
+    }
+
     /// The next generation of these weights, worked out on the host: what [`Held::breed`] must come to.
-    pub fn on_host(&self, [_, slots, parameters]: [usize; 3], weights: &[f32]) -> Vec<f32> {
+    ///
+    /// # Errors
+    /// The plan is not one for these sizes, see [`Breeding::check`].
+    pub fn on_host(&self, sizes: [usize; 3], weights: &[f32]) -> Result<Vec<f32>, BackendError> {
+        self.check(sizes)?;
+        let [_, slots, parameters] = sizes;
         let (mut children, mut scratch) = (Vec::with_capacity(weights.len()), Vec::new());
         for (place, planned) in self.parents.iter().enumerate() {
             let (leader, slot, first) = (place / slots, place % slots, children.len());
@@ -96,7 +152,7 @@ impl Breeding<'_> {
                 evolve::mutate(Level::new(), key, self.learning, &mut children[first..], &mut scratch);
             }
         }
-        children
+        Ok(children)
     }
 }
 
@@ -205,6 +261,9 @@ pub enum BackendError {
     /// What was asked does not fit the device.
     #[error("{0}")]
     TooLarge(String),
+    /// What was handed in does not fit together.
+    #[error("{0}")]
+    Misfit(String),
     /// Populations of one backend were handed to another.
     #[error("the populations are held by another device; bring them to the host first")]
     HeldElsewhere,

@@ -7,7 +7,7 @@ use serde_json::json;
 use super::{Error, print};
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu::device::{self, AdapterInfo, Choice, DeviceError, Request};
-use crate::backend::gpu::episode::{GpuEpisodes, Holding};
+use crate::backend::gpu::episode::{GpuEpisodes, Holding, Kernel};
 use crate::backend::gpu::exact::Pass;
 use crate::config::{self, Config};
 use crate::report::progress::Meter;
@@ -32,6 +32,9 @@ pub struct Args {
     /// Only this pass, instead of all exact ones that the adapter takes; `plain` shows what the passes are for
     #[arg(long, value_name = "PASS", value_parser = ["no-contraction", "guarded", "plain"])]
     pass: Option<String>,
+    /// Only this kernel, instead of both
+    #[arg(long, value_name = "KERNEL", value_parser = ["generic", "specialised"])]
+    kernel: Option<String>,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -44,6 +47,7 @@ pub struct Args {
 struct Line {
     adapter: String,
     pass: Pass,
+    kernel: Kernel,
     result: Result<Outcome, Error>,
 }
 
@@ -62,15 +66,18 @@ impl Line {
     }
 }
 
-/// Prints a table of adapters and passes, and after it what differs.
+/// Prints a table of adapters, passes and kernels, and after it what differs.
 pub fn run(args: Args) -> Result<(), Error> {
     let plan = plan(&args)?;
     let adapters = adapters(args.adapter.as_deref())?;
     let mut lines = Vec::new();
     for (choice, info) in adapters {
         for pass in passes(args.pass.as_deref(), &info) {
-            let request = Request { pass: Some(pass), ..choice.clone().into() };
-            lines.push(Line { adapter: info.to_string(), pass, result: verify(&plan, request, &info, args.quiet) });
+            for kernel in kernels(args.kernel.as_deref()) {
+                let request = Request { pass: Some(pass), ..choice.clone().into() };
+                let result = verify(&plan, request, kernel, &info, args.quiet);
+                lines.push(Line { adapter: info.to_string(), pass, kernel, result });
+            }
         }
     }
     print(&if args.json { in_json(&lines) } else { in_words(&lines) })?;
@@ -85,15 +92,16 @@ pub fn run(args: Args) -> Result<(), Error> {
 
 /// A table, and below it what differs.
 fn in_words(lines: &[Line]) -> String {
-    let mut text = format!("{:<15} {:>7} {:>13} {:<10} adapter\n", "pass", "worlds", "agent-steps", "result");
+    let mut text =
+        format!("{:<15} {:<12} {:>7} {:>13} {:<10} adapter\n", "pass", "kernel", "worlds", "agent-steps", "result");
     let mut failures = String::new();
     for line in lines {
-        let Line { adapter, pass, .. } = line;
+        let Line { adapter, pass, kernel, .. } = line;
         let (worlds, agent_steps) = line.compared();
         let failure = line.failure();
         let result = if failure.is_some() { "DIFFERENT" } else { "equal" };
-        text += &format!("{pass:<15} {worlds:>7} {agent_steps:>13} {result:<10} {adapter}\n");
-        failures.extend(failure.map(|what| format!("\n{adapter}, {pass} pass:\n  {what}\n")));
+        text += &format!("{pass:<15} {kernel:<12} {worlds:>7} {agent_steps:>13} {result:<10} {adapter}\n");
+        failures.extend(failure.map(|what| format!("\n{adapter}, {pass} pass, {kernel} kernel:\n  {what}\n")));
     }
     text + &failures
 }
@@ -104,6 +112,7 @@ fn in_json(lines: &[Line]) -> String {
         json!({
             "adapter": line.adapter,
             "pass": line.pass.to_string(),
+            "kernel": line.kernel.to_string(),
             "worlds": worlds,
             "agent_steps": agent_steps,
             "equal": failure.is_none(),
@@ -150,14 +159,19 @@ fn passes(name: Option<&str>, info: &AdapterInfo) -> Vec<Pass> {
     }
 }
 
-fn verify(plan: &Plan, request: Request, info: &AdapterInfo, quiet: bool) -> Result<Outcome, Error> {
-    let pass = request.pass.map_or_else(String::new, |pass| format!(", {pass} pass"));
+fn kernels(name: Option<&str>) -> impl Iterator<Item = Kernel> {
+    let all = [Kernel::Generic, Kernel::Specialised];
+    all.into_iter().filter(move |kernel| name.is_none_or(|name| kernel.to_string() == name))
+}
+
+fn verify(plan: &Plan, request: Request, kernel: Kernel, info: &AdapterInfo, quiet: bool) -> Result<Outcome, Error> {
+    let pass = request.pass.map_or_else(String::new, |pass| format!(", {pass} pass, {kernel} kernel"));
     let mut meter = Meter::new(quiet);
     let gpu = device::open(request)?;
     if let Some(mismatch) = gpu.self_test()? {
         return Ok(Outcome { mismatch: Some(mismatch.to_string()), ..Outcome::default() });
     }
-    let mut gpu = GpuEpisodes::new(gpu)?.holding(Holding::Always);
+    let mut gpu = GpuEpisodes::new(gpu)?.playing(kernel).holding(Holding::Always);
     let compared = compare(plan, &mut Cpu::default(), &mut gpu, |outcome| {
         let (done, all) = (outcome.worlds, plan.worlds.len());
         meter.show(done as f64 / all as f64, || format!("{}{pass}: {done} of {all} worlds", info.name));

@@ -525,15 +525,40 @@ impl Gpu {
         self.scoped(label, || self.device.create_bind_group(&descriptor))
     }
 
-    /// Compiles an entry point under the device's pass. Workgroup memory starts undefined unless `checked`.
-    pub fn pipeline(
+    /// Compiles one of the crate's own shaders, see [`Gpu::pipeline`].
+    pub(super) fn own_pipeline(
         &self,
         label: &str,
         wgsl: &str,
         entry: &str,
         layout: &Layout,
     ) -> Result<wgpu::ComputePipeline, DeviceError> {
-        let compiled = self.scoped(label, || exact::compile(&self.device, label, wgsl, self.pass, self.checked))?;
+        // SAFETY: the loops of the crate's own shaders end, their bindings are those of their layouts, and their indices
+        // are in bounds for groups and plans that were checked, as the checked builds in the tests show.
+        #[allow(unsafe_code)]
+        unsafe {
+            self.pipeline(label, wgsl, entry, layout)
+        }
+    }
+
+    /// Compiles an entry point under the device's pass. Workgroup memory starts undefined unless `checked`.
+    ///
+    /// # Safety
+    /// Unless `checked`, nothing keeps the shader within its buffers: its indices must be in bounds, its loops must end, it
+    /// must divide no integer by zero, and read no workgroup memory that it did not write. Its bindings must be those of
+    /// the layout, `checked` or not.
+    #[allow(unsafe_code)]
+    pub unsafe fn pipeline(
+        &self,
+        label: &str,
+        wgsl: &str,
+        entry: &str,
+        layout: &Layout,
+    ) -> Result<wgpu::ComputePipeline, DeviceError> {
+        let compiled = self.scoped(label, || {
+            // SAFETY: the caller's.
+            unsafe { exact::compile(&self.device, label, wgsl, self.pass, self.checked) }
+        })?;
         let module = compiled.map_err(|source| DeviceError::Shader { label: label.into(), source })?;
         let descriptor = wgpu::ComputePipelineDescriptor {
             label: Some(label),

@@ -1,10 +1,15 @@
 //! Whole episodes on a GPU: teams are packed into workgroups, workgroups into batches that fit the device.
 //!
+//! One shader text makes two kernels: the generic one, which plays any world, and the specialised one, made for a world's
+//! sizes, in which all loops have constant bounds and the policy is straight-line code. See [`Kernel`].
+//!
 //! While the GPU plays one batch, the CPU reads the record of the batch before it.
 
 use std::any::Any;
-use std::collections::HashMap;
+use std::cmp::Reverse;
 use std::collections::hash_map::Entry;
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::fmt::{self, Write};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -16,12 +21,25 @@ use super::device::{Binding, DeviceError, Gpu, Kind, Layout, Stopwatch, timed};
 use super::exact;
 use super::population::{Kernels, Population, Stretch, TOGETHER, parts};
 use crate::backend::{Backend, BackendError, Episode, Group, Held, Moment, Strided, Trace, Visit, Weights};
-use crate::world::{Constants, World};
+use crate::config::{MAX_AGENTS, MAX_HIDDEN_LAYERS};
+use crate::world::{Constants, INPUTS, OUTPUTS, World};
 
 /// Threads that share a warp on most GPUs; leaders and followers are kept apart by as many (`ROLE` in the shader).
 const ROLE: usize = 32;
-/// Workgroup sizes to choose from; every WebGPU device takes them.
+/// Workgroup sizes of the generic kernel to choose from; every WebGPU device takes them.
 const WORKGROUPS: [usize; 3] = [64, 128, 256];
+/// Teams of a workgroup of a specialised kernel: most fill a warp with one agent of as many teams.
+const TEAMS: [usize; 3] = [32, 16, 8];
+/// Threads of such a workgroup at most, so that each may have 80 registers of the 65 536 that an NVIDIA processor has.
+const MOST_THREADS: usize = 512;
+/// Weights of one policy at most that are written out as straight-line code.
+const MOST_WEIGHTS: usize = 512;
+/// Leaders at most whose sights a follower counts in registers.
+const SIGHTS: usize = 8;
+/// Specialised kernels at most, where nobody asks for more: each takes a fraction of a second to compile.
+const SPECIALISED: usize = 16;
+/// Weights that a thread reads at once.
+const FOUR: usize = 4;
 /// Tasks, as many as end where a binding may start (their size is no power of two).
 const TASK_ALIGNMENT: usize = BINDING_ALIGNMENT / 4;
 /// Bytes of one buffer that a batch aims for: enough to fill a GPU, small enough to overlap batches.
@@ -63,15 +81,65 @@ pub struct State {
     pub speed: f32,
 }
 
-/// What a pipeline is compiled for.
+/// Which kernel plays; no result depends on that.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kernel {
+    /// In rollouts a specialised one, for as many kinds of worlds as are worth compiling for, those with most to play
+    /// first; else the generic one.
+    Best,
+    /// The generic one.
+    Generic,
+    /// One made for its world's sizes, wherever there can be one.
+    Specialised,
+}
+
+impl fmt::Display for Kernel {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Kernel::Best => "best",
+            Kernel::Generic => "generic",
+            Kernel::Specialised => "specialised",
+        })
+    }
+}
+
+/// What a pipeline is compiled for: pipelines are kept by this.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 struct Shape {
     workgroup: usize,
     /// Agents a thread plays, one after another.
     slots: usize,
-    /// Widest layer, inputs included, rounded up to spare compilations.
-    widest: usize,
     trace: bool,
+    sizes: Sizes,
+}
+
+/// What a kernel knows of the worlds that it plays.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+enum Sizes {
+    /// The widest layer, inputs included, rounded up to spare compilations.
+    Any { widest: usize },
+    /// All that makes a difference to the code.
+    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], density: u32, by_sine: bool },
+}
+
+const WIDTHS: usize = MAX_HIDDEN_LAYERS + 2;
+
+impl Shape {
+    fn is_specialised(&self) -> bool {
+        matches!(self.sizes, Sizes::Fixed { .. })
+    }
+
+    fn generic(world: &World, packing: Packing, trace: bool) -> Shape {
+        let widest = world.constants.widths.into_iter().max().unwrap_or(0).next_power_of_two() as usize;
+        Shape { workgroup: packing.workgroup, slots: packing.slots, trace, sizes: Sizes::Any { widest } }
+    }
+
+    fn specialised(world: &World, packing: Packing, trace: bool) -> Shape {
+        let Constants { leaders, followers, pois, widths, density, max_turn_cos, .. } = world.constants;
+        let (agents, by_sine) = (leaders + followers, max_turn_cos > 0.7);
+        let sizes = Sizes::Fixed { teams: packing.teams, leaders, agents, pois, widths, density, by_sine };
+        Shape { workgroup: packing.workgroup, slots: packing.slots, trace, sizes }
+    }
 }
 
 /// How the teams of one world are packed.
@@ -89,8 +157,19 @@ fn seats(world: &World, teams: usize) -> usize {
 }
 
 impl Packing {
-    /// The packing that leaves the fewest threads idle.
-    fn of(world: &World, largest: usize) -> Packing {
+    /// For a specialised kernel: as many teams as a warp has threads, or as many as fit. None where there had
+    /// better be none: too many agents, or too large a policy.
+    fn specialised(world: &World, room: Room) -> Option<Packing> {
+        let threads = |teams: usize| seats(world, teams).next_multiple_of(ROLE);
+        let bytes = |teams: usize| 2 * teams * world.agents() * size_of::<Vec2>();
+        let fits =
+            |&teams: &usize| threads(teams) <= room.workgroup.min(MOST_THREADS) && bytes(teams) <= room.workgroup_bytes;
+        let teams = TEAMS.into_iter().find(fits).filter(|_| world.parameters() <= MOST_WEIGHTS)?;
+        Some(Packing { workgroup: threads(teams), slots: 1, teams })
+    }
+
+    /// For the generic kernel: the packing that leaves the fewest threads idle.
+    fn generic(world: &World, largest: usize) -> Packing {
         let sizes = WORKGROUPS.into_iter().filter(|&size| size <= largest);
         let packed = sizes.clone().filter_map(|workgroup| {
             let teams = (1..=workgroup).take_while(|&teams| seats(world, teams) <= workgroup).last()?;
@@ -113,6 +192,11 @@ fn steps_a_dispatch(world: &World, packing: Packing) -> usize {
     (TURNS / (packing.slots * agent + items * 33)).max(1)
 }
 
+/// Weights of a team as an episode reads them, four at a time.
+fn fours(world: &World) -> usize {
+    world.leaders() * world.parameters().div_ceil(FOUR)
+}
+
 /// Words of a team's record: sets and counts.
 fn record_words(world: &World) -> usize {
     world.set_words() + world.leaders() * world.followers()
@@ -132,10 +216,9 @@ struct Share {
 type Done<'a> = dyn Fn(&Share, &[u32], &[Moment]) + Sync + 'a;
 
 impl Share {
-    /// How many weights its teams have.
-    fn weights(&self, groups: &[Group<'_>]) -> usize {
-        let world = groups[self.group].world;
-        self.task.teams as usize * world.leaders() * world.parameters()
+    /// How many weights its teams have, in fours.
+    fn fours(&self, groups: &[Group<'_>]) -> usize {
+        self.task.teams as usize * fours(groups[self.group].world)
     }
 
     /// The task's part in one round of dispatches; none when it is done.
@@ -152,6 +235,7 @@ struct Work {
     shares: Vec<Share>,
     worlds: Vec<Constants>,
     places: Vec<Vec2>,
+    /// In fours.
     weights: usize,
     record: usize,
     moments: usize,
@@ -165,15 +249,31 @@ struct Room {
     batch: u64,
     /// Bytes of the largest buffer.
     buffer: u64,
-    /// Threads of the largest workgroup.
+    /// Threads of the largest workgroup, and bytes of its memory.
     workgroup: usize,
+    workgroup_bytes: usize,
 }
 
-/// Cuts the groups' teams into tasks and the tasks into batches.
+/// The shapes to play by kernels of their own: those compiled already, and of the others those with most to play, up to
+/// [`SPECIALISED`] in all.
+fn worth_compiling(work: BTreeMap<Shape, u64>, compiled: &HashSet<Shape>) -> HashSet<Shape> {
+    let room = SPECIALISED.saturating_sub(compiled.iter().filter(|shape| shape.is_specialised()).count());
+    let (mut shapes, mut new): (Vec<_>, Vec<_>) = work.into_iter().partition(|(shape, _)| compiled.contains(shape));
+    new.sort_by_key(|(_, agent_steps)| Reverse(*agent_steps));
+    shapes.extend(new.into_iter().take(room));
+    shapes.into_iter().map(|(shape, _)| shape).collect()
+}
+
+/// Cuts the groups' teams into tasks and the tasks into batches; worlds of the given shapes have kernels of their own.
 ///
 /// # Errors
 /// When one team's record is larger than the device's largest buffer.
-fn plan(groups: &[Group<'_>], trace: bool, room: Room) -> Result<Vec<Work>, BackendError> {
+fn plan(
+    groups: &[Group<'_>],
+    trace: bool,
+    room: Room,
+    specialised: &HashSet<Shape>,
+) -> Result<Vec<Work>, BackendError> {
     let target = room.buffer.min(room.batch);
     let mut batches = vec![Work::default()];
     for (index, group) in groups.iter().enumerate() {
@@ -181,7 +281,7 @@ fn plan(groups: &[Group<'_>], trace: bool, room: Room) -> Result<Vec<Work>, Back
         let moments_a_team = if trace { (world.steps() + 1) * world.agents() } else { 0 };
         let bytes_a_team = [
             record_words(world) * size_of::<u32>(),
-            world.leaders() * world.parameters() * size_of::<f32>(),
+            fours(world) * size_of::<[f32; FOUR]>(),
             moments_a_team * size_of::<Moment>(),
         ]
         .into_iter()
@@ -194,11 +294,14 @@ fn plan(groups: &[Group<'_>], trace: bool, room: Room) -> Result<Vec<Work>, Back
                 room.buffer
             )));
         }
-        let packing = Packing::of(world, room.workgroup);
+        let for_it =
+            Packing::specialised(world, room).map(|packing| (packing, Shape::specialised(world, packing, trace)));
+        let (packing, shape) = for_it.filter(|(_, shape)| specialised.contains(shape)).unwrap_or_else(|| {
+            let packing = Packing::generic(world, room.workgroup);
+            (packing, Shape::generic(world, packing, trace))
+        });
         let teams_a_task = packing.teams.min((target / bytes_a_team.max(1)).max(1) as usize);
-        let widest = world.constants.widths.into_iter().max().unwrap_or(0).next_power_of_two() as usize;
         let steps_a_dispatch = steps_a_dispatch(world, packing);
-        let shape = Shape { workgroup: packing.workgroup, slots: packing.slots, widest, trace };
         // A group's world, starts and POIs are stored once a batch.
         let mut stored: Option<(usize, Task)> = None;
         for first_team in (0..group.team_count()).step_by(teams_a_task) {
@@ -206,7 +309,7 @@ fn plan(groups: &[Group<'_>], trace: bool, room: Room) -> Result<Vec<Work>, Back
             let mut work = batches.last_mut().expect("there is a batch");
             let full = |used: usize, size: usize| used as u64 * size as u64 + teams as u64 * bytes_a_team > target;
             if full(work.record, size_of::<u32>())
-                || full(work.weights, size_of::<f32>())
+                || full(work.weights, size_of::<[f32; FOUR]>())
                 || full(work.moments, size_of::<Moment>())
             {
                 batches.push(Work::default());
@@ -232,7 +335,7 @@ fn plan(groups: &[Group<'_>], trace: bool, room: Room) -> Result<Vec<Work>, Back
                 end: world.constants.steps,
                 ..base
             };
-            work.weights += world.leaders() * world.parameters() * teams;
+            work.weights += fours(world) * teams;
             work.record += record_words(world) * teams;
             work.moments += moments_a_team * teams;
             if world.steps() > steps_a_dispatch {
@@ -245,15 +348,16 @@ fn plan(groups: &[Group<'_>], trace: bool, room: Room) -> Result<Vec<Work>, Back
     Ok(batches)
 }
 
-/// A task's weights, `[parameters][teams][leaders]`: neighbouring threads read neighbouring weights.
-fn gather(group: &Group<'_>, weights: &[f32], first_team: usize, teams: usize, to: &mut [f32]) {
+/// A task's weights, `[fours of a policy's weights][leaders][teams]`: neighbouring threads read neighbouring weights.
+fn gather(group: &Group<'_>, weights: &[f32], first_team: usize, teams: usize, to: &mut [[f32; FOUR]]) {
     let (leaders, parameters) = (group.world.leaders(), group.world.parameters());
-    let lanes = teams * leaders;
     let policies = &group.teams[first_team * leaders..(first_team + teams) * leaders];
-    for (lane, &policy) in policies.iter().enumerate() {
-        let from = ((lane % leaders) * group.policies + policy as usize) * parameters;
-        for (index, &weight) in weights[from..from + parameters].iter().enumerate() {
-            to[index * lanes + lane] = weight;
+    for (place, &policy) in policies.iter().enumerate() {
+        let (team, leader) = (place / leaders, place % leaders);
+        let from = (leader * group.policies + policy as usize) * parameters;
+        let lane = to[leader * teams + team..].iter_mut().step_by(leaders * teams);
+        for (four, weights) in lane.zip(weights[from..from + parameters].chunks(FOUR)) {
+            four[..weights.len()].copy_from_slice(weights);
         }
     }
 }
@@ -278,6 +382,7 @@ pub const HELD_FROM: u64 = 1 << 20;
 pub struct GpuEpisodes {
     gpu: Gpu,
     layout: Layout,
+    kernel: Kernel,
     pipelines: HashMap<Shape, wgpu::ComputePipeline>,
     holding: Holding,
     /// Compiled once something is to be held.
@@ -285,7 +390,7 @@ pub struct GpuEpisodes {
     /// Two sets, so that one batch plays while the other is read.
     lanes: [Buffers; 2],
     /// Weights on their way to the device.
-    staging: Vec<f32>,
+    staging: Vec<[f32; FOUR]>,
     /// Bytes of one buffer that a batch aims for.
     batch_bytes: u64,
     /// Changes the shader's text, so that tests can show that a change is noticed.
@@ -363,6 +468,7 @@ impl GpuEpisodes {
         Ok(GpuEpisodes {
             gpu,
             layout,
+            kernel: if software { Kernel::Generic } else { Kernel::Best },
             pipelines: HashMap::new(),
             holding: if software { Holding::Never } else { Holding::From(HELD_FROM) },
             kernels: None,
@@ -377,6 +483,18 @@ impl GpuEpisodes {
     /// The same with batches of other sizes; no result depends on them.
     pub fn batched(self, bytes: u64) -> GpuEpisodes {
         GpuEpisodes { batch_bytes: bytes, ..self }
+    }
+
+    /// The same with another choice of kernels than by default: [`Kernel::Best`], but [`Kernel::Generic`] on a software
+    /// renderer, which takes longer to compile the others than it saves.
+    pub fn playing(self, kernel: Kernel) -> GpuEpisodes {
+        GpuEpisodes { kernel, ..self }
+    }
+
+    /// How many generic and specialised kernels were compiled so far.
+    pub fn compiled(&self) -> [usize; 2] {
+        let specialised = self.pipelines.keys().filter(|shape| shape.is_specialised()).count();
+        [self.pipelines.len() - specialised, specialised]
     }
 
     /// The same with other populations held than by default.
@@ -417,13 +535,32 @@ impl GpuEpisodes {
             batch: self.batch_bytes,
             buffer: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(MAX_OFFSET),
             workgroup: limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x) as usize,
+            workgroup_bytes: limits.max_compute_workgroup_storage_size as usize,
+        }
+    }
+
+    /// The shapes that get kernels of their own.
+    fn specialised(&self, groups: &[Group<'_>], trace: bool) -> HashSet<Shape> {
+        let mut work: BTreeMap<Shape, u64> = BTreeMap::new();
+        for group in groups {
+            if let Some(packing) = Packing::specialised(group.world, self.room()) {
+                let agent_steps = group.team_count() * group.world.agents() * group.world.steps();
+                *work.entry(Shape::specialised(group.world, packing, trace)).or_default() += agent_steps as u64;
+            }
+        }
+        match self.kernel {
+            Kernel::Generic => HashSet::new(),
+            Kernel::Specialised => work.into_keys().collect(),
+            // Nobody traces for speed.
+            Kernel::Best if trace => HashSet::new(),
+            Kernel::Best => worth_compiling(work, &self.pipelines.keys().copied().collect()),
         }
     }
 
     /// Plays all tasks; `done` gets each with the batch's record and moments.
     fn play(&mut self, groups: &[Group<'_>], trace: bool, done: &Done<'_>) -> Result<(), BackendError> {
         let start = Instant::now();
-        let batches = plan(groups, trace, self.room())?;
+        let batches = plan(groups, trace, self.room(), &self.specialised(groups, trace))?;
         self.stages.gather += start.elapsed();
         for index in 0..=batches.len() {
             if let Some(work) = batches.get(index) {
@@ -481,14 +618,15 @@ impl GpuEpisodes {
         let worlds = upload(&mut buffers.worlds, "worlds", bytemuck::cast_slice(&work.worlds))?;
         let all_tasks = upload(&mut buffers.tasks, "tasks", bytemuck::cast_slice(&tasks))?;
         let places = upload(&mut buffers.places, "places", bytemuck::cast_slice(&work.places))?;
-        let weight_bytes = (work.weights * size_of::<f32>()) as u64;
+        let weight_bytes = (work.weights * size_of::<[f32; FOUR]>()) as u64;
         let weights = grown(gpu, &mut buffers.weights, "weights", weight_bytes, input)?.clone();
         for run in work.shares.chunk_by(|a, b| is_on_host(groups, a) == is_on_host(groups, b)) {
             if is_on_host(groups, &run[0]) {
                 let (first, last) = (run[0].task.weights as usize, &run[run.len() - 1]);
-                let end = last.task.weights as usize + last.weights(groups);
+                let end = last.task.weights as usize + last.fours(groups);
                 let bytes = bytemuck::cast_slice(&self.staging[first..end]);
-                gpu.scoped("weights", || gpu.queue.write_buffer(&weights, (first * size_of::<f32>()) as u64, bytes))?;
+                let offset = (first * size_of::<[f32; FOUR]>()) as u64;
+                gpu.scoped("weights", || gpu.queue.write_buffer(&weights, offset, bytes))?;
             }
         }
         let mut gathers = Vec::with_capacity(stretches.len());
@@ -584,6 +722,7 @@ impl GpuEpisodes {
             let ours = |population: &&Population| self.kernels.as_ref().is_some_and(|k| population.is_of(k));
             let population = (held as &dyn Any).downcast_ref().filter(ours).ok_or(BackendError::HeldElsewhere)?;
             let leaders = group.world.leaders();
+            population.check([leaders, group.policies, group.world.parameters()])?;
             let teams: u32 = shares.iter().map(|share| share.task.teams).sum();
             for first in (0..leaders).step_by(TOGETHER) {
                 let stretch = Stretch {
@@ -608,12 +747,12 @@ impl GpuEpisodes {
         if !work.shares.iter().any(|share| is_on_host(groups, share)) {
             return;
         }
-        self.staging.resize(work.weights, 0.0);
+        self.staging.resize(work.weights, [0.0; FOUR]);
         let mut rest = &mut self.staging[..];
         let mut parts = Vec::with_capacity(work.shares.len());
         for share in &work.shares {
             let group = &groups[share.group];
-            let (part, tail) = rest.split_at_mut(share.weights(groups));
+            let (part, tail) = rest.split_at_mut(share.fours(groups));
             rest = tail;
             if let Weights::OnHost(weights) = group.weights {
                 parts.push((share, group, weights, part));
@@ -626,7 +765,7 @@ impl GpuEpisodes {
 
     fn prepare_pipeline(&mut self, shape: Shape) -> Result<(), DeviceError> {
         if let Entry::Vacant(entry) = self.pipelines.entry(shape) {
-            entry.insert(self.gpu.pipeline("episode", &(self.edit)(source(shape)), "episode", &self.layout)?);
+            entry.insert(self.gpu.own_pipeline("episode", &(self.edit)(source(shape)), "episode", &self.layout)?);
         }
         Ok(())
     }
@@ -642,16 +781,35 @@ pub(super) fn grid(tasks: usize, limits: &wgpu::Limits) -> [u32; 3] {
     [tasks.div_ceil(rows) as u32, rows as u32, 1]
 }
 
-/// The whole shader, with its constants in front.
+/// The whole shader, with what it has in front.
 fn source(shape: Shape) -> String {
-    let Shape { workgroup, slots, widest, trace } = shape;
-    let shared = workgroup * slots;
+    let Shape { workgroup, slots, trace, sizes } = shape;
+    let (shared, tally, sights) = match sizes {
+        // As many agents as one team may have, or several teams on a thread each.
+        Sizes::Any { .. } => ((workgroup * slots).min(MAX_AGENTS), false, 1),
+        Sizes::Fixed { teams, leaders, agents, .. } => {
+            let tally = leaders < agents && leaders as usize <= SIGHTS;
+            (teams * agents as usize, tally, if tally { leaders } else { 1 })
+        }
+    };
     let constants = format!(
         "const WORKGROUP: u32 = {workgroup}u;\nconst SLOTS: u32 = {slots}u;\nconst SHARED: u32 = {shared}u;\n\
-         const WIDEST: u32 = {widest}u;\nconst TRACE: bool = {trace};"
+         const TRACE: bool = {trace};\nconst TALLY: bool = {tally};\nconst SIGHTS: u32 = {sights}u;"
     );
+    let front = match sizes {
+        Sizes::Any { widest } => {
+            format!("const WIDEST: u32 = {widest}u;\n{}", include_str!("../../../shaders/generic.wgsl"))
+        }
+        Sizes::Fixed { teams, leaders, agents, pois, widths, density, by_sine } => format!(
+            "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u, {density}u, {by_sine});\n\
+             fn adopt(task: Task) {{}}\n{}",
+            straight_policy(&widths),
+            words = agents.div_ceil(32)
+        ),
+    };
     exact::assemble(&[
         &constants,
+        &front,
         include_str!("../../../shaders/lib/layout.wgsl"),
         include_str!("../../../shaders/lib/math.wgsl"),
         include_str!("../../../shaders/sense.wgsl"),
@@ -663,18 +821,79 @@ fn source(shape: Shape) -> String {
     ])
 }
 
-/// The episode's shader in a few of its variants, small and large.
+/// A policy of these widths as straight-line code: `decide` of `shaders/generic.wgsl`, its loops written out. Each unit is
+/// a variable, and four weights at a time are read in the order in which they are needed, so that a compiler may read
+/// many before it waits for any.
+fn straight_policy(widths: &[u32; WIDTHS]) -> String {
+    let mut text =
+        String::from("fn decide(lane: u32, stride: u32, of_pois: vec4<f32>, of_agents: vec4<f32>) -> vec2<f32> {\n");
+    let mut line = |line: std::fmt::Arguments<'_>| writeln!(text, "    {line}").expect("a string takes a line");
+    let mut read = HashSet::new();
+    let mut inputs: Vec<String> =
+        (0..INPUTS).map(|input| format!("{}.{}", ["of_pois", "of_agents"][input / 4], AXES[input % 4])).collect();
+    let mut first = 0;
+    let layers = widths.windows(2).take_while(|pair| pair[1] > 0);
+    for (layer, pair) in layers.enumerate() {
+        let (rows, columns) = (pair[0] as usize, pair[1] as usize);
+        // The biases first.
+        for row in std::iter::once(rows).chain(0..rows) {
+            for column in 0..columns {
+                let weight = first + row * columns + column;
+                let (four, axis) = (weight / FOUR, AXES[weight % FOUR]);
+                if read.insert(four) {
+                    line(format_args!("let w{four} = weights[lane + {four}u * stride];"));
+                }
+                match row == rows {
+                    true => line(format_args!("var s{layer}_{column} = w{four}.{axis};")),
+                    false => line(format_args!("s{layer}_{column} += {} * w{four}.{axis};", inputs[row])),
+                }
+            }
+        }
+        inputs = (0..columns).map(|column| format!("u{layer}_{column}")).collect();
+        for (column, unit) in inputs.iter().enumerate() {
+            line(format_args!("let {unit} = activate(s{layer}_{column});"));
+        }
+        first += (rows + 1) * columns;
+    }
+    line(format_args!("return vec2({}, {});", inputs[0], inputs[1]));
+    text + "}\n"
+}
+
+const AXES: [&str; FOUR] = ["x", "y", "z", "w"];
+
+/// The episode's shader in a few of its variants, generic and specialised for the paper's first layout.
 pub fn shaders() -> Vec<(&'static str, String)> {
-    let shape = |workgroup, slots, widest, trace| source(Shape { workgroup, slots, widest, trace });
+    let generic =
+        |workgroup, slots, widest, trace| source(Shape { workgroup, slots, trace, sizes: Sizes::Any { widest } });
+    let specialised = |trace| {
+        let widths = [INPUTS as u32, 10, OUTPUTS as u32, 0, 0];
+        let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, density: 0, by_sine: true };
+        source(Shape { workgroup: 384, slots: 1, trace, sizes })
+    };
     vec![
-        ("episode", shape(64, 1, 16, false)),
-        ("episode, traced", shape(128, 1, 64, true)),
-        ("episode, large teams", shape(256, 5, 64, false)),
+        ("episode", generic(64, 1, 16, false)),
+        ("episode, traced", generic(128, 1, 64, true)),
+        ("episode, large teams", generic(256, 5, 64, false)),
+        ("episode, specialised", specialised(false)),
+        ("episode, specialised, traced", specialised(true)),
     ]
+}
+
+/// The shader that would play a world: the specialised one, where there can be one, or the generic one; for looking at
+/// what compilers make of it. `threads` is the size of the largest workgroup.
+#[doc(hidden)]
+pub fn shader_of(world: &World, kernel: Kernel, threads: usize) -> String {
+    let room = Room { batch: 0, buffer: 0, workgroup: threads, workgroup_bytes: 16 << 10 };
+    let made = Packing::specialised(world, room).filter(|_| kernel != Kernel::Generic);
+    source(made.map_or_else(
+        || Shape::generic(world, Packing::generic(world, threads), false),
+        |packing| Shape::specialised(world, packing, false),
+    ))
 }
 
 impl Backend for GpuEpisodes {
     fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
+        groups.iter().try_for_each(Group::check)?;
         self.play(groups, false, &|share, record, _| {
             let world = groups[share.group].world;
             let Task { sets, seen, teams, .. } = share.task;
@@ -693,6 +912,7 @@ impl Backend for GpuEpisodes {
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
+        group.check()?;
         let world = group.world;
         let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
         let (set_words, seen_words) = (world.set_words(), world.leaders() * world.followers());

@@ -4,7 +4,8 @@
 //!
 //! - [`Pass::NoContraction`] decorates every float result of the SPIR-V and hands it to a Vulkan driver unchanged.
 //! - [`Pass::Guarded`] rewrites the naga IR so that every float sum and product passes through the bits of an integer
-//!   `x ^ guard`, with `guard` a zero that only the run time knows. It works wherever wgpu does.
+//!   `x | guard`, with `guard` a zero that only the run time knows. It works wherever wgpu does. See [`guarded`] for why
+//!   no compiler can take it away.
 //!
 //! Shaders know of neither: they declare nothing for the passes, but leave `@group(0) @binding(0)` to the guard.
 //! Both passes refuse a shader that leaves the exact core (see [`foreign_operations`]), since no pass could save it.
@@ -27,7 +28,7 @@ use naga::{
 pub enum Pass {
     /// SPIR-V whose float results are all decorated `NoContraction`. Vulkan only; costs no instruction.
     NoContraction,
-    /// naga IR whose float sums and products all pass through integer bits. Everywhere; costs an `xor` each.
+    /// naga IR whose float sums and products all pass through integer bits. Everywhere; costs an `or` each.
     Guarded,
     /// Nothing is done. Only for showing that the tests notice; never chosen.
     Plain,
@@ -166,10 +167,32 @@ pub fn undecorated(words: &[u32]) -> usize {
     float_results(words).filter(|id| !decorated.contains(id)).count()
 }
 
-/// The module with every f32 sum and product passed through `bitcast<f32>(bitcast<u32>(x) ^ guard)`.
+/// The module with every f32 sum and product passed through `bitcast<f32>(bitcast<u32>(x) | guard)`.
 ///
 /// `guard` is a new uniform at group 0, binding 0, that must hold zero. Products alone would not do: a driver could
 /// still reassociate the sums.
+///
+/// # Why nothing takes a guard away
+///
+/// A compiler does not know the guard, so what it makes of a shader must be right for every guard. With `^` that is no
+/// hindrance: for every guard, `(x ^ guard) ^ guard` is `x`. It comes up where the operation between two guards falls
+/// away, as the first `0.0 + product` of an unrolled sum does: AMD's compiler then cancelled the two, and fused the
+/// bare product with the next sum. With `|` nothing can bring `x` back. A guard with a bit set makes that bit of
+/// `x | guard` the same for all `x`, so no function of `x | guard` and the guard is `x` for every guard; and the pass
+/// hands on nothing else of `x`. A fused or reordered sum needs a bare product or sum, so it would be wrong for some
+/// guard. Operation by operation, of those that may follow:
+///
+/// - `| guard` again, the operation between having fallen away (`0.0 + x`, `1.0 * x`, a selection, a copy): the two are
+///   one, `x | guard`, which still stands between `x` and what comes after.
+/// - Selections, loops' carried values and vectors: the guard may move behind them, `(x or y) | guard`, but no sum or
+///   product is among them, and it stands before the next one.
+/// - `&`, `|`, shifts by and with other words, and `abs`: a guard may move through, masked or shifted alike, and stays
+///   unknown wherever a bit of `x` is left. Bits that are masked off carry neither.
+/// - `^` with other words, negation, integer sums and conversions: no guard moves through.
+/// - `&`, `^` and sums of two guarded words, as `(x | guard) ^ (y | guard) = (x ^ y) & ~guard`: a guard may be shared, but
+///   what is under it is an integer operation, and neither a float sum nor a product.
+/// - `floor`, comparisons: of the guarded value, as any other; no guard moves through.
+/// - Nothing else meets the guard: the shader cannot name it, and the pass uses it in no other way.
 pub fn guarded(module: &Module) -> Result<Module, ShaderError> {
     let info = validate(module).map_err(|error| ShaderError::Invalid(error.to_string()))?;
     let foreign = foreign_in(module, &info);
@@ -222,7 +245,7 @@ fn guard_function(function: &mut Function, info: &FunctionInfo, module: &Module,
                 _ => zero,
             };
             let bits = append(Expression::As { expr: first, kind: ScalarKind::Uint, convert: None }, span);
-            let op = BinaryOperator::ExclusiveOr;
+            let op = BinaryOperator::InclusiveOr;
             let same = append(Expression::Binary { op, left: bits, right: zeros }, span);
             append(Expression::As { expr: same, kind: ScalarKind::Float, convert: None }, span)
         } else {
@@ -475,7 +498,11 @@ fn check_limits(module: &Module, limits: &wgpu::Limits) -> Result<(), ShaderErro
 /// guard) on; errors of the driver go to the device's error scopes.
 ///
 /// Unless `checked`, shaders run without bounds checks, loop bounds, division checks and zeroed workgroup memory.
-pub fn compile(
+///
+/// # Safety
+/// As of [`super::device::Gpu::pipeline`].
+#[allow(unsafe_code)]
+pub(super) unsafe fn compile(
     device: &wgpu::Device,
     label: &str,
     wgsl: &str,
@@ -502,8 +529,7 @@ pub fn compile(
                 ..Default::default()
             };
             // SAFETY: naga validated the module and wrote the SPIR-V, to which only decorations were added; limits were
-            // checked above; the shaders are this crate's own, whose loops end and whose indices are in bounds.
-            #[allow(unsafe_code)]
+            // checked above; the rest is the caller's.
             return Ok(unsafe { device.create_shader_module_passthrough(descriptor) });
         }
         Pass::Guarded => guarded(&module)?,
@@ -514,8 +540,6 @@ pub fn compile(
     if checked {
         return Ok(device.create_shader_module(descriptor));
     }
-    // SAFETY: wgpu validates the module; the shaders are this crate's own, whose loops end and whose indices are in
-    // bounds, as the checked builds in the tests show.
-    #[allow(unsafe_code)]
+    // SAFETY: wgpu validates the module; the rest is the caller's.
     Ok(unsafe { device.create_shader_module_trusted(descriptor, wgpu::ShaderRuntimeChecks::unchecked()) })
 }

@@ -84,7 +84,7 @@ impl Kernels {
         let text = edit(source());
         let pipeline = |entry, buffers: &[Binding]| -> Result<_, DeviceError> {
             let layout = gpu.layout(entry, buffers)?;
-            Ok((gpu.pipeline(entry, &text, entry, &layout)?, layout))
+            Ok((gpu.own_pipeline(entry, &text, entry, &layout)?, layout))
         };
         let breed = pipeline("breed", &[Read, Read, Read, Write])?;
         let gather = pipeline("gather", &[Read, Read, Read, Write, Read, Read, Read])?;
@@ -176,6 +176,16 @@ impl Population {
         Arc::ptr_eq(&self.kernels, kernels)
     }
 
+    /// Whether it has these sizes, `[leaders, slots, parameters]`.
+    ///
+    /// # Errors
+    /// It has others.
+    pub fn check(&self, sizes: [usize; 3]) -> Result<(), BackendError> {
+        let own = [self.leaders, self.slots, self.parameters];
+        let text = || format!("populations of {own:?} leaders, policies and weights stand for some of {sizes:?}");
+        if own == sizes { Ok(()) } else { Err(BackendError::Misfit(text())) }
+    }
+
     /// Bytes of the pieces that one leader's policies come back in.
     fn pieces(&self) -> impl Iterator<Item = Range<usize>> + use<> {
         let size = self.slots * self.parameters * size_of::<f32>();
@@ -185,6 +195,7 @@ impl Population {
 
 impl Held for Population {
     fn breed(&mut self, breeding: &Breeding<'_>) -> Result<(), BackendError> {
+        breeding.check([self.leaders, self.slots, self.parameters])?;
         let Kernels { gpu, breed: (pipeline, layout), .. } = &*self.kernels;
         let Breeding { parents, key, generation, learning } = *breeding;
         let threshold = evolve::mutation_threshold(learning.mutation_probability);

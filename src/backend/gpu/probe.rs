@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use wgpu::BufferUsages;
 
-use super::device::{Binding, DeviceError, Gpu};
-use super::episode::GpuEpisodes;
+use super::device::{Binding, DeviceError, Gpu, Kind};
+use super::episode::{GpuEpisodes, Kernel};
 use super::population::Kernels;
 use crate::backend::compare::first_mismatch;
 use crate::backend::cpu::Cpu;
@@ -49,7 +49,7 @@ pub type Probe = fn(&Gpu) -> Result<Option<Mismatch>, DeviceError>;
 
 /// All probes that a pass must survive, the quickest first.
 ///
-/// A new one is a function here: it compiles through `gpu.pipeline`, so that the pass under test applies to it.
+/// A new one is a function here: it compiles through `gpu.own_pipeline`, so that the pass under test applies to it.
 pub const ALL: &[Probe] = &[arithmetic, episode, breeding];
 
 /// Computations of `arithmetic`, in the order of `shaders/probe.wgsl`.
@@ -106,7 +106,7 @@ fn arithmetic(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
     let from = gpu.upload("probe values", &values, BufferUsages::STORAGE)?;
     let to = gpu.buffer("probe words", bytes, BufferUsages::STORAGE | BufferUsages::COPY_SRC)?;
     let layout = gpu.layout("probe", &[Binding::Read, Binding::Write])?;
-    let pipeline = gpu.pipeline("probe", SHADER, "probe", &layout)?;
+    let pipeline = gpu.own_pipeline("probe", SHADER, "probe", &layout)?;
     let buffers = gpu.bind("probe", &layout, &[from.as_entire_buffer_binding(), to.as_entire_buffer_binding()])?;
     gpu.dispatch("probe", &pipeline, &buffers, [ITEMS.div_ceil(WORKGROUP) as u32, 1, 1])?;
     let words: Vec<u32> = gpu.read(&to, 0..bytes)?;
@@ -129,7 +129,11 @@ fn episode(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
         Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies: TEAMS, teams: &teams };
     let traced = |error| refused(gpu, error);
     let expected = Cpu::default().trace(&group).map_err(traced)?;
-    let found = GpuEpisodes::new(gpu.clone())?.trace(&group).map_err(traced)?;
+    let mut episodes = GpuEpisodes::new(gpu.clone())?;
+    if gpu.adapter.kind != Kind::Software {
+        episodes = episodes.playing(Kernel::Specialised);
+    }
+    let found = episodes.trace(&group).map_err(traced)?;
     Ok(first_mismatch(&world, &expected, &found).map(|mismatch| Mismatch {
         probe: format!("an episode, {mismatch}").into(),
         values: Vec::new(),
@@ -152,7 +156,7 @@ fn breeding(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
     let mut held = Arc::new(Kernels::new(gpu.clone(), |text| text)?).hold(weights, sizes)?;
     let mut found = vec![0.0; weights.len()];
     held.breed(&breeding).and_then(|()| held.fetch(&mut found)).map_err(|error| refused(gpu, error))?;
-    let expected = breeding.on_host(sizes, weights);
+    let expected = breeding.on_host(sizes, weights).map_err(|error| refused(gpu, error))?;
     let differs = |index: &usize| expected[*index].to_bits() != found[*index].to_bits();
     Ok((0..found.len()).find(differs).map(|index| Mismatch {
         probe: format!("breeding, weight {}", index % world.parameters()).into(),
@@ -195,7 +199,7 @@ impl Ceiling {
     /// When the device fails.
     pub fn new(gpu: &Gpu) -> Result<Ceiling, DeviceError> {
         let layout = gpu.layout("ceiling", &[Binding::Read, Binding::Read, Binding::Write])?;
-        let pipeline = gpu.pipeline("ceiling", CEILING, "ceiling", &layout)?;
+        let pipeline = gpu.own_pipeline("ceiling", CEILING, "ceiling", &layout)?;
         let numbers = gpu.upload("ceiling's numbers", &[1.000_000_1f32, 0.25, -1.0, 0.0], BufferUsages::STORAGE)?;
         let turns = gpu.upload("ceiling's turns", &[0u32; 4], BufferUsages::STORAGE)?;
         let result = gpu.buffer("ceiling's result", (WORKGROUP * size_of::<f32>()) as u64, BufferUsages::STORAGE)?;
