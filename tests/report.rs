@@ -804,7 +804,7 @@ fn the_papers_figures_come_with_its_claims() {
     assert_eq!(folders.len(), 18);
     let last = |folder: &str| {
         let is_it = |arm: &&Value| {
-            let [layout, paradigm, fitness] = ["layout", "paradigm", "fitness"].map(|key| arm[key].as_str().unwrap());
+            let [layout, paradigm, fitness] = ["layout", "paradigm", "source"].map(|key| arm[key].as_str().unwrap());
             folder == format!("{}-{paradigm}-{fitness}", layout.replace(' ', "-"))
         };
         let arm = arms.iter().find(is_it).unwrap();

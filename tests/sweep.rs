@@ -340,7 +340,7 @@ fn a_varied_sweep_has_columns_and_a_picture_of_its_keys() {
     assert_eq!(axes[..3], [["G", "6", "3"], ["G", "3", "3"], ["G", "12", "3"]]);
     assert_eq!(axes[8..], [["Df", "6", "1"], ["Df", "6", "2"]]);
     let names: Vec<String> = results(&whole).into_iter().map(|(name, _)| name).collect();
-    assert_eq!(names, ["final.png", "final.svg", "points.csv", "results.csv", "sweep.toml"]);
+    assert_eq!(names, ["final.pdf", "final.png", "final.svg", "points.csv", "results.csv", "sweep.toml"]);
 
     // A dot for each value; the files' own values are lines.
     assert_eq!(fs::read_to_string(whole.join("final.svg")).unwrap().matches("<circle").count(), 8);

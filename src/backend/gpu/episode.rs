@@ -30,7 +30,7 @@ const ROLE: usize = 32;
 const WORKGROUPS: [usize; 3] = [64, 128, 256];
 /// Teams of a workgroup of a specialised kernel: most fill a warp with one agent of as many teams.
 const TEAMS: [usize; 3] = [32, 16, 8];
-/// Threads of such a workgroup at most, so that each may have 80 registers of the 65 536 that an NVIDIA processor has.
+/// Threads of such a workgroup at most, so that two or more fit into a compute unit and hide each other's waiting.
 const MOST_THREADS: usize = 512;
 /// Weights of one policy at most that are written out as straight-line code.
 const MOST_WEIGHTS: usize = 512;
@@ -486,7 +486,7 @@ impl GpuEpisodes {
     }
 
     /// The same with another choice of kernels than by default: [`Kernel::Best`], but [`Kernel::Generic`] on a software
-    /// renderer, which takes longer to compile the others than it saves.
+    /// renderer, whose compiler takes a second for each of the others.
     pub fn playing(self, kernel: Kernel) -> GpuEpisodes {
         GpuEpisodes { kernel, ..self }
     }
