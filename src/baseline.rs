@@ -4,6 +4,7 @@
 //! Both are played by a backend like any team, from the starts of the trial that they are held against. Random teams are
 //! drawn as generation 0 draws policies, by a purpose of their own, so that no result of a training changes.
 
+use std::cell::RefCell;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use fearless_simd::Level;
@@ -67,6 +68,7 @@ impl Baselines {
     /// # Errors
     /// When the backend fails; this generation can then be played again.
     pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<(), BackendError> {
+        thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
         let generation = self.generation;
         let mut playing: Vec<_> =
             self.places.iter_mut().filter(|place| generation <= place.config.learning.generations).collect();
@@ -84,10 +86,11 @@ impl Baselines {
         }
         backend.rollout(&groups, &|episode: Episode<'_>| {
             let (place, first) = homes[episode.group];
-            // G is the same for every leader, so one place for it would do; a score a leader is what credit writes.
-            let mut scores = vec![0.0; place.world.leaders()];
-            let observed = Credit::default().score(&episode, &place.world, Fitness::G, &mut scores);
-            place.observed[first + episode.team].fetch_add(observed, Relaxed);
+            CREDIT.with_borrow_mut(|(credit, scores)| {
+                scores.resize(place.world.leaders(), 0.0);
+                let observed = credit.score(&episode, &place.world, Fitness::G, scores);
+                place.observed[first + episode.team].fetch_add(observed, Relaxed);
+            });
         })?;
         playing.iter_mut().for_each(|place| place.conclude());
         self.generation += 1;
