@@ -342,6 +342,8 @@ fn a_varied_sweep_has_columns_and_a_picture_of_its_keys() {
     let names: Vec<String> = results(&whole).into_iter().map(|(name, _)| name).collect();
     assert_eq!(names, ["final.pdf", "final.png", "final.svg", "points.csv", "results.csv", "sweep.toml"]);
 
+    let picture = fs::read_to_string(whole.join("final.svg")).unwrap();
+    assert!(picture.contains("as in the file; generations (6): 3 "), "{}", &picture[..800]);
     // A dot for each value; the files' own values are lines.
     assert_eq!(fs::read_to_string(whole.join("final.svg")).unwrap().matches("<circle").count(), 8);
 

@@ -302,6 +302,23 @@ pub struct Dots {
 }
 
 impl Dots {
+    /// What each panel has, row by row.
+    fn description(&self) -> String {
+        let told = |spread: &Option<Spread>| spread.map_or("missing".into(), |[mean, ..]| format!("{mean:.2}"));
+        let panel = |(title, base, found): &(String, Option<Spread>, Vec<Option<Spread>>)| {
+            let mut found = found.iter();
+            let group = |(name, values): &(String, Vec<String>)| {
+                let values: Vec<_> =
+                    values.iter().zip(&mut found).map(|(value, spread)| format!("{value} {}", told(spread))).collect();
+                format!("{name}: {}", values.join(", "))
+            };
+            let groups: Vec<_> = self.groups.iter().map(group).collect();
+            let title = if title.is_empty() { String::new() } else { format!("{title}: ") };
+            format!("{title}{} as in the file; {}.", told(base), groups.join("; "))
+        };
+        self.panels.iter().map(panel).collect::<Vec<_>>().join(" ")
+    }
+
     pub fn scene(&self) -> Scene {
         const HIGH: f64 = 4.0;
         const RADIUS: f64 = 0.75;
@@ -316,6 +333,7 @@ impl Dots {
         let panels = Panels::new(self.panels.len(), plot + WRITTEN, height, left, 15.0);
         let whole = panels.width().max(text_width(&self.title, 3.2) * 1.1 + 6.0);
         let mut scene = Scene::new(whole, panels.above + panels.height());
+        (scene.title, scene.description) = (self.title.clone(), self.description());
         scene.bold([3.0, 5.0], &*self.title, 3.2, Anchor::Start, BLACK);
 
         let (accent, own) = (shade(0.7), Pen { dash: &[1.2, 0.8], ..Pen::new(BLACK, 0.25) });
