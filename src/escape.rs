@@ -14,7 +14,7 @@ pub fn line(text: &str) -> Cow<'_, str> {
     escaped(text, steers)
 }
 
-/// [`line`] of a text of several lines, which may have tabs.
+/// [`line()`] of a text of several lines, which may have tabs.
 pub fn lines(text: &str) -> Cow<'_, str> {
     escaped(text, |c| steers(c) && !matches!(c, '\n' | '\t'))
 }
