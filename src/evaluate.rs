@@ -9,6 +9,7 @@ use glam::Vec2;
 use crate::backend::{Backend, BackendError, Group};
 use crate::credit::Credit;
 use crate::evolve::{self, Key, Purpose};
+use crate::statistics;
 use crate::world::World;
 
 /// Most episodes of one evaluation.
@@ -58,7 +59,7 @@ pub struct Tally {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spread {
     pub mean: f64,
-    /// Sample standard deviation over episodes, and the 95 % interval of the mean (Student's t); none of one episode.
+    /// Sample standard deviation over episodes, and the 95 % interval of the mean ([`statistics::mean`]'s); none of one episode.
     pub deviation: Option<f64>,
     pub interval: Option<[f64; 2]>,
 }
@@ -84,7 +85,11 @@ impl Tally {
             (squares as f64 / (count * (count - 1.0))).sqrt() / unit
         });
         let interval = deviation.map(|deviation| {
-            let half = student(self.count - 1) * deviation / count.sqrt();
+            let half = match deviation {
+                // Of values that are all alike, as many may be off by one part as could have gone unseen.
+                0.0 => statistics::share(0, self.count as usize).map_or(0.0, |share| share.high) / unit,
+                deviation => statistics::reach(self.count as usize) * deviation / count.sqrt(),
+            };
             [(mean - half).max(0.0), (mean + half).min(most as f64)]
         });
         Spread { mean, deviation, interval }
@@ -184,20 +189,4 @@ pub fn evaluate(
         }
     }
     Ok(evaluation)
-}
-
-/// The 97.5 % quantile of Student's t: exact to the digits given up to 10 degrees of freedom, to 1e-5 beyond.
-fn student(degrees: u64) -> f64 {
-    const FEW: [f64; 10] =
-        [12.706205, 4.302653, 3.182446, 2.776445, 2.570582, 2.446912, 2.364624, 2.306004, 2.262157, 2.228139];
-    if let Some(&t) = degrees.checked_sub(1).and_then(|index| FEW.get(index as usize)) {
-        return t;
-    }
-    // Cornish and Fisher's expansion around the normal distribution's quantile.
-    let (z, n) = (1.959_963_984_540_054_f64, degrees as f64);
-    let polynomial = |factors: &[f64]| z * factors.iter().rev().fold(0.0, |sum, factor| sum * z * z + factor);
-    z + polynomial(&[1.0, 1.0]) / (4.0 * n)
-        + polynomial(&[3.0, 16.0, 5.0]) / (96.0 * n * n)
-        + polynomial(&[-15.0, 17.0, 19.0, 3.0]) / (384.0 * n * n * n)
-        + polynomial(&[-945.0, -1920.0, 1482.0, 776.0, 79.0]) / (92160.0 * n * n * n * n)
 }

@@ -20,7 +20,6 @@ const FLUSH: Duration = Duration::from_secs(1);
 /// Most runs that have files flushed to the disk at a time, each by a thread of its own.
 const MAX_WRITERS: usize = 32;
 /// The commit that this program was built from.
-const COMMIT: Option<&str> = option_env!("FLOTILLA_COMMIT");
 
 /// Why a run could not go on.
 #[derive(Debug, thiserror::Error)]
@@ -164,6 +163,9 @@ impl Session {
                 return Err(RecordError::Exists { path: path.clone() }.into());
             }
         }
+        for (_, path) in runs.iter().filter(|(_, path)| start == Start::Force && path.is_dir()) {
+            folder::lock(path)?;
+        }
         let opened = side_by_side(runs, |(config, path)| Member::open(config, path, start, disk))?;
         let (mut members, mut snapshots, mut notes) = (Vec::new(), Vec::new(), Vec::new());
         for (member, snapshot, told) in opened {
@@ -291,7 +293,7 @@ impl Session {
     fn settle_on(&mut self, (backend, machine): &Player) {
         for run in self.members.iter_mut().filter(|member| member.going.is_some()).map(|member| &mut member.run) {
             let Machine { backend: kind, adapter, driver, threads } = machine.clone();
-            let (version, commit) = (env!("CARGO_PKG_VERSION").into(), COMMIT.map(String::from));
+            let (version, commit) = (env!("CARGO_PKG_VERSION").into(), crate::COMMIT.map(String::from));
             let description = backend.describe();
             *run = Run { version, commit, description, backend: kind, adapter, driver, threads, ..run.clone() };
         }

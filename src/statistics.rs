@@ -37,9 +37,14 @@ pub fn mean(values: &[f64], step: f64) -> Option<Estimate> {
     let (value, error) = moments(values)?;
     let room = match error {
         0.0 => step * share(0, values.len())?.high,
-        error => error * student(values.len()).inverse_cdf(1.0 - (1.0 - CONFIDENCE) / 2.0),
+        error => error * reach(values.len()),
     };
     Some(Estimate { value, low: value - room, high: value + room })
+}
+
+/// How many standard errors the interval of a mean of so many values, two at least, reaches to either side.
+pub fn reach(count: usize) -> f64 {
+    student(count).inverse_cdf(1.0 - (1.0 - CONFIDENCE) / 2.0)
 }
 
 /// A share by Clopper and Pearson's exact interval; none of nothing.

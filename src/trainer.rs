@@ -227,12 +227,7 @@ impl Trainer {
         arm.trials.iter().map(sort).collect()
     }
 
-    /// [`Trainer::policies`], in the room of the next generation.
-    pub fn best_policies(&mut self, arm: usize) -> Vec<&[f32]> {
-        self.ends(&[arm]).remove(0).0
-    }
-
-    /// What came out of arms that are done: [`Trainer::best_policies`], and the snapshot after the last generation, whose
+    /// What came out of arms that are done: [`Trainer::policies`], in the room of the next generation, and the snapshot after the last generation, whose
     /// weights are left out since they are the same in another order.
     pub fn ends(&mut self, arms: &[usize]) -> Vec<End<'_>> {
         for &arm in arms {

@@ -938,8 +938,11 @@ fn a_paper_is_written_over_only_when_that_is_asked_for() {
     let old = folder.path().join("old");
     fs::create_dir(&old).unwrap();
     fs::write(old.join("figure4.svg"), "").unwrap();
-    refused(&old, &[], &["holds a paper already"]);
-    refused(&old, &["--resume"], &["nothing to go on with"]);
+    for flags in [&[][..], &["--resume"], &["--force"]] {
+        refused(&old, flags, &["holds figure4.svg, but no paper.toml"]);
+    }
+    assert!(old.join("figure4.svg").exists());
+    refused(&sweep, &["--force"], &["holds a sweep, no paper"]);
     refused(&sweep.join("sweep.toml"), &[], &["is a file"]);
 }
 
@@ -951,11 +954,16 @@ fn a_signal_stops_a_paper_and_it_goes_on_to_the_same_files() {
     let out = folder.path().join("a paper");
     let program = assert_cmd::cargo::cargo_bin!("flotilla");
     let flags = ["--trials", "1", "--generations", "60", "--backend", "cpu", "--quiet"];
+    // In the place of another, of which nothing may be left in the way of going on.
+    let other = ["--trials", "1", "--generations", "1", "--seed", "9", "--backend", "cpu", "--quiet"];
+    succeed(&[&["paper", "--out", out.to_str().unwrap()], &other[..]].concat());
     let mut child = Command::new(program);
-    let child = child.args(["paper", "--out"]).arg(&out).args(flags).stderr(Stdio::piped()).spawn().unwrap();
-    let metrics = out.join("arms/chaotic-leader-follower-Df/run.json");
+    child.args(["paper", "--force", "--out"]).arg(&out).args(flags);
+    let child = child.stderr(Stdio::piped()).spawn().unwrap();
+    let run = out.join("arms/chaotic-leader-follower-Df/run.json");
+    let trains = || fs::read_to_string(&run).is_ok_and(|text| text.contains("\"seed\": 0") && text.contains("running"));
     let start = std::time::Instant::now();
-    while !metrics.exists() {
+    while !trains() {
         assert!(start.elapsed().as_secs() < 60, "it does not start");
         std::thread::sleep(std::time::Duration::from_millis(2));
     }

@@ -12,7 +12,7 @@ use crate::config::{self, Override};
 use crate::memory;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
-use crate::record::folder::{self, Start};
+use crate::record::folder::{self, ARMS, Folder, PAPER, POINTS, SWEEP, Start};
 use crate::record::metrics::Row;
 use crate::report::curves::PRINT;
 use crate::report::paper::{self, Arm, Measured, Results, Summary, claims, tables};
@@ -23,8 +23,6 @@ use crate::run::{self, Options, Outcome, RunError, Session, Twin};
 use crate::shell;
 
 /// What a paper's folder holds: of which trials, generations and seed its arms are, and the arms themselves.
-const PAPER: &str = "paper.toml";
-const ARMS: &str = "arms";
 const CLAIMS: &str = "claims.md";
 const SUMMARY: &str = "summary.json";
 
@@ -94,6 +92,10 @@ pub fn run(args: Args) -> Result<(), Error> {
     let plan = memory::Plan::of(&configs, rayon::current_num_threads());
     plan.check(player.1.backend == "gpu").map_err(RunError::from)?;
     let disk = Disk::default();
+    disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
+    let _lock = folder::lock(out)?;
+    // Only now is nobody else writing here.
+    marks.compare(out, start)?;
     marks.claim(out, start, &disk)?;
 
     let folders: Vec<PathBuf> = arms.iter().map(|arm| out.join(ARMS).join(arm_name(arm))).collect();
@@ -105,6 +107,13 @@ pub fn run(args: Args) -> Result<(), Error> {
     let (mut session, notes) = Session::open(runs, start, &disk)?;
     for (run, note) in notes.iter().filter(|(_, note)| note.is_damage()) {
         say(format_args!("{}: {note}", arms[trained[*run]].name()));
+    }
+    let twins: Vec<usize> = (0..arms.len()).filter(|&arm| trained[places[arm]] != arm).collect();
+    if start == Start::Force {
+        // What is written over is gone before anything can stop this.
+        for &arm in &twins {
+            Folder::open(&folders[arm], start, &arms[arm].config, disk.clone())?;
+        }
     }
     let learning = arms[0].config.learning.clone();
     if !session.is_done() {
@@ -147,15 +156,13 @@ pub fn run(args: Args) -> Result<(), Error> {
             )));
         }
     }
-    let twins = (0..arms.len()).filter(|&arm| trained[places[arm]] != arm);
-    let twins = twins.map(|arm| Twin {
+    let twins = twins.into_iter().map(|arm| Twin {
         of: folders[trained[places[arm]]].clone(),
         of_config: configs[places[arm]].clone(),
         folder: folders[arm].clone(),
         config: arms[arm].config.clone(),
     });
-    let fresh = if start == Start::Fresh { Start::Resume } else { start };
-    run::record_twins(twins.collect(), fresh, &disk)?;
+    run::record_twins(twins.collect(), Start::Resume, &disk)?;
     for (arm, folder) in arms.iter_mut().zip(&folders) {
         let config = arm.config.clone();
         runs::metrics(folder, &config, |row| arm.add(row))?;
@@ -170,7 +177,10 @@ pub fn run(args: Args) -> Result<(), Error> {
                 args.command_to_resume()
             )));
         }
-        baselines.advance(&mut *player.0)?;
+        if let Err(error) = baselines.advance(&mut *player.0) {
+            player = args.loss.instead(&error).ok_or(error)?;
+            continue;
+        }
         let (generation, last) = (baselines.generation(), learning.generations);
         let part = generation as f64 / (last + 1) as f64;
         meter.show(part, || format!("playing random teams: generation {generation} of {last}"));
@@ -287,15 +297,22 @@ impl Marks {
             return Err(RecordError::NoFolder { path: out.into() }.into());
         }
         let (name, holds) = (out.display(), |name: &str| out.join(name).exists());
-        let paper = [PAPER, ARMS, CLAIMS, SUMMARY].iter().chain(&FIGURES).any(|name| holds(name));
+        let like_ours = [ARMS, CLAIMS, SUMMARY].iter().chain(&FIGURES).find(|name| holds(name));
         let what = match () {
-            () if paper => "a paper",
-            () if ["sweep.toml", "points"].into_iter().any(holds) => "a sweep",
+            () if holds(PAPER) => "a paper",
+            () if [SWEEP, POINTS].into_iter().any(holds) => "a sweep",
             () if folder::holds_run(out)? => "a run",
-            () => return Ok(()),
+            () => match like_ours {
+                None => return Ok(()),
+                Some(theirs) => {
+                    return Err(Error::Refused(format!(
+                        "{name} holds {theirs}, but no {PAPER}, which would say that it is a paper's; choose another --out"
+                    )));
+                }
+            },
         };
         match start {
-            Start::Force => Ok(()),
+            Start::Force if what == "a paper" => Ok(()),
             Start::Fresh if what == "a paper" => Err(Error::Refused(format!(
                 "{name} holds a paper already; go on with it by --resume, write over it by --force, or choose another --out"
             ))),
@@ -307,13 +324,6 @@ impl Marks {
     /// Refuses to go on with another paper, but for more generations.
     fn compare_paper(&self, out: &Path) -> Result<(), Error> {
         let path = out.join(PAPER);
-        if !path.exists() {
-            let name = out.display();
-            return Err(Error::Refused(format!(
-                "{name} holds figures without the runs that they are of: there is nothing to go on with; write over them \
-                 by --force, or choose another --out"
-            )));
-        }
         let text = config::read_file(&path)?;
         let there: toml::Table = text.parse().map_err(|error: toml::de::Error| RecordError::Damaged {
             path: path.clone(),
@@ -344,7 +354,6 @@ impl Marks {
             let path = path.to_path_buf();
             |error| RecordError::Write { path, error }
         };
-        disk.create_folder(out).map_err(failed(out))?;
         if start == Start::Force {
             for path in [CLAIMS, SUMMARY].iter().chain(&FIGURES).map(|name| out.join(name)) {
                 disk.remove(&path).map_err(failed(&path))?;

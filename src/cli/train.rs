@@ -109,6 +109,10 @@ pub fn run(args: Args) -> Result<(), Error> {
         |error| say(format_args!("{}: cannot be written: {error}; there are no event files", path.display()));
     let events = || Events::create(&path, config.learning.trials, &folder.join(METRICS)).map_err(events_failed).ok();
     let mut events = args.tensorboard.then(events).flatten();
+    if start == Start::Force && !args.tensorboard {
+        // They are of the run that was written over.
+        Events::clear(&path).unwrap_or_else(events_failed);
+    }
     let told = Told { config: &config, name: args.config.name(), folder: &folder, runs_on: &runs_on };
     if session.is_done() {
         return told.print(&session, None, args.json);

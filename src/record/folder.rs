@@ -21,6 +21,9 @@ pub const RUN: &str = "run.json";
 pub const METRICS: &str = "metrics.csv";
 pub const POLICIES: &str = "policies.safetensors";
 pub const CHECKPOINTS: &str = "checkpoints";
+/// What marks a folder as a paper's, and the folder of its runs.
+pub const PAPER: &str = "paper.toml";
+pub const ARMS: &str = "arms";
 /// In a sweep's folder: the sweep as it was run, and its tables.
 pub const SWEEP: &str = "sweep.toml";
 pub const RESULTS: &str = "results.csv";
@@ -409,8 +412,11 @@ impl Drop for Folder {
     }
 }
 
-/// Locks a folder for this process; none where the file system has no locks.
-fn lock(path: &Path) -> Result<Option<File>, RecordError> {
+/// Locks a folder for this process, as long as what this gives is kept; nothing where the file system has no locks.
+///
+/// # Errors
+/// Another process has it, or it cannot be written.
+pub(crate) fn lock(path: &Path) -> Result<Option<File>, RecordError> {
     let name = path.join(LOCK);
     if fs::metadata(&name).is_ok_and(|there| !there.is_file()) {
         return Err(RecordError::damaged(&name, "it is no file, as a lock has to be; remove it"));
@@ -425,7 +431,7 @@ fn lock(path: &Path) -> Result<Option<File>, RecordError> {
     }
 }
 
-/// The folder of the run or sweep that a file is needed by, if it is one of theirs; pictures are not needed.
+/// The folder of the run, sweep or paper that a file is needed by, if it is one of theirs; pictures are not needed.
 pub fn owner(path: &Path) -> Option<PathBuf> {
     let path = file::resolved(path);
     let (folder, name) = (file::folder(&path), path.file_name()?.to_str()?);
@@ -433,8 +439,9 @@ pub fn owner(path: &Path) -> Option<PathBuf> {
     let is_run = |folder: &Path| has(folder, &[CONFIG]) && has(folder, &[RUN, METRICS, CHECKPOINTS]);
     let of_run = [CONFIG, RUN, METRICS, POLICIES, LOCK].contains(&name) && is_run(folder);
     let of_sweep = [SWEEP, RESULTS, POINTS].contains(&name) && has(folder, &[SWEEP]);
+    let of_paper = name == PAPER && has(folder, &[ARMS]);
     let checkpoint = folder.ends_with(CHECKPOINTS) && is_run(file::folder(folder));
-    match (of_run || of_sweep, checkpoint) {
+    match (of_run || of_sweep || of_paper, checkpoint) {
         (true, _) => Some(folder.into()),
         (_, true) => Some(file::folder(folder).into()),
         _ => None,

@@ -37,15 +37,10 @@ impl Events {
         let seconds = now() as u64;
         let digits = trials.saturating_sub(1).to_string().len();
         let mut files = Vec::with_capacity(trials);
+        Events::clear(folder)?;
         for trial in 0..trials {
             let folder = folder.join(format!("trial-{trial:0digits$}"));
             fs::create_dir_all(&folder)?;
-            for entry in fs::read_dir(&folder)? {
-                let path = entry?.path();
-                if path.file_name().is_some_and(|name| name.to_string_lossy().contains(MARK)) {
-                    fs::remove_file(path)?;
-                }
-            }
             files.push(folder.join(format!("events.out.{MARK}.{seconds:010}.flotilla")));
         }
         let first = record(&event(now(), 0, &Content::Version));
@@ -61,6 +56,28 @@ impl Events {
         }
         events.flush()?;
         Ok(events)
+    }
+
+    /// Removes a run's event files, and nothing else.
+    ///
+    /// # Errors
+    /// One cannot be removed.
+    pub fn clear(folder: &Path) -> io::Result<()> {
+        if !folder.is_dir() {
+            return Ok(());
+        }
+        for trial in fs::read_dir(folder)? {
+            let trial = trial?.path();
+            let is_ours = trial.file_name().is_some_and(|name| name.to_string_lossy().starts_with("trial-"));
+            for entry in if is_ours && trial.is_dir() { Some(fs::read_dir(trial)?) } else { None }.into_iter().flatten()
+            {
+                let path = entry?.path();
+                if path.file_name().is_some_and(|name| name.to_string_lossy().contains(MARK)) {
+                    fs::remove_file(path)?;
+                }
+            }
+        }
+        Ok(())
     }
 
     fn add_at(&mut self, row: &Row, time: f64) {

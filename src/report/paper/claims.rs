@@ -94,7 +94,9 @@ enum Measure {
     Mean(Vec<f64>, Allowed),
     /// By pair of trials, in POIs.
     Difference(Vec<f64>, Allowed),
-    /// The same, with the p of its test.
+    /// By pair of trials, in shares of the POIs, of which a layout has four at most.
+    Shares(Vec<f64>, Allowed),
+    /// As [`Measure::Difference`], with the p of its test.
     Tested(Vec<f64>, Allowed),
     /// In how many of so many trials or pairs.
     Share(usize, usize, Allowed),
@@ -120,6 +122,13 @@ impl Measure {
             }
             Measure::Difference(values, allowed) | Measure::Tested(values, allowed) => {
                 let estimate = estimate(values, -pois)?;
+                (estimate, judge(estimate, *allowed), format!("{:+.2}", estimate.value))
+            }
+            Measure::Shares(values, allowed) => {
+                let estimate = match certain {
+                    true => Estimate::exact(*values.first()?),
+                    false => statistics::mean(values, 0.25)?.within(-1.0, 1.0),
+                };
                 (estimate, judge(estimate, *allowed), format!("{:+.2}", estimate.value))
             }
             &Measure::Share(count, of, allowed) => {
@@ -407,7 +416,7 @@ const TESTS: &[Test] = &[
                 let all = view.all()?;
                 Some(all.observed(END)?.iter().map(|pois| pois / all.pois as f64).collect::<Vec<_>>())
             };
-            Some(Measure::Difference(less(&share(view)?, &share(View { layout: GENERAL, ..view })?), BELOW_0))
+            Some(Measure::Shares(less(&share(view)?, &share(View { layout: GENERAL, ..view })?), BELOW_0))
         },
     },
     Test {
