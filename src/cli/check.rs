@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::{ConfigArgs, Error, plot, print};
+use super::{ConfigArgs, Error, output, plot, print};
 use crate::config::Config;
 use crate::memory::Plan;
 use crate::report::map;
@@ -82,6 +82,7 @@ struct Report<'a> {
 /// Prints the config, so that standard output is a config file again, with the cost as comments below it.
 pub fn run(args: Args) -> Result<(), Error> {
     let kind = args.out.as_deref().map(plot::kind_of).transpose()?;
+    output::check(&[("--out", args.out.as_deref())], &[&args.config.file.path])?;
     let config = args.config.load()?;
     if let (Some(out), Some(kind)) = (&args.out, kind) {
         let name = args.config.name();

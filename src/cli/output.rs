@@ -20,6 +20,10 @@ pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), 
         if path.exists() && !path.is_file() && !path.is_dir() {
             continue;
         }
+        // Better told before hours of playing than after.
+        if let Err(error) = std::fs::metadata(file::folder(path)) {
+            return Err(RecordError::Write { path: path.into(), error }.into());
+        }
         let resolved = file::resolved(path);
         let refused =
             |why: &str| Err(Error::Usage(format!("{flag} {}: this file {why}; name another to write", path.display())));

@@ -13,7 +13,7 @@ use crate::file;
 use crate::memory;
 use crate::record::RecordError;
 use crate::record::disk;
-use crate::record::folder::{CONFIG, RUN, Run, SWEEP, Start};
+use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
 use crate::report::progress::Meter;
 use crate::run::{Options, Outcome as Ended};
 use crate::shell;
@@ -239,9 +239,13 @@ fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         Err(ConfigError::Invalid { name: path.display().to_string(), problems, unlisted: 0 }.into())
     };
     if !there(&path)? {
-        return match there(&out.join(CONFIG))? {
-            true => refuse(format!("{} holds a run, not a sweep; choose another --out", out.display())),
-            false => Ok(()),
+        let holds = match there(&out.join(CONFIG))? {
+            true => Some("a run"),
+            false => folder::collection(out),
+        };
+        return match holds {
+            Some(what) => refuse(format!("{} holds {what}, not a sweep; choose another --out", out.display())),
+            None => Ok(()),
         };
     }
     let there = config::read_file(&path)?;
@@ -374,9 +378,9 @@ fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(),
             );
             if names.is_empty() {
             } else if sweep.axes.iter().any(|axis| axis.varied) {
-                text += "  final (.svg, .png)   G at the end, by each value of each varied key\n";
+                text += "  final (.svg, .png, .pdf)   G at the end, by each value of each varied key\n";
             } else {
-                text += "  final, reach, curves (.svg, .png)   G at the end, generations to reach one, and learning curves\n";
+                text += "  final, reach, curves (.svg, .png, .pdf)   G at the end, generations to reach one, and learning curves\n";
             }
             text.extend(note.map(|note| note + "\n"));
             print(&text)?;

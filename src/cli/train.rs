@@ -40,7 +40,7 @@ pub struct Args {
     /// Go on with the run in the folder (without --out the latest of this config's name), or start it if there is none
     #[arg(long, conflicts_with = "force")]
     resume: bool,
-    /// Write over the run in the folder
+    /// Write over the run in the folder (without --out in runs/NAME of the config)
     #[arg(long)]
     force: bool,
     /// No progress on standard error
@@ -92,6 +92,9 @@ pub fn run(args: Args) -> Result<(), Error> {
     Plan::of([&config], rayon::current_num_threads()).check(player.1.backend == "gpu").map_err(RunError::from)?;
     let runs_on = player.0.describe();
     let (folder, start) = args.folder()?;
+    if let Some(what) = folder::collection(&folder) {
+        return Err(Error::Refused(format!("{} holds {what}, not a run; choose another --out", folder.display())));
+    }
     let signals = Signals::listen()?;
     let opened = Session::open(vec![(config.clone(), folder.clone())], start, &Disk::default());
     let (mut session, notes) = opened.map_err(|error| match error {
@@ -115,6 +118,9 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
     let told = Told { config: &config, name: args.config.name(), folder: &folder, runs_on: &runs_on };
     if session.is_done() {
+        if !folder.join(CURVES).exists() {
+            draw(&folder);
+        }
         return told.print(&session, None, args.json);
     }
     if !args.quiet {

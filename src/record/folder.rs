@@ -219,7 +219,7 @@ impl Folder {
         if start == Start::Resume {
             folder.find(config, &mut found)?;
         }
-        if found.finished.is_some() {
+        if found.finished.is_some() && Config::load(&folder.file(CONFIG)).is_ok() {
             return Ok((folder, found));
         }
         folder.write_text(CONFIG, &config.to_toml())?;
@@ -429,6 +429,12 @@ pub(crate) fn lock(path: &Path) -> Result<Option<File>, RecordError> {
         Err(TryLockError::Error(error)) if error.kind() == ErrorKind::Unsupported => Ok(None),
         Err(TryLockError::Error(error)) => Err(RecordError::write(&name)(error)),
     }
+}
+
+/// What a folder holds many runs of, if it does: "a paper" or "a sweep".
+pub fn collection(path: &Path) -> Option<&'static str> {
+    let all = [(PAPER, "a paper"), (SWEEP, "a sweep")];
+    all.into_iter().find(|(name, _)| path.join(name).exists()).map(|(_, what)| what)
 }
 
 /// The folder of the run, sweep or paper that a file is needed by, if it is one of theirs; pictures are not needed.

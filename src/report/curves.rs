@@ -110,17 +110,18 @@ pub struct Figure {
 impl Figure {
     /// The figure at the width of a column.
     pub fn scene(&self) -> Scene {
-        const LEFT: f64 = 10.0;
         const RIGHT: f64 = 3.0;
         const GAP: f64 = 5.5;
         const BELOW: f64 = 9.0;
+        // Shares take more room than whole numbers.
+        let edge = if self.shares { 12.5 } else { 10.0 };
         let labels = distinct(&[&self.legend[..], &self.references].concat(), COLUMN - 20.0, SMALL);
         let rows = legend_rows(&labels);
         let titles = if self.panels.iter().any(|panel| !panel.title.is_empty()) { 4.5 } else { 1.5 };
         let above = 1.0 + rows.len() as f64 * 3.8 + titles;
         let columns = self.panels.len().max(1) as f64;
         let height = if columns > 1.0 { 36.0 } else { 46.0 };
-        let width = (COLUMN - LEFT - RIGHT - GAP * (columns - 1.0)) / columns;
+        let width = (COLUMN - edge - RIGHT - GAP * (columns - 1.0)) / columns;
         let banded = band_caption(self.panels.iter().flat_map(|panel| &panel.curves).map(|(_, curve)| curve));
         let caption = if banded.is_some() { 4.0 } else { 0.0 };
         let mut scene = Scene::new(COLUMN, above + height + BELOW + caption);
@@ -148,7 +149,7 @@ impl Figure {
             |panel: &Panel| panel.curves.iter().filter_map(|(_, c)| c.generation.last().copied()).fold(1.0, f64::max);
         let x_max = self.panels.iter().map(last).fold(1.0, f64::max);
         for (column, (panel, curves)) in self.panels.iter().zip(&thinned).enumerate() {
-            let left = LEFT + (width + GAP) * column as f64;
+            let left = edge + (width + GAP) * column as f64;
             let axes = Axes { left, above, width, height, x_max, y_max: self.y_max * 1.04 };
             scene.bold([left + width / 2.0, above - 1.3], &*panel.title, NORMAL, Anchor::Middle, BLACK);
             axes.draw(&mut scene, column == 0, self.y_max, self.shares);
@@ -157,11 +158,11 @@ impl Figure {
                     1 => "Generation".to_string(),
                     each => format!("Generation (each point the mean of {each})"),
                 };
-                let middle = LEFT + (COLUMN - LEFT - RIGHT) / 2.0;
+                let middle = edge + (COLUMN - edge - RIGHT) / 2.0;
                 scene.text([middle, above + height + 7.4], label, NORMAL, Anchor::Middle, BLACK);
             }
             if let Some(caption) = banded.as_ref().filter(|_| column == 0) {
-                draw_caption(&mut scene, [LEFT, above + height + 11.4], caption);
+                draw_caption(&mut scene, [edge, above + height + 11.4], caption);
             }
             scene.clipped([left - 0.8, above - 0.8, width + 1.6, height + 1.6], |scene| {
                 let (curves, references): (Vec<_>, Vec<_>) =
@@ -222,8 +223,9 @@ impl Figure {
 
 /// What a band is, if any of the curves has one.
 pub fn band_caption<'a>(curves: impl Iterator<Item = &'a Curve>) -> Option<String> {
-    let banded = curves.filter(|curve| curve.error.iter().any(|&error| error > 0.0));
-    let trials: std::collections::BTreeSet<u32> = banded.map(|curve| curve.trials).collect();
+    let curves: Vec<&Curve> = curves.collect();
+    curves.iter().any(|curve| curve.error.iter().any(|&error| error > 0.0)).then_some(())?;
+    let trials: std::collections::BTreeSet<u32> = curves.iter().map(|curve| curve.trials).collect();
     let (least, most) = (trials.first()?, trials.last()?);
     let trials = if least == most { most.to_string() } else { format!("{least} to {most}") };
     Some(format!("mean ± standard error over {trials} trials"))

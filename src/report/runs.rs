@@ -7,7 +7,7 @@ use super::curves::{Curve, Figure, Panel, Tally};
 use crate::config::{Config, ConfigError};
 use crate::file;
 use crate::record::RecordError;
-use crate::record::folder::{CONFIG, METRICS};
+use crate::record::folder::{self, CONFIG, METRICS};
 use crate::record::metrics::{self, RowsError};
 
 /// Most runs that one figure can tell apart.
@@ -26,6 +26,8 @@ pub enum RunError {
         "{folder}: {error}\nfind a config that is whole, and repeat the run with `flotilla train CONFIG --out DIR`"
     )]
     Config { folder: PathBuf, error: ConfigError },
+    #[error("{folder} holds {what}; name one of the runs in it, as {folder}/{example}")]
+    Collection { folder: PathBuf, what: &'static str, example: &'static str },
     #[error("{folder}: {reason}; finish the run with `flotilla train {folder}/{CONFIG} --out {folder} --resume`")]
     Unfinished { folder: PathBuf, reason: String },
     #[error(transparent)]
@@ -46,6 +48,10 @@ pub fn config(folder: &Path) -> Result<Config, RunError> {
     }
     let path = folder.join(CONFIG);
     if !seen(&path)? {
+        if let Some(what) = folder::collection(folder) {
+            let example = if what == "a sweep" { "points/0000" } else { "arms/chaotic-leader-follower-Df" };
+            return Err(RunError::Collection { folder: folder.into(), what, example });
+        }
         return Err(RunError::Foreign { folder: folder.into(), name: CONFIG });
     }
     Config::load(&path).map_err(|error| RunError::Config { folder: folder.into(), error })
