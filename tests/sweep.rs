@@ -331,7 +331,7 @@ fn a_varied_sweep_has_columns_and_a_picture_of_its_keys() {
     let listed = done(flotilla(&sweep, &whole, &["--list"]));
     assert!(listed.contains("learning.fitness = Df, world.coupling = 2\n"), "{listed}");
     let told = done(flotilla(&sweep, &whole, &["--quiet", skip]));
-    assert!(told.contains("10 of 10 points are done") && told.contains("  final (.svg, .png)"), "{told}");
+    assert!(told.contains("10 of 10 points are done") && told.contains("  final (.svg, .png, .pdf)"), "{told}");
 
     let table = fs::read_to_string(whole.join("points.csv")).unwrap();
     let rows: Vec<Vec<&str>> = table.lines().map(|line| line.split(',').collect()).collect();
