@@ -19,8 +19,6 @@ use crate::trainer::{SnapshotError, Trainer};
 const FLUSH: Duration = Duration::from_secs(1);
 /// Most runs that have files flushed to the disk at a time, each by a thread of its own.
 const MAX_WRITERS: usize = 32;
-/// The commit that this program was built from.
-
 /// Why a run could not go on.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
