@@ -269,6 +269,47 @@ fn a_sweep_and_a_config_are_told_apart() {
 }
 
 #[test]
+fn folders_of_many_runs_are_no_runs() {
+    let place = Place::new();
+    place.good(&["sweep", "grid.toml", "--out", "sweep", "--quiet"]);
+    let picture = fs::read(place.path("sweep/curves.svg")).unwrap();
+    for flags in [&[][..], &["--force"], &["--resume"]] {
+        let told = place.refused(1, &[&["train", "small.toml", "--out", "sweep"], flags].concat());
+        assert!(told.contains("sweep holds a sweep, not a run"), "{told}");
+    }
+    assert_eq!(fs::read(place.path("sweep/curves.svg")).unwrap(), picture);
+    for command in ["plot", "replay"] {
+        assert!(place.refused(1, &[command, "sweep"]).contains("name one of the runs in it, as sweep/points/0000"));
+    }
+    place.good(&["replay", "sweep/points/0000"]);
+}
+
+#[test]
+fn what_is_gone_of_a_done_run_is_written_again() {
+    let place = Place::with_run();
+    let config = fs::read(place.path("run/config.toml")).unwrap();
+    fs::write(place.path("run/config.toml"), "x = 1").unwrap();
+    fs::remove_file(place.path("run/curves.svg")).unwrap();
+    place.good(&["train", "small.toml", "--out", "run", "--resume", "--quiet"]);
+    assert_eq!(fs::read(place.path("run/config.toml")).unwrap(), config);
+    assert!(place.path("run/curves.svg").exists());
+    place.good(&["replay", "run"]);
+}
+
+#[test]
+fn outputs_are_looked_at_before_anything_is_done() {
+    let place = Place::with_run();
+    fs::copy(place.path("small.toml"), place.path("small.svg")).unwrap();
+    assert!(place.refused(2, &["check", "small.svg", "--out", "small.svg"]).contains("is read from"));
+    assert_eq!(fs::read(place.path("small.svg")).unwrap(), fs::read(place.path("small.toml")).unwrap());
+    let policies = "run/policies.safetensors";
+    let nowhere = ["rollout", "small.toml", "--policies", policies, "--scores", "s.csv", "--trace", "none/t.csv"];
+    let told = place.refused(1, &nowhere);
+    assert!(told.contains("none/t.csv") && !told.contains("playing"), "{told}");
+    assert!(!place.path("s.csv").exists());
+}
+
+#[test]
 fn what_cannot_be_seen_is_not_said_to_be_missing() {
     let place = Place::with_run();
     let hide = |name: &str| {
