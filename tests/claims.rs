@@ -1,5 +1,7 @@
 //! Statistics are scipy's, baselines are what a backend plays, and verdicts on the paper's claims follow from them.
 
+#![cfg(feature = "cli")]
+
 use std::sync::Mutex;
 
 use fearless_simd::Level;

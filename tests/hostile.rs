@@ -2,6 +2,8 @@
 //!
 //! `FLOTILLA_FUZZ` is how many mutated inputs each reader gets (20 000 if left out).
 
+#![cfg(feature = "cli")]
+
 use std::fs;
 use std::io::Cursor;
 use std::time::{Duration, Instant};

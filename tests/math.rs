@@ -398,6 +398,7 @@ fn flush_makes_small_values_positive_zero() {
 const RUST: &str = include_str!("../src/kernels/math.rs");
 const WGSL: &str = include_str!("../shaders/lib/math.wgsl");
 
+#[cfg(feature = "gpu")]
 #[test]
 fn the_shader_is_valid() {
     let module = naga::front::wgsl::parse_str(WGSL).unwrap_or_else(|error| panic!("{}", error.emit_to_string(WGSL)));

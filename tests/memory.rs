@@ -1,6 +1,8 @@
 //! What a run takes in memory is what `flotilla check` foretold, and a run that would take more than there is does not
 //! start.
 
+#![cfg(feature = "cli")]
+
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};

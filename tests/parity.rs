@@ -3,6 +3,8 @@
 //!
 //! Every test walks all adapters. What each has caught is said where it stands.
 
+#![cfg(feature = "gpu")]
+
 mod common;
 
 use std::mem::offset_of;

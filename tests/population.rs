@@ -1,5 +1,7 @@
 //! Populations that a GPU holds against populations on the host, bit for bit: bred, gathered, trained, saved and lost.
 
+#![cfg(feature = "cli")]
+
 mod common;
 
 use std::any::Any;

@@ -2,6 +2,8 @@
 //!
 //! `FLOTILLA_KILLS` is how often the real program is killed (20 if left out).
 
+#![cfg(feature = "cli")]
+
 mod common;
 
 use std::fs;

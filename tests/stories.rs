@@ -3,6 +3,8 @@
 //!
 //! Where results change on purpose, `FLOTILLA_WRITE_CLAIMS=1 cargo test --test stories` writes the tables anew.
 
+#![cfg(feature = "cli")]
+
 use std::fs;
 use std::path::Path;
 

@@ -1,6 +1,8 @@
 //! Sweeps: what a file expands to, how points are shared out, and that neither sharing, batching nor killing shows in
 //! the results.
 
+#![cfg(feature = "cli")]
+
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
