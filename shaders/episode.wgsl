@@ -32,7 +32,7 @@ struct Shape {
 }
 
 // This task's world.
-var<private> world: World;
+var<private> world: Constants;
 
 // Positions of all agents, `[agents][teams]`, as of the last step, and as of this step: the two take turns, so that one
 // barrier a step is enough.

@@ -38,6 +38,7 @@ pub mod bench;
 pub mod cli;
 pub mod config;
 pub mod credit;
+pub mod declare;
 pub mod escape;
 pub mod evaluate;
 pub mod evolve;

@@ -1,9 +1,9 @@
 //! One experiment's constants and start state, in the form that kernels and shaders read.
 
-use bytemuck::{Pod, Zeroable};
 use glam::{DVec2, Vec2};
 
 use crate::config::{Config, Coupling, Density, MAX_HIDDEN_LAYERS, Paradigm};
+use crate::declare::shared;
 
 /// Inputs of a policy: POI and agent density in four quadrants each.
 pub const INPUTS: usize = 8;
@@ -14,57 +14,57 @@ pub const GRID: f32 = 262_144.0;
 /// A squared range no distance on a map reaches.
 const UNLIMITED: f32 = 1e30;
 
-/// What every kernel reads, one field a word, the same on both sides (`struct World` in `shaders/lib/layout.wgsl`).
-///
-/// Derived numbers are computed here once, in f64, and rounded once.
-#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct Constants {
-    pub leaders: u32,
-    pub followers: u32,
-    pub pois: u32,
-    pub steps: u32,
-    /// u32 words in the set of agents near one POI.
-    pub words: u32,
-    /// Weight layers of a policy, and its widths `8, hidden…, 2` (unused entries 0).
-    pub layers: u32,
-    pub widths: [u32; MAX_HIDDEN_LAYERS + 2],
-    /// Weights of one policy.
-    pub parameters: u32,
-    pub map_x: f32,
-    pub map_y: f32,
-    /// Speed times `dt` is the length of a step.
-    pub dt: f32,
-    pub heading_x: f32,
-    pub heading_y: f32,
-    pub speed: f32,
-    pub min_speed: f32,
-    pub max_speed: f32,
-    /// Largest change of speed in a step.
-    pub max_speed_change: f32,
-    /// Largest turn in a step, at most π, with its cosine and sine (cosine -2 where any turn is allowed).
-    pub max_turn: f32,
-    pub max_turn_cos: f32,
-    pub max_turn_sin: f32,
-    /// Squared radii.
-    pub observation_radius2: f32,
-    pub attraction_radius2: f32,
-    pub repulsion_radius2: f32,
-    pub poi_range2: f32,
-    pub agent_range2: f32,
-    /// Walls push within this distance.
-    pub repulsion_radius: f32,
-    /// Gain over radius of each force.
-    pub attraction_scale: f32,
-    pub repulsion_scale: f32,
-    pub wall_gain: f32,
-    /// 1/P and 1/N.
-    pub poi_share: f32,
-    pub agent_share: f32,
-    /// 0 linear, 1 inverse.
-    pub density: u32,
-    /// 1/D with D = √2·max(map).
-    pub inverse_diagonal: f32,
+shared! {
+    /// What every kernel reads.
+    ///
+    /// Derived numbers are computed here once, in f64, and rounded once.
+    pub struct Constants {
+        pub leaders: u32,
+        pub followers: u32,
+        pub pois: u32,
+        pub steps: u32,
+        /// u32 words in the set of agents near one POI.
+        pub words: u32,
+        /// Weight layers of a policy, and its widths `8, hidden…, 2` (unused entries 0).
+        pub layers: u32,
+        pub widths: [u32; MAX_HIDDEN_LAYERS + 2],
+        /// Weights of one policy.
+        pub parameters: u32,
+        pub map_x: f32,
+        pub map_y: f32,
+        /// Speed times `dt` is the length of a step.
+        pub dt: f32,
+        pub heading_x: f32,
+        pub heading_y: f32,
+        pub speed: f32,
+        pub min_speed: f32,
+        pub max_speed: f32,
+        /// Largest change of speed in a step.
+        pub max_speed_change: f32,
+        /// Largest turn in a step, at most π, with its cosine and sine (cosine -2 where any turn is allowed).
+        pub max_turn: f32,
+        pub max_turn_cos: f32,
+        pub max_turn_sin: f32,
+        /// Squared radii.
+        pub observation_radius2: f32,
+        pub attraction_radius2: f32,
+        pub repulsion_radius2: f32,
+        pub poi_range2: f32,
+        pub agent_range2: f32,
+        /// Walls push within this distance.
+        pub repulsion_radius: f32,
+        /// Gain over radius of each force.
+        pub attraction_scale: f32,
+        pub repulsion_scale: f32,
+        pub wall_gain: f32,
+        /// 1/P and 1/N.
+        pub poi_share: f32,
+        pub agent_share: f32,
+        /// 0 linear, 1 inverse.
+        pub density: u32,
+        /// 1/D with D = √2·max(map).
+        pub inverse_diagonal: f32,
+    }
 }
 
 /// One world: constants, start positions of all agents (leaders first), POIs and how many agents each needs.

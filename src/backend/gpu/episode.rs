@@ -13,7 +13,7 @@ use std::fmt::{self, Write};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bytemuck::{Pod, Zeroable};
+use bytemuck::Zeroable;
 use glam::Vec2;
 use rayon::prelude::*;
 
@@ -22,6 +22,7 @@ use super::exact;
 use super::population::{Kernels, Population, Stretch, TOGETHER, parts};
 use crate::backend::{Backend, BackendError, Episode, Group, Held, Moment, Strided, Trace, Visit, Weights};
 use crate::config::{MAX_AGENTS, MAX_HIDDEN_LAYERS};
+use crate::declare::{Shared, shared};
 use crate::world::{Constants, INPUTS, OUTPUTS, World};
 
 /// Threads that share a warp on most GPUs; leaders and followers are kept apart by as many (`ROLE` in the shader).
@@ -52,33 +53,33 @@ const TURNS: usize = 60_000;
 /// Offsets of bindings are multiples of this on every WebGPU device.
 pub(super) const BINDING_ALIGNMENT: usize = 256;
 
-/// One workgroup's share of the work (`struct Task` in `shaders/lib/layout.wgsl`); offsets count elements.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct Task {
-    pub world: u32,
-    pub starts: u32,
-    pub pois: u32,
-    pub weights: u32,
-    pub sets: u32,
-    pub seen: u32,
-    pub moments: u32,
-    pub states: u32,
-    pub teams: u32,
-    /// The steps that a dispatch plays: from `first` on, before `end`.
-    pub first: u32,
-    pub end: u32,
-}
+shared! {
+    /// One workgroup's share of the work: some teams of one group.
+    #[derive(Default)]
+    pub struct Task {
+        pub world: u32,
+        /// Where each of these starts in its buffer, in elements.
+        pub starts: u32,
+        pub pois: u32,
+        pub weights: u32,
+        pub sets: u32,
+        pub seen: u32,
+        pub moments: u32,
+        pub states: u32,
+        pub teams: u32,
+        /// The steps that a dispatch plays: from `first` on, before `end`.
+        pub first: u32,
+        pub end: u32,
+    }
 
-/// An agent between two dispatches (`struct State` in the shader).
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-#[repr(C)]
-pub struct State {
-    pub x: f32,
-    pub y: f32,
-    pub hx: f32,
-    pub hy: f32,
-    pub speed: f32,
+    /// An agent between two dispatches.
+    pub struct State {
+        pub x: f32,
+        pub y: f32,
+        pub hx: f32,
+        pub hy: f32,
+        pub speed: f32,
+    }
 }
 
 /// Which kernel plays; no result depends on that.
@@ -810,6 +811,7 @@ fn source(shape: Shape) -> String {
     exact::assemble(&[
         &constants,
         &front,
+        &[Constants::wgsl(), Task::wgsl(), State::wgsl(), Moment::wgsl()].concat(),
         include_str!("../../../shaders/lib/layout.wgsl"),
         include_str!("../../../shaders/lib/math.wgsl"),
         include_str!("../../../shaders/sense.wgsl"),
