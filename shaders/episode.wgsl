@@ -9,6 +9,7 @@
 //   TRACE      whether every stage of every step is kept
 //   TALLY      whether a follower counts the leaders that it sees in registers (SIGHTS of them), not in the record
 //   shape      the sizes
+//   variant    what the step has code of its own for
 //   adopt      readies them
 //   decide     a leader's policy
 //
@@ -26,9 +27,6 @@ struct Shape {
     words: u32,
     // Teams of a workgroup; a task may have fewer.
     teams: u32,
-    density: u32,
-    // Whether the largest turn is so small that its sine tells angles apart, not its cosine.
-    by_sine: bool,
 }
 
 // This task's world.

@@ -1,15 +1,18 @@
 // What the generic kernel has in front instead of constants: the sizes of whatever world a task plays.
 //
-// The host puts this constant in front:
-//   WIDEST     widest layer of any policy, inputs included
+// The host puts in front:
+//   WIDEST         widest layer of any policy, inputs included
+//   world_variant  the variant of this task's world
 
 var<private> shape: Shape;
+var<private> variant: Variant;
 
 fn adopt(task: Task) {
     let agents = world.leaders + world.followers;
     // An empty task has no team, but something to divide by.
     let teams = max(task.teams, 1u);
-    shape = Shape(world.leaders, agents, world.pois, world.words, teams, world.density, world.max_turn_cos > 0.7);
+    shape = Shape(world.leaders, agents, world.pois, world.words, teams);
+    variant = world_variant();
 }
 
 // A leader's answer to its inputs: layer by layer, each unit's bias (the last of its weights) and weighted inputs added

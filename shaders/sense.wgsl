@@ -4,7 +4,7 @@
 fn density(range2: f32, dx: f32, dy: f32) -> f32 {
     let d2 = dx * dx + dy * dy;
     var density: f32;
-    if shape.density == 0u {
+    if variant.density == DENSITY_LINEAR {
         density = 1.0 - root(d2) * world.inverse_diagonal;
     } else {
         density = rsqrt(select(1.0, d2, d2 > 1.0));

@@ -63,9 +63,24 @@ pub trait Shared: Pod {
     /// Its fields as WGSL has them; those of a shared struct within it stand among its own.
     fn fields() -> String;
 
+    /// Its fields' names.
+    fn names() -> &'static [&'static str];
+
     /// `struct Name { … }`
     fn wgsl() -> String {
         format!("struct {} {{\n{}}}\n", Self::NAME, Self::fields())
+    }
+
+    /// The WGSL expression of this value, of a struct of whole numbers.
+    fn value(&self) -> String {
+        let words: Vec<String> = bytemuck::cast_slice(&[*self]).iter().map(|word: &u32| format!("{word}u")).collect();
+        format!("{}({})", Self::NAME, words.join(", "))
+    }
+
+    /// The WGSL expression of such a struct whose fields are those of another struct.
+    fn copied_from(other: &str) -> String {
+        let fields: Vec<String> = Self::names().iter().map(|name| format!("{other}.{name}")).collect();
+        format!("{}({})", Self::NAME, fields.join(", "))
     }
 }
 
@@ -74,10 +89,16 @@ pub trait Shared: Pod {
 ///
 /// All that is in them has 32 bits, so that nothing is padded on either side.
 macro_rules! shared {
-    ($($(#[$about:meta])* pub struct $name:ident $(as $lanes:ident)? $fields:tt)+) => {$(
-        $crate::declare::shared! { @struct $(#[$about])* $name $fields }
-        $($crate::declare::shared! { @lanes $name $lanes $fields })?
-    )+};
+    () => {};
+    ($(#[$about:meta])* pub struct $name:ident as $lanes:ident { $($fields:tt)+ } $($more:tt)*) => {
+        $crate::declare::shared! { @struct $(#[$about])* $name { $($fields)+ } }
+        $crate::declare::shared! { @lanes $name $lanes { $($fields)+ } }
+        $crate::declare::shared! { $($more)* }
+    };
+    ($(#[$about:meta])* pub struct $name:ident { $($fields:tt)+ } $($more:tt)*) => {
+        $crate::declare::shared! { @struct $(#[$about])* $name { $($fields)+ } }
+        $crate::declare::shared! { $($more)* }
+    };
     (@struct $(#[$about:meta])* $name:ident { $($(#[$doc:meta])* pub $field:ident: $type:ty,)+ }) => {
         $(#[$about])*
         #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
@@ -91,6 +112,10 @@ macro_rules! shared {
 
             fn fields() -> String {
                 [$(<$type as $crate::declare::Field>::declared(stringify!($field))),+].concat()
+            }
+
+            fn names() -> &'static [&'static str] {
+                &[$(stringify!($field)),+]
             }
         }
     };
@@ -127,7 +152,15 @@ pub trait Choice: Copy + Serialize + 'static {
     }
 }
 
-/// Defines an enum whose variants are written in configs as the words given, and in shaders as constants.
+/// What is to be done for each word of a choice by code of its own: the word's number is a constant of the compiler's.
+pub trait Fixed {
+    type Output;
+
+    fn with<const WORD: u32>(self) -> Self::Output;
+}
+
+/// Defines an enum whose variants are written in configs as the words given, and in shaders as constants: `wgsl` has
+/// `const DENSITY_LINEAR: u32 = 0u;` for what is `Density::Linear` here.
 macro_rules! choice {
     ($(#[$doc:meta])* $name:ident { $($(#[$variant_doc:meta])* $variant:ident = $word:literal,)* }) => {
         $(#[$doc])*
@@ -138,6 +171,26 @@ macro_rules! choice {
 
         impl $crate::declare::Choice for $name {
             const ALL: &'static [(&'static str, Self)] = &[$(($word, Self::$variant),)*];
+        }
+
+        impl $name {
+            /// The word of a number.
+            pub const fn of(number: u32) -> $name {
+                <$name as $crate::declare::Choice>::ALL[number as usize].1
+            }
+
+            /// Does what is to be done for this word.
+            #[inline(always)]
+            pub fn fix<F: $crate::declare::Fixed>(self, fixed: F) -> F::Output {
+                match self { $($name::$variant => fixed.with::<{ $name::$variant as u32 }>(),)* }
+            }
+
+            /// The words' numbers as constants of a shader.
+            pub fn wgsl() -> String {
+                let words = [$((stringify!($variant), $name::$variant as u32)),*];
+                let name = |word: &str| format!("{}_{}", stringify!($name), word).to_uppercase();
+                words.map(|(word, number)| format!("const {}: u32 = {number}u;\n", name(word))).concat()
+            }
         }
 
         impl std::fmt::Display for $name {

@@ -8,10 +8,11 @@
 //!                       └──────────────┴────────────── next generation ◀───────┘
 //! ```
 //!
-//! 1. [`config`] reads a TOML file and names everything that is wrong with it.
+//! 1. [`config`] reads a TOML file and names everything that is wrong with it. The sections of a step's parts, and all
+//!    else that is to be said of a part, stand in [`model`].
 //! 2. [`world`] turns it into one experiment's constants and start state.
 //! 3. [`trainer`] asks [`evolve`] for teams and hands all of them, of all trials, to a [`backend`] as one batch.
-//! 4. The backend plays each team's whole episode: by [`kernels`] on the CPU, by their twins under `shaders/` on a GPU.
+//! 4. The backend plays each team's whole episode: by [`model`] on the CPU, by its twins under `shaders/` on a GPU.
 //!    It reports who was near which POI at which step, and which leader each follower saw.
 //! 5. [`credit`] turns that record into G, D, Df and D++.
 //! 6. [`evolve`] selects and mutates, or has a GPU that holds the populations do the latter; [`run`] keeps what came out
@@ -24,7 +25,8 @@
 //! turns what was typed into all this.
 //!
 //! Imports run one way: `main ▸ cli ▸ {run, sweep, report, evaluate, verify, bench} ▸ trainer ▸ {evolve, credit,
-//! backend}`, `backend ▸ {evolve, kernels}`. Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
+//! backend}`, `backend ▸ {evolve, world ▸ config ▸ model ▸ {kernels,
+//! reader} ▸ declare}`. Only `backend::gpu` knows wgpu; the model knows neither threads nor GPUs.
 
 /// The commit that this was built from, where that is known; a debug build does not know it.
 pub const COMMIT: Option<&str> = {
@@ -45,6 +47,8 @@ pub mod evolve;
 pub mod file;
 pub mod kernels;
 pub mod memory;
+pub mod model;
+mod reader;
 pub mod record;
 pub mod report;
 pub mod run;

@@ -23,7 +23,9 @@ use super::population::{Kernels, Population, Stretch, TOGETHER, parts};
 use crate::backend::{Backend, BackendError, Episode, Group, Held, Moment, Strided, Trace, Visit, Weights};
 use crate::config::{MAX_AGENTS, MAX_HIDDEN_LAYERS};
 use crate::declare::{Shared, shared};
-use crate::world::{Constants, INPUTS, OUTPUTS, World};
+use crate::model::policy::PolicyConstants;
+use crate::model::{self, Constants, Variant};
+use crate::world::{INPUTS, OUTPUTS, World};
 
 /// Threads that share a warp on most GPUs; leaders and followers are kept apart by as many (`ROLE` in the shader).
 const ROLE: usize = 32;
@@ -120,7 +122,7 @@ enum Sizes {
     /// The widest layer, inputs included, rounded up to spare compilations.
     Any { widest: usize },
     /// All that makes a difference to the code.
-    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], density: u32, by_sine: bool },
+    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], variant: Variant },
 }
 
 const WIDTHS: usize = MAX_HIDDEN_LAYERS + 2;
@@ -131,14 +133,14 @@ impl Shape {
     }
 
     fn generic(world: &World, packing: Packing, trace: bool) -> Shape {
-        let widest = world.constants.widths.into_iter().max().unwrap_or(0).next_power_of_two() as usize;
+        let widest = world.constants.policy.widths.into_iter().max().unwrap_or(0).next_power_of_two() as usize;
         Shape { workgroup: packing.workgroup, slots: packing.slots, trace, sizes: Sizes::Any { widest } }
     }
 
     fn specialised(world: &World, packing: Packing, trace: bool) -> Shape {
-        let Constants { leaders, followers, pois, widths, density, max_turn_cos, .. } = world.constants;
-        let (agents, by_sine) = (leaders + followers, max_turn_cos > 0.7);
-        let sizes = Sizes::Fixed { teams: packing.teams, leaders, agents, pois, widths, density, by_sine };
+        let Constants { leaders, followers, pois, variant, policy: PolicyConstants { widths, .. }, .. } =
+            world.constants;
+        let sizes = Sizes::Fixed { teams: packing.teams, leaders, agents: leaders + followers, pois, widths, variant };
         Shape { workgroup: packing.workgroup, slots: packing.slots, trace, sizes }
     }
 }
@@ -186,7 +188,7 @@ impl Packing {
 
 /// Steps that one dispatch may play, see [`TURNS`].
 fn steps_a_dispatch(world: &World, packing: Packing) -> usize {
-    let Constants { widths, words, .. } = world.constants;
+    let Constants { words, policy: PolicyConstants { widths, .. }, .. } = world.constants;
     let network: u32 = widths.windows(2).map(|w| (w[0] + 2) * w[1]).sum();
     let agent = world.pois.len() + world.agents() + network as usize + 20;
     let items = (world.pois.len() * words as usize * packing.teams).div_ceil(packing.workgroup);
@@ -730,7 +732,7 @@ impl GpuEpisodes {
                     leaders: leaders as u32,
                     first: first as u32,
                     count: TOGETHER.min(leaders - first) as u32,
-                    parameters: group.world.constants.parameters,
+                    parameters: group.world.constants.policy.parameters,
                     teams,
                     teams_a_task: shares[0].task.teams,
                     choices: choices.len() as u32,
@@ -799,28 +801,24 @@ fn source(shape: Shape) -> String {
     );
     let front = match sizes {
         Sizes::Any { widest } => {
-            format!("const WIDEST: u32 = {widest}u;\n{}", include_str!("../../../shaders/generic.wgsl"))
+            let variant = Variant::copied_from("world");
+            let generic = include_str!("../../../shaders/generic.wgsl");
+            format!("const WIDEST: u32 = {widest}u;\nfn world_variant() -> Variant {{ return {variant}; }}\n{generic}")
         }
-        Sizes::Fixed { teams, leaders, agents, pois, widths, density, by_sine } => format!(
-            "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u, {density}u, {by_sine});\n\
+        Sizes::Fixed { teams, leaders, agents, pois, widths, variant } => format!(
+            "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u);\nconst variant = {variant};\n\
              fn adopt(task: Task) {{}}\n{}",
             straight_policy(&widths),
-            words = agents.div_ceil(32)
+            words = agents.div_ceil(32),
+            variant = variant.value()
         ),
     };
-    exact::assemble(&[
-        &constants,
-        &front,
-        &[Constants::wgsl(), Task::wgsl(), State::wgsl(), Moment::wgsl()].concat(),
-        include_str!("../../../shaders/lib/layout.wgsl"),
-        include_str!("../../../shaders/lib/math.wgsl"),
-        include_str!("../../../shaders/sense.wgsl"),
-        include_str!("../../../shaders/policy.wgsl"),
-        include_str!("../../../shaders/follow.wgsl"),
-        include_str!("../../../shaders/motion.wgsl"),
-        include_str!("../../../shaders/couple.wgsl"),
-        include_str!("../../../shaders/episode.wgsl"),
-    ])
+    let structs = [Task::wgsl(), State::wgsl(), Moment::wgsl()].concat();
+    let (front, math) =
+        ([constants, front, model::declarations(), structs], include_str!("../../../shaders/lib/math.wgsl"));
+    let front = front.iter().map(String::as_str).chain([include_str!("../../../shaders/lib/layout.wgsl"), math]);
+    let parts = front.chain(model::WGSL).chain([include_str!("../../../shaders/episode.wgsl")]);
+    exact::assemble(&parts.collect::<Vec<_>>())
 }
 
 /// A policy of these widths as straight-line code: `decide` of `shaders/generic.wgsl`, its loops written out. Each unit is
@@ -869,7 +867,8 @@ pub fn shaders() -> Vec<(&'static str, String)> {
         |workgroup, slots, widest, trace| source(Shape { workgroup, slots, trace, sizes: Sizes::Any { widest } });
     let specialised = |trace| {
         let widths = [INPUTS as u32, 10, OUTPUTS as u32, 0, 0];
-        let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, density: 0, by_sine: true };
+        let variant = Variant { density: 0, by_sine: 1 };
+        let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, variant };
         source(Shape { workgroup: 384, slots: 1, trace, sizes })
     };
     vec![
