@@ -17,11 +17,10 @@ fn adopt(task: Task) {
 
 // A leader's answer to its inputs: layer by layer, each unit's bias (the last of its weights) and weighted inputs added
 // in order.
-fn decide(lane: u32, stride: u32, of_pois: vec4<f32>, of_agents: vec4<f32>) -> vec2<f32> {
+fn decide(lane: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
     var inputs: array<f32, WIDEST>;
-    for (var quadrant = 0u; quadrant < 4u; quadrant++) {
-        inputs[quadrant] = of_pois[quadrant];
-        inputs[4u + quadrant] = of_agents[quadrant];
+    for (var input = 0u; input < INPUTS; input++) {
+        inputs[input] = sensed[input];
     }
     var first = 0u;
     for (var layer = 0u; layer < world.layers; layer++) {

@@ -27,3 +27,10 @@ fn sense(density: f32, dx: f32, dy: f32, hx: f32, hy: f32, sums: ptr<function, v
     (*sums).z += select(0.0, density, left && front);
     (*sums).w += select(0.0, density, left && !front);
 }
+
+// The policy's inputs, of the sums over a leader's quadrants.
+fn weigh_in(of_pois: vec4<f32>, of_agents: vec4<f32>) -> array<f32, INPUTS> {
+    let p = of_pois * world.poi_share;
+    let a = of_agents * world.agent_share;
+    return array(p.x, p.y, p.z, p.w, a.x, a.y, a.z, a.w);
+}

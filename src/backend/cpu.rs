@@ -397,7 +397,7 @@ impl<S: Simd> Block<S> {
         let Block { simd, world, agents, near, inputs, .. } = self;
         for (leader, (agent, inputs)) in agents.iter().zip(inputs).enumerate() {
             let &Agent { x, y, hx, hy, .. } = agent;
-            let mut sums = [splat(*simd, 0.0); 4];
+            let mut of_pois = [splat(*simd, 0.0); 4];
             let (fours, rest) = pois.as_chunks::<4>();
             for pois in fours {
                 let mut densities = [x; 4];
@@ -407,19 +407,15 @@ impl<S: Simd> Block<S> {
                 }
                 for (&density, poi) in densities.iter().zip(pois) {
                     let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
-                    sense::sense::<S>(density, dx, dy, hx, hy, &mut sums);
+                    sense::sense::<S>(density, dx, dy, hx, hy, &mut of_pois);
                 }
             }
             for poi in rest {
                 let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
                 let density = sense::density::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
-                sense::sense::<S>(density, dx, dy, hx, hy, &mut sums);
+                sense::sense::<S>(density, dx, dy, hx, hy, &mut of_pois);
             }
-            let (of_pois, of_agents) = inputs.split_at_mut(4);
-            for (input, sum) in of_pois.iter_mut().zip(sums) {
-                *input = sum * world.sense.poi_share;
-            }
-            let mut sums = [splat(*simd, 0.0); 4];
+            let mut of_agents = [splat(*simd, 0.0); 4];
             each_near(
                 near,
                 agents,
@@ -428,12 +424,10 @@ impl<S: Simd> Block<S> {
                 |_, other| {
                     let (dx, dy) = (other.x - x, other.y - y);
                     let density = sense::density::<S, DENSITY>(world, world.sense.agent_range2, dx, dy);
-                    sense::sense::<S>(density, dx, dy, hx, hy, &mut sums);
+                    sense::sense::<S>(density, dx, dy, hx, hy, &mut of_agents);
                 },
             );
-            for (input, sum) in of_agents.iter_mut().zip(sums) {
-                *input = sum * world.sense.agent_share;
-            }
+            *inputs = sense::weigh_in::<S>(world, of_pois, of_agents);
         }
     }
 

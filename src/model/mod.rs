@@ -87,7 +87,8 @@ impl<S: Simd> Lanes<S> {
 
 /// The structs and constants that the parts' shaders read.
 pub fn declarations() -> String {
-    [Constants::wgsl(), Variant::wgsl(), Density::wgsl()].concat()
+    let inputs = format!("const INPUTS: u32 = {}u;\n", sense::INPUTS);
+    [Constants::wgsl(), Variant::wgsl(), Density::wgsl(), inputs].concat()
 }
 
 /// The parts' shaders.

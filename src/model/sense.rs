@@ -146,3 +146,11 @@ pub fn sense<S: Simd>(density: S::f32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, h
     sums[2] += only::<S>(density_left, front);
     sums[3] += except::<S>(density_left, front);
 }
+
+/// The policy's inputs, of the sums over a leader's quadrants.
+#[inline(always)]
+pub fn weigh_in<S: Simd>(world: &Lanes<S>, of_pois: [S::f32s; 4], of_agents: [S::f32s; 4]) -> [S::f32s; INPUTS] {
+    let [p, a] = [world.sense.poi_share, world.sense.agent_share];
+    let ([p0, p1, p2, p3], [a0, a1, a2, a3]) = (of_pois, of_agents);
+    [p0 * p, p1 * p, p2 * p, p3 * p, a0 * a, a1 * a, a2 * a, a3 * a]
+}

@@ -826,11 +826,10 @@ fn source(shape: Shape) -> String {
 /// many before it waits for any.
 fn straight_policy(widths: &[u32; WIDTHS]) -> String {
     let mut text =
-        String::from("fn decide(lane: u32, stride: u32, of_pois: vec4<f32>, of_agents: vec4<f32>) -> vec2<f32> {\n");
+        String::from("fn decide(lane: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
     let mut line = |line: std::fmt::Arguments<'_>| writeln!(text, "    {line}").expect("a string takes a line");
     let mut read = HashSet::new();
-    let mut inputs: Vec<String> =
-        (0..INPUTS).map(|input| format!("{}.{}", ["of_pois", "of_agents"][input / 4], AXES[input % 4])).collect();
+    let mut inputs: Vec<String> = (0..INPUTS).map(|input| format!("inputs[{input}]")).collect();
     let mut first = 0;
     let layers = widths.windows(2).take_while(|pair| pair[1] > 0);
     for (layer, pair) in layers.enumerate() {
