@@ -18,15 +18,49 @@
 //! 6. [`evolve`] selects and mutates, or has a GPU that holds the populations do the latter; [`run`] keeps what came out
 //!    by [`record`]; [`report`] draws it.
 //!
-//! Around that: [`run`] keeps a trainer and its runs' folders and checkpoints together, [`sweep`] makes many runs of a grid,
-//! [`evaluate`] plays trained teams from starts that no training saw, [`baseline`] plays what needs no learning,
-//! [`statistics`] says what chance leaves open, [`memory`] tells what a run will take, [`verify`] compares two backends on
-//! the random worlds of [`sample`], [`mod@bench`] times a backend against what the machine can do at most, and [`cli`]
-//! turns what was typed into all this.
+//! # Modules
 //!
-//! Imports run one way: `main ▸ cli ▸ {run, sweep, report, evaluate, verify, bench} ▸ trainer ▸ {evolve, credit,
-//! backend}`, `backend ▸ {evolve, world ▸ config ▸ model ▸ {kernels,
-//! reader} ▸ declare}`. Only `backend::gpu` knows wgpu; the model knows neither threads nor GPUs.
+//! Each imports only those above it; a module without a feature is always there.
+//!
+//! | module | feature | holds |
+//! |---|---|---|
+//! | [`escape`], [`mod@file`], [`shell`] | | names, paths and command lines on their way in and out |
+//! | [`host`], [`parallel`] | | time, waiting and threads, as whoever runs flotilla has them |
+//! | [`declare`] | | what is declared once and has several forms: shared structs, choices of words |
+//! | [`reader`] | | a TOML text, read key by key |
+//! | [`kernels`] | | arithmetic on lanes of teams |
+//! | [`model`] | | each part of a step: keys, constants, formulas, shader, costs |
+//! | [`config`] | | the config: what an experiment is |
+//! | [`world`] | | one experiment's constants and start state |
+//! | [`evolve`] | | teams, selection and mutation, by counters |
+//! | [`sample`] | | random worlds for tests |
+//! | [`backend`] | `gpu` | whole episodes of many teams: on the CPU, and on a GPU |
+//! | [`credit`] | | G, D, Df and D++ |
+//! | [`trainer`] | | the generation loop |
+//! | [`verify`] | | whether two backends agree to the bit |
+//! | [`statistics`] | | what chance leaves open |
+//! | [`baseline`] | | what needs no learning |
+//! | [`evaluate`] | | trained teams, from starts that no training saw |
+//! | [`memory`] | | what a run will take |
+//! | [`record`] | `record` | files: policies, metrics, checkpoints, folders |
+//! | [`run`] | `record` | a trainer and its runs' folders, kept together |
+//! | [`report`] | `report` | pictures, films, pages; the paper's claims |
+//! | [`sweep`] | `report` | many runs of a grid |
+//! | [`mod@bench`] | `cli` | a backend's speed, and what the machine can do at most |
+//! | [`cli`] | `cli` | what was typed, turned into all this |
+//!
+//! Only `backend::gpu` knows wgpu; the model knows neither threads nor GPUs; only [`host`] asks for the time.
+//!
+//! # Features
+//!
+//! | feature | brings | crates in all, about |
+//! |---|---|---|
+//! | (none) | training, evaluation and verification by the CPU, on one thread; on WebAssembly too | 30 |
+//! | `parallel` | all threads, by rayon; the bits stay | 35 |
+//! | `gpu` | any GPU, by wgpu | 80 |
+//! | `record` | runs on disk | 55 |
+//! | `report` | `record`, and pictures | 75 |
+//! | `cli` (default) | the program, with all of these | 145 |
 
 /// The commit that this was built from, where that is known; a debug build does not know it.
 pub const COMMIT: Option<&str> = {
@@ -36,7 +70,9 @@ pub const COMMIT: Option<&str> = {
 
 pub mod backend;
 pub mod baseline;
+#[cfg(feature = "cli")]
 pub mod bench;
+#[cfg(feature = "cli")]
 pub mod cli;
 pub mod config;
 pub mod credit;
@@ -45,16 +81,22 @@ pub mod escape;
 pub mod evaluate;
 pub mod evolve;
 pub mod file;
+pub mod host;
 pub mod kernels;
 pub mod memory;
 pub mod model;
-mod reader;
+pub mod parallel;
+pub mod reader;
+#[cfg(feature = "record")]
 pub mod record;
+#[cfg(feature = "report")]
 pub mod report;
+#[cfg(feature = "record")]
 pub mod run;
 pub mod sample;
 pub mod shell;
 pub mod statistics;
+#[cfg(feature = "report")]
 pub mod sweep;
 pub mod trainer;
 pub mod verify;

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
-use crate::backend::gpu::episode::HELD_FROM;
+use crate::backend::HELD_FROM;
 use crate::config::Config;
 use crate::world::{INPUTS, OUTPUTS, World};
 

@@ -2,18 +2,19 @@
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use crate::backend::{Backend, BackendError};
 use crate::config::{self, Config};
+use crate::host::Instant;
 use crate::memory::{self, TooLittle};
 use crate::record::RecordError;
-use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule, Snapshot};
+use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule};
 use crate::record::disk::Disk;
 use crate::record::folder::{self, Folder, METRICS, Note, POLICIES, Run, Start, State, Story};
-use crate::record::metrics::{self, Mark, Row};
+use crate::record::metrics::{self, Mark};
 use crate::record::policies;
-use crate::trainer::{SnapshotError, Trainer};
+use crate::trainer::{Row, Snapshot, SnapshotError, Trainer};
 
 /// How often runs hand their metrics to the system.
 const FLUSH: Duration = Duration::from_secs(1);

@@ -166,11 +166,7 @@ pub fn world(seed: u64) -> Config {
             repulsion_gain: gain(rng, 5.0),
             wall_gain: gain(rng, 5.0),
         },
-        sense: Sense {
-            poi_range,
-            agent_range,
-            density: word(rng),
-        },
+        sense: Sense { poi_range, agent_range, density: word(rng) },
         policy: Policy {
             hidden: match rng.random_range(0..5) {
                 0 => vec![],

@@ -5,9 +5,9 @@ use std::ops::Range;
 use std::sync::Mutex;
 
 use crate::backend::compare::{Mismatch, first_mismatch};
-use crate::backend::{Backend, BackendError, Breeding, Group};
+use crate::backend::{Backend, BackendError, Group};
 use crate::config::Config;
-use crate::evolve::{Key, Purpose, UNCHANGED};
+use crate::evolve::{Breeding, Key, Purpose, UNCHANGED};
 use crate::sample;
 use crate::trainer::{Row, Trainer};
 use crate::world::World;

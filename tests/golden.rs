@@ -9,12 +9,12 @@ use std::fmt::Write;
 use std::sync::LazyLock;
 
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::gpu::device;
+use flotilla::backend::gpu;
 use flotilla::backend::gpu::episode::GpuEpisodes;
 use flotilla::backend::{Backend, BackendError, Episode, Group, Trace, Visit};
 use flotilla::config::{Config, Override};
 use flotilla::record::{hex, metrics};
-use flotilla::trainer::Trainer;
+use flotilla::trainer::{Row, Trainer};
 use flotilla::world::World;
 use sha2::{Digest, Sha256};
 
@@ -129,7 +129,7 @@ fn train(backend: &mut dyn Backend) -> Vec<Golden> {
     while !trainer.is_done() {
         for row in trainer.advance(backend).unwrap() {
             most[row.arm] = most[row.arm].max(row.best_g);
-            let metrics::Row { arm, trial, generation, best_g, mean_g, champion_g } = row;
+            let Row { arm, trial, generation, best_g, mean_g, champion_g } = row;
             writeln!(texts[arm], "{trial},{generation},{best_g},{mean_g},{champion_g},0").unwrap();
         }
     }
@@ -222,7 +222,7 @@ fn every_instruction_set() {
 #[test]
 fn every_adapter() {
     for (request, info) in common::adapters("every_adapter") {
-        check(&info.to_string(), &mut GpuEpisodes::new(device::open(request).unwrap()).unwrap());
+        check(&info.to_string(), &mut GpuEpisodes::new(gpu::open(request).unwrap()).unwrap());
     }
 }
 

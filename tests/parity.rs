@@ -6,15 +6,15 @@
 mod common;
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::gpu::device::{self, Request};
+use flotilla::backend::gpu::device::Request;
 use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, State, Task};
 use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::population::{Brood, Stretch};
-use flotilla::backend::{Backend, Breeding, Group, Moment, Weights};
+use flotilla::backend::{Backend, Group, Moment, Weights};
 use flotilla::config::{Config, Fitness};
 use flotilla::declare::Shared;
 use flotilla::evaluate::{Starts, evaluate};
-use flotilla::evolve::{Key, Purpose};
+use flotilla::evolve::{Breeding, Key, Purpose};
 use flotilla::trainer::Trainer;
 use flotilla::verify::{Outcome, Plan, compare};
 use flotilla::world::{Constants, World};
@@ -25,7 +25,7 @@ const KERNELS: [Kernel; 2] = [Kernel::Generic, Kernel::Specialised];
 
 /// One that holds all populations.
 fn open(request: &Request, pass: Pass, kernel: Kernel) -> GpuEpisodes {
-    let gpu = device::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
+    let gpu = gpu::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
     GpuEpisodes::new(gpu).unwrap().playing(kernel).holding(Holding::Always)
 }
 
@@ -54,7 +54,7 @@ fn checked_shaders_and_default_limits_agree() {
             [Request { checked: true, ..request.clone() }, Request { default_limits: true, ..request.clone() }]
         {
             for (kernel, seeds) in KERNELS.into_iter().zip([100..112, 100..102]) {
-                let gpu = device::open(request.clone()).unwrap();
+                let gpu = gpu::open(request.clone()).unwrap();
                 let backend = GpuEpisodes::new(gpu).unwrap().playing(kernel).holding(Holding::Always);
                 assert_eq!(check(&Plan::random(seeds, 5), backend).mismatch, None, "{info}, {kernel}, {request:?}");
             }
@@ -112,7 +112,7 @@ fn large_worlds_agree() {
     for (request, info) in common::adapters("large_worlds_agree") {
         let worlds = vec![("crowd".into(), crowd.clone()), ("leaders only".into(), leaders_only.clone())];
         let plan = Plan { worlds, teams: 2, seed: 0, generations: 0 };
-        let backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap();
+        let backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap();
         // Training them would take the software drivers minutes: traces and batches are enough.
         let plan = Plan { worlds: plan.worlds.into_iter().map(small_population).collect(), ..plan };
         assert_eq!(check(&plan, backend).mismatch, None, "{info}");
@@ -133,7 +133,7 @@ fn long_episodes_agree() {
     for (request, info) in common::adapters("long_episodes_agree") {
         for kernel in KERNELS {
             let plan = Plan { worlds: vec![("long".into(), config.clone())], teams: 9, seed: 0, generations: 0 };
-            let backend = GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap().playing(kernel);
+            let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap().playing(kernel);
             assert_eq!(check(&plan, backend).mismatch, None, "{info}, {kernel}");
         }
     }
@@ -160,7 +160,7 @@ fn batches_cut_small_give_the_same_record() {
     let expected = record(&mut Cpu::default());
     for (request, info) in common::adapters("batches_cut_small_give_the_same_record") {
         for bytes in [1 << 12, 1 << 15, 1 << 28] {
-            let backend = GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap();
+            let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
             assert_eq!(record(&mut backend.batched(bytes)), expected, "{info}, batches of {bytes} bytes");
         }
     }
@@ -191,7 +191,7 @@ fn training_gives_the_same_metrics_and_weights() {
         assert_eq!(train(&mut Cpu::default(), std::slice::from_ref(config)).1[0], weights[arm]);
     }
     for (request, info) in common::adapters("training_gives_the_same_metrics_and_weights") {
-        let mut backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap();
+        let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap();
         assert_eq!(train(&mut backend, &both), (rows.clone(), weights.clone()), "{info}");
     }
 }
@@ -273,7 +273,7 @@ fn a_wrong_index_is_an_error() {
     ];
     let mut backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::default())];
     for (request, _) in common::adapters("a_wrong_index_is_an_error") {
-        backends.push(Box::new(GpuEpisodes::new(device::open(request).unwrap()).unwrap().holding(Holding::Always)));
+        backends.push(Box::new(GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().holding(Holding::Always)));
     }
     for backend in &mut backends {
         for (group, named) in &bad {
@@ -289,7 +289,8 @@ fn a_wrong_index_is_an_error() {
         let key = Key::new(0, 0, Purpose::Mutation);
         for (parents, named) in [(vec![0; 11], "11 parents"), ([vec![0; 11], vec![3]].concat(), "policy 3 of 3")] {
             let breeding = Breeding { parents: &parents, key, generation: 0, learning: &learning };
-            for error in [held.breed(&breeding).expect_err(named), breeding.on_host(sizes, &weights).expect_err(named)]
+            for error in
+                [held.breed(&breeding).expect_err(named), breeding.on_host(sizes, &weights).expect_err(named).into()]
             {
                 assert!(error.to_string().contains(named), "{}: {error}", backend.describe());
             }
@@ -334,7 +335,7 @@ fn kernels_are_compiled_for_few_worlds_and_shared() {
     });
     let (gains, sizes): (Vec<_>, Vec<_>) = (gains.collect(), sizes.collect());
     for (request, info) in common::adapters("kernels_are_compiled_for_few_worlds_and_shared") {
-        let mut backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap().playing(Kernel::Best);
+        let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().playing(Kernel::Best);
         assert_eq!(play(&mut backend, &gains), [0, 1], "{info}: only the numbers differ");
         assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: the other worlds share the generic kernel");
         assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: nothing is compiled twice");

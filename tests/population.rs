@@ -8,11 +8,12 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::SeqCst};
 
 use fearless_simd::Level;
 use flotilla::backend::cpu::Cpu;
+use flotilla::backend::gpu;
 use flotilla::backend::gpu::device::{self, DeviceError, Kind};
-use flotilla::backend::gpu::episode::{GpuEpisodes, HELD_FROM, Holding};
-use flotilla::backend::{Backend, BackendError, Breeding, Group, Held, Trace, Visit, Weights};
+use flotilla::backend::gpu::episode::{GpuEpisodes, Holding};
+use flotilla::backend::{Backend, BackendError, Group, HELD_FROM, Held, Trace, Visit, Weights};
 use flotilla::config::{Config, Fitness, Learning, Mutation, Paradigm};
-use flotilla::evolve::{self, Key, Purpose, UNCHANGED};
+use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, Start};
 use flotilla::run::{Machine, Options, Outcome, Player, Session};
@@ -53,7 +54,7 @@ fn parents([leaders, slots, _]: [usize; 3], generation: usize) -> Vec<u32> {
 #[test]
 fn breeding_gives_the_same_bits() {
     for (request, info) in common::adapters("breeding_gives_the_same_bits") {
-        let mut backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap().holding(Holding::Always);
+        let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().holding(Holding::Always);
         let mut mutated = 0;
         for sizes in [[1, 2, 1], [3, 5, 97], [4, 51, 112], [2, 301, 64], [2, 17, 1000], [1, 300, 65], [257, 2, 18]] {
             for (case, probability) in [0.0, 0.1, 0.999, 1.0].into_iter().enumerate() {
@@ -148,7 +149,7 @@ fn training_comes_to_the_same_wherever_populations_are() {
     let (expected, snapshots) = reference();
     assert!(expected.rows.iter().any(|row| row.best_g > 0.0), "nothing was observed");
     for (request, info) in common::adapters("training_comes_to_the_same_wherever_populations_are") {
-        let gpu = device::open(request).unwrap();
+        let gpu = gpu::open(request).unwrap();
         let open = |holding| GpuEpisodes::new(gpu.clone()).unwrap().holding(holding);
         // The populations of some arms take more than this, of others less.
         let some = Holding::From(4 * 30 * 112 * 4);
@@ -231,7 +232,7 @@ fn a_setback_is_told() {
 #[test]
 fn what_does_not_fit_the_device_is_declined() {
     for (request, info) in common::adapters("what_does_not_fit_the_device_is_declined") {
-        let gpu = device::open(device::Request { default_limits: true, ..request }).unwrap();
+        let gpu = gpu::open(device::Request { default_limits: true, ..request }).unwrap();
         // The least over WebGPU's 128 MiB; a backend that declines does not look at the weights.
         let sizes = [1, (128 << 20) / 4 / 112 + 1, 112];
         let open = |holding| GpuEpisodes::new(gpu.clone()).unwrap().holding(holding);

@@ -13,7 +13,8 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::gpu::device::{self, DeviceError};
+use flotilla::backend::gpu;
+use flotilla::backend::gpu::device::DeviceError;
 use flotilla::backend::gpu::episode::GpuEpisodes;
 use flotilla::backend::{Backend, BackendError, Group, Trace, Visit};
 use flotilla::config::Config;
@@ -618,7 +619,7 @@ fn a_run_may_change_to_another_processor_and_back() {
     let expected = reference(&config);
     for (request, info) in common::adapters("a_run_may_change_to_another_processor_and_back") {
         let gpu = || -> Player {
-            let backend = GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap();
+            let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
             (Box::new(backend), Machine { backend: "gpu".into(), ..Machine::default() })
         };
         let folder = tempfile::tempdir().unwrap();

@@ -8,13 +8,13 @@ use std::sync::{Mutex, PoisonError};
 
 use fearless_simd::{Level, Simd, SimdMask, dispatch, f32x4, prelude::*};
 use glam::Vec2;
-use rayon::prelude::*;
 
 use super::{Backend, BackendError, Episode, Group, Moment, Strided, Trace, Visit, Weights};
 use crate::declare::Fixed;
 use crate::kernels::{math, splat};
 use crate::model::policy::PolicyConstants;
 use crate::model::{Constants, Lanes, couple, follow, motion, policy, sense};
+use crate::parallel::*;
 use crate::world::{INPUTS, OUTPUTS, World};
 
 /// Plays episodes on the processor, at the widest instruction set it has, on the threads of the current rayon pool.
@@ -85,7 +85,7 @@ impl Backend for Cpu {
     }
 
     fn describe(&self) -> String {
-        let threads = rayon::current_num_threads();
+        let threads = current_num_threads();
         format!("cpu ({}, {threads} thread{})", level_name(self.level), if threads == 1 { "" } else { "s" })
     }
 }

@@ -2,7 +2,8 @@
 
 use super::{BackendChoice, Breed, Error, RunOptions, say};
 use crate::backend::cpu::Cpu;
-use crate::backend::gpu::device::{self, Choice, DeviceError};
+use crate::backend::gpu;
+use crate::backend::gpu::device::{Choice, DeviceError};
 use crate::backend::gpu::episode::{GpuEpisodes, Holding};
 use crate::run::{Machine, Player};
 
@@ -57,7 +58,7 @@ pub fn start_threads(options: &RunOptions) -> Result<(), Error> {
 }
 
 fn gpu(choice: Choice, breed: Breed) -> Result<GpuEpisodes, DeviceError> {
-    let backend = GpuEpisodes::new(device::open(choice)?)?;
+    let backend = GpuEpisodes::new(gpu::open(choice)?)?;
     Ok(match breed {
         Breed::Auto => backend,
         Breed::Host => backend.holding(Holding::Never),

@@ -5,6 +5,7 @@ use serde_json::json;
 use super::{Error, print};
 use crate::backend::Backend;
 use crate::backend::cpu::Cpu;
+use crate::backend::gpu;
 use crate::backend::gpu::device::{self, Choice, Gpu};
 
 #[derive(clap::Args)]
@@ -19,7 +20,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let adapters: Vec<_> = device::adapters()
         .into_iter()
         .enumerate()
-        .map(|(index, info)| (index, info, device::open(Choice::Named(index.to_string()))))
+        .map(|(index, info)| (index, info, gpu::open(Choice::Named(index.to_string()))))
         .collect();
     if args.json {
         let adapters: Vec<_> = adapters

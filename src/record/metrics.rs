@@ -14,23 +14,11 @@ use super::disk::{Disk, Output};
 use super::{RecordError, hex};
 use crate::config::{MAX_GENERATIONS, MAX_TRIALS};
 use crate::file;
+use crate::trainer::Row;
 
 pub const HEADER: &str = "trial,generation,best_g,mean_g,champion_g,seconds";
 /// Most bytes in one line.
 const MAX_LINE: u64 = 256;
-
-/// What one generation of one trial came to; every G is in 0..1.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Row {
-    pub arm: usize,
-    pub trial: usize,
-    pub generation: usize,
-    /// The best and the mean team of the generation.
-    pub best_g: f64,
-    pub mean_g: f64,
-    /// The team of every population's best policy.
-    pub champion_g: f64,
-}
 
 /// How far a file has come, to be found there again.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -18,9 +18,9 @@ use crate::backend::{Backend, BackendError, Episode, Group, Strided, Trace};
 use crate::config::Config;
 use crate::credit::{self, Credit, Scores};
 use crate::evolve::{self, Key, Purpose};
-use crate::record::checkpoint::{self, Snapshot};
+use crate::record::checkpoint;
 use crate::record::folder::{CHECKPOINTS, POLICIES};
-use crate::trainer::Trainer;
+use crate::trainer::{Snapshot, Trainer};
 use crate::world::World;
 
 /// Most bytes of motion in a page, before they are written as text (4/3 of it). What is longer is thinned out.

@@ -9,6 +9,7 @@ use crate::file;
 use crate::record::RecordError;
 use crate::record::folder::{self, CONFIG, METRICS};
 use crate::record::metrics::{self, RowsError};
+use crate::trainer::Row;
 
 /// Most runs that one figure can tell apart.
 pub const MAX_RUNS: usize = 24;
@@ -66,7 +67,7 @@ fn seen(path: &Path) -> Result<bool, RecordError> {
 ///
 /// # Errors
 /// There are none yet, or they are not this run's.
-pub fn metrics(folder: &Path, config: &Config, mut each: impl FnMut(&metrics::Row)) -> Result<(), RunError> {
+pub fn metrics(folder: &Path, config: &Config, mut each: impl FnMut(&Row)) -> Result<(), RunError> {
     let path = folder.join(METRICS);
     let unfinished = |reason: String| RunError::Unfinished { folder: folder.into(), reason };
     if !seen(&path)? {

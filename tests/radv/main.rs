@@ -7,6 +7,7 @@
 //!
 //! `cargo test --test radv -- table --ignored --nocapture` makes the table of `benches/README.md`.
 
+#[expect(unsafe_code, reason = "a Vulkan driver is called directly")]
 mod driver;
 
 use std::collections::BTreeMap;

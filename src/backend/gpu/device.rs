@@ -1,20 +1,19 @@
 //! Finding, opening and talking to a GPU.
 //!
-//! [`open`] tests the device before handing it out: it tries the exact passes in turn and keeps the first under which
-//! every probe of [`super::probe`] gives the CPU's bits, or refuses the device by name.
+//! [`super::open`] tests a device before handing it out.
 
 use std::fmt;
 use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytemuck::Pod;
-use pollster::block_on;
+use futures_channel::oneshot;
 use wgpu::util::DeviceExt;
 
 use super::exact::{self, Pass, ShaderError};
-use super::probe;
 use crate::escape;
+use crate::host::{self, Instant};
 
 /// Names of renderers that run on the CPU, for drivers that do not admit it in their device type.
 const SOFTWARE: [&str; 5] = ["llvmpipe", "lavapipe", "swiftshader", "microsoft basic render", "software"];
@@ -160,7 +159,7 @@ fn found() -> Vec<(wgpu::Adapter, AdapterInfo)> {
         flags: wgpu::InstanceFlags::empty().with_env(),
         ..wgpu::InstanceDescriptor::new_without_display_handle()
     });
-    let mut adapters: Vec<_> = block_on(instance.enumerate_adapters(backends))
+    let mut adapters: Vec<_> = host::wait(instance.enumerate_adapters(backends))
         .into_iter()
         .filter(|a| a.get_downlevel_capabilities().flags.contains(wgpu::DownlevelFlags::COMPUTE_SHADERS))
         .map(|adapter| (adapter.get_info(), adapter))
@@ -233,41 +232,8 @@ impl fmt::Debug for Gpu {
     }
 }
 
-/// Opens an adapter and finds the first pass under which it is exact: no contraction on Vulkan, else guarded.
-pub fn open(request: impl Into<Request>) -> Result<Gpu, DeviceError> {
-    let request = request.into();
-    let (adapter, info) = choose(&request.choice)?;
-    let (passthrough, timestamps) = (wgpu::Features::PASSTHROUGH_SHADERS, wgpu::Features::TIMESTAMP_QUERY);
-    let features = adapter.features() & (passthrough | timestamps);
-    let own = adapter.get_info().backend == wgpu::Backend::Vulkan && features.contains(passthrough);
-    let candidates = match request.pass {
-        Some(Pass::NoContraction) if !own => {
-            let reason = "the no-contraction pass needs Vulkan".into();
-            return Err(DeviceError::Refused { adapter: info.to_string(), reason });
-        }
-        Some(pass) => vec![pass],
-        None if own => vec![Pass::NoContraction, Pass::Guarded],
-        None => vec![Pass::Guarded],
-    };
-    let limits = if request.default_limits { wgpu::Limits::defaults() } else { adapter.limits() };
-    let mut gpu = Gpu::new(&adapter, info, candidates[0], limits, features, request.checked)?;
-    let mut failures = Vec::new();
-    for pass in candidates {
-        gpu.pass = pass;
-        if pass == Pass::Plain {
-            return Ok(gpu);
-        }
-        match gpu.self_test() {
-            Ok(None) => return Ok(gpu),
-            Ok(Some(mismatch)) => failures.push((pass, mismatch.to_string())),
-            Err(lost @ DeviceError::Lost { .. }) => return Err(lost),
-            Err(error) => failures.push((pass, error.to_string())),
-        }
-    }
-    Err(DeviceError::Inexact { adapter: gpu.adapter.to_string(), failures })
-}
-
-fn choose(choice: &Choice) -> Result<(wgpu::Adapter, AdapterInfo), DeviceError> {
+/// The adapter of a choice.
+pub(super) fn choose(choice: &Choice) -> Result<(wgpu::Adapter, AdapterInfo), DeviceError> {
     let mut found = found();
     let infos: Vec<_> = found.iter().map(|(_, info)| info.clone()).collect();
     Ok(found.swap_remove(position(choice, &infos)?))
@@ -295,6 +261,9 @@ pub fn position(choice: &Choice, infos: &[AdapterInfo]) -> Result<usize, DeviceE
     }
 }
 
+/// Offsets of bindings are multiples of this on every WebGPU device.
+pub(super) const BINDING_ALIGNMENT: usize = 256;
+
 /// How a shader uses a buffer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Binding {
@@ -313,7 +282,8 @@ pub struct Layout {
 }
 
 impl Gpu {
-    fn new(
+    /// Opens an adapter, not yet tested.
+    pub(super) fn new(
         adapter: &wgpu::Adapter,
         info: AdapterInfo,
         pass: Pass,
@@ -331,7 +301,7 @@ impl Gpu {
             adapter: info.to_string(),
             reason: error.to_string(),
         };
-        let (device, queue) = block_on(adapter.request_device(&descriptor)).map_err(refused)?;
+        let (device, queue) = host::wait(adapter.request_device(&descriptor)).map_err(refused)?;
         let trouble = Arc::new(Mutex::new(Trouble::default()));
         let noted = trouble.clone();
         device.set_device_lost_callback(move |reason, message| {
@@ -348,16 +318,6 @@ impl Gpu {
             usage: wgpu::BufferUsages::UNIFORM,
         });
         Ok(Gpu { adapter: info, limits, pass, checked, device, queue, guard, trouble })
-    }
-
-    /// Runs every probe under the current pass; the first that differs from the CPU, if any.
-    pub fn self_test(&self) -> Result<Option<probe::Mismatch>, DeviceError> {
-        for probe in probe::ALL {
-            if let Some(mismatch) = probe(self)? {
-                return Ok(Some(mismatch));
-            }
-        }
-        Ok(None)
     }
 
     /// An error if the device was lost or anything failed outside the calls below; to be asked after every wait.
@@ -383,7 +343,7 @@ impl Gpu {
             [OutOfMemory, Validation, Internal].map(|f| self.device.push_error_scope(f));
         let made = make();
         // Innermost first; array elements would be dropped in the wrong order.
-        let errors = [block_on(internal.pop()), block_on(validation.pop()), block_on(memory.pop())];
+        let errors = [host::wait(internal.pop()), host::wait(validation.pop()), host::wait(memory.pop())];
         self.check()?;
         match errors.into_iter().flatten().next() {
             None => Ok(made),
@@ -428,7 +388,7 @@ impl Gpu {
         let size = bytes.end - bytes.start;
         let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ;
         let landing = self.buffer("reading back", size, usage)?;
-        let (send, receive) = std::sync::mpsc::channel();
+        let (send, receive) = oneshot::channel();
         self.scoped("reading back", || {
             let mut encoder = self.device.create_command_encoder(&Default::default());
             encoder.copy_buffer_to_buffer(buffer, bytes.start, &landing, 0, size);
@@ -437,7 +397,7 @@ impl Gpu {
             landing.map_async(wgpu::MapMode::Read, .., move |result| drop(send.send(result)));
         })?;
         self.wait()?;
-        let mapped = receive.recv().map_err(|error| self.failed("reading back", error))?;
+        let mapped = host::wait(receive).map_err(|error| self.failed("reading back", error))?;
         mapped.map_err(|error| self.failed("reading back", error))?;
         let view = landing.get_mapped_range(..).map_err(|error| self.failed("reading back", error))?;
         Ok(bytemuck::pod_collect_to_vec(&view[..]))
@@ -450,7 +410,7 @@ impl Gpu {
         bytes: Range<u64>,
         show: impl FnOnce(&[u8]) -> T,
     ) -> Result<T, DeviceError> {
-        let (send, receive) = std::sync::mpsc::channel();
+        let (send, receive) = oneshot::channel();
         // Nobody listens any more only if waiting failed.
         self.scoped("reading back", || {
             buffer.map_async(wgpu::MapMode::Read, bytes.clone(), move |result| drop(send.send(result)));
@@ -459,7 +419,7 @@ impl Gpu {
         let polled = self.device.poll(wgpu::PollType::Poll);
         self.check()?;
         polled.map_err(|error| self.failed("reading back", error))?;
-        let mapped = receive.recv().map_err(|error| self.failed("reading back", error))?;
+        let mapped = host::wait(receive).map_err(|error| self.failed("reading back", error))?;
         mapped.map_err(|error| self.failed("reading back", error))?;
         let view = buffer.get_mapped_range(bytes).map_err(|error| self.failed("reading back", error))?;
         let shown = show(&view);
@@ -475,6 +435,14 @@ impl Gpu {
 
     /// Waits until a submission is done, or everything.
     pub fn wait_for(&self, submission_index: Option<wgpu::SubmissionIndex>) -> Result<(), DeviceError> {
+        // A browser has no polling: there, whatever was submitted until now is waited for.
+        if cfg!(target_family = "wasm") {
+            let (send, done) = oneshot::channel();
+            self.queue.on_submitted_work_done(move || _ = send.send(()));
+            // What nobody answers is a lost device, as the check tells.
+            let _ = host::wait(done);
+            return self.check();
+        }
         let waited = self.device.poll(wgpu::PollType::Wait { submission_index, timeout: None });
         self.check()?;
         waited.map(drop).map_err(|error| self.failed("waiting", error))
@@ -535,7 +503,7 @@ impl Gpu {
     ) -> Result<wgpu::ComputePipeline, DeviceError> {
         // SAFETY: the loops of the crate's own shaders end, their bindings are those of their layouts, and their indices
         // are in bounds for groups and plans that were checked, as the checked builds in the tests show.
-        #[allow(unsafe_code)]
+        #[expect(unsafe_code, reason = "shaders of the crate's own are compiled without bounds checks")]
         unsafe {
             self.pipeline(label, wgsl, entry, layout)
         }
@@ -547,7 +515,7 @@ impl Gpu {
     /// Unless `checked`, nothing keeps the shader within its buffers: its indices must be in bounds, its loops must end, it
     /// must divide no integer by zero, and read no workgroup memory that it did not write. Its bindings must be those of
     /// the layout, `checked` or not.
-    #[allow(unsafe_code)]
+    #[expect(unsafe_code, reason = "shaders of the crate's own are compiled without bounds checks")]
     pub unsafe fn pipeline(
         &self,
         label: &str,
@@ -675,6 +643,12 @@ pub fn timed(watch: Option<&Stopwatch>) -> wgpu::ComputePassDescriptor<'_> {
         end_of_pass_write_index: Some(1),
     });
     wgpu::ComputePassDescriptor { label: None, timestamp_writes }
+}
+
+/// A dispatch of at least `tasks` workgroups, within the device's limit on each side.
+pub(super) fn grid(tasks: usize, limits: &wgpu::Limits) -> [u32; 3] {
+    let rows = tasks.div_ceil(limits.max_compute_workgroups_per_dimension as usize).max(1);
+    [tasks.div_ceil(rows) as u32, rows as u32, 1]
 }
 
 /// An error with all its causes.

@@ -11,20 +11,21 @@ use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fmt::{self, Write};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytemuck::Zeroable;
 use glam::Vec2;
-use rayon::prelude::*;
 
-use super::device::{Binding, DeviceError, Gpu, Kind, Layout, Stopwatch, timed};
+use super::device::{BINDING_ALIGNMENT, Binding, DeviceError, Gpu, Kind, Layout, Stopwatch, grid, timed};
 use super::exact;
 use super::population::{Kernels, Population, Stretch, TOGETHER, parts};
-use crate::backend::{Backend, BackendError, Episode, Group, Held, Moment, Strided, Trace, Visit, Weights};
+use crate::backend::{Backend, BackendError, Episode, Group, HELD_FROM, Held, Moment, Strided, Trace, Visit, Weights};
 use crate::config::{MAX_AGENTS, MAX_HIDDEN_LAYERS};
 use crate::declare::{Shared, shared};
+use crate::host::Instant;
 use crate::model::policy::PolicyConstants;
 use crate::model::{self, Constants, Variant};
+use crate::parallel::*;
 use crate::world::{INPUTS, OUTPUTS, World};
 
 /// Threads that share a warp on most GPUs; leaders and followers are kept apart by as many (`ROLE` in the shader).
@@ -52,8 +53,6 @@ const MAX_OFFSET: u64 = 1 << 33;
 /// Turns of loops that one thread takes in a dispatch, over all loops. Mesa's llvmpipe 22.3 leaves every loop for good
 /// after 65 535, and drivers stop a dispatch that runs for seconds: longer episodes take several dispatches.
 const TURNS: usize = 60_000;
-/// Offsets of bindings are multiples of this on every WebGPU device.
-pub(super) const BINDING_ALIGNMENT: usize = 256;
 
 shared! {
     /// One workgroup's share of the work: some teams of one group.
@@ -375,11 +374,6 @@ pub enum Holding {
     /// All; what does not fit is an error.
     Always,
 }
-
-/// Populations of a trial that take so many bytes are held where nothing else is asked for, but never by a software
-/// renderer: about what goes over the bus in the time of the few dispatches that holding costs. An estimate, not a
-/// measurement.
-pub const HELD_FROM: u64 = 1 << 20;
 
 /// Plays episodes on a GPU.
 pub struct GpuEpisodes {
@@ -778,12 +772,6 @@ fn is_on_host(groups: &[Group<'_>], share: &Share) -> bool {
     matches!(groups[share.group].weights, Weights::OnHost(_))
 }
 
-/// A dispatch of at least `tasks` workgroups, within the device's limit on each side.
-pub(super) fn grid(tasks: usize, limits: &wgpu::Limits) -> [u32; 3] {
-    let rows = tasks.div_ceil(limits.max_compute_workgroups_per_dimension as usize).max(1);
-    [tasks.div_ceil(rows) as u32, rows as u32, 1]
-}
-
 /// The whole shader, with what it has in front.
 fn source(shape: Shape) -> String {
     let Shape { workgroup, slots, trace, sizes } = shape;
@@ -825,8 +813,7 @@ fn source(shape: Shape) -> String {
 /// a variable, and four weights at a time are read in the order in which they are needed, so that a compiler may read
 /// many before it waits for any.
 fn straight_policy(widths: &[u32; WIDTHS]) -> String {
-    let mut text =
-        String::from("fn decide(lane: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
+    let mut text = String::from("fn decide(lane: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
     let mut line = |line: std::fmt::Arguments<'_>| writeln!(text, "    {line}").expect("a string takes a line");
     let mut read = HashSet::new();
     let mut inputs: Vec<String> = (0..INPUTS).map(|input| format!("inputs[{input}]")).collect();

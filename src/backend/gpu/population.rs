@@ -6,13 +6,12 @@ use std::sync::Arc;
 
 use bytemuck::Pod;
 
-use super::device::{Binding, DeviceError, Gpu, Layout};
-use super::episode::{BINDING_ALIGNMENT, grid};
+use super::device::{BINDING_ALIGNMENT, Binding, DeviceError, Gpu, Layout, grid};
 use super::exact;
-use crate::backend::{BackendError, Breeding, Held};
+use crate::backend::{BackendError, Held};
 use crate::config::Mutation;
 use crate::declare::{Shared, shared};
-use crate::evolve;
+use crate::evolve::{self, Breeding};
 
 /// Threads of a workgroup.
 const WORKGROUP: usize = 256;
