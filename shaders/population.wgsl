@@ -2,45 +2,15 @@
 // lays out the weights of a batch's teams as an episode reads them. One buffer holds one leader's policies,
 // `[slots][parameters]`.
 //
-// The host puts this constant in front:
-//   WORKGROUP  threads of a workgroup, a multiple of TILE
+// The host puts in front:
+//   WORKGROUP       threads of a workgroup, a multiple of TILE
+//   Brood, Stretch  as src/backend/gpu/population.rs declares them
 
 // Weights are 0 or of this size at least, and stay at the largest.
 const MIN_WEIGHT: f32 = 0x1p-30f;
 const MAX_WEIGHT: f32 = 1048576.0;
 
 const UNCHANGED: u32 = 0x80000000u;
-
-// How one leader's next generation is made. `Brood` in src/backend/gpu/population.rs.
-struct Brood {
-    // The slots' key, which has the generation and the population in it but not the slot.
-    key: array<u32, 4>,
-    slots: u32,
-    parameters: u32,
-    // Where the leader's parents start in the plan.
-    parents: u32,
-    // Weights whose word is below `threshold` mutate, or all of them.
-    threshold: u32,
-    all: u32,
-    // Whether noise is of a weight's own size.
-    scaled: u32,
-    sigma: f32,
-}
-
-// Some leaders' policies in some teams of one group, which tasks share. `Stretch` in src/backend/gpu/population.rs.
-struct Stretch {
-    // Leaders of a team; those gathered, from `first` on, are `count`, up to four.
-    leaders: u32,
-    first: u32,
-    count: u32,
-    parameters: u32,
-    teams: u32,
-    // Every task has so many, the last what is left.
-    teams_a_task: u32,
-    // Where the stretch starts in its buffers.
-    choices: u32,
-    weights: u32,
-}
 
 @group(0) @binding(1) var<storage, read> brood: Brood;
 // The slot that each slot's policy is copied from, with UNCHANGED set where it does not mutate.

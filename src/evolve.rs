@@ -128,7 +128,7 @@ pub fn jitter_starts(key: Key, generation: usize, episode: usize, world: &World,
         return;
     }
     let key = key.at(generation, episode, 0);
-    let map = Vec2::new(world.constants.map_x, world.constants.map_y);
+    let map = world.map();
     for (agent, start) in starts.iter_mut().enumerate() {
         let [x, y, ..] = key.draw(agent as u32).map(|word| {
             // 53 bits are exact in f64, and so is every step but the last, which rounds to f32.

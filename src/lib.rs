@@ -8,10 +8,11 @@
 //!                       └──────────────┴────────────── next generation ◀───────┘
 //! ```
 //!
-//! 1. [`config`] reads a TOML file and names everything that is wrong with it.
+//! 1. [`config`] reads a TOML file and names everything that is wrong with it. The sections of a step's parts, and all
+//!    else that is to be said of a part, stand in [`model`].
 //! 2. [`world`] turns it into one experiment's constants and start state.
 //! 3. [`trainer`] asks [`evolve`] for teams and hands all of them, of all trials, to a [`backend`] as one batch.
-//! 4. The backend plays each team's whole episode: by [`kernels`] on the CPU, by their twins under `shaders/` on a GPU.
+//! 4. The backend plays each team's whole episode: by [`model`] on the CPU, by its twins under `shaders/` on a GPU.
 //!    It reports who was near which POI at which step, and which leader each follower saw.
 //! 5. [`credit`] turns that record into G, D, Df and D++.
 //! 6. [`evolve`] selects and mutates, or has a GPU that holds the populations do the latter; [`run`] keeps what came out
@@ -25,9 +26,12 @@
 //! |---|---|---|
 //! | [`escape`], [`mod@file`], [`shell`] | | names, paths and command lines on their way in and out |
 //! | [`host`], [`parallel`] | | time, waiting and threads, as whoever runs flotilla has them |
-//! | [`config`] | | the config file |
+//! | [`declare`] | | what is declared once and has several forms: shared structs, choices of words |
+//! | [`reader`] | | a TOML text, read key by key |
+//! | [`kernels`] | | arithmetic on lanes of teams |
+//! | [`model`] | | each part of a step: keys, constants, formulas, shader, costs |
+//! | [`config`] | | the config: what an experiment is |
 //! | [`world`] | | one experiment's constants and start state |
-//! | [`kernels`] | | one agent's step, a team a lane |
 //! | [`evolve`] | | teams, selection and mutation, by counters |
 //! | [`sample`] | | random worlds for tests |
 //! | [`backend`] | `gpu` | whole episodes of many teams: on the CPU, and on a GPU |
@@ -45,7 +49,7 @@
 //! | [`mod@bench`] | `cli` | a backend's speed, and what the machine can do at most |
 //! | [`cli`] | `cli` | what was typed, turned into all this |
 //!
-//! Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs; only [`host`] asks for the time.
+//! Only `backend::gpu` knows wgpu; the model knows neither threads nor GPUs; only [`host`] asks for the time.
 //!
 //! # Features
 //!
@@ -72,6 +76,7 @@ pub mod bench;
 pub mod cli;
 pub mod config;
 pub mod credit;
+pub mod declare;
 pub mod escape;
 pub mod evaluate;
 pub mod evolve;
@@ -79,7 +84,9 @@ pub mod file;
 pub mod host;
 pub mod kernels;
 pub mod memory;
+pub mod model;
 pub mod parallel;
+pub mod reader;
 #[cfg(feature = "record")]
 pub mod record;
 #[cfg(feature = "report")]

@@ -169,7 +169,7 @@ impl Sizes {
 /// The CPU backend's state of one vector of teams.
 fn block_bytes(world: &World, lanes: u64) -> u64 {
     let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
-    let widest = world.constants.widths.into_iter().max().unwrap_or(0) as usize;
+    let widest = world.constants.policy.widths.into_iter().max().unwrap_or(0) as usize;
     let policies = leaders * (world.parameters() + INPUTS + 2 * widest + OUTPUTS);
     let words = 8 * agents + policies + 3 * followers + world.set_words() + followers * leaders;
     words as u64 * lanes * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8) as u64

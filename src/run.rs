@@ -32,7 +32,7 @@ pub enum RunError {
     #[error(
         "there is no memory for {what}, {bytes} bytes; choose a smaller population, fewer trials or another machine"
     )]
-    Memory { what: &'static str, bytes: usize },
+    Memory { what: &'static str, bytes: u64 },
     /// Populations cannot be brought to the host to be saved.
     #[error("no checkpoint could be made: {0}")]
     Held(BackendError),
@@ -40,7 +40,7 @@ pub enum RunError {
 
 impl RunError {
     /// There is no snapshot of so many bytes of policies.
-    pub fn of_snapshot(error: SnapshotError, what: &'static str, bytes: usize) -> RunError {
+    pub fn of_snapshot(error: SnapshotError, what: &'static str, bytes: u64) -> RunError {
         match error {
             SnapshotError::Memory(_) => RunError::Memory { what, bytes },
             SnapshotError::Backend(error) => RunError::Held(error),
@@ -152,9 +152,9 @@ impl Session {
         disk: &Disk,
     ) -> Result<(Session, Vec<(usize, Note)>), RunError> {
         // This generation and the next one; asked for first, since later a refusal would be an abort.
-        let bytes = 2 * runs.iter().map(|(config, _)| config.policy_bytes()).sum::<usize>();
+        let bytes = 2 * runs.iter().map(|(config, _)| config.policy_bytes()).sum::<u64>();
         Vec::<u8>::new()
-            .try_reserve_exact(bytes)
+            .try_reserve_exact(bytes.try_into().unwrap_or(usize::MAX))
             .map_err(|_| RunError::Memory { what: "twice the policies of all trials", bytes })?;
         // Before any of them is touched.
         for (_, path) in runs.iter().filter(|_| start == Start::Fresh) {

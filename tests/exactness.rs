@@ -137,7 +137,7 @@ fn nothing_that_decides_results_asks_the_platform() {
         "sin", "cos", "tan", "sin_cos", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2",
         "exp_m1", "ln", "ln_1p", "log2", "log10", "powf", "cbrt",
     ];
-    let decides = ["backend", "kernels"].map(|folder| files(&Path::new("src").join(folder))).concat();
+    let decides = ["backend", "kernels", "model"].map(|folder| files(&Path::new("src").join(folder))).concat();
     let single = ["world", "credit", "evolve", "trainer"].map(|name| PathBuf::from(format!("src/{name}.rs")));
     for path in decides.into_iter().chain(single) {
         let text = std::fs::read_to_string(&path).unwrap();

@@ -150,7 +150,7 @@ fn checkpoints_need_no_copy() {
         assert_eq!(keeper.newest(), Some(3));
         fs::read(checkpoint::path(&path, 3)).unwrap()
     });
-    assert!(files[0].len() > config.policy_bytes() && files[0] == files[1]);
+    assert!(files[0].len() as u64 > config.policy_bytes() && files[0] == files[1]);
     let read = checkpoint::read(&checkpoint::path(&folder.path().join("view"), 3), Path::new("none"), &config);
     let read = read.unwrap().expect("it has its weights");
     assert_eq!(read.snapshot, trainer.snapshot(0).unwrap());

@@ -7,8 +7,6 @@
 
 mod common;
 
-use std::mem::offset_of;
-
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::device::Request;
 use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, State, Task};
@@ -16,6 +14,7 @@ use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::population::{Brood, Stretch};
 use flotilla::backend::{Backend, Group, Moment, Weights};
 use flotilla::config::{Config, Fitness};
+use flotilla::declare::Shared;
 use flotilla::evaluate::{Starts, evaluate};
 use flotilla::evolve::{Breeding, Key, Purpose};
 use flotilla::trainer::Trainer;
@@ -199,65 +198,23 @@ fn training_gives_the_same_metrics_and_weights() {
     }
 }
 
-/// The structs of the shaders lie in memory as the host writes them.
+/// The structs of the shaders lie in memory as the host writes them: no side pads what the other does not.
 #[test]
 fn structs_lie_alike_on_both_sides() {
     let texts = gpu::shaders();
     let modules: Vec<_> = texts.iter().map(|(_, text)| exact::parse(text).unwrap().0).collect();
-    macro_rules! check {
-        ($wgsl:literal, $host:ty, $($field:ident),*) => {
-            let host = [$((stringify!($field), offset_of!($host, $field))),*];
-            let mut types = modules.iter().flat_map(|module| module.types.iter());
-            let (_, found) = types.find(|(_, ty)| ty.name.as_deref() == Some($wgsl)).unwrap();
-            let naga::TypeInner::Struct { members, span } = &found.inner else { panic!("{} is a struct", $wgsl) };
-            let wgsl: Vec<_> =
-                members.iter().map(|member| (member.name.as_deref().unwrap(), member.offset as usize)).collect();
-            assert_eq!(wgsl, host, $wgsl);
-            assert_eq!(*span as usize, size_of::<$host>(), $wgsl);
-        };
+    fn check<T: Shared>(modules: &[naga::Module]) {
+        let mut types = modules.iter().flat_map(|module| module.types.iter());
+        let (_, found) = types.find(|(_, ty)| ty.name.as_deref() == Some(T::NAME)).unwrap();
+        let naga::TypeInner::Struct { span, .. } = &found.inner else { panic!("{} is a struct", T::NAME) };
+        assert_eq!(*span as usize, size_of::<T>(), "{}", T::NAME);
     }
-    check!(
-        "World",
-        Constants,
-        leaders,
-        followers,
-        pois,
-        steps,
-        words,
-        layers,
-        widths,
-        parameters,
-        map_x,
-        map_y,
-        dt,
-        heading_x,
-        heading_y,
-        speed,
-        min_speed,
-        max_speed,
-        max_speed_change,
-        max_turn,
-        max_turn_cos,
-        max_turn_sin,
-        observation_radius2,
-        attraction_radius2,
-        repulsion_radius2,
-        poi_range2,
-        agent_range2,
-        repulsion_radius,
-        attraction_scale,
-        repulsion_scale,
-        wall_gain,
-        poi_share,
-        agent_share,
-        density,
-        inverse_diagonal
-    );
-    check!("Task", Task, world, starts, pois, weights, sets, seen, moments, states, teams, first, end);
-    check!("State", State, x, y, hx, hy, speed);
-    check!("Brood", Brood, key, slots, parameters, parents, threshold, all, scaled, sigma);
-    check!("Stretch", Stretch, leaders, first, count, parameters, teams, teams_a_task, choices, weights);
-    check!("Moment", Moment, inputs, outputs, force, position, heading, speed);
+    check::<Constants>(&modules);
+    check::<Task>(&modules);
+    check::<State>(&modules);
+    check::<Brood>(&modules);
+    check::<Stretch>(&modules);
+    check::<Moment>(&modules);
 }
 
 /// Drawn starts make one group an episode: batches of many groups, of which each has a few teams.

@@ -1,7 +1,7 @@
 //! The reference backend: one team a lane, one vector of teams a block, blocks shared out over threads.
 //!
 //! The loops here may skip whatever adds nothing (an agent out of reach of every lane), since sums start at +0 and
-//! keep their order; the formulas are [`crate::kernels`]'.
+//! keep their order; the formulas are [`crate::model`]'s.
 
 use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
@@ -10,9 +10,12 @@ use fearless_simd::{Level, Simd, SimdMask, dispatch, f32x4, prelude::*};
 use glam::Vec2;
 
 use super::{Backend, BackendError, Episode, Group, Moment, Strided, Trace, Visit, Weights};
-use crate::kernels::{Lanes, couple, follow, math, motion, policy, sense, splat};
+use crate::declare::Fixed;
+use crate::kernels::{math, splat};
+use crate::model::policy::PolicyConstants;
+use crate::model::{Constants, Lanes, couple, follow, motion, policy, sense};
 use crate::parallel::*;
-use crate::world::{Constants, INPUTS, OUTPUTS, World};
+use crate::world::{INPUTS, OUTPUTS, World};
 
 /// Plays episodes on the processor, at the widest instruction set it has, on the threads of the current rayon pool.
 pub struct Cpu {
@@ -235,10 +238,10 @@ impl<S: Simd> Block<S> {
         let constants = world.constants;
         let zero = splat(simd, 0.0);
         let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
-        let widest = constants.widths.into_iter().max().unwrap_or(0) as usize;
+        let widest = constants.policy.widths.into_iter().max().unwrap_or(0) as usize;
         let mut slots = vec![0; world.parameters()];
         let (mut first, mut slot) = (0, 0);
-        for widths in constants.widths[..=constants.layers as usize].windows(2) {
+        for widths in constants.policy.widths[..=constants.policy.layers as usize].windows(2) {
             let (rows, columns) = (widths[0] as usize + 1, widths[1] as usize);
             let mut column = 0;
             while column < columns {
@@ -338,8 +341,8 @@ impl<S: Simd> Block<S> {
         self.near.fill(0);
         let Block { world, agents, near, bounds, .. } = self;
         let (count, leaders) = (agents.len(), world.constants.leaders as usize);
-        let drawn = world.constants.attraction_radius2;
-        let sensed = world.constants.agent_range2.max(drawn);
+        let drawn = world.constants.follow.attraction_radius2;
+        let sensed = world.constants.sense.agent_range2.max(drawn);
         let reach2 = |agent: usize| if agent < leaders { sensed } else { drawn };
         if count > MANY {
             let lanes = S::f32s::LEN;
@@ -386,37 +389,33 @@ impl<S: Simd> Block<S> {
     /// Leaders sense: all POIs, then the other agents, each in ascending order.
     #[inline(always)]
     fn sense(&mut self, pois: &[Vec2]) {
-        if self.world.constants.density == 0 { self.sense_by::<true>(pois) } else { self.sense_by::<false>(pois) }
+        self.world.constants.variant.density().fix(Sensing { block: self, pois });
     }
 
     #[inline(always)]
-    fn sense_by<const LINEAR: bool>(&mut self, pois: &[Vec2]) {
+    fn sense_by<const DENSITY: u32>(&mut self, pois: &[Vec2]) {
         let Block { simd, world, agents, near, inputs, .. } = self;
         for (leader, (agent, inputs)) in agents.iter().zip(inputs).enumerate() {
             let &Agent { x, y, hx, hy, .. } = agent;
-            let mut sums = [splat(*simd, 0.0); 4];
+            let mut of_pois = [splat(*simd, 0.0); 4];
             let (fours, rest) = pois.as_chunks::<4>();
             for pois in fours {
                 let mut densities = [x; 4];
                 for (density, poi) in densities.iter_mut().zip(pois) {
                     let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
-                    *density = sense::density::<S, LINEAR>(world, world.poi_range2, dx, dy);
+                    *density = sense::density::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
                 }
                 for (&density, poi) in densities.iter().zip(pois) {
                     let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
-                    sense::sense::<S>(density, dx, dy, hx, hy, &mut sums);
+                    sense::sense::<S>(density, dx, dy, hx, hy, &mut of_pois);
                 }
             }
             for poi in rest {
                 let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
-                let density = sense::density::<S, LINEAR>(world, world.poi_range2, dx, dy);
-                sense::sense::<S>(density, dx, dy, hx, hy, &mut sums);
+                let density = sense::density::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
+                sense::sense::<S>(density, dx, dy, hx, hy, &mut of_pois);
             }
-            let (of_pois, of_agents) = inputs.split_at_mut(4);
-            for (input, sum) in of_pois.iter_mut().zip(sums) {
-                *input = sum * world.poi_share;
-            }
-            let mut sums = [splat(*simd, 0.0); 4];
+            let mut of_agents = [splat(*simd, 0.0); 4];
             each_near(
                 near,
                 agents,
@@ -424,13 +423,11 @@ impl<S: Simd> Block<S> {
                 #[inline(always)]
                 |_, other| {
                     let (dx, dy) = (other.x - x, other.y - y);
-                    let density = sense::density::<S, LINEAR>(world, world.agent_range2, dx, dy);
-                    sense::sense::<S>(density, dx, dy, hx, hy, &mut sums);
+                    let density = sense::density::<S, DENSITY>(world, world.sense.agent_range2, dx, dy);
+                    sense::sense::<S>(density, dx, dy, hx, hy, &mut of_agents);
                 },
             );
-            for (input, sum) in of_agents.iter_mut().zip(sums) {
-                *input = sum * world.agent_share;
-            }
+            *inputs = sense::weigh_in::<S>(world, of_pois, of_agents);
         }
     }
 
@@ -438,7 +435,7 @@ impl<S: Simd> Block<S> {
     #[inline(always)]
     fn decide(&mut self) {
         let Block { world, agents, weights, inputs, hidden, outputs, .. } = self;
-        let Constants { leaders, layers, widths, parameters, .. } = world.constants;
+        let Constants { leaders, policy: PolicyConstants { layers, widths, parameters }, .. } = world.constants;
         let mut first = 0;
         let [mut to, mut from] = hidden.each_mut().map(|units| &mut units[..]);
         for (layer, widths) in widths[..=layers as usize].windows(2).enumerate() {
@@ -508,7 +505,7 @@ impl<S: Simd> Block<S> {
             follower.sums = sums;
         }
         let agents = &mut agents[leaders..];
-        if world.constants.max_turn_cos > 0.7 {
+        if world.constants.variant.by_sine != 0 {
             steer::<S, true>(world, agents, followers);
         } else {
             steer::<S, false>(world, agents, followers);
@@ -524,9 +521,9 @@ impl<S: Simd> Block<S> {
             agent.speed = motion::accelerate::<S>(world, agent.speed, agent.wanted);
         }
         for agent in &mut self.agents {
-            let step = agent.speed * world.dt;
-            agent.x = motion::advance::<S>(agent.x, step, agent.hx, world.map_x);
-            agent.y = motion::advance::<S>(agent.y, step, agent.hy, world.map_y);
+            let step = agent.speed * world.motion.dt;
+            agent.x = motion::advance::<S>(agent.x, step, agent.hx, world.motion.map_x);
+            agent.y = motion::advance::<S>(agent.y, step, agent.hy, world.motion.map_y);
         }
     }
 
@@ -565,6 +562,21 @@ impl<S: Simd> Block<S> {
             moment.heading = [agent.hx[lane], agent.hy[lane]];
             moment.speed = agent.speed[lane];
         }
+    }
+}
+
+/// Leaders sense by one of the densities.
+struct Sensing<'a, S: Simd> {
+    block: &'a mut Block<S>,
+    pois: &'a [Vec2],
+}
+
+impl<S: Simd> Fixed for Sensing<'_, S> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with<const DENSITY: u32>(self) {
+        self.block.sense_by::<DENSITY>(self.pois);
     }
 }
 

@@ -5,8 +5,9 @@ use std::fmt::Debug;
 
 use glam::Vec2;
 
+use crate::declare::shared;
 use crate::evolve::{self, Breeding};
-use crate::world::World;
+use crate::world::{INPUTS, OUTPUTS, World};
 
 pub mod compare;
 pub mod cpu;
@@ -147,22 +148,23 @@ impl<'a> Strided<'a> {
     }
 }
 
-/// Floats that a [`Trace`] holds of one agent at one step, in this order.
-///
-/// The inputs and the outputs are a leader's, the force a follower's; who has none has zeros. So does step 0, the start.
-#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-#[repr(C)]
-pub struct Moment {
-    /// Sensed densities.
-    pub inputs: [f32; 8],
-    /// What the policy answered, each in -1..1.
-    pub outputs: [f32; 2],
-    /// Attraction, repulsion and wall push together.
-    pub force: [f32; 2],
-    /// State after the step.
-    pub position: [f32; 2],
-    pub heading: [f32; 2],
-    pub speed: f32,
+shared! {
+    /// Floats that a [`Trace`] holds of one agent at one step, in this order.
+    ///
+    /// The inputs and the outputs are a leader's, the force a follower's; who has none has zeros. So does step 0, the
+    /// start.
+    pub struct Moment {
+        /// Sensed densities.
+        pub inputs: [f32; INPUTS],
+        /// What the policy answered, each in -1..1.
+        pub outputs: [f32; OUTPUTS],
+        /// Attraction, repulsion and wall push together.
+        pub force: [f32; 2],
+        /// State after the step.
+        pub position: [f32; 2],
+        pub heading: [f32; 2],
+        pub speed: f32,
+    }
 }
 
 /// Every stage of every step: `moments[(step * teams + team) * agents + agent]`, steps `0..=steps`.

@@ -365,7 +365,7 @@ fn hex(colors: &[Color]) -> Vec<String> {
 /// One episode as the page reads it: motion as base64 of little-endian numbers, `[shown][agents]`.
 fn episode(played: &Played, shown: &[usize], exact: bool) -> serde_json::Value {
     let Played { world, scores, .. } = played;
-    let map = [world.constants.map_x, world.constants.map_y];
+    let map = world.map().to_array();
     let (mut positions, mut headings, mut near) = (Vec::new(), Vec::new(), Vec::new());
     for &step in shown {
         for agent in 0..world.agents() {

@@ -13,7 +13,7 @@ use std::fmt::{self, Write};
 use std::sync::Arc;
 use std::time::Duration;
 
-use bytemuck::{Pod, Zeroable};
+use bytemuck::Zeroable;
 use glam::Vec2;
 
 use super::device::{BINDING_ALIGNMENT, Binding, DeviceError, Gpu, Kind, Layout, Stopwatch, grid, timed};
@@ -21,9 +21,12 @@ use super::exact;
 use super::population::{Kernels, Population, Stretch, TOGETHER, parts};
 use crate::backend::{Backend, BackendError, Episode, Group, HELD_FROM, Held, Moment, Strided, Trace, Visit, Weights};
 use crate::config::{MAX_AGENTS, MAX_HIDDEN_LAYERS};
+use crate::declare::{Shared, shared};
 use crate::host::Instant;
+use crate::model::policy::PolicyConstants;
+use crate::model::{self, Constants, Variant};
 use crate::parallel::*;
-use crate::world::{Constants, INPUTS, OUTPUTS, World};
+use crate::world::{INPUTS, OUTPUTS, World};
 
 /// Threads that share a warp on most GPUs; leaders and followers are kept apart by as many (`ROLE` in the shader).
 const ROLE: usize = 32;
@@ -51,33 +54,33 @@ const MAX_OFFSET: u64 = 1 << 33;
 /// after 65 535, and drivers stop a dispatch that runs for seconds: longer episodes take several dispatches.
 const TURNS: usize = 60_000;
 
-/// One workgroup's share of the work (`struct Task` in `shaders/lib/layout.wgsl`); offsets count elements.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct Task {
-    pub world: u32,
-    pub starts: u32,
-    pub pois: u32,
-    pub weights: u32,
-    pub sets: u32,
-    pub seen: u32,
-    pub moments: u32,
-    pub states: u32,
-    pub teams: u32,
-    /// The steps that a dispatch plays: from `first` on, before `end`.
-    pub first: u32,
-    pub end: u32,
-}
+shared! {
+    /// One workgroup's share of the work: some teams of one group.
+    #[derive(Default)]
+    pub struct Task {
+        pub world: u32,
+        /// Where each of these starts in its buffer, in elements.
+        pub starts: u32,
+        pub pois: u32,
+        pub weights: u32,
+        pub sets: u32,
+        pub seen: u32,
+        pub moments: u32,
+        pub states: u32,
+        pub teams: u32,
+        /// The steps that a dispatch plays: from `first` on, before `end`.
+        pub first: u32,
+        pub end: u32,
+    }
 
-/// An agent between two dispatches (`struct State` in the shader).
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-#[repr(C)]
-pub struct State {
-    pub x: f32,
-    pub y: f32,
-    pub hx: f32,
-    pub hy: f32,
-    pub speed: f32,
+    /// An agent between two dispatches.
+    pub struct State {
+        pub x: f32,
+        pub y: f32,
+        pub hx: f32,
+        pub hy: f32,
+        pub speed: f32,
+    }
 }
 
 /// Which kernel plays; no result depends on that.
@@ -118,7 +121,7 @@ enum Sizes {
     /// The widest layer, inputs included, rounded up to spare compilations.
     Any { widest: usize },
     /// All that makes a difference to the code.
-    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], density: u32, by_sine: bool },
+    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], variant: Variant },
 }
 
 const WIDTHS: usize = MAX_HIDDEN_LAYERS + 2;
@@ -129,14 +132,14 @@ impl Shape {
     }
 
     fn generic(world: &World, packing: Packing, trace: bool) -> Shape {
-        let widest = world.constants.widths.into_iter().max().unwrap_or(0).next_power_of_two() as usize;
+        let widest = world.constants.policy.widths.into_iter().max().unwrap_or(0).next_power_of_two() as usize;
         Shape { workgroup: packing.workgroup, slots: packing.slots, trace, sizes: Sizes::Any { widest } }
     }
 
     fn specialised(world: &World, packing: Packing, trace: bool) -> Shape {
-        let Constants { leaders, followers, pois, widths, density, max_turn_cos, .. } = world.constants;
-        let (agents, by_sine) = (leaders + followers, max_turn_cos > 0.7);
-        let sizes = Sizes::Fixed { teams: packing.teams, leaders, agents, pois, widths, density, by_sine };
+        let Constants { leaders, followers, pois, variant, policy: PolicyConstants { widths, .. }, .. } =
+            world.constants;
+        let sizes = Sizes::Fixed { teams: packing.teams, leaders, agents: leaders + followers, pois, widths, variant };
         Shape { workgroup: packing.workgroup, slots: packing.slots, trace, sizes }
     }
 }
@@ -184,7 +187,7 @@ impl Packing {
 
 /// Steps that one dispatch may play, see [`TURNS`].
 fn steps_a_dispatch(world: &World, packing: Packing) -> usize {
-    let Constants { widths, words, .. } = world.constants;
+    let Constants { words, policy: PolicyConstants { widths, .. }, .. } = world.constants;
     let network: u32 = widths.windows(2).map(|w| (w[0] + 2) * w[1]).sum();
     let agent = world.pois.len() + world.agents() + network as usize + 20;
     let items = (world.pois.len() * words as usize * packing.teams).div_ceil(packing.workgroup);
@@ -723,7 +726,7 @@ impl GpuEpisodes {
                     leaders: leaders as u32,
                     first: first as u32,
                     count: TOGETHER.min(leaders - first) as u32,
-                    parameters: group.world.constants.parameters,
+                    parameters: group.world.constants.policy.parameters,
                     teams,
                     teams_a_task: shares[0].task.teams,
                     choices: choices.len() as u32,
@@ -786,39 +789,34 @@ fn source(shape: Shape) -> String {
     );
     let front = match sizes {
         Sizes::Any { widest } => {
-            format!("const WIDEST: u32 = {widest}u;\n{}", include_str!("../../../shaders/generic.wgsl"))
+            let variant = Variant::copied_from("world");
+            let generic = include_str!("../../../shaders/generic.wgsl");
+            format!("const WIDEST: u32 = {widest}u;\nfn world_variant() -> Variant {{ return {variant}; }}\n{generic}")
         }
-        Sizes::Fixed { teams, leaders, agents, pois, widths, density, by_sine } => format!(
-            "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u, {density}u, {by_sine});\n\
+        Sizes::Fixed { teams, leaders, agents, pois, widths, variant } => format!(
+            "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u);\nconst variant = {variant};\n\
              fn adopt(task: Task) {{}}\n{}",
             straight_policy(&widths),
-            words = agents.div_ceil(32)
+            words = agents.div_ceil(32),
+            variant = variant.value()
         ),
     };
-    exact::assemble(&[
-        &constants,
-        &front,
-        include_str!("../../../shaders/lib/layout.wgsl"),
-        include_str!("../../../shaders/lib/math.wgsl"),
-        include_str!("../../../shaders/sense.wgsl"),
-        include_str!("../../../shaders/policy.wgsl"),
-        include_str!("../../../shaders/follow.wgsl"),
-        include_str!("../../../shaders/motion.wgsl"),
-        include_str!("../../../shaders/couple.wgsl"),
-        include_str!("../../../shaders/episode.wgsl"),
-    ])
+    let structs = [Task::wgsl(), State::wgsl(), Moment::wgsl()].concat();
+    let (front, math) =
+        ([constants, front, model::declarations(), structs], include_str!("../../../shaders/lib/math.wgsl"));
+    let front = front.iter().map(String::as_str).chain([include_str!("../../../shaders/lib/layout.wgsl"), math]);
+    let parts = front.chain(model::WGSL).chain([include_str!("../../../shaders/episode.wgsl")]);
+    exact::assemble(&parts.collect::<Vec<_>>())
 }
 
 /// A policy of these widths as straight-line code: `decide` of `shaders/generic.wgsl`, its loops written out. Each unit is
 /// a variable, and four weights at a time are read in the order in which they are needed, so that a compiler may read
 /// many before it waits for any.
 fn straight_policy(widths: &[u32; WIDTHS]) -> String {
-    let mut text =
-        String::from("fn decide(lane: u32, stride: u32, of_pois: vec4<f32>, of_agents: vec4<f32>) -> vec2<f32> {\n");
+    let mut text = String::from("fn decide(lane: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
     let mut line = |line: std::fmt::Arguments<'_>| writeln!(text, "    {line}").expect("a string takes a line");
     let mut read = HashSet::new();
-    let mut inputs: Vec<String> =
-        (0..INPUTS).map(|input| format!("{}.{}", ["of_pois", "of_agents"][input / 4], AXES[input % 4])).collect();
+    let mut inputs: Vec<String> = (0..INPUTS).map(|input| format!("inputs[{input}]")).collect();
     let mut first = 0;
     let layers = widths.windows(2).take_while(|pair| pair[1] > 0);
     for (layer, pair) in layers.enumerate() {
@@ -855,7 +853,8 @@ pub fn shaders() -> Vec<(&'static str, String)> {
         |workgroup, slots, widest, trace| source(Shape { workgroup, slots, trace, sizes: Sizes::Any { widest } });
     let specialised = |trace| {
         let widths = [INPUTS as u32, 10, OUTPUTS as u32, 0, 0];
-        let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, density: 0, by_sine: true };
+        let variant = Variant { density: 0, by_sine: 1 };
+        let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, variant };
         source(Shape { workgroup: 384, slots: 1, trace, sizes })
     };
     vec![
