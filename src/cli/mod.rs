@@ -22,6 +22,7 @@ use crate::run::RunError;
 mod backend;
 mod bench;
 mod check;
+mod compare;
 mod completions;
 mod devices;
 mod init;
@@ -66,6 +67,8 @@ commands! {
     Paper(paper),
     /// Draw the learning curves of one run, or of several side by side.
     Plot(plot),
+    /// Compare runs, or the points of a sweep along an axis, with intervals and tests.
+    Compare(compare),
     /// Play the best team of a trial and generation again, as a page or a picture.
     Replay(replay),
     /// Measure how fast teams are played, alone and in whole generations.

@@ -127,6 +127,26 @@ impl Courses {
     }
 }
 
+/// G of the best team and of the champion, `[trials][generations]`, as far as the run has come.
+///
+/// # Errors
+/// See [`metrics()`]; or a trial's rows are not in order.
+pub fn trials(folder: &Path, config: &Config) -> Result<Vec<Vec<[f64; 2]>>, RunError> {
+    let mut trials = vec![vec![]; config.learning.trials];
+    let mut skipped = None;
+    metrics(folder, config, |row| match &mut trials[row.trial] {
+        trial if trial.len() == row.generation => trial.push([row.best_g, row.champion_g]),
+        _ => skipped = skipped.or(Some((row.trial, row.generation))),
+    })?;
+    match skipped {
+        None => Ok(trials),
+        Some((trial, generation)) => Err(RunError::Record(RecordError::Damaged {
+            path: folder.join(METRICS),
+            reason: format!("trial {trial} of generation {generation} is out of turn"),
+        })),
+    }
+}
+
 /// The curves of one run (best, mean and champion), or the best teams of several, by what differs between them.
 ///
 /// # Errors
