@@ -18,6 +18,7 @@
 //!    by [`record`]; [`report`] draws it.
 //!
 //! Around that: [`run`] keeps a trainer and its runs' folders and checkpoints together, [`sweep`] makes many runs of a grid,
+//! [`stepping`] plays teams by given actions instead of policies,
 //! [`evaluate`] plays trained teams from starts that no training saw, [`baseline`] plays what needs no learning,
 //! [`statistics`] says what chance leaves open, [`memory`] tells what a run will take, [`verify`] compares two backends on
 //! the random worlds of [`sample`], [`mod@bench`] times a backend against what the machine can do at most, and [`cli`]
@@ -50,6 +51,7 @@ pub mod run;
 pub mod sample;
 pub mod shell;
 pub mod statistics;
+pub mod stepping;
 pub mod sweep;
 pub mod trainer;
 pub mod verify;
