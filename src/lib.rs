@@ -1,5 +1,38 @@
 //! flotilla trains cooperative teams by coevolution, in batches, on any GPU, with the same bits on a CPU.
 //!
+//! # In a few lines
+//!
+//! Train, with a callback a generation that may stop:
+//!
+//! ```
+//! use std::ops::ControlFlow::{Break, Continue};
+//! use flotilla::{Config, front::Processor};
+//!
+//! let mut config = Config::parse(include_str!("../configs/generally_forward.toml"), "generally_forward.toml")?;
+//! (config.learning.trials, config.learning.generations) = (2, 10);
+//! let ((mut backend, _), _) = flotilla::open(&Processor::Cpu)?;
+//!
+//! let trained = flotilla::train(&config, &mut *backend, |generation| {
+//!     println!("{} of {}: {:?}", generation.generation, generation.last, generation.rows);
+//!     if generation.rows.iter().all(|row| row.champion_g == 1.0) { Break(()) } else { Continue(()) }
+//! })?;
+//! println!("{:?}, digest {}", trained.champion_g, trained.digest());
+//!
+//! // Play policies from wherever they come, here what trial 0 learned, and see what each leader was worth.
+//! use flotilla::evaluate::Starts;
+//! let played = flotilla::play(&config, &mut *backend, config.learning.population, &trained.policies[0], &Starts::Own)?;
+//! println!("the champion observes {} POIs; its leaders' D: {:?}", played.observed[0], &played.d[..4]);
+//!
+//! // Step teams by given actions, [teams][leaders][2] in -1..1, and see what leaders sense: [teams][leaders][8].
+//! let mut stepper = flotilla::stepper(&config, 16, false)?;
+//! let actions = vec![0.5; 16 * 4 * 2];
+//! stepper.step(&actions)?;
+//! println!("{:?}", &stepper.inputs()[..8]);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
+//! [`front`] has these and more; `examples/` has whole programs.
+//!
 //! # Follow one team from config to fitness
 //!
 //! ```text
@@ -24,7 +57,7 @@
 //! the random worlds of [`sample`], [`mod@bench`] times a backend against what the machine can do at most, and [`cli`]
 //! turns what was typed into all this.
 //!
-//! Imports run one way: `main ▸ cli ▸ {run, sweep, report, evaluate, verify, bench} ▸ trainer ▸ {evolve, credit,
+//! Imports run one way: `main ▸ cli ▸ {front, run, sweep, report, evaluate, verify, bench} ▸ trainer ▸ {evolve, credit,
 //! backend}`, `backend ▸ {evolve, kernels}`. Only `backend::gpu` knows wgpu; the kernels know neither threads nor GPUs.
 
 /// The commit that this was built from, where that is known; a debug build does not know it.
@@ -43,6 +76,7 @@ pub mod escape;
 pub mod evaluate;
 pub mod evolve;
 pub mod file;
+pub mod front;
 pub mod kernels;
 pub mod memory;
 pub mod record;
@@ -56,3 +90,6 @@ pub mod sweep;
 pub mod trainer;
 pub mod verify;
 pub mod world;
+
+pub use config::Config;
+pub use front::{open, play, stepper, trace, train};

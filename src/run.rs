@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
+use crate::backend::gpu::episode::GpuEpisodes;
 use crate::backend::{Backend, BackendError};
 use crate::config::{self, Config};
 use crate::memory::{self, TooLittle};
@@ -26,6 +27,7 @@ pub enum RunError {
     Record(#[from] RecordError),
     #[error(transparent)]
     TooLittle(#[from] TooLittle),
+    /// Whether all before the generation is saved, is told too.
     #[error("{error}\ngeneration {generation} could not be played{}", after(saved))]
     Backend { error: BackendError, generation: usize, saved: Result<(), Box<RunError>> },
     #[error(
@@ -49,9 +51,7 @@ impl RunError {
 
 fn after(saved: &Result<(), Box<RunError>>) -> String {
     match saved {
-        Ok(()) => {
-            "; all before it is saved: go on with --resume, with --on-device-loss cpu to change to the CPU".into()
-        }
+        Ok(()) => "; all before it is saved".into(),
         Err(error) => format!(", and what came before it could not be saved: {error}"),
     }
 }
@@ -64,6 +64,19 @@ pub struct Machine {
     pub adapter: Option<String>,
     pub driver: Option<String>,
     pub threads: usize,
+}
+
+impl Machine {
+    /// What a GPU backend runs on.
+    pub fn of_gpu(backend: &GpuEpisodes) -> Machine {
+        let adapter = &backend.gpu().adapter;
+        Machine {
+            backend: "gpu".into(),
+            adapter: Some(adapter.name.clone()),
+            driver: Some(adapter.driver.clone()),
+            threads: rayon::current_num_threads(),
+        }
+    }
 }
 
 /// A backend and what it is.

@@ -590,7 +590,7 @@ fn a_lost_device_costs_nothing() {
         // It saves, and is resumed.
         let path = folder.path().join("stop");
         let told = session(&config, &path, Start::Fresh, Disk::default(), failing(), None);
-        let error = told.end.unwrap_err().to_string();
+        let error = flotilla::cli::Error::from(told.end.unwrap_err()).to_string();
         assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
         assert_eq!(Run::read(&path.join("run.json")).unwrap().state, State::Stopped);
         let (results, told) = resume(&config, &path);

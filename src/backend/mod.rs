@@ -268,8 +268,6 @@ pub enum BackendError {
     #[error("the populations are held by another device; bring them to the host first")]
     HeldElsewhere,
     /// Nobody has the populations of the present generation any more.
-    #[error(
-        "the populations were lost with the device that held them; --resume goes on from the last checkpoint or the start"
-    )]
+    #[error("the populations were lost with the device that held them")]
     Gone,
 }

@@ -11,6 +11,7 @@ use super::{BackendChoice, Breed, Error, Overrides, RunOptions, backend, print};
 use crate::backend::cpu::{Cpu, level_name};
 use crate::bench::{self, Generations, Measure, Player, Profile};
 use crate::config::{self, Config};
+use crate::front;
 use crate::memory::Plan;
 use crate::run::{Machine, RunError};
 
@@ -135,15 +136,15 @@ fn open(args: &Args) -> Result<(Player, Machine), Error> {
                 ));
             }
             backend::start_threads(&args.run)?;
-            return Ok((Player::Cpu(Cpu::at_level(level), level), backend::cpu().1));
+            return Ok((Player::Cpu(Cpu::at_level(level), level), front::cpu().1));
         }
     };
     Ok(match backend::open_gpu(&args.run)? {
         Some(gpu) => {
-            let machine = backend::machine(&gpu);
+            let machine = Machine::of_gpu(&gpu);
             (Player::Gpu(Box::new(gpu)), machine)
         }
-        None => (Player::Cpu(Cpu::at_level(level), level), backend::cpu().1),
+        None => (Player::Cpu(Cpu::at_level(level), level), front::cpu().1),
     })
 }
 
