@@ -17,6 +17,22 @@ use crate::world::{World, on_grid};
 pub const MIN_WEIGHT: f32 = 1.0 / 1_073_741_824.0;
 /// Weights of larger size (2^20) stay at it.
 pub const MAX_WEIGHT: f32 = 1_048_576.0;
+/// Whether a number may be a weight.
+pub fn is_weight(number: f32) -> bool {
+    number == 0.0 || (MIN_WEIGHT..=MAX_WEIGHT).contains(&number.abs())
+}
+
+/// Makes weights fit for the kernels: those too small for them become 0. Gives the place of one that is too large or
+/// no number.
+pub fn admit(weights: &mut [f32]) -> Option<usize> {
+    weights.iter_mut().position(|weight| {
+        if weight.abs() < MIN_WEIGHT {
+            *weight = 0.0;
+        }
+        weight.is_nan() || weight.abs() > MAX_WEIGHT
+    })
+}
+
 /// Lanes of the widest vectors.
 const WIDEST: usize = 16;
 

@@ -1,5 +1,38 @@
 //! flotilla trains cooperative teams by coevolution, in batches, on any GPU, with the same bits on a CPU.
 //!
+//! # In a few lines
+//!
+//! Train, with a callback a generation that may stop:
+//!
+//! ```
+//! use std::ops::ControlFlow::{Break, Continue};
+//! use flotilla::{Config, front::Processor};
+//!
+//! let mut config = Config::parse(include_str!("../configs/generally_forward.toml"), "generally_forward.toml")?;
+//! (config.learning.trials, config.learning.generations) = (2, 10);
+//! let ((mut backend, _), _) = flotilla::open(&Processor::Cpu)?;
+//!
+//! let trained = flotilla::train(&config, &mut *backend, |generation| {
+//!     println!("{} of {}: {:?}", generation.generation, generation.last, generation.rows);
+//!     if generation.rows.iter().all(|row| row.champion_g == 1.0) { Break(()) } else { Continue(()) }
+//! })?;
+//! println!("{:?}, digest {}", trained.champion_g, trained.digest());
+//!
+//! // Play policies from wherever they come, here what trial 0 learned, and see what each leader was worth.
+//! use flotilla::evaluate::Starts;
+//! let played = flotilla::play(&config, &mut *backend, config.learning.population, &trained.policies[0], &Starts::Own)?;
+//! println!("the champion observes {} POIs; its leaders' D: {:?}", played.observed[0], &played.d[..4]);
+//!
+//! // Step teams by given actions, [teams][leaders][2] in -1..1, and see what leaders sense: [teams][leaders][8].
+//! let mut stepper = flotilla::stepper(&config, 16, false)?;
+//! let actions = vec![0.5; 16 * 4 * 2];
+//! stepper.step(&actions)?;
+//! println!("{:?}", &stepper.inputs()[..8]);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
+//! [`front`] has these and more; `examples/` has whole programs.
+//!
 //! # Follow one team from config to fitness
 //!
 //! ```text
@@ -41,11 +74,13 @@
 //! | [`statistics`] | | what chance leaves open |
 //! | [`baseline`] | | what needs no learning |
 //! | [`evaluate`] | | trained teams, from starts that no training saw |
+//! | [`stepping`] | | teams stepped by given actions |
 //! | [`memory`] | | what a run will take |
 //! | [`record`] | `record` | files: policies, metrics, checkpoints, folders |
 //! | [`run`] | `record` | a trainer and its runs' folders, kept together |
 //! | [`report`] | `report` | pictures, films, pages; the paper's claims |
 //! | [`sweep`] | `report` | many runs of a grid |
+//! | [`front`] | | what programs need, in a few lines |
 //! | [`mod@bench`] | `cli` | a backend's speed, and what the machine can do at most |
 //! | [`cli`] | `cli` | what was typed, turned into all this |
 //!
@@ -81,6 +116,7 @@ pub mod escape;
 pub mod evaluate;
 pub mod evolve;
 pub mod file;
+pub mod front;
 pub mod host;
 pub mod kernels;
 pub mod memory;
@@ -96,8 +132,14 @@ pub mod run;
 pub mod sample;
 pub mod shell;
 pub mod statistics;
+pub mod stepping;
 #[cfg(feature = "report")]
 pub mod sweep;
 pub mod trainer;
 pub mod verify;
 pub mod world;
+
+pub use config::Config;
+#[cfg(feature = "gpu")]
+pub use front::open;
+pub use front::{play, stepper, trace, train};

@@ -39,7 +39,7 @@ pub struct Plan {
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "this needs {} of memory at its peak, and {} is available; choose a smaller population, fewer trials{} or another \
-     machine (flotilla check tells what a config needs)",
+     machine",
     human(*needed), human(*available),
     if *checkpoint > 0 { format!(", no checkpoints (they take {} of it)", human(*checkpoint)) } else { String::new() }
 )]
@@ -94,11 +94,19 @@ impl Plan {
     /// # Errors
     /// There is less.
     pub fn check(&self, gpu: bool) -> Result<(), TooLittle> {
-        let (needed, checkpoint) = (if gpu { self.gpu_host } else { self.host }, self.checkpoint);
-        match available() {
-            Some(available) if available < needed => Err(TooLittle { needed, available, checkpoint }),
-            _ => Ok(()),
-        }
+        check(if gpu { self.gpu_host } else { self.host }, self.checkpoint)
+    }
+}
+
+/// Refuses a peak, so much of it for checkpoints, that does not fit in the memory that is available now; lets pass where the
+/// system does not tell.
+///
+/// # Errors
+/// There is less.
+pub fn check(needed: u64, checkpoint: u64) -> Result<(), TooLittle> {
+    match available() {
+        Some(available) if available < needed => Err(TooLittle { needed, available, checkpoint }),
+        _ => Ok(()),
     }
 }
 

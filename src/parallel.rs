@@ -3,7 +3,7 @@
 //! No result depends on it: whatever runs in parallel writes to places of its own.
 
 #[cfg(feature = "parallel")]
-pub use rayon::{current_num_threads, prelude::*, scope};
+pub use rayon::{current_num_threads, join, prelude::*, scope};
 
 #[cfg(not(feature = "parallel"))]
 pub use sequential::*;
@@ -17,13 +17,18 @@ mod sequential {
         1
     }
 
+    /// Runs both.
+    pub fn join<A, B>(one: impl FnOnce() -> A, other: impl FnOnce() -> B) -> (A, B) {
+        (one(), other())
+    }
+
     /// Runs this where all that it shares is shared.
     pub fn scope<R>(run: impl FnOnce(&()) -> R) -> R {
         run(&())
     }
 
     /// rayon's names for what slices have.
-    pub trait Slices<T> {
+    pub trait ParallelSlices<T> {
         fn par_iter(&self) -> Iter<'_, T>;
         fn par_iter_mut(&mut self) -> IterMut<'_, T>;
         fn par_chunks_mut(&mut self, size: usize) -> ChunksMut<'_, T>;
@@ -32,7 +37,7 @@ mod sequential {
         fn par_chunks(&self, size: usize) -> std::slice::Chunks<'_, T>;
     }
 
-    impl<T> Slices<T> for [T] {
+    impl<T> ParallelSlices<T> for [T] {
         fn par_iter(&self) -> Iter<'_, T> {
             self.iter()
         }
@@ -59,16 +64,16 @@ mod sequential {
     }
 
     /// rayon's names for what iterators have.
-    pub trait Items: IntoIterator + Sized {
+    pub trait ParallelItems: IntoIterator + Sized {
         fn into_par_iter(self) -> Self::IntoIter {
             self.into_iter()
         }
     }
 
-    impl<I: IntoIterator> Items for I {}
+    impl<I: IntoIterator> ParallelItems for I {}
 
     /// What rayon wants to know of how work is cut up.
-    pub trait Cut: Iterator + Sized {
+    pub trait ParallelCut: Iterator + Sized {
         fn with_min_len(self, _: usize) -> Self {
             self
         }
@@ -82,5 +87,5 @@ mod sequential {
         }
     }
 
-    impl<I: Iterator> Cut for I {}
+    impl<I: Iterator> ParallelCut for I {}
 }

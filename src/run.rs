@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
 
-use crate::backend::{Backend, BackendError};
+use crate::backend::{BackendError, Machine, Player};
 use crate::config::{self, Config};
 use crate::host::Instant;
 use crate::memory::{self, TooLittle};
@@ -27,6 +27,7 @@ pub enum RunError {
     Record(#[from] RecordError),
     #[error(transparent)]
     TooLittle(#[from] TooLittle),
+    /// Whether all before the generation is saved, is told too.
     #[error("{error}\ngeneration {generation} could not be played{}", after(saved))]
     Backend { error: BackendError, generation: usize, saved: Result<(), Box<RunError>> },
     #[error(
@@ -50,25 +51,10 @@ impl RunError {
 
 fn after(saved: &Result<(), Box<RunError>>) -> String {
     match saved {
-        Ok(()) => {
-            "; all before it is saved: go on with --resume, with --on-device-loss cpu to change to the CPU".into()
-        }
+        Ok(()) => "; all before it is saved".into(),
         Err(error) => format!(", and what came before it could not be saved: {error}"),
     }
 }
-
-/// What a run runs on, for `run.json`.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Machine {
-    /// "cpu" or "gpu".
-    pub backend: String,
-    pub adapter: Option<String>,
-    pub driver: Option<String>,
-    pub threads: usize,
-}
-
-/// A backend and what it is.
-pub type Player = (Box<dyn Backend>, Machine);
 
 /// What others may want of runs while they run.
 pub struct Options<'a> {

@@ -147,6 +147,14 @@ impl Trainer {
         self.arms[arm].generation
     }
 
+    /// Makes the generation that an arm plays next its last, or leaves it at an earlier one; gives the last. What comes out is
+    /// what a config of so many generations comes to.
+    pub fn end(&mut self, arm: usize) -> usize {
+        let Arm { config, generation, .. } = &mut self.arms[arm];
+        config.learning.generations = config.learning.generations.min(*generation);
+        config.learning.generations
+    }
+
     /// The error of a backend that held populations and that was made up for since this was last asked: the populations
     /// are on the host from then on.
     pub fn take_setback(&mut self) -> Option<BackendError> {

@@ -329,7 +329,7 @@ fn a_shader_over_the_devices_limits_is_refused() {
 #[test]
 fn an_unknown_adapter_lists_those_there_are() {
     let error = gpu::open(Choice::Named("no such adapter".into())).expect_err("there is no such adapter");
-    let message = error.to_string();
+    let message = flotilla::cli::Error::from(error).to_string();
     assert!(message.contains("no such adapter") && message.contains("--backend cpu") || !device::adapters().is_empty());
     for info in device::adapters() {
         assert!(message.contains(&info.name), "{message}");
@@ -367,7 +367,8 @@ fn a_number_is_an_index_and_nothing_is_no_name() {
 #[test]
 fn a_software_renderer_is_taken_by_name_alone() {
     let software = &two()[1..];
-    let error = device::position(&Choice::Real, software).expect_err("there is no GPU").to_string();
+    let error = device::position(&Choice::Real, software).expect_err("there is no GPU");
+    let error = flotilla::cli::Error::from(error).to_string();
     assert!(
         error.contains("0: llvmpipe") && error.contains("--adapter 0") && error.contains("--backend cpu"),
         "{error}"
@@ -423,7 +424,7 @@ fn a_refusal_names_the_device_and_the_probe() {
     let mismatch =
         probe::Mismatch { probe: "x*y + z".into(), values: vec![1.5f32.to_bits()], cpu: 1, gpu: 2 }.to_string();
     let failures = vec![(Pass::NoContraction, mismatch.clone()), (Pass::Guarded, mismatch)];
-    let message = DeviceError::Inexact { adapter: "Some GPU".into(), failures }.to_string();
+    let message = flotilla::cli::Error::from(DeviceError::Inexact { adapter: "Some GPU".into(), failures }).to_string();
     for part in ["Some GPU", "x*y + z", "no-contraction", "guarded", "0x00000002", "1.5e0", "--backend cpu"] {
         assert!(message.contains(part), "{part}: {message}");
     }

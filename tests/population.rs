@@ -14,11 +14,12 @@ use flotilla::backend::gpu;
 use flotilla::backend::gpu::device::{self, DeviceError, Kind};
 use flotilla::backend::gpu::episode::{GpuEpisodes, Holding};
 use flotilla::backend::{Backend, BackendError, Group, HELD_FROM, Held, Trace, Visit, Weights};
+use flotilla::backend::{Machine, Player};
 use flotilla::config::{Config, Fitness, Learning, Mutation, Paradigm};
 use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, Start};
-use flotilla::run::{Machine, Options, Outcome, Player, Session};
+use flotilla::run::{Options, Outcome, Session};
 use flotilla::trainer::{Row, Snapshot, SnapshotError, Trainer};
 
 fn learning() -> Learning {
@@ -240,7 +241,7 @@ fn what_does_not_fit_the_device_is_declined() {
         let open = |holding| GpuEpisodes::new(gpu.clone()).unwrap().holding(holding);
         assert!(open(Holding::From(1)).hold(&[], sizes).unwrap().is_none(), "{info}");
         let error = open(Holding::Always).hold(&[], sizes).unwrap_err().to_string();
-        assert!(error.contains("134217") && error.contains("--breed host"), "{info}: {error}");
+        assert!(error.contains("134217") && error.contains("breed on the host"), "{info}: {error}");
         assert!(open(Holding::Never).hold(&[], [1, 2, 1]).unwrap().is_none(), "{info}");
         // Nothing is asked for.
         let weights = vec![0.0; HELD_FROM as usize / 4];
@@ -420,7 +421,7 @@ fn a_run_survives_the_loss_of_the_device_that_holds_its_populations() {
         assert_eq!((ended.unwrap(), &found), (expected.clone(), &rows), "call {nth}");
         let name = format!("stop-{nth}");
         let (ended, _) = run(&name, Start::Fresh, Some(Device::failing_at(nth, true)), false);
-        let error = ended.unwrap_err().to_string();
+        let error = flotilla::cli::Error::from(ended.unwrap_err()).to_string();
         assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
         gone += usize::from(error.contains("the populations were lost"));
         let (ended, found) = run(&name, Start::Resume, None, false);

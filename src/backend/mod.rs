@@ -7,6 +7,7 @@ use glam::Vec2;
 
 use crate::declare::shared;
 use crate::evolve::{self, Breeding};
+use crate::parallel::current_num_threads;
 use crate::world::{INPUTS, OUTPUTS, World};
 
 pub mod compare;
@@ -211,6 +212,38 @@ impl From<evolve::Misfit> for BackendError {
     }
 }
 
+/// What a run runs on, for `run.json`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Machine {
+    /// "cpu" or "gpu".
+    pub backend: String,
+    pub adapter: Option<String>,
+    pub driver: Option<String>,
+    pub threads: usize,
+}
+
+impl Machine {
+    /// The CPU, on the threads that there are.
+    pub fn of_cpu() -> Machine {
+        Machine { backend: "cpu".into(), threads: current_num_threads(), ..Machine::default() }
+    }
+
+    /// What a GPU backend runs on.
+    #[cfg(feature = "gpu")]
+    pub fn of_gpu(backend: &gpu::episode::GpuEpisodes) -> Machine {
+        let adapter = &backend.gpu().adapter;
+        Machine {
+            backend: "gpu".into(),
+            adapter: Some(adapter.name.clone()),
+            driver: Some(adapter.driver.clone()),
+            threads: current_num_threads(),
+        }
+    }
+}
+
+/// A backend and what it is.
+pub type Player = (Box<dyn Backend>, Machine);
+
 /// Why episodes could not be played.
 #[derive(Debug, thiserror::Error)]
 pub enum BackendError {
@@ -228,8 +261,6 @@ pub enum BackendError {
     #[error("the populations are held by another device; bring them to the host first")]
     HeldElsewhere,
     /// Nobody has the populations of the present generation any more.
-    #[error(
-        "the populations were lost with the device that held them; --resume goes on from the last checkpoint or the start"
-    )]
+    #[error("the populations were lost with the device that held them")]
     Gone,
 }

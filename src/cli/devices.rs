@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use super::{Error, print};
+use super::{Error, print, remedy};
 use crate::backend::Backend;
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu;
@@ -50,7 +50,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         text += &format!("{index}: {info}\n");
         text += &match opened {
             Ok(gpu) => exact(gpu),
-            Err(error) => format!("   not usable: {error}\n"),
+            Err(error) => format!("   not usable: {error}{}\n", remedy::device(error)),
         };
     }
     if adapters.is_empty() {

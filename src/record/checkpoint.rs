@@ -19,7 +19,7 @@ use sha2::{Digest, Sha256};
 
 use super::disk::{self, Disk, Output};
 use super::metrics::Mark;
-use super::policies::{self, admit};
+use super::policies;
 use super::tensors::{self, Tensor, TensorFile};
 use super::{RecordError, hex};
 use crate::config::{self, Config};
@@ -145,7 +145,7 @@ impl Checkpoint {
         let elsewhere = generation == last + 1 && file.info(WEIGHTS).is_none();
         let mut floats = |name: &str, shape: &[usize]| -> Result<Vec<Vec<f32>>, String> {
             let mut trials: Vec<Vec<f32>> = file.read(name, Dtype::F32, shape, shape[0])?;
-            match trials.iter_mut().any(|numbers| admit(numbers).is_some()) {
+            match trials.iter_mut().any(|numbers| evolve::admit(numbers).is_some()) {
                 true => Err(format!("{name} has numbers that cannot be")),
                 false => Ok(trials),
             }

@@ -39,7 +39,7 @@ pub enum ReplayError {
     NoTrial { folder: String, trial: usize, trials: usize },
     #[error(
         "{folder}: metrics.csv has no generation {generation} of trial {trial}{}",
-        newest.map_or(String::new(), |newest| format!("; the newest is {newest}: choose one up to that, or finish the run with --resume"))
+        newest.map_or(String::new(), |newest| format!("; the newest is {newest}: choose one up to that"))
     )]
     NoGeneration { folder: String, trial: usize, generation: usize, newest: Option<usize> },
     #[error(

@@ -5,10 +5,11 @@ use std::sync::atomic::Ordering::Relaxed;
 
 use super::Point;
 use super::results::point_folder;
+use crate::backend::Player;
 use crate::config::Config;
 use crate::record::disk::Disk;
 use crate::record::folder::{Note, Start};
-use crate::run::{self, Outcome, Player, RunError, Session};
+use crate::run::{self, Outcome, RunError, Session};
 
 /// Most points in one batch: each keeps two files open, and systems allow a process 1024.
 const MAX_BATCH: usize = 400;

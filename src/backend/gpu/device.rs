@@ -95,34 +95,25 @@ impl From<&wgpu::AdapterInfo> for AdapterInfo {
 /// Why a GPU could not be had, or failed at work.
 #[derive(Debug, thiserror::Error)]
 pub enum DeviceError {
-    #[error("no GPU adapter found (is a Vulkan, Metal or DirectX 12 driver installed?); use --backend cpu")]
+    #[error("no GPU adapter found (is a Vulkan, Metal or DirectX 12 driver installed?)")]
     NoAdapter,
-    #[error(
-        "no GPU among the adapters, only {}; what may be a software renderer is taken by --adapter alone (--adapter 0); \
-         --backend cpu is faster than one",
-        list(.found)
-    )]
+    #[error("no GPU among the adapters, only {}", list(.found))]
     NoRealAdapter { found: Vec<AdapterInfo> },
     #[error("no adapter {} \"{name}\"; there {}", if is_index(name) { "has the number" } else { "matches" }, there_are(.found))]
     UnknownAdapter { name: String, found: Vec<AdapterInfo> },
-    #[error("{adapter}: cannot be opened: {reason}; choose another with --adapter, or use --backend cpu")]
+    #[error("{adapter}: cannot be opened: {reason}")]
     Refused { adapter: String, reason: String },
-    #[error(
-        "{adapter}: not bit-exact, so it cannot be used: {}; choose another with --adapter, or use --backend cpu",
-        inexact(.failures)
-    )]
+    #[error("{adapter}: not bit-exact, so it cannot be used: {}", inexact(.failures))]
     Inexact { adapter: String, failures: Vec<(Pass, String)> },
-    #[error("{adapter}: the device was lost ({reason}); run again, or use --backend cpu")]
+    #[error("{adapter}: the device was lost ({reason})")]
     Lost { adapter: String, reason: String },
-    #[error("{adapter}: out of memory for {what}; use a smaller batch, or --backend cpu")]
+    #[error("{adapter}: out of memory for {what}; use a smaller batch")]
     OutOfMemory { adapter: String, what: String },
-    #[error(
-        "{adapter}: {what} needs {bytes} bytes, the device allows {allowed}; use a smaller batch, or --backend cpu"
-    )]
+    #[error("{adapter}: {what} needs {bytes} bytes, the device allows {allowed}; use a smaller batch")]
     TooLarge { adapter: String, what: String, bytes: u64, allowed: u64 },
     #[error("shader {label} {source}")]
     Shader { label: String, source: ShaderError },
-    #[error("{adapter}: {what} failed: {reason}; use --backend cpu")]
+    #[error("{adapter}: {what} failed: {reason}")]
     Failed { adapter: String, what: String, reason: String },
 }
 
@@ -137,7 +128,7 @@ fn is_index(name: &str) -> bool {
 }
 
 fn there_are(found: &[AdapterInfo]) -> String {
-    if found.is_empty() { "is none at all; use --backend cpu".into() } else { format!("is {}", list(found)) }
+    if found.is_empty() { "is none at all".into() } else { format!("is {}", list(found)) }
 }
 
 fn inexact(failures: &[(Pass, String)]) -> String {

@@ -292,7 +292,7 @@ fn plan(
         if bytes_a_team > room.buffer {
             return Err(BackendError::TooLarge(format!(
                 "one team takes {bytes_a_team} bytes in one buffer, this adapter allows {}; \
-                 use --backend cpu, fewer steps or fewer POIs",
+                 use the CPU, fewer steps or fewer POIs",
                 room.buffer
             )));
         }
@@ -948,7 +948,7 @@ impl Backend for GpuEpisodes {
             return match self.holding {
                 Holding::Always => Err(BackendError::TooLarge(format!(
                     "the policies of one leader take {bytes} bytes, this adapter holds {allowed} in one buffer; \
-                     use --breed host, or a smaller population"
+                     breed on the host, or use a smaller population"
                 ))),
                 _ => Ok(None),
             };
