@@ -95,8 +95,8 @@ fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
         }
     }
     let inputs = weigh_in(of_pois, of_agents);
-    let lane = task.weights + leader * task.teams + (*me).team;
-    let outputs = decide(lane, shape.leaders * task.teams, inputs);
+    let start = task.weights + leader * task.teams + (*me).team;
+    let outputs = decide(start, shape.leaders * task.teams, inputs);
     if TRACE {
         (*me).inputs = inputs;
         (*me).outputs = outputs;
@@ -140,7 +140,7 @@ fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
 // Everyone moves.
 fn go(me: ptr<function, Agent>) {
     let next = (*me).next;
-    let heading = straighten(next.hx, next.hy);
+    let heading = renormalize(next.hx, next.hy);
     let speed = accelerate((*me).speed, next.speed);
     let step = speed * world.dt;
     (*me).x = advance((*me).x, step, heading.x, world.map_x);

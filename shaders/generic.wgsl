@@ -17,7 +17,7 @@ fn adopt(task: Task) {
 
 // A leader's answer to its inputs: layer by layer, each unit's bias (the last of its weights) and weighted inputs added
 // in order.
-fn decide(lane: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
+fn decide(start: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
     var inputs: array<f32, WIDEST>;
     for (var input = 0u; input < INPUTS; input++) {
         inputs[input] = sensed[input];
@@ -29,9 +29,9 @@ fn decide(lane: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
         var units: array<f32, WIDEST>;
         for (var column = 0u; column < columns; column++) {
             var index = first + column;
-            var sum = weight(lane, stride, index + rows * columns);
+            var sum = weight(start, stride, index + rows * columns);
             for (var row = 0u; row < rows; row++) {
-                sum += inputs[row] * weight(lane, stride, index);
+                sum += inputs[row] * weight(start, stride, index);
                 index += columns;
             }
             units[column] = activate(sum);
@@ -43,6 +43,6 @@ fn decide(lane: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
 }
 
 // One of a policy's weights.
-fn weight(lane: u32, stride: u32, index: u32) -> f32 {
-    return weights[lane + index / 4u * stride][index % 4u];
+fn weight(start: u32, stride: u32, index: u32) -> f32 {
+    return weights[start + index / 4u * stride][index % 4u];
 }

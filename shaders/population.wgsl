@@ -112,31 +112,31 @@ fn gather(
 ) {
     let across = (stretch.parameters + TILE - 1u) / TILE;
     let index = workgroup.y * workgroups.x + workgroup.x;
-    let first_lane = index / across * TILE;
-    let lanes = stretch.count * stretch.teams;
+    let first_policy = index / across * TILE;
+    let played = stretch.count * stretch.teams;
     let first_parameter = index % across * TILE;
     let column = thread % TILE;
     for (var row = thread / TILE; row < TILE; row += WORKGROUP / TILE) {
-        let lane = first_lane + row;
+        let policy = first_policy + row;
         let parameter = first_parameter + column;
         // The last four weights of a policy may be fewer.
         var weight = 0.0;
-        if lane < lanes && parameter < stretch.parameters {
-            let leader = lane / stretch.teams;
-            let choice = lane % stretch.teams * stretch.leaders + stretch.first + leader;
+        if policy < played && parameter < stretch.parameters {
+            let leader = policy / stretch.teams;
+            let choice = policy % stretch.teams * stretch.leaders + stretch.first + leader;
             weight = weight_of(leader, choices[stretch.choices + choice] * stretch.parameters + parameter);
         }
         tile[row * (TILE + 1u) + column] = weight;
     }
     workgroupBarrier();
-    let lane = first_lane + column;
-    let team = lane % stretch.teams;
-    let leader = stretch.first + lane / stretch.teams;
+    let policy = first_policy + column;
+    let team = policy % stretch.teams;
+    let leader = stretch.first + policy / stretch.teams;
     let before = team / stretch.teams_a_task * stretch.teams_a_task;
     let teams = min(stretch.teams_a_task, stretch.teams - before);
     let fours = (stretch.parameters + 3u) / 4u;
     let task = stretch.weights + before * stretch.leaders * fours;
-    for (var row = thread / TILE; row < TILE / 4u && lane < lanes; row += WORKGROUP / TILE) {
+    for (var row = thread / TILE; row < TILE / 4u && policy < played; row += WORKGROUP / TILE) {
         let four = first_parameter / 4u + row;
         if four < fours {
             let start = column * (TILE + 1u) + 4u * row;

@@ -201,3 +201,81 @@ macro_rules! choice {
     };
 }
 pub(crate) use choice;
+
+#[cfg(test)]
+mod tests {
+    use fearless_simd::{Level, dispatch};
+
+    use super::*;
+
+    choice! {
+        /// Of a test.
+        Colour {
+            Red = "red",
+            DarkGreen = "dark-green",
+        }
+    }
+
+    shared! {
+        /// Of a test.
+        pub struct Inner as InnerLanes {
+            pub size: f32,
+            pub count: u32,
+        }
+
+        pub struct Outer {
+            pub first: u32,
+            pub inner: Inner,
+            pub list: [f32; 3],
+        }
+
+        pub struct Pair {
+            pub size: u32,
+            pub count: u32,
+        }
+    }
+
+    /// The number that the compiler was given.
+    struct Number;
+
+    impl Fixed for Number {
+        type Output = u32;
+
+        fn with<const WORD: u32>(self) -> u32 {
+            WORD
+        }
+    }
+
+    #[test]
+    fn a_word_is_the_same_number_everywhere() {
+        assert_eq!(Colour::wgsl(), "const COLOUR_RED: u32 = 0u;\nconst COLOUR_DARKGREEN: u32 = 1u;\n");
+        for (number, (word, colour)) in (0..).zip(Colour::ALL) {
+            assert_eq!(
+                (Colour::of(number), colour.fix(Number), colour.to_string()),
+                (*colour, number, word.to_string())
+            );
+        }
+        assert_eq!(Colour::names().collect::<Vec<_>>(), ["red", "dark-green"]);
+    }
+
+    #[test]
+    fn a_shared_struct_reads_alike_in_wgsl() {
+        let text = "struct Outer {\n    first: u32,\n    size: f32,\n    count: u32,\n    list: array<f32, 3>,\n}\n";
+        assert_eq!(Outer::wgsl(), text);
+        let outer = Outer { first: 1, inner: Inner { size: 2.5, count: 3 }, list: [4.0, 5.0, 6.0] };
+        let words = [1, 2.5f32.to_bits(), 3, 4f32.to_bits(), 5f32.to_bits(), 6f32.to_bits()];
+        assert_eq!(bytemuck::cast_slice::<_, u32>(&[outer]), words);
+        assert_eq!(Pair { size: 7, count: 8 }.value(), "Pair(7u, 8u)");
+        assert_eq!(Pair::copied_from("world"), "Pair(world.size, world.count)");
+    }
+
+    #[test]
+    fn every_lane_holds_the_number() {
+        fn lanes<S: Simd>(simd: S, inner: Inner) -> (Vec<f32>, u32) {
+            let lanes = inner.lanes(simd);
+            ((0..S::f32s::LEN).map(|lane| lanes.size[lane]).collect(), lanes.count)
+        }
+        let (sizes, count) = dispatch!(Level::new(), simd => lanes(simd, Inner { size: 2.5, count: 3 }));
+        assert!(sizes.len() >= 4 && sizes.iter().all(|&size| size == 2.5) && count == 3, "{sizes:?}");
+    }
+}

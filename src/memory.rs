@@ -12,7 +12,7 @@ use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
 use crate::backend::HELD_FROM;
 use crate::config::Config;
-use crate::world::{INPUTS, OUTPUTS, World};
+use crate::world::World;
 
 /// Bytes of the program itself: its code, its threads' stacks and what it reads. A GPU's driver comes on top.
 pub const PROGRAM: u64 = 8 << 20;
@@ -177,9 +177,8 @@ impl Sizes {
 /// The CPU backend's state of one vector of teams.
 fn block_bytes(world: &World, lanes: u64) -> u64 {
     let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
-    let widest = world.constants.policy.widths.into_iter().max().unwrap_or(0) as usize;
-    let policies = leaders * (world.parameters() + INPUTS + 2 * widest + OUTPUTS);
-    let words = 8 * agents + policies + 3 * followers + world.set_words() + followers * leaders;
+    let words =
+        8 * agents + leaders * world.constants.policy.words() + 3 * followers + world.set_words() + followers * leaders;
     words as u64 * lanes * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8) as u64
 }
 

@@ -262,7 +262,7 @@ impl<S: Simd> Network<S> {
     fn new(simd: S, world: &World) -> Network<S> {
         let constants = world.constants;
         let zero = splat(simd, 0.0);
-        let widest = constants.policy.widths.into_iter().max().unwrap_or(0) as usize;
+        let widest = constants.policy.widest();
         let mut slots = vec![0; world.parameters()];
         let (mut first, mut slot) = (0, 0);
         for widths in constants.policy.widths[..=constants.policy.layers as usize].windows(2) {
@@ -344,14 +344,14 @@ impl<S: Simd> Network<S> {
             for units in eights {
                 let mut halves = [(units[0], units[0]); 8];
                 for (half, &unit) in halves.iter_mut().zip(&*units) {
-                    *half = math::half_tangent::<S>(unit);
+                    *half = math::half_tanh::<S>(unit);
                 }
                 for (unit, &half) in units.iter_mut().zip(&halves) {
-                    *unit = math::whole_tangent::<S>(half);
+                    *unit = math::whole_tanh::<S>(half);
                 }
             }
             for unit in rest {
-                *unit = math::whole_tangent::<S>(math::half_tangent::<S>(*unit));
+                *unit = math::whole_tanh::<S>(math::half_tanh::<S>(*unit));
             }
             first += (rows + 1) * columns;
             std::mem::swap(&mut from, &mut to);
@@ -600,7 +600,7 @@ impl<S: Simd> Block<S> {
     fn advance(&mut self) {
         let world = &self.world;
         for agent in &mut self.agents {
-            (agent.hx, agent.hy) = motion::straighten::<S>(agent.hx, agent.hy);
+            (agent.hx, agent.hy) = motion::renormalize::<S>(agent.hx, agent.hy);
             agent.speed = motion::accelerate::<S>(world, agent.speed, agent.wanted);
         }
         for agent in &mut self.agents {

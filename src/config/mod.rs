@@ -1,13 +1,13 @@
 //! The config: what an experiment is, with every default of the paper's calibration.
 //!
 //! A config is read from a file by [`Config::load`], or from text by [`Config::read`] where flags or a sweep change some
-//! of its keys. The sections of a step's parts stand with these parts, in [`crate::model`]; the others here, as plain data, and
-//! their keys in `keys`. Everything wrong with a text is found in one pass and reported by line.
+//! of its keys. Each section is plain data beside its keys, and each key stands once, with its unit, its meaning, where the
+//! paper has it, what it allows and its default: those of a step's parts with these parts, in [`crate::model`], the others
+//! here. Everything wrong with a text is found in one pass and reported by line, see [`crate::reader`].
 
 use serde::Serialize;
 
-use crate::declare::choice;
-use crate::reader;
+use crate::reader::{self, Reader};
 
 pub use crate::declare::Choice;
 pub use crate::model::couple::Coupling;
@@ -16,27 +16,16 @@ pub use crate::model::motion::Motion;
 pub use crate::model::policy::{MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
 pub use crate::model::sense::{Density, Sense};
 pub use crate::reader::{Key, Override, Problem};
+pub use learning::{
+    Checkpoint, Fitness, Learning, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm,
+};
 pub use load::{MAX_FILE_BYTES, is_standard_input, name, read_file};
+pub use world::{MAX_AGENTS, MAX_POIS, MAX_STEPS, World};
 
-mod keys;
+mod learning;
 mod load;
+mod world;
 
-/// Most agents (leaders and followers) in a team.
-pub const MAX_AGENTS: usize = 1024;
-/// Most POIs in a world.
-pub const MAX_POIS: usize = 256;
-/// Most steps in an episode.
-pub const MAX_STEPS: usize = 10_000;
-/// Most teams (policies a population) in one generation.
-pub const MAX_POPULATION: usize = 1 << 20;
-/// Most generations after the random start.
-pub const MAX_GENERATIONS: usize = 1_000_000;
-/// Most trials in one run.
-pub const MAX_TRIALS: usize = 4096;
-/// Most episodes averaged for one team's score.
-pub const MAX_EPISODES: usize = 1000;
-/// A team's record stays under a gigabyte whatever the config.
-const _: () = assert!(MAX_STEPS * MAX_POIS * MAX_AGENTS.div_ceil(32) * size_of::<u32>() < 1 << 30);
 /// Most bytes that the policies of all trials of a run may take.
 pub const MAX_POLICY_BYTES: u64 = 1 << 38;
 /// The sections that make a config a sweep: values to combine, and values to try one at a time.
@@ -69,87 +58,6 @@ pub struct Config {
     pub policy: Policy,
     pub learning: Learning,
     pub checkpoint: Checkpoint,
-}
-
-/// `[world]`: where everything starts. Lengths in map units, time in seconds, angles in radians.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct World {
-    pub map: [f64; 2],
-    pub leaders: Vec<[f64; 2]>,
-    pub followers: Vec<[f64; 2]>,
-    pub pois: Vec<[f64; 2]>,
-    pub coupling: Coupling,
-    pub observation_radius: f64,
-    pub steps: usize,
-    pub dt: f64,
-    pub heading: f64,
-    pub speed: f64,
-}
-
-/// `[learning]`: the cooperative coevolution.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Learning {
-    pub paradigm: Paradigm,
-    pub fitness: Fitness,
-    pub population: usize,
-    pub generations: usize,
-    pub trials: usize,
-    pub elites: usize,
-    pub mutation: Mutation,
-    pub mutation_probability: f64,
-    pub mutation_sigma: f64,
-    pub episodes_per_team: usize,
-    pub start_jitter: f64,
-    pub seed: u64,
-}
-
-/// `[checkpoint]`: how often a run saves what it needs to go on, without a say in its results; 0 is never.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Checkpoint {
-    /// After so many generations.
-    pub generations: usize,
-    /// After so many seconds.
-    pub seconds: f64,
-}
-
-impl Default for Checkpoint {
-    fn default() -> Checkpoint {
-        Checkpoint { generations: 0, seconds: 30.0 }
-    }
-}
-
-choice! {
-    /// Who learns.
-    Paradigm {
-        /// The leaders; followers keep their preset behaviour.
-        LeaderFollower = "leader-follower",
-        /// Every agent: the followers' places become leaders, appended after the leaders.
-        AllLeaders = "all-leaders",
-    }
-}
-
-choice! {
-    /// Which score a policy is selected by (see [`crate::credit`]).
-    Fitness {
-        /// The team's score.
-        G = "G",
-        /// Difference evaluation.
-        D = "D",
-        /// Difference evaluation that takes a leader's followers out with it.
-        Df = "Df",
-        /// Difference evaluation with copies of the leader as stepping stones.
-        Dpp = "D++",
-    }
-}
-
-choice! {
-    /// How a mutated weight gains its noise.
-    Mutation {
-        /// Times itself.
-        Scaled = "scaled",
-        /// Plainly.
-        Additive = "additive",
-    }
 }
 
 impl Config {
@@ -208,6 +116,29 @@ impl Config {
     pub fn policy_bytes(&self) -> u64 {
         let counts = [self.learning.trials, self.learners(), self.learning.population, self.parameters()];
         counts.map(|count| count as u64).iter().product::<u64>() * size_of::<f32>() as u64
+    }
+
+    /// Asks for every key. A faulty number reads as the most that is allowed, a faulty list as none, so that what depends
+    /// on it is not blamed as well.
+    fn ask(r: &mut Reader<'_>) -> Config {
+        let (motion, start_speed) = Motion::read(r);
+        let config = Config {
+            world: World::read(r, start_speed),
+            motion,
+            follow: Follow::read(r),
+            sense: Sense::read(r),
+            policy: Policy::read(r),
+            learning: Learning::read(r),
+            checkpoint: Checkpoint::read(r),
+        };
+        if r.faults() == 0 && config.policy_bytes() > MAX_POLICY_BYTES {
+            let gib = |bytes: u64| bytes.div_ceil(1 << 30);
+            let (bytes, most) = (gib(config.policy_bytes()), gib(MAX_POLICY_BYTES));
+            let population = config.learning.population;
+            let text = format!("found {population}, whose policies of all trials take {bytes} GiB, allowed {most} GiB");
+            r.blame_key("learning.population", text);
+        }
+        config
     }
 }
 

@@ -107,7 +107,7 @@ pub const GRID: f32 = 262_144.0;
 
 /// Lane operations of a leader's turn: bounded, and rotated.
 pub const TURN: u32 = BOUND + SIN_COS + operations::ROTATE;
-/// Lane operations of an agent's move: the heading straightened (its square 3, a scale 2, 2 products, 2 flushes), the
+/// Lane operations of an agent's move: the heading renormalized (its square 3, a scale 2, 2 products, 2 flushes), the
 /// speed brought up within 2 bounds, and on each axis a step (after one common product), snapped to the grid (4) and kept
 /// on the map.
 pub const MOVE: u32 = 3 + 2 + 2 + 2 * FLUSH + (2 + 2 * BOUND) + 1 + 2 * (2 + 4 + BOUND);
@@ -131,7 +131,7 @@ pub fn turn<S: Simd>(world: &Lanes<S>, hx: S::f32s, hy: S::f32s, wanted: S::f32s
 
 /// The heading scaled back to length 1, by one Newton step: turning lets it drift by a rounding.
 #[inline(always)]
-pub fn straighten<S: Simd>(hx: S::f32s, hy: S::f32s) -> (S::f32s, S::f32s) {
+pub fn renormalize<S: Simd>(hx: S::f32s, hy: S::f32s) -> (S::f32s, S::f32s) {
     let scale = splat(hx.token(), 1.5) - (hx * hx + hy * hy) * 0.5;
     (flush::<S>(hx * scale, TINY), flush::<S>(hy * scale, TINY))
 }

@@ -21,7 +21,7 @@ pub const MAX_HIDDEN_LAYERS: usize = 3;
 /// Most units in one hidden layer.
 pub const MAX_HIDDEN_UNITS: usize = 64;
 
-/// `[policy]`: the leaders' network, `8, hidden…, 2`.
+/// `[policy]`: the leaders' network, `inputs, hidden…, outputs`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Policy {
     pub hidden: Vec<usize>,
@@ -51,7 +51,7 @@ impl Policy {
 shared! {
     /// The sizes of a policy.
     pub struct PolicyConstants as PolicyLanes {
-        /// Weight layers, and the widths `8, hidden…, 2` (unused entries 0).
+        /// Weight layers, and the widths `inputs, hidden…, outputs` (unused entries 0).
         pub layers: u32,
         pub widths: [u32; MAX_HIDDEN_LAYERS + 2],
         /// Weights.
@@ -69,6 +69,16 @@ impl PolicyConstants {
         }
         widths[layers] = OUTPUTS as u32;
         PolicyConstants { layers: layers as u32, widths, parameters: policy.parameters() as u32 }
+    }
+
+    /// Units of the widest layer, inputs included.
+    pub fn widest(&self) -> usize {
+        self.widths.into_iter().max().unwrap_or(0) as usize
+    }
+
+    /// Words that a vector of teams takes of one leader: its weights, inputs, two layers and outputs.
+    pub fn words(&self) -> usize {
+        self.parameters as usize + INPUTS + 2 * self.widest() + OUTPUTS
     }
 
     /// Lane operations of one leader: a product and a sum a weight (the bias is where a sum starts), every unit's
@@ -97,7 +107,7 @@ pub fn weigh<S: Simd, const UNITS: usize>(inputs: &[S::f32s], weights: &[S::f32s
 /// The sum, ready for its tanh; sums too small to matter become 0, which keeps the next layer away from denormals.
 #[inline(always)]
 pub fn tame<S: Simd>(sum: S::f32s) -> S::f32s {
-    math::limit_tangent::<S>(math::flush::<S>(sum, TINY))
+    math::limit_tanh::<S>(math::flush::<S>(sum, TINY))
 }
 
 /// Sums under this size (2^-30) count as 0.

@@ -132,7 +132,7 @@ impl Shape {
     }
 
     fn generic(world: &World, packing: Packing, trace: bool) -> Shape {
-        let widest = world.constants.policy.widths.into_iter().max().unwrap_or(0).next_power_of_two() as usize;
+        let widest = world.constants.policy.widest().next_power_of_two();
         Shape { workgroup: packing.workgroup, slots: packing.slots, trace, sizes: Sizes::Any { widest } }
     }
 
@@ -813,7 +813,7 @@ fn source(shape: Shape) -> String {
 /// a variable, and four weights at a time are read in the order in which they are needed, so that a compiler may read
 /// many before it waits for any.
 fn straight_policy(widths: &[u32; WIDTHS]) -> String {
-    let mut text = String::from("fn decide(lane: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
+    let mut text = String::from("fn decide(start: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
     let mut line = |line: std::fmt::Arguments<'_>| writeln!(text, "    {line}").expect("a string takes a line");
     let mut read = HashSet::new();
     let mut inputs: Vec<String> = (0..INPUTS).map(|input| format!("inputs[{input}]")).collect();
@@ -827,7 +827,7 @@ fn straight_policy(widths: &[u32; WIDTHS]) -> String {
                 let weight = first + row * columns + column;
                 let (four, axis) = (weight / FOUR, AXES[weight % FOUR]);
                 if read.insert(four) {
-                    line(format_args!("let w{four} = weights[lane + {four}u * stride];"));
+                    line(format_args!("let w{four} = weights[start + {four}u * stride];"));
                 }
                 match row == rows {
                     true => line(format_args!("var s{layer}_{column} = w{four}.{axis};")),
