@@ -52,6 +52,10 @@ struct Task {
     // The steps that this dispatch plays: from `first` on, before `end`.
     first: u32,
     end: u32,
+    // Where packing finds and leaves what (`pack.wgsl`).
+    least: u32,
+    table: u32,
+    owners: u32,
 }
 
 // An agent between two dispatches. `State` in src/backend/gpu/episode.rs.

@@ -10,7 +10,7 @@ use fearless_simd::{Level, Simd, SimdMask, dispatch, f32x4, prelude::*};
 use glam::Vec2;
 use rayon::prelude::*;
 
-use super::{Backend, BackendError, Episode, Group, Moment, Strided, Trace, Visit, Weights};
+use super::{Backend, BackendError, Episode, Group, Moment, Seen, Strided, Trace, Visit, Weights};
 use crate::kernels::{Lanes, couple, follow, math, motion, policy, sense, splat};
 use crate::world::{Constants, INPUTS, OUTPUTS, World};
 
@@ -179,7 +179,7 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
         for lane in 0..lanes {
             let episode = block.episode(lane, 0, first + lane);
             sets.extend(episode.sets.iter());
-            seen.extend(episode.seen.iter());
+            seen.extend(episode.seen.words().iter());
         }
     }
     Trace { teams, agents, moments, sets, seen }
@@ -547,7 +547,7 @@ impl<S: Simd> Block<S> {
     /// One lane's record.
     fn episode(&self, lane: usize, group: usize, team: usize) -> Episode<'_> {
         let strided = |words| Strided { words, stride: S::f32s::LEN, offset: lane };
-        Episode { group, team, sets: strided(&self.sets), seen: strided(&self.seen) }
+        Episode { group, team, sets: strided(&self.sets), seen: Seen::Counts(strided(&self.seen)) }
     }
 
     /// One lane's agents as they stand; before the first step nothing has been sensed yet.
