@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, Group};
+use flotilla::backend::{Backend, Group, Need};
 use flotilla::config::Config;
 use flotilla::evolve::{Key, Purpose, random_policy};
 use flotilla::stepping::Stepper;
@@ -42,7 +42,14 @@ fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result
     let of = |world: &World| constant(world, teams, config.learning.seed);
     let weights = [of(&world), of(&small)];
     let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; leaders]).collect();
-    let group = |world, weights| Group { world, starts: &world.starts, weights, policies: teams, teams: &order };
+    let group = |world, weights| Group {
+        world,
+        starts: &world.starts,
+        weights,
+        policies: teams,
+        teams: &order,
+        need: Need::Scores,
+    };
     let groups = [group(&world, weights[0][..].into()), group(&small, weights[1][..].into())];
     let mut cpu = Cpu::at_level(level);
     let mut rollout = |group| cpu.rollout(&[group], &|episode| _ = std::hint::black_box(episode));

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use glam::Vec2;
 
-use crate::backend::{Backend, BackendError, Group, Moment};
+use crate::backend::{Backend, BackendError, Group, Moment, Need};
 use crate::credit::Credit;
 use crate::evolve::{self, Key, Purpose};
 use crate::statistics;
@@ -179,7 +179,8 @@ pub fn evaluate(
     for first in (0..episodes).step_by(at_once) {
         let batch: Vec<Vec<Vec2>> =
             (first..episodes.min(first + at_once)).map(|episode| starts.of(episode, world)).collect();
-        let groups: Vec<Group<'_>> = batch.iter().map(|starts| Group { starts, ..*group }).collect();
+        let groups: Vec<Group<'_>> =
+            batch.iter().map(|starts| Group { starts, need: Need::Scores, ..*group }).collect();
         let scored = Mutex::new((vec![0; batch.len() * teams], vec![[0_f32; 3]; batch.len() * teams * leaders]));
         backend.rollout(&groups, &|episode| {
             let scores = CREDIT.with_borrow_mut(|credit| credit.all(&episode, world));

@@ -16,7 +16,7 @@ use crate::backend::gpu::{
     device::{Choice, DeviceError},
     episode::{GpuEpisodes, Holding},
 };
-use crate::backend::{Backend, BackendError, Group, Machine, Player};
+use crate::backend::{Backend, BackendError, Group, Machine, Need, Player};
 use crate::config::{Config, ConfigError, MAX_POPULATION};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
 use crate::evolve::{self, MAX_WEIGHT};
@@ -410,6 +410,6 @@ impl<'a> Cast<'a> {
 
     fn group<'b>(&'b self, starts: &'b [glam::Vec2]) -> Group<'b> {
         let Cast { world, weights, policies, teams } = self;
-        Group { world, starts, weights: weights[..].into(), policies: *policies, teams }
+        Group { world, starts, weights: weights[..].into(), policies: *policies, teams, need: Need::Scores }
     }
 }

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
-use crate::backend::HELD_FROM;
+use crate::backend::{HELD_FROM, PACKED_FROM};
 use crate::config::Config;
 use crate::world::World;
 
@@ -80,12 +80,14 @@ impl Plan {
             let batch = u128::from(bytes) * u128::from(BATCH) / u128::from(weights.max(record).max(1));
             bytes.min(batch as u64 * batches)
         };
+        // What is packed of a record takes at most as much again, and where it does not fit the record comes whole.
+        let records = share(record, 2) * if record < PACKED_FROM { 1 } else { 2 };
         Plan {
             host: always + playing.max(sorting),
             checkpoint,
             // A batch is gathered, and two are on their way to the adapter or back.
-            gpu_host: always + (share(weights, 1) + share(weights, 2) + share(record, 2)).max(sorting),
-            adapter: share(weights, 2) + share(record, 2) + held,
+            gpu_host: always + (share(weights, 1) + share(weights, 2) + records).max(sorting),
+            adapter: share(weights, 2) + records + held,
         }
     }
 

@@ -25,7 +25,7 @@ use fearless_simd::{Level, Simd, dispatch, f32x4, prelude::*};
 use glam::Vec2;
 
 use crate::backend::cpu::{Agent, Block, transposed, turn};
-use crate::backend::{Episode, Strided};
+use crate::backend::{Episode, Seen, Strided};
 use crate::config::{Fitness, MAX_POPULATION};
 use crate::credit::{Credit, Scores};
 use crate::kernels::{bound, splat};
@@ -395,7 +395,7 @@ impl<S: Simd> Vectors for (S, Vec<Part<S>>) {
         seen.clear();
         seen.extend(part.block.counts.iter().map(|count| count[lane]));
         let plain = |words| Strided { words, stride: 1, offset: 0 };
-        Some(Episode { group: 0, team, sets: plain(sets), seen: plain(seen) })
+        Some(Episode { group: 0, team, sets: plain(sets), seen: Seen::Counts(plain(seen)) })
     }
 }
 

@@ -9,7 +9,7 @@ use std::time::Duration;
 use fearless_simd::Level;
 use glam::Vec2;
 
-use crate::backend::{Backend, BackendError, Episode, Group, Held, Weights};
+use crate::backend::{Backend, BackendError, Episode, Group, Held, Need, Weights};
 use crate::config::{Config, Learning};
 use crate::credit::Credit;
 use crate::evolve::{self, Breeding, Key, Purpose};
@@ -374,7 +374,8 @@ fn play(
             let weights = arm.held.get(index).map_or(trial.weights[..].into(), |held| Weights::Held(&**held));
             let teams = &trial.teams[range.start * leaders..range.end * leaders];
             for (episode, starts) in trial.starts.iter().enumerate() {
-                groups.push(Group { world: &arm.world, starts, weights, policies: population + 1, teams });
+                let (world, need) = (&arm.world, Need::Score(arm.config.learning.fitness));
+                groups.push(Group { world, starts, weights, policies: population + 1, teams, need });
                 places.push((&**arm, trial, episode * (population + 1) + range.start));
             }
         }

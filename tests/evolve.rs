@@ -6,7 +6,7 @@ use std::collections::HashSet;
 
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, Group};
+use flotilla::backend::{Backend, Group, Need};
 use flotilla::config::{Config, Fitness, Learning, Mutation, Paradigm};
 use flotilla::credit::Credit;
 use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose};
@@ -498,8 +498,8 @@ impl Plain<'_> {
             let key = self.key(Purpose::Starts);
             evolve::jitter_starts(key, generation, episode, &self.world, start_jitter, &mut starts);
             let teams = vec![0; team.len()];
-            let group =
-                Group { world: &self.world, starts: &starts, weights: weights[..].into(), policies: 1, teams: &teams };
+            let (world, weights, need) = (&self.world, weights[..].into(), Need::Scores);
+            let group = Group { world, starts: &starts, weights, policies: 1, teams: &teams, need };
             let found = std::sync::Mutex::new(None);
             let visit = |episode: flotilla::backend::Episode<'_>| {
                 let scores = Credit::default().all(&episode, &self.world);

@@ -7,7 +7,7 @@ use std::path::Path;
 
 use flotilla::Config;
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::{Backend, Group};
+use flotilla::backend::{Backend, Group, Need};
 use flotilla::evaluate::Starts;
 use flotilla::front::{self, Failure, Processor, Trained};
 use flotilla::record::disk::Disk;
@@ -126,7 +126,14 @@ fn given_policies_are_played_and_traced_team_by_team() {
         let traced = flotilla::trace(&config, &mut backend, teams, &weights, &starts, 3).expect("they fit");
         let from = starts.of(3, &world);
         let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; leaders]).collect();
-        let group = Group { world: &world, starts: &from, weights: weights[..].into(), policies: teams, teams: &order };
+        let group = Group {
+            world: &world,
+            starts: &from,
+            weights: weights[..].into(),
+            policies: teams,
+            teams: &order,
+            need: Need::Record,
+        };
         let trace = backend.trace(&group).expect("it fits");
         let (agents, steps) = (world.agents(), world.steps());
         for (step, team, agent) in

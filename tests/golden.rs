@@ -12,7 +12,7 @@ use std::sync::LazyLock;
 use flotilla::backend::cpu::{Cpu, level_name};
 #[cfg(feature = "gpu")]
 use flotilla::backend::gpu::{self, episode::GpuEpisodes};
-use flotilla::backend::{Backend, BackendError, Episode, Group, Trace, Visit};
+use flotilla::backend::{Backend, BackendError, Episode, Group, Need, Trace, Visit};
 use flotilla::config::{Config, Override};
 use flotilla::trainer::{Row, Trainer};
 use flotilla::world::World;
@@ -155,7 +155,8 @@ fn train(backend: &mut dyn Backend) -> Vec<Golden> {
 fn trace(backend: &mut dyn Backend, world: &World, weights: &[f32]) -> String {
     let policies = weights.len() / world.leaders() / world.parameters();
     let teams: Vec<u32> = (0..policies * world.leaders()).map(|place| (place / world.leaders()) as u32).collect();
-    let group = Group { world, starts: &world.starts, weights: weights.into(), policies, teams: &teams };
+    let group =
+        Group { world, starts: &world.starts, weights: weights.into(), policies, teams: &teams, need: Need::Record };
     let trace = backend.trace(&group).unwrap();
     let floats: Vec<f32> = bytemuck::cast_slice(&trace.moments).iter().map(|float: &f32| float + 0.0).collect();
     hex(&Sha256::digest(bytemuck::cast_slice::<f32, u8>(&floats)))

@@ -9,10 +9,10 @@ mod common;
 
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::device::Request;
-use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, State, Task};
+use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records, State, Task};
 use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::population::{Brood, Stretch};
-use flotilla::backend::{Backend, Group, Moment, Weights};
+use flotilla::backend::{Backend, Group, Moment, Need, Weights};
 use flotilla::config::{Config, Fitness};
 use flotilla::declare::Shared;
 use flotilla::evaluate::{Starts, evaluate};
@@ -25,10 +25,10 @@ use flotilla::{backend::gpu, sample};
 /// The generic one plays more worlds: the other has to be compiled for each, which takes software drivers a second.
 const KERNELS: [Kernel; 2] = [Kernel::Generic, Kernel::Specialised];
 
-/// One that holds all populations.
+/// One that holds all populations and packs all records.
 fn open(request: &Request, pass: Pass, kernel: Kernel) -> GpuEpisodes {
     let gpu = gpu::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
-    GpuEpisodes::new(gpu).unwrap().playing(kernel).holding(Holding::Always)
+    GpuEpisodes::new(gpu).unwrap().playing(kernel).holding(Holding::Always).bringing(Records::Packed)
 }
 
 fn check(plan: &Plan, mut backend: GpuEpisodes) -> Outcome {
@@ -57,7 +57,8 @@ fn checked_shaders_and_default_limits_agree() {
         {
             for (kernel, seeds) in KERNELS.into_iter().zip([100..112, 100..102]) {
                 let gpu = gpu::open(request.clone()).unwrap();
-                let backend = GpuEpisodes::new(gpu).unwrap().playing(kernel).holding(Holding::Always);
+                let backend = GpuEpisodes::new(gpu).unwrap().playing(kernel);
+                let backend = backend.holding(Holding::Always).bringing(Records::Packed);
                 assert_eq!(check(&Plan::random(seeds, 5), backend).mismatch, None, "{info}, {kernel}, {request:?}");
             }
         }
@@ -114,7 +115,7 @@ fn large_worlds_agree() {
     for (request, info) in common::adapters("large_worlds_agree") {
         let worlds = vec![("crowd".into(), crowd.clone()), ("leaders only".into(), leaders_only.clone())];
         let plan = Plan { worlds, teams: 2, seed: 0, generations: 0 };
-        let backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap();
+        let backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().bringing(Records::Packed);
         // Training them would take the software drivers minutes: traces and batches are enough.
         let plan = Plan { worlds: plan.worlds.into_iter().map(small_population).collect(), ..plan };
         assert_eq!(check(&plan, backend).mismatch, None, "{info}");
@@ -136,6 +137,7 @@ fn long_episodes_agree() {
         for kernel in KERNELS {
             let plan = Plan { worlds: vec![("long".into(), config.clone())], teams: 9, seed: 0, generations: 0 };
             let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap().playing(kernel);
+            let backend = backend.bringing(Records::Packed);
             assert_eq!(check(&plan, backend).mismatch, None, "{info}, {kernel}");
         }
     }
@@ -149,7 +151,9 @@ fn batches_cut_small_give_the_same_record() {
     let (policies, teams) = (4, 300);
     let weights = sample::weights(&world, policies, 1);
     let choice: Vec<u32> = (0..teams * world.leaders()).map(|i| (i * 7 % policies) as u32).collect();
-    let group = Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &choice };
+    let need = Need::Record;
+    let group =
+        Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &choice, need };
     let record = |backend: &mut dyn Backend| {
         let record = std::sync::Mutex::new(vec![Vec::new(); teams]);
         backend
@@ -227,7 +231,9 @@ fn held_out_episodes_come_to_the_same_on_every_backend() {
     let (policies, leaders) = (5, world.leaders());
     let weights = sample::weights(&world, policies, 11);
     let teams: Vec<u32> = (0..policies as u32).flat_map(|policy| std::iter::repeat_n(policy, leaders)).collect();
-    let group = Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams };
+    let need = Need::Record;
+    let group =
+        Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams, need };
     let starts = Starts::Drawn { episodes: 300, seed: 5, jitter: 6.0 };
     let expected = evaluate(&mut Cpu::default(), &group, &starts, &|_| ()).unwrap();
     let spreads: Vec<_> = (0..policies).map(|team| expected.team(team)).collect();
@@ -263,7 +269,9 @@ fn a_wrong_index_is_an_error() {
     let (policies, leaders) = (3, world.leaders());
     let weights = sample::weights(&world, policies, 1);
     let teams: Vec<u32> = (0..2 * leaders as u32).map(|place| place % 3).collect();
-    let good = Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams };
+    let need = Need::Record;
+    let good =
+        Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams, need };
     let mut wrong = teams.clone();
     wrong[leaders + 2] = 3;
     let few = &weights[1..];
@@ -321,6 +329,7 @@ fn kernels_are_compiled_for_few_worlds_and_shared() {
             weights: weights[..].into(),
             policies: 1,
             teams: &[0],
+            need: Need::Record,
         });
         backend.rollout(&groups.collect::<Vec<_>>(), &|_| ()).unwrap();
         backend.compiled()

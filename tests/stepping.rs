@@ -4,7 +4,7 @@
 use std::ops::Range;
 
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, Episode, Group, Moment, Strided, Trace};
+use flotilla::backend::{Backend, Episode, Group, Moment, Need, Seen, Strided, Trace};
 use flotilla::config::{Config, Fitness, MAX_POPULATION};
 use flotilla::credit::{Credit, Scores};
 use flotilla::evaluate::Starts;
@@ -30,7 +30,8 @@ impl Played {
         let weights = sample::weights(&world, teams, seed);
         let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; world.leaders()]).collect();
         let weights = weights[..].into();
-        let group = Group { world: &world, starts: &starts, weights, policies: teams, teams: &order };
+        let group =
+            Group { world: &world, starts: &starts, weights, policies: teams, teams: &order, need: Need::Record };
         let trace = Cpu::default().trace(&group).expect("the group fits the world");
         Played { world, starts, trace }
     }
@@ -98,7 +99,7 @@ impl Played {
             group: 0,
             team,
             sets: plain(&self.trace.sets[team * sets..][..sets]),
-            seen: plain(&self.trace.seen[team * seen..][..seen]),
+            seen: Seen::Counts(plain(&self.trace.seen[team * seen..][..seen])),
         };
         Credit::default().all(&episode, &self.world)
     }

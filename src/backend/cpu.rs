@@ -9,7 +9,7 @@ use std::sync::{Mutex, PoisonError};
 use fearless_simd::{Level, Simd, SimdMask, dispatch, f32x4, prelude::*};
 use glam::Vec2;
 
-use super::{Backend, BackendError, Episode, Group, Moment, Strided, Trace, Visit, Weights};
+use super::{Backend, BackendError, Episode, Group, Moment, Seen, Strided, Trace, Visit, Weights};
 use crate::declare::Fixed;
 use crate::kernels::{math, splat};
 use crate::model::policy::PolicyConstants;
@@ -182,7 +182,7 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
         for lane in 0..lanes {
             let episode = whole.episode(lane, 0, first + lane);
             sets.extend(episode.sets.iter());
-            seen.extend(episode.seen.iter());
+            seen.extend(episode.seen.words().iter());
         }
     }
     Trace { teams, agents, moments, sets, seen }
@@ -242,7 +242,7 @@ impl<S: Simd> Whole<S> {
     /// One lane's record.
     fn episode(&self, lane: usize, group: usize, team: usize) -> Episode<'_> {
         let strided = |words| Strided { words, stride: S::f32s::LEN, offset: lane };
-        Episode { group, team, sets: strided(&self.sets), seen: strided(&self.seen) }
+        Episode { group, team, sets: strided(&self.sets), seen: Seen::Counts(strided(&self.seen)) }
     }
 }
 

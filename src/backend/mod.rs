@@ -5,6 +5,7 @@ use std::fmt::Debug;
 
 use glam::Vec2;
 
+use crate::config::Fitness;
 use crate::declare::shared;
 use crate::evolve::{self, Breeding};
 use crate::parallel::current_num_threads;
@@ -20,6 +21,10 @@ pub mod gpu;
 /// measurement.
 pub const HELD_FROM: u64 = 1 << 20;
 
+/// Records of a batch that take so many bytes are packed where nothing else is asked for, but never by a software
+/// renderer: about what goes over the bus in the time that one more dispatch costs. An estimate, not a measurement.
+pub const PACKED_FROM: u64 = 1 << 20;
+
 /// Teams of one world that start alike and are made of one set of policies.
 #[derive(Clone, Copy, Debug)]
 pub struct Group<'a> {
@@ -31,6 +36,37 @@ pub struct Group<'a> {
     pub policies: usize,
     /// The policy each leader plays in each team, `[teams][leaders]`.
     pub teams: &'a [u32],
+    /// What its episodes must tell.
+    pub need: Need,
+}
+
+/// What is wanted of an episode. A backend may tell more, and does where that costs nothing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Need {
+    /// The whole record.
+    Record,
+    /// What every fitness is worked out from.
+    Scores,
+    /// What this fitness is worked out from.
+    Score(Fitness),
+}
+
+impl Need {
+    /// How many agents a set must have to make a difference, where so many must be near; none where the whole record
+    /// is wanted.
+    pub fn least(self, coupling: u32) -> Option<u32> {
+        match self {
+            Need::Record => None,
+            // D++ asks how many are missing.
+            Need::Scores | Need::Score(Fitness::Dpp) => Some(1),
+            Need::Score(Fitness::G | Fitness::D | Fitness::Df) => Some(coupling),
+        }
+    }
+
+    /// Whether it matters which leader a follower saw most.
+    pub fn owners(self) -> bool {
+        matches!(self, Need::Record | Need::Scores | Need::Score(Fitness::Df))
+    }
 }
 
 impl Group<'_> {
@@ -44,7 +80,7 @@ impl Group<'_> {
     /// # Errors
     /// Places, weights or choices are too few or too many, or a team plays a policy that there is not.
     pub fn check(&self) -> Result<(), BackendError> {
-        let Group { world, starts, weights, policies, teams } = *self;
+        let Group { world, starts, weights, policies, teams, .. } = *self;
         let misfit = |text: String| Err(BackendError::Misfit(text));
         let (agents, leaders) = (world.agents(), world.leaders());
         if starts.len() != agents {
@@ -115,10 +151,34 @@ pub struct Episode<'a> {
     /// Index of its group in the batch, and of the team in the group.
     pub group: usize,
     pub team: usize,
-    /// The agents near each POI after each step, a bit an agent: `[steps][pois][words]`.
+    /// The agents near each POI after each step, a bit an agent: `[steps][pois][words]`. Where only scores are
+    /// [needed](Need), there may be fewer steps, down to none, whose sets give the same scores, see [`crate::credit`].
     pub sets: Strided<'a>,
+    pub seen: Seen<'a>,
+}
+
+/// Which leaders the followers of one team saw.
+#[derive(Clone, Copy, Debug)]
+pub enum Seen<'a> {
     /// At how many steps each follower saw each leader: `[followers][leaders]`.
-    pub seen: Strided<'a>,
+    Counts(Strided<'a>),
+    /// The leader that each follower saw at most steps, as [`crate::credit::assign`] has it: [`owner_bits`] bits a
+    /// follower, all ones for nobody, from the lowest of a word on. Empty where nobody [needs](Need) it.
+    Most(Strided<'a>),
+}
+
+impl<'a> Seen<'a> {
+    /// The words, whichever they are.
+    pub fn words(self) -> Strided<'a> {
+        match self {
+            Seen::Counts(words) | Seen::Most(words) => words,
+        }
+    }
+}
+
+/// Bits that a leader's index takes in [`Seen::Most`].
+pub fn owner_bits(leaders: u32) -> u32 {
+    if leaders < 255 { 8 } else { 16 }
 }
 
 /// Words of one team among those of its neighbours: word i of this team is `words[i * stride + offset]`.

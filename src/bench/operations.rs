@@ -82,7 +82,7 @@ pub fn per_team_step(world: &World, reach: &Reach) -> f64 {
 mod tests {
     use super::*;
     use crate::backend::cpu::Cpu;
-    use crate::backend::{Backend, Group};
+    use crate::backend::{Backend, Group, Need};
     use crate::config::Config;
     use crate::sample;
 
@@ -93,7 +93,9 @@ mod tests {
     fn reach(world: &World, teams: usize) -> Reach {
         let weights = sample::weights(world, teams, 0);
         let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; world.leaders()]).collect();
-        let group = Group { world, starts: &world.starts, weights: weights[..].into(), policies: teams, teams: &order };
+        let need = Need::Record;
+        let group =
+            Group { world, starts: &world.starts, weights: weights[..].into(), policies: teams, teams: &order, need };
         Reach::of(world, &Cpu::default().trace(&group).expect("the CPU plays"))
     }
 

@@ -8,8 +8,7 @@ use clap::builder::PossibleValuesParser as Words;
 use serde_json::json;
 
 use super::{ConfigFile, Error, RunOptions, backend, output, print, say};
-use crate::backend::Machine;
-use crate::backend::{Backend, Group, Moment};
+use crate::backend::{Backend, Group, Machine, Moment, Need};
 use crate::config::{Choice, Override, Paradigm};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Spread, Starts};
 use crate::record::policies;
@@ -103,6 +102,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         weights: policies.weights[..].into(),
         policies: policies.policies,
         teams: &teams,
+        need: Need::Record,
     };
 
     let meter = Mutex::new(Meter::new(args.quiet));

@@ -8,7 +8,7 @@ use super::{Error, print};
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu;
 use crate::backend::gpu::device::{self, AdapterInfo, Choice, DeviceError, Request};
-use crate::backend::gpu::episode::{GpuEpisodes, Holding, Kernel};
+use crate::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records};
 use crate::backend::gpu::exact::Pass;
 use crate::config::{self, Config};
 use crate::report::progress::Meter;
@@ -172,7 +172,7 @@ fn verify(plan: &Plan, request: Request, kernel: Kernel, info: &AdapterInfo, qui
     if let Some(mismatch) = gpu::self_test(&gpu)? {
         return Ok(Outcome { mismatch: Some(mismatch.to_string()), ..Outcome::default() });
     }
-    let mut gpu = GpuEpisodes::new(gpu)?.playing(kernel).holding(Holding::Always);
+    let mut gpu = GpuEpisodes::new(gpu)?.playing(kernel).holding(Holding::Always).bringing(Records::Packed);
     let compared = compare(plan, &mut Cpu::default(), &mut gpu, |outcome| {
         let (done, all) = (outcome.worlds, plan.worlds.len());
         meter.show(done as f64 / all as f64, || format!("{}{pass}: {done} of {all} worlds", info.name));

@@ -14,7 +14,7 @@ use serde_json::json;
 use super::map::{self, Agent, FAINT, Legend, Poi, Team, View};
 use super::runs::{self, RunError};
 use super::scene::{Anchor, BLACK, Color, Scene};
-use crate::backend::{Backend, BackendError, Episode, Group, Strided, Trace};
+use crate::backend::{Backend, BackendError, Episode, Group, Need, Seen, Strided, Trace};
 use crate::config::Config;
 use crate::credit::{self, Credit, Scores};
 use crate::evolve::{self, Key, Purpose};
@@ -207,7 +207,8 @@ fn play_best(
             starts
         })
         .collect();
-    let group = |starts, teams| Group { world: &world, starts, weights, policies: population + 1, teams };
+    let need = Need::Record;
+    let group = |starts, teams| Group { world: &world, starts, weights, policies: population + 1, teams, need };
     let groups: Vec<Group<'_>> = starts.iter().map(|starts| group(starts, &teams)).collect();
     let observed: Vec<AtomicU32> = std::iter::repeat_with(AtomicU32::default).take(population).collect();
     backend.rollout(&groups, &|episode: Episode<'_>| {
@@ -225,7 +226,7 @@ fn play_best(
 
     let trace = backend.trace(&group(&starts[0], &teams[team * leaders..(team + 1) * leaders]))?;
     let whole = |words| Strided { words, stride: 1, offset: 0 };
-    let episode = Episode { group: 0, team: 0, sets: whole(&trace.sets), seen: whole(&trace.seen) };
+    let episode = Episode { group: 0, team: 0, sets: whole(&trace.sets), seen: Seen::Counts(whole(&trace.seen)) };
     let scores = Credit::default().all(&episode, &world);
     let mut owner = Vec::new();
     credit::assign(&episode.seen, &world, &mut owner);

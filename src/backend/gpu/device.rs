@@ -4,6 +4,7 @@
 
 use std::fmt;
 use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -215,6 +216,31 @@ pub struct Gpu {
     /// The zero that guarded arithmetic is masked with: binding 0 of every bind group.
     guard: wgpu::Buffer,
     trouble: Arc<Mutex<Trouble>>,
+    /// Bytes that went up and came down.
+    traffic: Arc<[AtomicU64; 2]>,
+}
+
+/// Bytes between host and device.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Traffic {
+    /// To the device.
+    pub up: u64,
+    /// From the device.
+    pub down: u64,
+}
+
+impl std::ops::Sub for Traffic {
+    type Output = Traffic;
+
+    fn sub(self, other: Traffic) -> Traffic {
+        Traffic { up: self.up - other.up, down: self.down - other.down }
+    }
+}
+
+impl std::ops::AddAssign for Traffic {
+    fn add_assign(&mut self, other: Traffic) {
+        (self.up, self.down) = (self.up + other.up, self.down + other.down);
+    }
 }
 
 impl fmt::Debug for Gpu {
@@ -308,7 +334,7 @@ impl Gpu {
             contents: &[0; 16],
             usage: wgpu::BufferUsages::UNIFORM,
         });
-        Ok(Gpu { adapter: info, limits, pass, checked, device, queue, guard, trouble })
+        Ok(Gpu { adapter: info, limits, pass, checked, device, queue, guard, trouble, traffic: Arc::default() })
     }
 
     /// An error if the device was lost or anything failed outside the calls below; to be asked after every wait.
@@ -370,13 +396,26 @@ impl Gpu {
     ) -> Result<wgpu::Buffer, DeviceError> {
         let bytes = bytemuck::cast_slice(contents);
         let buffer = self.buffer(what, bytes.len() as u64, usage | wgpu::BufferUsages::COPY_DST)?;
-        self.scoped(what, || self.queue.write_buffer(&buffer, 0, bytes))?;
+        self.scoped(what, || self.write(&buffer, 0, bytes))?;
         Ok(buffer)
+    }
+
+    /// Has bytes written to a buffer (usage `COPY_DST`), before all that is submitted from now on.
+    pub fn write(&self, buffer: &wgpu::Buffer, offset: u64, bytes: &[u8]) {
+        self.traffic[0].fetch_add(bytes.len() as u64, Relaxed);
+        self.queue.write_buffer(buffer, offset, bytes);
+    }
+
+    /// What was written to the device and read from it since it was opened.
+    pub fn traffic(&self) -> Traffic {
+        let [up, down] = [0, 1].map(|way| self.traffic[way].load(Relaxed));
+        Traffic { up, down }
     }
 
     /// Waits for all work and reads a range of a buffer (in bytes, multiples of 4; usage `COPY_SRC`).
     pub fn read<T: Pod>(&self, buffer: &wgpu::Buffer, bytes: Range<u64>) -> Result<Vec<T>, DeviceError> {
         let size = bytes.end - bytes.start;
+        self.traffic[1].fetch_add(size, Relaxed);
         let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ;
         let landing = self.buffer("reading back", size, usage)?;
         let (send, receive) = oneshot::channel();
@@ -394,13 +433,14 @@ impl Gpu {
         Ok(bytemuck::pod_collect_to_vec(&view[..]))
     }
 
-    /// Shows a range of a buffer whose work was waited for (in bytes, multiples of 4; usage `MAP_READ`).
+    /// Shows a range of a buffer, all that was copied to it of the device's, whose work was waited for (in bytes, multiples of 4; usage `MAP_READ`).
     pub fn mapped<T>(
         &self,
         buffer: &wgpu::Buffer,
         bytes: Range<u64>,
         show: impl FnOnce(&[u8]) -> T,
     ) -> Result<T, DeviceError> {
+        self.traffic[1].fetch_add(bytes.end - bytes.start, Relaxed);
         let (send, receive) = oneshot::channel();
         // Nobody listens any more only if waiting failed.
         self.scoped("reading back", || {

@@ -117,7 +117,7 @@ impl Kernels {
             for (index, piece) in weights.chunks(PIECE / size_of::<f32>()).enumerate() {
                 let bytes = bytemuck::cast_slice(piece);
                 gpu.scoped("a population", || {
-                    gpu.queue.write_buffer(buffer, (index * PIECE) as u64, bytes);
+                    gpu.write(buffer, (index * PIECE) as u64, bytes);
                     gpu.queue.submit([]);
                 })?;
                 gpu.wait()?;
@@ -231,8 +231,8 @@ impl Held for Population {
             groups.push(gpu.bind("breed", layout, &buffers)?);
         }
         gpu.scoped("breeding", || {
-            gpu.queue.write_buffer(&self.broods, 0, &parts(&broods));
-            gpu.queue.write_buffer(&self.plan, 0, bytemuck::cast_slice(parents));
+            gpu.write(&self.broods, 0, &parts(&broods));
+            gpu.write(&self.plan, 0, bytemuck::cast_slice(parents));
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             let mut pass = encoder.begin_compute_pass(&Default::default());
             pass.set_pipeline(pipeline);

@@ -13,7 +13,7 @@ use super::exact::Pass;
 use super::population::Kernels;
 use crate::backend::compare::first_mismatch;
 use crate::backend::cpu::Cpu;
-use crate::backend::{Backend, BackendError, Group, Held};
+use crate::backend::{Backend, BackendError, Group, Held, Need};
 use crate::config::{Config, Learning};
 use crate::evolve::{Breeding, Key, Purpose};
 use crate::sample;
@@ -177,8 +177,14 @@ fn episode(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
     let world = World::new(&config);
     let weights = sample::weights(&world, TEAMS, 0);
     let teams: Vec<u32> = (0..TEAMS as u32).flat_map(|team| vec![team; world.leaders()]).collect();
-    let group =
-        Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies: TEAMS, teams: &teams };
+    let group = Group {
+        world: &world,
+        starts: &world.starts,
+        weights: weights[..].into(),
+        policies: TEAMS,
+        teams: &teams,
+        need: Need::Record,
+    };
     let traced = |error| refused(gpu, error);
     let expected = Cpu::default().trace(&group).map_err(traced)?;
     let mut episodes = GpuEpisodes::new(gpu.clone())?;
@@ -278,7 +284,7 @@ impl Ceiling {
     fn set(&mut self, turns: u32, workgroups: u32) -> Result<(), DeviceError> {
         let words = [turns; 4];
         self.gpu.scoped("ceiling's turns", || {
-            self.gpu.queue.write_buffer(&self.turns, 0, bytemuck::cast_slice(&words));
+            self.gpu.write(&self.turns, 0, bytemuck::cast_slice(&words));
         })?;
         self.workgroups = workgroups;
         self.operations = f64::from(turns) * TURN * f64::from(workgroups) * WORKGROUP as f64;
