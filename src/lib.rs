@@ -46,7 +46,8 @@
 //! 2. [`world`] turns it into one experiment's constants and start state.
 //! 3. [`trainer`] asks [`evolve`] for teams and hands all of them, of all trials, to a [`backend`] as one batch.
 //! 4. The backend plays each team's whole episode: by [`model`] on the CPU, by its twins under `shaders/` on a GPU.
-//!    It reports who was near which POI at which step, and which leader each follower saw.
+//!    It reports who was near which POI at which step, and which leader each follower saw, or as much of that as is
+//!    needed.
 //! 5. [`credit`] turns that record into G, D, Df and D++.
 //! 6. [`evolve`] selects and mutates, or has a GPU that holds the populations do the latter; [`run`] keeps what came out
 //!    by [`record`]; [`report`] draws it.

@@ -118,6 +118,21 @@ fn plans_add_up() {
     assert!(!memory::copies_checkpoint(&[config(40_000)]));
 }
 
+/// Records that are large enough to be packed on a GPU take room twice: there may be as much again of what is packed.
+#[test]
+fn packed_records_are_counted() {
+    let adapter = |population| {
+        let config = Config::parse(&text(population, 2, 1, "generations = 0"), "config").unwrap();
+        Plan::of([&config], 1).adapter
+    };
+    // Weights and record of a team: 4 leaders of 112 weights; 25 steps of 4 POIs, and 8 followers who see 4 leaders.
+    let (weights, record) = (4 * 112 * 4, (25 * 4 + 8 * 4) * 4);
+    assert_eq!(adapter(100), 2 * 101 * (weights + record));
+    // By then populations are held, too: a buffer a leader and one more, and the parents.
+    let held = 5 * 112 * 4 + 4 * 4;
+    assert_eq!(adapter(2000), 2 * 2001 * (weights + 2 * record + held));
+}
+
 /// What is written from the populations is what would be written from a copy of them.
 #[test]
 fn checkpoints_need_no_copy() {

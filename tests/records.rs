@@ -12,9 +12,10 @@ use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records};
 use flotilla::backend::gpu::{self, device::Request};
 use flotilla::backend::{Backend, Group, Need};
-use flotilla::config::{Config, Fitness};
+use flotilla::config::{Config, Fitness, Paradigm};
 use flotilla::credit::Credit;
 use flotilla::sample;
+use flotilla::sweep::Sweep;
 use flotilla::trainer::Trainer;
 use flotilla::world::World;
 
@@ -255,6 +256,61 @@ fn a_generation_moves_less_than_95_bytes_a_team() {
             );
             if [0, 50].contains(&generation) {
                 assert!(a_team(up + traffic.down) * f64::from(1 << 20) <= 1e8, "{info}: generation {generation}");
+            }
+        }
+    }
+}
+
+/// Seconds that all threads have computed so far, whoever else did meanwhile (Linux counts in hundredths).
+fn processor_seconds() -> f64 {
+    let stat = std::fs::read_to_string("/proc/self/stat").expect("this is Linux");
+    // After the name, which may hold blanks, the times are the 12th and the 13th.
+    let fields = stat.rsplit(')').next().unwrap_or_default().split_whitespace().skip(11).take(2);
+    fields.map(|ticks| ticks.parse::<f64>().expect("a count") / 100.0).sum()
+}
+
+/// What compiling takes: the first two generations of two teams less twice the third, of everything that a GPU would compile, and of
+/// what a software renderer compiles by default. Drivers' caches have to be off (Mesa's by `MESA_SHADER_CACHE_DISABLE=true`).
+#[test]
+#[ignore = "prints a table"]
+fn compiling() {
+    let small = |mut config: Config| {
+        (config.learning.population, config.learning.trials, config.learning.generations) = (2, 1, 9);
+        config
+    };
+    let paper = [
+        ("generally forward", include_str!("../configs/generally_forward.toml")),
+        ("strictly forward", include_str!("../configs/strictly_forward.toml")),
+        ("chaotic", include_str!("../configs/chaotic.toml")),
+    ];
+    let mut cases = Vec::new();
+    for (name, text) in paper {
+        for paradigm in [Paradigm::LeaderFollower, Paradigm::AllLeaders] {
+            let mut config = small(config(text));
+            config.learning.paradigm = paradigm;
+            cases.push((format!("{name}, {paradigm:?}"), vec![config]));
+        }
+    }
+    let sweep = Sweep::read(include_str!("../configs/sweeps/large.toml"), "large.toml", &[], false).unwrap();
+    cases.push(("large.toml".into(), sweep.points.into_iter().map(|point| small(point.config)).collect()));
+    for (request, info) in common::adapters("compiling") {
+        for (name, configs) in &cases {
+            let backend = || GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap();
+            let gpu = backend().playing(Kernel::Best).holding(Holding::Always).bringing(Records::PackedFrom(0));
+            for (what, mut backend) in [("by default", backend()), ("as on a GPU", gpu)] {
+                let mut trainer = Trainer::new(configs.clone());
+                let mut seconds = || {
+                    let start = processor_seconds();
+                    trainer.advance(&mut backend).unwrap();
+                    processor_seconds() - start
+                };
+                // Breeding is compiled while the second one waits for it.
+                let (first, second, third) = (seconds(), seconds(), seconds());
+                let [generic, specialised] = backend.compiled();
+                println!(
+                    "{name}, {what}: {:.2} s, {generic} generic and {specialised} specialised kernels, {info}",
+                    first + second - 2.0 * third
+                );
             }
         }
     }
