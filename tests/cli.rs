@@ -315,11 +315,25 @@ fn overrides_out_of_range_name_the_flag() {
         (["--population", "1"], "--population: found 1, allowed 2 to 1048576"),
         (["--trials", "0"], "--trials: found 0, allowed 1 to 4096"),
         (["--generations", "-1"], "--generations: found -1, allowed 0 to 1000000"),
+        (["--generations", "1e3"], "--generations: found 1000.0, allowed a whole number, 0 to 1000000"),
         (["--seed", "-1"], &format!("--seed: found -1, {whole}")),
     ] {
         let output = check(GOOD, &flags);
         assert_eq!(output.status.code(), Some(2), "wrong usage, though only the config's ranges tell");
         assert_eq!(told(output), expected);
+    }
+    let wrong = check(GOOD, &["--trials", "five"]);
+    assert!(told(wrong).starts_with("invalid value 'five' for '--trials <N>': allowed a number\n"));
+    // A number below 0 is a value of any flag, and no flag itself.
+    for (line, flag) in [
+        ("replay x --trial -1", "--trial <N>"),
+        ("replay x --step -2", "--step <N>"),
+        ("sweep x --shards -1", "--shards <N>"),
+    ] {
+        let output = flotilla(&line.split(' ').collect::<Vec<_>>());
+        assert_eq!(output.status.code(), Some(2), "{line}");
+        let told = told(output);
+        assert!(told.contains(&format!("for '{flag}': allowed")) && !told.contains("tip:"), "{line}: {told}");
     }
     // A flag mends what the file has wrong.
     assert_eq!(check(with_line(23, "trials = 0"), &["--trials", "3"]).status.code(), Some(0));

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use std::sync::LazyLock;
 
 use clap::builder::PossibleValuesParser as Words;
-use clap::{CommandFactory, Parser, Subcommand, ValueEnum};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 
 use crate::backend::BackendError;
 use crate::backend::gpu::device::DeviceError;
@@ -106,12 +106,30 @@ static VERSION: LazyLock<String> = LazyLock::new(|| {
 /// The command failed.
 pub fn run() -> Result<(), Error> {
     refuse_steering(std::env::args_os().skip(1))?;
-    Cli::parse().command.run()
+    let typed = Cli::from_arg_matches(&command().get_matches());
+    typed.unwrap_or_else(|error| error.format(&mut command()).exit()).command.run()
 }
 
 /// The command line, to be parsed or described without being run.
 pub fn command() -> clap::Command {
-    Cli::command()
+    // A number below 0 is a value, if a wrong one, and no flag.
+    Cli::command().mut_subcommands(|command| {
+        command.mut_args(|arg| match arg.get_long().is_some() && arg.get_action().takes_values() {
+            true => arg.allow_negative_numbers(true),
+            false => arg,
+        })
+    })
+}
+
+/// A number for a config key, whose range is told with the config.
+fn number(text: &str) -> Result<toml::Value, String> {
+    let whole = text.parse::<i64>().map(toml::Value::from);
+    whole.or_else(|_| text.parse::<f64>().map(toml::Value::from)).map_err(|_| "allowed a number".into())
+}
+
+/// A count, or a place from 0.
+fn whole(text: &str) -> Result<usize, String> {
+    text.parse().map_err(|_| "allowed a whole number, from 0".into())
 }
 
 /// Refuses names and values that hold line breaks or escape sequences: none is needed, and any could end up in a
@@ -264,17 +282,17 @@ impl ConfigArgs {
 #[derive(clap::Args, Default)]
 pub struct Overrides {
     /// Start of all randomness
-    #[arg(long, help_heading = IN_CONFIG, value_name = "N", allow_negative_numbers = true)]
-    pub seed: Option<i64>,
+    #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
+    pub seed: Option<toml::Value>,
     /// Independent repetitions
-    #[arg(long, help_heading = IN_CONFIG, value_name = "N", allow_negative_numbers = true)]
-    pub trials: Option<i64>,
+    #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
+    pub trials: Option<toml::Value>,
     /// Generations after the random start
-    #[arg(long, help_heading = IN_CONFIG, value_name = "N", allow_negative_numbers = true)]
-    pub generations: Option<i64>,
+    #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
+    pub generations: Option<toml::Value>,
     /// Policies a population, and teams a generation
-    #[arg(long, help_heading = IN_CONFIG, value_name = "N", allow_negative_numbers = true)]
-    pub population: Option<i64>,
+    #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
+    pub population: Option<toml::Value>,
     /// Score that policies are selected by
     #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = Words::new(Fitness::names()))]
     pub fitness: Option<String>,
@@ -288,7 +306,7 @@ impl Overrides {
     pub fn list(&self) -> Vec<Override> {
         let Overrides { seed, trials, generations, population, fitness, paradigm } = self;
         let numbers = [("seed", seed), ("trials", trials), ("generations", generations), ("population", population)]
-            .map(|(name, &value)| (name, value.map(toml::Value::from)));
+            .map(|(name, value)| (name, value.clone()));
         let words = [("fitness", fitness), ("paradigm", paradigm)]
             .map(|(name, value)| (name, value.clone().map(toml::Value::from)));
         let set = |(name, value): (&str, Option<toml::Value>)| {

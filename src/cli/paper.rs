@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use serde_json::json;
 
 use super::recovery::{self, Checkpoints, Loss, Signals};
-use super::{Error, Overrides, RunOptions, backend, print, say};
+use super::{Error, Overrides, RunOptions, backend, number, print, say};
 use crate::baseline::Baselines;
 use crate::config::{self, Override};
 use crate::memory;
@@ -32,14 +32,14 @@ pub struct Args {
     #[arg(long, short, value_name = "DIR", default_value = "paper")]
     out: PathBuf,
     /// Independent repetitions [default: 5]
-    #[arg(long, value_name = "N", allow_negative_numbers = true)]
-    trials: Option<i64>,
+    #[arg(long, value_name = "N", value_parser = number)]
+    trials: Option<toml::Value>,
     /// Generations after the random start [default: 100]
-    #[arg(long, value_name = "N", allow_negative_numbers = true)]
-    generations: Option<i64>,
+    #[arg(long, value_name = "N", value_parser = number)]
+    generations: Option<toml::Value>,
     /// Start of all randomness [default: 0]
-    #[arg(long, value_name = "N", allow_negative_numbers = true)]
-    seed: Option<i64>,
+    #[arg(long, value_name = "N", value_parser = number)]
+    seed: Option<toml::Value>,
     /// Go on with the paper in the folder, or start it; of one that is done, draw figures and claims again
     #[arg(long, conflicts_with = "force")]
     resume: bool,
@@ -62,7 +62,8 @@ pub struct Args {
 
 impl Args {
     fn overrides(&self) -> Vec<Override> {
-        let &Args { seed, trials, generations, .. } = self;
+        let Args { seed, trials, generations, .. } = self;
+        let [seed, trials, generations] = [seed, trials, generations].map(Clone::clone);
         let overrides = Overrides { seed, trials, generations, ..Overrides::default() };
         [overrides.list(), self.checkpoints.list()].concat()
     }

@@ -7,7 +7,7 @@ use std::sync::atomic::AtomicBool;
 
 use clap::ValueEnum;
 
-use super::{Error, RunOptions, say};
+use super::{Error, RunOptions, number, say};
 use crate::backend::BackendError;
 use crate::backend::Player;
 use crate::config::Override;
@@ -50,22 +50,21 @@ pub fn setback(error: &BackendError) {
 #[derive(clap::Args)]
 pub struct Checkpoints {
     /// Save what --resume needs after so many generations; 0 is never
-    #[arg(long, value_name = "N", allow_negative_numbers = true)]
-    checkpoint_generations: Option<i64>,
+    #[arg(long, value_name = "N", value_parser = number)]
+    checkpoint_generations: Option<toml::Value>,
     /// Save what --resume needs after so many seconds; 0 is never
-    #[arg(long, value_name = "S", allow_negative_numbers = true)]
-    checkpoint_seconds: Option<f64>,
+    #[arg(long, value_name = "S", value_parser = number)]
+    checkpoint_seconds: Option<toml::Value>,
 }
 
 impl Checkpoints {
     /// The keys that were set, each named as its flag.
     pub fn list(&self) -> Vec<Override> {
-        let generations = self.checkpoint_generations.map(toml::Value::from);
-        let seconds = self.checkpoint_seconds.map(toml::Value::from);
-        let set = |(name, value): (&str, Option<toml::Value>)| {
-            Some(Override::new(format!("checkpoint.{name}"), value?, format!("--checkpoint-{name}")))
+        let Checkpoints { checkpoint_generations, checkpoint_seconds } = self;
+        let set = |(name, value): (&str, &Option<toml::Value>)| {
+            Some(Override::new(format!("checkpoint.{name}"), value.clone()?, format!("--checkpoint-{name}")))
         };
-        [("generations", generations), ("seconds", seconds)].into_iter().filter_map(set).collect()
+        [("generations", checkpoint_generations), ("seconds", checkpoint_seconds)].into_iter().filter_map(set).collect()
     }
 }
 

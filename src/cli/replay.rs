@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use serde_json::json;
 
 use super::recovery::Signals;
-use super::{Error, RunOptions, backend, output, print};
+use super::{Error, RunOptions, backend, output, print, whole};
 use crate::file;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
@@ -22,16 +22,16 @@ pub struct Args {
     #[arg(value_name = "RUN")]
     folder: PathBuf,
     /// Trial to look at
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = whole)]
     trial: usize,
     /// Generation whose best team plays [default: the newest]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = whole)]
     generation: Option<usize>,
     /// Another generation of the trial, side by side
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = whole)]
     compare: Option<usize>,
     /// Step to stop at, in a still picture [default: the last]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = whole)]
     step: Option<usize>,
     /// File to write: .html to play, .gif moving, .svg, .pdf or .png still; %04d.png: a numbered .png a moment, for a
     /// film [default: replay.html in RUN]

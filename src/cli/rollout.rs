@@ -7,7 +7,7 @@ use std::sync::Mutex;
 use clap::builder::PossibleValuesParser as Words;
 use serde_json::json;
 
-use super::{ConfigFile, Error, RunOptions, backend, output, print, say};
+use super::{ConfigFile, Error, RunOptions, backend, output, print, say, whole};
 use crate::backend::{Backend, Group, Machine, Moment, Need};
 use crate::config::{Choice, Override, Paradigm};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Spread, Starts};
@@ -34,7 +34,7 @@ pub struct Args {
     #[arg(long, value_name = "FILE")]
     policies: PathBuf,
     /// Take the tensor `weights.N` [default: `weights`, or else `weights.0`]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = whole)]
     trial: Option<usize>,
     /// Write every agent's state after every step, and what leaders sense and answer there
     #[arg(long, value_name = "FILE")]
@@ -58,7 +58,7 @@ pub struct Args {
         help_heading = HELD_OUT)]
     seed: Option<u64>,
     /// How far a start is moved at most, on each axis [default: the config's learning.start_jitter]
-    #[arg(long, value_name = "J", requires = "episodes", allow_negative_numbers = true, help_heading = HELD_OUT)]
+    #[arg(long, value_name = "J", requires = "episodes", help_heading = HELD_OUT)]
     start_jitter: Option<f64>,
 }
 

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 
 use super::recovery::{self, Loss, Signals};
-use super::{Error, Overrides, RunOptions, backend, output, print, say};
+use super::{Error, Overrides, RunOptions, backend, output, print, say, whole};
 use crate::config::{self, ConfigError, Problem};
 use crate::file;
 use crate::memory;
@@ -79,7 +79,7 @@ pub struct Args {
     #[arg(long, value_name = "HH:MM:SS", default_value = "01:00:00", value_parser = time_limit, help_heading = SCALE_OUT)]
     time: String,
     /// GPUs of a task of the job array [default: 1, or 0 with --backend cpu]
-    #[arg(long, value_name = "N", help_heading = SCALE_OUT)]
+    #[arg(long, value_name = "N", value_parser = whole, help_heading = SCALE_OUT)]
     gpus: Option<usize>,
     /// One more option of the batch script: --sbatch=--partition=long; may be given more than once
     #[arg(long, value_name = "OPTION", allow_hyphen_values = true, value_parser = an_option, help_heading = SCALE_OUT)]

@@ -51,11 +51,11 @@ mod tests {
 
     #[test]
     fn what_stands_in_a_cell_is_no_command() {
-        let rows = [["arm", "G"], ["50 % of_#1 & {x}^~$\\", "−0.50 [0, 1]"]];
+        let rows = [["arm", "G"], ["at % of_#1 & {x}^~$\\", "−0.50 [0, 1]"]];
         let rows = rows.map(|row| row.map(String::from).to_vec());
         assert_eq!(
             latex(&rows),
-            "\\begin{tabular}{lr}\n\\hline\narm & G \\\\ \\hline\n50 \\% of\\_\\#1 \\& \\{x\\}\\textasciicircum{}\\textasciitilde{}\\$\
+            "\\begin{tabular}{lr}\n\\hline\narm & G \\\\ \\hline\nat \\% of\\_\\#1 \\& \\{x\\}\\textasciicircum{}\\textasciitilde{}\\$\
              \\textbackslash{} & $-$0.50 [0, 1] \\\\\n\\hline\n\\end{tabular}\n"
         );
         assert_eq!(tex("[a]"), "{}[a]");
