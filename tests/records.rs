@@ -295,7 +295,7 @@ fn compiling() {
     cases.push(("large.toml".into(), sweep.points.into_iter().map(|point| small(point.config)).collect()));
     for (request, info) in common::adapters("compiling") {
         for (name, configs) in &cases {
-            let backend = || GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap();
+            let backend = || GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
             let gpu = backend().playing(Kernel::Best).holding(Holding::Always).bringing(Records::PackedFrom(0));
             for (what, mut backend) in [("by default", backend()), ("as on a GPU", gpu)] {
                 let mut trainer = Trainer::new(configs.clone());
