@@ -3,8 +3,13 @@
 //! Every fitness is a share of the world's P POIs, so it is counted in whole POIs and divided once. Nothing is
 //! simulated again: who stood near a POI at which step says what would have been observed without a leader, without
 //! its whole group, or with more of it.
+//!
+//! No fitness asks when a set stood, nor how often. Nor does a set make a difference that another set of its POI holds
+//! as a subset: without whomever, and with however many copies of whomever, the larger one still has at least as many
+//! agents. So of a record only the sets matter that no other of their POI contains; and of these, but for D++, only those
+//! with as many agents as the POI needs. A backend may leave out the others, see [`crate::backend::Need`].
 
-use crate::backend::{Episode, Strided};
+use crate::backend::{Episode, Seen, Strided, owner_bits};
 use crate::config::Fitness;
 use crate::world::World;
 
@@ -49,35 +54,36 @@ pub struct Credit {
 
 impl Credit {
     /// Scores every leader of the team by `fitness` into `scores`, `[leaders]`, and returns how many POIs the team
-    /// observed. The episode must be one of `world`.
+    /// observed. The episode must be one of `world`, played with that fitness as a [need](crate::backend::Need).
     pub fn score(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
         self.observed.clear();
         self.observed.resize(world.pois.len(), false);
-        match fitness {
-            Fitness::G => self.observe(episode, world),
-            Fitness::Df if world.followers() > 0 => self.lose_groups(episode, world),
-            Fitness::D | Fitness::Df => self.lose_leaders(episode, world),
-            Fitness::Dpp => self.add_copies(episode, world),
-        }
-        let observed = self.observed.iter().filter(|&&observed| observed).count() as u32;
         let pois = world.pois.len();
         match fitness {
-            Fitness::G => scores.fill(share(observed, pois)),
+            Fitness::G => {
+                self.observe(episode, world);
+                scores.fill(share(self.count_observed(), pois));
+            }
             Fitness::D | Fitness::Df => {
+                match fitness == Fitness::Df && world.followers() > 0 {
+                    true => self.lose_groups(episode, world),
+                    false => self.lose_leaders(episode, world),
+                }
                 self.count_lost(world);
                 scores.iter_mut().zip(&self.lost).for_each(|(score, &lost)| *score = share(lost, pois));
             }
             Fitness::Dpp => {
+                self.add_copies(episode, world);
                 self.count_lost(world);
                 for (leader, score) in scores.iter_mut().enumerate().take(world.leaders()) {
                     *score = self.stepping_stone(world, leader);
                 }
             }
         }
-        observed
+        self.count_observed()
     }
 
-    /// Every fitness of every leader. The episode must be one of `world`.
+    /// Every fitness of every leader. The episode must be one of `world`, played with all scores or the record as a need.
     pub fn all(&mut self, episode: &Episode<'_>, world: &World) -> Scores {
         let leaders = world.leaders();
         let mut by = |fitness| {
@@ -201,6 +207,10 @@ impl Credit {
         self.critical.extend((0..world.pois.len() * words).map(|index| of_word(index % words)));
     }
 
+    fn count_observed(&self) -> u32 {
+        self.observed.iter().filter(|&&observed| observed).count() as u32
+    }
+
     /// Counts the observed POIs to which each leader was critical.
     fn count_lost(&mut self, world: &World) {
         let (leaders, words) = (world.leaders(), world.constants.words as usize);
@@ -228,6 +238,9 @@ fn each_set(
     mut visit: impl FnMut(usize, u32, &[u32]),
 ) {
     let (pois, words) = (world.pois.len(), world.constants.words as usize);
+    if sets.is_empty() {
+        return;
+    }
     scratch.clear();
     scratch.resize(2 * words, 0);
     for poi in 0..pois {
@@ -259,20 +272,31 @@ fn each_set(
 
 /// Gives each follower to the leader it saw at most steps, ties to the lower index, or to [`NOBODY`] if it saw none:
 /// the owner of every agent, leaders their own, `[agents]`.
-pub fn assign(seen: &Strided<'_>, world: &World, owner: &mut Vec<u32>) {
+pub fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
     let leaders = world.constants.leaders;
     owner.clear();
     owner.extend(0..leaders);
-    owner.extend((0..world.followers()).map(|follower| {
-        let (mut most, mut best) = (0, NOBODY);
-        for leader in 0..leaders {
-            let steps = seen.get(follower * leaders as usize + leader as usize);
-            if steps > most {
-                (most, best) = (steps, leader);
+    let followers = 0..world.followers();
+    match seen {
+        Seen::Counts(seen) => owner.extend(followers.map(|follower| {
+            let (mut most, mut best) = (0, NOBODY);
+            for leader in 0..leaders {
+                let steps = seen.get(follower * leaders as usize + leader as usize);
+                if steps > most {
+                    (most, best) = (steps, leader);
+                }
             }
+            best
+        })),
+        Seen::Most(owners) => {
+            let bits = owner_bits(leaders);
+            let (a_word, nobody) = ((32 / bits) as usize, (1 << bits) - 1);
+            owner.extend(followers.map(|follower| {
+                let owner = owners.get(follower / a_word) >> (follower % a_word * bits as usize) & nobody;
+                if owner == nobody { NOBODY } else { owner }
+            }));
         }
-        best
-    }));
+    }
 }
 
 /// The agents that belong to each leader, a bit an agent, `[leaders][words]`.

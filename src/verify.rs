@@ -1,13 +1,15 @@
-//! Whether a backend agrees with the CPU, bit for bit: random worlds stage by stage, all of them as one batch, breeding
-//! where the backend holds populations, and short training runs.
+//! Whether a backend agrees with the CPU, bit for bit: random worlds stage by stage, all of them as one batch, once by the
+//! record and once by the scores, breeding where the backend holds populations, and short training runs.
 
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Mutex;
 
 use crate::backend::compare::{Mismatch, first_mismatch};
-use crate::backend::{Backend, BackendError, Breeding, Group};
-use crate::config::Config;
-use crate::evolve::{Key, Purpose, UNCHANGED};
+use crate::backend::{Backend, BackendError, Group, Need};
+use crate::config::{Config, Fitness};
+use crate::credit::{Credit, Scores};
+use crate::evolve::{Breeding, Key, Purpose, UNCHANGED};
 use crate::sample;
 use crate::trainer::{Row, Trainer};
 use crate::world::World;
@@ -66,7 +68,8 @@ impl Teams {
 
     fn group(&self) -> Group<'_> {
         let Teams { world, policies, weights, choice } = self;
-        Group { world, starts: &world.starts, weights: weights[..].into(), policies: *policies, teams: choice }
+        let need = Need::Record;
+        Group { world, starts: &world.starts, weights: weights[..].into(), policies: *policies, teams: choice, need }
     }
 }
 
@@ -99,7 +102,12 @@ pub fn compare(
         outcome.mismatch = Some(format!("{name}: the record of team {team} differs when all worlds are one batch"));
         return Ok(outcome);
     }
-    outcome.agent_steps *= 2;
+    if let Some((group, team, difference)) = compare_scores(&groups, reference, backend)? {
+        let (name, _) = &plan.worlds[group];
+        outcome.mismatch = Some(format!("{name}: stage credit, team {team}, {difference}"));
+        return Ok(outcome);
+    }
+    outcome.agent_steps *= 3;
     progress(&outcome);
     for ((name, config), teams) in plan.worlds.iter().zip(&all) {
         if let Some(mismatch) = compare_breeding(config, teams, backend)? {
@@ -132,7 +140,7 @@ fn compare_batch(
         backend.rollout(groups, &|episode| {
             // A team that is visited twice has a record twice as long.
             let mut record = records[episode.group][episode.team].lock().expect("no visit panics");
-            record.extend(episode.sets.iter().chain(episode.seen.iter()));
+            record.extend(episode.sets.iter().chain(episode.seen.words().iter()));
         })?;
         Ok::<_, BackendError>(records)
     };
@@ -144,6 +152,50 @@ fn compare_batch(
     let teams =
         groups.iter().enumerate().flat_map(|(index, group)| (0..group.team_count()).map(move |team| (index, team)));
     Ok(teams.into_iter().find(differs))
+}
+
+/// Plays all groups as one batch of which only scores are wanted, of every kind by turns, and holds them against those
+/// of the reference's whole record; the first group and team that differs, and how.
+fn compare_scores(
+    groups: &[Group<'_>],
+    reference: &mut dyn Backend,
+    backend: &mut dyn Backend,
+) -> Result<Option<(usize, usize, String)>, BackendError> {
+    const NEEDS: [Need; 5] = [
+        Need::Scores,
+        Need::Score(Fitness::G),
+        Need::Score(Fitness::D),
+        Need::Score(Fitness::Df),
+        Need::Score(Fitness::Dpp),
+    ];
+    let played = |backend: &mut dyn Backend, needs: &dyn Fn(usize) -> Need| {
+        let asked: Vec<Group<'_>> =
+            groups.iter().enumerate().map(|(index, group)| Group { need: needs(index), ..*group }).collect();
+        let scores: Vec<Mutex<BTreeMap<usize, Scores>>> = groups.iter().map(|_| Mutex::default()).collect();
+        backend.rollout(&asked, &|episode| {
+            let (group, mut credit) = (&groups[episode.group], Credit::default());
+            let found = match NEEDS[episode.group % NEEDS.len()] {
+                Need::Record | Need::Scores => credit.all(&episode, group.world),
+                Need::Score(fitness) => {
+                    let mut one = vec![0.0; group.world.leaders()];
+                    let observed = credit.score(&episode, group.world, fitness, &mut one);
+                    Scores { observed, d: one, ..Scores::default() }
+                }
+            };
+            scores[episode.group].lock().expect("no visit panics").insert(episode.team, found);
+        })?;
+        Ok::<_, BackendError>(scores.into_iter().map(|scores| scores.into_inner().expect("no visit panics")))
+    };
+    let expected = played(reference, &|_| Need::Record)?;
+    let found = played(backend, &|index| NEEDS[index % NEEDS.len()])?;
+    Ok(expected.zip(found).enumerate().find_map(|(group, (expected, found))| {
+        let differs = |(team, expected): (&usize, &Scores)| {
+            let found = found.get(team);
+            let differs = found != Some(expected);
+            differs.then(|| (group, *team, format!("expected {expected:?}, found {found:?}")))
+        };
+        expected.iter().find_map(differs)
+    }))
 }
 
 /// Breeds a world's policies where the backend holds them; the first weight that differs.

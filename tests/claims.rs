@@ -1,10 +1,12 @@
 //! Statistics are scipy's, baselines are what a backend plays, and verdicts on the paper's claims follow from them.
 
+#![cfg(feature = "cli")]
+
 use std::sync::Mutex;
 
 use fearless_simd::Level;
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::{Backend, Group};
+use flotilla::backend::{Backend, Group, Need};
 use flotilla::baseline::{Baseline, Baselines};
 use flotilla::config::{Fitness, Override, Paradigm};
 use flotilla::credit::Credit;
@@ -157,6 +159,7 @@ fn straight_ahead_solves_what_the_tables_say_and_random_teams_are_played() {
                 weights: weights[..].into(),
                 policies: population,
                 teams: &teams,
+                need: Need::Scores,
             };
             let visit = |episode: flotilla::backend::Episode<'_>| {
                 let observed = Credit::default().all(&episode, &world).observed;

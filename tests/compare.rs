@@ -1,5 +1,7 @@
 //! `flotilla compare` on runs whose metrics are known, and on a small sweep.
 
+#![cfg(feature = "cli")]
+
 use std::fmt::Write;
 use std::fs;
 use std::path::Path;

@@ -1,6 +1,6 @@
 //! Credit against its definition: the record is edited (agents taken out, copies added) and G counted anew.
 
-use flotilla::backend::{Episode, Strided};
+use flotilla::backend::{Episode, Need, Seen, Strided, owner_bits};
 use flotilla::config::Fitness;
 use flotilla::credit::{Credit, Scores};
 use flotilla::world::{Constants, World};
@@ -51,6 +51,40 @@ impl Record {
             seen[index * stride + offset] = steps;
         }
         (sets, seen)
+    }
+
+    /// What a need leaves of the record: of each POI the sets that are large enough and that no other contains, and the
+    /// leader that each follower saw most.
+    fn packed(&self, need: Need) -> (Vec<u32>, Vec<u32>) {
+        let (pois, words) = (self.coupling.len(), (self.leaders + self.followers).div_ceil(32));
+        let contains = |a: &[usize], b: &[usize]| b.iter().all(|agent| a.contains(agent));
+        let kept = |poi: usize| {
+            let all: Vec<&Vec<usize>> = self.near.iter().map(|sets| &sets[poi]).collect();
+            let least = need.least(self.coupling[poi]).unwrap() as usize;
+            let idle = |index: usize| {
+                let larger = |(other, set): (usize, &&Vec<usize>)| {
+                    other != index && contains(set, all[index]) && (other < index || !contains(all[index], set))
+                };
+                all[index].len() < least || all.iter().enumerate().any(larger)
+            };
+            (0..all.len()).filter(|&index| !idle(index)).map(|index| all[index].clone()).collect::<Vec<_>>()
+        };
+        let kept: Vec<Vec<Vec<usize>>> = (0..pois).map(kept).collect();
+        let rows = kept.iter().map(Vec::len).max().unwrap();
+        let mut sets = vec![0; rows * pois * words];
+        for (poi, kept) in kept.iter().enumerate() {
+            for (row, set) in kept.iter().enumerate() {
+                set.iter().for_each(|agent| sets[(row * pois + poi) * words + agent / 32] |= 1 << (agent % 32));
+            }
+        }
+        let bits = owner_bits(self.leaders as u32);
+        let a_word = (32 / bits) as usize;
+        let mut owners = vec![0; self.followers.div_ceil(a_word)];
+        for follower in 0..self.followers {
+            let owner = self.owner(self.leaders + follower).map_or((1 << bits) - 1, |owner| owner as u32);
+            owners[follower / a_word] |= owner << (follower % a_word * bits as usize);
+        }
+        (sets, if need.owners() { owners } else { vec![] })
     }
 
     /// Observed POIs if each agent counted as many times as `weight` says.
@@ -158,12 +192,32 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
     let offset = rng.random_range(0..stride);
     let (sets, seen) = record.words(stride, offset, rng);
     let strided = |words| Strided { words, stride, offset };
-    let episode = Episode { group: 0, team: 0, sets: strided(&sets), seen: strided(&seen) };
+    let episode = Episode { group: 0, team: 0, sets: strided(&sets), seen: Seen::Counts(strided(&seen)) };
     let expected = record.scores();
     assert_eq!(credit.all(&episode, &world), expected);
     let mut g = vec![f32::NAN; record.leaders];
     assert_eq!(credit.score(&episode, &world, Fitness::G, &mut g), expected.observed);
     assert_eq!(g, vec![expected.g; record.leaders]);
+    let needs = [Fitness::G, Fitness::D, Fitness::Df, Fitness::Dpp].map(Need::Score);
+    for need in [Need::Scores].into_iter().chain(needs) {
+        let (sets, owners) = record.packed(need);
+        let whole = |words| Strided { words, stride: 1, offset: 0 };
+        let episode = Episode { group: 0, team: 0, sets: whole(&sets), seen: Seen::Most(whole(&owners)) };
+        let Need::Score(fitness) = need else {
+            assert_eq!(credit.all(&episode, &world), expected, "packed");
+            continue;
+        };
+        let mut scores = vec![f32::NAN; record.leaders];
+        assert_eq!(credit.score(&episode, &world, fitness, &mut scores), expected.observed, "{need:?}");
+        let of_g = vec![expected.g; record.leaders];
+        let wanted = match fitness {
+            Fitness::G => &of_g,
+            Fitness::D => &expected.d,
+            Fitness::Df => &expected.df,
+            Fitness::Dpp => &expected.dpp,
+        };
+        assert_eq!(&scores, wanted, "{need:?}");
+    }
     expected
 }
 

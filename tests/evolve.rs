@@ -6,7 +6,7 @@ use std::collections::HashSet;
 
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, Group};
+use flotilla::backend::{Backend, Group, Need};
 use flotilla::config::{Config, Fitness, Learning, Mutation, Paradigm};
 use flotilla::credit::Credit;
 use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose};
@@ -104,7 +104,7 @@ proptest! {
         evolve::jitter_starts(Key::new(seed, 0, Purpose::Starts), 7, 1, &world, jitter, &mut starts);
         prop_assert_eq!(starts.len(), world.agents());
         for (start, from) in starts.iter().zip(&world.starts) {
-            for (at, from, wall) in [(start.x, from.x, world.constants.map_x), (start.y, from.y, world.constants.map_y)] {
+            for (at, from, wall) in [(start.x, from.x, world.map().x), (start.y, from.y, world.map().y)] {
                 prop_assert!((0.0..=wall).contains(&at));
                 prop_assert!((at * GRID).fract() == 0.0 || at == wall, "{} is off the grid", at);
                 prop_assert!(f64::from((at - from).abs()) <= jitter + 1.0 / f64::from(GRID) + 1e-5, "{} from {}", at, from);
@@ -498,8 +498,8 @@ impl Plain<'_> {
             let key = self.key(Purpose::Starts);
             evolve::jitter_starts(key, generation, episode, &self.world, start_jitter, &mut starts);
             let teams = vec![0; team.len()];
-            let group =
-                Group { world: &self.world, starts: &starts, weights: weights[..].into(), policies: 1, teams: &teams };
+            let (world, weights, need) = (&self.world, weights[..].into(), Need::Scores);
+            let group = Group { world, starts: &starts, weights, policies: 1, teams: &teams, need };
             let found = std::sync::Mutex::new(None);
             let visit = |episode: flotilla::backend::Episode<'_>| {
                 let scores = Credit::default().all(&episode, &self.world);

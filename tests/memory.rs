@@ -1,6 +1,8 @@
 //! What a run takes in memory is what `flotilla check` foretold, and a run that would take more than there is does not
 //! start.
 
+#![cfg(feature = "cli")]
+
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -116,6 +118,21 @@ fn plans_add_up() {
     assert!(!memory::copies_checkpoint(&[config(40_000)]));
 }
 
+/// Records that are large enough to be packed on a GPU take room twice: there may be as much again of what is packed.
+#[test]
+fn packed_records_are_counted() {
+    let adapter = |population| {
+        let config = Config::parse(&text(population, 2, 1, "generations = 0"), "config").unwrap();
+        Plan::of([&config], 1).adapter
+    };
+    // Weights and record of a team: 4 leaders of 112 weights; 25 steps of 4 POIs, and 8 followers who see 4 leaders.
+    let (weights, record) = (4 * 112 * 4, (25 * 4 + 8 * 4) * 4);
+    assert_eq!(adapter(100), 2 * 101 * (weights + record));
+    // By then populations are held, too: a buffer a leader and one more, and the parents.
+    let held = 5 * 112 * 4 + 4 * 4;
+    assert_eq!(adapter(2000), 2 * 2001 * (weights + 2 * record + held));
+}
+
 /// What is written from the populations is what would be written from a copy of them.
 #[test]
 fn checkpoints_need_no_copy() {
@@ -148,7 +165,7 @@ fn checkpoints_need_no_copy() {
         assert_eq!(keeper.newest(), Some(3));
         fs::read(checkpoint::path(&path, 3)).unwrap()
     });
-    assert!(files[0].len() > config.policy_bytes() && files[0] == files[1]);
+    assert!(files[0].len() as u64 > config.policy_bytes() && files[0] == files[1]);
     let read = checkpoint::read(&checkpoint::path(&folder.path().join("view"), 3), Path::new("none"), &config);
     let read = read.unwrap().expect("it has its weights");
     assert_eq!(read.snapshot, trainer.snapshot(0).unwrap());

@@ -5,10 +5,12 @@
 //! compared, unless every operation before the threshold was exact: the ties of a layout must fall as the mission says.
 //! Counted too is a step on which roundings grow beyond [`STATE`]: a policy may be steep, and forces may cancel.
 
+#![cfg(feature = "cli")]
+
 use std::f64::consts::PI;
 
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, Group, Moment, Trace};
+use flotilla::backend::{Backend, Group, Moment, Need, Trace};
 use flotilla::bench::with_agents;
 use flotilla::config::{Config, Coupling, Density, Paradigm};
 use flotilla::sample;
@@ -347,7 +349,8 @@ fn check(cpu: &mut Cpu, world: &Config, model: &Model, seed: u64) -> Tally {
         .map(|start| start + Vec2::new(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0)) * jitter)
         .map(|start| on_grid(start, model.map.as_vec2()))
         .collect();
-    let group = Group { world: &compiled, starts: &starts, weights: weights[..].into(), policies, teams: &teams };
+    let (world, need) = (&compiled, Need::Record);
+    let group = Group { world, starts: &starts, weights: weights[..].into(), policies, teams: &teams, need };
     let trace = cpu.trace(&group).unwrap();
     assert_eq!((trace.teams, trace.agents), (TEAMS, model.agents));
     let mut tally = Tally::default();

@@ -3,19 +3,20 @@
 //!
 //! Every test walks all adapters. What each has caught is said where it stands.
 
+#![cfg(feature = "gpu")]
+
 mod common;
 
-use std::mem::offset_of;
-
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::gpu::device::{self, Request};
-use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, State, Task};
+use flotilla::backend::gpu::device::Request;
+use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records, State, Task};
 use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::population::{Brood, Stretch};
-use flotilla::backend::{Backend, Breeding, Group, Moment, Weights};
+use flotilla::backend::{Backend, Group, Moment, Need, Weights};
 use flotilla::config::{Config, Fitness};
+use flotilla::declare::Shared;
 use flotilla::evaluate::{Starts, evaluate};
-use flotilla::evolve::{Key, Purpose};
+use flotilla::evolve::{Breeding, Key, Purpose};
 use flotilla::trainer::Trainer;
 use flotilla::verify::{Outcome, Plan, compare};
 use flotilla::world::{Constants, World};
@@ -24,10 +25,10 @@ use flotilla::{backend::gpu, sample};
 /// The generic one plays more worlds: the other has to be compiled for each, which takes software drivers a second.
 const KERNELS: [Kernel; 2] = [Kernel::Generic, Kernel::Specialised];
 
-/// One that holds all populations.
+/// One that holds all populations and packs all records.
 fn open(request: &Request, pass: Pass, kernel: Kernel) -> GpuEpisodes {
-    let gpu = device::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
-    GpuEpisodes::new(gpu).unwrap().playing(kernel).holding(Holding::Always)
+    let gpu = gpu::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
+    GpuEpisodes::new(gpu).unwrap().playing(kernel).holding(Holding::Always).bringing(Records::Packed)
 }
 
 fn check(plan: &Plan, mut backend: GpuEpisodes) -> Outcome {
@@ -55,8 +56,9 @@ fn checked_shaders_and_default_limits_agree() {
             [Request { checked: true, ..request.clone() }, Request { default_limits: true, ..request.clone() }]
         {
             for (kernel, seeds) in KERNELS.into_iter().zip([100..112, 100..102]) {
-                let gpu = device::open(request.clone()).unwrap();
-                let backend = GpuEpisodes::new(gpu).unwrap().playing(kernel).holding(Holding::Always);
+                let gpu = gpu::open(request.clone()).unwrap();
+                let backend = GpuEpisodes::new(gpu).unwrap().playing(kernel);
+                let backend = backend.holding(Holding::Always).bringing(Records::Packed);
                 assert_eq!(check(&Plan::random(seeds, 5), backend).mismatch, None, "{info}, {kernel}, {request:?}");
             }
         }
@@ -113,7 +115,7 @@ fn large_worlds_agree() {
     for (request, info) in common::adapters("large_worlds_agree") {
         let worlds = vec![("crowd".into(), crowd.clone()), ("leaders only".into(), leaders_only.clone())];
         let plan = Plan { worlds, teams: 2, seed: 0, generations: 0 };
-        let backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap();
+        let backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().bringing(Records::Packed);
         // Training them would take the software drivers minutes: traces and batches are enough.
         let plan = Plan { worlds: plan.worlds.into_iter().map(small_population).collect(), ..plan };
         assert_eq!(check(&plan, backend).mismatch, None, "{info}");
@@ -134,7 +136,8 @@ fn long_episodes_agree() {
     for (request, info) in common::adapters("long_episodes_agree") {
         for kernel in KERNELS {
             let plan = Plan { worlds: vec![("long".into(), config.clone())], teams: 9, seed: 0, generations: 0 };
-            let backend = GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap().playing(kernel);
+            let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap().playing(kernel);
+            let backend = backend.bringing(Records::Packed);
             assert_eq!(check(&plan, backend).mismatch, None, "{info}, {kernel}");
         }
     }
@@ -148,7 +151,9 @@ fn batches_cut_small_give_the_same_record() {
     let (policies, teams) = (4, 300);
     let weights = sample::weights(&world, policies, 1);
     let choice: Vec<u32> = (0..teams * world.leaders()).map(|i| (i * 7 % policies) as u32).collect();
-    let group = Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &choice };
+    let need = Need::Record;
+    let group =
+        Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &choice, need };
     let record = |backend: &mut dyn Backend| {
         let record = std::sync::Mutex::new(vec![Vec::new(); teams]);
         backend
@@ -161,7 +166,7 @@ fn batches_cut_small_give_the_same_record() {
     let expected = record(&mut Cpu::default());
     for (request, info) in common::adapters("batches_cut_small_give_the_same_record") {
         for bytes in [1 << 12, 1 << 15, 1 << 28] {
-            let backend = GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap();
+            let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
             assert_eq!(record(&mut backend.batched(bytes)), expected, "{info}, batches of {bytes} bytes");
         }
     }
@@ -192,70 +197,28 @@ fn training_gives_the_same_metrics_and_weights() {
         assert_eq!(train(&mut Cpu::default(), std::slice::from_ref(config)).1[0], weights[arm]);
     }
     for (request, info) in common::adapters("training_gives_the_same_metrics_and_weights") {
-        let mut backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap();
+        let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap();
         assert_eq!(train(&mut backend, &both), (rows.clone(), weights.clone()), "{info}");
     }
 }
 
-/// The structs of the shaders lie in memory as the host writes them.
+/// The structs of the shaders lie in memory as the host writes them: no side pads what the other does not.
 #[test]
 fn structs_lie_alike_on_both_sides() {
     let texts = gpu::shaders();
     let modules: Vec<_> = texts.iter().map(|(_, text)| exact::parse(text).unwrap().0).collect();
-    macro_rules! check {
-        ($wgsl:literal, $host:ty, $($field:ident),*) => {
-            let host = [$((stringify!($field), offset_of!($host, $field))),*];
-            let mut types = modules.iter().flat_map(|module| module.types.iter());
-            let (_, found) = types.find(|(_, ty)| ty.name.as_deref() == Some($wgsl)).unwrap();
-            let naga::TypeInner::Struct { members, span } = &found.inner else { panic!("{} is a struct", $wgsl) };
-            let wgsl: Vec<_> =
-                members.iter().map(|member| (member.name.as_deref().unwrap(), member.offset as usize)).collect();
-            assert_eq!(wgsl, host, $wgsl);
-            assert_eq!(*span as usize, size_of::<$host>(), $wgsl);
-        };
+    fn check<T: Shared>(modules: &[naga::Module]) {
+        let mut types = modules.iter().flat_map(|module| module.types.iter());
+        let (_, found) = types.find(|(_, ty)| ty.name.as_deref() == Some(T::NAME)).unwrap();
+        let naga::TypeInner::Struct { span, .. } = &found.inner else { panic!("{} is a struct", T::NAME) };
+        assert_eq!(*span as usize, size_of::<T>(), "{}", T::NAME);
     }
-    check!(
-        "World",
-        Constants,
-        leaders,
-        followers,
-        pois,
-        steps,
-        words,
-        layers,
-        widths,
-        parameters,
-        map_x,
-        map_y,
-        dt,
-        heading_x,
-        heading_y,
-        speed,
-        min_speed,
-        max_speed,
-        max_speed_change,
-        max_turn,
-        max_turn_cos,
-        max_turn_sin,
-        observation_radius2,
-        attraction_radius2,
-        repulsion_radius2,
-        poi_range2,
-        agent_range2,
-        repulsion_radius,
-        attraction_scale,
-        repulsion_scale,
-        wall_gain,
-        poi_share,
-        agent_share,
-        density,
-        inverse_diagonal
-    );
-    check!("Task", Task, world, starts, pois, weights, sets, seen, moments, states, teams, first, end);
-    check!("State", State, x, y, hx, hy, speed);
-    check!("Brood", Brood, key, slots, parameters, parents, threshold, all, scaled, sigma);
-    check!("Stretch", Stretch, leaders, first, count, parameters, teams, teams_a_task, choices, weights);
-    check!("Moment", Moment, inputs, outputs, force, position, heading, speed);
+    check::<Constants>(&modules);
+    check::<Task>(&modules);
+    check::<State>(&modules);
+    check::<Brood>(&modules);
+    check::<Stretch>(&modules);
+    check::<Moment>(&modules);
 }
 
 /// Drawn starts make one group an episode: batches of many groups, of which each has a few teams.
@@ -268,7 +231,9 @@ fn held_out_episodes_come_to_the_same_on_every_backend() {
     let (policies, leaders) = (5, world.leaders());
     let weights = sample::weights(&world, policies, 11);
     let teams: Vec<u32> = (0..policies as u32).flat_map(|policy| std::iter::repeat_n(policy, leaders)).collect();
-    let group = Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams };
+    let need = Need::Record;
+    let group =
+        Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams, need };
     let starts = Starts::Drawn { episodes: 300, seed: 5, jitter: 6.0 };
     let expected = evaluate(&mut Cpu::default(), &group, &starts, &|_| ()).unwrap();
     let spreads: Vec<_> = (0..policies).map(|team| expected.team(team)).collect();
@@ -304,7 +269,9 @@ fn a_wrong_index_is_an_error() {
     let (policies, leaders) = (3, world.leaders());
     let weights = sample::weights(&world, policies, 1);
     let teams: Vec<u32> = (0..2 * leaders as u32).map(|place| place % 3).collect();
-    let good = Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams };
+    let need = Need::Record;
+    let good =
+        Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams, need };
     let mut wrong = teams.clone();
     wrong[leaders + 2] = 3;
     let few = &weights[1..];
@@ -316,7 +283,7 @@ fn a_wrong_index_is_an_error() {
     ];
     let mut backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::default())];
     for (request, _) in common::adapters("a_wrong_index_is_an_error") {
-        backends.push(Box::new(GpuEpisodes::new(device::open(request).unwrap()).unwrap().holding(Holding::Always)));
+        backends.push(Box::new(GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().holding(Holding::Always)));
     }
     for backend in &mut backends {
         for (group, named) in &bad {
@@ -332,7 +299,8 @@ fn a_wrong_index_is_an_error() {
         let key = Key::new(0, 0, Purpose::Mutation);
         for (parents, named) in [(vec![0; 11], "11 parents"), ([vec![0; 11], vec![3]].concat(), "policy 3 of 3")] {
             let breeding = Breeding { parents: &parents, key, generation: 0, learning: &learning };
-            for error in [held.breed(&breeding).expect_err(named), breeding.on_host(sizes, &weights).expect_err(named)]
+            for error in
+                [held.breed(&breeding).expect_err(named), breeding.on_host(sizes, &weights).expect_err(named).into()]
             {
                 assert!(error.to_string().contains(named), "{}: {error}", backend.describe());
             }
@@ -361,6 +329,7 @@ fn kernels_are_compiled_for_few_worlds_and_shared() {
             weights: weights[..].into(),
             policies: 1,
             teams: &[0],
+            need: Need::Record,
         });
         backend.rollout(&groups.collect::<Vec<_>>(), &|_| ()).unwrap();
         backend.compiled()
@@ -377,7 +346,7 @@ fn kernels_are_compiled_for_few_worlds_and_shared() {
     });
     let (gains, sizes): (Vec<_>, Vec<_>) = (gains.collect(), sizes.collect());
     for (request, info) in common::adapters("kernels_are_compiled_for_few_worlds_and_shared") {
-        let mut backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap().playing(Kernel::Best);
+        let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().playing(Kernel::Best);
         assert_eq!(play(&mut backend, &gains), [0, 1], "{info}: only the numbers differ");
         assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: the other worlds share the generic kernel");
         assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: nothing is compiled twice");

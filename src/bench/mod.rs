@@ -3,17 +3,19 @@
 use std::cell::RefCell;
 use std::hint::black_box;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use fearless_simd::Level;
 
 use crate::backend::cpu::Cpu;
+use crate::backend::gpu::device::Traffic;
 use crate::backend::gpu::episode::{GpuEpisodes, Stages};
 use crate::backend::gpu::probe;
-use crate::backend::{Backend, BackendError, Group, Weights};
+use crate::backend::{Backend, BackendError, Group, Need, Weights};
 use crate::config::{Config, Coupling};
 use crate::credit::Credit;
 use crate::evolve::{Key, Purpose, form_teams, random_policy};
+use crate::host::Instant;
 use crate::sweep::layout::{self, MAX_FOLLOWERS, MAX_GROUPS};
 use crate::trainer::{Times, Trainer};
 use crate::world::World;
@@ -90,6 +92,8 @@ pub struct Profile {
     pub times: Times,
     /// What a GPU's rollouts are made of.
     pub stages: Option<Stages>,
+    /// What went over its bus, in rollouts and between them.
+    pub traffic: Traffic,
 }
 
 /// What to measure of whole generations.
@@ -187,16 +191,17 @@ fn generations(config: &Config, player: &mut Player) -> Result<(f64, Profile), B
     let mut trainer = Trainer::new(vec![config.clone()]);
     trainer.advance(player.backend())?;
     let take = |trainer: &mut Trainer, player: &mut Player| {
-        let stages = match player {
-            Player::Cpu(..) => None,
-            Player::Gpu(gpu) => Some(gpu.take_stages()),
+        let (stages, traffic) = match player {
+            Player::Cpu(..) => (None, Traffic::default()),
+            Player::Gpu(gpu) => (Some(gpu.take_stages()), gpu.gpu().traffic()),
         };
-        Profile { generations: trainer.generation(0), times: trainer.take_times(), stages }
+        Profile { generations: trainer.generation(0), times: trainer.take_times(), stages, traffic }
     };
-    let before = take(&mut trainer, player).generations;
+    let before = take(&mut trainer, player);
     let [seconds, _] = time(|| trainer.advance(player.backend()).map(drop), || Ok(0.0))?;
     let profile = take(&mut trainer, player);
-    Ok((seconds, Profile { generations: profile.generations - before, ..profile }))
+    let generations = profile.generations - before.generations;
+    Ok((seconds, Profile { generations, traffic: profile.traffic - before.traffic, ..profile }))
 }
 
 /// Seconds of one rollout of random policies, scored as in training, with the ceiling meanwhile; the mean G; and who was
@@ -219,7 +224,8 @@ fn rollout(
     // Where generations play from the device's memory, so do rollouts.
     let held = backend.hold(&weights, [leaders, population, world.parameters()])?;
     let played = held.as_deref().map_or(weights[..].into(), Weights::Held);
-    let group = Group { world, starts: &world.starts, weights: played, policies: population, teams: &teams };
+    let need = Need::Score(config.learning.fitness);
+    let group = Group { world, starts: &world.starts, weights: played, policies: population, teams: &teams, need };
     let observed = AtomicU64::new(0);
     let play = || {
         observed.store(0, Relaxed);

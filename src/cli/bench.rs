@@ -8,11 +8,13 @@ use fearless_simd::Level;
 use serde_json::json;
 
 use super::{BackendChoice, Breed, Error, Overrides, RunOptions, backend, print};
+use crate::backend::Machine;
 use crate::backend::cpu::{Cpu, level_name};
 use crate::bench::{self, Generations, Measure, Player, Profile};
 use crate::config::{self, Config};
+use crate::front;
 use crate::memory::Plan;
-use crate::run::{Machine, RunError};
+use crate::run::RunError;
 
 /// Team counts of the table, and of the JSON object.
 const TEAMS: [u32; 3] = [50, 4096, 131_072];
@@ -42,7 +44,7 @@ pub struct Args {
     /// Leave whole generations out
     #[arg(long)]
     rollout_only: bool,
-    /// Also tell where a generation's time goes
+    /// Also tell where a generation's time goes, and on a GPU what goes over its bus
     #[arg(long, conflicts_with = "rollout_only")]
     profile: bool,
     /// Instruction set of the CPU backend, of those that this processor has [default: the widest]
@@ -135,15 +137,15 @@ fn open(args: &Args) -> Result<(Player, Machine), Error> {
                 ));
             }
             backend::start_threads(&args.run)?;
-            return Ok((Player::Cpu(Cpu::at_level(level), level), backend::cpu().1));
+            return Ok((Player::Cpu(Cpu::at_level(level), level), front::cpu().1));
         }
     };
     Ok(match backend::open_gpu(&args.run)? {
         Some(gpu) => {
-            let machine = backend::machine(&gpu);
+            let machine = Machine::of_gpu(&gpu);
             (Player::Gpu(Box::new(gpu)), machine)
         }
-        None => (Player::Cpu(Cpu::at_level(level), level), backend::cpu().1),
+        None => (Player::Cpu(Cpu::at_level(level), level), front::cpu().1),
     })
 }
 
@@ -171,13 +173,17 @@ fn line(measure: &Measure) -> String {
             let name = format!("{}{}", if part { "  of it, " } else { "" }, name.replace('_', " "));
             let _ = writeln!(line, "{:>8} {name:<24} {ms:>12.4} ms {:>5.1}%", "", 100.0 * ms / whole);
         }
+        for (name, part, bytes) in traffic(profile) {
+            let name = format!("{}{}", if part { "  of it, " } else { "" }, name.replace('_', " "));
+            let _ = writeln!(line, "{:>8} {name:<24} {:>12.4} MB", "", 1e-6 * bytes);
+        }
     }
     line
 }
 
 /// Each stage of a generation in ms, in order; some are a part of the rollout before them.
 fn stages(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
-    let Profile { generations, times, stages } = profile;
+    let Profile { generations, times, stages, .. } = profile;
     let mut rows = vec![("teams_and_starts", false, times.prepare), ("rollout_and_scores", false, times.play)];
     if let Some(stages) = stages {
         rows.extend([
@@ -194,6 +200,21 @@ fn stages(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
     rows.extend([("fitness_and_champions", false, times.conclude), ("selection_and_mutation", false, times.breed)]);
     let ms = |time: Duration| 1e3 * time.as_secs_f64() / *generations as f64;
     rows.into_iter().map(|(name, part, time)| (name, part, ms(time))).collect()
+}
+
+/// What goes over a GPU's bus in a generation, in bytes: all of it, and the rollout's part.
+fn traffic(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
+    let Profile { generations, stages, traffic, .. } = profile;
+    let rows = stages.iter().flat_map(|stages| {
+        let rollouts = stages.traffic;
+        [
+            ("up_to_the_device", false, traffic.up),
+            ("rollout_up", true, rollouts.up),
+            ("down_from_it", false, traffic.down),
+            ("rollout_down", true, rollouts.down),
+        ]
+    });
+    rows.map(|(name, part, bytes)| (name, part, bytes as f64 / *generations as f64)).collect()
 }
 
 fn json(measure: &Measure, machine: &Machine) -> String {
@@ -228,7 +249,8 @@ fn json(measure: &Measure, machine: &Machine) -> String {
     }
     if let Some(profile) = &measure.profile {
         let stages = stages(profile).into_iter().map(|(name, _, ms)| (format!("{name}_ms"), json!(ms)));
-        object["profile"] = serde_json::Value::Object(stages.collect());
+        let traffic = traffic(profile).into_iter().map(|(name, _, bytes)| (format!("{name}_bytes"), json!(bytes)));
+        object["profile"] = serde_json::Value::Object(stages.chain(traffic).collect());
     }
     format!("{object}\n")
 }

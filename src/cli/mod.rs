@@ -31,6 +31,7 @@ mod output;
 mod paper;
 mod plot;
 mod recovery;
+mod remedy;
 mod replay;
 mod rollout;
 mod sweep;
@@ -150,17 +151,17 @@ fn refuse_steering(words: impl Iterator<Item = OsString>) -> Result<(), Error> {
 pub enum Error {
     #[error(transparent)]
     Config(#[from] ConfigError),
-    #[error(transparent)]
+    #[error("{}{}", .0, remedy::backend(.0))]
     Backend(#[from] BackendError),
-    #[error(transparent)]
+    #[error("{}{}", .0, remedy::device(.0))]
     Device(#[from] DeviceError),
-    #[error("{}{}", .0, remedy(.0, "run it again"))]
+    #[error("{}{}", .0, remedy::record(.0, "run it again"))]
     Record(#[from] RecordError),
-    #[error("{}{}", .0, resumable(.0))]
+    #[error("{}{}", .0, remedy::run(.0))]
     Run(#[from] RunError),
-    #[error(transparent)]
+    #[error("{}{}", .0, remedy::shown(.0))]
     Shown(#[from] crate::report::runs::RunError),
-    #[error(transparent)]
+    #[error("{}{}", .0, remedy::replayed(.0))]
     Replayed(#[from] ReplayError),
     #[error("standard output cannot be written: {0}")]
     Output(io::Error),
@@ -198,26 +199,6 @@ impl Error {
             Error::Stopped(_) => 75,
             _ => 1,
         }
-    }
-}
-
-/// What to do about a file that could not be written, before `again`.
-fn remedy(error: &RecordError, again: &str) -> String {
-    use io::ErrorKind::{FileTooLarge, PermissionDenied, QuotaExceeded, ReadOnlyFilesystem, StorageFull};
-    let RecordError::Write { error, .. } = error else { return String::new() };
-    match error.kind() {
-        StorageFull | QuotaExceeded => format!("; free some space, then {again}"),
-        FileTooLarge => format!("; the system allows no larger file here (see `ulimit -f`): raise that, then {again}"),
-        PermissionDenied | ReadOnlyFilesystem => "; choose a place you may write to".into(),
-        _ => String::new(),
-    }
-}
-
-/// What to do about a run that could not be written.
-fn resumable(error: &RunError) -> String {
-    match error {
-        RunError::Record(error) => remedy(error, "go on with --resume"),
-        _ => String::new(),
     }
 }
 

@@ -4,17 +4,19 @@ use std::fmt;
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::UNIX_EPOCH;
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::checkpoint::{self, Checkpoint};
 use super::disk::Disk;
-use super::metrics::{self, Row};
+use super::metrics;
 use super::{RecordError, hex, policies, read_text};
 use crate::config::Config;
 use crate::file;
+use crate::host;
+use crate::trainer::Row;
 
 pub const CONFIG: &str = "config.toml";
 pub const RUN: &str = "run.json";
@@ -505,6 +507,5 @@ fn shorten(value: &toml::Value) -> String {
 
 /// The time now, as in "2026-01-31T23:59:59Z".
 pub fn now() -> String {
-    // A clock that was never set has no date before 1970.
-    humantime::format_rfc3339_seconds(SystemTime::now().max(UNIX_EPOCH)).to_string()
+    humantime::format_rfc3339_seconds(UNIX_EPOCH + host::since_1970()).to_string()
 }

@@ -22,6 +22,7 @@ pub mod letters;
 pub mod map;
 pub mod paper;
 pub mod pdf;
+#[cfg(feature = "cli")]
 pub mod progress;
 pub mod replay;
 pub mod runs;

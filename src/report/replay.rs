@@ -14,13 +14,13 @@ use serde_json::json;
 use super::map::{self, Agent, FAINT, Legend, Poi, Team, View};
 use super::runs::{self, RunError};
 use super::scene::{Anchor, BLACK, Color, Scene};
-use crate::backend::{Backend, BackendError, Episode, Group, Strided, Trace};
+use crate::backend::{Backend, BackendError, Episode, Group, Need, Seen, Strided, Trace};
 use crate::config::Config;
 use crate::credit::{self, Credit, Scores};
 use crate::evolve::{self, Key, Purpose};
-use crate::record::checkpoint::{self, Snapshot};
+use crate::record::checkpoint;
 use crate::record::folder::{CHECKPOINTS, POLICIES};
-use crate::trainer::Trainer;
+use crate::trainer::{Snapshot, Trainer};
 use crate::world::World;
 
 /// Most bytes of motion in a page, before they are written as text (4/3 of it). What is longer is thinned out.
@@ -39,7 +39,7 @@ pub enum ReplayError {
     NoTrial { folder: String, trial: usize, trials: usize },
     #[error(
         "{folder}: metrics.csv has no generation {generation} of trial {trial}{}",
-        newest.map_or(String::new(), |newest| format!("; the newest is {newest}: choose one up to that, or finish the run with --resume"))
+        newest.map_or(String::new(), |newest| format!("; the newest is {newest}: choose one up to that"))
     )]
     NoGeneration { folder: String, trial: usize, generation: usize, newest: Option<usize> },
     #[error(
@@ -207,7 +207,8 @@ fn play_best(
             starts
         })
         .collect();
-    let group = |starts, teams| Group { world: &world, starts, weights, policies: population + 1, teams };
+    let need = Need::Record;
+    let group = |starts, teams| Group { world: &world, starts, weights, policies: population + 1, teams, need };
     let groups: Vec<Group<'_>> = starts.iter().map(|starts| group(starts, &teams)).collect();
     let observed: Vec<AtomicU32> = std::iter::repeat_with(AtomicU32::default).take(population).collect();
     backend.rollout(&groups, &|episode: Episode<'_>| {
@@ -225,7 +226,7 @@ fn play_best(
 
     let trace = backend.trace(&group(&starts[0], &teams[team * leaders..(team + 1) * leaders]))?;
     let whole = |words| Strided { words, stride: 1, offset: 0 };
-    let episode = Episode { group: 0, team: 0, sets: whole(&trace.sets), seen: whole(&trace.seen) };
+    let episode = Episode { group: 0, team: 0, sets: whole(&trace.sets), seen: Seen::Counts(whole(&trace.seen)) };
     let scores = Credit::default().all(&episode, &world);
     let mut owner = Vec::new();
     credit::assign(&episode.seen, &world, &mut owner);
@@ -365,7 +366,7 @@ fn hex(colors: &[Color]) -> Vec<String> {
 /// One episode as the page reads it: motion as base64 of little-endian numbers, `[shown][agents]`.
 fn episode(played: &Played, shown: &[usize], exact: bool) -> serde_json::Value {
     let Played { world, scores, .. } = played;
-    let map = [world.constants.map_x, world.constants.map_y];
+    let map = world.map().to_array();
     let (mut positions, mut headings, mut near) = (Vec::new(), Vec::new(), Vec::new());
     for &step in shown {
         for agent in 0..world.agents() {

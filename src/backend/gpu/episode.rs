@@ -3,7 +3,8 @@
 //! One shader text makes two kernels: the generic one, which plays any world, and the specialised one, made for a world's
 //! sizes, in which all loops have constant bounds and the policy is straight-line code. See [`Kernel`].
 //!
-//! While the GPU plays one batch, the CPU reads the record of the batch before it.
+//! While the GPU plays one batch, the CPU reads the record of the batch before it. Where only scores are wanted, the GPU
+//! keeps the record and hands over what of it they hang on, see [`Records`].
 
 use std::any::Any;
 use std::cmp::Reverse;
@@ -11,18 +12,25 @@ use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fmt::{self, Write};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use bytemuck::{Pod, Zeroable};
+use bytemuck::Zeroable;
 use glam::Vec2;
-use rayon::prelude::*;
 
-use super::device::{Binding, DeviceError, Gpu, Kind, Layout, Stopwatch, timed};
+use super::device::{BINDING_ALIGNMENT, Binding, DeviceError, Gpu, Kind, Layout, Stopwatch, Traffic, grid, timed};
 use super::exact;
 use super::population::{Kernels, Population, Stretch, TOGETHER, parts};
-use crate::backend::{Backend, BackendError, Episode, Group, Held, Moment, Strided, Trace, Visit, Weights};
+use crate::backend::{
+    Backend, BackendError, Episode, Group, HELD_FROM, Held, Moment, PACKED_FROM, Seen, Strided, Trace, Visit, Weights,
+    owner_bits,
+};
 use crate::config::{MAX_AGENTS, MAX_HIDDEN_LAYERS};
-use crate::world::{Constants, INPUTS, OUTPUTS, World};
+use crate::declare::{Shared, shared};
+use crate::host::Instant;
+use crate::model::policy::PolicyConstants;
+use crate::model::{self, Constants, Variant};
+use crate::parallel::*;
+use crate::world::{INPUTS, OUTPUTS, World};
 
 /// Threads that share a warp on most GPUs; leaders and followers are kept apart by as many (`ROLE` in the shader).
 const ROLE: usize = 32;
@@ -49,36 +57,38 @@ const MAX_OFFSET: u64 = 1 << 33;
 /// Turns of loops that one thread takes in a dispatch, over all loops. Mesa's llvmpipe 22.3 leaves every loop for good
 /// after 65 535, and drivers stop a dispatch that runs for seconds: longer episodes take several dispatches.
 const TURNS: usize = 60_000;
-/// Offsets of bindings are multiples of this on every WebGPU device.
-pub(super) const BINDING_ALIGNMENT: usize = 256;
 
-/// One workgroup's share of the work (`struct Task` in `shaders/lib/layout.wgsl`); offsets count elements.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct Task {
-    pub world: u32,
-    pub starts: u32,
-    pub pois: u32,
-    pub weights: u32,
-    pub sets: u32,
-    pub seen: u32,
-    pub moments: u32,
-    pub states: u32,
-    pub teams: u32,
-    /// The steps that a dispatch plays: from `first` on, before `end`.
-    pub first: u32,
-    pub end: u32,
-}
+shared! {
+    /// One workgroup's share of the work: some teams of one group.
+    #[derive(Default)]
+    pub struct Task {
+        pub world: u32,
+        /// Where each of these starts in its buffer, in elements.
+        pub starts: u32,
+        pub pois: u32,
+        pub weights: u32,
+        pub sets: u32,
+        pub seen: u32,
+        pub moments: u32,
+        pub states: u32,
+        pub teams: u32,
+        /// The steps that a dispatch plays: from `first` on, before `end`.
+        pub first: u32,
+        pub end: u32,
+        /// Where packing finds and leaves what, see `shaders/pack.wgsl`.
+        pub least: u32,
+        pub table: u32,
+        pub owners: u32,
+    }
 
-/// An agent between two dispatches (`struct State` in the shader).
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-#[repr(C)]
-pub struct State {
-    pub x: f32,
-    pub y: f32,
-    pub hx: f32,
-    pub hy: f32,
-    pub speed: f32,
+    /// An agent between two dispatches.
+    pub struct State {
+        pub x: f32,
+        pub y: f32,
+        pub hx: f32,
+        pub hy: f32,
+        pub speed: f32,
+    }
 }
 
 /// Which kernel plays; no result depends on that.
@@ -119,7 +129,7 @@ enum Sizes {
     /// The widest layer, inputs included, rounded up to spare compilations.
     Any { widest: usize },
     /// All that makes a difference to the code.
-    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], density: u32, by_sine: bool },
+    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], variant: Variant },
 }
 
 const WIDTHS: usize = MAX_HIDDEN_LAYERS + 2;
@@ -130,14 +140,14 @@ impl Shape {
     }
 
     fn generic(world: &World, packing: Packing, trace: bool) -> Shape {
-        let widest = world.constants.widths.into_iter().max().unwrap_or(0).next_power_of_two() as usize;
+        let widest = world.constants.policy.widest().next_power_of_two();
         Shape { workgroup: packing.workgroup, slots: packing.slots, trace, sizes: Sizes::Any { widest } }
     }
 
     fn specialised(world: &World, packing: Packing, trace: bool) -> Shape {
-        let Constants { leaders, followers, pois, widths, density, max_turn_cos, .. } = world.constants;
-        let (agents, by_sine) = (leaders + followers, max_turn_cos > 0.7);
-        let sizes = Sizes::Fixed { teams: packing.teams, leaders, agents, pois, widths, density, by_sine };
+        let Constants { leaders, followers, pois, variant, policy: PolicyConstants { widths, .. }, .. } =
+            world.constants;
+        let sizes = Sizes::Fixed { teams: packing.teams, leaders, agents: leaders + followers, pois, widths, variant };
         Shape { workgroup: packing.workgroup, slots: packing.slots, trace, sizes }
     }
 }
@@ -185,7 +195,7 @@ impl Packing {
 
 /// Steps that one dispatch may play, see [`TURNS`].
 fn steps_a_dispatch(world: &World, packing: Packing) -> usize {
-    let Constants { widths, words, .. } = world.constants;
+    let Constants { words, policy: PolicyConstants { widths, .. }, .. } = world.constants;
     let network: u32 = widths.windows(2).map(|w| (w[0] + 2) * w[1]).sum();
     let agent = world.pois.len() + world.agents() + network as usize + 20;
     let items = (world.pois.len() * words as usize * packing.teams).div_ceil(packing.workgroup);
@@ -212,8 +222,17 @@ struct Share {
     steps_a_dispatch: usize,
 }
 
+/// What came home of a batch's record.
+#[derive(Clone, Copy)]
+enum Home<'a> {
+    /// All of it.
+    Whole(&'a [u32]),
+    /// What scores hang on, as `shaders/pack.wgsl` has it.
+    Packed(&'a [u32]),
+}
+
 /// Gets a task with the record and the moments of its batch.
-type Done<'a> = dyn Fn(&Share, &[u32], &[Moment]) + Sync + 'a;
+type Done<'a> = dyn Fn(&Share, Home<'_>, &[Moment]) + Sync + 'a;
 
 impl Share {
     /// How many weights its teams have, in fours.
@@ -240,6 +259,52 @@ struct Work {
     record: usize,
     moments: usize,
     states: usize,
+    /// Words of all sets in the record.
+    sets: usize,
+    /// If the record is packed: the words of tables and owners, and how many agents a set must have, `[pois]` a group.
+    head: Option<usize>,
+    least: Vec<u32>,
+}
+
+impl Work {
+    /// Finds a place for what is packed of the record; none where the whole record is wanted, where packing takes too
+    /// long for one dispatch, or where there is nothing to gain.
+    fn pack(&mut self, groups: &[Group<'_>], records: Records) {
+        let packs = |share: &Share| groups[share.group].need.least(1).is_some() && pack_turns(groups, share) <= TURNS;
+        if !records.packs((self.record * size_of::<u32>()) as u64) || !self.shares.iter().all(packs) {
+            return;
+        }
+        let mut head = 0;
+        for shares in self.shares.chunk_by_mut(|a, b| a.group == b.group) {
+            let Group { world, need, .. } = groups[shares[0].group];
+            let least = self.least.len() as u32;
+            self.least.extend(world.coupling.iter().filter_map(|&coupling| need.least(coupling)));
+            for Share { task, .. } in shares {
+                let teams = task.teams as usize;
+                (task.least, task.table, task.owners) = (least, head as u32, NOWHERE);
+                head += teams + 1;
+                if need.owners() && world.followers() > 0 {
+                    task.owners = head as u32;
+                    head += owner_words(world) * teams;
+                }
+            }
+        }
+        self.head = Some(head).filter(|head| head + PACKED_HEAD < self.record);
+    }
+}
+
+/// Words of a team that say which leader each follower saw most.
+fn owner_words(world: &World) -> usize {
+    world.followers().div_ceil((32 / owner_bits(world.constants.leaders)) as usize)
+}
+
+/// Turns of loops that a thread takes at most to pack a task.
+fn pack_turns(groups: &[Group<'_>], share: &Share) -> usize {
+    let (world, teams) = (groups[share.group].world, share.task.teams as usize);
+    let sets = (world.pois.len() * teams).div_ceil(PACK_WORKGROUP);
+    let owners = (owner_words(world) * teams).div_ceil(PACK_WORKGROUP) * 4 * (world.leaders() + 2);
+    // Each set is read twice; as many at most are written or left empty.
+    sets * 4 * world.steps() * (world.constants.words as usize + 1) + owners + 3 * teams
 }
 
 /// Sizes of a device that bound a batch.
@@ -271,6 +336,7 @@ fn worth_compiling(work: BTreeMap<Shape, u64>, compiled: &HashSet<Shape>) -> Has
 fn plan(
     groups: &[Group<'_>],
     trace: bool,
+    records: Records,
     room: Room,
     specialised: &HashSet<Shape>,
 ) -> Result<Vec<Work>, BackendError> {
@@ -290,7 +356,7 @@ fn plan(
         if bytes_a_team > room.buffer {
             return Err(BackendError::TooLarge(format!(
                 "one team takes {bytes_a_team} bytes in one buffer, this adapter allows {}; \
-                 use --backend cpu, fewer steps or fewer POIs",
+                 use the CPU, fewer steps or fewer POIs",
                 room.buffer
             )));
         }
@@ -337,6 +403,7 @@ fn plan(
             };
             work.weights += fours(world) * teams;
             work.record += record_words(world) * teams;
+            work.sets += world.set_words() * teams;
             work.moments += moments_a_team * teams;
             if world.steps() > steps_a_dispatch {
                 work.states += world.agents() * teams;
@@ -345,6 +412,9 @@ fn plan(
         }
     }
     batches.retain(|work| !work.shares.is_empty());
+    if !trace {
+        batches.iter_mut().for_each(|work| work.pack(groups, records));
+    }
     Ok(batches)
 }
 
@@ -373,10 +443,38 @@ pub enum Holding {
     Always,
 }
 
-/// Populations of a trial that take so many bytes are held where nothing else is asked for, but never by a software
-/// renderer: about what goes over the bus in the time of the few dispatches that holding costs. An estimate, not a
-/// measurement.
-pub const HELD_FROM: u64 = 1 << 20;
+/// How records come home where only scores are wanted; no result depends on that.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Records {
+    /// Whole.
+    Whole,
+    /// Those of batches that take at least so many bytes are packed on the device first: of each POI the sets that
+    /// another one contains are left out, and of what followers saw only whom they saw most.
+    PackedFrom(u64),
+    /// All are packed, and room is made for as much as a whole record takes, so that little is ever brought whole.
+    Packed,
+}
+
+impl Records {
+    /// Whether a record of so many bytes is packed.
+    fn packs(self, bytes: u64) -> bool {
+        match self {
+            Records::Whole => false,
+            Records::PackedFrom(least) => bytes >= least,
+            Records::Packed => true,
+        }
+    }
+}
+
+/// Threads of a workgroup that packs a task.
+const PACK_WORKGROUP: usize = 64;
+/// Words before the others in what is packed (`struct Packed` in the shader): how many are taken, and of how many.
+const PACKED_HEAD: usize = 2;
+/// An offset that there is not.
+const NOWHERE: u32 = u32::MAX;
+/// The part of all sets for which room is made at first, and words for chance beside it.
+const KEPT: f64 = 1.0 / 16.0;
+const KEPT_AT_LEAST: usize = 256;
 
 /// Plays episodes on a GPU.
 pub struct GpuEpisodes {
@@ -385,6 +483,11 @@ pub struct GpuEpisodes {
     kernel: Kernel,
     pipelines: HashMap<Shape, wgpu::ComputePipeline>,
     holding: Holding,
+    records: Records,
+    /// Compiled once something is to be packed.
+    pack: Option<(wgpu::ComputePipeline, Layout)>,
+    /// The part of all sets for which room is made.
+    kept: f64,
     /// Compiled once something is to be held.
     kernels: Option<Arc<Kernels>>,
     /// Two sets, so that one batch plays while the other is read.
@@ -413,6 +516,8 @@ pub struct Stages {
     pub score: Duration,
     /// Playing, by the GPU's own clock; 0 where that was not asked for or there is none.
     pub gpu: Duration,
+    /// Bytes that went to the device, and came from it.
+    pub traffic: Traffic,
 }
 
 /// What is to be gathered from populations on the device, and the choices of those teams, `[teams][leaders]` each.
@@ -432,9 +537,39 @@ struct Buffers {
     states: Option<wgpu::Buffer>,
     record_back: Option<wgpu::Buffer>,
     moments_back: Option<wgpu::Buffer>,
+    least: Option<wgpu::Buffer>,
+    packed: Option<wgpu::Buffer>,
+    packed_back: Option<wgpu::Buffer>,
+    /// What comes home of the packed record, if it is packed, and whether the whole one comes in any case.
+    sent: Option<Sent>,
+    whole: bool,
     watch: Option<Stopwatch>,
     /// What to wait for.
     submitted: Option<wgpu::SubmissionIndex>,
+}
+
+/// A packed record on its way home.
+#[derive(Clone, Copy)]
+struct Sent {
+    /// Words that there is room for, tables and owners among them.
+    room: usize,
+    /// Bytes that are copied: all, or only how many words were taken.
+    bytes: u64,
+}
+
+impl Buffers {
+    /// Copies the whole record of a batch that was played, and waits for it.
+    fn bring_record(&mut self, gpu: &Gpu, bytes: u64) -> Result<(), DeviceError> {
+        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ;
+        let back = grown(gpu, &mut self.record_back, "record, read back", bytes, usage)?;
+        let Some(record) = &self.record else { return Ok(()) };
+        let submitted = gpu.scoped("record, read back", || {
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            encoder.copy_buffer_to_buffer(record, 0, back, 0, bytes);
+            gpu.queue.submit([encoder.finish()])
+        })?;
+        gpu.wait_for(Some(submitted))
+    }
 }
 
 /// A buffer of at least so many bytes, made anew where the present one is too small.
@@ -471,6 +606,9 @@ impl GpuEpisodes {
             kernel: if software { Kernel::Generic } else { Kernel::Best },
             pipelines: HashMap::new(),
             holding: if software { Holding::Never } else { Holding::From(HELD_FROM) },
+            records: if software { Records::Whole } else { Records::PackedFrom(PACKED_FROM) },
+            pack: None,
+            kept: KEPT,
             kernels: None,
             lanes: Default::default(),
             staging: Vec::new(),
@@ -500,6 +638,11 @@ impl GpuEpisodes {
     /// The same with other populations held than by default.
     pub fn holding(self, holding: Holding) -> GpuEpisodes {
         GpuEpisodes { holding, ..self }
+    }
+
+    /// The same with records brought home in another way than by default.
+    pub fn bringing(self, records: Records) -> GpuEpisodes {
+        GpuEpisodes { records, ..self }
     }
 
     /// The same with changed shaders, for tests that show that a change is noticed.
@@ -559,8 +702,8 @@ impl GpuEpisodes {
 
     /// Plays all tasks; `done` gets each with the batch's record and moments.
     fn play(&mut self, groups: &[Group<'_>], trace: bool, done: &Done<'_>) -> Result<(), BackendError> {
-        let start = Instant::now();
-        let batches = plan(groups, trace, self.room(), &self.specialised(groups, trace))?;
+        let (start, before) = (Instant::now(), self.gpu.traffic());
+        let batches = plan(groups, trace, self.records, self.room(), &self.specialised(groups, trace))?;
         self.stages.gather += start.elapsed();
         for index in 0..=batches.len() {
             if let Some(work) = batches.get(index) {
@@ -570,6 +713,7 @@ impl GpuEpisodes {
                 self.collect(previous % 2, &batches[previous], trace, done)?;
             }
         }
+        self.stages.traffic += self.gpu.traffic() - before;
         Ok(())
     }
 
@@ -584,6 +728,8 @@ impl GpuEpisodes {
         // Round by round, each shape's tasks stand together, from where a binding may start.
         let mut tasks: Vec<Task> = Vec::new();
         let mut dispatches: Vec<(Shape, usize, [u32; 3])> = Vec::new();
+        // Those that play every task once.
+        let mut first_round = 0;
         let mut shapes: Vec<Shape> = work.shares.iter().map(|share| share.shape).collect();
         shapes.sort_unstable();
         shapes.dedup();
@@ -600,8 +746,25 @@ impl GpuEpisodes {
                 tasks.resize(first + (grid[0] * grid[1]) as usize, Task::default());
                 dispatches.push((shape, first, grid));
                 self.prepare_pipeline(shape)?;
+                first_round += usize::from(round == 0);
             }
         }
+        if work.head.is_some() {
+            self.prepare_packing()?;
+        }
+        let sent = work.head.map(|head| {
+            let most = work.record - PACKED_HEAD - 1;
+            let room = match self.records {
+                Records::Packed => most,
+                _ => head + (work.sets as f64 * self.kept) as usize + KEPT_AT_LEAST,
+            };
+            // Where nearly all sets are kept, they are packed only to see when that changes.
+            match room <= most {
+                true => Sent { room, bytes: ((PACKED_HEAD + room) * size_of::<u32>()) as u64 },
+                false => Sent { room: head, bytes: (PACKED_HEAD * size_of::<u32>()) as u64 },
+            }
+        });
+        let whole = work.head.is_none_or(|head| sent.is_some_and(|sent| sent.room == head));
 
         let gpu = &self.gpu;
         let buffers = &mut self.lanes[lane];
@@ -612,7 +775,7 @@ impl GpuEpisodes {
         let moment_bytes = (work.moments * size_of::<Moment>()) as u64;
         let upload = |buffer, what, bytes: &[u8]| -> Result<wgpu::Buffer, DeviceError> {
             let buffer = grown(gpu, buffer, what, bytes.len() as u64, input)?;
-            gpu.scoped(what, || gpu.queue.write_buffer(buffer, 0, bytes))?;
+            gpu.scoped(what, || gpu.write(buffer, 0, bytes))?;
             Ok(buffer.clone())
         };
         let worlds = upload(&mut buffers.worlds, "worlds", bytemuck::cast_slice(&work.worlds))?;
@@ -626,7 +789,7 @@ impl GpuEpisodes {
                 let end = last.task.weights as usize + last.fours(groups);
                 let bytes = bytemuck::cast_slice(&self.staging[first..end]);
                 let offset = (first * size_of::<[f32; FOUR]>()) as u64;
-                gpu.scoped("weights", || gpu.queue.write_buffer(&weights, offset, bytes))?;
+                gpu.scoped("weights", || gpu.write(&weights, offset, bytes))?;
             }
         }
         let mut gathers = Vec::with_capacity(stretches.len());
@@ -642,14 +805,30 @@ impl GpuEpisodes {
         let moments = grown(gpu, &mut buffers.moments, "moments", moment_bytes, output)?;
         let state_bytes = (work.states * size_of::<State>()) as u64;
         let states = grown(gpu, &mut buffers.states, "states", state_bytes, output)?;
-        let record_back = grown(gpu, &mut buffers.record_back, "record, read back", record_bytes, back)?;
+        let record_back = match whole {
+            true => Some(grown(gpu, &mut buffers.record_back, "record, read back", record_bytes, back)?),
+            false => None,
+        };
         let moments_back = match trace {
             true => Some(grown(gpu, &mut buffers.moments_back, "moments, read back", moment_bytes, back)?),
             false => None,
         };
 
-        let mut bound = Vec::with_capacity(dispatches.len());
-        for (shape, first, grid) in dispatches {
+        let packing = match (work.head, sent, &self.pack) {
+            (Some(head), Some(sent), Some(pack)) => {
+                let bytes = ((PACKED_HEAD + sent.room) * size_of::<u32>()) as u64;
+                let packed = grown(gpu, &mut buffers.packed, "packed record", bytes, output | Usage::COPY_DST)?;
+                let header = [head as u32, sent.room as u32];
+                gpu.scoped("packed record", || gpu.write(packed, 0, bytemuck::cast_slice(&header)))?;
+                let back = grown(gpu, &mut buffers.packed_back, "packed record, read back", sent.bytes, back)?;
+                let least = upload(&mut buffers.least, "sizes of sets", bytemuck::cast_slice(&work.least))?;
+                Some((pack, least, packed, back, sent.bytes))
+            }
+            _ => None,
+        };
+
+        let (mut bound, mut packs) = (Vec::with_capacity(dispatches.len()), Vec::new());
+        for (index, (shape, first, grid)) in dispatches.into_iter().enumerate() {
             let tasks = wgpu::BufferBinding {
                 buffer: &all_tasks,
                 offset: (first * size_of::<Task>()) as u64,
@@ -657,6 +836,12 @@ impl GpuEpisodes {
             };
             let [worlds, places, weights, record, moments, states] =
                 [&worlds, &places, &weights, record, moments, states].map(|buffer| buffer.as_entire_buffer_binding());
+            if let Some(((pipeline, layout), least, packed, ..)) = packing.as_ref().filter(|_| index < first_round) {
+                let [least, packed] = [least, *packed].map(|buffer| buffer.as_entire_buffer_binding());
+                let group =
+                    gpu.bind("pack", layout, &[worlds.clone(), tasks.clone(), least, packed, record.clone()])?;
+                packs.push((pipeline, group, grid));
+            }
             let group =
                 gpu.bind("episode", &self.layout, &[worlds, tasks, places, weights, record, moments, states])?;
             bound.push((&self.pipelines[&shape], group, grid));
@@ -665,45 +850,75 @@ impl GpuEpisodes {
         let submitted = gpu.scoped("episodes", || {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             let mut pass = encoder.begin_compute_pass(&timed(watch));
-            for (pipeline, group, [x, y, z]) in gathers.iter().chain(&bound) {
+            for (pipeline, group, [x, y, z]) in gathers.iter().chain(&bound).chain(&packs) {
                 pass.set_pipeline(pipeline);
                 pass.set_bind_group(0, group, &[]);
                 pass.dispatch_workgroups(*x, *y, *z);
             }
             drop(pass);
             watch.inspect(|watch| watch.stop(&mut encoder));
-            encoder.copy_buffer_to_buffer(record, 0, record_back, 0, record_bytes);
+            if let Some(record_back) = record_back {
+                encoder.copy_buffer_to_buffer(record, 0, record_back, 0, record_bytes);
+            }
+            if let Some((.., packed, back, bytes)) = packing {
+                encoder.copy_buffer_to_buffer(packed, 0, back, 0, bytes);
+            }
             if let Some(moments_back) = moments_back {
                 encoder.copy_buffer_to_buffer(moments, 0, moments_back, 0, moment_bytes);
             }
             gpu.queue.submit([encoder.finish()])
         })?;
         buffers.submitted = Some(submitted);
+        (buffers.sent, buffers.whole) = (sent, whole);
         self.stages.upload += gathered.elapsed();
         Ok(())
     }
 
     /// Waits for one batch and hands its record on.
     fn collect(&mut self, lane: usize, work: &Work, trace: bool, done: &Done<'_>) -> Result<(), DeviceError> {
-        let buffers = &self.lanes[lane];
         let start = Instant::now();
-        self.gpu.wait_for(buffers.submitted.clone())?;
+        self.gpu.wait_for(self.lanes[lane].submitted.clone())?;
         let done_waiting = Instant::now();
-        let share_out = |record: &[u8], moments: &[Moment]| {
+        let mut score = Duration::ZERO;
+        let mut share_out = |record: Home<'_>, moments: &[Moment]| {
             let start = Instant::now();
-            let record = bytemuck::cast_slice(record);
             work.shares.par_iter().for_each(|share| done(share, record, moments));
-            start.elapsed()
+            score += start.elapsed();
         };
         let record_bytes = (work.record * size_of::<u32>()) as u64;
         let moment_bytes = (work.moments * size_of::<Moment>()) as u64;
-        let score = match (&buffers.record_back, &buffers.moments_back) {
-            (Some(record), Some(moments)) if trace => self.gpu.mapped(record, 0..record_bytes, |record| {
-                self.gpu.mapped(moments, 0..moment_bytes, |moments| share_out(record, bytemuck::cast_slice(moments)))
-            })??,
-            (Some(record), _) => self.gpu.mapped(record, 0..record_bytes, |record| share_out(record, &[]))?,
-            _ => unreachable!("a batch was submitted"),
-        };
+        let buffers = &mut self.lanes[lane];
+        let mut fits = false;
+        if let (Some(head), Some(Sent { room, bytes }), Some(back)) = (work.head, buffers.sent, &buffers.packed_back) {
+            let used = self.gpu.mapped(back, 0..bytes, |bytes| {
+                let words: &[u32] = bytemuck::cast_slice(bytes);
+                let used = words[0] as usize;
+                fits = used <= room && words.len() > PACKED_HEAD;
+                if fits {
+                    share_out(Home::Packed(&words[PACKED_HEAD..]), &[]);
+                }
+                used
+            })?;
+            // Half as much again, since the next generation may keep more; and a batch that did stays in mind for a while.
+            let kept = 1.5 * used.saturating_sub(head) as f64 / work.sets as f64;
+            self.kept = kept.max(0.9 * self.kept);
+        }
+        if !fits {
+            if !buffers.whole {
+                buffers.bring_record(&self.gpu, record_bytes)?;
+            }
+            match (&buffers.record_back, &buffers.moments_back) {
+                (Some(record), Some(moments)) if trace => self.gpu.mapped(record, 0..record_bytes, |record| {
+                    self.gpu.mapped(moments, 0..moment_bytes, |moments| {
+                        share_out(Home::Whole(bytemuck::cast_slice(record)), bytemuck::cast_slice(moments));
+                    })
+                })??,
+                (Some(record), _) => self.gpu.mapped(record, 0..record_bytes, |record| {
+                    share_out(Home::Whole(bytemuck::cast_slice(record)), &[]);
+                })?,
+                _ => unreachable!("a batch was submitted"),
+            }
+        }
         if let Some(watch) = &buffers.watch {
             self.stages.gpu += watch.read(&self.gpu)?;
         }
@@ -729,7 +944,7 @@ impl GpuEpisodes {
                     leaders: leaders as u32,
                     first: first as u32,
                     count: TOGETHER.min(leaders - first) as u32,
-                    parameters: group.world.constants.parameters,
+                    parameters: group.world.constants.policy.parameters,
                     teams,
                     teams_a_task: shares[0].task.teams,
                     choices: choices.len() as u32,
@@ -763,6 +978,16 @@ impl GpuEpisodes {
         });
     }
 
+    fn prepare_packing(&mut self) -> Result<(), DeviceError> {
+        use Binding::{Read, Write};
+        if self.pack.is_none() {
+            let layout = self.gpu.layout("pack", &[Read, Read, Read, Write, Write])?;
+            let pipeline = self.gpu.own_pipeline("pack", &(self.edit)(packing()), "pack", &layout)?;
+            self.pack = Some((pipeline, layout));
+        }
+        Ok(())
+    }
+
     fn prepare_pipeline(&mut self, shape: Shape) -> Result<(), DeviceError> {
         if let Entry::Vacant(entry) = self.pipelines.entry(shape) {
             entry.insert(self.gpu.own_pipeline("episode", &(self.edit)(source(shape)), "episode", &self.layout)?);
@@ -771,14 +996,20 @@ impl GpuEpisodes {
     }
 }
 
-fn is_on_host(groups: &[Group<'_>], share: &Share) -> bool {
-    matches!(groups[share.group].weights, Weights::OnHost(_))
+/// The whole shader that packs records, with its constants in front.
+fn packing() -> String {
+    let most = WORKGROUPS[WORKGROUPS.len() - 1].max(TEAMS[0]);
+    exact::assemble(&[
+        &format!(
+            "const WORKGROUP: u32 = {PACK_WORKGROUP}u;\nconst TEAMS: u32 = {most}u;\nconst NOWHERE: u32 = {NOWHERE}u;"
+        ),
+        include_str!("../../../shaders/lib/layout.wgsl"),
+        include_str!("../../../shaders/pack.wgsl"),
+    ])
 }
 
-/// A dispatch of at least `tasks` workgroups, within the device's limit on each side.
-pub(super) fn grid(tasks: usize, limits: &wgpu::Limits) -> [u32; 3] {
-    let rows = tasks.div_ceil(limits.max_compute_workgroups_per_dimension as usize).max(1);
-    [tasks.div_ceil(rows) as u32, rows as u32, 1]
+fn is_on_host(groups: &[Group<'_>], share: &Share) -> bool {
+    matches!(groups[share.group].weights, Weights::OnHost(_))
 }
 
 /// The whole shader, with what it has in front.
@@ -798,39 +1029,34 @@ fn source(shape: Shape) -> String {
     );
     let front = match sizes {
         Sizes::Any { widest } => {
-            format!("const WIDEST: u32 = {widest}u;\n{}", include_str!("../../../shaders/generic.wgsl"))
+            let variant = Variant::copied_from("world");
+            let generic = include_str!("../../../shaders/generic.wgsl");
+            format!("const WIDEST: u32 = {widest}u;\nfn world_variant() -> Variant {{ return {variant}; }}\n{generic}")
         }
-        Sizes::Fixed { teams, leaders, agents, pois, widths, density, by_sine } => format!(
-            "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u, {density}u, {by_sine});\n\
+        Sizes::Fixed { teams, leaders, agents, pois, widths, variant } => format!(
+            "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u);\nconst variant = {variant};\n\
              fn adopt(task: Task) {{}}\n{}",
             straight_policy(&widths),
-            words = agents.div_ceil(32)
+            words = agents.div_ceil(32),
+            variant = variant.value()
         ),
     };
-    exact::assemble(&[
-        &constants,
-        &front,
-        include_str!("../../../shaders/lib/layout.wgsl"),
-        include_str!("../../../shaders/lib/math.wgsl"),
-        include_str!("../../../shaders/sense.wgsl"),
-        include_str!("../../../shaders/policy.wgsl"),
-        include_str!("../../../shaders/follow.wgsl"),
-        include_str!("../../../shaders/motion.wgsl"),
-        include_str!("../../../shaders/couple.wgsl"),
-        include_str!("../../../shaders/episode.wgsl"),
-    ])
+    let structs = [Task::wgsl(), State::wgsl(), Moment::wgsl()].concat();
+    let (front, math) =
+        ([constants, front, model::declarations(), structs], include_str!("../../../shaders/lib/math.wgsl"));
+    let front = front.iter().map(String::as_str).chain([include_str!("../../../shaders/lib/layout.wgsl"), math]);
+    let parts = front.chain(model::WGSL).chain([include_str!("../../../shaders/episode.wgsl")]);
+    exact::assemble(&parts.collect::<Vec<_>>())
 }
 
 /// A policy of these widths as straight-line code: `decide` of `shaders/generic.wgsl`, its loops written out. Each unit is
 /// a variable, and four weights at a time are read in the order in which they are needed, so that a compiler may read
 /// many before it waits for any.
 fn straight_policy(widths: &[u32; WIDTHS]) -> String {
-    let mut text =
-        String::from("fn decide(lane: u32, stride: u32, of_pois: vec4<f32>, of_agents: vec4<f32>) -> vec2<f32> {\n");
+    let mut text = String::from("fn decide(start: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
     let mut line = |line: std::fmt::Arguments<'_>| writeln!(text, "    {line}").expect("a string takes a line");
     let mut read = HashSet::new();
-    let mut inputs: Vec<String> =
-        (0..INPUTS).map(|input| format!("{}.{}", ["of_pois", "of_agents"][input / 4], AXES[input % 4])).collect();
+    let mut inputs: Vec<String> = (0..INPUTS).map(|input| format!("inputs[{input}]")).collect();
     let mut first = 0;
     let layers = widths.windows(2).take_while(|pair| pair[1] > 0);
     for (layer, pair) in layers.enumerate() {
@@ -841,7 +1067,7 @@ fn straight_policy(widths: &[u32; WIDTHS]) -> String {
                 let weight = first + row * columns + column;
                 let (four, axis) = (weight / FOUR, AXES[weight % FOUR]);
                 if read.insert(four) {
-                    line(format_args!("let w{four} = weights[lane + {four}u * stride];"));
+                    line(format_args!("let w{four} = weights[start + {four}u * stride];"));
                 }
                 match row == rows {
                     true => line(format_args!("var s{layer}_{column} = w{four}.{axis};")),
@@ -867,7 +1093,8 @@ pub fn shaders() -> Vec<(&'static str, String)> {
         |workgroup, slots, widest, trace| source(Shape { workgroup, slots, trace, sizes: Sizes::Any { widest } });
     let specialised = |trace| {
         let widths = [INPUTS as u32, 10, OUTPUTS as u32, 0, 0];
-        let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, density: 0, by_sine: true };
+        let variant = Variant { density: 0, by_sine: 1 };
+        let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, variant };
         source(Shape { workgroup: 384, slots: 1, trace, sizes })
     };
     vec![
@@ -876,6 +1103,7 @@ pub fn shaders() -> Vec<(&'static str, String)> {
         ("episode, large teams", generic(256, 5, 64, false)),
         ("episode, specialised", specialised(false)),
         ("episode, specialised, traced", specialised(true)),
+        ("pack", packing()),
     ]
 }
 
@@ -894,19 +1122,34 @@ pub fn shader_of(world: &World, kernel: Kernel, threads: usize) -> String {
 impl Backend for GpuEpisodes {
     fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
         groups.iter().try_for_each(Group::check)?;
-        self.play(groups, false, &|share, record, _| {
+        self.play(groups, false, &|share, home, _| {
             let world = groups[share.group].world;
-            let Task { sets, seen, teams, .. } = share.task;
-            let stride = teams as usize;
-            let sets = &record[sets as usize..][..world.set_words() * stride];
-            let seen = &record[seen as usize..][..world.leaders() * world.followers() * stride];
-            for offset in 0..stride {
-                visit(Episode {
-                    group: share.group,
-                    team: share.first_team + offset,
-                    sets: Strided { words: sets, stride, offset },
-                    seen: Strided { words: seen, stride, offset },
-                });
+            let Task { sets, seen, table, owners, .. } = share.task;
+            let stride = share.task.teams as usize;
+            let (group, first) = (share.group, share.first_team);
+            match home {
+                Home::Whole(record) => {
+                    let sets = &record[sets as usize..][..world.set_words() * stride];
+                    let seen = &record[seen as usize..][..world.leaders() * world.followers() * stride];
+                    for offset in 0..stride {
+                        let strided = |words| Strided { words, stride, offset };
+                        let (sets, seen) = (strided(sets), Seen::Counts(strided(seen)));
+                        visit(Episode { group, team: first + offset, sets, seen });
+                    }
+                }
+                Home::Packed(words) => {
+                    let table = &words[table as usize..][..=stride];
+                    let owners = match owners {
+                        NOWHERE => &[],
+                        owners => &words[owners as usize..][..owner_words(world) * stride],
+                    };
+                    for (offset, ends) in table.windows(2).enumerate() {
+                        let words = &words[ends[0] as usize..ends[1] as usize];
+                        let sets = Strided { words, stride: 1, offset: 0 };
+                        let seen = Seen::Most(Strided { words: owners, stride, offset });
+                        visit(Episode { group, team: first + offset, sets, seen });
+                    }
+                }
             }
         })
     }
@@ -923,7 +1166,8 @@ impl Backend for GpuEpisodes {
             sets: vec![0; teams * set_words],
             seen: vec![0; teams * seen_words],
         });
-        self.play(std::slice::from_ref(group), true, &|share, record, moments| {
+        self.play(std::slice::from_ref(group), true, &|share, home, moments| {
+            let Home::Whole(record) = home else { unreachable!("no trace is packed") };
             let mut trace = trace.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
             let task = share.task;
             let stride = task.teams as usize;
@@ -961,7 +1205,7 @@ impl Backend for GpuEpisodes {
             return match self.holding {
                 Holding::Always => Err(BackendError::TooLarge(format!(
                     "the policies of one leader take {bytes} bytes, this adapter holds {allowed} in one buffer; \
-                     use --breed host, or a smaller population"
+                     breed on the host, or use a smaller population"
                 ))),
                 _ => Ok(None),
             };

@@ -1,0 +1,170 @@
+// Keeps of each team's record what its scores hang on, so that little has to come home. The record stays as it is.
+//
+// A set that another set of its POI contains changes no score (src/credit.rs says why). A POI's sets mostly grow as
+// agents come near, then shrink, so it is enough to go through them once and keep those that neither their predecessor
+// among the kept ones nor their successor contains. A team's kept sets become the record of an episode of fewer steps.
+//
+// The host puts these constants in front:
+//   WORKGROUP  threads of a workgroup
+//   TEAMS      teams of a task at most
+//   NOWHERE    an offset that there is not
+
+struct Packed {
+    // Words taken, more than `room` if they did not fit.
+    used: atomic<u32>,
+    room: u32,
+    // Of each task a table `[teams + 1]` of where its teams' sets start and end, and where that is asked for the leaders
+    // that followers saw most, `[words][teams]`. After all that the sets, `[rows][pois][words]` of each team.
+    words: array<u32>,
+}
+
+// In place of what an episode reads. How many agents a set must have to be kept, of each POI.
+@group(0) @binding(3) var<storage, read> least: array<u32>;
+@group(0) @binding(4) var<storage, read_write> packed: Packed;
+
+// Rows that each team takes, and where they start, or NOWHERE if they do not fit.
+var<workgroup> rows: array<atomic<u32>, TEAMS>;
+var<workgroup> homes: array<u32, TEAMS>;
+
+// Goes through the sets of one POI of one team and returns how many are kept. Unless `home` is NOWHERE, they go there, and
+// rows up to `all` are filled with empty sets.
+fn keep(task: Task, sizes: Sizes, team: u32, poi: u32, home: u32, all: u32) -> u32 {
+    let row = sizes.pois * sizes.words * task.teams;
+    let first = task.sets + poi * sizes.words * task.teams + team;
+    let enough = least[task.least + poi];
+    var kept = 0u;
+    // The set that is kept unless the next ones contain it.
+    var held = NOWHERE;
+    for (var step = 0u; step < sizes.steps; step++) {
+        var size = 0u;
+        var more = 0u;
+        var less = 0u;
+        for (var word = 0u; word < sizes.words; word++) {
+            let now = record[first + step * row + word * task.teams];
+            var before = 0u;
+            if held != NOWHERE {
+                before = record[first + held + word * task.teams];
+            }
+            size += countOneBits(now);
+            more |= now & ~before;
+            less |= before & ~now;
+        }
+        if size >= enough && more != 0u {
+            if less != 0u {
+                if home != NOWHERE {
+                    copy(task, sizes, first + held, home + (kept * sizes.pois + poi) * sizes.words);
+                }
+                kept += 1u;
+            }
+            held = step * row;
+        }
+    }
+    if held != NOWHERE {
+        if home != NOWHERE {
+            copy(task, sizes, first + held, home + (kept * sizes.pois + poi) * sizes.words);
+        }
+        kept += 1u;
+    }
+    for (var empty = kept; home != NOWHERE && empty < all; empty++) {
+        for (var word = 0u; word < sizes.words; word++) {
+            packed.words[home + (empty * sizes.pois + poi) * sizes.words + word] = 0u;
+        }
+    }
+    return kept;
+}
+
+fn copy(task: Task, sizes: Sizes, place: u32, home: u32) {
+    for (var word = 0u; word < sizes.words; word++) {
+        packed.words[home + word] = record[place + word * task.teams];
+    }
+}
+
+// What of a world is needed here.
+struct Sizes {
+    leaders: u32,
+    followers: u32,
+    pois: u32,
+    words: u32,
+    steps: u32,
+}
+
+// The leader that a follower saw most, ties to the lower index, or `nobody`.
+fn owner(task: Task, sizes: Sizes, team: u32, follower: u32, nobody: u32) -> u32 {
+    var most = 0u;
+    var best = nobody;
+    for (var leader = 0u; leader < sizes.leaders; leader++) {
+        let steps = record[task.seen + (follower * sizes.leaders + leader) * task.teams + team];
+        if steps > most {
+            most = steps;
+            best = leader;
+        }
+    }
+    return best;
+}
+
+// One workgroup packs one task.
+@compute @workgroup_size(WORKGROUP)
+fn pack(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    // Empty tasks have no teams.
+    let task = tasks[workgroup.y * workgroups.x + workgroup.x];
+    let world = task.world;
+    let sizes = Sizes(
+        worlds[world].leaders,
+        worlds[world].followers,
+        worlds[world].pois,
+        worlds[world].words,
+        worlds[world].steps,
+    );
+    for (var team = thread; team < task.teams; team += WORKGROUP) {
+        atomicStore(&rows[team], 0u);
+    }
+    workgroupBarrier();
+    // Neighbouring threads read neighbouring teams.
+    let items = sizes.pois * task.teams;
+    for (var item = thread; item < items; item += WORKGROUP) {
+        let team = item % task.teams;
+        atomicMax(&rows[team], keep(task, sizes, team, item / task.teams, NOWHERE, 0u));
+    }
+    workgroupBarrier();
+    let row = sizes.pois * sizes.words;
+    if thread == 0u && task.teams > 0u {
+        var size = 0u;
+        for (var team = 0u; team < task.teams; team++) {
+            size += atomicLoad(&rows[team]) * row;
+        }
+        var home = atomicAdd(&packed.used, size);
+        let fits = home + size <= packed.room;
+        for (var team = 0u; team < task.teams; team++) {
+            homes[team] = select(NOWHERE, home, fits);
+            packed.words[task.table + team] = home;
+            home += atomicLoad(&rows[team]) * row;
+        }
+        packed.words[task.table + task.teams] = home;
+    }
+    workgroupBarrier();
+    for (var item = thread; item < items; item += WORKGROUP) {
+        let team = item % task.teams;
+        keep(task, sizes, team, item / task.teams, homes[team], atomicLoad(&rows[team]));
+    }
+    if task.owners == NOWHERE {
+        return;
+    }
+    let nobody = select(0xffffu, 0xffu, sizes.leaders < 255u);
+    let bits = select(16u, 8u, sizes.leaders < 255u);
+    let a_word = 32u / bits;
+    let owner_items = (sizes.followers + a_word - 1u) / a_word * task.teams;
+    for (var item = thread; item < owner_items; item += WORKGROUP) {
+        let team = item % task.teams;
+        let first = item / task.teams * a_word;
+        let last = min(first + a_word, sizes.followers);
+        var word = 0u;
+        for (var follower = first; follower < last; follower++) {
+            word |= owner(task, sizes, team, follower, nobody) << ((follower - first) * bits);
+        }
+        packed.words[task.owners + item] = word;
+    }
+}

@@ -1,0 +1,317 @@
+//! What comes home of a GPU's episodes: scores are the same from whole and from packed records, whatever matters of them,
+//! and little goes over the bus.
+
+#![cfg(feature = "gpu")]
+
+mod common;
+
+use std::collections::BTreeMap;
+use std::sync::Mutex;
+
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records};
+use flotilla::backend::gpu::{self, device::Request};
+use flotilla::backend::{Backend, Group, Need};
+use flotilla::config::{Config, Fitness, Paradigm};
+use flotilla::credit::Credit;
+use flotilla::sample;
+use flotilla::sweep::Sweep;
+use flotilla::trainer::Trainer;
+use flotilla::world::World;
+
+const NEEDS: [Need; 5] = [
+    Need::Scores,
+    Need::Score(Fitness::G),
+    Need::Score(Fitness::D),
+    Need::Score(Fitness::Df),
+    Need::Score(Fitness::Dpp),
+];
+
+/// Some teams of one world; their policies' weights are random, or all 0.
+struct Teams {
+    world: World,
+    weights: Vec<f32>,
+    choice: Vec<u32>,
+}
+
+impl Teams {
+    fn new(config: &Config, teams: usize, random: bool) -> Teams {
+        let world = World::new(config);
+        let mut weights = sample::weights(&world, 5, config.learning.seed);
+        if !random {
+            weights.fill(0.0);
+        }
+        Teams { choice: (0..teams * world.leaders()).map(|place| (place * 7 % 5) as u32).collect(), weights, world }
+    }
+
+    fn group(&self, need: Need) -> Group<'_> {
+        let Teams { world, weights, choice } = self;
+        Group { world, starts: &world.starts, weights: weights[..].into(), policies: 5, teams: choice, need }
+    }
+
+    /// Bytes of their whole record.
+    fn whole(&self) -> u64 {
+        let words = self.world.set_words() + self.world.leaders() * self.world.followers();
+        (self.choice.len() / self.world.leaders() * words * 4) as u64
+    }
+}
+
+/// POIs observed and what the need asks for, of every team of every group.
+type Scores = BTreeMap<(usize, usize), (u32, Vec<Vec<f32>>)>;
+
+/// Plays all teams as one batch, the needs of the groups by turns from `first` on; `asked` is what the backend is told.
+fn scores(backend: &mut dyn Backend, all: &[Teams], first: usize, asked: impl Fn(Need) -> Need) -> Scores {
+    let need = |group: usize| NEEDS[(group + first) % NEEDS.len()];
+    let groups: Vec<_> = all.iter().enumerate().map(|(index, teams)| teams.group(asked(need(index)))).collect();
+    let scores = Mutex::new(Scores::new());
+    let visit = |episode: flotilla::backend::Episode<'_>| {
+        let (world, mut credit) = (groups[episode.group].world, Credit::default());
+        let found = match need(episode.group) {
+            Need::Score(fitness) => {
+                let mut one = vec![0.0; world.leaders()];
+                (credit.score(&episode, world, fitness, &mut one), vec![one])
+            }
+            _ => {
+                let all = credit.all(&episode, world);
+                (all.observed, vec![all.d, all.df, all.dpp])
+            }
+        };
+        let before = scores.lock().unwrap().insert((episode.group, episode.team), found);
+        assert!(before.is_none(), "a team is visited twice");
+    };
+    backend.rollout(&groups, &visit).unwrap();
+    scores.into_inner().unwrap()
+}
+
+fn expected(all: &[Teams], first: usize) -> Scores {
+    scores(&mut Cpu::default(), all, first, |_| Need::Record)
+}
+
+fn open(request: &Request, records: Records) -> GpuEpisodes {
+    GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap().bringing(records)
+}
+
+/// What came from the device since this was last asked.
+fn down(backend: &mut GpuEpisodes) -> u64 {
+    backend.take_stages().traffic.down
+}
+
+fn config(text: &str) -> Config {
+    Config::parse(text, "records.toml").unwrap()
+}
+
+/// `[[x, y], …]`, a step apart from each other.
+fn line(count: usize, [x, y]: [f64; 2], [dx, dy]: [f64; 2]) -> String {
+    let places = (0..count).map(|i| format!("[{:?}, {:?}]", x + i as f64 * dx, y + i as f64 * dy));
+    format!("[{}]", places.collect::<Vec<_>>().join(", "))
+}
+
+/// Random worlds; more agents than a word has bits, more leaders than a byte tells apart, more POIs than threads.
+fn worlds() -> Vec<Config> {
+    let odd = [
+        format!(
+            "[world]\nleaders = {}\nfollowers = {}\npois = {}\nsteps = 12\ncoupling = [3, 20, 70]\n\
+             [policy]\nhidden = []",
+            line(30, [10.0, 5.0], [0.3, 0.0]),
+            line(41, [10.0, 4.0], [0.2, 0.0]),
+            line(3, [12.0, 8.0], [2.0, 0.0])
+        ),
+        format!(
+            "[world]\nleaders = {}\nfollowers = {}\npois = {}\nsteps = 3\ncoupling = 1\n[policy]\nhidden = []",
+            line(260, [5.0, 5.0], [0.1, 0.0]),
+            line(5, [30.5, 4.0], [0.1, 0.0]),
+            line(70, [5.0, 6.0], [0.5, 0.1])
+        ),
+    ];
+    (0..28).map(sample::world).chain(odd.iter().map(|text| config(text))).collect()
+}
+
+#[test]
+fn scores_are_the_same_from_whole_and_packed_records() {
+    let all: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37, true)).collect();
+    let expected: Vec<Scores> = (0..2).map(|first| expected(&all, first)).collect();
+    let different = expected[0].values().filter(|(observed, _)| *observed > 0).count();
+    assert!(different > 100, "only {different} teams observe anything");
+    for (request, info) in common::adapters("scores_are_the_same_from_whole_and_packed_records") {
+        for (first, expected) in expected.iter().enumerate() {
+            for (records, bytes) in [(Records::Whole, 1 << 28), (Records::Packed, 1 << 28), (Records::Packed, 1 << 15)]
+            {
+                let mut backend = open(&request, records).batched(bytes).playing(Kernel::Generic);
+                let found = scores(&mut backend, &all, first, |need| need);
+                assert!(found == *expected, "{info}: needs from {first} on, {records:?}, batches of {bytes} bytes");
+            }
+        }
+        let mut checked = open(&Request { checked: true, ..request }, Records::Packed);
+        assert!(scores(&mut checked, &all, 0, |need| need) == expected[0], "{info}: checked");
+    }
+}
+
+/// The canary: each part of the rule, changed in the shader, changes scores.
+#[test]
+fn a_changed_rule_is_noticed() {
+    type Edit = fn(String) -> String;
+    let edits: [Edit; 4] = [
+        |text| text.replace("size >= enough", "size > enough"),
+        |text| text.replace("if less != 0u", "if more == 0u"),
+        |text| text.replace("step < sizes.steps", "step + 1u < sizes.steps"),
+        |text| text.replace("if steps > most", "if steps >= most"),
+    ];
+    let all: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37, true)).collect();
+    let expected = expected(&all, 0);
+    for (request, info) in common::adapters("a_changed_rule_is_noticed") {
+        for (index, edit) in edits.into_iter().enumerate() {
+            let mut backend = open(&request, Records::Packed).edited(edit);
+            assert!(scores(&mut backend, &all, 0, |need| need) != expected, "{info}: edit {index} was not noticed");
+        }
+    }
+}
+
+/// Agents in single file at a steady pace: at every step another one is at the POI, so every set matters, the packed record
+/// is as large as the whole one, and does not fit. Then nobody comes near a POI, and nothing matters.
+#[test]
+fn everything_or_nothing_may_matter() {
+    let file = |poi: f64| {
+        let text = format!(
+            "[world]\nspeed = 1.5\nleaders = {}\npois = [[10.0, {poi:?}]]\nsteps = 24\ncoupling = 1\n\
+             observation_radius = 0.14\n[policy]\nhidden = []",
+            line(24, [10.0, 20.0], [0.0, -0.3])
+        );
+        vec![Teams::new(&config(&text), 500, false)]
+    };
+    let (dense, empty) = (file(20.3), file(45.0));
+    let [for_dense, for_empty] = [&dense, &empty].map(|teams| expected(teams, 0));
+    assert!(for_dense.values().all(|(observed, _)| *observed == 1) && for_empty.values().all(|(o, _)| *o == 0));
+    let (whole, table) = (dense[0].whole(), 501 * 4);
+    for (request, info) in common::adapters("everything_or_nothing_may_matter") {
+        let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
+        let mut play = |all: &[Teams], expected: &Scores| {
+            assert!(scores(&mut backend, all, 0, |need| need) == *expected, "{info}");
+            down(&mut backend)
+        };
+        let first = play(&empty, &for_empty);
+        assert!(first >= table && first < whole / 4, "{info}: {first} of {whole} bytes");
+        let overflown = play(&dense, &for_dense);
+        assert!(overflown > whole && overflown < whole + whole / 4, "{info}: {overflown} of {whole} bytes");
+        assert_eq!(play(&dense, &for_dense), whole + 8, "{info}: known to be dense");
+        // It packs again once less matters.
+        let again = (0..60).map(|_| play(&empty, &for_empty)).find(|&bytes| bytes < whole / 4);
+        assert!(again.is_some(), "{info}: whole records for ever");
+    }
+}
+
+/// Whole records come home where they are asked for, where one dispatch cannot pack them, and by default from software.
+#[test]
+fn whole_records_come_where_they_must() {
+    let text = |steps: usize| {
+        format!(
+            "[world]\nleaders = [[10.0, 5.0], [20.0, 5.0]]\nfollowers = [[12.0, 2.0], [8.0, 2.0]]\n\
+             pois = [[10.0, 15.0], [30.0, 40.0]]\nsteps = {steps}\ncoupling = 1\n[policy]\nhidden = []"
+        )
+    };
+    let of = |steps: usize| vec![Teams::new(&config(&text(steps)), 20, true)];
+    let (short, long, longest) = (of(100), of(3000), of(10_000));
+    let [for_short, for_long, for_longest] = [&short, &long, &longest].map(|teams| expected(teams, 0));
+    for (request, info) in common::adapters("whole_records_come_where_they_must") {
+        let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
+        assert!(scores(&mut backend, &short, 0, |_| Need::Record) == for_short, "{info}");
+        assert_eq!(down(&mut backend), short[0].whole(), "{info}: the record was asked for");
+        // Several dispatches.
+        assert!(scores(&mut backend, &long, 0, |need| need) == for_long, "{info}");
+        assert!(down(&mut backend) < long[0].whole(), "{info}: 3000 steps");
+        assert!(scores(&mut backend, &longest, 0, |need| need) == for_longest, "{info}");
+        assert_eq!(down(&mut backend), longest[0].whole(), "{info}: 10 000 steps");
+        let mut small = open(&request, Records::PackedFrom(1 << 20)).playing(Kernel::Generic);
+        assert!(scores(&mut small, &short, 0, |need| need) == for_short, "{info}");
+        assert_eq!(down(&mut small), short[0].whole(), "{info}: not worth packing");
+    }
+}
+
+/// Bytes over the bus, up and down, of every generation of generally forward under Df, its populations held, by team:
+/// at 2^20 teams 100 MB are 95. More teams by `FLOTILLA_TEAMS`.
+#[test]
+fn a_generation_moves_less_than_95_bytes_a_team() {
+    let mut config = config(include_str!("../configs/generally_forward.toml"));
+    let teams = std::env::var("FLOTILLA_TEAMS").map_or(1 << 11, |teams| teams.parse().unwrap());
+    (config.learning.trials, config.learning.population, config.learning.generations) = (1, teams, 60);
+    config.learning.fitness = Fitness::Df;
+    for (request, info) in common::adapters("a_generation_moves_less_than_95_bytes_a_team") {
+        let mut backend = open(&request, Records::PackedFrom(0)).holding(Holding::Always);
+        let mut trainer = Trainer::new(vec![config.clone()]);
+        let mut before = backend.gpu().traffic();
+        for generation in 0..=50 {
+            let rows = trainer.advance(&mut backend).unwrap();
+            let (whole, played) = (backend.gpu().traffic(), backend.take_stages().traffic);
+            let held = (teams as u64 + 1) * 4 * 112 * 4;
+            let traffic = whole - std::mem::replace(&mut before, whole);
+            // The populations go up once.
+            let up = traffic.up - if generation == 0 { held } else { 0 };
+            let a_team = |bytes: u64| bytes as f64 / teams as f64;
+            let mean_g = rows.first().map_or(0.0, |row| row.mean_g);
+            println!(
+                "{info}: generation {generation}, mean G of the last {mean_g:.2}: {:.1} bytes a team up ({:.1} of it \
+                 rollouts), {:.1} down",
+                a_team(up),
+                a_team(played.up),
+                a_team(traffic.down)
+            );
+            if [0, 50].contains(&generation) {
+                assert!(a_team(up + traffic.down) * f64::from(1 << 20) <= 1e8, "{info}: generation {generation}");
+            }
+        }
+    }
+}
+
+/// Seconds that all threads have computed so far, whoever else did meanwhile (Linux counts in hundredths).
+fn processor_seconds() -> f64 {
+    let stat = std::fs::read_to_string("/proc/self/stat").expect("this is Linux");
+    // After the name, which may hold blanks, the times are the 12th and the 13th.
+    let fields = stat.rsplit(')').next().unwrap_or_default().split_whitespace().skip(11).take(2);
+    fields.map(|ticks| ticks.parse::<f64>().expect("a count") / 100.0).sum()
+}
+
+/// What compiling takes: the first two generations of two teams less twice the third, of everything that a GPU would compile, and of
+/// what a software renderer compiles by default. Drivers' caches have to be off (Mesa's by `MESA_SHADER_CACHE_DISABLE=true`).
+#[test]
+#[ignore = "prints a table"]
+fn compiling() {
+    let small = |mut config: Config| {
+        (config.learning.population, config.learning.trials, config.learning.generations) = (2, 1, 9);
+        config
+    };
+    let paper = [
+        ("generally forward", include_str!("../configs/generally_forward.toml")),
+        ("strictly forward", include_str!("../configs/strictly_forward.toml")),
+        ("chaotic", include_str!("../configs/chaotic.toml")),
+    ];
+    let mut cases = Vec::new();
+    for (name, text) in paper {
+        for paradigm in [Paradigm::LeaderFollower, Paradigm::AllLeaders] {
+            let mut config = small(config(text));
+            config.learning.paradigm = paradigm;
+            cases.push((format!("{name}, {paradigm:?}"), vec![config]));
+        }
+    }
+    let sweep = Sweep::read(include_str!("../configs/sweeps/large.toml"), "large.toml", &[], false).unwrap();
+    cases.push(("large.toml".into(), sweep.points.into_iter().map(|point| small(point.config)).collect()));
+    for (request, info) in common::adapters("compiling") {
+        for (name, configs) in &cases {
+            let backend = || GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap();
+            let gpu = backend().playing(Kernel::Best).holding(Holding::Always).bringing(Records::PackedFrom(0));
+            for (what, mut backend) in [("by default", backend()), ("as on a GPU", gpu)] {
+                let mut trainer = Trainer::new(configs.clone());
+                let mut seconds = || {
+                    let start = processor_seconds();
+                    trainer.advance(&mut backend).unwrap();
+                    processor_seconds() - start
+                };
+                // Breeding is compiled while the second one waits for it.
+                let (first, second, third) = (seconds(), seconds(), seconds());
+                let [generic, specialised] = backend.compiled();
+                println!(
+                    "{name}, {what}: {:.2} s, {generic} generic and {specialised} specialised kernels, {info}",
+                    first + second - 2.0 * third
+                );
+            }
+        }
+    }
+}
