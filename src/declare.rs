@@ -9,6 +9,7 @@ pub trait Field: Pod {
     /// One team a lane: a float in every lane, all else as it is.
     type Lanes<S: Simd>: Copy;
 
+    /// The value so.
     fn lanes<S: Simd>(self, simd: S) -> Self::Lanes<S>;
 
     /// The lines of a WGSL struct that declare such a field.
@@ -58,6 +59,7 @@ lists!(u32 f32);
 
 /// A struct that lies in memory as its shaders read it: see [`shared!`].
 pub trait Shared: Pod {
+    /// What the shaders call it too.
     const NAME: &'static str;
 
     /// Its fields as WGSL has them; those of a shared struct within it stand among its own.
@@ -154,8 +156,10 @@ pub trait Choice: Copy + Serialize + 'static {
 
 /// What is to be done for each word of a choice by code of its own: the word's number is a constant of the compiler's.
 pub trait Fixed {
+    /// What it comes to.
     type Output;
 
+    /// Does it for the word of this number.
     fn with<const WORD: u32>(self) -> Self::Output;
 }
 

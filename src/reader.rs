@@ -220,12 +220,15 @@ impl<T: Number> Display for Allowed<T> {
 
 /// A type that keys have numbers of.
 pub trait Number: Copy + PartialOrd + Display + Serialize {
+    /// 0.
     const ZERO: Self;
+    /// With its article: "a number".
     const KIND: &'static str;
 
     /// The number that was written, `None` inside where the type cannot hold it, or `None` for another kind of value.
     fn read(value: &DeValue<'_>) -> Option<Option<Self>>;
 
+    /// Whether it is infinity.
     fn is_infinite(self) -> bool {
         false
     }

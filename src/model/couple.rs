@@ -65,6 +65,7 @@ shared! {
 }
 
 impl CoupleConstants {
+    /// Of this radius.
     pub fn new(observation_radius: f64) -> CoupleConstants {
         CoupleConstants { observation_radius2: (observation_radius * observation_radius) as f32 }
     }

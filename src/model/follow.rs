@@ -27,6 +27,7 @@ pub struct Follow {
 }
 
 impl Follow {
+    /// Reads the section.
     pub(crate) fn read(r: &mut Reader<'_>) -> Follow {
         let attraction_radius = r
             .key(
@@ -72,6 +73,7 @@ shared! {
 }
 
 impl FollowConstants {
+    /// Of a valid section.
     pub fn new(follow: &Follow) -> FollowConstants {
         let squared = |radius: f64| (radius * radius) as f32;
         FollowConstants {

@@ -73,6 +73,7 @@ pub struct Lanes<S: Simd> {
 }
 
 impl<S: Simd> Lanes<S> {
+    /// Puts every float into all lanes.
     pub fn new(simd: S, constants: Constants) -> Lanes<S> {
         let Constants { motion, couple, follow, sense, .. } = constants;
         Lanes {

@@ -28,6 +28,7 @@ pub struct Policy {
 }
 
 impl Policy {
+    /// Reads the section.
     pub(crate) fn read(r: &mut Reader<'_>) -> Policy {
         Policy {
             hidden: r
@@ -60,6 +61,7 @@ shared! {
 }
 
 impl PolicyConstants {
+    /// Of a valid section.
     pub fn new(policy: &Policy) -> PolicyConstants {
         let mut widths = [0; MAX_HIDDEN_LAYERS + 2];
         let layers = policy.hidden.len() + 1;

@@ -42,6 +42,7 @@ pub struct Sense {
 }
 
 impl Sense {
+    /// Reads the section.
     pub(crate) fn read(r: &mut Reader<'_>) -> Sense {
         Sense {
             poi_range: r
