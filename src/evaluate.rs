@@ -31,6 +31,7 @@ pub enum Starts {
 }
 
 impl Starts {
+    /// Episodes of each team.
     pub fn episodes(&self) -> usize {
         match *self {
             Starts::Own => 1,
@@ -81,12 +82,14 @@ pub struct Spread {
 }
 
 impl Tally {
+    /// Adds a value.
     pub fn add(&mut self, value: u64) {
         self.count += 1;
         self.sum += value;
         self.squares += u128::from(value) * u128::from(value);
     }
 
+    /// 0 of none.
     pub fn mean(&self) -> f64 {
         self.sum as f64 / self.count as f64
     }

@@ -56,6 +56,7 @@ pub enum Purpose {
 pub struct Key([u32; 4]);
 
 impl Key {
+    /// The place of a trial of a seed, for a purpose.
     pub fn new(seed: u64, trial: usize, purpose: Purpose) -> Key {
         Key(math::draw_scalar([seed as u32, (seed >> 32) as u32, trial as u32, purpose as u32]))
     }

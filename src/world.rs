@@ -63,18 +63,22 @@ impl World {
         Vec2::new(self.constants.motion.map_x, self.constants.motion.map_y)
     }
 
+    /// Agents that have a policy, the first of all.
     pub fn leaders(&self) -> usize {
         self.constants.leaders as usize
     }
 
+    /// Agents that follow.
     pub fn followers(&self) -> usize {
         self.constants.followers as usize
     }
 
+    /// Leaders and followers.
     pub fn agents(&self) -> usize {
         self.leaders() + self.followers()
     }
 
+    /// Steps of an episode.
     pub fn steps(&self) -> usize {
         self.constants.steps as usize
     }

@@ -139,9 +139,15 @@ impl<'a> Weights<'a> {
 /// After an error they may be of any generation.
 pub trait Held: Any + Debug + Send + Sync {
     /// Makes the next generation, to the bits of [`crate::evolve::mutate`].
+    ///
+    /// # Errors
+    /// The plan does not fit the populations, or the device failed.
     fn breed(&mut self, breeding: &Breeding<'_>) -> Result<(), BackendError>;
 
     /// Copies all weights to the host, `[leaders][slots][parameters]`.
+    ///
+    /// # Errors
+    /// The device failed.
     fn fetch(&self, weights: &mut [f32]) -> Result<(), BackendError>;
 }
 
@@ -195,15 +201,18 @@ impl<'a> Strided<'a> {
         (0..self.len()).map(move |index| self.get(index))
     }
 
+    /// Word `index` of this team.
     #[inline]
     pub fn get(&self, index: usize) -> u32 {
         self.words[index * self.stride + self.offset]
     }
 
+    /// Words of each team.
     pub fn len(&self) -> usize {
         self.words.len() / self.stride
     }
 
+    /// Whether there is no word.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -240,6 +249,7 @@ pub struct Trace {
 }
 
 impl Trace {
+    /// What one agent of one team did at one step.
     pub fn moment(&self, step: usize, team: usize, agent: usize) -> &Moment {
         &self.moments[(step * self.teams + team) * self.agents + agent]
     }
@@ -251,13 +261,22 @@ pub type Visit<'a> = dyn Fn(Episode<'_>) + Sync + 'a;
 /// Plays episodes. Every implementation gives the same bits.
 pub trait Backend: Send {
     /// Plays every team of every group once.
+    ///
+    /// # Errors
+    /// A group does not fit together or does not fit the device, or the device failed.
     fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError>;
 
     /// Plays one group and keeps every stage of every step.
+    ///
+    /// # Errors
+    /// As for [`Backend::rollout`].
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError>;
 
     /// Takes the populations of one trial, `[leaders][slots][parameters]`, into memory of its own, to breed them there;
     /// none where they had better stay on the host.
+    ///
+    /// # Errors
+    /// They were asked to be held here and do not fit, or the device failed.
     fn hold(&mut self, _weights: &[f32], _sizes: [usize; 3]) -> Result<Option<Box<dyn Held>>, BackendError> {
         Ok(None)
     }

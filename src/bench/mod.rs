@@ -42,6 +42,7 @@ pub enum Player {
 }
 
 impl Player {
+    /// What plays.
     pub fn backend(&mut self) -> &mut dyn Backend {
         match self {
             Player::Cpu(cpu, _) => cpu,
@@ -105,10 +106,12 @@ pub enum Generations {
 }
 
 impl Measure {
+    /// Agents of all teams together.
     pub fn agents(&self) -> usize {
         self.leaders + self.followers
     }
 
+    /// Steps of all teams together.
     pub fn team_steps(&self) -> f64 {
         (self.teams * self.steps) as f64
     }

@@ -28,8 +28,9 @@ mod world;
 
 /// Most bytes that the policies of all trials of a run may take.
 pub const MAX_POLICY_BYTES: u64 = 1 << 38;
-/// The sections that make a config a sweep: values to combine, and values to try one at a time.
+/// The section that makes a config a sweep: values to combine.
 pub const GRID: &str = "grid";
+/// The section of values to try one at a time.
 pub const VARY: &str = "vary";
 
 /// Every key of a config, in the order of [`Config::to_toml`].

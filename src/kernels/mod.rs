@@ -43,12 +43,17 @@ pub fn bound<S: Simd>(x: S::f32s, low: S::f32s, high: S::f32s) -> S::f32s {
 
 /// Lane operations of each function here: an f32 or integer operation, comparison or selection is one.
 pub mod operations {
+    /// [`rsqrt`](super::math::rsqrt).
     pub const RSQRT: u32 = 12;
+    /// [`root`](super::math::root).
     pub const ROOT: u32 = 12;
+    /// [`recip`](super::math::recip).
     pub const RECIP: u32 = 8;
     /// A bound, a square, 5 and 3 for numerator and denominator; their squares' sum, its rough reciprocal (4) and 6 more.
     pub const TANH: u32 = BOUND + 1 + 5 + 3 + 3 + 4 + 6;
+    /// [`sin_cos`](super::math::sin_cos).
     pub const SIN_COS: u32 = 26;
+    /// [`flush`](super::math::flush).
     pub const FLUSH: u32 = 3;
     /// A clamp: minimum and maximum.
     pub const BOUND: u32 = 2;

@@ -40,6 +40,9 @@ impl Disk {
     }
 
     /// Creates a folder and those above it.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn create_folder(&self, path: &Path) -> io::Result<()> {
         self.pass(Operation::CreateFolder, path)?;
         fs::create_dir_all(path).map_err(|error| match error.kind() {
@@ -51,6 +54,9 @@ impl Disk {
     }
 
     /// A new file in the place of any other; a link that stands there is replaced, never followed.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn create(&self, path: &Path) -> io::Result<Output> {
         self.remove(path)?;
         self.pass(Operation::Create, path)?;
@@ -59,6 +65,9 @@ impl Disk {
     }
 
     /// The file as it is up to `length` bytes, to be written on from there; a link to another file is refused.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn append(&self, path: &Path, length: u64) -> io::Result<Output> {
         if !fs::symlink_metadata(path)?.is_file() {
             return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no plain file"));
@@ -71,6 +80,9 @@ impl Disk {
     }
 
     /// Gives a file new content: after a crash at any moment it has either all of the old or all of the new.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn replace(&self, path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
         let temporary = temporary(path);
         let write = || {
@@ -87,6 +99,9 @@ impl Disk {
 
     /// Writes a file that the user named, whole or not at all; a link to a file is followed. What is no file (a device, a
     /// pipe, `/dev/stdout`) is written to as it stands.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn deliver(&self, path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
         let there = fs::metadata(path);
         if there.as_ref().is_ok_and(|there| !there.is_file() && !there.is_dir()) {
@@ -121,6 +136,9 @@ impl Disk {
     }
 
     /// Renames within a folder, for good.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
         self.pass(Operation::Rename, to)?;
         fs::rename(from, to)?;
@@ -128,6 +146,9 @@ impl Disk {
     }
 
     /// Removes a file, if it is there.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn remove(&self, path: &Path) -> io::Result<()> {
         if fs::symlink_metadata(path).is_err_and(|error| error.kind() == io::ErrorKind::NotFound) {
             return Ok(());
@@ -172,6 +193,9 @@ pub struct Output {
 
 impl Output {
     /// Waits until all that was written is on the disk.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn sync(&self) -> io::Result<()> {
         self.disk.pass(Operation::Flush, &self.path)?;
         self.file.sync_all()
@@ -183,6 +207,9 @@ impl Output {
     }
 
     /// The same file, to flush it from another thread.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn share(&self) -> io::Result<Output> {
         Ok(Output { disk: self.disk.clone(), path: self.path.clone(), file: self.file.try_clone()? })
     }

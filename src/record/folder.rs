@@ -18,17 +18,25 @@ use crate::file;
 use crate::host;
 use crate::trainer::Row;
 
+/// The config, every key written out.
 pub const CONFIG: &str = "config.toml";
+/// What the run is and what became of it, see [`Run`].
 pub const RUN: &str = "run.json";
+/// See [`super::metrics`].
 pub const METRICS: &str = "metrics.csv";
+/// See [`super::policies`].
 pub const POLICIES: &str = "policies.safetensors";
+/// The folder of [`super::checkpoint`]s.
 pub const CHECKPOINTS: &str = "checkpoints";
 /// What marks a folder as a paper's, and the folder of its runs.
 pub const PAPER: &str = "paper.toml";
+/// The folder of a paper's runs.
 pub const ARMS: &str = "arms";
 /// In a sweep's folder: the sweep as it was run, and its tables.
 pub const SWEEP: &str = "sweep.toml";
+/// A sweep's rows, one a trial.
 pub const RESULTS: &str = "results.csv";
+/// A sweep's points, one a line.
 pub const POINTS: &str = "points.csv";
 /// Locked by whoever trains in the folder. The lock is the system's: it goes with the process, however that ends.
 const LOCK: &str = ".lock";
@@ -339,6 +347,7 @@ impl Folder {
         self.write_text(RUN, &(text + "\n"))
     }
 
+    /// Where a file of the folder is.
     pub fn file(&self, name: &str) -> PathBuf {
         self.path.join(name)
     }

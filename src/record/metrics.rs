@@ -16,6 +16,7 @@ use crate::config::{MAX_GENERATIONS, MAX_TRIALS};
 use crate::file;
 use crate::trainer::Row;
 
+/// The first line.
 pub const HEADER: &str = "trial,generation,best_g,mean_g,champion_g,seconds";
 /// Most bytes in one line.
 const MAX_LINE: u64 = 256;
@@ -37,6 +38,9 @@ pub struct Writer {
 
 impl Writer {
     /// Starts a file with its header, in the place of any other.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn create(disk: &Disk, path: &Path) -> io::Result<Writer> {
         let mut writer = Writer { output: BufWriter::new(disk.create(path)?), bytes: 0, hash: Sha256::new() };
         writer.line(HEADER)?;
@@ -45,6 +49,9 @@ impl Writer {
     }
 
     /// Goes on from a mark, dropping what was written after it; none where the file no longer is what was marked.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn resume(disk: &Disk, path: &Path, mark: &Mark) -> io::Result<Option<Writer>> {
         let mut hash = Sha256::new();
         let mut file = match file::open(path) {
@@ -73,16 +80,25 @@ impl Writer {
     }
 
     /// Adds rows that became complete after so many seconds.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn add(&mut self, rows: &[Row], seconds: f64) -> io::Result<()> {
         rows.iter().try_for_each(|row| self.line(&format!("{},{seconds:.3}", shared(row))))
     }
 
     /// Hands all lines to the system, so that others can read them.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn flush(&mut self) -> io::Result<()> {
         self.output.flush()
     }
 
     /// Where the file stands, and the file, for whoever has to see that this much of it is on the disk.
+    ///
+    /// # Errors
+    /// What the system says.
     pub fn mark(&mut self) -> io::Result<(Mark, Output)> {
         self.output.flush()?;
         let sha256 = hex(&self.hash.clone().finalize());

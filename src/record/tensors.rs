@@ -41,6 +41,9 @@ impl<'a> Tensor<'a> {
 }
 
 /// Writes a file of a kind ("policies 1"), whole or not at all.
+///
+/// # Errors
+/// What the system says; nothing else was touched then.
 pub fn write(
     disk: &Disk,
     path: &Path,
@@ -151,6 +154,7 @@ impl<R: Read + Seek> TensorFile<R> {
         self.metadata(KIND)
     }
 
+    /// What the file says of itself under a key.
     pub fn metadata(&self, key: &str) -> Option<&str> {
         self.header.metadata().as_ref()?.get(key).map(String::as_str)
     }

@@ -26,6 +26,7 @@ pub struct Tally {
 }
 
 impl Tally {
+    /// Adds a value.
     pub fn add(&mut self, value: f64) {
         self.count += 1;
         let before = value - self.mean;

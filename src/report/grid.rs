@@ -72,6 +72,7 @@ pub struct HeatMap {
 }
 
 impl HeatMap {
+    /// The picture.
     pub fn scene(&self) -> Scene {
         const HIGH: f64 = 7.5;
         let longest = |labels: &[String]| labels.iter().map(|label| text_width(label, SMALL)).fold(0.0, f64::max);
@@ -175,6 +176,7 @@ pub struct Curves {
 }
 
 impl Curves {
+    /// The picture.
     pub fn scene(&self) -> Scene {
         const HEIGHT: f64 = 26.0;
         const LEFT: f64 = 14.0;
@@ -319,6 +321,7 @@ impl Dots {
         self.panels.iter().map(panel).collect::<Vec<_>>().join(" ")
     }
 
+    /// The picture.
     pub fn scene(&self) -> Scene {
         const HIGH: f64 = 4.0;
         const RADIUS: f64 = 0.75;

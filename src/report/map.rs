@@ -55,6 +55,7 @@ const DASHES: [&[f64]; 3] = [&[], &[0.9, 0.5], &[0.3, 0.35]];
 const LABEL: f64 = 2.4;
 const LEAST: f64 = 1.9;
 const PALE: Color = [250, 250, 250];
+/// Of what is there to be looked past.
 pub const FAINT: Color = [95, 95, 95];
 
 /// One agent.
@@ -378,6 +379,7 @@ impl Legend {
         (places, y + Self::ROW)
     }
 
+    /// How high a map of this width is, in points.
     pub fn height(&self, width: f64) -> f64 {
         self.places(width).1
     }

@@ -100,6 +100,7 @@ impl Rows {
         self.best_g.iter().rposition(Option::is_some)
     }
 
+    /// The value of a generation, if it is one of those.
     pub fn get(&self, generation: usize) -> Option<f64> {
         self.best_g.get(generation).copied().flatten()
     }
@@ -508,6 +509,7 @@ pub struct Frames<'a> {
 }
 
 impl<'a> Frames<'a> {
+    /// Frames of these episodes, as fast as `motion` says.
     pub fn new(config: &Config, played: &'a [Played], motion: Motion) -> Frames<'a> {
         let steps = played.first().map_or(0, |first| first.world.steps()) as f64;
         let seconds = steps * config.world.dt;

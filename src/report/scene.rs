@@ -24,9 +24,13 @@ const MAX_PIXELS: f64 = 8192.0;
 /// Red, green, blue.
 pub type Color = [u8; 3];
 
+/// Of text.
 pub const BLACK: Color = [0, 0, 0];
+/// Of paper.
 pub const WHITE: Color = [255, 255, 255];
+/// Of what matters less.
 pub const GREY: Color = [120, 120, 120];
+/// Of grids.
 pub const LIGHT: Color = [222, 222, 222];
 
 /// Colours that the colour-blind tell apart, by Okabe and Ito, those first that stay apart in grey as well.
@@ -45,6 +49,7 @@ pub struct Pen {
 }
 
 impl Pen {
+    /// A line of this colour and width, whole.
     pub fn new(color: Color, width: f64) -> Pen {
         Pen { color, width, dash: &[], opacity: 1.0 }
     }
@@ -120,6 +125,7 @@ pub enum Kind {
 }
 
 impl Kind {
+    /// Every kind.
     pub const ALL: [Kind; 3] = [Kind::Svg, Kind::Png, Kind::Pdf];
 
     /// By the end of a file's name.
@@ -128,6 +134,7 @@ impl Kind {
         Kind::ALL.into_iter().find(|kind| extension == kind.extension())
     }
 
+    /// A file's ending, without its dot.
     pub fn extension(self) -> &'static str {
         match self {
             Kind::Svg => "svg",
@@ -138,22 +145,27 @@ impl Kind {
 }
 
 impl Scene {
+    /// An empty picture of this size, in points.
     pub fn new(width: f64, height: f64) -> Scene {
         Scene { width, height, title: String::new(), description: String::new(), marks: Vec::new() }
     }
 
+    /// A line through places.
     pub fn line(&mut self, points: Vec<[f64; 2]>, pen: Pen) {
         self.marks.push(Mark::Shape { points, closed: false, fill: None, pen: Some(pen) });
     }
 
+    /// A polygon, filled, outlined or both.
     pub fn polygon(&mut self, points: Vec<[f64; 2]>, fill: Option<Fill>, pen: Option<Pen>) {
         self.marks.push(Mark::Shape { points, closed: true, fill, pen });
     }
 
+    /// An upright rectangle, by its corner and sides.
     pub fn rectangle(&mut self, [x, y, width, height]: [f64; 4], fill: Option<Fill>, pen: Option<Pen>) {
         self.polygon(vec![[x, y], [x + width, y], [x + width, y + height], [x, y + height]], fill, pen);
     }
 
+    /// A circle.
     pub fn circle(&mut self, center: [f64; 2], radius: f64, fill: Option<Fill>, pen: Option<Pen>) {
         self.marks.push(Mark::Circle { center, radius, fill, pen });
     }
@@ -163,6 +175,7 @@ impl Scene {
         self.write(Mark::Text { place, text: text.into(), size, anchor, color, upright: false, bold: false });
     }
 
+    /// Bold text at a place.
     pub fn bold(&mut self, place: [f64; 2], text: impl Into<String>, size: f64, anchor: Anchor, color: Color) {
         self.write(Mark::Text { place, text: text.into(), size, anchor, color, upright: false, bold: true });
     }

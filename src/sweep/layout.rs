@@ -15,6 +15,7 @@ use crate::config::{Override, Problem};
 pub const FOLLOWERS: &str = "followers_per_leader";
 /// Leaders, each with its followers and a POI (1 to 256; 4 where only the other axis is given).
 pub const GROUPS: &str = "groups";
+/// Both.
 pub const AXES: [&str; 2] = [FOLLOWERS, GROUPS];
 const DEFAULT_FOLLOWERS: usize = 2;
 const DEFAULT_GROUPS: usize = 4;

@@ -257,6 +257,9 @@ pub(super) fn choose(choice: &Choice) -> Result<(wgpu::Adapter, AdapterInfo), De
 }
 
 /// Which of the [`adapters`] is chosen.
+///
+/// # Errors
+/// There is no adapter, none that is a GPU, or none of that name or number.
 pub fn position(choice: &Choice, infos: &[AdapterInfo]) -> Result<usize, DeviceError> {
     match choice {
         Choice::Named(name) => {
@@ -338,6 +341,9 @@ impl Gpu {
     }
 
     /// An error if the device was lost or anything failed outside the calls below; to be asked after every wait.
+    ///
+    /// # Errors
+    /// The device was lost, or a command failed.
     pub fn check(&self) -> Result<(), DeviceError> {
         let mut trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(reason) = &trouble.lost {
@@ -354,6 +360,9 @@ impl Gpu {
     }
 
     /// Runs `make` and reports what wgpu found wrong with it, as an error about `what`.
+    ///
+    /// # Errors
+    /// What wgpu found, or the device was lost.
     pub fn scoped<T>(&self, what: &str, make: impl FnOnce() -> T) -> Result<T, DeviceError> {
         use wgpu::ErrorFilter::{Internal, OutOfMemory, Validation};
         let [memory, validation, internal] =
@@ -372,6 +381,9 @@ impl Gpu {
     }
 
     /// A new buffer of `bytes` bytes, all zero.
+    ///
+    /// # Errors
+    /// It is larger than the device allows, or there is no memory for it.
     pub fn buffer(&self, what: &str, bytes: u64, usage: wgpu::BufferUsages) -> Result<wgpu::Buffer, DeviceError> {
         let mut allowed = self.limits.max_buffer_size;
         if usage.contains(wgpu::BufferUsages::STORAGE) {
@@ -388,6 +400,9 @@ impl Gpu {
     }
 
     /// A new buffer that holds `contents`.
+    ///
+    /// # Errors
+    /// It is larger than the device allows, or there is no memory for it.
     pub fn upload<T: Pod>(
         &self,
         what: &str,
@@ -413,6 +428,9 @@ impl Gpu {
     }
 
     /// Waits for all work and reads a range of a buffer (in bytes, multiples of 4; usage `COPY_SRC`).
+    ///
+    /// # Errors
+    /// The device was lost or has no memory for the copy.
     pub fn read<T: Pod>(&self, buffer: &wgpu::Buffer, bytes: Range<u64>) -> Result<Vec<T>, DeviceError> {
         let size = bytes.end - bytes.start;
         self.traffic[1].fetch_add(size, Relaxed);
@@ -434,6 +452,9 @@ impl Gpu {
     }
 
     /// Shows a range of a buffer, all that was copied to it of the device's, whose work was waited for (in bytes, multiples of 4; usage `MAP_READ`).
+    ///
+    /// # Errors
+    /// The device was lost, or the buffer cannot be read.
     pub fn mapped<T>(
         &self,
         buffer: &wgpu::Buffer,
@@ -460,11 +481,17 @@ impl Gpu {
     }
 
     /// Waits until everything submitted is done.
+    ///
+    /// # Errors
+    /// The device was lost, or a command failed.
     pub fn wait(&self) -> Result<(), DeviceError> {
         self.wait_for(None)
     }
 
     /// Waits until a submission is done, or everything.
+    ///
+    /// # Errors
+    /// The device was lost, or a command failed.
     pub fn wait_for(&self, submission_index: Option<wgpu::SubmissionIndex>) -> Result<(), DeviceError> {
         // A browser has no polling: there, whatever was submitted until now is waited for.
         if cfg!(target_family = "wasm") {
@@ -480,6 +507,9 @@ impl Gpu {
     }
 
     /// The layout of a pipeline that uses these buffers as bindings 1, 2, … of group 0.
+    ///
+    /// # Errors
+    /// The device allows no so many buffers.
     pub fn layout(&self, label: &str, buffers: &[Binding]) -> Result<Layout, DeviceError> {
         let entry = |(binding, &kind): (u32, &Binding)| wgpu::BindGroupLayoutEntry {
             binding,
@@ -509,6 +539,9 @@ impl Gpu {
     }
 
     /// Buffers for a pipeline, in the order of its layout.
+    ///
+    /// # Errors
+    /// A buffer does not fit its binding.
     pub fn bind(
         &self,
         label: &str,
@@ -546,6 +579,9 @@ impl Gpu {
     /// Unless `checked`, nothing keeps the shader within its buffers: its indices must be in bounds, its loops must end, it
     /// must divide no integer by zero, and read no workgroup memory that it did not write. Its bindings must be those of
     /// the layout, `checked` or not.
+    ///
+    /// # Errors
+    /// The shader leaves the exact core, or asks for more than the device allows; or the driver refuses it.
     #[expect(unsafe_code, reason = "shaders of the crate's own are compiled without bounds checks")]
     pub unsafe fn pipeline(
         &self,
@@ -574,6 +610,9 @@ impl Gpu {
     }
 
     /// Submits one dispatch, without waiting for it.
+    ///
+    /// # Errors
+    /// The device was lost, or refuses the dispatch.
     pub fn dispatch(
         &self,
         what: &str,
@@ -606,6 +645,9 @@ impl Gpu {
 
     /// How long one dispatch takes: by the device's clock where it has one that can be asked, else from submitting it
     /// to seeing it done.
+    ///
+    /// # Errors
+    /// The device was lost, or refuses the dispatch.
     pub fn time(
         &self,
         what: &str,
@@ -627,6 +669,9 @@ impl Gpu {
     }
 
     /// A stopwatch, if the device's clock can be asked.
+    ///
+    /// # Errors
+    /// There is no memory for its few numbers.
     pub fn stopwatch(&self) -> Result<Option<Stopwatch>, DeviceError> {
         if !self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY) {
             return Ok(None);
@@ -658,6 +703,9 @@ impl Stopwatch {
     }
 
     /// How long the pass took that was submitted, and waited for, last.
+    ///
+    /// # Errors
+    /// The device was lost.
     pub fn read(&self, gpu: &Gpu) -> Result<Duration, DeviceError> {
         let read = |bytes: &[u8]| bytemuck::pod_collect_to_vec::<u8, u64>(bytes);
         let ticks = gpu.mapped(&self.landing, 0..self.landing.size(), read)?;

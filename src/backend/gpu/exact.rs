@@ -67,6 +67,9 @@ pub fn assemble(parts: &[&str]) -> String {
 }
 
 /// Parses and validates; the capabilities are those of plain WebGPU (no f16, f64, subgroups).
+///
+/// # Errors
+/// It does not parse or is not valid.
 pub fn parse(wgsl: &str) -> Result<(Module, ModuleInfo), ShaderError> {
     let module = naga::front::wgsl::parse_str(wgsl).map_err(|error| ShaderError::Parse(error.emit_to_string(wgsl)))?;
     let info = validate(&module).map_err(|error| ShaderError::Invalid(error.emit_to_string(wgsl)))?;
@@ -82,12 +85,18 @@ fn validate(module: &Module) -> Result<ModuleInfo, Box<Invalid>> {
 /// The SPIR-V of all entry points, every float result decorated `NoContraction`.
 ///
 /// `checked` keeps naga's bounds checks, loop bounds, division checks and zeroed workgroup memory.
+///
+/// # Errors
+/// It does not parse, is not valid, or has no SPIR-V.
 pub fn spirv(wgsl: &str, checked: bool) -> Result<Vec<u32>, ShaderError> {
     let (module, info) = parse(wgsl)?;
     Ok(decorate(&emit(&module, &info, checked)?))
 }
 
 /// naga's own SPIR-V of a module, not yet exact.
+///
+/// # Errors
+/// It has no SPIR-V.
 pub fn emit(module: &Module, info: &ModuleInfo, checked: bool) -> Result<Vec<u32>, ShaderError> {
     let policy = if checked { BoundsCheckPolicy::Restrict } else { BoundsCheckPolicy::Unchecked };
     let options = spv::Options {
@@ -193,6 +202,9 @@ pub fn undecorated(words: &[u32]) -> usize {
 ///   what is under it is an integer operation, and neither a float sum nor a product.
 /// - `floor`, comparisons: of the guarded value, as any other; no guard moves through.
 /// - Nothing else meets the guard: the shader cannot name it, and the pass uses it in no other way.
+///
+/// # Errors
+/// The module is not valid.
 pub fn guarded(module: &Module) -> Result<Module, ShaderError> {
     let info = validate(module).map_err(|error| ShaderError::Invalid(error.to_string()))?;
     let foreign = foreign_in(module, &info);
@@ -271,6 +283,9 @@ fn rounds(expression: &Expression, inner: &TypeInner) -> bool {
 }
 
 /// How often a module uses a float sum or product in any other way than by its bits; 0 after [`guarded`].
+///
+/// # Errors
+/// The module is not valid.
 pub fn unguarded(module: &Module) -> Result<usize, ShaderError> {
     let info = validate(module).map_err(|error| ShaderError::Invalid(error.to_string()))?;
     Ok(functions(module, &info)

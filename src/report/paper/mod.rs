@@ -96,6 +96,7 @@ impl Arm {
         format!("{}, {}, {}", self.layout.name, self.paradigm, self.fitness)
     }
 
+    /// POIs of its layout.
     pub fn pois(&self) -> usize {
         self.config.world.pois.len()
     }
