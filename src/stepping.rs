@@ -339,6 +339,8 @@ struct Part<S: Simd> {
     sets: Vec<u32>,
     /// That of every step, `[teams][steps][pois][words]`, if it is kept.
     record: Vec<u32>,
+    /// What is turned into rows.
+    columns: Vec<S::f32s>,
     /// Agents and counts before a step, where some teams are over.
     kept: (Vec<Agent<S>>, Vec<S::u32s>),
 }
@@ -348,7 +350,7 @@ fn vectors<S: Simd>(simd: S, world: &World, teams: usize, record: usize) -> Box<
         let teams = S::f32s::LEN.min(teams - first);
         let block = Block::new(simd, world);
         let sets = vec![0; world.pois.len() * world.constants.words as usize * S::f32s::LEN];
-        Part { block, first, teams, sets, record: vec![0; teams * record], kept: Default::default() }
+        Part { block, first, teams, sets, record: vec![0; teams * record], columns: vec![], kept: Default::default() }
     };
     let parts: Vec<Part<S>> = (0..teams).step_by(S::f32s::LEN).map(part).collect();
     Box::new((simd, parts))
@@ -521,22 +523,20 @@ impl<S: Simd> Part<S> {
             self.lanes().filter(|&(_, team)| steps[team] >= last).for_each(|(lane, _)| self.keep(lane));
         }
         self.block.couple(&world.pois, &mut self.sets);
-        let lanes: &[f32] = bytemuck::cast_slice(&self.sets);
         let (pois, words) = (world.pois.len(), world.constants.words as usize);
-        to_rows(
-            simd,
-            pois * words,
-            #[inline(always)]
-            |column| &lanes[column * S::f32s::LEN..][..S::f32s::LEN],
-            bytemuck::cast_slice_mut(near),
-        );
+        let sets = bytemuck::cast_slice::<u32, f32>(&self.sets).chunks_exact(S::f32s::LEN);
+        self.columns.clear();
+        self.columns.extend(sets.map(|lanes| S::f32s::from_slice(simd, lanes)));
+        to_rows(simd, &self.columns, bytemuck::cast_slice_mut(near));
         for (team, step) in steps.iter_mut().enumerate().filter(|(_, step)| **step < last) {
             let near = &near[team * pois * words..][..pois * words];
-            let told = newly[team * pois..][..pois].iter_mut().zip(&mut observed[team * pois..][..pois]);
-            for ((newly, observed), (near, &coupling)) in told.zip(near.chunks_exact(words).zip(&world.coupling)) {
-                let count: u32 = near.iter().map(|word| word.count_ones()).sum();
-                *newly = !*observed & (count >= coupling);
-                *observed |= *newly;
+            let newly = &mut newly[team * pois..][..pois];
+            let observed = &mut observed[team * pois..][..pois];
+            for (poi, &coupling) in world.coupling.iter().enumerate() {
+                let count: u32 = near[poi * words..][..words].iter().map(|word| word.count_ones()).sum();
+                if count >= coupling && !observed[poi] {
+                    (newly[poi], observed[poi]) = (true, true);
+                }
             }
             if !self.record.is_empty() {
                 let at = team * world.set_words() + *step as usize * near.len();
@@ -553,7 +553,8 @@ impl<S: Simd> Part<S> {
         let columns = world.leaders() * OUTPUTS;
         let (actions, teams) = (&actions[self.first * columns..], self.teams);
         for quad in 0..S::f32s::LEN / 4 {
-            let rows = [0, 1, 2, 3].map(|lane| &actions[team_of(quad * 4 + lane, teams) * columns..][..columns]);
+            let row = |lane: usize| &actions[team_of(quad * 4 + lane, teams) * columns..][..columns];
+            let rows = [row(0), row(1), row(2), row(3)];
             let outputs = self.block.outputs.as_flattened_mut();
             turn(
                 simd,
@@ -586,64 +587,57 @@ impl<S: Simd> Part<S> {
     #[inline(always)]
     fn sense(&mut self, simd: S, world: &World, inputs: &mut [f32]) {
         self.block.look(&world.pois);
-        let columns = self.block.inputs.as_flattened();
-        to_rows(
-            simd,
-            columns.len(),
-            #[inline(always)]
-            |column| columns[column].as_slice(),
-            inputs,
-        );
+        to_rows(simd, self.block.inputs.as_flattened(), inputs);
     }
 
     #[inline(always)]
-    fn states(&self, simd: S, shown: Slices<'_>) {
-        let agents = &self.block.agents[..];
-        to_rows(
-            simd,
-            agents.len() * 2,
-            #[inline(always)]
-            |column| {
-                let agent = &agents[column / 2];
-                if column % 2 == 0 { agent.x.as_slice() } else { agent.y.as_slice() }
-            },
-            shown.positions,
-        );
-        to_rows(
-            simd,
-            agents.len() * 2,
-            #[inline(always)]
-            |column| {
-                let agent = &agents[column / 2];
-                if column % 2 == 0 { agent.hx.as_slice() } else { agent.hy.as_slice() }
-            },
-            shown.headings,
-        );
-        to_rows(
-            simd,
-            agents.len(),
-            #[inline(always)]
-            |column| agents[column].speed.as_slice(),
-            shown.speeds,
-        );
+    fn states(&mut self, simd: S, shown: Slices<'_>) {
+        let Part { block, columns, .. } = self;
+        columns.clear();
+        for agent in &block.agents {
+            columns.extend_from_slice(&[agent.x, agent.y]);
+        }
+        to_rows(simd, columns, shown.positions);
+        columns.clear();
+        for agent in &block.agents {
+            columns.extend_from_slice(&[agent.hx, agent.hy]);
+        }
+        to_rows(simd, columns, shown.headings);
+        columns.clear();
+        for agent in &block.agents {
+            columns.push(agent.speed);
+        }
+        to_rows(simd, columns, shown.speeds);
     }
 }
 
 /// Turns columns, a lane a team, into a row of numbers a team; lanes that have no row are left out.
 #[inline(always)]
-fn to_rows<'a, S: Simd>(simd: S, columns: usize, lanes: impl Fn(usize) -> &'a [f32], rows: &mut [f32]) {
-    let whole = columns / 4 * 4;
-    for (quad, rows) in rows.chunks_mut(columns * 4).enumerate() {
-        let four = |column: usize| &lanes(column)[quad * 4..quad * 4 + 4];
-        for at in (0..whole).step_by(4) {
-            let fours = [0, 1, 2, 3].map(|column| f32x4::from_slice(simd, four(at + column)));
-            for (row, four) in rows.chunks_exact_mut(columns).zip(transposed(fours)) {
-                four.store_slice(&mut row[at..at + 4]);
+fn to_rows<S: Simd>(simd: S, columns: &[S::f32s], rows: &mut [f32]) {
+    let count = columns.len();
+    let (fours, rest) = columns.as_chunks::<4>();
+    for (quad, rows) in rows.chunks_mut(count * 4).enumerate() {
+        let lanes = quad * 4..quad * 4 + 4;
+        for (at, [a, b, c, d]) in (0..).step_by(4).zip(fours) {
+            let turned = transposed([
+                f32x4::from_slice(simd, &a.as_slice()[lanes.clone()]),
+                f32x4::from_slice(simd, &b.as_slice()[lanes.clone()]),
+                f32x4::from_slice(simd, &c.as_slice()[lanes.clone()]),
+                f32x4::from_slice(simd, &d.as_slice()[lanes.clone()]),
+            ]);
+            let mut to = at;
+            for four in &turned {
+                if let Some(row) = rows.get_mut(to..to + 4) {
+                    four.store_slice(row);
+                }
+                to += count;
             }
         }
-        for column in whole..columns {
-            for (row, &number) in rows.chunks_exact_mut(columns).zip(four(column)) {
-                row[column] = number;
+        for (at, column) in (fours.len() * 4..).zip(rest) {
+            for (row, &number) in column.as_slice()[lanes.clone()].iter().enumerate() {
+                if let Some(to) = rows.get_mut(row * count + at) {
+                    *to = number;
+                }
             }
         }
     }
