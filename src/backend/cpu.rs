@@ -374,6 +374,13 @@ pub(crate) struct Block<S: Simd> {
     bounds: Vec<Bounds<S>>,
 }
 
+/// What of a [`Block`] must be kept from one step to the next, once it has looked.
+pub(crate) struct Standing<S: Simd> {
+    pub agents: Vec<Agent<S>>,
+    pub counts: Vec<S::u32s>,
+    near: Vec<u64>,
+}
+
 #[derive(Clone, Copy)]
 pub(crate) struct Agent<S: Simd> {
     pub x: S::f32s,
@@ -408,6 +415,20 @@ impl<S: Simd> Block<S> {
             near: vec![0; agents.div_ceil(64) * agents],
             bounds: vec![Bounds::nowhere(simd); agents.div_ceil(S::f32s::LEN)],
         }
+    }
+
+    /// Only what is kept.
+    pub fn into_standing(self) -> Standing<S> {
+        let Block { agents, counts, near, .. } = self;
+        Standing { agents, counts, near }
+    }
+
+    /// Takes on what stands of other teams, for what stands of these.
+    #[inline(always)]
+    pub fn swap(&mut self, standing: &mut Standing<S>) {
+        std::mem::swap(&mut self.agents, &mut standing.agents);
+        std::mem::swap(&mut self.counts, &mut standing.counts);
+        std::mem::swap(&mut self.near, &mut standing.near);
     }
 
     /// Puts one lane's agents where they start.
