@@ -420,10 +420,10 @@ impl<S: Simd> Batch<S> {
         shown: &mut Shown,
         act: &(impl Fn(&mut Room<S>, &mut Part<S>, Slices<'_>) + Sync),
     ) {
-        let Batch { simd, parts, idle } = self;
+        let (simd, parts, idle) = (self.simd, &mut self.parts, &self.idle);
         View::new(parts, shown).each(world, &|parts, mut shown| {
             let room = idle.lock().unwrap_or_else(PoisonError::into_inner).pop();
-            let mut room = room.unwrap_or_else(|| Room::new(*simd, world));
+            let mut room = room.unwrap_or_else(|| Room::new(simd, world));
             for part in parts {
                 let own = shown.split(part.teams, world);
                 act(&mut room, part, own);
