@@ -20,11 +20,12 @@
 //! ```
 
 use std::cell::RefCell;
+use std::sync::{Mutex, PoisonError};
 
 use fearless_simd::{Level, Simd, dispatch, f32x4, prelude::*};
 use glam::Vec2;
 
-use crate::backend::cpu::{Agent, Block, transposed, turn};
+use crate::backend::cpu::{Agent, Block, Standing, transposed, turn};
 use crate::backend::{Episode, Seen, Strided};
 use crate::config::{Fitness, MAX_POPULATION};
 use crate::credit::{Credit, Scores};
@@ -329,73 +330,106 @@ trait Vectors: Send + Sync {
     fn episode<'a>(&'a self, team: usize, world: &World, seen: &'a mut Vec<u32>) -> Option<Episode<'a>>;
 }
 
-/// One vector of teams.
+/// One vector of teams. Between steps it keeps no more than it needs, for many go through the caches.
 struct Part<S: Simd> {
-    block: Block<S>,
     /// The first of the teams, and how many there are.
     first: usize,
     teams: usize,
+    standing: Standing<S>,
+    /// Who was near each POI at each step, `[teams][steps][pois][words]`, if that is kept.
+    record: Vec<u32>,
+}
+
+/// What a thread plays a step with: the block takes on what stands of one vector of teams after the other.
+struct Room<S: Simd> {
+    block: Block<S>,
     /// Who is near each POI, `[pois][words][lanes]`.
     sets: Vec<u32>,
-    /// That of every step, `[teams][steps][pois][words]`, if it is kept.
-    record: Vec<u32>,
+    /// What is turned into rows.
+    columns: Vec<S::f32s>,
     /// Agents and counts before a step, where some teams are over.
     kept: (Vec<Agent<S>>, Vec<S::u32s>),
+}
+
+/// Vectors of teams, and the rooms of as many threads as have been at work at once.
+struct Batch<S: Simd> {
+    simd: S,
+    parts: Vec<Part<S>>,
+    idle: Mutex<Vec<Room<S>>>,
 }
 
 fn vectors<S: Simd>(simd: S, world: &World, teams: usize, record: usize) -> Box<dyn Vectors> {
     let part = |first: usize| {
         let teams = S::f32s::LEN.min(teams - first);
-        let block = Block::new(simd, world);
-        let sets = vec![0; world.pois.len() * world.constants.words as usize * S::f32s::LEN];
-        Part { block, first, teams, sets, record: vec![0; teams * record], kept: Default::default() }
+        Part { first, teams, standing: Block::new(simd, world).into_standing(), record: vec![0; teams * record] }
     };
-    let parts: Vec<Part<S>> = (0..teams).step_by(S::f32s::LEN).map(part).collect();
-    Box::new((simd, parts))
+    let parts = (0..teams).step_by(S::f32s::LEN).map(part).collect();
+    Box::new(Batch { simd, parts, idle: Mutex::default() })
 }
 
 /// So many vectors are done by one thread, which takes less time than to wake another.
 const FEW: usize = 8;
 
-impl<S: Simd> Vectors for (S, Vec<Part<S>>) {
+impl<S: Simd> Vectors for Batch<S> {
     fn reset(&mut self, world: &World, chosen: Option<&[bool]>, starts: Option<&[Vec2]>, shown: &mut Shown) {
-        let (simd, parts) = self;
-        View::new(parts, shown).each(world, &|part, shown| {
+        let simd = self.simd;
+        self.each(world, shown, &|room, part, shown| {
             simd.vectorize(
                 #[inline(always)]
-                || part.reset(*simd, world, chosen, starts, shown),
+                || room.reset(simd, world, part, chosen, starts, shown),
             );
         });
     }
 
     fn step(&mut self, world: &World, actions: &[f32], shown: &mut Shown) {
-        let (simd, parts) = self;
-        View::new(parts, shown).each(world, &|part, shown| {
+        let simd = self.simd;
+        self.each(world, shown, &|room, part, shown| {
             simd.vectorize(
                 #[inline(always)]
-                || part.step(*simd, world, actions, shown),
+                || room.step(simd, world, part, actions, shown),
             );
         });
     }
 
     fn states(&mut self, world: &World, shown: &mut Shown) {
-        let (simd, parts) = self;
-        View::new(parts, shown).each(world, &|part, shown| {
+        let simd = self.simd;
+        self.each(world, shown, &|room, part, shown| {
             simd.vectorize(
                 #[inline(always)]
-                || part.states(*simd, shown),
+                || room.states(simd, part, shown),
             );
         });
     }
 
     fn episode<'a>(&'a self, team: usize, world: &World, seen: &'a mut Vec<u32>) -> Option<Episode<'a>> {
-        let (part, lane) = (&self.1[team / S::f32s::LEN], team % S::f32s::LEN);
+        let (part, lane) = (&self.parts[team / S::f32s::LEN], team % S::f32s::LEN);
         let words = world.set_words();
         let sets = part.record.get(lane * words..(lane + 1) * words)?;
         seen.clear();
-        seen.extend(part.block.counts.iter().map(|count| count[lane]));
+        seen.extend(part.standing.counts.iter().map(|count| count[lane]));
         let plain = |words| Strided { words, stride: 1, offset: 0 };
         Some(Episode { group: 0, team, sets: plain(sets), seen: Seen::Counts(plain(seen)) })
+    }
+}
+
+impl<S: Simd> Batch<S> {
+    /// Does something with every vector, shared out over threads.
+    fn each(
+        &mut self,
+        world: &World,
+        shown: &mut Shown,
+        act: &(impl Fn(&mut Room<S>, &mut Part<S>, Slices<'_>) + Sync),
+    ) {
+        let (simd, parts, idle) = (self.simd, &mut self.parts, &self.idle);
+        View::new(parts, shown).each(world, &|parts, mut shown| {
+            let room = idle.lock().unwrap_or_else(PoisonError::into_inner).pop();
+            let mut room = room.unwrap_or_else(|| Room::new(simd, world));
+            for part in parts {
+                let own = shown.split(part.teams, world);
+                act(&mut room, part, own);
+            }
+            idle.lock().unwrap_or_else(PoisonError::into_inner).push(room);
+        });
     }
 }
 
@@ -423,19 +457,16 @@ impl<'a, S: Simd> View<'a, S> {
         View { parts, shown: Slices { inputs, near, newly, observed, steps, positions, headings, speeds } }
     }
 
-    /// Does something with every vector, shared out over threads.
-    fn each(self, world: &World, act: &(impl Fn(&mut Part<S>, Slices<'_>) + Sync)) {
+    /// Does something with a few at a time, shared out over threads.
+    fn each(self, world: &World, act: &(impl Fn(&'a mut [Part<S>], Slices<'a>) + Sync)) {
         let View { parts, mut shown } = self;
         if parts.len() > FEW {
             let (low, high) = parts.split_at_mut(parts.len() / 2);
             let first = shown.split(low.len() * S::f32s::LEN, world);
             let (low, high) = (View { parts: low, shown: first }, View { parts: high, shown });
             join(|| low.each(world, act), || high.each(world, act));
-            return;
-        }
-        for part in parts {
-            let own = shown.split(part.teams, world);
-            act(part, own);
+        } else {
+            act(parts, shown);
         }
     }
 }
@@ -468,49 +499,65 @@ fn team_of(lane: usize, teams: usize) -> usize {
     if lane < teams { lane } else { 0 }
 }
 
-impl<S: Simd> Part<S> {
-    /// Every lane and its team, of those of this part.
-    #[inline(always)]
-    fn lanes(&self) -> impl Iterator<Item = (usize, usize)> + use<S> {
-        let teams = self.teams;
-        (0..S::f32s::LEN).map(move |lane| (lane, team_of(lane, teams)))
+/// Every lane and its team, in a vector of so many.
+#[inline(always)]
+fn lanes<S: Simd>(teams: usize) -> impl Iterator<Item = (usize, usize)> {
+    (0..S::f32s::LEN).map(move |lane| (lane, team_of(lane, teams)))
+}
+
+impl<S: Simd> Room<S> {
+    fn new(simd: S, world: &World) -> Room<S> {
+        let sets = vec![0; world.pois.len() * world.constants.words as usize * S::f32s::LEN];
+        Room { block: Block::new(simd, world), sets, columns: vec![], kept: Default::default() }
     }
 
     #[inline(always)]
-    fn reset(&mut self, simd: S, world: &World, chosen: Option<&[bool]>, starts: Option<&[Vec2]>, shown: Slices<'_>) {
+    fn reset(
+        &mut self,
+        simd: S,
+        world: &World,
+        part: &mut Part<S>,
+        chosen: Option<&[bool]>,
+        starts: Option<&[Vec2]>,
+        shown: Slices<'_>,
+    ) {
         let Slices { inputs, near, newly, observed, steps, .. } = shown;
         let (agents, pois, words) = (world.agents(), world.pois.len(), world.constants.words as usize);
+        let Part { first, teams, ref mut standing, ref mut record } = *part;
         let is_chosen = |team: usize| chosen.is_none_or(|chosen| chosen[team]);
-        if !(self.first..self.first + self.teams).any(is_chosen) {
+        if !(first..first + teams).any(is_chosen) {
             return;
         }
-        let first = self.first;
-        for (lane, team) in self.lanes().filter(|&(_, team)| is_chosen(first + team)) {
+        self.block.swap(standing);
+        for (lane, team) in lanes::<S>(teams).filter(|&(_, team)| is_chosen(first + team)) {
             let at = (first + team) * agents;
             self.block.place(lane, starts.map_or(&world.starts, |starts| &starts[at..at + agents]));
             self.block.start_lane(lane);
         }
-        for team in (0..self.teams).filter(|team| is_chosen(self.first + team)) {
+        let size = record.len() / teams;
+        for team in (0..teams).filter(|team| is_chosen(first + team)) {
             near[team * pois * words..][..pois * words].fill(0);
             newly[team * pois..][..pois].fill(false);
             observed[team * pois..][..pois].fill(false);
             steps[team] = 0;
-            let size = self.record.len() / self.teams;
-            self.record[team * size..][..size].fill(0);
+            record[team * size..][..size].fill(0);
         }
         self.sense(simd, world, inputs);
+        self.block.swap(standing);
     }
 
     #[inline(always)]
-    fn step(&mut self, simd: S, world: &World, actions: &[f32], shown: Slices<'_>) {
+    fn step(&mut self, simd: S, world: &World, part: &mut Part<S>, actions: &[f32], shown: Slices<'_>) {
         let Slices { inputs, near, newly, observed, steps, .. } = shown;
         let last = world.constants.steps;
         let over = steps.iter().filter(|&&step| step >= last).count();
         newly.fill(false);
-        if over == self.teams {
+        let Part { first, teams, ref mut standing, ref mut record } = *part;
+        if over == teams {
             return;
         }
-        self.take(simd, world, actions);
+        self.block.swap(standing);
+        self.take(simd, world, &actions[first * world.leaders() * OUTPUTS..], teams);
         if over == 0 {
             self.block.go();
         } else {
@@ -518,42 +565,41 @@ impl<S: Simd> Part<S> {
             agents.clone_from(&self.block.agents);
             counts.clone_from(&self.block.counts);
             self.block.go();
-            self.lanes().filter(|&(_, team)| steps[team] >= last).for_each(|(lane, _)| self.keep(lane));
+            lanes::<S>(teams).filter(|&(_, team)| steps[team] >= last).for_each(|(lane, _)| self.keep(lane));
         }
         self.block.couple(&world.pois, &mut self.sets);
-        let lanes: &[f32] = bytemuck::cast_slice(&self.sets);
         let (pois, words) = (world.pois.len(), world.constants.words as usize);
-        to_rows(
-            simd,
-            pois * words,
-            #[inline(always)]
-            |column| &lanes[column * S::f32s::LEN..][..S::f32s::LEN],
-            bytemuck::cast_slice_mut(near),
-        );
+        let sets = bytemuck::cast_slice::<u32, f32>(&self.sets).chunks_exact(S::f32s::LEN);
+        self.columns.clear();
+        self.columns.extend(sets.map(|lanes| S::f32s::from_slice(simd, lanes)));
+        to_rows(simd, &self.columns, bytemuck::cast_slice_mut(near));
         for (team, step) in steps.iter_mut().enumerate().filter(|(_, step)| **step < last) {
             let near = &near[team * pois * words..][..pois * words];
-            let told = newly[team * pois..][..pois].iter_mut().zip(&mut observed[team * pois..][..pois]);
-            for ((newly, observed), (near, &coupling)) in told.zip(near.chunks_exact(words).zip(&world.coupling)) {
-                let count: u32 = near.iter().map(|word| word.count_ones()).sum();
-                *newly = !*observed & (count >= coupling);
-                *observed |= *newly;
+            let newly = &mut newly[team * pois..][..pois];
+            let observed = &mut observed[team * pois..][..pois];
+            for (poi, &coupling) in world.coupling.iter().enumerate() {
+                let count: u32 = near[poi * words..][..words].iter().map(|word| word.count_ones()).sum();
+                if count >= coupling && !observed[poi] {
+                    (newly[poi], observed[poi]) = (true, true);
+                }
             }
-            if !self.record.is_empty() {
+            if !record.is_empty() {
                 let at = team * world.set_words() + *step as usize * near.len();
-                self.record[at..at + near.len()].copy_from_slice(near);
+                record[at..at + near.len()].copy_from_slice(near);
             }
             *step += 1;
         }
         self.sense(simd, world, inputs);
+        self.block.swap(standing);
     }
 
-    /// Takes the actions of its teams as the policies' answers.
+    /// Takes the actions of so many teams as the policies' answers.
     #[inline(always)]
-    fn take(&mut self, simd: S, world: &World, actions: &[f32]) {
+    fn take(&mut self, simd: S, world: &World, actions: &[f32], teams: usize) {
         let columns = world.leaders() * OUTPUTS;
-        let (actions, teams) = (&actions[self.first * columns..], self.teams);
         for quad in 0..S::f32s::LEN / 4 {
-            let rows = [0, 1, 2, 3].map(|lane| &actions[team_of(quad * 4 + lane, teams) * columns..][..columns]);
+            let row = |lane: usize| &actions[team_of(quad * 4 + lane, teams) * columns..][..columns];
+            let rows = [row(0), row(1), row(2), row(3)];
             let outputs = self.block.outputs.as_flattened_mut();
             turn(
                 simd,
@@ -586,64 +632,57 @@ impl<S: Simd> Part<S> {
     #[inline(always)]
     fn sense(&mut self, simd: S, world: &World, inputs: &mut [f32]) {
         self.block.look(&world.pois);
-        let columns = self.block.inputs.as_flattened();
-        to_rows(
-            simd,
-            columns.len(),
-            #[inline(always)]
-            |column| columns[column].as_slice(),
-            inputs,
-        );
+        to_rows(simd, self.block.inputs.as_flattened(), inputs);
     }
 
     #[inline(always)]
-    fn states(&self, simd: S, shown: Slices<'_>) {
-        let agents = &self.block.agents[..];
-        to_rows(
-            simd,
-            agents.len() * 2,
-            #[inline(always)]
-            |column| {
-                let agent = &agents[column / 2];
-                if column % 2 == 0 { agent.x.as_slice() } else { agent.y.as_slice() }
-            },
-            shown.positions,
-        );
-        to_rows(
-            simd,
-            agents.len() * 2,
-            #[inline(always)]
-            |column| {
-                let agent = &agents[column / 2];
-                if column % 2 == 0 { agent.hx.as_slice() } else { agent.hy.as_slice() }
-            },
-            shown.headings,
-        );
-        to_rows(
-            simd,
-            agents.len(),
-            #[inline(always)]
-            |column| agents[column].speed.as_slice(),
-            shown.speeds,
-        );
+    fn states(&mut self, simd: S, part: &Part<S>, shown: Slices<'_>) {
+        let (columns, agents) = (&mut self.columns, &part.standing.agents);
+        columns.clear();
+        for agent in agents {
+            columns.extend_from_slice(&[agent.x, agent.y]);
+        }
+        to_rows(simd, columns, shown.positions);
+        columns.clear();
+        for agent in agents {
+            columns.extend_from_slice(&[agent.hx, agent.hy]);
+        }
+        to_rows(simd, columns, shown.headings);
+        columns.clear();
+        for agent in agents {
+            columns.push(agent.speed);
+        }
+        to_rows(simd, columns, shown.speeds);
     }
 }
 
 /// Turns columns, a lane a team, into a row of numbers a team; lanes that have no row are left out.
 #[inline(always)]
-fn to_rows<'a, S: Simd>(simd: S, columns: usize, lanes: impl Fn(usize) -> &'a [f32], rows: &mut [f32]) {
-    let whole = columns / 4 * 4;
-    for (quad, rows) in rows.chunks_mut(columns * 4).enumerate() {
-        let four = |column: usize| &lanes(column)[quad * 4..quad * 4 + 4];
-        for at in (0..whole).step_by(4) {
-            let fours = [0, 1, 2, 3].map(|column| f32x4::from_slice(simd, four(at + column)));
-            for (row, four) in rows.chunks_exact_mut(columns).zip(transposed(fours)) {
-                four.store_slice(&mut row[at..at + 4]);
+fn to_rows<S: Simd>(simd: S, columns: &[S::f32s], rows: &mut [f32]) {
+    let count = columns.len();
+    let (fours, rest) = columns.as_chunks::<4>();
+    for (quad, rows) in rows.chunks_mut(count * 4).enumerate() {
+        let lanes = quad * 4..quad * 4 + 4;
+        for (at, [a, b, c, d]) in (0..).step_by(4).zip(fours) {
+            let turned = transposed([
+                f32x4::from_slice(simd, &a.as_slice()[lanes.clone()]),
+                f32x4::from_slice(simd, &b.as_slice()[lanes.clone()]),
+                f32x4::from_slice(simd, &c.as_slice()[lanes.clone()]),
+                f32x4::from_slice(simd, &d.as_slice()[lanes.clone()]),
+            ]);
+            let mut to = at;
+            for four in &turned {
+                if let Some(row) = rows.get_mut(to..to + 4) {
+                    four.store_slice(row);
+                }
+                to += count;
             }
         }
-        for column in whole..columns {
-            for (row, &number) in rows.chunks_exact_mut(columns).zip(four(column)) {
-                row[column] = number;
+        for (at, column) in (fours.len() * 4..).zip(rest) {
+            for (row, &number) in column.as_slice()[lanes.clone()].iter().enumerate() {
+                if let Some(to) = rows.get_mut(row * count + at) {
+                    *to = number;
+                }
             }
         }
     }

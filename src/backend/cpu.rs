@@ -377,6 +377,13 @@ pub(crate) struct Block<S: Simd> {
     bounds: Vec<Bounds<S>>,
 }
 
+/// What of a [`Block`] must be kept from one step to the next, once it has looked.
+pub(crate) struct Standing<S: Simd> {
+    pub agents: Vec<Agent<S>>,
+    pub counts: Vec<S::u32s>,
+    near: Vec<u64>,
+}
+
 #[derive(Clone, Copy)]
 pub(crate) struct Agent<S: Simd> {
     pub x: S::f32s,
@@ -411,6 +418,20 @@ impl<S: Simd> Block<S> {
             near: vec![0; agents.div_ceil(64) * agents],
             bounds: vec![Bounds::nowhere(simd); agents.div_ceil(S::f32s::LEN)],
         }
+    }
+
+    /// Only what is kept.
+    pub fn into_standing(self) -> Standing<S> {
+        let Block { agents, counts, near, .. } = self;
+        Standing { agents, counts, near }
+    }
+
+    /// Takes on what stands of other teams, for what stands of these.
+    #[inline(always)]
+    pub fn swap(&mut self, standing: &mut Standing<S>) {
+        std::mem::swap(&mut self.agents, &mut standing.agents);
+        std::mem::swap(&mut self.counts, &mut standing.counts);
+        std::mem::swap(&mut self.near, &mut standing.near);
     }
 
     /// Puts one lane's agents where they start.
@@ -658,16 +679,23 @@ impl<S: Simd> Fixed for Sensing<'_, S> {
 /// Turns rows of equal length into columns: `put` gets the number of each and its four numbers.
 #[inline(always)]
 pub(crate) fn turn<S: Simd>(simd: S, rows: [&[f32]; 4], mut put: impl FnMut(usize, &[f32])) {
-    let columns = rows[0].len();
+    let [a, b, c, d] = rows;
+    let columns = a.len();
     let whole = columns / 4 * 4;
     for at in (0..whole).step_by(4) {
-        let fours = rows.map(|row| f32x4::from_slice(simd, &row[at..at + 4]));
-        for (column, four) in (at..).zip(transposed(fours)) {
+        // Written out: a call that is not inlined knows nothing of wide instructions.
+        let fours = [
+            f32x4::from_slice(simd, &a[at..at + 4]),
+            f32x4::from_slice(simd, &b[at..at + 4]),
+            f32x4::from_slice(simd, &c[at..at + 4]),
+            f32x4::from_slice(simd, &d[at..at + 4]),
+        ];
+        for (column, four) in (at..).zip(&transposed(fours)) {
             put(column, four.as_slice());
         }
     }
     for column in whole..columns {
-        put(column, &rows.map(|row| row[column]));
+        put(column, &[a[column], b[column], c[column], d[column]]);
     }
 }
 
