@@ -9,8 +9,8 @@ use std::process::ExitCode;
 use flotilla::backend::cpu::Cpu;
 use flotilla::baseline::Baselines;
 use flotilla::config::Override;
-use flotilla::record::metrics::Row;
 use flotilla::report::paper::{self, Results, claims, tables};
+use flotilla::trainer::Row;
 use flotilla::trainer::Trainer;
 
 fn main() -> ExitCode {

@@ -9,6 +9,7 @@
 //   TRACE      whether every stage of every step is kept
 //   TALLY      whether a follower counts the leaders that it sees in registers (SIGHTS of them), not in the record
 //   shape      the sizes
+//   variant    what the step has code of its own for
 //   adopt      readies them
 //   decide     a leader's policy
 //
@@ -26,13 +27,10 @@ struct Shape {
     words: u32,
     // Teams of a workgroup; a task may have fewer.
     teams: u32,
-    density: u32,
-    // Whether the largest turn is so small that its sine tells angles apart, not its cosine.
-    by_sine: bool,
 }
 
 // This task's world.
-var<private> world: World;
+var<private> world: Constants;
 
 // Positions of all agents, `[agents][teams]`, as of the last step, and as of this step: the two take turns, so that one
 // barrier a step is enough.
@@ -54,8 +52,7 @@ struct Agent {
     // How often it saw each leader.
     seen: array<u32, SIGHTS>,
     // For the trace: what was sensed and answered, or the force.
-    of_pois: vec4<f32>,
-    of_agents: vec4<f32>,
+    inputs: array<f32, INPUTS>,
     outputs: vec2<f32>,
     force: vec2<f32>,
 }
@@ -80,30 +77,28 @@ fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
     let y = (*me).y;
     let hx = (*me).hx;
     let hy = (*me).hy;
-    var sums = vec4(0.0);
+    var of_pois = vec4(0.0);
     for (var poi = 0u; poi < shape.pois; poi++) {
         let place = places[task.pois + poi];
         let dx = place.x - x;
         let dy = place.y - y;
-        sense(density(world.poi_range2, dx, dy), dx, dy, hx, hy, &sums);
+        sense(density(world.poi_range2, dx, dy), dx, dy, hx, hy, &of_pois);
     }
-    let of_pois = sums * world.poi_share;
-    sums = vec4(0.0);
+    var of_agents = vec4(0.0);
     for (var other = 0u; other < shape.agents; other++) {
         let place = positions[first + other * shape.teams];
         let dx = place.x - x;
         let dy = place.y - y;
         // Who is out of reach adds 0: a warp goes past whoever is out of reach of all of it.
         if dx * dx + dy * dy <= world.agent_range2 && other != leader {
-            sense(density(world.agent_range2, dx, dy), dx, dy, hx, hy, &sums);
+            sense(density(world.agent_range2, dx, dy), dx, dy, hx, hy, &of_agents);
         }
     }
-    let of_agents = sums * world.agent_share;
-    let lane = task.weights + leader * task.teams + (*me).team;
-    let outputs = decide(lane, shape.leaders * task.teams, of_pois, of_agents);
+    let inputs = weigh_in(of_pois, of_agents);
+    let start = task.weights + leader * task.teams + (*me).team;
+    let outputs = decide(start, shape.leaders * task.teams, inputs);
     if TRACE {
-        (*me).of_pois = of_pois;
-        (*me).of_agents = of_agents;
+        (*me).inputs = inputs;
         (*me).outputs = outputs;
     }
     let heading = turn(hx, hy, wanted_turn(outputs.x));
@@ -145,7 +140,7 @@ fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
 // Everyone moves.
 fn go(me: ptr<function, Agent>) {
     let next = (*me).next;
-    let heading = straighten(next.hx, next.hy);
+    let heading = renormalize(next.hx, next.hy);
     let speed = accelerate((*me).speed, next.speed);
     let step = speed * world.dt;
     (*me).x = advance((*me).x, step, heading.x, world.map_x);
@@ -177,13 +172,8 @@ fn couple(task: Task, step: u32, now: u32, thread: u32) {
 }
 
 fn trace(task: Task, step: u32, me: ptr<function, Agent>) {
-    let of_pois = (*me).of_pois;
-    let of_agents = (*me).of_agents;
     var moment: Moment;
-    for (var quadrant = 0u; quadrant < 4u; quadrant++) {
-        moment.inputs[quadrant] = of_pois[quadrant];
-        moment.inputs[4u + quadrant] = of_agents[quadrant];
-    }
+    moment.inputs = (*me).inputs;
     moment.outputs = array<f32, 2>((*me).outputs.x, (*me).outputs.y);
     moment.force = array<f32, 2>((*me).force.x, (*me).force.y);
     moment.position = array<f32, 2>((*me).x, (*me).y);

@@ -1,24 +1,26 @@
 // What the generic kernel has in front instead of constants: the sizes of whatever world a task plays.
 //
-// The host puts this constant in front:
-//   WIDEST     widest layer of any policy, inputs included
+// The host puts in front:
+//   WIDEST         widest layer of any policy, inputs included
+//   world_variant  the variant of this task's world
 
 var<private> shape: Shape;
+var<private> variant: Variant;
 
 fn adopt(task: Task) {
     let agents = world.leaders + world.followers;
     // An empty task has no team, but something to divide by.
     let teams = max(task.teams, 1u);
-    shape = Shape(world.leaders, agents, world.pois, world.words, teams, world.density, world.max_turn_cos > 0.7);
+    shape = Shape(world.leaders, agents, world.pois, world.words, teams);
+    variant = world_variant();
 }
 
 // A leader's answer to its inputs: layer by layer, each unit's bias (the last of its weights) and weighted inputs added
 // in order.
-fn decide(lane: u32, stride: u32, of_pois: vec4<f32>, of_agents: vec4<f32>) -> vec2<f32> {
+fn decide(start: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
     var inputs: array<f32, WIDEST>;
-    for (var quadrant = 0u; quadrant < 4u; quadrant++) {
-        inputs[quadrant] = of_pois[quadrant];
-        inputs[4u + quadrant] = of_agents[quadrant];
+    for (var input = 0u; input < INPUTS; input++) {
+        inputs[input] = sensed[input];
     }
     var first = 0u;
     for (var layer = 0u; layer < world.layers; layer++) {
@@ -27,9 +29,9 @@ fn decide(lane: u32, stride: u32, of_pois: vec4<f32>, of_agents: vec4<f32>) -> v
         var units: array<f32, WIDEST>;
         for (var column = 0u; column < columns; column++) {
             var index = first + column;
-            var sum = weight(lane, stride, index + rows * columns);
+            var sum = weight(start, stride, index + rows * columns);
             for (var row = 0u; row < rows; row++) {
-                sum += inputs[row] * weight(lane, stride, index);
+                sum += inputs[row] * weight(start, stride, index);
                 index += columns;
             }
             units[column] = activate(sum);
@@ -41,6 +43,6 @@ fn decide(lane: u32, stride: u32, of_pois: vec4<f32>, of_agents: vec4<f32>) -> v
 }
 
 // One of a policy's weights.
-fn weight(lane: u32, stride: u32, index: u32) -> f32 {
-    return weights[lane + index / 4u * stride][index % 4u];
+fn weight(start: u32, stride: u32, index: u32) -> f32 {
+    return weights[start + index / 4u * stride][index % 4u];
 }

@@ -16,7 +16,7 @@ fn turn(hx: f32, hy: f32, wanted: f32) -> vec2<f32> {
 }
 
 // The heading scaled back to length 1, by one Newton step: turning lets it drift by a rounding.
-fn straighten(hx: f32, hy: f32) -> vec2<f32> {
+fn renormalize(hx: f32, hy: f32) -> vec2<f32> {
     let scale = 1.5 - (hx * hx + hy * hy) * 0.5;
     return vec2(flush(hx * scale, TINY), flush(hy * scale, TINY));
 }

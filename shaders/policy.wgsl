@@ -5,7 +5,7 @@ const TINY: f32 = 0x1p-30f;
 
 // A unit's sum after its tanh; sums too small to matter become 0, which keeps the next layer away from denormals.
 fn activate(sum: f32) -> f32 {
-    return whole_tangent(half_tangent(limit_tangent(flush(sum, TINY))));
+    return whole_tanh(half_tanh(limit_tanh(flush(sum, TINY))));
 }
 
 // The wanted turn, in radians to the left, of the policy's first output in -1..1.

@@ -2,45 +2,15 @@
 // lays out the weights of a batch's teams as an episode reads them. One buffer holds one leader's policies,
 // `[slots][parameters]`.
 //
-// The host puts this constant in front:
-//   WORKGROUP  threads of a workgroup, a multiple of TILE
+// The host puts in front:
+//   WORKGROUP       threads of a workgroup, a multiple of TILE
+//   Brood, Stretch  as src/backend/gpu/population.rs declares them
 
 // Weights are 0 or of this size at least, and stay at the largest.
 const MIN_WEIGHT: f32 = 0x1p-30f;
 const MAX_WEIGHT: f32 = 1048576.0;
 
 const UNCHANGED: u32 = 0x80000000u;
-
-// How one leader's next generation is made. `Brood` in src/backend/gpu/population.rs.
-struct Brood {
-    // The slots' key, which has the generation and the population in it but not the slot.
-    key: array<u32, 4>,
-    slots: u32,
-    parameters: u32,
-    // Where the leader's parents start in the plan.
-    parents: u32,
-    // Weights whose word is below `threshold` mutate, or all of them.
-    threshold: u32,
-    all: u32,
-    // Whether noise is of a weight's own size.
-    scaled: u32,
-    sigma: f32,
-}
-
-// Some leaders' policies in some teams of one group, which tasks share. `Stretch` in src/backend/gpu/population.rs.
-struct Stretch {
-    // Leaders of a team; those gathered, from `first` on, are `count`, up to four.
-    leaders: u32,
-    first: u32,
-    count: u32,
-    parameters: u32,
-    teams: u32,
-    // Every task has so many, the last what is left.
-    teams_a_task: u32,
-    // Where the stretch starts in its buffers.
-    choices: u32,
-    weights: u32,
-}
 
 @group(0) @binding(1) var<storage, read> brood: Brood;
 // The slot that each slot's policy is copied from, with UNCHANGED set where it does not mutate.
@@ -142,31 +112,31 @@ fn gather(
 ) {
     let across = (stretch.parameters + TILE - 1u) / TILE;
     let index = workgroup.y * workgroups.x + workgroup.x;
-    let first_lane = index / across * TILE;
-    let lanes = stretch.count * stretch.teams;
+    let first_policy = index / across * TILE;
+    let played = stretch.count * stretch.teams;
     let first_parameter = index % across * TILE;
     let column = thread % TILE;
     for (var row = thread / TILE; row < TILE; row += WORKGROUP / TILE) {
-        let lane = first_lane + row;
+        let policy = first_policy + row;
         let parameter = first_parameter + column;
         // The last four weights of a policy may be fewer.
         var weight = 0.0;
-        if lane < lanes && parameter < stretch.parameters {
-            let leader = lane / stretch.teams;
-            let choice = lane % stretch.teams * stretch.leaders + stretch.first + leader;
+        if policy < played && parameter < stretch.parameters {
+            let leader = policy / stretch.teams;
+            let choice = policy % stretch.teams * stretch.leaders + stretch.first + leader;
             weight = weight_of(leader, choices[stretch.choices + choice] * stretch.parameters + parameter);
         }
         tile[row * (TILE + 1u) + column] = weight;
     }
     workgroupBarrier();
-    let lane = first_lane + column;
-    let team = lane % stretch.teams;
-    let leader = stretch.first + lane / stretch.teams;
+    let policy = first_policy + column;
+    let team = policy % stretch.teams;
+    let leader = stretch.first + policy / stretch.teams;
     let before = team / stretch.teams_a_task * stretch.teams_a_task;
     let teams = min(stretch.teams_a_task, stretch.teams - before);
     let fours = (stretch.parameters + 3u) / 4u;
     let task = stretch.weights + before * stretch.leaders * fours;
-    for (var row = thread / TILE; row < TILE / 4u && lane < lanes; row += WORKGROUP / TILE) {
+    for (var row = thread / TILE; row < TILE / 4u && policy < played; row += WORKGROUP / TILE) {
         let four = first_parameter / 4u + row;
         if four < fours {
             let start = column * (TILE + 1u) + 4u * row;

@@ -4,7 +4,7 @@
 fn density(range2: f32, dx: f32, dy: f32) -> f32 {
     let d2 = dx * dx + dy * dy;
     var density: f32;
-    if shape.density == 0u {
+    if variant.density == DENSITY_LINEAR {
         density = 1.0 - root(d2) * world.inverse_diagonal;
     } else {
         density = rsqrt(select(1.0, d2, d2 > 1.0));
@@ -26,4 +26,11 @@ fn sense(density: f32, dx: f32, dy: f32, hx: f32, hy: f32, sums: ptr<function, v
     (*sums).y += select(0.0, density, !left && front);
     (*sums).z += select(0.0, density, left && front);
     (*sums).w += select(0.0, density, left && !front);
+}
+
+// The policy's inputs, of the sums over a leader's quadrants.
+fn weigh_in(of_pois: vec4<f32>, of_agents: vec4<f32>) -> array<f32, INPUTS> {
+    let p = of_pois * world.poi_share;
+    let a = of_agents * world.agent_share;
+    return array(p.x, p.y, p.z, p.w, a.x, a.y, a.z, a.w);
 }

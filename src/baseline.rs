@@ -9,12 +9,12 @@ use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use fearless_simd::Level;
 use glam::Vec2;
-use rayon::prelude::*;
 
 use crate::backend::{Backend, BackendError, Episode, Group, Need};
 use crate::config::{Config, Fitness, Learning};
 use crate::credit::Credit;
 use crate::evolve::{self, Key, Purpose};
+use crate::parallel::*;
 use crate::world::World;
 
 /// What came out for one config: G in 0..1, `[trials][generations + 1]`.

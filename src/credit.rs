@@ -58,28 +58,29 @@ impl Credit {
     pub fn score(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
         self.observed.clear();
         self.observed.resize(world.pois.len(), false);
-        match fitness {
-            Fitness::G => self.observe(episode, world),
-            Fitness::Df if world.followers() > 0 => self.lose_groups(episode, world),
-            Fitness::D | Fitness::Df => self.lose_leaders(episode, world),
-            Fitness::Dpp => self.add_copies(episode, world),
-        }
-        let observed = self.observed.iter().filter(|&&observed| observed).count() as u32;
         let pois = world.pois.len();
         match fitness {
-            Fitness::G => scores.fill(share(observed, pois)),
+            Fitness::G => {
+                self.observe(episode, world);
+                scores.fill(share(self.count_observed(), pois));
+            }
             Fitness::D | Fitness::Df => {
+                match fitness == Fitness::Df && world.followers() > 0 {
+                    true => self.lose_groups(episode, world),
+                    false => self.lose_leaders(episode, world),
+                }
                 self.count_lost(world);
                 scores.iter_mut().zip(&self.lost).for_each(|(score, &lost)| *score = share(lost, pois));
             }
             Fitness::Dpp => {
+                self.add_copies(episode, world);
                 self.count_lost(world);
                 for (leader, score) in scores.iter_mut().enumerate().take(world.leaders()) {
                     *score = self.stepping_stone(world, leader);
                 }
             }
         }
-        observed
+        self.count_observed()
     }
 
     /// Every fitness of every leader. The episode must be one of `world`, played with all scores or the record as a need.
@@ -204,6 +205,10 @@ impl Credit {
             |word: usize| u32::MAX.checked_shl(leaders.saturating_sub(word * 32) as u32).map_or(u32::MAX, |v| !v);
         self.critical.clear();
         self.critical.extend((0..world.pois.len() * words).map(|index| of_word(index % words)));
+    }
+
+    fn count_observed(&self) -> u32 {
+        self.observed.iter().filter(|&&observed| observed).count() as u32
     }
 
     /// Counts the observed POIs to which each leader was critical.

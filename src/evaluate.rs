@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use glam::Vec2;
 
-use crate::backend::{Backend, BackendError, Group, Need};
+use crate::backend::{Backend, BackendError, Group, Moment, Need};
 use crate::credit::Credit;
 use crate::evolve::{self, Key, Purpose};
 use crate::statistics;
@@ -17,6 +17,8 @@ pub const MAX_EPISODES: u32 = 1_000_000;
 /// Most bytes of scores that wait to be summed, and most episodes that play as one batch.
 const BATCH_BYTES: usize = 1 << 26;
 const BATCH_EPISODES: usize = 256;
+/// Most bytes of a trace in memory at once, unless one team's are more.
+const TRACE_BYTES: usize = 1 << 26;
 
 /// Where the agents of each episode start.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -45,6 +47,20 @@ impl Starts {
         }
         starts
     }
+}
+
+/// The choice of policies by which team `t` is made of every leader's policy `t`, `[teams][leaders]`.
+pub fn one_policy_a_team(teams: usize, leaders: usize) -> Vec<u32> {
+    (0..teams as u32).flat_map(|policy| std::iter::repeat_n(policy, leaders)).collect()
+}
+
+/// A group in parts whose traces do not take much memory at once, each with its first team.
+pub fn parts<'a>(group: &Group<'a>) -> impl Iterator<Item = (usize, Group<'a>)> {
+    let (group, leaders) = (*group, group.world.leaders());
+    let moments = (group.world.steps() + 1) * group.world.agents() * size_of::<Moment>();
+    let teams = (TRACE_BYTES / (moments + group.world.set_words() * size_of::<u32>())).max(1);
+    let parts = group.teams.chunks(teams * leaders).enumerate();
+    parts.map(move |(part, chosen)| (part * teams, Group { teams: chosen, ..group }))
 }
 
 /// What a whole number came to over episodes; sums are exact, whatever their order.

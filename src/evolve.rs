@@ -7,16 +7,32 @@ use std::ops::Range;
 
 use fearless_simd::{Level, Simd, SimdMask, dispatch, prelude::*};
 use glam::Vec2;
-use rayon::prelude::*;
 
 use crate::config::{Learning, Mutation};
 use crate::kernels::{bound, math, splat};
+use crate::parallel::*;
 use crate::world::{World, on_grid};
 
 /// Weights are 0 or of this size (2^-30) at least, so that no product in a policy is denormal.
 pub const MIN_WEIGHT: f32 = 1.0 / 1_073_741_824.0;
 /// Weights of larger size (2^20) stay at it.
 pub const MAX_WEIGHT: f32 = 1_048_576.0;
+/// Whether a number may be a weight.
+pub fn is_weight(number: f32) -> bool {
+    number == 0.0 || (MIN_WEIGHT..=MAX_WEIGHT).contains(&number.abs())
+}
+
+/// Makes weights fit for the kernels: those too small for them become 0. Gives the place of one that is too large or
+/// no number.
+pub fn admit(weights: &mut [f32]) -> Option<usize> {
+    weights.iter_mut().position(|weight| {
+        if weight.abs() < MIN_WEIGHT {
+            *weight = 0.0;
+        }
+        weight.is_nan() || weight.abs() > MAX_WEIGHT
+    })
+}
+
 /// Lanes of the widest vectors.
 const WIDEST: usize = 16;
 
@@ -128,7 +144,7 @@ pub fn jitter_starts(key: Key, generation: usize, episode: usize, world: &World,
         return;
     }
     let key = key.at(generation, episode, 0);
-    let map = Vec2::new(world.constants.map_x, world.constants.map_y);
+    let map = world.map();
     for (agent, start) in starts.iter_mut().enumerate() {
         let [x, y, ..] = key.draw(agent as u32).map(|word| {
             // 53 bits are exact in f64, and so is every step but the last, which rounds to f32.
@@ -272,6 +288,64 @@ fn mutate_lanes<S: Simd>(simd: S, key: Key, learning: &Learning, weights: &mut [
     let listed = chosen.list(0);
     chosen.address(simd, 0, listed, key.fork());
     chosen.mutate(simd, learning, weights);
+}
+
+/// A plan that is not one for the populations it was handed to.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct Misfit(String);
+
+/// How the next generation of a trial's populations comes from this one.
+#[derive(Clone, Debug)]
+pub struct Breeding<'a> {
+    /// The plan, `[leaders][slots]`, see [`draw_parents`].
+    pub parents: &'a [u32],
+    /// The trial's key of [`Purpose::Mutation`], and the generation to draw for.
+    pub key: Key,
+    pub generation: usize,
+    pub learning: &'a Learning,
+}
+
+impl Breeding<'_> {
+    /// Whether the plan is one for populations of these sizes, `[leaders, slots, parameters]`. Every backend asks this before it breeds.
+    ///
+    /// # Errors
+    /// It has too few or too many places, or a parent that there is not.
+    pub fn check(&self, [leaders, slots, _]: [usize; 3]) -> Result<(), Misfit> {
+        let misfit = |text: String| Err(Misfit(text));
+        if self.parents.len() != leaders * slots {
+            return misfit(format!("{} parents for {leaders} populations of {slots}", self.parents.len()));
+        }
+        match self.parents.iter().position(|&planned| (planned & !UNCHANGED) as usize >= slots) {
+            None => Ok(()),
+            Some(place) => misfit(format!(
+                "slot {} of population {} has policy {} of {slots} as its parent (they count from 0)",
+                place % slots,
+                place / slots,
+                self.parents[place] & !UNCHANGED
+            )),
+        }
+    }
+
+    /// The next generation of these weights, worked out on the host: what every backend must come to.
+    ///
+    /// # Errors
+    /// The plan is not one for these sizes, see [`Breeding::check`].
+    pub fn on_host(&self, sizes: [usize; 3], weights: &[f32]) -> Result<Vec<f32>, Misfit> {
+        self.check(sizes)?;
+        let [_, slots, parameters] = sizes;
+        let (mut children, mut scratch) = (Vec::with_capacity(weights.len()), Vec::new());
+        for (place, planned) in self.parents.iter().enumerate() {
+            let (leader, slot, first) = (place / slots, place % slots, children.len());
+            let parent = leader * slots + (planned & !UNCHANGED) as usize;
+            children.extend_from_slice(&weights[parent * parameters..(parent + 1) * parameters]);
+            if planned & UNCHANGED == 0 {
+                let key = self.key.at(self.generation, leader, slot);
+                mutate(Level::new(), key, self.learning, &mut children[first..], &mut scratch);
+            }
+        }
+        Ok(children)
+    }
 }
 
 /// The slots of one population to be filled by a plan.

@@ -21,7 +21,7 @@ fn calm_drivers() {
     let valid = std::env::var_os(name).is_some_and(|folder| std::path::Path::new(&folder).is_absolute());
     if cfg!(target_os = "linux") && !valid {
         // SAFETY: the process has no other thread yet that could read the environment.
-        #[allow(unsafe_code)]
+        #[expect(unsafe_code, reason = "the environment is only safe to change while there is one thread")]
         unsafe {
             std::env::set_var(name, "/dev/null");
         }

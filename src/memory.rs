@@ -10,9 +10,9 @@ use std::path::Path;
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
-use crate::backend::gpu::episode::{HELD_FROM, PACKED_FROM};
+use crate::backend::{HELD_FROM, PACKED_FROM};
 use crate::config::Config;
-use crate::world::{INPUTS, OUTPUTS, World};
+use crate::world::World;
 
 /// Bytes of the program itself: its code, its threads' stacks and what it reads. A GPU's driver comes on top.
 pub const PROGRAM: u64 = 8 << 20;
@@ -39,7 +39,7 @@ pub struct Plan {
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "this needs {} of memory at its peak, and {} is available; choose a smaller population, fewer trials{} or another \
-     machine (flotilla check tells what a config needs)",
+     machine",
     human(*needed), human(*available),
     if *checkpoint > 0 { format!(", no checkpoints (they take {} of it)", human(*checkpoint)) } else { String::new() }
 )]
@@ -96,11 +96,19 @@ impl Plan {
     /// # Errors
     /// There is less.
     pub fn check(&self, gpu: bool) -> Result<(), TooLittle> {
-        let (needed, checkpoint) = (if gpu { self.gpu_host } else { self.host }, self.checkpoint);
-        match available() {
-            Some(available) if available < needed => Err(TooLittle { needed, available, checkpoint }),
-            _ => Ok(()),
-        }
+        check(if gpu { self.gpu_host } else { self.host }, self.checkpoint)
+    }
+}
+
+/// Refuses a peak, so much of it for checkpoints, that does not fit in the memory that is available now; lets pass where the
+/// system does not tell.
+///
+/// # Errors
+/// There is less.
+pub fn check(needed: u64, checkpoint: u64) -> Result<(), TooLittle> {
+    match available() {
+        Some(available) if available < needed => Err(TooLittle { needed, available, checkpoint }),
+        _ => Ok(()),
     }
 }
 
@@ -171,9 +179,8 @@ impl Sizes {
 /// The CPU backend's state of one vector of teams.
 fn block_bytes(world: &World, lanes: u64) -> u64 {
     let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
-    let widest = world.constants.widths.into_iter().max().unwrap_or(0) as usize;
-    let policies = leaders * (world.parameters() + INPUTS + 2 * widest + OUTPUTS);
-    let words = 8 * agents + policies + 3 * followers + world.set_words() + followers * leaders;
+    let words =
+        8 * agents + leaders * world.constants.policy.words() + 3 * followers + world.set_words() + followers * leaders;
     words as u64 * lanes * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8) as u64
 }
 

@@ -2,18 +2,19 @@
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use crate::backend::{Backend, BackendError};
+use crate::backend::{BackendError, Machine, Player};
 use crate::config::{self, Config};
+use crate::host::Instant;
 use crate::memory::{self, TooLittle};
 use crate::record::RecordError;
-use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule, Snapshot};
+use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule};
 use crate::record::disk::Disk;
 use crate::record::folder::{self, Folder, METRICS, Note, POLICIES, Run, Start, State, Story};
-use crate::record::metrics::{self, Mark, Row};
+use crate::record::metrics::{self, Mark};
 use crate::record::policies;
-use crate::trainer::{SnapshotError, Trainer};
+use crate::trainer::{Row, Snapshot, SnapshotError, Trainer};
 
 /// How often runs hand their metrics to the system.
 const FLUSH: Duration = Duration::from_secs(1);
@@ -26,12 +27,13 @@ pub enum RunError {
     Record(#[from] RecordError),
     #[error(transparent)]
     TooLittle(#[from] TooLittle),
+    /// Whether all before the generation is saved, is told too.
     #[error("{error}\ngeneration {generation} could not be played{}", after(saved))]
     Backend { error: BackendError, generation: usize, saved: Result<(), Box<RunError>> },
     #[error(
         "there is no memory for {what}, {bytes} bytes; choose a smaller population, fewer trials or another machine"
     )]
-    Memory { what: &'static str, bytes: usize },
+    Memory { what: &'static str, bytes: u64 },
     /// Populations cannot be brought to the host to be saved.
     #[error("no checkpoint could be made: {0}")]
     Held(BackendError),
@@ -39,7 +41,7 @@ pub enum RunError {
 
 impl RunError {
     /// There is no snapshot of so many bytes of policies.
-    pub fn of_snapshot(error: SnapshotError, what: &'static str, bytes: usize) -> RunError {
+    pub fn of_snapshot(error: SnapshotError, what: &'static str, bytes: u64) -> RunError {
         match error {
             SnapshotError::Memory(_) => RunError::Memory { what, bytes },
             SnapshotError::Backend(error) => RunError::Held(error),
@@ -49,25 +51,10 @@ impl RunError {
 
 fn after(saved: &Result<(), Box<RunError>>) -> String {
     match saved {
-        Ok(()) => {
-            "; all before it is saved: go on with --resume, with --on-device-loss cpu to change to the CPU".into()
-        }
+        Ok(()) => "; all before it is saved".into(),
         Err(error) => format!(", and what came before it could not be saved: {error}"),
     }
 }
-
-/// What a run runs on, for `run.json`.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Machine {
-    /// "cpu" or "gpu".
-    pub backend: String,
-    pub adapter: Option<String>,
-    pub driver: Option<String>,
-    pub threads: usize,
-}
-
-/// A backend and what it is.
-pub type Player = (Box<dyn Backend>, Machine);
 
 /// What others may want of runs while they run.
 pub struct Options<'a> {
@@ -151,9 +138,9 @@ impl Session {
         disk: &Disk,
     ) -> Result<(Session, Vec<(usize, Note)>), RunError> {
         // This generation and the next one; asked for first, since later a refusal would be an abort.
-        let bytes = 2 * runs.iter().map(|(config, _)| config.policy_bytes()).sum::<usize>();
+        let bytes = 2 * runs.iter().map(|(config, _)| config.policy_bytes()).sum::<u64>();
         Vec::<u8>::new()
-            .try_reserve_exact(bytes)
+            .try_reserve_exact(bytes.try_into().unwrap_or(usize::MAX))
             .map_err(|_| RunError::Memory { what: "twice the policies of all trials", bytes })?;
         // Before any of them is touched.
         for (_, path) in runs.iter().filter(|_| start == Start::Fresh) {

@@ -166,11 +166,7 @@ pub fn world(seed: u64) -> Config {
             repulsion_gain: gain(rng, 5.0),
             wall_gain: gain(rng, 5.0),
         },
-        sense: Sense {
-            poi_range,
-            agent_range,
-            density: if rng.random_bool(0.5) { Density::Linear } else { Density::Inverse },
-        },
+        sense: Sense { poi_range, agent_range, density: word(rng) },
         policy: Policy {
             hidden: match rng.random_range(0..5) {
                 0 => vec![],
@@ -181,7 +177,7 @@ pub fn world(seed: u64) -> Config {
         },
         learning: Learning {
             paradigm: if rng.random_bool(0.25) { Paradigm::AllLeaders } else { Paradigm::LeaderFollower },
-            fitness: [Fitness::G, Fitness::D, Fitness::Df, Fitness::Dpp][rng.random_range(0..4)],
+            fitness: word(rng),
             population: rng.random_range(2..=20),
             generations: 3,
             trials: 1,
@@ -195,6 +191,11 @@ pub fn world(seed: u64) -> Config {
         },
         checkpoint: Checkpoint::default(),
     }
+}
+
+/// Any word of a choice.
+fn word<T: Choice>(rng: &mut ChaCha8Rng) -> T {
+    T::ALL[rng.random_range(0..T::ALL.len())].1
 }
 
 /// Weights `[leaders][policies][parameters]`, nearly normal; of some policies all small, all large, or mostly 0.

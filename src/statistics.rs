@@ -2,12 +2,22 @@
 //!
 //! Trials of two arms with one seed are pairs: the same starts and, where sizes agree, the same first populations. Their
 //! differences are one sample, of which [`mean`] gives the interval and [`p_value`] the test.
+//!
+//! What asks less of the samples: [`bootstrap`] gives the interval of a mean or a difference, [`rank_sum`] tests two
+//! samples, [`signed_rank`] pairs, and [`holm`] corrects for many tests. A G takes few values, so ranks are full of
+//! ties; `statrs` has no exact p of such samples, so both tests count them here.
 
+use rand::rngs::ChaCha8Rng;
+use rand::{RngExt, SeedableRng};
 use serde::Serialize;
-use statrs::distribution::{Beta, ContinuousCDF, StudentsT};
+use statrs::distribution::{Beta, ContinuousCDF, Normal, StudentsT};
 
 /// The share of intervals that hold what they estimate.
 pub const CONFIDENCE: f64 = 0.95;
+/// Samples that a [`bootstrap`] draws.
+pub const RESAMPLES: usize = 9999;
+/// Most values, in both samples together, whose p is counted out; above, it is that of a normal distribution.
+pub const EXACT: usize = 100;
 
 /// A number with its 95 % interval, both ends included.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -92,4 +102,175 @@ fn moments(values: &[f64]) -> Option<(f64, f64)> {
 /// Student's distribution for the mean of so many values, two at least.
 fn student(count: usize) -> StudentsT {
     StudentsT::new(0.0, 1.0, (count - 1) as f64).expect("two values leave a degree of freedom")
+}
+
+/// The mean of the first sample, less that of the second where there is one, with its bootstrap interval: bias-corrected
+/// and accelerated (BCa) over [`RESAMPLES`] samples, by one seed, so that the same values always have the same interval.
+/// None where a sample has fewer than two values.
+///
+/// Where all values of each sample are alike, the interval has no width.
+pub fn bootstrap(samples: &[&[f64]]) -> Option<Estimate> {
+    if samples.is_empty() || samples.iter().any(|sample| sample.len() < 2) {
+        return None;
+    }
+    // Sums something over the first sample and what is taken off.
+    let total = |of: &mut dyn FnMut(&[f64], f64) -> f64| -> f64 {
+        samples.iter().zip([1.0, -1.0]).map(|(sample, sign)| of(sample, sign)).sum()
+    };
+    let mean = |sample: &[f64]| moments(sample).map_or(f64::NAN, |(mean, _)| mean);
+    let value = total(&mut |sample, sign| sign * mean(sample));
+    let moment = |power: i32| {
+        total(&mut |sample, sign| {
+            let (mean, count) = (mean(sample), sample.len() as f64);
+            sample.iter().map(|value| (sign * (value - mean) / count).powi(power)).sum()
+        })
+    };
+    let spread = moment(2);
+    if spread == 0.0 {
+        return Some(Estimate::exact(value));
+    }
+    let acceleration = moment(3) / spread.powf(1.5) / 6.0;
+
+    let mut random = ChaCha8Rng::seed_from_u64(0);
+    let mut draw = |sample: &[f64], sign: f64| {
+        let count = sample.len();
+        sign * (0..count).map(|_| sample[random.random_range(0..count)]).sum::<f64>() / count as f64
+    };
+    let mut drawn: Vec<f64> = (0..RESAMPLES).map(|_| total(&mut draw)).collect();
+    drawn.sort_by(f64::total_cmp);
+    // Means that only rounding tells apart are the same.
+    let grain = 1e-9 * spread.sqrt();
+    let [below, most] = [value - grain, value + grain].map(|at| drawn.partition_point(|&drawn| drawn < at));
+    let normal = Normal::standard();
+    let bias = normal.inverse_cdf((below + most) as f64 / 2.0 / RESAMPLES as f64);
+    let end = |tail: f64| {
+        let shifted = bias + normal.inverse_cdf(tail);
+        let place = normal.cdf(bias + shifted / (1.0 - acceleration * shifted)) * (RESAMPLES - 1) as f64;
+        let (left, right) = (drawn[place.floor() as usize], drawn[place.ceil() as usize]);
+        left + (right - left) * place.fract()
+    };
+    let tail = (1.0 - CONFIDENCE) / 2.0;
+    Some(Estimate { value, low: end(tail), high: end(1.0 - tail) })
+}
+
+/// What a test of two samples says.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Tested {
+    /// Vargha and Delaney's A: the share of pairings in which the first sample has the larger value, half of those in
+    /// which both have the same added. 0.5 where neither is ahead.
+    pub a: f64,
+    /// Two-sided.
+    pub p: f64,
+}
+
+/// Mann and Whitney's test, over all pairings of two samples; none where one is empty.
+///
+/// The p is exact up to [`EXACT`] values: twice the smaller tail over all ways to deal the values out, ties as they are.
+/// Above, it is by the normal distribution, corrected for ties and continuity.
+pub fn rank_sum(one: &[f64], other: &[f64]) -> Option<Tested> {
+    if one.is_empty() || other.is_empty() {
+        return None;
+    }
+    let ranks = twice_ranks(&[one, other].concat());
+    let (count, all) = (one.len(), ranks.len());
+    let sum: usize = ranks[..count].iter().sum();
+    let pairings = (count * other.len()) as f64;
+    let a = (sum - count * (count + 1)) as f64 / 2.0 / pairings;
+    let p = if all <= EXACT {
+        // The fewer the values in the sample, the fewer sums.
+        let (size, sum) = if 2 * count <= all { (count, sum) } else { (other.len(), ranks[count..].iter().sum()) };
+        two_sided(&sums_of(&ranks, size), sum)
+    } else {
+        let middle = (all + 1) as f64;
+        let squares: f64 = ranks.iter().map(|&rank| (rank as f64 - middle).powi(2)).sum();
+        normal(sum as f64 - count as f64 * middle, pairings * squares / (all * (all - 1)) as f64)
+    };
+    Some(Tested { a, p })
+}
+
+/// Wilcoxon's signed-rank test of the differences between pairs; none of none.
+///
+/// Pairs without a difference have no say in p; it is exact for up to [`EXACT`] others, over all their signs, and by the
+/// normal distribution above, as in [`rank_sum`]. A is over the pairs themselves.
+pub fn signed_rank(differences: &[f64]) -> Option<Tested> {
+    let differences: Vec<f64> = differences.iter().map(|&difference| grained(difference)).collect();
+    let (up, down) = (|value: &&f64| **value > 0.0, |value: &&f64| **value < 0.0);
+    let [up_count, down_count] =
+        [differences.iter().filter(up).count(), differences.iter().filter(down).count()].map(|count| count as f64);
+    let some: Vec<f64> = differences.iter().copied().filter(|&difference| difference != 0.0).collect();
+    let ranks = twice_ranks(&some.iter().map(|difference| difference.abs()).collect::<Vec<_>>());
+    let sum: usize = ranks.iter().zip(&some).filter(|(_, difference)| **difference > 0.0).map(|(rank, _)| rank).sum();
+    let p = if some.len() <= EXACT {
+        two_sided(&sums_of_any(&ranks), sum)
+    } else {
+        let [all, squares] = [1, 2].map(|power| ranks.iter().map(|&rank| (rank as f64).powi(power)).sum::<f64>());
+        normal(sum as f64 - all / 2.0, squares / 4.0)
+    };
+    let count = (!differences.is_empty()).then_some(differences.len() as f64)?;
+    Some(Tested { a: (1.0 + (up_count - down_count) / count) / 2.0, p })
+}
+
+/// Holm's correction of p-values for being many: in their order, none above 1.
+pub fn holm(p: &[f64]) -> Vec<f64> {
+    let mut order: Vec<usize> = (0..p.len()).collect();
+    order.sort_by(|&a, &b| p[a].total_cmp(&p[b]));
+    let (mut corrected, mut most) = (vec![0.0; p.len()], 0.0f64);
+    for (at, place) in order.into_iter().enumerate() {
+        most = most.max(p[place] * (p.len() - at) as f64).min(1.0);
+        corrected[place] = most;
+    }
+    corrected
+}
+
+/// A value without what rounding leaves in its last digits, so that ties are ties.
+fn grained(value: f64) -> f64 {
+    (value * 1e12).round() / 1e12
+}
+
+/// Twice the rank of every value, from 1, ties sharing the middle of theirs: whole numbers.
+fn twice_ranks(values: &[f64]) -> Vec<usize> {
+    let values: Vec<f64> = values.iter().map(|&value| grained(value)).collect();
+    let mut sorted = values.clone();
+    sorted.sort_by(f64::total_cmp);
+    let up_to = |value: f64| sorted.partition_point(|&other| other <= value);
+    values.iter().map(|&value| sorted.partition_point(|&other| other < value) + up_to(value) + 1).collect()
+}
+
+/// How many choices of `size` ranks have which sum.
+fn sums_of(ranks: &[usize], size: usize) -> Vec<f64> {
+    let most = ranks.iter().sum::<usize>();
+    let mut ways = vec![vec![0.0; most + 1]; size + 1];
+    ways[0][0] = 1.0;
+    for (seen, &rank) in ranks.iter().enumerate() {
+        for chosen in (1..=size.min(seen + 1)).rev() {
+            let (fewer, with) = ways.split_at_mut(chosen);
+            with[0][rank..].iter_mut().zip(&fewer[chosen - 1]).for_each(|(with, without)| *with += without);
+        }
+    }
+    ways.swap_remove(size)
+}
+
+/// How likely which sum is where each rank is chosen or not with equal chances.
+fn sums_of_any(ranks: &[usize]) -> Vec<f64> {
+    let mut ways = vec![0.0; ranks.iter().sum::<usize>() + 1];
+    ways[0] = 1.0;
+    for &rank in ranks {
+        for sum in (0..ways.len()).rev() {
+            ways[sum] = 0.5 * (ways[sum] + if sum < rank { 0.0 } else { ways[sum - rank] });
+        }
+    }
+    ways
+}
+
+/// Twice the smaller tail of a distribution from one of its sums on.
+fn two_sided(ways: &[f64], sum: usize) -> f64 {
+    let [low, high, all] = [&ways[..=sum], &ways[sum..], ways].map(|ways| ways.iter().sum::<f64>());
+    (2.0 * low.min(high) / all).min(1.0)
+}
+
+/// The same of a sum of doubled ranks that is so far off its mean, by the normal distribution.
+fn normal(off: f64, variance: f64) -> f64 {
+    // Doubled, half a rank is one.
+    let z = (off.abs() - 1.0) / variance.sqrt();
+    if variance > 0.0 { (2.0 * Normal::standard().sf(z)).min(1.0) } else { 1.0 }
 }

@@ -4,18 +4,17 @@ use std::cell::RefCell;
 use std::collections::TryReserveError;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use fearless_simd::Level;
 use glam::Vec2;
-use rayon::prelude::*;
 
-use crate::backend::{Backend, BackendError, Breeding, Episode, Group, Held, Need, Weights};
+use crate::backend::{Backend, BackendError, Episode, Group, Held, Need, Weights};
 use crate::config::{Config, Learning};
 use crate::credit::Credit;
-use crate::evolve::{self, Key, Purpose};
-pub use crate::record::checkpoint::Snapshot;
-pub use crate::record::metrics::Row;
+use crate::evolve::{self, Breeding, Key, Purpose};
+use crate::host::Instant;
+use crate::parallel::*;
 use crate::world::World;
 
 /// Trains any number of arms (one experiment each) side by side.
@@ -24,6 +23,36 @@ pub struct Trainer {
     level: Level,
     times: Times,
     setback: Option<BackendError>,
+}
+
+/// What one generation of one trial came to; every G is in 0..1.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Row {
+    pub arm: usize,
+    pub trial: usize,
+    pub generation: usize,
+    /// The best and the mean team of the generation.
+    pub best_g: f64,
+    pub mean_g: f64,
+    /// The team of every population's best policy.
+    pub champion_g: f64,
+}
+
+/// What an arm needs to go on from where it was: the populations about to play, and each trial's unfinished row.
+///
+/// Its numbers are its own, or (`N` a slice) a trainer's.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Snapshot<N = Vec<f32>> {
+    /// The generation that plays next.
+    pub generation: usize,
+    /// The run's last generation, after which policies stay as they are.
+    pub last: usize,
+    /// A trial's weights, `[leaders][policies + 1][parameters]`.
+    pub weights: Vec<N>,
+    /// A trial's scores of the generation before, `[leaders][policies]`.
+    pub fitness: Vec<N>,
+    /// A trial's row of the generation before.
+    pub pending: Vec<Option<Row>>,
 }
 
 /// Where the time of generations went.
@@ -118,6 +147,14 @@ impl Trainer {
         self.arms[arm].generation
     }
 
+    /// Makes the generation that an arm plays next its last, or leaves it at an earlier one; gives the last. What comes out is
+    /// what a config of so many generations comes to.
+    pub fn end(&mut self, arm: usize) -> usize {
+        let Arm { config, generation, .. } = &mut self.arms[arm];
+        config.learning.generations = config.learning.generations.min(*generation);
+        config.learning.generations
+    }
+
     /// The error of a backend that held populations and that was made up for since this was last asked: the populations
     /// are on the host from then on.
     pub fn take_setback(&mut self) -> Option<BackendError> {
@@ -146,7 +183,7 @@ impl Trainer {
     /// When the backend fails; the trainer then still stands before this generation.
     pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
         // Once inside the thread pool, for a small generation is over sooner than a thread is woken.
-        rayon::scope(|_| match self.catch_up(backend) {
+        scope(|_| match self.catch_up(backend) {
             // A device may have room for the populations or for the episodes, but not for both.
             Err(error) if self.bring_home() => {
                 let rows = self.catch_up(backend)?;

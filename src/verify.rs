@@ -6,10 +6,10 @@ use std::ops::Range;
 use std::sync::Mutex;
 
 use crate::backend::compare::{Mismatch, first_mismatch};
-use crate::backend::{Backend, BackendError, Breeding, Group, Need};
+use crate::backend::{Backend, BackendError, Group, Need};
 use crate::config::{Config, Fitness};
 use crate::credit::{Credit, Scores};
-use crate::evolve::{Key, Purpose, UNCHANGED};
+use crate::evolve::{Breeding, Key, Purpose, UNCHANGED};
 use crate::sample;
 use crate::trainer::{Row, Trainer};
 use crate::world::World;

@@ -1,5 +1,7 @@
 //! Statistics are scipy's, baselines are what a backend plays, and verdicts on the paper's claims follow from them.
 
+#![cfg(feature = "cli")]
+
 use std::sync::Mutex;
 
 use fearless_simd::Level;
@@ -11,7 +13,7 @@ use flotilla::credit::Credit;
 use flotilla::evolve::{self, Key, Purpose};
 use flotilla::report::paper::claims::{Claim, Verdict, claims};
 use flotilla::report::paper::{self, Arm, LAYOUTS, Results, SOURCES, Source, tables};
-use flotilla::statistics;
+use flotilla::statistics::{self, Tested};
 use flotilla::world::World;
 use serde_json::Value;
 
@@ -52,6 +54,60 @@ fn intervals_and_tests_are_those_of_scipy() {
         near(statistics::mean(&less, 1.0).unwrap().value, &case["difference"]);
         near(statistics::p_value(&less).unwrap(), &case["p"]);
     }
+    let [ranks, signs, intervals, corrected] = ["ranks", "signs", "intervals", "corrected"].map(list);
+    assert!(ranks.len() > 8 && signs.len() > 5 && intervals.len() > 3 && corrected.len() > 2);
+    for case in ranks {
+        let tested = statistics::rank_sum(&numbers(&case["one"]), &numbers(&case["other"])).unwrap();
+        near(tested.a, &case["a"]);
+        near(tested.p, &case["p"]);
+    }
+    for case in signs {
+        let less = numbers(&case["less"]);
+        let tested = statistics::signed_rank(&less).unwrap();
+        near(tested.p, &case["p"]);
+        let ahead = |less: &f64| if *less > 0.0 { 1.0 } else { f64::from(*less == 0.0) / 2.0 };
+        near(tested.a, &(less.iter().map(ahead).sum::<f64>() / less.len() as f64).into());
+    }
+    for case in intervals {
+        let samples: Vec<_> = case["samples"].as_array().unwrap().iter().map(numbers).collect();
+        let ours = statistics::bootstrap(&samples.iter().map(Vec::as_slice).collect::<Vec<_>>()).unwrap();
+        let [low, high] = ["low", "high"].map(|end| case[end].as_f64().unwrap());
+        // Both draw at random, and not the same.
+        let off = 0.03 * (high - low);
+        assert!((ours.low - low).abs() < off && (ours.high - high).abs() < off, "{ours:?} is not {low} to {high}");
+    }
+    for case in corrected {
+        let holm = statistics::holm(&numbers(&case["p"]));
+        holm.iter().zip(case["holm"].as_array().unwrap()).for_each(|(&ours, theirs)| near(ours, theirs));
+    }
+}
+
+#[test]
+fn tests_of_samples_without_a_difference_say_so() {
+    let alike = [0.75; 8];
+    let nothing = Some(Tested { a: 0.5, p: 1.0 });
+    assert_eq!(statistics::rank_sum(&alike, &alike[..3]), nothing);
+    assert_eq!(statistics::rank_sum(&[0.75; 80], &[0.75; 90]), nothing);
+    assert_eq!(statistics::signed_rank(&[0.0; 4]), nothing);
+    assert_eq!((statistics::rank_sum(&alike, &[]), statistics::signed_rank(&[])), (None, None));
+    // Of 5 pairs, 2 of 32 ways; of 5 and 5, 2 of 252: the least that p can be.
+    assert_eq!(statistics::signed_rank(&[1.0; 5]), Some(Tested { a: 1.0, p: 2.0 / 32.0 }));
+    let [one, other] = [[1.0; 5], [0.0; 5]];
+    assert_eq!(statistics::rank_sum(&one, &other), Some(Tested { a: 1.0, p: 2.0 / 252.0 }));
+    // A third less than nothing, and two thirds less than a third, are ties but for rounding.
+    let thirds = [1.0 / 3.0, 2.0 / 3.0 - 1.0 / 3.0, 2.0 / 3.0 - 1.0, 1.0 - 2.0 / 3.0];
+    assert_eq!(statistics::signed_rank(&thirds), statistics::signed_rank(&[1.0, 1.0, -1.0, 1.0]));
+}
+
+#[test]
+fn an_interval_is_the_same_every_time_and_has_no_width_without_spread() {
+    let (one, other) = ([0.25, 0.5, 1.0, 0.75], [0.5, 0.25, 0.0]);
+    let interval = statistics::bootstrap(&[&one, &other]).unwrap();
+    assert_eq!(statistics::bootstrap(&[&one, &other]), Some(interval));
+    assert!(interval.low < interval.value && interval.value == 0.375 && interval.value < interval.high);
+    let alike = statistics::bootstrap(&[&[0.5; 4], &[0.25; 3]]).unwrap();
+    assert_eq!((alike.low, alike.value, alike.high), (0.25, 0.25, 0.25));
+    assert_eq!((statistics::bootstrap(&[&one, &[1.0]]), statistics::bootstrap(&[])), (None, None));
 }
 
 #[test]

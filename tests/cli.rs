@@ -1,5 +1,7 @@
 //! The binary on good and bad input: exit codes, what it prints and where.
 
+#![cfg(feature = "cli")]
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Output;

@@ -316,15 +316,16 @@ proptest! {
     fn a_valid_config_makes_normal_constants(config in configs()) {
         let constants = flotilla::world::World::new(&config).constants;
         let c = &constants;
-        for value in [
-            c.map_x, c.map_y, c.dt, c.heading_x, c.heading_y, c.speed, c.min_speed, c.max_speed,
-            c.max_speed_change, c.max_turn, c.max_turn_cos, c.max_turn_sin, c.observation_radius2,
-            c.attraction_radius2, c.repulsion_radius2, c.poi_range2, c.agent_range2, c.attraction_scale,
-            c.repulsion_scale, c.wall_gain, c.poi_share, c.agent_share, c.inverse_diagonal,
-        ] {
+        let parts: [&[f32]; 4] = [
+            bytemuck::cast_slice(std::slice::from_ref(&c.motion)),
+            bytemuck::cast_slice(std::slice::from_ref(&c.couple)),
+            bytemuck::cast_slice(std::slice::from_ref(&c.follow)),
+            bytemuck::cast_slice(std::slice::from_ref(&c.sense)),
+        ];
+        for value in parts.concat().into_iter().chain([c.heading_x, c.heading_y, c.speed]) {
             prop_assert!(value == 0.0 || (2f32.powi(-100)..=1e30).contains(&value.abs()), "{:?}", constants);
         }
-        prop_assert_eq!(config.parameters(), c.parameters as usize);
+        prop_assert_eq!(config.parameters(), c.policy.parameters as usize);
         prop_assert_eq!(config.learners(), c.leaders as usize);
     }
 

@@ -104,7 +104,7 @@ proptest! {
         evolve::jitter_starts(Key::new(seed, 0, Purpose::Starts), 7, 1, &world, jitter, &mut starts);
         prop_assert_eq!(starts.len(), world.agents());
         for (start, from) in starts.iter().zip(&world.starts) {
-            for (at, from, wall) in [(start.x, from.x, world.constants.map_x), (start.y, from.y, world.constants.map_y)] {
+            for (at, from, wall) in [(start.x, from.x, world.map().x), (start.y, from.y, world.map().y)] {
                 prop_assert!((0.0..=wall).contains(&at));
                 prop_assert!((at * GRID).fract() == 0.0 || at == wall, "{} is off the grid", at);
                 prop_assert!(f64::from((at - from).abs()) <= jitter + 1.0 / f64::from(GRID) + 1e-5, "{} from {}", at, from);

@@ -1,12 +1,15 @@
 //! The shaders stay inside the exact core, the compile passes reach all of their arithmetic, and devices obey.
 
+#![cfg(feature = "gpu")]
+#![expect(unsafe_code, reason = "shaders of the test's own are compiled without bounds checks")]
+
 mod common;
 
 use std::path::{Path, PathBuf};
 
 use flotilla::backend::gpu::device::{self, AdapterInfo, Binding, Choice, DeviceError, Kind, Request};
 use flotilla::backend::gpu::exact::{self, Pass, ShaderError};
-use flotilla::backend::gpu::{probe, shaders};
+use flotilla::backend::gpu::{self, probe, shaders};
 use wgpu::BufferUsages;
 
 const BOTH: [Pass; 2] = [Pass::NoContraction, Pass::Guarded];
@@ -136,7 +139,7 @@ fn nothing_that_decides_results_asks_the_platform() {
         "sin", "cos", "tan", "sin_cos", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2",
         "exp_m1", "ln", "ln_1p", "log2", "log10", "powf", "cbrt",
     ];
-    let decides = ["backend", "kernels"].map(|folder| files(&Path::new("src").join(folder))).concat();
+    let decides = ["backend", "kernels", "model"].map(|folder| files(&Path::new("src").join(folder))).concat();
     let single = ["world", "credit", "evolve", "trainer"].map(|name| PathBuf::from(format!("src/{name}.rs")));
     for path in decides.into_iter().chain(single) {
         let text = std::fs::read_to_string(&path).unwrap();
@@ -237,7 +240,7 @@ fn all_of_the_core_can_be_guarded() {
     assert_eq!(exact::unguarded(&guarded).expect("it is valid"), 0);
     for (request, _) in common::adapters("all_of_the_core_can_be_guarded") {
         for (pass, checked) in [(BOTH[0], false), (BOTH[0], true), (BOTH[1], false), (BOTH[1], true)] {
-            let gpu = match device::open(Request { pass: Some(pass), checked, ..request.clone() }) {
+            let gpu = match gpu::open(Request { pass: Some(pass), checked, ..request.clone() }) {
                 Err(DeviceError::Refused { .. }) if pass == Pass::NoContraction => continue,
                 opened => opened.unwrap_or_else(|error| panic!("{error}")),
             };
@@ -266,14 +269,14 @@ fn devices_are_exact_under_both_passes() {
     for (request, info) in common::adapters("devices_are_exact_under_both_passes") {
         for pass in BOTH {
             for checked in [false, true] {
-                match device::open(Request { pass: Some(pass), checked, ..request.clone() }) {
+                match gpu::open(Request { pass: Some(pass), checked, ..request.clone() }) {
                     Ok(gpu) => assert_eq!((gpu.pass, gpu.checked), (pass, checked)),
                     Err(DeviceError::Refused { .. }) if pass == Pass::NoContraction && info.backend != "vulkan" => {}
                     Err(error) => panic!("{error}"),
                 }
             }
         }
-        let gpu = device::open(request).unwrap_or_else(|error| panic!("{error}"));
+        let gpu = gpu::open(request).unwrap_or_else(|error| panic!("{error}"));
         assert_eq!(gpu.pass == Pass::NoContraction, info.backend == "vulkan", "{info}: the cheaper pass is taken");
     }
 }
@@ -282,9 +285,8 @@ fn devices_are_exact_under_both_passes() {
 #[test]
 fn the_probes_catch_a_device_without_a_pass() {
     for (request, info) in common::adapters("the_probes_catch_a_device_without_a_pass") {
-        let gpu =
-            device::open(Request { pass: Some(Pass::Plain), ..request }).unwrap_or_else(|error| panic!("{error}"));
-        let mismatch = gpu.self_test().unwrap_or_else(|error| panic!("{error}"));
+        let gpu = gpu::open(Request { pass: Some(Pass::Plain), ..request }).unwrap_or_else(|error| panic!("{error}"));
+        let mismatch = gpu::self_test(&gpu).unwrap_or_else(|error| panic!("{error}"));
         if ["llvmpipe", "SwiftShader"].iter().any(|known| info.name.contains(known)) {
             let mismatch = mismatch.unwrap_or_else(|| panic!("{info} reassociates, but no probe shows it"));
             assert_ne!(mismatch.cpu, mismatch.gpu, "{mismatch}");
@@ -295,7 +297,7 @@ fn the_probes_catch_a_device_without_a_pass() {
 #[test]
 fn webgpus_default_limits_are_enough() {
     for (request, _) in common::adapters("webgpus_default_limits_are_enough") {
-        let gpu = device::open(Request { default_limits: true, ..request }).unwrap_or_else(|error| panic!("{error}"));
+        let gpu = gpu::open(Request { default_limits: true, ..request }).unwrap_or_else(|error| panic!("{error}"));
         assert_eq!(gpu.limits, wgpu::Limits::defaults());
         let error = gpu.buffer("the weights", (128 << 20) + 4, BufferUsages::STORAGE).expect_err("it is over 128 MiB");
         assert!(matches!(error, DeviceError::TooLarge { allowed, .. } if allowed == 128 << 20), "{error}");
@@ -309,7 +311,7 @@ fn a_shader_over_the_devices_limits_is_refused() {
     for (request, _) in common::adapters("a_shader_over_the_devices_limits_is_refused") {
         for pass in BOTH {
             let request = Request { default_limits: true, pass: Some(pass), ..request.clone() };
-            let gpu = match device::open(request) {
+            let gpu = match gpu::open(request) {
                 Err(DeviceError::Refused { .. }) if pass == Pass::NoContraction => continue,
                 opened => opened.unwrap_or_else(|error| panic!("{error}")),
             };
@@ -329,15 +331,15 @@ fn a_shader_over_the_devices_limits_is_refused() {
 
 #[test]
 fn an_unknown_adapter_lists_those_there_are() {
-    let error = device::open(Choice::Named("no such adapter".into())).expect_err("there is no such adapter");
-    let message = error.to_string();
+    let error = gpu::open(Choice::Named("no such adapter".into())).expect_err("there is no such adapter");
+    let message = flotilla::cli::Error::from(error).to_string();
     assert!(message.contains("no such adapter") && message.contains("--backend cpu") || !device::adapters().is_empty());
     for info in device::adapters() {
         assert!(message.contains(&info.name), "{message}");
     }
     for (request, info) in common::adapters("an_unknown_adapter_lists_those_there_are") {
         let by_name = Choice::Named(info.name.to_uppercase());
-        let gpu = device::open(Request { choice: by_name, ..request }).unwrap_or_else(|error| panic!("{error}"));
+        let gpu = gpu::open(Request { choice: by_name, ..request }).unwrap_or_else(|error| panic!("{error}"));
         assert_eq!(gpu.adapter.name, info.name);
     }
 }
@@ -368,7 +370,8 @@ fn a_number_is_an_index_and_nothing_is_no_name() {
 #[test]
 fn a_software_renderer_is_taken_by_name_alone() {
     let software = &two()[1..];
-    let error = device::position(&Choice::Real, software).expect_err("there is no GPU").to_string();
+    let error = device::position(&Choice::Real, software).expect_err("there is no GPU");
+    let error = flotilla::cli::Error::from(error).to_string();
     assert!(
         error.contains("0: llvmpipe") && error.contains("--adapter 0") && error.contains("--backend cpu"),
         "{error}"
@@ -379,7 +382,7 @@ fn a_software_renderer_is_taken_by_name_alone() {
 
 #[test]
 fn a_real_gpu_is_never_a_software_renderer() {
-    match device::open(Choice::Real) {
+    match gpu::open(Choice::Real) {
         Ok(gpu) => assert!(gpu.adapter.kind.is_real(), "{}", gpu.adapter),
         Err(DeviceError::NoRealAdapter { found }) => assert!(found.iter().all(|info| !info.kind.is_real())),
         Err(DeviceError::NoAdapter) => assert!(device::adapters().is_empty()),
@@ -393,7 +396,7 @@ fn a_real_gpu_is_never_a_software_renderer() {
 #[test]
 fn a_lost_device_is_an_error() {
     for (request, info) in common::adapters("a_lost_device_is_an_error") {
-        let gpu = device::open(request).unwrap_or_else(|error| panic!("{error}"));
+        let gpu = gpu::open(request).unwrap_or_else(|error| panic!("{error}"));
         gpu.check().expect("nothing has happened yet");
         gpu.device.destroy();
         let error = gpu.wait().and_then(|()| gpu.buffer("a buffer", 64, BufferUsages::STORAGE).map(drop));
@@ -406,7 +409,7 @@ fn a_lost_device_is_an_error() {
 #[test]
 fn running_out_of_memory_is_an_error() {
     for (request, info) in common::adapters("running_out_of_memory_is_an_error") {
-        let gpu = device::open(request).unwrap_or_else(|error| panic!("{error}"));
+        let gpu = gpu::open(request).unwrap_or_else(|error| panic!("{error}"));
         let bytes = gpu.limits.max_storage_buffer_binding_size.min(gpu.limits.max_buffer_size) & !3;
         // SwiftShader has less memory than one buffer may take; elsewhere two of the largest may well fit.
         let made = [(); 2].map(|()| gpu.buffer("the sets", bytes, BufferUsages::STORAGE));
@@ -424,7 +427,7 @@ fn a_refusal_names_the_device_and_the_probe() {
     let mismatch =
         probe::Mismatch { probe: "x*y + z".into(), values: vec![1.5f32.to_bits()], cpu: 1, gpu: 2 }.to_string();
     let failures = vec![(Pass::NoContraction, mismatch.clone()), (Pass::Guarded, mismatch)];
-    let message = DeviceError::Inexact { adapter: "Some GPU".into(), failures }.to_string();
+    let message = flotilla::cli::Error::from(DeviceError::Inexact { adapter: "Some GPU".into(), failures }).to_string();
     for part in ["Some GPU", "x*y + z", "no-contraction", "guarded", "0x00000002", "1.5e0", "--backend cpu"] {
         assert!(message.contains(part), "{part}: {message}");
     }

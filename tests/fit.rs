@@ -151,7 +151,7 @@ fn the_logarithm_is_as_good_as_its_form_and_f32_allow() {
 /// Both parts of tanh(x/2) = n/d: with the limit and d's coefficients as they are, n is the best it can be for tanh x.
 #[test]
 fn the_tangent_ends_at_1_and_errs_both_ways_alike() {
-    let (limit, all) = (f64::from(numbers("limit_tangent")[0]), numbers("half_tangent"));
+    let (limit, all) = (f64::from(numbers("limit_tanh")[0]), numbers("half_tanh"));
     let [a, b, c, d, e] = all[..5] else { panic!("five coefficients: {all:?}") };
     let [a, b, c, d, e] = [a, b, c, d, e].map(f64::from);
     let tanh = |x: f64| {

@@ -2,10 +2,13 @@
 //!
 //! `FLOTILLA_FUZZ` is how many mutated inputs each reader gets (20 000 if left out).
 
+#![cfg(feature = "cli")]
+
 use std::fs;
 use std::io::Cursor;
 use std::time::{Duration, Instant};
 
+use flotilla::backend::Machine;
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::Config;
 use flotilla::evolve::{MAX_WEIGHT, MIN_WEIGHT};
@@ -15,7 +18,7 @@ use flotilla::record::folder::{METRICS, POLICIES, RUN, Run, Start};
 use flotilla::record::metrics::Rows;
 use flotilla::record::tensors::MAX_HEADER_BYTES;
 use flotilla::record::{hex, policies};
-use flotilla::run::{Machine, Options, Session};
+use flotilla::run::{Options, Session};
 use flotilla::trainer::Trainer;
 use rand::{RngExt, SeedableRng, rngs::ChaCha8Rng};
 use sha2::{Digest, Sha256};

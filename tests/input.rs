@@ -1,4 +1,5 @@
 //! The binary on what a careless or hostile user types and leaves in files: one clear line, nothing lost, no waiting.
+#![cfg(feature = "cli")]
 #![cfg(unix)]
 
 use std::ffi::OsStr;

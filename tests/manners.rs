@@ -1,5 +1,7 @@
 //! What makes the program at home on a machine: its version, configs to start from, standard input, shells and manuals.
 
+#![cfg(feature = "cli")]
+
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Output};

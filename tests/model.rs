@@ -5,6 +5,8 @@
 //! compared, unless every operation before the threshold was exact: the ties of a layout must fall as the mission says.
 //! Counted too is a step on which roundings grow beyond [`STATE`]: a policy may be steep, and forces may cancel.
 
+#![cfg(feature = "cli")]
+
 use std::f64::consts::PI;
 
 use flotilla::backend::cpu::{Cpu, level_name};

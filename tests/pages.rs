@@ -10,6 +10,8 @@
 //! Commands that are not run, and those inside a text (`` `flotilla …` ``), have to be such that the program takes their
 //! flags; a word in capitals stands for a value there.
 
+#![cfg(feature = "cli")]
+
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};

@@ -3,19 +3,20 @@
 //!
 //! Every test walks all adapters. What each has caught is said where it stands.
 
+#![cfg(feature = "gpu")]
+
 mod common;
 
-use std::mem::offset_of;
-
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::gpu::device::{self, Request};
+use flotilla::backend::gpu::device::Request;
 use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records, State, Task};
 use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::population::{Brood, Stretch};
-use flotilla::backend::{Backend, Breeding, Group, Moment, Need, Weights};
+use flotilla::backend::{Backend, Group, Moment, Need, Weights};
 use flotilla::config::{Config, Fitness};
+use flotilla::declare::Shared;
 use flotilla::evaluate::{Starts, evaluate};
-use flotilla::evolve::{Key, Purpose};
+use flotilla::evolve::{Breeding, Key, Purpose};
 use flotilla::trainer::Trainer;
 use flotilla::verify::{Outcome, Plan, compare};
 use flotilla::world::{Constants, World};
@@ -26,7 +27,7 @@ const KERNELS: [Kernel; 2] = [Kernel::Generic, Kernel::Specialised];
 
 /// One that holds all populations and packs all records.
 fn open(request: &Request, pass: Pass, kernel: Kernel) -> GpuEpisodes {
-    let gpu = device::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
+    let gpu = gpu::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
     GpuEpisodes::new(gpu).unwrap().playing(kernel).holding(Holding::Always).bringing(Records::Packed)
 }
 
@@ -55,7 +56,7 @@ fn checked_shaders_and_default_limits_agree() {
             [Request { checked: true, ..request.clone() }, Request { default_limits: true, ..request.clone() }]
         {
             for (kernel, seeds) in KERNELS.into_iter().zip([100..112, 100..102]) {
-                let gpu = device::open(request.clone()).unwrap();
+                let gpu = gpu::open(request.clone()).unwrap();
                 let backend = GpuEpisodes::new(gpu).unwrap().playing(kernel);
                 let backend = backend.holding(Holding::Always).bringing(Records::Packed);
                 assert_eq!(check(&Plan::random(seeds, 5), backend).mismatch, None, "{info}, {kernel}, {request:?}");
@@ -114,7 +115,7 @@ fn large_worlds_agree() {
     for (request, info) in common::adapters("large_worlds_agree") {
         let worlds = vec![("crowd".into(), crowd.clone()), ("leaders only".into(), leaders_only.clone())];
         let plan = Plan { worlds, teams: 2, seed: 0, generations: 0 };
-        let backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap().bringing(Records::Packed);
+        let backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().bringing(Records::Packed);
         // Training them would take the software drivers minutes: traces and batches are enough.
         let plan = Plan { worlds: plan.worlds.into_iter().map(small_population).collect(), ..plan };
         assert_eq!(check(&plan, backend).mismatch, None, "{info}");
@@ -135,7 +136,7 @@ fn long_episodes_agree() {
     for (request, info) in common::adapters("long_episodes_agree") {
         for kernel in KERNELS {
             let plan = Plan { worlds: vec![("long".into(), config.clone())], teams: 9, seed: 0, generations: 0 };
-            let backend = GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap().playing(kernel);
+            let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap().playing(kernel);
             let backend = backend.bringing(Records::Packed);
             assert_eq!(check(&plan, backend).mismatch, None, "{info}, {kernel}");
         }
@@ -165,7 +166,7 @@ fn batches_cut_small_give_the_same_record() {
     let expected = record(&mut Cpu::default());
     for (request, info) in common::adapters("batches_cut_small_give_the_same_record") {
         for bytes in [1 << 12, 1 << 15, 1 << 28] {
-            let backend = GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap();
+            let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
             assert_eq!(record(&mut backend.batched(bytes)), expected, "{info}, batches of {bytes} bytes");
         }
     }
@@ -196,73 +197,28 @@ fn training_gives_the_same_metrics_and_weights() {
         assert_eq!(train(&mut Cpu::default(), std::slice::from_ref(config)).1[0], weights[arm]);
     }
     for (request, info) in common::adapters("training_gives_the_same_metrics_and_weights") {
-        let mut backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap();
+        let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap();
         assert_eq!(train(&mut backend, &both), (rows.clone(), weights.clone()), "{info}");
     }
 }
 
-/// The structs of the shaders lie in memory as the host writes them.
+/// The structs of the shaders lie in memory as the host writes them: no side pads what the other does not.
 #[test]
 fn structs_lie_alike_on_both_sides() {
     let texts = gpu::shaders();
     let modules: Vec<_> = texts.iter().map(|(_, text)| exact::parse(text).unwrap().0).collect();
-    macro_rules! check {
-        ($wgsl:literal, $host:ty, $($field:ident),*) => {
-            let host = [$((stringify!($field), offset_of!($host, $field))),*];
-            let mut types = modules.iter().flat_map(|module| module.types.iter());
-            let (_, found) = types.find(|(_, ty)| ty.name.as_deref() == Some($wgsl)).unwrap();
-            let naga::TypeInner::Struct { members, span } = &found.inner else { panic!("{} is a struct", $wgsl) };
-            let wgsl: Vec<_> =
-                members.iter().map(|member| (member.name.as_deref().unwrap(), member.offset as usize)).collect();
-            assert_eq!(wgsl, host, $wgsl);
-            assert_eq!(*span as usize, size_of::<$host>(), $wgsl);
-        };
+    fn check<T: Shared>(modules: &[naga::Module]) {
+        let mut types = modules.iter().flat_map(|module| module.types.iter());
+        let (_, found) = types.find(|(_, ty)| ty.name.as_deref() == Some(T::NAME)).unwrap();
+        let naga::TypeInner::Struct { span, .. } = &found.inner else { panic!("{} is a struct", T::NAME) };
+        assert_eq!(*span as usize, size_of::<T>(), "{}", T::NAME);
     }
-    check!(
-        "World",
-        Constants,
-        leaders,
-        followers,
-        pois,
-        steps,
-        words,
-        layers,
-        widths,
-        parameters,
-        map_x,
-        map_y,
-        dt,
-        heading_x,
-        heading_y,
-        speed,
-        min_speed,
-        max_speed,
-        max_speed_change,
-        max_turn,
-        max_turn_cos,
-        max_turn_sin,
-        observation_radius2,
-        attraction_radius2,
-        repulsion_radius2,
-        poi_range2,
-        agent_range2,
-        repulsion_radius,
-        attraction_scale,
-        repulsion_scale,
-        wall_gain,
-        poi_share,
-        agent_share,
-        density,
-        inverse_diagonal
-    );
-    check!(
-        "Task", Task, world, starts, pois, weights, sets, seen, moments, states, teams, first, end, least, table,
-        owners
-    );
-    check!("State", State, x, y, hx, hy, speed);
-    check!("Brood", Brood, key, slots, parameters, parents, threshold, all, scaled, sigma);
-    check!("Stretch", Stretch, leaders, first, count, parameters, teams, teams_a_task, choices, weights);
-    check!("Moment", Moment, inputs, outputs, force, position, heading, speed);
+    check::<Constants>(&modules);
+    check::<Task>(&modules);
+    check::<State>(&modules);
+    check::<Brood>(&modules);
+    check::<Stretch>(&modules);
+    check::<Moment>(&modules);
 }
 
 /// Drawn starts make one group an episode: batches of many groups, of which each has a few teams.
@@ -327,7 +283,7 @@ fn a_wrong_index_is_an_error() {
     ];
     let mut backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::default())];
     for (request, _) in common::adapters("a_wrong_index_is_an_error") {
-        backends.push(Box::new(GpuEpisodes::new(device::open(request).unwrap()).unwrap().holding(Holding::Always)));
+        backends.push(Box::new(GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().holding(Holding::Always)));
     }
     for backend in &mut backends {
         for (group, named) in &bad {
@@ -343,7 +299,8 @@ fn a_wrong_index_is_an_error() {
         let key = Key::new(0, 0, Purpose::Mutation);
         for (parents, named) in [(vec![0; 11], "11 parents"), ([vec![0; 11], vec![3]].concat(), "policy 3 of 3")] {
             let breeding = Breeding { parents: &parents, key, generation: 0, learning: &learning };
-            for error in [held.breed(&breeding).expect_err(named), breeding.on_host(sizes, &weights).expect_err(named)]
+            for error in
+                [held.breed(&breeding).expect_err(named), breeding.on_host(sizes, &weights).expect_err(named).into()]
             {
                 assert!(error.to_string().contains(named), "{}: {error}", backend.describe());
             }
@@ -389,7 +346,7 @@ fn kernels_are_compiled_for_few_worlds_and_shared() {
     });
     let (gains, sizes): (Vec<_>, Vec<_>) = (gains.collect(), sizes.collect());
     for (request, info) in common::adapters("kernels_are_compiled_for_few_worlds_and_shared") {
-        let mut backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap().playing(Kernel::Best);
+        let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().playing(Kernel::Best);
         assert_eq!(play(&mut backend, &gains), [0, 1], "{info}: only the numbers differ");
         assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: the other worlds share the generic kernel");
         assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: nothing is compiled twice");

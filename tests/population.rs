@@ -1,5 +1,7 @@
 //! Populations that a GPU holds against populations on the host, bit for bit: bred, gathered, trained, saved and lost.
 
+#![cfg(feature = "cli")]
+
 mod common;
 
 use std::any::Any;
@@ -8,14 +10,16 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::SeqCst};
 
 use fearless_simd::Level;
 use flotilla::backend::cpu::Cpu;
+use flotilla::backend::gpu;
 use flotilla::backend::gpu::device::{self, DeviceError, Kind};
-use flotilla::backend::gpu::episode::{GpuEpisodes, HELD_FROM, Holding};
-use flotilla::backend::{Backend, BackendError, Breeding, Group, Held, Trace, Visit, Weights};
+use flotilla::backend::gpu::episode::{GpuEpisodes, Holding};
+use flotilla::backend::{Backend, BackendError, Group, HELD_FROM, Held, Trace, Visit, Weights};
+use flotilla::backend::{Machine, Player};
 use flotilla::config::{Config, Fitness, Learning, Mutation, Paradigm};
-use flotilla::evolve::{self, Key, Purpose, UNCHANGED};
+use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, Start};
-use flotilla::run::{Machine, Options, Outcome, Player, Session};
+use flotilla::run::{Options, Outcome, Session};
 use flotilla::trainer::{Row, Snapshot, SnapshotError, Trainer};
 
 fn learning() -> Learning {
@@ -53,7 +57,7 @@ fn parents([leaders, slots, _]: [usize; 3], generation: usize) -> Vec<u32> {
 #[test]
 fn breeding_gives_the_same_bits() {
     for (request, info) in common::adapters("breeding_gives_the_same_bits") {
-        let mut backend = GpuEpisodes::new(device::open(request).unwrap()).unwrap().holding(Holding::Always);
+        let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().holding(Holding::Always);
         let mut mutated = 0;
         for sizes in [[1, 2, 1], [3, 5, 97], [4, 51, 112], [2, 301, 64], [2, 17, 1000], [1, 300, 65], [257, 2, 18]] {
             for (case, probability) in [0.0, 0.1, 0.999, 1.0].into_iter().enumerate() {
@@ -148,7 +152,7 @@ fn training_comes_to_the_same_wherever_populations_are() {
     let (expected, snapshots) = reference();
     assert!(expected.rows.iter().any(|row| row.best_g > 0.0), "nothing was observed");
     for (request, info) in common::adapters("training_comes_to_the_same_wherever_populations_are") {
-        let gpu = device::open(request).unwrap();
+        let gpu = gpu::open(request).unwrap();
         let open = |holding| GpuEpisodes::new(gpu.clone()).unwrap().holding(holding);
         // The populations of some arms take more than this, of others less.
         let some = Holding::From(4 * 30 * 112 * 4);
@@ -231,13 +235,13 @@ fn a_setback_is_told() {
 #[test]
 fn what_does_not_fit_the_device_is_declined() {
     for (request, info) in common::adapters("what_does_not_fit_the_device_is_declined") {
-        let gpu = device::open(device::Request { default_limits: true, ..request }).unwrap();
+        let gpu = gpu::open(device::Request { default_limits: true, ..request }).unwrap();
         // The least over WebGPU's 128 MiB; a backend that declines does not look at the weights.
         let sizes = [1, (128 << 20) / 4 / 112 + 1, 112];
         let open = |holding| GpuEpisodes::new(gpu.clone()).unwrap().holding(holding);
         assert!(open(Holding::From(1)).hold(&[], sizes).unwrap().is_none(), "{info}");
         let error = open(Holding::Always).hold(&[], sizes).unwrap_err().to_string();
-        assert!(error.contains("134217") && error.contains("--breed host"), "{info}: {error}");
+        assert!(error.contains("134217") && error.contains("breed on the host"), "{info}: {error}");
         assert!(open(Holding::Never).hold(&[], [1, 2, 1]).unwrap().is_none(), "{info}");
         // Nothing is asked for.
         let weights = vec![0.0; HELD_FROM as usize / 4];
@@ -417,7 +421,7 @@ fn a_run_survives_the_loss_of_the_device_that_holds_its_populations() {
         assert_eq!((ended.unwrap(), &found), (expected.clone(), &rows), "call {nth}");
         let name = format!("stop-{nth}");
         let (ended, _) = run(&name, Start::Fresh, Some(Device::failing_at(nth, true)), false);
-        let error = ended.unwrap_err().to_string();
+        let error = flotilla::cli::Error::from(ended.unwrap_err()).to_string();
         assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
         gone += usize::from(error.contains("the populations were lost"));
         let (ended, found) = run(&name, Start::Resume, None, false);

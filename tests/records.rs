@@ -1,13 +1,16 @@
 //! What comes home of a GPU's episodes: scores are the same from whole and from packed records, whatever matters of them,
 //! and little goes over the bus.
 
+#![cfg(feature = "gpu")]
+
 mod common;
 
 use std::collections::BTreeMap;
 use std::sync::Mutex;
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::gpu::device::{self, Request};
+use flotilla::backend::gpu;
+use flotilla::backend::gpu::device::Request;
 use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records};
 use flotilla::backend::{Backend, Group, Need};
 use flotilla::config::{Config, Fitness, Paradigm};
@@ -86,7 +89,7 @@ fn expected(all: &[Teams], first: usize) -> Scores {
 }
 
 fn open(request: &Request, records: Records) -> GpuEpisodes {
-    GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap().bringing(records)
+    GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap().bringing(records)
 }
 
 /// What came from the device since this was last asked.
@@ -293,7 +296,7 @@ fn compiling() {
     cases.push(("large.toml".into(), sweep.points.into_iter().map(|point| small(point.config)).collect()));
     for (request, info) in common::adapters("compiling") {
         for (name, configs) in &cases {
-            let backend = || GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap();
+            let backend = || GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
             let gpu = backend().playing(Kernel::Best).holding(Holding::Always).bringing(Records::PackedFrom(0));
             for (what, mut backend) in [("by default", backend()), ("as on a GPU", gpu)] {
                 let mut trainer = Trainer::new(configs.clone());

@@ -2,6 +2,8 @@
 //!
 //! `FLOTILLA_KILLS` is how often the real program is killed (20 if left out).
 
+#![cfg(feature = "cli")]
+
 mod common;
 
 use std::fs;
@@ -13,15 +15,17 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::gpu::device::{self, DeviceError};
+use flotilla::backend::gpu;
+use flotilla::backend::gpu::device::DeviceError;
 use flotilla::backend::gpu::episode::GpuEpisodes;
 use flotilla::backend::{Backend, BackendError, Group, Trace, Visit};
+use flotilla::backend::{Machine, Player};
 use flotilla::config::Config;
 use flotilla::record::checkpoint::{self, Checkpoint};
 use flotilla::record::disk::{Disk, Operation};
 use flotilla::record::folder::{Folder, METRICS, Note, POLICIES, Run, Start, State};
 use flotilla::record::{RecordError, policies};
-use flotilla::run::{Machine, Options, Outcome, Player, Results, RunError, Session};
+use flotilla::run::{Options, Outcome, Results, RunError, Session};
 use rand::{RngExt, SeedableRng, rngs::ChaCha8Rng};
 use tempfile::TempDir;
 
@@ -590,7 +594,7 @@ fn a_lost_device_costs_nothing() {
         // It saves, and is resumed.
         let path = folder.path().join("stop");
         let told = session(&config, &path, Start::Fresh, Disk::default(), failing(), None);
-        let error = told.end.unwrap_err().to_string();
+        let error = flotilla::cli::Error::from(told.end.unwrap_err()).to_string();
         assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
         assert_eq!(Run::read(&path.join("run.json")).unwrap().state, State::Stopped);
         let (results, told) = resume(&config, &path);
@@ -618,7 +622,7 @@ fn a_run_may_change_to_another_processor_and_back() {
     let expected = reference(&config);
     for (request, info) in common::adapters("a_run_may_change_to_another_processor_and_back") {
         let gpu = || -> Player {
-            let backend = GpuEpisodes::new(device::open(request.clone()).unwrap()).unwrap();
+            let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
             (Box::new(backend), Machine { backend: "gpu".into(), ..Machine::default() })
         };
         let folder = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! `docs/reference.md` says what the table of keys in `src/config.rs` says. `FLOTILLA_WRITE=1` writes the page anew.
+//! `docs/reference.md` says what the table of keys says. `FLOTILLA_WRITE=1` writes the page anew.
 
 use std::fmt::Write;
 

@@ -1,5 +1,7 @@
 //! Pictures and replays of small real runs, and what becomes of damaged ones.
 
+#![cfg(feature = "cli")]
+
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -3,14 +3,16 @@
 //!
 //! Where results change on purpose, `FLOTILLA_WRITE_CLAIMS=1 cargo test --test stories` writes the tables anew.
 
+#![cfg(feature = "cli")]
+
 use std::fs;
 use std::path::Path;
 
 use flotilla::backend::cpu::Cpu;
 use flotilla::baseline::Baselines;
 use flotilla::config::Override;
-use flotilla::record::metrics::Row;
 use flotilla::report::paper::{self, Results, claims, tables};
+use flotilla::trainer::Row;
 use flotilla::trainer::Trainer;
 
 const TRIALS: u32 = 30;

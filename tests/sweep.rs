@@ -1,6 +1,8 @@
 //! Sweeps: what a file expands to, how points are shared out, and that neither sharing, batching nor killing shows in
 //! the results.
 
+#![cfg(feature = "cli")]
+
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -452,7 +454,7 @@ fn batches_fit_in_memory() {
     let sweep = sweep_of(SMALL);
     let points: Vec<_> = sweep.points.iter().collect();
     let one = run::bytes(&points[0].config);
-    assert!(one > points[0].config.policy_bytes());
+    assert!(one as u64 > points[0].config.policy_bytes());
     for memory in [0, one, 2 * one, 3 * one, usize::MAX] {
         let batches = run::batches(&points, memory);
         assert_eq!(batches.concat().iter().map(|point| point.index).collect::<Vec<_>>(), (0..8).collect::<Vec<_>>());

@@ -1,5 +1,7 @@
 //! `train` and `rollout` as a user meets them: the files, what is printed and where, exit codes.
 
+#![cfg(feature = "cli")]
+
 use std::collections::HashMap;
 use std::fs;
 use std::path::{Path, PathBuf};

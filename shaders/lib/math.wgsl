@@ -35,22 +35,22 @@ fn rough_twice_recip(x: f32) -> f32 {
 }
 
 // x, brought to where tanh comes to 1 if it is beyond.
-fn limit_tangent(x: f32) -> f32 {
+fn limit_tanh(x: f32) -> f32 {
     let limit = 7.5501223;
     let low = select(limit, x, x < limit);
     return select(-limit, low, low > -limit);
 }
 
-// n and d with tanh(x/2) = n/d, for an x from limit_tangent.
-fn half_tangent(x: f32) -> vec2<f32> {
+// n and d with tanh(x/2) = n/d, for an x from limit_tanh.
+fn half_tanh(x: f32) -> vec2<f32> {
     let z = x * x;
     let n = x * ((z * 0.02999907 + 14.7163315) * z + 544.93274);
     let d = (z + 120.25281) * z + 1089.8662;
     return vec2<f32>(n, d);
 }
 
-// tanh x of its half_tangent.
-fn whole_tangent(half: vec2<f32>) -> f32 {
+// tanh x of its half_tanh.
+fn whole_tanh(half: vec2<f32>) -> f32 {
     let n = half.x;
     let d = half.y;
     let s = n * n + d * d;

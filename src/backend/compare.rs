@@ -3,7 +3,8 @@
 use std::fmt;
 
 use super::{Moment, Trace};
-use crate::world::World;
+use crate::model::sense;
+use crate::world::{INPUTS, World};
 
 /// What is compared of a step, in the order in which a step works it out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -75,9 +76,9 @@ pub fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<
     for (index, (a, b)) in expected.moments.iter().zip(&found.moments).enumerate() {
         let (agent, team) = (index % expected.agents, index / expected.agents % expected.teams);
         let step = index / expected.agents / expected.teams;
-        for (field, (&a, &b)) in words(a).iter().zip(words(b)).enumerate() {
+        for (word, (&a, &b)) in words(a).iter().zip(words(b)).enumerate() {
             if a != b {
-                let (stage, name) = FIELDS[field];
+                let (stage, name) = field(word);
                 note(Mismatch { step, team, stage, place: format!("agent {agent}, {name}"), expected: a, found: b });
             }
         }
@@ -103,27 +104,27 @@ pub fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<
 }
 
 /// The stage and name of each word of a [`Moment`].
-const FIELDS: [(Stage, &str); 17] = [
-    (Stage::Sense, "POIs back right"),
-    (Stage::Sense, "POIs front right"),
-    (Stage::Sense, "POIs front left"),
-    (Stage::Sense, "POIs back left"),
-    (Stage::Sense, "agents back right"),
-    (Stage::Sense, "agents front right"),
-    (Stage::Sense, "agents front left"),
-    (Stage::Sense, "agents back left"),
-    (Stage::Policy, "turn"),
-    (Stage::Policy, "speed"),
-    (Stage::Follow, "force x"),
-    (Stage::Follow, "force y"),
-    (Stage::Move, "x"),
-    (Stage::Move, "y"),
-    (Stage::Move, "heading x"),
-    (Stage::Move, "heading y"),
-    (Stage::Move, "speed"),
-];
+fn field(word: usize) -> (Stage, &'static str) {
+    const OTHERS: [(Stage, &str); WORDS - INPUTS] = [
+        (Stage::Policy, "turn"),
+        (Stage::Policy, "speed"),
+        (Stage::Follow, "force x"),
+        (Stage::Follow, "force y"),
+        (Stage::Move, "x"),
+        (Stage::Move, "y"),
+        (Stage::Move, "heading x"),
+        (Stage::Move, "heading y"),
+        (Stage::Move, "speed"),
+    ];
+    match word.checked_sub(INPUTS) {
+        None => (Stage::Sense, sense::NAMES[word]),
+        Some(other) => OTHERS[other],
+    }
+}
 
-fn words(moment: &Moment) -> &[u32; 17] {
+const WORDS: usize = size_of::<Moment>() / size_of::<u32>();
+
+fn words(moment: &Moment) -> &[u32; WORDS] {
     bytemuck::cast_ref(moment)
 }
 

@@ -1,18 +1,21 @@
 //! The reference backend: one team a lane, one vector of teams a block, blocks shared out over threads.
 //!
 //! The loops here may skip whatever adds nothing (an agent out of reach of every lane), since sums start at +0 and
-//! keep their order; the formulas are [`crate::kernels`]'.
+//! keep their order; the formulas are [`crate::model`]'s.
 
 use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
 
 use fearless_simd::{Level, Simd, SimdMask, dispatch, f32x4, prelude::*};
 use glam::Vec2;
-use rayon::prelude::*;
 
 use super::{Backend, BackendError, Episode, Group, Moment, Seen, Strided, Trace, Visit, Weights};
-use crate::kernels::{Lanes, couple, follow, math, motion, policy, sense, splat};
-use crate::world::{Constants, INPUTS, OUTPUTS, World};
+use crate::declare::Fixed;
+use crate::kernels::{math, splat};
+use crate::model::policy::PolicyConstants;
+use crate::model::{Constants, Lanes, couple, follow, motion, policy, sense};
+use crate::parallel::*;
+use crate::world::{INPUTS, OUTPUTS, World};
 
 /// Plays episodes on the processor, at the widest instruction set it has, on the threads of the current rayon pool.
 pub struct Cpu {
@@ -82,7 +85,7 @@ impl Backend for Cpu {
     }
 
     fn describe(&self) -> String {
-        let threads = rayon::current_num_threads();
+        let threads = current_num_threads();
         format!("cpu ({}, {threads} thread{})", level_name(self.level), if threads == 1 { "" } else { "s" })
     }
 }
@@ -125,11 +128,11 @@ fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
     let runs = runs(groups);
     let blocks: Vec<(&Run<'_>, usize)> =
         runs.iter().flat_map(|run| (0..run.teams).step_by(width).map(move |team| (run, team))).collect();
-    // A thread takes whatever block lies idle: as many are made as threads play at once.
-    let idle: Mutex<Vec<Block<S>>> = Mutex::default();
+    // A thread takes whatever lies idle: as many are made as threads play at once.
+    let idle: Mutex<Vec<Whole<S>>> = Mutex::default();
     let take = |world: &World| {
         let mut idle = idle.lock().unwrap_or_else(PoisonError::into_inner);
-        let fits = idle.iter().position(|block| block.world.constants == world.constants);
+        let fits = idle.iter().position(|whole| whole.block.world.constants == world.constants);
         if fits.is_none() {
             // Left over from a world that is done.
             idle.clear();
@@ -137,20 +140,20 @@ fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
         fits.map(|index| idle.swap_remove(index))
     };
     blocks.par_iter().with_max_len(1).for_each(|&(run, first)| {
-        let mut block = take(run.world).unwrap_or_else(|| Block::new(simd, run.world));
+        let mut whole = take(run.world).unwrap_or_else(|| Whole::new(simd, run.world));
         let teams = width.min(run.teams - first);
         simd.vectorize(
             #[inline(always)]
             || {
-                block.load(run, first, teams);
-                block.play(run.world, 0..run.world.steps());
+                whole.load(run, first, teams);
+                whole.play(run.world, 0..run.world.steps());
             },
         );
         for lane in 0..teams {
             let (group, team) = run.locate(first + lane);
-            visit(block.episode(lane, run.first + group, team));
+            visit(whole.episode(lane, run.first + group, team));
         }
-        idle.lock().unwrap_or_else(PoisonError::into_inner).push(block);
+        idle.lock().unwrap_or_else(PoisonError::into_inner).push(whole);
     });
 }
 
@@ -160,24 +163,24 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
     let run = Run { world, first: 0, groups: std::slice::from_ref(group), teams };
     let mut moments = vec![bytemuck::Zeroable::zeroed(); (steps + 1) * teams * agents];
     let (mut sets, mut seen) = (Vec::new(), Vec::new());
-    let mut block = Block::new(simd, world);
+    let mut whole = Whole::new(simd, world);
     for first in (0..teams).step_by(S::f32s::LEN) {
         let lanes = S::f32s::LEN.min(teams - first);
-        block.load(&run, first, lanes);
+        whole.load(&run, first, lanes);
         for step in 0..=steps {
             if step > 0 {
                 simd.vectorize(
                     #[inline(always)]
-                    || block.play(world, step - 1..step),
+                    || whole.play(world, step - 1..step),
                 );
             }
             for lane in 0..lanes {
                 let at = (step * teams + first + lane) * agents;
-                block.moments(lane, step > 0, &mut moments[at..at + agents]);
+                whole.block.moments(lane, step > 0, &mut moments[at..at + agents]);
             }
         }
         for lane in 0..lanes {
-            let episode = block.episode(lane, 0, first + lane);
+            let episode = whole.episode(lane, 0, first + lane);
             sets.extend(episode.sets.iter());
             seen.extend(episode.seen.words().iter());
         }
@@ -185,60 +188,84 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
     Trace { teams, agents, moments, sets, seen }
 }
 
-/// The state of one vector of teams, everything a lane a team.
-struct Block<S: Simd> {
-    simd: S,
-    world: Lanes<S>,
-    /// Leaders first.
-    agents: Vec<Agent<S>>,
-    /// `[leaders]`, layer by layer, units that are weighed together (see [`together`]) a row an input, then the biases.
-    weights: Vec<S::f32s>,
-    /// Where in there each weight of a policy belongs.
-    slots: Vec<usize>,
+/// Whole episodes of one vector of teams: their policies, and their record.
+struct Whole<S: Simd> {
+    block: Block<S>,
+    network: Network<S>,
     /// Group and team of each lane.
     places: Vec<(usize, usize)>,
-    inputs: Vec<[S::f32s; INPUTS]>,
-    /// A layer's units and the next one's, `[leaders][units]`.
-    hidden: [Vec<S::f32s>; 2],
-    outputs: Vec<[S::f32s; OUTPUTS]>,
-    followers: Vec<Follower<S>>,
-    /// At how many steps each follower saw each leader, `[followers][leaders]`.
-    counts: Vec<S::u32s>,
-    /// A bit for each pair of agents that may be in reach in some lane: `[words][agents]`.
-    near: Vec<u64>,
-    bounds: Vec<Bounds<S>>,
     /// `[steps][pois][words][lanes]`, and the counts when they are complete, `[followers][leaders][lanes]`.
     sets: Vec<u32>,
     seen: Vec<u32>,
 }
 
-#[derive(Clone, Copy)]
-struct Agent<S: Simd> {
-    x: S::f32s,
-    y: S::f32s,
-    hx: S::f32s,
-    hy: S::f32s,
-    speed: S::f32s,
-    /// The speed it wants next.
-    wanted: S::f32s,
+impl<S: Simd> Whole<S> {
+    fn new(simd: S, world: &World) -> Whole<S> {
+        Whole {
+            block: Block::new(simd, world),
+            network: Network::new(simd, world),
+            places: Vec::with_capacity(S::f32s::LEN),
+            sets: vec![0; world.set_words() * S::f32s::LEN],
+            seen: vec![0; world.followers() * world.leaders() * S::f32s::LEN],
+        }
+    }
+
+    /// Puts `teams` teams of the run, from `first` on, at their start; lanes left over repeat the first.
+    #[inline(always)]
+    fn load(&mut self, run: &Run<'_>, first: usize, teams: usize) {
+        let Whole { block, network, places, .. } = self;
+        places.clear();
+        places.extend((0..S::f32s::LEN).map(|lane| run.locate(first + if lane < teams { lane } else { 0 })));
+        for (lane, &(group, _)) in places.iter().enumerate() {
+            block.place(lane, run.groups[group].starts);
+        }
+        block.start();
+        network.load(run, places);
+    }
+
+    /// Plays some steps.
+    #[inline(always)]
+    fn play(&mut self, world: &World, steps: Range<usize>) {
+        let Whole { block, network, sets, seen, .. } = self;
+        let size = world.pois.len() * world.constants.words as usize * S::f32s::LEN;
+        for step in steps {
+            block.look(&world.pois);
+            network.decide(&block.inputs, &mut block.outputs);
+            block.go();
+            block.couple(&world.pois, &mut sets[step * size..]);
+        }
+        for (words, count) in seen.chunks_exact_mut(S::f32s::LEN).zip(&block.counts) {
+            count.store_slice(words);
+        }
+    }
+
+    /// One lane's record.
+    fn episode(&self, lane: usize, group: usize, team: usize) -> Episode<'_> {
+        let strided = |words| Strided { words, stride: S::f32s::LEN, offset: lane };
+        Episode { group, team, sets: strided(&self.sets), seen: Seen::Counts(strided(&self.seen)) }
+    }
 }
 
-#[derive(Clone, Copy)]
-struct Follower<S: Simd> {
-    sums: follow::Sums<S>,
-    pull: follow::Pull<S>,
-    sizes: (S::f32s, S::f32s),
+/// The leaders' policies of one vector of teams.
+struct Network<S: Simd> {
+    simd: S,
+    constants: Constants,
+    /// `[leaders]`, layer by layer, units that are weighed together (see [`together`]) a row an input, then the biases.
+    weights: Vec<S::f32s>,
+    /// Where in there each weight of a policy belongs.
+    slots: Vec<usize>,
+    /// A layer's units and the next one's, `[leaders][units]`.
+    hidden: [Vec<S::f32s>; 2],
 }
 
-impl<S: Simd> Block<S> {
-    fn new(simd: S, world: &World) -> Block<S> {
+impl<S: Simd> Network<S> {
+    fn new(simd: S, world: &World) -> Network<S> {
         let constants = world.constants;
         let zero = splat(simd, 0.0);
-        let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
-        let widest = constants.widths.into_iter().max().unwrap_or(0) as usize;
+        let widest = constants.policy.widest();
         let mut slots = vec![0; world.parameters()];
         let (mut first, mut slot) = (0, 0);
-        for widths in constants.widths[..=constants.layers as usize].windows(2) {
+        for widths in constants.policy.widths[..=constants.policy.layers as usize].windows(2) {
             let (rows, columns) = (widths[0] as usize + 1, widths[1] as usize);
             let mut column = 0;
             while column < columns {
@@ -251,44 +278,20 @@ impl<S: Simd> Block<S> {
             }
             first += rows * columns;
         }
-        let pull = follow::Pull { x: zero, y: zero, influenced: S::mask32s::splat(simd, false) };
-        Block {
+        Network {
             simd,
-            world: Lanes::new(simd, constants),
-            agents: vec![Agent { x: zero, y: zero, hx: zero, hy: zero, speed: zero, wanted: zero }; agents],
-            weights: vec![zero; leaders * world.parameters()],
+            constants,
+            weights: vec![zero; world.leaders() * world.parameters()],
             slots,
-            places: Vec::with_capacity(S::f32s::LEN),
-            inputs: vec![[zero; INPUTS]; leaders],
-            hidden: [vec![zero; leaders * widest], vec![zero; leaders * widest]],
-            outputs: vec![[zero; OUTPUTS]; leaders],
-            followers: vec![Follower { sums: follow::Sums::new(simd), pull, sizes: (zero, zero) }; followers],
-            counts: vec![S::u32s::splat(simd, 0); followers * leaders],
-            near: vec![0; agents.div_ceil(64) * agents],
-            bounds: vec![Bounds::nowhere(simd); agents.div_ceil(S::f32s::LEN)],
-            sets: vec![0; world.set_words() * S::f32s::LEN],
-            seen: vec![0; followers * leaders * S::f32s::LEN],
+            hidden: [vec![zero; world.leaders() * widest], vec![zero; world.leaders() * widest]],
         }
     }
 
-    /// Puts `teams` teams of the run, from `first` on, at their start; lanes left over repeat the first.
+    /// Takes the policies of each lane's group and team.
     #[inline(always)]
-    fn load(&mut self, run: &Run<'_>, first: usize, teams: usize) {
-        let Block { simd, world, agents, weights, slots, places, counts, .. } = self;
+    fn load(&mut self, run: &Run<'_>, places: &[(usize, usize)]) {
+        let Network { simd, weights, slots, .. } = self;
         let (leaders, parameters) = (run.world.leaders(), run.world.parameters());
-        places.clear();
-        places.extend((0..S::f32s::LEN).map(|lane| run.locate(first + if lane < teams { lane } else { 0 })));
-        for (lane, &(group, _)) in places.iter().enumerate() {
-            for (agent, start) in agents.iter_mut().zip(run.groups[group].starts) {
-                agent.x[lane] = start.x;
-                agent.y[lane] = start.y;
-            }
-        }
-        for agent in agents {
-            agent.hx = splat(*simd, world.constants.heading_x);
-            agent.hy = splat(*simd, world.constants.heading_y);
-            agent.speed = splat(*simd, world.constants.speed);
-        }
         for (leader, weights) in weights.chunks_exact_mut(parameters).enumerate() {
             // Four lanes at a time, the narrowest vector: four policies' weights are turned into four weights' lanes.
             for (quad, places) in places.as_chunks::<4>().0.iter().enumerate() {
@@ -298,38 +301,162 @@ impl<S: Simd> Block<S> {
                     let Weights::OnHost(weights) = group.weights else { unreachable!("seen before playing") };
                     &weights[(leader * group.policies + policy) * parameters..][..parameters]
                 });
-                let mut put = |slot: usize, lanes: &[f32]| {
-                    weights[slot].as_mut_slice()[quad * 4..quad * 4 + 4].copy_from_slice(lanes);
-                };
-                let (fours, rest) = slots.as_chunks::<4>();
-                for (at, slots) in (0..).step_by(4).zip(fours) {
-                    let rows = policies.map(|policy| f32x4::from_slice(*simd, &policy[at..at + 4]));
-                    for (&slot, lanes) in slots.iter().zip(transposed(rows)) {
-                        put(slot, lanes.as_slice());
+                turn(
+                    *simd,
+                    policies,
+                    #[inline(always)]
+                    |parameter, lanes| {
+                        weights[slots[parameter]].as_mut_slice()[quad * 4..quad * 4 + 4].copy_from_slice(lanes);
+                    },
+                );
+            }
+        }
+    }
+
+    /// Leaders decide where to turn and how fast to go.
+    #[inline(always)]
+    fn decide(&mut self, inputs: &[[S::f32s; INPUTS]], outputs: &mut [[S::f32s; OUTPUTS]]) {
+        let Network { weights, hidden, constants, .. } = self;
+        let &mut Constants { leaders, policy: PolicyConstants { layers, widths, parameters }, .. } = constants;
+        let mut first = 0;
+        let [mut to, mut from] = hidden.each_mut().map(|units| &mut units[..]);
+        for (layer, widths) in widths[..=layers as usize].windows(2).enumerate() {
+            let [rows, columns] = [widths[0] as usize, widths[1] as usize];
+            let inputs = if layer == 0 { inputs.as_flattened() } else { &*from };
+            let units = &mut to[..leaders as usize * columns];
+            let weights = (0..leaders as usize).map(|leader| &weights[leader * parameters as usize + first..]);
+            match (rows, columns) {
+                // The paper's network, whose sizes the compiler makes use of.
+                (INPUTS, 10) => weigh_layer::<S, INPUTS, 10>(inputs, units, weights),
+                (10, OUTPUTS) => weigh_layer::<S, 10, OUTPUTS>(inputs, units, weights),
+                _ => {
+                    let leaders = inputs.chunks_exact(rows).zip(units.chunks_exact_mut(columns));
+                    for ((inputs, units), weights) in leaders.zip(weights) {
+                        weigh::<S>(inputs, units, weights);
                     }
                 }
-                for (at, &slot) in (fours.len() * 4..).zip(rest) {
-                    put(slot, &policies.map(|policy| policy[at]));
+            }
+            // All leaders' tanh at once, and in short loops: the processor sees far enough ahead to keep its units busy.
+            for unit in &mut *units {
+                *unit = policy::tame::<S>(*unit);
+            }
+            let (eights, rest) = units.as_chunks_mut::<8>();
+            for units in eights {
+                let mut halves = [(units[0], units[0]); 8];
+                for (half, &unit) in halves.iter_mut().zip(&*units) {
+                    *half = math::half_tanh::<S>(unit);
+                }
+                for (unit, &half) in units.iter_mut().zip(&halves) {
+                    *unit = math::whole_tanh::<S>(half);
                 }
             }
+            for unit in rest {
+                *unit = math::whole_tanh::<S>(math::half_tanh::<S>(*unit));
+            }
+            first += (rows + 1) * columns;
+            std::mem::swap(&mut from, &mut to);
+        }
+        outputs.copy_from_slice(&from.as_chunks::<OUTPUTS>().0[..leaders as usize]);
+    }
+}
+
+/// The state of one vector of teams, everything a lane a team, and a step of it. Every read in a step is of the state
+/// before it.
+pub(crate) struct Block<S: Simd> {
+    simd: S,
+    world: Lanes<S>,
+    /// Leaders first.
+    pub agents: Vec<Agent<S>>,
+    pub inputs: Vec<[S::f32s; INPUTS]>,
+    pub outputs: Vec<[S::f32s; OUTPUTS]>,
+    followers: Vec<Follower<S>>,
+    /// At how many steps each follower saw each leader, `[followers][leaders]`.
+    pub counts: Vec<S::u32s>,
+    /// A bit for each pair of agents that may be in reach in some lane: `[words][agents]`.
+    near: Vec<u64>,
+    bounds: Vec<Bounds<S>>,
+}
+
+#[derive(Clone, Copy)]
+pub(crate) struct Agent<S: Simd> {
+    pub x: S::f32s,
+    pub y: S::f32s,
+    pub hx: S::f32s,
+    pub hy: S::f32s,
+    pub speed: S::f32s,
+    /// The speed it wants next.
+    wanted: S::f32s,
+}
+
+#[derive(Clone, Copy)]
+struct Follower<S: Simd> {
+    sums: follow::Sums<S>,
+    pull: follow::Pull<S>,
+    sizes: (S::f32s, S::f32s),
+}
+
+impl<S: Simd> Block<S> {
+    pub fn new(simd: S, world: &World) -> Block<S> {
+        let zero = splat(simd, 0.0);
+        let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
+        let pull = follow::Pull { x: zero, y: zero, influenced: S::mask32s::splat(simd, false) };
+        Block {
+            simd,
+            world: Lanes::new(simd, world.constants),
+            agents: vec![Agent { x: zero, y: zero, hx: zero, hy: zero, speed: zero, wanted: zero }; agents],
+            inputs: vec![[zero; INPUTS]; leaders],
+            outputs: vec![[zero; OUTPUTS]; leaders],
+            followers: vec![Follower { sums: follow::Sums::new(simd), pull, sizes: (zero, zero) }; followers],
+            counts: vec![S::u32s::splat(simd, 0); followers * leaders],
+            near: vec![0; agents.div_ceil(64) * agents],
+            bounds: vec![Bounds::nowhere(simd); agents.div_ceil(S::f32s::LEN)],
+        }
+    }
+
+    /// Puts one lane's agents where they start.
+    #[inline(always)]
+    pub fn place(&mut self, lane: usize, starts: &[Vec2]) {
+        for (agent, start) in self.agents.iter_mut().zip(starts) {
+            agent.x[lane] = start.x;
+            agent.y[lane] = start.y;
+        }
+    }
+
+    /// Sets all lanes' agents to their first heading and speed.
+    #[inline(always)]
+    pub fn start(&mut self) {
+        let Block { simd, world, agents, counts, .. } = self;
+        for agent in agents {
+            agent.hx = splat(*simd, world.constants.heading_x);
+            agent.hy = splat(*simd, world.constants.heading_y);
+            agent.speed = splat(*simd, world.constants.speed);
         }
         counts.fill(S::u32s::splat(*simd, 0));
     }
 
-    /// Plays some steps; every read in a step is of the state before it.
+    /// [`Block::start`] of one lane.
     #[inline(always)]
-    fn play(&mut self, world: &World, steps: Range<usize>) {
-        for step in steps {
-            self.find_near();
-            self.sense(&world.pois);
-            self.decide();
-            self.follow();
-            self.advance();
-            self.couple(&world.pois, step);
+    pub fn start_lane(&mut self, lane: usize) {
+        let Constants { heading_x, heading_y, speed, .. } = self.world.constants;
+        for agent in &mut self.agents {
+            (agent.hx[lane], agent.hy[lane], agent.speed[lane]) = (heading_x, heading_y, speed);
         }
-        for (words, count) in self.seen.chunks_exact_mut(S::f32s::LEN).zip(&self.counts) {
-            count.store_slice(words);
-        }
+        self.counts.iter_mut().for_each(|count| count[lane] = 0);
+    }
+
+    /// What leaders sense, for the policies to answer.
+    #[inline(always)]
+    pub fn look(&mut self, pois: &[Vec2]) {
+        self.find_near();
+        self.sense(pois);
+    }
+
+    /// Everyone moves: leaders as their policies answered, followers after whoever was near.
+    #[inline(always)]
+    pub fn go(&mut self) {
+        self.act();
+        self.follow();
+        self.advance();
     }
 
     /// Marks the pairs of agents that one of them may sense or be drawn to, in any lane.
@@ -338,8 +465,8 @@ impl<S: Simd> Block<S> {
         self.near.fill(0);
         let Block { world, agents, near, bounds, .. } = self;
         let (count, leaders) = (agents.len(), world.constants.leaders as usize);
-        let drawn = world.constants.attraction_radius2;
-        let sensed = world.constants.agent_range2.max(drawn);
+        let drawn = world.constants.follow.attraction_radius2;
+        let sensed = world.constants.sense.agent_range2.max(drawn);
         let reach2 = |agent: usize| if agent < leaders { sensed } else { drawn };
         if count > MANY {
             let lanes = S::f32s::LEN;
@@ -386,37 +513,33 @@ impl<S: Simd> Block<S> {
     /// Leaders sense: all POIs, then the other agents, each in ascending order.
     #[inline(always)]
     fn sense(&mut self, pois: &[Vec2]) {
-        if self.world.constants.density == 0 { self.sense_by::<true>(pois) } else { self.sense_by::<false>(pois) }
+        self.world.constants.variant.density().fix(Sensing { block: self, pois });
     }
 
     #[inline(always)]
-    fn sense_by<const LINEAR: bool>(&mut self, pois: &[Vec2]) {
+    fn sense_by<const DENSITY: u32>(&mut self, pois: &[Vec2]) {
         let Block { simd, world, agents, near, inputs, .. } = self;
         for (leader, (agent, inputs)) in agents.iter().zip(inputs).enumerate() {
             let &Agent { x, y, hx, hy, .. } = agent;
-            let mut sums = [splat(*simd, 0.0); 4];
+            let mut of_pois = [splat(*simd, 0.0); 4];
             let (fours, rest) = pois.as_chunks::<4>();
             for pois in fours {
                 let mut densities = [x; 4];
                 for (density, poi) in densities.iter_mut().zip(pois) {
                     let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
-                    *density = sense::density::<S, LINEAR>(world, world.poi_range2, dx, dy);
+                    *density = sense::density::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
                 }
                 for (&density, poi) in densities.iter().zip(pois) {
                     let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
-                    sense::sense::<S>(density, dx, dy, hx, hy, &mut sums);
+                    sense::sense::<S>(density, dx, dy, hx, hy, &mut of_pois);
                 }
             }
             for poi in rest {
                 let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
-                let density = sense::density::<S, LINEAR>(world, world.poi_range2, dx, dy);
-                sense::sense::<S>(density, dx, dy, hx, hy, &mut sums);
+                let density = sense::density::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
+                sense::sense::<S>(density, dx, dy, hx, hy, &mut of_pois);
             }
-            let (of_pois, of_agents) = inputs.split_at_mut(4);
-            for (input, sum) in of_pois.iter_mut().zip(sums) {
-                *input = sum * world.poi_share;
-            }
-            let mut sums = [splat(*simd, 0.0); 4];
+            let mut of_agents = [splat(*simd, 0.0); 4];
             each_near(
                 near,
                 agents,
@@ -424,64 +547,21 @@ impl<S: Simd> Block<S> {
                 #[inline(always)]
                 |_, other| {
                     let (dx, dy) = (other.x - x, other.y - y);
-                    let density = sense::density::<S, LINEAR>(world, world.agent_range2, dx, dy);
-                    sense::sense::<S>(density, dx, dy, hx, hy, &mut sums);
+                    let density = sense::density::<S, DENSITY>(world, world.sense.agent_range2, dx, dy);
+                    sense::sense::<S>(density, dx, dy, hx, hy, &mut of_agents);
                 },
             );
-            for (input, sum) in of_agents.iter_mut().zip(sums) {
-                *input = sum * world.agent_share;
-            }
+            *inputs = sense::weigh_in::<S>(world, of_pois, of_agents);
         }
     }
 
-    /// Leaders decide where to turn and how fast to go.
+    /// Leaders turn and wish for a speed as their policies say.
     #[inline(always)]
-    fn decide(&mut self) {
-        let Block { world, agents, weights, inputs, hidden, outputs, .. } = self;
-        let Constants { leaders, layers, widths, parameters, .. } = world.constants;
-        let mut first = 0;
-        let [mut to, mut from] = hidden.each_mut().map(|units| &mut units[..]);
-        for (layer, widths) in widths[..=layers as usize].windows(2).enumerate() {
-            let [rows, columns] = [widths[0] as usize, widths[1] as usize];
-            let inputs = if layer == 0 { inputs.as_flattened() } else { &*from };
-            let units = &mut to[..leaders as usize * columns];
-            let weights = (0..leaders as usize).map(|leader| &weights[leader * parameters as usize + first..]);
-            match (rows, columns) {
-                // The paper's network, whose sizes the compiler makes use of.
-                (INPUTS, 10) => weigh_layer::<S, INPUTS, 10>(inputs, units, weights),
-                (10, OUTPUTS) => weigh_layer::<S, 10, OUTPUTS>(inputs, units, weights),
-                _ => {
-                    let leaders = inputs.chunks_exact(rows).zip(units.chunks_exact_mut(columns));
-                    for ((inputs, units), weights) in leaders.zip(weights) {
-                        weigh::<S>(inputs, units, weights);
-                    }
-                }
-            }
-            // All leaders' tanh at once, and in short loops: the processor sees far enough ahead to keep its units busy.
-            for unit in &mut *units {
-                *unit = policy::tame::<S>(*unit);
-            }
-            let (eights, rest) = units.as_chunks_mut::<8>();
-            for units in eights {
-                let mut halves = [(units[0], units[0]); 8];
-                for (half, &unit) in halves.iter_mut().zip(&*units) {
-                    *half = math::half_tangent::<S>(unit);
-                }
-                for (unit, &half) in units.iter_mut().zip(&halves) {
-                    *unit = math::whole_tangent::<S>(half);
-                }
-            }
-            for unit in rest {
-                *unit = math::whole_tangent::<S>(math::half_tangent::<S>(*unit));
-            }
-            first += (rows + 1) * columns;
-            std::mem::swap(&mut from, &mut to);
-        }
-        for (agent, (output, units)) in agents.iter_mut().zip(outputs.iter_mut().zip(from.as_chunks::<OUTPUTS>().0)) {
-            *output = *units;
-            let turn = policy::wanted_turn::<S>(units[0]);
-            (agent.hx, agent.hy) = motion::turn::<S>(world, agent.hx, agent.hy, turn);
-            agent.wanted = policy::wanted_speed::<S>(world, units[1]);
+    fn act(&mut self) {
+        let Block { world, agents, outputs, .. } = self;
+        for (agent, &[turn, speed]) in agents.iter_mut().zip(&*outputs) {
+            (agent.hx, agent.hy) = motion::turn::<S>(world, agent.hx, agent.hy, policy::wanted_turn::<S>(turn));
+            agent.wanted = policy::wanted_speed::<S>(world, speed);
         }
     }
 
@@ -508,7 +588,7 @@ impl<S: Simd> Block<S> {
             follower.sums = sums;
         }
         let agents = &mut agents[leaders..];
-        if world.constants.max_turn_cos > 0.7 {
+        if world.constants.variant.by_sine != 0 {
             steer::<S, true>(world, agents, followers);
         } else {
             steer::<S, false>(world, agents, followers);
@@ -520,21 +600,19 @@ impl<S: Simd> Block<S> {
     fn advance(&mut self) {
         let world = &self.world;
         for agent in &mut self.agents {
-            (agent.hx, agent.hy) = motion::straighten::<S>(agent.hx, agent.hy);
+            (agent.hx, agent.hy) = motion::renormalize::<S>(agent.hx, agent.hy);
             agent.speed = motion::accelerate::<S>(world, agent.speed, agent.wanted);
         }
         for agent in &mut self.agents {
-            let step = agent.speed * world.dt;
-            agent.x = motion::advance::<S>(agent.x, step, agent.hx, world.map_x);
-            agent.y = motion::advance::<S>(agent.y, step, agent.hy, world.map_y);
+            let step = agent.speed * world.motion.dt;
+            agent.x = motion::advance::<S>(agent.x, step, agent.hx, world.motion.map_x);
+            agent.y = motion::advance::<S>(agent.y, step, agent.hy, world.motion.map_y);
         }
     }
 
-    /// Records who is near each POI.
+    /// Records who is near each POI, `[pois][words][lanes]`.
     #[inline(always)]
-    fn couple(&mut self, pois: &[Vec2], step: usize) {
-        let size = self.world.constants.words as usize * S::f32s::LEN;
-        let mut sets = &mut self.sets[step * pois.len() * size..];
+    pub fn couple(&mut self, pois: &[Vec2], mut sets: &mut [u32]) {
         let (fours, rest) = pois.as_chunks::<4>();
         for pois in fours {
             sets = observe(self.simd, &self.world, &self.agents, pois, sets);
@@ -542,12 +620,6 @@ impl<S: Simd> Block<S> {
         for poi in rest {
             sets = observe(self.simd, &self.world, &self.agents, std::array::from_ref(poi), sets);
         }
-    }
-
-    /// One lane's record.
-    fn episode(&self, lane: usize, group: usize, team: usize) -> Episode<'_> {
-        let strided = |words| Strided { words, stride: S::f32s::LEN, offset: lane };
-        Episode { group, team, sets: strided(&self.sets), seen: Seen::Counts(strided(&self.seen)) }
     }
 
     /// One lane's agents as they stand; before the first step nothing has been sensed yet.
@@ -568,9 +640,40 @@ impl<S: Simd> Block<S> {
     }
 }
 
+/// Leaders sense by one of the densities.
+struct Sensing<'a, S: Simd> {
+    block: &'a mut Block<S>,
+    pois: &'a [Vec2],
+}
+
+impl<S: Simd> Fixed for Sensing<'_, S> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with<const DENSITY: u32>(self) {
+        self.block.sense_by::<DENSITY>(self.pois);
+    }
+}
+
+/// Turns rows of equal length into columns: `put` gets the number of each and its four numbers.
+#[inline(always)]
+pub(crate) fn turn<S: Simd>(simd: S, rows: [&[f32]; 4], mut put: impl FnMut(usize, &[f32])) {
+    let columns = rows[0].len();
+    let whole = columns / 4 * 4;
+    for at in (0..whole).step_by(4) {
+        let fours = rows.map(|row| f32x4::from_slice(simd, &row[at..at + 4]));
+        for (column, four) in (at..).zip(transposed(fours)) {
+            put(column, four.as_slice());
+        }
+    }
+    for column in whole..columns {
+        put(column, &rows.map(|row| row[column]));
+    }
+}
+
 /// Rows turned into columns.
 #[inline(always)]
-fn transposed<S: Simd>([a, b, c, d]: [f32x4<S>; 4]) -> [f32x4<S>; 4] {
+pub(crate) fn transposed<S: Simd>([a, b, c, d]: [f32x4<S>; 4]) -> [f32x4<S>; 4] {
     let (low, high) = (a.zip_low(c), a.zip_high(c));
     let (other_low, other_high) = (b.zip_low(d), b.zip_high(d));
     [low.zip_low(other_low), low.zip_high(other_low), high.zip_low(other_high), high.zip_high(other_high)]

@@ -3,16 +3,27 @@
 use std::any::Any;
 use std::fmt::Debug;
 
-use fearless_simd::Level;
 use glam::Vec2;
 
-use crate::config::{Fitness, Learning};
-use crate::evolve::{self, Key, UNCHANGED};
-use crate::world::World;
+use crate::config::Fitness;
+use crate::declare::shared;
+use crate::evolve::{self, Breeding};
+use crate::parallel::current_num_threads;
+use crate::world::{INPUTS, OUTPUTS, World};
 
 pub mod compare;
 pub mod cpu;
+#[cfg(feature = "gpu")]
 pub mod gpu;
+
+/// Populations of a trial that take so many bytes are held where nothing else is asked for, but never by a software
+/// renderer: about what goes over the bus in the time of the few dispatches that holding costs. An estimate, not a
+/// measurement.
+pub const HELD_FROM: u64 = 1 << 20;
+
+/// Records of a batch that take so many bytes are packed where nothing else is asked for, but never by a software
+/// renderer: about what goes over the bus in the time that one more dispatch costs. An estimate, not a measurement.
+pub const PACKED_FROM: u64 = 1 << 20;
 
 /// Teams of one world that start alike and are made of one set of policies.
 #[derive(Clone, Copy, Debug)]
@@ -134,59 +145,6 @@ pub trait Held: Any + Debug + Send + Sync {
     fn fetch(&self, weights: &mut [f32]) -> Result<(), BackendError>;
 }
 
-/// How the next generation of a trial's populations comes from this one.
-#[derive(Clone, Debug)]
-pub struct Breeding<'a> {
-    /// The plan, `[leaders][slots]`, see [`crate::evolve::draw_parents`].
-    pub parents: &'a [u32],
-    /// The trial's key of [`crate::evolve::Purpose::Mutation`], and the generation to draw for.
-    pub key: Key,
-    pub generation: usize,
-    pub learning: &'a Learning,
-}
-
-impl Breeding<'_> {
-    /// Whether the plan is one for populations of these sizes, `[leaders, slots, parameters]`. [`Held::breed`] asks this.
-    ///
-    /// # Errors
-    /// It has too few or too many places, or a parent that there is not.
-    pub fn check(&self, [leaders, slots, _]: [usize; 3]) -> Result<(), BackendError> {
-        let misfit = |text: String| Err(BackendError::Misfit(text));
-        if self.parents.len() != leaders * slots {
-            return misfit(format!("{} parents for {leaders} populations of {slots}", self.parents.len()));
-        }
-        match self.parents.iter().position(|&planned| (planned & !UNCHANGED) as usize >= slots) {
-            None => Ok(()),
-            Some(place) => misfit(format!(
-                "slot {} of population {} has policy {} of {slots} as its parent (they count from 0)",
-                place % slots,
-                place / slots,
-                self.parents[place] & !UNCHANGED
-            )),
-        }
-    }
-
-    /// The next generation of these weights, worked out on the host: what [`Held::breed`] must come to.
-    ///
-    /// # Errors
-    /// The plan is not one for these sizes, see [`Breeding::check`].
-    pub fn on_host(&self, sizes: [usize; 3], weights: &[f32]) -> Result<Vec<f32>, BackendError> {
-        self.check(sizes)?;
-        let [_, slots, parameters] = sizes;
-        let (mut children, mut scratch) = (Vec::with_capacity(weights.len()), Vec::new());
-        for (place, planned) in self.parents.iter().enumerate() {
-            let (leader, slot, first) = (place / slots, place % slots, children.len());
-            let parent = leader * slots + (planned & !UNCHANGED) as usize;
-            children.extend_from_slice(&weights[parent * parameters..(parent + 1) * parameters]);
-            if planned & UNCHANGED == 0 {
-                let key = self.key.at(self.generation, leader, slot);
-                evolve::mutate(Level::new(), key, self.learning, &mut children[first..], &mut scratch);
-            }
-        }
-        Ok(children)
-    }
-}
-
 /// What one team did, as far as credit needs it.
 #[derive(Clone, Copy, Debug)]
 pub struct Episode<'a> {
@@ -251,22 +209,23 @@ impl<'a> Strided<'a> {
     }
 }
 
-/// Floats that a [`Trace`] holds of one agent at one step, in this order.
-///
-/// The inputs and the outputs are a leader's, the force a follower's; who has none has zeros. So does step 0, the start.
-#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-#[repr(C)]
-pub struct Moment {
-    /// Sensed densities.
-    pub inputs: [f32; 8],
-    /// What the policy answered, each in -1..1.
-    pub outputs: [f32; 2],
-    /// Attraction, repulsion and wall push together.
-    pub force: [f32; 2],
-    /// State after the step.
-    pub position: [f32; 2],
-    pub heading: [f32; 2],
-    pub speed: f32,
+shared! {
+    /// Floats that a [`Trace`] holds of one agent at one step, in this order.
+    ///
+    /// The inputs and the outputs are a leader's, the force a follower's; who has none has zeros. So does step 0, the
+    /// start.
+    pub struct Moment {
+        /// Sensed densities.
+        pub inputs: [f32; INPUTS],
+        /// What the policy answered, each in -1..1.
+        pub outputs: [f32; OUTPUTS],
+        /// Attraction, repulsion and wall push together.
+        pub force: [f32; 2],
+        /// State after the step.
+        pub position: [f32; 2],
+        pub heading: [f32; 2],
+        pub speed: f32,
+    }
 }
 
 /// Every stage of every step: `moments[(step * teams + team) * agents + agent]`, steps `0..=steps`.
@@ -307,10 +266,49 @@ pub trait Backend: Send {
     fn describe(&self) -> String;
 }
 
+impl From<evolve::Misfit> for BackendError {
+    fn from(misfit: evolve::Misfit) -> BackendError {
+        BackendError::Misfit(misfit.to_string())
+    }
+}
+
+/// What a run runs on, for `run.json`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Machine {
+    /// "cpu" or "gpu".
+    pub backend: String,
+    pub adapter: Option<String>,
+    pub driver: Option<String>,
+    pub threads: usize,
+}
+
+impl Machine {
+    /// The CPU, on the threads that there are.
+    pub fn of_cpu() -> Machine {
+        Machine { backend: "cpu".into(), threads: current_num_threads(), ..Machine::default() }
+    }
+
+    /// What a GPU backend runs on.
+    #[cfg(feature = "gpu")]
+    pub fn of_gpu(backend: &gpu::episode::GpuEpisodes) -> Machine {
+        let adapter = &backend.gpu().adapter;
+        Machine {
+            backend: "gpu".into(),
+            adapter: Some(adapter.name.clone()),
+            driver: Some(adapter.driver.clone()),
+            threads: current_num_threads(),
+        }
+    }
+}
+
+/// A backend and what it is.
+pub type Player = (Box<dyn Backend>, Machine);
+
 /// Why episodes could not be played.
 #[derive(Debug, thiserror::Error)]
 pub enum BackendError {
     /// A GPU could not be opened, or failed.
+    #[cfg(feature = "gpu")]
     #[error(transparent)]
     Gpu(#[from] gpu::device::DeviceError),
     /// What was asked does not fit the device.
@@ -323,8 +321,6 @@ pub enum BackendError {
     #[error("the populations are held by another device; bring them to the host first")]
     HeldElsewhere,
     /// Nobody has the populations of the present generation any more.
-    #[error(
-        "the populations were lost with the device that held them; --resume goes on from the last checkpoint or the start"
-    )]
+    #[error("the populations were lost with the device that held them")]
     Gone,
 }

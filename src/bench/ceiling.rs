@@ -5,9 +5,11 @@
 //! episodes are played with, so that its rate is what an episode could reach that never waited for anything.
 
 use std::hint::black_box;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
+
+use crate::host::Instant;
 
 /// Chains of products, and as many of sums: with factor and term they fill 16 registers. Two units of either kind with a
 /// latency of 3 need 6; where there are 32 registers, there may be 4 units.

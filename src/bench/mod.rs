@@ -3,7 +3,7 @@
 use std::cell::RefCell;
 use std::hint::black_box;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use fearless_simd::Level;
 
@@ -15,6 +15,7 @@ use crate::backend::{Backend, BackendError, Group, Need, Weights};
 use crate::config::{Config, Coupling};
 use crate::credit::Credit;
 use crate::evolve::{Key, Purpose, form_teams, random_policy};
+use crate::host::Instant;
 use crate::sweep::layout::{self, MAX_FOLLOWERS, MAX_GROUPS};
 use crate::trainer::{Times, Trainer};
 use crate::world::World;

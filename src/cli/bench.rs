@@ -8,11 +8,13 @@ use fearless_simd::Level;
 use serde_json::json;
 
 use super::{BackendChoice, Breed, Error, Overrides, RunOptions, backend, print};
+use crate::backend::Machine;
 use crate::backend::cpu::{Cpu, level_name};
 use crate::bench::{self, Generations, Measure, Player, Profile};
 use crate::config::{self, Config};
+use crate::front;
 use crate::memory::Plan;
-use crate::run::{Machine, RunError};
+use crate::run::RunError;
 
 /// Team counts of the table, and of the JSON object.
 const TEAMS: [u32; 3] = [50, 4096, 131_072];
@@ -135,15 +137,15 @@ fn open(args: &Args) -> Result<(Player, Machine), Error> {
                 ));
             }
             backend::start_threads(&args.run)?;
-            return Ok((Player::Cpu(Cpu::at_level(level), level), backend::cpu().1));
+            return Ok((Player::Cpu(Cpu::at_level(level), level), front::cpu().1));
         }
     };
     Ok(match backend::open_gpu(&args.run)? {
         Some(gpu) => {
-            let machine = backend::machine(&gpu);
+            let machine = Machine::of_gpu(&gpu);
             (Player::Gpu(Box::new(gpu)), machine)
         }
-        None => (Player::Cpu(Cpu::at_level(level), level), backend::cpu().1),
+        None => (Player::Cpu(Cpu::at_level(level), level), front::cpu().1),
     })
 }
 

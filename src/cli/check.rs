@@ -34,7 +34,7 @@ struct Cost {
     /// Weights of one policy.
     parameters: usize,
     /// Bytes of all trials' policies.
-    policy_bytes: usize,
+    policy_bytes: u64,
     /// Bytes of one team's record: who was near which POI at which step, and which leader each follower saw.
     record_bytes: usize,
     /// Peak of the process where the CPU plays, and how much of it only while a checkpoint is written.

@@ -2,9 +2,10 @@
 
 use serde_json::json;
 
-use super::{Error, print};
+use super::{Error, print, remedy};
 use crate::backend::Backend;
 use crate::backend::cpu::Cpu;
+use crate::backend::gpu;
 use crate::backend::gpu::device::{self, Choice, Gpu};
 
 #[derive(clap::Args)]
@@ -19,7 +20,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let adapters: Vec<_> = device::adapters()
         .into_iter()
         .enumerate()
-        .map(|(index, info)| (index, info, device::open(Choice::Named(index.to_string()))))
+        .map(|(index, info)| (index, info, gpu::open(Choice::Named(index.to_string()))))
         .collect();
     if args.json {
         let adapters: Vec<_> = adapters
@@ -49,7 +50,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         text += &format!("{index}: {info}\n");
         text += &match opened {
             Ok(gpu) => exact(gpu),
-            Err(error) => format!("   not usable: {error}\n"),
+            Err(error) => format!("   not usable: {error}{}\n", remedy::device(error)),
         };
     }
     if adapters.is_empty() {

@@ -22,6 +22,7 @@ use crate::run::RunError;
 mod backend;
 mod bench;
 mod check;
+mod compare;
 mod completions;
 mod devices;
 mod init;
@@ -30,6 +31,7 @@ mod output;
 mod paper;
 mod plot;
 mod recovery;
+mod remedy;
 mod replay;
 mod rollout;
 mod sweep;
@@ -66,6 +68,8 @@ commands! {
     Paper(paper),
     /// Draw the learning curves of one run, or of several side by side.
     Plot(plot),
+    /// Compare runs, or the points of a sweep along an axis, with intervals and tests.
+    Compare(compare),
     /// Play the best team of a trial and generation again, as a page or a picture.
     Replay(replay),
     /// Measure how fast teams are played, alone and in whole generations.
@@ -129,17 +133,17 @@ fn refuse_steering(words: impl Iterator<Item = OsString>) -> Result<(), Error> {
 pub enum Error {
     #[error(transparent)]
     Config(#[from] ConfigError),
-    #[error(transparent)]
+    #[error("{}{}", .0, remedy::backend(.0))]
     Backend(#[from] BackendError),
-    #[error(transparent)]
+    #[error("{}{}", .0, remedy::device(.0))]
     Device(#[from] DeviceError),
-    #[error("{}{}", .0, remedy(.0, "run it again"))]
+    #[error("{}{}", .0, remedy::record(.0, "run it again"))]
     Record(#[from] RecordError),
-    #[error("{}{}", .0, resumable(.0))]
+    #[error("{}{}", .0, remedy::run(.0))]
     Run(#[from] RunError),
-    #[error(transparent)]
+    #[error("{}{}", .0, remedy::shown(.0))]
     Shown(#[from] crate::report::runs::RunError),
-    #[error(transparent)]
+    #[error("{}{}", .0, remedy::replayed(.0))]
     Replayed(#[from] ReplayError),
     #[error("standard output cannot be written: {0}")]
     Output(io::Error),
@@ -177,26 +181,6 @@ impl Error {
             Error::Stopped(_) => 75,
             _ => 1,
         }
-    }
-}
-
-/// What to do about a file that could not be written, before `again`.
-fn remedy(error: &RecordError, again: &str) -> String {
-    use io::ErrorKind::{FileTooLarge, PermissionDenied, QuotaExceeded, ReadOnlyFilesystem, StorageFull};
-    let RecordError::Write { error, .. } = error else { return String::new() };
-    match error.kind() {
-        StorageFull | QuotaExceeded => format!("; free some space, then {again}"),
-        FileTooLarge => format!("; the system allows no larger file here (see `ulimit -f`): raise that, then {again}"),
-        PermissionDenied | ReadOnlyFilesystem => "; choose a place you may write to".into(),
-        _ => String::new(),
-    }
-}
-
-/// What to do about a run that could not be written.
-fn resumable(error: &RunError) -> String {
-    match error {
-        RunError::Record(error) => remedy(error, "go on with --resume"),
-        _ => String::new(),
     }
 }
 

@@ -13,7 +13,6 @@ use crate::memory;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, ARMS, Folder, PAPER, POINTS, SWEEP, Start};
-use crate::record::metrics::Row;
 use crate::report::curves::PRINT;
 use crate::report::paper::{self, Arm, Measured, Results, Summary, claims, tables};
 use crate::report::progress::{Meter, Progress};
@@ -21,6 +20,7 @@ use crate::report::runs;
 use crate::report::scene::Kind;
 use crate::run::{self, Options, Outcome, RunError, Session, Twin};
 use crate::shell;
+use crate::trainer::Row;
 
 /// What a paper's folder holds: of which trials, generations and seed its arms are, and the arms themselves.
 const CLAIMS: &str = "claims.md";

@@ -7,10 +7,11 @@ use std::sync::atomic::AtomicBool;
 
 use clap::ValueEnum;
 
-use super::{Error, RunOptions, backend, say};
+use super::{Error, RunOptions, say};
 use crate::backend::BackendError;
+use crate::backend::Player;
 use crate::config::Override;
-use crate::run::Player;
+use crate::front;
 use crate::shell;
 
 /// What to do about a failing device.
@@ -33,7 +34,7 @@ impl Loss {
     /// The backend to go on with after another failed, if that was asked for.
     pub fn instead(self, error: &BackendError) -> Option<Player> {
         (self.on_device_loss == OnLoss::Cpu).then(|| {
-            let (backend, machine) = backend::cpu();
+            let (backend, machine) = front::cpu();
             say(format_args!("{error}\ngoing on with {}, to the same results", backend.describe()));
             (backend, machine)
         })

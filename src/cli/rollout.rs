@@ -8,16 +8,14 @@ use clap::builder::PossibleValuesParser as Words;
 use serde_json::json;
 
 use super::{ConfigFile, Error, RunOptions, backend, output, print, say};
+use crate::backend::Machine;
 use crate::backend::{Backend, Group, Moment, Need};
 use crate::config::{Choice, Override, Paradigm};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Spread, Starts};
 use crate::record::policies;
 use crate::report::progress::Meter;
-use crate::run::Machine;
 use crate::world::World;
 
-/// Most bytes of a trace in memory at once.
-const TRACE_BYTES: usize = 1 << 26;
 const HELD_OUT: &str = "Starts that no training saw";
 /// Columns of a trace, and what leaders add to them: the eight inputs and two outputs of their policies.
 const STATES: &str = "team,step,agent,role,x,y,heading_x,heading_y,speed";
@@ -98,8 +96,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     if !args.quiet {
         say(format_args!("playing on {}", backend.describe()));
     }
-    let teams: Vec<u32> =
-        (0..policies.policies as u32).flat_map(|policy| std::iter::repeat_n(policy, world.leaders())).collect();
+    let teams = evaluate::one_policy_a_team(policies.policies, world.leaders());
     let group = Group {
         world: &world,
         starts: &world.starts,
@@ -218,8 +215,6 @@ fn write_trace(
     meter: &mut Meter,
 ) -> Result<(), Error> {
     let (leaders, agents, steps) = (group.world.leaders(), group.world.agents(), group.world.steps());
-    let team_bytes = (steps + 1) * agents * size_of::<Moment>() + group.world.set_words() * 4;
-    let teams = (TRACE_BYTES / team_bytes).max(1);
     let (whole, episodes) = (group.team_count(), starts.episodes());
     let mut failed = None;
     let written = output::write(path, |file| {
@@ -227,8 +222,8 @@ fn write_trace(
         for episode in 0..episodes {
             let starts = starts.of(episode, group.world);
             let last = if episodes > 1 { format!(",{episode}") } else { String::new() };
-            for (part, chosen) in group.teams.chunks(teams * leaders).enumerate() {
-                let trace = match backend.trace(&Group { teams: chosen, starts: &starts, ..*group }) {
+            for (first, part) in evaluate::parts(&Group { starts: &starts, ..*group }) {
+                let trace = match backend.trace(&part) {
                     Ok(trace) => trace,
                     Err(error) => {
                         failed = Some(error);
@@ -241,7 +236,7 @@ fn write_trace(
                             let moment = trace.moment(step, team, agent);
                             let ([x, y], [hx, hy], speed) = (moment.position, moment.heading, moment.speed);
                             let role = if agent < leaders { "leader" } else { "follower" };
-                            let index = part * teams + team;
+                            let index = first + team;
                             write!(file, "{index},{step},{agent},{role},{x},{y},{hx},{hy},{speed}")?;
                             // What a leader senses in a state moves it on to the next.
                             let next = (agent < leaders && step < steps).then(|| trace.moment(step + 1, team, agent));
@@ -255,7 +250,7 @@ fn write_trace(
                         }
                     }
                 }
-                let done = episode * whole + part * teams + trace.teams;
+                let done = episode * whole + first + trace.teams;
                 meter.show(done as f64 / (whole * episodes) as f64, || format!("tracing {}", counted(whole, episodes)));
             }
         }

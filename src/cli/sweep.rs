@@ -100,7 +100,7 @@ fn positive(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|value| *value > 0.0 && *value < 1e9).ok_or_else(|| "allowed a number above 0".into())
 }
 
-fn share(text: &str) -> Result<f64, String> {
+pub(super) fn share(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|value| (0.0..=1.0).contains(value)).ok_or_else(|| "allowed a number in 0..1".into())
 }
 
@@ -161,11 +161,9 @@ impl Args {
     /// The grid's axes that pictures have across and down.
     fn picture_axes(&self, sweep: &Sweep) -> Result<Vec<usize>, Error> {
         let find = |name: &String| {
-            let found = sweep.axes.iter().position(|axis| axis.key == *name || axis.leaf() == name);
-            found.ok_or_else(|| {
-                let keys: Vec<_> = sweep.axes.iter().map(|axis| &*axis.key).collect();
-                Error::Usage(format!("--axes: {name} is no axis of the grid; it has {}", keys.join(", ")))
-            })
+            let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
+            let unknown = || Error::Usage(format!("--axes: {name} is no axis of the grid; it has {}", keys()));
+            sweep.axis(name).ok_or_else(unknown)
         };
         if !self.axes.is_empty() && sweep.axes.iter().any(|axis| axis.varied) {
             return Err(Error::Usage("--axes: a sweep with [vary] has one picture, of all its keys".into()));

@@ -2,23 +2,23 @@
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 
 use serde_json::json;
 
 use super::recovery::{self, Checkpoints, Loss, Signals, quoted};
 use super::{ConfigArgs, Error, RunOptions, backend, print, say};
 use crate::config::Config;
+use crate::host::Instant;
 use crate::memory::Plan;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, METRICS, POLICIES, Start};
-use crate::record::metrics::Row;
 use crate::report::progress::Progress;
 use crate::report::runs;
 use crate::report::tensorboard::Events;
 use crate::run::{Options, Outcome, Results, RunError, Session};
 use crate::shell;
+use crate::trainer::Row;
 
 /// Where runs without `--out` go.
 const RUNS: &str = "runs";

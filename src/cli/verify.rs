@@ -6,6 +6,7 @@ use serde_json::json;
 
 use super::{Error, print};
 use crate::backend::cpu::Cpu;
+use crate::backend::gpu;
 use crate::backend::gpu::device::{self, AdapterInfo, Choice, DeviceError, Request};
 use crate::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records};
 use crate::backend::gpu::exact::Pass;
@@ -167,8 +168,8 @@ fn kernels(name: Option<&str>) -> impl Iterator<Item = Kernel> {
 fn verify(plan: &Plan, request: Request, kernel: Kernel, info: &AdapterInfo, quiet: bool) -> Result<Outcome, Error> {
     let pass = request.pass.map_or_else(String::new, |pass| format!(", {pass} pass, {kernel} kernel"));
     let mut meter = Meter::new(quiet);
-    let gpu = device::open(request)?;
-    if let Some(mismatch) = gpu.self_test()? {
+    let gpu = gpu::open(request)?;
+    if let Some(mismatch) = gpu::self_test(&gpu)? {
         return Ok(Outcome { mismatch: Some(mismatch.to_string()), ..Outcome::default() });
     }
     let mut gpu = GpuEpisodes::new(gpu)?.playing(kernel).holding(Holding::Always).bringing(Records::Packed);

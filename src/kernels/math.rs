@@ -61,29 +61,29 @@ fn rough_twice_recip<S: Simd>(x: S::f32s) -> S::f32s {
 
 /// x, brought to where tanh comes to 1 if it is beyond. 2 operations.
 #[inline(always)]
-pub fn limit_tangent<S: Simd>(x: S::f32s) -> S::f32s {
+pub fn limit_tanh<S: Simd>(x: S::f32s) -> S::f32s {
     let limit = S::f32s::splat(x.token(), 7.5501223);
     // For numbers this is the shader's pair of selects, in half the operations.
     x.min(limit).max(-limit)
 }
 
-/// n and d with tanh(x/2) = n/d, for an x from [`limit_tangent`]; [`whole_tangent`] goes on with them. 9 operations.
+/// n and d with tanh(x/2) = n/d, for an x from [`limit_tanh`]; [`whole_tanh`] goes on with them. 9 operations.
 ///
 /// A rational approximation whose two parts meet where tanh comes to 1.
 #[inline(always)]
-pub fn half_tangent<S: Simd>(x: S::f32s) -> (S::f32s, S::f32s) {
+pub fn half_tanh<S: Simd>(x: S::f32s) -> (S::f32s, S::f32s) {
     let z = x * x;
     let n = x * ((z * 0.02999907 + 14.7163315) * z + 544.93274);
     let d = (z + 120.25281) * z + 1089.8662;
     (n, d)
 }
 
-/// tanh x of its [`limit_tangent`]'s [`half_tangent`], for 0 and any finite |x| from 2^-40, in [-1, 1], within 4.5e-7,
+/// tanh x of its [`limit_tanh`]'s [`half_tanh`], for 0 and any finite |x| from 2^-40, in [-1, 1], within 4.5e-7,
 /// and 1.1e-6 of its size; odd. 13 operations.
 ///
 /// tanh x = 2nd/(n² + d²), which cannot pass 1.
 #[inline(always)]
-pub fn whole_tangent<S: Simd>((n, d): (S::f32s, S::f32s)) -> S::f32s {
+pub fn whole_tanh<S: Simd>((n, d): (S::f32s, S::f32s)) -> S::f32s {
     let s = n * n + d * d;
     let y = rough_twice_recip::<S>(s);
     n * d * (y * (S::f32s::splat(n.token(), 2.0) - s * 0.5 * y))

@@ -1,4 +1,4 @@
-//! One agent's step, as pure functions over lanes of teams: the twins of `shaders/*.wgsl`, same names, same order.
+//! Arithmetic on lanes of teams that comes out alike everywhere: what the parts of [`crate::model`] are made of.
 //!
 //! Every function is generic over the processor's lane type, `S::f32s`, one team a lane. Only `+ - *`, comparison,
 //! select, abs, floor and integer operations are used, each correctly rounded everywhere, so lane width, processor
@@ -6,14 +6,7 @@
 
 use fearless_simd::{Select, Simd, prelude::*};
 
-use crate::world::Constants;
-
-pub mod couple;
-pub mod follow;
 pub mod math;
-pub mod motion;
-pub mod policy;
-pub mod sense;
 
 /// `if_true` in the lanes where `condition` holds, `if_false` elsewhere, in WGSL's order of arguments.
 #[inline(always)]
@@ -48,25 +41,19 @@ pub fn bound<S: Simd>(x: S::f32s, low: S::f32s, high: S::f32s) -> S::f32s {
     x.max(low).min(high)
 }
 
-macro_rules! lanes {
-    ($($field:ident)*) => {
-        /// The world's constants, each in every lane: the operation that needs one takes it from memory.
-        #[derive(Clone, Copy)]
-        pub struct Lanes<S: Simd> {
-            pub constants: Constants,
-            $(pub $field: S::f32s,)*
-        }
-
-        impl<S: Simd> Lanes<S> {
-            pub fn new(simd: S, constants: Constants) -> Lanes<S> {
-                Lanes { constants, $($field: splat(simd, constants.$field),)* }
-            }
-        }
-    };
-}
-
-lanes! {
-    map_x map_y dt min_speed max_speed max_speed_change max_turn max_turn_cos max_turn_sin observation_radius2
-    attraction_radius2 repulsion_radius2 poi_range2 agent_range2 repulsion_radius attraction_scale repulsion_scale wall_gain
-    poi_share agent_share inverse_diagonal
+/// Lane operations of each function here: an f32 or integer operation, comparison or selection is one.
+pub mod operations {
+    pub const RSQRT: u32 = 12;
+    pub const ROOT: u32 = 12;
+    pub const RECIP: u32 = 8;
+    /// A bound, a square, 5 and 3 for numerator and denominator; their squares' sum, its rough reciprocal (4) and 6 more.
+    pub const TANH: u32 = BOUND + 1 + 5 + 3 + 3 + 4 + 6;
+    pub const SIN_COS: u32 = 26;
+    pub const FLUSH: u32 = 3;
+    /// A clamp: minimum and maximum.
+    pub const BOUND: u32 = 2;
+    /// An offset and its square: 2 differences, 2 products, a sum.
+    pub const SQUARED_DISTANCE: u32 = 5;
+    /// A rotation, or an offset seen from a heading: 4 products, 2 sums.
+    pub const ROTATE: u32 = 6;
 }

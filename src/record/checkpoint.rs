@@ -12,19 +12,21 @@ use std::io::{Read, Seek};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use safetensors::tensor::Dtype;
 use sha2::{Digest, Sha256};
 
 use super::disk::{self, Disk, Output};
-use super::metrics::{Mark, Row};
-use super::policies::{self, admit};
+use super::metrics::Mark;
+use super::policies;
 use super::tensors::{self, Tensor, TensorFile};
 use super::{RecordError, hex};
 use crate::config::{self, Config};
 use crate::evolve;
 use crate::file;
+use crate::host::Instant;
+use crate::trainer::{Row, Snapshot};
 
 const KIND: &str = "checkpoint 1";
 /// Tensors, of all trials together.
@@ -40,23 +42,6 @@ const DIGITS: usize = 9;
 const KEPT: usize = 2;
 /// Of a run's time, checkpoints by the clock take one part in this at most.
 const SHARE: u32 = 20;
-
-/// What an arm needs to go on from where it was: the populations about to play, and each trial's unfinished row.
-///
-/// Its numbers are its own, or (`N` a slice) a trainer's.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Snapshot<N = Vec<f32>> {
-    /// The generation that plays next.
-    pub generation: usize,
-    /// The run's last generation, after which policies stay as they are.
-    pub last: usize,
-    /// A trial's weights, `[leaders][policies + 1][parameters]`.
-    pub weights: Vec<N>,
-    /// A trial's scores of the generation before, `[leaders][policies]`.
-    pub fitness: Vec<N>,
-    /// A trial's row of the generation before.
-    pub pending: Vec<Option<Row>>,
-}
 
 /// A run at one moment.
 #[derive(Clone, Debug, PartialEq)]
@@ -160,7 +145,7 @@ impl Checkpoint {
         let elsewhere = generation == last + 1 && file.info(WEIGHTS).is_none();
         let mut floats = |name: &str, shape: &[usize]| -> Result<Vec<Vec<f32>>, String> {
             let mut trials: Vec<Vec<f32>> = file.read(name, Dtype::F32, shape, shape[0])?;
-            match trials.iter_mut().any(|numbers| admit(numbers).is_some()) {
+            match trials.iter_mut().any(|numbers| evolve::admit(numbers).is_some()) {
                 true => Err(format!("{name} has numbers that cannot be")),
                 false => Ok(trials),
             }

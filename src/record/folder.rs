@@ -4,17 +4,18 @@ use std::fmt;
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::checkpoint::{self, Checkpoint};
 use super::disk::Disk;
-use super::metrics::{self, Row};
+use super::metrics;
 use super::{RecordError, hex, policies, read_text};
 use crate::config::Config;
 use crate::file;
+use crate::host;
+use crate::trainer::Row;
 
 pub const CONFIG: &str = "config.toml";
 pub const RUN: &str = "run.json";
@@ -505,7 +506,7 @@ fn shorten(value: &toml::Value) -> String {
 
 /// The time now, as in "2026-01-31T23:59:59Z".
 pub fn now() -> String {
-    utc(SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |time| time.as_secs()))
+    utc(host::since_1970().as_secs())
 }
 
 /// A number of seconds after the start of 1970 (Gregorian calendar, days counted in eras of 400 years from March).

@@ -14,23 +14,11 @@ use super::disk::{Disk, Output};
 use super::{RecordError, hex};
 use crate::config::{MAX_GENERATIONS, MAX_TRIALS};
 use crate::file;
+use crate::trainer::Row;
 
 pub const HEADER: &str = "trial,generation,best_g,mean_g,champion_g,seconds";
 /// Most bytes in one line.
 const MAX_LINE: u64 = 256;
-
-/// What one generation of one trial came to; every G is in 0..1.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Row {
-    pub arm: usize,
-    pub trial: usize,
-    pub generation: usize,
-    /// The best and the mean team of the generation.
-    pub best_g: f64,
-    pub mean_g: f64,
-    /// The team of every population's best policy.
-    pub champion_g: f64,
-}
 
 /// How far a file has come, to be found there again.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -86,10 +74,7 @@ impl Writer {
 
     /// Adds rows that became complete after so many seconds.
     pub fn add(&mut self, rows: &[Row], seconds: f64) -> io::Result<()> {
-        rows.iter().try_for_each(|row| {
-            let Row { trial, generation, best_g, mean_g, champion_g, .. } = row;
-            self.line(&format!("{trial},{generation},{best_g},{mean_g},{champion_g},{seconds:.3}"))
-        })
+        rows.iter().try_for_each(|row| self.line(&format!("{},{seconds:.3}", shared(row))))
     }
 
     /// Hands all lines to the system, so that others can read them.
@@ -103,6 +88,24 @@ impl Writer {
         let sha256 = hex(&self.hash.clone().finalize());
         Ok((Mark { bytes: self.bytes, sha256 }, self.output.get_ref().share()?))
     }
+}
+
+/// A row's line without its seconds, which is the same bits on every backend.
+fn shared(row: &Row) -> String {
+    let Row { trial, generation, best_g, mean_g, champion_g, .. } = row;
+    format!("{trial},{generation},{best_g},{mean_g},{champion_g}")
+}
+
+/// SHA-256 over rows as in a file, without their seconds, and then over policies: a run's digest.
+pub fn digest(rows: impl Iterator<Item = Row>, policies: &[impl AsRef<[f32]>]) -> [u8; 32] {
+    let mut hash = Sha256::new();
+    let header = HEADER.rsplit_once(',').map_or("", |(shared, _)| shared);
+    for line in std::iter::once(header.to_string()).chain(rows.map(|row| shared(&row))) {
+        hash.update(line);
+        hash.update("\n");
+    }
+    policies.iter().for_each(|weights| hash.update(bytemuck::cast_slice::<f32, u8>(weights.as_ref())));
+    hash.finalize().into()
 }
 
 /// What is wrong with a file's rows.

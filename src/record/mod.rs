@@ -39,20 +39,16 @@ pub enum RecordError {
     /// Policies of a trial that the file does not have.
     #[error("{path}: {reason}")]
     NoTrial { path: PathBuf, reason: String },
-    #[error("{path} holds a run already; go on with it by --resume, write over it by --force, or choose another --out")]
+    #[error("{path} holds a run already")]
     Exists { path: PathBuf },
-    #[error("{path} is a file; choose a folder by --out")]
+    #[error("{path} is a file")]
     NoFolder { path: PathBuf },
-    #[error(
-        "{path} is a run of {there} generations, which cannot become one of {here}; resume with --generations {there} or \
-         more, or choose another --out"
-    )]
+    #[error("{path} is a run of {there} generations, which cannot become one of {here}")]
     Shorter { path: PathBuf, there: usize, here: usize },
-    #[error("another process is training in {path}; wait for it, stop it, or choose another --out")]
+    #[error("another process is training in {path}")]
     Locked { path: PathBuf },
     #[error(
-        "{path} is a run of another config, so it cannot go on with this one; what differs:\n{}\n\
-         resume with the config it was started with ({path}/config.toml), or choose another --out",
+        "{path} is a run of another config, so it cannot go on with this one; what differs:\n{}",
         differences.join("\n")
     )]
     ConfigDiffers { path: PathBuf, differences: Vec<String> },

@@ -17,7 +17,7 @@ use super::disk::Disk;
 use super::tensors::{self, Tensor, TensorFile};
 use crate::config::{Config, MAX_POPULATION};
 use crate::escape;
-use crate::evolve::{MAX_WEIGHT, MIN_WEIGHT};
+use crate::evolve::{MAX_WEIGHT, admit};
 use crate::world::{INPUTS, OUTPUTS};
 
 const KIND: &str = "policies 1";
@@ -142,15 +142,4 @@ pub fn from_file(
         ));
     }
     Ok(Policies { policies: shape[1], weights })
-}
-
-/// Makes weights fit for the kernels: those too small for them become 0. Gives the place of one that is too large or
-/// no number.
-pub(super) fn admit(weights: &mut [f32]) -> Option<usize> {
-    weights.iter_mut().position(|weight| {
-        if weight.abs() < MIN_WEIGHT {
-            *weight = 0.0;
-        }
-        weight.is_nan() || weight.abs() > MAX_WEIGHT
-    })
 }

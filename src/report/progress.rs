@@ -2,11 +2,12 @@
 //! time.
 
 use std::io::{self, IsTerminal, Write};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use crate::record::metrics::Row;
+use crate::host::Instant;
+use crate::trainer::Row;
 
 /// Letters that a curve takes; with the longest name and the value it fits the usual 80.
 const CURVE: usize = 24;

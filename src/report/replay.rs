@@ -18,9 +18,9 @@ use crate::backend::{Backend, BackendError, Episode, Group, Need, Seen, Strided,
 use crate::config::Config;
 use crate::credit::{self, Credit, Scores};
 use crate::evolve::{self, Key, Purpose};
-use crate::record::checkpoint::{self, Snapshot};
+use crate::record::checkpoint;
 use crate::record::folder::{CHECKPOINTS, POLICIES};
-use crate::trainer::Trainer;
+use crate::trainer::{Snapshot, Trainer};
 use crate::world::World;
 
 /// Most bytes of motion in a page, before they are written as text (4/3 of it). What is longer is thinned out.
@@ -39,7 +39,7 @@ pub enum ReplayError {
     NoTrial { folder: String, trial: usize, trials: usize },
     #[error(
         "{folder}: metrics.csv has no generation {generation} of trial {trial}{}",
-        newest.map_or(String::new(), |newest| format!("; the newest is {newest}: choose one up to that, or finish the run with --resume"))
+        newest.map_or(String::new(), |newest| format!("; the newest is {newest}: choose one up to that"))
     )]
     NoGeneration { folder: String, trial: usize, generation: usize, newest: Option<usize> },
     #[error(
@@ -366,7 +366,7 @@ fn hex(colors: &[Color]) -> Vec<String> {
 /// One episode as the page reads it: motion as base64 of little-endian numbers, `[shown][agents]`.
 fn episode(played: &Played, shown: &[usize], exact: bool) -> serde_json::Value {
     let Played { world, scores, .. } = played;
-    let map = [world.constants.map_x, world.constants.map_y];
+    let map = world.map().to_array();
     let (mut positions, mut headings, mut near) = (Vec::new(), Vec::new(), Vec::new());
     for &step in shown {
         for agent in 0..world.agents() {

@@ -9,6 +9,7 @@ use crate::file;
 use crate::record::RecordError;
 use crate::record::folder::{self, CONFIG, METRICS};
 use crate::record::metrics::{self, RowsError};
+use crate::trainer::Row;
 
 /// Most runs that one figure can tell apart.
 pub const MAX_RUNS: usize = 24;
@@ -16,19 +17,17 @@ pub const MAX_RUNS: usize = 24;
 /// Why a run could not be shown.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
-    #[error("{0}: no such folder; `flotilla train CONFIG --out {0}` makes a run there")]
+    #[error("{0}: no such folder")]
     Missing(PathBuf),
-    #[error("{0} is a file; name the folder of a run, which `flotilla train` makes")]
+    #[error("{0} is a file; name the folder of a run")]
     NoFolder(PathBuf),
-    #[error("{folder} is no run's folder: it has no {name}; `flotilla train CONFIG --out DIR` makes one that has")]
+    #[error("{folder} is no run's folder: it has no {name}")]
     Foreign { folder: PathBuf, name: &'static str },
-    #[error(
-        "{folder}: {error}\nfind a config that is whole, and repeat the run with `flotilla train CONFIG --out DIR`"
-    )]
+    #[error("{folder}: {error}")]
     Config { folder: PathBuf, error: ConfigError },
     #[error("{folder} holds {what}; name one of the runs in it, as {folder}/{example}")]
     Collection { folder: PathBuf, what: &'static str, example: &'static str },
-    #[error("{folder}: {reason}; finish the run with `flotilla train {folder}/{CONFIG} --out {folder} --resume`")]
+    #[error("{folder}: {reason}")]
     Unfinished { folder: PathBuf, reason: String },
     #[error(transparent)]
     Record(#[from] RecordError),
@@ -66,7 +65,7 @@ fn seen(path: &Path) -> Result<bool, RecordError> {
 ///
 /// # Errors
 /// There are none yet, or they are not this run's.
-pub fn metrics(folder: &Path, config: &Config, mut each: impl FnMut(&metrics::Row)) -> Result<(), RunError> {
+pub fn metrics(folder: &Path, config: &Config, mut each: impl FnMut(&Row)) -> Result<(), RunError> {
     let path = folder.join(METRICS);
     let unfinished = |reason: String| RunError::Unfinished { folder: folder.into(), reason };
     if !seen(&path)? {
@@ -123,6 +122,26 @@ impl Courses {
             }
         })?;
         Ok(courses)
+    }
+}
+
+/// G of the best team and of the champion, `[trials][generations]`, as far as the run has come.
+///
+/// # Errors
+/// See [`metrics()`]; or a trial's rows are not in order.
+pub fn trials(folder: &Path, config: &Config) -> Result<Vec<Vec<[f64; 2]>>, RunError> {
+    let mut trials = vec![vec![]; config.learning.trials];
+    let mut skipped = None;
+    metrics(folder, config, |row| match &mut trials[row.trial] {
+        trial if trial.len() == row.generation => trial.push([row.best_g, row.champion_g]),
+        _ => skipped = skipped.or(Some((row.trial, row.generation))),
+    })?;
+    match skipped {
+        None => Ok(trials),
+        Some((trial, generation)) => Err(RunError::Record(RecordError::Damaged {
+            path: folder.join(METRICS),
+            reason: format!("trial {trial} of generation {generation} is out of turn"),
+        })),
     }
 }
 

@@ -7,9 +7,11 @@
 use std::fs::{self, OpenOptions};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
-use crate::record::metrics::{self, Row};
+use crate::host::{self, Instant};
+use crate::record::metrics;
+use crate::trainer::Row;
 
 /// Most bytes of a trial that wait to be written.
 const MOST: usize = 1 << 16;
@@ -112,7 +114,7 @@ impl Events {
 
 /// Seconds since 1970.
 fn now() -> f64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64()
+    host::since_1970().as_secs_f64()
 }
 
 enum Content<'a> {

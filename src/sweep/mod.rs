@@ -13,6 +13,7 @@
 //! | [`run`] | trains a shard's points side by side |
 //! | [`results`] | `results.csv` and `points.csv`, put together from the points' folders |
 //! | [`pictures`] | heat maps and curves of them |
+//! | [`arms`] | points by the values of one axis, to be compared |
 //! | [`slurm`] | the batch script of a job array |
 
 use std::collections::BTreeMap;
@@ -24,6 +25,7 @@ use toml::{Spanned, Table, Value};
 use crate::config::{self, Config, ConfigError, GRID, Override, Problem, VARY, read_file};
 use crate::escape;
 
+pub mod arms;
 pub mod layout;
 pub mod pictures;
 pub mod results;

@@ -9,7 +9,8 @@ use crate::file;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{CONFIG, METRICS, POINTS, RESULTS};
-use crate::record::metrics::{self, Row};
+use crate::record::metrics;
+use crate::trainer::Row;
 
 /// What [`write()`] makes of the points that are complete.
 #[derive(Clone, Copy, Debug, PartialEq)]

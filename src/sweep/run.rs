@@ -5,10 +5,11 @@ use std::sync::atomic::Ordering::Relaxed;
 
 use super::Point;
 use super::results::point_folder;
+use crate::backend::Player;
 use crate::config::Config;
 use crate::record::disk::Disk;
 use crate::record::folder::{Note, Start};
-use crate::run::{self, Outcome, Player, RunError, Session};
+use crate::run::{self, Outcome, RunError, Session};
 
 /// Most points in one batch: each keeps two files open, and systems allow a process 1024.
 const MAX_BATCH: usize = 400;
@@ -47,8 +48,9 @@ pub fn bytes(config: &Config) -> usize {
     let learning = &config.learning;
     let scores =
         learning.trials * (learning.population + 1) * (config.learners() + 1) * (learning.episodes_per_team + 2);
-    3 * (config.policy_bytes() + learning.trials * config.learners() * config.parameters() * size_of::<f32>())
-        + scores * size_of::<f32>()
+    let champions = learning.trials * config.learners() * config.parameters();
+    let bytes = 3 * config.policy_bytes() + ((3 * champions + scores) * size_of::<f32>()) as u64;
+    bytes.try_into().unwrap_or(usize::MAX)
 }
 
 /// Steps of a team that a point takes until it is done.

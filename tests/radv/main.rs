@@ -7,6 +7,9 @@
 //!
 //! `cargo test --test radv -- table --ignored --nocapture` makes the table of `benches/README.md`.
 
+#![cfg(feature = "gpu")]
+
+#[expect(unsafe_code, reason = "a Vulkan driver is called directly")]
 mod driver;
 
 use std::collections::BTreeMap;

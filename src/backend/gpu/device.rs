@@ -1,21 +1,20 @@
 //! Finding, opening and talking to a GPU.
 //!
-//! [`open`] tests the device before handing it out: it tries the exact passes in turn and keeps the first under which
-//! every probe of [`super::probe`] gives the CPU's bits, or refuses the device by name.
+//! [`super::open`] tests a device before handing it out.
 
 use std::fmt;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytemuck::Pod;
-use pollster::block_on;
+use futures_channel::oneshot;
 use wgpu::util::DeviceExt;
 
 use super::exact::{self, Pass, ShaderError};
-use super::probe;
 use crate::escape;
+use crate::host::{self, Instant};
 
 /// Names of renderers that run on the CPU, for drivers that do not admit it in their device type.
 const SOFTWARE: [&str; 5] = ["llvmpipe", "lavapipe", "swiftshader", "microsoft basic render", "software"];
@@ -97,34 +96,25 @@ impl From<&wgpu::AdapterInfo> for AdapterInfo {
 /// Why a GPU could not be had, or failed at work.
 #[derive(Debug, thiserror::Error)]
 pub enum DeviceError {
-    #[error("no GPU adapter found (is a Vulkan, Metal or DirectX 12 driver installed?); use --backend cpu")]
+    #[error("no GPU adapter found (is a Vulkan, Metal or DirectX 12 driver installed?)")]
     NoAdapter,
-    #[error(
-        "no GPU among the adapters, only {}; what may be a software renderer is taken by --adapter alone (--adapter 0); \
-         --backend cpu is faster than one",
-        list(.found)
-    )]
+    #[error("no GPU among the adapters, only {}", list(.found))]
     NoRealAdapter { found: Vec<AdapterInfo> },
     #[error("no adapter {} \"{name}\"; there {}", if is_index(name) { "has the number" } else { "matches" }, there_are(.found))]
     UnknownAdapter { name: String, found: Vec<AdapterInfo> },
-    #[error("{adapter}: cannot be opened: {reason}; choose another with --adapter, or use --backend cpu")]
+    #[error("{adapter}: cannot be opened: {reason}")]
     Refused { adapter: String, reason: String },
-    #[error(
-        "{adapter}: not bit-exact, so it cannot be used: {}; choose another with --adapter, or use --backend cpu",
-        inexact(.failures)
-    )]
+    #[error("{adapter}: not bit-exact, so it cannot be used: {}", inexact(.failures))]
     Inexact { adapter: String, failures: Vec<(Pass, String)> },
-    #[error("{adapter}: the device was lost ({reason}); run again, or use --backend cpu")]
+    #[error("{adapter}: the device was lost ({reason})")]
     Lost { adapter: String, reason: String },
-    #[error("{adapter}: out of memory for {what}; use a smaller batch, or --backend cpu")]
+    #[error("{adapter}: out of memory for {what}; use a smaller batch")]
     OutOfMemory { adapter: String, what: String },
-    #[error(
-        "{adapter}: {what} needs {bytes} bytes, the device allows {allowed}; use a smaller batch, or --backend cpu"
-    )]
+    #[error("{adapter}: {what} needs {bytes} bytes, the device allows {allowed}; use a smaller batch")]
     TooLarge { adapter: String, what: String, bytes: u64, allowed: u64 },
     #[error("shader {label} {source}")]
     Shader { label: String, source: ShaderError },
-    #[error("{adapter}: {what} failed: {reason}; use --backend cpu")]
+    #[error("{adapter}: {what} failed: {reason}")]
     Failed { adapter: String, what: String, reason: String },
 }
 
@@ -139,7 +129,7 @@ fn is_index(name: &str) -> bool {
 }
 
 fn there_are(found: &[AdapterInfo]) -> String {
-    if found.is_empty() { "is none at all; use --backend cpu".into() } else { format!("is {}", list(found)) }
+    if found.is_empty() { "is none at all".into() } else { format!("is {}", list(found)) }
 }
 
 fn inexact(failures: &[(Pass, String)]) -> String {
@@ -161,7 +151,7 @@ fn found() -> Vec<(wgpu::Adapter, AdapterInfo)> {
         flags: wgpu::InstanceFlags::empty().with_env(),
         ..wgpu::InstanceDescriptor::new_without_display_handle()
     });
-    let mut adapters: Vec<_> = block_on(instance.enumerate_adapters(backends))
+    let mut adapters: Vec<_> = host::wait(instance.enumerate_adapters(backends))
         .into_iter()
         .filter(|a| a.get_downlevel_capabilities().flags.contains(wgpu::DownlevelFlags::COMPUTE_SHADERS))
         .map(|adapter| (adapter.get_info(), adapter))
@@ -259,41 +249,8 @@ impl fmt::Debug for Gpu {
     }
 }
 
-/// Opens an adapter and finds the first pass under which it is exact: no contraction on Vulkan, else guarded.
-pub fn open(request: impl Into<Request>) -> Result<Gpu, DeviceError> {
-    let request = request.into();
-    let (adapter, info) = choose(&request.choice)?;
-    let (passthrough, timestamps) = (wgpu::Features::PASSTHROUGH_SHADERS, wgpu::Features::TIMESTAMP_QUERY);
-    let features = adapter.features() & (passthrough | timestamps);
-    let own = adapter.get_info().backend == wgpu::Backend::Vulkan && features.contains(passthrough);
-    let candidates = match request.pass {
-        Some(Pass::NoContraction) if !own => {
-            let reason = "the no-contraction pass needs Vulkan".into();
-            return Err(DeviceError::Refused { adapter: info.to_string(), reason });
-        }
-        Some(pass) => vec![pass],
-        None if own => vec![Pass::NoContraction, Pass::Guarded],
-        None => vec![Pass::Guarded],
-    };
-    let limits = if request.default_limits { wgpu::Limits::defaults() } else { adapter.limits() };
-    let mut gpu = Gpu::new(&adapter, info, candidates[0], limits, features, request.checked)?;
-    let mut failures = Vec::new();
-    for pass in candidates {
-        gpu.pass = pass;
-        if pass == Pass::Plain {
-            return Ok(gpu);
-        }
-        match gpu.self_test() {
-            Ok(None) => return Ok(gpu),
-            Ok(Some(mismatch)) => failures.push((pass, mismatch.to_string())),
-            Err(lost @ DeviceError::Lost { .. }) => return Err(lost),
-            Err(error) => failures.push((pass, error.to_string())),
-        }
-    }
-    Err(DeviceError::Inexact { adapter: gpu.adapter.to_string(), failures })
-}
-
-fn choose(choice: &Choice) -> Result<(wgpu::Adapter, AdapterInfo), DeviceError> {
+/// The adapter of a choice.
+pub(super) fn choose(choice: &Choice) -> Result<(wgpu::Adapter, AdapterInfo), DeviceError> {
     let mut found = found();
     let infos: Vec<_> = found.iter().map(|(_, info)| info.clone()).collect();
     Ok(found.swap_remove(position(choice, &infos)?))
@@ -321,6 +278,9 @@ pub fn position(choice: &Choice, infos: &[AdapterInfo]) -> Result<usize, DeviceE
     }
 }
 
+/// Offsets of bindings are multiples of this on every WebGPU device.
+pub(super) const BINDING_ALIGNMENT: usize = 256;
+
 /// How a shader uses a buffer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Binding {
@@ -339,7 +299,8 @@ pub struct Layout {
 }
 
 impl Gpu {
-    fn new(
+    /// Opens an adapter, not yet tested.
+    pub(super) fn new(
         adapter: &wgpu::Adapter,
         info: AdapterInfo,
         pass: Pass,
@@ -357,7 +318,7 @@ impl Gpu {
             adapter: info.to_string(),
             reason: error.to_string(),
         };
-        let (device, queue) = block_on(adapter.request_device(&descriptor)).map_err(refused)?;
+        let (device, queue) = host::wait(adapter.request_device(&descriptor)).map_err(refused)?;
         let trouble = Arc::new(Mutex::new(Trouble::default()));
         let noted = trouble.clone();
         device.set_device_lost_callback(move |reason, message| {
@@ -374,16 +335,6 @@ impl Gpu {
             usage: wgpu::BufferUsages::UNIFORM,
         });
         Ok(Gpu { adapter: info, limits, pass, checked, device, queue, guard, trouble, traffic: Arc::default() })
-    }
-
-    /// Runs every probe under the current pass; the first that differs from the CPU, if any.
-    pub fn self_test(&self) -> Result<Option<probe::Mismatch>, DeviceError> {
-        for probe in probe::ALL {
-            if let Some(mismatch) = probe(self)? {
-                return Ok(Some(mismatch));
-            }
-        }
-        Ok(None)
     }
 
     /// An error if the device was lost or anything failed outside the calls below; to be asked after every wait.
@@ -409,7 +360,7 @@ impl Gpu {
             [OutOfMemory, Validation, Internal].map(|f| self.device.push_error_scope(f));
         let made = make();
         // Innermost first; array elements would be dropped in the wrong order.
-        let errors = [block_on(internal.pop()), block_on(validation.pop()), block_on(memory.pop())];
+        let errors = [host::wait(internal.pop()), host::wait(validation.pop()), host::wait(memory.pop())];
         self.check()?;
         match errors.into_iter().flatten().next() {
             None => Ok(made),
@@ -467,7 +418,7 @@ impl Gpu {
         self.traffic[1].fetch_add(size, Relaxed);
         let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ;
         let landing = self.buffer("reading back", size, usage)?;
-        let (send, receive) = std::sync::mpsc::channel();
+        let (send, receive) = oneshot::channel();
         self.scoped("reading back", || {
             let mut encoder = self.device.create_command_encoder(&Default::default());
             encoder.copy_buffer_to_buffer(buffer, bytes.start, &landing, 0, size);
@@ -476,7 +427,7 @@ impl Gpu {
             landing.map_async(wgpu::MapMode::Read, .., move |result| drop(send.send(result)));
         })?;
         self.wait()?;
-        let mapped = receive.recv().map_err(|error| self.failed("reading back", error))?;
+        let mapped = host::wait(receive).map_err(|error| self.failed("reading back", error))?;
         mapped.map_err(|error| self.failed("reading back", error))?;
         let view = landing.get_mapped_range(..).map_err(|error| self.failed("reading back", error))?;
         Ok(bytemuck::pod_collect_to_vec(&view[..]))
@@ -490,7 +441,7 @@ impl Gpu {
         show: impl FnOnce(&[u8]) -> T,
     ) -> Result<T, DeviceError> {
         self.traffic[1].fetch_add(bytes.end - bytes.start, Relaxed);
-        let (send, receive) = std::sync::mpsc::channel();
+        let (send, receive) = oneshot::channel();
         // Nobody listens any more only if waiting failed.
         self.scoped("reading back", || {
             buffer.map_async(wgpu::MapMode::Read, bytes.clone(), move |result| drop(send.send(result)));
@@ -499,7 +450,7 @@ impl Gpu {
         let polled = self.device.poll(wgpu::PollType::Poll);
         self.check()?;
         polled.map_err(|error| self.failed("reading back", error))?;
-        let mapped = receive.recv().map_err(|error| self.failed("reading back", error))?;
+        let mapped = host::wait(receive).map_err(|error| self.failed("reading back", error))?;
         mapped.map_err(|error| self.failed("reading back", error))?;
         let view = buffer.get_mapped_range(bytes).map_err(|error| self.failed("reading back", error))?;
         let shown = show(&view);
@@ -515,6 +466,14 @@ impl Gpu {
 
     /// Waits until a submission is done, or everything.
     pub fn wait_for(&self, submission_index: Option<wgpu::SubmissionIndex>) -> Result<(), DeviceError> {
+        // A browser has no polling: there, whatever was submitted until now is waited for.
+        if cfg!(target_family = "wasm") {
+            let (send, done) = oneshot::channel();
+            self.queue.on_submitted_work_done(move || _ = send.send(()));
+            // What nobody answers is a lost device, as the check tells.
+            let _ = host::wait(done);
+            return self.check();
+        }
         let waited = self.device.poll(wgpu::PollType::Wait { submission_index, timeout: None });
         self.check()?;
         waited.map(drop).map_err(|error| self.failed("waiting", error))
@@ -575,7 +534,7 @@ impl Gpu {
     ) -> Result<wgpu::ComputePipeline, DeviceError> {
         // SAFETY: the loops of the crate's own shaders end, their bindings are those of their layouts, and their indices
         // are in bounds for groups and plans that were checked, as the checked builds in the tests show.
-        #[allow(unsafe_code)]
+        #[expect(unsafe_code, reason = "shaders of the crate's own are compiled without bounds checks")]
         unsafe {
             self.pipeline(label, wgsl, entry, layout)
         }
@@ -587,7 +546,7 @@ impl Gpu {
     /// Unless `checked`, nothing keeps the shader within its buffers: its indices must be in bounds, its loops must end, it
     /// must divide no integer by zero, and read no workgroup memory that it did not write. Its bindings must be those of
     /// the layout, `checked` or not.
-    #[allow(unsafe_code)]
+    #[expect(unsafe_code, reason = "shaders of the crate's own are compiled without bounds checks")]
     pub unsafe fn pipeline(
         &self,
         label: &str,
@@ -715,6 +674,12 @@ pub fn timed(watch: Option<&Stopwatch>) -> wgpu::ComputePassDescriptor<'_> {
         end_of_pass_write_index: Some(1),
     });
     wgpu::ComputePassDescriptor { label: None, timestamp_writes }
+}
+
+/// A dispatch of at least `tasks` workgroups, within the device's limit on each side.
+pub(super) fn grid(tasks: usize, limits: &wgpu::Limits) -> [u32; 3] {
+    let rows = tasks.div_ceil(limits.max_compute_workgroups_per_dimension as usize).max(1);
+    [tasks.div_ceil(rows) as u32, rows as u32, 1]
 }
 
 /// An error with all its causes.

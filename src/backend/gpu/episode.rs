@@ -12,20 +12,25 @@ use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fmt::{self, Write};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use bytemuck::{Pod, Zeroable};
+use bytemuck::Zeroable;
 use glam::Vec2;
-use rayon::prelude::*;
 
-use super::device::{Binding, DeviceError, Gpu, Kind, Layout, Stopwatch, Traffic, timed};
+use super::device::{BINDING_ALIGNMENT, Binding, DeviceError, Gpu, Kind, Layout, Stopwatch, Traffic, grid, timed};
 use super::exact;
 use super::population::{Kernels, Population, Stretch, TOGETHER, parts};
 use crate::backend::{
-    Backend, BackendError, Episode, Group, Held, Moment, Seen, Strided, Trace, Visit, Weights, owner_bits,
+    Backend, BackendError, Episode, Group, HELD_FROM, Held, Moment, PACKED_FROM, Seen, Strided, Trace, Visit, Weights,
+    owner_bits,
 };
 use crate::config::{MAX_AGENTS, MAX_HIDDEN_LAYERS};
-use crate::world::{Constants, INPUTS, OUTPUTS, World};
+use crate::declare::{Shared, shared};
+use crate::host::Instant;
+use crate::model::policy::PolicyConstants;
+use crate::model::{self, Constants, Variant};
+use crate::parallel::*;
+use crate::world::{INPUTS, OUTPUTS, World};
 
 /// Threads that share a warp on most GPUs; leaders and followers are kept apart by as many (`ROLE` in the shader).
 const ROLE: usize = 32;
@@ -52,40 +57,38 @@ const MAX_OFFSET: u64 = 1 << 33;
 /// Turns of loops that one thread takes in a dispatch, over all loops. Mesa's llvmpipe 22.3 leaves every loop for good
 /// after 65 535, and drivers stop a dispatch that runs for seconds: longer episodes take several dispatches.
 const TURNS: usize = 60_000;
-/// Offsets of bindings are multiples of this on every WebGPU device.
-pub(super) const BINDING_ALIGNMENT: usize = 256;
 
-/// One workgroup's share of the work (`struct Task` in `shaders/lib/layout.wgsl`); offsets count elements.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct Task {
-    pub world: u32,
-    pub starts: u32,
-    pub pois: u32,
-    pub weights: u32,
-    pub sets: u32,
-    pub seen: u32,
-    pub moments: u32,
-    pub states: u32,
-    pub teams: u32,
-    /// The steps that a dispatch plays: from `first` on, before `end`.
-    pub first: u32,
-    pub end: u32,
-    /// Where packing finds and leaves what, see `shaders/pack.wgsl`.
-    pub least: u32,
-    pub table: u32,
-    pub owners: u32,
-}
+shared! {
+    /// One workgroup's share of the work: some teams of one group.
+    #[derive(Default)]
+    pub struct Task {
+        pub world: u32,
+        /// Where each of these starts in its buffer, in elements.
+        pub starts: u32,
+        pub pois: u32,
+        pub weights: u32,
+        pub sets: u32,
+        pub seen: u32,
+        pub moments: u32,
+        pub states: u32,
+        pub teams: u32,
+        /// The steps that a dispatch plays: from `first` on, before `end`.
+        pub first: u32,
+        pub end: u32,
+        /// Where packing finds and leaves what, see `shaders/pack.wgsl`.
+        pub least: u32,
+        pub table: u32,
+        pub owners: u32,
+    }
 
-/// An agent between two dispatches (`struct State` in the shader).
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-#[repr(C)]
-pub struct State {
-    pub x: f32,
-    pub y: f32,
-    pub hx: f32,
-    pub hy: f32,
-    pub speed: f32,
+    /// An agent between two dispatches.
+    pub struct State {
+        pub x: f32,
+        pub y: f32,
+        pub hx: f32,
+        pub hy: f32,
+        pub speed: f32,
+    }
 }
 
 /// Which kernel plays; no result depends on that.
@@ -126,7 +129,7 @@ enum Sizes {
     /// The widest layer, inputs included, rounded up to spare compilations.
     Any { widest: usize },
     /// All that makes a difference to the code.
-    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], density: u32, by_sine: bool },
+    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], variant: Variant },
 }
 
 const WIDTHS: usize = MAX_HIDDEN_LAYERS + 2;
@@ -137,14 +140,14 @@ impl Shape {
     }
 
     fn generic(world: &World, packing: Packing, trace: bool) -> Shape {
-        let widest = world.constants.widths.into_iter().max().unwrap_or(0).next_power_of_two() as usize;
+        let widest = world.constants.policy.widest().next_power_of_two();
         Shape { workgroup: packing.workgroup, slots: packing.slots, trace, sizes: Sizes::Any { widest } }
     }
 
     fn specialised(world: &World, packing: Packing, trace: bool) -> Shape {
-        let Constants { leaders, followers, pois, widths, density, max_turn_cos, .. } = world.constants;
-        let (agents, by_sine) = (leaders + followers, max_turn_cos > 0.7);
-        let sizes = Sizes::Fixed { teams: packing.teams, leaders, agents, pois, widths, density, by_sine };
+        let Constants { leaders, followers, pois, variant, policy: PolicyConstants { widths, .. }, .. } =
+            world.constants;
+        let sizes = Sizes::Fixed { teams: packing.teams, leaders, agents: leaders + followers, pois, widths, variant };
         Shape { workgroup: packing.workgroup, slots: packing.slots, trace, sizes }
     }
 }
@@ -192,7 +195,7 @@ impl Packing {
 
 /// Steps that one dispatch may play, see [`TURNS`].
 fn steps_a_dispatch(world: &World, packing: Packing) -> usize {
-    let Constants { widths, words, .. } = world.constants;
+    let Constants { words, policy: PolicyConstants { widths, .. }, .. } = world.constants;
     let network: u32 = widths.windows(2).map(|w| (w[0] + 2) * w[1]).sum();
     let agent = world.pois.len() + world.agents() + network as usize + 20;
     let items = (world.pois.len() * words as usize * packing.teams).div_ceil(packing.workgroup);
@@ -353,7 +356,7 @@ fn plan(
         if bytes_a_team > room.buffer {
             return Err(BackendError::TooLarge(format!(
                 "one team takes {bytes_a_team} bytes in one buffer, this adapter allows {}; \
-                 use --backend cpu, fewer steps or fewer POIs",
+                 use the CPU, fewer steps or fewer POIs",
                 room.buffer
             )));
         }
@@ -440,11 +443,6 @@ pub enum Holding {
     Always,
 }
 
-/// Populations of a trial that take so many bytes are held where nothing else is asked for, but never by a software
-/// renderer: about what goes over the bus in the time of the few dispatches that holding costs. An estimate, not a
-/// measurement.
-pub const HELD_FROM: u64 = 1 << 20;
-
 /// How records come home where only scores are wanted; no result depends on that.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Records {
@@ -468,9 +466,6 @@ impl Records {
     }
 }
 
-/// Records of a batch that take so many bytes are packed where nothing else is asked for, but never by a software
-/// renderer: about what goes over the bus in the time that one more dispatch costs. An estimate, not a measurement.
-pub const PACKED_FROM: u64 = 1 << 20;
 /// Threads of a workgroup that packs a task.
 const PACK_WORKGROUP: usize = 64;
 /// Words before the others in what is packed (`struct Packed` in the shader): how many are taken, and of how many.
@@ -949,7 +944,7 @@ impl GpuEpisodes {
                     leaders: leaders as u32,
                     first: first as u32,
                     count: TOGETHER.min(leaders - first) as u32,
-                    parameters: group.world.constants.parameters,
+                    parameters: group.world.constants.policy.parameters,
                     teams,
                     teams_a_task: shares[0].task.teams,
                     choices: choices.len() as u32,
@@ -1004,7 +999,9 @@ impl GpuEpisodes {
 /// The whole shader that packs records, with its constants in front.
 fn packing() -> String {
     let most = WORKGROUPS[WORKGROUPS.len() - 1].max(TEAMS[0]);
+    let structs = [model::declarations(), Task::wgsl(), State::wgsl(), Moment::wgsl()].concat();
     exact::assemble(&[
+        &structs,
         &format!(
             "const WORKGROUP: u32 = {PACK_WORKGROUP}u;\nconst TEAMS: u32 = {most}u;\nconst NOWHERE: u32 = {NOWHERE}u;"
         ),
@@ -1015,12 +1012,6 @@ fn packing() -> String {
 
 fn is_on_host(groups: &[Group<'_>], share: &Share) -> bool {
     matches!(groups[share.group].weights, Weights::OnHost(_))
-}
-
-/// A dispatch of at least `tasks` workgroups, within the device's limit on each side.
-pub(super) fn grid(tasks: usize, limits: &wgpu::Limits) -> [u32; 3] {
-    let rows = tasks.div_ceil(limits.max_compute_workgroups_per_dimension as usize).max(1);
-    [tasks.div_ceil(rows) as u32, rows as u32, 1]
 }
 
 /// The whole shader, with what it has in front.
@@ -1040,39 +1031,34 @@ fn source(shape: Shape) -> String {
     );
     let front = match sizes {
         Sizes::Any { widest } => {
-            format!("const WIDEST: u32 = {widest}u;\n{}", include_str!("../../../shaders/generic.wgsl"))
+            let variant = Variant::copied_from("world");
+            let generic = include_str!("../../../shaders/generic.wgsl");
+            format!("const WIDEST: u32 = {widest}u;\nfn world_variant() -> Variant {{ return {variant}; }}\n{generic}")
         }
-        Sizes::Fixed { teams, leaders, agents, pois, widths, density, by_sine } => format!(
-            "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u, {density}u, {by_sine});\n\
+        Sizes::Fixed { teams, leaders, agents, pois, widths, variant } => format!(
+            "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u);\nconst variant = {variant};\n\
              fn adopt(task: Task) {{}}\n{}",
             straight_policy(&widths),
-            words = agents.div_ceil(32)
+            words = agents.div_ceil(32),
+            variant = variant.value()
         ),
     };
-    exact::assemble(&[
-        &constants,
-        &front,
-        include_str!("../../../shaders/lib/layout.wgsl"),
-        include_str!("../../../shaders/lib/math.wgsl"),
-        include_str!("../../../shaders/sense.wgsl"),
-        include_str!("../../../shaders/policy.wgsl"),
-        include_str!("../../../shaders/follow.wgsl"),
-        include_str!("../../../shaders/motion.wgsl"),
-        include_str!("../../../shaders/couple.wgsl"),
-        include_str!("../../../shaders/episode.wgsl"),
-    ])
+    let structs = [Task::wgsl(), State::wgsl(), Moment::wgsl()].concat();
+    let (front, math) =
+        ([constants, front, model::declarations(), structs], include_str!("../../../shaders/lib/math.wgsl"));
+    let front = front.iter().map(String::as_str).chain([include_str!("../../../shaders/lib/layout.wgsl"), math]);
+    let parts = front.chain(model::WGSL).chain([include_str!("../../../shaders/episode.wgsl")]);
+    exact::assemble(&parts.collect::<Vec<_>>())
 }
 
 /// A policy of these widths as straight-line code: `decide` of `shaders/generic.wgsl`, its loops written out. Each unit is
 /// a variable, and four weights at a time are read in the order in which they are needed, so that a compiler may read
 /// many before it waits for any.
 fn straight_policy(widths: &[u32; WIDTHS]) -> String {
-    let mut text =
-        String::from("fn decide(lane: u32, stride: u32, of_pois: vec4<f32>, of_agents: vec4<f32>) -> vec2<f32> {\n");
+    let mut text = String::from("fn decide(start: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
     let mut line = |line: std::fmt::Arguments<'_>| writeln!(text, "    {line}").expect("a string takes a line");
     let mut read = HashSet::new();
-    let mut inputs: Vec<String> =
-        (0..INPUTS).map(|input| format!("{}.{}", ["of_pois", "of_agents"][input / 4], AXES[input % 4])).collect();
+    let mut inputs: Vec<String> = (0..INPUTS).map(|input| format!("inputs[{input}]")).collect();
     let mut first = 0;
     let layers = widths.windows(2).take_while(|pair| pair[1] > 0);
     for (layer, pair) in layers.enumerate() {
@@ -1083,7 +1069,7 @@ fn straight_policy(widths: &[u32; WIDTHS]) -> String {
                 let weight = first + row * columns + column;
                 let (four, axis) = (weight / FOUR, AXES[weight % FOUR]);
                 if read.insert(four) {
-                    line(format_args!("let w{four} = weights[lane + {four}u * stride];"));
+                    line(format_args!("let w{four} = weights[start + {four}u * stride];"));
                 }
                 match row == rows {
                     true => line(format_args!("var s{layer}_{column} = w{four}.{axis};")),
@@ -1109,7 +1095,8 @@ pub fn shaders() -> Vec<(&'static str, String)> {
         |workgroup, slots, widest, trace| source(Shape { workgroup, slots, trace, sizes: Sizes::Any { widest } });
     let specialised = |trace| {
         let widths = [INPUTS as u32, 10, OUTPUTS as u32, 0, 0];
-        let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, density: 0, by_sine: true };
+        let variant = Variant { density: 0, by_sine: 1 };
+        let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, variant };
         source(Shape { workgroup: 384, slots: 1, trace, sizes })
     };
     vec![
@@ -1220,7 +1207,7 @@ impl Backend for GpuEpisodes {
             return match self.holding {
                 Holding::Always => Err(BackendError::TooLarge(format!(
                     "the policies of one leader take {bytes} bytes, this adapter holds {allowed} in one buffer; \
-                     use --breed host, or a smaller population"
+                     breed on the host, or use a smaller population"
                 ))),
                 _ => Ok(None),
             };

@@ -501,7 +501,7 @@ fn check_limits(module: &Module, limits: &wgpu::Limits) -> Result<(), ShaderErro
 ///
 /// # Safety
 /// As of [`super::device::Gpu::pipeline`].
-#[allow(unsafe_code)]
+#[expect(unsafe_code, reason = "shaders are compiled without bounds checks")]
 pub(super) unsafe fn compile(
     device: &wgpu::Device,
     label: &str,

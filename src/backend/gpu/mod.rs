@@ -1,13 +1,22 @@
 //! The GPU backend, on any adapter that wgpu reaches.
 //!
-//! [`device`] finds and opens adapters, [`exact`] makes the shaders' arithmetic bit-identical to the CPU's,
-//! [`probe`] tests on the opened device that it is; [`episode`] plays, [`population`] keeps policies on the device.
+//! Each module imports only those above it:
+//!
+//! | module | holds |
+//! |---|---|
+//! | [`exact`] | what makes the shaders' arithmetic bit-identical to the CPU's |
+//! | [`device`] | adapters, and what is asked of an opened one |
+//! | [`population`] | policies that stay on the device |
+//! | [`episode`] | whole episodes |
+//! | [`probe`] | opening a device, and the tests that it must pass |
 
 pub mod device;
 pub mod episode;
 pub mod exact;
 pub mod population;
 pub mod probe;
+
+pub use probe::{open, self_test};
 
 /// The whole text of every shader, with a name for each: what the lints and the exactness tests walk over.
 pub fn shaders() -> Vec<(&'static str, String)> {

@@ -4,14 +4,14 @@ use std::fmt;
 use std::ops::Range;
 use std::sync::Arc;
 
-use bytemuck::{Pod, Zeroable};
+use bytemuck::Pod;
 
-use super::device::{Binding, DeviceError, Gpu, Layout};
-use super::episode::{BINDING_ALIGNMENT, grid};
+use super::device::{BINDING_ALIGNMENT, Binding, DeviceError, Gpu, Layout, grid};
 use super::exact;
-use crate::backend::{BackendError, Breeding, Held};
+use crate::backend::{BackendError, Held};
 use crate::config::Mutation;
-use crate::evolve;
+use crate::declare::{Shared, shared};
+use crate::evolve::{self, Breeding};
 
 /// Threads of a workgroup.
 const WORKGROUP: usize = 256;
@@ -22,33 +22,38 @@ pub const TOGETHER: usize = 4;
 /// Bytes that go to or come from the device at a time, so that as much memory beside the populations is enough.
 const PIECE: usize = 64 << 20;
 
-/// How one leader's next generation is made (`struct Brood` in `shaders/population.wgsl`).
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-#[repr(C)]
-pub struct Brood {
-    pub key: [u32; 4],
-    pub slots: u32,
-    pub parameters: u32,
-    pub parents: u32,
-    pub threshold: u32,
-    pub all: u32,
-    pub scaled: u32,
-    pub sigma: f32,
-}
+shared! {
+    /// How one leader's next generation is made.
+    pub struct Brood {
+        /// The slots' key, which has the generation and the population in it but not the slot.
+        pub key: [u32; 4],
+        pub slots: u32,
+        pub parameters: u32,
+        /// Where the leader's parents start in the plan.
+        pub parents: u32,
+        /// Weights whose word is below it mutate, or all of them.
+        pub threshold: u32,
+        pub all: u32,
+        /// Whether noise is of a weight's own size.
+        pub scaled: u32,
+        pub sigma: f32,
+    }
 
-/// Some leaders' policies in some teams of one group, which tasks share (`struct Stretch` in the shader).
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-#[repr(C)]
-pub struct Stretch {
-    pub leaders: u32,
-    /// Those gathered: the first, and how many, up to [`TOGETHER`].
-    pub first: u32,
-    pub count: u32,
-    pub parameters: u32,
-    pub teams: u32,
-    pub teams_a_task: u32,
-    pub choices: u32,
-    pub weights: u32,
+    /// Some leaders' policies in some teams of one group, which tasks share.
+    pub struct Stretch {
+        /// Leaders of a team.
+        pub leaders: u32,
+        /// Those gathered: the first, and how many, up to [`TOGETHER`].
+        pub first: u32,
+        pub count: u32,
+        pub parameters: u32,
+        pub teams: u32,
+        /// Every task has so many, the last what is left.
+        pub teams_a_task: u32,
+        /// Where the stretch starts in its buffers.
+        pub choices: u32,
+        pub weights: u32,
+    }
 }
 
 impl Stretch {
@@ -254,10 +259,11 @@ impl Held for Population {
     }
 }
 
-/// The whole shader, with its constant in front.
+/// The whole shader, with what it has in front.
 fn source() -> String {
     exact::assemble(&[
         &format!("const WORKGROUP: u32 = {WORKGROUP}u;"),
+        &[Brood::wgsl(), Stretch::wgsl()].concat(),
         include_str!("../../../shaders/lib/math.wgsl"),
         include_str!("../../../shaders/population.wgsl"),
     ])

@@ -7,14 +7,15 @@ use std::time::Duration;
 
 use wgpu::BufferUsages;
 
-use super::device::{Binding, DeviceError, Gpu, Kind};
+use super::device::{self, Binding, DeviceError, Gpu, Kind, Request};
 use super::episode::{GpuEpisodes, Kernel};
+use super::exact::Pass;
 use super::population::Kernels;
 use crate::backend::compare::first_mismatch;
 use crate::backend::cpu::Cpu;
-use crate::backend::{Backend, BackendError, Breeding, Group, Held, Need};
+use crate::backend::{Backend, BackendError, Group, Held, Need};
 use crate::config::{Config, Learning};
-use crate::evolve::{Key, Purpose};
+use crate::evolve::{Breeding, Key, Purpose};
 use crate::sample;
 use crate::world::World;
 
@@ -51,6 +52,57 @@ pub type Probe = fn(&Gpu) -> Result<Option<Mismatch>, DeviceError>;
 ///
 /// A new one is a function here: it compiles through `gpu.own_pipeline`, so that the pass under test applies to it.
 pub const ALL: &[Probe] = &[arithmetic, episode, breeding];
+
+/// Opens an adapter and finds the first pass under which every probe gives the CPU's bits: no contraction on Vulkan, else
+/// guarded.
+///
+/// # Errors
+/// There is no such adapter, it cannot be opened, or it is not exact under any pass.
+pub fn open(request: impl Into<Request>) -> Result<Gpu, DeviceError> {
+    let request = request.into();
+    let (adapter, info) = device::choose(&request.choice)?;
+    let (passthrough, timestamps) = (wgpu::Features::PASSTHROUGH_SHADERS, wgpu::Features::TIMESTAMP_QUERY);
+    let features = adapter.features() & (passthrough | timestamps);
+    let own = adapter.get_info().backend == wgpu::Backend::Vulkan && features.contains(passthrough);
+    let candidates = match request.pass {
+        Some(Pass::NoContraction) if !own => {
+            let reason = "the no-contraction pass needs Vulkan".into();
+            return Err(DeviceError::Refused { adapter: info.to_string(), reason });
+        }
+        Some(pass) => vec![pass],
+        None if own => vec![Pass::NoContraction, Pass::Guarded],
+        None => vec![Pass::Guarded],
+    };
+    let limits = if request.default_limits { wgpu::Limits::defaults() } else { adapter.limits() };
+    let mut gpu = Gpu::new(&adapter, info, candidates[0], limits, features, request.checked)?;
+    let mut failures = Vec::new();
+    for pass in candidates {
+        gpu.pass = pass;
+        if pass == Pass::Plain {
+            return Ok(gpu);
+        }
+        match self_test(&gpu) {
+            Ok(None) => return Ok(gpu),
+            Ok(Some(mismatch)) => failures.push((pass, mismatch.to_string())),
+            Err(lost @ DeviceError::Lost { .. }) => return Err(lost),
+            Err(error) => failures.push((pass, error.to_string())),
+        }
+    }
+    Err(DeviceError::Inexact { adapter: gpu.adapter.to_string(), failures })
+}
+
+/// Runs every probe under the device's current pass; the first that differs from the CPU, if any.
+///
+/// # Errors
+/// The device fails.
+pub fn self_test(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
+    for probe in ALL {
+        if let Some(mismatch) = probe(gpu)? {
+            return Ok(Some(mismatch));
+        }
+    }
+    Ok(None)
+}
 
 /// Computations of `arithmetic`, in the order of `shaders/probe.wgsl`.
 const NAMES: [&str; 36] = [
@@ -162,7 +214,7 @@ fn breeding(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
     let mut held = Arc::new(Kernels::new(gpu.clone(), |text| text)?).hold(weights, sizes)?;
     let mut found = vec![0.0; weights.len()];
     held.breed(&breeding).and_then(|()| held.fetch(&mut found)).map_err(|error| refused(gpu, error))?;
-    let expected = breeding.on_host(sizes, weights).map_err(|error| refused(gpu, error))?;
+    let expected = breeding.on_host(sizes, weights).map_err(|error| refused(gpu, error.into()))?;
     let differs = |index: &usize| expected[*index].to_bits() != found[*index].to_bits();
     Ok((0..found.len()).find(differs).map(|index| Mismatch {
         probe: format!("breeding, weight {}", index % world.parameters()).into(),

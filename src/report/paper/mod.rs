@@ -11,7 +11,7 @@ use serde::Serialize;
 use super::curves::{Curve, Figure, Panel, Tally};
 use crate::baseline::Baseline;
 use crate::config::{Config, ConfigError, Fitness, Override, Paradigm};
-use crate::record::metrics::Row;
+use crate::trainer::Row;
 
 pub mod claims;
 pub mod tables;

@@ -3,6 +3,7 @@
 use super::claims::{Claim, END, Verdict};
 use super::{LAYOUTS, PARADIGMS, Results, SOURCES, Source};
 use crate::config::Learning;
+use crate::report::table::markdown;
 use crate::statistics;
 
 /// What needs no learning: the figures of straight ahead and of random teams beside those of evolution, and whether
@@ -66,7 +67,7 @@ pub fn without_learning(results: Results<'_>) -> String {
             solved.join("; ")
         )
     };
-    format!("{meaning}\n\n{}\n{}", aligned(&rows), aligned(&races))
+    format!("{meaning}\n\n{}\n{}", markdown(&rows), markdown(&races))
 }
 
 /// The verdict on every claim, without figures: for a terminal and the first page.
@@ -76,7 +77,7 @@ pub fn verdicts(claims: &[Claim]) -> String {
         let cells = cells(claim, |verdict, _| verdict.to_string());
         rows.push([vec![claim.layout.to_string(), claim.words.to_string()], cells].concat());
     }
-    aligned(&rows)
+    markdown(&rows)
 }
 
 /// Every claim with its measure and figures.
@@ -88,7 +89,7 @@ pub fn full(claims: &[Claim]) -> String {
         let cells = cells(claim, |verdict, measured| format!("{verdict}: {measured}"));
         rows.push([[layout, place, words, measure].map(String::from).to_vec(), cells].concat());
     }
-    aligned(&rows)
+    markdown(&rows)
 }
 
 fn sources() -> Vec<String> {
@@ -146,17 +147,3 @@ the interval of those that do starts at 9 in 10; *similar*, *comparable* and *sl
 the POIs. The columns *straight ahead* and *random teams* hold the same measure for what needs no learning, and are not
 counted: a *yes* there says that the claim speaks of the task rather than of what was learned. Alone, Df is D. Every
 interval stands for itself: of so many, a few miss what they estimate by chance.";
-
-/// A Markdown table whose columns are of one width each.
-fn aligned(rows: &[Vec<String>]) -> String {
-    let columns = rows[0].len();
-    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-    let widths: Vec<usize> = (0..columns).map(width).collect();
-    let line = |row: &[String]| {
-        let cells: Vec<String> = row.iter().zip(&widths).map(|(cell, &width)| format!("{cell:width$}")).collect();
-        format!("| {} |\n", cells.join(" | "))
-    };
-    let rule = line(&widths.iter().map(|&width| "-".repeat(width)).collect::<Vec<_>>());
-    let (head, body) = (line(&rows[0]), rows[1..].iter().map(|row| line(row)));
-    std::iter::once(head).chain([rule]).chain(body).collect()
-}

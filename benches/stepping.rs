@@ -1,0 +1,116 @@
+//! What stepping takes of a rollout: the same steps of the same teams as whole episodes, as whole episodes with the smallest
+//! network there is, and by [`Stepper`], by turns.
+//!
+//! ```text
+//! cargo bench --bench stepping [-- CONFIG [TEAMS [ROUNDS]]]
+//! ```
+//!
+//! Leaders answer the same at every step, each by its own draw, so that a network of any size plays the very same episodes;
+//! what a network takes does not depend on its weights.
+
+use std::error::Error;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use fearless_simd::Level;
+use flotilla::backend::cpu::{Cpu, level_name};
+use flotilla::backend::{Backend, Group};
+use flotilla::config::Config;
+use flotilla::evolve::{Key, Purpose, random_policy};
+use flotilla::stepping::Stepper;
+use flotilla::world::{OUTPUTS, World};
+
+/// Least time that one measurement takes.
+const LEAST: Duration = Duration::from_millis(150);
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let words: Vec<String> = std::env::args().skip(1).filter(|word| word != "--bench").collect();
+    let config = Config::load(Path::new(words.first().map_or("configs/generally_forward.toml", |word| word)))?;
+    let teams: usize = words.get(1).map_or(Ok(4096), |word| word.parse())?;
+    let rounds: usize = words.get(2).map_or(Ok(9), |word| word.parse())?;
+    for level in Cpu::levels().into_iter().filter(|level| ["AVX2", "AVX-512", "NEON"].contains(&level_name(*level))) {
+        measure(&config, level, teams, rounds)?;
+    }
+    Ok(())
+}
+
+fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result<(), Box<dyn Error>> {
+    let mut small = config.clone();
+    small.policy.hidden.clear();
+    let (world, small) = (World::new(config), World::new(&small));
+    let leaders = world.leaders();
+    let of = |world: &World| constant(world, teams, config.learning.seed);
+    let weights = [of(&world), of(&small)];
+    let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; leaders]).collect();
+    let need = flotilla::backend::Need::Record;
+    let group = |world, weights| Group { world, starts: &world.starts, weights, policies: teams, teams: &order, need };
+    let groups = [group(&world, weights[0][..].into()), group(&small, weights[1][..].into())];
+    let mut cpu = Cpu::at_level(level);
+    let mut rollout = |group| cpu.rollout(&[group], &|episode| _ = std::hint::black_box(episode));
+
+    let mut first = world.clone();
+    first.constants.steps = 1;
+    let trace = Cpu::default().trace(&Group { world: &first, starts: &world.starts, ..groups[0] })?;
+    let actions: Vec<f32> = (0..teams)
+        .flat_map(|team| (0..leaders).map(move |leader| (team, leader)))
+        .flat_map(|(team, leader)| trace.moment(1, team, leader).outputs)
+        .collect();
+    let mut stepper = Stepper::at_level(level, world.clone(), teams, false)?;
+    let mut states = 0.0;
+    let mut steps = |with_states: bool| -> Result<(), Box<dyn Error>> {
+        stepper.reset();
+        for _ in 0..world.steps() {
+            stepper.step(&actions)?;
+            if with_states {
+                states += stepper.states().speeds[0];
+            }
+        }
+        Ok(())
+    };
+
+    let agent_steps = (teams * world.agents() * world.steps()) as f64;
+    let mut rows = [const { Vec::new() }; 4];
+    for _ in 0..rounds {
+        rows[0].push(time(|| Ok(rollout(groups[0])?))?);
+        rows[1].push(time(|| Ok(rollout(groups[1])?))?);
+        rows[2].push(time(|| steps(false))?);
+        rows[3].push(time(|| steps(true))?);
+    }
+    println!("{}, {teams} teams, {rounds} rounds: ns an agent-step, share of the first", level_name(level));
+    let names = ["rollout", "rollout without hidden units", "stepping", "stepping, and everyone's states"];
+    for (name, row) in names.into_iter().zip(&rows) {
+        let shares = row.iter().zip(&rows[0]).map(|(time, whole)| time / whole);
+        println!("  {name:<34}{:>6.2}{:>7.2}", median(row.clone()) / agent_steps * 1e9, median(shares.collect()));
+    }
+    Ok(())
+}
+
+/// Policies that answer the same whatever they sense, `[leaders][teams][parameters]`: all weights 0 but the outputs' biases.
+fn constant(world: &World, teams: usize, seed: u64) -> Vec<f32> {
+    let (key, parameters) = (Key::new(seed, 0, Purpose::Weights), world.parameters());
+    let inputs = world.constants.policy.widths[world.constants.policy.layers as usize - 1] as usize;
+    let mut weights = vec![0.0; world.leaders() * teams * parameters];
+    for (index, policy) in weights.chunks_exact_mut(parameters).enumerate() {
+        let mut biases = [0.0; OUTPUTS];
+        random_policy(Level::new(), key.at(0, index / teams, index % teams), &mut biases);
+        for (unit, bias) in biases.into_iter().enumerate() {
+            policy[parameters - (OUTPUTS - 1 - unit) * (inputs + 1) - 1] = bias;
+        }
+    }
+    weights
+}
+
+/// Seconds of one call.
+fn time(mut call: impl FnMut() -> Result<(), Box<dyn Error>>) -> Result<f64, Box<dyn Error>> {
+    let (start, mut calls) = (Instant::now(), 0);
+    while calls == 0 || start.elapsed() < LEAST {
+        call()?;
+        calls += 1;
+    }
+    Ok(start.elapsed().as_secs_f64() / f64::from(calls))
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}

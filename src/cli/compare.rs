@@ -1,0 +1,180 @@
+//! `flotilla compare`: runs, or the points of a sweep along an axis, with intervals and tests.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use serde_json::json;
+
+use super::sweep::share;
+use super::{Error, print, say};
+use crate::file;
+use crate::record::folder::{self, SWEEP};
+use crate::report::comparison::{self, Arm, At, Comparison, ComparisonError, Options};
+use crate::report::runs::{self, MAX_RUNS, RunError};
+use crate::sweep::{Sweep, results};
+use crate::{shell, statistics};
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folders that `flotilla train` made, two at least, or one that `flotilla sweep` made
+    #[arg(required = true, value_name = "RUN")]
+    folders: Vec<PathBuf>,
+    /// Of a sweep: the axis whose values are compared, for each combination of the others [default: its only one]
+    #[arg(long, value_name = "AXIS")]
+    by: Option<String>,
+    /// Generations to compare G at, as 0,50,last; last is the last one that all have come to
+    #[arg(long, value_name = "N,…", value_delimiter = ',', default_value = "last", value_parser = at)]
+    at: Vec<At>,
+    /// G whose first generation is compared, in 0..1
+    #[arg(long, value_name = "G", default_value_t = 0.75, value_parser = share)]
+    reach: f64,
+    /// Compare pair by pair; trials with one seed and number are pairs
+    #[arg(long)]
+    paired: bool,
+    /// Print one JSON object (docs/json.md)
+    #[arg(long, conflicts_with_all = ["csv", "latex"])]
+    json: bool,
+    /// Print CSV, a row a mean or a difference
+    #[arg(long, conflicts_with = "latex")]
+    csv: bool,
+    /// Print LaTeX tables, which need no package
+    #[arg(long)]
+    latex: bool,
+}
+
+fn at(text: &str) -> Result<At, String> {
+    match text {
+        "last" => Ok(At::Last),
+        _ => text.parse().map(At::Generation).map_err(|_| "allowed generations, from 0, or last".into()),
+    }
+}
+
+/// Arms with what they have in common.
+type Group = (String, Vec<Arm>);
+
+pub fn run(args: Args) -> Result<(), Error> {
+    let mut notes = Vec::new();
+    let groups = match &*args.folders {
+        [folder] if folder::collection(folder) == Some("a sweep") => of_sweep(folder, &args, &mut notes)?,
+        folders => vec![(String::new(), of_runs(folders, &args)?)],
+    };
+    let options = Options { at: args.at.clone(), reach: args.reach, paired: args.paired };
+    let compare = |(place, arms): &Group| {
+        comparison::compare(place, arms, &options).map_err(|error| match error {
+            ComparisonError::Beyond { at, .. } => Error::Usage(format!("--at {at}: {error}")),
+            ComparisonError::NoPairs(..) => Error::Usage(format!("--paired: {error}")),
+            ComparisonError::OneTrial(_) => Error::Refused(format!("{error}: `flotilla train CONFIG --trials 5`")),
+            ComparisonError::TooShort(_) => Error::Missing(error.to_string()),
+        })
+    };
+    let all = groups.iter().map(compare).collect::<Result<Vec<Comparison>, Error>>()?;
+    for comparison in &all {
+        let place = if comparison.place.is_empty() { String::new() } else { format!("{}: ", comparison.place) };
+        notes.extend(comparison.notes.iter().map(|note| format!("{place}{note}")));
+    }
+    if !args.paired && groups.iter().any(|(_, arms)| comparison::paired(arms)) {
+        notes.push("these arms have one seed, so their trials are pairs: --paired compares pair by pair".into());
+    }
+    notes.iter().for_each(|note| say(format_args!("note: {note}")));
+    if args.csv {
+        let mut text = Vec::new();
+        comparison::csv(&all, &mut text).map_err(Error::Output)?;
+        return print(&String::from_utf8_lossy(&text));
+    }
+    if args.json {
+        let told = json!({
+            "confidence": statistics::CONFIDENCE,
+            "resamples": statistics::RESAMPLES,
+            "test": if args.paired { "wilcoxon" } else { "mann-whitney" },
+            "comparisons": all,
+            "notes": notes,
+        });
+        return print(&format!("{told}\n"));
+    }
+    print(&if args.latex { comparison::latex(&all, &options) } else { comparison::text(&all, &options) })
+}
+
+/// Every run an arm, named by what sets it apart.
+fn of_runs(folders: &[PathBuf], args: &Args) -> Result<Vec<Arm>, Error> {
+    if let Some(by) = &args.by {
+        return Err(Error::Usage(format!(
+            "--by {by}: that takes the folder of one sweep, which {} is not",
+            folders[0].display()
+        )));
+    }
+    if folders.len() < 2 {
+        let folder = folders[0].display();
+        // What is wrong with the folder goes first.
+        runs::config(&folders[0])?;
+        return Err(Error::Usage(format!("{folder} is one run; name another to compare it with")));
+    }
+    too_many(folders.len(), "runs")?;
+    let mut seen = BTreeSet::new();
+    if let Some(twice) = folders.iter().find(|folder| !seen.insert(file::resolved(folder))) {
+        return Err(Error::Usage(format!("{} is named twice; name other runs", twice.display())));
+    }
+    let configs = folders.iter().map(|folder| runs::config(folder)).collect::<Result<Vec<_>, _>>()?;
+    let arms = runs::labels(folders, &configs).into_iter().zip(folders);
+    Ok(arms.map(|(name, folder)| Arm::read(name, vec![folder.clone()])).collect::<Result<_, _>>()?)
+}
+
+/// The values of an axis as arms, for each combination of the others; those without runs are noted.
+fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Group>, Error> {
+    let sweep = Sweep::load(&out.join(SWEEP), &[], false)?;
+    let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
+    let by = match (&args.by, sweep.axes.len()) {
+        (Some(name), _) => sweep
+            .axis(name)
+            .ok_or_else(|| Error::Usage(format!("--by {name}: that is no axis of the sweep; it has {}", keys())))?,
+        (None, 1) => 0,
+        (None, _) => return Err(Error::Usage(format!("the sweep has several axes; name one by --by: {}", keys()))),
+    };
+    let mut groups = Vec::new();
+    for group in sweep.arms(by) {
+        let mut arms = Vec::new();
+        for (name, points) in group.arms {
+            let mut folders = Vec::new();
+            for point in points {
+                let folder = results::point_folder(out, point);
+                match runs::config(&folder).and_then(|config| runs::metrics(&folder, &config, |_| {}).map(|()| config))
+                {
+                    Ok(config) if config == point.config => folders.push(folder),
+                    Ok(_) => return Err(Error::Refused(format!("{} is a run of another config", folder.display()))),
+                    Err(RunError::Missing(_) | RunError::Unfinished { .. }) => {
+                        notes.push(format!(
+                            "{} was not run, and is left out: {}",
+                            folder.display(),
+                            sweep.describe(point)
+                        ));
+                    }
+                    Err(error) => return Err(error.into()),
+                }
+            }
+            if !folders.is_empty() {
+                arms.push(Arm::read(name, folders)?);
+            }
+        }
+        too_many(arms.len(), "values")?;
+        if arms.len() > 1 {
+            groups.push((group.place, arms));
+        }
+    }
+    let [file, folder] = [out.join(SWEEP), out.into()].map(|path| path.display().to_string());
+    let command = shell::command(["flotilla", "sweep", &file, "--out", &folder, "--resume"]);
+    match groups.is_empty() {
+        false => Ok(groups),
+        true => Err(Error::Missing(format!(
+            "{}: no two values of {} have runs to compare; `{command}` trains them",
+            out.display(),
+            sweep.axes[by].key,
+        ))),
+    }
+}
+
+/// Refuses more arms than anybody reads.
+fn too_many(count: usize, what: &str) -> Result<(), Error> {
+    match count <= MAX_RUNS {
+        true => Ok(()),
+        false => Err(Error::Usage(format!("{count} {what} are too many to compare, two by two; {MAX_RUNS} at most"))),
+    }
+}

@@ -1,0 +1,113 @@
+//! What to type about an error of the library, which knows of no flags: each gives what is added to the error's own text.
+
+use std::io::ErrorKind::{FileTooLarge, PermissionDenied, QuotaExceeded, ReadOnlyFilesystem, StorageFull};
+
+use crate::backend::BackendError;
+use crate::backend::gpu::device::DeviceError;
+use crate::record::RecordError;
+use crate::record::folder::CONFIG;
+use crate::report::replay::ReplayError;
+use crate::report::runs;
+use crate::run::RunError;
+
+/// About a device that cannot be had, or failed.
+pub fn device(error: &DeviceError) -> &'static str {
+    match error {
+        DeviceError::NoRealAdapter { .. } => {
+            "; what may be a software renderer is taken by --adapter alone (--adapter 0); --backend cpu is faster than one"
+        }
+        DeviceError::Refused { .. } | DeviceError::Inexact { .. } => {
+            "; choose another with --adapter, or use --backend cpu"
+        }
+        DeviceError::Lost { .. } => "; run again, or use --backend cpu",
+        DeviceError::OutOfMemory { .. } | DeviceError::TooLarge { .. } => ", or --backend cpu",
+        DeviceError::NoAdapter | DeviceError::Failed { .. } => "; use --backend cpu",
+        DeviceError::UnknownAdapter { found, .. } if found.is_empty() => "; use --backend cpu",
+        DeviceError::UnknownAdapter { .. } | DeviceError::Shader { .. } => "",
+    }
+}
+
+/// About episodes that could not be played.
+pub fn backend(error: &BackendError) -> &'static str {
+    match error {
+        BackendError::Gpu(error) => device(error),
+        BackendError::TooLarge(_) => " (by --backend cpu and --breed host)",
+        BackendError::Gone => "; run it again",
+        BackendError::Misfit(_) | BackendError::HeldElsewhere => "",
+    }
+}
+
+/// About files, before `again`.
+pub fn record(error: &RecordError, again: &str) -> String {
+    match error {
+        RecordError::Write { error, .. } => match error.kind() {
+            StorageFull | QuotaExceeded => format!("; free some space, then {again}"),
+            FileTooLarge => {
+                format!("; the system allows no larger file here (see `ulimit -f`): raise that, then {again}")
+            }
+            PermissionDenied | ReadOnlyFilesystem => "; choose a place you may write to".into(),
+            _ => String::new(),
+        },
+        RecordError::Exists { .. } => {
+            "; go on with it by --resume, write over it by --force, or choose another --out".into()
+        }
+        RecordError::NoFolder { .. } => "; choose a folder by --out".into(),
+        RecordError::Shorter { there, .. } => {
+            format!("; resume with --generations {there} or more, or choose another --out")
+        }
+        RecordError::Locked { .. } => "; wait for it, stop it, or choose another --out".into(),
+        RecordError::ConfigDiffers { path, .. } => format!(
+            "\nresume with the config it was started with ({}/{CONFIG}), or choose another --out",
+            path.display()
+        ),
+        RecordError::Read { .. } | RecordError::Damaged { .. } | RecordError::NoTrial { .. } => String::new(),
+    }
+}
+
+/// About a run that could not go on.
+pub fn run(error: &RunError) -> String {
+    match error {
+        RunError::Record(error) => record(error, "go on with --resume"),
+        RunError::TooLittle(_) => " (flotilla check tells what a config needs)".into(),
+        RunError::Backend { saved: Ok(()), .. } => {
+            ": go on with --resume, with --on-device-loss cpu to change to the CPU".into()
+        }
+        RunError::Backend { saved: Err(error), .. } => run(error),
+        RunError::Held(BackendError::Gone) => "; --resume goes on from the last checkpoint or the start".into(),
+        RunError::Held(error) => backend(error).into(),
+        RunError::Memory { .. } => String::new(),
+    }
+}
+
+/// About a run that could not be shown.
+pub fn shown(error: &runs::RunError) -> String {
+    match error {
+        runs::RunError::Missing(folder) => {
+            format!("; `flotilla train CONFIG --out {}` makes a run there", folder.display())
+        }
+        runs::RunError::NoFolder(_) => ", which `flotilla train` makes".into(),
+        runs::RunError::Foreign { .. } => "; `flotilla train CONFIG --out DIR` makes one that has".into(),
+        runs::RunError::Config { .. } => {
+            "\nfind a config that is whole, and repeat the run with `flotilla train CONFIG --out DIR`".into()
+        }
+        runs::RunError::Unfinished { folder, .. } => {
+            let folder = folder.display();
+            format!("; finish the run with `flotilla train {folder}/{CONFIG} --out {folder} --resume`")
+        }
+        runs::RunError::Record(error) => record(error, "try again"),
+        runs::RunError::Collection { .. } => String::new(),
+    }
+}
+
+/// About an episode that could not be replayed.
+pub fn replayed(error: &ReplayError) -> String {
+    match error {
+        ReplayError::Run(error) => shown(error),
+        ReplayError::Backend(error) => backend(error).into(),
+        ReplayError::NoGeneration { newest: Some(_), .. } => ", or finish the run with --resume".into(),
+        ReplayError::NoGeneration { .. }
+        | ReplayError::NoTrial { .. }
+        | ReplayError::Differs { .. }
+        | ReplayError::Stopped => String::new(),
+    }
+}

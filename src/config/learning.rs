@@ -1,0 +1,165 @@
+//! `[learning]` and `[checkpoint]`: their data and their keys.
+
+use serde::Serialize;
+
+use crate::declare::choice;
+use crate::model::{LEAST, LONGEST};
+use crate::reader::{Reader, between};
+
+/// Most teams (policies a population) in one generation.
+pub const MAX_POPULATION: usize = 1 << 20;
+/// Most generations after the random start.
+pub const MAX_GENERATIONS: usize = 1_000_000;
+/// Most trials in one run.
+pub const MAX_TRIALS: usize = 4096;
+/// Most episodes averaged for one team's score.
+pub const MAX_EPISODES: usize = 1000;
+/// `[learning]`: the cooperative coevolution.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Learning {
+    pub paradigm: Paradigm,
+    pub fitness: Fitness,
+    pub population: usize,
+    pub generations: usize,
+    pub trials: usize,
+    pub elites: usize,
+    pub mutation: Mutation,
+    pub mutation_probability: f64,
+    pub mutation_sigma: f64,
+    pub episodes_per_team: usize,
+    pub start_jitter: f64,
+    pub seed: u64,
+}
+
+choice! {
+    /// Who learns.
+    Paradigm {
+        /// The leaders; followers keep their preset behaviour.
+        LeaderFollower = "leader-follower",
+        /// Every agent: the followers' places become leaders, appended after the leaders.
+        AllLeaders = "all-leaders",
+    }
+}
+
+choice! {
+    /// Which score a policy is selected by (see [`crate::credit`]).
+    Fitness {
+        /// The team's score.
+        G = "G",
+        /// Difference evaluation.
+        D = "D",
+        /// Difference evaluation that takes a leader's followers out with it.
+        Df = "Df",
+        /// Difference evaluation with copies of the leader as stepping stones.
+        Dpp = "D++",
+    }
+}
+
+choice! {
+    /// How a mutated weight gains its noise.
+    Mutation {
+        /// Times itself.
+        Scaled = "scaled",
+        /// Plainly.
+        Additive = "additive",
+    }
+}
+
+impl Learning {
+    pub(super) fn read(r: &mut Reader<'_>) -> Learning {
+        let population = r
+            .key("learning.population", "policies", "k: policies of each learner, and teams of a generation", "4.3")
+            .number(between(2, MAX_POPULATION), 50);
+        Learning {
+            paradigm: r
+                .key("learning.paradigm", "", "who learns: the leaders, or every agent", "4.1, 4.4")
+                .choice(Paradigm::LeaderFollower),
+            fitness: r
+                .key(
+                    "learning.fitness",
+                    "",
+                    "what policies are selected by: the team's score G, D without a leader, Df without a leader \
+                     and its followers, or D++ with copies of a leader",
+                    "3.2, Eq. 1; 4.2, Eq. 5; 2.2",
+                )
+                .choice(Fitness::Df),
+            population,
+            generations: r
+                .key("learning.generations", "generations", "how many follow the random start", "4.3, Alg. 1")
+                .number(between(0, MAX_GENERATIONS), 100),
+            trials: r
+                .key("learning.trials", "trials", "independent repetitions", "5")
+                .number(between(1, MAX_TRIALS), 5),
+            elites: r
+                .key(
+                    "learning.elites",
+                    "policies",
+                    "n: the best of a population, which survive unchanged",
+                    "4.3, Alg. 1",
+                )
+                .number(between(0, population).because("learning.population"), 1),
+            mutation: r
+                .key(
+                    "learning.mutation",
+                    "",
+                    "what a mutated weight w gains: w·N(0, σ) if scaled, N(0, σ) if additive",
+                    "2.4, 4.3",
+                )
+                .choice(Mutation::Scaled),
+            mutation_probability: r
+                .key("learning.mutation_probability", "", "of each weight of a new policy, to mutate", "2.4, 4.3")
+                .number(between(LEAST, 1.0).or_zero(), 0.15),
+            mutation_sigma: r
+                .key("learning.mutation_sigma", "", "σ: standard deviation of a mutation", "2.4, 4.3")
+                .number(between(LEAST, 100.0).or_zero(), 0.1),
+            episodes_per_team: r
+                .key("learning.episodes_per_team", "episodes", "over which a team's scores are averaged", "")
+                .number(between(1, MAX_EPISODES), 1),
+            start_jitter: r
+                .key(
+                    "learning.start_jitter",
+                    "units",
+                    "j: in every episode each agent's start is moved by a uniform offset in −j to j on both axes, \
+                     the same for all teams of a generation",
+                    "",
+                )
+                .number(between(LEAST, LONGEST).or_zero(), 0.0),
+            seed: r
+                .key("learning.seed", "", "start of all randomness: config and seed decide every bit", "")
+                .number(between(0, i64::MAX as u64), 0),
+        }
+    }
+}
+
+/// `[checkpoint]`: how often a run saves what it needs to go on, without a say in its results; 0 is never.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Checkpoint {
+    /// After so many generations.
+    pub generations: usize,
+    /// After so many seconds.
+    pub seconds: f64,
+}
+
+impl Default for Checkpoint {
+    fn default() -> Checkpoint {
+        Checkpoint { generations: 0, seconds: 30.0 }
+    }
+}
+
+impl Checkpoint {
+    pub(super) fn read(r: &mut Reader<'_>) -> Checkpoint {
+        Checkpoint {
+            generations: r
+                .key(
+                    "checkpoint.generations",
+                    "generations",
+                    "between checkpoints, which change no result; 0 is never",
+                    "",
+                )
+                .number(between(0, MAX_GENERATIONS), 0),
+            seconds: r
+                .key("checkpoint.seconds", "s", "between checkpoints, which change no result; 0 is never", "")
+                .number(between(0.01, 1e9).or_zero(), Checkpoint::default().seconds),
+        }
+    }
+}

@@ -1,0 +1,179 @@
+//! The config: what an experiment is, with every default of the paper's calibration.
+//!
+//! A config is read from a file by [`Config::load`], or from text by [`Config::read`] where flags or a sweep change some
+//! of its keys. Each section is plain data beside its keys, and each key stands once, with its unit, its meaning, where the
+//! paper has it, what it allows and its default: those of a step's parts with these parts, in [`crate::model`], the others
+//! here. Everything wrong with a text is found in one pass and reported by line, see [`crate::reader`].
+
+use serde::Serialize;
+
+use crate::reader::{self, Reader};
+
+pub use crate::declare::Choice;
+pub use crate::model::couple::Coupling;
+pub use crate::model::follow::Follow;
+pub use crate::model::motion::Motion;
+pub use crate::model::policy::{MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
+pub use crate::model::sense::{Density, Sense};
+pub use crate::reader::{Key, Override, Problem};
+pub use learning::{
+    Checkpoint, Fitness, Learning, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm,
+};
+pub use load::{MAX_FILE_BYTES, is_standard_input, name, read_file};
+pub use world::{MAX_AGENTS, MAX_POIS, MAX_STEPS, World};
+
+mod learning;
+mod load;
+mod world;
+
+/// Most bytes that the policies of all trials of a run may take.
+pub const MAX_POLICY_BYTES: u64 = 1 << 38;
+/// The sections that make a config a sweep: values to combine, and values to try one at a time.
+pub const GRID: &str = "grid";
+pub const VARY: &str = "vary";
+
+/// Every key of a config, in the order of [`Config::to_toml`].
+pub fn keys() -> Vec<Key> {
+    let (config, mut keys) = reader::keys(Config::ask);
+    let mut order = Vec::new();
+    let text = config.to_toml();
+    let mut section = "";
+    for line in text.lines() {
+        match line.split_once(" = ") {
+            Some((leaf, _)) => order.push(format!("{section}.{leaf}")),
+            None => section = line.trim_matches(['[', ']']),
+        }
+    }
+    keys.sort_by_key(|key| order.iter().position(|name| name == key.name));
+    keys
+}
+
+/// One experiment, as written in a config file.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Config {
+    pub world: World,
+    pub motion: Motion,
+    pub follow: Follow,
+    pub sense: Sense,
+    pub policy: Policy,
+    pub learning: Learning,
+    pub checkpoint: Checkpoint,
+}
+
+impl Config {
+    /// Reads a config from its text; `name` stands for the file in errors.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the text.
+    pub fn parse(text: &str, name: &str) -> Result<Config, ConfigError> {
+        Config::read(text, name, &[], &[])
+    }
+
+    /// Reads a config with some keys set from elsewhere, checked together with the rest.
+    ///
+    /// Sections named in `foreign` belong to somebody else (a sweep's `grid`) and are passed over.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the text and the overrides.
+    pub fn read(text: &str, name: &str, foreign: &[&str], overrides: &[Override]) -> Result<Config, ConfigError> {
+        let others = reader::Others {
+            foreign,
+            refused: if foreign.contains(&GRID) { &[] } else { &[GRID, VARY] },
+            message: "this makes the file a sweep, of many configs; use `flotilla sweep`",
+        };
+        reader::read(text, others, overrides, Config::ask).map_err(|reader::Problems { listed, unlisted }| {
+            ConfigError::Invalid { name: name.to_string(), problems: listed, unlisted }
+        })
+    }
+
+    /// This config with some keys changed.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the overrides.
+    pub fn with(&self, overrides: &[Override]) -> Result<Config, ConfigError> {
+        Config::read(&self.to_toml(), "the config", &[], overrides)
+    }
+
+    /// The config file that says this, every key written out.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("numbers, words and lists of them under plain keys are TOML")
+    }
+
+    /// Everything that learns: the leaders, and in the all-leaders paradigm the followers too.
+    pub fn learners(&self) -> usize {
+        match self.learning.paradigm {
+            Paradigm::LeaderFollower => self.world.leaders.len(),
+            Paradigm::AllLeaders => self.world.leaders.len() + self.world.followers.len(),
+        }
+    }
+
+    /// Weights of one policy, biases included.
+    pub fn parameters(&self) -> usize {
+        self.policy.parameters()
+    }
+
+    /// Bytes that the policies of all trials take.
+    pub fn policy_bytes(&self) -> u64 {
+        let counts = [self.learning.trials, self.learners(), self.learning.population, self.parameters()];
+        counts.map(|count| count as u64).iter().product::<u64>() * size_of::<f32>() as u64
+    }
+
+    /// Asks for every key. A faulty number reads as the most that is allowed, a faulty list as none, so that what depends
+    /// on it is not blamed as well.
+    fn ask(r: &mut Reader<'_>) -> Config {
+        let (motion, start_speed) = Motion::read(r);
+        let config = Config {
+            world: World::read(r, start_speed),
+            motion,
+            follow: Follow::read(r),
+            sense: Sense::read(r),
+            policy: Policy::read(r),
+            learning: Learning::read(r),
+            checkpoint: Checkpoint::read(r),
+        };
+        if r.faults() == 0 && config.policy_bytes() > MAX_POLICY_BYTES {
+            let gib = |bytes: u64| bytes.div_ceil(1 << 30);
+            let (bytes, most) = (gib(config.policy_bytes()), gib(MAX_POLICY_BYTES));
+            let population = config.learning.population;
+            let text = format!("found {population}, whose policies of all trials take {bytes} GiB, allowed {most} GiB");
+            r.blame_key("learning.population", text);
+        }
+        config
+    }
+}
+
+/// Why there is no config.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ConfigError {
+    #[error("{name}: cannot be read: {reason}")]
+    Unreadable { name: String, reason: String },
+    /// All that is wrong, by line; what came from outside the file (see [`Override`]) last.
+    #[error("{}", list(name, problems, *unlisted))]
+    Invalid { name: String, problems: Vec<Problem>, unlisted: usize },
+}
+
+impl ConfigError {
+    /// Whether nothing in the file is wrong, but flags given beside it are.
+    pub fn is_usage(&self) -> bool {
+        match self {
+            ConfigError::Unreadable { .. } => false,
+            ConfigError::Invalid { problems, .. } => problems.iter().all(|problem| problem.key.starts_with("--")),
+        }
+    }
+}
+
+fn list(name: &str, problems: &[Problem], unlisted: usize) -> String {
+    let lines = problems.iter().map(|Problem { line, key, message }| {
+        let place = line.map_or(String::new(), |line| format!("{name}:{line}: "));
+        let key = if key.is_empty() { String::new() } else { format!("{key}: ") };
+        format!("{place}{key}{message}")
+    });
+    let mut lines: Vec<String> = lines.collect();
+    if unlisted > 0 {
+        lines.push(format!("… and {unlisted} more"));
+    }
+    if lines.len() > 1 {
+        lines.insert(0, format!("{} problems in {name}", problems.len() + unlisted));
+    }
+    lines.join("\n")
+}

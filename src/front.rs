@@ -1,0 +1,416 @@
+//! What programs need, in a few lines: train with a callback, play and trace given policies, step teams by hand, read runs.
+//!
+//! Everything here checks what it is given, and hands back plain arrays; their shapes are written `[teams][leaders][8]`, the
+//! last index moving fastest. Beneath are [`crate::trainer`], [`crate::evaluate`], [`crate::stepping`] and [`crate::record`].
+//! Runs that keep their files as they train, to be gone on with after anything, are [`crate::run`]'s.
+
+use std::borrow::Cow;
+use std::ops::ControlFlow;
+#[cfg(feature = "report")]
+use std::path::Path;
+
+use crate::backend::cpu::Cpu;
+#[cfg(feature = "gpu")]
+use crate::backend::gpu::{
+    self,
+    device::{Choice, DeviceError},
+    episode::{GpuEpisodes, Holding},
+};
+use crate::backend::{Backend, BackendError, Group, Machine, Need, Player};
+use crate::config::{Config, ConfigError, MAX_POPULATION};
+use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
+use crate::evolve::{self, MAX_WEIGHT};
+use crate::memory::{self, Plan, TooLittle};
+use crate::parallel::current_num_threads;
+#[cfg(feature = "record")]
+use crate::record::{RecordError, folder::POLICIES, hex, metrics, policies};
+#[cfg(feature = "report")]
+use crate::report::runs;
+use crate::stepping::{StepError, Stepper};
+use crate::trainer::{Row, Trainer};
+use crate::world::{INPUTS, OUTPUTS, World};
+
+/// Why a function here could not do what it was asked. Nothing was changed then.
+#[derive(Debug, thiserror::Error)]
+pub enum Failure {
+    /// Everything that is wrong with a config.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// A number that no config file could hold.
+    #[error("the config cannot be written down: {0}")]
+    Unwritten(String),
+    #[error(transparent)]
+    TooLittle(#[from] TooLittle),
+    #[error("there is no memory for {what}, {bytes} bytes")]
+    Memory { what: &'static str, bytes: u128 },
+    #[error(transparent)]
+    Backend(#[from] BackendError),
+    #[error("{0} teams; there may be 1 to {MAX_POPULATION}")]
+    Teams(usize),
+    #[error(
+        "{found} weights for {teams} teams; [leaders][teams][parameters] are [{leaders}][{teams}][{parameters}], or \
+         [1][{teams}][{parameters}] where leaders share a policy"
+    )]
+    Weights { found: usize, leaders: usize, teams: usize, parameters: usize },
+    #[error(
+        "weight {parameter} of the policy of leader {leader} in team {team} is {value}, allowed is a size up to {MAX_WEIGHT}"
+    )]
+    Weight { leader: usize, team: usize, parameter: usize, value: f32 },
+    #[error(
+        "{episodes} episodes from starts moved by up to {jitter}; there may be 1 to {MAX_EPISODES}, and a jitter from 0 on"
+    )]
+    Starts { episodes: u32, jitter: f64 },
+    #[error(transparent)]
+    Step(#[from] StepError),
+    #[cfg(feature = "report")]
+    #[error(transparent)]
+    Run(#[from] runs::RunError),
+    #[cfg(feature = "record")]
+    #[error(transparent)]
+    Record(#[from] RecordError),
+}
+
+/// What episodes are to be played on.
+#[cfg(feature = "gpu")]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Processor {
+    /// A GPU where there is one that can, else the CPU.
+    #[default]
+    Auto,
+    Cpu,
+    /// A GPU that is no software renderer.
+    Gpu,
+    /// The adapter of this number in `gpu::device::adapters`, or whose name contains this; also a software renderer.
+    Adapter(String),
+}
+
+/// What was found to play on besides the CPU.
+#[cfg(feature = "gpu")]
+pub struct Found {
+    pub gpu: Option<GpuEpisodes>,
+    /// Why a GPU that is there was passed over.
+    pub passed_over: Option<DeviceError>,
+}
+
+/// Looks for a GPU; none is an error only where one is asked for, or where it alone may hold the populations. It holds those
+/// that it had better, where nothing else is asked for.
+///
+/// # Errors
+/// There is none that can be used.
+#[cfg(feature = "gpu")]
+pub fn find_gpu(processor: &Processor, holding: Option<Holding>) -> Result<Found, DeviceError> {
+    let choice = match processor {
+        Processor::Cpu => return Ok(Found { gpu: None, passed_over: None }),
+        Processor::Auto | Processor::Gpu => Choice::Real,
+        Processor::Adapter(name) => Choice::Named(name.clone()),
+    };
+    let optional = *processor == Processor::Auto && holding != Some(Holding::Always);
+    match gpu::open(choice).and_then(GpuEpisodes::new) {
+        Ok(gpu) => {
+            let gpu = match holding {
+                Some(holding) => gpu.holding(holding),
+                None => gpu,
+            };
+            Ok(Found { gpu: Some(gpu), passed_over: None })
+        }
+        Err(DeviceError::NoAdapter | DeviceError::NoRealAdapter { .. }) if optional => {
+            Ok(Found { gpu: None, passed_over: None })
+        }
+        Err(error) if optional => Ok(Found { gpu: None, passed_over: Some(error) }),
+        Err(error) => Err(error),
+    }
+}
+
+/// Opens what episodes are to be played on; also gives why a GPU that is there was passed over.
+///
+/// # Errors
+/// There is no such GPU, or none that can be used.
+#[cfg(feature = "gpu")]
+pub fn open(processor: &Processor) -> Result<(Player, Option<DeviceError>), DeviceError> {
+    let Found { gpu, passed_over } = find_gpu(processor, None)?;
+    Ok((gpu.map_or_else(cpu, on_gpu), passed_over))
+}
+
+/// The backend that is always there.
+pub fn cpu() -> Player {
+    (Box::new(Cpu::default()), Machine::of_cpu())
+}
+
+/// A GPU, and what it is.
+#[cfg(feature = "gpu")]
+pub fn on_gpu(backend: GpuEpisodes) -> Player {
+    let machine = Machine::of_gpu(&backend);
+    (Box::new(backend), machine)
+}
+
+/// A generation of all trials that has been played, its champions too.
+#[derive(Clone, Copy, Debug)]
+pub struct Generation<'a> {
+    pub generation: usize,
+    /// The last that there will be.
+    pub last: usize,
+    /// What it came to, by trial.
+    pub rows: &'a [Row],
+}
+
+/// What a training came to.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Trained {
+    /// What was trained; where the training was stopped, of fewer generations.
+    pub config: Config,
+    /// G of each generation's best and mean team, and of the team of every population's best policy, in 0..1:
+    /// `[trials][generations + 1]`, the random start first.
+    pub best_g: Vec<f64>,
+    pub mean_g: Vec<f64>,
+    pub champion_g: Vec<f64>,
+    /// The last generation's policies, best first in each population: `[trials]` of `[leaders][policies][parameters]`.
+    pub policies: Vec<Vec<f32>>,
+}
+
+impl Trained {
+    fn new(config: Config, rows: &[Row], policies: Vec<Vec<f32>>) -> Trained {
+        let columns = config.learning.generations + 1;
+        let mut trained = Trained {
+            best_g: vec![0.0; config.learning.trials * columns],
+            mean_g: vec![0.0; config.learning.trials * columns],
+            champion_g: vec![0.0; config.learning.trials * columns],
+            config,
+            policies,
+        };
+        for row in rows {
+            let at = row.trial * columns + row.generation;
+            (trained.best_g[at], trained.mean_g[at], trained.champion_g[at]) = (row.best_g, row.mean_g, row.champion_g);
+        }
+        trained
+    }
+
+    /// Reads what a run came to from its folder.
+    ///
+    /// # Errors
+    /// The folder holds no run, or one that is not finished, or its files are damaged.
+    #[cfg(feature = "report")]
+    pub fn read(folder: &Path) -> Result<Trained, Failure> {
+        let config = runs::config(folder)?;
+        let mut rows = Vec::new();
+        runs::metrics(folder, &config, |row| rows.push(*row))?;
+        let (found, expected) = (rows.len(), config.learning.trials * (config.learning.generations + 1));
+        if found != expected {
+            let reason = format!("its {} has {found} rows of {expected}", crate::record::folder::METRICS);
+            return Err(runs::RunError::Unfinished { folder: folder.into(), reason }.into());
+        }
+        let policies = policies::read_all(&folder.join(POLICIES), &config)?;
+        Ok(Trained::new(config, &rows, policies))
+    }
+
+    /// The digest that `run.json` has of a run that came to the same: of the metrics and all policies.
+    #[cfg(feature = "record")]
+    pub fn digest(&self) -> String {
+        let trials = self.config.learning.trials;
+        let rows = (0..=self.config.learning.generations).flat_map(|generation| {
+            (0..trials).map(move |trial| {
+                let at = trial * (self.config.learning.generations + 1) + generation;
+                let (best_g, mean_g, champion_g) = (self.best_g[at], self.mean_g[at], self.champion_g[at]);
+                Row { arm: 0, trial, generation, best_g, mean_g, champion_g }
+            })
+        });
+        hex(&metrics::digest(rows, &self.policies))
+    }
+}
+
+/// Trains all trials of a config. `watch` is told of every generation, and stops the training by
+/// [`ControlFlow::Break`]: then one more generation is played, and what comes out is to the bit what a config of so few
+/// generations comes to.
+///
+/// # Errors
+/// The config is wrong or too large for the memory there is, or the backend fails.
+pub fn train(
+    config: &Config,
+    backend: &mut dyn Backend,
+    mut watch: impl FnMut(Generation<'_>) -> ControlFlow<()>,
+) -> Result<Trained, Failure> {
+    let mut config = checked(config)?;
+    let plan = Plan::of([&config], current_num_threads());
+    // Nothing is saved on the way.
+    let needed = plan.host.min(plan.gpu_host) - plan.checkpoint;
+    memory::check(needed, 0)?;
+    let (mut trainer, mut rows, mut stopped) = (Trainer::new(vec![config.clone()]), Vec::new(), false);
+    while !trainer.is_done() {
+        let played = trainer.advance(backend)?;
+        if let Some(&Row { generation, .. }) = played.first().filter(|_| !stopped) {
+            let last = config.learning.generations;
+            stopped = watch(Generation { generation, last, rows: &played }).is_break();
+            if stopped {
+                config.learning.generations = trainer.end(0);
+            }
+        }
+        rows.extend(played);
+    }
+    let policies = trainer.policies(0);
+    Ok(Trained::new(config, &rows, policies))
+}
+
+/// What teams scored: of several episodes, means.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Played {
+    /// POIs observed, `[teams]`, and these over all POIs.
+    pub observed: Vec<f64>,
+    pub g: Vec<f32>,
+    /// `[teams][leaders]`.
+    pub d: Vec<f32>,
+    pub df: Vec<f32>,
+    pub dpp: Vec<f32>,
+}
+
+/// Plays teams of given policies, `[leaders][teams][parameters]`: team `t` is made of every leader's policy `t`. Where
+/// all leaders of a team share one, `[1][teams][parameters]` will do. A policy's parameters are layer by layer and unit
+/// by unit: a weight for each input, then the bias.
+///
+/// # Errors
+/// The config, the weights or the starts are wrong, or the backend fails.
+pub fn play(
+    config: &Config,
+    backend: &mut dyn Backend,
+    teams: usize,
+    weights: &[f32],
+    starts: &Starts,
+) -> Result<Played, Failure> {
+    let cast = Cast::new(config, teams, weights, starts)?;
+    let evaluation = evaluate::evaluate(backend, &cast.group(&cast.world.starts), starts, &|_| ())?;
+    let Evaluation { leaders, .. } = evaluation;
+    let scores: Vec<[f32; 4]> =
+        (0..teams * leaders).map(|place| evaluation.scores(place / leaders, place % leaders)).collect();
+    Ok(Played {
+        observed: evaluation.observed.iter().map(evaluate::Tally::mean).collect(),
+        g: scores.iter().step_by(leaders).map(|&[g, ..]| g).collect(),
+        d: scores.iter().map(|&[_, d, ..]| d).collect(),
+        df: scores.iter().map(|&[_, _, df, _]| df).collect(),
+        dpp: scores.iter().map(|&[.., dpp]| dpp).collect(),
+    })
+}
+
+/// Everything that teams did in one episode.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Traced {
+    /// Where everyone was, from the start on: `[teams][steps + 1][agents][2]`, leaders first.
+    pub positions: Vec<f32>,
+    /// Unit vectors, likewise.
+    pub headings: Vec<f32>,
+    /// `[teams][steps + 1][agents]`.
+    pub speeds: Vec<f32>,
+    /// What leaders sensed there, `[teams][steps][leaders][8]`, and what their policies answered,
+    /// `[teams][steps][leaders][2]`: that leads to the next step's states.
+    pub inputs: Vec<f32>,
+    pub outputs: Vec<f32>,
+    /// The agents near each POI after each step, a bit an agent: `[teams][steps][pois][words]`.
+    pub near: Vec<u32>,
+}
+
+/// Plays one episode of given policies, see [`play`], and keeps everything.
+///
+/// # Errors
+/// The config, the weights or the starts are wrong, there is no memory for so much, or the backend fails.
+pub fn trace(
+    config: &Config,
+    backend: &mut dyn Backend,
+    teams: usize,
+    weights: &[f32],
+    starts: &Starts,
+    episode: usize,
+) -> Result<Traced, Failure> {
+    let cast = Cast::new(config, teams, weights, starts)?;
+    let world = &cast.world;
+    let (agents, leaders, steps) = (world.agents(), world.leaders(), world.steps());
+    let a_team = (steps + 1) * agents * 5 + steps * leaders * (INPUTS + OUTPUTS) + world.set_words();
+    let bytes = a_team as u128 * 4 * teams as u128;
+    let fits = usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok());
+    if !fits {
+        return Err(Failure::Memory { what: "all steps of all teams", bytes });
+    }
+    let states = teams * (steps + 1) * agents;
+    let mut traced = Traced {
+        positions: Vec::with_capacity(states * 2),
+        headings: Vec::with_capacity(states * 2),
+        speeds: Vec::with_capacity(states),
+        inputs: Vec::with_capacity(teams * steps * leaders * INPUTS),
+        outputs: Vec::with_capacity(teams * steps * leaders * OUTPUTS),
+        near: Vec::with_capacity(teams * world.set_words()),
+    };
+    let starts = starts.of(episode, world);
+    for (_, part) in evaluate::parts(&cast.group(&starts)) {
+        let trace = backend.trace(&part)?;
+        for (team, step) in (0..trace.teams).flat_map(|team| (0..=steps).map(move |step| (team, step))) {
+            for moment in (0..agents).map(|agent| trace.moment(step, team, agent)) {
+                traced.positions.extend(moment.position);
+                traced.headings.extend(moment.heading);
+                traced.speeds.push(moment.speed);
+            }
+            // A trace has what led to a state beside it.
+            for moment in (0..leaders).filter(|_| step > 0).map(|leader| trace.moment(step, team, leader)) {
+                traced.inputs.extend(moment.inputs);
+                traced.outputs.extend(moment.outputs);
+            }
+        }
+        traced.near.extend(trace.sets);
+    }
+    Ok(traced)
+}
+
+/// Teams to be stepped by given actions, all at the world's start; with a record, they can be scored.
+///
+/// # Errors
+/// The config is wrong, or there may be no so many teams.
+pub fn stepper(config: &Config, teams: usize, recording: bool) -> Result<Stepper, Failure> {
+    let world = World::new(&checked(config)?);
+    Ok(if recording { Stepper::recording(world, teams)? } else { Stepper::new(world, teams)? })
+}
+
+/// A config that may have been built by hand, as if it had been read from a file.
+fn checked(config: &Config) -> Result<Config, Failure> {
+    let text = toml::to_string(config).map_err(|error| Failure::Unwritten(error.to_string()))?;
+    Ok(Config::parse(&text, "the config")?)
+}
+
+/// Teams of given policies, fit to be played.
+struct Cast<'a> {
+    world: World,
+    weights: Cow<'a, [f32]>,
+    policies: usize,
+    teams: Vec<u32>,
+}
+
+impl<'a> Cast<'a> {
+    fn new(config: &Config, teams: usize, weights: &'a [f32], starts: &Starts) -> Result<Cast<'a>, Failure> {
+        let world = World::new(&checked(config)?);
+        if !(1..=MAX_POPULATION).contains(&teams) {
+            return Err(Failure::Teams(teams));
+        }
+        if let &Starts::Drawn { episodes, jitter, .. } = starts
+            && !((1..=MAX_EPISODES).contains(&episodes) && jitter.is_finite() && jitter >= 0.0)
+        {
+            return Err(Failure::Starts { episodes, jitter });
+        }
+        let (leaders, parameters) = (world.leaders(), world.parameters());
+        let shared = weights.len() / teams == parameters;
+        if !weights.len().is_multiple_of(teams) || !(shared || weights.len() / teams == leaders * parameters) {
+            return Err(Failure::Weights { found: weights.len(), leaders, teams, parameters });
+        }
+        let mut weights = match shared {
+            true if leaders > 1 => Cow::Owned(weights.repeat(leaders)),
+            _ => Cow::Borrowed(weights),
+        };
+        if !weights.iter().all(|&weight| evolve::is_weight(weight))
+            && let Some(place) = evolve::admit(weights.to_mut())
+        {
+            let (policy, parameter, value) = (place / parameters, place % parameters, weights[place]);
+            return Err(Failure::Weight { leader: policy / teams, team: policy % teams, parameter, value });
+        }
+        let order = evaluate::one_policy_a_team(teams, leaders);
+        Ok(Cast { world, weights, policies: teams, teams: order })
+    }
+
+    fn group<'b>(&'b self, starts: &'b [glam::Vec2]) -> Group<'b> {
+        let Cast { world, weights, policies, teams } = self;
+        let need = Need::Record;
+        Group { world, starts, weights: weights[..].into(), policies: *policies, teams, need }
+    }
+}

@@ -1,0 +1,156 @@
+//! What a leader senses: the density of POIs and of agents in four quadrants around its heading (Section 3.1).
+
+use fearless_simd::{Simd, prelude::*};
+use serde::Serialize;
+
+use super::{LONGEST, Lanes};
+use crate::declare::{choice, shared};
+use crate::kernels::{
+    except,
+    math::{root, rsqrt},
+    only,
+    operations::{ROOT, ROTATE, RSQRT, SQUARED_DISTANCE},
+    select, splat,
+};
+use crate::reader::{Reader, between};
+
+/// The shader's part.
+pub const WGSL: &str = include_str!("../../shaders/sense.wgsl");
+
+/// Inputs of a policy: POI and agent density in four quadrants each.
+pub const INPUTS: usize = 8;
+/// What they are, in order.
+pub const NAMES: [&str; INPUTS] = [
+    "POIs back right",
+    "POIs front right",
+    "POIs front left",
+    "POIs back left",
+    "agents back right",
+    "agents front right",
+    "agents front left",
+    "agents back left",
+];
+/// A squared range no distance on a map reaches.
+const UNLIMITED: f32 = 1e30;
+
+/// `[sense]`: what a leader senses. An infinite range is unlimited; a config file says so with `inf`.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Sense {
+    pub poi_range: f64,
+    pub agent_range: f64,
+    pub density: Density,
+}
+
+impl Sense {
+    pub(crate) fn read(r: &mut Reader<'_>) -> Sense {
+        Sense {
+            poi_range: r
+                .key("sense.poi_range", "units", "how far leaders sense POIs", "3.1")
+                .number(between(0.01, LONGEST).or_unlimited(), f64::INFINITY),
+            agent_range: r
+                .key("sense.agent_range", "units", "how far leaders sense other agents", "3.1")
+                .number(between(0.01, LONGEST).or_unlimited(), 5.0),
+            density: r
+                .key(
+                    "sense.density",
+                    "",
+                    "what something at distance d adds to its quadrant's density: 1 − d/(√2·max(map)) if linear, \
+                     1/max(d, 1) if inverse",
+                    "3.1",
+                )
+                .choice(Density::Linear),
+        }
+    }
+}
+
+choice! {
+    /// How a sensed distance counts.
+    Density {
+        /// `1 - d/D` with D = √2·max(map).
+        Linear = "linear",
+        /// `1 / max(d, 1)`.
+        Inverse = "inverse",
+    }
+}
+
+shared! {
+    /// What sensing reads.
+    pub struct SenseConstants as SenseLanes {
+        /// Squared ranges.
+        pub poi_range2: f32,
+        pub agent_range2: f32,
+        /// 1/P and 1/N.
+        pub poi_share: f32,
+        pub agent_share: f32,
+        /// 1/D with D = √2·max(map).
+        pub inverse_diagonal: f32,
+    }
+}
+
+impl SenseConstants {
+    /// Of so many agents and POIs on this map.
+    pub fn new(sense: &Sense, agents: usize, pois: usize, map: [f64; 2]) -> SenseConstants {
+        let range2 = |range: f64| if range.is_infinite() { UNLIMITED } else { (range * range) as f32 };
+        SenseConstants {
+            poi_range2: range2(sense.poi_range),
+            agent_range2: range2(sense.agent_range),
+            poi_share: (1.0 / pois as f64) as f32,
+            agent_share: (1.0 / agents as f64) as f32,
+            inverse_diagonal: (1.0 / (2f64.sqrt() * map[0].max(map[1]))) as f32,
+        }
+    }
+}
+
+/// Lane operations of a leader that senses an entity: the range's test and selection, the quadrant's 4 tests and what
+/// joins them (4), 2 selections by the side and 4 by the front, 4 sums; and the density: a root, scaled and taken from 1,
+/// or an inverse root of at least 1.
+pub fn operations(density: Density) -> u32 {
+    let density = match density {
+        Density::Linear => ROOT + 2,
+        Density::Inverse => RSQRT + 2,
+    };
+    SQUARED_DISTANCE + ROTATE + 2 + 4 + 4 + 2 + 4 + 4 + density
+}
+
+/// Lane operations of a leader, whatever it senses: a density is weighed by the share of its kind.
+pub const WEIGHED: u32 = INPUTS as u32;
+
+/// What an entity at offset (`dx`, `dy`) adds to the density of its quadrant: nothing beyond the range.
+#[inline(always)]
+pub fn density<S: Simd, const DENSITY: u32>(world: &Lanes<S>, range2: S::f32s, dx: S::f32s, dy: S::f32s) -> S::f32s {
+    let one = splat(dx.token(), 1.0);
+    let d2 = dx * dx + dy * dy;
+    let density = match const { Density::of(DENSITY) } {
+        Density::Linear => one - root::<S>(d2) * world.sense.inverse_diagonal,
+        Density::Inverse => rsqrt::<S>(select::<S>(one, d2, d2.simd_gt(one))),
+    };
+    only::<S>(density, d2.simd_le(range2))
+}
+
+/// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant, in the order of the policy's inputs:
+/// back-right, front-right, front-left, back-left.
+///
+/// The quadrant is read off the signs of the offset along the heading and to its left; a tie goes to the quadrant
+/// counterclockwise of it, so that each boundary belongs to exactly one quadrant.
+#[inline(always)]
+pub fn sense<S: Simd>(density: S::f32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, hy: S::f32s, sums: &mut [S::f32s; 4]) {
+    let zero = splat(dx.token(), 0.0);
+    let fx = dx * hx + dy * hy;
+    let fy = dy * hx - dx * hy;
+    let left = fy.simd_gt(zero) | (fy.simd_ge(zero) & fx.simd_ge(zero));
+    let front = fx.simd_gt(zero) | (fx.simd_ge(zero) & !fy.simd_gt(zero));
+    let density_left = only::<S>(density, left);
+    let density_right = except::<S>(density, left);
+    sums[0] += except::<S>(density_right, front);
+    sums[1] += only::<S>(density_right, front);
+    sums[2] += only::<S>(density_left, front);
+    sums[3] += except::<S>(density_left, front);
+}
+
+/// The policy's inputs, of the sums over a leader's quadrants.
+#[inline(always)]
+pub fn weigh_in<S: Simd>(world: &Lanes<S>, of_pois: [S::f32s; 4], of_agents: [S::f32s; 4]) -> [S::f32s; INPUTS] {
+    let [p, a] = [world.sense.poi_share, world.sense.agent_share];
+    let ([p0, p1, p2, p3], [a0, a1, a2, a3]) = (of_pois, of_agents);
+    [p0 * p, p1 * p, p2 * p, p3 * p, a0 * a, a1 * a, a2 * a, a3 * a]
+}

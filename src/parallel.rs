@@ -1,0 +1,91 @@
+//! The one way to share work between threads: rayon's, or without the feature `parallel` the same calls on this thread.
+//!
+//! No result depends on it: whatever runs in parallel writes to places of its own.
+
+#[cfg(feature = "parallel")]
+pub use rayon::{current_num_threads, join, prelude::*, scope};
+
+#[cfg(not(feature = "parallel"))]
+pub use sequential::*;
+
+#[cfg(not(feature = "parallel"))]
+mod sequential {
+    use std::slice::{ChunksExact, ChunksExactMut, ChunksMut, Iter, IterMut};
+
+    /// Threads that work is shared between.
+    pub fn current_num_threads() -> usize {
+        1
+    }
+
+    /// Runs both.
+    pub fn join<A, B>(one: impl FnOnce() -> A, other: impl FnOnce() -> B) -> (A, B) {
+        (one(), other())
+    }
+
+    /// Runs this where all that it shares is shared.
+    pub fn scope<R>(run: impl FnOnce(&()) -> R) -> R {
+        run(&())
+    }
+
+    /// rayon's names for what slices have.
+    pub trait ParallelSlices<T> {
+        fn par_iter(&self) -> Iter<'_, T>;
+        fn par_iter_mut(&mut self) -> IterMut<'_, T>;
+        fn par_chunks_mut(&mut self, size: usize) -> ChunksMut<'_, T>;
+        fn par_chunks_exact(&self, size: usize) -> ChunksExact<'_, T>;
+        fn par_chunks_exact_mut(&mut self, size: usize) -> ChunksExactMut<'_, T>;
+        fn par_chunks(&self, size: usize) -> std::slice::Chunks<'_, T>;
+    }
+
+    impl<T> ParallelSlices<T> for [T] {
+        fn par_iter(&self) -> Iter<'_, T> {
+            self.iter()
+        }
+
+        fn par_iter_mut(&mut self) -> IterMut<'_, T> {
+            self.iter_mut()
+        }
+
+        fn par_chunks_mut(&mut self, size: usize) -> ChunksMut<'_, T> {
+            self.chunks_mut(size)
+        }
+
+        fn par_chunks_exact(&self, size: usize) -> ChunksExact<'_, T> {
+            self.chunks_exact(size)
+        }
+
+        fn par_chunks_exact_mut(&mut self, size: usize) -> ChunksExactMut<'_, T> {
+            self.chunks_exact_mut(size)
+        }
+
+        fn par_chunks(&self, size: usize) -> std::slice::Chunks<'_, T> {
+            self.chunks(size)
+        }
+    }
+
+    /// rayon's names for what iterators have.
+    pub trait ParallelItems: IntoIterator + Sized {
+        fn into_par_iter(self) -> Self::IntoIter {
+            self.into_iter()
+        }
+    }
+
+    impl<I: IntoIterator> ParallelItems for I {}
+
+    /// What rayon wants to know of how work is cut up.
+    pub trait ParallelCut: Iterator + Sized {
+        fn with_min_len(self, _: usize) -> Self {
+            self
+        }
+
+        fn with_max_len(self, _: usize) -> Self {
+            self
+        }
+
+        fn flat_map_iter<R: IntoIterator>(self, each: impl FnMut(Self::Item) -> R) -> impl Iterator<Item = R::Item> {
+            self.flat_map(each)
+        }
+    }
+
+    impl<I: Iterator> ParallelCut for I {}
+}

@@ -1,0 +1,613 @@
+//! A TOML text read key by key: whoever asks for a key says what it allows, and everything that is wrong with the text
+//! is found in one pass and reported by line.
+//!
+//! What is asked for is also a table of keys, see [`keys`]. Which keys there are is no matter of this module.
+
+use std::collections::BTreeMap;
+use std::fmt::{self, Display};
+use std::ops::RangeInclusive;
+
+use serde::Serialize;
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+use crate::declare::Choice;
+
+/// Most problems listed of one text.
+const MAX_LISTED: usize = 50;
+
+/// What is to be known of one key: a line of the table behind `docs/reference.md` and every commented config.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Key {
+    /// Dotted: `world.dt`.
+    pub name: &'static str,
+    /// Empty where it has none.
+    pub unit: &'static str,
+    /// What kind of value it takes: `number`, `word`, `list of positions [x, y]`.
+    pub kind: String,
+    /// The values it takes; bounds that other keys set go by these keys' names.
+    pub range: String,
+    /// As TOML; none where the key has to be given.
+    pub default: Option<String>,
+    /// Without a full stop.
+    pub meaning: &'static str,
+    /// Section and equation of the paper; empty where it says nothing of this.
+    pub paper: &'static str,
+}
+
+/// A key set from outside the config file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Override {
+    /// The dotted key: `learning.population`.
+    pub key: String,
+    /// What it is set to, as TOML.
+    pub text: String,
+    /// What errors call it: `--population`.
+    pub name: String,
+}
+
+impl Override {
+    /// Sets `key` to `value`; errors call it `name`.
+    pub fn new(key: impl Into<String>, value: impl Into<toml::Value>, name: impl Into<String>) -> Override {
+        Override { key: key.into(), text: value.into().to_string(), name: name.into() }
+    }
+}
+
+/// One thing wrong with a config.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Problem {
+    /// The line in the file, from 1; none for an [`Override`].
+    pub line: Option<usize>,
+    /// The dotted key with any place in its list, `world.leaders[3][1]`, or the override's name; empty for broken TOML.
+    pub key: String,
+    /// What was found and what is allowed.
+    pub message: String,
+}
+
+/// All that is wrong with a text, by line; what came from outside it (see [`Override`]) last.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Problems {
+    pub listed: Vec<Problem>,
+    /// How many more there are.
+    pub unlisted: usize,
+}
+
+/// Sections of a text that are not for whoever reads it.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Others<'a> {
+    /// These are passed over.
+    pub foreign: &'a [&'a str],
+    /// With any of these the text is something else, as the message says; of that nothing else is worth saying.
+    pub refused: &'a [&'a str],
+    pub message: &'a str,
+}
+
+/// Reads a text, with some keys set from elsewhere: `ask` asks for every key that there is.
+///
+/// # Errors
+/// Everything that is wrong with the text and the overrides.
+pub fn read<T>(
+    text: &str,
+    others: Others<'_>,
+    overrides: &[Override],
+    ask: impl FnOnce(&mut Reader<'_>) -> T,
+) -> Result<T, Problems> {
+    let (document, errors) = DeTable::parse_recoverable(text);
+    let mut reader = Reader::default();
+    for error in first_slips(text, &errors) {
+        let span = error.span().unwrap_or(0..0);
+        let at = text.get(span.clone()).filter(|at| !at.trim().is_empty());
+        let at = at.map_or(String::new(), |at| format!(" (at `{}`)", shorten(at)));
+        let message = error.message().trim().replace('\n', ", ") + &at;
+        reader.blame(Place::Offset(span.start), "", message);
+    }
+    if reader.problems.is_empty() {
+        let mut refused = document.get_ref().keys().filter(|key| others.refused.contains(&key.get_ref().as_ref()));
+        if let Some(section) = refused.next() {
+            reader.blame(Place::Offset(section.span().start), section.get_ref(), others.message.into());
+        }
+    }
+    if reader.problems.is_empty() {
+        reader.fill(document.into_inner(), text, others.foreign, overrides);
+        let read = ask(&mut reader);
+        reader.blame_unknown();
+        if reader.problems.is_empty() {
+            return Ok(read);
+        }
+    }
+    Err(reader.into_problems(text))
+}
+
+/// What an empty text comes to, and every key that `ask` asks for, in that order.
+pub fn keys<T>(ask: impl FnOnce(&mut Reader<'_>) -> T) -> (T, Vec<Key>) {
+    let mut reader = Reader { table: Some(vec![]), ..Reader::default() };
+    let read = ask(&mut reader);
+    (read, reader.table.unwrap_or_default())
+}
+
+/// The syntax errors that no earlier one explains: a slip can break the rest of its line, a list left open the rest of
+/// the file.
+fn first_slips<'e>(text: &str, errors: &'e [toml::de::Error]) -> impl Iterator<Item = &'e toml::de::Error> {
+    let left_open = errors.iter().any(|error| error.message().contains("unclosed array"));
+    let in_list = |error: &toml::de::Error| left_open && error.message().contains("array");
+    let end = errors.iter().position(in_list).map_or(errors.len(), |first| first + 1);
+    let mut last = None;
+    errors[..end].iter().filter(move |error| {
+        let start = error.span().map_or(0, |span| span.start);
+        let new_line = last.is_none_or(|last| text.get(last..start).is_some_and(|since| since.contains('\n')));
+        last = if new_line { Some(start) } else { last };
+        new_line
+    })
+}
+
+/// The values a number may have.
+#[derive(Clone, Copy, Debug)]
+pub struct Allowed<T> {
+    low: T,
+    high: T,
+    zero: bool,
+    unlimited: bool,
+    /// Where the bounds come from.
+    because: &'static str,
+}
+
+/// The numbers from `low` to `high`, both included.
+pub fn between<T>(low: T, high: T) -> Allowed<T> {
+    Allowed { low, high, zero: false, unlimited: false, because: "" }
+}
+
+impl<T: Number> Allowed<T> {
+    /// Also 0, where the least other value is greater.
+    pub fn or_zero(self) -> Self {
+        Allowed { zero: true, ..self }
+    }
+
+    /// Also infinity.
+    pub fn or_unlimited(self) -> Self {
+        Allowed { unlimited: true, ..self }
+    }
+
+    /// The bounds are those of other keys, by these names.
+    pub fn because(self, because: &'static str) -> Self {
+        Allowed { because, ..self }
+    }
+
+    fn holds(&self, value: T) -> bool {
+        (self.low..=self.high).contains(&value)
+            || self.zero && value == T::ZERO
+            || self.unlimited && value.is_infinite()
+    }
+
+    /// The default, or the bound next to it where other keys leave no room for it.
+    fn nearest(&self, default: T) -> T {
+        match default {
+            _ if self.holds(default) => default,
+            _ if default < self.low => self.low,
+            _ => self.high,
+        }
+    }
+}
+
+impl<T: Number> Allowed<T> {
+    /// What is allowed in any config: a bound that other keys set goes by their names.
+    fn in_general(&self) -> String {
+        match self.because {
+            "" => self.to_string(),
+            both if both.contains(" to ") => both.into(),
+            most => format!("{}{} to {most}", if self.zero { "0 or " } else { "" }, self.low),
+        }
+    }
+}
+
+impl<T: Number> Display for Allowed<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Allowed { low, high, .. } = self;
+        match (self.zero, low.partial_cmp(high)) {
+            (true, Some(std::cmp::Ordering::Less)) => write!(f, "0 or {low} to {high}")?,
+            (true, _) => write!(f, "0")?,
+            (false, Some(std::cmp::Ordering::Less)) => write!(f, "{low} to {high}")?,
+            (false, _) => write!(f, "{high}")?,
+        }
+        if self.unlimited {
+            write!(f, " or inf (unlimited)")?;
+        }
+        if !self.because.is_empty() {
+            write!(f, " ({})", self.because)?;
+        }
+        Ok(())
+    }
+}
+
+/// A type that keys have numbers of.
+pub trait Number: Copy + PartialOrd + Display + Serialize {
+    const ZERO: Self;
+    const KIND: &'static str;
+
+    /// The number that was written, `None` inside where the type cannot hold it, or `None` for another kind of value.
+    fn read(value: &DeValue<'_>) -> Option<Option<Self>>;
+
+    fn is_infinite(self) -> bool {
+        false
+    }
+}
+
+impl Number for f64 {
+    const ZERO: f64 = 0.0;
+    const KIND: &'static str = "a number";
+
+    fn read(value: &DeValue<'_>) -> Option<Option<f64>> {
+        match value {
+            DeValue::Integer(_) => Some(i64::read(value)?.map(|integer| integer as f64)),
+            DeValue::Float(float) => {
+                let value: Option<f64> = float.as_str().parse().ok();
+                let written = |value: &f64| value.is_finite() || float.as_str().contains("inf");
+                // Adding 0 turns -0 into 0.
+                Some(value.filter(written).map(|value| value + 0.0))
+            }
+            _ => None,
+        }
+    }
+
+    fn is_infinite(self) -> bool {
+        self == f64::INFINITY
+    }
+}
+
+macro_rules! whole_number {
+    ($($type:ty)*) => {$(
+        impl Number for $type {
+            const ZERO: $type = 0;
+            const KIND: &'static str = "a whole number";
+
+            fn read(value: &DeValue<'_>) -> Option<Option<$type>> {
+                value.as_integer().map(|integer| <$type>::from_str_radix(integer.as_str(), integer.radix()).ok())
+            }
+        }
+    )*};
+}
+whole_number!(i64 u64 usize);
+
+/// Where a value was written, in the order in which problems are told.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Place {
+    /// This many bytes into the file.
+    Offset(usize),
+    Outside,
+}
+
+/// A value and what errors say of it.
+struct Entry<'a> {
+    value: Spanned<DeValue<'a>>,
+    /// The text that the value's span counts in.
+    text: &'a str,
+    outside: bool,
+    /// What the user calls it: the key, with any place in its list, or the override's name.
+    name: String,
+}
+
+impl Entry<'_> {
+    fn place(&self) -> Place {
+        if self.outside { Place::Outside } else { Place::Offset(self.value.span().start) }
+    }
+
+    fn found(&self) -> String {
+        match self.value.get_ref() {
+            DeValue::Array(items) => format!("a list of {}", items.len()),
+            DeValue::Table(_) => "a table".into(),
+            _ => shorten(self.text.get(self.value.span()).unwrap_or_default()),
+        }
+    }
+}
+
+/// A text from the file, fit for one line of an error.
+fn shorten(text: &str) -> String {
+    let line = text.lines().next().unwrap_or_default();
+    let end = line.char_indices().nth(40).map_or(line.len(), |(end, _)| end);
+    let more = if end < text.len() { "…" } else { "" };
+    line[..end].chars().map(|c| if c.is_control() { ' ' } else { c }).chain(more.chars()).collect()
+}
+
+/// The values of a file that were not asked for yet, and what is wrong with those that were.
+#[derive(Default)]
+pub struct Reader<'a> {
+    /// By dotted key.
+    entries: BTreeMap<String, Entry<'a>>,
+    /// Values outside any section.
+    strays: Vec<Entry<'a>>,
+    /// Where each section starts.
+    sections: BTreeMap<String, usize>,
+    /// The keys asked for, with the place and name of those that were there.
+    known: BTreeMap<&'static str, Option<(Place, String)>>,
+    /// Place, name and message of each.
+    problems: Vec<(Place, String, String)>,
+    /// All there is to know of the keys asked for, where somebody wants to.
+    table: Option<Vec<Key>>,
+}
+
+/// A key that is being asked for; what it allows and its default are yet to be said.
+pub struct Asked<'r, 'a> {
+    reader: &'r mut Reader<'a>,
+    name: &'static str,
+    unit: &'static str,
+    meaning: &'static str,
+    paper: &'static str,
+}
+
+impl<'a> Reader<'a> {
+    fn fill(&mut self, document: DeTable<'a>, text: &'a str, foreign: &[&str], overrides: &'a [Override]) {
+        for (section, value) in document {
+            let start = section.span().start;
+            let section = section.into_inner().into_owned();
+            if foreign.contains(&section.as_str()) {
+                continue;
+            }
+            let span = value.span();
+            match value.into_inner() {
+                DeValue::Table(table) => {
+                    for (key, value) in table {
+                        let name = format!("{section}.{}", key.into_inner());
+                        self.entries.insert(name.clone(), Entry { value, text, outside: false, name });
+                    }
+                    self.sections.insert(section, start);
+                }
+                other => {
+                    let value = Spanned::new(span, other);
+                    self.strays.push(Entry { value, text, outside: false, name: section });
+                }
+            }
+        }
+        for Override { key, text, name } in overrides {
+            let (value, errors) = DeValue::parse_recoverable(text);
+            for error in errors {
+                self.blame(Place::Outside, name, format!("found {}: {}", shorten(text), error.message().trim()));
+            }
+            self.entries.insert(key.clone(), Entry { value, text, outside: true, name: name.clone() });
+        }
+    }
+
+    fn take(&mut self, key: &'static str) -> Option<Entry<'a>> {
+        let entry = self.entries.remove(key);
+        self.known.insert(key, entry.as_ref().map(|entry| (entry.place(), entry.name.clone())));
+        entry
+    }
+
+    /// How many things were wrong so far.
+    pub fn faults(&self) -> usize {
+        self.problems.len()
+    }
+
+    /// Asks for a key.
+    pub fn key<'r>(
+        &'r mut self,
+        name: &'static str,
+        unit: &'static str,
+        meaning: &'static str,
+        paper: &'static str,
+    ) -> Asked<'r, 'a> {
+        Asked { reader: self, name, unit, meaning, paper }
+    }
+
+    /// A number, or its default where there is none.
+    fn number<T: Number>(&mut self, entry: Option<Entry<'_>>, allowed: Allowed<T>, default: T) -> T {
+        entry.map_or_else(|| allowed.nearest(default), |entry| self.check(&entry, allowed))
+    }
+
+    fn check<T: Number>(&mut self, entry: &Entry<'_>, allowed: Allowed<T>) -> T {
+        let kind = match T::read(entry.value.get_ref()) {
+            Some(Some(value)) if allowed.holds(value) => return value,
+            Some(_) => String::new(),
+            None => format!("{}, ", T::KIND),
+        };
+        self.blame(entry.place(), &entry.name, format!("found {}, allowed {kind}{allowed}", entry.found()));
+        allowed.high
+    }
+
+    /// The items of a list, or none of a list of another length or of another thing.
+    fn items(&mut self, entry: Entry<'a>, lengths: RangeInclusive<usize>, what: &str) -> Option<Vec<Entry<'a>>> {
+        let found = entry.found();
+        let (place, Entry { value, text, outside, name }) = (entry.place(), entry);
+        match value.into_inner() {
+            DeValue::Array(items) if lengths.contains(&items.len()) => {
+                let named = |(index, value)| Entry { value, text, outside, name: format!("{name}[{index}]") };
+                Some(items.into_iter().enumerate().map(named).collect())
+            }
+            _ => {
+                let lengths = between(*lengths.start(), *lengths.end());
+                self.blame(place, &name, format!("found {found}, allowed a list of {lengths} {what}"));
+                None
+            }
+        }
+    }
+
+    fn two(&mut self, entry: Entry<'a>, allowed: [Allowed<f64>; 2]) -> [f64; 2] {
+        let most = allowed.map(|side| side.high);
+        let Some(items) = self.items(entry, 2..=2, "numbers") else { return most };
+        let mut values = most;
+        for ((value, item), side) in values.iter_mut().zip(&items).zip(allowed) {
+            *value = self.check(item, side);
+        }
+        values
+    }
+
+    fn numbers<T: Number>(&mut self, entry: Entry<'a>, counts: RangeInclusive<usize>, allowed: Allowed<T>) -> Vec<T> {
+        let items = self.items(entry, counts, &format!("numbers, each {allowed}")).unwrap_or_default();
+        items.iter().map(|item| self.check(item, allowed)).collect()
+    }
+
+    fn blame(&mut self, place: Place, name: &str, message: String) {
+        self.problems.push((place, name.to_string(), message));
+    }
+
+    /// Blames a key that was asked for; where it is missing, at its section's start.
+    pub fn blame_key(&mut self, key: &'static str, message: String) {
+        let section = || self.sections.get(section(key)).copied().unwrap_or(0);
+        let known = self.known.get(key).cloned().flatten();
+        let (place, name) = known.unwrap_or_else(|| (Place::Offset(section()), key.to_string()));
+        self.blame(place, &name, message);
+    }
+
+    /// Blames all that was not asked for.
+    fn blame_unknown(&mut self) {
+        let known: Vec<&str> = self.known.keys().copied().collect();
+        let mut sections: Vec<&str> = known.iter().map(|key| section(key)).collect();
+        sections.dedup();
+        for entry in std::mem::take(&mut self.strays) {
+            let name = &entry.name;
+            let message = if sections.contains(&name.as_str()) {
+                format!("found {}, allowed a section [{name}]", entry.found())
+            } else {
+                format!("unknown key{}", hint(name, &known))
+            };
+            self.blame(entry.place(), &shorten(name), message);
+        }
+        for (name, start) in std::mem::take(&mut self.sections) {
+            if !sections.contains(&name.as_str()) {
+                let message = format!("unknown section{}", hint(&name, &sections));
+                self.blame(Place::Offset(start), &shorten(&name), message);
+                self.entries.retain(|key, entry| entry.outside || section(key) != name);
+            }
+        }
+        for (key, entry) in std::mem::take(&mut self.entries) {
+            self.blame(entry.place(), &shorten(&entry.name), format!("unknown key{}", hint(&key, &known)));
+        }
+    }
+
+    fn into_problems(mut self, text: &str) -> Problems {
+        self.problems.sort_by_key(|problem| problem.0);
+        let unlisted = self.problems.len().saturating_sub(MAX_LISTED);
+        let listed = self.problems.into_iter().take(MAX_LISTED).map(|(place, key, message)| {
+            let line = match place {
+                Place::Offset(offset) => Some(text.bytes().take(offset).filter(|&byte| byte == b'\n').count() + 1),
+                Place::Outside => None,
+            };
+            Problem { line, key, message }
+        });
+        Problems { listed: listed.collect(), unlisted }
+    }
+}
+
+impl<'a> Asked<'_, 'a> {
+    /// What was written in the config. Where somebody wants to know of the key, its kind, range and default are noted.
+    fn take(&mut self, about: impl FnOnce() -> (String, String, Option<String>)) -> Option<Entry<'a>> {
+        if let Some(table) = &mut self.reader.table {
+            let Asked { name, unit, meaning, paper, .. } = *self;
+            let (kind, range, default) = about();
+            table.push(Key { name, unit, kind, range, default, meaning, paper });
+        }
+        self.reader.take(self.name)
+    }
+
+    /// A number, or its default where the key was left out.
+    pub fn number<T: Number>(mut self, allowed: Allowed<T>, default: T) -> T {
+        let entry = self.take(|| (kind::<T>().into(), allowed.in_general(), Some(written(&default))));
+        self.reader.number(entry, allowed, default)
+    }
+
+    /// What one of the words stands for, or its default where the key was left out.
+    pub fn choice<T: Choice>(mut self, default: T) -> T {
+        let words = || T::names().map(|word| format!("{word:?}")).collect::<Vec<_>>().join(" or ");
+        let Some(entry) = self.take(|| ("word".into(), words(), Some(written(&default)))) else { return default };
+        let word = entry.value.get_ref().as_str();
+        T::ALL.iter().find(|choice| Some(choice.0) == word).map_or_else(
+            || {
+                let message = format!("found {}, allowed {}", entry.found(), words());
+                self.reader.blame(entry.place(), &entry.name, message);
+                default
+            },
+            |choice| choice.1,
+        )
+    }
+
+    /// Two numbers, or their default where the key was left out.
+    pub fn pair(mut self, allowed: Allowed<f64>, default: [f64; 2]) -> [f64; 2] {
+        let about = || ("two numbers".into(), format!("each {}", allowed.in_general()), Some(written(&default)));
+        let Some(entry) = self.take(about) else { return default };
+        self.reader.two(entry, [allowed; 2])
+    }
+
+    /// Positions within these sides; `None` where they have to be given and were not, or were no such list.
+    pub fn positions(
+        mut self,
+        counts: RangeInclusive<usize>,
+        sides: [Allowed<f64>; 2],
+        default: Option<Vec<[f64; 2]>>,
+    ) -> Option<Vec<[f64; 2]>> {
+        const WHAT: &str = "positions [x, y]";
+        let (fewest, most) = (*counts.start(), *counts.end());
+        let range = || format!("{} of them, on {}", between(fewest, most), sides[0].because);
+        let Some(entry) = self.take(|| (format!("list of {WHAT}"), range(), default.as_ref().map(written))) else {
+            if default.is_none() {
+                let message = format!("missing, allowed a list of {} {WHAT}", between(fewest, most));
+                self.reader.blame_key(self.name, message);
+            }
+            return default;
+        };
+        let items = self.reader.items(entry, counts, WHAT)?;
+        Some(items.into_iter().map(|item| self.reader.two(item, sides)).collect())
+    }
+
+    /// A list of numbers, or its default where the key was left out.
+    pub fn numbers<T: Number>(mut self, counts: RangeInclusive<usize>, allowed: Allowed<T>, default: Vec<T>) -> Vec<T> {
+        let range = || format!("{} of them, each {}", between(*counts.start(), *counts.end()), allowed.in_general());
+        let about = || (format!("list of {}s", kind::<T>()), range(), Some(written(&default)));
+        match self.take(about) {
+            Some(entry) => self.reader.numbers(entry, counts, allowed),
+            None => default,
+        }
+    }
+
+    /// One number, or a list of so many; the default is one.
+    pub fn one_or_list<T: Number>(
+        mut self,
+        allowed: Allowed<T>,
+        counts: RangeInclusive<usize>,
+        default: T,
+    ) -> OneOrList<T> {
+        let kind = || format!("{}, or a list of them", kind::<T>());
+        match self.take(|| (kind(), allowed.in_general(), Some(written(&default)))) {
+            Some(entry) if entry.value.get_ref().is_array() => {
+                OneOrList::List(self.reader.numbers(entry, counts, allowed))
+            }
+            entry => OneOrList::One(self.reader.number(entry, allowed, default)),
+        }
+    }
+}
+
+/// What a key holds that takes both.
+pub enum OneOrList<T> {
+    One(T),
+    List(Vec<T>),
+}
+
+/// A kind of number without its article.
+fn kind<T: Number>() -> &'static str {
+    T::KIND.trim_start_matches("a ")
+}
+
+/// A value as TOML has it.
+fn written<T: Serialize>(value: &T) -> String {
+    toml::Value::try_from(value).expect("numbers, words and lists of them are TOML").to_string()
+}
+
+/// The section of a dotted key.
+fn section(key: &str) -> &str {
+    key.split_once('.').map_or(key, |(section, _)| section)
+}
+
+/// `, did you mean …?` with the known name nearest to an unknown one, or else what its section knows.
+fn hint(name: &str, known: &[&str]) -> String {
+    const LONGEST_NAME: usize = 64;
+    let last = |key: &'_ str| key.rsplit('.').next().unwrap_or_default().to_lowercase();
+    let leaf = last(name);
+    let same_section = |key: &str| section(key) == section(name);
+    let distance = |key: &str| (strsim::damerau_levenshtein(&last(key), &leaf), !same_section(key));
+    let nearest = known.iter().filter(|_| name.len() <= LONGEST_NAME).min_by_key(|key| distance(key));
+    if let Some(key) = nearest.filter(|key| distance(key).0 <= leaf.len() / 3) {
+        return format!(", did you mean `{key}`?");
+    }
+    let siblings: Vec<String> = known.iter().filter(|key| same_section(key)).map(|key| last(key)).collect();
+    match siblings.is_empty() {
+        true => String::new(),
+        false => format!("; [{}] has {}", section(name), siblings.join(", ")),
+    }
+}

@@ -1,0 +1,418 @@
+//! Arms side by side: what their trials came to, with 95 % intervals, and a test of every pair.
+
+use std::fmt::Write;
+use std::io;
+use std::path::PathBuf;
+
+use serde::Serialize;
+
+use super::runs::{self, RunError};
+use super::table;
+use crate::statistics::{self, Estimate, Tested};
+
+/// Trials that are compared with those of others.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Arm {
+    /// What sets it apart: "fitness Df".
+    pub name: String,
+    /// The runs whose trials these are.
+    pub folders: Vec<PathBuf>,
+    /// Generations that these were to have.
+    pub planned: usize,
+    pub trials: Vec<Trial>,
+}
+
+/// One trial of a run.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Trial {
+    /// The run's seed and the trial's number: trials of two arms that share both are a pair.
+    pub key: (u64, usize),
+    /// G of the best team and of the champion, by generation.
+    pub course: Vec<[f64; 2]>,
+}
+
+impl Arm {
+    /// Reads the trials of some runs, as far as they have come.
+    ///
+    /// # Errors
+    /// A run cannot be read.
+    pub fn read(name: String, folders: Vec<PathBuf>) -> Result<Arm, RunError> {
+        let mut arm = Arm { name, folders, planned: 0, trials: vec![] };
+        for folder in &arm.folders {
+            let config = runs::config(folder)?;
+            let courses = runs::trials(folder, &config)?.into_iter().enumerate();
+            arm.trials.extend(courses.map(|(trial, course)| Trial { key: (config.learning.seed, trial), course }));
+            arm.planned = arm.planned.max(config.learning.generations);
+        }
+        Ok(arm)
+    }
+
+    /// The last generation that all its trials have come to.
+    fn last(&self) -> Option<usize> {
+        self.trials.iter().map(|trial| trial.course.len()).min()?.checked_sub(1)
+    }
+
+    fn keys(&self) -> Vec<(u64, usize)> {
+        self.trials.iter().map(|trial| trial.key).collect()
+    }
+}
+
+/// Whether all arms have the same seeds and trials, so that these are pairs.
+pub fn paired(arms: &[Arm]) -> bool {
+    arms.iter().all(|arm| arm.keys() == arms[0].keys())
+}
+
+/// A generation to compare at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum At {
+    Generation(usize),
+    /// The last one that all trials of all arms have come to.
+    Last,
+}
+
+/// What is compared, and how.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Options {
+    pub at: Vec<At>,
+    /// The best team's G (in 0..1) whose first generation is compared.
+    pub reach: f64,
+    /// Compare pair by pair.
+    pub paired: bool,
+}
+
+/// Why arms cannot be compared.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum ComparisonError {
+    #[error("{0} has one trial, of which no interval can be had; that takes two or more")]
+    OneTrial(String),
+    #[error("{0} has no generation that every trial has come to")]
+    TooShort(String),
+    #[error("the arms have come to generation {last}")]
+    Beyond { at: usize, last: usize },
+    #[error("{0} and {1} have not the same seeds and numbers of trials, so their trials are no pairs")]
+    NoPairs(String, String),
+}
+
+/// What is measured in every trial.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[serde(tag = "measure", rename_all = "snake_case")]
+pub enum Measure {
+    /// G of the best team at a generation.
+    BestG { generation: usize },
+    /// G of the champion.
+    ChampionG { generation: usize },
+    /// The first generation at which the best team's G is at least this. A trial that does not come to it up to a last
+    /// generation counts as one that does at the next.
+    GenerationsToReach { reach: f64, generation: usize },
+}
+
+impl Measure {
+    fn of(self, trial: &Trial) -> f64 {
+        match self {
+            Measure::BestG { generation } => trial.course[generation][0],
+            Measure::ChampionG { generation } => trial.course[generation][1],
+            Measure::GenerationsToReach { reach, generation } => {
+                let reached = trial.course[..=generation].iter().position(|[best, _]| *best >= reach);
+                reached.unwrap_or(generation + 1) as f64
+            }
+        }
+    }
+
+    /// In how many trials it was reached, if that is the question.
+    fn reached(self, values: &[f64]) -> Option<usize> {
+        match self {
+            Measure::GenerationsToReach { generation, .. } => {
+                Some(values.iter().filter(|&&value| value <= generation as f64).count())
+            }
+            _ => None,
+        }
+    }
+
+    fn digits(self) -> usize {
+        if let Measure::GenerationsToReach { .. } = self { 1 } else { 3 }
+    }
+
+    /// As in JSON and CSV.
+    fn key(self) -> &'static str {
+        match self {
+            Measure::BestG { .. } => "best_g",
+            Measure::ChampionG { .. } => "champion_g",
+            Measure::GenerationsToReach { .. } => "generations_to_reach",
+        }
+    }
+}
+
+impl std::fmt::Display for Measure {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Measure::BestG { generation } => write!(f, "best team's G, generation {generation}"),
+            Measure::ChampionG { generation } => write!(f, "champion's G, generation {generation}"),
+            Measure::GenerationsToReach { reach, .. } => write!(f, "generations to G {reach}"),
+        }
+    }
+}
+
+/// Arms side by side.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Comparison {
+    /// What the arms of a sweep have in common: "coupling 3". Empty of runs.
+    #[serde(rename = "where")]
+    pub place: String,
+    /// The last generation that all have come to.
+    pub generation: usize,
+    pub arms: Vec<Named>,
+    pub measures: Vec<Measured>,
+    /// What a reader has to know.
+    pub notes: Vec<String>,
+}
+
+/// An arm as it is told of.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Named {
+    pub name: String,
+    pub folders: Vec<PathBuf>,
+    pub trials: usize,
+}
+
+/// What one measure came to.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Measured {
+    #[serde(flatten)]
+    pub measure: Measure,
+    /// By arm.
+    pub arms: Vec<Mean>,
+    /// Every two arms once.
+    pub pairs: Vec<Pair>,
+}
+
+/// The mean over an arm's trials.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Mean {
+    #[serde(flatten)]
+    pub mean: Estimate,
+    /// In how many trials a G was reached.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reached: Option<usize>,
+}
+
+/// What sets two arms apart.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Pair {
+    /// Their places among the arms.
+    pub arms: [usize; 2],
+    /// The first's mean less the second's.
+    #[serde(flatten)]
+    pub difference: Estimate,
+    #[serde(flatten)]
+    pub test: Tested,
+    /// Corrected for the number of pairs.
+    pub p_holm: f64,
+}
+
+/// Compares every two of two or more arms; `place` is what they have in common.
+///
+/// # Errors
+/// The arms have too few trials or generations, or are no pairs where pairs are asked for.
+pub fn compare(place: &str, arms: &[Arm], options: &Options) -> Result<Comparison, ComparisonError> {
+    let mut last = usize::MAX;
+    for arm in arms {
+        if arm.trials.len() < 2 {
+            return Err(ComparisonError::OneTrial(arm.name.clone()));
+        }
+        last = last.min(arm.last().ok_or_else(|| ComparisonError::TooShort(arm.name.clone()))?);
+    }
+    if let Some(other) = arms.iter().find(|arm| options.paired && arm.keys() != arms[0].keys()) {
+        return Err(ComparisonError::NoPairs(arms[0].name.clone(), other.name.clone()));
+    }
+    let mut generations = Vec::new();
+    for &at in &options.at {
+        let at = if let At::Generation(at) = at { at } else { last };
+        if at > last {
+            return Err(ComparisonError::Beyond { at, last });
+        }
+        if !generations.contains(&at) {
+            generations.push(at);
+        }
+    }
+    let best = generations.iter().map(|&generation| Measure::BestG { generation });
+    let champion = generations.iter().map(|&generation| Measure::ChampionG { generation });
+    let reach = Measure::GenerationsToReach { reach: options.reach, generation: last };
+    let measures = best.chain(champion).chain([reach]).map(|measure| measured(measure, arms, options.paired)).collect();
+
+    let mut notes: Vec<String> = arms
+        .iter()
+        .filter_map(|arm| Some((arm, arm.last().filter(|&come| come < arm.planned)?)))
+        .map(|(arm, come)| format!("{} has come to generation {come} of {}", arm.name, arm.planned))
+        .collect();
+    if arms.iter().any(|arm| arm.planned > last) {
+        notes.push(format!("arms are compared up to generation {last}, which all have come to"));
+    }
+    let named = |arm: &Arm| Named { name: arm.name.clone(), folders: arm.folders.clone(), trials: arm.trials.len() };
+    Ok(Comparison { place: place.into(), generation: last, arms: arms.iter().map(named).collect(), measures, notes })
+}
+
+fn measured(measure: Measure, arms: &[Arm], paired: bool) -> Measured {
+    let values = |arm: &Arm| arm.trials.iter().map(|trial| measure.of(trial)).collect::<Vec<_>>();
+    let values: Vec<Vec<f64>> = arms.iter().map(values).collect();
+    let two = "arms of two trials or more";
+    let means = values
+        .iter()
+        .map(|values| Mean { mean: statistics::bootstrap(&[values]).expect(two), reached: measure.reached(values) });
+    let mut pairs = Vec::new();
+    for (first, one) in values.iter().enumerate() {
+        for (second, other) in values.iter().enumerate().skip(first + 1) {
+            let (difference, test) = if paired {
+                let less: Vec<f64> = one.iter().zip(other).map(|(one, other)| one - other).collect();
+                (statistics::bootstrap(&[&less]), statistics::signed_rank(&less))
+            } else {
+                (statistics::bootstrap(&[one, other]), statistics::rank_sum(one, other))
+            };
+            let (difference, test) = (difference.expect(two), test.expect(two));
+            pairs.push(Pair { arms: [first, second], difference, test, p_holm: 0.0 });
+        }
+    }
+    let corrected = statistics::holm(&pairs.iter().map(|pair| pair.test.p).collect::<Vec<_>>());
+    pairs.iter_mut().zip(corrected).for_each(|(pair, p)| pair.p_holm = p);
+    Measured { measure, arms: means.collect(), pairs }
+}
+
+impl Comparison {
+    /// A row an arm, its means side by side.
+    fn means(&self) -> Vec<Vec<String>> {
+        let mut head = vec!["arm".to_string(), "trials".into()];
+        head.extend(self.measures.iter().map(|measured| measured.measure.to_string()));
+        let rows = self.arms.iter().enumerate().map(|(at, arm)| {
+            let cell = |Measured { measure, arms, .. }: &Measured| {
+                let reached = arms[at].reached.map_or(String::new(), |count| format!(" ({count} of {})", arm.trials));
+                estimate(arms[at].mean, measure.digits(), false) + &reached
+            };
+            [arm.name.clone(), arm.trials.to_string()].into_iter().chain(self.measures.iter().map(cell)).collect()
+        });
+        [head].into_iter().chain(rows).collect()
+    }
+
+    /// A row a measure and pair.
+    fn pairs(&self) -> Vec<Vec<String>> {
+        let head = ["measure", "pair", "difference", "A", "p", "p (Holm)"].map(String::from).to_vec();
+        let row = |measure: Measure, pair: &Pair| {
+            let names = pair.arms.map(|arm| &*self.arms[arm].name);
+            let difference = estimate(pair.difference, measure.digits(), true);
+            let (a, p) = (format!("{:.2}", pair.test.a), [pair.test.p, pair.p_holm].map(probability));
+            [vec![measure.to_string(), names.join(" − "), difference, a], p.to_vec()].concat()
+        };
+        let rows = self
+            .measures
+            .iter()
+            .flat_map(|Measured { measure, pairs, .. }| pairs.iter().map(|pair| row(*measure, pair)));
+        [head].into_iter().chain(rows).collect()
+    }
+}
+
+/// "0.92 [0.86, 0.97]", with minus signs as typeset.
+fn estimate(Estimate { value, low, high }: Estimate, digits: usize, signed: bool) -> String {
+    // No "-0.000".
+    let [value, low, high] = [value, low, high].map(|x| {
+        let tens = 10f64.powi(digits as i32);
+        (x * tens).round() / tens + 0.0
+    });
+    let value = if signed { format!("{value:+.digits$}") } else { format!("{value:.digits$}") };
+    format!("{value} [{low:.digits$}, {high:.digits$}]").replace('-', "−")
+}
+
+fn probability(p: f64) -> String {
+    if p < 0.001 { "< 0.001".into() } else { format!("{p:.3}") }
+}
+
+/// How the tables are to be read.
+fn legend(all: &[Comparison], options: &Options) -> String {
+    let (test, a) = match options.paired {
+        true => ("Wilcoxon's signed ranks", "a pair's first trial"),
+        false => ("Mann and Whitney's test", "a trial of the first arm"),
+    };
+    let mut text = format!(
+        "Means over trials with 95 % bootstrap intervals. Of a pair, the first arm less the second; A: how likely {a} has\n\
+         the larger value, 0.5 if neither; p: two-sided, by {test}; Holm: corrected for the number of pairs.\n"
+    );
+    let never = |measured: &Measured, all: &Comparison| {
+        measured.arms.iter().zip(&all.arms).any(|(mean, arm)| mean.reached.is_some_and(|reached| reached < arm.trials))
+    };
+    if all.iter().any(|all| all.measures.iter().any(|measured| never(measured, all))) {
+        let _ = writeln!(
+            text,
+            "A trial that does not reach G {} counts as one that does a generation after the last.",
+            options.reach
+        );
+    }
+    text
+}
+
+/// For people.
+pub fn text(all: &[Comparison], options: &Options) -> String {
+    let mut text = String::new();
+    for comparison in all {
+        if !comparison.place.is_empty() {
+            let _ = writeln!(text, "{}\n", comparison.place);
+        }
+        let _ = writeln!(text, "{}\n{}", table::markdown(&comparison.means()), table::markdown(&comparison.pairs()));
+    }
+    text + &legend(all, options)
+}
+
+/// For a paper: two tables a comparison, and how to read them as comments.
+pub fn latex(all: &[Comparison], options: &Options) -> String {
+    let comment = |text: &str| text.lines().map(|line| format!("% {line}\n")).collect::<String>();
+    let mut text = comment(&legend(all, options));
+    for comparison in all {
+        text += &comment(&comparison.place);
+        let _ = writeln!(text, "{}\n{}", table::latex(&comparison.means()), table::latex(&comparison.pairs()));
+    }
+    text
+}
+
+/// For other programs: a row a measure and arm, then one a measure and pair.
+///
+/// # Errors
+/// The output cannot be written.
+pub fn csv(all: &[Comparison], output: impl io::Write) -> io::Result<()> {
+    let mut table = csv::Writer::from_writer(output);
+    table.write_record([
+        "where",
+        "measure",
+        "generation",
+        "reach",
+        "arm",
+        "other",
+        "trials",
+        "other_trials",
+        "value",
+        "low",
+        "high",
+        "reached",
+        "a",
+        "p",
+        "p_holm",
+    ])?;
+    for Comparison { place, arms: named, measures, .. } in all {
+        for Measured { measure, arms, pairs } in measures {
+            let (generation, reach) = match *measure {
+                Measure::BestG { generation } | Measure::ChampionG { generation } => (generation, String::new()),
+                Measure::GenerationsToReach { reach, generation } => (generation, reach.to_string()),
+            };
+            let place = || [place.clone(), measure.key().into(), generation.to_string(), reach.clone()];
+            let numbers = |Estimate { value, low, high }| [value, low, high].map(|number: f64| number.to_string());
+            for (arm, Mean { mean, reached }) in named.iter().zip(arms) {
+                let whose = [arm.name.clone(), String::new(), arm.trials.to_string(), String::new()];
+                let reached = reached.map_or(String::new(), |count| count.to_string());
+                let rest = [reached, String::new(), String::new(), String::new()];
+                table.write_record([&place()[..], &whose, &numbers(*mean), &rest].concat())?;
+            }
+            for Pair { arms, difference, test, p_holm } in pairs {
+                let [one, other] = arms.map(|arm| &named[arm]);
+                let whose = [one.name.clone(), other.name.clone(), one.trials.to_string(), other.trials.to_string()];
+                let rest = [String::new(), test.a.to_string(), test.p.to_string(), p_holm.to_string()];
+                table.write_record([&place()[..], &whose, &numbers(*difference), &rest].concat())?;
+            }
+        }
+    }
+    table.flush()
+}

@@ -1,0 +1,650 @@
+//! Step by step: teams whose leaders do what the caller says, on the CPU.
+//!
+//! A [`Stepper`] plays the episodes of [`crate::backend`], by the same kernels on the same vectors of teams, but in place
+//! of policies' answers it takes actions. Given a policy's own answers, it comes to the bits of
+//! [`Backend::trace`](crate::backend::Backend::trace).
+//!
+//! ```
+//! use flotilla::{config::Config, stepping::Stepper, world::World};
+//!
+//! let config = Config::parse(include_str!("../configs/generally_forward.toml"), "generally_forward.toml")?;
+//! let mut stepper = Stepper::new(World::new(&config), 64)?;
+//! // Every leader of every team straight ahead at full speed: [teams][leaders][2].
+//! let ahead = [0.0, 1.0].repeat(64 * stepper.world().leaders());
+//! while !stepper.is_over(0) {
+//!     stepper.step(&ahead)?;
+//! }
+//! let observed = stepper.observed()[..4].iter().filter(|&&observed| observed).count();
+//! println!("team 0 observed {observed} of 4 POIs, its first leader senses {:?}", &stepper.inputs()[..8]);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+use std::cell::RefCell;
+
+use fearless_simd::{Level, Simd, dispatch, f32x4, prelude::*};
+use glam::Vec2;
+
+use crate::backend::cpu::{Agent, Block, transposed, turn};
+use crate::backend::{Episode, Seen, Strided};
+use crate::config::{Fitness, MAX_POPULATION};
+use crate::credit::{Credit, Scores};
+use crate::kernels::{bound, splat};
+use crate::parallel::*;
+use crate::world::{GRID, INPUTS, OUTPUTS, World, on_grid};
+
+/// Teams of one world, each at a step of its own.
+///
+/// Arrays are flat and stay where they are from step to step; their shapes are written `[teams][leaders][8]`, the last
+/// index moving fastest. Agents are counted leaders first.
+pub struct Stepper {
+    world: World,
+    vectors: Box<dyn Vectors>,
+    shown: Shown,
+}
+
+/// What is told of all teams.
+struct Shown {
+    inputs: Vec<f32>,
+    near: Vec<u32>,
+    newly: Vec<bool>,
+    observed: Vec<bool>,
+    steps: Vec<u32>,
+    positions: Vec<f32>,
+    headings: Vec<f32>,
+    speeds: Vec<f32>,
+}
+
+/// Where all agents are.
+#[derive(Clone, Copy, Debug)]
+pub struct States<'a> {
+    /// `[teams][agents][2]`: x and y on the map.
+    pub positions: &'a [f32],
+    /// `[teams][agents][2]`: unit vectors.
+    pub headings: &'a [f32],
+    /// `[teams][agents]`.
+    pub speeds: &'a [f32],
+}
+
+/// Why teams could not be made, started, stepped or scored. They are then as they were.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum StepError {
+    #[error("{0} teams; there may be 1 to {MAX_POPULATION}")]
+    Teams(usize),
+    /// A world that [`World::new`] did not make of a valid config.
+    #[error("the world's {0} do not fit its numbers of agents and POIs")]
+    World(&'static str),
+    #[error("there is no memory for {teams} teams, {bytes} bytes")]
+    Memory { teams: usize, bytes: u128 },
+    #[error("{found} {what}, but {shape} are {expected}")]
+    Length { what: &'static str, shape: &'static str, expected: usize, found: usize },
+    #[error("the {} of leader {leader} in team {team} is {value}, which is no finite number", ["turn", "speed"][*.output])]
+    Action { team: usize, leader: usize, output: usize, value: f32 },
+    #[error("agent {agent} of team {team} would start at ({}, {}), which is not on the map", at[0], at[1])]
+    Start { team: usize, agent: usize, at: [f32; 2] },
+    #[error("team {team} of {teams} (they count from 0)")]
+    NoTeam { team: usize, teams: usize },
+    #[error("no record was kept to score teams by")]
+    NotRecorded,
+}
+
+impl Stepper {
+    /// So many teams, all at the world's start. No record is kept.
+    ///
+    /// # Errors
+    /// No team or more than [`MAX_POPULATION`], or there is no memory for them.
+    pub fn new(world: World, teams: usize) -> Result<Stepper, StepError> {
+        Stepper::at_level(Level::new(), world, teams, false)
+    }
+
+    /// So many teams, all at the world's start, with a record of who was near which POI at which step, by which
+    /// [`Stepper::scores`] and [`Stepper::fitness`] tell what each leader was worth.
+    ///
+    /// # Errors
+    /// No team or more than [`MAX_POPULATION`], or there is no memory for them.
+    pub fn recording(world: World, teams: usize) -> Result<Stepper, StepError> {
+        Stepper::at_level(Level::new(), world, teams, true)
+    }
+
+    /// [`Stepper::new`] or [`Stepper::recording`], by a chosen instruction set (tests compare them; benches choose one).
+    ///
+    /// # Errors
+    /// No team or more than [`MAX_POPULATION`], or there is no memory for them.
+    pub fn at_level(level: Level, world: World, teams: usize, recording: bool) -> Result<Stepper, StepError> {
+        if !(1..=MAX_POPULATION).contains(&teams) {
+            return Err(StepError::Teams(teams));
+        }
+        let (agents, leaders, pois) = (world.agents(), world.leaders(), world.pois.len());
+        let words = world.constants.words as usize;
+        let fits = [
+            ("leaders", leaders > 0),
+            ("POIs", pois == world.coupling.len()),
+            ("start positions", world.starts.len() == agents),
+            ("sets", words == agents.div_ceil(32)),
+        ];
+        if let Some((what, _)) = fits.into_iter().find(|(_, fits)| !fits) {
+            return Err(StepError::World(what));
+        }
+        // Asked for first, since later a refusal would be an abort: a team's numbers, in the vectors and as shown.
+        let record = if recording { world.set_words() } else { 0 };
+        let in_vectors = agents * 6 + leaders * (INPUTS + OUTPUTS) + world.followers() * (11 + leaders) + pois * words;
+        let numbers = in_vectors + record + leaders * INPUTS + agents * 5 + pois * (words + 1) + 1;
+        let bytes = numbers as u128 * 4 * teams as u128;
+        usize::try_from(bytes)
+            .ok()
+            .and_then(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).ok())
+            .ok_or(StepError::Memory { teams, bytes })?;
+        let vectors = dispatch!(level, simd => vectors(simd, &world, teams, record));
+        let shown = Shown {
+            inputs: vec![0.0; teams * leaders * INPUTS],
+            near: vec![0; teams * pois * words],
+            newly: vec![false; teams * pois],
+            observed: vec![false; teams * pois],
+            steps: vec![0; teams],
+            positions: vec![0.0; teams * agents * 2],
+            headings: vec![0.0; teams * agents * 2],
+            speeds: vec![0.0; teams * agents],
+        };
+        let mut stepper = Stepper { world, vectors, shown };
+        stepper.reset();
+        Ok(stepper)
+    }
+
+    /// The world that all teams are in.
+    pub fn world(&self) -> &World {
+        &self.world
+    }
+
+    /// How many teams there are.
+    pub fn teams(&self) -> usize {
+        self.shown.steps.len()
+    }
+
+    /// Puts all teams at the world's start.
+    pub fn reset(&mut self) {
+        self.vectors.reset(&self.world, None, None, &mut self.shown);
+    }
+
+    /// Puts all teams where they are told to start, `[teams][agents][2]`, each place moved to the nearest one of the
+    /// kernels' grid (within 2^-19). [`crate::evaluate::Starts`] draws such places.
+    ///
+    /// # Errors
+    /// Too few or too many numbers, or a place that is not on the map.
+    pub fn reset_to(&mut self, starts: &[f32]) -> Result<(), StepError> {
+        let starts = self.checked(starts, None)?;
+        self.vectors.reset(&self.world, None, Some(&starts), &mut self.shown);
+        Ok(())
+    }
+
+    /// Puts the chosen teams, `[teams]`, at the world's start or where they are told to, as [`Stepper::reset_to`] does; the
+    /// others' places are not looked at, and they stay as they are.
+    ///
+    /// # Errors
+    /// Too few or too many choices or numbers, or a place that is not on the map.
+    pub fn reset_some(&mut self, chosen: &[bool], starts: Option<&[f32]>) -> Result<(), StepError> {
+        self.check_length("choices", "[teams]", self.teams(), chosen.len())?;
+        let starts = starts.map(|starts| self.checked(starts, Some(chosen))).transpose()?;
+        self.vectors.reset(&self.world, Some(chosen), starts.as_deref(), &mut self.shown);
+        Ok(())
+    }
+
+    /// Plays one step by what every leader is to do, `[teams][leaders][2]`: a turn, in parts of a half turn to the left, and
+    /// a speed, from -1 for standing still to 1 for the highest. Numbers beyond -1..1 are taken as -1 or 1.
+    ///
+    /// A team that has played its last step stays as it is, whatever is asked of it, until it is reset.
+    ///
+    /// # Errors
+    /// Too few or too many numbers, or one that is not finite; no team has moved then.
+    pub fn step(&mut self, actions: &[f32]) -> Result<(), StepError> {
+        let leaders = self.world.leaders();
+        let expected = self.teams() * leaders * OUTPUTS;
+        self.check_length("actions", "[teams][leaders][2]", expected, actions.len())?;
+        // All at once, which is quick; where the bad one is, is looked for only if there is one.
+        if !actions.iter().fold(true, |finite, action| finite & action.is_finite()) {
+            let index = actions.iter().position(|action| !action.is_finite()).unwrap_or(0);
+            let (leader, output) = (index / OUTPUTS, index % OUTPUTS);
+            return Err(StepError::Action {
+                team: leader / leaders,
+                leader: leader % leaders,
+                output,
+                value: actions[index],
+            });
+        }
+        self.vectors.step(&self.world, actions, &mut self.shown);
+        Ok(())
+    }
+
+    /// What every leader senses where it is, `[teams][leaders][8]`: the density of POIs, then of agents, in four quadrants
+    /// around its heading, back right, front right, front left, back left.
+    pub fn inputs(&self) -> &[f32] {
+        &self.shown.inputs
+    }
+
+    /// The agents near each POI after the last step, `[teams][pois][words]`, a bit an agent, 32 a word. A start counts for
+    /// nothing: before its first step a team is near none.
+    pub fn near(&self) -> &[u32] {
+        &self.shown.near
+    }
+
+    /// The POIs that were observed for the first time by the last step, `[teams][pois]`.
+    pub fn newly_observed(&self) -> &[bool] {
+        &self.shown.newly
+    }
+
+    /// The POIs that have been observed since the start, `[teams][pois]`.
+    pub fn observed(&self) -> &[bool] {
+        &self.shown.observed
+    }
+
+    /// How many steps each team has played since its start, `[teams]`: after as many as the world's, its episode is over.
+    pub fn steps(&self) -> &[u32] {
+        &self.shown.steps
+    }
+
+    /// Whether a team has played its last step; a team that there is not never does.
+    pub fn is_over(&self, team: usize) -> bool {
+        self.shown.steps.get(team).is_some_and(|&step| step as usize >= self.world.steps())
+    }
+
+    /// Where everyone is, worked out now.
+    pub fn states(&mut self) -> States<'_> {
+        self.vectors.states(&self.world, &mut self.shown);
+        let Shown { positions, headings, speeds, .. } = &self.shown;
+        States { positions, headings, speeds }
+    }
+
+    /// Every fitness of a team's episode as far as it has been played.
+    ///
+    /// # Errors
+    /// There is no such team, or no record was kept.
+    pub fn scores(&self, team: usize) -> Result<Scores, StepError> {
+        if team >= self.teams() {
+            return Err(StepError::NoTeam { team, teams: self.teams() });
+        }
+        let mut seen = Vec::new();
+        let episode = self.vectors.episode(team, &self.world, &mut seen).ok_or(StepError::NotRecorded)?;
+        Ok(Credit::default().all(&episode, &self.world))
+    }
+
+    /// What every leader was worth, by one fitness, as far as its team's episode has been played: `[teams][leaders]`.
+    ///
+    /// # Errors
+    /// There is room for fewer or more numbers, or no record was kept.
+    pub fn fitness(&self, fitness: Fitness, scores: &mut [f32]) -> Result<(), StepError> {
+        thread_local! { static CREDIT: RefCell<(Credit, Vec<u32>)> = RefCell::default(); }
+        let leaders = self.world.leaders();
+        self.check_length("scores", "[teams][leaders]", self.teams() * leaders, scores.len())?;
+        scores.par_chunks_exact_mut(leaders).with_min_len(FEW).enumerate().try_for_each(|(team, scores)| {
+            CREDIT.with_borrow_mut(|(credit, seen)| {
+                let episode = self.vectors.episode(team, &self.world, seen).ok_or(StepError::NotRecorded)?;
+                credit.score(&episode, &self.world, fitness, scores);
+                Ok(())
+            })
+        })
+    }
+
+    fn check_length(
+        &self,
+        what: &'static str,
+        shape: &'static str,
+        expected: usize,
+        found: usize,
+    ) -> Result<(), StepError> {
+        if found == expected { Ok(()) } else { Err(StepError::Length { what, shape, expected, found }) }
+    }
+
+    /// The start positions of the chosen teams, on the grid.
+    fn checked(&self, starts: &[f32], chosen: Option<&[bool]>) -> Result<Vec<Vec2>, StepError> {
+        let (agents, constants) = (self.world.agents(), &self.world.constants);
+        self.check_length("coordinates", "[teams][agents][2]", self.teams() * agents * 2, starts.len())?;
+        let map = Vec2::new(constants.motion.map_x, constants.motion.map_y);
+        let mut placed = Vec::with_capacity(self.teams() * agents);
+        for (index, &[x, y]) in starts.as_chunks::<2>().0.iter().enumerate() {
+            let (team, agent) = (index / agents, index % agents);
+            let on_map = (0.0..=map.x).contains(&x) && (0.0..=map.y).contains(&y);
+            if chosen.is_some_and(|chosen| !chosen[team]) {
+                placed.push(Vec2::ZERO);
+            } else if on_map {
+                placed.push(settled(Vec2::new(x, y), map));
+            } else {
+                return Err(StepError::Start { team, agent, at: [x, y] });
+            }
+        }
+        Ok(placed)
+    }
+}
+
+/// The place itself where it is on the grid or a wall, coordinate by coordinate, else the nearest on the grid.
+fn settled(place: Vec2, map: Vec2) -> Vec2 {
+    let near = on_grid(place, map);
+    let settle = |at: f32, wall: f32, near: f32| if (at * GRID).fract() == 0.0 || at == wall { at } else { near };
+    Vec2::new(settle(place.x, map.x, near.x), settle(place.y, map.y, near.y))
+}
+
+/// Vectors of teams of some instruction set.
+trait Vectors: Send + Sync {
+    fn reset(&mut self, world: &World, chosen: Option<&[bool]>, starts: Option<&[Vec2]>, shown: &mut Shown);
+    fn step(&mut self, world: &World, actions: &[f32], shown: &mut Shown);
+    fn states(&mut self, world: &World, shown: &mut Shown);
+    /// The record of a team, if one is kept; `seen` takes a part of it.
+    fn episode<'a>(&'a self, team: usize, world: &World, seen: &'a mut Vec<u32>) -> Option<Episode<'a>>;
+}
+
+/// One vector of teams.
+struct Part<S: Simd> {
+    block: Block<S>,
+    /// The first of the teams, and how many there are.
+    first: usize,
+    teams: usize,
+    /// Who is near each POI, `[pois][words][lanes]`.
+    sets: Vec<u32>,
+    /// That of every step, `[teams][steps][pois][words]`, if it is kept.
+    record: Vec<u32>,
+    /// Agents and counts before a step, where some teams are over.
+    kept: (Vec<Agent<S>>, Vec<S::u32s>),
+}
+
+fn vectors<S: Simd>(simd: S, world: &World, teams: usize, record: usize) -> Box<dyn Vectors> {
+    let part = |first: usize| {
+        let teams = S::f32s::LEN.min(teams - first);
+        let block = Block::new(simd, world);
+        let sets = vec![0; world.pois.len() * world.constants.words as usize * S::f32s::LEN];
+        Part { block, first, teams, sets, record: vec![0; teams * record], kept: Default::default() }
+    };
+    let parts: Vec<Part<S>> = (0..teams).step_by(S::f32s::LEN).map(part).collect();
+    Box::new((simd, parts))
+}
+
+/// So many vectors are done by one thread, which takes less time than to wake another.
+const FEW: usize = 8;
+
+impl<S: Simd> Vectors for (S, Vec<Part<S>>) {
+    fn reset(&mut self, world: &World, chosen: Option<&[bool]>, starts: Option<&[Vec2]>, shown: &mut Shown) {
+        let (simd, parts) = self;
+        View::new(parts, shown).each(world, &|part, shown| {
+            simd.vectorize(
+                #[inline(always)]
+                || part.reset(*simd, world, chosen, starts, shown),
+            );
+        });
+    }
+
+    fn step(&mut self, world: &World, actions: &[f32], shown: &mut Shown) {
+        let (simd, parts) = self;
+        View::new(parts, shown).each(world, &|part, shown| {
+            simd.vectorize(
+                #[inline(always)]
+                || part.step(*simd, world, actions, shown),
+            );
+        });
+    }
+
+    fn states(&mut self, world: &World, shown: &mut Shown) {
+        let (simd, parts) = self;
+        View::new(parts, shown).each(world, &|part, shown| {
+            simd.vectorize(
+                #[inline(always)]
+                || part.states(*simd, shown),
+            );
+        });
+    }
+
+    fn episode<'a>(&'a self, team: usize, world: &World, seen: &'a mut Vec<u32>) -> Option<Episode<'a>> {
+        let (part, lane) = (&self.1[team / S::f32s::LEN], team % S::f32s::LEN);
+        let words = world.set_words();
+        let sets = part.record.get(lane * words..(lane + 1) * words)?;
+        seen.clear();
+        seen.extend(part.block.counts.iter().map(|count| count[lane]));
+        let plain = |words| Strided { words, stride: 1, offset: 0 };
+        Some(Episode { group: 0, team, sets: plain(sets), seen: Seen::Counts(plain(seen)) })
+    }
+}
+
+/// Some vectors of teams, and what is told of them.
+struct View<'a, S: Simd> {
+    parts: &'a mut [Part<S>],
+    shown: Slices<'a>,
+}
+
+/// [`Shown`] of some teams.
+struct Slices<'a> {
+    inputs: &'a mut [f32],
+    near: &'a mut [u32],
+    newly: &'a mut [bool],
+    observed: &'a mut [bool],
+    steps: &'a mut [u32],
+    positions: &'a mut [f32],
+    headings: &'a mut [f32],
+    speeds: &'a mut [f32],
+}
+
+impl<'a, S: Simd> View<'a, S> {
+    fn new(parts: &'a mut [Part<S>], shown: &'a mut Shown) -> View<'a, S> {
+        let Shown { inputs, near, newly, observed, steps, positions, headings, speeds } = shown;
+        View { parts, shown: Slices { inputs, near, newly, observed, steps, positions, headings, speeds } }
+    }
+
+    /// Does something with every vector, shared out over threads.
+    fn each(self, world: &World, act: &(impl Fn(&mut Part<S>, Slices<'_>) + Sync)) {
+        let View { parts, mut shown } = self;
+        if parts.len() > FEW {
+            let (low, high) = parts.split_at_mut(parts.len() / 2);
+            let first = shown.split(low.len() * S::f32s::LEN, world);
+            let (low, high) = (View { parts: low, shown: first }, View { parts: high, shown });
+            join(|| low.each(world, act), || high.each(world, act));
+            return;
+        }
+        for part in parts {
+            let own = shown.split(part.teams, world);
+            act(part, own);
+        }
+    }
+}
+
+impl<'a> Slices<'a> {
+    /// Takes the first teams off.
+    fn split(&mut self, teams: usize, world: &World) -> Slices<'a> {
+        fn take<'a, T>(slice: &mut &'a mut [T], count: usize) -> &'a mut [T] {
+            let (taken, rest) = std::mem::take(slice).split_at_mut(count);
+            *slice = rest;
+            taken
+        }
+        let (agents, pois) = (world.agents(), world.pois.len());
+        Slices {
+            inputs: take(&mut self.inputs, teams * world.leaders() * INPUTS),
+            near: take(&mut self.near, teams * pois * world.constants.words as usize),
+            newly: take(&mut self.newly, teams * pois),
+            observed: take(&mut self.observed, teams * pois),
+            steps: take(&mut self.steps, teams),
+            positions: take(&mut self.positions, teams * agents * 2),
+            headings: take(&mut self.headings, teams * agents * 2),
+            speeds: take(&mut self.speeds, teams * agents),
+        }
+    }
+}
+
+/// The team in a lane of a vector of so many; lanes left over repeat the first.
+#[inline(always)]
+fn team_of(lane: usize, teams: usize) -> usize {
+    if lane < teams { lane } else { 0 }
+}
+
+impl<S: Simd> Part<S> {
+    /// Every lane and its team, of those of this part.
+    #[inline(always)]
+    fn lanes(&self) -> impl Iterator<Item = (usize, usize)> + use<S> {
+        let teams = self.teams;
+        (0..S::f32s::LEN).map(move |lane| (lane, team_of(lane, teams)))
+    }
+
+    #[inline(always)]
+    fn reset(&mut self, simd: S, world: &World, chosen: Option<&[bool]>, starts: Option<&[Vec2]>, shown: Slices<'_>) {
+        let Slices { inputs, near, newly, observed, steps, .. } = shown;
+        let (agents, pois, words) = (world.agents(), world.pois.len(), world.constants.words as usize);
+        let is_chosen = |team: usize| chosen.is_none_or(|chosen| chosen[team]);
+        if !(self.first..self.first + self.teams).any(is_chosen) {
+            return;
+        }
+        let first = self.first;
+        for (lane, team) in self.lanes().filter(|&(_, team)| is_chosen(first + team)) {
+            let at = (first + team) * agents;
+            self.block.place(lane, starts.map_or(&world.starts, |starts| &starts[at..at + agents]));
+            self.block.start_lane(lane);
+        }
+        for team in (0..self.teams).filter(|team| is_chosen(self.first + team)) {
+            near[team * pois * words..][..pois * words].fill(0);
+            newly[team * pois..][..pois].fill(false);
+            observed[team * pois..][..pois].fill(false);
+            steps[team] = 0;
+            let size = self.record.len() / self.teams;
+            self.record[team * size..][..size].fill(0);
+        }
+        self.sense(simd, world, inputs);
+    }
+
+    #[inline(always)]
+    fn step(&mut self, simd: S, world: &World, actions: &[f32], shown: Slices<'_>) {
+        let Slices { inputs, near, newly, observed, steps, .. } = shown;
+        let last = world.constants.steps;
+        let over = steps.iter().filter(|&&step| step >= last).count();
+        newly.fill(false);
+        if over == self.teams {
+            return;
+        }
+        self.take(simd, world, actions);
+        if over == 0 {
+            self.block.go();
+        } else {
+            let (agents, counts) = &mut self.kept;
+            agents.clone_from(&self.block.agents);
+            counts.clone_from(&self.block.counts);
+            self.block.go();
+            self.lanes().filter(|&(_, team)| steps[team] >= last).for_each(|(lane, _)| self.keep(lane));
+        }
+        self.block.couple(&world.pois, &mut self.sets);
+        let lanes: &[f32] = bytemuck::cast_slice(&self.sets);
+        let (pois, words) = (world.pois.len(), world.constants.words as usize);
+        to_rows(
+            simd,
+            pois * words,
+            #[inline(always)]
+            |column| &lanes[column * S::f32s::LEN..][..S::f32s::LEN],
+            bytemuck::cast_slice_mut(near),
+        );
+        for (team, step) in steps.iter_mut().enumerate().filter(|(_, step)| **step < last) {
+            let near = &near[team * pois * words..][..pois * words];
+            let told = newly[team * pois..][..pois].iter_mut().zip(&mut observed[team * pois..][..pois]);
+            for ((newly, observed), (near, &coupling)) in told.zip(near.chunks_exact(words).zip(&world.coupling)) {
+                let count: u32 = near.iter().map(|word| word.count_ones()).sum();
+                *newly = !*observed & (count >= coupling);
+                *observed |= *newly;
+            }
+            if !self.record.is_empty() {
+                let at = team * world.set_words() + *step as usize * near.len();
+                self.record[at..at + near.len()].copy_from_slice(near);
+            }
+            *step += 1;
+        }
+        self.sense(simd, world, inputs);
+    }
+
+    /// Takes the actions of its teams as the policies' answers.
+    #[inline(always)]
+    fn take(&mut self, simd: S, world: &World, actions: &[f32]) {
+        let columns = world.leaders() * OUTPUTS;
+        let (actions, teams) = (&actions[self.first * columns..], self.teams);
+        for quad in 0..S::f32s::LEN / 4 {
+            let rows = [0, 1, 2, 3].map(|lane| &actions[team_of(quad * 4 + lane, teams) * columns..][..columns]);
+            let outputs = self.block.outputs.as_flattened_mut();
+            turn(
+                simd,
+                rows,
+                #[inline(always)]
+                |column, lanes| outputs[column].as_mut_slice()[quad * 4..quad * 4 + 4].copy_from_slice(lanes),
+            );
+        }
+        for output in self.block.outputs.as_flattened_mut() {
+            *output = bound::<S>(*output, splat(simd, -1.0), splat(simd, 1.0));
+        }
+    }
+
+    /// Puts a lane back to what was kept of it.
+    #[inline(always)]
+    fn keep(&mut self, lane: usize) {
+        let (agents, counts) = &self.kept;
+        for (agent, kept) in self.block.agents.iter_mut().zip(agents) {
+            agent.x[lane] = kept.x[lane];
+            agent.y[lane] = kept.y[lane];
+            agent.hx[lane] = kept.hx[lane];
+            agent.hy[lane] = kept.hy[lane];
+            agent.speed[lane] = kept.speed[lane];
+        }
+        for (count, kept) in self.block.counts.iter_mut().zip(counts) {
+            count[lane] = kept[lane];
+        }
+    }
+
+    #[inline(always)]
+    fn sense(&mut self, simd: S, world: &World, inputs: &mut [f32]) {
+        self.block.look(&world.pois);
+        let columns = self.block.inputs.as_flattened();
+        to_rows(
+            simd,
+            columns.len(),
+            #[inline(always)]
+            |column| columns[column].as_slice(),
+            inputs,
+        );
+    }
+
+    #[inline(always)]
+    fn states(&self, simd: S, shown: Slices<'_>) {
+        let agents = &self.block.agents[..];
+        to_rows(
+            simd,
+            agents.len() * 2,
+            #[inline(always)]
+            |column| {
+                let agent = &agents[column / 2];
+                if column % 2 == 0 { agent.x.as_slice() } else { agent.y.as_slice() }
+            },
+            shown.positions,
+        );
+        to_rows(
+            simd,
+            agents.len() * 2,
+            #[inline(always)]
+            |column| {
+                let agent = &agents[column / 2];
+                if column % 2 == 0 { agent.hx.as_slice() } else { agent.hy.as_slice() }
+            },
+            shown.headings,
+        );
+        to_rows(
+            simd,
+            agents.len(),
+            #[inline(always)]
+            |column| agents[column].speed.as_slice(),
+            shown.speeds,
+        );
+    }
+}
+
+/// Turns columns, a lane a team, into a row of numbers a team; lanes that have no row are left out.
+#[inline(always)]
+fn to_rows<'a, S: Simd>(simd: S, columns: usize, lanes: impl Fn(usize) -> &'a [f32], rows: &mut [f32]) {
+    let whole = columns / 4 * 4;
+    for (quad, rows) in rows.chunks_mut(columns * 4).enumerate() {
+        let four = |column: usize| &lanes(column)[quad * 4..quad * 4 + 4];
+        for at in (0..whole).step_by(4) {
+            let fours = [0, 1, 2, 3].map(|column| f32x4::from_slice(simd, four(at + column)));
+            for (row, four) in rows.chunks_exact_mut(columns).zip(transposed(fours)) {
+                four.store_slice(&mut row[at..at + 4]);
+            }
+        }
+        for column in whole..columns {
+            for (row, &number) in rows.chunks_exact_mut(columns).zip(four(column)) {
+                row[column] = number;
+            }
+        }
+    }
+}

@@ -1,0 +1,49 @@
+//! The points of a sweep as arms that are compared along one axis.
+
+use std::collections::BTreeMap;
+
+use super::{Axis, Point, Sweep};
+use crate::escape;
+
+/// The key whose values only repeat: points that differ in nothing else are one arm.
+const SEED: &str = "learning.seed";
+
+/// Points that differ in the values of one axis, and in seeds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Group<'a> {
+    /// What they have in common: "coupling 3, fitness Df". Empty where there is no other axis.
+    pub place: String,
+    /// By the axis's value: "repulsion_gain 2.0".
+    pub arms: Vec<(String, Vec<&'a Point>)>,
+}
+
+impl Sweep {
+    /// The axis of a name: its key, or that without its section.
+    pub fn axis(&self, name: &str) -> Option<usize> {
+        self.axes.iter().position(|axis| axis.key == name || axis.leaf() == name)
+    }
+
+    /// The points by the values of an axis, a group for each combination of the other axes that has two or more of them.
+    pub fn arms(&self, by: usize) -> Vec<Group<'_>> {
+        let told =
+            |axis: &Axis, value: usize| escape::line(&format!("{} {}", axis.leaf(), axis.label(value))).to_string();
+        let mut groups: BTreeMap<Vec<usize>, BTreeMap<usize, Vec<&Point>>> = BTreeMap::new();
+        for point in &self.points {
+            let of = |(at, axis): (usize, &Axis)| if at == by || axis.key == SEED { 0 } else { point.values[at] };
+            let place = self.axes.iter().enumerate().map(of).collect();
+            groups.entry(place).or_default().entry(point.values[by]).or_default().push(point);
+        }
+        groups.retain(|_, arms| arms.len() > 1);
+        let many = groups.len() > 1;
+        let groups = groups.into_iter().map(|(place, arms)| {
+            let others = self.axes.iter().zip(place).enumerate();
+            let others =
+                others.filter(|(at, (axis, value))| *at != by && axis.key != SEED && (!axis.varied || *value > 0));
+            let place: Vec<_> = others.map(|(_, (axis, value))| told(axis, value)).collect();
+            let arms = arms.into_iter().map(|(value, points)| (told(&self.axes[by], value), points));
+            let place = if many && place.is_empty() { "as in the file".into() } else { place.join(", ") };
+            Group { place, arms: arms.collect() }
+        });
+        groups.collect()
+    }
+}

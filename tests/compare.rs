@@ -1,0 +1,354 @@
+//! `flotilla compare` on runs whose metrics are known, and on a small sweep.
+
+#![cfg(feature = "cli")]
+
+use std::fmt::Write;
+use std::fs;
+use std::path::Path;
+
+use assert_cmd::cargo::cargo_bin_cmd;
+use flotilla::config::{Config, Override};
+use flotilla::record::metrics::HEADER;
+use flotilla::statistics;
+use serde_json::Value;
+use tempfile::TempDir;
+
+const WORLD: &str = "[world]\nleaders = [[10, 5], [20, 5]]\nfollowers = [[12, 2]]\npois = [[10, 15], [20, 15]]\n";
+
+/// A run in a folder: G of the best team by trial and generation, that of the champion half as much.
+fn run(folder: &TempDir, name: &str, keys: &[(&str, &str)], trials: &[&[f64]]) {
+    let set = |(key, value): &(&str, &str)| Override { key: (*key).into(), text: (*value).into(), name: (*key).into() };
+    let count = trials.len().to_string();
+    let all: Vec<Override> = [("learning.trials", &*count)].iter().chain(keys).map(set).collect();
+    let config = Config::read(WORLD, name, &[], &all).unwrap();
+    let path = folder.path().join(name);
+    fs::create_dir_all(&path).unwrap();
+    fs::write(path.join("config.toml"), config.to_toml()).unwrap();
+    let mut metrics = format!("{HEADER}\n");
+    for generation in 0..trials.iter().map(|trial| trial.len()).max().unwrap() {
+        for (number, trial) in trials.iter().enumerate().filter(|(_, trial)| trial.len() > generation) {
+            let best = trial[generation];
+            let _ = writeln!(metrics, "{number},{generation},{best},0,{},0.5", best / 2.0);
+        }
+    }
+    fs::write(path.join("metrics.csv"), metrics).unwrap();
+}
+
+/// What a command line prints, and what it tells on standard error.
+fn flotilla(folder: &Path, line: &str) -> (i32, String, String) {
+    let mut command = cargo_bin_cmd!("flotilla");
+    let output = command.current_dir(folder).args(line.split(' ')).output().unwrap();
+    let [out, told] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+    (output.status.code().unwrap(), out, told)
+}
+
+fn good(folder: &TempDir, line: &str) -> (String, String) {
+    let (code, out, told) = flotilla(folder.path(), line);
+    assert_eq!(code, 0, "{line}: {told}");
+    (out, told)
+}
+
+fn json(folder: &TempDir, line: &str) -> Value {
+    serde_json::from_str(&good(folder, &format!("{line} --json")).0).unwrap()
+}
+
+/// Fails with an exit code and a line that has these words.
+fn bad(folder: &TempDir, line: &str, code: i32, words: &[&str]) {
+    let (found, out, told) = flotilla(folder.path(), line);
+    assert_eq!((found, &*out), (code, ""), "{line}: {told}");
+    for word in words {
+        assert!(told.starts_with("error: ") && told.contains(word), "{line}: {told}");
+    }
+}
+
+fn number(value: &Value) -> f64 {
+    value.as_f64().unwrap_or_else(|| panic!("{value} is no number"))
+}
+
+const GENERATIONS: (&str, &str) = ("learning.generations", "1");
+const FITNESS_G: (&str, &str) = ("learning.fitness", "'G'");
+const SEED_1: (&str, &str) = ("learning.seed", "1");
+
+/// Trials that come from nothing to these.
+fn two(ends: &[f64]) -> Vec<[f64; 2]> {
+    ends.iter().map(|&end| [0.0, end]).collect()
+}
+
+fn slices(trials: &[[f64; 2]]) -> Vec<&[f64]> {
+    trials.iter().map(|trial| &trial[..]).collect()
+}
+
+#[test]
+fn two_arms_are_told_with_intervals_and_a_test() {
+    let folder = tempfile::tempdir().unwrap();
+    let (one, other) = ([1.0, 1.0, 0.75, 1.0, 1.0], [0.5, 0.75, 0.5, 0.5, 0.25]);
+    run(&folder, "df", &[GENERATIONS], &slices(&two(&one)));
+    run(&folder, "g", &[GENERATIONS, FITNESS_G, SEED_1], &slices(&two(&other)));
+    let (text, told) = good(&folder, "compare df g");
+    assert_eq!(told, "");
+    for words in [
+        "| arm                | trials | best team's G, generation 1 | champion's G, generation 1 | generations to G 0.75",
+        "| fitness Df, seed 0 | 5      | 0.950 [0.",
+        "| fitness G, seed 1  | 5      | 0.500 [",
+        "| 1.0 [1.0, 1.0] (5 of 5)",
+        "(1 of 5)",
+        "| best team's G, generation 1 | fitness Df, seed 0 − fitness G, seed 1 | +0.450 [",
+        "| 0.98 | 0.016 | 0.016    |",
+        "A trial that does not reach G 0.75 counts as one that does a generation after the last.",
+    ] {
+        assert!(text.contains(words), "{words:?} is not in\n{text}");
+    }
+    let told = json(&folder, "compare df g");
+    let comparison = &told["comparisons"][0];
+    assert_eq!((&told["test"], &comparison["generation"]), (&"mann-whitney".into(), &1.into()));
+    let [best, champion, reach] = [0, 1, 2].map(|measure| &comparison["measures"][measure]);
+    assert_eq!((&best["measure"], &best["generation"]), (&"best_g".into(), &1.into()));
+    // The first of the cases that scipy tells.
+    let pair = &best["pairs"][0];
+    assert!((number(&pair["a"]) - 0.98).abs() < 1e-12 && (number(&pair["p"]) - 4.0 / 252.0).abs() < 1e-12, "{pair}");
+    let difference = statistics::bootstrap(&[&one, &other]).unwrap();
+    for (key, expected) in [("value", difference.value), ("low", difference.low), ("high", difference.high)] {
+        assert!((number(&pair[key]) - expected).abs() < 1e-12, "{pair}");
+    }
+    assert_eq!((number(&champion["arms"][0]["value"]), &champion["measure"]), (0.475, &"champion_g".into()));
+    // At generation 1, or counted as at 2.
+    assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["value"])), [1.0, 1.8]);
+    assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["reached"])), [5.0, 1.0]);
+    // The other way round is the same with the other sign.
+    let turned = &json(&folder, "compare g df")["comparisons"][0]["measures"][0]["pairs"][0];
+    assert!((number(&turned["value"]) + difference.value).abs() < 1e-12);
+    assert_eq!(number(&turned["p"]), number(&pair["p"]));
+    assert!((number(&turned["a"]) - 0.02).abs() < 1e-12);
+}
+
+#[test]
+fn pairs_are_told_of_and_compared_as_pairs_where_that_is_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let (one, other) = ([1.0, 0.75, 0.5, 1.0, 0.25], [0.75, 0.5, 0.25, 0.75, 0.0]);
+    run(&folder, "df", &[GENERATIONS], &slices(&two(&one)));
+    run(&folder, "g", &[GENERATIONS, FITNESS_G], &slices(&two(&other)));
+    let (_, told) = good(&folder, "compare df g");
+    assert!(told.contains("note: these arms have one seed") && told.contains("--paired"), "{told}");
+    let (text, told) = good(&folder, "compare df g --paired");
+    assert!(told.is_empty() && text.contains("Wilcoxon's signed ranks"), "{told}{text}");
+    let told = json(&folder, "compare df g --paired");
+    let pair = &told["comparisons"][0]["measures"][0]["pairs"][0];
+    // Every pair a quarter apart: the least p of five.
+    assert_eq!(["value", "low", "high", "a", "p"].map(|key| number(&pair[key])), [0.25, 0.25, 0.25, 1.0, 2.0 / 32.0]);
+    let loose = &json(&folder, "compare df g")["comparisons"][0]["measures"][0]["pairs"][0];
+    assert!(number(&loose["p"]) > 0.3 && number(&loose["a"]) < 0.8, "{loose}");
+
+    run(&folder, "seed", &[GENERATIONS, SEED_1], &slices(&two(&one)));
+    run(&folder, "more", &[GENERATIONS, FITNESS_G], &slices(&two(&[1.0; 6])));
+    bad(&folder, "compare df seed --paired", 2, &["--paired: ", "no pairs"]);
+    bad(&folder, "compare df more --paired", 2, &["--paired: ", "numbers of trials"]);
+    let uneven = &json(&folder, "compare df more")["comparisons"][0];
+    assert_eq!([0, 1].map(|arm| number(&uneven["arms"][arm]["trials"])), [5.0, 6.0]);
+}
+
+#[test]
+fn arms_that_are_alike_do_not_differ() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["a", "b_50%"] {
+        run(&folder, name, &[GENERATIONS], &slices(&two(&[0.5; 4])));
+    }
+    let told = json(&folder, "compare a b_50%");
+    for measure in told["comparisons"][0]["measures"].as_array().unwrap() {
+        let pair = &measure["pairs"][0];
+        let found = ["value", "low", "high", "a", "p", "p_holm"].map(|key| number(&pair[key]));
+        assert_eq!(found, [0.0, 0.0, 0.0, 0.5, 1.0, 1.0], "{measure}");
+    }
+    // Nothing sets them apart but where they are.
+    let (text, _) = good(&folder, "compare a b_50% --latex");
+    assert!(
+        text.starts_with("% Means over trials")
+            && text.contains(r"best team's G, generation 1 & a $-$ b\_50\% & +0.000")
+    );
+    for (open, close) in [(r"\begin{tabular}", r"\end{tabular}"), ("{", "}")] {
+        assert_eq!(text.matches(open).count(), text.matches(close).count(), "{text}");
+    }
+    let columns = |line: &str| line.matches(" & ").count();
+    let rows: Vec<usize> = text.lines().filter(|line| line.contains(r" \\")).map(columns).collect();
+    assert_eq!(rows, [4, 4, 4, 5, 5, 5, 5], "{text}");
+}
+
+#[test]
+fn many_pairs_are_corrected_and_every_form_says_the_same() {
+    let folder = tempfile::tempdir().unwrap();
+    let ends = [[0.0, 0.25, 0.25, 0.0, 0.5, 0.25], [0.5, 0.75, 0.5, 0.5, 0.25, 0.5], [1.0, 1.0, 0.75, 1.0, 1.0, 0.5]];
+    for (name, ends) in ["x", "y", "z"].into_iter().zip(&ends) {
+        run(&folder, name, &[GENERATIONS], &slices(&two(ends)));
+    }
+    let told = json(&folder, "compare x y z --at 0,last,1 --reach 1");
+    let measures = told["comparisons"][0]["measures"].as_array().unwrap();
+    // The last generation is 1, and told once.
+    let names: Vec<_> =
+        measures.iter().map(|measure| (measure["measure"].as_str().unwrap(), number(&measure["generation"]))).collect();
+    let expected =
+        [("best_g", 0.0), ("best_g", 1.0), ("champion_g", 0.0), ("champion_g", 1.0), ("generations_to_reach", 1.0)];
+    assert_eq!(names, expected);
+    let pairs = measures[1]["pairs"].as_array().unwrap();
+    let p: Vec<f64> =
+        [[0, 1], [0, 2], [1, 2]].iter().map(|[a, b]| statistics::rank_sum(&ends[*a], &ends[*b]).unwrap().p).collect();
+    assert_eq!(pairs.iter().map(|pair| number(&pair["p"])).collect::<Vec<_>>(), p);
+    assert_eq!(pairs.iter().map(|pair| number(&pair["p_holm"])).collect::<Vec<_>>(), statistics::holm(&p));
+    assert!(number(&pairs[0]["p_holm"]) > p[0], "{pairs:?}");
+
+    let (text, _) = good(&folder, "compare x y z --at 0,last,1 --reach 1 --csv");
+    let mut table = csv::Reader::from_reader(text.as_bytes());
+    let rows: Vec<std::collections::HashMap<String, String>> = table.deserialize().map(Result::unwrap).collect();
+    assert_eq!(rows.len(), 5 * (3 + 3));
+    let row =
+        rows.iter().find(|row| row["measure"] == "best_g" && row["generation"] == "1" && row["other"] == "z").unwrap();
+    assert_eq!((&*row["arm"], &*row["trials"], &*row["other_trials"]), ("x", "6", "6"));
+    for key in ["value", "low", "high", "a", "p", "p_holm"] {
+        assert_eq!(row[key].parse::<f64>().unwrap(), number(&pairs[1][key]), "{key}");
+    }
+    let row = rows.iter().find(|row| row["reach"] == "1" && row["arm"] == "z" && row["other"].is_empty()).unwrap();
+    assert_eq!((&*row["reached"], &*row["value"]), ("4", &*(1.0 + 2.0 / 6.0).to_string()));
+}
+
+#[test]
+fn unfinished_runs_are_compared_as_far_as_they_are_and_that_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    const WHOLE: [f64; 11] = [0.0, 0.5, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0];
+    let ten = ("learning.generations", "10");
+    run(&folder, "whole", &[ten], &[&WHOLE[..]; 3]);
+    // The last trial is a generation behind, and a line is cut short.
+    run(&folder, "part", &[ten, FITNESS_G], &[&[0.0, 0.5, 0.75, 1.0], &[0.0, 0.0, 0.0, 1.0], &[0.5, 0.75, 0.5]]);
+    let metrics = folder.path().join("part/metrics.csv");
+    fs::write(&metrics, fs::read_to_string(&metrics).unwrap() + "2,3,1,0.").unwrap();
+    let (text, told) = good(&folder, "compare whole part");
+    assert!(told.contains("note: fitness G has come to generation 2 of 10\n"), "{told}");
+    assert!(told.contains("note: arms are compared up to generation 2, which all have come to\n"), "{told}");
+    assert!(text.contains("best team's G, generation 2"), "{text}");
+    let told = json(&folder, "compare whole part");
+    let reach = &told["comparisons"][0]["measures"][2];
+    // What is reached later is not known of all: 3, 3, 3, and 2, 3, 1.
+    assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["value"])), [3.0, 2.0]);
+    assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["reached"])), [0.0, 2.0]);
+    bad(&folder, "compare whole part --at 3", 2, &["--at 3: ", "generation 2"]);
+
+    // Runs of different lengths are told of, too.
+    run(&folder, "short", &[GENERATIONS], &slices(&two(&[0.5, 1.0])));
+    let (_, told) = good(&folder, "compare whole short");
+    assert_eq!(
+        told.lines().next(),
+        Some("note: arms are compared up to generation 1, which all have come to"),
+        "{told}"
+    );
+
+    fs::write(&metrics, fs::read_to_string(&metrics).unwrap().replace("\n1,1,", "\n1,2,")).unwrap();
+    bad(&folder, "compare whole part", 1, &["metrics.csv: trial 1 of generation 2 is out of turn"]);
+}
+
+#[test]
+fn what_cannot_be_compared_is_refused_in_a_line() {
+    let folder = tempfile::tempdir().unwrap();
+    run(&folder, "a", &[GENERATIONS], &slices(&two(&[0.5; 4])));
+    run(&folder, "b", &[GENERATIONS, FITNESS_G], &slices(&two(&[0.5; 4])));
+    run(&folder, "one", &[GENERATIONS, FITNESS_G], &slices(&two(&[0.5])));
+    run(&folder, "torn", &[GENERATIONS, FITNESS_G], &[&[0.5, 0.5], &[]]);
+    fs::create_dir(folder.path().join("paper")).unwrap();
+    fs::write(folder.path().join("paper/paper.toml"), "seed = 0\n").unwrap();
+    bad(&folder, "compare a", 2, &["a is one run", "another"]);
+    bad(&folder, "compare a b ./a", 2, &["./a is named twice"]);
+    bad(&folder, "compare a one", 1, &["one trial", "--trials"]);
+    bad(&folder, "compare a torn", 1, &["no generation that every trial has come to"]);
+    bad(&folder, "compare a none", 1, &["none: no such folder", "flotilla train"]);
+    bad(&folder, "compare none", 1, &["none: no such folder"]);
+    bad(&folder, "compare paper a", 1, &["paper holds a paper", "arms/"]);
+    bad(&folder, "compare a b --at 2", 2, &["--at 2: ", "generation 1"]);
+    bad(&folder, "compare a b --at then", 2, &["allowed generations, from 0, or last"]);
+    bad(&folder, "compare a b --reach 2", 2, &["0..1"]);
+    bad(&folder, "compare a b --by fitness", 2, &["--by fitness: ", "sweep"]);
+    bad(&folder, "compare a b --json --csv", 2, &["--json", "--csv"]);
+    let many = (0..25).map(|at| format!(" r{at}")).collect::<String>();
+    bad(&folder, &format!("compare{many}"), 2, &["25 runs are too many", "24 at most"]);
+    assert_eq!(flotilla(folder.path(), "compare").0, 2);
+}
+
+/// Two couplings, two fitnesses and two seeds, by which trials are only more.
+const SWEEP: &str = "\
+[learning]
+population = 8
+trials = 3
+generations = 2
+[grid]
+\"world.coupling\" = [1, 2]
+\"learning.fitness\" = [\"G\", \"Df\"]
+\"learning.seed\" = [4, 5]
+";
+
+#[test]
+fn a_sweep_is_compared_along_an_axis_and_seeds_are_more_trials() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("x.toml"), format!("{WORLD}{SWEEP}")).unwrap();
+    good(&folder, "sweep x.toml --out s --backend cpu --quiet");
+    bad(&folder, "compare s", 2, &["several axes", "--by", "world.coupling, learning.fitness, learning.seed"]);
+    bad(&folder, "compare s --by steps", 2, &["--by steps: ", "world.coupling, learning.fitness"]);
+    let told = json(&folder, "compare s --by fitness");
+    let comparisons = told["comparisons"].as_array().unwrap();
+    let places: Vec<_> = comparisons.iter().map(|comparison| &comparison["where"]).collect();
+    assert_eq!(places, ["coupling 1", "coupling 2"]);
+    // Points in order: coupling, fitness, seed. Coupling 2 with Df are 6 and 7.
+    let arm = &comparisons[1]["arms"][1];
+    assert_eq!((&arm["name"], &arm["trials"]), (&"fitness Df".into(), &6.into()));
+    assert_eq!(arm["folders"], serde_json::json!(["s/points/0006", "s/points/0007"]));
+    let ends: Vec<f64> = ["0006", "0007"]
+        .iter()
+        .flat_map(|point| {
+            let text = fs::read_to_string(folder.path().join("s/points").join(point).join("metrics.csv")).unwrap();
+            let last = text.lines().filter(|line| line.split(',').nth(1) == Some("2"));
+            last.map(|line| line.split(',').nth(2).unwrap().parse().unwrap()).collect::<Vec<f64>>()
+        })
+        .collect();
+    assert_eq!(ends.len(), 6);
+    let value = &comparisons[1]["measures"][0]["arms"][1]["value"];
+    assert_eq!(number(value), statistics::bootstrap(&[&ends]).unwrap().value);
+    let (text, _) = good(&folder, "compare s --by learning.fitness --paired");
+    assert!(text.starts_with("coupling 1\n\n| arm") && text.contains("\ncoupling 2\n\n"), "{text}");
+    // Seeds themselves are compared where that is asked for, fitness by fitness.
+    assert_eq!(json(&folder, "compare s --by seed")["comparisons"].as_array().unwrap().len(), 4);
+
+    fs::remove_dir_all(folder.path().join("s/points/0006")).unwrap();
+    fs::remove_dir_all(folder.path().join("s/points/0002")).unwrap();
+    fs::remove_dir_all(folder.path().join("s/points/0003")).unwrap();
+    let (_, note) = good(&folder, "compare s --by fitness");
+    assert!(note.contains("note: s/points/0006 was not run, and is left out: world.coupling = 2"), "{note}");
+    let told = json(&folder, "compare s --by fitness");
+    assert_eq!(told["comparisons"].as_array().unwrap().len(), 1);
+    assert_eq!(told["comparisons"][0]["arms"][1]["trials"], 3);
+    fs::remove_dir_all(folder.path().join("s/points")).unwrap();
+    bad(
+        &folder,
+        "compare s --by fitness",
+        1,
+        &["no two values of learning.fitness", "flotilla sweep s/sweep.toml --out s --resume"],
+    );
+}
+
+#[test]
+fn a_varied_key_is_compared_with_the_files_own_value() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = "[learning]\npopulation = 8\ntrials = 2\ngenerations = 1\n[grid]\n\"learning.fitness\" = [\"G\", \"Df\"]\n\
+                [vary]\n\"motion.max_speed\" = [2.0, 5.0]\n\"world.steps\" = [8]\n";
+    fs::write(folder.path().join("x.toml"), format!("{WORLD}{text}")).unwrap();
+    good(&folder, "sweep x.toml --out s --backend cpu --quiet");
+    let told = json(&folder, "compare s --by max_speed");
+    let names = |comparison: &Value| {
+        let arms = comparison["arms"].as_array().unwrap().iter();
+        arms.map(|arm| arm["name"].as_str().unwrap().to_string()).collect::<Vec<_>>()
+    };
+    let comparisons = told["comparisons"].as_array().unwrap();
+    assert_eq!(
+        comparisons.iter().map(|comparison| &comparison["where"]).collect::<Vec<_>>(),
+        ["fitness G", "fitness Df"]
+    );
+    assert_eq!(names(&comparisons[0]), ["max_speed 3.0", "max_speed 2.0", "max_speed 5.0"]);
+    // By a key of the grid: also where one of the others is varied.
+    let told = json(&folder, "compare s --by fitness");
+    let places: Vec<_> =
+        told["comparisons"].as_array().unwrap().iter().map(|comparison| &comparison["where"]).collect();
+    assert_eq!(places, ["as in the file", "steps 8", "max_speed 2.0", "max_speed 5.0"]);
+}

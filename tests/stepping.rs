@@ -1,0 +1,264 @@
+//! Teams stepped by hand come to what a backend's traces say, whatever instruction set, number of teams and order of
+//! resets; what cannot be stepped is told, and nothing moves then.
+
+use std::ops::Range;
+
+use flotilla::backend::cpu::{Cpu, level_name};
+use flotilla::backend::{Backend, Episode, Group, Moment, Need, Seen, Strided, Trace};
+use flotilla::config::{Config, Fitness, MAX_POPULATION};
+use flotilla::credit::{Credit, Scores};
+use flotilla::evaluate::Starts;
+use flotilla::sample;
+use flotilla::stepping::{StepError, Stepper};
+use flotilla::world::World;
+use glam::Vec2;
+
+/// What teams of random policies do from some starts.
+struct Played {
+    world: World,
+    starts: Vec<Vec2>,
+    trace: Trace,
+}
+
+impl Played {
+    fn new(seed: u64, teams: usize) -> Played {
+        let world = World::new(&sample::world(seed));
+        let starts = match seed % 2 {
+            0 => world.starts.clone(),
+            _ => Starts::Drawn { episodes: 1, seed, jitter: 0.7 }.of(0, &world),
+        };
+        let weights = sample::weights(&world, teams, seed);
+        let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; world.leaders()]).collect();
+        let weights = weights[..].into();
+        let group =
+            Group { world: &world, starts: &starts, weights, policies: teams, teams: &order, need: Need::Record };
+        let trace = Cpu::default().trace(&group).expect("the group fits the world");
+        Played { world, starts, trace }
+    }
+
+    /// What the leaders of a team answered at a step, from 0.
+    fn actions(&self, step: usize, team: usize) -> impl Iterator<Item = f32> {
+        (0..self.world.leaders()).flat_map(move |leader| self.trace.moment(step + 1, team, leader).outputs)
+    }
+
+    fn starts_of(&self, teams: usize) -> Vec<f32> {
+        bytemuck::cast_slice(&self.starts).repeat(teams)
+    }
+
+    /// What a stepper's team in a step is to look like, place by place in bits.
+    fn check(&self, stepper: &mut Stepper, step: usize, team: usize, about: &str) {
+        let (leaders, agents) = (self.world.leaders(), self.world.agents());
+        let about = format!("{about}, team {team}, step {step}");
+        let bits = |numbers: &[f32]| numbers.iter().map(|number| number.to_bits()).collect::<Vec<_>>();
+        let moments = |step: usize, count| (0..count).map(move |agent| *self.trace.moment(step, team, agent));
+        if step < self.world.steps() {
+            let sensed: Vec<f32> = moments(step + 1, leaders).flat_map(|moment| moment.inputs).collect();
+            assert_eq!(
+                bits(&stepper.inputs()[team * sensed.len()..][..sensed.len()]),
+                bits(&sensed),
+                "inputs, {about}"
+            );
+        }
+        let states = stepper.states();
+        let expected: [Vec<f32>; 3] = [
+            moments(step, agents).flat_map(|Moment { position, .. }| position).collect(),
+            moments(step, agents).flat_map(|Moment { heading, .. }| heading).collect(),
+            moments(step, agents).map(|Moment { speed, .. }| speed).collect(),
+        ];
+        for (found, expected) in [states.positions, states.headings, states.speeds].into_iter().zip(expected) {
+            assert_eq!(bits(&found[team * expected.len()..][..expected.len()]), bits(&expected), "states, {about}");
+        }
+        let (pois, words) = (self.world.pois.len(), self.world.constants.words as usize);
+        let sets = self.trace.sets[team * self.world.set_words()..][..self.world.set_words()].chunks(pois * words);
+        let sets: Vec<&[u32]> = sets.collect();
+        let now = step.checked_sub(1).map_or(vec![0; pois * words], |step| sets[step].to_vec());
+        assert_eq!(stepper.near()[team * now.len()..][..now.len()], now, "near, {about}");
+        let enough = |range: Range<usize>, poi: usize| {
+            let count = |step: &usize| sets[*step][poi * words..][..words].iter().map(|word| word.count_ones()).sum();
+            range.into_iter().any(|step| {
+                let count: u32 = count(&step);
+                count >= self.world.coupling[poi]
+            })
+        };
+        let observed: Vec<bool> = (0..pois).map(|poi| enough(0..step, poi)).collect();
+        let before: Vec<bool> = (0..pois).map(|poi| enough(0..step.saturating_sub(1), poi)).collect();
+        let newly: Vec<bool> = observed.iter().zip(before).map(|(&observed, before)| observed && !before).collect();
+        assert_eq!(stepper.observed()[team * pois..][..pois], observed, "observed, {about}");
+        assert_eq!(stepper.steps()[team] as usize, step, "{about}");
+        assert_eq!(stepper.is_over(team), step == self.world.steps(), "{about}");
+        // A team that was over before the last step observed nothing by it: its caller knows.
+        if step < self.world.steps() || stepper.newly_observed()[team * pois..][..pois].contains(&true) {
+            assert_eq!(stepper.newly_observed()[team * pois..][..pois], newly, "newly observed, {about}");
+        }
+    }
+
+    fn scores(&self, team: usize) -> Scores {
+        let (sets, seen) = (self.world.set_words(), self.world.leaders() * self.world.followers());
+        let plain = |words| Strided { words, stride: 1, offset: 0 };
+        let episode = Episode {
+            group: 0,
+            team,
+            sets: plain(&self.trace.sets[team * sets..][..sets]),
+            seen: Seen::Counts(plain(&self.trace.seen[team * seen..][..seen])),
+        };
+        Credit::default().all(&episode, &self.world)
+    }
+}
+
+#[test]
+fn a_policys_own_answers_give_the_bits_of_its_trace() {
+    for level in Cpu::levels() {
+        // Less than the lanes, as many, one more, and more vectors than one thread takes.
+        for (seed, teams) in (0..40).zip([1, 3, 16, 17, 37, 150].into_iter().cycle()) {
+            let played = Played::new(seed, teams);
+            let about = format!("seed {seed}, {teams} teams, {}", level_name(level));
+            let stepper = Stepper::at_level(level, played.world.clone(), teams, true);
+            let mut stepper = stepper.unwrap_or_else(|error| panic!("{about}: {error}"));
+            stepper.reset_to(&played.starts_of(teams)).expect("they are on the map");
+            let mut observed = vec![0; teams];
+            for step in 0..=played.world.steps() {
+                (0..teams).for_each(|team| played.check(&mut stepper, step, team, &about));
+                let newly = stepper.newly_observed().chunks(played.world.pois.len());
+                observed.iter_mut().zip(newly).for_each(|(sum, newly)| {
+                    *sum += newly.iter().filter(|&&newly| newly).count() as u32;
+                });
+                if step < played.world.steps() {
+                    let actions: Vec<f32> = (0..teams).flat_map(|team| played.actions(step, team)).collect();
+                    stepper.step(&actions).unwrap_or_else(|error| panic!("{about}: {error}"));
+                }
+            }
+            let leaders = played.world.leaders();
+            let mut dpp = vec![-1.0; teams * leaders];
+            stepper.fitness(Fitness::Dpp, &mut dpp).expect("a record is kept");
+            for (team, dpp) in dpp.chunks(leaders).enumerate() {
+                let scores = played.scores(team);
+                assert_eq!(stepper.scores(team).as_ref(), Ok(&scores), "{about}, team {team}");
+                assert_eq!((scores.observed, &scores.dpp[..]), (observed[team], dpp), "{about}, team {team}");
+            }
+        }
+    }
+}
+
+/// Teams start again at different times, and stand still in between.
+#[test]
+fn each_team_has_its_own_time() {
+    for (seed, level) in (0..20).zip(Cpu::levels().into_iter().cycle()) {
+        let teams = 21;
+        let played = Played::new(seed, teams);
+        let (last, starts) = (played.world.steps(), played.starts_of(teams));
+        let stepper = Stepper::at_level(level, played.world.clone(), teams, true);
+        let mut stepper = stepper.unwrap_or_else(|error| panic!("{error}"));
+        stepper.reset_to(&starts).expect("they are on the map");
+        let mut steps = vec![0; teams];
+        let mut over = 0;
+        for tick in 0..3 * last {
+            let actions: Vec<f32> = (0..teams)
+                .flat_map(|team| match steps[team] {
+                    step if step < last => played.actions(step, team).collect::<Vec<_>>(),
+                    _ => vec![0.3; 2 * played.world.leaders()],
+                })
+                .collect();
+            stepper.step(&actions).expect("they are actions");
+            over += steps.iter().filter(|&&step| step == last).count();
+            steps.iter_mut().for_each(|step| *step = last.min(*step + 1));
+            // Some after their end, some in the middle, the first by itself too.
+            let chosen: Vec<bool> = (0..teams).map(|team| (tick * 7 + team * 5).is_multiple_of(2 * last)).collect();
+            stepper.reset_some(&chosen, Some(&starts)).expect("they are on the map");
+            for (team, step) in steps.iter_mut().enumerate() {
+                *step = if chosen[team] { 0 } else { *step };
+                played.check(&mut stepper, *step, team, &format!("seed {seed}, {}", level_name(level)));
+                if *step == last {
+                    assert_eq!(stepper.scores(team), Ok(played.scores(team)), "seed {seed}, team {team}");
+                }
+            }
+        }
+        assert!(over > teams, "hardly any team was stepped after its end");
+    }
+}
+
+fn world() -> World {
+    let text = include_str!("../configs/generally_forward.toml");
+    World::new(&Config::parse(text, "generally_forward.toml").expect("the project's own config"))
+}
+
+#[test]
+fn what_cannot_be_stepped_is_told_and_nothing_moves() {
+    let world = world();
+    assert!(matches!(Stepper::new(world.clone(), 0), Err(StepError::Teams(0))));
+    assert!(matches!(Stepper::new(world.clone(), MAX_POPULATION + 1), Err(StepError::Teams(_))));
+    assert!(matches!(Stepper::new(world.clone(), usize::MAX), Err(StepError::Teams(_))));
+    let misfit = World { coupling: vec![], ..world.clone() };
+    assert!(matches!(Stepper::new(misfit, 1), Err(StepError::World("POIs"))));
+
+    let mut stepper = Stepper::new(world.clone(), 3).expect("three teams are few");
+    let (good, leaders) = ([0.25; 24], world.leaders());
+    stepper.step(&good).expect("they are actions");
+    let before = (stepper.inputs().to_vec(), stepper.states().positions.to_vec(), stepper.steps().to_vec());
+    let tell = |error: Result<(), StepError>| error.expect_err("it is refused").to_string();
+    let mut told = vec![
+        tell(stepper.step(&good[1..])),
+        tell(stepper.step(&[])),
+        tell(stepper.reset_to(&[1.0; 71])),
+        tell(stepper.reset_some(&[true; 2], None)),
+        tell(stepper.reset_some(&[true, false, true], Some(&[f32::NAN; 72]))),
+        tell(stepper.fitness(Fitness::D, &mut [0.0; 11])),
+        tell(stepper.fitness(Fitness::D, &mut [0.0; 12])),
+        tell(stepper.scores(1).map(drop)),
+        tell(stepper.scores(3).map(drop)),
+    ];
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let mut actions = good;
+        actions[(leaders + 2) * 2 + 1] = bad;
+        told.push(tell(stepper.step(&actions)));
+    }
+    for at in [-0.001, 50.001, f32::NAN, f32::INFINITY] {
+        let mut starts = [1.0; 72];
+        starts[2 * 24 + 2 * 5 + 1] = at;
+        told.push(tell(stepper.reset_to(&starts)));
+        // Who is not chosen may be anywhere.
+        let mut other = Stepper::new(world.clone(), 3).expect("three teams are few");
+        other.reset_some(&[true, true, false], Some(&starts)).expect("the others are on the map");
+    }
+    let expected = [
+        "23 actions, but [teams][leaders][2] are 24",
+        "0 actions, but [teams][leaders][2] are 24",
+        "71 coordinates, but [teams][agents][2] are 72",
+        "2 choices, but [teams] are 3",
+        "agent 0 of team 0 would start at (NaN, NaN), which is not on the map",
+        "11 scores, but [teams][leaders] are 12",
+        "no record was kept to score teams by",
+        "no record was kept to score teams by",
+        "team 3 of 3 (they count from 0)",
+        "the speed of leader 2 in team 1 is NaN, which is no finite number",
+        "the speed of leader 2 in team 1 is inf, which is no finite number",
+        "the speed of leader 2 in team 1 is -inf, which is no finite number",
+        "agent 5 of team 2 would start at (1, -0.001), which is not on the map",
+        "agent 5 of team 2 would start at (1, 50.001), which is not on the map",
+        "agent 5 of team 2 would start at (1, NaN), which is not on the map",
+        "agent 5 of team 2 would start at (1, inf), which is not on the map",
+    ];
+    assert_eq!(told, expected);
+    assert_eq!((stepper.inputs().to_vec(), stepper.states().positions.to_vec(), stepper.steps().to_vec()), before);
+}
+
+#[test]
+fn actions_are_taken_within_their_range_and_starts_on_the_grid() {
+    let world = world();
+    let positions = |action: [f32; 2], starts: Option<&[f32]>| {
+        let mut stepper = Stepper::new(world.clone(), 5).expect("five teams are few");
+        starts.into_iter().for_each(|starts| stepper.reset_to(starts).expect("they are on the map"));
+        (0..10).for_each(|_| stepper.step(&action.repeat(5 * world.leaders())).expect("they are actions"));
+        stepper.states().positions.to_vec()
+    };
+    assert_eq!(positions([7.0, 1e30], None), positions([1.0, 1.0], None));
+    assert_eq!(positions([-1.5, -9.0], None), positions([-1.0, -1.0], None));
+    assert_ne!(positions([1.0, 0.9], None), positions([1.0, 1.0], None));
+
+    let on_grid: Vec<f32> = bytemuck::cast_slice(&world.starts).repeat(5);
+    assert_eq!(positions([0.1, 0.2], Some(&on_grid)), positions([0.1, 0.2], None));
+    // Between two places of the grid, nearer to the first.
+    let beside: Vec<f32> =
+        on_grid.iter().map(|at| at + if *at < 16.0 { 1.0 / (1 << 20) as f32 } else { 0.0 }).collect();
+    assert_ne!(beside, on_grid);
+    assert_eq!(positions([0.1, 0.2], Some(&beside)), positions([0.1, 0.2], None));
+}
