@@ -999,7 +999,9 @@ impl GpuEpisodes {
 /// The whole shader that packs records, with its constants in front.
 fn packing() -> String {
     let most = WORKGROUPS[WORKGROUPS.len() - 1].max(TEAMS[0]);
+    let structs = [model::declarations(), Task::wgsl(), State::wgsl(), Moment::wgsl()].concat();
     exact::assemble(&[
+        &structs,
         &format!(
             "const WORKGROUP: u32 = {PACK_WORKGROUP}u;\nconst TEAMS: u32 = {most}u;\nconst NOWHERE: u32 = {NOWHERE}u;"
         ),
