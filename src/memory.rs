@@ -1,27 +1,21 @@
 //! What a run takes in memory at its peak, told before it starts.
 //!
-//! Every array that grows with the run is counted as it is laid out where it lives: [`crate::trainer`] for what every
-//! run has, [`crate::backend::cpu`] and [`crate::backend::gpu::episode`] for what episodes take. What does not grow is
-//! [`PROGRAM`]. Nothing else is as large: checkpoints and policies are written straight from the populations, or from
+//! Every array that grows with the run is counted where it lives: [`trainer`] tells what every run has, [`backend`] what
+//! episodes take. What does not grow is [`PROGRAM`]. Nothing else is as large: checkpoints and policies are written straight from the populations, or from
 //! one copy, see [`copies_checkpoint`]. A sweep keeps its batches to half of what is available.
 
 use std::fs;
 use std::path::Path;
 
-use fearless_simd::{Level, Simd, dispatch, prelude::*};
-
-use crate::backend::{HELD_FROM, PACKED_FROM};
+use crate::backend::{self, BATCH_BYTES, PACKED_FROM, cpu};
 use crate::config::Config;
+use crate::trainer;
 use crate::world::World;
 
 /// Bytes of the program itself: its code, its threads' stacks and what it reads. A GPU's driver comes on top.
 pub const PROGRAM: u64 = 8 << 20;
 /// Most bytes of populations of which a checkpoint takes a copy, to be written while training goes on.
 const COPIED: u64 = 64 << 20;
-/// Words that an episode of a trial takes in a batch, whoever plays it.
-const EPISODE: u64 = 40;
-/// Bytes of one buffer that a batch on a GPU aims for.
-const BATCH: u64 = 256 << 20;
 
 /// Peaks, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,23 +47,22 @@ pub struct TooLittle {
 impl Plan {
     /// What it takes to train these (valid) configs side by side, on so many threads.
     pub fn of<'a>(configs: impl IntoIterator<Item = &'a Config>, threads: usize) -> Plan {
-        let lanes = lanes(Level::new());
+        let lanes = cpu::lanes();
         let [mut training, mut checkpoint, mut queue, mut weights, mut record] = [0_u64; 5];
         let [mut block, mut order, mut populations, mut held] = [0_u64; 4];
         for config in configs {
             let world = World::new(config);
-            let sizes = Sizes::of(config);
-            training += sizes.training();
-            checkpoint += sizes.checkpoint(config);
-            queue += (sizes.trials * sizes.episodes * sizes.slots).div_ceil(lanes) * 16;
-            block = block.max(block_bytes(&world, lanes));
-            order = order.max(sizes.policies * size_of::<usize>() as u64);
-            populations += sizes.trials * sizes.leaders;
-            held += sizes.held();
-            let teams = sizes.trials * sizes.episodes * sizes.slots;
-            weights = weights.saturating_add(teams * sizes.leaders * sizes.parameters.next_multiple_of(4) * 4);
-            let words = (world.set_words() + world.followers() * world.leaders()) as u64;
-            record = teams.saturating_mul(4 * words).saturating_add(record);
+            let (trials, policies) = (config.learning.trials as u64, config.learning.population);
+            let teams = trials * config.learning.episodes_per_team as u64 * (policies as u64 + 1);
+            training += trainer::bytes(config);
+            checkpoint += checkpoint_bytes(config);
+            queue += teams.div_ceil(lanes) * 16;
+            block = block.max(cpu::block_bytes(&world));
+            order = order.max((policies * size_of::<usize>()) as u64);
+            populations += trials * world.leaders() as u64;
+            held += trials * backend::held_bytes([world.leaders(), policies + 1, world.parameters()]);
+            weights = weights.saturating_add(teams * backend::weight_bytes(&world));
+            record = teams.saturating_mul(backend::record_bytes(&world)).saturating_add(record);
         }
         // Episodes and the final sorting of each population take turns.
         let playing = threads as u64 * block + queue;
@@ -77,7 +70,7 @@ impl Plan {
         let always = PROGRAM + training + checkpoint;
         // A batch ends where the larger of its two large buffers is full; two are under way.
         let share = |bytes: u64, batches: u64| {
-            let batch = u128::from(bytes) * u128::from(BATCH) / u128::from(weights.max(record).max(1));
+            let batch = u128::from(bytes) * u128::from(BATCH_BYTES) / u128::from(weights.max(record).max(1));
             bytes.min(batch as u64 * batches)
         };
         // What is packed of a record takes at most as much again, and where it does not fit the record comes whole.
@@ -115,81 +108,13 @@ pub fn check(needed: u64, checkpoint: u64) -> Result<(), TooLittle> {
 /// Whether a checkpoint of these configs' trainer is a copy, written while training goes on. Larger ones are written
 /// from the populations themselves, and training waits.
 pub fn copies_checkpoint<'a>(configs: impl IntoIterator<Item = &'a Config>) -> bool {
-    configs.into_iter().map(|config| Sizes::of(config).snapshot()).sum::<u64>() <= COPIED
+    configs.into_iter().map(trainer::snapshot_bytes).sum::<u64>() <= COPIED
 }
 
-/// Counts of a config, for arithmetic.
-struct Sizes {
-    trials: u64,
-    leaders: u64,
-    policies: u64,
-    /// The policies and the champion.
-    slots: u64,
-    parameters: u64,
-    agents: u64,
-    episodes: u64,
-}
-
-impl Sizes {
-    fn of(config: &Config) -> Sizes {
-        let learning = &config.learning;
-        Sizes {
-            trials: learning.trials as u64,
-            leaders: config.learners() as u64,
-            policies: learning.population as u64,
-            slots: learning.population as u64 + 1,
-            parameters: config.parameters() as u64,
-            agents: (config.world.leaders.len() + config.world.followers.len()) as u64,
-            episodes: learning.episodes_per_team as u64,
-        }
-    }
-
-    /// A trainer's trials.
-    fn training(&self) -> u64 {
-        let Sizes { trials, leaders, policies, slots, parameters, agents, episodes } = self;
-        let weights = 2 * leaders * slots * parameters;
-        let orders_and_fitness = 2 * leaders * policies;
-        let teams_and_parents = 2 * leaders * slots;
-        let observed_and_scores = episodes * slots * (1 + leaders);
-        // Each episode's start positions, and its place in a batch.
-        let starts = episodes * (2 * agents + EPISODE);
-        4 * trials * (weights + orders_and_fitness + teams_and_parents + observed_and_scores + starts)
-    }
-
-    /// What a GPU holds of the populations by itself: a buffer a leader and one more, and every slot's parent.
-    fn held(&self) -> u64 {
-        let Sizes { trials, leaders, slots, parameters, .. } = self;
-        let population = 4 * slots * parameters;
-        let parents = 4 * leaders * slots;
-        if leaders * population < HELD_FROM { 0 } else { trials * ((leaders + 1) * population + parents) }
-    }
-
-    /// The numbers of a snapshot.
-    fn snapshot(&self) -> u64 {
-        4 * self.trials * self.leaders * (self.slots * self.parameters + self.policies)
-    }
-
-    /// What a checkpoint copies.
-    fn checkpoint(&self, config: &Config) -> u64 {
-        let due = config.checkpoint.generations > 0 || config.checkpoint.seconds > 0.0;
-        if due && self.snapshot() <= COPIED { self.snapshot() } else { 0 }
-    }
-}
-
-/// The CPU backend's state of one vector of teams.
-fn block_bytes(world: &World, lanes: u64) -> u64 {
-    let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
-    let words =
-        8 * agents + leaders * world.constants.policy.words() + 3 * followers + world.set_words() + followers * leaders;
-    words as u64 * lanes * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8) as u64
-}
-
-/// Lanes of the vectors that the CPU backend plays on.
-fn lanes(level: Level) -> u64 {
-    fn count<S: Simd>(_: S) -> u64 {
-        S::f32s::LEN as u64
-    }
-    dispatch!(level, simd => count(simd))
+/// What a checkpoint copies.
+fn checkpoint_bytes(config: &Config) -> u64 {
+    let due = config.checkpoint.generations > 0 || config.checkpoint.seconds > 0.0;
+    if due && copies_checkpoint([config]) { trainer::snapshot_bytes(config) } else { 0 }
 }
 
 /// Bytes that this process may still take: what the system has free or can free, within the limit of its control

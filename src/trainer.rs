@@ -358,6 +358,35 @@ impl Trainer {
     }
 }
 
+/// Words that an episode of a trial takes in a batch, whoever plays it.
+const EPISODE: u64 = 40;
+
+/// Bytes that the trials of a (valid) config take, whoever plays their episodes.
+pub fn bytes(config: &Config) -> u64 {
+    let [trials, leaders, policies, parameters] = sizes(config);
+    let (slots, episodes) = (policies + 1, config.learning.episodes_per_team as u64);
+    let agents = (config.world.leaders.len() + config.world.followers.len()) as u64;
+    let weights = 2 * leaders * slots * parameters;
+    let orders_and_fitness = 2 * leaders * policies;
+    let teams_and_parents = 2 * leaders * slots;
+    let observed_and_scores = episodes * slots * (1 + leaders);
+    // Each episode's start positions, and its place in a batch.
+    let starts = episodes * (2 * agents + EPISODE);
+    4 * trials * (weights + orders_and_fitness + teams_and_parents + observed_and_scores + starts)
+}
+
+/// Bytes of the numbers of a [`Snapshot`] of a (valid) config's arm.
+pub fn snapshot_bytes(config: &Config) -> u64 {
+    let [trials, leaders, policies, parameters] = sizes(config);
+    4 * trials * leaders * ((policies + 1) * parameters + policies)
+}
+
+/// `[trials, leaders, policies, parameters]`
+fn sizes(config: &Config) -> [u64; 4] {
+    let learning = &config.learning;
+    [learning.trials, config.learners(), learning.population, config.parameters()].map(|count| count as u64)
+}
+
 /// Plays a range of the teams of every trial, given the population, all as one batch; keeps what they scored.
 fn play(
     backend: &mut dyn Backend,

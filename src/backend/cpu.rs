@@ -699,6 +699,22 @@ pub(crate) fn turn<S: Simd>(simd: S, rows: [&[f32]; 4], mut put: impl FnMut(usiz
     }
 }
 
+/// Lanes of the vectors that this processor plays on.
+pub fn lanes() -> u64 {
+    fn count<S: Simd>(_: S) -> u64 {
+        S::f32s::LEN as u64
+    }
+    dispatch!(Level::new(), simd => count(simd))
+}
+
+/// Bytes that one vector of teams takes.
+pub fn block_bytes(world: &World) -> u64 {
+    let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
+    let words =
+        8 * agents + leaders * world.constants.policy.words() + 3 * followers + world.set_words() + followers * leaders;
+    words as u64 * lanes() * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8) as u64
+}
+
 /// Rows turned into columns.
 #[inline(always)]
 pub(crate) fn transposed<S: Simd>([a, b, c, d]: [f32x4<S>; 4]) -> [f32x4<S>; 4] {

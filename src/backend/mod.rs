@@ -25,6 +25,39 @@ pub const HELD_FROM: u64 = 1 << 20;
 /// renderer: about what goes over the bus in the time that one more dispatch costs. An estimate, not a measurement.
 pub const PACKED_FROM: u64 = 1 << 20;
 
+/// Bytes of one buffer that a batch on a GPU aims for: enough to fill it, small enough to overlap batches.
+pub const BATCH_BYTES: u64 = 256 << 20;
+/// Weights that a GPU's thread reads at once.
+const FOUR: usize = 4;
+
+/// Words of a team's record: sets and counts.
+fn record_words(world: &World) -> usize {
+    world.set_words() + world.leaders() * world.followers()
+}
+
+/// Bytes of a team's record.
+pub fn record_bytes(world: &World) -> u64 {
+    (record_words(world) * size_of::<u32>()) as u64
+}
+
+/// Weights of a team as an episode on a GPU reads them, four at a time.
+fn fours(world: &World) -> usize {
+    world.leaders() * world.parameters().div_ceil(FOUR)
+}
+
+/// Bytes of a team's weights as an episode on a GPU reads them.
+pub fn weight_bytes(world: &World) -> u64 {
+    (fours(world) * size_of::<[f32; FOUR]>()) as u64
+}
+
+/// Bytes that a GPU holds of a trial's populations, `[leaders, slots, parameters]`, where it does: a buffer a leader and
+/// one more, and every slot's parent.
+pub fn held_bytes([leaders, slots, parameters]: [usize; 3]) -> u64 {
+    let [leaders, population, parents] =
+        [leaders, 4 * slots * parameters, 4 * leaders * slots].map(|count| count as u64);
+    if leaders * population < HELD_FROM { 0 } else { (leaders + 1) * population + parents }
+}
+
 /// Teams of one world that start alike and are made of one set of policies.
 #[derive(Clone, Copy, Debug)]
 pub struct Group<'a> {

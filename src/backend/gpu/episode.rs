@@ -21,8 +21,8 @@ use super::device::{BINDING_ALIGNMENT, Binding, DeviceError, Gpu, Kind, Layout, 
 use super::exact;
 use super::population::{Kernels, Population, Stretch, TOGETHER, parts};
 use crate::backend::{
-    Backend, BackendError, Episode, Group, HELD_FROM, Held, Moment, PACKED_FROM, Seen, Strided, Trace, Visit, Weights,
-    owner_bits,
+    BATCH_BYTES, Backend, BackendError, Episode, FOUR, Group, HELD_FROM, Held, Moment, PACKED_FROM, Seen, Strided,
+    Trace, Visit, Weights, fours, owner_bits, record_words,
 };
 use crate::config::{MAX_AGENTS, MAX_HIDDEN_LAYERS};
 use crate::declare::{Shared, shared};
@@ -46,12 +46,8 @@ const MOST_WEIGHTS: usize = 512;
 const SIGHTS: usize = 8;
 /// Specialised kernels at most, where nobody asks for more: each takes a fraction of a second to compile.
 const SPECIALISED: usize = 16;
-/// Weights that a thread reads at once.
-const FOUR: usize = 4;
 /// Tasks, as many as end where a binding may start (their size is no power of two).
 const TASK_ALIGNMENT: usize = BINDING_ALIGNMENT / 4;
-/// Bytes of one buffer that a batch aims for: enough to fill a GPU, small enough to overlap batches.
-const BATCH_BYTES: u64 = 256 << 20;
 /// Offsets within a buffer are u32 words.
 const MAX_OFFSET: u64 = 1 << 33;
 /// Turns of loops that one thread takes in a dispatch, over all loops. Mesa's llvmpipe 22.3 leaves every loop for good
@@ -200,16 +196,6 @@ fn steps_a_dispatch(world: &World, packing: Packing) -> usize {
     let agent = world.pois.len() + world.agents() + network as usize + 20;
     let items = (world.pois.len() * words as usize * packing.teams).div_ceil(packing.workgroup);
     (TURNS / (packing.slots * agent + items * 33)).max(1)
-}
-
-/// Weights of a team as an episode reads them, four at a time.
-fn fours(world: &World) -> usize {
-    world.leaders() * world.parameters().div_ceil(FOUR)
-}
-
-/// Words of a team's record: sets and counts.
-fn record_words(world: &World) -> usize {
-    world.set_words() + world.leaders() * world.followers()
 }
 
 /// A task and where its teams come from.
