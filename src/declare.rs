@@ -57,7 +57,7 @@ macro_rules! lists {
 }
 lists!(u32 f32);
 
-/// A struct that lies in memory as its shaders read it: see [`shared!`].
+/// A struct that lies in memory as its shaders read it: see `shared!`.
 pub trait Shared: Pod {
     /// What the shaders call it too.
     const NAME: &'static str;
@@ -143,7 +143,7 @@ macro_rules! shared {
 }
 pub(crate) use shared;
 
-/// A key whose value is one of a few words: see [`choice!`].
+/// A key whose value is one of a few words: see `choice!`.
 pub trait Choice: Copy + Serialize + 'static {
     /// Every word with what it stands for; its place is its number.
     const ALL: &'static [(&'static str, Self)];

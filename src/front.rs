@@ -23,7 +23,9 @@ use crate::evolve::{self, MAX_WEIGHT};
 use crate::memory::{self, Plan, TooLittle};
 use crate::parallel::current_num_threads;
 #[cfg(feature = "record")]
-use crate::record::{RecordError, folder::POLICIES, hex, metrics, policies};
+use crate::record::{RecordError, hex, metrics};
+#[cfg(feature = "report")]
+use crate::record::{folder::POLICIES, policies};
 #[cfg(feature = "report")]
 use crate::report::runs;
 use crate::stepping::{StepError, Stepper};

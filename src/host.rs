@@ -1,6 +1,6 @@
 //! What flotilla takes from where it runs: the time, and a way to wait. Nothing else in the crate asks for either.
 //!
-//! Native programs have both from the system. WebAssembly has neither: there, whoever embeds the crate [`install`]s
+//! Native programs have both from the system. WebAssembly has neither: there, whoever embeds the crate `install`s
 //! them. Without a clock, time stands still there; without a way to park, waiting asks again and again.
 
 #[cfg(not(target_family = "wasm"))]

@@ -8,12 +8,12 @@ use crate::backend::{BackendError, Machine, Player};
 use crate::config::{self, Config};
 use crate::host::Instant;
 use crate::memory::{self, TooLittle};
-use crate::record::RecordError;
-use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule};
+use crate::record::checkpoint::{Checkpoint, Keeper, Schedule};
 use crate::record::disk::Disk;
 use crate::record::folder::{self, Folder, METRICS, Note, POLICIES, Run, Start, State, Story};
 use crate::record::metrics::{self, Mark};
 use crate::record::policies;
+use crate::record::{RecordError, config_digest};
 use crate::trainer::{Row, Snapshot, SnapshotError, Trainer};
 
 /// How often runs hand their metrics to the system.
@@ -425,7 +425,7 @@ impl Member {
         }
         let since = Instant::now();
         let (metrics, output) = metrics.mark().map_err(failed)?;
-        let (config, seconds) = (checkpoint::digest(&self.config), self.before + seconds);
+        let (config, seconds) = (config_digest(&self.config), self.before + seconds);
         if !memory::copies_checkpoint([&self.config]) {
             let snapshot = trainer.view(*arm).map_err(RunError::Held)?;
             return Ok(keeper.save_now(&Checkpoint { config, seconds, metrics, snapshot }, &output, since)?);
@@ -445,7 +445,7 @@ impl Member {
         let Snapshot { generation, last, fitness, pending, .. } = end;
         let fitness = fitness.into_iter().map(<[f32]>::to_vec).collect();
         let snapshot = Snapshot { generation, last, weights: vec![], fitness, pending };
-        let (config, metrics) = (checkpoint::digest(&self.config), ending.take().unwrap_or(mark));
+        let (config, metrics) = (config_digest(&self.config), ending.take().unwrap_or(mark));
         keeper.save(Checkpoint { config, seconds: self.before + seconds, metrics, snapshot }, output, since)?;
         let path = self.folder.file(POLICIES);
         if path.exists() {

@@ -1,6 +1,6 @@
 //! The shaders stay inside the exact core, the compile passes reach all of their arithmetic, and devices obey.
 
-#![cfg(feature = "gpu")]
+#![cfg(feature = "cli")]
 #![expect(unsafe_code, reason = "shaders of the test's own are compiled without bounds checks")]
 
 mod common;

@@ -148,7 +148,7 @@ fn checkpoints_need_no_copy() {
         let path = folder.path().join(name);
         fs::create_dir(&path).unwrap();
         let mut keeper = Keeper::new(disk.clone(), path.clone(), config.clone(), vec![0, 1], 1);
-        let (config, seconds) = (checkpoint::digest(&config), 2.5);
+        let (config, seconds) = (flotilla::record::config_digest(&config), 2.5);
         let (metrics, output) = metrics.mark().unwrap();
         match name {
             "copy" => {

@@ -1,7 +1,7 @@
 //! What comes home of a GPU's episodes: scores are the same from whole and from packed records, whatever matters of them,
 //! and little goes over the bus.
 
-#![cfg(feature = "gpu")]
+#![cfg(feature = "cli")]
 
 mod common;
 

@@ -1,5 +1,6 @@
 //! The crate is laid out as its documentation says: modules import downwards, and only one asks for the time.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -101,6 +102,49 @@ fn modules_import_downwards() {
     let gpu = Path::new("src/backend/gpu");
     let count = check(&gpu.join("mod.rs"), gpu, "super");
     assert!(count > 5, "only {count} imports were found");
+}
+
+/// The folder's modules, each with those beside it that it imports.
+fn beside(folder: &Path) -> BTreeMap<String, Vec<String>> {
+    let root = folder.strip_prefix("src").unwrap().iter().map(|name| name.to_str().unwrap());
+    let root = ["crate"].into_iter().chain(root).collect::<Vec<_>>().join("::");
+    let stem = |path: PathBuf| path.file_stem().unwrap().to_str().unwrap().to_string();
+    let all = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    let all = all.filter(|path| path.is_dir() || path.extension().is_some_and(|ending| ending == "rs")).map(stem);
+    let all: Vec<String> = all.filter(|name| !["mod", "lib", "main"].contains(&&**name)).collect();
+    let of = |name: &String| {
+        let module = folder.join(name);
+        let mut found: Vec<String> = files(&module).iter().flat_map(|path| imports(&code(path), &root)).collect();
+        if module.with_extension("rs").is_file() {
+            found.extend(imports(&code(&module.with_extension("rs")), "super"));
+        }
+        found.retain(|other| other != name && all.contains(other));
+        (name.clone(), found)
+    };
+    all.iter().map(of).collect()
+}
+
+#[test]
+fn no_modules_need_each_other() {
+    let mut folders = vec![PathBuf::from("src")];
+    let mut at = 0;
+    while let Some(folder) = folders.get(at).cloned() {
+        let inside = fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path());
+        folders.extend(inside.filter(|path| path.is_dir()));
+        let mut left = beside(&folder);
+        // Those that import nothing that is left are in order.
+        while !left.is_empty() {
+            let free: Vec<String> = left
+                .iter()
+                .filter(|(_, imported)| !imported.iter().any(|other| left.contains_key(other)))
+                .map(|(name, _)| name.clone())
+                .collect();
+            assert!(!free.is_empty(), "{}: among these are some that import each other: {left:?}", folder.display());
+            left.retain(|name, _| !free.contains(name));
+        }
+        at += 1;
+    }
+    assert!(folders.len() > 8, "only {folders:?} were looked through");
 }
 
 #[test]

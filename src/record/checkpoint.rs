@@ -15,14 +15,13 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use safetensors::tensor::Dtype;
-use sha2::{Digest, Sha256};
 
 use super::disk::{self, Disk, Output};
 use super::metrics::Mark;
 use super::policies;
 use super::tensors::{self, Tensor, TensorFile};
-use super::{RecordError, hex};
-use crate::config::{self, Config};
+use super::{RecordError, config_digest};
+use crate::config::Config;
 use crate::evolve;
 use crate::file;
 use crate::host::Instant;
@@ -46,7 +45,7 @@ const SHARE: u32 = 20;
 /// A run at one moment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Checkpoint<N = Vec<f32>> {
-    /// [`digest`] of the run's config.
+    /// [`config_digest`] of the run's config.
     pub config: String,
     /// Time trained.
     pub seconds: f64,
@@ -55,21 +54,11 @@ pub struct Checkpoint<N = Vec<f32>> {
     pub snapshot: Snapshot<N>,
 }
 
-/// SHA-256 of all of a config that has a say in the results.
-pub fn digest(config: &Config) -> String {
-    hex(&Sha256::digest(without_checkpoint(config).to_toml()))
-}
-
-/// The config with `[checkpoint]`, which may differ between sessions of one run, at its defaults.
-pub fn without_checkpoint(config: &Config) -> Config {
-    Config { checkpoint: config::Checkpoint::default(), ..config.clone() }
-}
-
 impl<N> Checkpoint<N> {
     /// Whether it is of a run of this config, or of the same that was to be shorter.
     pub fn is_of(&self, config: &Config) -> bool {
         let last = self.snapshot.last;
-        last <= config.learning.generations && self.config == digest(&of_length(config, last))
+        last <= config.learning.generations && self.config == config_digest(&of_length(config, last))
     }
 }
 

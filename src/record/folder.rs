@@ -494,7 +494,7 @@ fn numbered(parent: &Path, stem: &str, number: usize) -> PathBuf {
 
 /// The keys in which two configs differ, those without a say in the results left out.
 pub fn differences(old: &Config, new: &Config) -> Vec<String> {
-    let table = |config: &Config| toml::Table::try_from(checkpoint::without_checkpoint(config)).unwrap_or_default();
+    let table = |config: &Config| toml::Table::try_from(super::without_checkpoint(config)).unwrap_or_default();
     let (old, new) = (table(old), table(new));
     let mut differences = Vec::new();
     for (section, keys) in &new {

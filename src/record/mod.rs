@@ -16,6 +16,9 @@ use std::fmt::Display;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
+use sha2::{Digest, Sha256};
+
+use crate::config::{self, Config};
 use crate::file;
 
 pub mod checkpoint;
@@ -80,6 +83,16 @@ fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
         ));
     }
     String::from_utf8(bytes).map_err(|_| RecordError::damaged(path, "it is not UTF-8 text"))
+}
+
+/// SHA-256 of all of a config that has a say in the results.
+pub fn config_digest(config: &Config) -> String {
+    hex(&Sha256::digest(without_checkpoint(config).to_toml()))
+}
+
+/// The config with `[checkpoint]`, which may differ between sessions of one run, at its defaults.
+pub fn without_checkpoint(config: &Config) -> Config {
+    Config { checkpoint: config::Checkpoint::default(), ..config.clone() }
 }
 
 /// Lowercase hexadecimal.

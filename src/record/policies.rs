@@ -12,7 +12,6 @@ use std::path::Path;
 use safetensors::tensor::Dtype;
 
 use super::RecordError;
-use super::checkpoint;
 use super::disk::Disk;
 use super::tensors::{self, Tensor, TensorFile};
 use crate::config::{Config, MAX_POPULATION};
@@ -21,7 +20,7 @@ use crate::evolve::{MAX_WEIGHT, admit};
 use crate::world::{INPUTS, OUTPUTS};
 
 const KIND: &str = "policies 1";
-/// Metadata: [`checkpoint::digest`] of the config.
+/// Metadata: [`super::config_digest`] of the config.
 pub(super) const CONFIG: &str = "config";
 
 /// Policies of one trial.
@@ -53,7 +52,7 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
     let tensor = |(trial, weights)| Tensor::floats(format!("weights.{trial}"), shape.clone(), [weights]);
     let tensors: Vec<_> = trials.iter().map(AsRef::as_ref).enumerate().map(tensor).collect();
     let metadata =
-        BTreeMap::from([("layers".to_string(), layers(config)), (CONFIG.to_string(), checkpoint::digest(config))]);
+        BTreeMap::from([("layers".to_string(), layers(config)), (CONFIG.to_string(), super::config_digest(config))]);
     tensors::write(disk, path, KIND, &metadata, &tensors).map_err(RecordError::write(path))
 }
 

@@ -13,8 +13,14 @@ const POINTS: f64 = 72.0 / 25.4;
 const FONT: Name<'static> = Name(b"DejaVuSans");
 const INFO: SystemInfo<'static> = SystemInfo { registry: Str(b"Adobe"), ordering: Str(b"Identity"), supplement: 0 };
 
-/// The picture as a PDF file.
-pub fn pdf(scene: &Scene) -> Vec<u8> {
+impl Scene {
+    /// The picture as a PDF file.
+    pub fn pdf(&self) -> Vec<u8> {
+        pdf(self)
+    }
+}
+
+fn pdf(scene: &Scene) -> Vec<u8> {
     let [catalog, pages, page, contents, font, cid, descriptor, file, unicode, info] =
         std::array::from_fn(|index| Ref::new(index as i32 + 1));
     let mut page_of = Page::default();

@@ -12,7 +12,6 @@ use tiny_skia::{
 
 use super::letters;
 pub use super::letters::text_width;
-use super::pdf;
 
 /// Units of an SVG in a millimetre: letters one unit high would be less than browsers can draw.
 const SVG_UNITS: f64 = 10.0;
@@ -378,7 +377,7 @@ impl Scene {
         match kind {
             Kind::Svg => Ok(self.svg().into_bytes()),
             Kind::Png => self.png(per_mm),
-            Kind::Pdf => Ok(pdf::pdf(self)),
+            Kind::Pdf => Ok(self.pdf()),
         }
     }
 }
