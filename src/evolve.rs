@@ -17,6 +17,7 @@ use crate::world::{World, on_grid};
 pub const MIN_WEIGHT: f32 = 1.0 / 1_073_741_824.0;
 /// Weights of larger size (2^20) stay at it.
 pub const MAX_WEIGHT: f32 = 1_048_576.0;
+
 /// Whether a number may be a weight.
 pub fn is_weight(number: f32) -> bool {
     number == 0.0 || (MIN_WEIGHT..=MAX_WEIGHT).contains(&number.abs())
@@ -308,7 +309,8 @@ pub struct Breeding<'a> {
 }
 
 impl Breeding<'_> {
-    /// Whether the plan is one for populations of these sizes, `[leaders, slots, parameters]`. Every backend asks this before it breeds.
+    /// Whether the plan is one for populations of these sizes, `[leaders, slots, parameters]`. Every backend asks this
+    /// before it breeds.
     ///
     /// # Errors
     /// It has too few or too many places, or a parent that there is not.

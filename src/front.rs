@@ -62,6 +62,8 @@ pub enum Failure {
         "{episodes} episodes from starts moved by up to {jitter}; there may be 1 to {MAX_EPISODES}, and a jitter from 0 on"
     )]
     Starts { episodes: u32, jitter: f64 },
+    #[error("episode {episode} of {episodes} (they count from 0)")]
+    NoEpisode { episode: usize, episodes: usize },
     #[error(transparent)]
     Step(#[from] StepError),
     #[cfg(feature = "report")]
@@ -94,8 +96,8 @@ pub struct Found {
     pub passed_over: Option<DeviceError>,
 }
 
-/// Looks for a GPU; none is an error only where one is asked for, or where it alone may hold the populations. It holds those
-/// that it had better, where nothing else is asked for.
+/// Looks for a GPU; none is an error only where one is asked for, or where it alone may hold the populations
+/// ([`Processor::Cpu`] never has one). It holds those that it had better, where nothing else is asked for.
 ///
 /// # Errors
 /// There is none that can be used.
@@ -193,8 +195,18 @@ impl Trained {
     #[cfg(feature = "report")]
     pub fn read(folder: &Path) -> Result<Trained, Failure> {
         let config = runs::config(folder)?;
-        let mut rows = Vec::new();
-        runs::metrics(folder, &config, |row| rows.push(*row))?;
+        let (mut rows, mut turns) = (Vec::new(), vec![0; config.learning.trials]);
+        let mut in_turn = true;
+        runs::metrics(folder, &config, |row| {
+            in_turn &= turns[row.trial] == row.generation;
+            turns[row.trial] += 1;
+            rows.push(*row);
+        })?;
+        if !in_turn {
+            let path = folder.join(crate::record::folder::METRICS);
+            let reason = "its rows are not one a trial and generation, in their order".into();
+            return Err(RecordError::Damaged { path, reason }.into());
+        }
         let (found, expected) = (rows.len(), config.learning.trials * (config.learning.generations + 1));
         if found != expected {
             let reason = format!("its {} has {found} rows of {expected}", crate::record::folder::METRICS);
@@ -232,8 +244,10 @@ pub fn train(
 ) -> Result<Trained, Failure> {
     let mut config = checked(config)?;
     let plan = Plan::of([&config], current_num_threads());
-    // Nothing is saved on the way.
-    let needed = plan.host.min(plan.gpu_host) - plan.checkpoint;
+    // Nothing is saved on the way, but what comes out is kept: the rows twice, and the policies.
+    let rows = config.learning.trials as u64 * (config.learning.generations as u64 + 1);
+    let kept = rows * (size_of::<Row>() + 3 * size_of::<f64>()) as u64 + config.policy_bytes();
+    let needed = (plan.host.min(plan.gpu_host) - plan.checkpoint).saturating_add(kept);
     memory::check(needed, 0)?;
     let (mut trainer, mut rows, mut stopped) = (Trainer::new(vec![config.clone()]), Vec::new(), false);
     while !trainer.is_done() {
@@ -320,6 +334,9 @@ pub fn trace(
     episode: usize,
 ) -> Result<Traced, Failure> {
     let cast = Cast::new(config, teams, weights, starts)?;
+    if episode >= starts.episodes() {
+        return Err(Failure::NoEpisode { episode, episodes: starts.episodes() });
+    }
     let world = &cast.world;
     let (agents, leaders, steps) = (world.agents(), world.leaders(), world.steps());
     let a_team = (steps + 1) * agents * 5 + steps * leaders * (INPUTS + OUTPUTS) + world.set_words();
@@ -360,7 +377,7 @@ pub fn trace(
 /// Teams to be stepped by given actions, all at the world's start; with a record, they can be scored.
 ///
 /// # Errors
-/// The config is wrong, or there may be no so many teams.
+/// The config is wrong, or there may not be so many teams.
 pub fn stepper(config: &Config, teams: usize, recording: bool) -> Result<Stepper, Failure> {
     let world = World::new(&checked(config)?);
     Ok(if recording { Stepper::recording(world, teams)? } else { Stepper::new(world, teams)? })
@@ -395,6 +412,12 @@ impl<'a> Cast<'a> {
         let shared = weights.len() / teams == parameters;
         if !weights.len().is_multiple_of(teams) || !(shared || weights.len() / teams == leaders * parameters) {
             return Err(Failure::Weights { found: weights.len(), leaders, teams, parameters });
+        }
+        // A shared policy is repeated; every leader has a place in a team, and several scores.
+        let repeated = if shared && leaders > 1 { parameters * size_of::<f32>() } else { 0 };
+        let bytes = teams as u128 * leaders as u128 * (repeated + 28) as u128;
+        if !usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok()) {
+            return Err(Failure::Memory { what: "all teams", bytes });
         }
         let mut weights = match shared {
             true if leaders > 1 => Cow::Owned(weights.repeat(leaders)),

@@ -68,7 +68,7 @@
 //! | [`world`] | | one experiment's constants and start state |
 //! | [`evolve`] | | teams, selection and mutation, by counters |
 //! | [`sample`] | | random worlds for tests |
-//! | [`backend`] | `gpu` | whole episodes of many teams: on the CPU, and on a GPU |
+//! | [`backend`] | | whole episodes of many teams: on the CPU, and with `gpu` on a GPU |
 //! | [`credit`] | | G, D, Df and D++ |
 //! | [`trainer`] | | the generation loop |
 //! | [`verify`] | | whether two backends agree to the bit |

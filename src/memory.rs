@@ -1,8 +1,8 @@
 //! What a run takes in memory at its peak, told before it starts.
 //!
 //! Every array that grows with the run is counted where it lives: [`trainer`] tells what every run has, [`backend`] what
-//! episodes take. What does not grow is [`PROGRAM`]. Nothing else is as large: checkpoints and policies are written straight from the populations, or from
-//! one copy, see [`copies_checkpoint`]. A sweep keeps its batches to half of what is available.
+//! episodes take. What does not grow is [`PROGRAM`]. Nothing else is as large: checkpoints and policies are written
+//! straight from the populations, or from one copy, see [`copies_checkpoint`]. A sweep keeps its batches to half of what is available.
 
 use std::fs;
 use std::path::Path;

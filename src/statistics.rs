@@ -110,7 +110,9 @@ fn student(count: usize) -> StudentsT {
 ///
 /// Where all values of each sample are alike, the interval has no width.
 pub fn bootstrap(samples: &[&[f64]]) -> Option<Estimate> {
-    if samples.is_empty() || samples.iter().any(|sample| sample.len() < 2) {
+    if samples.is_empty()
+        || samples.iter().any(|sample| sample.len() < 2 || !sample.iter().all(|value| value.is_finite()))
+    {
         return None;
     }
     // Sums something over the first sample and what is taken off.
@@ -168,7 +170,7 @@ pub struct Tested {
 /// The p is exact up to [`EXACT`] values: twice the smaller tail over all ways to deal the values out, ties as they are.
 /// Above, it is by the normal distribution, corrected for ties and continuity.
 pub fn rank_sum(one: &[f64], other: &[f64]) -> Option<Tested> {
-    if one.is_empty() || other.is_empty() {
+    if one.is_empty() || other.is_empty() || !one.iter().chain(other).all(|value| value.is_finite()) {
         return None;
     }
     let ranks = twice_ranks(&[one, other].concat());
@@ -193,6 +195,9 @@ pub fn rank_sum(one: &[f64], other: &[f64]) -> Option<Tested> {
 /// Pairs without a difference have no say in p; it is exact for up to [`EXACT`] others, over all their signs, and by the
 /// normal distribution above, as in [`rank_sum`]. A is over the pairs themselves.
 pub fn signed_rank(differences: &[f64]) -> Option<Tested> {
+    if !differences.iter().all(|difference| difference.is_finite()) {
+        return None;
+    }
     let differences: Vec<f64> = differences.iter().map(|&difference| grained(difference)).collect();
     let (up, down) = (|value: &&f64| **value > 0.0, |value: &&f64| **value < 0.0);
     let [up_count, down_count] =

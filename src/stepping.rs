@@ -114,17 +114,11 @@ impl Stepper {
         if !(1..=MAX_POPULATION).contains(&teams) {
             return Err(StepError::Teams(teams));
         }
-        let (agents, leaders, pois) = (world.agents(), world.leaders(), world.pois.len());
-        let words = world.constants.words as usize;
-        let fits = [
-            ("leaders", leaders > 0),
-            ("POIs", pois == world.coupling.len()),
-            ("start positions", world.starts.len() == agents),
-            ("sets", words == agents.div_ceil(32)),
-        ];
-        if let Some((what, _)) = fits.into_iter().find(|(_, fits)| !fits) {
+        if let Some(what) = world.misfit() {
             return Err(StepError::World(what));
         }
+        let (agents, leaders, pois) = (world.agents(), world.leaders(), world.pois.len());
+        let words = world.constants.words as usize;
         // Asked for first, since later a refusal would be an abort: a team's numbers, in the vectors and as shown.
         let record = if recording { world.set_words() } else { 0 };
         let in_vectors = agents * 6 + leaders * (INPUTS + OUTPUTS) + world.followers() * (11 + leaders) + pois * words;

@@ -264,8 +264,8 @@ impl Trainer {
         arm.trials.iter().map(sort).collect()
     }
 
-    /// What came out of arms that are done: [`Trainer::policies`], in the room of the next generation, and the snapshot after the last generation, whose
-    /// weights are left out since they are the same in another order.
+    /// What came out of arms that are done: [`Trainer::policies`], in the room of the next generation, and the snapshot
+    /// after the last generation, whose weights are left out since they are the same in another order.
     pub fn ends(&mut self, arms: &[usize]) -> Vec<End<'_>> {
         for &arm in arms {
             let arm = &mut self.arms[arm];

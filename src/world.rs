@@ -2,12 +2,13 @@
 
 use glam::{DVec2, Vec2};
 
-use crate::config::Config;
+use crate::config::{Config, MAX_AGENTS, MAX_HIDDEN_UNITS, MAX_POIS, MAX_STEPS};
+use crate::declare::Choice;
 use crate::model::couple::CoupleConstants;
 use crate::model::follow::FollowConstants;
 use crate::model::motion::MotionConstants;
 use crate::model::policy::PolicyConstants;
-use crate::model::sense::SenseConstants;
+use crate::model::sense::{Density, SenseConstants};
 
 pub use crate::model::motion::GRID;
 pub use crate::model::policy::OUTPUTS;
@@ -61,6 +62,38 @@ impl World {
     /// Its width and height.
     pub fn map(&self) -> Vec2 {
         Vec2::new(self.constants.motion.map_x, self.constants.motion.map_y)
+    }
+
+    /// What does not fit the rest, of a world that [`World::new`] did not make. Shaders rely on it.
+    pub fn misfit(&self) -> Option<&'static str> {
+        let (constants, pois) = (&self.constants, self.pois.len());
+        let PolicyConstants { layers, widths, parameters } = constants.policy;
+        let used = widths.get(..=layers as usize).unwrap_or_default();
+        let weights: Option<u32> = used
+            .windows(2)
+            .try_fold(0_u32, |sum, widths| sum.checked_add(widths[0].checked_add(1)?.checked_mul(widths[1])?));
+        let ends = used.len() > 1 && used[0] as usize == INPUTS && used[used.len() - 1] as usize == OUTPUTS;
+        let small = used.iter().all(|&width| (1..=MAX_HIDDEN_UNITS.max(INPUTS) as u32).contains(&width));
+        let fits = [
+            ("leaders", constants.leaders > 0),
+            (
+                "agents",
+                constants.leaders.checked_add(constants.followers).is_some_and(|all| all as usize <= MAX_AGENTS),
+            ),
+            ("POIs", (1..=MAX_POIS).contains(&pois) && pois == self.coupling.len() && pois == constants.pois as usize),
+            ("steps", (1..=MAX_STEPS).contains(&(constants.steps as usize))),
+            (
+                "start positions",
+                self.starts.len() as u64 == u64::from(constants.leaders) + u64::from(constants.followers),
+            ),
+            ("sets", constants.words as usize == self.starts.len().div_ceil(32)),
+            ("density", (constants.variant.density as usize) < Density::ALL.len()),
+            (
+                "policies",
+                ends && small && weights == Some(parameters) && widths[used.len()..].iter().all(|&left| left == 0),
+            ),
+        ];
+        fits.into_iter().find(|(_, fits)| !fits).map(|(what, _)| what)
     }
 
     /// Agents that have a policy, the first of all.

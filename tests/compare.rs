@@ -57,7 +57,10 @@ fn bad(folder: &TempDir, line: &str, code: i32, words: &[&str]) {
     let (found, out, told) = flotilla(folder.path(), line);
     assert_eq!((found, &*out), (code, ""), "{line}: {told}");
     for word in words {
-        assert!(told.starts_with("error: ") && told.contains(word), "{line}: {told}");
+        let error = told.lines().position(|line| line.starts_with("error: ")).expect("an error is told");
+        // Only notes come before it.
+        assert!(told.lines().take(error).all(|line| line.starts_with("note: ")), "{line}: {told}");
+        assert!(told.contains(word), "{line}: {told}");
     }
 }
 
@@ -128,7 +131,7 @@ fn pairs_are_told_of_and_compared_as_pairs_where_that_is_asked_for() {
     run(&folder, "df", &[GENERATIONS], &slices(&two(&one)));
     run(&folder, "g", &[GENERATIONS, FITNESS_G], &slices(&two(&other)));
     let (_, told) = good(&folder, "compare df g");
-    assert!(told.contains("note: these arms have one seed") && told.contains("--paired"), "{told}");
+    assert!(told.contains("note: these arms have the same seeds") && told.contains("--paired"), "{told}");
     let (text, told) = good(&folder, "compare df g --paired");
     assert!(told.is_empty() && text.contains("Wilcoxon's signed ranks"), "{told}{text}");
     let told = json(&folder, "compare df g --paired");
@@ -351,4 +354,34 @@ fn a_varied_key_is_compared_with_the_files_own_value() {
     let places: Vec<_> =
         told["comparisons"].as_array().unwrap().iter().map(|comparison| &comparison["where"]).collect();
     assert_eq!(places, ["as in the file", "steps 8", "max_speed 2.0", "max_speed 5.0"]);
+}
+
+#[test]
+fn different_layouts_are_told_and_are_no_pairs() {
+    let folder = tempfile::tempdir().unwrap();
+    let trials = [&[0.0, 0.5][..], &[0.0, 1.0]];
+    run(&folder, "here", &[GENERATIONS], &trials);
+    run(&folder, "there", &[GENERATIONS, ("world.pois", "[[10, 15], [20, 16]]")], &trials);
+    let (_, told) = good(&folder, "compare here there");
+    assert!(told.contains("note: the arms play in different layouts: world.pois differ"), "{told}");
+    assert!(!told.contains("--paired"), "{told}");
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_folder_whose_name_is_no_text_is_told_as_well_as_can_be() {
+    use std::ffi::OsStr;
+    use std::os::unix::ffi::OsStrExt;
+
+    let folder = tempfile::tempdir().unwrap();
+    let trials = [&[0.0, 0.5][..], &[0.0, 1.0]];
+    run(&folder, "one", &[GENERATIONS], &trials);
+    run(&folder, "two", &[GENERATIONS, FITNESS_G], &trials);
+    let odd = OsStr::from_bytes(b"two\xff");
+    fs::rename(folder.path().join("two"), folder.path().join(odd)).unwrap();
+    let mut command = cargo_bin_cmd!("flotilla");
+    let output = command.current_dir(folder.path()).args(["compare", "--json", "one"]).arg(odd).output().unwrap();
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(told["comparisons"][0]["arms"][1]["folders"][0], "two\u{fffd}");
 }

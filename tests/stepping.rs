@@ -4,7 +4,7 @@
 use std::ops::Range;
 
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, Episode, Group, Moment, Need, Seen, Strided, Trace};
+use flotilla::backend::{Backend, BackendError, Episode, Group, Moment, Need, Seen, Strided, Trace};
 use flotilla::config::{Config, Fitness, MAX_POPULATION};
 use flotilla::credit::{Credit, Scores};
 use flotilla::evaluate::Starts;
@@ -187,8 +187,41 @@ fn what_cannot_be_stepped_is_told_and_nothing_moves() {
     assert!(matches!(Stepper::new(world.clone(), 0), Err(StepError::Teams(0))));
     assert!(matches!(Stepper::new(world.clone(), MAX_POPULATION + 1), Err(StepError::Teams(_))));
     assert!(matches!(Stepper::new(world.clone(), usize::MAX), Err(StepError::Teams(_))));
-    let misfit = World { coupling: vec![], ..world.clone() };
-    assert!(matches!(Stepper::new(misfit, 1), Err(StepError::World("POIs"))));
+    let changed = |change: fn(&mut World)| {
+        let mut world = world.clone();
+        change(&mut world);
+        let error = Stepper::new(world.clone(), 1).err().expect("its parts do not fit");
+        let none = vec![0.0; world.leaders() * world.parameters()];
+        let teams = vec![0; world.leaders()];
+        let group = Group {
+            world: &world,
+            starts: &world.starts,
+            weights: none[..].into(),
+            policies: 1,
+            teams: &teams,
+            need: Need::Scores,
+        };
+        let refused = Cpu::default().rollout(&[group], &|_| unreachable!("nobody plays")).expect_err("nor here");
+        assert!(matches!(refused, BackendError::Misfit(_)), "{refused}");
+        error
+    };
+    for (what, change) in [
+        ("POIs", (|world| world.coupling.clear()) as fn(&mut World)),
+        ("POIs", |world| (world.pois, world.coupling) = (vec![], vec![])),
+        ("POIs", |world| world.constants.pois += 1),
+        ("start positions", |world| _ = world.starts.pop()),
+        ("start positions", |world| world.constants.followers += 1),
+        ("agents", |world| world.constants.followers = u32::MAX),
+        ("sets", |world| world.constants.words = 2),
+        ("density", |world| world.constants.variant.density = 9),
+        ("steps", |world| world.constants.steps = u32::MAX),
+        ("policies", |world| world.constants.policy.parameters += 1),
+        ("policies", |world| world.constants.policy.layers = 9),
+        ("policies", |world| world.constants.policy.widths[1] = u32::MAX),
+    ] {
+        let error = changed(change);
+        assert!(matches!(error, StepError::World(found) if found == what), "{what}: {error}");
+    }
 
     let mut stepper = Stepper::new(world.clone(), 3).expect("three teams are few");
     let (good, leaders) = ([0.25; 24], world.leaders());

@@ -115,6 +115,9 @@ impl Group<'_> {
     pub fn check(&self) -> Result<(), BackendError> {
         let Group { world, starts, weights, policies, teams, .. } = *self;
         let misfit = |text: String| Err(BackendError::Misfit(text));
+        if let Some(what) = world.misfit() {
+            return misfit(format!("a world whose {what} do not fit the rest of it"));
+        }
         let (agents, leaders) = (world.agents(), world.leaders());
         if starts.len() != agents {
             return misfit(format!("{} start positions for {agents} agents", starts.len()));

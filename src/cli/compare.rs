@@ -7,6 +7,7 @@ use serde_json::json;
 
 use super::sweep::share;
 use super::{Error, print, say};
+use crate::config::World;
 use crate::file;
 use crate::record::folder::{self, SWEEP};
 use crate::report::comparison::{self, Arm, At, Comparison, ComparisonError, Options};
@@ -56,8 +57,12 @@ pub fn run(args: Args) -> Result<(), Error> {
     let mut notes = Vec::new();
     let groups = match &*args.folders {
         [folder] if folder::collection(folder) == Some("a sweep") => of_sweep(folder, &args, &mut notes)?,
-        folders => vec![(String::new(), of_runs(folders, &args)?)],
+        folders => vec![(String::new(), of_runs(folders, &args, &mut notes)?)],
     };
+    // Told even if nothing can be compared: they may say why.
+    let tell = |notes: &[String]| notes.iter().for_each(|note| say(format_args!("note: {note}")));
+    tell(&notes);
+    let told = notes.len();
     let options = Options { at: args.at.clone(), reach: args.reach, paired: args.paired };
     let compare = |(place, arms): &Group| {
         comparison::compare(place, arms, &options).map_err(|error| match error {
@@ -72,10 +77,12 @@ pub fn run(args: Args) -> Result<(), Error> {
         let place = if comparison.place.is_empty() { String::new() } else { format!("{}: ", comparison.place) };
         notes.extend(comparison.notes.iter().map(|note| format!("{place}{note}")));
     }
-    if !args.paired && groups.iter().any(|(_, arms)| comparison::paired(arms)) {
-        notes.push("these arms have one seed, so their trials are pairs: --paired compares pair by pair".into());
+    // Of runs, all that there was to tell yet is that their layouts differ.
+    let alike = args.folders.len() == 1 || told == 0;
+    if !args.paired && alike && groups.iter().all(|(_, arms)| comparison::paired(arms)) {
+        notes.push("these arms have the same seeds, so their trials are pairs: --paired compares pair by pair".into());
     }
-    notes.iter().for_each(|note| say(format_args!("note: {note}")));
+    tell(&notes[told..]);
     if args.csv {
         let mut text = Vec::new();
         comparison::csv(&all, &mut text).map_err(Error::Output)?;
@@ -95,7 +102,7 @@ pub fn run(args: Args) -> Result<(), Error> {
 }
 
 /// Every run an arm, named by what sets it apart.
-fn of_runs(folders: &[PathBuf], args: &Args) -> Result<Vec<Arm>, Error> {
+fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<Vec<Arm>, Error> {
     if let Some(by) = &args.by {
         return Err(Error::Usage(format!(
             "--by {by}: that takes the folder of one sweep, which {} is not",
@@ -114,6 +121,18 @@ fn of_runs(folders: &[PathBuf], args: &Args) -> Result<Vec<Arm>, Error> {
         return Err(Error::Usage(format!("{} is named twice; name other runs", twice.display())));
     }
     let configs = folders.iter().map(|folder| runs::config(folder)).collect::<Result<Vec<_>, _>>()?;
+    let first = &configs[0].world;
+    let differs = |differs: fn(&World, &World) -> bool| configs.iter().any(|config| differs(&config.world, first));
+    let layouts = [
+        ("world.map", differs(|a, b| a.map != b.map)),
+        ("world.leaders", differs(|a, b| a.leaders != b.leaders)),
+        ("world.followers", differs(|a, b| a.followers != b.followers)),
+        ("world.pois", differs(|a, b| a.pois != b.pois)),
+    ];
+    let layouts: Vec<&str> = layouts.into_iter().filter(|(_, differ)| *differ).map(|(key, _)| key).collect();
+    if !layouts.is_empty() {
+        notes.push(format!("the arms play in different layouts: {} differ", layouts.join(", ")));
+    }
     let arms = runs::labels(folders, &configs).into_iter().zip(folders);
     Ok(arms.map(|(name, folder)| Arm::read(name, vec![folder.clone()])).collect::<Result<_, _>>()?)
 }

@@ -170,7 +170,7 @@ pub struct Comparison {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Named {
     pub name: String,
-    pub folders: Vec<PathBuf>,
+    pub folders: Vec<String>,
     pub trials: usize,
 }
 
@@ -247,7 +247,11 @@ pub fn compare(place: &str, arms: &[Arm], options: &Options) -> Result<Compariso
     if arms.iter().any(|arm| arm.planned > last) {
         notes.push(format!("arms are compared up to generation {last}, which all have come to"));
     }
-    let named = |arm: &Arm| Named { name: arm.name.clone(), folders: arm.folders.clone(), trials: arm.trials.len() };
+    let named = |arm: &Arm| Named {
+        name: arm.name.clone(),
+        folders: arm.folders.iter().map(|folder| folder.display().to_string()).collect(),
+        trials: arm.trials.len(),
+    };
     Ok(Comparison { place: place.into(), generation: last, arms: arms.iter().map(named).collect(), measures, notes })
 }
 

@@ -40,8 +40,8 @@ pub fn tex(text: &str) -> String {
         '<' | '>' | '|' => format!("${c}$"),
         _ => c.to_string(),
     };
-    // A row that starts with a bracket would be read as the last one's measure.
-    let guard = if text.starts_with('[') { "{}" } else { "" };
+    // A row that starts with a bracket or a star would be read as part of the line break before it.
+    let guard = if text.starts_with(['[', '*']) { "{}" } else { "" };
     guard.chars().map(String::from).chain(text.chars().map(escaped)).collect()
 }
 

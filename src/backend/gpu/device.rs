@@ -451,7 +451,8 @@ impl Gpu {
         Ok(bytemuck::pod_collect_to_vec(&view[..]))
     }
 
-    /// Shows a range of a buffer, all that was copied to it of the device's, whose work was waited for (in bytes, multiples of 4; usage `MAP_READ`).
+    /// Shows a range of a buffer to which all was copied, by work that was waited for (in bytes, multiples of 4; usage
+    /// `MAP_READ`).
     ///
     /// # Errors
     /// The device was lost, or the buffer cannot be read.
@@ -509,7 +510,7 @@ impl Gpu {
     /// The layout of a pipeline that uses these buffers as bindings 1, 2, … of group 0.
     ///
     /// # Errors
-    /// The device allows no so many buffers.
+    /// The device does not allow so many buffers.
     pub fn layout(&self, label: &str, buffers: &[Binding]) -> Result<Layout, DeviceError> {
         let entry = |(binding, &kind): (u32, &Binding)| wgpu::BindGroupLayoutEntry {
             binding,
