@@ -7,7 +7,7 @@ use std::sync::Mutex;
 
 use crate::backend::compare::{Mismatch, first_mismatch};
 use crate::backend::{Backend, BackendError, Group, Need};
-use crate::config::{Config, Fitness};
+use crate::config::Config;
 use crate::credit::{Credit, Scores};
 use crate::evolve::{Breeding, Key, Purpose, UNCHANGED};
 use crate::sample;
@@ -161,20 +161,13 @@ fn compare_scores(
     reference: &mut dyn Backend,
     backend: &mut dyn Backend,
 ) -> Result<Option<(usize, usize, String)>, BackendError> {
-    const NEEDS: [Need; 5] = [
-        Need::Scores,
-        Need::Score(Fitness::G),
-        Need::Score(Fitness::D),
-        Need::Score(Fitness::Df),
-        Need::Score(Fitness::Dpp),
-    ];
     let played = |backend: &mut dyn Backend, needs: &dyn Fn(usize) -> Need| {
         let asked: Vec<Group<'_>> =
             groups.iter().enumerate().map(|(index, group)| Group { need: needs(index), ..*group }).collect();
         let scores: Vec<Mutex<BTreeMap<usize, Scores>>> = groups.iter().map(|_| Mutex::default()).collect();
         backend.rollout(&asked, &|episode| {
             let (group, mut credit) = (&groups[episode.group], Credit::default());
-            let found = match NEEDS[episode.group % NEEDS.len()] {
+            let found = match Need::OF_SCORES[episode.group % Need::OF_SCORES.len()] {
                 Need::Record | Need::Scores => credit.all(&episode, group.world),
                 Need::Score(fitness) => {
                     let mut one = vec![0.0; group.world.leaders()];
@@ -187,7 +180,7 @@ fn compare_scores(
         Ok::<_, BackendError>(scores.into_iter().map(|scores| scores.into_inner().expect("no visit panics")))
     };
     let expected = played(reference, &|_| Need::Record)?;
-    let found = played(backend, &|index| NEEDS[index % NEEDS.len()])?;
+    let found = played(backend, &|index| Need::OF_SCORES[index % Need::OF_SCORES.len()])?;
     Ok(expected.zip(found).enumerate().find_map(|(group, (expected, found))| {
         let differs = |(team, expected): (&usize, &Scores)| {
             let found = found.get(team);

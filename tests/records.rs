@@ -19,14 +19,6 @@ use flotilla::sweep::Sweep;
 use flotilla::trainer::Trainer;
 use flotilla::world::World;
 
-const NEEDS: [Need; 5] = [
-    Need::Scores,
-    Need::Score(Fitness::G),
-    Need::Score(Fitness::D),
-    Need::Score(Fitness::Df),
-    Need::Score(Fitness::Dpp),
-];
-
 /// Some teams of one world; their policies' weights are random, or all 0.
 struct Teams {
     world: World,
@@ -61,7 +53,7 @@ type Scores = BTreeMap<(usize, usize), (u32, Vec<Vec<f32>>)>;
 
 /// Plays all teams as one batch, the needs of the groups by turns from `first` on; `asked` is what the backend is told.
 fn scores(backend: &mut dyn Backend, all: &[Teams], first: usize, asked: impl Fn(Need) -> Need) -> Scores {
-    let need = |group: usize| NEEDS[(group + first) % NEEDS.len()];
+    let need = |group: usize| Need::OF_SCORES[(group + first) % Need::OF_SCORES.len()];
     let groups: Vec<_> = all.iter().enumerate().map(|(index, teams)| teams.group(asked(need(index)))).collect();
     let scores = Mutex::new(Scores::new());
     let visit = |episode: flotilla::backend::Episode<'_>| {

@@ -85,6 +85,15 @@ pub enum Need {
 }
 
 impl Need {
+    /// Every need of scores alone.
+    pub const OF_SCORES: [Need; 5] = [
+        Need::Scores,
+        Need::Score(Fitness::G),
+        Need::Score(Fitness::D),
+        Need::Score(Fitness::Df),
+        Need::Score(Fitness::Dpp),
+    ];
+
     /// How many agents a set must have to make a difference, where so many must be near; none where the whole record
     /// is wanted.
     pub fn least(self, coupling: u32) -> Option<u32> {
