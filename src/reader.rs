@@ -559,6 +559,37 @@ impl<'a> Asked<'_, 'a> {
         }
     }
 
+    /// A list of as many lists of numbers as `of`, another key, has items (any number where that is not known), or of
+    /// none, which is the default. `blame` tells what is wrong with lists whose numbers are allowed, each fault with its
+    /// list.
+    pub fn lists<T: Number>(
+        mut self,
+        what: &str,
+        (of, count): (&str, Option<usize>),
+        lengths: RangeInclusive<usize>,
+        allowed: Allowed<T>,
+        blame: impl FnOnce(&[Vec<T>]) -> Vec<(usize, String)>,
+    ) -> Vec<Vec<T>> {
+        let range = || format!("none, or as many as {of}, of numbers each {}", allowed.in_general());
+        let Some(entry) = self.take(|| (format!("list of {what}"), range(), Some("[]".into()))) else { return vec![] };
+        if entry.value.get_ref().as_array().is_some_and(|items| items.is_empty()) {
+            return vec![];
+        }
+        let reader = self.reader;
+        let faults = reader.faults();
+        let counts = count.map_or(1..=usize::MAX, |count| count..=count);
+        let items = reader.items(entry, counts, &format!("{what}, or none")).unwrap_or_default();
+        let places: Vec<_> = items.iter().map(|item| (item.place(), item.name.clone())).collect();
+        let lists: Vec<_> = items.into_iter().map(|item| reader.numbers(item, lengths.clone(), allowed)).collect();
+        if reader.faults() == faults {
+            for (list, message) in blame(&lists) {
+                let (place, name) = &places[list];
+                reader.blame(*place, name, message);
+            }
+        }
+        if reader.faults() == faults { lists } else { vec![] }
+    }
+
     /// One number, or a list of so many; the default is one.
     pub fn one_or_list<T: Number>(
         mut self,

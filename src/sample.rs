@@ -39,8 +39,58 @@ const LAYOUTS: [Layout; 10] = [
 ];
 
 /// A valid config of 1 to 40 agents and 1 to 8 POIs, a pure function of the seed: a hundred seeds in a row hold every
-/// kind of layout, both paradigms and densities, 0 to 3 hidden layers, and gains, speeds and turn rates down to 0.
+/// kind of layout, both paradigms and densities, 0 to 3 hidden layers, gains, speeds and turn rates down to 0, and every
+/// kind of observers, windows and orders of POIs, beside worlds with none of these.
 pub fn world(seed: u64) -> Config {
+    let mut config = plain_world(seed);
+    // By a stream of its own, so that the world is otherwise as it would be without.
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed ^ 0x7275_6c65);
+    if rng.random_bool(0.5) {
+        observe_otherwise(rng, &mut config);
+    }
+    config
+}
+
+/// Gives a world observers, windows and an order of its POIs.
+fn observe_otherwise(rng: &mut ChaCha8Rng, config: &mut Config) {
+    let (leaders, agents) = (config.learners(), config.world.leaders.len() + config.world.followers.len());
+    let world = &mut config.world;
+    let pois = world.pois.len();
+    let counted = |observers: Observers| observers.among(leaders, agents - leaders).len();
+    world.observers = [Observers::All, word(rng)][rng.random_range(0..2)];
+    if counted(world.observers) == 0 {
+        world.observers = Observers::All;
+    }
+    let most = counted(world.observers);
+    match &mut world.coupling {
+        Coupling::Same(coupling) => *coupling = most.min(*coupling),
+        Coupling::Each(couplings) => couplings.iter_mut().for_each(|coupling| *coupling = most.min(*coupling)),
+    }
+    if rng.random_bool(0.6) {
+        let window = |rng: &mut ChaCha8Rng| {
+            let first = rng.random_range(1..=world.steps);
+            match rng.random_range(0..4) {
+                0 => [first, first],
+                1 => [first, rng.random_range(first..=world.steps)],
+                2 => [1, first],
+                _ => [1, world.steps],
+            }
+        };
+        world.windows = (0..pois).map(|_| window(rng)).collect();
+    }
+    if rng.random_bool(0.6) {
+        // Each comes after some of those before it in an order that starts anywhere.
+        let (first, step) = (rng.random_range(0..pois), if rng.random_bool(0.5) { 1 } else { pois - 1 });
+        let order: Vec<usize> = (0..pois).map(|place| (first + place * step) % pois).collect();
+        world.after = vec![vec![]; pois];
+        for (place, &poi) in order.iter().enumerate() {
+            let before = order[..place].iter().copied().filter(|_| rng.random_bool(0.4));
+            world.after[poi] = before.collect();
+        }
+    }
+}
+
+fn plain_world(seed: u64) -> Config {
     let rng = &mut ChaCha8Rng::seed_from_u64(seed);
     let layout = LAYOUTS[(seed % LAYOUTS.len() as u64) as usize];
     let exact = matches!(layout, Layout::Grid | Layout::Groups | Layout::OnePoint | Layout::Boundaries);
@@ -139,6 +189,9 @@ pub fn world(seed: u64) -> Config {
             pois,
             coupling,
             observation_radius,
+            observers: Observers::All,
+            windows: vec![],
+            after: vec![],
             steps: rng.random_range(20..=60),
             dt: [0.05, 0.2, 0.2, 0.5, 1.0][rng.random_range(0..5)],
             heading: if exact || rng.random_bool(0.3) {

@@ -65,15 +65,21 @@ choice! {
     }
 }
 
+impl Paradigm {
+    /// Asks for it; it says which agents there are.
+    pub(super) fn read(r: &mut Reader<'_>) -> Paradigm {
+        r.key("learning.paradigm", "", "who learns: the leaders, or every agent", "4.1, 4.4")
+            .choice(Paradigm::LeaderFollower)
+    }
+}
+
 impl Learning {
-    pub(super) fn read(r: &mut Reader<'_>) -> Learning {
+    pub(super) fn read(r: &mut Reader<'_>, paradigm: Paradigm) -> Learning {
         let population = r
             .key("learning.population", "policies", "k: policies of each learner, and teams of a generation", "4.3")
             .number(between(2, MAX_POPULATION), 50);
         Learning {
-            paradigm: r
-                .key("learning.paradigm", "", "who learns: the leaders, or every agent", "4.1, 4.4")
-                .choice(Paradigm::LeaderFollower),
+            paradigm,
             fitness: r
                 .key(
                     "learning.fitness",

@@ -10,7 +10,7 @@ use serde::Serialize;
 use crate::reader::{self, Reader};
 
 pub use crate::declare::Choice;
-pub use crate::model::couple::Coupling;
+pub use crate::model::couple::{Coupling, Observers};
 pub use crate::model::follow::Follow;
 pub use crate::model::motion::Motion;
 pub use crate::model::policy::{MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
@@ -123,13 +123,14 @@ impl Config {
     /// on it is not blamed as well.
     fn ask(r: &mut Reader<'_>) -> Config {
         let (motion, start_speed) = Motion::read(r);
+        let paradigm = Paradigm::read(r);
         let config = Config {
-            world: World::read(r, start_speed),
+            world: World::read(r, start_speed, paradigm),
             motion,
             follow: Follow::read(r),
             sense: Sense::read(r),
             policy: Policy::read(r),
-            learning: Learning::read(r),
+            learning: Learning::read(r, paradigm),
             checkpoint: Checkpoint::read(r),
         };
         if r.faults() == 0 && config.policy_bytes() > MAX_POLICY_BYTES {

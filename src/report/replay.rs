@@ -213,7 +213,7 @@ fn play_best(
     let groups: Vec<Group<'_>> = starts.iter().map(|starts| group(starts, &teams)).collect();
     let observed: Vec<AtomicU32> = std::iter::repeat_with(AtomicU32::default).take(population).collect();
     backend.rollout(&groups, &|episode: Episode<'_>| {
-        let seen = first_observed(&world, &episode.sets).iter().flatten().count();
+        let seen = credit::observed_at(episode.sets, &world).iter().flatten().count();
         observed[episode.team].fetch_add(seen as u32, Relaxed);
     })?;
     let (mut team, mut most) = (0, 0);
@@ -231,25 +231,18 @@ fn play_best(
     let scores = Credit::default().all(&episode, &world);
     let mut owner = Vec::new();
     credit::assign(&episode.seen, &world, &mut owner);
-    let observed = first_observed(&world, &episode.sets);
+    let observed = credit::observed_at(episode.sets, &world);
     Ok(Played { trial, generation, team, best_g, episodes: starts.len(), scores, owner, observed, trace, world })
 }
 
-/// The step (from 1) at which each POI first had as many agents near as it needs.
-fn first_observed(world: &World, sets: &Strided<'_>) -> Vec<Option<usize>> {
-    let pois = world.pois.len();
-    let first = |poi| (0..world.steps()).find(|&step| near(world, sets, step * pois + poi) >= world.coupling[poi]);
-    (0..pois).map(|poi| first(poi).map(|step| step + 1)).collect()
-}
-
-/// Agents in one set.
+/// Observers in one set.
 fn near(world: &World, sets: &Strided<'_>, set: usize) -> u32 {
     let words = world.constants.words as usize;
-    (set * words..(set + 1) * words).map(|word| sets.get(word).count_ones()).sum()
+    world.rule.count((set * words..(set + 1) * words).map(|word| sets.get(word)))
 }
 
 impl Played {
-    /// Agents near a POI after a step, 0 at the start.
+    /// Observers near a POI after a step, 0 at the start.
     pub fn near(&self, step: usize, poi: usize) -> u32 {
         let sets = Strided { words: &self.trace.sets, stride: 1, offset: 0 };
         step.checked_sub(1).map_or(0, |step| near(&self.world, &sets, step * self.world.pois.len() + poi))

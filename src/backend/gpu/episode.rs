@@ -253,10 +253,13 @@ struct Work {
 }
 
 impl Work {
-    /// Finds a place for what is packed of the record; none where the whole record is wanted, where packing takes too
-    /// long for one dispatch, or where there is nothing to gain.
+    /// Finds a place for what is packed of the record; none where the whole record is wanted, where it matters when sets
+    /// stood, where packing takes too long for one dispatch, or where there is nothing to gain.
     fn pack(&mut self, groups: &[Group<'_>], records: Records) {
-        let packs = |share: &Share| groups[share.group].need.least(1).is_some() && pack_turns(groups, share) <= TURNS;
+        let packs = |share: &Share| {
+            let Group { world, need, .. } = groups[share.group];
+            need.least(1).is_some() && !world.rule.is_timed() && pack_turns(groups, share) <= TURNS
+        };
         if !records.packs((self.record * size_of::<u32>()) as u64) || !self.shares.iter().all(packs) {
             return;
         }
