@@ -20,7 +20,7 @@ const _: () = assert!(MAX_STEPS * MAX_POIS * MAX_AGENTS.div_ceil(32) * size_of::
 
 /// `[world]`: where everything starts. Lengths in map units, time in seconds, angles in radians.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct World {
+pub struct Domain {
     pub map: [f64; 2],
     pub leaders: Vec<[f64; 2]>,
     pub followers: Vec<[f64; 2]>,
@@ -33,9 +33,9 @@ pub struct World {
     pub speed: f64,
 }
 
-impl World {
+impl Domain {
     /// Reads the section; agents start with one of these speeds.
-    pub(super) fn read(r: &mut Reader<'_>, start_speed: Allowed<f64>) -> World {
+    pub(super) fn read(r: &mut Reader<'_>, start_speed: Allowed<f64>) -> Domain {
         let map = r
             .key("world.map", "units", "width and height; positions stay within 0 to these", "3.1")
             .pair(between(1.0, LONGEST), [50.0, 50.0]);
@@ -64,7 +64,7 @@ impl World {
             let message = format!("found {agents} agents with the leaders, allowed 1 to {MAX_AGENTS}");
             r.blame_key("world.followers", message);
         }
-        World {
+        Domain {
             map,
             coupling: Coupling::read(r, agents.min(MAX_AGENTS), pois.as_ref().map(Vec::len)),
             leaders: leaders.unwrap_or_default(),
