@@ -18,7 +18,7 @@ const MAX_LISTED: usize = 50;
 
 /// What is to be known of one key: a line of the table behind `docs/reference.md` and every commented config.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Key {
+pub struct Definition {
     /// Dotted: `world.dt`.
     pub name: &'static str,
     /// Empty where it has none.
@@ -119,7 +119,7 @@ pub fn read<T>(
 }
 
 /// What an empty text comes to, and every key that `ask` asks for, in that order.
-pub fn keys<T>(ask: impl FnOnce(&mut Reader<'_>) -> T) -> (T, Vec<Key>) {
+pub fn keys<T>(ask: impl FnOnce(&mut Reader<'_>) -> T) -> (T, Vec<Definition>) {
     let mut reader = Reader { table: Some(vec![]), ..Reader::default() };
     let read = ask(&mut reader);
     (read, reader.table.unwrap_or_default())
@@ -324,7 +324,7 @@ pub struct Reader<'a> {
     /// Place, name and message of each.
     problems: Vec<(Place, String, String)>,
     /// All there is to know of the keys asked for, where somebody wants to.
-    table: Option<Vec<Key>>,
+    table: Option<Vec<Definition>>,
 }
 
 /// A key that is being asked for; what it allows and its default are yet to be said.
@@ -495,7 +495,7 @@ impl<'a> Asked<'_, 'a> {
         if let Some(table) = &mut self.reader.table {
             let Asked { name, unit, meaning, paper, .. } = *self;
             let (kind, range, default) = about();
-            table.push(Key { name, unit, kind, range, default, meaning, paper });
+            table.push(Definition { name, unit, kind, range, default, meaning, paper });
         }
         self.reader.take(self.name)
     }

@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use flotilla::config::{
-    Checkpoint, Config, ConfigError, Coupling, Density, Fitness, Follow, Learning, MAX_EPISODES, MAX_GENERATIONS,
+    Config, ConfigError, Coupling, Density, Domain, Fitness, Follow, Learning, MAX_EPISODES, MAX_GENERATIONS,
     MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion, Mutation, Observers, Override,
-    Paradigm, Policy, Problem, Sense, World,
+    Paradigm, Policy, Problem, Saving, Sense,
 };
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -24,7 +24,7 @@ fn problems(text: &str) -> Vec<Problem> {
 fn every_key_but_leaders_and_pois_has_its_default() {
     let config = Config::parse(SMALLEST, "test.toml").unwrap();
     let expected = Config {
-        world: World {
+        world: Domain {
             map: [50.0, 50.0],
             leaders: vec![[1.0, 2.0]],
             followers: vec![],
@@ -68,7 +68,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             start_jitter: 0.0,
             seed: 0,
         },
-        checkpoint: Checkpoint { generations: 0, seconds: 30.0 },
+        checkpoint: Saving { generations: 0, seconds: 30.0 },
     };
     assert_eq!(config, expected);
 }
@@ -196,7 +196,7 @@ fn word<T: flotilla::config::Choice + std::fmt::Debug>() -> impl Strategy<Value 
     (0..T::ALL.len()).prop_map(|index| T::ALL[index].1)
 }
 
-fn worlds() -> impl Strategy<Value = (World, Motion)> {
+fn worlds() -> impl Strategy<Value = (Domain, Motion)> {
     let speeds = (size_or_zero(1e-6, 1e3), 0.0..=1.0, 0.0..=1.0).prop_map(|(max, a, b): (f64, f64, f64)| {
         let tidy = |speed: f64| if speed < 1e-6 { 0.0 } else { speed };
         let min = tidy(max * a);
@@ -231,7 +231,7 @@ fn worlds() -> impl Strategy<Value = (World, Motion)> {
                     };
                     let after: Vec<_> = follows.into_iter().enumerate().map(before).filter(|_| kind & 2 > 0).collect();
                     (
-                        World {
+                        Domain {
                             map,
                             leaders,
                             followers,
@@ -301,7 +301,7 @@ fn configs() -> impl Strategy<Value = Config> {
         },
     );
     let checkpoint = (0..=MAX_GENERATIONS, prop_oneof![Just(0.0), 0.01..=1e9])
-        .prop_map(|(generations, seconds)| Checkpoint { generations, seconds });
+        .prop_map(|(generations, seconds)| Saving { generations, seconds });
     (worlds(), follow, sense, policy, learning, checkpoint).prop_map(
         |((mut world, motion), follow, sense, policy, learning, checkpoint)| {
             if learning.paradigm == Paradigm::AllLeaders && world.observers == Observers::Followers {

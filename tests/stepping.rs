@@ -71,8 +71,8 @@ impl Played {
         let sets: Vec<&[u32]> = sets.collect();
         let now = step.checked_sub(1).map_or(vec![0; pois * words], |step| sets[step].to_vec());
         assert_eq!(stepper.near()[team * now.len()..][..now.len()], now, "near, {about}");
-        let plain = Strided { words: &self.trace.sets[team * self.world.set_words()..], stride: 1, offset: 0 };
-        let at = credit::observed_at(plain, &self.world);
+        let words = &self.trace.sets[team * self.world.set_words()..][..self.world.set_words()];
+        let at = credit::observed_at(Strided { words, stride: 1, offset: 0 }, &self.world);
         let by = |step: usize| at.iter().map(move |at| at.is_some_and(|at| at <= step)).collect::<Vec<bool>>();
         let (observed, before) = (by(step), by(step.saturating_sub(1)));
         let newly: Vec<bool> = observed.iter().zip(before).map(|(&observed, before)| observed && !before).collect();

@@ -139,22 +139,22 @@ impl Learning {
 
 /// `[checkpoint]`: how often a run saves what it needs to go on, without a say in its results; 0 is never.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Checkpoint {
+pub struct Saving {
     /// After so many generations.
     pub generations: usize,
     /// After so many seconds.
     pub seconds: f64,
 }
 
-impl Default for Checkpoint {
-    fn default() -> Checkpoint {
-        Checkpoint { generations: 0, seconds: 30.0 }
+impl Default for Saving {
+    fn default() -> Saving {
+        Saving { generations: 0, seconds: 30.0 }
     }
 }
 
-impl Checkpoint {
-    pub(super) fn read(r: &mut Reader<'_>) -> Checkpoint {
-        Checkpoint {
+impl Saving {
+    pub(super) fn read(r: &mut Reader<'_>) -> Saving {
+        Saving {
             generations: r
                 .key(
                     "checkpoint.generations",
@@ -165,7 +165,7 @@ impl Checkpoint {
                 .number(between(0, MAX_GENERATIONS), 0),
             seconds: r
                 .key("checkpoint.seconds", "s", "between checkpoints, which change no result; 0 is never", "")
-                .number(between(0.01, 1e9).or_zero(), Checkpoint::default().seconds),
+                .number(between(0.01, 1e9).or_zero(), Saving::default().seconds),
         }
     }
 }

@@ -20,7 +20,7 @@ const _: () = assert!(MAX_STEPS * MAX_POIS * MAX_AGENTS.div_ceil(32) * size_of::
 
 /// `[world]`: where everything starts. Lengths in map units, time in seconds, angles in radians.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct World {
+pub struct Domain {
     pub map: [f64; 2],
     pub leaders: Vec<[f64; 2]>,
     pub followers: Vec<[f64; 2]>,
@@ -38,9 +38,9 @@ pub struct World {
     pub speed: f64,
 }
 
-impl World {
+impl Domain {
     /// Reads the section; agents start with one of these speeds, and learn by this paradigm.
-    pub(super) fn read(r: &mut Reader<'_>, start_speed: Allowed<f64>, paradigm: Paradigm) -> World {
+    pub(super) fn read(r: &mut Reader<'_>, start_speed: Allowed<f64>, paradigm: Paradigm) -> Domain {
         let map = r
             .key("world.map", "units", "width and height; positions stay within 0 to these", "3.1")
             .pair(between(1.0, LONGEST), [50.0, 50.0]);
@@ -84,7 +84,7 @@ impl World {
         let places = pois.as_ref().map(Vec::len);
         let steps =
             r.key("world.steps", "steps", "T: length of an episode", "3.2, Eq. 2").number(between(1, MAX_STEPS), 25);
-        World {
+        Domain {
             map,
             coupling: Coupling::read(r, counted.clamp(1, MAX_AGENTS), observers.counted(), places),
             observers,

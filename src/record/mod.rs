@@ -92,7 +92,7 @@ pub fn config_digest(config: &Config) -> String {
 
 /// The config with `[checkpoint]`, which may differ between sessions of one run, at its defaults.
 pub fn without_checkpoint(config: &Config) -> Config {
-    Config { checkpoint: config::Checkpoint::default(), ..config.clone() }
+    Config { checkpoint: config::Saving::default(), ..config.clone() }
 }
 
 /// Lowercase hexadecimal.

@@ -59,7 +59,7 @@ const PALE: Color = [250, 250, 250];
 pub const FAINT: Color = [95, 95, 95];
 
 /// One agent.
-pub struct Agent {
+pub struct Marker {
     pub place: DVec2,
     /// Its heading, of any length but 0.
     pub heading: DVec2,
@@ -82,13 +82,13 @@ pub struct Poi {
 pub struct Team {
     /// The first of the agents lead.
     pub leaders: usize,
-    pub agents: Vec<Agent>,
+    pub agents: Vec<Marker>,
     pub pois: Vec<Poi>,
 }
 
 /// Where a part of the map is drawn.
 #[derive(Clone, Copy)]
-pub struct View {
+pub struct Viewport {
     left: f64,
     above: f64,
     /// Millimetres a unit of the map.
@@ -101,17 +101,17 @@ pub struct View {
     radius: f64,
 }
 
-impl View {
+impl Viewport {
     /// A part of a config's map, from corner to corner, as large as fits into a square of so many millimetres.
-    pub fn new(config: &Config, [from, to]: [DVec2; 2], side: f64) -> View {
+    pub fn new(config: &Config, [from, to]: [DVec2; 2], side: f64) -> Viewport {
         let scale = side / (to - from).max_element();
         let (map, radius) = (config.world.map.into(), config.world.observation_radius);
-        View { left: 0.0, above: 0.0, scale, from, to, map, radius }
+        Viewport { left: 0.0, above: 0.0, scale, from, to, map, radius }
     }
 
     /// The same view from another upper left corner, in millimetres.
-    pub fn moved_to(self, [left, above]: [f64; 2]) -> View {
-        View { left, above, ..self }
+    pub fn moved_to(self, [left, above]: [f64; 2]) -> Viewport {
+        Viewport { left, above, ..self }
     }
 
     /// Width and height in millimetres.
@@ -288,7 +288,7 @@ impl View {
 
     /// What the signs mean: how each is drawn at a place, and the words for it.
     pub fn legend(&self, teams: &[Team], counts: &str) -> Legend {
-        let mut entries: Vec<Entry> = Vec::new();
+        let mut entries: Vec<Gloss> = Vec::new();
         let Some(team) = teams.first() else { return Legend::default() };
         let mut pois = teams.iter().flat_map(|team| &team.pois);
         let up = DVec2::Y;
@@ -347,13 +347,13 @@ impl View {
     }
 }
 
-type Entry = (f64, String, Box<dyn Fn(&mut Scene, [f64; 2])>);
+type Gloss = (f64, String, Box<dyn Fn(&mut Scene, [f64; 2])>);
 
 /// What the signs of a map mean.
 #[derive(Default)]
 pub struct Legend {
     /// A sign's width, its words, and how it is drawn from a place on the baseline.
-    entries: Vec<Entry>,
+    entries: Vec<Gloss>,
 }
 
 impl Legend {
@@ -402,7 +402,7 @@ pub fn layout(name: &str, config: &Config) -> Scene {
     let world = World::new(config);
     let heading = DVec2::new(config.world.heading.cos(), config.world.heading.sin());
     let leaders = world.leaders();
-    let agent = |(index, start): (usize, &glam::Vec2)| Agent {
+    let agent = |(index, start): (usize, &glam::Vec2)| Marker {
         place: start.as_dvec2(),
         heading,
         group: (index < leaders).then_some(index),
@@ -420,7 +420,7 @@ pub fn layout(name: &str, config: &Config) -> Scene {
         pois: config.world.pois.iter().zip(&world.coupling).map(poi).collect(),
     };
     let map = DVec2::from(config.world.map);
-    let view = View::new(config, [DVec2::ZERO, map], 80.0).moved_to([LEFT, HEAD]);
+    let view = Viewport::new(config, [DVec2::ZERO, map], 80.0).moved_to([LEFT, HEAD]);
     let [width, height] = view.size();
     let radius = config.world.observation_radius;
     let mut legend = view.legend(std::slice::from_ref(&team), "");
