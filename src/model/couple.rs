@@ -209,6 +209,11 @@ impl Rule {
         !self.windows.is_empty() || !self.after.is_empty()
     }
 
+    /// Whether an agent counts.
+    pub fn counts(&self, agent: usize) -> bool {
+        self.counted(agent / 32, 1 << (agent % 32)) != 0
+    }
+
     /// Those of a word of a set that count.
     #[inline]
     pub fn counted(&self, word: usize, agents: u32) -> u32 {

@@ -271,15 +271,19 @@ impl Replayed {
             let place = at(step, agent).lerp(at(next, agent), part);
             trail.push(place);
             let group = (self.owner[agent] != credit::NOBODY).then_some(self.owner[agent] as usize);
-            Marker { place, heading: toward(step, agent).lerp(toward(next, agent), part), group, trail }
+            let counts = world.rule.counts(agent);
+            Marker { place, heading: toward(step, agent).lerp(toward(next, agent), part), group, counts, trail }
         };
+        // What a step finds observed.
+        let before: Vec<bool> = self.observed.iter().map(|at| at.is_some_and(|at| at < step.max(1))).collect();
         let poi = |(poi, place): (usize, &Vec2)| {
             let (near, needed) = (self.near(step, poi), world.coupling[poi]);
             Poi {
                 place: place.as_dvec2(),
-                label: format!("{near}/{needed}"),
+                label: map::poi_label(&world.rule, poi, format!("{near}/{needed}")),
                 share: Some(f64::from(near) / f64::from(needed)),
                 observed: self.observed[poi].is_some_and(|observed| observed <= step),
+                open: world.rule.is_open(poi, step.max(1) as u32, &before),
             }
         };
         Team {
@@ -341,6 +345,9 @@ pub fn page(name: &str, config: &Config, played: &[Replayed]) -> String {
         "map": world.map,
         "pois": world.pois,
         "observation_radius": world.observation_radius,
+        "observers": world.observers,
+        "windows": world.windows,
+        "after": world.after,
         "attraction_radius": config.follow.attraction_radius,
         "dt": world.dt,
         "steps": world.steps,
