@@ -5,11 +5,13 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Mutex;
 
+use glam::Vec2;
+
 use crate::backend::compare::{Mismatch, first_mismatch};
 use crate::backend::{Backend, BackendError, Group, Need};
 use crate::config::Config;
 use crate::credit::{Credit, Scores};
-use crate::evolve::{Breeding, Key, Purpose, UNCHANGED};
+use crate::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use crate::sample;
 use crate::trainer::{Row, Trainer};
 use crate::world::World;
@@ -54,6 +56,8 @@ struct Teams {
     policies: usize,
     weights: Vec<f32>,
     choice: Vec<u32>,
+    /// See [`Group::starts`].
+    places: Vec<Vec2>,
 }
 
 impl Teams {
@@ -63,13 +67,19 @@ impl Teams {
         let leaders = world.leaders();
         let policy = |place: usize| ((place / leaders + place % leaders) % policies) as u32;
         let choice = (0..teams * leaders).map(policy).collect();
-        Teams { policies, weights: sample::weights(&world, policies, seed), choice, world }
+        let mut weights = sample::weights(&world, policies, seed);
+        // Of a shared population, teams mix policies all the same: that asks for more.
+        weights.truncate(config.populations() * policies * world.parameters());
+        let mut places = world.starts.clone();
+        let learning = &config.learning;
+        evolve::jitter_pois(Key::new(seed, 0, Purpose::Pois), 0, 0, &world, learning.poi_jitter, &mut places);
+        Teams { policies, weights, choice, places, world }
     }
 
     fn group(&self) -> Group<'_> {
-        let Teams { world, policies, weights, choice } = self;
+        let Teams { world, policies, weights, choice, places } = self;
         let need = Need::Record;
-        Group { world, starts: &world.starts, weights: weights[..].into(), policies: *policies, teams: choice, need }
+        Group { world, starts: places, weights: weights[..].into(), policies: *policies, teams: choice, need }
     }
 }
 
@@ -195,11 +205,11 @@ fn compare_scores(
 fn compare_breeding(config: &Config, teams: &Teams, backend: &mut dyn Backend) -> Result<Option<String>, BackendError> {
     let Teams { world, policies, weights, .. } = teams;
     let (slots, parameters) = (*policies, world.parameters());
-    let sizes = [world.leaders(), slots, parameters];
+    let sizes = [weights.len() / slots / parameters, slots, parameters];
     let Some(mut held) = backend.hold(weights, sizes)? else { return Ok(None) };
     // Each slot's parent is the slot after it, every fourth is kept as it is.
     let planned = |place: usize| ((place + 1) % slots) as u32 | if place % 4 == 3 { UNCHANGED } else { 0 };
-    let parents: Vec<u32> = (0..world.leaders()).flat_map(|_| (0..slots).map(planned)).collect();
+    let parents: Vec<u32> = (0..sizes[0]).flat_map(|_| (0..slots).map(planned)).collect();
     let (key, learning) = (Key::new(config.learning.seed, 0, Purpose::Mutation), &config.learning);
     let breeding = Breeding { parents: &parents, key, generation: 0, learning };
     held.breed(&breeding)?;

@@ -38,7 +38,7 @@ coupling = 4
 type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Which between them cover every choice that a config has, and sizes on both sides of every special case.
-const CASES: [Case; 17] = [
+const CASES: [Case; 22] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -121,6 +121,41 @@ const CASES: [Case; 17] = [
         FORTY_AGENTS,
         &[("world.after", "[[], [0], [1], [0], [3], [3]]"), ("world.coupling", "3")],
     ),
+    (
+        "behaviours",
+        "policies choose behaviours, G",
+        GENERALLY_FORWARD,
+        &[("policy.actions", "'behaviours'"), ("learning.fitness", "'G'")],
+    ),
+    (
+        "behaviours-of-all",
+        "20 leaders choose behaviours, no hidden layer",
+        CHAOTIC,
+        &[("policy.actions", "'behaviours'"), ("policy.hidden", "[]"), ("learning.paradigm", "'all-leaders'")],
+    ),
+    (
+        "shared",
+        "all leaders share a policy, D of two episodes",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.sharing", "'all'"),
+            ("learning.fitness", "'D'"),
+            ("learning.start_jitter", "0.5"),
+            ("learning.episodes_per_team", "2"),
+        ],
+    ),
+    (
+        "shared-by-all",
+        "twelve leaders share a policy that chooses behaviours",
+        GENERALLY_FORWARD,
+        &[("learning.sharing", "'all'"), ("learning.paradigm", "'all-leaders'"), ("policy.actions", "'behaviours'")],
+    ),
+    (
+        "moved-pois",
+        "two episodes a team with POIs elsewhere",
+        GENERALLY_FORWARD,
+        &[("learning.poi_jitter", "3.0"), ("learning.episodes_per_team", "2"), ("learning.population", "13")],
+    ),
 ];
 
 static CONFIGS: LazyLock<Vec<Config>> = LazyLock::new(|| {
@@ -169,15 +204,15 @@ fn train(backend: &mut dyn Backend) -> Vec<Golden> {
         Golden {
             bytes: text.len() + size_of_val(&policies[..]),
             sha256: hex(&hash.finalize()),
-            episodes: trace(backend, trainer.world(arm), &trainer.policies(arm)[0]),
+            episodes: trace(backend, &CONFIGS[arm], trainer.world(arm), &trainer.policies(arm)[0]),
         }
     };
     texts.iter().enumerate().map(golden).collect()
 }
 
 /// Plays a trial's policies, team j of the policies with index j, and hashes every float without the sign of a zero.
-fn trace(backend: &mut dyn Backend, world: &World, weights: &[f32]) -> String {
-    let policies = weights.len() / world.leaders() / world.parameters();
+fn trace(backend: &mut dyn Backend, config: &Config, world: &World, weights: &[f32]) -> String {
+    let policies = config.learning.population;
     let teams: Vec<u32> = (0..policies * world.leaders()).map(|place| (place / world.leaders()) as u32).collect();
     let group =
         Group { world, starts: &world.starts, weights: weights.into(), policies, teams: &teams, need: Need::Record };

@@ -170,11 +170,11 @@ impl Checkpoint {
         let (population, parameters) = (of.learning.population, of.parameters());
         let mut weights = Vec::new();
         for (trial, fitness) in self.snapshot.fitness.iter().enumerate() {
-            let sorted = match policies::from_file(&mut file, of, Some(trial)) {
+            let sorted = match policies::from_file(&mut file, of, &[of.populations()], Some(trial)) {
                 Ok(sorted) if sorted.policies == population => sorted.weights,
                 _ => return false,
             };
-            let mut slots = vec![0.0; of.learners() * (population + 1) * parameters];
+            let mut slots = vec![0.0; of.populations() * (population + 1) * parameters];
             let populations = slots.chunks_exact_mut((population + 1) * parameters);
             let sorted = sorted.chunks_exact(population * parameters);
             for ((slots, sorted), fitness) in populations.zip(sorted).zip(fitness.chunks_exact(population)) {
@@ -201,8 +201,12 @@ struct Shapes {
 
 impl Shapes {
     fn of(config: &Config) -> Shapes {
-        let (trials, leaders, policies) = (config.learning.trials, config.learners(), config.learning.population);
-        Shapes { weights: [trials, leaders, policies + 1, config.parameters()], fitness: [trials, leaders, policies] }
+        let (trials, populations, policies) =
+            (config.learning.trials, config.populations(), config.learning.population);
+        Shapes {
+            weights: [trials, populations, policies + 1, config.parameters()],
+            fitness: [trials, populations, policies],
+        }
     }
 }
 

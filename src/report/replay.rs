@@ -17,7 +17,7 @@ use super::scene::{Anchor, BLACK, Color, Scene};
 use crate::backend::{Backend, BackendError, Episode, Group, Need, Seen, Strided, Trace};
 use crate::config::Config;
 use crate::credit::{self, Credit, Scores};
-use crate::evolve::{self, Key, Purpose};
+use crate::evolve;
 use crate::record::checkpoint;
 use crate::record::folder::{CHECKPOINTS, POLICIES};
 use crate::trainer::{Snapshot, Trainer};
@@ -198,13 +198,11 @@ fn play_best(
     let (leaders, population) = (world.leaders(), learning.population);
     let weights = trainer.weights(0, 0)?.into();
 
-    let mut teams = vec![0; population * leaders];
-    evolve::form_teams(Key::new(learning.seed, trial, Purpose::Teams), generation, leaders, &mut teams);
-    let key = Key::new(learning.seed, trial, Purpose::Starts);
+    let teams = evolve::teams_of(learning, trial, generation, leaders);
     let starts: Vec<Vec<Vec2>> = (0..learning.episodes_per_team)
         .map(|episode| {
             let mut starts = Vec::new();
-            evolve::jitter_starts(key, generation, episode, &world, learning.start_jitter, &mut starts);
+            evolve::places(learning, trial, generation, episode, &world, &mut starts);
             starts
         })
         .collect();
@@ -225,14 +223,19 @@ fn play_best(
     }
     let best_g = f64::from(most) / (world.pois.len() * starts.len()) as f64;
 
-    let trace = backend.trace(&group(&starts[0], &teams[team * leaders..(team + 1) * leaders]))?;
+    let shown = group(&starts[0], &teams[team * leaders..(team + 1) * leaders]);
+    let trace = backend.trace(&shown)?;
+    // POIs are drawn where they were.
+    let moved = shown.moved_pois().map(<[Vec2]>::to_vec);
     let whole = |words| Strided { words, stride: 1, offset: 0 };
     let episode = Episode { group: 0, team: 0, sets: whole(&trace.sets), seen: Seen::Counts(whole(&trace.seen)) };
     let scores = Credit::default().all(&episode, &world);
     let mut owner = Vec::new();
     credit::assign(&episode.seen, &world, &mut owner);
     let observed = credit::observed_at(episode.sets, &world);
-    Ok(Replayed { trial, generation, team, best_g, episodes: starts.len(), scores, owner, observed, trace, world })
+    let episodes = starts.len();
+    let world = World { pois: moved.unwrap_or(world.pois.clone()), ..world };
+    Ok(Replayed { trial, generation, team, best_g, episodes, scores, owner, observed, trace, world })
 }
 
 /// Observers in one set.
