@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use flotilla::config::{self, Key, Override};
-use flotilla::report::paper::{Arm, arms};
+use flotilla::report::paper::{Experiment, arms};
 use flotilla::sweep::Sweep;
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
@@ -33,7 +33,7 @@ impl Config {
     #[staticmethod]
     fn paper(layout: &str) -> PyResult<Config> {
         let arms = arms(&[]).raise()?;
-        let name = |arm: &Arm| arm.layout.name.replace(' ', "_");
+        let name = |arm: &Experiment| arm.layout.name.replace(' ', "_");
         let found = arms.iter().find(|arm| name(arm) == layout.replace([' ', '-'], "_"));
         found.map(|arm| Config(arm.config.clone())).ok_or_else(|| {
             let mut names: Vec<_> = arms.iter().map(name).collect();

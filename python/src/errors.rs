@@ -107,7 +107,7 @@ impl Raised for ReplayError {
     }
 }
 
-impl Raised for runs::RunError {
+impl Raised for runs::ReadError {
     fn raised(self) -> PyErr {
         failed(self)
     }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use flotilla::report::curves::PRINT;
 use flotilla::report::replay::{self as again, Motion, Played, ReplayError};
 use flotilla::report::runs;
-use flotilla::report::scene::{Kind, Scene};
+use flotilla::report::scene::{Format, Scene};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
@@ -101,7 +101,7 @@ impl Figure {
 
     /// The picture as the file that a path's ending says, of so many pixels across.
     fn file<'py>(&self, py: Python<'py>, path: PathBuf, width: Option<u32>) -> PyResult<Bound<'py, PyBytes>> {
-        let Some(kind) = Kind::of(&path) else {
+        let Some(kind) = Format::of(&path) else {
             let text = format!("{}: its name must end in .svg, .pdf or .png", path.display());
             return Err(PyValueError::new_err(text));
         };

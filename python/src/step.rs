@@ -4,7 +4,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use flotilla::config::{Choice, Fitness};
 use flotilla::front;
-use flotilla::report::map::{Agent, Poi, Team, View};
+use flotilla::report::map::{self, Marker, Poi, Team, Viewport};
 use flotilla::report::scene::Scene;
 use flotilla::stepping;
 use flotilla::world::{INPUTS, OUTPUTS};
@@ -186,7 +186,7 @@ impl Stepper {
                 return None;
             }
             let team = team_of(&mut stepper, team);
-            let view = View::new(&self.config, [DVec2::ZERO, self.config.world.map.into()], SIDE);
+            let view = Viewport::new(&self.config, [DVec2::ZERO, self.config.world.map.into()], SIDE);
             let [width, height] = view.size();
             let mut scene = Scene::new(width, height);
             view.draw(&mut scene, &team);
@@ -214,29 +214,26 @@ fn team_of(stepper: &mut stepping::Stepper, team: usize) -> Team {
     let places: Vec<_> = (0..agents).map(|agent| (at(states.positions, agent), at(states.headings, agent))).collect();
     let world = stepper.world();
     let (pois, words) = (world.pois.len(), world.constants.words as usize);
-    let near = |poi: usize| {
-        let words = &stepper.near()[(team * pois + poi) * words..][..words];
-        words.iter().map(|word| word.count_ones()).sum::<u32>()
+    let near = |poi: usize| world.rule.count(stepper.near()[(team * pois + poi) * words..][..words].iter().copied());
+    let (step, observed) = (stepper.steps()[team].max(1), &stepper.observed()[team * pois..][..pois]);
+    let agent = |(agent, (place, heading))| {
+        let group = (agent < leaders).then_some(agent);
+        Marker { place, heading, group, counts: world.rule.counts(agent), trail: vec![place] }
+    };
+    let poi = |(poi, place): (usize, &Vec2)| {
+        let (near, needed) = (near(poi), world.coupling[poi]);
+        Poi {
+            place: place.as_dvec2(),
+            label: map::poi_label(&world.rule, poi, format!("{near}/{needed}")),
+            share: Some(f64::from(near) / f64::from(needed)),
+            observed: observed[poi],
+            open: world.rule.is_open(poi, step, observed),
+        }
     };
     Team {
         leaders,
-        agents: (0..)
-            .zip(places)
-            .map(|(agent, (place, heading))| Agent {
-                place,
-                heading,
-                group: (agent < leaders).then_some(agent),
-                trail: vec![place],
-            })
-            .collect(),
-        pois: (world.pois.iter().enumerate())
-            .map(|(poi, place)| Poi {
-                place: place.as_dvec2(),
-                label: format!("{}/{}", near(poi), world.coupling[poi]),
-                share: Some(f64::from(near(poi)) / f64::from(world.coupling[poi])),
-                observed: stepper.observed()[team * pois + poi],
-            })
-            .collect(),
+        agents: places.into_iter().enumerate().map(agent).collect(),
+        pois: world.pois.iter().enumerate().map(poi).collect(),
     }
 }
 

@@ -7,12 +7,12 @@ use std::time::{Duration, Instant};
 
 use flotilla::backend::Player;
 use flotilla::front::{self, Trained};
-use flotilla::memory::Plan;
+use flotilla::memory::Peaks;
 use flotilla::record::disk::Disk;
-use flotilla::record::folder::{self, Folder, METRICS, POLICIES, Start, State};
+use flotilla::record::folder::{self, Folder, METRICS, POLICIES, Start, Status};
 use flotilla::record::{RecordError, metrics, policies};
 use flotilla::report::runs;
-use flotilla::run::{Options, Outcome, RunError, Session};
+use flotilla::run::{Ended, Options, RunError, Session};
 use flotilla::trainer::Row;
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::exceptions::{PyTypeError, PyValueError};
@@ -194,7 +194,7 @@ pub fn train_into(
     }
     let mut watcher = Watcher::new(callback.as_ref());
     let notes = workers::play(py, backend, |player| {
-        Plan::of([&config.0], rayon::current_num_threads())
+        Peaks::of([&config.0], rayon::current_num_threads())
             .check(player.1.backend == "gpu")
             .map_err(RunError::from)
             .raise()?;
@@ -221,7 +221,7 @@ pub fn train_into(
             if watcher.error.is_some() {
                 break;
             }
-            if outcome == Outcome::Stopped {
+            if outcome == Ended::Stopped {
                 // The callback's wish: as much as there is, and its champions, is what the run comes to.
                 last = session.end().raise()?;
                 watcher.callback = None;
@@ -308,7 +308,7 @@ pub fn save(
         let (backend, description) = played;
         let run = folder::Run {
             version: env!("CARGO_PKG_VERSION").into(),
-            state: State::Done,
+            state: Status::Done,
             backend,
             description,
             threads: rayon::current_num_threads(),
