@@ -63,7 +63,7 @@ def compare(runs: Sequence[Run | str | os.PathLike[str]], *, at: str | int = "la
         paired: compare pair by pair: trials with one seed and number are pairs.
 
     Returns:
-        what ``docs/json.md`` says of ``flotilla compare --json``.
+        what ``docs/json.md`` says of ``flotilla compare RUN RUN --json``.
 
     Raises:
         ValueError: there is nothing to compare.

@@ -229,7 +229,7 @@ def train(
     Args:
         config: what to train.
         seed: instead of the config's ``learning.seed``.
-        out: a folder to keep the run in as it trains, as ``flotilla train --out`` does: whatever happens, it can be gone on
+        out: a folder to keep the run in as it trains, as ``flotilla train CONFIG --out DIR`` does: whatever happens, it can be gone on
             with. None trains in memory; :meth:`Run.save` still writes it.
         resume: go on with the run in ``out``, or start it where there is none.
         force: write over the run in ``out``.

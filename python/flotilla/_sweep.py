@@ -95,7 +95,7 @@ def sweep(
         executor: who plays the points: any ``concurrent.futures.Executor``, of processes or of Dask's, MPI's or Slurm's
             (submitit) workers. Points travel as configs, and results come back as arrays. Where a worker is lost, its
             points are played again, to the same bits. None trains them here, side by side.
-        out: a folder to keep the sweep in, as ``flotilla sweep --out`` does; without ``executor`` alone.
+        out: a folder to keep the sweep in, as ``flotilla sweep SWEEP --out DIR`` does; without ``executor`` alone.
         skip_impossible: leave out points that cannot run.
         backend: as of :func:`train`.
         progress: told how many points of how many are done.

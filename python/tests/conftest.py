@@ -11,7 +11,7 @@ import pytest
 
 import flotilla
 
-ROOT = pathlib.Path(__file__).parents[2]
+ROOT = pathlib.Path(os.environ.get("FLOTILLA_ROOT") or pathlib.Path(__file__).parents[2])
 SOURCE = pathlib.Path(__file__).parents[1] / "flotilla"
 
 
