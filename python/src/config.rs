@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use flotilla::config::{self, Key, Override};
+use flotilla::config::{self, Definition, Override};
 use flotilla::report::paper::{Experiment, arms};
 use flotilla::sweep::Sweep;
 use pyo3::exceptions::{PyTypeError, PyValueError};
@@ -76,7 +76,7 @@ impl Config {
 /// Every key of a config: its name, unit, kind, range, default, meaning and where the paper has it.
 #[pyfunction]
 pub fn keys() -> Vec<(String, String, String, String, Option<String>, String, String)> {
-    let row = |Key { name, unit, kind, range, default, meaning, paper }| {
+    let row = |Definition { name, unit, kind, range, default, meaning, paper }| {
         let [name, unit, meaning, paper] = [name, unit, meaning, paper].map(String::from);
         (name, unit, kind, range, default, meaning, paper)
     };

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use flotilla::report::curves::PRINT;
-use flotilla::report::replay::{self as again, Motion, Played, ReplayError};
+use flotilla::report::replay::{self as again, Film, Replayed, ReplayError};
 use flotilla::report::runs;
 use flotilla::report::scene::{Format, Scene};
 use pyo3::exceptions::PyValueError;
@@ -19,7 +19,7 @@ use crate::workers;
 pub struct Replay {
     name: String,
     config: flotilla::Config,
-    played: Vec<Played>,
+    played: Vec<Replayed>,
 }
 
 /// Plays the best teams of some generations of a trial again.
@@ -57,8 +57,8 @@ impl Replay {
     /// Trial, generation, team, G and POIs observed of each episode.
     #[getter]
     fn episodes(&self) -> Vec<(usize, usize, usize, f64, usize)> {
-        let row = |played: &Played| {
-            let Played { trial, generation, team, best_g, ref observed, .. } = *played;
+        let row = |played: &Replayed| {
+            let Replayed { trial, generation, team, best_g, ref observed, .. } = *played;
             (trial, generation, team, best_g, observed.iter().flatten().count())
         };
         self.played.iter().map(row).collect()
@@ -69,7 +69,7 @@ impl Replay {
     }
 
     fn gif<'py>(&self, py: Python<'py>, width: Option<u32>, fps: u32) -> PyResult<Bound<'py, PyBytes>> {
-        let motion = Motion { width, fps };
+        let motion = Film { width, fps };
         let bytes = workers::aside(py, || again::gif(&self.config, &self.played, motion)).raise()?;
         Ok(PyBytes::new(py, &bytes))
     }
