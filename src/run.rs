@@ -269,6 +269,23 @@ impl Session {
         Ok(Ended::Done)
     }
 
+    /// Makes the generation that is played next the last of each run, or leaves it at an earlier one; gives the last of all.
+    /// What each then comes to is what a run of so many generations comes to.
+    ///
+    /// # Errors
+    /// A config cannot be written.
+    pub fn end(&mut self) -> Result<usize, RunError> {
+        let mut last = 0;
+        for member in &mut self.members {
+            if let Some(Going { arm, .. }) = member.going {
+                member.config.learning.generations = self.trainer.end(arm);
+                member.folder.write_config(&member.config)?;
+            }
+            last = last.max(member.config.learning.generations);
+        }
+        Ok(last)
+    }
+
     /// The runs that have something left to do.
     fn going(&self) -> impl Iterator<Item = usize> {
         self.members.iter().enumerate().filter(|(_, member)| member.going.is_some()).map(|(run, _)| run)

@@ -232,8 +232,16 @@ impl Folder {
         if found.finished.is_some() && Config::load(&folder.file(CONFIG)).is_ok() {
             return Ok((folder, found));
         }
-        folder.write_text(CONFIG, &config.to_toml())?;
+        folder.write_config(config)?;
         Ok((folder, found))
+    }
+
+    /// Writes `config.toml`.
+    ///
+    /// # Errors
+    /// It cannot be written.
+    pub fn write_config(&self, config: &Config) -> Result<(), RecordError> {
+        self.write_text(CONFIG, &config.to_toml())
     }
 
     /// Removes a run; whatever else is in the folder stays.
