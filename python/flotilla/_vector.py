@@ -263,7 +263,7 @@ class VectorEnv:
 
         Example:
             >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).states()[0].shape
-            (2, 20, 2)
+            (2, 12, 2)
         """
         return self._teams.stepper.states()
 
@@ -272,7 +272,7 @@ class VectorEnv:
 
         Example:
             >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).near().shape
-            (2, 4, 20)
+            (2, 4, 12)
         """
         return _near(self._teams.stepper.near, self._teams.agents)
 
