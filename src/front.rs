@@ -278,8 +278,8 @@ pub struct Played {
 }
 
 /// Plays teams of given policies, `[leaders][teams][parameters]`: team `t` is made of every leader's policy `t`. Where
-/// all leaders of a team share one, `[1][teams][parameters]` will do. A policy's parameters are layer by layer and unit
-/// by unit: a weight for each input, then the bias.
+/// all leaders of a team share one, `[1][teams][parameters]` will do. A policy's parameters stand layer by layer, in each
+/// input by input with the bias last, in each unit by unit.
 ///
 /// # Errors
 /// The config, the weights or the starts are wrong, or the backend fails.

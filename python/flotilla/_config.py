@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from flotilla import _native
+from flotilla import _native as native
 
 
 class Key(NamedTuple):
@@ -61,13 +61,13 @@ class Config:
     """
 
     __slots__ = ("_native",)
-    _native: _native.Config
+    _native: native.Config
 
     def __init__(self, **sections: Mapping[str, Any]) -> None:
-        self._native = _native.Config.build(_flat(sections))
+        self._native = native.Config.build(_flat(sections))
 
     @classmethod
-    def _of(cls, made: _native.Config) -> Config:
+    def _of(cls, made: native.Config) -> Config:
         config = object.__new__(cls)
         config._native = made
         return config
@@ -84,7 +84,7 @@ class Config:
             50
         """
         path = os.fspath(path)
-        return cls._of(_native.Config.load("./-" if path == "-" else path))
+        return cls._of(native.Config.load("./-" if path == "-" else path))
 
     @classmethod
     def parse(cls, text: str, name: str = "the config") -> Config:
@@ -97,7 +97,7 @@ class Config:
             >>> flotilla.Config.parse("[world]\\nleaders = [[1, 1]]\\npois = [[2, 2]]").leaders
             1
         """
-        return cls._of(_native.Config.parse(text, name))
+        return cls._of(native.Config.parse(text, name))
 
     @classmethod
     def paper(cls, layout: str = "generally_forward", fitness: str = "Df", paradigm: str = "leader-follower") -> Config:
@@ -110,7 +110,7 @@ class Config:
             >>> flotilla.Config.paper("chaotic", fitness="G")
             <flotilla.Config: 4 leaders, 16 followers, 4 POIs; leader-follower by G, 50 teams, 100 generations, 5 trials, seed 0>
         """
-        config = cls._of(_native.Config.paper(layout))
+        config = cls._of(native.Config.paper(layout))
         return config.replace(learning={"fitness": fitness, "paradigm": paradigm})
 
     @staticmethod
@@ -121,7 +121,7 @@ class Config:
             >>> flotilla.Config.keys()[0].name
             'world.map'
         """
-        return [Key(*key) for key in _native.keys()]
+        return [Key(*key) for key in native.keys()]
 
     def replace(self, **sections: Mapping[str, Any]) -> Config:
         """This config with some keys changed; those of a section that are not named stay.

@@ -17,7 +17,7 @@ from flotilla._vector import PIXELS, RENDER_MODES, Teams
 Box = spaces.Box
 
 
-class TeamEnv(ParallelEnv[str, Floats, Floats]):
+class TeamEnv(ParallelEnv[str, Floats, Floats]):  # type: ignore[misc, unused-ignore]
     """See :func:`flotilla.parallel_env`."""
 
     def __init__(self, config: Config, render_mode: str | None = None, reward: str = "G") -> None:
@@ -82,8 +82,9 @@ class TeamEnv(ParallelEnv[str, Floats, Floats]):
             {agent: {} for agent in agents},
         )
 
-    def state(self) -> NDArray[Any]:
-        return self._teams.state()[0]
+    def state(self) -> Floats:
+        state: Floats = self._teams.state()[0]
+        return state
 
     def render(self) -> NDArray[np.uint8] | None:
         return self._teams.stepper.render(0, PIXELS) if self.render_mode == "rgb_array" else None

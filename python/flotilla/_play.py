@@ -33,7 +33,7 @@ class Trace:
         >>> config = flotilla.Config.paper()
         >>> still = np.zeros((4, 1, config.parameters), np.float32)
         >>> flotilla.rollout(config, still, trace=True).trace.positions.shape
-        (1, 26, 20, 2)
+        (1, 26, 12, 2)
     """
 
     positions: Floats
@@ -97,7 +97,8 @@ def rollout(
         config: the world, and the policies' network.
         policies: float32 ``[leaders, teams, parameters]``: team ``t`` is made of every leader's policy ``t``; or
             ``[1, teams, parameters]`` where the leaders of a team share one. Not copied where they are C-contiguous
-            float32. A policy's parameters are layer by layer and unit by unit: a weight for each input, then the bias.
+            float32. A policy's parameters stand layer by layer, in each input by input with the bias last, in each unit by
+            unit.
         episodes: play every team from so many starts that no training saw; None plays once, from the config's own.
         seed: of these starts; the same for all policies.
         jitter: how far a start is moved at most on each axis, in map units; None is the config's ``learning.start_jitter``.
@@ -157,7 +158,7 @@ def forward(policies: ArrayLike, inputs: ArrayLike, hidden: Sequence[int] | None
     Within 5e-6 of the program's answers, which have arithmetic of their own that is the same everywhere.
 
     Args:
-        policies: ``[..., parameters]``, layer by layer and unit by unit: a weight for each input, then the bias.
+        policies: ``[..., parameters]``: layer by layer, in each input by input with the bias last, in each unit by unit.
         inputs: ``[..., 8]``; the axes before the last are broadcast against those of the policies.
         hidden: units of the hidden layers, ``config["policy.hidden"]``; None where there is at most one.
 
@@ -183,8 +184,8 @@ def forward(policies: ArrayLike, inputs: ArrayLike, hidden: Sequence[int] | None
     values = values.astype(np.float64)
     for before, after in zip(layers, layers[1:]):
         layer = weights[..., at : at + (before + 1) * after].astype(np.float64)
-        layer = layer.reshape(*weights.shape[:-1], after, before + 1)
-        values = np.tanh(np.einsum("...ui,...i->...u", layer[..., :-1], values) + layer[..., -1])
+        layer = layer.reshape(*weights.shape[:-1], before + 1, after)
+        values = np.tanh(np.einsum("...iu,...i->...u", layer[..., :-1, :], values) + layer[..., -1, :])
         at += (before + 1) * after
     answers: Floats = values.astype(np.float32)
     return answers
@@ -210,10 +211,10 @@ def to_onnx(policy: ArrayLike, path: Any, hidden: Sequence[int] | None = None) -
     layers, at, value = widths(weights.size, hidden), 0, "inputs"
     nodes, tensors = [], []
     for index, (before, after) in enumerate(zip(layers, layers[1:])):
-        layer = weights[at : at + (before + 1) * after].reshape(after, before + 1)
+        layer = weights[at : at + (before + 1) * after].reshape(before + 1, after)
         at += layer.size
-        tensors.append(numpy_helper.from_array(np.ascontiguousarray(layer[:, :-1].T), f"weights.{index}"))
-        tensors.append(numpy_helper.from_array(np.ascontiguousarray(layer[:, -1]), f"biases.{index}"))
+        tensors.append(numpy_helper.from_array(layer[:-1], f"weights.{index}"))
+        tensors.append(numpy_helper.from_array(layer[-1], f"biases.{index}"))
         result = "outputs" if index == len(layers) - 2 else f"layer.{index}"
         nodes.append(helper.make_node("Gemm", [value, f"weights.{index}", f"biases.{index}"], [f"sums.{index}"]))
         nodes.append(helper.make_node("Tanh", [f"sums.{index}"], [result]))

@@ -16,10 +16,10 @@ from flotilla._errors import Error
 from flotilla._run import Run
 
 
-def program(command: str, *words: str | os.PathLike[str], quiet: bool = True, **flags: Any) -> dict[str, Any]:
+def program(command: str, *words: str, **flags: Any) -> dict[str, Any]:
     """Runs a command with flags (`by=None` is none, `force=True` is `--force`); what it told, as a dictionary."""
-    line = [sys.executable, "-m", "flotilla", command, *map(os.fspath, words), "--json"]
-    if quiet and command != "compare" and command != "devices":
+    line = [sys.executable, "-m", "flotilla", command, *words, "--json"]
+    if command != "compare":
         line.append("--quiet")
     for name, value in flags.items():
         flag = "--" + name.rstrip("_").replace("_", "-")
@@ -48,8 +48,6 @@ def program(command: str, *words: str | os.PathLike[str], quiet: bool = True, **
         raise ValueError(text.removeprefix("error: "))
     if found is None or (running.returncode != 0 and command != "verify"):
         raise Error(text.removeprefix("error: ") or f"flotilla {command} ended with {running.returncode}")
-    if not quiet and text:
-        print(text, file=sys.stderr)
     given: dict[str, Any] = found
     return given
 

@@ -47,11 +47,11 @@ class Run:
     """
 
     def __init__(self, outcome: _native.Outcome, played: tuple[str, str], times: list[float] | None, folder: str | None):
-        config, metrics, self.policies, self.digest = outcome
-        self.config: Config = Config._of(config)
+        config, metrics, policies, digest = outcome
+        self.config = Config._of(config)
         self.metrics: dict[str, NDArray[np.float64]] = dict(zip(METRICS, metrics))
-        self.policies: list[Floats]
-        self.digest: str
+        self.policies: list[Floats] = policies
+        self.digest: str = digest
         self.backend = played[1]
         self._played, self._times, self._folder = played, times, folder
         self._kept: tempfile.TemporaryDirectory[str] | None = None

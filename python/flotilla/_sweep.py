@@ -27,7 +27,7 @@ TRIES = 3
 class Point(NamedTuple):
     """One run of a sweep."""
 
-    index: int
+    number: int
     """Its place among all combinations."""
     values: dict[str, Any]
     """By the axes' keys."""
@@ -67,7 +67,7 @@ class Sweep:
         for point in self.points:
             for trial in range(len(point.run.policies)):
                 last = {name: values[trial, -1] for name, values in point.run.metrics.items()}
-                rows.append({"point": point.index, **point.values, "trial": trial, **last})
+                rows.append({"point": point.number, **point.values, "trial": trial, **last})
         return pandas.DataFrame(rows)
 
     def __repr__(self) -> str:

@@ -84,6 +84,10 @@ class VectorEnv:
     0, every team of every episode starts from a place of its own, drawn from the seed of :meth:`reset`; else all start
     where the config says. ``close`` gives nothing back, for there is nothing to give.
 
+    Leaders sense the density of POIs, then of agents, in four quadrants around their heading: back right, front right, front
+    left, back left. They are told a turn, in parts of a half turn to the left, and a speed, from -1 for standing still to 1
+    for the highest. The spaces need gymnasium.
+
     Args:
         config: the world. Of its learning only who leads and the jitter of starts counts here.
         num_envs: how many teams.
@@ -95,12 +99,6 @@ class VectorEnv:
             ``options={"reset_mask": mask}``.
         copy: give every step's observations as arrays of their own.
         render_mode: None or ``"rgb_array"``.
-
-    Attributes:
-        single_observation_space: ``Box [leaders, 8]``: what leaders sense: the density of POIs, then of agents, in four
-            quadrants around their heading: back right, front right, front left, back left. (The spaces need gymnasium.)
-        single_action_space: ``Box [leaders, 2]`` in -1..1: a turn, in parts of a half turn to the left, and a speed, from
-            standing still to the highest.
 
     Raises:
         ValueError: a number or word is not allowed.
@@ -142,30 +140,35 @@ class VectorEnv:
 
     @property
     def single_observation_space(self) -> spaces.Box:
+        """What is seen of one team, ``Box [leaders, 8]``."""
         from gymnasium import spaces
 
         return spaces.Box(0, np.inf, (self.leaders, _native.INPUTS), np.float32)
 
     @property
     def single_action_space(self) -> spaces.Box:
+        """What one team is told, ``Box [leaders, 2]``."""
         from gymnasium import spaces
 
         return spaces.Box(-1, 1, (self.leaders, _native.OUTPUTS), np.float32)
 
     @property
     def observation_space(self) -> spaces.Box:
+        """What is seen of all teams, ``Box [num_envs, leaders, 8]``."""
         from gymnasium import spaces
 
         return spaces.Box(0, np.inf, (self.num_envs, self.leaders, _native.INPUTS), np.float32)
 
     @property
     def action_space(self) -> spaces.Box:
+        """What all teams are told, ``Box [num_envs, leaders, 2]``."""
         from gymnasium import spaces
 
         return spaces.Box(-1, 1, (self.num_envs, self.leaders, _native.OUTPUTS), np.float32)
 
     @property
     def unwrapped(self) -> VectorEnv:
+        """Itself."""
         return self
 
     def _observations(self) -> Floats:
@@ -223,7 +226,7 @@ class VectorEnv:
             >>> truncated, rewards.shape, infos["final_obs"].shape
             (array([ True,  True]), (2, 4), (2, 4, 8))
         """
-        teams, infos = self._teams, {}
+        teams, infos = self._teams, dict[str, Any]()
         if self.autoreset == "next_step" and self._any_over:
             fresh = self._over
             teams.reset(None, fresh)
@@ -263,7 +266,7 @@ class VectorEnv:
 
         Example:
             >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).states()[0].shape
-            (2, 20, 2)
+            (2, 12, 2)
         """
         return self._teams.stepper.states()
 
@@ -272,7 +275,7 @@ class VectorEnv:
 
         Example:
             >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).near().shape
-            (2, 4, 20)
+            (2, 4, 12)
         """
         return _near(self._teams.stepper.near, self._teams.agents)
 

@@ -32,7 +32,7 @@ def documented():
                     yield f"{name}.{member}", value
 
 
-@pytest.mark.parametrize("name, thing", documented(), ids=lambda value: value if isinstance(value, str) else "")
+@pytest.mark.parametrize("name, thing", list(documented()), ids=lambda value: value if isinstance(value, str) else "")
 def test_examples_do_what_they_say(name, thing):
     text = inspect.getdoc(thing)
     assert text, f"{name} has no docstring"
@@ -54,7 +54,7 @@ def snippets():
                 yield pytest.param(code, id=f"{page.relative_to(ROOT)} {number}")
 
 
-@pytest.mark.parametrize("code", snippets())
+@pytest.mark.parametrize("code", list(snippets()))
 def test_snippets_run(code):
     os.symlink(ROOT / "configs", "configs")
     exec(compile(code, "snippet", "exec"), {"__name__": "snippet"})

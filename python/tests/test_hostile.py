@@ -74,10 +74,10 @@ def test_wrong_arguments_are_told(name):
     raised = []
 
     @settings(max_examples=EXAMPLES, deadline=None, database=None, suppress_health_check=list(HealthCheck), derandomize=True)
-    @given(things, things, things, things)
-    def call(*given):
+    @given(st.tuples(things, things, things, things))
+    def call(arguments):
         try:
-            FUNCTIONS[name](*given)
+            FUNCTIONS[name](*arguments)
         except ALLOWED as error:
             raised.append(error)
             assert "panicked" not in str(error) and "unwrap" not in str(error)

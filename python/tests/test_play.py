@@ -102,8 +102,8 @@ def test_wrong_policies_are_one_sentence(config, change, error, says):
 def test_the_network_in_numpy():
     rng = np.random.default_rng(1)
     policy, inputs = rng.normal(size=112), rng.normal(size=8)
-    hidden = np.tanh(policy[:90].reshape(10, 9) @ [*inputs, 1])
-    assert np.allclose(forward(policy, inputs), np.tanh(policy[90:].reshape(2, 11) @ [*hidden, 1]), atol=1e-7)
+    hidden = np.tanh([*inputs, 1] @ policy[:90].reshape(9, 10))
+    assert np.allclose(forward(policy, inputs), np.tanh([*hidden, 1] @ policy[90:].reshape(11, 2)), atol=1e-7)
     assert forward(np.zeros((3, 1, 18)), np.zeros((5, 8))).shape == (3, 5, 2)
     with pytest.raises(ValueError, match="name its hidden layers"):
         forward(np.zeros(113), inputs)

@@ -91,7 +91,11 @@ def test_what_is_wrong_with_a_sweep_is_told(grid):
     with pytest.raises(ConfigError) as error:
         sweep(grid.replace("[1, 3]", "[1, 300]"))
     assert "world.coupling" in str(error.value) and error.value.problems[0].line is not None
-    assert len(sweep(grid.replace("[1, 3]", "[1, 300]"), skip_impossible=True)) == 2
+    sizes = "\n".join(line for line in grid.splitlines() if not line.startswith(("population", "elites", '"')))
+    sizes += '\n"learning.population" = [2, 20]\n"learning.elites" = [1, 5]\n'
+    with pytest.raises(ConfigError, match="1 of 4 points"):
+        sweep(sizes)
+    assert [point.number for point in sweep(sizes, skip_impossible=True)] == [0, 2, 3]
     with pytest.raises(flotilla.Error, match="nowhere.toml: cannot be read"):
         sweep("nowhere.toml")
     with pytest.raises(ConfigError, match="grid"):
