@@ -10,8 +10,8 @@ use crate::host::Instant;
 use crate::memory::{self, TooLittle};
 use crate::record::checkpoint::{Checkpoint, Keeper, Schedule};
 use crate::record::disk::Disk;
-use crate::record::folder::{self, Folder, METRICS, Note, POLICIES, Run, Start, State, Story};
-use crate::record::metrics::{self, Mark};
+use crate::record::folder::{self, Folder, METRICS, Note, POLICIES, Run, Start, Status, Story};
+use crate::record::metrics::{self, Extent};
 use crate::record::policies;
 use crate::record::{RecordError, config_digest};
 use crate::trainer::{Row, Snapshot, SnapshotError, Trainer};
@@ -90,7 +90,7 @@ pub struct Results {
 
 /// How a session ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Outcome {
+pub enum Ended {
     Done,
     /// Everything is saved.
     Stopped,
@@ -124,7 +124,7 @@ struct Going {
     metrics: metrics::Writer,
     keeper: Keeper,
     /// Where the metrics were before the last generation's rows.
-    ending: Option<Mark>,
+    ending: Option<Extent>,
 }
 
 impl Session {
@@ -201,14 +201,14 @@ impl Session {
     ///
     /// # Errors
     /// The backend fails (what came before is saved then), or something cannot be written.
-    pub fn train(&mut self, player: &mut Player, options: &mut Options<'_>) -> Result<Outcome, RunError> {
+    pub fn train(&mut self, player: &mut Player, options: &mut Options<'_>) -> Result<Ended, RunError> {
         self.since = Instant::now();
         for member in self.members.iter_mut().filter(|member| member.going.is_some()) {
             member.run.sessions = member.run.sessions.saturating_add(1);
             member.run.command = options.command.into();
         }
         self.settle_on(player);
-        self.write_runs(State::Running)?;
+        self.write_runs(Status::Running)?;
         let (mut flushed, mut setback, mut told) = (Instant::now(), None, false);
         // Once, and only what a generation has made up for: a device that is gone for good is told of as such.
         let mut tell = |error: Option<BackendError>| {
@@ -260,13 +260,13 @@ impl Session {
                 saved => {
                     saved?;
                     if stop {
-                        return Ok(Outcome::Stopped);
+                        return Ok(Ended::Stopped);
                     }
                 }
             }
         }
         tell(setback);
-        Ok(Outcome::Done)
+        Ok(Ended::Done)
     }
 
     /// The runs that have something left to do.
@@ -338,12 +338,12 @@ impl Session {
     fn stop(&mut self) -> Result<(), RunError> {
         let saved = self.save();
         let waited = self.members.iter_mut().try_for_each(Member::wait);
-        let written = self.write_runs(State::Stopped);
+        let written = self.write_runs(Status::Stopped);
         saved.and(waited).and(written)
     }
 
     /// Writes `run.json` of every run that is not done.
-    fn write_runs(&mut self, state: State) -> Result<(), RunError> {
+    fn write_runs(&mut self, state: Status) -> Result<(), RunError> {
         let seconds = self.seconds();
         let going = self.members.iter_mut().zip(&self.generations).filter(|(member, _)| member.going.is_some());
         side_by_side(going.collect(), |(member, &next)| member.write_run(state, next, seconds, None)).map(drop)
@@ -397,7 +397,7 @@ impl Member {
     }
 
     fn is_due(&self, next: usize) -> bool {
-        let config::Checkpoint { generations, seconds } = self.config.checkpoint;
+        let config::Saving { generations, seconds } = self.config.checkpoint;
         self.going.as_ref().is_some_and(|going| going.keeper.is_due(&Schedule { generations, seconds }, next))
     }
 
@@ -455,13 +455,13 @@ impl Member {
         policies::write(&self.folder.disk, &path, &self.config, policies)?;
         let (story, digest) = self.folder.digest(&self.config, policies)?;
         keeper.wait()?;
-        self.write_run(State::Done, generation, seconds, Some(digest.clone()))?;
+        self.write_run(Status::Done, generation, seconds, Some(digest.clone()))?;
         self.results = Some(Results { story, digest });
         self.going = None;
         Ok(())
     }
 
-    fn write_run(&mut self, state: State, next: usize, seconds: f64, digest: Option<String>) -> Result<(), RunError> {
+    fn write_run(&mut self, state: Status, next: usize, seconds: f64, digest: Option<String>) -> Result<(), RunError> {
         let generations = next.min(self.config.learning.generations + 1);
         let (updated, seconds) = (folder::now(), self.before + seconds);
         self.run = Run { state, updated, seconds, generations, digest, ..self.run.clone() };

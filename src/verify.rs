@@ -61,7 +61,7 @@ pub fn short_trainings() -> Vec<(String, Config)> {
 
 /// How much was compared, and the first difference, if any.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Outcome {
+pub struct Agreement {
     pub worlds: usize,
     pub agent_steps: u64,
     /// Where, in words.
@@ -101,9 +101,9 @@ pub fn compare(
     plan: &Plan,
     reference: &mut dyn Backend,
     backend: &mut dyn Backend,
-    mut progress: impl FnMut(&Outcome),
-) -> Result<Outcome, BackendError> {
-    let mut outcome = Outcome::default();
+    mut progress: impl FnMut(&Agreement),
+) -> Result<Agreement, BackendError> {
+    let mut outcome = Agreement::default();
     let mut all = Vec::with_capacity(plan.worlds.len());
     for (name, config) in &plan.worlds {
         let teams = Teams::new(config, plan.teams, plan.seed);

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::backend::cpu::Cpu;
-use flotilla::record::evidence::{Comparison, Evidence, SCHEMA, Tier};
+use flotilla::record::evidence::{Compared, SCHEMA, Sighting, Tier};
 
 #[path = "../examples/evidence.rs"]
 mod evidence;
@@ -33,14 +33,14 @@ fn a_report_needs_no_gpu() {
     let table = String::from_utf8(output.stdout).unwrap();
 
     let text = fs::read_to_string(&file).unwrap();
-    let found = Evidence::parse(&text).unwrap();
+    let found = Sighting::parse(&text).unwrap();
     assert_eq!((found.schema, found.tier, found.note.as_deref()), (SCHEMA, Tier::Executed, Some("a test")));
     assert_eq!(found.date.len(), "2026-01-31".len());
     assert!(found.target.starts_with(std::env::consts::ARCH), "{}", found.target);
     assert!(found.toolchain.starts_with("rustc 1."), "{}", found.toolchain);
     assert_eq!(found.comparisons.len(), Cpu::levels().len() - 1, "every instruction set but the narrowest");
     for comparison in &found.comparisons {
-        let Comparison { adapter, worlds, agent_steps, equal, .. } = comparison;
+        let Compared { adapter, worlds, agent_steps, equal, .. } = comparison;
         assert!(adapter.starts_with("cpu (") && (*worlds, *equal) == (2, true) && *agent_steps > 0, "{comparison:?}");
         assert_ne!(*adapter, comparison.against);
         assert!(table.contains(adapter), "{table}");
@@ -86,7 +86,7 @@ fn the_page_is_what_the_files_make() {
 fn a_row_that_differs_shows() {
     let folder = tempfile::tempdir().unwrap();
     let row = |name: &str, digest: &str, failure: Option<&str>| {
-        let comparison = Comparison {
+        let comparison = Compared {
             adapter: "A GPU (discrete GPU, vulkan)".into(),
             pass: Some("guarded".into()),
             kernel: Some("generic".into()),
@@ -96,8 +96,9 @@ fn a_row_that_differs_shows() {
             equal: failure.is_none(),
             failure: failure.map(String::from),
         };
-        let trained = vec![flotilla::record::evidence::Training { config: "chaotic".into(), digest: digest.into() }];
-        let evidence = Evidence { comparisons: vec![comparison], trained, ..Evidence::new(Tier::Executed) };
+        let trained =
+            vec![flotilla::record::evidence::ShortTraining { config: "chaotic".into(), digest: digest.into() }];
+        let evidence = Sighting { comparisons: vec![comparison], trained, ..Sighting::new(Tier::Executed) };
         fs::write(folder.path().join(format!("{name}.json")), evidence.to_json()).unwrap();
     };
     row("one", "aa", None);

@@ -160,7 +160,7 @@ pub enum Error {
     #[error("{}{}", .0, remedy::run(.0))]
     Run(#[from] RunError),
     #[error("{}{}", .0, remedy::shown(.0))]
-    Shown(#[from] crate::report::runs::RunError),
+    Shown(#[from] crate::report::runs::ReadError),
     #[error("{}{}", .0, remedy::replayed(.0))]
     Replayed(#[from] ReplayError),
     #[error("standard output cannot be written: {0}")]

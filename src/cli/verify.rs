@@ -11,15 +11,15 @@ use super::{Error, output, print};
 use crate::backend::Backend;
 use crate::backend::cpu::{Cpu, level_name};
 use crate::backend::gpu;
-use crate::backend::gpu::device::{self, AdapterInfo, Choice, DeviceError, Request};
+use crate::backend::gpu::device::{self, AdapterInfo, DeviceError, Request, Wanted};
 use crate::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records};
 use crate::backend::gpu::exact::Pass;
 use crate::config::{self, Config};
 use crate::escape;
 use crate::front::{self, Failure};
-use crate::record::evidence::{Comparison, Evidence, Tier, Training};
+use crate::record::evidence::{Compared, ShortTraining, Sighting, Tier};
 use crate::report::progress::Meter;
-use crate::verify::{Outcome, Plan, compare, short_trainings};
+use crate::verify::{Agreement, Plan, compare, short_trainings};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -77,7 +77,7 @@ pub fn run(args: Args) -> Result<(), Error> {
             for kernel in kernels(args.kernel.as_deref()) {
                 let request = Request { pass: Some(pass), ..choice.clone().into() };
                 let result = verify(&plan, request, kernel, &info, args.quiet);
-                lines.push(Comparison {
+                lines.push(Compared {
                     pass: Some(pass.to_string()),
                     kernel: Some(kernel.to_string()),
                     ..line(info.to_string(), &Cpu::default(), result)
@@ -100,16 +100,17 @@ pub fn run(args: Args) -> Result<(), Error> {
 }
 
 /// One line of the table; an error of the device counts as a failure.
-fn line(adapter: String, reference: &Cpu, result: Result<Outcome, Error>) -> Comparison {
+fn line(adapter: String, reference: &Cpu, result: Result<Agreement, Error>) -> Compared {
     let against = reference.describe();
-    let outcome = result.unwrap_or_else(|error| Outcome { mismatch: Some(error.to_string()), ..Outcome::default() });
-    let Outcome { worlds, agent_steps, mismatch: failure } = outcome;
+    let outcome =
+        result.unwrap_or_else(|error| Agreement { mismatch: Some(error.to_string()), ..Agreement::default() });
+    let Agreement { worlds, agent_steps, mismatch: failure } = outcome;
     let equal = failure.is_none();
-    Comparison { adapter, pass: None, kernel: None, against, worlds, agent_steps, equal, failure }
+    Compared { adapter, pass: None, kernel: None, against, worlds, agent_steps, equal, failure }
 }
 
 /// Every instruction set of the processor against the narrowest.
-fn instruction_sets(plan: &Plan, quiet: bool) -> Vec<Comparison> {
+fn instruction_sets(plan: &Plan, quiet: bool) -> Vec<Compared> {
     let levels = Cpu::levels();
     let wider = levels[1..].iter().map(|&level| {
         let (mut reference, mut wider) = (Cpu::at_level(levels[0]), Cpu::at_level(level));
@@ -122,7 +123,7 @@ fn instruction_sets(plan: &Plan, quiet: bool) -> Vec<Comparison> {
 }
 
 /// Shows how far a comparison has come.
-fn meter_of<'a>(meter: &'a mut Meter, plan: &'a Plan, what: String) -> impl FnMut(&Outcome) + 'a {
+fn meter_of<'a>(meter: &'a mut Meter, plan: &'a Plan, what: String) -> impl FnMut(&Agreement) + 'a {
     move |outcome| {
         let (done, all) = (outcome.worlds, plan.worlds.len());
         meter.show(done as f64 / all as f64, || format!("{what}: {done} of {all} worlds"));
@@ -130,7 +131,7 @@ fn meter_of<'a>(meter: &'a mut Meter, plan: &'a Plan, what: String) -> impl FnMu
 }
 
 /// What was compared, on what, and what short trainings come to here.
-fn evidence(lines: &[Comparison], note: Option<String>, quiet: bool) -> Result<Evidence, Error> {
+fn evidence(lines: &[Compared], note: Option<String>, quiet: bool) -> Result<Sighting, Error> {
     let (mut trained, mut meter) = (Vec::new(), Meter::new(quiet));
     let trainings = short_trainings();
     for (index, (name, config)) in trainings.iter().enumerate() {
@@ -139,16 +140,16 @@ fn evidence(lines: &[Comparison], note: Option<String>, quiet: bool) -> Result<E
             Failure::Backend(error) => Error::Backend(error),
             other => Error::Refused(other.to_string()),
         })?;
-        trained.push(Training { config: name.clone(), digest: came.digest() });
+        trained.push(ShortTraining { config: name.clone(), digest: came.digest() });
     }
     meter.clear();
-    Ok(Evidence {
+    Ok(Sighting {
         processor: processor(),
         instructions: Some(level_name(Level::new()).into()),
         note,
         comparisons: lines.to_vec(),
         trained,
-        ..Evidence::new(Tier::Executed)
+        ..Sighting::new(Tier::Executed)
     })
 }
 
@@ -170,11 +171,11 @@ fn processor() -> Option<String> {
 }
 
 /// A table, and below it what differs.
-fn in_words(lines: &[Comparison]) -> String {
+fn in_words(lines: &[Compared]) -> String {
     let mut text =
         format!("{:<15} {:<12} {:>7} {:>13} {:<10} adapter\n", "pass", "kernel", "worlds", "agent-steps", "result");
     let mut failures = String::new();
-    for Comparison { adapter, pass, kernel, against, worlds, agent_steps, equal, failure } in lines {
+    for Compared { adapter, pass, kernel, against, worlds, agent_steps, equal, failure } in lines {
         let result = if *equal { "equal" } else { "DIFFERENT" };
         let [pass, kernel] = [pass, kernel].map(|name| name.as_deref().unwrap_or("-"));
         text += &format!("{pass:<15} {kernel:<12} {worlds:>7} {agent_steps:>13} {result:<10} {adapter}\n");
@@ -186,7 +187,7 @@ fn in_words(lines: &[Comparison]) -> String {
     text + &failures
 }
 
-fn in_json(lines: &[Comparison]) -> String {
+fn in_json(lines: &[Compared]) -> String {
     format!("{}\n", json!({ "equal": lines.iter().all(|line| line.equal), "comparisons": lines }))
 }
 
@@ -202,12 +203,12 @@ fn plan(args: &Args) -> Result<Plan, Error> {
 }
 
 /// The adapters to verify, each with what opens it.
-fn adapters(name: Option<&str>) -> Result<Vec<(Choice, AdapterInfo)>, Error> {
+fn adapters(name: Option<&str>) -> Result<Vec<(Wanted, AdapterInfo)>, Error> {
     let found = device::adapters();
-    let all = found.iter().cloned().enumerate().map(|(index, info)| (Choice::Named(index.to_string()), info));
+    let all = found.iter().cloned().enumerate().map(|(index, info)| (Wanted::Named(index.to_string()), info));
     match name {
         Some(name) => {
-            let named = Choice::Named(name.into());
+            let named = Wanted::Named(name.into());
             let index = device::position(&named, &found)?;
             Ok(vec![(named, found[index].clone())])
         }
@@ -230,12 +231,12 @@ fn kernels(name: Option<&str>) -> impl Iterator<Item = Kernel> {
     all.into_iter().filter(move |kernel| name.is_none_or(|name| kernel.to_string() == name))
 }
 
-fn verify(plan: &Plan, request: Request, kernel: Kernel, info: &AdapterInfo, quiet: bool) -> Result<Outcome, Error> {
+fn verify(plan: &Plan, request: Request, kernel: Kernel, info: &AdapterInfo, quiet: bool) -> Result<Agreement, Error> {
     let pass = request.pass.map_or_else(String::new, |pass| format!(", {pass} pass, {kernel} kernel"));
     let mut meter = Meter::new(quiet);
     let gpu = gpu::open(request)?;
     if let Some(mismatch) = gpu::self_test(&gpu)? {
-        return Ok(Outcome { mismatch: Some(mismatch.to_string()), ..Outcome::default() });
+        return Ok(Agreement { mismatch: Some(mismatch.to_string()), ..Agreement::default() });
     }
     let mut gpu = GpuEpisodes::new(gpu)?.playing(kernel).holding(Holding::Always).bringing(Records::Packed);
     let shown = meter_of(&mut meter, plan, format!("{}{pass}", info.name));

@@ -10,7 +10,7 @@ pub const SCHEMA: u32 = 1;
 /// What a file tells.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Evidence {
+pub struct Sighting {
     /// [`SCHEMA`].
     pub schema: u32,
     pub tier: Tier,
@@ -34,10 +34,10 @@ pub struct Evidence {
     #[serde(default)]
     pub findings: Vec<String>,
     #[serde(default)]
-    pub comparisons: Vec<Comparison>,
+    pub comparisons: Vec<Compared>,
     /// What short trainings came to.
     #[serde(default)]
-    pub trained: Vec<Training>,
+    pub trained: Vec<ShortTraining>,
 }
 
 /// How much a row is worth, the most first.
@@ -55,7 +55,7 @@ pub enum Tier {
 /// Episodes and trainings played on two sides.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Comparison {
+pub struct Compared {
     /// What was compared: an adapter with its driver, or "cpu (AVX2)".
     pub adapter: String,
     /// Where that is a GPU.
@@ -74,15 +74,15 @@ pub struct Comparison {
 /// A training, and the digest that `flotilla train` prints of it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Training {
+pub struct ShortTraining {
     pub config: String,
     pub digest: String,
 }
 
-impl Evidence {
+impl Sighting {
     /// Of this program, today.
-    pub fn new(tier: Tier) -> Evidence {
-        Evidence {
+    pub fn new(tier: Tier) -> Sighting {
+        Sighting {
             schema: SCHEMA,
             tier,
             date: now()[..10].into(),
@@ -103,8 +103,8 @@ impl Evidence {
     ///
     /// # Errors
     /// What is wrong with it, in words.
-    pub fn parse(text: &str) -> Result<Evidence, String> {
-        let found: Evidence = serde_json::from_str(text).map_err(|error| format!("it is no evidence: {error}"))?;
+    pub fn parse(text: &str) -> Result<Sighting, String> {
+        let found: Sighting = serde_json::from_str(text).map_err(|error| format!("it is no evidence: {error}"))?;
         match found.schema {
             SCHEMA => Ok(found),
             other => Err(format!("it has schema {other}, known is {SCHEMA}")),
