@@ -9,7 +9,7 @@ use glam::Vec2;
 
 use crate::backend::compare::{Mismatch, first_mismatch};
 use crate::backend::{Backend, BackendError, Group, Need};
-use crate::config::Config;
+use crate::config::{Config, Paradigm};
 use crate::credit::{Credit, Scores};
 use crate::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use crate::sample;
@@ -39,6 +39,26 @@ impl Plan {
         let worlds = seeds.map(|seed| (format!("random world {seed}"), sample::world(seed))).collect();
         Plan { worlds, teams, seed, generations: 3 }
     }
+}
+
+/// Short trainings of the paper's six experiments, each with its name: what they come to is the same on every machine, so
+/// that their digests compare machines that never meet.
+pub fn short_trainings() -> Vec<(String, Config)> {
+    const LAYOUTS: [(&str, &str); 3] = [
+        ("generally forward", include_str!("../configs/generally_forward.toml")),
+        ("strictly forward", include_str!("../configs/strictly_forward.toml")),
+        ("chaotic", include_str!("../configs/chaotic.toml")),
+    ];
+    let mut trainings = Vec::new();
+    for (name, text) in LAYOUTS {
+        for paradigm in [Paradigm::LeaderFollower, Paradigm::AllLeaders] {
+            let mut config = Config::parse(text, name).expect("the paper's own config");
+            config.learning.paradigm = paradigm;
+            (config.learning.trials, config.learning.generations) = (2, 10);
+            trainings.push((format!("{name}, {paradigm}"), config));
+        }
+    }
+    trainings
 }
 
 /// How much was compared, and the first difference, if any.

@@ -34,10 +34,14 @@ impl Cpu {
         Cpu { level }
     }
 
-    /// Every instruction set that this processor has, narrowest first.
+    /// Every instruction set that this processor has, narrowest first; with the feature `scalar` also doing without one.
     pub fn levels() -> Vec<Level> {
         let best = Level::new();
         let mut levels = vec![Level::baseline()];
+        #[cfg(feature = "scalar")]
+        if !levels[0].is_fallback() {
+            levels.insert(0, Level::fallback());
+        }
         #[cfg(target_arch = "x86_64")]
         {
             levels.extend(best.as_sse4_2().map(Level::Sse4_2));
@@ -64,6 +68,10 @@ pub fn level_name(level: Level) -> &'static str {
     #[cfg(target_arch = "aarch64")]
     if level.as_neon().is_some() {
         return "NEON";
+    }
+    #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+    if level.as_wasm_simd128().is_some() {
+        return "SIMD128";
     }
     let _ = level;
     "scalar"

@@ -8,6 +8,7 @@
 //! | [`metrics`] | `metrics.csv` |
 //! | [`checkpoint`] | `checkpoints/`, written beside training |
 //! | [`folder`] | the run's folder, its lock and `run.json` |
+//! | [`evidence`] | what was seen on a machine, for `docs/evidence.md` |
 //!
 //! Every file that is read is taken as hostile: its size is checked before memory is taken, what it says is checked
 //! before it is used, and nothing in it names another file.
@@ -23,6 +24,7 @@ use crate::file;
 
 pub mod checkpoint;
 pub mod disk;
+pub mod evidence;
 pub mod folder;
 pub mod metrics;
 pub mod policies;

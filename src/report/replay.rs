@@ -381,7 +381,7 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
             } else {
                 let share = |axis: usize| (f64::from(place[axis]) / f64::from(map[axis]) * 65535.0).round() as u16;
                 positions.extend([share(0), share(1)].iter().flat_map(|share| share.to_le_bytes()));
-                let turn = f64::from(heading[1]).atan2(f64::from(heading[0])) / std::f64::consts::TAU;
+                let turn = libm::atan2(f64::from(heading[1]), f64::from(heading[0])) / std::f64::consts::TAU;
                 headings.push((turn.rem_euclid(1.0) * 256.0).round() as u32 as u8);
             }
         }
