@@ -203,7 +203,7 @@ pub fn train(configs: &[Config], backend: &mut dyn Backend) -> Vec<(Golden, f64)
         let golden = Golden {
             bytes: text.len() + size_of_val(&policies[..]),
             sha256: hex(&hash.finalize()),
-            episodes: trace(backend, &CONFIGS[arm], trainer.world(arm), &trainer.policies(arm)[0]),
+            episodes: trace(backend, &configs[arm], trainer.world(arm), &trainer.policies(arm)[0]),
         };
         (golden, most[arm])
     };
