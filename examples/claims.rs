@@ -9,7 +9,7 @@ use std::process::ExitCode;
 use flotilla::backend::cpu::Cpu;
 use flotilla::baseline::Baselines;
 use flotilla::config::Override;
-use flotilla::report::paper::{self, Results, claims, tables};
+use flotilla::report::paper::{self, Evidence, claims, tables};
 use flotilla::trainer::Row;
 use flotilla::trainer::Trainer;
 
@@ -62,7 +62,7 @@ fn measure(keys: &[Override]) -> Result<String, String> {
     while !baselines.is_done() {
         baselines.advance(&mut backend).map_err(|error| error.to_string())?;
     }
-    let results = Results { arms: &arms, baselines: &baselines.found() };
+    let results = Evidence { arms: &arms, baselines: &baselines.found() };
     let claims = claims::claims(results);
     let heading = tables::heading(&arms[0].config.learning, &claims);
     Ok(format!("{}\n{}\n{heading}\n", tables::without_learning(results), tables::verdicts(&claims)))

@@ -28,12 +28,12 @@ pub struct Baseline {
 
 /// Plays the baselines of any number of configs side by side, generation by generation.
 pub struct Baselines {
-    places: Vec<Place>,
+    places: Vec<Setting>,
     generation: usize,
 }
 
 /// One config and its trials.
-struct Place {
+struct Setting {
     config: Config,
     world: World,
     /// `[trials][populations][population + 1][parameters]`; the last policy is zero.
@@ -50,7 +50,7 @@ struct Place {
 impl Baselines {
     /// Of valid configs; fitness, selection and mutation have no say.
     pub fn new(configs: Vec<Config>) -> Baselines {
-        Baselines { places: configs.into_iter().map(Place::new).collect(), generation: 0 }
+        Baselines { places: configs.into_iter().map(Setting::new).collect(), generation: 0 }
     }
 
     /// The generation that plays next.
@@ -103,12 +103,12 @@ impl Baselines {
     }
 }
 
-impl Place {
-    fn new(config: Config) -> Place {
+impl Setting {
+    fn new(config: Config) -> Setting {
         let world = World::new(&config);
         let Learning { trials, population, episodes_per_team, generations, .. } = config.learning;
         let none = || vec![Vec::with_capacity(generations + 1); trials];
-        Place {
+        Setting {
             weights: vec![vec![0.0; config.populations() * (population + 1) * world.parameters()]; trials],
             starts: vec![vec![vec![]; episodes_per_team]; trials],
             teams: (0..=population as u32).flat_map(|team| vec![team; world.leaders()]).collect(),
@@ -121,7 +121,7 @@ impl Place {
 
     /// Draws a generation's policies and starts.
     fn prepare(&mut self, generation: usize) {
-        let Place { config, world, weights, starts, observed, .. } = self;
+        let Setting { config, world, weights, starts, observed, .. } = self;
         let Learning { seed, population, .. } = config.learning;
         let (level, parameters) = (Level::new(), world.parameters());
         weights.par_iter_mut().zip(starts).enumerate().for_each(|(trial, (weights, starts))| {

@@ -4,13 +4,16 @@
 //! simulated again: who stood near a POI at which step says what would have been observed without a leader, without
 //! its whole group, or with more of it.
 //!
-//! No fitness asks when a set stood, nor how often. Nor does a set make a difference that another set of its POI holds
+//! By the default [`Rule`](crate::model::couple::Rule) no fitness asks when a set stood, nor how often. Nor does a set make a difference that another set of its POI holds
 //! as a subset: without whomever, and with however many copies of whomever, the larger one still has at least as many
 //! agents. So of a record only the sets matter that no other of their POI contains; and of these, but for D++, only those
 //! with as many agents as the POI needs. A backend may leave out the others, see [`crate::backend::Need`].
 
+use std::ops::RangeInclusive;
+
 use crate::backend::{Episode, Seen, Strided, owner_bits};
 use crate::config::Fitness;
+use crate::model::couple::NEVER;
 use crate::world::World;
 
 /// Owner of an agent that belongs to no group.
@@ -19,7 +22,7 @@ pub const NOBODY: u32 = u32::MAX;
 /// Every fitness of one team; the differences are `[leaders]`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Scores {
-    /// POIs that at some step had as many agents near as they need.
+    /// POIs that were observed: by the default rule, that at some step had as many agents near as they need.
     pub observed: u32,
     /// Observed POIs over P, the same for every leader (paper, Equation 1).
     pub g: f32,
@@ -50,12 +53,18 @@ pub struct Credit {
     completed: Vec<u32>,
     /// One set and the one before it, `[2][words]`.
     sets: Vec<u32>,
+    /// By another rule than the default: the step at which each POI was observed, and would be otherwise, `[pois]`.
+    observed_at: Vec<u32>,
+    otherwise: Vec<u32>,
 }
 
 impl Credit {
     /// Scores every leader of the team by `fitness` into `scores`, `[leaders]`, and returns how many POIs the team
     /// observed. The episode must be one of `world`, played with that fitness as a [need](crate::backend::Need).
     pub fn score(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
+        if !world.rule.is_plain() {
+            return self.replay(episode, world, fitness, scores);
+        }
         self.observed.clear();
         self.observed.resize(world.pois.len(), false);
         let pois = world.pois.len();
@@ -167,12 +176,11 @@ impl Credit {
         );
     }
 
-    /// D++ of one leader. With `D++(n) = (POIs that n copies complete) / n`: D if it is at least D++(C), C being the
-    /// largest coupling of the world, else the first D++(n), n = 1, 2, …, that D++(n + 1) does not better.
+    /// D++ of one leader.
     fn stepping_stone(&mut self, world: &World, leader: usize) -> f32 {
-        let most = world.coupling.iter().copied().max().unwrap_or(0) as usize;
+        let most = world.coupling.iter().copied().max().unwrap_or(0);
         self.completed.clear();
-        self.completed.resize(most + 1, 0);
+        self.completed.resize(most as usize + 1, 0);
         let mut at_most = 0u32;
         for (poi, &coupling) in world.coupling.iter().enumerate() {
             let company = self.company[poi * world.leaders() + leader];
@@ -181,20 +189,12 @@ impl Credit {
                 at_most += 1;
             }
         }
-        // Copies needed are under C, so C copies complete all that any number would.
-        let (lost, pois) = (self.lost[leader], world.pois.len());
-        if u64::from(lost) * most as u64 >= u64::from(at_most) {
-            return share(lost, pois);
-        }
-        let mut gain = self.completed[1];
-        for copies in 1..most {
-            let next = gain + self.completed[copies + 1];
-            if u64::from(next) * copies as u64 <= u64::from(gain) * (copies as u64 + 1) {
-                return share(gain, pois * copies);
-            }
-            gain = next;
-        }
-        share(gain, pois * most)
+        // Copies needed are under the largest coupling, so that many complete all that any number would.
+        let mut gain = 0;
+        stepping_stone(self.lost[leader], most, at_most, world.pois.len(), |copies| {
+            gain += self.completed[copies as usize];
+            gain
+        })
     }
 
     /// Before any large enough set, every leader may be critical.
@@ -220,6 +220,136 @@ impl Credit {
             bits(critical).for_each(|leader| self.lost[leader] += 1);
         }
     }
+}
+
+/// By any other rule than the default.
+impl Credit {
+    /// [`Credit::score`], each fitness by its definition.
+    fn replay(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
+        let Credit { owner, groups, observed_at, otherwise, .. } = self;
+        let (pois, words) = (world.pois.len(), world.constants.words as usize);
+        let replay = Replay { sets: episode.sets, world };
+        replay.observe(observed_at);
+        let observed = count(observed_at);
+        let in_groups = fitness == Fitness::Df && world.followers() > 0;
+        if in_groups {
+            assign(&episode.seen, world, owner);
+            groups.clear();
+            gather(owner, world, groups);
+        }
+        for (leader, score) in scores.iter_mut().enumerate().take(world.leaders()) {
+            let mut lost = |out: &dyn Fn(usize) -> u32| {
+                replay.observe_without(observed_at, |_, word, agents| agents & !out(word), otherwise);
+                observed - count(otherwise)
+            };
+            *score = match fitness {
+                Fitness::G => share(observed, pois),
+                Fitness::Df if in_groups => share(lost(&|word| groups[leader * words + word]), pois),
+                Fitness::D | Fitness::Df => share(lost(&|word| alone(leader, word)), pois),
+                Fitness::Dpp => {
+                    let lost = lost(&|word| alone(leader, word));
+                    let most = world.coupling.iter().copied().max().unwrap_or(0);
+                    let mut gain = |copies: u32| {
+                        replay.observe_with(observed_at, leader, copies, otherwise);
+                        count(otherwise) - observed
+                    };
+                    stepping_stone(lost, most, gain(most), pois, gain)
+                }
+            };
+        }
+        observed
+    }
+}
+
+/// Who was near which POI at which step, by a rule that is replayed.
+#[derive(Clone, Copy)]
+struct Replay<'a> {
+    sets: Strided<'a>,
+    world: &'a World,
+}
+
+impl Replay<'_> {
+    /// How many observers are near a POI after a step, of those of each word that `stay` lets stay.
+    fn near(&self, poi: usize, step: u32, stay: impl Fn(usize, u32) -> u32) -> u32 {
+        let Replay { sets, world } = self;
+        let words = world.constants.words as usize;
+        let first = ((step as usize - 1) * world.pois.len() + poi) * words;
+        world.rule.count((0..words).map(|word| stay(word, sets.get(first + word))))
+    }
+
+    /// At which step each POI is observed, where it has `enough` agents after one, which is asked for the steps that are
+    /// `worth` asking among those at which the rule lets it be.
+    fn play(
+        &self,
+        observed_at: &mut Vec<u32>,
+        worth: impl Fn(usize, RangeInclusive<u32>) -> RangeInclusive<u32>,
+        near: impl Fn(usize, u32) -> u32,
+    ) {
+        let Replay { sets, world } = self;
+        let pois = world.pois.len();
+        observed_at.clear();
+        observed_at.resize(pois, NEVER);
+        let steps = sets.len() / (pois * world.constants.words as usize);
+        world.rule.observe(steps as u32, observed_at, |poi, open| {
+            worth(poi, open).find(|&step| near(poi, step) >= world.coupling[poi])
+        });
+    }
+
+    /// As it was.
+    fn observe(&self, observed_at: &mut Vec<u32>) {
+        self.play(observed_at, |_, open| open, |poi, step| self.near(poi, step, |_, agents| agents));
+    }
+
+    /// With some agents left out, by step and word: no POI is observed sooner than it was.
+    fn observe_without(&self, was: &[u32], stay: impl Fn(u32, usize, u32) -> u32, observed_at: &mut Vec<u32>) {
+        let later = |poi: usize, open: RangeInclusive<u32>| was[poi].max(*open.start())..=*open.end();
+        self.play(observed_at, later, |poi, step| self.near(poi, step, |word, agents| stay(step, word, agents)));
+    }
+
+    /// With so many more copies of an agent: no POI is observed later than it was.
+    fn observe_with(&self, was: &[u32], agent: usize, copies: u32, observed_at: &mut Vec<u32>) {
+        let sooner = |poi: usize, open: RangeInclusive<u32>| *open.start()..=was[poi].min(*open.end());
+        self.play(observed_at, sooner, |poi, step| {
+            let copied = self.near(poi, step, |word, agents| agents & alone(agent, word));
+            self.near(poi, step, |_, agents| agents) + copies * copied
+        });
+    }
+}
+
+/// How many POIs are observed.
+fn count(observed_at: &[u32]) -> u32 {
+    observed_at.iter().filter(|&&step| step != NEVER).count() as u32
+}
+
+/// The step at which each POI is observed, from 1, or none: `[pois]`.
+pub fn observed_at(sets: Strided<'_>, world: &World) -> Vec<Option<usize>> {
+    let mut observed_at = Vec::new();
+    Replay { sets, world }.observe(&mut observed_at);
+    observed_at.into_iter().map(|step| (step != NEVER).then_some(step as usize)).collect()
+}
+
+/// A word of the set of one agent.
+fn alone(agent: usize, word: usize) -> u32 {
+    if agent / 32 == word { 1 << (agent % 32) } else { 0 }
+}
+
+/// D++: what is lost without the leader, if that is at least D++(most), else the first `D++(n) = gain(n) / n`,
+/// n = 1, 2, …, that D++(n + 1) does not better. All in POIs; `gain` is asked in this order, of `most` copies it is
+/// `at_most`.
+#[inline(always)]
+fn stepping_stone(lost: u32, most: u32, at_most: u32, pois: usize, mut gain: impl FnMut(u32) -> u32) -> f32 {
+    if u64::from(lost) * u64::from(most) >= u64::from(at_most) {
+        return share(lost, pois);
+    }
+    let mut now = gain(1);
+    for copies in 1..most {
+        let next = gain(copies + 1);
+        if u64::from(next) * u64::from(copies) <= u64::from(now) * (u64::from(copies) + 1) {
+            return share(now, pois * copies as usize);
+        }
+        now = next;
+    }
+    share(now, pois * most as usize)
 }
 
 /// A count over a count, both exact in f32.

@@ -233,16 +233,16 @@ mod tests {
             pub list: [f32; 3],
         }
 
-        pub struct Pair {
+        pub struct Duo {
             pub size: u32,
             pub count: u32,
         }
     }
 
     /// The number that the compiler was given.
-    struct Number;
+    struct Given;
 
-    impl Fixed for Number {
+    impl Fixed for Given {
         type Output = u32;
 
         fn with<const WORD: u32>(self) -> u32 {
@@ -255,7 +255,7 @@ mod tests {
         assert_eq!(Colour::wgsl(), "const COLOUR_RED: u32 = 0u;\nconst COLOUR_DARKGREEN: u32 = 1u;\n");
         for (number, (word, colour)) in (0..).zip(Colour::ALL) {
             assert_eq!(
-                (Colour::of(number), colour.fix(Number), colour.to_string()),
+                (Colour::of(number), colour.fix(Given), colour.to_string()),
                 (*colour, number, word.to_string())
             );
         }
@@ -269,8 +269,8 @@ mod tests {
         let outer = Outer { first: 1, inner: Inner { size: 2.5, count: 3 }, list: [4.0, 5.0, 6.0] };
         let words = [1, 2.5f32.to_bits(), 3, 4f32.to_bits(), 5f32.to_bits(), 6f32.to_bits()];
         assert_eq!(bytemuck::cast_slice::<_, u32>(&[outer]), words);
-        assert_eq!(Pair { size: 7, count: 8 }.value(), "Pair(7u, 8u)");
-        assert_eq!(Pair::copied_from("world"), "Pair(world.size, world.count)");
+        assert_eq!(Duo { size: 7, count: 8 }.value(), "Duo(7u, 8u)");
+        assert_eq!(Duo::copied_from("world"), "Duo(world.size, world.count)");
     }
 
     #[test]

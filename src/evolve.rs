@@ -401,7 +401,7 @@ impl Breeding<'_> {
 
 /// The slots of one population to be filled by a plan.
 #[derive(Clone, Copy, Debug)]
-pub struct Brood<'a> {
+pub struct Offspring<'a> {
     /// Of purpose [`Purpose::Mutation`].
     pub key: Key,
     /// The generation that ends, and the population.
@@ -415,14 +415,14 @@ pub struct Brood<'a> {
 }
 
 /// Fills slots, `[slots][parameters]`: each gets its parent's weights and [`mutate`]s. `scratch` may hold anything.
-pub fn breed(level: Level, learning: &Learning, brood: Brood<'_>, children: &mut [f32], scratch: &mut Vec<u32>) {
+pub fn breed(level: Level, learning: &Learning, brood: Offspring<'_>, children: &mut [f32], scratch: &mut Vec<u32>) {
     let parameters = children.len() / brood.parents.len();
     // As many as stay in the innermost cache.
     let together = (BRED_TOGETHER / parameters).clamp(1, WIDEST);
     for (batch, (children, parents)) in
         children.chunks_mut(together * parameters).zip(brood.parents.chunks(together)).enumerate()
     {
-        let batch = Brood { first: brood.first + batch * together, parents, ..brood };
+        let batch = Offspring { first: brood.first + batch * together, parents, ..brood };
         dispatch!(level, simd => mutate_brood(simd, learning, batch, children, scratch));
     }
 }
@@ -431,7 +431,13 @@ pub fn breed(level: Level, learning: &Learning, brood: Brood<'_>, children: &mut
 const BRED_TOGETHER: usize = 2048;
 
 #[inline(always)]
-fn mutate_brood<S: Simd>(simd: S, learning: &Learning, brood: Brood<'_>, children: &mut [f32], scratch: &mut Vec<u32>) {
+fn mutate_brood<S: Simd>(
+    simd: S,
+    learning: &Learning,
+    brood: Offspring<'_>,
+    children: &mut [f32],
+    scratch: &mut Vec<u32>,
+) {
     let parameters = children.len() / brood.parents.len();
     let mut chosen = Chosen::new(scratch, brood.parents.len(), parameters);
     for (batch, parents) in brood.parents.chunks(S::f32s::LEN).enumerate() {

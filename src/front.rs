@@ -13,14 +13,14 @@ use crate::backend::cpu::Cpu;
 #[cfg(feature = "gpu")]
 use crate::backend::gpu::{
     self,
-    device::{Choice, DeviceError},
+    device::{DeviceError, Wanted},
     episode::{GpuEpisodes, Holding},
 };
 use crate::backend::{Backend, BackendError, Group, Machine, Need, Player};
 use crate::config::{Config, ConfigError, MAX_POPULATION};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
 use crate::evolve::{self, MAX_WEIGHT};
-use crate::memory::{self, Plan, TooLittle};
+use crate::memory::{self, Peaks, TooLittle};
 use crate::parallel::current_num_threads;
 #[cfg(feature = "record")]
 use crate::record::{RecordError, hex, metrics};
@@ -68,7 +68,7 @@ pub enum Failure {
     Step(#[from] StepError),
     #[cfg(feature = "report")]
     #[error(transparent)]
-    Run(#[from] runs::RunError),
+    Run(#[from] runs::ReadError),
     #[cfg(feature = "record")]
     #[error(transparent)]
     Record(#[from] RecordError),
@@ -105,8 +105,8 @@ pub struct Found {
 pub fn find_gpu(processor: &Processor, holding: Option<Holding>) -> Result<Found, DeviceError> {
     let choice = match processor {
         Processor::Cpu => return Ok(Found { gpu: None, passed_over: None }),
-        Processor::Auto | Processor::Gpu => Choice::Real,
-        Processor::Adapter(name) => Choice::Named(name.clone()),
+        Processor::Auto | Processor::Gpu => Wanted::Real,
+        Processor::Adapter(name) => Wanted::Named(name.clone()),
     };
     let optional = *processor == Processor::Auto && holding != Some(Holding::Always);
     match gpu::open(choice).and_then(GpuEpisodes::new) {
@@ -210,7 +210,7 @@ impl Trained {
         let (found, expected) = (rows.len(), config.learning.trials * (config.learning.generations + 1));
         if found != expected {
             let reason = format!("its {} has {found} rows of {expected}", crate::record::folder::METRICS);
-            return Err(runs::RunError::Unfinished { folder: folder.into(), reason }.into());
+            return Err(runs::ReadError::Unfinished { folder: folder.into(), reason }.into());
         }
         let policies = policies::read_all(&folder.join(POLICIES), &config)?;
         Ok(Trained::new(config, &rows, policies))
@@ -243,7 +243,7 @@ pub fn train(
     mut watch: impl FnMut(Generation<'_>) -> ControlFlow<()>,
 ) -> Result<Trained, Failure> {
     let mut config = checked(config)?;
-    let plan = Plan::of([&config], current_num_threads());
+    let plan = Peaks::of([&config], current_num_threads());
     // Nothing is saved on the way, but what comes out is kept: the rows twice, and the policies.
     let rows = config.learning.trials as u64 * (config.learning.generations as u64 + 1);
     let kept = rows * (size_of::<Row>() + 3 * size_of::<f64>()) as u64 + config.policy_bytes();

@@ -83,14 +83,14 @@ mod embedded {
         use std::sync::Arc;
         use std::task::{Context, Poll, Wake};
 
-        struct Host;
-        impl Wake for Host {
-            fn wake(self: Arc<Host>) {
+        struct Bell;
+        impl Wake for Bell {
+            fn wake(self: Arc<Bell>) {
                 HOST.get().inspect(|host| (host.wake)());
             }
         }
         let mut future = std::pin::pin!(future);
-        let waker = Arc::new(Host).into();
+        let waker = Arc::new(Bell).into();
         loop {
             match future.as_mut().poll(&mut Context::from_waker(&waker)) {
                 Poll::Ready(output) => return output,

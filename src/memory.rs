@@ -19,7 +19,7 @@ const COPIED: u64 = 64 << 20;
 
 /// Peaks, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Plan {
+pub struct Peaks {
     /// Of the process, where the CPU plays; and how much of that only while a checkpoint is written.
     pub host: u64,
     pub checkpoint: u64,
@@ -44,9 +44,9 @@ pub struct TooLittle {
     pub checkpoint: u64,
 }
 
-impl Plan {
+impl Peaks {
     /// What it takes to train these (valid) configs side by side, on so many threads.
-    pub fn of<'a>(configs: impl IntoIterator<Item = &'a Config>, threads: usize) -> Plan {
+    pub fn of<'a>(configs: impl IntoIterator<Item = &'a Config>, threads: usize) -> Peaks {
         let lanes = cpu::lanes();
         let [mut training, mut checkpoint, mut queue, mut weights, mut record] = [0_u64; 5];
         let [mut block, mut order, mut populations, mut held] = [0_u64; 4];
@@ -75,7 +75,7 @@ impl Plan {
         };
         // What is packed of a record takes at most as much again, and where it does not fit the record comes whole.
         let records = share(record, 2) * if record < PACKED_FROM { 1 } else { 2 };
-        Plan {
+        Peaks {
             host: always + playing.max(sorting),
             checkpoint,
             // A batch is gathered, and two are on their way to the adapter or back.

@@ -18,7 +18,7 @@ const MAX_LISTED: usize = 50;
 
 /// What is to be known of one key: a line of the table behind `docs/reference.md` and every commented config.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Key {
+pub struct Definition {
     /// Dotted: `world.dt`.
     pub name: &'static str,
     /// Empty where it has none.
@@ -119,7 +119,7 @@ pub fn read<T>(
 }
 
 /// What an empty text comes to, and every key that `ask` asks for, in that order.
-pub fn keys<T>(ask: impl FnOnce(&mut Reader<'_>) -> T) -> (T, Vec<Key>) {
+pub fn keys<T>(ask: impl FnOnce(&mut Reader<'_>) -> T) -> (T, Vec<Definition>) {
     let mut reader = Reader { table: Some(vec![]), ..Reader::default() };
     let read = ask(&mut reader);
     (read, reader.table.unwrap_or_default())
@@ -324,7 +324,7 @@ pub struct Reader<'a> {
     /// Place, name and message of each.
     problems: Vec<(Place, String, String)>,
     /// All there is to know of the keys asked for, where somebody wants to.
-    table: Option<Vec<Key>>,
+    table: Option<Vec<Definition>>,
 }
 
 /// A key that is being asked for; what it allows and its default are yet to be said.
@@ -495,7 +495,7 @@ impl<'a> Asked<'_, 'a> {
         if let Some(table) = &mut self.reader.table {
             let Asked { name, unit, meaning, paper, .. } = *self;
             let (kind, range, default) = about();
-            table.push(Key { name, unit, kind, range, default, meaning, paper });
+            table.push(Definition { name, unit, kind, range, default, meaning, paper });
         }
         self.reader.take(self.name)
     }
@@ -557,6 +557,37 @@ impl<'a> Asked<'_, 'a> {
             Some(entry) => self.reader.numbers(entry, counts, allowed),
             None => default,
         }
+    }
+
+    /// A list of as many lists of numbers as `of`, another key, has items (any number where that is not known), or of
+    /// none, which is the default. `blame` tells what is wrong with lists whose numbers are allowed, each fault with its
+    /// list.
+    pub fn lists<T: Number>(
+        mut self,
+        what: &str,
+        (of, count): (&str, Option<usize>),
+        lengths: RangeInclusive<usize>,
+        allowed: Allowed<T>,
+        blame: impl FnOnce(&[Vec<T>]) -> Vec<(usize, String)>,
+    ) -> Vec<Vec<T>> {
+        let range = || format!("none, or as many as {of}, of numbers each {}", allowed.in_general());
+        let Some(entry) = self.take(|| (format!("list of {what}"), range(), Some("[]".into()))) else { return vec![] };
+        if entry.value.get_ref().as_array().is_some_and(|items| items.is_empty()) {
+            return vec![];
+        }
+        let reader = self.reader;
+        let faults = reader.faults();
+        let counts = count.map_or(1..=usize::MAX, |count| count..=count);
+        let items = reader.items(entry, counts, &format!("{what}, or none")).unwrap_or_default();
+        let places: Vec<_> = items.iter().map(|item| (item.place(), item.name.clone())).collect();
+        let lists: Vec<_> = items.into_iter().map(|item| reader.numbers(item, lengths.clone(), allowed)).collect();
+        if reader.faults() == faults {
+            for (list, message) in blame(&lists) {
+                let (place, name) = &places[list];
+                reader.blame(*place, name, message);
+            }
+        }
+        if reader.faults() == faults { lists } else { vec![] }
     }
 
     /// One number, or a list of so many; the default is one.

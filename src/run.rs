@@ -10,8 +10,8 @@ use crate::host::Instant;
 use crate::memory::{self, TooLittle};
 use crate::record::checkpoint::{Checkpoint, Keeper, Schedule};
 use crate::record::disk::Disk;
-use crate::record::folder::{self, Folder, METRICS, Note, POLICIES, Run, Start, State, Story};
-use crate::record::metrics::{self, Mark};
+use crate::record::folder::{self, Folder, METRICS, Note, POLICIES, Run, Start, Status, Story};
+use crate::record::metrics::{self, Extent};
 use crate::record::policies::{self, Init, Policies};
 use crate::record::{RecordError, config_digest};
 use crate::trainer::{Row, Snapshot, SnapshotError, Trainer};
@@ -90,7 +90,7 @@ pub struct Results {
 
 /// How a session ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Outcome {
+pub enum Ended {
     Done,
     /// Everything is saved.
     Stopped,
@@ -124,7 +124,7 @@ struct Going {
     metrics: metrics::Writer,
     keeper: Keeper,
     /// Where the metrics were before the last generation's rows.
-    ending: Option<Mark>,
+    ending: Option<Extent>,
 }
 
 impl Session {
@@ -183,10 +183,10 @@ impl Session {
             going.arm = arms.len();
             arms.push(run);
             let fits = match snapshot {
-                From::Checkpoint(snapshot) => trainer.restore(going.arm, snapshot),
-                From::Policies(Init { trials, .. }) => (trials.into_iter().enumerate())
+                Origin::Checkpoint(snapshot) => trainer.restore(going.arm, snapshot),
+                Origin::Policies(Init { trials, .. }) => (trials.into_iter().enumerate())
                     .all(|(trial, Policies { policies, weights })| trainer.start_from(going.arm, trial, policies, &weights)),
-                From::Chance => true,
+                Origin::Chance => true,
             };
             if !fits {
                 unreachable!("checkpoints and policies are read in the sizes of their config");
@@ -220,14 +220,14 @@ impl Session {
     ///
     /// # Errors
     /// The backend fails (what came before is saved then), or something cannot be written.
-    pub fn train(&mut self, player: &mut Player, options: &mut Options<'_>) -> Result<Outcome, RunError> {
+    pub fn train(&mut self, player: &mut Player, options: &mut Options<'_>) -> Result<Ended, RunError> {
         self.since = Instant::now();
         for member in self.members.iter_mut().filter(|member| member.going.is_some()) {
             member.run.sessions = member.run.sessions.saturating_add(1);
             member.run.command = options.command.into();
         }
         self.settle_on(player);
-        self.write_runs(State::Running)?;
+        self.write_runs(Status::Running)?;
         self.save_starts()?;
         let (mut flushed, mut setback, mut told) = (Instant::now(), None, false);
         // Once, and only what a generation has made up for: a device that is gone for good is told of as such.
@@ -280,13 +280,30 @@ impl Session {
                 saved => {
                     saved?;
                     if stop {
-                        return Ok(Outcome::Stopped);
+                        return Ok(Ended::Stopped);
                     }
                 }
             }
         }
         tell(setback);
-        Ok(Outcome::Done)
+        Ok(Ended::Done)
+    }
+
+    /// Makes the generation that is played next the last of each run, or leaves it at an earlier one; gives the last of all.
+    /// What each then comes to is what a run of so many generations comes to.
+    ///
+    /// # Errors
+    /// A config cannot be written.
+    pub fn end(&mut self) -> Result<usize, RunError> {
+        let mut last = 0;
+        for member in &mut self.members {
+            if let Some(Going { arm, .. }) = member.going {
+                member.config.learning.generations = self.trainer.end(arm);
+                member.folder.write_config(&member.config)?;
+            }
+            last = last.max(member.config.learning.generations);
+        }
+        Ok(last)
     }
 
     /// The runs that have something left to do.
@@ -371,12 +388,12 @@ impl Session {
     fn stop(&mut self) -> Result<(), RunError> {
         let saved = self.save();
         let waited = self.members.iter_mut().try_for_each(Member::wait);
-        let written = self.write_runs(State::Stopped);
+        let written = self.write_runs(Status::Stopped);
         saved.and(waited).and(written)
     }
 
     /// Writes `run.json` of every run that is not done.
-    fn write_runs(&mut self, state: State) -> Result<(), RunError> {
+    fn write_runs(&mut self, state: Status) -> Result<(), RunError> {
         let seconds = self.seconds();
         let going = self.members.iter_mut().zip(&self.generations).filter(|(member, _)| member.going.is_some());
         side_by_side(going.collect(), |(member, &next)| member.write_run(state, next, seconds, None)).map(drop)
@@ -389,7 +406,7 @@ impl Session {
 }
 
 /// What a run goes on from, or starts from.
-enum From {
+enum Origin {
     Checkpoint(Snapshot),
     Policies(Init),
     Chance,
@@ -403,7 +420,7 @@ impl Member {
         init: Option<Init>,
         start: Start,
         disk: &Disk,
-    ) -> Result<(Member, From, Vec<Note>), RunError> {
+    ) -> Result<(Member, Origin, Vec<Note>), RunError> {
         let (folder, found) = Folder::open(&path, start, &config, disk.clone())?;
         let checkpoint = found.checkpoint.as_ref().map(|(checkpoint, _)| checkpoint);
         let begun = checkpoint.is_some() || found.run.is_some();
@@ -420,16 +437,16 @@ impl Member {
         }
         let member = Member { config, going: None, folder, run, results: None, before: 0.0 };
         if let Some((story, digest)) = found.finished.zip(member.run.digest.clone()) {
-            return Ok((Member { results: Some(Results { story, digest }), ..member }, From::Chance, found.notes));
+            return Ok((Member { results: Some(Results { story, digest }), ..member }, Origin::Chance, found.notes));
         }
         let (metrics, before, from) = match found.checkpoint {
-            Some((Checkpoint { snapshot, seconds, .. }, metrics)) => (metrics, seconds, From::Checkpoint(snapshot)),
+            Some((Checkpoint { snapshot, seconds, .. }, metrics)) => (metrics, seconds, Origin::Checkpoint(snapshot)),
             None => {
                 let metrics = metrics::Writer::create(disk, &member.folder.file(METRICS));
-                (metrics.map_err(member.metrics_failed())?, 0.0, init.map_or(From::Chance, From::Policies))
+                (metrics.map_err(member.metrics_failed())?, 0.0, init.map_or(Origin::Chance, Origin::Policies))
             }
         };
-        let generation = if let From::Checkpoint(snapshot) = &from { snapshot.generation } else { 0 };
+        let generation = if let Origin::Checkpoint(snapshot) = &from { snapshot.generation } else { 0 };
         let checkpoints = member.folder.file(folder::CHECKPOINTS);
         let keeper = Keeper::new(disk.clone(), checkpoints, member.config.clone(), found.kept, generation);
         let going = Some(Going { arm: 0, metrics, keeper, ending: None });
@@ -450,7 +467,7 @@ impl Member {
     }
 
     fn is_due(&self, next: usize) -> bool {
-        let config::Checkpoint { generations, seconds } = self.config.checkpoint;
+        let config::Saving { generations, seconds } = self.config.checkpoint;
         self.going.as_ref().is_some_and(|going| going.keeper.is_due(&Schedule { generations, seconds }, next))
     }
 
@@ -509,13 +526,13 @@ impl Member {
         policies::write(&self.folder.disk, &path, &self.config, policies)?;
         let (story, digest) = self.folder.digest(&self.config, policies)?;
         keeper.wait()?;
-        self.write_run(State::Done, generation, seconds, Some(digest.clone()))?;
+        self.write_run(Status::Done, generation, seconds, Some(digest.clone()))?;
         self.results = Some(Results { story, digest });
         self.going = None;
         Ok(())
     }
 
-    fn write_run(&mut self, state: State, next: usize, seconds: f64, digest: Option<String>) -> Result<(), RunError> {
+    fn write_run(&mut self, state: Status, next: usize, seconds: f64, digest: Option<String>) -> Result<(), RunError> {
         let generations = next.min(self.config.learning.generations + 1);
         let (updated, seconds) = (folder::now(), self.before + seconds);
         self.run = Run { state, updated, seconds, generations, digest, ..self.run.clone() };

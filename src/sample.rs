@@ -8,7 +8,7 @@ use crate::world::World;
 
 /// How a world's agents and POIs are laid out.
 #[derive(Clone, Copy)]
-enum Layout {
+enum Placing {
     /// Anywhere on the map.
     Scattered,
     /// Within a few radii of one point, as in a team that has come together.
@@ -25,25 +25,75 @@ enum Layout {
     Boundaries,
 }
 
-const LAYOUTS: [Layout; 10] = [
-    Layout::Scattered,
-    Layout::Scattered,
-    Layout::Crowded,
-    Layout::Crowded,
-    Layout::Grid,
-    Layout::Groups,
-    Layout::Groups,
-    Layout::OnePoint,
-    Layout::Walls,
-    Layout::Boundaries,
+const LAYOUTS: [Placing; 10] = [
+    Placing::Scattered,
+    Placing::Scattered,
+    Placing::Crowded,
+    Placing::Crowded,
+    Placing::Grid,
+    Placing::Groups,
+    Placing::Groups,
+    Placing::OnePoint,
+    Placing::Walls,
+    Placing::Boundaries,
 ];
 
 /// A valid config of 1 to 40 agents and 1 to 8 POIs, a pure function of the seed: a hundred seeds in a row hold every
-/// kind of layout, both paradigms and densities, 0 to 3 hidden layers, and gains, speeds and turn rates down to 0.
+/// kind of layout, both paradigms and densities, 0 to 3 hidden layers, gains, speeds and turn rates down to 0, and every
+/// kind of observers, windows and orders of POIs, beside worlds with none of these.
 pub fn world(seed: u64) -> Config {
+    let mut config = plain_world(seed);
+    // By a stream of its own, so that the world is otherwise as it would be without.
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed ^ 0x7275_6c65);
+    if rng.random_bool(0.5) {
+        observe_otherwise(rng, &mut config);
+    }
+    config
+}
+
+/// Gives a world observers, windows and an order of its POIs.
+fn observe_otherwise(rng: &mut ChaCha8Rng, config: &mut Config) {
+    let (leaders, agents) = (config.learners(), config.world.leaders.len() + config.world.followers.len());
+    let world = &mut config.world;
+    let pois = world.pois.len();
+    let counted = |observers: Observers| observers.among(leaders, agents - leaders).len();
+    world.observers = [Observers::All, word(rng)][rng.random_range(0..2)];
+    if counted(world.observers) == 0 {
+        world.observers = Observers::All;
+    }
+    let most = counted(world.observers);
+    match &mut world.coupling {
+        Coupling::Same(coupling) => *coupling = most.min(*coupling),
+        Coupling::Each(couplings) => couplings.iter_mut().for_each(|coupling| *coupling = most.min(*coupling)),
+    }
+    if rng.random_bool(0.6) {
+        let window = |rng: &mut ChaCha8Rng| {
+            let first = rng.random_range(1..=world.steps);
+            match rng.random_range(0..4) {
+                0 => [first, first],
+                1 => [first, rng.random_range(first..=world.steps)],
+                2 => [1, first],
+                _ => [1, world.steps],
+            }
+        };
+        world.windows = (0..pois).map(|_| window(rng)).collect();
+    }
+    if rng.random_bool(0.6) {
+        // Each comes after some of those before it in an order that starts anywhere.
+        let (first, step) = (rng.random_range(0..pois), if rng.random_bool(0.5) { 1 } else { pois - 1 });
+        let order: Vec<usize> = (0..pois).map(|place| (first + place * step) % pois).collect();
+        world.after = vec![vec![]; pois];
+        for (place, &poi) in order.iter().enumerate() {
+            let before = order[..place].iter().copied().filter(|_| rng.random_bool(0.4));
+            world.after[poi] = before.collect();
+        }
+    }
+}
+
+fn plain_world(seed: u64) -> Config {
     let rng = &mut ChaCha8Rng::seed_from_u64(seed);
     let layout = LAYOUTS[(seed % LAYOUTS.len() as u64) as usize];
-    let exact = matches!(layout, Layout::Grid | Layout::Groups | Layout::OnePoint | Layout::Boundaries);
+    let exact = matches!(layout, Placing::Grid | Placing::Groups | Placing::OnePoint | Placing::Boundaries);
     let number = |rng: &mut ChaCha8Rng, low: f64, high: f64| {
         let value = rng.random_range(low..high);
         if exact { (value * 2.0).ceil() / 2.0 } else { value }
@@ -76,16 +126,16 @@ pub fn world(seed: u64) -> Config {
     ];
     let mut place = |index: usize, agent: bool| -> [f64; 2] {
         let offset = match layout {
-            Layout::Scattered => map.map(|side| rng.random_range(0.0..1.0) * side),
-            Layout::Crowded => {
+            Placing::Scattered => map.map(|side| rng.random_range(0.0..1.0) * side),
+            Placing::Crowded => {
                 let reach = 1.5 * attraction_radius;
                 centre.map(|at| at + rng.random_range(-reach..reach))
             }
-            Layout::Grid => {
+            Placing::Grid => {
                 let reach = if agent { 8 } else { 16 };
                 centre.map(|at| at + f64::from(rng.random_range(-reach..=reach)) / 2.0)
             }
-            Layout::Groups => {
+            Placing::Groups => {
                 let group = (index % 4) as f64;
                 let [x, y] = match (agent, index / 4) {
                     (true, 0) => [0.0, 0.0],
@@ -97,8 +147,8 @@ pub fn world(seed: u64) -> Config {
                 };
                 [10.0 + 10.0 * group + x, 5.0 + y]
             }
-            Layout::OnePoint => centre,
-            Layout::Walls => {
+            Placing::OnePoint => centre,
+            Placing::Walls => {
                 let mut at = map.map(|side| rng.random_range(0.0..1.0) * side);
                 let axis = rng.random_range(0..2);
                 at[axis] = if rng.random_bool(0.5) { 0.0 } else { map[axis] };
@@ -107,8 +157,8 @@ pub fn world(seed: u64) -> Config {
                 }
                 at
             }
-            Layout::Boundaries if agent && index == 0 => centre,
-            Layout::Boundaries => {
+            Placing::Boundaries if agent && index == 0 => centre,
+            Placing::Boundaries => {
                 let radius = radii[rng.random_range(0..radii.len())];
                 let [x, y] = [[1, 0], [0, 1], [-1, 0], [0, -1], [1, 1], [-1, 1], [-1, -1], [1, -1]]
                     [rng.random_range(0..8)]
@@ -135,13 +185,16 @@ pub fn world(seed: u64) -> Config {
     let actions = if later.random_bool(0.3) { Actions::Behaviours } else { Actions::Direct };
     let gain = |rng: &mut ChaCha8Rng, high: f64| if rng.random_bool(0.1) { 0.0 } else { rng.random_range(0.1..high) };
     Config {
-        world: crate::config::World {
+        world: crate::config::Domain {
             map,
             leaders: starts[..leaders].to_vec(),
             followers: starts[leaders..].to_vec(),
             pois,
             coupling,
             observation_radius,
+            observers: Observers::All,
+            windows: vec![],
+            after: vec![],
             steps: rng.random_range(20..=60),
             dt: [0.05, 0.2, 0.2, 0.5, 1.0][rng.random_range(0..5)],
             heading: if exact || rng.random_bool(0.3) {
@@ -195,7 +248,7 @@ pub fn world(seed: u64) -> Config {
             poi_jitter: if later.random_bool(0.3) { later.random_range(0.5..5.0) } else { 0.0 },
             seed,
         },
-        checkpoint: Checkpoint::default(),
+        checkpoint: Saving::default(),
     }
 }
 

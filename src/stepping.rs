@@ -567,15 +567,26 @@ impl<S: Simd> Room<S> {
         self.columns.clear();
         self.columns.extend(sets.map(|lanes| S::f32s::from_slice(simd, lanes)));
         to_rows(simd, &self.columns, bytemuck::cast_slice_mut(near));
+        let rule = &world.rule;
         for (team, step) in steps.iter_mut().enumerate().filter(|(_, step)| **step < last) {
             let near = &near[team * pois * words..][..pois * words];
             let newly = &mut newly[team * pois..][..pois];
             let observed = &mut observed[team * pois..][..pois];
-            for (poi, &coupling) in world.coupling.iter().enumerate() {
-                let count: u32 = near[poi * words..][..words].iter().map(|word| word.count_ones()).sum();
-                if count >= coupling && !observed[poi] {
-                    (newly[poi], observed[poi]) = (true, true);
+            if rule.is_plain() {
+                for (poi, &coupling) in world.coupling.iter().enumerate() {
+                    let count: u32 = near[poi * words..][..words].iter().map(|word| word.count_ones()).sum();
+                    if count >= coupling && !observed[poi] {
+                        (newly[poi], observed[poi]) = (true, true);
+                    }
                 }
+            } else {
+                for (poi, &coupling) in world.coupling.iter().enumerate() {
+                    let near = near[poi * words..][..words].iter().copied();
+                    newly[poi] =
+                        !observed[poi] && rule.is_open(poi, *step + 1, observed) && rule.count(near) >= coupling;
+                }
+                // What is observed by a step opens no other POI before the next.
+                observed.iter_mut().zip(&*newly).for_each(|(observed, newly)| *observed |= newly);
             }
             if !record.is_empty() {
                 let at = team * world.set_words() + *step as usize * near.len();

@@ -72,7 +72,7 @@ pub struct Times {
 struct Arm {
     config: Config,
     world: World,
-    trials: Vec<Trial>,
+    trials: Vec<Lineage>,
     /// The generation that plays next, two past the last when all is done.
     generation: usize,
     /// The generation of the populations that are about to play: an earlier one after they were lost with the device
@@ -103,7 +103,7 @@ pub enum SnapshotError {
 ///
 /// A population has one slot more than policies: the last holds the champion of the generation before, which plays
 /// along as one more team.
-struct Trial {
+struct Lineage {
     index: usize,
     /// `[populations][policies + 1][parameters]`, this generation's and the next.
     weights: Vec<f32>,
@@ -256,7 +256,7 @@ impl Trainer {
     /// `[populations][policies][parameters]` a trial.
     pub fn policies(&self, arm: usize) -> Vec<Vec<f32>> {
         let arm = &self.arms[arm];
-        let sort = |trial: &Trial| {
+        let sort = |trial: &Lineage| {
             let mut policies = vec![0.0; arm.policies()];
             arm.sort(&trial.weights, &trial.fitness, &mut policies);
             policies
@@ -352,7 +352,7 @@ impl Trainer {
         let (index, level, arm) = (arm, self.level, &mut self.arms[arm]);
         let Snapshot { generation, last, weights, fitness, pending } = snapshot;
         let counts = [weights.len(), fitness.len(), pending.len()];
-        let fits = |((trial, weights), fitness): ((&Trial, &Vec<f32>), &Vec<f32>)| {
+        let fits = |((trial, weights), fitness): ((&Lineage, &Vec<f32>), &Vec<f32>)| {
             trial.weights.len() == weights.len() && trial.fitness.len() == fitness.len()
         };
         if counts != [arm.trials.len(); 3] || !arm.trials.iter().zip(&weights).zip(&fitness).all(fits) {
@@ -447,7 +447,7 @@ fn play(
 impl Arm {
     fn new(config: Config, trials: Range<usize>, level: Level) -> Arm {
         let world = World::new(&config);
-        let trials = trials.into_par_iter().map(|index| Trial::new(&config, &world, index, level));
+        let trials = trials.into_par_iter().map(|index| Lineage::new(&config, &world, index, level));
         Arm {
             trials: trials.collect(),
             world,
@@ -516,7 +516,7 @@ impl Arm {
         for (held, trial) in self.held.iter().zip(&mut self.trials) {
             held.fetch(&mut trial.children)?;
         }
-        for Trial { weights, children, .. } in &mut self.trials {
+        for Lineage { weights, children, .. } in &mut self.trials {
             std::mem::swap(weights, children);
         }
         self.host_age = self.age;
@@ -595,7 +595,7 @@ impl Arm {
     /// Completes the last generation's rows, whose champions have just played.
     fn finish(&mut self) -> Vec<Row> {
         let (pois, population) = (self.world.pois.len(), self.config.learning.population);
-        let row = |trial: &mut Trial| {
+        let row = |trial: &mut Lineage| {
             let [_, _, champion_g] = trial.summary(pois, population);
             trial.pending.map(|row| Row { champion_g, ..row })
         };
@@ -649,7 +649,7 @@ impl Arm {
         trials.par_iter_mut().for_each(|trial| {
             let tournaments = Key::new(seed, trial.index, Purpose::Tournament);
             let key = Key::new(seed, trial.index, Purpose::Mutation);
-            let Trial { weights, children, parents, fitness, .. } = trial;
+            let Lineage { weights, children, parents, fitness, .. } = trial;
             let plans = fitness.par_chunks_exact(population).zip(parents.par_chunks_exact_mut(population + 1));
             let populations = weights.par_chunks_exact(stride).zip(children.par_chunks_exact_mut(stride));
             plans.zip(populations).enumerate().for_each(|(leader, ((fitness, parents), (policies, children)))| {
@@ -658,7 +658,7 @@ impl Arm {
                 // Small shares, so that no thread is left with a long one at the end.
                 broods.with_max_len(4).enumerate().for_each(|(index, (parents, children))| {
                     let first = index * BROOD;
-                    let brood = evolve::Brood { key, generation, population: leader, first, parents, policies };
+                    let brood = evolve::Offspring { key, generation, population: leader, first, parents, policies };
                     SCRATCH.with_borrow_mut(|scratch| {
                         evolve::breed(level, &config.learning, brood, children, scratch);
                     });
@@ -683,8 +683,8 @@ impl Arm {
     }
 }
 
-impl Trial {
-    fn new(config: &Config, world: &World, index: usize, level: Level) -> Trial {
+impl Lineage {
+    fn new(config: &Config, world: &World, index: usize, level: Level) -> Lineage {
         let Learning { seed, population, episodes_per_team, .. } = config.learning;
         let (leaders, populations, parameters) = (world.leaders(), config.populations(), world.parameters());
         let key = Key::new(seed, index, Purpose::Weights);
@@ -697,7 +697,7 @@ impl Trial {
                 .for_each(|(slot, policy)| evolve::random_policy(level, key.at(0, leader, slot), policy));
         });
         let slots = episodes_per_team * (population + 1);
-        Trial {
+        Lineage {
             index,
             children: vec![0.0; weights.len()],
             weights,
@@ -728,7 +728,7 @@ impl Trial {
     /// Hands each team's scores, averaged over its episodes, back to its policies.
     fn rate(&mut self, leaders: usize, population: usize) {
         let episodes = self.starts.len();
-        let Trial { orders, scores, fitness, .. } = self;
+        let Lineage { orders, scores, fitness, .. } = self;
         let populations = fitness.par_chunks_exact_mut(population).zip(orders.par_chunks_exact(population));
         populations.with_min_len(few(population)).enumerate().for_each(|(leader, (fitness, order))| {
             for (team, &policy) in order.iter().enumerate() {
@@ -749,17 +749,9 @@ impl Trial {
 
 /// The score of one leader of a team, averaged over episodes; `scores` are `[episodes][teams][leaders]`.
 #[inline(always)]
-fn mean_score(
-    scores: &[AtomicU32],
-    episodes: usize,
-    teams: usize,
-    team: usize,
-    leaders: usize,
-    leader: usize,
-) -> f32 {
-    let score = |episode: usize| {
-        f64::from(f32::from_bits(scores[(episode * teams + team) * leaders + leader].load(Relaxed)))
-    };
+fn mean_score(scores: &[AtomicU32], episodes: usize, teams: usize, team: usize, leaders: usize, leader: usize) -> f32 {
+    let score =
+        |episode: usize| f64::from(f32::from_bits(scores[(episode * teams + team) * leaders + leader].load(Relaxed)));
     let total: f64 = (0..episodes).map(score).sum();
     (total / episodes as f64) as f32
 }

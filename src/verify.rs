@@ -43,7 +43,7 @@ impl Plan {
 
 /// How much was compared, and the first difference, if any.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Outcome {
+pub struct Agreement {
     pub worlds: usize,
     pub agent_steps: u64,
     /// Where, in words.
@@ -91,9 +91,9 @@ pub fn compare(
     plan: &Plan,
     reference: &mut dyn Backend,
     backend: &mut dyn Backend,
-    mut progress: impl FnMut(&Outcome),
-) -> Result<Outcome, BackendError> {
-    let mut outcome = Outcome::default();
+    mut progress: impl FnMut(&Agreement),
+) -> Result<Agreement, BackendError> {
+    let mut outcome = Agreement::default();
     let mut all = Vec::with_capacity(plan.worlds.len());
     for (name, config) in &plan.worlds {
         let teams = Teams::new(config, plan.teams, plan.seed);

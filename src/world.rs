@@ -4,7 +4,7 @@ use glam::{DVec2, Vec2};
 
 use crate::config::{Config, MAX_AGENTS, MAX_HIDDEN_UNITS, MAX_POIS, MAX_STEPS};
 use crate::declare::Choice;
-use crate::model::couple::CoupleConstants;
+use crate::model::couple::{CoupleConstants, Rule};
 use crate::model::follow::FollowConstants;
 use crate::model::motion::MotionConstants;
 use crate::model::policy::PolicyConstants;
@@ -15,13 +15,15 @@ pub use crate::model::policy::{BEHAVIOURS, OUTPUTS};
 pub use crate::model::sense::INPUTS;
 pub use crate::model::{Constants, Variant};
 
-/// One world: constants, start positions of all agents (leaders first), POIs and how many agents each needs.
+/// One world: constants, start positions of all agents (leaders first), POIs, how many agents each needs, and by what rule
+/// these observe.
 #[derive(Clone, Debug, PartialEq)]
 pub struct World {
     pub constants: Constants,
     pub starts: Vec<Vec2>,
     pub pois: Vec<Vec2>,
     pub coupling: Vec<u32>,
+    pub rule: Rule,
 }
 
 impl World {
@@ -56,6 +58,7 @@ impl World {
             starts: [points(&world.leaders), points(&world.followers)].concat(),
             pois: points(&world.pois),
             coupling: world.coupling.of_each(pois),
+            rule: Rule::new(world.observers.among(leaders, agents - leaders), agents, &world.windows, &world.after),
         }
     }
 
@@ -87,6 +90,7 @@ impl World {
                 self.starts.len() as u64 == u64::from(constants.leaders) + u64::from(constants.followers),
             ),
             ("sets", constants.words as usize == self.starts.len().div_ceil(32)),
+            ("observers, windows and order of POIs", self.rule.fits(constants.words as usize, pois)),
             ("density", (constants.variant.density as usize) < Density::ALL.len()),
             (
                 "policies",

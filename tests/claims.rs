@@ -12,12 +12,12 @@ use flotilla::config::{Fitness, Override, Paradigm};
 use flotilla::credit::Credit;
 use flotilla::evolve::{self, Key, Purpose};
 use flotilla::report::paper::claims::{Claim, Verdict, claims};
-use flotilla::report::paper::{self, Arm, LAYOUTS, Results, SOURCES, Source, tables};
+use flotilla::report::paper::{self, Evidence, Experiment, LAYOUTS, SOURCES, Source, tables};
 use flotilla::statistics::{self, Tested};
 use flotilla::world::World;
 use serde_json::Value;
 
-fn arms(trials: u32, generations: u32) -> Vec<Arm> {
+fn arms(trials: u32, generations: u32) -> Vec<Experiment> {
     let few = [("learning.trials", trials), ("learning.generations", generations), ("learning.seed", 3)];
     paper::arms(&few.map(|(key, value)| Override::new(key, value, key))).unwrap()
 }
@@ -174,7 +174,7 @@ fn straight_ahead_solves_what_the_tables_say_and_random_teams_are_played() {
 }
 
 /// Claims of arms whose best teams come to a share of the POIs, by layout, paradigm, fitness, trial and generation.
-fn judged(trials: u32, generations: u32, g: impl Fn(&Arm, usize, usize) -> f64) -> Vec<Claim> {
+fn judged(trials: u32, generations: u32, g: impl Fn(&Experiment, usize, usize) -> f64) -> Vec<Claim> {
     let mut arms = arms(trials, generations);
     for arm in &mut arms {
         let course = |trial| (0..=generations as usize).map(|at| g(arm, trial, at)).collect();
@@ -182,7 +182,7 @@ fn judged(trials: u32, generations: u32, g: impl Fn(&Arm, usize, usize) -> f64) 
     }
     let none = vec![vec![0.0; generations as usize + 1]; trials as usize];
     let baselines = vec![Baseline { straight: none.clone(), random: none }; 6];
-    claims(Results { arms: &arms, baselines: &baselines })
+    claims(Evidence { arms: &arms, baselines: &baselines })
 }
 
 /// The verdict on the claim whose words have these, by source.
@@ -196,9 +196,9 @@ const G: Source = Source::Evolved(Fitness::G);
 
 #[test]
 fn verdicts_are_as_strict_as_the_words() {
-    let led = |arm: &Arm| arm.paradigm == Paradigm::LeaderFollower;
+    let led = |arm: &Experiment| arm.paradigm == Paradigm::LeaderFollower;
     let all_but = |exceptions: usize| {
-        move |arm: &Arm, trial: usize, at: usize| match led(arm) {
+        move |arm: &Experiment, trial: usize, at: usize| match led(arm) {
             true if trial < exceptions && at == 70 => 0.75,
             true => 1.0,
             false => 0.0,
@@ -240,7 +240,7 @@ fn verdicts_are_as_strict_as_the_words() {
     assert_eq!(verdict(&around, 1, "more drastic", G), Verdict::Undecided);
 
     // Df apart from G by a little, by much, and in spread.
-    let df = |arm: &Arm| arm.fitness == Fitness::Df;
+    let df = |arm: &Experiment| arm.fitness == Fitness::Df;
     let slight = judged(40, 100, |arm, trial, _| if df(arm) || trial % 5 > 0 { 1.0 } else { 0.75 });
     assert_eq!(verdict(&slight, 2, "slight benefit", G), Verdict::Yes);
     let great = judged(40, 100, |arm, _, _| if df(arm) { 1.0 } else { 0.5 });

@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use flotilla::config::{
-    Actions, Checkpoint, Config, ConfigError, Coupling, Density, Fitness, Follow, Learning, MAX_EPISODES, MAX_GENERATIONS,
-    MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion, Mutation, Override, Paradigm,
-    Policy, Problem, Sense, Sharing, World,
+    Actions, Config, ConfigError, Coupling, Density, Domain, Fitness, Follow, Learning, MAX_EPISODES, MAX_GENERATIONS,
+    MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion, Mutation, Observers, Override,
+    Paradigm, Policy, Problem, Saving, Sense, Sharing,
 };
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -24,13 +24,16 @@ fn problems(text: &str) -> Vec<Problem> {
 fn every_key_but_leaders_and_pois_has_its_default() {
     let config = Config::parse(SMALLEST, "test.toml").unwrap();
     let expected = Config {
-        world: World {
+        world: Domain {
             map: [50.0, 50.0],
             leaders: vec![[1.0, 2.0]],
             followers: vec![],
             pois: vec![[3.0, 4.0]],
             coupling: Coupling::Same(1), // 3 where there are as many agents
             observation_radius: 5.0,
+            observers: Observers::All,
+            windows: vec![],
+            after: vec![],
             steps: 25,
             dt: 0.2,
             heading: std::f64::consts::FRAC_PI_2,
@@ -67,7 +70,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             poi_jitter: 0.0,
             seed: 0,
         },
-        checkpoint: Checkpoint { generations: 0, seconds: 30.0 },
+        checkpoint: Saving { generations: 0, seconds: 30.0 },
     };
     assert_eq!(config, expected);
 }
@@ -195,7 +198,7 @@ fn word<T: flotilla::config::Choice + std::fmt::Debug>() -> impl Strategy<Value 
     (0..T::ALL.len()).prop_map(|index| T::ALL[index].1)
 }
 
-fn worlds() -> impl Strategy<Value = (World, Motion)> {
+fn worlds() -> impl Strategy<Value = (Domain, Motion)> {
     let speeds = (size_or_zero(1e-6, 1e3), 0.0..=1.0, 0.0..=1.0).prop_map(|(max, a, b): (f64, f64, f64)| {
         let tidy = |speed: f64| if speed < 1e-6 { 0.0 } else { speed };
         let min = tidy(max * a);
@@ -205,22 +208,41 @@ fn worlds() -> impl Strategy<Value = (World, Motion)> {
         |(x, y, leaders, followers, pois, (min_speed, speed, max_speed))| {
             let places =
                 move |count| vec((size_or_zero(1e-6, x), size_or_zero(1e-6, y)).prop_map(|(x, y)| [x, y]), count);
-            let agents = leaders + followers;
-            let coupling =
-                prop_oneof![(1..=agents).prop_map(Coupling::Same), vec(1..=agents, pois).prop_map(Coupling::Each)];
+            let coupling = word().prop_flat_map(move |observers| {
+                let (observers, most) = match observers {
+                    Observers::All => (observers, leaders + followers),
+                    Observers::Followers if followers > 0 => (observers, leaders.min(followers)),
+                    _ => (Observers::Leaders, leaders),
+                };
+                let each = vec(1..=most, pois).prop_map(Coupling::Each);
+                (prop_oneof![(1..=most).prop_map(Coupling::Same), each], Just(observers))
+            });
             let rest = (size(0.01, 1e4), 1..=MAX_STEPS, size(1e-4, 10.0), -1e3..=1e3);
+            let rules = (vec((0.0..=1.0f64, 0.0..=1.0f64), pois), vec(vec(any::<bool>(), pois), pois), 0..4usize);
+            let rest = (rest, rules);
             let motion = (size_or_zero(1e-3, 1e3), size_or_zero(1e-3, 1e3));
             (places(leaders), places(followers), places(pois), coupling, rest, motion).prop_map(
-                move |(leaders, followers, pois, coupling, (observation_radius, steps, dt, heading), motion)| {
+                move |(leaders, followers, pois, (coupling, observers), (rest, rules), motion)| {
+                    let ((observation_radius, steps, dt, heading), (parts, follows, kind)) = (rest, rules);
                     let map = [x, y];
+                    let step = |part: f64| 1 + (part * (steps - 1) as f64) as usize;
+                    let windows: Vec<_> =
+                        parts.iter().map(|&(a, b)| [step(a.min(b)), step(a.max(b))]).filter(|_| kind & 1 > 0).collect();
+                    let before = |(poi, follows): (usize, Vec<bool>)| {
+                        (0..poi).filter(|&other| follows[other]).collect::<Vec<_>>()
+                    };
+                    let after: Vec<_> = follows.into_iter().enumerate().map(before).filter(|_| kind & 2 > 0).collect();
                     (
-                        World {
+                        Domain {
                             map,
                             leaders,
                             followers,
                             pois,
                             coupling,
                             observation_radius,
+                            observers,
+                            windows,
+                            after,
                             steps,
                             dt,
                             heading,
@@ -285,16 +307,13 @@ fn configs() -> impl Strategy<Value = Config> {
         },
     );
     let checkpoint = (0..=MAX_GENERATIONS, prop_oneof![Just(0.0), 0.01..=1e9])
-        .prop_map(|(generations, seconds)| Checkpoint { generations, seconds });
+        .prop_map(|(generations, seconds)| Saving { generations, seconds });
     (worlds(), follow, sense, policy, learning, checkpoint).prop_map(
-        |((world, motion), follow, sense, policy, learning, checkpoint)| Config {
-            world,
-            motion,
-            follow,
-            sense,
-            policy,
-            learning,
-            checkpoint,
+        |((mut world, motion), follow, sense, policy, learning, checkpoint)| {
+            if learning.paradigm == Paradigm::AllLeaders && world.observers == Observers::Followers {
+                world.observers = Observers::Leaders;
+            }
+            Config { world, motion, follow, sense, policy, learning, checkpoint }
         },
     )
 }
@@ -392,4 +411,71 @@ fn counts_at_their_limits_are_valid() {
         assert!(Config::parse(&text(most), "test.toml").is_ok());
         assert_eq!(problems(&text(most + 1))[0].key, format!("learning.{key}"));
     }
+}
+
+/// What is wrong with who observes, when and in what order is told with its line and its place in the list.
+#[test]
+fn rules_that_cannot_be_are_refused_where_they_stand() {
+    let world = |rest: &str| {
+        format!("[world]\nleaders = [[1, 2], [2, 2]]\nfollowers = [[1, 1]]\npois = [[3, 4], [5, 6], [7, 8]]\n{rest}")
+    };
+    for (rest, expected) in [
+        ("after = [[], [0]]", "5: world.after: found a list of 2, allowed a list of 3 lists of POIs, or none"),
+        ("after = [[], [3], []]", "5: world.after[1][0]: found 3, allowed 0 to 2 (the last POI)"),
+        ("after = [[], [-1], []]", "5: world.after[1][0]: found -1, allowed 0 to 2 (the last POI)"),
+        (
+            "after = [[], 0, []]",
+            "5: world.after[1]: found 0, allowed a list of 0 to 3 numbers, each 0 to 2 (the last POI)",
+        ),
+        ("after = [\n[],\n[0, 1],\n[]]", "7: world.after[1]: found the POI itself, allowed others"),
+        (
+            "after = [\n[],\n[0, 2],\n[0, 1]]",
+            "7: world.after[1]: found POI 1 after POI 2 after POI 1, which can never begin",
+        ),
+        (
+            "after = [[1], [2], [0]]",
+            "5: world.after[0]: found POI 0 after POI 1 after POI 2 after POI 0, which can never begin",
+        ),
+        // Who waits for a cycle is not blamed for it.
+        ("after = [[1], [2], [1]]", "5: world.after[1]: found POI 1 after POI 2 after POI 1, which can never begin"),
+        ("windows = [[1, 2]]", "5: world.windows: found a list of 1, allowed a list of 3 pairs [first, last], or none"),
+        ("windows = [[1, 2], [0, 3], [1, 9]]", "5: world.windows[1][0]: found 0, allowed 1 to 25 (world.steps)"),
+        ("windows = [[1, 2], [1, 3],\n[1, 26]]", "6: world.windows[2][1]: found 26, allowed 1 to 25 (world.steps)"),
+        (
+            "windows = [[1, 2], [1, 3],\n[9, 3]]",
+            "6: world.windows[2]: found the steps from 9 to 3, allowed the earlier one first",
+        ),
+        (
+            "windows = [[1, 2, 3], [1, 3], [1, 3]]",
+            "5: world.windows[0]: found a list of 3, allowed a list of 2 numbers",
+        ),
+        ("windows = 3", "5: world.windows: found 3, allowed a list of 3 pairs [first, last], or none"),
+        ("observers = 'nobody'", "5: world.observers: found 'nobody', allowed \"all\" or \"leaders\" or \"followers\""),
+        (
+            "observers = 'followers'\ncoupling = 2",
+            "6: world.coupling: found 2, allowed 1 (the number of followers, who alone are observers)",
+        ),
+        (
+            "observers = 'leaders'\ncoupling = [1, 2, 3]",
+            "6: world.coupling[2]: found 3, allowed 1 to 2 (the number of leaders, who alone are observers)",
+        ),
+        (
+            "observers = 'followers'\n[learning]\nparadigm = 'all-leaders'",
+            "5: world.observers: found \"followers\", but all agents lead, so nobody would observe",
+        ),
+    ] {
+        let error = Config::parse(&world(rest), "rules.toml").expect_err(rest).to_string();
+        assert!(error.starts_with(&format!("rules.toml:{expected}")) && !error.contains('\n'), "{rest}: {error}");
+    }
+    let alone = "[world]\nleaders = [[1, 2]]\npois = [[3, 4]]\nobservers = 'followers'";
+    let error = Config::parse(alone, "rules.toml").unwrap_err().to_string();
+    assert_eq!(
+        error,
+        "rules.toml:4: world.observers: found \"followers\", but there are no followers, so nobody would observe"
+    );
+    // By the flag, it is the flag that is blamed or the key that no longer fits.
+    let flag = Override::new("learning.paradigm", "all-leaders", "--paradigm");
+    let text = world("observers = 'followers'");
+    assert!(Config::read(&text, "rules.toml", &[], &[flag]).is_err());
+    assert_eq!(Config::parse(&text, "rules.toml").unwrap().world.coupling, Coupling::Same(1));
 }

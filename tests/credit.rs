@@ -1,21 +1,36 @@
-//! Credit against its definition: the record is edited (agents taken out, copies added) and G counted anew.
+//! Credit against its definition: the record is edited (agents taken out, copies added) and G counted anew, step by step
+//! as the rule has it.
 
 use flotilla::backend::{Episode, Need, Seen, Strided, owner_bits};
-use flotilla::config::Fitness;
+use flotilla::config::{Fitness, Observers};
 use flotilla::credit::{Credit, Scores};
+use flotilla::model::couple;
 use flotilla::world::{Constants, World};
 use glam::Vec2;
 use rand::rngs::ChaCha8Rng;
+use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 
 /// One team's record, sets as lists of agents: `near[step][poi]`, and `seen[follower][leader]`.
+#[derive(Clone, Debug)]
 struct Record {
     leaders: usize,
     followers: usize,
     coupling: Vec<u32>,
     near: Vec<Vec<Vec<usize>>>,
     seen: Vec<Vec<u32>>,
+    rule: Rule,
 }
+
+/// By what rule POIs are observed, as a config has it.
+#[derive(Clone, Debug)]
+struct Rule {
+    observers: Observers,
+    windows: Vec<[usize; 2]>,
+    after: Vec<Vec<usize>>,
+}
+
+const PLAIN: Rule = Rule { observers: Observers::All, windows: vec![], after: vec![] };
 
 impl Record {
     fn world(&self) -> World {
@@ -32,6 +47,10 @@ impl Record {
             starts: vec![Vec2::ZERO; agents],
             pois: vec![Vec2::ZERO; self.coupling.len()],
             coupling: self.coupling.clone(),
+            rule: {
+                let Rule { observers, windows, after } = &self.rule;
+                couple::Rule::new(observers.among(self.leaders, self.followers), agents, windows, after)
+            },
         }
     }
 
@@ -87,13 +106,26 @@ impl Record {
         (sets, if need.owners() { owners } else { vec![] })
     }
 
-    /// Observed POIs if each agent counted as many times as `weight` says.
-    fn observed(&self, weight: impl Fn(usize) -> u32) -> u32 {
-        let enough = |poi: usize| {
-            let total = |sets: &Vec<Vec<usize>>| sets[poi].iter().map(|&agent| weight(agent)).sum::<u32>();
-            self.near.iter().any(|sets| total(sets) >= self.coupling[poi])
-        };
-        (0..self.coupling.len()).filter(|&poi| enough(poi)).count() as u32
+    /// Observed POIs if each agent counted as many times as `weight` says of a step, from 0: step after step, what is
+    /// observed at one opens others from the next on.
+    fn observed(&self, weight: impl Fn(usize, usize) -> u32) -> u32 {
+        let mut observed = vec![false; self.coupling.len()];
+        for (step, sets) in self.near.iter().enumerate() {
+            let before = observed.clone();
+            for (poi, set) in sets.iter().enumerate() {
+                let Rule { observers, windows, after } = &self.rule;
+                let at_its_time = windows.is_empty() || (windows[poi][0] <= step + 1 && step + 1 <= windows[poi][1]);
+                let in_its_turn = after.is_empty() || after[poi].iter().all(|&other| before[other]);
+                let counts = |&&agent: &&usize| match observers {
+                    Observers::All => true,
+                    Observers::Leaders => agent < self.leaders,
+                    Observers::Followers => agent >= self.leaders,
+                };
+                let there: u32 = set.iter().filter(counts).map(|&agent| weight(step, agent)).sum();
+                observed[poi] |= at_its_time && in_its_turn && there >= self.coupling[poi];
+            }
+        }
+        observed.iter().filter(|&&observed| observed).count() as u32
     }
 
     /// The leader a follower belongs to.
@@ -109,11 +141,11 @@ impl Record {
     fn scores(&self) -> Scores {
         let share = |count: u32, of: u32| count as f32 / of as f32;
         let pois = self.coupling.len() as u32;
-        let observed = self.observed(|_| 1);
+        let observed = self.observed(|_, _| 1);
         let owners: Vec<_> = (0..self.leaders + self.followers).map(|agent| self.owner(agent)).collect();
-        let without = |leader| observed - self.observed(|agent| (agent != leader) as u32);
-        let without_group = |leader| observed - self.observed(|agent| (owners[agent] != Some(leader)) as u32);
-        let gain = |leader, copies| self.observed(|agent| 1 + if agent == leader { copies } else { 0 }) - observed;
+        let without = |leader| observed - self.observed(|_, agent| (agent != leader) as u32);
+        let without_group = |leader| observed - self.observed(|_, agent| (owners[agent] != Some(leader)) as u32);
+        let gain = |leader, copies| self.observed(|_, agent| 1 + if agent == leader { copies } else { 0 }) - observed;
         // a/b is bettered by c/d
         let bettered =
             |(a, b): (u32, u32), (c, d): (u32, u32)| u64::from(c) * u64::from(b) > u64::from(a) * u64::from(d);
@@ -184,7 +216,33 @@ fn random(rng: &mut ChaCha8Rng, agents: usize) -> Record {
         _ => (0..leaders).map(|_| rng.random_range(0..=most)).collect(),
     };
     let seen = (0..followers).map(|_| row(rng)).collect();
-    Record { leaders, followers, coupling, near, seen }
+    Record { leaders, followers, coupling, near, seen, rule: PLAIN }
+}
+
+/// The same with another rule, of every kind.
+fn ruled(rng: &mut ChaCha8Rng, record: Record) -> Record {
+    let (pois, steps) = (record.coupling.len(), record.near.len());
+    let observers = match rng.random_range(0..4) {
+        0 => Observers::Leaders,
+        1 if record.followers > 0 => Observers::Followers,
+        _ => Observers::All,
+    };
+    let window = |rng: &mut ChaCha8Rng| {
+        let (a, b) = (rng.random_range(1..=steps), rng.random_range(1..=steps));
+        if rng.random_bool(0.5) { [1, steps] } else { [a.min(b), a.max(b)] }
+    };
+    let windows = if rng.random_bool(0.5) { (0..pois).map(|_| window(rng)).collect() } else { vec![] };
+    let mut after = vec![];
+    if rng.random_bool(0.6) {
+        let mut order: Vec<usize> = (0..pois).collect();
+        order.shuffle(rng);
+        after = vec![vec![]; pois];
+        for place in 1..pois {
+            let some = order[..place].iter().copied().filter(|_| rng.random_bool(0.5));
+            after[order[place]] = some.collect();
+        }
+    }
+    Record { rule: Rule { observers, windows, after }, ..record }
 }
 
 fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: usize) -> Scores {
@@ -198,6 +256,9 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
     let mut g = vec![f32::NAN; record.leaders];
     assert_eq!(credit.score(&episode, &world, Fitness::G, &mut g), expected.observed);
     assert_eq!(g, vec![expected.g; record.leaders]);
+    if world.rule.is_timed() {
+        return expected;
+    }
     let needs = [Fitness::G, Fitness::D, Fitness::Df, Fitness::Dpp].map(Need::Score);
     for need in [Need::Scores].into_iter().chain(needs) {
         let (sets, owners) = record.packed(need);
@@ -226,12 +287,18 @@ fn every_fitness_is_its_definition() {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut credit = Credit::default();
     let mut differ = [0; 5];
+    // Of records by another rule: scores that are not those by the default, and D, Df, D++ that are not 0.
+    let mut by_rule = [0; 4];
     for case in 0..6000 {
         let agents = [3, 12, 20, 32, 33, 70][case % 6];
         let record = random(&mut rng, agents);
+        let other = ruled(&mut rng, record.clone());
+        let found = compare(&other, &mut credit, &mut rng, [1, 8, 16][case % 3]);
         let stride = [1, 8, 16][case % 3];
         let scores = compare(&record, &mut credit, &mut rng, stride);
         let any = |list: &[f32]| list.iter().any(|&score| score > 0.0);
+        let kinds = [found != scores, any(&found.d), found.df != found.d, found.dpp != found.d];
+        by_rule.iter_mut().zip(kinds).for_each(|(count, is)| *count += is as u32);
         differ[0] += any(&scores.d) as u32;
         differ[1] += (scores.df != scores.d) as u32;
         differ[2] += (scores.dpp != scores.d) as u32;
@@ -240,6 +307,7 @@ fn every_fitness_is_its_definition() {
     }
     // The records are of every kind: with critical leaders, with critical groups, with stepping stones, all, none.
     assert!(differ.iter().all(|&cases| cases > 300), "{differ:?}");
+    assert!(by_rule.iter().all(|&cases| cases > 300), "{by_rule:?}");
 }
 
 #[test]
@@ -248,6 +316,7 @@ fn a_thousand_agents() {
     let mut credit = Credit::default();
     for case in 0..30 {
         let record = random(&mut rng, 1000);
+        let record = if case % 2 == 0 { record } else { ruled(&mut rng, record) };
         compare(&record, &mut credit, &mut rng, [1, 8, 16][case % 3]);
     }
 }
@@ -260,7 +329,7 @@ fn by_hand(record: &Record) -> Scores {
 #[test]
 fn a_pair_must_meet() {
     let near = vec![vec![vec![0, 1], vec![0]], vec![vec![], vec![1]]];
-    let scores = by_hand(&Record { leaders: 2, followers: 0, coupling: vec![2, 2], near, seen: vec![] });
+    let scores = by_hand(&Record { leaders: 2, followers: 0, coupling: vec![2, 2], near, seen: vec![], rule: PLAIN });
     assert_eq!((scores.observed, scores.g), (1, 0.5));
     assert_eq!((scores.d, scores.df), (vec![0.5, 0.5], vec![0.5, 0.5]));
 }
@@ -269,7 +338,7 @@ fn a_pair_must_meet() {
 #[test]
 fn a_spare_agent_hides_a_leader_but_not_its_group() {
     let near = vec![vec![vec![0, 1, 2]]];
-    let record = Record { leaders: 2, followers: 1, coupling: vec![2], near, seen: vec![vec![3, 1]] };
+    let record = Record { leaders: 2, followers: 1, coupling: vec![2], near, seen: vec![vec![3, 1]], rule: PLAIN };
     let scores = by_hand(&record);
     assert_eq!(scores.d, [0.0, 0.0]);
     assert_eq!(scores.df, [1.0, 0.0]);
@@ -281,7 +350,14 @@ fn a_spare_agent_hides_a_leader_but_not_its_group() {
 #[test]
 fn an_unled_follower_is_nobodys() {
     let near = vec![vec![vec![1, 2]]];
-    let scores = by_hand(&Record { leaders: 1, followers: 2, coupling: vec![2], near, seen: vec![vec![0], vec![0]] });
+    let scores = by_hand(&Record {
+        leaders: 1,
+        followers: 2,
+        coupling: vec![2],
+        near,
+        seen: vec![vec![0], vec![0]],
+        rule: PLAIN,
+    });
     assert_eq!((scores.g, scores.d, scores.df), (1.0, vec![0.0], vec![0.0]));
 }
 
@@ -289,7 +365,7 @@ fn an_unled_follower_is_nobodys() {
 #[test]
 fn a_second_pair_at_another_step_is_enough() {
     let near = vec![vec![vec![0, 1]], vec![vec![2, 3]]];
-    let scores = by_hand(&Record { leaders: 4, followers: 0, coupling: vec![2], near, seen: vec![] });
+    let scores = by_hand(&Record { leaders: 4, followers: 0, coupling: vec![2], near, seen: vec![], rule: PLAIN });
     assert_eq!((scores.g, scores.d), (1.0, vec![0.0; 4]));
 }
 
@@ -297,7 +373,7 @@ fn a_second_pair_at_another_step_is_enough() {
 #[test]
 fn stepping_stones() {
     let near = vec![vec![vec![0], vec![0, 1]]];
-    let scores = by_hand(&Record { leaders: 3, followers: 0, coupling: vec![3, 3], near, seen: vec![] });
+    let scores = by_hand(&Record { leaders: 3, followers: 0, coupling: vec![3, 3], near, seen: vec![], rule: PLAIN });
     // Leader 0: one copy completes 1 of 2 POIs (value 1/2), two copies both (2/2 over 2 = 1/2): not bettered.
     // Leader 1: one copy completes the second POI. Leader 2 was near nothing.
     assert_eq!((scores.d, scores.dpp), (vec![0.0; 3], vec![0.5, 0.5, 0.0]));
@@ -307,9 +383,48 @@ fn stepping_stones() {
 #[test]
 fn a_stepping_stone_two_copies_away_is_found_and_three_away_is_not() {
     let near = |set: &[usize]| vec![vec![set.to_vec()]];
-    let alone =
-        |coupling| Record { leaders: 1, followers: 0, coupling: vec![coupling], near: near(&[0]), seen: vec![] };
+    let alone = |coupling| Record {
+        leaders: 1,
+        followers: 0,
+        coupling: vec![coupling],
+        near: near(&[0]),
+        seen: vec![],
+        rule: PLAIN,
+    };
     assert_eq!(by_hand(&alone(2)).dpp, [1.0]);
     assert_eq!(by_hand(&alone(3)).dpp, [0.5]);
     assert_eq!(by_hand(&alone(4)).dpp, [0.0]);
+}
+
+/// A follower that a leader brought to one POI may leave another locked.
+#[test]
+fn who_opens_a_poi_is_missed_at_those_behind_it() {
+    // Leader 0 alone observes POI 0 at step 1; leader 1 is at POI 1 at steps 1 and 2, which is observed at step 2.
+    let near = vec![vec![vec![0], vec![1]], vec![vec![], vec![1]]];
+    let rule = Rule { after: vec![vec![], vec![0]], ..PLAIN };
+    let record = Record { leaders: 2, followers: 0, coupling: vec![1, 1], near, seen: vec![], rule };
+    let scores = by_hand(&record);
+    assert_eq!((scores.observed, scores.d), (2, vec![1.0, 0.5]));
+    // Observed at the same step, one opens no other.
+    let near = record.near[..1].to_vec();
+    assert_eq!(by_hand(&Record { near, ..record.clone() }).observed, 1);
+    // A window that is over before it opens.
+    let rule = Rule { windows: vec![[1, 2], [1, 1]], ..record.rule.clone() };
+    let scores = by_hand(&Record { rule, ..record });
+    assert_eq!((scores.observed, scores.d), (1, vec![0.5, 0.0]));
+}
+
+/// Where followers alone observe, a leader is worth what it led there.
+#[test]
+fn a_leader_that_does_not_observe_is_worth_its_followers() {
+    let near = vec![vec![vec![0, 1, 2]]];
+    let rule = Rule { observers: Observers::Followers, ..PLAIN };
+    let record = Record { leaders: 1, followers: 2, coupling: vec![2], near, seen: vec![vec![0], vec![1]], rule };
+    let scores = by_hand(&record);
+    assert_eq!(
+        (scores.observed, &scores.d[..], &scores.df[..], &scores.dpp[..]),
+        (1, &[0.0][..], &[1.0][..], &[0.0][..])
+    );
+    let near = vec![vec![vec![0, 1]]];
+    assert_eq!(by_hand(&Record { near, ..record }).observed, 0);
 }

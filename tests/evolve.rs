@@ -545,7 +545,8 @@ impl Plain<'_> {
             let shared = self.config.learning.sharing == Sharing::All;
             let (mut observed, mut fitness) = (Vec::new(), vec![vec![0.0; population]; self.policies.len()]);
             for (index, team) in teams.chunks(leaders).enumerate() {
-                let team: Vec<usize> = team.iter().map(|&policy| if shared { index } else { policy as usize }).collect();
+                let team: Vec<usize> =
+                    team.iter().map(|&policy| if shared { index } else { policy as usize }).collect();
                 let (pois, scores) = self.play(generation, &team);
                 observed.push(pois);
                 if shared {

@@ -7,7 +7,7 @@ mod common;
 
 use std::path::{Path, PathBuf};
 
-use flotilla::backend::gpu::device::{self, AdapterInfo, Binding, Choice, DeviceError, Kind, Request};
+use flotilla::backend::gpu::device::{self, AdapterInfo, Binding, DeviceError, Kind, Request, Wanted};
 use flotilla::backend::gpu::exact::{self, Pass, ShaderError};
 use flotilla::backend::gpu::{self, probe, shaders};
 use wgpu::BufferUsages;
@@ -331,14 +331,14 @@ fn a_shader_over_the_devices_limits_is_refused() {
 
 #[test]
 fn an_unknown_adapter_lists_those_there_are() {
-    let error = gpu::open(Choice::Named("no such adapter".into())).expect_err("there is no such adapter");
+    let error = gpu::open(Wanted::Named("no such adapter".into())).expect_err("there is no such adapter");
     let message = flotilla::cli::Error::from(error).to_string();
     assert!(message.contains("no such adapter") && message.contains("--backend cpu") || !device::adapters().is_empty());
     for info in device::adapters() {
         assert!(message.contains(&info.name), "{message}");
     }
     for (request, info) in common::adapters("an_unknown_adapter_lists_those_there_are") {
-        let by_name = Choice::Named(info.name.to_uppercase());
+        let by_name = Wanted::Named(info.name.to_uppercase());
         let gpu = gpu::open(Request { choice: by_name, ..request }).unwrap_or_else(|error| panic!("{error}"));
         assert_eq!(gpu.adapter.name, info.name);
     }
@@ -357,7 +357,7 @@ fn two() -> Vec<AdapterInfo> {
 
 #[test]
 fn a_number_is_an_index_and_nothing_is_no_name() {
-    let find = |name: &str| device::position(&Choice::Named(name.into()), &two());
+    let find = |name: &str| device::position(&Wanted::Named(name.into()), &two());
     for (name, index) in [("0", 0), ("1", 1), ("rtx 4090", 0), ("LLVM", 1), ("LLVM 15", 1)] {
         assert_eq!(find(name).expect(name), index, "{name}");
     }
@@ -370,19 +370,19 @@ fn a_number_is_an_index_and_nothing_is_no_name() {
 #[test]
 fn a_software_renderer_is_taken_by_name_alone() {
     let software = &two()[1..];
-    let error = device::position(&Choice::Real, software).expect_err("there is no GPU");
+    let error = device::position(&Wanted::Real, software).expect_err("there is no GPU");
     let error = flotilla::cli::Error::from(error).to_string();
     assert!(
         error.contains("0: llvmpipe") && error.contains("--adapter 0") && error.contains("--backend cpu"),
         "{error}"
     );
-    assert_eq!(device::position(&Choice::Real, &two()).unwrap(), 0);
-    assert!(matches!(device::position(&Choice::Real, &[]), Err(DeviceError::NoAdapter)));
+    assert_eq!(device::position(&Wanted::Real, &two()).unwrap(), 0);
+    assert!(matches!(device::position(&Wanted::Real, &[]), Err(DeviceError::NoAdapter)));
 }
 
 #[test]
 fn a_real_gpu_is_never_a_software_renderer() {
-    match gpu::open(Choice::Real) {
+    match gpu::open(Wanted::Real) {
         Ok(gpu) => assert!(gpu.adapter.kind.is_real(), "{}", gpu.adapter),
         Err(DeviceError::NoRealAdapter { found }) => assert!(found.iter().all(|info| !info.kind.is_real())),
         Err(DeviceError::NoAdapter) => assert!(device::adapters().is_empty()),
@@ -425,7 +425,7 @@ fn running_out_of_memory_is_an_error() {
 #[test]
 fn a_refusal_names_the_device_and_the_probe() {
     let mismatch =
-        probe::Mismatch { probe: "x*y + z".into(), values: vec![1.5f32.to_bits()], cpu: 1, gpu: 2 }.to_string();
+        probe::Deviation { probe: "x*y + z".into(), values: vec![1.5f32.to_bits()], cpu: 1, gpu: 2 }.to_string();
     let failures = vec![(Pass::NoContraction, mismatch.clone()), (Pass::Guarded, mismatch)];
     let message = flotilla::cli::Error::from(DeviceError::Inexact { adapter: "Some GPU".into(), failures }).to_string();
     for part in ["Some GPU", "x*y + z", "no-contraction", "guarded", "0x00000002", "1.5e0", "--backend cpu"] {

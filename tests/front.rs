@@ -12,7 +12,7 @@ use flotilla::evaluate::Starts;
 use flotilla::front::{self, Failure, Processor, Trained};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::Start;
-use flotilla::run::{Options, Outcome, Session};
+use flotilla::run::{Ended, Options, Session};
 use flotilla::sample;
 use flotilla::stepping::StepError;
 use flotilla::world::World;
@@ -54,7 +54,7 @@ fn recorded(config: &Config, folder: &Path) -> String {
             watch: &mut |_| (),
         },
     );
-    assert_eq!(ended.expect("it trains"), Outcome::Done);
+    assert_eq!(ended.expect("it trains"), Ended::Done);
     session.results(0).expect("it is done").digest.clone()
 }
 

@@ -38,7 +38,7 @@ coupling = 4
 type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Which between them cover every choice that a config has, and sizes on both sides of every special case.
-const CASES: [Case; 18] = [
+const CASES: [Case; 22] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -97,6 +97,30 @@ const CASES: [Case; 18] = [
         &[("world.coupling", "[1, 2, 5, 7]"), ("learning.seed", "81985529216486895")],
     ),
     ("forty-agents", "40 agents, two words a set, six POIs", FORTY_AGENTS, &[]),
+    (
+        "followers-observe",
+        "only followers observe, Df",
+        GENERALLY_FORWARD,
+        &[("world.observers", "'followers'"), ("world.coupling", "2")],
+    ),
+    (
+        "leaders-observe",
+        "only leaders observe, D++",
+        GENERALLY_FORWARD,
+        &[("world.observers", "'leaders'"), ("world.coupling", "1"), ("learning.fitness", "'D++'")],
+    ),
+    (
+        "windows",
+        "POIs that can be observed at some steps, D",
+        CHAOTIC,
+        &[("world.windows", "[[1, 20], [16, 24], [30, 50], [21, 21]]"), ("learning.fitness", "'D'")],
+    ),
+    (
+        "after",
+        "POIs one after the other, Df, two words a set",
+        FORTY_AGENTS,
+        &[("world.after", "[[], [0], [1], [0], [3], [3]]"), ("world.coupling", "3")],
+    ),
     (
         "behaviours",
         "policies choose behaviours, G",

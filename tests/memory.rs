@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use assert_cmd::cargo::cargo_bin;
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::Config;
-use flotilla::memory::{self, Plan};
+use flotilla::memory::{self, Peaks};
 use flotilla::record::checkpoint::{self, Checkpoint, Keeper};
 use flotilla::record::disk::Disk;
 use flotilla::record::metrics;
@@ -87,7 +87,7 @@ fn a_run_that_does_not_fit_does_not_start() {
     let folder = tempfile::tempdir().unwrap();
     let (path, out) = (folder.path().join("config.toml"), folder.path().join("run"));
     let text = text(1 << 20, 140, 1, "generations = 0\nseconds = 0.0");
-    let needed = Plan::of([&Config::parse(&text, "config").unwrap()], 1).host;
+    let needed = Peaks::of([&Config::parse(&text, "config").unwrap()], 1).host;
     if memory::available().is_none_or(|available| available >= needed) {
         println!("skipped: this system does not tell what is free, or has {needed} bytes");
         return;
@@ -109,8 +109,8 @@ fn a_run_that_does_not_fit_does_not_start() {
 fn plans_add_up() {
     let config = |population| Config::parse(&text(population, 2, 1, "generations = 1"), "config").unwrap();
     let [small, large] = [config(1000), config(9000)];
-    let [one, other, both] = [vec![&small], vec![&large], vec![&small, &large]].map(|configs| Plan::of(configs, 3));
-    let growing = |plan: Plan| plan.host - memory::PROGRAM;
+    let [one, other, both] = [vec![&small], vec![&large], vec![&small, &large]].map(|configs| Peaks::of(configs, 3));
+    let growing = |plan: Peaks| plan.host - memory::PROGRAM;
     assert_eq!(both.checkpoint, one.checkpoint + other.checkpoint);
     assert!(growing(both) > growing(other) && growing(both) <= growing(one) + growing(other));
     assert!(both.adapter > other.adapter && both.gpu_host > both.host - both.checkpoint);
@@ -123,7 +123,7 @@ fn plans_add_up() {
 fn packed_records_are_counted() {
     let adapter = |population| {
         let config = Config::parse(&text(population, 2, 1, "generations = 0"), "config").unwrap();
-        Plan::of([&config], 1).adapter
+        Peaks::of([&config], 1).adapter
     };
     // Weights and record of a team: 4 leaders of 112 weights; 25 steps of 4 POIs, and 8 followers who see 4 leaders.
     let (weights, record) = (4 * 112 * 4, (25 * 4 + 8 * 4) * 4);

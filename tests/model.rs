@@ -526,7 +526,9 @@ fn kernels_follow_the_mission() {
         })
         .reduce(Tally::default, Tally::merge);
     let Tally { agent_steps, borderline, unchosen, worst, wrong } = tally;
-    println!("{agent_steps} agent-steps, {borderline} borderline, {unchosen} open choices, worst differences {worst:?}");
+    println!(
+        "{agent_steps} agent-steps, {borderline} borderline, {unchosen} open choices, worst differences {worst:?}"
+    );
     assert!(wrong.is_empty(), "{} differences, the first:\n{}", wrong.len(), wrong[..wrong.len().min(10)].join("\n"));
     assert!(agent_steps >= 1_000_000, "{agent_steps} agent-steps");
     // Leaders that choose among a few turns often come to lie alike, on ties.

@@ -18,7 +18,7 @@ use flotilla::declare::Shared;
 use flotilla::evaluate::{Starts, evaluate};
 use flotilla::evolve::{Breeding, Key, Purpose};
 use flotilla::trainer::Trainer;
-use flotilla::verify::{Outcome, Plan, compare};
+use flotilla::verify::{Agreement, Plan, compare};
 use flotilla::world::{Constants, World};
 use flotilla::{backend::gpu, sample};
 
@@ -31,7 +31,7 @@ fn open(request: &Request, pass: Pass, kernel: Kernel) -> GpuEpisodes {
     GpuEpisodes::new(gpu).unwrap().playing(kernel).holding(Holding::Always).bringing(Records::Packed)
 }
 
-fn check(plan: &Plan, mut backend: GpuEpisodes) -> Outcome {
+fn check(plan: &Plan, mut backend: GpuEpisodes) -> Agreement {
     compare(plan, &mut Cpu::default(), &mut backend, |_| ()).unwrap()
 }
 

@@ -19,7 +19,7 @@ use flotilla::config::{Config, Fitness, Learning, Mutation, Paradigm, Sharing};
 use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, Start};
-use flotilla::run::{Options, Outcome, Session};
+use flotilla::run::{Ended, Options, Session};
 use flotilla::trainer::{Row, Snapshot, SnapshotError, Trainer};
 
 fn learning() -> Learning {
@@ -393,7 +393,7 @@ fn populations_lost_with_their_device_are_made_again() {
 #[test]
 fn a_run_survives_the_loss_of_the_device_that_holds_its_populations() {
     let mut config = arms().remove(0);
-    config.checkpoint = flotilla::config::Checkpoint { generations: 2, seconds: 0.0 };
+    config.checkpoint = flotilla::config::Saving { generations: 2, seconds: 0.0 };
     let folder = tempfile::tempdir().unwrap();
     let run = |name: &str, start: Start, device: Option<Device>, change: bool| {
         let path = folder.path().join(name);
@@ -410,7 +410,7 @@ fn a_run_survives_the_loss_of_the_device_that_holds_its_populations() {
         };
         let mut player = device.map_or_else(cpu, |device| (Box::new(device), Machine::default()));
         let ended = session.train(&mut player, &mut options).map(|outcome| {
-            assert_eq!(outcome, Outcome::Done);
+            assert_eq!(outcome, Ended::Done);
             session.results(0).cloned().unwrap()
         });
         let metrics = std::fs::read_to_string(path.join(METRICS)).unwrap();

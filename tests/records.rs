@@ -12,7 +12,7 @@ use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records};
 use flotilla::backend::gpu::{self, device::Request};
 use flotilla::backend::{Backend, Group, Need};
-use flotilla::config::{Config, Fitness, Paradigm};
+use flotilla::config::{Config, Coupling, Fitness, Observers, Paradigm};
 use flotilla::credit::Credit;
 use flotilla::sample;
 use flotilla::sweep::Sweep;
@@ -249,6 +249,36 @@ fn a_generation_moves_less_than_95_bytes_a_team() {
             if [0, 50].contains(&generation) {
                 assert!(a_team(up + traffic.down) * f64::from(1 << 20) <= 1e8, "{info}: generation {generation}");
             }
+        }
+    }
+}
+
+/// Whether a POI is observed may hang on when somebody was near: such records come whole. Whose presence counts does not.
+#[test]
+fn records_are_packed_only_where_time_does_not_matter() {
+    let of = |change: fn(&mut Config)| {
+        let mut config = config(include_str!("../configs/generally_forward.toml"));
+        config.world.steps = 60;
+        change(&mut config);
+        vec![Teams::new(&config, 200, true)]
+    };
+    let cases: [(_, _, fn(&mut Config)); 4] = [
+        ("by the default rule", true, |_| ()),
+        ("observed by followers", true, |config| {
+            (config.world.observers, config.world.coupling) = (Observers::Followers, Coupling::Same(2));
+        }),
+        ("at some steps", false, |config| config.world.windows = vec![[20, 40]; 4]),
+        ("one after the other", false, |config| config.world.after = vec![vec![], vec![0], vec![0], vec![0]]),
+    ];
+    for (request, info) in common::adapters("records_are_packed_only_where_time_does_not_matter") {
+        for (what, packed, change) in cases {
+            let all = of(change);
+            let expected = expected(&all, 0);
+            assert!(expected.values().any(|(observed, _)| *observed > 0), "{what}: nothing is observed");
+            let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
+            assert!(scores(&mut backend, &all, 0, |need| need) == expected, "{info}, {what}");
+            let down = down(&mut backend);
+            assert_eq!(down < all[0].whole() / 2, packed, "{info}, {what}: {down} bytes");
         }
     }
 }

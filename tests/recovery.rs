@@ -23,9 +23,9 @@ use flotilla::backend::{Machine, Player};
 use flotilla::config::Config;
 use flotilla::record::checkpoint::{self, Checkpoint};
 use flotilla::record::disk::{Disk, Operation};
-use flotilla::record::folder::{Folder, METRICS, Note, POLICIES, Run, Start, State};
+use flotilla::record::folder::{Folder, METRICS, Note, POLICIES, Run, Start, Status};
 use flotilla::record::{RecordError, policies};
-use flotilla::run::{Options, Outcome, Results, RunError, Session};
+use flotilla::run::{Ended, Options, Results, RunError, Session};
 use rand::{RngExt, SeedableRng, rngs::ChaCha8Rng};
 use tempfile::TempDir;
 
@@ -59,7 +59,7 @@ fn cpu() -> Player {
 /// What one session came to: how it ended and with what, what was told of the folder, and the generations it started
 /// before and reached.
 struct Told {
-    end: Result<Outcome, RunError>,
+    end: Result<Ended, RunError>,
     results: Option<Results>,
     notes: Vec<Note>,
     start: usize,
@@ -74,7 +74,7 @@ fn session(config: &Config, path: &Path, start: Start, disk: Disk, player: Playe
     let notes = notes.into_iter().map(|(_, note)| note).collect();
     if session.is_done() {
         let results = session.results(0).cloned();
-        return Told { end: Ok(Outcome::Done), results, notes, start: 0, reached: 0 };
+        return Told { end: Ok(Ended::Done), results, notes, start: 0, reached: 0 };
     }
     let start = session.generations()[0];
     let end = train(&mut session, player, &mut |_| None, &mut |next| stop_at.is_some_and(|at| next[0] >= at));
@@ -87,7 +87,7 @@ fn train(
     mut player: Player,
     instead: &mut dyn FnMut(&BackendError) -> Option<Player>,
     stops: &mut dyn FnMut(&[usize]) -> bool,
-) -> Result<Outcome, RunError> {
+) -> Result<Ended, RunError> {
     let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
     let mut options = Options {
         command: "",
@@ -103,7 +103,7 @@ fn train(
 /// Goes on to the end on a good disk.
 fn resume(config: &Config, path: &Path) -> (Results, Told) {
     let told = session(config, path, Start::Resume, Disk::default(), cpu(), None);
-    assert!(matches!(told.end, Ok(Outcome::Done)), "{:?}", told.end);
+    assert!(matches!(told.end, Ok(Ended::Done)), "{:?}", told.end);
     (told.results.clone().unwrap(), told)
 }
 
@@ -119,7 +119,7 @@ fn reference(config: &Config) -> (Results, (String, Vec<u8>)) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run");
     let told = session(config, &path, Start::Fresh, Disk::default(), cpu(), None);
-    assert!(matches!(told.end, Ok(Outcome::Done)), "{:?}", told.end);
+    assert!(matches!(told.end, Ok(Ended::Done)), "{:?}", told.end);
     (told.results.unwrap(), what_came_out(&path))
 }
 
@@ -141,7 +141,7 @@ fn a_run_stopped_before_any_generation_goes_on_to_the_same_results() {
         let told = session(&config, &path, Start::Fresh, Disk::default(), cpu(), Some(stop_at));
         // The last step completes the run, so there is nothing left to stop.
         let done = stop_at == config.learning.generations + 2;
-        assert_eq!(told.end.unwrap(), if done { Outcome::Done } else { Outcome::Stopped });
+        assert_eq!(told.end.unwrap(), if done { Ended::Done } else { Ended::Stopped });
         assert_eq!(told.reached, stop_at);
         let (results, told) = resume(&config, &path);
         assert_eq!(told.start, if done { 0 } else { stop_at });
@@ -162,7 +162,7 @@ fn a_run_that_is_done_is_not_run_again() {
         _ => panic!("{operation:?} {}", path.display()),
     });
     let told = session(&config, &path, Start::Resume, disk, cpu(), None);
-    assert_eq!((told.end.unwrap(), told.results), (Outcome::Done, Some(expected.0.clone())));
+    assert_eq!((told.end.unwrap(), told.results), (Ended::Done, Some(expected.0.clone())));
     assert_eq!(fs::read(path.join(METRICS)).unwrap(), before);
     // With one of its results damaged, it goes on from its last checkpoint to restore it.
     for (name, at) in [(POLICIES, 500), (METRICS, 60)] {
@@ -324,11 +324,11 @@ fn runs_side_by_side_come_to_what_they_come_to_alone() {
     assert_eq!(session.generations(), [11, 7, 0, 0]);
     assert_eq!(notes.iter().map(|(run, _)| *run).collect::<Vec<_>>(), [0, 2, 3]);
     let stopped = train(&mut session, cpu(), &mut |_| None, &mut |next| next[2] >= 3);
-    assert_eq!((stopped.unwrap(), session.generations()), (Outcome::Stopped, &[14, 7, 3, 3][..]));
+    assert_eq!((stopped.unwrap(), session.generations()), (Ended::Stopped, &[14, 7, 3, 3][..]));
     drop(session);
     let (mut session, _) = open();
     let done = train(&mut session, cpu(), &mut |_| None, &mut |_| false);
-    assert_eq!((done.unwrap(), session.generations()), (Outcome::Done, &[16, 7, 11, 16][..]));
+    assert_eq!((done.unwrap(), session.generations()), (Ended::Done, &[16, 7, 11, 16][..]));
     for (run, expected) in expected.iter().enumerate() {
         assert_eq!(
             (session.results(run), what_came_out(&path(run))),
@@ -368,7 +368,7 @@ fn no_failing_disk_operation_costs_a_run() {
         (folder, path, told, count.load(SeqCst), failed)
     };
     let (_, _, told, operations, _) = attempt(Box::new(|_| false));
-    assert_eq!((told.end.unwrap(), told.results), (Outcome::Done, Some(expected.0.clone())));
+    assert_eq!((told.end.unwrap(), told.results), (Ended::Done, Some(expected.0.clone())));
     assert!(operations > 14 * 5, "{operations}");
     let mut kinds = Vec::new();
     for at in 0..operations {
@@ -596,7 +596,7 @@ fn a_lost_device_costs_nothing() {
         let told = session(&config, &path, Start::Fresh, Disk::default(), failing(), None);
         let error = flotilla::cli::Error::from(told.end.unwrap_err()).to_string();
         assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
-        assert_eq!(Run::read(&path.join("run.json")).unwrap().state, State::Stopped);
+        assert_eq!(Run::read(&path.join("run.json")).unwrap().state, Status::Stopped);
         let (results, told) = resume(&config, &path);
         assert_eq!((told.start, results), (left, expected.0.clone()));
         assert_eq!(what_came_out(&path), expected.1);
@@ -610,7 +610,7 @@ fn a_lost_device_costs_nothing() {
             asked += 1;
             Some(cpu())
         };
-        assert_eq!(train(&mut session, failing(), &mut instead, &mut |_| false).unwrap(), Outcome::Done);
+        assert_eq!(train(&mut session, failing(), &mut instead, &mut |_| false).unwrap(), Ended::Done);
         assert_eq!(session.results(0), Some(&expected.0));
         assert_eq!((asked, what_came_out(&path)), (1, expected.1.clone()));
     }
@@ -629,10 +629,10 @@ fn a_run_may_change_to_another_processor_and_back() {
         let path = folder.path().join("run");
         for (stop_at, player) in [(4, cpu()), (9, gpu()), (12, cpu())] {
             let told = session(&config, &path, Start::Resume, Disk::default(), player, Some(stop_at));
-            assert_eq!((told.end.unwrap(), told.reached), (Outcome::Stopped, stop_at));
+            assert_eq!((told.end.unwrap(), told.reached), (Ended::Stopped, stop_at));
         }
         let told = session(&config, &path, Start::Resume, Disk::default(), gpu(), None);
-        assert_eq!((told.end.unwrap(), told.results), (Outcome::Done, Some(expected.0.clone())), "{info}");
+        assert_eq!((told.end.unwrap(), told.results), (Ended::Done, Some(expected.0.clone())), "{info}");
         assert_eq!(what_came_out(&path), expected.1, "{info}");
     }
 }

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use flotilla::config::{self, Config, Coupling, Key, Override};
+use flotilla::config::{self, Config, Coupling, Definition, Override};
 
 const PAGE: &str = "docs/reference.md";
 const OPENING: &str = "\
@@ -31,7 +31,7 @@ fn page() -> String {
         let _ = write!(page, "\n## `[{}]`\n\n", section(&keys[0]));
         page += "| key | unit | type | range | default | meaning | paper |\n|---|---|---|---|---|---|---|\n";
         for key in keys {
-            let Key { name, unit, kind, range, default, meaning, paper } = key;
+            let Definition { name, unit, kind, range, default, meaning, paper } = key;
             let leaf = name.split_once('.').map_or(*name, |(_, leaf)| leaf);
             let default = default.as_ref().map_or("none: it has to be given".into(), |default| format!("`{default}`"));
             let cells = [&format!("`{leaf}`"), *unit, kind, range, &default, meaning, paper].map(cell);
@@ -41,7 +41,7 @@ fn page() -> String {
     page
 }
 
-fn section(key: &Key) -> &str {
+fn section(key: &Definition) -> &str {
     key.name.split_once('.').expect("keys are dotted").0
 }
 
@@ -86,7 +86,7 @@ fn every_key_is_told_of_once_and_in_the_order_of_a_config() {
 fn ranges_are_those_that_configs_are_held_to() {
     // Keys left out give way to the one that is set.
     let smallest = "[world]\nleaders = [[1, 2]]\npois = [[3, 4]]\n";
-    let holds = |key: &Key, text: String| {
+    let holds = |key: &Definition, text: String| {
         let set = Override { key: key.name.into(), text, name: key.name.into() };
         Config::read(smallest, "smallest", &[], &[set]).is_ok()
     };

@@ -1,12 +1,10 @@
 //! Teams stepped by hand come to what a backend's traces say, whatever instruction set, number of teams and order of
 //! resets; what cannot be stepped is told, and nothing moves then.
 
-use std::ops::Range;
-
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, BackendError, Episode, Group, Moment, Need, Seen, Strided, Trace};
 use flotilla::config::{Config, Fitness, MAX_POPULATION};
-use flotilla::credit::{Credit, Scores};
+use flotilla::credit::{self, Credit, Scores};
 use flotilla::evaluate::Starts;
 use flotilla::sample;
 use flotilla::stepping::{StepError, Stepper};
@@ -73,15 +71,10 @@ impl Played {
         let sets: Vec<&[u32]> = sets.collect();
         let now = step.checked_sub(1).map_or(vec![0; pois * words], |step| sets[step].to_vec());
         assert_eq!(stepper.near()[team * now.len()..][..now.len()], now, "near, {about}");
-        let enough = |range: Range<usize>, poi: usize| {
-            let count = |step: &usize| sets[*step][poi * words..][..words].iter().map(|word| word.count_ones()).sum();
-            range.into_iter().any(|step| {
-                let count: u32 = count(&step);
-                count >= self.world.coupling[poi]
-            })
-        };
-        let observed: Vec<bool> = (0..pois).map(|poi| enough(0..step, poi)).collect();
-        let before: Vec<bool> = (0..pois).map(|poi| enough(0..step.saturating_sub(1), poi)).collect();
+        let words = &self.trace.sets[team * self.world.set_words()..][..self.world.set_words()];
+        let at = credit::observed_at(Strided { words, stride: 1, offset: 0 }, &self.world);
+        let by = |step: usize| at.iter().map(move |at| at.is_some_and(|at| at <= step)).collect::<Vec<bool>>();
+        let (observed, before) = (by(step), by(step.saturating_sub(1)));
         let newly: Vec<bool> = observed.iter().zip(before).map(|(&observed, before)| observed && !before).collect();
         assert_eq!(stepper.observed()[team * pois..][..pois], observed, "observed, {about}");
         assert_eq!(stepper.steps()[team] as usize, step, "{about}");

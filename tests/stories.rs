@@ -11,7 +11,7 @@ use std::path::Path;
 use flotilla::backend::cpu::Cpu;
 use flotilla::baseline::Baselines;
 use flotilla::config::Override;
-use flotilla::report::paper::{self, Results, claims, tables};
+use flotilla::report::paper::{self, Evidence, claims, tables};
 use flotilla::trainer::Row;
 use flotilla::trainer::Trainer;
 
@@ -37,7 +37,7 @@ fn the_pages_tell_what_comes_out() {
         baselines.advance(&mut backend).unwrap();
     }
     let baselines = baselines.found();
-    let results = Results { arms: &arms, baselines: &baselines };
+    let results = Evidence { arms: &arms, baselines: &baselines };
     let claims = claims::claims(results);
     let (baseline, heading) = (tables::without_learning(results), tables::heading(&learning, &claims));
     let first_page = format!("{baseline}\n{heading}\n\n{}", tables::verdicts(&claims));

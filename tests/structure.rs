@@ -165,3 +165,47 @@ fn imports_are_found_however_they_are_written() {
     assert_eq!(imports(code, "crate"), ["a", "c", "d", "g", "h"]);
     assert_eq!(listed("//! | [`a`], [`mod@b`] | `c` | d |\n//! | x | [`y`] |\n"), ["a", "b"]);
 }
+
+/// The types that a text declares: but a command's `Args`, and what a trait's implementations choose.
+fn types(code: &str) -> Vec<String> {
+    let mut found = Vec::new();
+    let mut inside: Option<&str> = None;
+    for line in code.lines() {
+        let start = line.trim_start();
+        let indent = &line[..line.len() - start.len()];
+        if inside == Some(indent) && start.starts_with('}') {
+            inside = None;
+        }
+        let mut words = start.split_whitespace().skip_while(|word| word.starts_with("pub") || *word == "unsafe");
+        let kind = words.next().unwrap_or_default();
+        let name: String = words.next().unwrap_or_default().chars().take_while(|c| c.is_alphanumeric()).collect();
+        let declares = ["struct", "enum", "trait"].contains(&kind) || kind == "type" && inside.is_none();
+        if declares && !name.is_empty() && name != "Args" {
+            found.push(name);
+        }
+        if inside.is_none() && (kind == "trait" || kind.starts_with("impl")) && !line.ends_with('}') {
+            inside = Some(indent);
+        }
+    }
+    found
+}
+
+#[test]
+fn no_type_name_stands_for_two_things() {
+    let mut places: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    for path in files(Path::new("src")) {
+        for name in types(&fs::read_to_string(&path).unwrap()) {
+            places.entry(name).or_default().push(path.display().to_string());
+        }
+    }
+    assert!(places.len() > 200, "only {} types were found", places.len());
+    places.retain(|_, places| places.len() > 1);
+    assert!(places.is_empty(), "{places:#?}");
+}
+
+#[test]
+fn types_are_found_however_they_are_written() {
+    let code = "pub struct A<'a> {\n}\nimpl B for A {\n    type C = u8;\n}\nmod m {\n    pub(crate) enum D { E }\n}\n\
+                pub trait F {\n    type G;\n}\ntype H = u8;\nstruct Args;\nimpl X for A {}\ntype I = u8;\n// struct J;";
+    assert_eq!(types(code), ["A", "D", "F", "H", "I"]);
+}

@@ -8,7 +8,7 @@ use crate::world::{INPUTS, World};
 
 /// What is compared of a step, in the order in which a step works it out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Stage {
+pub enum Quantity {
     /// The inputs of a leader's policy.
     Sense,
     /// What the policy answered.
@@ -23,15 +23,15 @@ pub enum Stage {
     Influence,
 }
 
-impl fmt::Display for Stage {
+impl fmt::Display for Quantity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.pad(match self {
-            Stage::Sense => "sense",
-            Stage::Policy => "policy",
-            Stage::Follow => "follow",
-            Stage::Move => "move",
-            Stage::Couple => "couple",
-            Stage::Influence => "influence",
+            Quantity::Sense => "sense",
+            Quantity::Policy => "policy",
+            Quantity::Follow => "follow",
+            Quantity::Move => "move",
+            Quantity::Couple => "couple",
+            Quantity::Influence => "influence",
         })
     }
 }
@@ -41,7 +41,7 @@ impl fmt::Display for Stage {
 pub struct Mismatch {
     pub step: usize,
     pub team: usize,
-    pub stage: Stage,
+    pub stage: Quantity,
     /// Which number of the stage: "agent 3, input 2".
     pub place: String,
     /// Both bit patterns.
@@ -53,7 +53,7 @@ impl fmt::Display for Mismatch {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Mismatch { step, team, stage, place, expected, found } = self;
         write!(f, "stage {stage}, team {team}, {place}, step {step}: expected {expected:#010x}")?;
-        if matches!(stage, Stage::Couple | Stage::Influence) {
+        if matches!(stage, Quantity::Couple | Quantity::Influence) {
             return write!(f, ", found {found:#010x}");
         }
         let (expected, value) = (f32::from_bits(*expected), f32::from_bits(*found));
@@ -89,7 +89,7 @@ pub fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<
             let (team, row) = (index / world.set_words(), index % world.set_words());
             let (step, poi, word) = (row / pois / set_words, row / set_words % pois, row % set_words);
             let place = format!("POI {poi}, agents from {}", word * 32);
-            note(Mismatch { step: step + 1, team, stage: Stage::Couple, place, expected: a, found: b });
+            note(Mismatch { step: step + 1, team, stage: Quantity::Couple, place, expected: a, found: b });
         }
     }
     let pairs = world.leaders() * world.followers();
@@ -97,27 +97,27 @@ pub fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<
         if a != b {
             let (team, pair) = (index / pairs, index % pairs);
             let place = format!("follower {}, leader {}", pair / world.leaders(), pair % world.leaders());
-            note(Mismatch { step: world.steps(), team, stage: Stage::Influence, place, expected: a, found: b });
+            note(Mismatch { step: world.steps(), team, stage: Quantity::Influence, place, expected: a, found: b });
         }
     }
     first
 }
 
 /// The stage and name of each word of a [`Moment`].
-fn field(word: usize) -> (Stage, &'static str) {
-    const OTHERS: [(Stage, &str); WORDS - INPUTS] = [
-        (Stage::Policy, "turn"),
-        (Stage::Policy, "speed"),
-        (Stage::Follow, "force x"),
-        (Stage::Follow, "force y"),
-        (Stage::Move, "x"),
-        (Stage::Move, "y"),
-        (Stage::Move, "heading x"),
-        (Stage::Move, "heading y"),
-        (Stage::Move, "speed"),
+fn field(word: usize) -> (Quantity, &'static str) {
+    const OTHERS: [(Quantity, &str); WORDS - INPUTS] = [
+        (Quantity::Policy, "turn"),
+        (Quantity::Policy, "speed"),
+        (Quantity::Follow, "force x"),
+        (Quantity::Follow, "force y"),
+        (Quantity::Move, "x"),
+        (Quantity::Move, "y"),
+        (Quantity::Move, "heading x"),
+        (Quantity::Move, "heading y"),
+        (Quantity::Move, "speed"),
     ];
     match word.checked_sub(INPUTS) {
-        None => (Stage::Sense, sense::NAMES[word]),
+        None => (Quantity::Sense, sense::NAMES[word]),
         Some(other) => OTHERS[other],
     }
 }

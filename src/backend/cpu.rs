@@ -91,7 +91,7 @@ impl Backend for Cpu {
 }
 
 /// Groups that follow each other in the same world: their teams may share a block.
-struct Run<'a> {
+struct Chain<'a> {
     world: &'a World,
     /// Index in the batch of the first group, and the groups.
     first: usize,
@@ -99,7 +99,7 @@ struct Run<'a> {
     teams: usize,
 }
 
-impl Run<'_> {
+impl Chain<'_> {
     /// Group (in the run) and team (in the group) of a team of the run.
     fn locate(&self, mut team: usize) -> (usize, usize) {
         for (index, group) in self.groups.iter().enumerate() {
@@ -112,12 +112,12 @@ impl Run<'_> {
     }
 }
 
-fn runs<'a>(groups: &'a [Group<'a>]) -> Vec<Run<'a>> {
+fn runs<'a>(groups: &'a [Group<'a>]) -> Vec<Chain<'a>> {
     let mut first = 0;
     let mut runs = Vec::new();
     for groups in groups.chunk_by(|a, b| std::ptr::eq(a.world, b.world)) {
         let teams = groups.iter().map(Group::team_count).sum();
-        runs.push(Run { world: groups[0].world, first, groups, teams });
+        runs.push(Chain { world: groups[0].world, first, groups, teams });
         first += groups.len();
     }
     runs
@@ -126,7 +126,7 @@ fn runs<'a>(groups: &'a [Group<'a>]) -> Vec<Run<'a>> {
 fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
     let width = S::f32s::LEN;
     let runs = runs(groups);
-    let blocks: Vec<(&Run<'_>, usize)> =
+    let blocks: Vec<(&Chain<'_>, usize)> =
         runs.iter().flat_map(|run| (0..run.teams).step_by(width).map(move |team| (run, team))).collect();
     // A thread takes whatever lies idle: as many are made as threads play at once.
     let idle: Mutex<Vec<Whole<S>>> = Mutex::default();
@@ -160,7 +160,7 @@ fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
 fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
     let world = group.world;
     let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
-    let run = Run { world, first: 0, groups: std::slice::from_ref(group), teams };
+    let run = Chain { world, first: 0, groups: std::slice::from_ref(group), teams };
     let mut moments = vec![bytemuck::Zeroable::zeroed(); (steps + 1) * teams * agents];
     let (mut sets, mut seen) = (Vec::new(), Vec::new());
     let mut whole = Whole::new(simd, world);
@@ -215,7 +215,7 @@ impl<S: Simd> Whole<S> {
 
     /// Puts `teams` teams of the run, from `first` on, at their start; lanes left over repeat the first.
     #[inline(always)]
-    fn load(&mut self, run: &Run<'_>, first: usize, teams: usize) {
+    fn load(&mut self, run: &Chain<'_>, first: usize, teams: usize) {
         let Whole { block, network, places, moved, .. } = self;
         moved.clear();
         places.clear();
@@ -340,7 +340,7 @@ impl<S: Simd> Network<S> {
 
     /// Takes the policies of each lane's group and team.
     #[inline(always)]
-    fn load(&mut self, run: &Run<'_>, places: &[(usize, usize)]) {
+    fn load(&mut self, run: &Chain<'_>, places: &[(usize, usize)]) {
         let Network { simd, weights, slots, .. } = self;
         let (leaders, parameters) = (run.world.leaders(), run.world.parameters());
         for (leader, weights) in weights.chunks_exact_mut(parameters).enumerate() {

@@ -36,17 +36,17 @@ const TRACED_TEAMS: usize = 64;
 const TRACED_PAIRS: usize = 1 << 28;
 
 /// What is measured.
-pub enum Player {
+pub enum Subject {
     Cpu(Cpu, Level),
     Gpu(Box<GpuEpisodes>),
 }
 
-impl Player {
+impl Subject {
     /// What plays.
     pub fn backend(&mut self) -> &mut dyn Backend {
         match self {
-            Player::Cpu(cpu, _) => cpu,
-            Player::Gpu(gpu) => &mut **gpu,
+            Subject::Cpu(cpu, _) => cpu,
+            Subject::Gpu(gpu) => &mut **gpu,
         }
     }
 
@@ -54,10 +54,10 @@ impl Player {
     ///
     /// # Errors
     /// When the GPU fails.
-    fn ceiling(&self) -> Result<Box<Ceiling>, BackendError> {
+    fn ceiling(&self) -> Result<Box<Peak>, BackendError> {
         Ok(match self {
-            &Player::Cpu(_, level) => Box::new(move || Ok(ceiling::measure(level))),
-            Player::Gpu(gpu) => {
+            &Subject::Cpu(_, level) => Box::new(move || Ok(ceiling::measure(level))),
+            Subject::Gpu(gpu) => {
                 let ceiling = probe::Ceiling::new(gpu.gpu())?;
                 Box::new(move || Ok(ceiling.measure()?))
             }
@@ -65,10 +65,10 @@ impl Player {
     }
 }
 
-type Ceiling = dyn FnMut() -> Result<f64, BackendError>;
+type Peak = dyn FnMut() -> Result<f64, BackendError>;
 
 /// What was measured of one config.
-pub struct Measure {
+pub struct Timing {
     pub teams: usize,
     pub leaders: usize,
     pub followers: usize,
@@ -105,7 +105,7 @@ pub enum Generations {
     Profiled,
 }
 
-impl Measure {
+impl Timing {
     /// Agents of all teams together.
     pub fn agents(&self) -> usize {
         self.leaders + self.followers
@@ -158,7 +158,7 @@ pub fn with_agents(config: &Config, agents: usize) -> Result<Config, String> {
 ///
 /// # Errors
 /// When the backend fails.
-pub fn measure(config: &Config, player: &mut Player, generations: Generations) -> Result<Measure, BackendError> {
+pub fn measure(config: &Config, player: &mut Subject, generations: Generations) -> Result<Timing, BackendError> {
     let world = World::new(config);
     let ceiling = &mut player.ceiling()?;
     let ([rollout, ceiling], mean_g, reach) = rollout(config, &world, player.backend(), ceiling)?;
@@ -166,14 +166,14 @@ pub fn measure(config: &Config, player: &mut Player, generations: Generations) -
         Generations::LeftOut => (None, None),
         Generations::Timed => (Some(self::generations(config, player)?.0), None),
         Generations::Profiled => {
-            if let Player::Gpu(gpu) = player {
+            if let Subject::Gpu(gpu) = player {
                 gpu.use_clock()?;
             }
             let (generation, profile) = self::generations(config, player)?;
             (Some(generation), Some(profile))
         }
     };
-    Ok(Measure {
+    Ok(Timing {
         teams: config.learning.population,
         leaders: world.leaders(),
         followers: world.followers(),
@@ -190,13 +190,13 @@ pub fn measure(config: &Config, player: &mut Player, generations: Generations) -
 }
 
 /// Seconds of one generation, and where they went; the first, which readies what the others use, does not count.
-fn generations(config: &Config, player: &mut Player) -> Result<(f64, Profile), BackendError> {
+fn generations(config: &Config, player: &mut Subject) -> Result<(f64, Profile), BackendError> {
     let mut trainer = Trainer::new(vec![config.clone()]);
     trainer.advance(player.backend())?;
-    let take = |trainer: &mut Trainer, player: &mut Player| {
+    let take = |trainer: &mut Trainer, player: &mut Subject| {
         let (stages, traffic) = match player {
-            Player::Cpu(..) => (None, Traffic::default()),
-            Player::Gpu(gpu) => (Some(gpu.take_stages()), gpu.gpu().traffic()),
+            Subject::Cpu(..) => (None, Traffic::default()),
+            Subject::Gpu(gpu) => (Some(gpu.take_stages()), gpu.gpu().traffic()),
         };
         Profile { generations: trainer.generation(0), times: trainer.take_times(), stages, traffic }
     };
@@ -213,7 +213,7 @@ fn rollout(
     config: &Config,
     world: &World,
     backend: &mut dyn Backend,
-    ceiling: &mut Ceiling,
+    ceiling: &mut Peak,
 ) -> Result<([f64; 2], f64, Reach), BackendError> {
     thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
     let (population, leaders, seed) = (config.learning.population, world.leaders(), config.learning.seed);

@@ -10,10 +10,10 @@ use serde_json::json;
 use super::{BackendChoice, Breed, Error, Overrides, RunOptions, backend, print};
 use crate::backend::Machine;
 use crate::backend::cpu::{Cpu, level_name};
-use crate::bench::{self, Generations, Measure, Player, Profile};
+use crate::bench::{self, Generations, Profile, Subject, Timing};
 use crate::config::{self, Config};
 use crate::front;
-use crate::memory::Plan;
+use crate::memory::Peaks;
 use crate::run::RunError;
 
 /// Team counts of the table, and of the JSON object.
@@ -68,7 +68,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let configs = combinations(&config, &args)?;
     let (mut player, machine) = open(&args)?;
     for config in &configs {
-        let plan = Plan::of([config], rayon::current_num_threads());
+        let plan = Peaks::of([config], rayon::current_num_threads());
         plan.check(machine.backend == "gpu").map_err(RunError::from)?;
     }
     if !args.json {
@@ -118,7 +118,7 @@ fn combinations(config: &Config, args: &Args) -> Result<Vec<Config>, Error> {
     Ok(configs)
 }
 
-fn open(args: &Args) -> Result<(Player, Machine), Error> {
+fn open(args: &Args) -> Result<(Subject, Machine), Error> {
     let level = match &args.instructions {
         None => Level::new(),
         Some(_) if args.run.backend == BackendChoice::Gpu => {
@@ -137,15 +137,15 @@ fn open(args: &Args) -> Result<(Player, Machine), Error> {
                 ));
             }
             backend::start_threads(&args.run)?;
-            return Ok((Player::Cpu(Cpu::at_level(level), level), front::cpu().1));
+            return Ok((Subject::Cpu(Cpu::at_level(level), level), front::cpu().1));
         }
     };
     Ok(match backend::open_gpu(&args.run)? {
         Some(gpu) => {
             let machine = Machine::of_gpu(&gpu);
-            (Player::Gpu(Box::new(gpu)), machine)
+            (Subject::Gpu(Box::new(gpu)), machine)
         }
-        None => (Player::Cpu(Cpu::at_level(level), level), front::cpu().1),
+        None => (Subject::Cpu(Cpu::at_level(level), level), front::cpu().1),
     })
 }
 
@@ -155,8 +155,8 @@ A rollout plays and scores all teams once; generations also select and mutate: t
 The ceiling is what chains of f32 sums and products in registers reach, none fused; benches/README.md says what counts.
 ";
 
-fn line(measure: &Measure) -> String {
-    let Measure { teams, steps, rollout, generation, .. } = measure;
+fn line(measure: &Timing) -> String {
+    let Timing { teams, steps, rollout, generation, .. } = measure;
     let agents = measure.agents();
     let generations = generation.map_or("-".into(), |generation| format!("{:.0}%", 100.0 * rollout / generation));
     let mut line = format!(
@@ -217,8 +217,8 @@ fn traffic(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
     rows.map(|(name, part, bytes)| (name, part, bytes as f64 / *generations as f64)).collect()
 }
 
-fn json(measure: &Measure, machine: &Machine) -> String {
-    let Measure { teams, leaders, followers, pois, steps, rollout, mean_g, reach, operations, ceiling, .. } = measure;
+fn json(measure: &Timing, machine: &Machine) -> String {
+    let Timing { teams, leaders, followers, pois, steps, rollout, mean_g, reach, operations, ceiling, .. } = measure;
     let agents = measure.agents();
     let mut object = json!({
         "backend": machine.backend,

@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::{ConfigArgs, Error, output, plot, print};
 use crate::config::Config;
-use crate::memory::Plan;
+use crate::memory::Peaks;
 use crate::report::map;
 use crate::world::World;
 
@@ -55,7 +55,7 @@ impl Cost {
             * wide(learning.population + 1)
             * wide(learning.episodes_per_team);
         let team_steps = teams * wide(world.steps());
-        let plan = Plan::of([config], rayon::current_num_threads());
+        let plan = Peaks::of([config], rayon::current_num_threads());
         Cost {
             agents: world.agents(),
             learners: config.learners(),

@@ -7,11 +7,11 @@ use serde_json::json;
 
 use super::sweep::share;
 use super::{Error, print, say};
-use crate::config::World;
+use crate::config::Domain;
 use crate::file;
 use crate::record::folder::{self, SWEEP};
-use crate::report::comparison::{self, Arm, At, Comparison, ComparisonError, Options};
-use crate::report::runs::{self, MAX_RUNS, RunError};
+use crate::report::comparison::{self, At, Cohort, Comparison, ComparisonError, Question};
+use crate::report::runs::{self, MAX_RUNS, ReadError};
 use crate::sweep::{Sweep, results};
 use crate::{shell, statistics};
 
@@ -51,7 +51,7 @@ fn at(text: &str) -> Result<At, String> {
 }
 
 /// Arms with what they have in common.
-type Group = (String, Vec<Arm>);
+type Contest = (String, Vec<Cohort>);
 
 pub fn run(args: Args) -> Result<(), Error> {
     let mut notes = Vec::new();
@@ -63,8 +63,8 @@ pub fn run(args: Args) -> Result<(), Error> {
     let tell = |notes: &[String]| notes.iter().for_each(|note| say(format_args!("note: {note}")));
     tell(&notes);
     let told = notes.len();
-    let options = Options { at: args.at.clone(), reach: args.reach, paired: args.paired };
-    let compare = |(place, arms): &Group| {
+    let options = Question { at: args.at.clone(), reach: args.reach, paired: args.paired };
+    let compare = |(place, arms): &Contest| {
         comparison::compare(place, arms, &options).map_err(|error| match error {
             ComparisonError::Beyond { at, .. } => Error::Usage(format!("--at {at}: {error}")),
             ComparisonError::NoPairs(..) => Error::Usage(format!("--paired: {error}")),
@@ -102,7 +102,7 @@ pub fn run(args: Args) -> Result<(), Error> {
 }
 
 /// Every run an arm, named by what sets it apart.
-fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<Vec<Arm>, Error> {
+fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<Vec<Cohort>, Error> {
     if let Some(by) = &args.by {
         return Err(Error::Usage(format!(
             "--by {by}: that takes the folder of one sweep, which {} is not",
@@ -122,7 +122,7 @@ fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<
     }
     let configs = folders.iter().map(|folder| runs::config(folder)).collect::<Result<Vec<_>, _>>()?;
     let first = &configs[0].world;
-    let differs = |differs: fn(&World, &World) -> bool| configs.iter().any(|config| differs(&config.world, first));
+    let differs = |differs: fn(&Domain, &Domain) -> bool| configs.iter().any(|config| differs(&config.world, first));
     let layouts = [
         ("world.map", differs(|a, b| a.map != b.map)),
         ("world.leaders", differs(|a, b| a.leaders != b.leaders)),
@@ -134,11 +134,11 @@ fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<
         notes.push(format!("the arms play in different layouts: {} differ", layouts.join(", ")));
     }
     let arms = runs::labels(folders, &configs).into_iter().zip(folders);
-    Ok(arms.map(|(name, folder)| Arm::read(name, vec![folder.clone()])).collect::<Result<_, _>>()?)
+    Ok(arms.map(|(name, folder)| Cohort::read(name, vec![folder.clone()])).collect::<Result<_, _>>()?)
 }
 
 /// The values of an axis as arms, for each combination of the others; those without runs are noted.
-fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Group>, Error> {
+fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Contest>, Error> {
     let sweep = Sweep::load(&out.join(SWEEP), &[], false)?;
     let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
     let by = match (&args.by, sweep.axes.len()) {
@@ -159,7 +159,7 @@ fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Grou
                 {
                     Ok(config) if config == point.config => folders.push(folder),
                     Ok(_) => return Err(Error::Refused(format!("{} is a run of another config", folder.display()))),
-                    Err(RunError::Missing(_) | RunError::Unfinished { .. }) => {
+                    Err(ReadError::Missing(_) | ReadError::Unfinished { .. }) => {
                         notes.push(format!(
                             "{} was not run, and is left out: {}",
                             folder.display(),
@@ -170,7 +170,7 @@ fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Grou
                 }
             }
             if !folders.is_empty() {
-                arms.push(Arm::read(name, folders)?);
+                arms.push(Cohort::read(name, folders)?);
             }
         }
         too_many(arms.len(), "values")?;

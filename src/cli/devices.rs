@@ -6,7 +6,7 @@ use super::{Error, print, remedy};
 use crate::backend::Backend;
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu;
-use crate::backend::gpu::device::{self, Choice, Gpu};
+use crate::backend::gpu::device::{self, Gpu, Wanted};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -20,7 +20,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let adapters: Vec<_> = device::adapters()
         .into_iter()
         .enumerate()
-        .map(|(index, info)| (index, info, gpu::open(Choice::Named(index.to_string()))))
+        .map(|(index, info)| (index, info, gpu::open(Wanted::Named(index.to_string()))))
         .collect();
     if args.json {
         let adapters: Vec<_> = adapters

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
 use super::{Error, output, print};
-use crate::config::{self, Config, Key};
+use crate::config::{self, Config, Definition};
 use crate::record::RecordError;
 
 /// The paper's layouts, with the text of each one's config file.
@@ -78,7 +78,7 @@ fn commented(from: &str, config: &Config) -> String {
 }
 
 /// Meaning and facts, on a line of their own each where one does not hold both.
-fn comment(Key { unit, kind, range, default, meaning, .. }: &Key) -> String {
+fn comment(Definition { unit, kind, range, default, meaning, .. }: &Definition) -> String {
     let unit = if unit.is_empty() { String::new() } else { format!("{unit}; ") };
     let default = default.as_ref().map_or("has to be given".into(), |default| format!("default {default}"));
     let facts = format!("({unit}{kind}, {range}; {default})");

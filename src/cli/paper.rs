@@ -14,11 +14,11 @@ use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, ARMS, Folder, PAPER, POINTS, SWEEP, Start};
 use crate::report::curves::PRINT;
-use crate::report::paper::{self, Arm, Measured, Results, Summary, claims, tables};
-use crate::report::progress::{Meter, Progress};
+use crate::report::paper::{self, Evidence, Experiment, Summary, Trajectory, claims, tables};
+use crate::report::progress::{Board, Meter};
 use crate::report::runs;
-use crate::report::scene::Kind;
-use crate::run::{self, Options, Outcome, RunError, Session, Twin};
+use crate::report::scene::Format;
+use crate::run::{self, Ended, Options, RunError, Session, Twin};
 use crate::shell;
 use crate::trainer::Row;
 
@@ -90,7 +90,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     marks.compare(out, start)?;
     let mut player = backend::open(&args.run)?;
     let (configs, places) = paper::trained(&arms);
-    let plan = memory::Plan::of(&configs, rayon::current_num_threads());
+    let plan = memory::Peaks::of(&configs, rayon::current_num_threads());
     plan.check(player.1.backend == "gpu").map_err(RunError::from)?;
     let disk = Disk::default();
     disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
@@ -128,7 +128,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         }
         let names = arms.iter().map(|arm| (arm.name(), arm.pois())).collect();
         let next = |generations: &[usize]| generations.iter().min().copied().unwrap_or(0);
-        let mut progress = Progress::new(names, next(session.generations()), learning.generations, quiet);
+        let mut progress = Board::new(names, next(session.generations()), learning.generations, quiet);
         let of_arms = |row: &Row| {
             let (row, places) = (*row, places.iter().enumerate());
             places.filter(move |&(_, &place)| place == row.arm).map(move |(arm, _)| Row { arm, ..row })
@@ -148,7 +148,7 @@ pub fn run(args: Args) -> Result<(), Error> {
             },
         );
         progress.clear();
-        if ended? == Outcome::Stopped {
+        if ended? == Ended::Stopped {
             return Err(Error::Stopped(format!(
                 "before generation {} of {}, with everything saved; go on with\n  {}",
                 next(session.generations()),
@@ -188,7 +188,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
     meter.clear();
     let baselines = baselines.found();
-    let found = Results { arms: &arms, baselines: &baselines };
+    let found = Evidence { arms: &arms, baselines: &baselines };
     let ran = (0..configs.len()).map(|run| session.run(run));
     let seconds = ran.map(|run| run.seconds).fold(0.0, f64::max);
 
@@ -202,7 +202,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     };
     for (index, layout) in paper::LAYOUTS.iter().enumerate() {
         let scene = paper::figure(found, index).scene();
-        for kind in Kind::ALL {
+        for kind in Format::ALL {
             let name = format!("figure{}.{}", layout.figure, kind.extension());
             let picture = scene.file(kind, PRINT).map_err(failed(&out.join(&name)))?;
             write(name, &picture)?;
@@ -220,13 +220,13 @@ pub fn run(args: Args) -> Result<(), Error> {
         seed: learning.seed,
         trials: learning.trials,
         generations: learning.generations,
-        curves: Measured::all(found),
+        curves: Trajectory::all(found),
         claims: &claims,
     };
     let summary = serde_json::to_string(&summary).expect("plain fields are JSON") + "\n";
     write(SUMMARY.into(), summary.as_bytes())?;
     if args.json {
-        let arm = |(index, arm): (usize, &Arm)| {
+        let arm = |(index, arm): (usize, &Experiment)| {
             let last = arm.best.iter().filter_map(|trial| trial.last()).sum::<f64>() / arm.best.len() as f64;
             json!({
                 "name": arm_name(arm),
@@ -275,7 +275,7 @@ const FIGURES: [&str; 9] = [
 ];
 
 /// An arm's folder: "chaotic-all-leaders-Df".
-fn arm_name(arm: &Arm) -> String {
+fn arm_name(arm: &Experiment) -> String {
     format!("{}-{}-{}", arm.layout.name.replace(' ', "-"), arm.paradigm, arm.fitness)
 }
 

@@ -6,7 +6,7 @@ use super::{Error, output, print, say};
 use crate::record::RecordError;
 use crate::report::curves::PRINT;
 use crate::report::runs::{self, MAX_RUNS};
-use crate::report::scene::{Kind, Scene};
+use crate::report::scene::{Format, Scene};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -51,16 +51,16 @@ pub fn run(args: Args) -> Result<(), Error> {
 ///
 /// # Errors
 /// Nothing that a picture can be.
-pub(super) fn kind_of(path: &Path) -> Result<Kind, Error> {
+pub(super) fn kind_of(path: &Path) -> Result<Format, Error> {
     let wrong = || Error::Usage(format!("--out {}: its name must end in .svg, .pdf or .png", path.display()));
-    Kind::of(path).ok_or_else(wrong)
+    Format::of(path).ok_or_else(wrong)
 }
 
 /// Writes a picture, whole or not at all.
 ///
 /// # Errors
 /// The file cannot be written.
-pub(super) fn write(scene: &Scene, kind: Kind, path: &Path) -> Result<(), Error> {
+pub(super) fn write(scene: &Scene, kind: Format, path: &Path) -> Result<(), Error> {
     let failed = |error| RecordError::Write { path: path.into(), error };
     let content = scene.file(kind, PRINT).map_err(failed)?;
     output::write(path, |output| output.write_all(&content))

@@ -85,22 +85,22 @@ pub fn run(error: &RunError) -> String {
 }
 
 /// About a run that could not be shown.
-pub fn shown(error: &runs::RunError) -> String {
+pub fn shown(error: &runs::ReadError) -> String {
     match error {
-        runs::RunError::Missing(folder) => {
+        runs::ReadError::Missing(folder) => {
             format!("; `flotilla train CONFIG --out {}` makes a run there", folder.display())
         }
-        runs::RunError::NoFolder(_) => ", which `flotilla train` makes".into(),
-        runs::RunError::Foreign { .. } => "; `flotilla train CONFIG --out DIR` makes one that has".into(),
-        runs::RunError::Config { .. } => {
+        runs::ReadError::NoFolder(_) => ", which `flotilla train` makes".into(),
+        runs::ReadError::Foreign { .. } => "; `flotilla train CONFIG --out DIR` makes one that has".into(),
+        runs::ReadError::Config { .. } => {
             "\nfind a config that is whole, and repeat the run with `flotilla train CONFIG --out DIR`".into()
         }
-        runs::RunError::Unfinished { folder, .. } => {
+        runs::ReadError::Unfinished { folder, .. } => {
             let folder = folder.display();
             format!("; finish the run with `flotilla train {folder}/{CONFIG} --out {folder} --resume`")
         }
-        runs::RunError::Record(error) => record(error, "try again"),
-        runs::RunError::Collection { .. } => String::new(),
+        runs::ReadError::Record(error) => record(error, "try again"),
+        runs::ReadError::Collection { .. } => String::new(),
     }
 }
 

@@ -12,9 +12,9 @@ use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::report::curves::PRINT;
 use crate::report::progress::Meter;
-use crate::report::replay::{self, FPS, Motion, Played, ReplayError, Rows};
+use crate::report::replay::{self, FPS, Film, History, ReplayError, Replayed};
 use crate::report::runs;
-use crate::report::scene::Kind;
+use crate::report::scene::Format;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -65,7 +65,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
     let generation = match generation {
         Some(generation) => generation,
-        None if trial < config.learning.trials => Rows::read(&folder, &config, trial)?.newest().unwrap_or(0),
+        None if trial < config.learning.trials => History::read(&folder, &config, trial)?.newest().unwrap_or(0),
         None => 0,
     };
     let generations: Vec<usize> = compare.into_iter().chain([generation]).collect();
@@ -87,7 +87,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let failed = |error| RecordError::Write { path: out.clone(), error };
     let name = folder.canonicalize().ok().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
     let name = name.unwrap_or_else(|| folder.display().to_string());
-    let motion = Motion { width, fps: fps.unwrap_or(FPS) };
+    let motion = Film { width, fps: fps.unwrap_or(FPS) };
     let disk = Disk::default();
     let content = match kind {
         Form::Page => replay::page(&name, &config, &played).into_bytes(),
@@ -124,13 +124,13 @@ pub fn run(args: Args) -> Result<(), Error> {
 }
 
 /// Says what was played and where it was written, as text or as one JSON object.
-fn report(played: &[Played], json: bool, text: &str, mut object: serde_json::Value) -> Result<(), Error> {
+fn report(played: &[Replayed], json: bool, text: &str, mut object: serde_json::Value) -> Result<(), Error> {
     if !json {
         played.iter().try_for_each(|played| print(&tell(played)))?;
         return print(text);
     }
-    let episode = |played: &Played| {
-        let Played { trial, generation, team, best_g, .. } = played;
+    let episode = |played: &Replayed| {
+        let Replayed { trial, generation, team, best_g, .. } = played;
         json!({ "trial": trial, "generation": generation, "team": team, "best_g": best_g })
     };
     object["episodes"] = played.iter().map(episode).collect();
@@ -138,8 +138,8 @@ fn report(played: &[Played], json: bool, text: &str, mut object: serde_json::Val
 }
 
 /// What was played, in a line.
-fn tell(played: &Played) -> String {
-    let Played { trial, generation, team, best_g, episodes, world, .. } = played;
+fn tell(played: &Replayed) -> String {
+    let Replayed { trial, generation, team, best_g, episodes, world, .. } = played;
     let (pois, digits) = (world.pois.len(), if *episodes > 1 { 2 } else { 0 });
     format!(
         "trial {trial}, generation {generation}: team {team} is the best, it observed {:.digits$} of {pois} POIs{}, as \
@@ -153,19 +153,19 @@ fn tell(played: &Played) -> String {
 enum Form {
     Page,
     Gif,
-    Still(Kind),
+    Still(Format),
     Film(Numbered),
 }
 
 impl Form {
     fn of(path: &Path) -> Result<Form, Error> {
         let extension = path.extension().map(|extension| extension.to_ascii_lowercase());
-        match (extension.as_ref().and_then(|extension| extension.to_str()), Kind::of(path)) {
+        match (extension.as_ref().and_then(|extension| extension.to_str()), Format::of(path)) {
             (Some("html"), _) => Ok(Form::Page),
             (Some("gif"), _) => Ok(Form::Gif),
             (_, Some(kind)) => {
                 let numbered = path.file_name().and_then(|name| Numbered::of(name.to_str()?));
-                Ok(numbered.filter(|_| kind == Kind::Png).map_or(Form::Still(kind), Form::Film))
+                Ok(numbered.filter(|_| kind == Format::Png).map_or(Form::Still(kind), Form::Film))
             }
             _ => {
                 let path = path.display();
@@ -177,7 +177,7 @@ impl Form {
     /// Refuses flags that would say nothing.
     fn takes(&self, out: &Path, width: Option<u32>, fps: Option<u32>, step: Option<usize>) -> Result<(), Error> {
         let moves = matches!(self, Form::Gif | Form::Film(_));
-        let pixels = moves || matches!(self, Form::Still(Kind::Png));
+        let pixels = moves || matches!(self, Form::Still(Format::Png));
         let unused = [
             ("--width", width.is_some() && !pixels, "a .gif or .png"),
             ("--fps", fps.is_some() && !moves, "a .gif, or pictures like %04d.png"),

@@ -190,7 +190,8 @@ fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> Strin
     });
     object["best"]["team"] = json!(best);
     if let Starts::Drawn { seed, jitter, poi_jitter, .. } = starts {
-        (object["seed"], object["start_jitter"], object["poi_jitter"]) = (json!(seed), json!(jitter), json!(poi_jitter));
+        (object["seed"], object["start_jitter"], object["poi_jitter"]) =
+            (json!(seed), json!(jitter), json!(poi_jitter));
     }
     format!("{object}\n")
 }

@@ -15,11 +15,11 @@ use crate::record::RecordError;
 use crate::record::disk;
 use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
 use crate::report::progress::Meter;
-use crate::run::{Options, Outcome as Ended};
+use crate::run::{Ended, Options};
 use crate::shell;
 use crate::sweep::pictures;
 use crate::sweep::results::{self, Missing, Outcome};
-use crate::sweep::run::{self, Progress};
+use crate::sweep::run::{self, Headway};
 use crate::sweep::shard::{self, MAX_SHARDS, Shard};
 use crate::sweep::slurm::Job;
 use crate::sweep::{Point, Sweep};
@@ -307,7 +307,7 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
         _ => Start::Fresh,
     };
     let mut ticker = Ticker::new(args.quiet);
-    let mut options = run::Options {
+    let mut options = run::Manner {
         start,
         memory,
         runs: Options {
@@ -357,7 +357,7 @@ fn free_memory() -> usize {
 
 /// Puts together what is there, draws it, and fails where something is missing.
 fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(), Error> {
-    let options = results::Options { every: args.every as usize, reach: args.reach };
+    let options = results::Detail { every: args.every as usize, reach: args.reach };
     let outcomes = results::write(sweep, out, &options)?;
     let (names, note) = pictures::draw(sweep, &outcomes, &options, axes, out)?;
     match args.json {
@@ -412,7 +412,7 @@ fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(),
 fn as_json(
     sweep: &Sweep,
     outcomes: &[Result<Outcome, Missing>],
-    options: &results::Options,
+    options: &results::Detail,
     out: &Path,
     pictures: &[String],
 ) -> serde_json::Value {
@@ -455,7 +455,7 @@ fn as_json(
 }
 
 /// What a person wants to know at the end: the best and the worst points.
-fn summary(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>], options: &results::Options) -> String {
+fn summary(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>], options: &results::Detail) -> String {
     const LISTED: usize = 12;
     let done = sweep.points.iter().zip(outcomes).filter_map(|(point, outcome)| Some((point, outcome.as_ref().ok()?)));
     let mut done: Vec<_> =
@@ -511,10 +511,10 @@ fn list(sweep: &Sweep, shards: usize) -> Result<(), Error> {
 fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> Result<(), Error> {
     output::check(&[("--slurm", file)], &[&args.sweep])?;
     let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.into());
-    let program = std::env::current_exe().unwrap_or_else(|_| "flotilla".into());
     let out = absolute(out);
     let cpu = args.run.backend == super::BackendChoice::Cpu;
-    let command = [program.display().to_string()].into_iter().chain(args.words(&absolute(&args.sweep), &out)).collect();
+    let command =
+        [super::program().display().to_string()].into_iter().chain(args.words(&absolute(&args.sweep), &out)).collect();
     let job = Job {
         name: &sweep.name,
         command,
@@ -546,8 +546,8 @@ impl Ticker {
         Ticker(Meter::new(quiet))
     }
 
-    fn tick(&mut self, progress: &Progress) {
-        let Progress { done, points, batch, generation, last, played, total } = *progress;
+    fn tick(&mut self, progress: &Headway) {
+        let Headway { done, points, batch, generation, last, played, total } = *progress;
         self.0.show(played as f64 / total.max(1) as f64, || {
             format!("{done}/{points} points done, {batch} side by side at generation {}/{last}", generation.min(last))
         });

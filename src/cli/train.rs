@@ -9,15 +9,15 @@ use super::recovery::{self, Checkpoints, Loss, Signals, quoted};
 use super::{ConfigArgs, Error, RunOptions, backend, print, say};
 use crate::config::Config;
 use crate::host::Instant;
-use crate::memory::Plan;
+use crate::memory::Peaks;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, METRICS, POLICIES, Start};
 use crate::record::policies;
-use crate::report::progress::Progress;
+use crate::report::progress::Board;
 use crate::report::runs;
 use crate::report::tensorboard::Events;
-use crate::run::{Options, Outcome, Results, RunError, Session};
+use crate::run::{Ended, Options, Results, RunError, Session};
 use crate::shell;
 use crate::trainer::Row;
 
@@ -94,7 +94,7 @@ impl Args {
 pub fn run(args: Args) -> Result<(), Error> {
     let config = args.config.load_with(args.checkpoints.list())?;
     let mut player = backend::open(&args.run)?;
-    Plan::of([&config], rayon::current_num_threads()).check(player.1.backend == "gpu").map_err(RunError::from)?;
+    Peaks::of([&config], rayon::current_num_threads()).check(player.1.backend == "gpu").map_err(RunError::from)?;
     let runs_on = player.0.describe();
     let init = args.init.as_deref().map(|path| policies::read_init(path, &config)).transpose()?;
     let (folder, start) = args.folder()?;
@@ -134,7 +134,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
 
     let (since, from, last) = (Instant::now(), session.generations()[0], config.learning.generations);
-    let mut shown = Progress::new(vec![(String::new(), config.world.pois.len())], from, last, args.quiet);
+    let mut shown = Board::new(vec![(String::new(), config.world.pois.len())], from, last, args.quiet);
     let ended = session.train(
         &mut player,
         &mut Options {
@@ -158,12 +158,12 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
     let next = session.generations()[0];
     match ended? {
-        Outcome::Done => {
+        Ended::Done => {
             draw(&folder);
-            let trained = Trained { generations: next.min(last + 1) - from.min(last + 1), since };
+            let trained = Training { generations: next.min(last + 1) - from.min(last + 1), since };
             told.print(&session, Some(trained), args.json)
         }
-        Outcome::Stopped => Err(Error::Stopped(format!(
+        Ended::Stopped => Err(Error::Stopped(format!(
             "before generation {next} of {last}, with everything saved; go on with\n  {}",
             args.command_to_resume(&folder)
         ))),
@@ -184,7 +184,7 @@ fn draw(folder: &Path) {
 }
 
 /// What was trained just now.
-struct Trained {
+struct Training {
     generations: usize,
     since: Instant,
 }
@@ -199,7 +199,7 @@ struct Told<'a> {
 
 impl Told<'_> {
     /// Prints what a run came to; `trained` is none where it was done already.
-    fn print(&self, session: &Session, trained: Option<Trained>, json: bool) -> Result<(), Error> {
+    fn print(&self, session: &Session, trained: Option<Training>, json: bool) -> Result<(), Error> {
         let results = session.results(0).expect("the run is done");
         let done_already = trained.is_none();
         let (generations, seconds) =
@@ -226,7 +226,7 @@ impl Told<'_> {
         let learning = &self.config.learning;
         let course = |rows: &[Row]| {
             let [best, mean, champion] = SCORES.map(|(_, share)| {
-                let Spread { mean, lowest, highest } = Spread::of(rows.iter().map(share));
+                let Extremes { mean, lowest, highest } = Extremes::of(rows.iter().map(share));
                 json!({ "mean": mean, "lowest": lowest, "highest": highest })
             });
             json!({ "best_g": best, "mean_g": mean, "champion_g": champion })
@@ -264,22 +264,22 @@ const SCORES: [(&str, Score); 3] =
     [("best team", |row| row.best_g), ("mean team", |row| row.mean_g), ("champion", |row| row.champion_g)];
 
 /// Where trials are.
-struct Spread {
+struct Extremes {
     mean: f64,
     lowest: f64,
     highest: f64,
 }
 
-impl Spread {
-    fn of(shares: impl Iterator<Item = f64>) -> Spread {
-        let (mut count, mut spread) = (0.0, Spread { mean: 0.0, lowest: f64::INFINITY, highest: 0.0 });
+impl Extremes {
+    fn of(shares: impl Iterator<Item = f64>) -> Extremes {
+        let (mut count, mut spread) = (0.0, Extremes { mean: 0.0, lowest: f64::INFINITY, highest: 0.0 });
         for share in shares {
             count += 1.0;
             spread.mean += share;
             spread.lowest = spread.lowest.min(share);
             spread.highest = spread.highest.max(share);
         }
-        Spread { mean: spread.mean / count, ..spread }
+        Extremes { mean: spread.mean / count, ..spread }
     }
 }
 
@@ -292,7 +292,7 @@ fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> S
     let mut table = vec![["", SCORES[0].0, SCORES[1].0, SCORES[2].0].map(String::from)];
     for (name, rows) in [("start", &story.first), (&*last, &story.last)] {
         let [best, mean, champion] = SCORES.map(|(_, share)| {
-            let Spread { mean, lowest, highest } = Spread::of(rows.iter().map(|row| share(row) * pois as f64));
+            let Extremes { mean, lowest, highest } = Extremes::of(rows.iter().map(|row| share(row) * pois as f64));
             format!("{mean:.2} ({lowest:.2} to {highest:.2})")
         });
         table.push([name.into(), best, mean, champion]);

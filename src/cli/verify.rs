@@ -7,12 +7,12 @@ use serde_json::json;
 use super::{Error, print};
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu;
-use crate::backend::gpu::device::{self, AdapterInfo, Choice, DeviceError, Request};
+use crate::backend::gpu::device::{self, AdapterInfo, DeviceError, Request, Wanted};
 use crate::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records};
 use crate::backend::gpu::exact::Pass;
 use crate::config::{self, Config};
 use crate::report::progress::Meter;
-use crate::verify::{Outcome, Plan, compare};
+use crate::verify::{Agreement, Plan, compare};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -49,7 +49,7 @@ struct Line {
     adapter: String,
     pass: Pass,
     kernel: Kernel,
-    result: Result<Outcome, Error>,
+    result: Result<Agreement, Error>,
 }
 
 impl Line {
@@ -137,12 +137,12 @@ fn plan(args: &Args) -> Result<Plan, Error> {
 }
 
 /// The adapters to verify, each with what opens it.
-fn adapters(name: Option<&str>) -> Result<Vec<(Choice, AdapterInfo)>, Error> {
+fn adapters(name: Option<&str>) -> Result<Vec<(Wanted, AdapterInfo)>, Error> {
     let found = device::adapters();
-    let all = found.iter().cloned().enumerate().map(|(index, info)| (Choice::Named(index.to_string()), info));
+    let all = found.iter().cloned().enumerate().map(|(index, info)| (Wanted::Named(index.to_string()), info));
     match name {
         Some(name) => {
-            let named = Choice::Named(name.into());
+            let named = Wanted::Named(name.into());
             let index = device::position(&named, &found)?;
             Ok(vec![(named, found[index].clone())])
         }
@@ -165,12 +165,12 @@ fn kernels(name: Option<&str>) -> impl Iterator<Item = Kernel> {
     all.into_iter().filter(move |kernel| name.is_none_or(|name| kernel.to_string() == name))
 }
 
-fn verify(plan: &Plan, request: Request, kernel: Kernel, info: &AdapterInfo, quiet: bool) -> Result<Outcome, Error> {
+fn verify(plan: &Plan, request: Request, kernel: Kernel, info: &AdapterInfo, quiet: bool) -> Result<Agreement, Error> {
     let pass = request.pass.map_or_else(String::new, |pass| format!(", {pass} pass, {kernel} kernel"));
     let mut meter = Meter::new(quiet);
     let gpu = gpu::open(request)?;
     if let Some(mismatch) = gpu::self_test(&gpu)? {
-        return Ok(Outcome { mismatch: Some(mismatch.to_string()), ..Outcome::default() });
+        return Ok(Agreement { mismatch: Some(mismatch.to_string()), ..Agreement::default() });
     }
     let mut gpu = GpuEpisodes::new(gpu)?.playing(kernel).holding(Holding::Always).bringing(Records::Packed);
     let compared = compare(plan, &mut Cpu::default(), &mut gpu, |outcome| {

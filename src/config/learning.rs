@@ -77,15 +77,21 @@ choice! {
     }
 }
 
+impl Paradigm {
+    /// Asks for it; it says which agents there are.
+    pub(super) fn read(r: &mut Reader<'_>) -> Paradigm {
+        r.key("learning.paradigm", "", "who learns: the leaders, or every agent", "4.1, 4.4")
+            .choice(Paradigm::LeaderFollower)
+    }
+}
+
 impl Learning {
-    pub(super) fn read(r: &mut Reader<'_>) -> Learning {
+    pub(super) fn read(r: &mut Reader<'_>, paradigm: Paradigm) -> Learning {
         let population = r
             .key("learning.population", "policies", "k: policies of each learner, and teams of a generation", "4.3")
             .number(between(2, MAX_POPULATION), 50);
         Learning {
-            paradigm: r
-                .key("learning.paradigm", "", "who learns: the leaders, or every agent", "4.1, 4.4")
-                .choice(Paradigm::LeaderFollower),
+            paradigm,
             sharing: r
                 .key(
                     "learning.sharing",
@@ -162,22 +168,22 @@ impl Learning {
 
 /// `[checkpoint]`: how often a run saves what it needs to go on, without a say in its results; 0 is never.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Checkpoint {
+pub struct Saving {
     /// After so many generations.
     pub generations: usize,
     /// After so many seconds.
     pub seconds: f64,
 }
 
-impl Default for Checkpoint {
-    fn default() -> Checkpoint {
-        Checkpoint { generations: 0, seconds: 30.0 }
+impl Default for Saving {
+    fn default() -> Saving {
+        Saving { generations: 0, seconds: 30.0 }
     }
 }
 
-impl Checkpoint {
-    pub(super) fn read(r: &mut Reader<'_>) -> Checkpoint {
-        Checkpoint {
+impl Saving {
+    pub(super) fn read(r: &mut Reader<'_>) -> Saving {
+        Saving {
             generations: r
                 .key(
                     "checkpoint.generations",
@@ -188,7 +194,7 @@ impl Checkpoint {
                 .number(between(0, MAX_GENERATIONS), 0),
             seconds: r
                 .key("checkpoint.seconds", "s", "between checkpoints, which change no result; 0 is never", "")
-                .number(between(0.01, 1e9).or_zero(), Checkpoint::default().seconds),
+                .number(between(0.01, 1e9).or_zero(), Saving::default().seconds),
         }
     }
 }

@@ -10,17 +10,17 @@ use serde::Serialize;
 use crate::reader::{self, Reader};
 
 pub use crate::declare::Choice;
-pub use crate::model::couple::Coupling;
+pub use crate::model::couple::{Coupling, Observers};
 pub use crate::model::follow::Follow;
 pub use crate::model::motion::Motion;
 pub use crate::model::policy::{Actions, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
 pub use crate::model::sense::{Density, Sense};
-pub use crate::reader::{Key, Override, Problem};
+pub use crate::reader::{Definition, Override, Problem};
 pub use learning::{
-    Checkpoint, Fitness, Learning, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm, Sharing,
+    Fitness, Learning, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm, Saving, Sharing,
 };
 pub use load::{MAX_FILE_BYTES, is_standard_input, name, read_file};
-pub use world::{MAX_AGENTS, MAX_POIS, MAX_STEPS, World};
+pub use world::{Domain, MAX_AGENTS, MAX_POIS, MAX_STEPS};
 
 mod learning;
 mod load;
@@ -34,7 +34,7 @@ pub const GRID: &str = "grid";
 pub const VARY: &str = "vary";
 
 /// Every key of a config, in the order of [`Config::to_toml`].
-pub fn keys() -> Vec<Key> {
+pub fn keys() -> Vec<Definition> {
     let (config, mut keys) = reader::keys(Config::ask);
     let mut order = Vec::new();
     let text = config.to_toml();
@@ -52,13 +52,13 @@ pub fn keys() -> Vec<Key> {
 /// One experiment, as written in a config file.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Config {
-    pub world: World,
+    pub world: Domain,
     pub motion: Motion,
     pub follow: Follow,
     pub sense: Sense,
     pub policy: Policy,
     pub learning: Learning,
-    pub checkpoint: Checkpoint,
+    pub checkpoint: Saving,
 }
 
 impl Config {
@@ -131,14 +131,15 @@ impl Config {
     /// on it is not blamed as well.
     fn ask(r: &mut Reader<'_>) -> Config {
         let (motion, start_speed) = Motion::read(r);
+        let paradigm = Paradigm::read(r);
         let config = Config {
-            world: World::read(r, start_speed),
+            world: Domain::read(r, start_speed, paradigm),
             motion,
             follow: Follow::read(r),
             sense: Sense::read(r),
             policy: Policy::read(r),
-            learning: Learning::read(r),
-            checkpoint: Checkpoint::read(r),
+            learning: Learning::read(r, paradigm),
+            checkpoint: Saving::read(r),
         };
         if r.faults() == 0 && config.policy_bytes() > MAX_POLICY_BYTES {
             let gib = |bytes: u64| bytes.div_ceil(1 << 30);

@@ -4,8 +4,8 @@ use std::f64::consts::FRAC_PI_2;
 
 use serde::Serialize;
 
-use super::Coupling;
-use crate::model::couple::observation_radius;
+use super::{Coupling, Observers, Paradigm};
+use crate::model::couple::{after, observation_radius, windows};
 use crate::model::{LEAST, LONGEST};
 use crate::reader::{Allowed, Reader, between};
 
@@ -20,22 +20,27 @@ const _: () = assert!(MAX_STEPS * MAX_POIS * MAX_AGENTS.div_ceil(32) * size_of::
 
 /// `[world]`: where everything starts. Lengths in map units, time in seconds, angles in radians.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct World {
+pub struct Domain {
     pub map: [f64; 2],
     pub leaders: Vec<[f64; 2]>,
     pub followers: Vec<[f64; 2]>,
     pub pois: Vec<[f64; 2]>,
     pub coupling: Coupling,
     pub observation_radius: f64,
+    pub observers: Observers,
+    /// The first and the last step, from 1, at which each POI can be observed; empty where that is any.
+    pub windows: Vec<[usize; 2]>,
+    /// The POIs that each comes after; empty where none comes after any.
+    pub after: Vec<Vec<usize>>,
     pub steps: usize,
     pub dt: f64,
     pub heading: f64,
     pub speed: f64,
 }
 
-impl World {
-    /// Reads the section; agents start with one of these speeds.
-    pub(super) fn read(r: &mut Reader<'_>, start_speed: Allowed<f64>) -> World {
+impl Domain {
+    /// Reads the section; agents start with one of these speeds, and learn by this paradigm.
+    pub(super) fn read(r: &mut Reader<'_>, start_speed: Allowed<f64>, paradigm: Paradigm) -> Domain {
         let map = r
             .key("world.map", "units", "width and height; positions stay within 0 to these", "3.1")
             .pair(between(1.0, LONGEST), [50.0, 50.0]);
@@ -64,16 +69,32 @@ impl World {
             let message = format!("found {agents} agents with the leaders, allowed 1 to {MAX_AGENTS}");
             r.blame_key("world.followers", message);
         }
-        World {
+        let observers = Observers::read(r);
+        let counted = match (leaders.as_ref(), followers.as_ref(), paradigm) {
+            (Some(leaders), Some(followers), Paradigm::LeaderFollower) => {
+                observers.among(leaders.len(), followers.len()).len()
+            }
+            (Some(_), Some(_), Paradigm::AllLeaders) => observers.among(agents, 0).len(),
+            _ => MAX_AGENTS,
+        };
+        if counted == 0 {
+            let why = if paradigm == Paradigm::AllLeaders { "all agents lead" } else { "there are no followers" };
+            r.blame_key("world.observers", format!("found \"{observers}\", but {why}, so nobody would observe"));
+        }
+        let places = pois.as_ref().map(Vec::len);
+        let steps =
+            r.key("world.steps", "steps", "T: length of an episode", "3.2, Eq. 2").number(between(1, MAX_STEPS), 25);
+        Domain {
             map,
-            coupling: Coupling::read(r, agents.min(MAX_AGENTS), pois.as_ref().map(Vec::len)),
+            coupling: Coupling::read(r, counted.clamp(1, MAX_AGENTS), observers.counted(), places),
+            observers,
+            windows: windows(r, steps, places),
+            after: after(r, places),
             leaders: leaders.unwrap_or_default(),
             followers: followers.unwrap_or_default(),
             pois: pois.unwrap_or_default(),
             observation_radius: observation_radius(r),
-            steps: r
-                .key("world.steps", "steps", "T: length of an episode", "3.2, Eq. 2")
-                .number(between(1, MAX_STEPS), 25),
+            steps,
             dt: r.key("world.dt", "s", "time that a step takes", "").number(between(1e-4, 10.0), 0.2),
             heading: r
                 .key(

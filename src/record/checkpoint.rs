@@ -17,7 +17,7 @@ use std::time::Duration;
 use safetensors::tensor::Dtype;
 
 use super::disk::{self, Disk, Output};
-use super::metrics::Mark;
+use super::metrics::Extent;
 use super::policies;
 use super::tensors::{self, Tensor, TensorFile};
 use super::{RecordError, config_digest};
@@ -53,7 +53,7 @@ pub struct Checkpoint<N = Vec<f32>> {
     pub init: Option<String>,
     /// Time trained.
     pub seconds: f64,
-    pub metrics: Mark,
+    pub metrics: Extent,
     /// Without weights where these are kept in `policies.safetensors`.
     pub snapshot: Snapshot<N>,
 }
@@ -126,7 +126,7 @@ impl Checkpoint {
         };
         let config = text("config")?;
         let seconds = text("seconds")?.parse().ok().filter(|seconds: &f64| seconds.is_finite() && *seconds >= 0.0);
-        let metrics = Mark { bytes: number("metrics_bytes")?, sha256: text("metrics_sha256")? };
+        let metrics = Extent { bytes: number("metrics_bytes")?, sha256: text("metrics_sha256")? };
         let generation = number("generation")? as usize;
         let learning = &of.learning;
         // Those of an earlier version do not say it, and are of runs that were not extended.

@@ -61,7 +61,7 @@ pub enum Start {
 pub struct Run {
     /// Of the program.
     pub version: String,
-    pub state: State,
+    pub state: Status,
     pub seed: u64,
     /// "cpu" or "gpu", and in words.
     pub backend: String,
@@ -93,7 +93,7 @@ pub struct Run {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum State {
+pub enum Status {
     /// Or killed.
     Running,
     /// By a signal or an error, after saving.
@@ -106,7 +106,7 @@ impl Run {
     pub fn new(config: &Config) -> Run {
         Run {
             version: String::new(),
-            state: State::Running,
+            state: Status::Running,
             seed: config.learning.seed,
             backend: String::new(),
             description: String::new(),
@@ -150,7 +150,7 @@ pub struct Folder {
 }
 
 /// Where a run goes on, and what there is to tell about it.
-pub struct Found {
+pub struct Resumed {
     /// The newest whole checkpoint, and metrics cut to where it stands.
     pub checkpoint: Option<(Checkpoint, metrics::Writer)>,
     /// Generations of all checkpoints that may be used, oldest first.
@@ -210,7 +210,7 @@ impl Folder {
     ///
     /// # Errors
     /// It holds a run that must not be written over, is in use, belongs to another config or cannot be written.
-    pub fn open(path: &Path, start: Start, config: &Config, disk: Disk) -> Result<(Folder, Found), RecordError> {
+    pub fn open(path: &Path, start: Start, config: &Config, disk: Disk) -> Result<(Folder, Resumed), RecordError> {
         let checkpoints = path.join(CHECKPOINTS);
         if path.is_file() {
             return Err(RecordError::NoFolder { path: path.into() });
@@ -229,15 +229,23 @@ impl Folder {
         if start == Start::Force {
             folder.clear()?;
         }
-        let mut found = Found { checkpoint: None, kept: vec![], run: None, finished: None, notes: vec![] };
+        let mut found = Resumed { checkpoint: None, kept: vec![], run: None, finished: None, notes: vec![] };
         if start == Start::Resume {
             folder.find(config, &mut found)?;
         }
         if found.finished.is_some() && Config::load(&folder.file(CONFIG)).is_ok() {
             return Ok((folder, found));
         }
-        folder.write_text(CONFIG, &config.to_toml())?;
+        folder.write_config(config)?;
         Ok((folder, found))
+    }
+
+    /// Writes `config.toml`.
+    ///
+    /// # Errors
+    /// It cannot be written.
+    pub fn write_config(&self, config: &Config) -> Result<(), RecordError> {
+        self.write_text(CONFIG, &config.to_toml())
     }
 
     /// Removes a run; whatever else is in the folder stays.
@@ -253,7 +261,7 @@ impl Folder {
     }
 
     /// Finds where the run goes on.
-    fn find(&self, config: &Config, found: &mut Found) -> Result<(), RecordError> {
+    fn find(&self, config: &Config, found: &mut Resumed) -> Result<(), RecordError> {
         let checkpoints = self.file(CHECKPOINTS);
         let mut kept = checkpoint::tidy(&self.disk, &checkpoints)?;
         let before = self.compare(config, found, !kept.is_empty())?;
@@ -312,7 +320,7 @@ impl Folder {
 
     /// Refuses another config than the one the run was started with, but for more generations; gives that one, where it
     /// is there.
-    fn compare(&self, config: &Config, found: &mut Found, checkpoints: bool) -> Result<Option<Config>, RecordError> {
+    fn compare(&self, config: &Config, found: &mut Resumed, checkpoints: bool) -> Result<Option<Config>, RecordError> {
         let path = self.file(CONFIG);
         match Config::load(&path) {
             Ok(before) => {
@@ -394,7 +402,7 @@ impl Folder {
 
     /// What a run that is done came to; none where its files are not all as it left them.
     fn finished(&self, run: &Run, config: &Config) -> Option<Story> {
-        let digest = run.digest.as_ref().filter(|_| run.state == State::Done)?;
+        let digest = run.digest.as_ref().filter(|_| run.state == Status::Done)?;
         if run.generations != config.learning.generations + 1 {
             return None;
         }

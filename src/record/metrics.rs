@@ -23,7 +23,7 @@ const MAX_LINE: u64 = 256;
 
 /// How far a file has come, to be found there again.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Mark {
+pub struct Extent {
     pub bytes: u64,
     /// SHA-256 of these bytes.
     pub sha256: String,
@@ -52,7 +52,7 @@ impl Writer {
     ///
     /// # Errors
     /// What the system says.
-    pub fn resume(disk: &Disk, path: &Path, mark: &Mark) -> io::Result<Option<Writer>> {
+    pub fn resume(disk: &Disk, path: &Path, mark: &Extent) -> io::Result<Option<Writer>> {
         let mut hash = Sha256::new();
         let mut file = match file::open(path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -99,10 +99,10 @@ impl Writer {
     ///
     /// # Errors
     /// What the system says.
-    pub fn mark(&mut self) -> io::Result<(Mark, Output)> {
+    pub fn mark(&mut self) -> io::Result<(Extent, Output)> {
         self.output.flush()?;
         let sha256 = hex(&self.hash.clone().finalize());
-        Ok((Mark { bytes: self.bytes, sha256 }, self.output.get_ref().share()?))
+        Ok((Extent { bytes: self.bytes, sha256 }, self.output.get_ref().share()?))
     }
 }
 

@@ -6,13 +6,13 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::runs::{self, RunError};
+use super::runs::{self, ReadError};
 use super::table;
 use crate::statistics::{self, Estimate, Tested};
 
 /// Trials that are compared with those of others.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Arm {
+pub struct Cohort {
     /// What sets it apart: "fitness Df".
     pub name: String,
     /// The runs whose trials these are.
@@ -31,13 +31,13 @@ pub struct Trial {
     pub course: Vec<[f64; 2]>,
 }
 
-impl Arm {
+impl Cohort {
     /// Reads the trials of some runs, as far as they have come.
     ///
     /// # Errors
     /// A run cannot be read.
-    pub fn read(name: String, folders: Vec<PathBuf>) -> Result<Arm, RunError> {
-        let mut arm = Arm { name, folders, planned: 0, trials: vec![] };
+    pub fn read(name: String, folders: Vec<PathBuf>) -> Result<Cohort, ReadError> {
+        let mut arm = Cohort { name, folders, planned: 0, trials: vec![] };
         for folder in &arm.folders {
             let config = runs::config(folder)?;
             let courses = runs::trials(folder, &config)?.into_iter().enumerate();
@@ -58,7 +58,7 @@ impl Arm {
 }
 
 /// Whether all arms have the same seeds and trials, so that these are pairs.
-pub fn paired(arms: &[Arm]) -> bool {
+pub fn paired(arms: &[Cohort]) -> bool {
     arms.iter().all(|arm| arm.keys() == arms[0].keys())
 }
 
@@ -72,7 +72,7 @@ pub enum At {
 
 /// What is compared, and how.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Options {
+pub struct Question {
     pub at: Vec<At>,
     /// The best team's G (in 0..1) whose first generation is compared.
     pub reach: f64,
@@ -182,7 +182,7 @@ pub struct Measured {
     /// By arm.
     pub arms: Vec<Mean>,
     /// Every two arms once.
-    pub pairs: Vec<Pair>,
+    pub pairs: Vec<Versus>,
 }
 
 /// The mean over an arm's trials.
@@ -197,7 +197,7 @@ pub struct Mean {
 
 /// What sets two arms apart.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Pair {
+pub struct Versus {
     /// Their places among the arms.
     pub arms: [usize; 2],
     /// The first's mean less the second's.
@@ -213,7 +213,7 @@ pub struct Pair {
 ///
 /// # Errors
 /// The arms have too few trials or generations, or are no pairs where pairs are asked for.
-pub fn compare(place: &str, arms: &[Arm], options: &Options) -> Result<Comparison, ComparisonError> {
+pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Comparison, ComparisonError> {
     let mut last = usize::MAX;
     for arm in arms {
         if arm.trials.len() < 2 {
@@ -247,7 +247,7 @@ pub fn compare(place: &str, arms: &[Arm], options: &Options) -> Result<Compariso
     if arms.iter().any(|arm| arm.planned > last) {
         notes.push(format!("arms are compared up to generation {last}, which all have come to"));
     }
-    let named = |arm: &Arm| Named {
+    let named = |arm: &Cohort| Named {
         name: arm.name.clone(),
         folders: arm.folders.iter().map(|folder| folder.display().to_string()).collect(),
         trials: arm.trials.len(),
@@ -255,8 +255,8 @@ pub fn compare(place: &str, arms: &[Arm], options: &Options) -> Result<Compariso
     Ok(Comparison { place: place.into(), generation: last, arms: arms.iter().map(named).collect(), measures, notes })
 }
 
-fn measured(measure: Measure, arms: &[Arm], paired: bool) -> Measured {
-    let values = |arm: &Arm| arm.trials.iter().map(|trial| measure.of(trial)).collect::<Vec<_>>();
+fn measured(measure: Measure, arms: &[Cohort], paired: bool) -> Measured {
+    let values = |arm: &Cohort| arm.trials.iter().map(|trial| measure.of(trial)).collect::<Vec<_>>();
     let values: Vec<Vec<f64>> = arms.iter().map(values).collect();
     let two = "arms of two trials or more";
     let means = values
@@ -272,7 +272,7 @@ fn measured(measure: Measure, arms: &[Arm], paired: bool) -> Measured {
                 (statistics::bootstrap(&[one, other]), statistics::rank_sum(one, other))
             };
             let (difference, test) = (difference.expect(two), test.expect(two));
-            pairs.push(Pair { arms: [first, second], difference, test, p_holm: 0.0 });
+            pairs.push(Versus { arms: [first, second], difference, test, p_holm: 0.0 });
         }
     }
     let corrected = statistics::holm(&pairs.iter().map(|pair| pair.test.p).collect::<Vec<_>>());
@@ -298,7 +298,7 @@ impl Comparison {
     /// A row a measure and pair.
     fn pairs(&self) -> Vec<Vec<String>> {
         let head = ["measure", "pair", "difference", "A", "p", "p (Holm)"].map(String::from).to_vec();
-        let row = |measure: Measure, pair: &Pair| {
+        let row = |measure: Measure, pair: &Versus| {
             let names = pair.arms.map(|arm| &*self.arms[arm].name);
             let difference = estimate(pair.difference, measure.digits(), true);
             let (a, p) = (format!("{:.2}", pair.test.a), [pair.test.p, pair.p_holm].map(probability));
@@ -328,7 +328,7 @@ fn probability(p: f64) -> String {
 }
 
 /// How the tables are to be read.
-fn legend(all: &[Comparison], options: &Options) -> String {
+fn legend(all: &[Comparison], options: &Question) -> String {
     let (test, a) = match options.paired {
         true => ("Wilcoxon's signed ranks", "a pair's first trial"),
         false => ("Mann and Whitney's test", "a trial of the first arm"),
@@ -351,7 +351,7 @@ fn legend(all: &[Comparison], options: &Options) -> String {
 }
 
 /// For people.
-pub fn text(all: &[Comparison], options: &Options) -> String {
+pub fn text(all: &[Comparison], options: &Question) -> String {
     let mut text = String::new();
     for comparison in all {
         if !comparison.place.is_empty() {
@@ -363,7 +363,7 @@ pub fn text(all: &[Comparison], options: &Options) -> String {
 }
 
 /// For a paper: two tables a comparison, and how to read them as comments.
-pub fn latex(all: &[Comparison], options: &Options) -> String {
+pub fn latex(all: &[Comparison], options: &Question) -> String {
     let comment = |text: &str| text.lines().map(|line| format!("% {line}\n")).collect::<String>();
     let mut text = comment(&legend(all, options));
     for comparison in all {
@@ -410,7 +410,7 @@ pub fn csv(all: &[Comparison], output: impl io::Write) -> io::Result<()> {
                 let rest = [reached, String::new(), String::new(), String::new()];
                 table.write_record([&place()[..], &whose, &numbers(*mean), &rest].concat())?;
             }
-            for Pair { arms, difference, test, p_holm } in pairs {
+            for Versus { arms, difference, test, p_holm } in pairs {
                 let [one, other] = arms.map(|arm| &named[arm]);
                 let whose = [one.name.clone(), other.name.clone(), one.trials.to_string(), other.trials.to_string()];
                 let rest = [String::new(), test.a.to_string(), test.p.to_string(), p_holm.to_string()];

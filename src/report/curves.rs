@@ -18,14 +18,14 @@ const DASHES: [&[f64]; 5] = [&[], &[1.6, 0.7], &[1.8, 0.6, 0.4, 0.6], &[0.5, 0.5
 
 /// Mean and standard deviation of any number of values, gathered one by one.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Tally {
+pub struct Average {
     pub count: u32,
     pub mean: f64,
     /// Sum of squared distances from the mean.
     squares: f64,
 }
 
-impl Tally {
+impl Average {
     /// Adds a value.
     pub fn add(&mut self, value: f64) {
         self.count += 1;
@@ -58,7 +58,7 @@ pub struct Curve {
 
 impl Curve {
     /// One tally a generation, from generation 0; generations without values are left out.
-    pub fn new(tallies: &[Tally]) -> Curve {
+    pub fn new(tallies: &[Average]) -> Curve {
         let mut curve = Curve::default();
         for (generation, tally) in tallies.iter().enumerate().filter(|(_, tally)| tally.count > 0) {
             curve.generation.push(generation as f64);

@@ -289,7 +289,7 @@ impl Curves {
 }
 
 /// A share in 0..1 with the ends of its interval.
-pub type Spread = [f64; 3];
+pub type Interval = [f64; 3];
 
 /// One value with its interval for each value of each of several keys, beside that of what was not varied, in a panel for
 /// each of several settings.
@@ -300,14 +300,14 @@ pub struct Dots {
     /// Down the side: a key with its own value, and its other values.
     pub groups: Vec<(String, Vec<String>)>,
     /// Title, what comes out with every key's own value, and for each row of all groups what comes out there.
-    pub panels: Vec<(String, Option<Spread>, Vec<Option<Spread>>)>,
+    pub panels: Vec<(String, Option<Interval>, Vec<Option<Interval>>)>,
 }
 
 impl Dots {
     /// What each panel has, row by row.
     fn description(&self) -> String {
-        let told = |spread: &Option<Spread>| spread.map_or("missing".into(), |[mean, ..]| format!("{mean:.2}"));
-        let panel = |(title, base, found): &(String, Option<Spread>, Vec<Option<Spread>>)| {
+        let told = |spread: &Option<Interval>| spread.map_or("missing".into(), |[mean, ..]| format!("{mean:.2}"));
+        let panel = |(title, base, found): &(String, Option<Interval>, Vec<Option<Interval>>)| {
             let mut found = found.iter();
             let group = |(name, values): &(String, Vec<String>)| {
                 let values: Vec<_> =

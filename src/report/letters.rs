@@ -43,12 +43,12 @@ pub fn text_width(text: &str, size: f64) -> f64 {
 /// A glyph's outline as the data of an SVG path, in the font's units with y downwards; none of a space.
 pub fn outline(glyph: ttf_parser::GlyphId) -> Option<String> {
     /// Writes each point as its way from the one before, which takes fewer digits.
-    struct Outline {
+    struct Strokes {
         path: String,
         at: [i32; 2],
         start: [i32; 2],
     }
-    impl Outline {
+    impl Strokes {
         fn put(&mut self, command: char, points: &[[f32; 2]]) {
             self.path.push(command);
             let ends = points.iter().map(|&[x, y]| [x.round() as i32, -(y.round() as i32)]);
@@ -68,7 +68,7 @@ pub fn outline(glyph: ttf_parser::GlyphId) -> Option<String> {
             }
         }
     }
-    impl OutlineBuilder for Outline {
+    impl OutlineBuilder for Strokes {
         fn move_to(&mut self, x: f32, y: f32) {
             self.put('m', &[[x, y]]);
             self.start = self.at;
@@ -87,24 +87,24 @@ pub fn outline(glyph: ttf_parser::GlyphId) -> Option<String> {
             self.at = self.start;
         }
     }
-    let mut outline = Outline { path: String::new(), at: [0, 0], start: [0, 0] };
+    let mut outline = Strokes { path: String::new(), at: [0, 0], start: [0, 0] };
     FONT.outline_glyph(glyph, &mut outline)?;
     Some(outline.path)
 }
 
 /// The outlines of a text whose baseline starts at `(start, 0)`, in millimetres.
 pub fn letters(text: &str, size: f64, start: f64) -> Option<tiny_skia::Path> {
-    struct Outline {
+    struct Letters {
         builder: PathBuilder,
         scale: f32,
         x: f32,
     }
-    impl Outline {
+    impl Letters {
         fn at(&self, x: f32, y: f32) -> (f32, f32) {
             (self.x + x * self.scale, -y * self.scale)
         }
     }
-    impl OutlineBuilder for Outline {
+    impl OutlineBuilder for Letters {
         fn move_to(&mut self, x: f32, y: f32) {
             let (x, y) = self.at(x, y);
             self.builder.move_to(x, y);
@@ -126,7 +126,7 @@ pub fn letters(text: &str, size: f64, start: f64) -> Option<tiny_skia::Path> {
         }
     }
     let scale = size / units_per_em();
-    let mut outline = Outline { builder: PathBuilder::new(), scale: scale as f32, x: 0.0 };
+    let mut outline = Letters { builder: PathBuilder::new(), scale: scale as f32, x: 0.0 };
     for (glyph, place, _) in set(text).0 {
         outline.x = (start + f64::from(place) * scale) as f32;
         FONT.outline_glyph(glyph, &mut outline);

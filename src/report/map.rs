@@ -4,7 +4,8 @@ use glam::DVec2;
 
 use super::curves::round_step;
 use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
-use crate::config::Config;
+use crate::config::{Config, Observers};
+use crate::model::couple::Rule;
 use crate::world::World;
 
 /// Colours of leaders and their followers on white. Green is the observed POIs', and grey nobody's.
@@ -51,6 +52,9 @@ pub const GROUPS_DARK: [Color; 16] = [
 /// Once the colours are used up, they come again in dashes; what these do not tell apart, the numbers do.
 const DASHES: [&[f64]; 3] = [&[], &[0.9, 0.5], &[0.3, 0.35]];
 
+/// The circle of a POI that cannot be observed now.
+const CLOSED: &[f64] = &[0.3, 1.2];
+
 /// Sizes of letters, in millimetres.
 const LABEL: f64 = 2.4;
 const LEAST: f64 = 1.9;
@@ -59,12 +63,14 @@ const PALE: Color = [250, 250, 250];
 pub const FAINT: Color = [95, 95, 95];
 
 /// One agent.
-pub struct Agent {
+pub struct Marker {
     pub place: DVec2,
     /// Its heading, of any length but 0.
     pub heading: DVec2,
     /// The leader in whose group it is.
     pub group: Option<usize>,
+    /// Whether its presence at a POI counts.
+    pub counts: bool,
     /// Where it was, up to its place.
     pub trail: Vec<DVec2>,
 }
@@ -76,19 +82,35 @@ pub struct Poi {
     /// How much of what it needs is there, 0 to 1; none before an episode.
     pub share: Option<f64>,
     pub observed: bool,
+    /// Whether enough agents would observe it now: it is its time, and those that it comes after are observed.
+    pub open: bool,
+}
+
+/// A POI's label: what it needs, or has of it, and by its number when it can be observed, where that is not always.
+pub fn poi_label(rule: &Rule, poi: usize, needs: String) -> String {
+    if !rule.is_timed() {
+        return needs;
+    }
+    let window = rule.window(poi).map(|[first, last]| match first == last {
+        true => format!(", step {first}"),
+        false => format!(", steps {first} to {last}"),
+    });
+    let after: Vec<_> = rule.after(poi).iter().map(usize::to_string).collect();
+    let after = if after.is_empty() { String::new() } else { format!(", after {}", after.join(" ")) };
+    format!("{poi}: {needs}{}{after}", window.unwrap_or_default())
 }
 
 /// A team at one moment.
 pub struct Team {
     /// The first of the agents lead.
     pub leaders: usize,
-    pub agents: Vec<Agent>,
+    pub agents: Vec<Marker>,
     pub pois: Vec<Poi>,
 }
 
 /// Where a part of the map is drawn.
 #[derive(Clone, Copy)]
-pub struct View {
+pub struct Viewport {
     left: f64,
     above: f64,
     /// Millimetres a unit of the map.
@@ -101,17 +123,17 @@ pub struct View {
     radius: f64,
 }
 
-impl View {
+impl Viewport {
     /// A part of a config's map, from corner to corner, as large as fits into a square of so many millimetres.
-    pub fn new(config: &Config, [from, to]: [DVec2; 2], side: f64) -> View {
+    pub fn new(config: &Config, [from, to]: [DVec2; 2], side: f64) -> Viewport {
         let scale = side / (to - from).max_element();
         let (map, radius) = (config.world.map.into(), config.world.observation_radius);
-        View { left: 0.0, above: 0.0, scale, from, to, map, radius }
+        Viewport { left: 0.0, above: 0.0, scale, from, to, map, radius }
     }
 
     /// The same view from another upper left corner, in millimetres.
-    pub fn moved_to(self, [left, above]: [f64; 2]) -> View {
-        View { left, above, ..self }
+    pub fn moved_to(self, [left, above]: [f64; 2]) -> Viewport {
+        Viewport { left, above, ..self }
     }
 
     /// Width and height in millimetres.
@@ -150,6 +172,9 @@ impl View {
             let leads = index < team.leaders;
             let size = if leads { size * 1.35 } else { size };
             arrow(scene, self.at(agent.place), agent.heading, size, agent.group, leads);
+            if !agent.counts {
+                strike(scene, self.at(agent.place), agent.heading, size);
+            }
         }
         let mut taken = Vec::new();
         for (poi, ([x, y], size)) in team.pois.iter().zip(labels.into_iter().flatten()) {
@@ -169,6 +194,7 @@ impl View {
         let opacity = if poi.observed { 0.22 } else { 0.06 };
         let dash: &[f64] = match self.radius * self.scale {
             _ if poi.observed => &[],
+            _ if !poi.open => CLOSED,
             small if small < 2.5 => &[0.5, 0.4],
             _ => &[1.0, 0.8],
         };
@@ -288,7 +314,7 @@ impl View {
 
     /// What the signs mean: how each is drawn at a place, and the words for it.
     pub fn legend(&self, teams: &[Team], counts: &str) -> Legend {
-        let mut entries: Vec<Entry> = Vec::new();
+        let mut entries: Vec<Gloss> = Vec::new();
         let Some(team) = teams.first() else { return Legend::default() };
         let mut pois = teams.iter().flat_map(|team| &team.pois);
         let up = DVec2::Y;
@@ -317,7 +343,26 @@ impl View {
                 Box::new(move |scene, [x, y]| scene.circle([x + 1.2, y - 0.8], 1.2, Some(fill), Some(pen.clone()))),
             ));
         }
-        if pois.any(|poi| !poi.observed) {
+        if team.agents.iter().any(|agent| !agent.counts) {
+            let (leads, up) = (!team.agents[0].counts, DVec2::Y);
+            entries.push((
+                3.4,
+                "does not observe".into(),
+                Box::new(move |scene, [x, y]| {
+                    arrow(scene, [x + 1.4, y - 0.8], up, 1.5, None, leads);
+                    strike(scene, [x + 1.4, y - 0.8], up, 1.5);
+                }),
+            ));
+        }
+        if pois.clone().any(|poi| !poi.observed && !poi.open) {
+            let pen = Pen { dash: CLOSED, ..Pen::new(GREY, 0.25) };
+            entries.push((
+                3.0,
+                "POI that cannot be observed now".into(),
+                Box::new(move |scene, [x, y]| scene.circle([x + 1.2, y - 0.8], 1.2, None, Some(pen.clone()))),
+            ));
+        }
+        if pois.any(|poi| !poi.observed && poi.open) {
             let pen = Pen { dash: &[0.7, 0.5], ..Pen::new(GREY, 0.25) };
             entries.push((
                 3.0,
@@ -347,13 +392,13 @@ impl View {
     }
 }
 
-type Entry = (f64, String, Box<dyn Fn(&mut Scene, [f64; 2])>);
+type Gloss = (f64, String, Box<dyn Fn(&mut Scene, [f64; 2])>);
 
 /// What the signs of a map mean.
 #[derive(Default)]
 pub struct Legend {
     /// A sign's width, its words, and how it is drawn from a place on the baseline.
-    entries: Vec<Entry>,
+    entries: Vec<Gloss>,
 }
 
 impl Legend {
@@ -402,30 +447,36 @@ pub fn layout(name: &str, config: &Config) -> Scene {
     let world = World::new(config);
     let heading = DVec2::new(config.world.heading.cos(), config.world.heading.sin());
     let leaders = world.leaders();
-    let agent = |(index, start): (usize, &glam::Vec2)| Agent {
+    let agent = |(index, start): (usize, &glam::Vec2)| Marker {
         place: start.as_dvec2(),
         heading,
         group: (index < leaders).then_some(index),
+        counts: world.rule.counts(index),
         trail: vec![],
     };
-    let poi = |(&place, needed): (&[f64; 2], &u32)| Poi {
+    let none = vec![false; world.pois.len()];
+    let poi = |(poi, (&place, needed)): (usize, (&[f64; 2], &u32))| Poi {
         place: place.into(),
-        label: needed.to_string(),
+        label: poi_label(&world.rule, poi, needed.to_string()),
         share: None,
         observed: false,
+        open: world.rule.is_open(poi, 1, &none),
     };
     let team = Team {
         leaders,
         agents: world.starts.iter().enumerate().map(agent).collect(),
-        pois: config.world.pois.iter().zip(&world.coupling).map(poi).collect(),
+        pois: config.world.pois.iter().zip(&world.coupling).enumerate().map(poi).collect(),
     };
     let map = DVec2::from(config.world.map);
-    let view = View::new(config, [DVec2::ZERO, map], 80.0).moved_to([LEFT, HEAD]);
+    let view = Viewport::new(config, [DVec2::ZERO, map], 80.0).moved_to([LEFT, HEAD]);
     let [width, height] = view.size();
     let radius = config.world.observation_radius;
     let mut legend = view.legend(std::slice::from_ref(&team), "");
     let alike = world.coupling.windows(2).all(|pair| pair[0] == pair[1]);
     let needs = match (world.coupling.first(), view.poi_labels(&team)) {
+        (_, Some(_)) if world.rule.is_timed() => {
+            format!("at a POI: its number, agents it needs within {radius} of it, and when")
+        }
         (_, Some(_)) => format!("number at a POI: agents it needs, within {radius} of it"),
         (Some(&needed), None) if alike => {
             format!("each POI needs {} within {radius} of it", count(needed as usize, "agent"))
@@ -462,16 +513,27 @@ pub fn layout(name: &str, config: &Config) -> Scene {
         let more = if places.len() > 12 { ", …" } else { "" };
         format!("{what} at {}{more}. ", list.join(", "))
     };
+    let who = match config.world.observers {
+        Observers::All => String::new(),
+        observers => format!(" Only {observers} observe."),
+    };
+    let timed = if world.rule.is_timed() { pois_in_words(&world.rule, world.pois.len()) } else { String::new() };
     let starts: Vec<DVec2> = team.agents[..leaders].iter().map(|agent| agent.place).collect();
     let pois: Vec<DVec2> = team.pois.iter().map(|poi| poi.place).collect();
     scene.description = format!(
-        "A map of {} by {} units before any training. {}{}{couplings}, within {radius} of it.",
+        "A map of {} by {} units before any training. {}{}{couplings}, within {radius} of it.{who}{timed}",
         map.x,
         map.y,
         places("Leaders", &starts),
         places("POIs", &pois),
     );
     scene
+}
+
+/// When the first of so many POIs can be observed, for whoever does not see it.
+fn pois_in_words(rule: &Rule, pois: usize) -> String {
+    let list: Vec<_> = (0..pois.min(12)).map(|poi| poi_label(rule, poi, "any time".into())).collect();
+    format!(" POIs can be observed: {}{}.", list.join("; "), if pois > 12 { "; …" } else { "" })
 }
 
 /// "1 leader", "2 leaders".
@@ -488,6 +550,15 @@ fn arrow(scene: &mut Scene, [px, py]: [f64; 2], heading: DVec2, size: f64, group
         // Small ones keep more colour than outline.
         true => scene.polygon(corners, Some(group_color(group).into()), Some(Pen::new(BLACK, (size * 0.1).min(0.2)))),
         false => scene.polygon(corners, Some(WHITE.into()), Some(group_pen(group, 0.35))),
+    }
+}
+
+/// A stroke across the arrow of an agent that does not count.
+fn strike(scene: &mut Scene, [px, py]: [f64; 2], heading: DVec2, size: f64) {
+    let [x, y] = heading.normalize_or(DVec2::Y).to_array();
+    let end = |side: f64| [px - side * size * y, py - side * size * x];
+    for (color, width) in [(WHITE, 0.32), (BLACK, 0.16)] {
+        scene.line(vec![end(1.1), end(-1.1)], Pen::new(color, size * width));
     }
 }
 

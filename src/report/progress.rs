@@ -105,7 +105,7 @@ impl Meter {
 }
 
 /// Shows on standard error how arms train side by side.
-pub struct Progress {
+pub struct Board {
     arms: Vec<Growing>,
     last: usize,
     /// Where this session started.
@@ -171,9 +171,9 @@ impl Growing {
     }
 }
 
-impl Progress {
+impl Board {
     /// Arms by name and number of POIs, which train to generation `last`, this time from generation `from`.
-    pub fn new(arms: Vec<(String, usize)>, from: usize, last: usize, quiet: bool) -> Progress {
+    pub fn new(arms: Vec<(String, usize)>, from: usize, last: usize, quiet: bool) -> Board {
         let parts = vec![(0.0, 0); CURVE.min(last + 1)];
         let arms: Vec<Growing> = arms
             .into_iter()
@@ -181,7 +181,7 @@ impl Progress {
             .collect();
         let pace = Pace::new(quiet);
         let terminal = pace.terminal.then(|| Terminal::new(&arms, from, last));
-        Progress { arms, last, from, pace, terminal }
+        Board { arms, last, from, pace, terminal }
     }
 
     /// Takes in the rows that became complete; `next` is the generation that plays next.

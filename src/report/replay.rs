@@ -11,8 +11,8 @@ use base64::prelude::BASE64_STANDARD;
 use glam::{DVec2, Vec2};
 use serde_json::json;
 
-use super::map::{self, Agent, FAINT, Legend, Poi, Team, View};
-use super::runs::{self, RunError};
+use super::map::{self, FAINT, Legend, Marker, Poi, Team, Viewport};
+use super::runs::{self, ReadError};
 use super::scene::{Anchor, BLACK, Color, Scene};
 use crate::backend::{Backend, BackendError, Episode, Group, Need, Seen, Strided, Trace};
 use crate::config::Config;
@@ -32,7 +32,7 @@ const EXACT_BYTES: usize = 600_000;
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
     #[error(transparent)]
-    Run(#[from] RunError),
+    Run(#[from] ReadError),
     #[error(transparent)]
     Backend(#[from] BackendError),
     #[error("{folder} has no trial {trial}: its config has {trials}, 0 to {}", trials - 1)]
@@ -53,7 +53,7 @@ pub enum ReplayError {
 }
 
 /// One team's episode, with what it was worth.
-pub struct Played {
+pub struct Replayed {
     pub trial: usize,
     pub generation: usize,
     /// Index of the team among those of its generation.
@@ -73,16 +73,16 @@ pub struct Played {
 }
 
 /// The metrics of one trial.
-pub struct Rows {
+pub struct History {
     pub best_g: Vec<Option<f64>>,
 }
 
-impl Rows {
+impl History {
     /// Reads a trial's best G by generation.
     ///
     /// # Errors
     /// The metrics cannot be read.
-    pub fn read(folder: &Path, config: &Config, trial: usize) -> Result<Rows, RunError> {
+    pub fn read(folder: &Path, config: &Config, trial: usize) -> Result<History, ReadError> {
         let mut best_g = Vec::new();
         runs::metrics(folder, config, |row| {
             if row.trial == trial {
@@ -92,7 +92,7 @@ impl Rows {
                 best_g[row.generation] = Some(row.best_g);
             }
         })?;
-        Ok(Rows { best_g })
+        Ok(History { best_g })
     }
 
     /// The newest generation that has a row.
@@ -118,14 +118,14 @@ pub fn replay(
     generations: &[usize],
     backend: &mut dyn Backend,
     watch: &mut dyn FnMut(usize) -> bool,
-) -> Result<Vec<Played>, ReplayError> {
+) -> Result<Vec<Replayed>, ReplayError> {
     let name = || folder.display().to_string();
     let config = runs::config(folder)?;
     let trials = config.learning.trials;
     if trial >= trials {
         return Err(ReplayError::NoTrial { folder: name(), trial, trials });
     }
-    let rows = Rows::read(folder, &config, trial)?;
+    let rows = History::read(folder, &config, trial)?;
     let newest = rows.newest();
     for &generation in generations {
         if rows.get(generation).is_none() {
@@ -134,7 +134,7 @@ pub fn replay(
     }
     let mut order: Vec<usize> = (0..generations.len()).collect();
     order.sort_by_key(|&index| generations[index]);
-    let mut played: Vec<Option<Played>> = generations.iter().map(|_| None).collect();
+    let mut played: Vec<Option<Replayed>> = generations.iter().map(|_| None).collect();
     let mut trainer = Trainer::of_trial(config.clone(), trial);
     for index in order {
         let generation = generations[index];
@@ -193,7 +193,7 @@ fn play_best(
     trainer: &mut Trainer,
     trial: usize,
     backend: &mut dyn Backend,
-) -> Result<Played, ReplayError> {
+) -> Result<Replayed, ReplayError> {
     use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
     let learning = &config.learning;
     let (generation, world) = (trainer.generation(0), trainer.world(0).clone());
@@ -213,7 +213,7 @@ fn play_best(
     let groups: Vec<Group<'_>> = starts.iter().map(|starts| group(starts, &teams)).collect();
     let observed: Vec<AtomicU32> = std::iter::repeat_with(AtomicU32::default).take(population).collect();
     backend.rollout(&groups, &|episode: Episode<'_>| {
-        let seen = first_observed(&world, &episode.sets).iter().flatten().count();
+        let seen = credit::observed_at(episode.sets, &world).iter().flatten().count();
         observed[episode.team].fetch_add(seen as u32, Relaxed);
     })?;
     let (mut team, mut most) = (0, 0);
@@ -234,27 +234,20 @@ fn play_best(
     let scores = Credit::default().all(&episode, &world);
     let mut owner = Vec::new();
     credit::assign(&episode.seen, &world, &mut owner);
-    let observed = first_observed(&world, &episode.sets);
+    let observed = credit::observed_at(episode.sets, &world);
     let episodes = starts.len();
     let world = World { pois: moved.unwrap_or(world.pois.clone()), ..world };
-    Ok(Played { trial, generation, team, best_g, episodes, scores, owner, observed, trace, world })
+    Ok(Replayed { trial, generation, team, best_g, episodes, scores, owner, observed, trace, world })
 }
 
-/// The step (from 1) at which each POI first had as many agents near as it needs.
-fn first_observed(world: &World, sets: &Strided<'_>) -> Vec<Option<usize>> {
-    let pois = world.pois.len();
-    let first = |poi| (0..world.steps()).find(|&step| near(world, sets, step * pois + poi) >= world.coupling[poi]);
-    (0..pois).map(|poi| first(poi).map(|step| step + 1)).collect()
-}
-
-/// Agents in one set.
+/// Observers in one set.
 fn near(world: &World, sets: &Strided<'_>, set: usize) -> u32 {
     let words = world.constants.words as usize;
-    (set * words..(set + 1) * words).map(|word| sets.get(word).count_ones()).sum()
+    world.rule.count((set * words..(set + 1) * words).map(|word| sets.get(word)))
 }
 
-impl Played {
-    /// Agents near a POI after a step, 0 at the start.
+impl Replayed {
+    /// Observers near a POI after a step, 0 at the start.
     pub fn near(&self, step: usize, poi: usize) -> u32 {
         let sets = Strided { words: &self.trace.sets, stride: 1, offset: 0 };
         step.checked_sub(1).map_or(0, |step| near(&self.world, &sets, step * self.world.pois.len() + poi))
@@ -283,15 +276,19 @@ impl Played {
             let place = at(step, agent).lerp(at(next, agent), part);
             trail.push(place);
             let group = (self.owner[agent] != credit::NOBODY).then_some(self.owner[agent] as usize);
-            Agent { place, heading: toward(step, agent).lerp(toward(next, agent), part), group, trail }
+            let counts = world.rule.counts(agent);
+            Marker { place, heading: toward(step, agent).lerp(toward(next, agent), part), group, counts, trail }
         };
+        // What a step finds observed.
+        let before: Vec<bool> = self.observed.iter().map(|at| at.is_some_and(|at| at < step.max(1))).collect();
         let poi = |(poi, place): (usize, &Vec2)| {
             let (near, needed) = (self.near(step, poi), world.coupling[poi]);
             Poi {
                 place: place.as_dvec2(),
-                label: format!("{near}/{needed}"),
+                label: map::poi_label(&world.rule, poi, format!("{near}/{needed}")),
                 share: Some(f64::from(near) / f64::from(needed)),
                 observed: self.observed[poi].is_some_and(|observed| observed <= step),
+                open: world.rule.is_open(poi, step.max(1) as u32, &before),
             }
         };
         Team {
@@ -334,7 +331,7 @@ impl Played {
 }
 
 /// A page that plays episodes of one run, side by side; `name` is the run's.
-pub fn page(name: &str, config: &Config, played: &[Played]) -> String {
+pub fn page(name: &str, config: &Config, played: &[Replayed]) -> String {
     let count = played.len().max(1);
     let size = |per_agent: usize, world: &World| world.agents() * per_agent + world.pois.len() * 2;
     let exact = played.iter().map(|p| (p.world.steps() + 1) * size(16, &p.world)).sum::<usize>() <= EXACT_BYTES;
@@ -353,6 +350,9 @@ pub fn page(name: &str, config: &Config, played: &[Played]) -> String {
         "map": world.map,
         "pois": world.pois,
         "observation_radius": world.observation_radius,
+        "observers": world.observers,
+        "windows": world.windows,
+        "after": world.after,
         "attraction_radius": config.follow.attraction_radius,
         "dt": world.dt,
         "steps": world.steps,
@@ -370,8 +370,8 @@ fn hex(colors: &[Color]) -> Vec<String> {
 }
 
 /// One episode as the page reads it: motion as base64 of little-endian numbers, `[shown][agents]`.
-fn episode(played: &Played, shown: &[usize], exact: bool) -> serde_json::Value {
-    let Played { world, scores, .. } = played;
+fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value {
+    let Replayed { world, scores, .. } = played;
     let map = world.map().to_array();
     let (mut positions, mut headings, mut near) = (Vec::new(), Vec::new(), Vec::new());
     for &step in shown {
@@ -413,26 +413,26 @@ fn episode(played: &Played, shown: &[usize], exact: bool) -> serde_json::Value {
 }
 
 /// Episodes side by side, to be drawn at any of their moments.
-struct Stage<'a> {
-    played: &'a [Played],
-    view: View,
+struct Screen<'a> {
+    played: &'a [Replayed],
+    view: Viewport,
     width: f64,
     legend: Legend,
 }
 
-impl<'a> Stage<'a> {
+impl<'a> Screen<'a> {
     const SIDE: f64 = 80.0;
     const EDGE: f64 = 2.5;
     const HEAD: f64 = 9.0;
 
     /// `note` stands below the pictures, among what their signs mean.
-    fn new(config: &Config, played: &'a [Played], note: Option<String>) -> Stage<'a> {
-        let view = View::new(config, busy(config, played), Self::SIDE);
+    fn new(config: &Config, played: &'a [Replayed], note: Option<String>) -> Screen<'a> {
+        let view = Viewport::new(config, busy(config, played), Self::SIDE);
         let width = view.size()[0].max(60.0);
         let teams: Vec<Team> = played.iter().map(|played| played.team(played.world.steps() as f64)).collect();
         let mut legend = view.legend(&teams, "2/3: 2 agents near of 3 needed");
         note.into_iter().for_each(|note| legend.note(note));
-        Stage { played, view, width, legend }
+        Screen { played, view, width, legend }
     }
 
     /// The picture `place` steps from the start; between steps, motion is drawn straight.
@@ -469,13 +469,13 @@ impl<'a> Stage<'a> {
 }
 
 /// Episodes side by side after a step, each with its trails up to there.
-pub fn still(config: &Config, played: &[Played], step: usize) -> Scene {
-    Stage::new(config, played, None).scene(step as f64)
+pub fn still(config: &Config, played: &[Replayed], step: usize) -> Scene {
+    Screen::new(config, played, None).scene(step as f64)
 }
 
 /// The part of the map, from corner to corner, where anything happens in any of the episodes, at least half as high as
 /// wide or the other way round.
-fn busy(config: &Config, played: &[Played]) -> [DVec2; 2] {
+fn busy(config: &Config, played: &[Replayed]) -> [DVec2; 2] {
     let map = DVec2::from(config.world.map);
     let around = |at: DVec2, margin: f64| [at - margin, at + margin];
     let pois = config.world.pois.iter().map(|&poi| around(poi.into(), config.world.observation_radius + 1.0));
@@ -495,7 +495,7 @@ fn busy(config: &Config, played: &[Played]) -> [DVec2; 2] {
 
 /// How a moving picture is made: pixels across, and pictures a second.
 #[derive(Clone, Copy, Debug)]
-pub struct Motion {
+pub struct Film {
     /// As many as fit into 960 by 720 pixels where it is not given.
     pub width: Option<u32>,
     pub fps: u32,
@@ -507,7 +507,7 @@ const LONGEST: f64 = 15.0;
 
 /// The pictures of a moving picture, one after the other.
 pub struct Frames<'a> {
-    stage: Stage<'a>,
+    stage: Screen<'a>,
     /// Steps from the start, of each picture.
     pub places: Vec<f64>,
     per_mm: f64,
@@ -515,7 +515,7 @@ pub struct Frames<'a> {
 
 impl<'a> Frames<'a> {
     /// Frames of these episodes, as fast as `motion` says.
-    pub fn new(config: &Config, played: &'a [Played], motion: Motion) -> Frames<'a> {
+    pub fn new(config: &Config, played: &'a [Replayed], motion: Film) -> Frames<'a> {
         let steps = played.first().map_or(0, |first| first.world.steps()) as f64;
         let seconds = steps * config.world.dt;
         let times = [1.0, 2.0, 4.0, 5.0, 8.0, 10.0, 16.0, 20.0, 32.0, 50.0];
@@ -528,7 +528,7 @@ impl<'a> Frames<'a> {
             note += if note.is_empty() { "" } else { "; " };
             note += "motion between steps is drawn straight";
         }
-        let stage = Stage::new(config, played, Some(note).filter(|note| !note.is_empty()));
+        let stage = Screen::new(config, played, Some(note).filter(|note| !note.is_empty()));
         let Scene { width, height, .. } = stage.scene(0.0);
         let per_mm = motion.width.map_or((960.0 / width).min(720.0 / height), |pixels| f64::from(pixels) / width);
         Frames { stage, places, per_mm }
@@ -544,7 +544,7 @@ impl<'a> Frames<'a> {
 ///
 /// # Errors
 /// The encoder refused, which it does for want of memory alone.
-pub fn gif(config: &Config, played: &[Played], motion: Motion) -> std::io::Result<Vec<u8>> {
+pub fn gif(config: &Config, played: &[Replayed], motion: Film) -> std::io::Result<Vec<u8>> {
     let frames = Frames::new(config, played, motion);
     let picture = |place: f64| {
         let (scene, per_mm) = frames.scene(place);

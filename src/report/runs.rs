@@ -3,7 +3,7 @@
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use super::curves::{Curve, Figure, Panel, Tally};
+use super::curves::{Average, Curve, Figure, Panel};
 use crate::config::{Config, ConfigError};
 use crate::file;
 use crate::record::RecordError;
@@ -16,7 +16,7 @@ pub const MAX_RUNS: usize = 24;
 
 /// Why a run could not be shown.
 #[derive(Debug, thiserror::Error)]
-pub enum RunError {
+pub enum ReadError {
     #[error("{0}: no such folder")]
     Missing(PathBuf),
     #[error("{0} is a file; name the folder of a run")]
@@ -37,23 +37,23 @@ pub enum RunError {
 ///
 /// # Errors
 /// The folder is not there, is no run's, or its config is damaged.
-pub fn config(folder: &Path) -> Result<Config, RunError> {
+pub fn config(folder: &Path) -> Result<Config, ReadError> {
     let kind = std::fs::metadata(folder).map_err(|error| match error.kind() {
-        ErrorKind::NotFound => RunError::Missing(folder.into()),
-        _ => RunError::Record(RecordError::Read { path: folder.into(), error }),
+        ErrorKind::NotFound => ReadError::Missing(folder.into()),
+        _ => ReadError::Record(RecordError::Read { path: folder.into(), error }),
     })?;
     if !kind.is_dir() {
-        return Err(RunError::NoFolder(folder.into()));
+        return Err(ReadError::NoFolder(folder.into()));
     }
     let path = folder.join(CONFIG);
     if !seen(&path)? {
         if let Some(what) = folder::collection(folder) {
             let example = if what == "a sweep" { "points/0000" } else { "arms/chaotic-leader-follower-Df" };
-            return Err(RunError::Collection { folder: folder.into(), what, example });
+            return Err(ReadError::Collection { folder: folder.into(), what, example });
         }
-        return Err(RunError::Foreign { folder: folder.into(), name: CONFIG });
+        return Err(ReadError::Foreign { folder: folder.into(), name: CONFIG });
     }
-    Config::load(&path).map_err(|error| RunError::Config { folder: folder.into(), error })
+    Config::load(&path).map_err(|error| ReadError::Config { folder: folder.into(), error })
 }
 
 /// Whether a file is there; an error where that cannot be seen.
@@ -65,13 +65,13 @@ fn seen(path: &Path) -> Result<bool, RecordError> {
 ///
 /// # Errors
 /// There are none yet, or they are not this run's.
-pub fn metrics(folder: &Path, config: &Config, mut each: impl FnMut(&Row)) -> Result<(), RunError> {
+pub fn metrics(folder: &Path, config: &Config, mut each: impl FnMut(&Row)) -> Result<(), ReadError> {
     let path = folder.join(METRICS);
-    let unfinished = |reason: String| RunError::Unfinished { folder: folder.into(), reason };
+    let unfinished = |reason: String| ReadError::Unfinished { folder: folder.into(), reason };
     if !seen(&path)? {
         return Err(unfinished(format!("it has no {METRICS} yet")));
     }
-    let damaged = |reason: String| RunError::Record(RecordError::Damaged { path: path.clone(), reason });
+    let damaged = |reason: String| ReadError::Record(RecordError::Damaged { path: path.clone(), reason });
     let mut count = 0;
     for row in metrics::open(&path)? {
         let row = match row {
@@ -97,9 +97,9 @@ pub fn metrics(folder: &Path, config: &Config, mut each: impl FnMut(&Row)) -> Re
 /// What a run's metrics came to, by generation: shares of the POIs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Courses {
-    pub best: Vec<Tally>,
-    pub mean: Vec<Tally>,
-    pub champion: Vec<Tally>,
+    pub best: Vec<Average>,
+    pub mean: Vec<Average>,
+    pub champion: Vec<Average>,
 }
 
 impl Courses {
@@ -107,7 +107,7 @@ impl Courses {
     ///
     /// # Errors
     /// See [`metrics()`].
-    pub fn read(folder: &Path, config: &Config) -> Result<Courses, RunError> {
+    pub fn read(folder: &Path, config: &Config) -> Result<Courses, ReadError> {
         let mut courses = Courses { best: vec![], mean: vec![], champion: vec![] };
         metrics(folder, config, |row| {
             for (course, g) in [
@@ -116,7 +116,7 @@ impl Courses {
                 (&mut courses.champion, row.champion_g),
             ] {
                 if course.len() <= row.generation {
-                    course.resize(row.generation + 1, Tally::default());
+                    course.resize(row.generation + 1, Average::default());
                 }
                 course[row.generation].add(g);
             }
@@ -129,7 +129,7 @@ impl Courses {
 ///
 /// # Errors
 /// See [`metrics()`]; or a trial's rows are not in order.
-pub fn trials(folder: &Path, config: &Config) -> Result<Vec<Vec<[f64; 2]>>, RunError> {
+pub fn trials(folder: &Path, config: &Config) -> Result<Vec<Vec<[f64; 2]>>, ReadError> {
     let mut trials = vec![vec![]; config.learning.trials];
     let mut skipped = None;
     metrics(folder, config, |row| match &mut trials[row.trial] {
@@ -138,7 +138,7 @@ pub fn trials(folder: &Path, config: &Config) -> Result<Vec<Vec<[f64; 2]>>, RunE
     })?;
     match skipped {
         None => Ok(trials),
-        Some((trial, generation)) => Err(RunError::Record(RecordError::Damaged {
+        Some((trial, generation)) => Err(ReadError::Record(RecordError::Damaged {
             path: folder.join(METRICS),
             reason: format!("trial {trial} of generation {generation} is out of turn"),
         })),
@@ -149,14 +149,14 @@ pub fn trials(folder: &Path, config: &Config) -> Result<Vec<Vec<[f64; 2]>>, RunE
 ///
 /// # Errors
 /// A run cannot be read.
-pub fn figure(folders: &[PathBuf]) -> Result<Figure, RunError> {
+pub fn figure(folders: &[PathBuf]) -> Result<Figure, ReadError> {
     let configs = folders.iter().map(|folder| config(folder)).collect::<Result<Vec<_>, _>>()?;
     let all = folders.iter().zip(&configs).map(|(folder, config)| Courses::read(folder, config));
     let all = all.collect::<Result<Vec<_>, _>>()?;
     let pois = configs.first().map_or(1, |config| config.world.pois.len());
     let same = configs.iter().all(|config| config.world.pois.len() == pois);
     let scale = if same { pois as f64 } else { 1.0 };
-    let curve = |tallies: &[Tally]| Curve::new(tallies).scaled(scale);
+    let curve = |tallies: &[Average]| Curve::new(tallies).scaled(scale);
     let (legend, curves): (Vec<String>, Vec<Curve>) = match &*all {
         [Courses { best, mean, champion }] => [("best team", best), ("champion", champion), ("mean team", mean)]
             .map(|(label, tallies)| (label.to_string(), curve(tallies)))
@@ -180,8 +180,9 @@ pub fn figure(folders: &[PathBuf]) -> Result<Figure, RunError> {
 ///
 /// # Errors
 /// A run cannot be read.
-pub fn paired(folders: &[PathBuf]) -> Result<bool, RunError> {
-    let seeds = folders.iter().map(|folder| Ok(config(folder)?.learning.seed)).collect::<Result<Vec<_>, RunError>>()?;
+pub fn paired(folders: &[PathBuf]) -> Result<bool, ReadError> {
+    let seeds =
+        folders.iter().map(|folder| Ok(config(folder)?.learning.seed)).collect::<Result<Vec<_>, ReadError>>()?;
     Ok(seeds.len() > 1 && seeds.iter().all(|seed| *seed == seeds[0]))
 }
 

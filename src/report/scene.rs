@@ -117,28 +117,28 @@ pub struct Scene {
 
 /// What a picture is written as.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
+pub enum Format {
     Svg,
     Png,
     Pdf,
 }
 
-impl Kind {
+impl Format {
     /// Every kind.
-    pub const ALL: [Kind; 3] = [Kind::Svg, Kind::Png, Kind::Pdf];
+    pub const ALL: [Format; 3] = [Format::Svg, Format::Png, Format::Pdf];
 
     /// By the end of a file's name.
-    pub fn of(path: &std::path::Path) -> Option<Kind> {
+    pub fn of(path: &std::path::Path) -> Option<Format> {
         let extension = path.extension()?.to_ascii_lowercase();
-        Kind::ALL.into_iter().find(|kind| extension == kind.extension())
+        Format::ALL.into_iter().find(|kind| extension == kind.extension())
     }
 
     /// A file's ending, without its dot.
     pub fn extension(self) -> &'static str {
         match self {
-            Kind::Svg => "svg",
-            Kind::Png => "png",
-            Kind::Pdf => "pdf",
+            Format::Svg => "svg",
+            Format::Png => "png",
+            Format::Pdf => "pdf",
         }
     }
 }
@@ -207,14 +207,14 @@ impl Scene {
     }
 
     fn write_svg(&self, svg: &mut String) -> std::fmt::Result {
-        let [width, height] = [self.width, self.height].map(|side| Number(side * SVG_UNITS));
+        let [width, height] = [self.width, self.height].map(|side| Rounded(side * SVG_UNITS));
         writeln!(
             svg,
             "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{}mm\" height=\"{}mm\" viewBox=\"0 0 {width} {height}\" \
              xmlns:xlink=\"http://www.w3.org/1999/xlink\" stroke-linejoin=\"round\" role=\"img\" \
              aria-labelledby=\"title description\">\n<title id=\"title\">{}</title>\n<desc id=\"description\">{}</desc>",
-            Number(self.width),
-            Number(self.height),
+            Rounded(self.width),
+            Rounded(self.height),
             Escaped(&self.title),
             Escaped(&self.description),
         )?;
@@ -234,7 +234,7 @@ impl Scene {
                 Mark::Shape { points, closed, fill, pen } => {
                     write!(svg, "<{} points=\"", if *closed { "polygon" } else { "polyline" })?;
                     for (index, point) in points.iter().enumerate() {
-                        let [x, y] = point.map(|at| Number((at * SVG_UNITS * 10.0).round() / 10.0));
+                        let [x, y] = point.map(|at| Rounded((at * SVG_UNITS * 10.0).round() / 10.0));
                         write!(svg, "{}{x},{y}", if index == 0 { "" } else { " " })?;
                     }
                     svg.push('"');
@@ -242,14 +242,14 @@ impl Scene {
                     svg.push_str("/>\n");
                 }
                 Mark::Circle { center, radius, fill, pen } => {
-                    let [x, y, radius] = [center[0], center[1], *radius].map(|at| Number(at * SVG_UNITS));
+                    let [x, y, radius] = [center[0], center[1], *radius].map(|at| Rounded(at * SVG_UNITS));
                     write!(svg, "<circle cx=\"{x}\" cy=\"{y}\" r=\"{radius}\"")?;
                     paint_svg(svg, fill.as_ref(), pen.as_ref())?;
                     svg.push_str("/>\n");
                 }
                 Mark::Text { place, text, size, anchor, color, upright, bold } => {
                     let (glyphs, length) = letters::set(text);
-                    let [x, y] = place.map(|at| Number(at * SVG_UNITS));
+                    let [x, y] = place.map(|at| Rounded(at * SVG_UNITS));
                     let start = match anchor {
                         Anchor::Start => 0,
                         Anchor::Middle => -i64::from(length / 2),
@@ -258,7 +258,7 @@ impl Scene {
                     write!(svg, "<g aria-label=\"{}\" fill=\"{}\"", Escaped(text), hex(*color))?;
                     if *bold {
                         // The font has one weight; an outline makes it the other.
-                        let width = Number(letters::units_per_em() * BOLD);
+                        let width = Rounded(letters::units_per_em() * BOLD);
                         write!(svg, " stroke=\"{}\" stroke-width=\"{width}\"", hex(*color))?;
                     }
                     let turn = if *upright { " rotate(-90)" } else { "" };
@@ -273,7 +273,7 @@ impl Scene {
                     if std::mem::replace(&mut clipped, area.is_some()) {
                         svg.push_str("</g>\n");
                     }
-                    if let Some([x, y, width, height]) = area.map(|area| area.map(|at| Number(at * SVG_UNITS))) {
+                    if let Some([x, y, width, height]) = area.map(|area| area.map(|at| Rounded(at * SVG_UNITS))) {
                         clips += 1;
                         writeln!(
                             svg,
@@ -373,11 +373,11 @@ impl Scene {
     ///
     /// # Errors
     /// An encoder refused, which it does for want of memory alone.
-    pub fn file(&self, kind: Kind, per_mm: f64) -> std::io::Result<Vec<u8>> {
+    pub fn file(&self, kind: Format, per_mm: f64) -> std::io::Result<Vec<u8>> {
         match kind {
-            Kind::Svg => Ok(self.svg().into_bytes()),
-            Kind::Png => self.png(per_mm),
-            Kind::Pdf => Ok(self.pdf()),
+            Format::Svg => Ok(self.svg().into_bytes()),
+            Format::Png => self.png(per_mm),
+            Format::Pdf => Ok(self.pdf()),
         }
     }
 }
@@ -417,18 +417,18 @@ fn paint_svg(svg: &mut String, fill: Option<&Fill>, pen: Option<&Pen>) -> std::f
         Some(Fill { color, opacity }) => {
             write!(svg, " fill=\"{}\"", hex(*color))?;
             if *opacity < 1.0 {
-                write!(svg, " fill-opacity=\"{}\"", Number(*opacity))?;
+                write!(svg, " fill-opacity=\"{}\"", Rounded(*opacity))?;
             }
         }
     }
     if let Some(Pen { color, width, dash, opacity }) = pen {
-        write!(svg, " stroke=\"{}\" stroke-width=\"{}\"", hex(*color), Number(width * SVG_UNITS))?;
+        write!(svg, " stroke=\"{}\" stroke-width=\"{}\"", hex(*color), Rounded(width * SVG_UNITS))?;
         if !dash.is_empty() {
-            let dashes: Vec<_> = dash.iter().map(|length| Number(length * SVG_UNITS).to_string()).collect();
+            let dashes: Vec<_> = dash.iter().map(|length| Rounded(length * SVG_UNITS).to_string()).collect();
             write!(svg, " stroke-dasharray=\"{}\"", dashes.join(" "))?;
         }
         if *opacity < 1.0 {
-            write!(svg, " stroke-opacity=\"{}\"", Number(*opacity))?;
+            write!(svg, " stroke-opacity=\"{}\"", Rounded(*opacity))?;
         }
     }
     Ok(())
@@ -439,9 +439,9 @@ fn hex([r, g, b]: Color) -> String {
 }
 
 /// Printed with two digits after the point at most, and none that say nothing. (A tenth of a unit is 0.01 mm.)
-struct Number(f64);
+struct Rounded(f64);
 
-impl std::fmt::Display for Number {
+impl std::fmt::Display for Rounded {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let text = format!("{:.2}", self.0);
         f.write_str(text.trim_end_matches('0').trim_end_matches('.'))

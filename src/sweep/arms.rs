@@ -10,7 +10,7 @@ const SEED: &str = "learning.seed";
 
 /// Points that differ in the values of one axis, and in seeds.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Group<'a> {
+pub struct Series<'a> {
     /// What they have in common: "coupling 3, fitness Df". Empty where there is no other axis.
     pub place: String,
     /// By the axis's value: "repulsion_gain 2.0".
@@ -24,7 +24,7 @@ impl Sweep {
     }
 
     /// The points by the values of an axis, a group for each combination of the other axes that has two or more of them.
-    pub fn arms(&self, by: usize) -> Vec<Group<'_>> {
+    pub fn arms(&self, by: usize) -> Vec<Series<'_>> {
         let told =
             |axis: &Axis, value: usize| escape::line(&format!("{} {}", axis.leaf(), axis.label(value))).to_string();
         let mut groups: BTreeMap<Vec<usize>, BTreeMap<usize, Vec<&Point>>> = BTreeMap::new();
@@ -42,7 +42,7 @@ impl Sweep {
             let place: Vec<_> = others.map(|(_, (axis, value))| told(axis, value)).collect();
             let arms = arms.into_iter().map(|(value, points)| (told(&self.axes[by], value), points));
             let place = if many && place.is_empty() { "as in the file".into() } else { place.join(", ") };
-            Group { place, arms: arms.collect() }
+            Series { place, arms: arms.collect() }
         });
         groups.collect()
     }

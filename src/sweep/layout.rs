@@ -104,18 +104,18 @@ pub(super) fn conflicts(grid: &Grid, base: &Table) -> Vec<Problem> {
 }
 
 /// How a sweep's points are laid out.
-pub(super) struct Layout {
+pub(super) struct Arrangement {
     axes: Option<[Option<usize>; 2]>,
     places: Vec<[i32; 2]>,
     pois: bool,
     map: bool,
 }
 
-impl Layout {
-    pub(super) fn of(grid: &Grid, base: &Table) -> Layout {
+impl Arrangement {
+    pub(super) fn of(grid: &Grid, base: &Table) -> Arrangement {
         let axes = AXES.map(|key| grid.axes.iter().position(|(axis, _)| axis.key == key));
         let used = axes.iter().any(Option::is_some);
-        Layout {
+        Arrangement {
             axes: used.then_some(axes),
             places: if used { places() } else { vec![] },
             pois: !says(grid, base, "world.pois"),

@@ -146,7 +146,7 @@ impl Sweep {
             return Err(invalid(name, problems));
         }
 
-        let layout = layout::Layout::of(&grid, &base);
+        let layout = layout::Arrangement::of(&grid, &base);
         let tried: Vec<_> = (0..total)
             .map(|index| {
                 let values = grid.values(index);

@@ -3,13 +3,13 @@
 
 use std::path::Path;
 
-use super::results::{Missing, Options, Outcome, mean_and_error};
+use super::results::{Detail, Missing, Outcome, mean_and_error};
 use super::{Axis, Point, Sweep};
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::report::curves::{Curve, PRINT, SMALL, distinct};
-use crate::report::grid::{Cell, Curves, Dots, HeatMap, Scale, Spread};
-use crate::report::scene::Kind;
+use crate::report::grid::{Cell, Curves, Dots, HeatMap, Interval, Scale};
+use crate::report::scene::Format;
 
 /// Most values of an axis, and most panels, that a figure has room for.
 const MAX_VALUES: usize = 40;
@@ -20,14 +20,14 @@ const MAX_ROWS: usize = 100;
 const LONGEST: f64 = 36.0;
 
 /// A point that is done and what it came to, none where there is none.
-type Place<'a> = Option<(&'a Point, &'a Outcome)>;
+type Spot<'a> = Option<(&'a Point, &'a Outcome)>;
 
 /// The points by the values of two axes, with a panel for each combination of the others.
-struct Grid<'a> {
+struct Facets<'a> {
     x: &'a Axis,
     y: Option<&'a Axis>,
     /// Title, and the points `[y][x]`, with what they came to.
-    panels: Vec<(String, Vec<Place<'a>>)>,
+    panels: Vec<(String, Vec<Spot<'a>>)>,
 }
 
 /// Draws the figures of the points that are done, over one or two axes; gives the files' names, and what was left out.
@@ -37,18 +37,18 @@ struct Grid<'a> {
 pub fn draw(
     sweep: &Sweep,
     outcomes: &[Result<Outcome, Missing>],
-    options: &Options,
+    options: &Detail,
     axes: &[usize],
     out: &Path,
 ) -> Result<(Vec<String>, Option<String>), RecordError> {
     let scenes = if sweep.axes.iter().any(|axis| axis.varied) {
         dots(sweep, outcomes).map(|dots| vec![("final", dots.scene())])
     } else {
-        let of_grid = |grid: Grid<'_>| {
+        let of_grid = |grid: Facets<'_>| {
             let (last, reach) = (grid.last().scene(), grid.reach(options).scene());
             vec![("final", last), ("reach", reach), ("curves", grid.curves(sweep).scene())]
         };
-        Grid::new(sweep, outcomes, axes).map(of_grid)
+        Facets::new(sweep, outcomes, axes).map(of_grid)
     };
     let scenes = match scenes {
         Ok(scenes) => scenes,
@@ -57,7 +57,7 @@ pub fn draw(
     let disk = Disk::default();
     let mut names = Vec::new();
     for (name, scene) in scenes {
-        for kind in Kind::ALL {
+        for kind in Format::ALL {
             let name = format!("{name}.{}", kind.extension());
             let path = out.join(&name);
             let bytes = scene.file(kind, PRINT);
@@ -96,7 +96,7 @@ fn dots(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>]) -> Result<Dots, St
         }
         let Ok(outcome) = outcome else { continue };
         let (mean, error) = mean_and_error(&outcome.best);
-        let spread: Spread = [mean, mean - 2.0 * error, mean + 2.0 * error];
+        let spread: Interval = [mean, mean - 2.0 * error, mean + 2.0 * error];
         let mut row = 0;
         let changed = varied.iter().find_map(|&axis| {
             let value = point.values[axis];
@@ -115,9 +115,9 @@ fn group(axis: &Axis) -> (String, Vec<String>) {
     (format!("{label} ({})", values[0]), values[1..].to_vec())
 }
 
-impl<'a> Grid<'a> {
+impl<'a> Facets<'a> {
     /// The points by the axes asked for, or by the first two that have more than one value.
-    fn new(sweep: &'a Sweep, outcomes: &'a [Result<Outcome, Missing>], asked: &[usize]) -> Result<Grid<'a>, String> {
+    fn new(sweep: &'a Sweep, outcomes: &'a [Result<Outcome, Missing>], asked: &[usize]) -> Result<Facets<'a>, String> {
         let varied = (0..sweep.axes.len()).filter(|&axis| sweep.axes[axis].values.len() > 1 && !asked.contains(&axis));
         let wanted = if asked.is_empty() { 2 } else { asked.len() };
         let mut axes: Vec<usize> = asked.iter().copied().chain(varied).take(wanted).collect();
@@ -157,11 +157,11 @@ impl<'a> Grid<'a> {
             let panel = others.iter().fold(0, |panel, &axis| panel * counts(axis) + point.values[axis]);
             panels[panel].1[y.map_or(0, |y| point.values[y]) * counts(x) + point.values[x]] = Some((point, outcome));
         }
-        Ok(Grid { x: &sweep.axes[x], y: y.map(|y| &sweep.axes[y]), panels })
+        Ok(Facets { x: &sweep.axes[x], y: y.map(|y| &sweep.axes[y]), panels })
     }
 
     fn heat_map(&self, title: String, key: Vec<(f64, String)>, cell: impl Fn(&Point, &Outcome) -> Cell) -> HeatMap {
-        let cells = |points: &Vec<Place<'_>>| {
+        let cells = |points: &Vec<Spot<'_>>| {
             points.iter().map(|at| at.map_or(Cell::Empty, |(point, outcome)| cell(point, outcome))).collect()
         };
         HeatMap {
@@ -183,7 +183,7 @@ impl<'a> Grid<'a> {
     }
 
     /// Generations to reach a G, shaded by their logarithm.
-    fn reach(&self, options: &Options) -> HeatMap {
+    fn reach(&self, options: &Detail) -> HeatMap {
         let all = self.panels.iter().flat_map(|(_, points)| points).flatten();
         let last = all.map(|(point, _)| point.config.learning.generations).max().unwrap_or(0).max(1) as f64;
         let place = |generation: f64| generation.ln_1p() / last.ln_1p();
@@ -204,7 +204,7 @@ impl<'a> Grid<'a> {
         let mut panels = Vec::new();
         for row in 0..self.y.map_or(1, |y| y.values.len()) {
             for (title, points) in &self.panels {
-                let curve = |(value, at): (usize, &Place<'_>)| {
+                let curve = |(value, at): (usize, &Spot<'_>)| {
                     let outcome = (*at)?.1;
                     let mut curve = Curve { trials: outcome.best.len() as u32, ..Curve::default() };
                     for &(generation, mean, error) in &outcome.curve {

@@ -14,7 +14,7 @@ use crate::trainer::Row;
 
 /// What [`write()`] makes of the points that are complete.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Options {
+pub struct Detail {
     /// Every how many generations `results.csv` has a row; the last always has one.
     pub every: usize,
     /// The G (in 0..1) whose first generation is told.
@@ -27,7 +27,7 @@ pub struct Outcome {
     /// Best G in the last generation of every trial, and its champion's.
     pub best: Vec<f64>,
     pub champion: Vec<f64>,
-    /// The first generation of every trial whose best G is at least [`Options::reach`].
+    /// The first generation of every trial whose best G is at least [`Detail::reach`].
     pub reached: Vec<Option<usize>>,
     /// Generation, mean and standard error over the trials of the best G, as often as `results.csv` has rows.
     pub curve: Vec<(usize, f64, f64)>,
@@ -72,7 +72,7 @@ pub enum Missing {
 ///
 /// # Errors
 /// The files cannot be written.
-pub fn write(sweep: &Sweep, out: &Path, options: &Options) -> Result<Vec<Result<Outcome, Missing>>, RecordError> {
+pub fn write(sweep: &Sweep, out: &Path, options: &Detail) -> Result<Vec<Result<Outcome, Missing>>, RecordError> {
     let disk = Disk::default();
     let mut outcomes = Vec::new();
     let path = out.join(RESULTS);
@@ -112,7 +112,7 @@ fn labels(sweep: &Sweep, point: &Point) -> Vec<String> {
 fn summary(
     sweep: &Sweep,
     outcomes: &[Result<Outcome, Missing>],
-    options: &Options,
+    options: &Detail,
     output: &mut dyn Write,
 ) -> io::Result<()> {
     let mut table = csv::Writer::from_writer(output);
@@ -139,7 +139,7 @@ fn summary(
 }
 
 /// A complete point's rows for `results.csv`, by trial and generation, and what it came to.
-fn read(point: &Point, out: &Path, options: &Options) -> Result<(Vec<Row>, Outcome), Missing> {
+fn read(point: &Point, out: &Path, options: &Detail) -> Result<(Vec<Row>, Outcome), Missing> {
     let folder = point_folder(out, point);
     let damaged = |error: &dyn std::fmt::Display| Missing::Damaged(error.to_string());
     let path = folder.join(METRICS);

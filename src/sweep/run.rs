@@ -9,27 +9,27 @@ use crate::backend::Player;
 use crate::config::Config;
 use crate::record::disk::Disk;
 use crate::record::folder::{Note, Start};
-use crate::run::{self, Outcome, RunError, Session};
+use crate::run::{self, Ended, RunError, Session};
 
 /// Most points in one batch: each keeps two files open, and systems allow a process 1024.
 const MAX_BATCH: usize = 400;
 
 /// How points are run.
-pub struct Options<'a> {
+pub struct Manner<'a> {
     pub start: Start,
     /// Bytes that the points of a batch may take; more points than fit run in several batches, to the same results.
     pub memory: usize,
     /// As for any run, but for its watch.
     pub runs: run::Options<'a>,
     /// Told of every generation played.
-    pub watch: &'a mut dyn FnMut(&Progress),
+    pub watch: &'a mut dyn FnMut(&Headway),
     /// Told what was found in a point's folder.
     pub note: &'a mut dyn FnMut(&Point, &Note),
 }
 
 /// How far the points have come.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Progress {
+pub struct Headway {
     /// Points done, those found done included, of all.
     pub done: usize,
     pub points: usize,
@@ -81,12 +81,12 @@ pub fn batches<'a>(points: &'a [&'a Point], memory: usize) -> Vec<&'a [&'a Point
 ///
 /// # Errors
 /// A folder cannot be used or written, there is too little memory, or the backend fails; what came before is saved.
-pub fn run(points: &[&Point], out: &Path, player: &mut Player, options: &mut Options<'_>) -> Result<Outcome, RunError> {
+pub fn run(points: &[&Point], out: &Path, player: &mut Player, options: &mut Manner<'_>) -> Result<Ended, RunError> {
     let total = points.iter().map(|point| team_steps(&point.config)).sum();
-    let mut progress = Progress { done: 0, points: points.len(), batch: 0, generation: 0, last: 0, played: 0, total };
+    let mut progress = Headway { done: 0, points: points.len(), batch: 0, generation: 0, last: 0, played: 0, total };
     for batch in batches(points, options.memory) {
         if options.runs.stop.load(Relaxed) {
-            return Ok(Outcome::Stopped);
+            return Ok(Ended::Stopped);
         }
         let runs = batch.iter().map(|point| (point.config.clone(), point_folder(out, point))).collect();
         let (mut session, notes) = Session::open(runs, options.start, &Disk::default())?;
@@ -109,11 +109,11 @@ pub fn run(points: &[&Point], out: &Path, player: &mut Player, options: &mut Opt
         let mut watch = |now: &run::Progress<'_>| tell(now.generations);
         let run::Options { command, stop, save, ref mut instead, ref mut setback, .. } = options.runs;
         let mut runs = run::Options { command, stop, save, instead, setback, watch: &mut watch };
-        if !session.is_done() && session.train(player, &mut runs)? == Outcome::Stopped {
-            return Ok(Outcome::Stopped);
+        if !session.is_done() && session.train(player, &mut runs)? == Ended::Stopped {
+            return Ok(Ended::Stopped);
         }
     }
-    Ok(Outcome::Done)
+    Ok(Ended::Done)
 }
 
 /// A point's last generation.

@@ -2,7 +2,7 @@
 
 use std::io::Write;
 
-use flotilla::backend::gpu::device::{self, AdapterInfo, Choice, Request};
+use flotilla::backend::gpu::device::{self, AdapterInfo, Request, Wanted};
 
 /// Every adapter, each with the request that opens it.
 ///
@@ -17,6 +17,6 @@ pub fn adapters(test: &str) -> Vec<(Request, AdapterInfo)> {
         // Straight to the stream: what a passing test prints by macro is not shown.
         writeln!(std::io::stderr(), "\n{message}").expect("standard error takes a line");
     }
-    let request = |index: usize| Request::from(Choice::Named(index.to_string()));
+    let request = |index: usize| Request::from(Wanted::Named(index.to_string()));
     found.into_iter().enumerate().map(|(index, info)| (request(index), info)).collect()
 }

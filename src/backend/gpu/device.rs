@@ -169,7 +169,7 @@ fn found() -> Vec<(wgpu::Adapter, AdapterInfo)> {
 
 /// Which adapter to open.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Choice {
+pub enum Wanted {
     /// A GPU, never a software renderer.
     Real,
     /// By its index in [`adapters`], which is what a number is, or else by a part of its name in any case (the first
@@ -177,10 +177,10 @@ pub enum Choice {
     Named(String),
 }
 
-/// What to open, and how. Only tests and `verify` need more than a [`Choice`].
+/// What to open, and how. Only tests and `verify` need more than a [`Wanted`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Request {
-    pub choice: Choice,
+    pub choice: Wanted,
     /// This pass alone instead of the first that is exact. [`Pass::Plain`] is opened untested.
     pub pass: Option<Pass>,
     /// WebGPU's default limits instead of the adapter's own.
@@ -189,8 +189,8 @@ pub struct Request {
     pub checked: bool,
 }
 
-impl From<Choice> for Request {
-    fn from(choice: Choice) -> Self {
+impl From<Wanted> for Request {
+    fn from(choice: Wanted) -> Self {
         Request { choice, pass: None, default_limits: false, checked: false }
     }
 }
@@ -250,7 +250,7 @@ impl fmt::Debug for Gpu {
 }
 
 /// The adapter of a choice.
-pub(super) fn choose(choice: &Choice) -> Result<(wgpu::Adapter, AdapterInfo), DeviceError> {
+pub(super) fn choose(choice: &Wanted) -> Result<(wgpu::Adapter, AdapterInfo), DeviceError> {
     let mut found = found();
     let infos: Vec<_> = found.iter().map(|(_, info)| info.clone()).collect();
     Ok(found.swap_remove(position(choice, &infos)?))
@@ -260,9 +260,9 @@ pub(super) fn choose(choice: &Choice) -> Result<(wgpu::Adapter, AdapterInfo), De
 ///
 /// # Errors
 /// There is no adapter, none that is a GPU, or none of that name or number.
-pub fn position(choice: &Choice, infos: &[AdapterInfo]) -> Result<usize, DeviceError> {
+pub fn position(choice: &Wanted, infos: &[AdapterInfo]) -> Result<usize, DeviceError> {
     match choice {
-        Choice::Named(name) => {
+        Wanted::Named(name) => {
             let part = name.trim().to_lowercase();
             let found = match is_index(&part) {
                 true => part.parse().ok().filter(|&index: &usize| index < infos.len()),
@@ -273,11 +273,11 @@ pub fn position(choice: &Choice, infos: &[AdapterInfo]) -> Result<usize, DeviceE
             found.ok_or_else(|| DeviceError::UnknownAdapter { name: name.clone(), found: infos.to_vec() })
         }
         // The most wanted adapter is the first.
-        Choice::Real if infos.first().is_some_and(|info| !info.kind.is_real()) => {
+        Wanted::Real if infos.first().is_some_and(|info| !info.kind.is_real()) => {
             Err(DeviceError::NoRealAdapter { found: infos.to_vec() })
         }
-        Choice::Real if infos.is_empty() => Err(DeviceError::NoAdapter),
-        Choice::Real => Ok(0),
+        Wanted::Real if infos.is_empty() => Err(DeviceError::NoAdapter),
+        Wanted::Real => Ok(0),
     }
 }
 
@@ -296,7 +296,7 @@ pub enum Binding {
 
 /// The buffers of a pipeline: group 0, the guard at 0, then the given ones from 1 on.
 #[derive(Clone, Debug)]
-pub struct Layout {
+pub struct Bindings {
     bindings: wgpu::BindGroupLayout,
     pipeline: wgpu::PipelineLayout,
 }
@@ -511,7 +511,7 @@ impl Gpu {
     ///
     /// # Errors
     /// The device does not allow so many buffers.
-    pub fn layout(&self, label: &str, buffers: &[Binding]) -> Result<Layout, DeviceError> {
+    pub fn layout(&self, label: &str, buffers: &[Binding]) -> Result<Bindings, DeviceError> {
         let entry = |(binding, &kind): (u32, &Binding)| wgpu::BindGroupLayoutEntry {
             binding,
             visibility: wgpu::ShaderStages::COMPUTE,
@@ -535,7 +535,7 @@ impl Gpu {
                 bind_group_layouts: &[Some(&bindings)],
                 immediate_size: 0,
             });
-            Layout { bindings, pipeline }
+            Bindings { bindings, pipeline }
         })
     }
 
@@ -546,7 +546,7 @@ impl Gpu {
     pub fn bind(
         &self,
         label: &str,
-        layout: &Layout,
+        layout: &Bindings,
         buffers: &[wgpu::BufferBinding<'_>],
     ) -> Result<wgpu::BindGroup, DeviceError> {
         let all = std::iter::once(self.guard.as_entire_buffer_binding()).chain(buffers.iter().cloned());
@@ -564,7 +564,7 @@ impl Gpu {
         label: &str,
         wgsl: &str,
         entry: &str,
-        layout: &Layout,
+        layout: &Bindings,
     ) -> Result<wgpu::ComputePipeline, DeviceError> {
         // SAFETY: the loops of the crate's own shaders end, their bindings are those of their layouts, and their indices
         // are in bounds for groups and plans that were checked, as the checked builds in the tests show.
@@ -589,7 +589,7 @@ impl Gpu {
         label: &str,
         wgsl: &str,
         entry: &str,
-        layout: &Layout,
+        layout: &Bindings,
     ) -> Result<wgpu::ComputePipeline, DeviceError> {
         let compiled = self.scoped(label, || {
             // SAFETY: the caller's.

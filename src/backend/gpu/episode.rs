@@ -17,7 +17,7 @@ use std::time::Duration;
 use bytemuck::Zeroable;
 use glam::Vec2;
 
-use super::device::{BINDING_ALIGNMENT, Binding, DeviceError, Gpu, Kind, Layout, Stopwatch, Traffic, grid, timed};
+use super::device::{BINDING_ALIGNMENT, Binding, Bindings, DeviceError, Gpu, Kind, Stopwatch, Traffic, grid, timed};
 use super::exact;
 use super::population::{Kernels, Population, Stretch, TOGETHER, parts};
 use crate::backend::{
@@ -167,7 +167,7 @@ fn seats(world: &World, teams: usize) -> usize {
 impl Packing {
     /// For a specialised kernel: as many teams as a warp has threads, or as many as fit. None where there had
     /// better be none: too many agents, or too large a policy.
-    fn specialised(world: &World, room: Room) -> Option<Packing> {
+    fn specialised(world: &World, room: Capacity) -> Option<Packing> {
         let threads = |teams: usize| seats(world, teams).next_multiple_of(ROLE);
         let bytes = |teams: usize| 2 * teams * world.agents() * size_of::<Vec2>();
         let fits =
@@ -255,10 +255,13 @@ struct Work {
 }
 
 impl Work {
-    /// Finds a place for what is packed of the record; none where the whole record is wanted, where packing takes too
-    /// long for one dispatch, or where there is nothing to gain.
+    /// Finds a place for what is packed of the record; none where the whole record is wanted, where it matters when sets
+    /// stood, where packing takes too long for one dispatch, or where there is nothing to gain.
     fn pack(&mut self, groups: &[Group<'_>], records: Records) {
-        let packs = |share: &Share| groups[share.group].need.least(1).is_some() && pack_turns(groups, share) <= TURNS;
+        let packs = |share: &Share| {
+            let Group { world, need, .. } = groups[share.group];
+            need.least(1).is_some() && !world.rule.is_timed() && pack_turns(groups, share) <= TURNS
+        };
         if !records.packs((self.record * size_of::<u32>()) as u64) || !self.shares.iter().all(packs) {
             return;
         }
@@ -297,7 +300,7 @@ fn pack_turns(groups: &[Group<'_>], share: &Share) -> usize {
 
 /// Sizes of a device that bound a batch.
 #[derive(Clone, Copy, Debug)]
-struct Room {
+struct Capacity {
     /// Bytes of one buffer that a batch aims for.
     batch: u64,
     /// Bytes of the largest buffer.
@@ -325,7 +328,7 @@ fn plan(
     groups: &[Group<'_>],
     trace: bool,
     records: Records,
-    room: Room,
+    room: Capacity,
     specialised: &HashSet<Shape>,
 ) -> Result<Vec<Work>, BackendError> {
     let target = room.buffer.min(room.batch);
@@ -415,8 +418,8 @@ fn gather(group: &Group<'_>, weights: &[f32], first_team: usize, teams: usize, t
     for (place, &policy) in policies.iter().enumerate() {
         let (team, leader) = (place / leaders, place % leaders);
         let from = group.place(weights, leader, policy as usize);
-        let lane = to[leader * teams + team..].iter_mut().step_by(leaders * teams);
-        for (four, weights) in lane.zip(weights[from..from + parameters].chunks(FOUR)) {
+        let column = to[leader * teams + team..].iter_mut().step_by(leaders * teams);
+        for (four, weights) in column.zip(weights[from..from + parameters].chunks(FOUR)) {
             four[..weights.len()].copy_from_slice(weights);
         }
     }
@@ -469,19 +472,19 @@ const KEPT_AT_LEAST: usize = 256;
 /// Plays episodes on a GPU.
 pub struct GpuEpisodes {
     gpu: Gpu,
-    layout: Layout,
+    layout: Bindings,
     kernel: Kernel,
     pipelines: HashMap<Shape, wgpu::ComputePipeline>,
     holding: Holding,
     records: Records,
     /// Compiled once something is to be packed.
-    pack: Option<(wgpu::ComputePipeline, Layout)>,
+    pack: Option<(wgpu::ComputePipeline, Bindings)>,
     /// The part of all sets for which room is made.
     kept: f64,
     /// Compiled once something is to be held.
     kernels: Option<Arc<Kernels>>,
     /// Two sets, so that one batch plays while the other is read.
-    lanes: [Buffers; 2],
+    flights: [Buffers; 2],
     /// Weights on their way to the device.
     staging: Vec<[f32; FOUR]>,
     /// Bytes of one buffer that a batch aims for.
@@ -531,7 +534,7 @@ struct Buffers {
     packed: Option<wgpu::Buffer>,
     packed_back: Option<wgpu::Buffer>,
     /// What comes home of the packed record, if it is packed, and whether the whole one comes in any case.
-    sent: Option<Sent>,
+    sent: Option<Parcel>,
     whole: bool,
     watch: Option<Stopwatch>,
     /// What to wait for.
@@ -540,7 +543,7 @@ struct Buffers {
 
 /// A packed record on its way home.
 #[derive(Clone, Copy)]
-struct Sent {
+struct Parcel {
     /// Words that there is room for, tables and owners among them.
     room: usize,
     /// Bytes that are copied: all, or only how many words were taken.
@@ -600,7 +603,7 @@ impl GpuEpisodes {
             pack: None,
             kept: KEPT,
             kernels: None,
-            lanes: Default::default(),
+            flights: Default::default(),
             staging: Vec::new(),
             batch_bytes: BATCH_BYTES,
             edit: |text| text,
@@ -646,8 +649,8 @@ impl GpuEpisodes {
     /// # Errors
     /// When the device fails.
     pub fn use_clock(&mut self) -> Result<(), DeviceError> {
-        for lane in &mut self.lanes {
-            lane.watch = self.gpu.stopwatch()?;
+        for flight in &mut self.flights {
+            flight.watch = self.gpu.stopwatch()?;
         }
         Ok(())
     }
@@ -662,9 +665,9 @@ impl GpuEpisodes {
         &self.gpu
     }
 
-    fn room(&self) -> Room {
+    fn room(&self) -> Capacity {
         let limits = &self.gpu.limits;
-        Room {
+        Capacity {
             batch: self.batch_bytes,
             buffer: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(MAX_OFFSET),
             workgroup: limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x) as usize,
@@ -708,7 +711,7 @@ impl GpuEpisodes {
     }
 
     /// Hands one batch to the device.
-    fn submit(&mut self, lane: usize, groups: &[Group<'_>], work: &Work, trace: bool) -> Result<(), BackendError> {
+    fn submit(&mut self, flight: usize, groups: &[Group<'_>], work: &Work, trace: bool) -> Result<(), BackendError> {
         use wgpu::BufferUsages as Usage;
         let start = Instant::now();
         let (stretches, choices) = self.stretches(groups, work)?;
@@ -750,14 +753,14 @@ impl GpuEpisodes {
             };
             // Where nearly all sets are kept, they are packed only to see when that changes.
             match room <= most {
-                true => Sent { room, bytes: ((PACKED_HEAD + room) * size_of::<u32>()) as u64 },
-                false => Sent { room: head, bytes: (PACKED_HEAD * size_of::<u32>()) as u64 },
+                true => Parcel { room, bytes: ((PACKED_HEAD + room) * size_of::<u32>()) as u64 },
+                false => Parcel { room: head, bytes: (PACKED_HEAD * size_of::<u32>()) as u64 },
             }
         });
         let whole = work.head.is_none_or(|head| sent.is_some_and(|sent| sent.room == head));
 
         let gpu = &self.gpu;
-        let buffers = &mut self.lanes[lane];
+        let buffers = &mut self.flights[flight];
         let input = Usage::STORAGE | Usage::COPY_DST;
         let output = Usage::STORAGE | Usage::COPY_SRC;
         let back = Usage::COPY_DST | Usage::MAP_READ;
@@ -865,9 +868,9 @@ impl GpuEpisodes {
     }
 
     /// Waits for one batch and hands its record on.
-    fn collect(&mut self, lane: usize, work: &Work, trace: bool, done: &Done<'_>) -> Result<(), DeviceError> {
+    fn collect(&mut self, flight: usize, work: &Work, trace: bool, done: &Done<'_>) -> Result<(), DeviceError> {
         let start = Instant::now();
-        self.gpu.wait_for(self.lanes[lane].submitted.clone())?;
+        self.gpu.wait_for(self.flights[flight].submitted.clone())?;
         let done_waiting = Instant::now();
         let mut score = Duration::ZERO;
         let mut share_out = |record: Home<'_>, moments: &[Moment]| {
@@ -877,9 +880,10 @@ impl GpuEpisodes {
         };
         let record_bytes = (work.record * size_of::<u32>()) as u64;
         let moment_bytes = (work.moments * size_of::<Moment>()) as u64;
-        let buffers = &mut self.lanes[lane];
+        let buffers = &mut self.flights[flight];
         let mut fits = false;
-        if let (Some(head), Some(Sent { room, bytes }), Some(back)) = (work.head, buffers.sent, &buffers.packed_back) {
+        if let (Some(head), Some(Parcel { room, bytes }), Some(back)) = (work.head, buffers.sent, &buffers.packed_back)
+        {
             let used = self.gpu.mapped(back, 0..bytes, |bytes| {
                 let words: &[u32] = bytemuck::cast_slice(bytes);
                 let used = words[0] as usize;
@@ -1111,7 +1115,7 @@ pub fn shaders() -> Vec<(&'static str, String)> {
 /// what compilers make of it. `threads` is the size of the largest workgroup.
 #[doc(hidden)]
 pub fn shader_of(world: &World, kernel: Kernel, threads: usize) -> String {
-    let room = Room { batch: 0, buffer: 0, workgroup: threads, workgroup_bytes: 16 << 10 };
+    let room = Capacity { batch: 0, buffer: 0, workgroup: threads, workgroup_bytes: 16 << 10 };
     let made = Packing::specialised(world, room).filter(|_| kernel != Kernel::Generic);
     source(made.map_or_else(
         || Shape::generic(world, Packing::generic(world, threads), false),

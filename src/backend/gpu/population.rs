@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use bytemuck::Pod;
 
-use super::device::{BINDING_ALIGNMENT, Binding, DeviceError, Gpu, Layout, grid};
+use super::device::{BINDING_ALIGNMENT, Binding, Bindings, DeviceError, Gpu, grid};
 use super::exact;
 use crate::backend::{BackendError, Held};
 use crate::config::Mutation;
@@ -66,8 +66,8 @@ impl Stretch {
 /// What works on the populations of one device.
 pub struct Kernels {
     gpu: Gpu,
-    breed: (wgpu::ComputePipeline, Layout),
-    gather: (wgpu::ComputePipeline, Layout),
+    breed: (wgpu::ComputePipeline, Bindings),
+    gather: (wgpu::ComputePipeline, Bindings),
 }
 
 /// One dispatch, with all that it uses.

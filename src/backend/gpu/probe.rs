@@ -21,7 +21,7 @@ use crate::world::World;
 
 /// Where a device first differed from the CPU.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Mismatch {
+pub struct Deviation {
     /// What was computed.
     pub probe: Cow<'static, str>,
     /// From which values, in the order `x, y, z, w`.
@@ -30,9 +30,9 @@ pub struct Mismatch {
     pub gpu: u32,
 }
 
-impl fmt::Display for Mismatch {
+impl fmt::Display for Deviation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Mismatch { probe, values, cpu, gpu } = self;
+        let Deviation { probe, values, cpu, gpu } = self;
         write!(f, "probe \"{probe}\" gives {gpu:#010x} instead of {cpu:#010x}")?;
         if !values.is_empty() {
             let values: Vec<_> = values.iter().map(|&word| format!("{:e}", f32::from_bits(word))).collect();
@@ -46,7 +46,7 @@ impl fmt::Display for Mismatch {
 pub const SHADER: &str = include_str!("../../../shaders/probe.wgsl");
 
 /// One probe: the first mismatch under the device's current pass, or none.
-pub type Probe = fn(&Gpu) -> Result<Option<Mismatch>, DeviceError>;
+pub type Probe = fn(&Gpu) -> Result<Option<Deviation>, DeviceError>;
 
 /// All probes that a pass must survive, the quickest first.
 ///
@@ -95,7 +95,7 @@ pub fn open(request: impl Into<Request>) -> Result<Gpu, DeviceError> {
 ///
 /// # Errors
 /// The device fails.
-pub fn self_test(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
+pub fn self_test(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     for probe in ALL {
         if let Some(mismatch) = probe(gpu)? {
             return Ok(Some(mismatch));
@@ -152,7 +152,7 @@ const ITEMS: usize = 4096;
 const WORKGROUP: usize = 64;
 
 /// Contraction, reassociation, conversion and comparison, on [`ITEMS`] groups of values.
-fn arithmetic(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
+fn arithmetic(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     let values = values();
     let bytes = (ITEMS * NAMES.len() * size_of::<u32>()) as u64;
     let from = gpu.upload("probe values", &values, BufferUsages::STORAGE)?;
@@ -166,12 +166,12 @@ fn arithmetic(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
         let expected = expected(&values, item);
         let differs = (0..NAMES.len()).find(|&probe| words[probe] != expected[probe])?;
         let inputs = values[item * 4..][..4].iter().map(|value| value.to_bits()).collect();
-        Some(Mismatch { probe: NAMES[differs].into(), values: inputs, cpu: expected[differs], gpu: words[differs] })
+        Some(Deviation { probe: NAMES[differs].into(), values: inputs, cpu: expected[differs], gpu: words[differs] })
     }))
 }
 
 /// A whole episode of the paper's first layout, stage by stage.
-fn episode(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
+fn episode(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     const TEAMS: usize = 8;
     let config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
     let world = World::new(&config);
@@ -192,7 +192,7 @@ fn episode(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
         episodes = episodes.playing(Kernel::Specialised);
     }
     let found = episodes.trace(&group).map_err(traced)?;
-    Ok(first_mismatch(&world, &expected, &found).map(|mismatch| Mismatch {
+    Ok(first_mismatch(&world, &expected, &found).map(|mismatch| Deviation {
         probe: format!("an episode, {mismatch}").into(),
         values: Vec::new(),
         cpu: mismatch.expected,
@@ -201,7 +201,7 @@ fn episode(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
 }
 
 /// The next generation of two populations.
-fn breeding(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
+fn breeding(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     const SLOTS: usize = 64;
     let config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
     let world = World::new(&config);
@@ -216,7 +216,7 @@ fn breeding(gpu: &Gpu) -> Result<Option<Mismatch>, DeviceError> {
     held.breed(&breeding).and_then(|()| held.fetch(&mut found)).map_err(|error| refused(gpu, error))?;
     let expected = breeding.on_host(sizes, weights).map_err(|error| refused(gpu, error.into()))?;
     let differs = |index: &usize| expected[*index].to_bits() != found[*index].to_bits();
-    Ok((0..found.len()).find(differs).map(|index| Mismatch {
+    Ok((0..found.len()).find(differs).map(|index| Deviation {
         probe: format!("breeding, weight {}", index % world.parameters()).into(),
         values: Vec::new(),
         cpu: expected[index].to_bits(),

@@ -6,7 +6,7 @@
 
 use serde::Serialize;
 
-use super::{Course, LAYOUTS, Results, SOURCES, Source};
+use super::{Course, Evidence, LAYOUTS, SOURCES, Source};
 use crate::config::Paradigm;
 use crate::statistics::{self, Estimate};
 
@@ -83,28 +83,28 @@ impl Claim {
 }
 
 /// The values that the words allow: at least the first, under the second.
-type Allowed = [f64; 2];
-const ABOVE_0: Allowed = [f64::MIN_POSITIVE, f64::INFINITY];
-const BELOW_0: Allowed = [f64::NEG_INFINITY, 0.0];
-const MOST: Allowed = [0.5 + f64::EPSILON, f64::INFINITY];
+type Band = [f64; 2];
+const ABOVE_0: Band = [f64::MIN_POSITIVE, f64::INFINITY];
+const BELOW_0: Band = [f64::NEG_INFINITY, 0.0];
+const MOST: Band = [0.5 + f64::EPSILON, f64::INFINITY];
 
 /// What was measured and what the words allow.
-enum Measure {
+enum Criterion {
     /// By trial, in POIs.
-    Mean(Vec<f64>, Allowed),
+    Mean(Vec<f64>, Band),
     /// By pair of trials, in POIs.
-    Difference(Vec<f64>, Allowed),
+    Difference(Vec<f64>, Band),
     /// By pair of trials, in shares of the POIs, of which a layout has four at most.
-    Shares(Vec<f64>, Allowed),
-    /// As [`Measure::Difference`], with the p of its test.
-    Tested(Vec<f64>, Allowed),
+    Shares(Vec<f64>, Band),
+    /// As [`Criterion::Difference`], with the p of its test.
+    Tested(Vec<f64>, Band),
     /// In how many of so many trials or pairs.
-    Share(usize, usize, Allowed),
+    Share(usize, usize, Band),
     /// The same, and it should be all.
     All(usize, usize),
 }
 
-impl Measure {
+impl Criterion {
     /// Of teams that can observe so many POIs.
     fn find(self, column: usize, of: String, certain: bool, pois: f64) -> Option<Finding> {
         let estimate = |values: &[f64], least: f64| match certain {
@@ -116,26 +116,26 @@ impl Measure {
             false => statistics::share(count, of),
         };
         let (estimate, verdict, measured) = match &self {
-            Measure::Mean(values, allowed) => {
+            Criterion::Mean(values, allowed) => {
                 let estimate = estimate(values, 0.0)?;
                 (estimate, judge(estimate, *allowed), format!("{:.2}", estimate.value))
             }
-            Measure::Difference(values, allowed) | Measure::Tested(values, allowed) => {
+            Criterion::Difference(values, allowed) | Criterion::Tested(values, allowed) => {
                 let estimate = estimate(values, -pois)?;
                 (estimate, judge(estimate, *allowed), format!("{:+.2}", estimate.value))
             }
-            Measure::Shares(values, allowed) => {
+            Criterion::Shares(values, allowed) => {
                 let estimate = match certain {
                     true => Estimate::exact(*values.first()?),
                     false => statistics::mean(values, 0.25)?.within(-1.0, 1.0),
                 };
                 (estimate, judge(estimate, *allowed), format!("{:+.2}", estimate.value))
             }
-            &Measure::Share(count, of, allowed) => {
+            &Criterion::Share(count, of, allowed) => {
                 let estimate = share(count, of)?;
                 (estimate, judge(estimate, allowed), format!("{count} of {of}"))
             }
-            &Measure::All(count, of) => {
+            &Criterion::All(count, of) => {
                 let estimate = share(count, of)?;
                 // One that does not is enough to refute; so many that do have to be seen to believe it of all.
                 let verdict = if count < of { Verdict::No } else { judge(estimate, [1.0 - FEW, f64::INFINITY]) };
@@ -143,7 +143,7 @@ impl Measure {
             }
         };
         let p = match &self {
-            Measure::Tested(values, _) if !certain => statistics::p_value(values),
+            Criterion::Tested(values, _) if !certain => statistics::p_value(values),
             _ => None,
         };
         let interval = if certain { String::new() } else { format!(" [{:.2}, {:.2}]", estimate.low, estimate.high) };
@@ -155,7 +155,7 @@ impl Measure {
 }
 
 /// Whether an interval lies within what is allowed.
-fn judge(estimate: Estimate, [from, below]: Allowed) -> Verdict {
+fn judge(estimate: Estimate, [from, below]: Band) -> Verdict {
     match estimate {
         Estimate { low, high, .. } if low >= from && high < below => Verdict::Yes,
         Estimate { low, high, .. } if high < from || low >= below => Verdict::No,
@@ -165,13 +165,13 @@ fn judge(estimate: Estimate, [from, below]: Allowed) -> Verdict {
 
 /// Where a claim is looked up.
 #[derive(Clone, Copy)]
-struct View<'a> {
-    results: Results<'a>,
+struct Lookup<'a> {
+    results: Evidence<'a>,
     layout: usize,
     source: Source,
 }
 
-impl<'a> View<'a> {
+impl<'a> Lookup<'a> {
     fn course(&'a self, paradigm: Paradigm) -> Option<Course<'a>> {
         self.results.course(self.layout, paradigm, self.source)
     }
@@ -233,7 +233,7 @@ struct Test {
     /// Generations that the claim speaks of.
     needs: usize,
     sources: &'static [Source],
-    find: fn(View<'_>) -> Option<Measure>,
+    find: fn(Lookup<'_>) -> Option<Criterion>,
 }
 
 /// Everyone leads: there Df is D, and the same training.
@@ -256,25 +256,25 @@ const MORE_RELIABLY: &str = "“more reliably” led than alone";
 const ODD_PAIRS: &str =
     "of the pairs in which only one observes all POIs at generation 100, leader-follower does in: over half";
 
-fn more_optimal(view: View<'_>) -> Option<Measure> {
-    Some(Measure::Difference(view.lead()?, ABOVE_0))
+fn more_optimal(view: Lookup<'_>) -> Option<Criterion> {
+    Some(Criterion::Difference(view.lead()?, ABOVE_0))
 }
 
-fn much_faster(view: View<'_>) -> Option<Measure> {
+fn much_faster(view: Lookup<'_>) -> Option<Criterion> {
     let (led, all) = (view.led()?.solved(END)?, view.all()?.solved(END)?);
     // Who never gets there gets there after the end at the earliest.
     let sooner = |(led, all): &(&Option<usize>, &Option<usize>)| {
         led.is_some_and(|led| 2 * led <= all.unwrap_or(END + 1) && Some(led) != **all)
     };
-    Some(Measure::Share(led.iter().zip(&all).filter(sooner).count(), led.len(), MOST))
+    Some(Criterion::Share(led.iter().zip(&all).filter(sooner).count(), led.len(), MOST))
 }
 
-fn more_reliably(view: View<'_>) -> Option<Measure> {
+fn more_reliably(view: Lookup<'_>) -> Option<Criterion> {
     let pois = view.pois(1.0);
     let (led, all) = (view.led()?.observed(END)?, view.all()?.observed(END)?);
     let pairs = || led.iter().zip(&all).map(|(led, all)| (*led >= pois, *all >= pois));
     let odd = pairs().filter(|(led, all)| led != all).count();
-    Some(Measure::Share(pairs().filter(|pair| *pair == (true, false)).count(), odd, MOST))
+    Some(Criterion::Share(pairs().filter(|pair| *pair == (true, false)).count(), odd, MOST))
 }
 
 /// The other fitness that one is compared with, so that every two are once.
@@ -322,7 +322,7 @@ const TESTS: &[Test] = &[
         measure: "all-leaders, trials that ever observe all 4 up to generation 100: under half",
         needs: END,
         sources: ALONE,
-        find: |view| Some(Measure::Share(view.all()?.count_solved(END)?, view.all()?.trials(), [0.0, 0.5])),
+        find: |view| Some(Criterion::Share(view.all()?.count_solved(END)?, view.all()?.trials(), [0.0, 0.5])),
     },
     Test {
         place: "§5.1, Fig. 4",
@@ -331,7 +331,7 @@ const TESTS: &[Test] = &[
         measure: "all-leaders, POIs at generation 100: under 1",
         needs: END,
         sources: ALONE,
-        find: |view| Some(Measure::Mean(view.all()?.observed(END)?, [f64::NEG_INFINITY, 1.0])),
+        find: |view| Some(Criterion::Mean(view.all()?.observed(END)?, [f64::NEG_INFINITY, 1.0])),
     },
     Test {
         place: "§5.1",
@@ -340,7 +340,7 @@ const TESTS: &[Test] = &[
         measure: "leader-follower, POIs at generation 19: at least 3",
         needs: 19,
         sources: &SOURCES,
-        find: |view| Some(Measure::Mean(view.led()?.observed(19)?, [3.0, f64::INFINITY])),
+        find: |view| Some(Criterion::Mean(view.led()?.observed(19)?, [3.0, f64::INFINITY])),
     },
     Test {
         place: "§5.1, Fig. 4",
@@ -349,7 +349,7 @@ const TESTS: &[Test] = &[
         measure: "leader-follower, trials that ever observe all 4 up to generation 40: all",
         needs: 40,
         sources: &SOURCES,
-        find: |view| Some(Measure::All(view.led()?.count_solved(40)?, view.led()?.trials())),
+        find: |view| Some(Criterion::All(view.led()?.count_solved(40)?, view.led()?.trials())),
     },
     Test {
         place: "§5.1",
@@ -361,7 +361,7 @@ const TESTS: &[Test] = &[
         find: |view| {
             let led = view.led()?;
             let always = |trial: &&Vec<f64>| trial[40..=END].iter().all(|&g| g >= 1.0);
-            Some(Measure::All(led.best.iter().filter(always).count(), led.trials()))
+            Some(Criterion::All(led.best.iter().filter(always).count(), led.trials()))
         },
     },
     Test {
@@ -401,7 +401,7 @@ const TESTS: &[Test] = &[
         find: |view| {
             let all = view.all()?;
             let any = all.observed_by(END)?.iter().filter(|&&pois| pois > 0.0).count();
-            Some(Measure::Share(any, all.trials(), [0.0, FEW]))
+            Some(Criterion::Share(any, all.trials(), [0.0, FEW]))
         },
     },
     Test {
@@ -412,11 +412,11 @@ const TESTS: &[Test] = &[
         needs: END,
         sources: ALONE,
         find: |view| {
-            let share = |view: View<'_>| {
+            let share = |view: Lookup<'_>| {
                 let all = view.all()?;
                 Some(all.observed(END)?.iter().map(|pois| pois / all.pois as f64).collect::<Vec<_>>())
             };
-            Some(Measure::Shares(less(&share(view)?, &share(View { layout: GENERAL, ..view })?), BELOW_0))
+            Some(Criterion::Shares(less(&share(view)?, &share(Lookup { layout: GENERAL, ..view })?), BELOW_0))
         },
     },
     Test {
@@ -426,7 +426,7 @@ const TESTS: &[Test] = &[
         measure: "leader-follower, POIs at generation 30: at least 1.5 of the 2 that this layout has",
         needs: 30,
         sources: &SOURCES,
-        find: |view| Some(Measure::Mean(view.led()?.observed(30)?, [view.pois(0.75), f64::INFINITY])),
+        find: |view| Some(Criterion::Mean(view.led()?.observed(30)?, [view.pois(0.75), f64::INFINITY])),
     },
     Test {
         place: "§5.2",
@@ -435,7 +435,7 @@ const TESTS: &[Test] = &[
         measure: "leader-follower, trials that ever observe both POIs up to generation 100: all",
         needs: END,
         sources: &SOURCES,
-        find: |view| Some(Measure::All(view.led()?.count_solved(END)?, view.led()?.trials())),
+        find: |view| Some(Criterion::All(view.led()?.count_solved(END)?, view.led()?.trials())),
     },
     Test {
         place: "§5.2",
@@ -449,7 +449,7 @@ const TESTS: &[Test] = &[
         find: |view| {
             let margin = view.pois(SMALL);
             let differences = view.between(view.source, next(view.source), <[f64]>::to_vec)?;
-            Some(Measure::Difference(differences, [-margin, margin]))
+            Some(Criterion::Difference(differences, [-margin, margin]))
         },
     },
     Test {
@@ -460,7 +460,7 @@ const TESTS: &[Test] = &[
                   other, by pair (Brown-Forsythe): above 0",
         needs: END,
         sources: &[G, D],
-        find: |view| Some(Measure::Tested(view.between(DF, view.source, statistics::distances)?, ABOVE_0)),
+        find: |view| Some(Criterion::Tested(view.between(DF, view.source, statistics::distances)?, ABOVE_0)),
     },
     Test {
         place: "§5",
@@ -499,7 +499,7 @@ const TESTS: &[Test] = &[
         sources: &[Source::Random, G],
         find: |view| {
             let all = view.all()?;
-            Some(Measure::Share(all.observed(0)?.iter().filter(|&&pois| pois > 0.0).count(), all.trials(), MOST))
+            Some(Criterion::Share(all.observed(0)?.iter().filter(|&&pois| pois > 0.0).count(), all.trials(), MOST))
         },
     },
     Test {
@@ -509,7 +509,7 @@ const TESTS: &[Test] = &[
         measure: "all-leaders, trials that ever observe all 4 up to generation 100: 1 in 10 to 9 in 10",
         needs: END,
         sources: ALONE,
-        find: |view| Some(Measure::Share(view.all()?.count_solved(END)?, view.all()?.trials(), [FEW, 1.0 - FEW])),
+        find: |view| Some(Criterion::Share(view.all()?.count_solved(END)?, view.all()?.trials(), [FEW, 1.0 - FEW])),
     },
     Test {
         place: "§5.3",
@@ -519,7 +519,7 @@ const TESTS: &[Test] = &[
                   as if every second trial were a POI off",
         needs: END,
         sources: ALONE,
-        find: |view| Some(Measure::Mean(statistics::distances(&view.all()?.observed(END)?), [0.5, f64::INFINITY])),
+        find: |view| Some(Criterion::Mean(statistics::distances(&view.all()?.observed(END)?), [0.5, f64::INFINITY])),
     },
     Test {
         place: "§5.3",
@@ -530,7 +530,7 @@ const TESTS: &[Test] = &[
         sources: &SOURCES,
         find: |view| {
             let margin = view.pois(SMALL);
-            Some(Measure::Difference(view.lead()?, [-margin, margin]))
+            Some(Criterion::Difference(view.lead()?, [-margin, margin]))
         },
     },
     Test {
@@ -540,7 +540,7 @@ const TESTS: &[Test] = &[
         measure: "POIs at generation 100, leader-follower less all-leaders, by pair: above −0.4",
         needs: END,
         sources: &SOURCES,
-        find: |view| Some(Measure::Difference(view.lead()?, [-view.pois(SMALL), f64::INFINITY])),
+        find: |view| Some(Criterion::Difference(view.lead()?, [-view.pois(SMALL), f64::INFINITY])),
     },
     Test {
         place: "§5.3, Fig. 6",
@@ -552,7 +552,7 @@ const TESTS: &[Test] = &[
         sources: &SOURCES,
         find: |view| {
             let distances = |course: Course<'_>| Some(statistics::distances(&course.observed(END)?));
-            Some(Measure::Tested(less(&distances(view.led()?)?, &distances(view.all()?)?), BELOW_0))
+            Some(Criterion::Tested(less(&distances(view.led()?)?, &distances(view.all()?)?), BELOW_0))
         },
     },
     Test {
@@ -564,7 +564,7 @@ const TESTS: &[Test] = &[
         sources: &[G],
         find: |view| {
             let differences = view.between(DF, view.source, <[f64]>::to_vec)?;
-            Some(Measure::Difference(differences, [f64::MIN_POSITIVE, view.pois(SMALL)]))
+            Some(Criterion::Difference(differences, [f64::MIN_POSITIVE, view.pois(SMALL)]))
         },
     },
     Test {
@@ -574,25 +574,25 @@ const TESTS: &[Test] = &[
         measure: "leader-follower, trials that ever observe all 4 up to generation 100: all",
         needs: END,
         sources: &[Source::Straight, Source::Random, G],
-        find: |view| Some(Measure::All(view.led()?.count_solved(END)?, view.led()?.trials())),
+        find: |view| Some(Criterion::All(view.led()?.count_solved(END)?, view.led()?.trials())),
     },
 ];
 
 /// Every claim of the paper on these experiments.
-pub fn claims(results: Results<'_>) -> Vec<Claim> {
+pub fn claims(results: Evidence<'_>) -> Vec<Claim> {
     TESTS.iter().map(|test| test.claim(results)).collect()
 }
 
 impl Test {
-    fn claim(&self, results: Results<'_>) -> Claim {
+    fn claim(&self, results: Evidence<'_>) -> Claim {
         let findings = self.sources.iter().filter_map(|&source| self.finding(results, source)).collect();
         let Test { place, layout, words, measure, .. } = *self;
         Claim { place, layout: LAYOUTS[layout].name, words, measure, findings }
     }
 
-    fn finding(&self, results: Results<'_>, source: Source) -> Option<Finding> {
+    fn finding(&self, results: Evidence<'_>, source: Source) -> Option<Finding> {
         let column = SOURCES.iter().position(|&other| other == source)?;
-        let view = View { results, layout: self.layout, source };
+        let view = Lookup { results, layout: self.layout, source };
         let course = view.led()?;
         let of = match self.sources {
             EVOLVED => format!("{source} − {}", next(source)),

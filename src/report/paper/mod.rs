@@ -8,7 +8,7 @@
 
 use serde::Serialize;
 
-use super::curves::{Curve, Figure, Panel, Tally};
+use super::curves::{Average, Curve, Figure, Panel};
 use crate::baseline::Baseline;
 use crate::config::{Config, ConfigError, Fitness, Override, Paradigm};
 use crate::trainer::Row;
@@ -38,7 +38,7 @@ pub const FITNESSES: [Fitness; 3] = [Fitness::G, Fitness::D, Fitness::Df];
 
 /// One experiment: a curve of one of the figures.
 #[derive(Clone, Debug)]
-pub struct Arm {
+pub struct Experiment {
     pub layout: Layout,
     pub paradigm: Paradigm,
     pub fitness: Fitness,
@@ -51,7 +51,7 @@ pub struct Arm {
 ///
 /// # Errors
 /// What is wrong with the overrides.
-pub fn arms(overrides: &[Override]) -> Result<Vec<Arm>, ConfigError> {
+pub fn arms(overrides: &[Override]) -> Result<Vec<Experiment>, ConfigError> {
     let mut arms = Vec::new();
     for layout in LAYOUTS {
         for paradigm in PARADIGMS {
@@ -61,7 +61,7 @@ pub fn arms(overrides: &[Override]) -> Result<Vec<Arm>, ConfigError> {
                 config.learning.paradigm = paradigm;
                 config.learning.fitness = fitness;
                 let best = vec![Vec::with_capacity(config.learning.generations + 1); config.learning.trials];
-                arms.push(Arm { layout, paradigm, fitness, config, best });
+                arms.push(Experiment { layout, paradigm, fitness, config, best });
             }
         }
     }
@@ -69,9 +69,9 @@ pub fn arms(overrides: &[Override]) -> Result<Vec<Arm>, ConfigError> {
 }
 
 /// The configs to train for all arms, and which of these each arm is: where everyone leads, nobody follows, and Df is D.
-pub fn trained(arms: &[Arm]) -> (Vec<Config>, Vec<usize>) {
+pub fn trained(arms: &[Experiment]) -> (Vec<Config>, Vec<usize>) {
     let mut configs: Vec<Config> = Vec::new();
-    let place = |arm: &Arm| {
+    let place = |arm: &Experiment| {
         let mut config = arm.config.clone();
         if (arm.paradigm, arm.fitness) == (Paradigm::AllLeaders, Fitness::Df) {
             config.learning.fitness = Fitness::D;
@@ -85,7 +85,7 @@ pub fn trained(arms: &[Arm]) -> (Vec<Config>, Vec<usize>) {
     (configs, places)
 }
 
-impl Arm {
+impl Experiment {
     /// Takes in a row; a trial's rows come in order of generations.
     pub fn add(&mut self, row: &Row) {
         self.best[row.trial].push(row.best_g);
@@ -103,15 +103,15 @@ impl Arm {
 }
 
 /// The configs to play baselines of, one a layout and paradigm, in their order: fitness has no say in them.
-pub fn grounds(arms: &[Arm]) -> Vec<Config> {
+pub fn grounds(arms: &[Experiment]) -> Vec<Config> {
     arms.iter().filter(|arm| arm.fitness == FITNESSES[0]).map(|arm| arm.config.clone()).collect()
 }
 
 /// All that came out.
 #[derive(Clone, Copy, Debug)]
-pub struct Results<'a> {
+pub struct Evidence<'a> {
     /// Those of [`arms()`].
-    pub arms: &'a [Arm],
+    pub arms: &'a [Experiment],
     /// Those of [`grounds`].
     pub baselines: &'a [Baseline],
 }
@@ -155,11 +155,11 @@ pub struct Course<'a> {
     pub certain: bool,
 }
 
-impl Results<'_> {
+impl Evidence<'_> {
     /// What a source came to in one of [`LAYOUTS`]; none where there are no such arms.
     pub fn course(&self, layout: usize, paradigm: Paradigm, source: Source) -> Option<Course<'_>> {
         let figure = LAYOUTS.get(layout)?.figure;
-        let is_here = |arm: &&Arm| (arm.layout.figure, arm.paradigm) == (figure, paradigm);
+        let is_here = |arm: &&Experiment| (arm.layout.figure, arm.paradigm) == (figure, paradigm);
         let mut here = self.arms.iter().filter(is_here);
         let pois = here.clone().next()?.pois();
         let ground = PARADIGMS.len() * layout + PARADIGMS.iter().position(|&other| other == paradigm)?;
@@ -186,8 +186,8 @@ impl Course<'_> {
     }
 
     /// POIs over trials, by generation.
-    fn tallies(&self) -> Vec<Tally> {
-        let mut tallies = vec![Tally::default(); self.best.iter().map(Vec::len).max().unwrap_or(0)];
+    fn tallies(&self) -> Vec<Average> {
+        let mut tallies = vec![Average::default(); self.best.iter().map(Vec::len).max().unwrap_or(0)];
         for trial in self.best {
             tallies.iter_mut().zip(trial).for_each(|(tally, best)| tally.add(best * self.pois as f64));
         }
@@ -200,7 +200,7 @@ impl Course<'_> {
 }
 
 /// A figure of the paper: one panel a paradigm, one curve a fitness, and what needs no learning in grey.
-pub fn figure(results: Results<'_>, layout: usize) -> Figure {
+pub fn figure(results: Evidence<'_>, layout: usize) -> Figure {
     let [straight, random, evolved @ ..] = SOURCES;
     let sources = [evolved.as_slice(), &[straight, random]].concat();
     let panel = |(letter, paradigm): (&str, Paradigm)| Panel {
@@ -242,13 +242,13 @@ pub struct Summary<'a> {
     pub generations: usize,
     /// Of every arm, and of what needs no learning.
     #[serde(rename = "arms")]
-    pub curves: Vec<Measured>,
+    pub curves: Vec<Trajectory>,
     pub claims: &'a [claims::Claim],
 }
 
 /// One curve, in POIs observed by the best team of each generation; of random teams, by the best so far.
 #[derive(Serialize)]
-pub struct Measured {
+pub struct Trajectory {
     pub layout: &'static str,
     pub paradigm: Paradigm,
     /// `straight ahead`, `random teams`, or the fitness.
@@ -263,23 +263,23 @@ pub struct Measured {
     pub deviation: Vec<f64>,
 }
 
-impl Measured {
+impl Trajectory {
     /// Every curve, by layout, paradigm and source.
-    pub fn all(results: Results<'_>) -> Vec<Measured> {
+    pub fn all(results: Evidence<'_>) -> Vec<Trajectory> {
         let mut all = Vec::new();
         for (index, layout) in LAYOUTS.iter().enumerate() {
             for paradigm in PARADIGMS {
                 for source in SOURCES {
                     let Some(course) = results.course(index, paradigm, source) else { continue };
                     let fitness = if let Source::Evolved(fitness) = source { Some(fitness) } else { None };
-                    all.push(Measured {
+                    all.push(Trajectory {
                         layout: layout.name,
                         paradigm,
                         source: source.to_string(),
                         fitness,
                         pois: course.pois,
                         curve: course.curve(),
-                        deviation: course.tallies().iter().map(Tally::deviation).collect(),
+                        deviation: course.tallies().iter().map(Average::deviation).collect(),
                     });
                 }
             }

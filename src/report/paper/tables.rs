@@ -1,14 +1,14 @@
 //! What came out, as Markdown that also reads well as plain text.
 
 use super::claims::{Claim, END, Verdict};
-use super::{LAYOUTS, PARADIGMS, Results, SOURCES, Source};
+use super::{Evidence, LAYOUTS, PARADIGMS, SOURCES, Source};
 use crate::config::Learning;
 use crate::report::table::markdown;
 use crate::statistics;
 
 /// What needs no learning: the figures of straight ahead and of random teams beside those of evolution, and whether
 /// evolution came further than random search.
-pub fn without_learning(results: Results<'_>) -> String {
+pub fn without_learning(results: Evidence<'_>) -> String {
     let last = results.arms.first().map_or(0, |arm| arm.config.learning.generations).min(END);
     let teams = results.arms.first().map_or(0, |arm| arm.config.learning.population) * (last + 1);
     let mut sources = vec!["POIs at generation ".to_string() + &last.to_string(), "of".into()];
