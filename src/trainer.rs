@@ -325,6 +325,26 @@ impl Trainer {
         Ok(Snapshot { generation, last, weights: each(weights)?, fitness: each(fitness)?, pending })
     }
 
+    /// Puts given policies, `[populations][policies][parameters]`, in the first slots of a trial's populations, in their order:
+    /// as many as there is room for. The others stay as they were drawn. False where the arm has played already, or sizes do
+    /// not fit.
+    #[must_use]
+    pub fn start_from(&mut self, arm: usize, trial: usize, policies: usize, weights: &[f32]) -> bool {
+        let arm = &mut self.arms[arm];
+        let (populations, parameters) = (arm.config.populations(), arm.world.parameters());
+        let population = arm.config.learning.population;
+        let Some(trial) = arm.trials.get_mut(trial) else { return false };
+        if arm.generation > 0 || arm.offered || policies == 0 || weights.len() != populations * policies * parameters {
+            return false;
+        }
+        let taken = policies.min(population) * parameters;
+        let slots = trial.weights.chunks_exact_mut((population + 1) * parameters);
+        for (slots, policies) in slots.zip(weights.chunks_exact(policies * parameters)) {
+            slots[..taken].copy_from_slice(&policies[..taken]);
+        }
+        true
+    }
+
     /// Goes on with an arm from a snapshot of an arm of the same config, but for its number of generations, which may have
     /// been smaller; false where the sizes do not fit.
     #[must_use]

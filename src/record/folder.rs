@@ -80,6 +80,9 @@ pub struct Run {
     pub generations: usize,
     /// See [`Folder::digest`]; once the run is done.
     pub digest: Option<String>,
+    /// [`policies::Init::digest`] of what it started from, if not at random.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub init: Option<String>,
     /// What the last session was started by, as a shell reads it.
     #[serde(default)]
     pub command: String,
@@ -116,6 +119,7 @@ impl Run {
             sessions: 0,
             generations: 0,
             digest: None,
+            init: None,
             command: String::new(),
             commit: None,
         }

@@ -52,11 +52,32 @@ pub enum RecordError {
     Shorter { path: PathBuf, there: usize, here: usize },
     #[error("another process is training in {path}")]
     Locked { path: PathBuf },
+    /// A run that started from given policies, or that did not, cannot go on as if it had started from others.
+    #[error("{path} {}, so it cannot go on as a run {}", started(there), started_from(here))]
+    InitDiffers { path: PathBuf, there: Option<String>, here: String },
+    #[error("{path} {}, and has no checkpoint yet: it starts over from these alone", started(&Some(there.clone())))]
+    InitNeeded { path: PathBuf, there: String },
     #[error(
         "{path} is a run of another config, so it cannot go on with this one; what differs:\n{}",
         differences.join("\n")
     )]
     ConfigDiffers { path: PathBuf, differences: Vec<String> },
+}
+
+fn started(digest: &Option<String>) -> String {
+    match digest {
+        Some(digest) => format!("started from a file of policies with SHA-256 {}", brief(digest)),
+        None => "did not start from a file of policies".into(),
+    }
+}
+
+fn started_from(digest: &str) -> String {
+    format!("from the file with SHA-256 {}", brief(digest))
+}
+
+/// The start of a digest, enough to tell files apart.
+fn brief(digest: &str) -> String {
+    digest.chars().take(16).chain(['…']).collect()
 }
 
 impl RecordError {

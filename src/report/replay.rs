@@ -138,7 +138,9 @@ pub fn replay(
     let mut trainer = Trainer::of_trial(config.clone(), trial);
     for index in order {
         let generation = generations[index];
-        if let Some(snapshot) = nearest(folder, &config, trial, trainer.generation(0) + 1..=generation) {
+        // A run that started from given policies has those of generation 0.
+        let next = trainer.generation(0);
+        if let Some(snapshot) = nearest(folder, &config, trial, next + usize::from(next > 0)..=generation) {
             // A checkpoint of other sizes is of another config: training on from the start does without.
             let _ = trainer.restore(0, snapshot);
         }
