@@ -114,7 +114,7 @@ impl Record {
             let before = observed.clone();
             for (poi, set) in sets.iter().enumerate() {
                 let Rule { observers, windows, after } = &self.rule;
-                let at_its_time = windows.is_empty() || (windows[poi][0] <= step + 1 && step + 1 <= windows[poi][1]);
+                let at_its_time = windows.is_empty() || ((windows[poi][0]..=windows[poi][1]).contains(&(step + 1)));
                 let in_its_turn = after.is_empty() || after[poi].iter().all(|&other| before[other]);
                 let counts = |&&agent: &&usize| match observers {
                     Observers::All => true,
