@@ -150,7 +150,7 @@ pub fn replay(
             }
             trainer.advance(backend)?;
         }
-        let found = play_best(&config, &mut trainer, trial, backend)?;
+        let found = play_best(&config.at(generation), &mut trainer, trial, backend)?;
         let expected = rows.get(generation).unwrap_or(f64::NAN);
         if found.best_g != expected {
             let found = found.best_g;
