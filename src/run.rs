@@ -184,8 +184,11 @@ impl Session {
             arms.push(run);
             let fits = match snapshot {
                 Origin::Checkpoint(snapshot) => trainer.restore(going.arm, snapshot),
-                Origin::Policies(Init { trials, .. }) => (trials.into_iter().enumerate())
-                    .all(|(trial, Policies { policies, weights })| trainer.start_from(going.arm, trial, policies, &weights)),
+                Origin::Policies(Init { trials, .. }) => {
+                    (trials.into_iter().enumerate()).all(|(trial, Policies { policies, weights })| {
+                        trainer.start_from(going.arm, trial, policies, &weights)
+                    })
+                }
                 Origin::Chance => true,
             };
             if !fits {

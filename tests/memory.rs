@@ -158,7 +158,8 @@ fn checkpoints_need_no_copy() {
                 keeper.wait().unwrap();
             }
             _ => {
-                let checkpoint = Checkpoint { config, init: None, seconds, metrics, snapshot: trainer.view(0).unwrap() };
+                let checkpoint =
+                    Checkpoint { config, init: None, seconds, metrics, snapshot: trainer.view(0).unwrap() };
                 keeper.save_now(&checkpoint, &output, Instant::now()).unwrap();
             }
         }

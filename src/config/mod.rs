@@ -19,8 +19,8 @@ pub use crate::reader::{Definition, Override, Problem};
 pub use learning::{
     Fitness, Learning, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm, Saving, Sharing,
 };
-pub use stages::{MAX_STAGES, Stage};
 pub use load::{MAX_FILE_BYTES, is_standard_input, name, read_file};
+pub use stages::{MAX_STAGES, Stage};
 pub use world::{Domain, MAX_AGENTS, MAX_POIS, MAX_STEPS};
 
 mod learning;

@@ -102,9 +102,8 @@ struct Written<'a> {
 
 /// Reads the stages of a text whose other keys make a valid config; all that is wrong with them, by line.
 pub(super) fn read(text: &str, outside: bool, own: &Config) -> Result<Vec<Stage>, Vec<Problem>> {
-    let line_of = |offset: usize| {
-        (!outside).then(|| text.bytes().take(offset).filter(|&byte| byte == b'\n').count() + 1)
-    };
+    let line_of =
+        |offset: usize| (!outside).then(|| text.bytes().take(offset).filter(|&byte| byte == b'\n').count() + 1);
     let (document, _) = DeTable::parse_recoverable(text);
     let Some(list) = document.get_ref().get(STAGES) else { return Ok(vec![]) };
     let problems = RefCell::new(Vec::new());

@@ -343,12 +343,17 @@ pub fn page(name: &str, config: &Config, played: &[Replayed]) -> String {
         })
         .collect();
     let world = &config.world;
+    // Where they move, they are where the first episode has them.
+    let pois = match played.first().filter(|_| config.learning.poi_jitter > 0.0) {
+        Some(first) => first.world.pois.iter().map(|poi| poi.as_dvec2().to_array()).collect(),
+        None => world.pois.clone(),
+    };
     let data = json!({
         "run": name,
         "paradigm": config.learning.paradigm,
         "fitness": config.learning.fitness,
         "map": world.map,
-        "pois": world.pois,
+        "pois": pois,
         "observation_radius": world.observation_radius,
         "observers": world.observers,
         "windows": world.windows,
