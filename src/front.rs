@@ -257,6 +257,7 @@ pub fn train(
             stopped = watch(Generation { generation, last, rows: &played }).is_break();
             if stopped {
                 config.learning.generations = trainer.end(0);
+                config.stages.retain(|stage| stage.from <= config.learning.generations);
             }
         }
         rows.extend(played);

@@ -445,7 +445,7 @@ impl Member {
         let (metrics, before, from) = match found.checkpoint {
             Some((Checkpoint { snapshot, seconds, .. }, metrics)) => (metrics, seconds, Origin::Checkpoint(snapshot)),
             None => {
-                let metrics = metrics::Writer::create(disk, &member.folder.file(METRICS));
+                let metrics = metrics::Writer::create(disk, &member.folder.file(METRICS), &member.config);
                 (metrics.map_err(member.metrics_failed())?, 0.0, init.map_or(Origin::Chance, Origin::Policies))
             }
         };

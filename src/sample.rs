@@ -183,6 +183,18 @@ fn plain_world(seed: u64) -> Config {
     // What came later has draws of its own: the worlds of the seeds stay as they were in all else.
     let later = &mut ChaCha8Rng::seed_from_u64(!seed);
     let actions = if later.random_bool(0.3) { Actions::Behaviours } else { Actions::Direct };
+    // Of the generations that are trained when worlds are compared, the last may be shorter and elsewhere.
+    let stages = match later.random_bool(0.2) {
+        true => {
+            let set = [
+                ("world.steps", toml::Value::Integer(later.random_range(5..=30))),
+                ("learning.poi_jitter", toml::Value::Float(1.5)),
+                ("learning.episodes_per_team", toml::Value::Integer(later.random_range(1..=2))),
+            ];
+            vec![Stage { from: 2, set: set.map(|(key, value)| (key.to_string(), value)).into() }]
+        }
+        false => vec![],
+    };
     let gain = |rng: &mut ChaCha8Rng, high: f64| if rng.random_bool(0.1) { 0.0 } else { rng.random_range(0.1..high) };
     Config {
         world: crate::config::Domain {
@@ -249,6 +261,7 @@ fn plain_world(seed: u64) -> Config {
             seed,
         },
         checkpoint: Saving::default(),
+        stages,
     }
 }
 

@@ -71,6 +71,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             seed: 0,
         },
         checkpoint: Saving { generations: 0, seconds: 30.0 },
+        stages: vec![],
     };
     assert_eq!(config, expected);
 }
@@ -313,7 +314,7 @@ fn configs() -> impl Strategy<Value = Config> {
             if learning.paradigm == Paradigm::AllLeaders && world.observers == Observers::Followers {
                 world.observers = Observers::Leaders;
             }
-            Config { world, motion, follow, sense, policy, learning, checkpoint }
+            Config { world, motion, follow, sense, policy, learning, checkpoint, stages: vec![] }
         },
     )
 }

@@ -38,7 +38,7 @@ coupling = 4
 type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Which between them cover every choice that a config has, and sizes on both sides of every special case.
-const CASES: [Case; 22] = [
+const CASES: [Case; 23] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -155,6 +155,16 @@ const CASES: [Case; 22] = [
         "two episodes a team with POIs elsewhere",
         GENERALLY_FORWARD,
         &[("learning.poi_jitter", "3.0"), ("learning.episodes_per_team", "2"), ("learning.population", "13")],
+    ),
+    (
+        "stages",
+        "coupling 1, from generation 3 on 3 with moved starts, from generation 6 on all of a team's speed",
+        GENERALLY_FORWARD,
+        &[(
+            "stages",
+            "[{from = 0, set = {'world.coupling' = 1}}, {from = 3, set = {'learning.start_jitter' = 0.5}}, \
+             {from = 6, set = {'motion.max_speed' = 10.0}}]",
+        )],
     ),
 ];
 

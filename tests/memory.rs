@@ -143,7 +143,7 @@ fn checkpoints_need_no_copy() {
     }
     let folder = tempfile::tempdir().unwrap();
     let disk = Disk::default();
-    let mut metrics = metrics::Writer::create(&disk, &folder.path().join("metrics.csv")).unwrap();
+    let mut metrics = metrics::Writer::create(&disk, &folder.path().join("metrics.csv"), &config).unwrap();
     let files = ["copy", "view"].map(|name| {
         let path = folder.path().join(name);
         fs::create_dir(&path).unwrap();

@@ -47,24 +47,33 @@ struct Cost {
 
 impl Cost {
     fn of(config: &Config) -> Cost {
-        let world = World::new(config);
-        let learning = &config.learning;
         let wide = |count: usize| count as u128;
-        let teams = wide(learning.trials)
-            * wide(learning.generations + 1)
-            * wide(learning.population + 1)
-            * wide(learning.episodes_per_team);
-        let team_steps = teams * wide(world.steps());
+        let [mut teams, mut team_steps, mut agent_steps] = [0; 3];
+        let (mut agents, mut record_bytes) = (0, 0);
+        // Of stages all that they play, and the size of the largest.
+        for share in config.shares() {
+            let (world, learning) = (World::new(&share), &share.learning);
+            let played = wide(learning.trials)
+                * wide(learning.generations + 1)
+                * wide(learning.population + 1)
+                * wide(learning.episodes_per_team);
+            teams += played;
+            team_steps += played * wide(world.steps());
+            agent_steps += played * wide(world.steps()) * wide(world.agents());
+            agents = agents.max(world.agents());
+            let words = world.set_words() + world.followers() * world.leaders();
+            record_bytes = record_bytes.max(words * size_of::<u32>());
+        }
         let plan = Peaks::of([config], rayon::current_num_threads());
         Cost {
-            agents: world.agents(),
+            agents,
             learners: config.learners(),
             teams,
             team_steps,
-            agent_steps: team_steps * wide(world.agents()),
+            agent_steps,
             parameters: config.parameters(),
             policy_bytes: config.policy_bytes(),
-            record_bytes: (world.set_words() + world.followers() * world.leaders()) * size_of::<u32>(),
+            record_bytes,
             host_bytes: plan.host,
             checkpoint_bytes: plan.checkpoint,
             gpu_host_bytes: plan.gpu_host,

@@ -36,6 +36,9 @@ pub struct Args {
     /// Take the tensor `weights.N` [default: `weights`, or else `weights.0`]
     #[arg(long, value_name = "N", value_parser = whole)]
     trial: Option<usize>,
+    /// Play in the world of the config's stage N, from 0 [default: that of the file's own keys]
+    #[arg(long, value_name = "N", value_parser = whole)]
+    stage: Option<usize>,
     /// Write every agent's state after every step, and what leaders sense and answer there
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
@@ -92,6 +95,17 @@ pub fn run(args: Args) -> Result<(), Error> {
         set("poi_jitter", args.poi_jitter.map(toml::Value::from)),
     ];
     let config = args.config.load(&overrides.into_iter().flatten().collect::<Vec<_>>())?;
+    let config = match args.stage {
+        None => config,
+        Some(stage) => {
+            let mut staged = config.staged();
+            if stage >= staged.len() {
+                let stages = staged.len();
+                return Err(Error::Usage(format!("--stage {stage}: the config has {stages}, 0 to {}", stages - 1)));
+            }
+            staged.swap_remove(stage).1
+        }
+    };
     let starts = args.starts(config.learning.start_jitter, config.learning.poi_jitter)?;
     let policies = policies::read(&args.policies, &config, args.trial)?;
     let world = World::new(&config);

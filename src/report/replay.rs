@@ -150,7 +150,7 @@ pub fn replay(
             }
             trainer.advance(backend)?;
         }
-        let found = play_best(&config, &mut trainer, trial, backend)?;
+        let found = play_best(&config.at(generation), &mut trainer, trial, backend)?;
         let expected = rows.get(generation).unwrap_or(f64::NAN);
         if found.best_g != expected {
             let found = found.best_g;
@@ -343,12 +343,17 @@ pub fn page(name: &str, config: &Config, played: &[Replayed]) -> String {
         })
         .collect();
     let world = &config.world;
+    // Where they move, they are where the first episode has them.
+    let pois = match played.first().filter(|_| config.learning.poi_jitter > 0.0) {
+        Some(first) => first.world.pois.iter().map(|poi| poi.as_dvec2().to_array()).collect(),
+        None => world.pois.clone(),
+    };
     let data = json!({
         "run": name,
         "paradigm": config.learning.paradigm,
         "fitness": config.learning.fitness,
         "map": world.map,
-        "pois": world.pois,
+        "pois": pois,
         "observation_radius": world.observation_radius,
         "observers": world.observers,
         "windows": world.windows,
