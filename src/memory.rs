@@ -7,7 +7,7 @@
 use std::fs;
 use std::path::Path;
 
-use crate::backend::{self, BATCH_BYTES, PACKED_FROM, cpu};
+use crate::backend::{self, BATCH_BYTES, Need, PACKED_FROM, cpu};
 use crate::config::Config;
 use crate::trainer;
 use crate::world::World;
@@ -51,18 +51,18 @@ impl Peaks {
         let [mut training, mut checkpoint, mut queue, mut weights, mut record] = [0_u64; 5];
         let [mut block, mut order, mut populations, mut held] = [0_u64; 4];
         for config in configs {
-            let world = World::new(config);
+            let (world, need) = (World::new(config), Need::Score(config.learning.fitness));
             let (trials, policies) = (config.learning.trials as u64, config.learning.population);
             let teams = trials * config.learning.episodes_per_team as u64 * (policies as u64 + 1);
             training += trainer::bytes(config);
             checkpoint += checkpoint_bytes(config);
             queue += teams.div_ceil(lanes) * 16;
-            block = block.max(cpu::block_bytes(&world));
+            block = block.max(cpu::block_bytes(&world, need));
             order = order.max((policies * size_of::<usize>()) as u64);
             populations += trials * world.leaders() as u64;
             held += trials * backend::held_bytes([world.leaders(), policies + 1, world.parameters()]);
             weights = weights.saturating_add(teams * backend::weight_bytes(&world));
-            record = teams.saturating_mul(backend::record_bytes(&world)).saturating_add(record);
+            record = teams.saturating_mul(backend::record_bytes(&world, need)).saturating_add(record);
         }
         // Episodes and the final sorting of each population take turns.
         let playing = threads as u64 * block + queue;

@@ -437,6 +437,11 @@ fn arms() -> Vec<Config> {
             small(config, 2, 0, 1);
             config.learning.fitness = Fitness::G;
         }),
+        config(CHAOTIC, |config| {
+            small(config, 10, 3, 1);
+            (config.learning.fitness, config.learning.led_within) = (Fitness::Dt, 5);
+            config.world.windows = vec![[1, 50], [10, 30], [1, 20], [1, 50]];
+        }),
         config(GENERALLY_FORWARD, |config| {
             small(config, 6, 2, 1);
             config.learning.elites = 6;
@@ -498,7 +503,7 @@ impl Plain<'_> {
             let key = self.key(Purpose::Starts);
             evolve::jitter_starts(key, generation, episode, &self.world, start_jitter, &mut starts);
             let teams = vec![0; team.len()];
-            let (world, weights, need) = (&self.world, weights[..].into(), Need::Scores);
+            let (world, weights, need) = (&self.world, weights[..].into(), Need::Sights);
             let group = Group { world, starts: &starts, weights, policies: 1, teams: &teams, need };
             let found = std::sync::Mutex::new(None);
             let visit = |episode: flotilla::backend::Episode<'_>| {
@@ -508,6 +513,7 @@ impl Plain<'_> {
                     Fitness::D => scores.d,
                     Fitness::Df => scores.df,
                     Fitness::Dpp => scores.dpp,
+                    Fitness::Dt => scores.dt,
                 };
                 assert!(found.lock().unwrap().replace((scores.observed, mine)).is_none(), "one visit a team");
             };

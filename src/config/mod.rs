@@ -17,7 +17,7 @@ pub use crate::model::policy::{MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
 pub use crate::model::sense::{Density, Sense};
 pub use crate::reader::{Definition, Override, Problem};
 pub use learning::{
-    Fitness, Learning, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm, Saving,
+    Fitness, Learning, LedBy, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm, Saving,
 };
 pub use load::{MAX_FILE_BYTES, is_standard_input, name, read_file};
 pub use world::{Domain, MAX_AGENTS, MAX_POIS, MAX_STEPS};
