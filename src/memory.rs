@@ -7,7 +7,7 @@
 use std::fs;
 use std::path::Path;
 
-use crate::backend::{self, BATCH_BYTES, PACKED_FROM, cpu};
+use crate::backend::{self, BATCH_BYTES, Need, PACKED_FROM, cpu};
 use crate::config::Config;
 use crate::trainer;
 use crate::world::World;
@@ -57,6 +57,7 @@ impl Peaks {
                     (config, world)
                 })
                 .collect();
+            let need = |config: &Config| Need::Score(config.learning.fitness);
             // Of what a stage decides, the largest counts.
             let most = |size: &dyn Fn(&Config, &World) -> u64| {
                 staged.iter().map(|(config, world)| size(config, world)).max().unwrap_or(0)
@@ -66,13 +67,14 @@ impl Peaks {
             training += trainer::bytes(config);
             checkpoint += checkpoint_bytes(config);
             queue += most(&|config, _| teams(config).div_ceil(lanes) * 16);
-            block = block.max(most(&|_, world| cpu::block_bytes(world)));
+            block = block.max(most(&|config, world| cpu::block_bytes(world, need(config))));
             order = order.max((policies * size_of::<usize>()) as u64);
             populations += trials * config.populations() as u64;
             held += trials * backend::held_bytes([config.populations(), policies + 1, config.parameters()]);
             weights = weights.saturating_add(most(&|config, world| teams(config) * backend::weight_bytes(world)));
-            record = record
-                .saturating_add(most(&|config, world| teams(config).saturating_mul(backend::record_bytes(world))));
+            record = record.saturating_add(most(&|config, world| {
+                teams(config).saturating_mul(backend::record_bytes(world, need(config)))
+            }));
         }
         // Episodes and the final sorting of each population take turns.
         let playing = threads as u64 * block + queue;

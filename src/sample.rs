@@ -48,6 +48,8 @@ pub fn world(seed: u64) -> Config {
     if rng.random_bool(0.5) {
         observe_otherwise(rng, &mut config);
     }
+    config.learning.led_within = [0, 1, rng.random_range(2..=10)][rng.random_range(0..3)];
+    config.learning.led_by = word(rng);
     config
 }
 
@@ -255,6 +257,8 @@ fn plain_world(seed: u64) -> Config {
             mutation: if rng.random_bool(0.5) { Mutation::Scaled } else { Mutation::Additive },
             mutation_probability: 0.15,
             mutation_sigma: 0.1,
+            led_within: 0,
+            led_by: LedBy::MostSeen,
             episodes_per_team: 1,
             start_jitter: 0.0,
             poi_jitter: if later.random_bool(0.3) { later.random_range(0.5..5.0) } else { 0.0 },

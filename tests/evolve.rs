@@ -443,6 +443,11 @@ fn arms() -> Vec<Config> {
             small(config, 2, 0, 1);
             config.learning.fitness = Fitness::G;
         }),
+        config(CHAOTIC, |config| {
+            small(config, 10, 3, 1);
+            (config.learning.fitness, config.learning.led_within) = (Fitness::Dt, 5);
+            config.world.windows = vec![[1, 50], [10, 30], [1, 20], [1, 50]];
+        }),
         config(GENERALLY_FORWARD, |config| {
             small(config, 6, 2, 1);
             config.learning.elites = 6;
@@ -553,7 +558,7 @@ impl Plain<'_> {
             evolve::jitter_starts(key, generation, episode, &of_stage, start_jitter, &mut starts);
             evolve::jitter_pois(self.key(Purpose::Pois), generation, episode, &of_stage, poi_jitter, &mut starts);
             let teams = vec![0; team.len()];
-            let (world, weights, need) = (&of_stage, weights[..].into(), Need::Scores);
+            let (world, weights, need) = (&of_stage, weights[..].into(), Need::Sights);
             let group = Group { world, starts: &starts, weights, policies: 1, teams: &teams, need };
             let found = std::sync::Mutex::new(None);
             let visit = |episode: flotilla::backend::Episode<'_>| {
@@ -563,6 +568,7 @@ impl Plain<'_> {
                     Fitness::D => scores.d,
                     Fitness::Df => scores.df,
                     Fitness::Dpp => scores.dpp,
+                    Fitness::Dt => scores.dt,
                 };
                 assert!(found.lock().unwrap().replace((scores.observed, mine)).is_none(), "one visit a team");
             };

@@ -38,7 +38,7 @@ coupling = 4
 type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Which between them cover every choice that a config has, and sizes on both sides of every special case.
-const CASES: [Case; 23] = [
+const CASES: [Case; 25] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -165,6 +165,21 @@ const CASES: [Case; 23] = [
             "[{from = 0, set = {'world.coupling' = 1}}, {from = 3, set = {'learning.start_jitter' = 0.5}}, \
              {from = 6, set = {'motion.max_speed' = 10.0}}]",
         )],
+    ),
+    ("led-step-by-step", "Dt, led by whom it saw most so far", CHAOTIC, &[("learning.fitness", "'Dt'")]),
+    (
+        "relay",
+        "Dt, led by any of the last 3 steps, only followers observe, one POI after the other",
+        FORTY_AGENTS,
+        &[
+            ("learning.fitness", "'Dt'"),
+            ("learning.led_within", "3"),
+            ("learning.led_by", "'any-seen'"),
+            ("world.observers", "'followers'"),
+            ("world.coupling", "2"),
+            ("world.after", "[[], [0], [], [2], [3], [4]]"),
+            ("world.windows", "[[1, 25], [2, 25], [3, 20], [1, 25], [1, 25], [10, 11]]"),
+        ],
     ),
 ];
 

@@ -13,7 +13,7 @@ use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records, Sta
 use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::population::{Brood, Stretch};
 use flotilla::backend::{Backend, Group, Moment, Need, Weights};
-use flotilla::config::{Config, Fitness};
+use flotilla::config::{Config, Coupling, Fitness, Observers};
 use flotilla::declare::Shared;
 use flotilla::evaluate::{Starts, evaluate};
 use flotilla::evolve::{Breeding, Key, Purpose};
@@ -69,7 +69,7 @@ fn checked_shaders_and_default_limits_agree() {
 #[test]
 fn a_changed_twin_is_named_by_its_stage() {
     type Edit = fn(String) -> String;
-    let edits: [(&str, Edit); 9] = [
+    let edits: [(&str, Edit); 11] = [
         ("sense", |text| replaced(text, "density = 1.0 - root(d2)", "density = 1.0000001 - root(d2)")),
         ("policy", |text| replaced(text, "14.7163315", "14.716334")),
         ("follow", |text| replaced(text, "vec2(push * world.wall_gain", "vec2(push * 1.01 * world.wall_gain")),
@@ -79,6 +79,8 @@ fn a_changed_twin_is_named_by_its_stage() {
         ("policy", |text| replaced(text, "if wanted[3] > most", "if wanted[3] >= most")),
         ("policy", |text| replaced(text, "if densities.y > most", "if densities.y >= most")),
         ("breed", |text| replaced(text, "* brood.sigma", "* 1.0000001 * brood.sigma")),
+        ("sight", |text| replaced(text, "return d2 <= world.attr", "return 1.01 * d2 <= world.attr")),
+        ("sight", |text| replaced(text, "sights + (step * rows + row)", "sights + (step * rows + rows - 1u - row)")),
     ];
     for (request, info) in common::adapters("a_changed_twin_is_named_by_its_stage") {
         for ((stage, edit), kernel) in edits.into_iter().zip(KERNELS.into_iter().cycle()) {
@@ -183,6 +185,11 @@ fn training_gives_the_same_metrics_and_weights() {
     (jittered.learning.trials, jittered.learning.generations, jittered.learning.population) = (1, 2, 20);
     (jittered.learning.start_jitter, jittered.learning.episodes_per_team) = (0.5, 3);
     jittered.learning.fitness = Fitness::Dpp;
+    let mut relay = Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap();
+    (relay.learning.trials, relay.learning.generations, relay.learning.population) = (1, 3, 20);
+    (relay.learning.fitness, relay.learning.led_within) = (Fitness::Dt, 4);
+    (relay.world.observers, relay.world.coupling) = (Observers::Followers, Coupling::Same(1));
+    (relay.world.steps, relay.world.after) = (40, vec![vec![], vec![0], vec![], vec![2]]);
     let train = |backend: &mut dyn Backend, configs: &[Config]| {
         let mut trainer = Trainer::new(configs.to_vec());
         let mut rows = Vec::new();
@@ -192,8 +199,9 @@ fn training_gives_the_same_metrics_and_weights() {
         let weights: Vec<Vec<Vec<f32>>> = (0..configs.len()).map(|arm| trainer.policies(arm)).collect();
         (rows, weights)
     };
-    let both = [config.clone(), jittered.clone()];
+    let both = [config.clone(), jittered.clone(), relay.clone()];
     let (rows, weights) = train(&mut Cpu::default(), &both);
+    assert!(rows.iter().any(|row| row.arm == 2 && row.best_g > 0.0), "nothing was relayed: {rows:?}");
     assert!(rows.iter().any(|row| row.best_g > 0.0), "nothing was observed: {rows:?}");
     for (arm, config) in both.iter().enumerate() {
         assert_eq!(train(&mut Cpu::default(), std::slice::from_ref(config)).1[0], weights[arm]);

@@ -51,9 +51,17 @@ impl Teams {
 /// POIs observed and what the need asks for, of every team of every group.
 type Scores = BTreeMap<(usize, usize), (u32, Vec<Vec<f32>>)>;
 
+/// The need of a group where those that a packed record answers come by turns, from `first` on; or Dt, which none does.
+fn need_of(group: usize, first: usize) -> Need {
+    let (packed, _) = Need::OF_SCORES.split_at(5);
+    if first == DT { Need::Score(Fitness::Dt) } else { packed[(group + first) % packed.len()] }
+}
+
+const DT: usize = usize::MAX;
+
 /// Plays all teams as one batch, the needs of the groups by turns from `first` on; `asked` is what the backend is told.
 fn scores(backend: &mut dyn Backend, all: &[Teams], first: usize, asked: impl Fn(Need) -> Need) -> Scores {
-    let need = |group: usize| Need::OF_SCORES[(group + first) % Need::OF_SCORES.len()];
+    let need = |group: usize| need_of(group, first);
     let groups: Vec<_> = all.iter().enumerate().map(|(index, teams)| teams.group(asked(need(index)))).collect();
     let scores = Mutex::new(Scores::new());
     let visit = |episode: flotilla::backend::Episode<'_>| {
@@ -64,6 +72,7 @@ fn scores(backend: &mut dyn Backend, all: &[Teams], first: usize, asked: impl Fn
                 (credit.score(&episode, world, fitness, &mut one), vec![one])
             }
             _ => {
+                // Dt is not asked for, whatever the record tells.
                 let all = credit.all(&episode, world);
                 (all.observed, vec![all.d, all.df, all.dpp])
             }
@@ -76,7 +85,7 @@ fn scores(backend: &mut dyn Backend, all: &[Teams], first: usize, asked: impl Fn
 }
 
 fn expected(all: &[Teams], first: usize) -> Scores {
-    scores(&mut Cpu::default(), all, first, |_| Need::Record)
+    scores(&mut Cpu::default(), all, first, |_| Need::Sights)
 }
 
 fn open(request: &Request, records: Records) -> GpuEpisodes {
@@ -115,7 +124,14 @@ fn worlds() -> Vec<Config> {
             line(70, [5.0, 6.0], [0.5, 0.1])
         ),
     ];
-    (0..28).map(sample::world).chain(odd.iter().map(|text| config(text))).collect()
+    let random = (0..28).map(|seed| {
+        let mut config = sample::world(seed);
+        // By such rules no record is packed.
+        config.world.windows.clear();
+        config.world.after.clear();
+        config
+    });
+    random.chain(odd.iter().map(|text| config(text))).collect()
 }
 
 #[test]
@@ -277,8 +293,13 @@ fn records_are_packed_only_where_time_does_not_matter() {
             assert!(expected.values().any(|(observed, _)| *observed > 0), "{what}: nothing is observed");
             let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
             assert!(scores(&mut backend, &all, 0, |need| need) == expected, "{info}, {what}");
-            let down = down(&mut backend);
-            assert_eq!(down < all[0].whole() / 2, packed, "{info}, {what}: {down} bytes");
+            let moved = down(&mut backend);
+            assert_eq!(moved < all[0].whole() / 2, packed, "{info}, {what}: {moved} bytes");
+            // Dt asks when its followers were led: nothing is packed, and sights come with the rest.
+            let expected = scores(&mut Cpu::default(), &all, DT, |_| Need::Sights);
+            assert!(scores(&mut backend, &all, DT, |need| need) == expected, "{info}, {what}, Dt");
+            let sights = (200 * 4 * all[0].world.sight_words()) as u64;
+            assert_eq!(down(&mut backend), all[0].whole() + sights, "{info}, {what}, Dt");
         }
     }
 }

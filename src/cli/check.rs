@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::{ConfigArgs, Error, output, plot, print};
+use crate::backend::{self, Need};
 use crate::config::Config;
 use crate::memory::Peaks;
 use crate::report::map;
@@ -35,8 +36,8 @@ struct Cost {
     parameters: usize,
     /// Bytes of all trials' policies.
     policy_bytes: u64,
-    /// Bytes of one team's record: who was near which POI at which step, and which leader each follower saw.
-    record_bytes: usize,
+    /// Bytes of one team's record: who was near which POI at which step, which leader each follower saw and, for Dt, when.
+    record_bytes: u64,
     /// Peak of the process where the CPU plays, and how much of it only while a checkpoint is written.
     host_bytes: u64,
     checkpoint_bytes: u64,
@@ -61,8 +62,7 @@ impl Cost {
             team_steps += played * wide(world.steps());
             agent_steps += played * wide(world.steps()) * wide(world.agents());
             agents = agents.max(world.agents());
-            let words = world.set_words() + world.followers() * world.leaders();
-            record_bytes = record_bytes.max(words * size_of::<u32>());
+            record_bytes = record_bytes.max(backend::record_bytes(&world, Need::Score(learning.fitness)));
         }
         let plan = Peaks::of([config], rayon::current_num_threads());
         Cost {

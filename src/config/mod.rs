@@ -17,7 +17,8 @@ pub use crate::model::policy::{Actions, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Pol
 pub use crate::model::sense::{Density, Sense};
 pub use crate::reader::{Definition, Override, Problem};
 pub use learning::{
-    Fitness, Learning, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm, Saving, Sharing,
+    Fitness, Learning, LedBy, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm, Saving,
+    Sharing,
 };
 pub use load::{MAX_FILE_BYTES, is_standard_input, name, read_file};
 pub use stages::{MAX_STAGES, Stage};
