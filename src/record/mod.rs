@@ -14,13 +14,13 @@
 //! before it is used, and nothing in it names another file.
 
 use std::fmt::Display;
-use std::io::{self, Read};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
 use crate::config::{self, Config};
-use crate::file;
+use crate::file::{self, TextError};
 
 pub mod checkpoint;
 pub mod disk;
@@ -96,16 +96,11 @@ impl RecordError {
 
 /// A small text file, refused where it is larger than `most` bytes.
 fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
-    let mut bytes = Vec::new();
     let file = file::open(path).map_err(RecordError::read(path))?;
-    file.take(most + 1).read_to_end(&mut bytes).map_err(RecordError::read(path))?;
-    if bytes.len() as u64 > most {
-        return Err(RecordError::damaged(
-            path,
-            format_args!("it is larger than the {most} bytes such a file may have"),
-        ));
-    }
-    String::from_utf8(bytes).map_err(|_| RecordError::damaged(path, "it is not UTF-8 text"))
+    file::text(file, most).map_err(|error| match error {
+        TextError::Read(error) => RecordError::read(path)(error),
+        wrong => RecordError::damaged(path, wrong),
+    })
 }
 
 /// Keys that came later, at their defaults: they are left out of a config's digest, so that a run of an earlier version
