@@ -82,7 +82,7 @@ class VectorEnv:
 
     Every episode takes ``world.steps`` steps; then it is *truncated*. Where the config's ``learning.start_jitter`` is above
     0, every team of every episode starts from a place of its own, drawn from the seed of :meth:`reset`; else all start
-    where the config says. ``close`` gives nothing back, for there is nothing to give.
+    where the config says. POIs stay where the config has them. ``close`` gives nothing back, for there is nothing to give.
 
     Leaders sense the density of POIs, then of agents, in four quadrants around their heading: back right, front right, front
     left, back left. They are told a turn, in parts of a half turn to the left, and a speed, from -1 for standing still to 1

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use flotilla::report::curves::PRINT;
-use flotilla::report::replay::{self as again, Film, Replayed, ReplayError};
+use flotilla::report::replay::{self as again, Film, ReplayError, Replayed};
 use flotilla::report::runs;
 use flotilla::report::scene::{Format, Scene};
 use pyo3::exceptions::PyValueError;
