@@ -67,6 +67,7 @@ def signature(name: str, thing: object) -> str:
     except (TypeError, ValueError):
         return name
     found = re.sub(r"'([^']*)'", lambda part: part.group(0) if part.group(1) in ("", *WORDS) else part.group(1), found)
+    found = found.replace("(cls, ", "(").replace("(cls)", "()")
     return name + found.replace("(self, ", "(").replace("(self)", "()")
 
 

@@ -11,7 +11,7 @@ OUTPUTS: int
 
 _F32 = NDArray[np.float32]
 _F64 = NDArray[np.float64]
-_Starts = tuple[int, int, float] | None
+_Starts = tuple[int, int, float, float] | None
 
 Outcome = tuple[Config, list[_F64], list[_F32], str]
 
@@ -29,6 +29,8 @@ class Config:
     def to_dict(self) -> dict[str, Any]: ...
     @property
     def learners(self) -> int: ...
+    @property
+    def widths(self) -> list[int]: ...
     @property
     def parameters(self) -> int: ...
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -88,6 +87,7 @@ def rollout(
     episodes: int | None = None,
     seed: int = 0,
     jitter: float | None = None,
+    poi_jitter: float | None = None,
     trace: bool = False,
     backend: str | int = "auto",
 ) -> Rollout:
@@ -102,6 +102,7 @@ def rollout(
         episodes: play every team from so many starts that no training saw; None plays once, from the config's own.
         seed: of these starts; the same for all policies.
         jitter: how far a start is moved at most on each axis, in map units; None is the config's ``learning.start_jitter``.
+        poi_jitter: likewise of each POI; None is the config's ``learning.poi_jitter``.
         trace: also give all that the teams did in the first episode.
         backend: what to play on, to the same bits: ``"auto"``, ``"cpu"``, ``"gpu"``, or an adapter's number or name.
 
@@ -123,14 +124,17 @@ def rollout(
     array, name = floats("policies", policies, 3), backend_name(backend)
     starts = None
     if episodes is not None:
-        reach = config["learning.start_jitter"] if jitter is None else jitter
+        learning = config["learning"]
+        reaches = [learning["start_jitter"] if jitter is None else jitter]
+        reaches.append(learning["poi_jitter"] if poi_jitter is None else poi_jitter)
         starts = (
             whole("episodes", episodes, 1, MAX_EPISODES),
             whole("seed", seed, 0, 2**63 - 1),
-            number("jitter", reach, 0, 1e9),
+            number("jitter", reaches[0], 0, 1e9),
+            number("poi_jitter", reaches[1], 0, 1e9),
         )
-    elif jitter is not None:
-        raise ValueError("jitter is of starts that are drawn, say how many by episodes")
+    elif jitter is not None or poi_jitter is not None:
+        raise ValueError("a jitter is of starts that are drawn, say how many by episodes")
     observed, g, d, df, dpp = _native.rollout(config._native, array, starts, name)
     traced = None
     if trace:
@@ -139,28 +143,48 @@ def rollout(
     return Rollout(observed, g, d, df, dpp, traced)
 
 
-def widths(parameters: int, hidden: Sequence[int] | None = None) -> list[int]:
-    """Widths of a policy's layers, its inputs and outputs included: ``[8, 10, 2]``."""
-    ins, outs = _native.INPUTS, _native.OUTPUTS
-    if hidden is None:
-        hidden = [] if parameters == (ins + 1) * outs else [max((parameters - outs) // (ins + 1 + outs), 1)]
-    found = [ins, *(whole("hidden", units, 1, 64) for units in hidden), outs]
+def _layers(config: Config | None, parameters: int) -> list[int]:
+    """Widths of a policy's layers, inputs and outputs included."""
+    if config is not None and not isinstance(config, Config):
+        raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config")
+    if config is None:
+        ins, outs = _native.INPUTS, _native.OUTPUTS
+        units = (parameters - outs) // (ins + 1 + outs)
+        found = [ins, outs] if parameters == (ins + 1) * outs else [ins, max(units, 1), outs]
+    else:
+        found = config._native.widths
     expected = sum((before + 1) * after for before, after in zip(found, found[1:]))
     if expected != parameters:
         named = ", ".join(map(str, found))
-        raise ValueError(f"a policy has {parameters} parameters, but layers of {named} units take {expected}; name its hidden layers")
+        hint = "" if config is not None else "; say by config which layers it has"
+        raise ValueError(f"a policy has {parameters} parameters, but layers of {named} units take {expected}{hint}")
     return found
 
 
-def forward(policies: ArrayLike, inputs: ArrayLike, hidden: Sequence[int] | None = None) -> Floats:
+def _chosen(inputs: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The most wanted behaviour as a turn and a speed: hold, towards and away from POIs, towards and away from agents."""
+    behaviour = wanted.argmax(-1)
+    inputs = np.broadcast_to(inputs, (*behaviour.shape, inputs.shape[-1]))
+    sensed = np.where((behaviour < 3)[..., None], inputs[..., :4], inputs[..., 4:])
+    turn = np.array([-0.75, -0.25, 0.25, 0.75])[sensed.argmax(-1)]
+    away = (behaviour == 2) | (behaviour == 4)
+    turn = np.where(away, np.where(turn < 0, turn + 1, turn - 1), turn)
+    turn = np.where(sensed.max(-1) > 0, turn, 0.0)
+    hold = behaviour == 0
+    return np.stack([np.where(hold, 0.0, turn), np.where(hold, -1.0, 1.0)], axis=-1)
+
+
+def forward(policies: ArrayLike, inputs: ArrayLike, config: Config | None = None) -> Floats:
     """What policies answer, in plain NumPy: a fully connected network with a bias and tanh in every layer.
 
-    Within 5e-6 of the program's answers, which have arithmetic of their own that is the same everywhere.
+    Within 5e-6 of the program's answers, which have arithmetic of their own that is the same everywhere. Where a config says
+    that policies choose among behaviours, this chooses too; two that are wanted alike within that much may be taken for each
+    other.
 
     Args:
         policies: ``[..., parameters]``: layer by layer, in each input by input with the bias last, in each unit by unit.
         inputs: ``[..., 8]``; the axes before the last are broadcast against those of the policies.
-        hidden: units of the hidden layers, ``config["policy.hidden"]``; None where there is at most one.
+        config: whose policies they are; None where they have at most one hidden layer, and answer directly.
 
     Returns:
         float32 ``[..., 2]`` in -1..1: the turn, in parts of a half turn to the left, and the speed, from standing still to
@@ -174,32 +198,35 @@ def forward(policies: ArrayLike, inputs: ArrayLike, hidden: Sequence[int] | None
         >>> flotilla.forward(ahead, np.ones((5, 8))).shape
         (5, 2)
     """
-    weights, values = np.asarray(policies), np.asarray(inputs)
-    for what, array in (("policies", weights), ("inputs", values)):
+    weights, given = np.asarray(policies), np.asarray(inputs)
+    for what, array in (("policies", weights), ("inputs", given)):
         if array.dtype.kind not in "fiu" or array.ndim == 0:
             raise ValueError(f"{what} are {array.dtype} of shape {array.shape}, allowed are arrays of numbers")
-    if values.shape[-1] != _native.INPUTS:
-        raise ValueError(f"inputs have the shape {values.shape}, allowed is [..., {_native.INPUTS}]")
-    layers, at = widths(weights.shape[-1], hidden), 0
-    values = values.astype(np.float64)
+    if given.shape[-1] != _native.INPUTS:
+        raise ValueError(f"inputs have the shape {given.shape}, allowed is [..., {_native.INPUTS}]")
+    layers, at = _layers(config, weights.shape[-1]), 0
+    values = sensed = given.astype(np.float64)
     for before, after in zip(layers, layers[1:]):
         layer = weights[..., at : at + (before + 1) * after].astype(np.float64)
         layer = layer.reshape(*weights.shape[:-1], before + 1, after)
         values = np.tanh(np.einsum("...iu,...i->...u", layer[..., :-1, :], values) + layer[..., -1, :])
         at += (before + 1) * after
+    if layers[-1] != _native.OUTPUTS:
+        values = _chosen(sensed, values)
     answers: Floats = values.astype(np.float32)
     return answers
 
 
-def to_onnx(policy: ArrayLike, path: Any, hidden: Sequence[int] | None = None) -> None:
-    """Writes one policy as an ONNX model with an input ``inputs [n, 8]`` and an output ``outputs [n, 2]``.
+def to_onnx(policy: ArrayLike, path: str | os.PathLike[str], config: Config | None = None) -> None:
+    """Writes one policy's network as an ONNX model with an input ``inputs [n, 8]`` and an output ``outputs [n, 2]``.
 
-    Needs the package ``onnx`` (``pip install flotilla-teams[onnx]``).
+    Needs the package ``onnx`` (``pip install flotilla-teams[onnx]``). Where a config says that policies choose among
+    behaviours, the output is ``[n, 5]``: how much each is wanted.
 
     Args:
         policy: ``[parameters]``.
         path: file to write.
-        hidden: as of :func:`forward`.
+        config: as of :func:`forward`.
 
     Raises:
         ValueError: the shape does not fit.
@@ -208,7 +235,7 @@ def to_onnx(policy: ArrayLike, path: Any, hidden: Sequence[int] | None = None) -
     from onnx import TensorProto, helper, numpy_helper
 
     weights = floats("policy", policy, 1)
-    layers, at, value = widths(weights.size, hidden), 0, "inputs"
+    layers, at, value = _layers(config, weights.size), 0, "inputs"
     nodes, tensors = [], []
     for index, (before, after) in enumerate(zip(layers, layers[1:])):
         layer = weights[at : at + (before + 1) * after].reshape(before + 1, after)
@@ -224,4 +251,4 @@ def to_onnx(policy: ArrayLike, path: Any, hidden: Sequence[int] | None = None) -
     graph = helper.make_graph(nodes, "policy", [given], [answered], tensors)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     onnx.checker.check_model(model)
-    onnx.save(model, path)
+    onnx.save(model, os.fspath(path))

@@ -34,8 +34,8 @@ class Run:
         metrics: ``best_g``, ``mean_g`` and ``champion_g``, each float64 ``[trials, generations + 1]``, the random start
             first: the share of POIs observed, 0 to 1, by each generation's best and mean team, and by the team of every
             population's best policy.
-        policies: one float32 ``[leaders, policies, parameters]`` a trial, best policy first, so that team 0 of a rollout is
-            the champion.
+        policies: one float32 ``[leaders, policies, parameters]`` a trial, or ``[1, policies, parameters]`` where leaders
+            share a policy (``learning.sharing``); best policy first, so that team 0 of a rollout is the champion.
         digest: of all of these: the same as the program's for this config and seed.
         backend: what it was trained on, in words.
 

@@ -54,13 +54,15 @@ class Teams:
             self.drawn += self.count
         self.stepper.reset(chosen, starts)
 
-    def step(self, actions: Floats) -> NDArray[np.bool_]:
-        """Plays a step, and rewards it; which teams have played their last one."""
+    def step(self, actions: Floats, rested: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+        """Plays a step, and rewards it; which teams but those that have rested have played their last one."""
         if self.reward == "G":
             self.stepper.step(actions, self.rewards)
         else:
             self.stepper.step(actions, None)
         over: NDArray[np.bool_] = self.steps >= self.length
+        if rested is not None:
+            over &= ~rested
         if self.reward != "G":
             if over.any():
                 self.stepper.fitness(self.reward, self.rewards)
@@ -82,7 +84,7 @@ class VectorEnv:
 
     Every episode takes ``world.steps`` steps; then it is *truncated*. Where the config's ``learning.start_jitter`` is above
     0, every team of every episode starts from a place of its own, drawn from the seed of :meth:`reset`; else all start
-    where the config says. ``close`` gives nothing back, for there is nothing to give.
+    where the config says. POIs stay where the config has them. ``close`` gives nothing back, for there is nothing to give.
 
     Leaders sense the density of POIs, then of agents, in four quadrants around their heading: back right, front right, front
     left, back left. They are told a turn, in parts of a half turn to the left, and a speed, from -1 for standing still to 1
@@ -227,18 +229,14 @@ class VectorEnv:
             (array([ True,  True]), (2, 4), (2, 4, 8))
         """
         teams, infos = self._teams, dict[str, Any]()
+        array = floats("actions", actions, 3)
         if self.autoreset == "next_step" and self._any_over:
+            # Teams that are over stay where they are at this step.
             fresh = self._over
+            over = teams.step(array, fresh)
             teams.reset(None, fresh)
-            array = floats("actions", actions, 3)
-            if fresh.all():
-                self._check(array)
-                teams.rewards.fill(0)
-                over = np.zeros(self.num_envs, np.bool_)
-            else:
-                over = self._step_some(array, ~fresh)
         else:
-            over = teams.step(floats("actions", actions, 3))
+            over = teams.step(array)
         self._any_over = bool(over.any())
         if self.autoreset == "same_step" and self._any_over:
             infos["final_obs"], infos["_final_obs"] = teams.inputs.copy(), over
@@ -246,20 +244,6 @@ class VectorEnv:
         self._over = over
         rewards = teams.rewards.copy() if self.copy else teams.rewards
         return self._observations(), rewards, self._terminated, over, infos
-
-    def _check(self, actions: Floats) -> None:
-        expected = (self.num_envs, self.leaders, _native.OUTPUTS)
-        if actions.shape != expected:
-            raise ValueError(f"actions are {list(actions.shape)}, allowed is [teams, leaders, 2] = {list(expected)}")
-        if not np.isfinite(actions).all():
-            raise ValueError("an action is no finite number")
-
-    def _step_some(self, actions: Floats, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """A step of some teams; the others, which have just started, stay where they are."""
-        over = self._teams.step(actions)
-        self._teams.stepper.reset(~chosen, None)
-        self._teams.rewards[~chosen] = 0
-        return over & chosen
 
     def states(self) -> tuple[Floats, Floats, Floats]:
         """Where everyone is: positions and headings ``[num_envs, agents, 2]``, speeds ``[num_envs, agents]``, leaders first.

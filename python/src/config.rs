@@ -67,6 +67,12 @@ impl Config {
         self.0.learners()
     }
 
+    /// Of a policy's layers, inputs and outputs included.
+    #[getter]
+    fn widths(&self) -> Vec<usize> {
+        self.0.policy.widths()
+    }
+
     #[getter]
     fn parameters(&self) -> usize {
         self.0.parameters()

@@ -12,8 +12,13 @@ use crate::errors::Raise;
 use crate::workers;
 
 /// Where episodes start: the config's own places, or so many drawn ones.
-fn drawn(drawn: Option<(u32, u64, f64)>) -> Starts {
-    drawn.map_or(Starts::Own, |(episodes, seed, jitter)| Starts::Drawn { episodes, seed, jitter })
+fn drawn(drawn: Option<(u32, u64, f64, f64)>) -> Starts {
+    drawn.map_or(Starts::Own, |(episodes, seed, jitter, poi_jitter)| Starts::Drawn {
+        episodes,
+        seed,
+        jitter,
+        poi_jitter,
+    })
 }
 
 /// A team's policies, `[leaders or 1][teams][parameters]`, as they lie in memory.
@@ -43,7 +48,7 @@ pub fn rollout<'py>(
     py: Python<'py>,
     config: &Config,
     policies: PyReadonlyArray3<'py, f32>,
-    starts: Option<(u32, u64, f64)>,
+    starts: Option<(u32, u64, f64, f64)>,
     backend: &str,
 ) -> PyResult<Scores<'py>> {
     let (teams, weights) = weights(config, &policies)?;
@@ -72,7 +77,7 @@ pub fn trace<'py>(
     py: Python<'py>,
     config: &Config,
     policies: PyReadonlyArray3<'py, f32>,
-    starts: Option<(u32, u64, f64)>,
+    starts: Option<(u32, u64, f64, f64)>,
     episode: usize,
     backend: &str,
 ) -> PyResult<Motion<'py>> {
@@ -110,7 +115,7 @@ pub fn starts<'py>(
     if !(jitter.is_finite() && jitter >= 0.0 && usize::try_from(bytes).is_ok_and(|bytes| bytes < 1 << 36)) {
         return Err(Failure::Starts { episodes: count.try_into().unwrap_or(u32::MAX), jitter }).raise();
     }
-    let starts = Starts::Drawn { episodes: 1, seed, jitter };
+    let starts = Starts::Drawn { episodes: 1, seed, jitter, poi_jitter: 0.0 };
     let places = workers::aside(py, || {
         let mut places = Vec::with_capacity(count * world.agents() * 2);
         (0..count).for_each(|team| {

@@ -123,7 +123,7 @@ impl<'a> Watcher<'a> {
     }
 }
 
-/// What a training came to: its config, the three metrics `[trials, generations + 1]`, every trial's policies `[leaders,
+/// What a training came to: its config, the three metrics `[trials, generations + 1]`, every trial's policies `[leaders or 1,
 /// policies, parameters]`, and its digest.
 type Outcomes<'py> = (Config, [Bound<'py, PyArray2<f64>>; 3], Vec<Bound<'py, PyArray3<f32>>>, String);
 
@@ -131,7 +131,7 @@ fn outcomes(py: Python<'_>, trained: Trained, digest: String) -> PyResult<Outcom
     let Trained { config, best_g, mean_g, champion_g, policies, .. } = trained;
     let learning = &config.learning;
     let table = |values| PyArray1::from_vec(py, values).reshape([learning.trials, learning.generations + 1]);
-    let shape = [config.learners(), learning.population, config.parameters()];
+    let shape = [config.populations(), learning.population, config.parameters()];
     let policies = policies.into_iter().map(|trial| PyArray1::from_vec(py, trial).reshape(shape));
     let metrics = [table(best_g)?, table(mean_g)?, table(champion_g)?];
     let policies = policies.collect::<PyResult<_>>()?;
@@ -272,7 +272,7 @@ pub fn save(
 ) -> PyResult<String> {
     let (config, learning) = (&config.0, &config.0.learning);
     let (trials, columns) = (learning.trials, learning.generations + 1);
-    let shape = [config.learners(), learning.population, config.parameters()];
+    let shape = [config.populations(), learning.population, config.parameters()];
     let fits = metrics.iter().all(|metrics| metrics.shape() == [trials, columns])
         && policies.len() == trials
         && policies.iter().all(|policies| policies.shape() == shape)

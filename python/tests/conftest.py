@@ -69,6 +69,10 @@ def random_config(seed: int) -> flotilla.Config:
         "trials": int(rng.integers(1, 4)),
         "seed": int(rng.integers(0, 1 << 40)),
         "start_jitter": float(rng.choice([0, 1.5])),
+        "poi_jitter": float(rng.choice([0, 1.0])),
+        "sharing": str(rng.choice(["none", "all"])),
         "episodes_per_team": int(rng.integers(1, 3)),
     }
-    return flotilla.Config(world=world, learning=learning, policy={"hidden": [int(units) for units in rng.integers(1, 12, rng.integers(0, 3))]})
+    hidden = [int(units) for units in rng.integers(1, 12, rng.integers(0, 3))]
+    policy = {"hidden": hidden, "actions": str(rng.choice(["direct", "behaviours"]))}
+    return flotilla.Config(world=world, learning=learning, policy=policy)

@@ -125,6 +125,24 @@ def test_some_teams_are_started_anew():
         VectorEnv(config, 6).reset(options={"reset_mask": mask * 1.0})
 
 
+@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+@pytest.mark.parametrize("reward", ["G", "Df"])
+def test_the_next_episode_starts_elsewhere_where_starts_are_drawn(mode, reward):
+    config = Config.paper().replace(world={"steps": 3}, learning={"start_jitter": 3.0})
+    env, by_hand = VectorEnv(config, 4, reward, autoreset=mode), VectorEnv(config, 4, autoreset="disabled")
+    env.reset(seed=2)
+    starts = [by_hand.reset(seed=2)[0].copy(), by_hand.reset()[0].copy(), by_hand.reset()[0].copy()]
+    actions, seen = np.ones((4, 4, 2), np.float32), []
+    for _ in range(8):
+        inputs, rewards, _, truncated, _ = env.step(actions)
+        seen.append(inputs.copy())
+    places = [3, 7] if mode == "next_step" else [2, 5]
+    for place, start in zip(places, starts[1:]):
+        assert np.array_equal(seen[place], start)
+    if mode == "next_step":
+        assert not rewards.any() and not truncated.any()
+
+
 def test_starts_are_drawn_from_the_seed():
     config = Config.paper().replace(learning={"start_jitter": 2.0})
     env = VectorEnv(config, 8, autoreset="disabled")

@@ -36,9 +36,12 @@ def test_drawn_starts_are_the_program_s(config, program):
         rollout(config, run.policies[0], jitter=2)
 
 
-@pytest.mark.parametrize("seed", range(8))
+ACTIONS = ("direct", "behaviours")
+
+
+@pytest.mark.parametrize("seed", range(12))
 def test_a_trace_is_what_policies_answered(seed):
-    config = random_config(seed).replace(policy={"hidden": [[10], [], [7, 5], [1, 2, 3]][seed % 4]})
+    config = random_config(seed).replace(policy={"hidden": [[10], [], [7, 5], [1, 2, 3]][seed % 4], "actions": ACTIONS[seed // 8]})
     policies = random_policies(config, 9, seed)
     trace = rollout(config, policies, trace=True).trace
     agents = len(config["world.leaders"]) + len(config["world.followers"])
@@ -48,8 +51,9 @@ def test_a_trace_is_what_policies_answered(seed):
     assert trace.inputs.shape == (9, steps, config.leaders, 8) and trace.outputs.shape == (9, steps, config.leaders, 2)
     assert trace.near.shape == (9, steps, pois, agents) and trace.near.dtype == np.bool_
     # [teams, 1, leaders, parameters] against [teams, steps, leaders, 8]
-    answers = forward(policies.transpose(1, 0, 2)[:, None], trace.inputs, config["policy.hidden"])
+    answers = forward(policies.transpose(1, 0, 2)[:, None], trace.inputs, config)
     assert np.abs(answers - trace.outputs).max() < 5e-6
+    assert config["policy.actions"] == "direct" or set(np.unique(answers[..., 1])) <= {-1, 1}
     # Who is near is near.
     place = np.asarray(config["world.pois"])[None, None, :, None]
     distance = np.linalg.norm(trace.positions[:, 1:, None] - place, axis=-1)
@@ -65,6 +69,15 @@ def test_a_shared_policy_is_every_leader_s(config):
     one, all_ = rollout(config, shared), rollout(config, np.repeat(shared, 4, axis=0))
     for name in ("observed", "g", "d", "df", "dpp"):
         assert np.array_equal(getattr(one, name), getattr(all_, name))
+
+
+def test_leaders_may_share_a_policy(config, program):
+    config = config.replace(learning={"sharing": "all"})
+    run = train(config, out="run")
+    assert [trial.shape for trial in run.policies] == [(1, 20, 112)] * 2
+    assert rollout(config, run.policies[0]).g[0] == run.metrics["champion_g"][0, -1]
+    train(config).save("saved")
+    assert flotilla.Run.open("saved").digest == run.digest
 
 
 def test_other_arrays_are_converted(config):
@@ -105,7 +118,7 @@ def test_the_network_in_numpy():
     hidden = np.tanh([*inputs, 1] @ policy[:90].reshape(9, 10))
     assert np.allclose(forward(policy, inputs), np.tanh([*hidden, 1] @ policy[90:].reshape(11, 2)), atol=1e-7)
     assert forward(np.zeros((3, 1, 18)), np.zeros((5, 8))).shape == (3, 5, 2)
-    with pytest.raises(ValueError, match="name its hidden layers"):
+    with pytest.raises(ValueError, match="say by config"):
         forward(np.zeros(113), inputs)
     with pytest.raises(ValueError, match=r"inputs have the shape \(7,\)"):
         forward(policy, inputs[:7])
@@ -116,7 +129,7 @@ def test_onnx_answers_the_same(tmp_path):
     runtime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
     config = Config.paper().replace(policy={"hidden": [7, 5]})
     policy = random_policies(config, 1)[0, 0]
-    flotilla.to_onnx(policy, "policy.onnx", [7, 5])
+    flotilla.to_onnx(policy, "policy.onnx", config)
     inputs = np.random.default_rng(2).random((50, 8), np.float32)
     answers = runtime.InferenceSession("policy.onnx").run(None, {"inputs": inputs})[0]
-    assert np.abs(answers - forward(policy, inputs, [7, 5])).max() < 5e-6
+    assert np.abs(answers - forward(policy, inputs, config)).max() < 5e-6
