@@ -96,7 +96,6 @@ pub fn compare(
     let mut outcome = Agreement::default();
     let mut all = Vec::with_capacity(plan.worlds.len());
     for (name, config) in &plan.worlds {
-        // Stages train below; a stage's own world is that of its config.
         let teams = Teams::new(config, plan.teams, plan.seed);
         if let Some(mismatch) = compare_stages(&teams, reference, backend)? {
             outcome.mismatch = Some(format!("{name}: {mismatch}"));

@@ -13,7 +13,7 @@ use crate::workers;
 
 /// Where episodes start: the config's own places, or so many drawn ones.
 fn drawn(drawn: Option<(u32, u64, f64)>) -> Starts {
-    drawn.map_or(Starts::Own, |(episodes, seed, jitter)| Starts::Drawn { episodes, seed, jitter })
+    drawn.map_or(Starts::Own, |(episodes, seed, jitter)| Starts::Drawn { episodes, seed, jitter, poi_jitter: 0.0 })
 }
 
 /// A team's policies, `[leaders or 1][teams][parameters]`, as they lie in memory.
@@ -110,7 +110,7 @@ pub fn starts<'py>(
     if !(jitter.is_finite() && jitter >= 0.0 && usize::try_from(bytes).is_ok_and(|bytes| bytes < 1 << 36)) {
         return Err(Failure::Starts { episodes: count.try_into().unwrap_or(u32::MAX), jitter }).raise();
     }
-    let starts = Starts::Drawn { episodes: 1, seed, jitter };
+    let starts = Starts::Drawn { episodes: 1, seed, jitter, poi_jitter: 0.0 };
     let places = workers::aside(py, || {
         let mut places = Vec::with_capacity(count * world.agents() * 2);
         (0..count).for_each(|team| {
