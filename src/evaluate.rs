@@ -12,6 +12,8 @@ use crate::evolve::{self, Key, Purpose};
 use crate::statistics;
 use crate::world::World;
 
+pub use crate::evolve::one_policy_a_team;
+
 /// Most episodes of one evaluation.
 pub const MAX_EPISODES: u32 = 1_000_000;
 /// Most bytes of scores that wait to be summed, and most episodes that play as one batch.
@@ -20,14 +22,14 @@ const BATCH_EPISODES: usize = 256;
 /// Most bytes of a trace in memory at once, unless one team's are more.
 const TRACE_BYTES: usize = 1 << 26;
 
-/// Where the agents of each episode start.
+/// Where the agents of each episode start, and where its POIs are.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Starts {
     /// One episode, from where the config says.
     Own,
-    /// So many episodes, every start moved by a uniform offset in `-jitter..jitter` on both axes, drawn from the seed.
-    /// No training draws from where these are drawn, whatever its seed.
-    Drawn { episodes: u32, seed: u64, jitter: f64 },
+    /// So many episodes, every start moved by a uniform offset in `-jitter..jitter` on both axes, and every POI likewise by
+    /// `poi_jitter`, drawn from the seed. No training draws from where these are drawn, whatever its seed.
+    Drawn { episodes: u32, seed: u64, jitter: f64, poi_jitter: f64 },
 }
 
 impl Starts {
@@ -39,20 +41,16 @@ impl Starts {
         }
     }
 
-    /// Start positions of an episode, `[agents]`, the same for all teams.
+    /// Start positions of an episode, `[agents]`, the same for all teams; after them places of the POIs, if they move.
     pub fn of(&self, episode: usize, world: &World) -> Vec<Vec2> {
         let mut starts = world.starts.clone();
-        if let Starts::Drawn { seed, jitter, .. } = *self {
-            let key = Key::new(seed, 0, Purpose::HeldOut);
-            evolve::jitter_starts(key, 0, episode, world, jitter, &mut starts);
+        if let Starts::Drawn { seed, jitter, poi_jitter, .. } = *self {
+            let key = |purpose| Key::new(seed, 0, purpose);
+            evolve::jitter_starts(key(Purpose::HeldOut), 0, episode, world, jitter, &mut starts);
+            evolve::jitter_pois(key(Purpose::HeldOutPois), 0, episode, world, poi_jitter, &mut starts);
         }
         starts
     }
-}
-
-/// The choice of policies by which team `t` is made of every leader's policy `t`, `[teams][leaders]`.
-pub fn one_policy_a_team(teams: usize, leaders: usize) -> Vec<u32> {
-    (0..teams as u32).flat_map(|policy| std::iter::repeat_n(policy, leaders)).collect()
 }
 
 /// A group in parts whose traces do not take much memory at once, each with its first team.

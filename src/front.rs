@@ -280,8 +280,8 @@ pub struct Played {
 }
 
 /// Plays teams of given policies, `[leaders][teams][parameters]`: team `t` is made of every leader's policy `t`. Where
-/// all leaders of a team share one, `[1][teams][parameters]` will do. A policy's parameters are layer by layer and unit
-/// by unit: a weight for each input, then the bias.
+/// all leaders of a team share one, `[1][teams][parameters]` will do. A policy's parameters stand layer by layer, in each
+/// input by input with the bias last, in each unit by unit.
 ///
 /// # Errors
 /// The config, the weights or the starts are wrong, or the backend fails.
@@ -413,26 +413,23 @@ impl<'a> Cast<'a> {
         if !(1..=MAX_POPULATION).contains(&teams) {
             return Err(Failure::Teams(teams));
         }
-        if let &Starts::Drawn { episodes, jitter, .. } = starts
-            && !((1..=MAX_EPISODES).contains(&episodes) && jitter.is_finite() && jitter >= 0.0)
-        {
-            return Err(Failure::Starts { episodes, jitter });
+        if let &Starts::Drawn { episodes, jitter, poi_jitter, .. } = starts {
+            let wrong = [jitter, poi_jitter].into_iter().find(|jitter| !jitter.is_finite() || *jitter < 0.0);
+            if wrong.is_some() || !(1..=MAX_EPISODES).contains(&episodes) {
+                return Err(Failure::Starts { episodes, jitter: wrong.unwrap_or(jitter) });
+            }
         }
         let (leaders, parameters) = (world.leaders(), world.parameters());
         let shared = weights.len() / teams == parameters;
         if !weights.len().is_multiple_of(teams) || !(shared || weights.len() / teams == leaders * parameters) {
             return Err(Failure::Weights { found: weights.len(), leaders, teams, parameters });
         }
-        // A shared policy is repeated; every leader has a place in a team, and several scores.
-        let repeated = if shared && leaders > 1 { parameters * size_of::<f32>() } else { 0 };
-        let bytes = teams as u128 * leaders as u128 * (repeated + 28) as u128;
+        // Every leader has a place in a team, and several scores.
+        let bytes = teams as u128 * leaders as u128 * 28;
         if !usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok()) {
             return Err(Failure::Memory { what: "all teams", bytes });
         }
-        let mut weights = match shared {
-            true if leaders > 1 => Cow::Owned(weights.repeat(leaders)),
-            _ => Cow::Borrowed(weights),
-        };
+        let mut weights = Cow::Borrowed(weights);
         if !weights.iter().all(|&weight| evolve::is_weight(weight))
             && let Some(place) = evolve::admit(weights.to_mut())
         {

@@ -92,6 +92,7 @@
 //! | feature | brings | crates in all, about |
 //! |---|---|---|
 //! | (none) | training, evaluation and verification by the CPU, on one thread; on WebAssembly too | 30 |
+//! | `scalar` | episodes without vector instructions, too, for `verify --report` | 30 |
 //! | `parallel` | all threads, by rayon; the bits stay | 35 |
 //! | `gpu` | any GPU, by wgpu | 80 |
 //! | `record` | runs on disk | 55 |

@@ -59,8 +59,8 @@ impl Peaks {
             queue += teams.div_ceil(lanes) * 16;
             block = block.max(cpu::block_bytes(&world, need));
             order = order.max((policies * size_of::<usize>()) as u64);
-            populations += trials * world.leaders() as u64;
-            held += trials * backend::held_bytes([world.leaders(), policies + 1, world.parameters()]);
+            populations += trials * config.populations() as u64;
+            held += trials * backend::held_bytes([config.populations(), policies + 1, world.parameters()]);
             weights = weights.saturating_add(teams * backend::weight_bytes(&world));
             record = teams.saturating_mul(backend::record_bytes(&world, need)).saturating_add(record);
         }

@@ -182,6 +182,9 @@ fn plain_world(seed: u64) -> Config {
     } else {
         Coupling::Same(coupling())
     };
+    // What came later has draws of its own: the worlds of the seeds stay as they were in all else.
+    let later = &mut ChaCha8Rng::seed_from_u64(!seed);
+    let actions = if later.random_bool(0.3) { Actions::Behaviours } else { Actions::Direct };
     let gain = |rng: &mut ChaCha8Rng, high: f64| if rng.random_bool(0.1) { 0.0 } else { rng.random_range(0.1..high) };
     Config {
         world: crate::config::Domain {
@@ -229,9 +232,11 @@ fn plain_world(seed: u64) -> Config {
                 2 => vec![5, 5, 5],
                 _ => vec![10],
             },
+            actions,
         },
         learning: Learning {
             paradigm: if rng.random_bool(0.25) { Paradigm::AllLeaders } else { Paradigm::LeaderFollower },
+            sharing: if later.random_bool(0.2) { Sharing::All } else { Sharing::None },
             fitness: word(rng),
             population: rng.random_range(2..=20),
             generations: 3,
@@ -244,6 +249,7 @@ fn plain_world(seed: u64) -> Config {
             led_by: LedBy::MostSeen,
             episodes_per_team: 1,
             start_jitter: 0.0,
+            poi_jitter: if later.random_bool(0.3) { later.random_range(0.5..5.0) } else { 0.0 },
             seed,
         },
         checkpoint: Saving::default(),

@@ -10,7 +10,7 @@ use fearless_simd::Level;
 use glam::Vec2;
 
 use crate::backend::{Backend, BackendError, Episode, Group, Held, Need, Weights};
-use crate::config::{Config, Learning};
+use crate::config::{Config, Learning, Sharing};
 use crate::credit::Credit;
 use crate::evolve::{self, Breeding, Key, Purpose};
 use crate::host::Instant;
@@ -47,9 +47,9 @@ pub struct Snapshot<N = Vec<f32>> {
     pub generation: usize,
     /// The run's last generation, after which policies stay as they are.
     pub last: usize,
-    /// A trial's weights, `[leaders][policies + 1][parameters]`.
+    /// A trial's weights, `[populations][policies + 1][parameters]`, see [`Config::populations`].
     pub weights: Vec<N>,
-    /// A trial's scores of the generation before, `[leaders][policies]`.
+    /// A trial's scores of the generation before, `[populations][policies]`.
     pub fitness: Vec<N>,
     /// A trial's row of the generation before.
     pub pending: Vec<Option<Row>>,
@@ -105,20 +105,20 @@ pub enum SnapshotError {
 /// along as one more team.
 struct Lineage {
     index: usize,
-    /// `[leaders][policies + 1][parameters]`, this generation's and the next.
+    /// `[populations][policies + 1][parameters]`, this generation's and the next.
     weights: Vec<f32>,
     children: Vec<f32>,
-    /// Policies of each team, `[leaders][policies]`, and as the backend wants them, `[policies + 1][leaders]`.
+    /// Policies of each team, `[populations][policies]`, and as the backend wants them, `[policies + 1][leaders]`.
     orders: Vec<u32>,
     teams: Vec<u32>,
-    /// Start positions, `[episodes][agents]`.
+    /// Start positions, and where POIs are if they move, `[episodes][agents + pois]`.
     starts: Vec<Vec<Vec2>>,
     /// POIs observed, `[episodes][policies + 1]`, and f32 scores as bits, `[episodes][policies + 1][leaders]`.
     observed: Vec<AtomicU32>,
     scores: Vec<AtomicU32>,
-    /// Mean score of every policy, `[leaders][policies]`.
+    /// Mean score of every policy, `[populations][policies]`.
     fitness: Vec<f32>,
-    /// The plan of the next generation, see [`evolve::draw_parents`], `[leaders][policies + 1]`.
+    /// The plan of the next generation, see [`evolve::draw_parents`], `[populations][policies + 1]`.
     parents: Vec<u32>,
     /// The last generation's row, whose champion has yet to play.
     pending: Option<Row>,
@@ -253,7 +253,7 @@ impl Trainer {
     }
 
     /// The policies of the last generation of an arm that has played it, best first in each population, one
-    /// `[leaders][policies][parameters]` a trial.
+    /// `[populations][policies][parameters]` a trial.
     pub fn policies(&self, arm: usize) -> Vec<Vec<f32>> {
         let arm = &self.arms[arm];
         let sort = |trial: &Lineage| {
@@ -283,7 +283,7 @@ impl Trainer {
         arms.iter().map(end).collect()
     }
 
-    /// The populations of a trial about to play, `[leaders][policies + 1][parameters]`; a population's last slot is
+    /// The populations of a trial about to play, `[populations][policies + 1][parameters]`; a population's last slot is
     /// the champion's of the generation before.
     ///
     /// # Errors
@@ -325,6 +325,26 @@ impl Trainer {
         Ok(Snapshot { generation, last, weights: each(weights)?, fitness: each(fitness)?, pending })
     }
 
+    /// Puts given policies, `[populations][policies][parameters]`, in the first slots of a trial's populations, in their order:
+    /// as many as there is room for. The others stay as they were drawn. False where the arm has played already, or sizes do
+    /// not fit.
+    #[must_use]
+    pub fn start_from(&mut self, arm: usize, trial: usize, policies: usize, weights: &[f32]) -> bool {
+        let arm = &mut self.arms[arm];
+        let (populations, parameters) = (arm.config.populations(), arm.world.parameters());
+        let population = arm.config.learning.population;
+        let Some(trial) = arm.trials.get_mut(trial) else { return false };
+        if arm.generation > 0 || arm.offered || policies == 0 || weights.len() != populations * policies * parameters {
+            return false;
+        }
+        let taken = policies.min(population) * parameters;
+        let slots = trial.weights.chunks_exact_mut((population + 1) * parameters);
+        for (slots, policies) in slots.zip(weights.chunks_exact(policies * parameters)) {
+            slots[..taken].copy_from_slice(&policies[..taken]);
+        }
+        true
+    }
+
     /// Goes on with an arm from a snapshot of an arm of the same config, but for its number of generations, which may have
     /// been smaller; false where the sizes do not fit.
     #[must_use]
@@ -363,28 +383,29 @@ const EPISODE: u64 = 40;
 
 /// Bytes that the trials of a (valid) config take, whoever plays their episodes.
 pub fn bytes(config: &Config) -> u64 {
-    let [trials, leaders, policies, parameters] = sizes(config);
+    let ([trials, populations, policies, parameters], leaders) = (sizes(config), config.learners() as u64);
     let (slots, episodes) = (policies + 1, config.learning.episodes_per_team as u64);
     let agents = (config.world.leaders.len() + config.world.followers.len()) as u64;
-    let weights = 2 * leaders * slots * parameters;
-    let orders_and_fitness = 2 * leaders * policies;
-    let teams_and_parents = 2 * leaders * slots;
+    let moved = if config.learning.poi_jitter > 0.0 { config.world.pois.len() as u64 } else { 0 };
+    let weights = 2 * populations * slots * parameters;
+    let orders_and_fitness = 2 * populations * policies;
+    let teams_and_parents = (leaders + populations) * slots;
     let observed_and_scores = episodes * slots * (1 + leaders);
-    // Each episode's start positions, and its place in a batch.
-    let starts = episodes * (2 * agents + EPISODE);
+    // Each episode's places, and its own place in a batch.
+    let starts = episodes * (2 * (agents + moved) + EPISODE);
     4 * trials * (weights + orders_and_fitness + teams_and_parents + observed_and_scores + starts)
 }
 
 /// Bytes of the numbers of a [`Snapshot`] of a (valid) config's arm.
 pub fn snapshot_bytes(config: &Config) -> u64 {
-    let [trials, leaders, policies, parameters] = sizes(config);
-    4 * trials * leaders * ((policies + 1) * parameters + policies)
+    let [trials, populations, policies, parameters] = sizes(config);
+    4 * trials * populations * ((policies + 1) * parameters + policies)
 }
 
-/// `[trials, leaders, policies, parameters]`
+/// `[trials, populations, policies, parameters]`
 fn sizes(config: &Config) -> [u64; 4] {
     let learning = &config.learning;
-    [learning.trials, config.learners(), learning.population, config.parameters()].map(|count| count as u64)
+    [learning.trials, config.populations(), learning.population, config.parameters()].map(|count| count as u64)
 }
 
 /// Plays a range of the teams of every trial, given the population, all as one batch; keeps what they scored.
@@ -461,7 +482,7 @@ impl Arm {
 
     /// Numbers in the policies of one trial.
     fn policies(&self) -> usize {
-        self.world.leaders() * self.config.learning.population * self.world.parameters()
+        self.config.populations() * self.config.learning.population * self.world.parameters()
     }
 
     /// What it is as far as the host knows.
@@ -480,7 +501,7 @@ impl Arm {
         if std::mem::replace(&mut self.offered, true) {
             return Ok(());
         }
-        let sizes = [self.world.leaders(), self.config.learning.population + 1, self.world.parameters()];
+        let sizes = [self.config.populations(), self.config.learning.population + 1, self.world.parameters()];
         let held: Option<Vec<_>> =
             self.trials.iter().map(|trial| backend.hold(&trial.weights, sizes).transpose()).collect::<Option<_>>();
         self.held = held.map_or(Ok(vec![]), |held| held.into_iter().collect())?;
@@ -531,22 +552,24 @@ impl Arm {
     fn prepare(&mut self, level: Level) {
         let Arm { config, world, trials, age: generation, .. } = self;
         let generation = *generation;
-        let Learning { seed, population, start_jitter, .. } = config.learning;
+        let Learning { seed, population, sharing, .. } = config.learning;
         let leaders = world.leaders();
         trials.par_iter_mut().for_each(|trial| {
-            let key = Key::new(seed, trial.index, Purpose::Teams);
-            let orders = trial.orders.par_chunks_exact_mut(population).with_min_len(few(population)).enumerate();
-            orders.for_each(|(leader, order)| evolve::shuffle(level, key, generation, leader, order));
-            let orders = &trial.orders;
-            let teams = trial.teams[..population * leaders].par_chunks_exact_mut(leaders).with_min_len(CHUNK);
-            teams.enumerate().for_each(|(team, policies)| {
-                for (policy, order) in policies.iter_mut().zip(orders.chunks_exact(population)) {
-                    *policy = order[team];
-                }
-            });
-            let key = Key::new(seed, trial.index, Purpose::Starts);
+            // Where all leaders share a policy, its team is the one that it has from the start.
+            if sharing == Sharing::None {
+                let key = Key::new(seed, trial.index, Purpose::Teams);
+                let orders = trial.orders.par_chunks_exact_mut(population).with_min_len(few(population)).enumerate();
+                orders.for_each(|(leader, order)| evolve::shuffle(level, key, generation, leader, order));
+                let orders = &trial.orders;
+                let teams = trial.teams[..population * leaders].par_chunks_exact_mut(leaders).with_min_len(CHUNK);
+                teams.enumerate().for_each(|(team, policies)| {
+                    for (policy, order) in policies.iter_mut().zip(orders.chunks_exact(population)) {
+                        *policy = order[team];
+                    }
+                });
+            }
             for (episode, starts) in trial.starts.iter_mut().enumerate() {
-                evolve::jitter_starts(key, generation, episode, world, start_jitter, starts);
+                evolve::places(&config.learning, trial.index, generation, episode, world, starts);
             }
         });
     }
@@ -561,7 +584,10 @@ impl Arm {
             let [best_g, mean_g, champion_g] = trial.summary(world.pois.len(), population);
             rows.extend(trial.pending.map(|row| Row { champion_g, ..row }));
             trial.pending = Some(Row { arm, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
-            trial.rate(world.leaders(), population);
+            match config.learning.sharing {
+                Sharing::None => trial.rate(world.leaders(), population),
+                Sharing::All => trial.rate_shared(world.leaders(), population),
+            }
         }
         rows
     }
@@ -660,9 +686,9 @@ impl Arm {
 impl Lineage {
     fn new(config: &Config, world: &World, index: usize, level: Level) -> Lineage {
         let Learning { seed, population, episodes_per_team, .. } = config.learning;
-        let (leaders, parameters) = (world.leaders(), world.parameters());
+        let (leaders, populations, parameters) = (world.leaders(), config.populations(), world.parameters());
         let key = Key::new(seed, index, Purpose::Weights);
-        let mut weights = vec![0.0; leaders * (population + 1) * parameters];
+        let mut weights = vec![0.0; populations * (population + 1) * parameters];
         weights.par_chunks_exact_mut((population + 1) * parameters).enumerate().for_each(|(leader, policies)| {
             policies[..population * parameters]
                 .par_chunks_exact_mut(parameters)
@@ -675,14 +701,14 @@ impl Lineage {
             index,
             children: vec![0.0; weights.len()],
             weights,
-            orders: vec![0; leaders * population],
+            orders: vec![0; populations * population],
             // The champion's team, the last, is made of every population's last slot.
-            teams: vec![population as u32; (population + 1) * leaders],
+            teams: evolve::one_policy_a_team(population + 1, leaders),
             starts: vec![Vec::new(); episodes_per_team],
             observed: std::iter::repeat_with(AtomicU32::default).take(slots).collect(),
             scores: std::iter::repeat_with(AtomicU32::default).take(slots * leaders).collect(),
-            fitness: vec![0.0; leaders * population],
-            parents: vec![0; leaders * (population + 1)],
+            fitness: vec![0.0; populations * population],
+            parents: vec![0; populations * (population + 1)],
             pending: None,
         }
     }
@@ -706,15 +732,28 @@ impl Lineage {
         let populations = fitness.par_chunks_exact_mut(population).zip(orders.par_chunks_exact(population));
         populations.with_min_len(few(population)).enumerate().for_each(|(leader, (fitness, order))| {
             for (team, &policy) in order.iter().enumerate() {
-                let score = |episode: usize| {
-                    let at = (episode * (population + 1) + team) * leaders + leader;
-                    f64::from(f32::from_bits(scores[at].load(Relaxed)))
-                };
-                let total: f64 = (0..episodes).map(score).sum();
-                fitness[policy as usize] = (total / episodes as f64) as f32;
+                fitness[policy as usize] = mean_score(scores, episodes, population + 1, team, leaders, leader);
             }
         });
     }
+
+    /// [`Trial::rate`] where every leader of a team plays the same policy: its mean over them, in their order.
+    fn rate_shared(&mut self, leaders: usize, population: usize) {
+        let (episodes, scores) = (self.starts.len(), &self.scores);
+        self.fitness.par_iter_mut().with_min_len(few(leaders)).enumerate().for_each(|(team, fitness)| {
+            let score = |leader| f64::from(mean_score(scores, episodes, population + 1, team, leaders, leader));
+            *fitness = ((0..leaders).map(score).sum::<f64>() / leaders as f64) as f32;
+        });
+    }
+}
+
+/// The score of one leader of a team, averaged over episodes; `scores` are `[episodes][teams][leaders]`.
+#[inline(always)]
+fn mean_score(scores: &[AtomicU32], episodes: usize, teams: usize, team: usize, leaders: usize, leader: usize) -> f32 {
+    let score =
+        |episode: usize| f64::from(f32::from_bits(scores[(episode * teams + team) * leaders + leader].load(Relaxed)));
+    let total: f64 = (0..episodes).map(score).sum();
+    (total / episodes as f64) as f32
 }
 
 /// Slots that one thread fills at a time.

@@ -5,11 +5,13 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Mutex;
 
+use glam::Vec2;
+
 use crate::backend::compare::{Mismatch, first_mismatch};
 use crate::backend::{Backend, BackendError, Group, Need};
-use crate::config::Config;
+use crate::config::{Config, Paradigm};
 use crate::credit::{Credit, Scores};
-use crate::evolve::{Breeding, Key, Purpose, UNCHANGED};
+use crate::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use crate::sample;
 use crate::trainer::{Row, Trainer};
 use crate::world::World;
@@ -39,6 +41,26 @@ impl Plan {
     }
 }
 
+/// Short trainings of the paper's six experiments, each with its name: what they come to is the same on every machine, so
+/// that their digests compare machines that never meet.
+pub fn short_trainings() -> Vec<(String, Config)> {
+    const LAYOUTS: [(&str, &str); 3] = [
+        ("generally forward", include_str!("../configs/generally_forward.toml")),
+        ("strictly forward", include_str!("../configs/strictly_forward.toml")),
+        ("chaotic", include_str!("../configs/chaotic.toml")),
+    ];
+    let mut trainings = Vec::new();
+    for (name, text) in LAYOUTS {
+        for paradigm in [Paradigm::LeaderFollower, Paradigm::AllLeaders] {
+            let mut config = Config::parse(text, name).expect("the paper's own config");
+            config.learning.paradigm = paradigm;
+            (config.learning.trials, config.learning.generations) = (2, 10);
+            trainings.push((format!("{name}, {paradigm}"), config));
+        }
+    }
+    trainings
+}
+
 /// How much was compared, and the first difference, if any.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Agreement {
@@ -56,6 +78,8 @@ struct Teams {
     choice: Vec<u32>,
     /// Of every other world also who was seen at which step, which kernels of their own record.
     need: Need,
+    /// See [`Group::starts`].
+    places: Vec<Vec2>,
 }
 
 impl Teams {
@@ -65,14 +89,20 @@ impl Teams {
         let leaders = world.leaders();
         let policy = |place: usize| ((place / leaders + place % leaders) % policies) as u32;
         let choice = (0..teams * leaders).map(policy).collect();
+        let mut weights = sample::weights(&world, policies, seed);
+        // Of a shared population, teams mix policies all the same: that asks for more.
+        weights.truncate(config.populations() * policies * world.parameters());
+        let mut places = world.starts.clone();
+        let learning = &config.learning;
+        evolve::jitter_pois(Key::new(seed, 0, Purpose::Pois), 0, 0, &world, learning.poi_jitter, &mut places);
         let need = if sights { Need::Sights } else { Need::Record };
-        Teams { policies, weights: sample::weights(&world, policies, seed), choice, world, need }
+        Teams { policies, weights, choice, need, places, world }
     }
 
     fn group(&self) -> Group<'_> {
-        let Teams { world, policies, weights, choice, need } = self;
+        let Teams { world, policies, weights, choice, need, places } = self;
         let weights = weights[..].into();
-        Group { world, starts: &world.starts, weights, policies: *policies, teams: choice, need: *need }
+        Group { world, starts: places, weights, policies: *policies, teams: choice, need: *need }
     }
 }
 
@@ -206,11 +236,11 @@ fn compare_scores(
 fn compare_breeding(config: &Config, teams: &Teams, backend: &mut dyn Backend) -> Result<Option<String>, BackendError> {
     let Teams { world, policies, weights, .. } = teams;
     let (slots, parameters) = (*policies, world.parameters());
-    let sizes = [world.leaders(), slots, parameters];
+    let sizes = [weights.len() / slots / parameters, slots, parameters];
     let Some(mut held) = backend.hold(weights, sizes)? else { return Ok(None) };
     // Each slot's parent is the slot after it, every fourth is kept as it is.
     let planned = |place: usize| ((place + 1) % slots) as u32 | if place % 4 == 3 { UNCHANGED } else { 0 };
-    let parents: Vec<u32> = (0..world.leaders()).flat_map(|_| (0..slots).map(planned)).collect();
+    let parents: Vec<u32> = (0..sizes[0]).flat_map(|_| (0..slots).map(planned)).collect();
     let (key, learning) = (Key::new(config.learning.seed, 0, Purpose::Mutation), &config.learning);
     let breeding = Breeding { parents: &parents, key, generation: 0, learning };
     held.breed(&breeding)?;

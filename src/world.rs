@@ -11,7 +11,7 @@ use crate::model::policy::PolicyConstants;
 use crate::model::sense::{Density, SenseConstants};
 
 pub use crate::model::motion::GRID;
-pub use crate::model::policy::OUTPUTS;
+pub use crate::model::policy::{BEHAVIOURS, OUTPUTS};
 pub use crate::model::sense::INPUTS;
 pub use crate::model::{Constants, Variant};
 
@@ -92,7 +92,7 @@ impl World {
         let weights: Option<u32> = used
             .windows(2)
             .try_fold(0_u32, |sum, widths| sum.checked_add(widths[0].checked_add(1)?.checked_mul(widths[1])?));
-        let ends = used.len() > 1 && used[0] as usize == INPUTS && used[used.len() - 1] as usize == OUTPUTS;
+        let ends = used.len() > 1 && used[0] as usize == INPUTS && constants.policy.actions().is_some();
         let small = used.iter().all(|&width| (1..=MAX_HIDDEN_UNITS.max(INPUTS) as u32).contains(&width));
         let fits = [
             ("leaders", constants.leaders > 0),

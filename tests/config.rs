@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use flotilla::config::{
-    Config, ConfigError, Coupling, Density, Domain, Fitness, Follow, Learning, LedBy, MAX_EPISODES, MAX_GENERATIONS,
-    MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion, Mutation, Observers, Override,
-    Paradigm, Policy, Problem, Saving, Sense,
+    Actions, Config, ConfigError, Coupling, Density, Domain, Fitness, Follow, Learning, LedBy, MAX_EPISODES,
+    MAX_GENERATIONS, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion, Mutation,
+    Observers, Override, Paradigm, Policy, Problem, Saving, Sense, Sharing,
 };
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -53,9 +53,10 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             wall_gain: 1.0,
         },
         sense: Sense { poi_range: f64::INFINITY, agent_range: 5.0, density: Density::Linear },
-        policy: Policy { hidden: vec![10] },
+        policy: Policy { hidden: vec![10], actions: Actions::Direct },
         learning: Learning {
             paradigm: Paradigm::LeaderFollower,
+            sharing: Sharing::None,
             fitness: Fitness::Df,
             population: 50,
             generations: 100,
@@ -68,6 +69,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             led_by: LedBy::MostSeen,
             episodes_per_team: 1,
             start_jitter: 0.0,
+            poi_jitter: 0.0,
             seed: 0,
         },
         checkpoint: Saving { generations: 0, seconds: 30.0 },
@@ -274,22 +276,25 @@ fn configs() -> impl Strategy<Value = Config> {
         agent_range,
         density,
     });
-    let policy = vec(1..=MAX_HIDDEN_UNITS, 0..=MAX_HIDDEN_LAYERS).prop_map(|hidden| Policy { hidden });
+    let policy = (vec(1..=MAX_HIDDEN_UNITS, 0..=MAX_HIDDEN_LAYERS), word())
+        .prop_map(|(hidden, actions)| Policy { hidden, actions });
     let sizes = (2..=5000usize, 0..=MAX_GENERATIONS, 1..=9usize, 0.0..=1.0f64, 1..=MAX_EPISODES);
     let mutation = (word(), size_or_zero(1e-6, 1.0), size_or_zero(1e-6, 100.0));
     let mutation = (mutation, 0..=MAX_STEPS, word());
-    let learning = (word(), word(), sizes, mutation, size_or_zero(1e-6, 1e4), 0..=i64::MAX as u64).prop_map(
+    let jitters = (size_or_zero(1e-6, 1e4), size_or_zero(1e-6, 1e4));
+    let learning = ((word(), word()), word(), sizes, mutation, jitters, 0..=i64::MAX as u64).prop_map(
         |(
-            paradigm,
+            (paradigm, sharing),
             fitness,
             (population, generations, trials, part, episodes_per_team),
             mutation,
-            start_jitter,
+            (start_jitter, poi_jitter),
             seed,
         )| {
             let ((mutation, mutation_probability, mutation_sigma), led_within, led_by) = mutation;
             Learning {
                 paradigm,
+                sharing,
                 fitness,
                 population,
                 generations,
@@ -302,6 +307,7 @@ fn configs() -> impl Strategy<Value = Config> {
                 led_by,
                 episodes_per_team,
                 start_jitter,
+                poi_jitter,
                 seed,
             }
         },

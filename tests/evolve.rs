@@ -7,7 +7,7 @@ use std::collections::HashSet;
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group, Need};
-use flotilla::config::{Config, Fitness, Learning, Mutation, Paradigm};
+use flotilla::config::{Actions, Config, Fitness, Learning, Mutation, Paradigm, Sharing};
 use flotilla::credit::Credit;
 use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose};
 use flotilla::trainer::{Row, Trainer};
@@ -446,6 +446,18 @@ fn arms() -> Vec<Config> {
             small(config, 6, 2, 1);
             config.learning.elites = 6;
         }),
+        config(GENERALLY_FORWARD, |config| {
+            small(config, 11, 4, 2);
+            (config.learning.sharing, config.learning.fitness) = (Sharing::All, Fitness::D);
+            (config.learning.start_jitter, config.learning.episodes_per_team) = (0.5, 2);
+        }),
+        config(STRICTLY_FORWARD, |config| {
+            small(config, 13, 5, 1);
+            (config.learning.sharing, config.learning.paradigm) = (Sharing::All, Paradigm::AllLeaders);
+            config.policy.actions = Actions::Behaviours;
+            (config.learning.poi_jitter, config.learning.episodes_per_team) = (3.0, 3);
+            config.world.coupling = flotilla::config::Coupling::Same(2);
+        }),
     ]
 }
 
@@ -483,7 +495,7 @@ struct Plain<'a> {
     config: &'a Config,
     world: World,
     trial: usize,
-    /// `[leaders][policies][parameters]`.
+    /// `[populations][policies][parameters]`.
     policies: Vec<Vec<Vec<f32>>>,
 }
 
@@ -494,14 +506,16 @@ impl Plain<'_> {
 
     /// Observed POIs over all episodes of a generation, and each leader's mean score.
     fn play(&self, generation: usize, team: &[usize]) -> (u32, Vec<f32>) {
-        let Learning { fitness, episodes_per_team, start_jitter, .. } = self.config.learning;
+        let Learning { fitness, episodes_per_team, start_jitter, poi_jitter, .. } = self.config.learning;
+        let population = |leader: usize| &self.policies[if self.policies.len() == 1 { 0 } else { leader }];
         let weights: Vec<f32> =
-            team.iter().zip(&self.policies).flat_map(|(&policy, all)| all[policy].clone()).collect();
+            team.iter().enumerate().flat_map(|(leader, &policy)| population(leader)[policy].clone()).collect();
         let (mut observed, mut totals) = (0, vec![0.0; team.len()]);
         for episode in 0..episodes_per_team {
             let mut starts = Vec::new();
             let key = self.key(Purpose::Starts);
             evolve::jitter_starts(key, generation, episode, &self.world, start_jitter, &mut starts);
+            evolve::jitter_pois(self.key(Purpose::Pois), generation, episode, &self.world, poi_jitter, &mut starts);
             let teams = vec![0; team.len()];
             let (world, weights, need) = (&self.world, weights[..].into(), Need::Sights);
             let group = Group { world, starts: &starts, weights, policies: 1, teams: &teams, need };
@@ -534,11 +548,18 @@ impl Plain<'_> {
         for generation in 0..=generations {
             let mut teams = vec![0; population * leaders];
             evolve::form_teams(self.key(Purpose::Teams), generation, leaders, &mut teams);
-            let (mut observed, mut fitness) = (Vec::new(), vec![vec![0.0; population]; leaders]);
-            for team in teams.chunks(leaders) {
-                let team: Vec<usize> = team.iter().map(|&policy| policy as usize).collect();
+            let shared = self.config.learning.sharing == Sharing::All;
+            let (mut observed, mut fitness) = (Vec::new(), vec![vec![0.0; population]; self.policies.len()]);
+            for (index, team) in teams.chunks(leaders).enumerate() {
+                let team: Vec<usize> =
+                    team.iter().map(|&policy| if shared { index } else { policy as usize }).collect();
                 let (pois, scores) = self.play(generation, &team);
                 observed.push(pois);
+                if shared {
+                    let sum = scores.iter().fold(0.0, |sum, &score| sum + f64::from(score));
+                    fitness[0][index] = (sum / leaders as f64) as f32;
+                    continue;
+                }
                 team.iter()
                     .zip(scores)
                     .enumerate()
@@ -552,7 +573,7 @@ impl Plain<'_> {
                 })
                 .collect();
             // The champion plays along with the next generation, so from the starts of that.
-            let champion: Vec<usize> = ranked.iter().map(|order| order[0]).collect();
+            let champion: Vec<usize> = (0..leaders).map(|leader| ranked[if shared { 0 } else { leader }][0]).collect();
             let (champion, _) = self.play(generation + 1, &champion);
             let total: u32 = observed.iter().sum();
             rows.push(Row {
@@ -579,6 +600,37 @@ impl Plain<'_> {
     }
 }
 
+/// POIs move as starts do, by draws of their own, and nothing is said of them where they stay.
+#[test]
+fn pois_are_jittered_by_draws_of_their_own() {
+    let world = World::new(&config(GENERALLY_FORWARD, |config| config.world.pois[0] = [0.5, 49.5]));
+    let [starts, pois] = [Purpose::Starts, Purpose::Pois].map(|purpose| Key::new(4, 0, purpose));
+    let draw = |key, generation, episode| {
+        let mut places = vec![];
+        evolve::jitter_pois(key, generation, episode, &world, 2.0, &mut places);
+        places
+    };
+    let (mut sum, mut least, mut most) = (Vec2::ZERO, f32::INFINITY, f32::NEG_INFINITY);
+    for generation in 0..500 {
+        for (index, (place, from)) in draw(pois, generation, 1).iter().zip(&world.pois).enumerate() {
+            let moved = place - from;
+            assert!(moved.abs().max_element() <= 2.0 && (place * 262_144.0).fract() == Vec2::ZERO, "{moved}");
+            assert!(place.min_element() >= 0.0 && place.max_element() <= 50.0, "{place}");
+            if index > 0 {
+                sum += moved;
+                (least, most) = (least.min(moved.min_element()), most.max(moved.max_element()));
+            }
+        }
+        assert_ne!(draw(pois, generation, 0), draw(pois, generation, 1));
+        assert_ne!(draw(pois, generation, 0), draw(starts, generation, 0));
+    }
+    // Of 1500 uniform offsets of deviation 2/√3.
+    assert!(sum.abs().max_element() / 1500.0 < 0.15 && least < -1.95 && most > 1.95, "{sum}, {least}, {most}");
+    let mut places = world.starts.clone();
+    evolve::jitter_pois(pois, 0, 0, &world, 0.0, &mut places);
+    assert_eq!(places, world.starts);
+}
+
 #[test]
 fn the_trainer_is_algorithm_1() {
     let configs = arms();
@@ -594,7 +646,7 @@ fn the_trainer_is_algorithm_1() {
                 weights
             };
             let population = |leader| (0..config.learning.population).map(|slot| policy(leader, slot)).collect();
-            let fresh = (0..world.leaders()).map(population).collect();
+            let fresh = (0..config.populations()).map(population).collect();
             let (expected, weights) = Plain { config, world, trial, policies: fresh }.train();
             let rows: Vec<Row> =
                 rows.iter().filter(|row| row.trial == trial).map(|&row| Row { arm: 0, ..row }).collect();

@@ -8,8 +8,15 @@ mod common;
 use std::path::{Path, PathBuf};
 
 use flotilla::backend::gpu::device::{self, AdapterInfo, Binding, DeviceError, Kind, Request, Wanted};
+use flotilla::backend::gpu::episode::{self, Kernel};
 use flotilla::backend::gpu::exact::{self, Pass, ShaderError};
 use flotilla::backend::gpu::{self, probe, shaders};
+use flotilla::verify::short_trainings;
+use flotilla::world::World;
+use naga::back::{hlsl, msl};
+use naga::proc::{BoundsCheckPolicies, BoundsCheckPolicy};
+use naga::valid::{Capabilities, FunctionInfo, ValidationFlags, Validator};
+use naga::{BinaryOperator, Expression, Function, Module, ScalarKind};
 use wgpu::BufferUsages;
 
 const BOTH: [Pass; 2] = [Pass::NoContraction, Pass::Guarded];
@@ -132,16 +139,18 @@ fn a_foreign_operation_inside_a_function_and_a_loop_is_found() {
     assert_eq!(exact::foreign_operations(&module), ["deep: float Divide"]);
 }
 
-/// Functions that Rust takes from the platform's mathematical library, which rounds them as it likes.
+/// Functions that Rust takes from the platform's mathematical library, which rounds them as it likes: results and
+/// pictures would hang on it.
 #[test]
-fn nothing_that_decides_results_asks_the_platform() {
-    const PLATFORM: [&str; 20] = [
+fn nothing_asks_the_platform_for_a_function() {
+    const PLATFORM: [&str; 22] = [
         "sin", "cos", "tan", "sin_cos", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2",
-        "exp_m1", "ln", "ln_1p", "log2", "log10", "powf", "cbrt",
+        "exp_m1", "ln", "ln_1p", "log", "log2", "log10", "powf", "cbrt", "hypot",
     ];
-    let decides = ["backend", "kernels", "model"].map(|folder| files(&Path::new("src").join(folder))).concat();
-    let single = ["world", "credit", "evolve", "trainer"].map(|name| PathBuf::from(format!("src/{name}.rs")));
-    for path in decides.into_iter().chain(single) {
+    let code = files(Path::new("src")).into_iter().filter(|path| path.extension().is_some_and(|ending| ending == "rs"));
+    let code: Vec<PathBuf> = code.collect();
+    assert!(code.len() > 50, "only {code:?} were read");
+    for path in code {
         let text = std::fs::read_to_string(&path).unwrap();
         for name in PLATFORM {
             for call in [format!(".{name}("), format!("f32::{name}("), format!("f64::{name}(")] {
@@ -183,6 +192,121 @@ fn every_sum_and_product_is_guarded() {
         assert!(exact::unguarded(&module).expect("shaders are valid") > 0 || name == INTEGERS, "{name}");
         let guarded = exact::guarded(&module).unwrap_or_else(|error| panic!("{name} {error}"));
         assert_eq!(exact::unguarded(&guarded).expect("guarded shaders are valid"), 0, "{name}");
+    }
+}
+
+/// Every shader, and the episode's kernels that are made for the paper's layouts.
+fn kernels() -> Vec<(String, String)> {
+    let made = short_trainings().into_iter().flat_map(|(name, config)| {
+        let world = World::new(&config);
+        [64, 256, 1024].map(|threads| {
+            let text = episode::shader_of(&world, Kernel::Specialised, threads);
+            (format!("{name}, {threads} threads"), text)
+        })
+    });
+    shaders().into_iter().map(|(name, text)| (name.to_string(), text)).chain(made).collect()
+}
+
+/// How many sums, differences and products of floats a module has.
+fn rounding_operations(module: &Module) -> usize {
+    let info = Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(module).expect("it is valid");
+    let floats = |function: &Function, info: &FunctionInfo| {
+        let rounds = function.expressions.iter().filter(|(handle, expression)| {
+            let float = info[*handle].ty.inner_with(&module.types).scalar_kind() == Some(ScalarKind::Float);
+            let op = match expression {
+                Expression::Binary { op, .. } => *op,
+                _ => return false,
+            };
+            float && matches!(op, BinaryOperator::Add | BinaryOperator::Subtract | BinaryOperator::Multiply)
+        });
+        rounds.filter(|(handle, _)| info[*handle].ref_count > 0).count()
+    };
+    let functions = module.functions.iter().map(|(handle, function)| floats(function, &info[handle]));
+    let entries = module.entry_points.iter().enumerate();
+    functions.chain(entries.map(|(at, entry)| floats(&entry.function, info.get_entry_point(at)))).sum()
+}
+
+/// How often a text takes a sum, difference or product by its bits, and joins these with something by `|`.
+fn guarded_operations(text: &str, casts: &[&str]) -> usize {
+    let guarded = |inside: &str| {
+        let (mut depth, mut operator) = (0, false);
+        for (at, letter) in inside.char_indices() {
+            match letter {
+                '(' | '[' => depth += 1,
+                ')' if depth == 0 => return operator && inside[at + 1..].starts_with(" | "),
+                ')' | ']' => depth -= 1,
+                '+' | '-' | '*' => {
+                    operator |= depth == 0 && inside[..at].ends_with(' ') && inside[at + 1..].starts_with(' ')
+                }
+                _ => {}
+            }
+        }
+        false
+    };
+    casts
+        .iter()
+        .flat_map(|cast| text.match_indices(cast))
+        .filter(|(at, cast)| guarded(&text[at + cast.len()..]))
+        .count()
+}
+
+/// Metal and DirectX compile texts, and by default Metal's compiler may fuse and reorder: a guard has to stand in the text
+/// around every single sum and product, whatever options the text was written by.
+#[test]
+fn every_product_is_guarded_in_metals_and_directx_text() {
+    for (name, text) in kernels() {
+        let (module, _) = exact::parse(&text).unwrap_or_else(|error| panic!("{name} {error}"));
+        let guarded = exact::guarded(&module).unwrap_or_else(|error| panic!("{name} {error}"));
+        let info =
+            Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&guarded).expect("it is valid");
+        let there = rounding_operations(&guarded);
+        assert!(there > 0 || name == INTEGERS, "{name}: nothing to guard");
+        let policy = |checked| match checked {
+            true => BoundsCheckPolicy::Restrict,
+            false => BoundsCheckPolicy::Unchecked,
+        };
+        for (lang_version, checked) in [((2, 0), false), ((2, 0), true), ((3, 2), false)] {
+            let policy = policy(checked);
+            let options = msl::Options {
+                lang_version,
+                bounds_check_policies: BoundsCheckPolicies {
+                    index: policy,
+                    buffer: policy,
+                    image_load: policy,
+                    binding_array: policy,
+                },
+                zero_initialize_workgroup_memory: checked,
+                force_loop_bounding: checked,
+                emit_int_div_checks: checked,
+                ..Default::default()
+            };
+            let (metal, _) =
+                msl::write_string(&guarded, &info, &options, &Default::default()).expect("it has Metal text");
+            check_text(
+                &format!("{name}, Metal {lang_version:?}"),
+                &metal,
+                there,
+                &["as_type<uint>(", "as_type<metal::uint2>(", "as_type<metal::uint3>(", "as_type<metal::uint4>("],
+            );
+        }
+        let mut directx = String::new();
+        let (options, pipeline) = (hlsl::Options::default(), hlsl::PipelineOptions::default());
+        let written = hlsl::Writer::new(&mut directx, &options, &pipeline).write(&guarded, &info, None);
+        written.unwrap_or_else(|error| panic!("{name}: {error}"));
+        check_text(&format!("{name}, DirectX"), &directx, there, &["asuint("]);
+        // Without the pass nothing is guarded, or this test shows nothing.
+        let info =
+            Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&module).expect("it is valid");
+        let (plain, _) =
+            msl::write_string(&module, &info, &Default::default(), &Default::default()).expect("it has text");
+        assert_eq!(guarded_operations(&plain, &["as_type<uint>("]), 0, "{name}");
+    }
+}
+
+fn check_text(name: &str, text: &str, there: usize, casts: &[&str]) {
+    assert_eq!(guarded_operations(text, casts), there, "{name}: operations that stand guarded in\n{text}");
+    for never in ["fma(", "mad(", "fast::", "dot(", "mix(", "lerp(", "half", "#pragma"] {
+        assert!(!text.contains(never), "{name} has {never}");
     }
 }
 

@@ -69,13 +69,15 @@ fn checked_shaders_and_default_limits_agree() {
 #[test]
 fn a_changed_twin_is_named_by_its_stage() {
     type Edit = fn(String) -> String;
-    let edits: [(&str, Edit); 9] = [
+    let edits: [(&str, Edit); 11] = [
         ("sense", |text| replaced(text, "density = 1.0 - root(d2)", "density = 1.0000001 - root(d2)")),
         ("policy", |text| replaced(text, "14.7163315", "14.716334")),
         ("follow", |text| replaced(text, "vec2(push * world.wall_gain", "vec2(push * 1.01 * world.wall_gain")),
         ("move", |text| replaced(text, "let scale = 1.5", "let scale = 1.5000001")),
         ("couple", |text| replaced(text, "d2 <= world.observation_radius2", "d2 <= 0.99 * world.observation_radius2")),
         ("influence", |text| replaced(text, "seen = u32(", "seen = 2u * u32(")),
+        ("policy", |text| replaced(text, "if wanted[3] > most", "if wanted[3] >= most")),
+        ("policy", |text| replaced(text, "if densities.y > most", "if densities.y >= most")),
         ("breed", |text| replaced(text, "* brood.sigma", "* 1.0000001 * brood.sigma")),
         ("sight", |text| replaced(text, "return d2 <= world.attr", "return 1.01 * d2 <= world.attr")),
         ("sight", |text| replaced(text, "sights + (step * rows + row)", "sights + (step * rows + rows - 1u - row)")),
@@ -242,8 +244,10 @@ fn held_out_episodes_come_to_the_same_on_every_backend() {
     let need = Need::Record;
     let group =
         Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams, need };
-    let starts = Starts::Drawn { episodes: 300, seed: 5, jitter: 6.0 };
+    let starts = Starts::Drawn { episodes: 300, seed: 5, jitter: 6.0, poi_jitter: 4.0 };
     let expected = evaluate(&mut Cpu::default(), &group, &starts, &|_| ()).unwrap();
+    let others = Starts::Drawn { episodes: 300, seed: 5, jitter: 6.0, poi_jitter: 0.0 };
+    assert_ne!(evaluate(&mut Cpu::default(), &group, &others, &|_| ()).unwrap(), expected, "moved POIs matter");
     let spreads: Vec<_> = (0..policies).map(|team| expected.team(team)).collect();
     assert!(spreads.iter().any(|spread| spread.deviation > Some(0.0)), "nobody observes anything: {spreads:?}");
     for (request, info) in common::adapters("held_out_episodes_come_to_the_same_on_every_backend") {

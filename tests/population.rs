@@ -15,7 +15,7 @@ use flotilla::backend::gpu::device::{self, DeviceError, Kind};
 use flotilla::backend::gpu::episode::{GpuEpisodes, Holding};
 use flotilla::backend::{Backend, BackendError, Group, HELD_FROM, Held, Trace, Visit, Weights};
 use flotilla::backend::{Machine, Player};
-use flotilla::config::{Config, Fitness, Learning, Mutation, Paradigm};
+use flotilla::config::{Config, Fitness, Learning, Mutation, Paradigm, Sharing};
 use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, Start};
@@ -102,7 +102,11 @@ fn arms() -> Vec<Config> {
     (third.learning.trials, third.learning.generations, third.learning.population) = (1, 6, 7);
     (third.learning.paradigm, third.learning.mutation_probability) = (Paradigm::AllLeaders, 1.0);
     third.policy.hidden = vec![5, 30, 3];
-    vec![first, second, third]
+    // Six leaders, more than are gathered at a time, share a population.
+    let mut fourth = parse(include_str!("../configs/strictly_forward.toml"));
+    (fourth.learning.trials, fourth.learning.generations, fourth.learning.population) = (2, 4, 35);
+    (fourth.learning.paradigm, fourth.learning.sharing) = (Paradigm::AllLeaders, Sharing::All);
+    vec![first, second, third, fourth]
 }
 
 /// What a trainer of [`arms`] comes to, and what it would save before each generation.

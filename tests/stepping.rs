@@ -23,7 +23,7 @@ impl Played {
         let world = World::new(&sample::world(seed));
         let starts = match seed % 2 {
             0 => world.starts.clone(),
-            _ => Starts::Drawn { episodes: 1, seed, jitter: 0.7 }.of(0, &world),
+            _ => Starts::Drawn { episodes: 1, seed, jitter: 0.7, poi_jitter: 0.0 }.of(0, &world),
         };
         let weights = sample::weights(&world, teams, seed);
         let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; world.leaders()]).collect();

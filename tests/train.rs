@@ -672,7 +672,7 @@ fn no_training_starts_where_teams_are_evaluated() {
     };
     let mut held_out = std::collections::HashSet::new();
     for seed in 0..4 {
-        let starts = Starts::Drawn { episodes: 64, seed, jitter: 2.0 };
+        let starts = Starts::Drawn { episodes: 64, seed, jitter: 2.0, poi_jitter: 0.0 };
         held_out.extend((0..64).map(|episode| bits(&starts.of(episode, &world))));
     }
     assert_eq!(held_out.len(), 4 * 64);

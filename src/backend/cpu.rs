@@ -34,10 +34,14 @@ impl Cpu {
         Cpu { level }
     }
 
-    /// Every instruction set that this processor has, narrowest first.
+    /// Every instruction set that this processor has, narrowest first; with the feature `scalar` also doing without one.
     pub fn levels() -> Vec<Level> {
         let best = Level::new();
         let mut levels = vec![Level::baseline()];
+        #[cfg(feature = "scalar")]
+        if !levels[0].is_fallback() {
+            levels.insert(0, Level::fallback());
+        }
         #[cfg(target_arch = "x86_64")]
         {
             levels.extend(best.as_sse4_2().map(Level::Sse4_2));
@@ -64,6 +68,10 @@ pub fn level_name(level: Level) -> &'static str {
     #[cfg(target_arch = "aarch64")]
     if level.as_neon().is_some() {
         return "NEON";
+    }
+    #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+    if level.as_wasm_simd128().is_some() {
+        return "SIMD128";
     }
     let _ = level;
     "scalar"
@@ -202,6 +210,8 @@ struct Whole<S: Simd> {
     network: Network<S>,
     /// Group and team of each lane.
     places: Vec<(usize, usize)>,
+    /// Where POIs are, a lane each; empty where they are the world's in all.
+    moved: Vec<[S::f32s; 2]>,
     /// `[steps][pois][words][lanes]`, and the counts when they are complete, `[followers][leaders][lanes]`.
     sets: Vec<u32>,
     seen: Vec<u32>,
@@ -220,6 +230,7 @@ impl<S: Simd> Whole<S> {
             block: Block::new(simd, world),
             network: Network::new(simd, world),
             places: Vec::with_capacity(S::f32s::LEN),
+            moved: Vec::new(),
             sets: vec![0; world.set_words() * S::f32s::LEN],
             seen: vec![0; world.followers() * world.leaders() * S::f32s::LEN],
             sights: vec![0; sight_words(world, sighted) * S::f32s::LEN],
@@ -229,11 +240,21 @@ impl<S: Simd> Whole<S> {
     /// Puts `teams` teams of the run, from `first` on, at their start; lanes left over repeat the first.
     #[inline(always)]
     fn load(&mut self, run: &Chain<'_>, first: usize, teams: usize) {
-        let Whole { block, network, places, .. } = self;
+        let Whole { block, network, places, moved, .. } = self;
+        moved.clear();
         places.clear();
         places.extend((0..S::f32s::LEN).map(|lane| run.locate(first + if lane < teams { lane } else { 0 })));
         for (lane, &(group, _)) in places.iter().enumerate() {
             block.place(lane, run.groups[group].starts);
+        }
+        if places.iter().any(|&(group, _)| run.groups[group].moved_pois().is_some()) {
+            moved.resize(run.world.pois.len(), [splat(block.simd, 0.0); 2]);
+            for (lane, &(group, _)) in places.iter().enumerate() {
+                let pois = run.groups[group].moved_pois().unwrap_or(&run.world.pois);
+                for ([x, y], poi) in moved.iter_mut().zip(pois) {
+                    (x[lane], y[lane]) = (poi.x, poi.y);
+                }
+            }
         }
         block.start();
         network.load(run, places);
@@ -242,17 +263,11 @@ impl<S: Simd> Whole<S> {
     /// Plays some steps.
     #[inline(always)]
     fn play(&mut self, world: &World, steps: Range<usize>) {
-        let Whole { block, network, sets, seen, sights, .. } = self;
-        let of_step = sights.len() / world.steps();
-        let size = world.pois.len() * world.constants.words as usize * S::f32s::LEN;
-        for step in steps {
-            block.look(&world.pois);
-            network.decide(&block.inputs, &mut block.outputs);
-            if of_step > 0 {
-                block.watch(&mut sights[step * of_step..]);
-            }
-            block.go();
-            block.couple(&world.pois, &mut sets[step * size..]);
+        let Whole { block, network, moved, sets, seen, sights, .. } = self;
+        if moved.is_empty() {
+            play(block, network, &world.pois, (sets, sights), steps);
+        } else {
+            play(block, network, moved, (sets, sights), steps);
         }
         for (words, count) in seen.chunks_exact_mut(S::f32s::LEN).zip(&block.counts) {
             count.store_slice(words);
@@ -264,6 +279,50 @@ impl<S: Simd> Whole<S> {
         let strided = |words| Strided { words, stride: S::f32s::LEN, offset: lane };
         let seen = Seen::Counts(strided(&self.seen));
         Episode { group, team, sets: strided(&self.sets), seen, sights: strided(&self.sights) }
+    }
+}
+
+/// Plays some steps; the sets, and the sights where there are any, are of all steps.
+#[inline(always)]
+fn play<S: Simd>(
+    block: &mut Block<S>,
+    network: &mut Network<S>,
+    pois: &[impl Place<S>],
+    (sets, sights): (&mut [u32], &mut [u32]),
+    steps: Range<usize>,
+) {
+    let of_step = sights.len() / block.world.constants.steps as usize;
+    let size = pois.len() * block.world.constants.words as usize * S::f32s::LEN;
+    for step in steps {
+        block.look(pois);
+        network.decide(&block.inputs, &mut block.outputs);
+        if of_step > 0 {
+            block.watch(&mut sights[step * of_step..]);
+        }
+        block.go();
+        block.couple(pois, &mut sets[step * size..]);
+    }
+}
+
+/// Where a POI is.
+pub(crate) trait Place<S: Simd>: Copy {
+    /// One team a lane.
+    fn lanes(self, simd: S) -> [S::f32s; 2];
+}
+
+/// The same in all teams.
+impl<S: Simd> Place<S> for Vec2 {
+    #[inline(always)]
+    fn lanes(self, simd: S) -> [S::f32s; 2] {
+        [splat(simd, self.x), splat(simd, self.y)]
+    }
+}
+
+/// In each team its own.
+impl<S: Simd> Place<S> for [S::f32s; 2] {
+    #[inline(always)]
+    fn lanes(self, _: S) -> [S::f32s; 2] {
+        self
     }
 }
 
@@ -320,7 +379,7 @@ impl<S: Simd> Network<S> {
                     let group = &run.groups[group];
                     let policy = group.teams[team * leaders + leader] as usize;
                     let Weights::OnHost(weights) = group.weights else { unreachable!("seen before playing") };
-                    &weights[(leader * group.policies + policy) * parameters..][..parameters]
+                    &weights[group.place(weights, leader, policy)..][..parameters]
                 });
                 turn(
                     *simd,
@@ -377,7 +436,12 @@ impl<S: Simd> Network<S> {
             first += (rows + 1) * columns;
             std::mem::swap(&mut from, &mut to);
         }
-        outputs.copy_from_slice(&from.as_chunks::<OUTPUTS>().0[..leaders as usize]);
+        if widths[layers as usize] as usize == OUTPUTS {
+            return outputs.copy_from_slice(&from.as_chunks::<OUTPUTS>().0[..leaders as usize]);
+        }
+        for ((answer, inputs), wanted) in outputs.iter_mut().zip(inputs).zip(from.as_chunks().0) {
+            *answer = policy::choose::<S>(inputs, wanted);
+        }
     }
 }
 
@@ -488,7 +552,7 @@ impl<S: Simd> Block<S> {
 
     /// What leaders sense, for the policies to answer.
     #[inline(always)]
-    pub fn look(&mut self, pois: &[Vec2]) {
+    pub fn look(&mut self, pois: &[impl Place<S>]) {
         self.find_near();
         self.sense(pois);
     }
@@ -554,12 +618,12 @@ impl<S: Simd> Block<S> {
 
     /// Leaders sense: all POIs, then the other agents, each in ascending order.
     #[inline(always)]
-    fn sense(&mut self, pois: &[Vec2]) {
+    fn sense(&mut self, pois: &[impl Place<S>]) {
         self.world.constants.variant.density().fix(Sensing { block: self, pois });
     }
 
     #[inline(always)]
-    fn sense_by<const DENSITY: u32>(&mut self, pois: &[Vec2]) {
+    fn sense_by<P: Place<S>, const DENSITY: u32>(&mut self, pois: &[P]) {
         let Block { simd, world, agents, near, inputs, .. } = self;
         for (leader, (agent, inputs)) in agents.iter().zip(inputs).enumerate() {
             let &Agent { x, y, hx, hy, .. } = agent;
@@ -568,16 +632,19 @@ impl<S: Simd> Block<S> {
             for pois in fours {
                 let mut densities = [x; 4];
                 for (density, poi) in densities.iter_mut().zip(pois) {
-                    let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
+                    let [px, py] = poi.lanes(*simd);
+                    let [dx, dy] = [px - x, py - y];
                     *density = sense::density::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
                 }
                 for (&density, poi) in densities.iter().zip(pois) {
-                    let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
+                    let [px, py] = poi.lanes(*simd);
+                    let [dx, dy] = [px - x, py - y];
                     sense::sense::<S>(density, dx, dy, hx, hy, &mut of_pois);
                 }
             }
             for poi in rest {
-                let [dx, dy] = [splat(*simd, poi.x) - x, splat(*simd, poi.y) - y];
+                let [px, py] = poi.lanes(*simd);
+                let [dx, dy] = [px - x, py - y];
                 let density = sense::density::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
                 sense::sense::<S>(density, dx, dy, hx, hy, &mut of_pois);
             }
@@ -671,7 +738,7 @@ impl<S: Simd> Block<S> {
 
     /// Records who is near each POI, `[pois][words][lanes]`.
     #[inline(always)]
-    pub fn couple(&mut self, pois: &[Vec2], mut sets: &mut [u32]) {
+    pub fn couple(&mut self, pois: &[impl Place<S>], mut sets: &mut [u32]) {
         let (fours, rest) = pois.as_chunks::<4>();
         for pois in fours {
             sets = observe(self.simd, &self.world, &self.agents, pois, sets);
@@ -700,17 +767,17 @@ impl<S: Simd> Block<S> {
 }
 
 /// Leaders sense by one of the densities.
-struct Sensing<'a, S: Simd> {
+struct Sensing<'a, S: Simd, P> {
     block: &'a mut Block<S>,
-    pois: &'a [Vec2],
+    pois: &'a [P],
 }
 
-impl<S: Simd> Fixed for Sensing<'_, S> {
+impl<S: Simd, P: Place<S>> Fixed for Sensing<'_, S, P> {
     type Output = ();
 
     #[inline(always)]
     fn with<const DENSITY: u32>(self) {
-        self.block.sense_by::<DENSITY>(self.pois);
+        self.block.sense_by::<P, DENSITY>(self.pois);
     }
 }
 
@@ -808,12 +875,12 @@ fn observe<'a, S: Simd, const N: usize>(
     simd: S,
     world: &Lanes<S>,
     agents: &[Agent<S>],
-    pois: &[Vec2; N],
+    pois: &[impl Place<S>; N],
     sets: &'a mut [u32],
 ) -> &'a mut [u32] {
     let mut places = [[splat(simd, 0.0); 2]; N];
     for (place, poi) in places.iter_mut().zip(pois) {
-        *place = [splat(simd, poi.x), splat(simd, poi.y)];
+        *place = poi.lanes(simd);
     }
     let words = world.constants.words as usize;
     for (word, agents) in agents.chunks(32).enumerate() {

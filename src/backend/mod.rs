@@ -51,19 +51,19 @@ pub fn weight_bytes(world: &World) -> u64 {
     (fours(world) * size_of::<[f32; FOUR]>()) as u64
 }
 
-/// Bytes that a GPU holds of a trial's populations, `[leaders, slots, parameters]`, where it does: a buffer a leader and
-/// one more, and every slot's parent.
-pub fn held_bytes([leaders, slots, parameters]: [usize; 3]) -> u64 {
-    let [leaders, population, parents] =
-        [leaders, 4 * slots * parameters, 4 * leaders * slots].map(|count| count as u64);
-    if leaders * population < HELD_FROM { 0 } else { (leaders + 1) * population + parents }
+/// Bytes that a GPU holds of a trial's populations, `[populations, slots, parameters]`, where it does: a buffer a population
+/// and one more, and every slot's parent.
+pub fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {
+    let [populations, population, parents] =
+        [populations, 4 * slots * parameters, 4 * populations * slots].map(|count| count as u64);
+    if populations * population < HELD_FROM { 0 } else { (populations + 1) * population + parents }
 }
 
 /// Teams of one world that start alike and are made of one set of policies.
 #[derive(Clone, Copy, Debug)]
 pub struct Group<'a> {
     pub world: &'a World,
-    /// Start positions `[agents]`, leaders first.
+    /// Start positions `[agents]`, leaders first; after them places of the POIs, `[pois]`, unless these are the world's.
     pub starts: &'a [Vec2],
     pub weights: Weights<'a>,
     /// Policies a leader has to choose from.
@@ -121,10 +121,23 @@ impl Need {
     }
 }
 
-impl Group<'_> {
+impl<'a> Group<'a> {
     /// How many teams play.
     pub fn team_count(&self) -> usize {
         self.teams.len() / self.world.leaders()
+    }
+
+    /// Where its POIs are, if not where the world has them.
+    pub fn moved_pois(&self) -> Option<&'a [Vec2]> {
+        Some(&self.starts[self.world.agents()..]).filter(|pois| !pois.is_empty())
+    }
+
+    /// Where the weights of a leader's policy start among those on the host.
+    #[inline]
+    pub(crate) fn place(&self, weights: &[f32], leader: usize, policy: usize) -> usize {
+        let parameters = self.world.parameters();
+        let shared = weights.len() == self.policies * parameters;
+        (if shared { policy } else { leader * self.policies + policy }) * parameters
     }
 
     /// Whether its parts fit each other. Every backend asks this before it plays.
@@ -138,15 +151,16 @@ impl Group<'_> {
             return misfit(format!("a world whose {what} do not fit the rest of it"));
         }
         let (agents, leaders) = (world.agents(), world.leaders());
-        if starts.len() != agents {
+        if starts.len() != agents && starts.len() != agents + world.pois.len() {
             return misfit(format!("{} start positions for {agents} agents", starts.len()));
         }
         if !teams.len().is_multiple_of(leaders) {
             return misfit(format!("{} choices of policies for teams of {leaders} leaders", teams.len()));
         }
-        let numbers = leaders * policies * world.parameters();
+        let shared = policies * world.parameters();
+        let numbers = leaders * shared;
         if let Weights::OnHost(weights) = weights
-            && weights.len() != numbers
+            && ![shared, numbers].contains(&weights.len())
         {
             return misfit(format!("{} weights, but {policies} policies a leader have {numbers}", weights.len()));
         }
@@ -162,7 +176,8 @@ impl Group<'_> {
     }
 }
 
-/// What the policies of a group are, `[leaders][policies][parameters]`: each number 0 or of size 2^-30 to 2^20.
+/// What the policies of a group are, `[leaders][policies][parameters]`, or `[1][policies][parameters]` where all leaders
+/// choose from the same: each number 0 or of size 2^-30 to 2^20.
 #[derive(Clone, Copy, Debug)]
 pub enum Weights<'a> {
     OnHost(&'a [f32]),
@@ -199,7 +214,7 @@ pub trait Held: Any + Debug + Send + Sync {
     /// The plan does not fit the populations, or the device failed.
     fn breed(&mut self, breeding: &Breeding<'_>) -> Result<(), BackendError>;
 
-    /// Copies all weights to the host, `[leaders][slots][parameters]`.
+    /// Copies all weights to the host, `[populations][slots][parameters]`.
     ///
     /// # Errors
     /// The device failed.
@@ -335,7 +350,7 @@ pub trait Backend: Send {
     /// As for [`Backend::rollout`].
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError>;
 
-    /// Takes the populations of one trial, `[leaders][slots][parameters]`, into memory of its own, to breed them there;
+    /// Takes the populations of one trial, `[populations][slots][parameters]`, a leader's each or one for all, into memory of its own, to breed them there;
     /// none where they had better stay on the host.
     ///
     /// # Errors

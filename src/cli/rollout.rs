@@ -60,19 +60,22 @@ pub struct Args {
     /// How far a start is moved at most, on each axis [default: the config's learning.start_jitter]
     #[arg(long, value_name = "J", requires = "episodes", help_heading = HELD_OUT)]
     start_jitter: Option<f64>,
+    /// How far a POI is moved at most, on each axis [default: the config's learning.poi_jitter]
+    #[arg(long, value_name = "J", requires = "episodes", help_heading = HELD_OUT)]
+    poi_jitter: Option<f64>,
 }
 
 impl Args {
-    /// Where episodes start, given the config's jitter.
-    fn starts(&self, jitter: f64) -> Result<Starts, Error> {
+    /// Where episodes start, given the config's jitters.
+    fn starts(&self, jitter: f64, poi_jitter: f64) -> Result<Starts, Error> {
         let (Some(episodes), seed) = (self.episodes, self.seed.unwrap_or(0)) else { return Ok(Starts::Own) };
-        if jitter == 0.0 && (episodes > 1 || self.seed.is_some()) {
+        if jitter == 0.0 && poi_jitter == 0.0 && (episodes > 1 || self.seed.is_some()) {
             return Err(Error::Usage(format!(
                 "--episodes {episodes}: learning.start_jitter is 0, so all episodes are the same; \
-                 set it in the config, or give --start-jitter"
+                 set it or learning.poi_jitter in the config, or give --start-jitter or --poi-jitter"
             )));
         }
-        Ok(Starts::Drawn { episodes, seed, jitter })
+        Ok(Starts::Drawn { episodes, seed, jitter, poi_jitter })
     }
 }
 
@@ -86,9 +89,10 @@ pub fn run(args: Args) -> Result<(), Error> {
     let overrides = [
         set("paradigm", args.paradigm.clone().map(toml::Value::from)),
         set("start_jitter", args.start_jitter.map(toml::Value::from)),
+        set("poi_jitter", args.poi_jitter.map(toml::Value::from)),
     ];
     let config = args.config.load(&overrides.into_iter().flatten().collect::<Vec<_>>())?;
-    let starts = args.starts(config.learning.start_jitter)?;
+    let starts = args.starts(config.learning.start_jitter, config.learning.poi_jitter)?;
     let policies = policies::read(&args.policies, &config, args.trial)?;
     let world = World::new(&config);
     let (mut backend, machine) = backend::open(&args.run)?;
@@ -144,7 +148,12 @@ fn in_words(evaluation: &Evaluation, starts: &Starts) -> String {
         );
     }
     let from = match starts {
-        Starts::Drawn { seed, jitter, .. } => format!(", starts moved by up to {jitter} (seed {seed})"),
+        Starts::Drawn { seed, jitter, poi_jitter: 0.0, .. } => {
+            format!(", starts moved by up to {jitter} (seed {seed})")
+        }
+        Starts::Drawn { seed, jitter, poi_jitter, .. } => {
+            format!(", starts moved by up to {jitter}, POIs by up to {poi_jitter} (seed {seed})")
+        }
         Starts::Own => String::new(),
     };
     let names = ["team 0".into(), format!("best (team {best})"), "mean of all teams".into()];
@@ -172,6 +181,7 @@ fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> Strin
         "episodes": evaluation.episodes,
         "seed": null,
         "start_jitter": null,
+        "poi_jitter": null,
         "backend": machine.backend,
         "adapter": machine.adapter,
         "team_0": spread(evaluation.team(0)),
@@ -179,8 +189,9 @@ fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> Strin
         "mean": spread(evaluation.mean()),
     });
     object["best"]["team"] = json!(best);
-    if let Starts::Drawn { seed, jitter, .. } = starts {
-        (object["seed"], object["start_jitter"]) = (json!(seed), json!(jitter));
+    if let Starts::Drawn { seed, jitter, poi_jitter, .. } = starts {
+        (object["seed"], object["start_jitter"], object["poi_jitter"]) =
+            (json!(seed), json!(jitter), json!(poi_jitter));
     }
     format!("{object}\n")
 }

@@ -19,6 +19,7 @@ pub const MAX_EPISODES: usize = 1000;
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Learning {
     pub paradigm: Paradigm,
+    pub sharing: Sharing,
     pub fitness: Fitness,
     pub population: usize,
     pub generations: usize,
@@ -32,6 +33,7 @@ pub struct Learning {
     pub led_by: LedBy,
     pub episodes_per_team: usize,
     pub start_jitter: f64,
+    pub poi_jitter: f64,
     pub seed: u64,
 }
 
@@ -42,6 +44,16 @@ choice! {
         LeaderFollower = "leader-follower",
         /// Every agent: the followers' places become leaders, appended after the leaders.
         AllLeaders = "all-leaders",
+    }
+}
+
+choice! {
+    /// Which leaders have a policy in common.
+    Sharing {
+        /// None: each has a population of its own.
+        None = "none",
+        /// All: there is one population, and every leader of a team plays the same policy.
+        All = "all",
     }
 }
 
@@ -96,6 +108,15 @@ impl Learning {
             .number(between(2, MAX_POPULATION), 50);
         Learning {
             paradigm,
+            sharing: r
+                .key(
+                    "learning.sharing",
+                    "",
+                    "whose policy is the same: nobody's, or all leaders': then there is one population, whose policies are \
+                     selected by the mean of their leaders' scores",
+                    "2.1",
+                )
+                .choice(Sharing::None),
             fitness: r
                 .key(
                     "learning.fitness",
@@ -161,6 +182,14 @@ impl Learning {
                     "units",
                     "j: in every episode each agent's start is moved by a uniform offset in −j to j on both axes, \
                      the same for all teams of a generation",
+                    "",
+                )
+                .number(between(LEAST, LONGEST).or_zero(), 0.0),
+            poi_jitter: r
+                .key(
+                    "learning.poi_jitter",
+                    "units",
+                    "likewise, of each POI",
                     "",
                 )
                 .number(between(LEAST, LONGEST).or_zero(), 0.0),

@@ -13,11 +13,12 @@ pub use crate::declare::Choice;
 pub use crate::model::couple::{Coupling, Observers};
 pub use crate::model::follow::Follow;
 pub use crate::model::motion::Motion;
-pub use crate::model::policy::{MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
+pub use crate::model::policy::{Actions, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
 pub use crate::model::sense::{Density, Sense};
 pub use crate::reader::{Definition, Override, Problem};
 pub use learning::{
     Fitness, Learning, LedBy, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm, Saving,
+    Sharing,
 };
 pub use load::{MAX_FILE_BYTES, is_standard_input, name, read_file};
 pub use world::{Domain, MAX_AGENTS, MAX_POIS, MAX_STEPS};
@@ -108,6 +109,14 @@ impl Config {
         }
     }
 
+    /// Populations of a trial: one a learner, or one for all of them.
+    pub fn populations(&self) -> usize {
+        match self.learning.sharing {
+            Sharing::None => self.learners(),
+            Sharing::All => 1,
+        }
+    }
+
     /// Weights of one policy, biases included.
     pub fn parameters(&self) -> usize {
         self.policy.parameters()
@@ -115,7 +124,7 @@ impl Config {
 
     /// Bytes that the policies of all trials take.
     pub fn policy_bytes(&self) -> u64 {
-        let counts = [self.learning.trials, self.learners(), self.learning.population, self.parameters()];
+        let counts = [self.learning.trials, self.populations(), self.learning.population, self.parameters()];
         counts.map(|count| count as u64).iter().product::<u64>() * size_of::<f32>() as u64
     }
 

@@ -80,6 +80,9 @@ pub struct Run {
     pub generations: usize,
     /// See [`Folder::digest`]; once the run is done.
     pub digest: Option<String>,
+    /// [`policies::Init::digest`] of what it started from, if not at random.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub init: Option<String>,
     /// What the last session was started by, as a shell reads it.
     #[serde(default)]
     pub command: String,
@@ -116,6 +119,7 @@ impl Run {
             sessions: 0,
             generations: 0,
             digest: None,
+            init: None,
             command: String::new(),
             commit: None,
         }
@@ -232,8 +236,16 @@ impl Folder {
         if found.finished.is_some() && Config::load(&folder.file(CONFIG)).is_ok() {
             return Ok((folder, found));
         }
-        folder.write_text(CONFIG, &config.to_toml())?;
+        folder.write_config(config)?;
         Ok((folder, found))
+    }
+
+    /// Writes `config.toml`.
+    ///
+    /// # Errors
+    /// It cannot be written.
+    pub fn write_config(&self, config: &Config) -> Result<(), RecordError> {
+        self.write_text(CONFIG, &config.to_toml())
     }
 
     /// Removes a run; whatever else is in the folder stays.

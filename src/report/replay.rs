@@ -17,7 +17,7 @@ use super::scene::{Anchor, BLACK, Color, Scene};
 use crate::backend::{Backend, BackendError, Episode, Group, Need, Seen, Strided, Trace};
 use crate::config::{Config, Fitness, Observers};
 use crate::credit::{self, Credit, Scores};
-use crate::evolve::{self, Key, Purpose};
+use crate::evolve;
 use crate::record::checkpoint;
 use crate::record::folder::{CHECKPOINTS, POLICIES};
 use crate::trainer::{Snapshot, Trainer};
@@ -140,7 +140,9 @@ pub fn replay(
     let mut trainer = Trainer::of_trial(config.clone(), trial);
     for index in order {
         let generation = generations[index];
-        if let Some(snapshot) = nearest(folder, &config, trial, trainer.generation(0) + 1..=generation) {
+        // A run that started from given policies has those of generation 0.
+        let next = trainer.generation(0);
+        if let Some(snapshot) = nearest(folder, &config, trial, next + usize::from(next > 0)..=generation) {
             // A checkpoint of other sizes is of another config: training on from the start does without.
             let _ = trainer.restore(0, snapshot);
         }
@@ -200,13 +202,11 @@ fn play_best(
     let (leaders, population) = (world.leaders(), learning.population);
     let weights = trainer.weights(0, 0)?.into();
 
-    let mut teams = vec![0; population * leaders];
-    evolve::form_teams(Key::new(learning.seed, trial, Purpose::Teams), generation, leaders, &mut teams);
-    let key = Key::new(learning.seed, trial, Purpose::Starts);
+    let teams = evolve::teams_of(learning, trial, generation, leaders);
     let starts: Vec<Vec<Vec2>> = (0..learning.episodes_per_team)
         .map(|episode| {
             let mut starts = Vec::new();
-            evolve::jitter_starts(key, generation, episode, &world, learning.start_jitter, &mut starts);
+            evolve::places(learning, trial, generation, episode, &world, &mut starts);
             starts
         })
         .collect();
@@ -228,8 +228,10 @@ fn play_best(
     let best_g = f64::from(most) / (world.pois.len() * starts.len()) as f64;
 
     let need = if learning.fitness == Fitness::Dt { Need::Sights } else { need };
-    let best = &teams[team * leaders..(team + 1) * leaders];
-    let trace = backend.trace(&Group { need, ..group(&starts[0], best) })?;
+    let shown = Group { need, ..group(&starts[0], &teams[team * leaders..(team + 1) * leaders]) };
+    let trace = backend.trace(&shown)?;
+    // POIs are drawn where they were.
+    let moved = shown.moved_pois().map(<[Vec2]>::to_vec);
     let whole = |words| Strided { words, stride: 1, offset: 0 };
     let (sets, seen, sights) = (whole(&trace.sets), Seen::Counts(whole(&trace.seen)), whole(&trace.sights));
     let episode = Episode { group: 0, team: 0, sets, seen, sights };
@@ -239,7 +241,9 @@ fn play_best(
     let mut led = Vec::new();
     credit::lead(&episode.sights, &world, &mut led);
     let observed = credit::observed_at(episode.sets, &world);
-    Ok(Replayed { trial, generation, team, best_g, episodes: starts.len(), scores, owner, led, observed, trace, world })
+    let episodes = starts.len();
+    let world = World { pois: moved.unwrap_or(world.pois.clone()), ..world };
+    Ok(Replayed { trial, generation, team, best_g, episodes, scores, owner, led, observed, trace, world })
 }
 
 /// Observers in one set.
@@ -403,7 +407,7 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
             } else {
                 let share = |axis: usize| (f64::from(place[axis]) / f64::from(map[axis]) * 65535.0).round() as u16;
                 positions.extend([share(0), share(1)].iter().flat_map(|share| share.to_le_bytes()));
-                let turn = f64::from(heading[1]).atan2(f64::from(heading[0])) / std::f64::consts::TAU;
+                let turn = libm::atan2(f64::from(heading[1]), f64::from(heading[0])) / std::f64::consts::TAU;
                 headings.push((turn.rem_euclid(1.0) * 256.0).round() as u32 as u8);
             }
         }

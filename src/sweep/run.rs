@@ -48,7 +48,7 @@ pub fn bytes(config: &Config) -> usize {
     let learning = &config.learning;
     let scores =
         learning.trials * (learning.population + 1) * (config.learners() + 1) * (learning.episodes_per_team + 2);
-    let champions = learning.trials * config.learners() * config.parameters();
+    let champions = learning.trials * config.populations() * config.parameters();
     let bytes = 3 * config.policy_bytes() + ((3 * champions + scores) * size_of::<f32>()) as u64;
     bytes.try_into().unwrap_or(usize::MAX)
 }

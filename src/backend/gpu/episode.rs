@@ -27,7 +27,7 @@ use crate::backend::{
 use crate::config::{MAX_AGENTS, MAX_HIDDEN_LAYERS};
 use crate::declare::{Shared, shared};
 use crate::host::Instant;
-use crate::model::policy::PolicyConstants;
+use crate::model::policy::{Actions, PolicyConstants};
 use crate::model::{self, Constants, Variant};
 use crate::parallel::*;
 use crate::world::{INPUTS, OUTPUTS, World};
@@ -137,8 +137,8 @@ impl Kept {
 /// What a kernel knows of the worlds that it plays.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 enum Sizes {
-    /// The widest layer, inputs included, rounded up to spare compilations.
-    Any { widest: usize },
+    /// The widest layer, inputs included, rounded up to spare compilations, and whether the outputs choose a behaviour.
+    Any { widest: usize, chooses: bool },
     /// All that makes a difference to the code.
     Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], variant: Variant },
 }
@@ -151,8 +151,10 @@ impl Shape {
     }
 
     fn generic(world: &World, packing: Packing, records: Kept) -> Shape {
-        let widest = world.constants.policy.widest().next_power_of_two();
-        Shape { workgroup: packing.workgroup, slots: packing.slots, records, sizes: Sizes::Any { widest } }
+        let policy = &world.constants.policy;
+        let chooses = policy.actions() == Some(Actions::Behaviours);
+        let sizes = Sizes::Any { widest: policy.widest().next_power_of_two(), chooses };
+        Shape { workgroup: packing.workgroup, slots: packing.slots, records, sizes }
     }
 
     fn specialised(world: &World, packing: Packing, records: Kept) -> Shape {
@@ -391,9 +393,11 @@ fn plan(
             }
             let (world_index, base) = *stored.get_or_insert_with(|| {
                 let starts = work.places.len() as u32;
+                let pois = starts + world.agents() as u32;
                 work.places.extend(group.starts);
-                let pois = work.places.len() as u32;
-                work.places.extend(&world.pois);
+                if group.moved_pois().is_none() {
+                    work.places.extend(&world.pois);
+                }
                 work.worlds.push(world.constants);
                 (work.worlds.len() - 1, Task { starts, pois, ..Task::default() })
             });
@@ -431,7 +435,7 @@ fn gather(group: &Group<'_>, weights: &[f32], first_team: usize, teams: usize, t
     let policies = &group.teams[first_team * leaders..(first_team + teams) * leaders];
     for (place, &policy) in policies.iter().enumerate() {
         let (team, leader) = (place / leaders, place % leaders);
-        let from = (leader * group.policies + policy as usize) * parameters;
+        let from = group.place(weights, leader, policy as usize);
         let column = to[leader * teams + team..].iter_mut().step_by(leaders * teams);
         for (four, weights) in column.zip(weights[from..from + parameters].chunks(FOUR)) {
             four[..weights.len()].copy_from_slice(weights);
@@ -1039,10 +1043,13 @@ fn source(shape: Shape) -> String {
          const TRACE: bool = {trace};\nconst SIGHTED: bool = {sighted};\nconst TALLY: bool = {tally};\nconst SIGHTS: u32 = {sights}u;"
     );
     let front = match sizes {
-        Sizes::Any { widest } => {
+        Sizes::Any { widest, chooses } => {
             let variant = Variant::copied_from("world");
             let generic = include_str!("../../../shaders/generic.wgsl");
-            format!("const WIDEST: u32 = {widest}u;\nfn world_variant() -> Variant {{ return {variant}; }}\n{generic}")
+            format!(
+                "const WIDEST: u32 = {widest}u;\nconst CHOOSES: bool = {chooses};\n\
+                 fn world_variant() -> Variant {{ return {variant}; }}\n{generic}"
+            )
         }
         Sizes::Fixed { teams, leaders, agents, pois, widths, variant } => format!(
             "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u);\nconst variant = {variant};\n\
@@ -1092,7 +1099,10 @@ fn straight_policy(widths: &[u32; WIDTHS]) -> String {
         }
         first += (rows + 1) * columns;
     }
-    line(format_args!("return vec2({}, {});", inputs[0], inputs[1]));
+    match inputs.len() {
+        OUTPUTS => line(format_args!("return vec2({});", inputs.join(", "))),
+        _ => line(format_args!("return choose(inputs, array({}));", inputs.join(", "))),
+    }
     text + "}\n"
 }
 
@@ -1100,10 +1110,11 @@ const AXES: [&str; FOUR] = ["x", "y", "z", "w"];
 
 /// The episode's shader in a few of its variants, generic and specialised for the paper's first layout.
 pub fn shaders() -> Vec<(&'static str, String)> {
-    let generic =
-        |workgroup, slots, widest, records| source(Shape { workgroup, slots, records, sizes: Sizes::Any { widest } });
-    let specialised = |records| {
-        let widths = [INPUTS as u32, 10, OUTPUTS as u32, 0, 0];
+    let generic = |workgroup, slots, widest, records: Kept| {
+        source(Shape { workgroup, slots, records, sizes: Sizes::Any { widest, chooses: records.trace } })
+    };
+    let specialised = |records, actions: Actions| {
+        let widths = [INPUTS as u32, 10, actions.outputs() as u32, 0, 0];
         let variant = Variant { density: 0, by_sine: 1 };
         let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, variant };
         source(Shape { workgroup: 384, slots: 1, records, sizes })
@@ -1114,9 +1125,10 @@ pub fn shaders() -> Vec<(&'static str, String)> {
         ("episode", generic(64, 1, 16, little)),
         ("episode, traced", generic(128, 1, 64, trace)),
         ("episode, large teams", generic(256, 5, 64, little)),
-        ("episode, specialised", specialised(little)),
-        ("episode, specialised, with sights", specialised(sights)),
-        ("episode, specialised, traced", specialised(trace)),
+        ("episode, specialised", specialised(little, Actions::Direct)),
+        ("episode, specialised, with sights", specialised(sights, Actions::Direct)),
+        ("episode, specialised, behaviours", specialised(little, Actions::Behaviours)),
+        ("episode, specialised, traced", specialised(trace, Actions::Direct)),
         ("pack", packing()),
     ]
 }
