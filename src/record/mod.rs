@@ -105,8 +105,16 @@ fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
 
 /// Keys that came later, at their defaults: they are left out of a config's digest, so that a run of an earlier version
 /// can go on.
-const LATER: [&str; 5] =
-    ["observers = \"all\"\n", "windows = []\n", "after = []\n", "led_within = 0\n", "led_by = \"most-seen\"\n"];
+const LATER: [&str; 8] = [
+    "observers = \"all\"\n",
+    "windows = []\n",
+    "after = []\n",
+    "actions = \"direct\"\n",
+    "sharing = \"none\"\n",
+    "led_within = 0\n",
+    "led_by = \"most-seen\"\n",
+    "poi_jitter = 0.0\n",
+];
 
 /// SHA-256 of all of a config that has a say in the results.
 pub fn config_digest(config: &Config) -> String {
