@@ -4,7 +4,7 @@
 //! `tests/golden.txt` says what each of its lines covers and when they may be minted anew.
 
 #[cfg(feature = "gpu")]
-mod common;
+mod support;
 
 use std::fmt::Write;
 use std::sync::LazyLock;
@@ -312,7 +312,7 @@ fn every_instruction_set() {
 #[cfg(feature = "gpu")]
 #[test]
 fn every_adapter() {
-    for (request, info) in common::adapters("every_adapter") {
+    for (request, info) in support::adapters("every_adapter") {
         check(&info.to_string(), &mut GpuEpisodes::new(gpu::open(request).unwrap()).unwrap());
     }
 }
