@@ -32,8 +32,8 @@ after = [[], [0]]
 [learning]
 fitness = \"Dt\"
 led_within = 4
-population = 10
-generations = 4
+population = 20
+generations = 15
 trials = 1
 ";
 
@@ -116,7 +116,7 @@ fn a_rollout_tells_dt() {
     let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
     let weights: Vec<f32> = bytemuck::pod_collect_to_vec(file.tensor("weights.0").unwrap().data());
     let config = Config::load(&config).unwrap();
-    let played = |config: &Config| flotilla::play(config, &mut Cpu::default(), 10, &weights, &Starts::Own).unwrap();
+    let played = |config: &Config| flotilla::play(config, &mut Cpu::default(), 20, &weights, &Starts::Own).unwrap();
     let by_dt = played(&config);
     let column = |index: usize| found.iter().map(|row| row[index]).collect::<Vec<f32>>();
     assert_eq!((column(3), column(4), column(6)), (by_dt.d.clone(), by_dt.df.clone(), by_dt.dt.clone()));
@@ -126,7 +126,7 @@ fn a_rollout_tells_dt() {
     let by_df = played(&config.with(&[fitness("Df")]).unwrap());
     assert_eq!((by_df.df, by_df.dt), (by_dt.df, vec![]));
     let several = told(&["--episodes", "3", "--start-jitter", "0.5"]);
-    assert_eq!((several.len(), several[0].len()), (20, 12));
+    assert_eq!((several.len(), several[0].len()), (40, 12));
 }
 
 /// The page of a run by Dt says whom each follower is led by at every step, when POIs can be observed and by whom.
