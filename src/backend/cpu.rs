@@ -287,7 +287,7 @@ impl<S: Simd> Whole<S> {
 fn play<S: Simd>(
     block: &mut Block<S>,
     network: &mut Network<S>,
-    pois: &[impl Spot<S>],
+    pois: &[impl Locus<S>],
     sets: &mut [u32],
     sights: &mut [u32],
     steps: Range<usize>,
@@ -306,13 +306,13 @@ fn play<S: Simd>(
 }
 
 /// Where a POI is.
-pub(crate) trait Spot<S: Simd>: Copy {
+pub(crate) trait Locus<S: Simd>: Copy {
     /// One team a lane.
     fn lanes(self, simd: S) -> [S::f32s; 2];
 }
 
 /// The same in all teams.
-impl<S: Simd> Spot<S> for Vec2 {
+impl<S: Simd> Locus<S> for Vec2 {
     #[inline(always)]
     fn lanes(self, simd: S) -> [S::f32s; 2] {
         [splat(simd, self.x), splat(simd, self.y)]
@@ -320,7 +320,7 @@ impl<S: Simd> Spot<S> for Vec2 {
 }
 
 /// In each team its own.
-impl<S: Simd> Spot<S> for [S::f32s; 2] {
+impl<S: Simd> Locus<S> for [S::f32s; 2] {
     #[inline(always)]
     fn lanes(self, _: S) -> [S::f32s; 2] {
         self
@@ -553,7 +553,7 @@ impl<S: Simd> Block<S> {
 
     /// What leaders sense, for the policies to answer.
     #[inline(always)]
-    pub fn look(&mut self, pois: &[impl Spot<S>]) {
+    pub fn look(&mut self, pois: &[impl Locus<S>]) {
         self.find_near();
         self.sense(pois);
     }
@@ -619,12 +619,12 @@ impl<S: Simd> Block<S> {
 
     /// Leaders sense: all POIs, then the other agents, each in ascending order.
     #[inline(always)]
-    fn sense(&mut self, pois: &[impl Spot<S>]) {
+    fn sense(&mut self, pois: &[impl Locus<S>]) {
         self.world.constants.variant.density().fix(Sensing { block: self, pois });
     }
 
     #[inline(always)]
-    fn sense_by<P: Spot<S>, const DENSITY: u32>(&mut self, pois: &[P]) {
+    fn sense_by<P: Locus<S>, const DENSITY: u32>(&mut self, pois: &[P]) {
         let Block { simd, world, agents, near, inputs, .. } = self;
         for (leader, (agent, inputs)) in agents.iter().zip(inputs).enumerate() {
             let &Agent { x, y, hx, hy, .. } = agent;
@@ -739,7 +739,7 @@ impl<S: Simd> Block<S> {
 
     /// Records who is near each POI, `[pois][words][lanes]`.
     #[inline(always)]
-    pub fn couple(&mut self, pois: &[impl Spot<S>], mut sets: &mut [u32]) {
+    pub fn couple(&mut self, pois: &[impl Locus<S>], mut sets: &mut [u32]) {
         let (fours, rest) = pois.as_chunks::<4>();
         for pois in fours {
             sets = observe(self.simd, &self.world, &self.agents, pois, sets);
@@ -773,7 +773,7 @@ struct Sensing<'a, S: Simd, P> {
     pois: &'a [P],
 }
 
-impl<S: Simd, P: Spot<S>> Fixed for Sensing<'_, S, P> {
+impl<S: Simd, P: Locus<S>> Fixed for Sensing<'_, S, P> {
     type Output = ();
 
     #[inline(always)]
@@ -876,7 +876,7 @@ fn observe<'a, S: Simd, const N: usize>(
     simd: S,
     world: &Lanes<S>,
     agents: &[Agent<S>],
-    pois: &[impl Spot<S>; N],
+    pois: &[impl Locus<S>; N],
     sets: &'a mut [u32],
 ) -> &'a mut [u32] {
     let mut places = [[splat(simd, 0.0); 2]; N];

@@ -13,7 +13,7 @@ use super::checkpoint::{self, Checkpoint};
 use super::disk::Disk;
 use super::metrics;
 use super::{RecordError, hex, policies, read_text};
-use crate::config::Config;
+use crate::config::{Config, MAX_STAGES};
 use crate::file;
 use crate::host;
 use crate::trainer::Row;
@@ -518,9 +518,16 @@ pub fn differences(old: &Config, new: &Config) -> Vec<String> {
             }
         }
     }
-    let stages = |table: &toml::Table| table.get("stages").map_or("none".to_string(), shorten);
-    if old.get("stages") != new.get("stages") {
-        differences.push(format!("  stages: {} there, {} here", stages(&old), stages(&new)));
+    let stage = |table: &toml::Table, index: usize| table.get("stages")?.as_array()?.get(index).cloned();
+    for index in 0..MAX_STAGES {
+        match [stage(&old, index), stage(&new, index)] {
+            [None, None] => break,
+            [there, here] if there == here => {}
+            [there, here] => {
+                let told = |stage: Option<toml::Value>| stage.as_ref().map_or("nothing".into(), shorten);
+                differences.push(format!("  stages[{index}]: {} there, {} here", told(there), told(here)));
+            }
+        }
     }
     differences
 }
