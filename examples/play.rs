@@ -27,7 +27,7 @@ pub fn main() -> Result<(), Box<dyn Error>> {
 
     // The same policy from other starts, and what each leader was worth there.
     let policy = &policies[best * parameters..][..parameters];
-    let starts = Starts::Drawn { episodes: 100, seed: 1, jitter: 0.5 };
+    let starts = Starts::Drawn { episodes: 100, seed: 1, jitter: 0.5, poi_jitter: 0.0 };
     let played = flotilla::play(&config, &mut *backend, 1, policy, &starts)?;
     println!("and {:.2} of them on average from jittered starts", played.observed[0]);
     println!("its leaders' D are {:.2?}, their Df {:.2?}", played.d, played.df);

@@ -20,7 +20,7 @@ pub fn main() -> Result<(), Box<dyn Error>> {
     let mut stepper = flotilla::stepper(&config, teams, true)?;
 
     // Every team from a start of its own.
-    let drawn = Starts::Drawn { episodes: teams as u32, seed: 1, jitter: 0.5 };
+    let drawn = Starts::Drawn { episodes: teams as u32, seed: 1, jitter: 0.5, poi_jitter: 0.0 };
     let starts = (0..teams).flat_map(|team| drawn.of(team, stepper.world()));
     let starts: Vec<f32> = starts.flat_map(|start| start.to_array()).collect();
     stepper.reset_to(&starts)?;

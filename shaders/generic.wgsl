@@ -2,6 +2,7 @@
 //
 // The host puts in front:
 //   WIDEST         widest layer of any policy, inputs included
+//   CHOOSES        whether outputs choose a behaviour
 //   world_variant  the variant of this task's world
 
 var<private> shape: Shape;
@@ -38,6 +39,9 @@ fn decide(start: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
         }
         inputs = units;
         first += (rows + 1u) * columns;
+    }
+    if CHOOSES {
+        return choose(sensed, array(inputs[0], inputs[1], inputs[2], inputs[3], inputs[4]));
     }
     return vec2(inputs[0], inputs[1]);
 }

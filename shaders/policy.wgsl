@@ -8,6 +8,57 @@ fn activate(sum: f32) -> f32 {
     return whole_tanh(half_tanh(limit_tanh(flush(sum, TINY))));
 }
 
+// Behaviours to choose among: hold, towards POIs, away from POIs, towards agents, away from agents.
+const BEHAVIOURS: u32 = 5u;
+
+// The turn to the middle of the quadrant of most, in half turns to the left, or to the one opposite; straight ahead where
+// there is nothing.
+fn quadrant(densities: vec4<f32>, away: bool) -> f32 {
+    var most = densities.x;
+    var turn = -0.75;
+    if densities.y > most {
+        most = densities.y;
+        turn = -0.25;
+    }
+    if densities.z > most {
+        most = densities.z;
+        turn = 0.25;
+    }
+    if densities.w > most {
+        most = densities.w;
+        turn = 0.75;
+    }
+    let back = turn + select(-1.0, 1.0, turn < 0.0);
+    return select(0.0, select(turn, back, away), most > 0.0);
+}
+
+// What the most wanted behaviour is as a direct answer: the first of the largest `wanted`, each in -1..1.
+fn choose(inputs: array<f32, INPUTS>, wanted: array<f32, BEHAVIOURS>) -> vec2<f32> {
+    var most = wanted[0];
+    var behaviour = 0u;
+    if wanted[1] > most {
+        most = wanted[1];
+        behaviour = 1u;
+    }
+    if wanted[2] > most {
+        most = wanted[2];
+        behaviour = 2u;
+    }
+    if wanted[3] > most {
+        most = wanted[3];
+        behaviour = 3u;
+    }
+    if wanted[4] > most {
+        behaviour = 4u;
+    }
+    if behaviour == 0u {
+        return vec2(0.0, -1.0);
+    }
+    let pois = vec4(inputs[0], inputs[1], inputs[2], inputs[3]);
+    let agents = vec4(inputs[4], inputs[5], inputs[6], inputs[7]);
+    return vec2(quadrant(select(agents, pois, behaviour < 3u), behaviour == 2u || behaviour == 4u), 1.0);
+}
+
 // The wanted turn, in radians to the left, of the policy's first output in -1..1.
 fn wanted_turn(output: f32) -> f32 {
     return output * 3.14159274;

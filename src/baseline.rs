@@ -36,9 +36,9 @@ pub struct Baselines {
 struct Setting {
     config: Config,
     world: World,
-    /// `[trials][leaders][population + 1][parameters]`; the last policy is zero.
+    /// `[trials][populations][population + 1][parameters]`; the last policy is zero.
     weights: Vec<Vec<f32>>,
-    /// `[trials][episodes][agents]`.
+    /// `[trials][episodes][agents]`, with POIs if they move.
     starts: Vec<Vec<Vec<Vec2>>>,
     /// Team j is every leader's policy j, `[population + 1][leaders]`.
     teams: Vec<u32>,
@@ -109,7 +109,7 @@ impl Setting {
         let Learning { trials, population, episodes_per_team, generations, .. } = config.learning;
         let none = || vec![Vec::with_capacity(generations + 1); trials];
         Setting {
-            weights: vec![vec![0.0; world.leaders() * (population + 1) * world.parameters()]; trials],
+            weights: vec![vec![0.0; config.populations() * (population + 1) * world.parameters()]; trials],
             starts: vec![vec![vec![]; episodes_per_team]; trials],
             teams: (0..=population as u32).flat_map(|team| vec![team; world.leaders()]).collect(),
             observed: std::iter::repeat_with(AtomicU32::default).take(trials * (population + 1)).collect(),
@@ -122,7 +122,7 @@ impl Setting {
     /// Draws a generation's policies and starts.
     fn prepare(&mut self, generation: usize) {
         let Setting { config, world, weights, starts, observed, .. } = self;
-        let Learning { seed, population, start_jitter, .. } = config.learning;
+        let Learning { seed, population, .. } = config.learning;
         let (level, parameters) = (Level::new(), world.parameters());
         weights.par_iter_mut().zip(starts).enumerate().for_each(|(trial, (weights, starts))| {
             let key = Key::new(seed, trial, Purpose::Baseline);
@@ -131,9 +131,8 @@ impl Setting {
                 let drawn = policies.chunks_exact_mut(parameters).take(population).enumerate();
                 drawn.for_each(|(slot, policy)| evolve::random_policy(level, key.at(generation, leader, slot), policy));
             });
-            let key = Key::new(seed, trial, Purpose::Starts);
             for (episode, starts) in starts.iter_mut().enumerate() {
-                evolve::jitter_starts(key, generation, episode, world, start_jitter, starts);
+                evolve::places(&config.learning, trial, generation, episode, world, starts);
             }
         });
         observed.iter().for_each(|observed| observed.store(0, Relaxed));

@@ -8,7 +8,7 @@ use std::ops::Range;
 use fearless_simd::{Level, Simd, SimdMask, dispatch, prelude::*};
 use glam::Vec2;
 
-use crate::config::{Learning, Mutation};
+use crate::config::{Learning, Mutation, Sharing};
 use crate::kernels::{bound, math, splat};
 use crate::parallel::*;
 use crate::world::{World, on_grid};
@@ -50,6 +50,9 @@ pub enum Purpose {
     Baseline = 6,
     /// Starts that teams are evaluated from, not trained.
     HeldOut = 7,
+    Pois = 8,
+    /// Places of POIs that teams are evaluated at, not trained.
+    HeldOutPois = 9,
 }
 
 /// A place in the space of all randomness; [`Key::draw`] gives its numbers, by a counter.
@@ -120,6 +123,21 @@ pub fn form_teams(key: Key, generation: usize, leaders: usize, teams: &mut [u32]
     }
 }
 
+/// Teams of one generation of a trial, `[teams][leaders]`: by [`form_teams`], or where all leaders share a policy, team `t`
+/// of policy `t`.
+pub fn teams_of(learning: &Learning, trial: usize, generation: usize, leaders: usize) -> Vec<u32> {
+    let mut teams = one_policy_a_team(learning.population, leaders);
+    if learning.sharing == Sharing::None {
+        form_teams(Key::new(learning.seed, trial, Purpose::Teams), generation, leaders, &mut teams);
+    }
+    teams
+}
+
+/// The choice of policies by which team `t` is made of every leader's policy `t`, `[teams][leaders]`.
+pub fn one_policy_a_team(teams: usize, leaders: usize) -> Vec<u32> {
+    (0..teams as u32).flat_map(|policy| std::iter::repeat_n(policy, leaders)).collect()
+}
+
 /// What [`form_teams`] has of one population: its policy in each team.
 pub fn shuffle(level: Level, key: Key, generation: usize, population: usize, order: &mut [u32]) {
     let key = key.at(generation, population, 0);
@@ -139,20 +157,50 @@ fn shuffle_lanes<S: Simd>(simd: S, key: Key, order: &mut [u32]) {
     }
 }
 
+/// Places of one episode of a trial's generation, as a [`crate::backend::Group`] has them: where agents start, and if POIs
+/// move, where these are.
+pub fn places(
+    learning: &Learning,
+    trial: usize,
+    generation: usize,
+    episode: usize,
+    world: &World,
+    places: &mut Vec<Vec2>,
+) {
+    let key = Key::new(learning.seed, trial, Purpose::Starts);
+    jitter_starts(key, generation, episode, world, learning.start_jitter, places);
+    if learning.poi_jitter > 0.0 {
+        let key = Key::new(learning.seed, trial, Purpose::Pois);
+        jitter_pois(key, generation, episode, world, learning.poi_jitter, places);
+    }
+}
+
 /// Start positions of one episode: the world's, each moved by a uniform offset in `-jitter..jitter` on both axes.
 pub fn jitter_starts(key: Key, generation: usize, episode: usize, world: &World, jitter: f64, starts: &mut Vec<Vec2>) {
     starts.clone_from(&world.starts);
+    scatter(key.at(generation, episode, 0), world.map(), jitter, starts);
+}
+
+/// Adds the POIs of one episode, moved likewise, to the start positions; none where nothing moves them.
+pub fn jitter_pois(key: Key, generation: usize, episode: usize, world: &World, jitter: f64, places: &mut Vec<Vec2>) {
+    if jitter > 0.0 {
+        let first = places.len();
+        places.extend(&world.pois);
+        scatter(key.at(generation, episode, 0), world.map(), jitter, &mut places[first..]);
+    }
+}
+
+/// Moves each place by a uniform offset in `-jitter..jitter` on both axes.
+fn scatter(key: Key, map: Vec2, jitter: f64, places: &mut [Vec2]) {
     if jitter == 0.0 {
         return;
     }
-    let key = key.at(generation, episode, 0);
-    let map = world.map();
-    for (agent, start) in starts.iter_mut().enumerate() {
-        let [x, y, ..] = key.draw(agent as u32).map(|word| {
+    for (index, place) in places.iter_mut().enumerate() {
+        let [x, y, ..] = key.draw(index as u32).map(|word| {
             // 53 bits are exact in f64, and so is every step but the last, which rounds to f32.
             ((word as f64 / (1u64 << 32) as f64) * 2.0 - 1.0) * jitter
         });
-        *start = on_grid(*start + Vec2::new(x as f32, y as f32), map);
+        *place = on_grid(*place + Vec2::new(x as f32, y as f32), map);
     }
 }
 
@@ -300,7 +348,7 @@ pub struct Misfit(String);
 /// How the next generation of a trial's populations comes from this one.
 #[derive(Clone, Debug)]
 pub struct Breeding<'a> {
-    /// The plan, `[leaders][slots]`, see [`draw_parents`].
+    /// The plan, `[populations][slots]`, see [`draw_parents`].
     pub parents: &'a [u32],
     /// The trial's key of [`Purpose::Mutation`], and the generation to draw for.
     pub key: Key,

@@ -17,7 +17,7 @@ use crate::backend::gpu::{
     episode::{GpuEpisodes, Holding},
 };
 use crate::backend::{Backend, BackendError, Group, Machine, Need, Player};
-use crate::config::{Config, ConfigError, MAX_POPULATION};
+use crate::config::{Config, ConfigError, Fitness, MAX_POPULATION};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
 use crate::evolve::{self, MAX_WEIGHT};
 use crate::memory::{self, Peaks, TooLittle};
@@ -257,6 +257,7 @@ pub fn train(
             stopped = watch(Generation { generation, last, rows: &played }).is_break();
             if stopped {
                 config.learning.generations = trainer.end(0);
+                config.stages.retain(|stage| stage.from <= config.learning.generations);
             }
         }
         rows.extend(played);
@@ -275,11 +276,13 @@ pub struct Played {
     pub d: Vec<f32>,
     pub df: Vec<f32>,
     pub dpp: Vec<f32>,
+    /// Only where it is the config's fitness, else empty: it takes a record of who was seen at every step.
+    pub dt: Vec<f32>,
 }
 
 /// Plays teams of given policies, `[leaders][teams][parameters]`: team `t` is made of every leader's policy `t`. Where
-/// all leaders of a team share one, `[1][teams][parameters]` will do. A policy's parameters are layer by layer and unit
-/// by unit: a weight for each input, then the bias.
+/// all leaders of a team share one, `[1][teams][parameters]` will do. A policy's parameters stand layer by layer, in each
+/// input by input with the bias last, in each unit by unit.
 ///
 /// # Errors
 /// The config, the weights or the starts are wrong, or the backend fails.
@@ -291,7 +294,9 @@ pub fn play(
     starts: &Starts,
 ) -> Result<Played, Failure> {
     let cast = Cast::new(config, teams, weights, starts)?;
-    let evaluation = evaluate::evaluate(backend, &cast.group(&cast.world.starts), starts, &|_| ())?;
+    let need = if config.learning.fitness == Fitness::Dt { Need::Sights } else { Need::Scores };
+    let group = Group { need, ..cast.group(&cast.world.starts) };
+    let evaluation = evaluate::evaluate(backend, &group, starts, &|_| ())?;
     let Evaluation { leaders, .. } = evaluation;
     let scores: Vec<[f32; 4]> =
         (0..teams * leaders).map(|place| evaluation.scores(place / leaders, place % leaders)).collect();
@@ -301,6 +306,7 @@ pub fn play(
         d: scores.iter().map(|&[_, d, ..]| d).collect(),
         df: scores.iter().map(|&[_, _, df, _]| df).collect(),
         dpp: scores.iter().map(|&[.., dpp]| dpp).collect(),
+        dt: (0..teams * leaders).filter_map(|place| evaluation.dt(place / leaders, place % leaders)).collect(),
     })
 }
 
@@ -374,13 +380,18 @@ pub fn trace(
     Ok(traced)
 }
 
-/// Teams to be stepped by given actions, all at the world's start; with a record, they can be scored.
+/// Teams to be stepped by given actions, all at the world's start; with a record, they can be scored, by Dt where that is
+/// the config's fitness.
 ///
 /// # Errors
 /// The config is wrong, or there may not be so many teams.
 pub fn stepper(config: &Config, teams: usize, recording: bool) -> Result<Stepper, Failure> {
     let world = World::new(&checked(config)?);
-    Ok(if recording { Stepper::recording(world, teams)? } else { Stepper::new(world, teams)? })
+    Ok(match (recording, config.learning.fitness) {
+        (false, _) => Stepper::new(world, teams)?,
+        (true, Fitness::Dt) => Stepper::recording(world, teams)?.with_sights()?,
+        (true, _) => Stepper::recording(world, teams)?,
+    })
 }
 
 /// A config that may have been built by hand, as if it had been read from a file.
@@ -403,26 +414,23 @@ impl<'a> Cast<'a> {
         if !(1..=MAX_POPULATION).contains(&teams) {
             return Err(Failure::Teams(teams));
         }
-        if let &Starts::Drawn { episodes, jitter, .. } = starts
-            && !((1..=MAX_EPISODES).contains(&episodes) && jitter.is_finite() && jitter >= 0.0)
-        {
-            return Err(Failure::Starts { episodes, jitter });
+        if let &Starts::Drawn { episodes, jitter, poi_jitter, .. } = starts {
+            let wrong = [jitter, poi_jitter].into_iter().find(|jitter| !jitter.is_finite() || *jitter < 0.0);
+            if wrong.is_some() || !(1..=MAX_EPISODES).contains(&episodes) {
+                return Err(Failure::Starts { episodes, jitter: wrong.unwrap_or(jitter) });
+            }
         }
         let (leaders, parameters) = (world.leaders(), world.parameters());
         let shared = weights.len() / teams == parameters;
         if !weights.len().is_multiple_of(teams) || !(shared || weights.len() / teams == leaders * parameters) {
             return Err(Failure::Weights { found: weights.len(), leaders, teams, parameters });
         }
-        // A shared policy is repeated; every leader has a place in a team, and several scores.
-        let repeated = if shared && leaders > 1 { parameters * size_of::<f32>() } else { 0 };
-        let bytes = teams as u128 * leaders as u128 * (repeated + 28) as u128;
+        // Every leader has a place in a team, and several scores.
+        let bytes = teams as u128 * leaders as u128 * 28;
         if !usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok()) {
             return Err(Failure::Memory { what: "all teams", bytes });
         }
-        let mut weights = match shared {
-            true if leaders > 1 => Cow::Owned(weights.repeat(leaders)),
-            _ => Cow::Borrowed(weights),
-        };
+        let mut weights = Cow::Borrowed(weights);
         if !weights.iter().all(|&weight| evolve::is_weight(weight))
             && let Some(place) = evolve::admit(weights.to_mut())
         {

@@ -10,7 +10,7 @@ use fearless_simd::Level;
 use glam::Vec2;
 
 use crate::backend::{Backend, BackendError, Episode, Group, Held, Need, Weights};
-use crate::config::{Config, Learning};
+use crate::config::{Config, Learning, Sharing};
 use crate::credit::Credit;
 use crate::evolve::{self, Breeding, Key, Purpose};
 use crate::host::Instant;
@@ -47,9 +47,9 @@ pub struct Snapshot<N = Vec<f32>> {
     pub generation: usize,
     /// The run's last generation, after which policies stay as they are.
     pub last: usize,
-    /// A trial's weights, `[leaders][policies + 1][parameters]`.
+    /// A trial's weights, `[populations][policies + 1][parameters]`, see [`Config::populations`].
     pub weights: Vec<N>,
-    /// A trial's scores of the generation before, `[leaders][policies]`.
+    /// A trial's scores of the generation before, `[populations][policies]`.
     pub fitness: Vec<N>,
     /// A trial's row of the generation before.
     pub pending: Vec<Option<Row>>,
@@ -70,8 +70,14 @@ pub struct Times {
 
 /// One experiment and its trials.
 struct Arm {
+    /// Those of the stage that plays.
     config: Config,
     world: World,
+    /// All stages, each with its first generation, and which of them plays.
+    stages: Vec<(usize, Config, World)>,
+    stage: usize,
+    /// The stage whose champions play beside the first generation of this one.
+    leaving: Option<usize>,
     trials: Vec<Lineage>,
     /// The generation that plays next, two past the last when all is done.
     generation: usize,
@@ -105,20 +111,22 @@ pub enum SnapshotError {
 /// along as one more team.
 struct Lineage {
     index: usize,
-    /// `[leaders][policies + 1][parameters]`, this generation's and the next.
+    /// `[populations][policies + 1][parameters]`, this generation's and the next.
     weights: Vec<f32>,
     children: Vec<f32>,
-    /// Policies of each team, `[leaders][policies]`, and as the backend wants them, `[policies + 1][leaders]`.
+    /// Policies of each team, `[populations][policies]`, and as the backend wants them, `[policies + 1][leaders]`.
     orders: Vec<u32>,
     teams: Vec<u32>,
-    /// Start positions, `[episodes][agents]`.
+    /// Start positions, and where POIs are if they move, `[episodes][agents + pois]`.
     starts: Vec<Vec<Vec2>>,
+    /// Likewise of the champions of the stage before, where one ends.
+    farewell: Vec<Vec<Vec2>>,
     /// POIs observed, `[episodes][policies + 1]`, and f32 scores as bits, `[episodes][policies + 1][leaders]`.
     observed: Vec<AtomicU32>,
     scores: Vec<AtomicU32>,
-    /// Mean score of every policy, `[leaders][policies]`.
+    /// Mean score of every policy, `[populations][policies]`.
     fitness: Vec<f32>,
-    /// The plan of the next generation, see [`evolve::draw_parents`], `[leaders][policies + 1]`.
+    /// The plan of the next generation, see [`evolve::draw_parents`], `[populations][policies + 1]`.
     parents: Vec<u32>,
     /// The last generation's row, whose champion has yet to play.
     pending: Option<Row>,
@@ -253,7 +261,7 @@ impl Trainer {
     }
 
     /// The policies of the last generation of an arm that has played it, best first in each population, one
-    /// `[leaders][policies][parameters]` a trial.
+    /// `[populations][policies][parameters]` a trial.
     pub fn policies(&self, arm: usize) -> Vec<Vec<f32>> {
         let arm = &self.arms[arm];
         let sort = |trial: &Lineage| {
@@ -283,7 +291,7 @@ impl Trainer {
         arms.iter().map(end).collect()
     }
 
-    /// The populations of a trial about to play, `[leaders][policies + 1][parameters]`; a population's last slot is
+    /// The populations of a trial about to play, `[populations][policies + 1][parameters]`; a population's last slot is
     /// the champion's of the generation before.
     ///
     /// # Errors
@@ -294,9 +302,10 @@ impl Trainer {
         Ok(&arm.trials[trial].weights)
     }
 
-    /// The world that an arm trains in.
+    /// The world that an arm's next generation plays in.
     pub fn world(&self, arm: usize) -> &World {
-        &self.arms[arm].world
+        let arm = &self.arms[arm];
+        &arm.stages[arm.stage_of(arm.generation.min(arm.last()))].2
     }
 
     /// What [`Trainer::restore`] needs of an arm, where it lies.
@@ -325,6 +334,26 @@ impl Trainer {
         Ok(Snapshot { generation, last, weights: each(weights)?, fitness: each(fitness)?, pending })
     }
 
+    /// Puts given policies, `[populations][policies][parameters]`, in the first slots of a trial's populations, in their order:
+    /// as many as there is room for. The others stay as they were drawn. False where the arm has played already, or sizes do
+    /// not fit.
+    #[must_use]
+    pub fn start_from(&mut self, arm: usize, trial: usize, policies: usize, weights: &[f32]) -> bool {
+        let arm = &mut self.arms[arm];
+        let (populations, parameters) = (arm.config.populations(), arm.world.parameters());
+        let population = arm.config.learning.population;
+        let Some(trial) = arm.trials.get_mut(trial) else { return false };
+        if arm.generation > 0 || arm.offered || policies == 0 || weights.len() != populations * policies * parameters {
+            return false;
+        }
+        let taken = policies.min(population) * parameters;
+        let slots = trial.weights.chunks_exact_mut((population + 1) * parameters);
+        for (slots, policies) in slots.zip(weights.chunks_exact(policies * parameters)) {
+            slots[..taken].copy_from_slice(&policies[..taken]);
+        }
+        true
+    }
+
     /// Goes on with an arm from a snapshot of an arm of the same config, but for its number of generations, which may have
     /// been smaller; false where the sizes do not fit.
     #[must_use]
@@ -351,6 +380,7 @@ impl Trainer {
         if generation == last + 1 && last < arm.last() {
             // There the policies stayed, here they have a next generation.
             (arm.age, arm.host_age) = (last, last);
+            arm.enter();
             // Nobody holds them, so nobody can fail.
             let _ = arm.breed(level);
         }
@@ -361,36 +391,41 @@ impl Trainer {
 /// Words that an episode of a trial takes in a batch, whoever plays it.
 const EPISODE: u64 = 40;
 
-/// Bytes that the trials of a (valid) config take, whoever plays their episodes.
+/// Bytes that the trials of a (valid) config take, whoever plays their episodes: in the stage that takes most.
 pub fn bytes(config: &Config) -> u64 {
-    let [trials, leaders, policies, parameters] = sizes(config);
+    config.staged().iter().map(|(_, config)| bytes_of_stage(config)).max().unwrap_or(0)
+}
+
+fn bytes_of_stage(config: &Config) -> u64 {
+    let ([trials, populations, policies, parameters], leaders) = (sizes(config), config.learners() as u64);
     let (slots, episodes) = (policies + 1, config.learning.episodes_per_team as u64);
     let agents = (config.world.leaders.len() + config.world.followers.len()) as u64;
-    let weights = 2 * leaders * slots * parameters;
-    let orders_and_fitness = 2 * leaders * policies;
-    let teams_and_parents = 2 * leaders * slots;
+    let moved = if config.learning.poi_jitter > 0.0 { config.world.pois.len() as u64 } else { 0 };
+    let weights = 2 * populations * slots * parameters;
+    let orders_and_fitness = 2 * populations * policies;
+    let teams_and_parents = (leaders + populations) * slots;
     let observed_and_scores = episodes * slots * (1 + leaders);
-    // Each episode's start positions, and its place in a batch.
-    let starts = episodes * (2 * agents + EPISODE);
+    // Each episode's places, and its own place in a batch.
+    let starts = episodes * (2 * (agents + moved) + EPISODE);
     4 * trials * (weights + orders_and_fitness + teams_and_parents + observed_and_scores + starts)
 }
 
 /// Bytes of the numbers of a [`Snapshot`] of a (valid) config's arm.
 pub fn snapshot_bytes(config: &Config) -> u64 {
-    let [trials, leaders, policies, parameters] = sizes(config);
-    4 * trials * leaders * ((policies + 1) * parameters + policies)
+    let [trials, populations, policies, parameters] = sizes(config);
+    4 * trials * populations * ((policies + 1) * parameters + policies)
 }
 
-/// `[trials, leaders, policies, parameters]`
+/// `[trials, populations, policies, parameters]`
 fn sizes(config: &Config) -> [u64; 4] {
     let learning = &config.learning;
-    [learning.trials, config.learners(), learning.population, config.parameters()].map(|count| count as u64)
+    [learning.trials, config.populations(), learning.population, config.parameters()].map(|count| count as u64)
 }
 
 /// Plays a range of the teams of every trial, given the population, all as one batch; keeps what they scored.
-fn play(
+fn play<'a>(
     backend: &mut dyn Backend,
-    arms: &[(usize, &mut Arm)],
+    arms: &'a [(usize, &'a mut Arm)],
     range: impl Fn(&Arm) -> Range<usize>,
 ) -> Result<(), BackendError> {
     thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
@@ -401,20 +436,27 @@ fn play(
         let range = range(arm);
         for (index, trial) in arm.trials.iter().enumerate() {
             let weights = arm.held.get(index).map_or(trial.weights[..].into(), |held| Weights::Held(&**held));
-            let teams = &trial.teams[range.start * leaders..range.end * leaders];
-            for (episode, starts) in trial.starts.iter().enumerate() {
-                let (world, need) = (&arm.world, Need::Score(arm.config.learning.fitness));
-                groups.push(Group { world, starts, weights, policies: population + 1, teams, need });
-                places.push((&**arm, trial, episode * (population + 1) + range.start));
+            let mut cast = |world, fitness, starts: &'a [Vec<Vec2>], range: Range<usize>| {
+                let (teams, need) = (&trial.teams[range.start * leaders..range.end * leaders], Need::Score(fitness));
+                for (episode, starts) in starts.iter().enumerate() {
+                    groups.push(Group { world, starts, weights, policies: population + 1, teams, need });
+                    places.push((world, fitness, trial, episode * (population + 1) + range.start));
+                }
+            };
+            // Champions play in their own stage.
+            let end = if arm.leaving.is_some() { population } else { range.end };
+            cast(&arm.world, arm.config.learning.fitness, &trial.starts, range.start..end);
+            if let Some((_, config, world)) = arm.leaving.map(|stage| &arm.stages[stage]) {
+                cast(world, config.learning.fitness, &trial.farewell, population..population + 1);
             }
         }
     }
     backend.rollout(&groups, &|episode: Episode<'_>| {
-        let (arm, trial, first) = places[episode.group];
-        let (team, leaders) = (first + episode.team, arm.world.leaders());
+        let (world, fitness, trial, first) = places[episode.group];
+        let (team, leaders) = (first + episode.team, world.leaders());
         CREDIT.with_borrow_mut(|(credit, scores)| {
             scores.resize(leaders, 0.0);
-            let observed = credit.score(&episode, &arm.world, arm.config.learning.fitness, scores);
+            let observed = credit.score(&episode, world, fitness, scores);
             trial.observed[team].store(observed, Relaxed);
             for (to, score) in trial.scores[team * leaders..].iter().zip(&*scores) {
                 to.store(score.to_bits(), Relaxed);
@@ -425,17 +467,51 @@ fn play(
 
 impl Arm {
     fn new(config: Config, trials: Range<usize>, level: Level) -> Arm {
-        let world = World::new(&config);
-        let trials = trials.into_par_iter().map(|index| Lineage::new(&config, &world, index, level));
+        let stages = config.staged().into_iter().map(|(from, config)| {
+            let world = World::new(&config);
+            (from, config, world)
+        });
+        let stages: Vec<_> = stages.collect();
+        let most = stages.iter().map(|(_, config, _)| config.learning.episodes_per_team).max().unwrap_or(1);
+        let (_, config, world) = stages[0].clone();
+        let trials = trials.into_par_iter().map(|index| Lineage::new(&config, &world, most, index, level));
         Arm {
             trials: trials.collect(),
             world,
             config,
+            stages,
+            stage: 0,
+            leaving: None,
             generation: 0,
             age: 0,
             host_age: 0,
             held: vec![],
             offered: false,
+        }
+    }
+
+    /// The stage of a generation.
+    fn stage_of(&self, generation: usize) -> usize {
+        self.stages.iter().rposition(|stage| stage.0 <= generation).unwrap_or(0)
+    }
+
+    /// Takes on the stage of the populations that are about to play.
+    fn enter(&mut self) {
+        let (age, last) = (self.age, self.last());
+        let stage = self.stage_of(age.min(last));
+        if stage != self.stage {
+            let (_, config, world) = self.stages[stage].clone();
+            (self.config, self.world, self.stage) = (config, world, stage);
+            // A run may end sooner than it was to.
+            self.config.learning.generations = last;
+        }
+        let before = if age == 0 { stage } else { self.stage_of(age - 1) };
+        self.leaving = (before != stage).then_some(before);
+        let episodes = self.config.learning.episodes_per_team;
+        let of_champions = self.leaving.map_or(0, |stage| self.stages[stage].1.learning.episodes_per_team);
+        for trial in &mut self.trials {
+            trial.starts.resize(episodes, vec![]);
+            trial.farewell.resize(of_champions, vec![]);
         }
     }
 
@@ -461,7 +537,7 @@ impl Arm {
 
     /// Numbers in the policies of one trial.
     fn policies(&self) -> usize {
-        self.world.leaders() * self.config.learning.population * self.world.parameters()
+        self.config.populations() * self.config.learning.population * self.world.parameters()
     }
 
     /// What it is as far as the host knows.
@@ -480,7 +556,7 @@ impl Arm {
         if std::mem::replace(&mut self.offered, true) {
             return Ok(());
         }
-        let sizes = [self.world.leaders(), self.config.learning.population + 1, self.world.parameters()];
+        let sizes = [self.config.populations(), self.config.learning.population + 1, self.world.parameters()];
         let held: Option<Vec<_>> =
             self.trials.iter().map(|trial| backend.hold(&trial.weights, sizes).transpose()).collect::<Option<_>>();
         self.held = held.map_or(Ok(vec![]), |held| held.into_iter().collect())?;
@@ -529,39 +605,52 @@ impl Arm {
 
     /// Forms the teams of a generation and draws its starts.
     fn prepare(&mut self, level: Level) {
-        let Arm { config, world, trials, age: generation, .. } = self;
+        self.enter();
+        let Arm { config, world, stages, leaving, trials, age: generation, .. } = self;
         let generation = *generation;
-        let Learning { seed, population, start_jitter, .. } = config.learning;
+        let Learning { seed, population, sharing, .. } = config.learning;
         let leaders = world.leaders();
         trials.par_iter_mut().for_each(|trial| {
-            let key = Key::new(seed, trial.index, Purpose::Teams);
-            let orders = trial.orders.par_chunks_exact_mut(population).with_min_len(few(population)).enumerate();
-            orders.for_each(|(leader, order)| evolve::shuffle(level, key, generation, leader, order));
-            let orders = &trial.orders;
-            let teams = trial.teams[..population * leaders].par_chunks_exact_mut(leaders).with_min_len(CHUNK);
-            teams.enumerate().for_each(|(team, policies)| {
-                for (policy, order) in policies.iter_mut().zip(orders.chunks_exact(population)) {
-                    *policy = order[team];
-                }
-            });
-            let key = Key::new(seed, trial.index, Purpose::Starts);
+            // Where all leaders share a policy, its team is the one that it has from the start.
+            if sharing == Sharing::None {
+                let key = Key::new(seed, trial.index, Purpose::Teams);
+                let orders = trial.orders.par_chunks_exact_mut(population).with_min_len(few(population)).enumerate();
+                orders.for_each(|(leader, order)| evolve::shuffle(level, key, generation, leader, order));
+                let orders = &trial.orders;
+                let teams = trial.teams[..population * leaders].par_chunks_exact_mut(leaders).with_min_len(CHUNK);
+                teams.enumerate().for_each(|(team, policies)| {
+                    for (policy, order) in policies.iter_mut().zip(orders.chunks_exact(population)) {
+                        *policy = order[team];
+                    }
+                });
+            }
             for (episode, starts) in trial.starts.iter_mut().enumerate() {
-                evolve::jitter_starts(key, generation, episode, world, start_jitter, starts);
+                evolve::places(&config.learning, trial.index, generation, episode, world, starts);
+            }
+            if let Some((_, config, world)) = leaving.map(|stage| &stages[stage]) {
+                for (episode, starts) in trial.farewell.iter_mut().enumerate() {
+                    evolve::places(&config.learning, trial.index, generation, episode, world, starts);
+                }
             }
         });
     }
 
     /// Turns what was observed into fitness and rows.
     fn conclude(&mut self, arm: usize) -> Vec<Row> {
-        let Arm { config, world, trials, age: generation, .. } = self;
+        let Arm { config, world, stages, leaving, trials, age: generation, .. } = self;
         let generation = *generation;
         let population = config.learning.population;
+        let pois_before = leaving.map_or(world.pois.len(), |stage| stages[stage].2.pois.len());
         let mut rows = Vec::with_capacity(trials.len());
         for trial in trials {
-            let [best_g, mean_g, champion_g] = trial.summary(world.pois.len(), population);
+            let [best_g, mean_g] = trial.summary(world.pois.len(), population);
+            let champion_g = trial.champion(pois_before, population);
             rows.extend(trial.pending.map(|row| Row { champion_g, ..row }));
             trial.pending = Some(Row { arm, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
-            trial.rate(world.leaders(), population);
+            match config.learning.sharing {
+                Sharing::None => trial.rate(world.leaders(), population),
+                Sharing::All => trial.rate_shared(world.leaders(), population),
+            }
         }
         rows
     }
@@ -570,7 +659,7 @@ impl Arm {
     fn finish(&mut self) -> Vec<Row> {
         let (pois, population) = (self.world.pois.len(), self.config.learning.population);
         let row = |trial: &mut Lineage| {
-            let [_, _, champion_g] = trial.summary(pois, population);
+            let champion_g = trial.champion(pois, population);
             trial.pending.map(|row| Row { champion_g, ..row })
         };
         let rows = self.trials.iter_mut().filter_map(row).collect();
@@ -658,11 +747,12 @@ impl Arm {
 }
 
 impl Lineage {
-    fn new(config: &Config, world: &World, index: usize, level: Level) -> Lineage {
-        let Learning { seed, population, episodes_per_team, .. } = config.learning;
-        let (leaders, parameters) = (world.leaders(), world.parameters());
+    /// With room for so many episodes a team.
+    fn new(config: &Config, world: &World, episodes: usize, index: usize, level: Level) -> Lineage {
+        let Learning { seed, population, .. } = config.learning;
+        let (leaders, populations, parameters) = (world.leaders(), config.populations(), world.parameters());
         let key = Key::new(seed, index, Purpose::Weights);
-        let mut weights = vec![0.0; leaders * (population + 1) * parameters];
+        let mut weights = vec![0.0; populations * (population + 1) * parameters];
         weights.par_chunks_exact_mut((population + 1) * parameters).enumerate().for_each(|(leader, policies)| {
             policies[..population * parameters]
                 .par_chunks_exact_mut(parameters)
@@ -670,33 +760,43 @@ impl Lineage {
                 .enumerate()
                 .for_each(|(slot, policy)| evolve::random_policy(level, key.at(0, leader, slot), policy));
         });
-        let slots = episodes_per_team * (population + 1);
+        let slots = episodes * (population + 1);
         Lineage {
             index,
             children: vec![0.0; weights.len()],
             weights,
-            orders: vec![0; leaders * population],
+            orders: vec![0; populations * population],
             // The champion's team, the last, is made of every population's last slot.
-            teams: vec![population as u32; (population + 1) * leaders],
-            starts: vec![Vec::new(); episodes_per_team],
+            teams: evolve::one_policy_a_team(population + 1, leaders),
+            starts: vec![],
+            farewell: vec![],
             observed: std::iter::repeat_with(AtomicU32::default).take(slots).collect(),
             scores: std::iter::repeat_with(AtomicU32::default).take(slots * leaders).collect(),
-            fitness: vec![0.0; leaders * population],
-            parents: vec![0; leaders * (population + 1)],
+            fitness: vec![0.0; populations * population],
+            parents: vec![0; populations * (population + 1)],
             pending: None,
         }
     }
 
-    /// G of the best team, of the mean team and of the champion's team.
-    fn summary(&self, pois: usize, population: usize) -> [f64; 3] {
+    /// G of the best team and of the mean team.
+    fn summary(&self, pois: usize, population: usize) -> [f64; 2] {
         let episodes = self.starts.len();
-        let observed = |team: usize| -> u64 {
-            (0..episodes).map(|episode| u64::from(self.observed[episode * (population + 1) + team].load(Relaxed))).sum()
-        };
+        let observed = |team: usize| self.observed(team, episodes, population);
         let whole = (pois * episodes) as f64;
         let best = (0..population).map(observed).max().unwrap_or(0);
         let total: u64 = (0..population).map(observed).sum();
-        [best as f64 / whole, total as f64 / (whole * population as f64), observed(population) as f64 / whole]
+        [best as f64 / whole, total as f64 / (whole * population as f64)]
+    }
+
+    /// G of the champion's team, which may have played in the stage before.
+    fn champion(&self, pois: usize, population: usize) -> f64 {
+        let episodes = if self.farewell.is_empty() { self.starts.len() } else { self.farewell.len() };
+        self.observed(population, episodes, population) as f64 / (pois * episodes) as f64
+    }
+
+    /// POIs that a team observed in all episodes.
+    fn observed(&self, team: usize, episodes: usize, population: usize) -> u64 {
+        (0..episodes).map(|episode| u64::from(self.observed[episode * (population + 1) + team].load(Relaxed))).sum()
     }
 
     /// Hands each team's scores, averaged over its episodes, back to its policies.
@@ -706,15 +806,28 @@ impl Lineage {
         let populations = fitness.par_chunks_exact_mut(population).zip(orders.par_chunks_exact(population));
         populations.with_min_len(few(population)).enumerate().for_each(|(leader, (fitness, order))| {
             for (team, &policy) in order.iter().enumerate() {
-                let score = |episode: usize| {
-                    let at = (episode * (population + 1) + team) * leaders + leader;
-                    f64::from(f32::from_bits(scores[at].load(Relaxed)))
-                };
-                let total: f64 = (0..episodes).map(score).sum();
-                fitness[policy as usize] = (total / episodes as f64) as f32;
+                fitness[policy as usize] = mean_score(scores, episodes, population + 1, team, leaders, leader);
             }
         });
     }
+
+    /// [`Trial::rate`] where every leader of a team plays the same policy: its mean over them, in their order.
+    fn rate_shared(&mut self, leaders: usize, population: usize) {
+        let (episodes, scores) = (self.starts.len(), &self.scores);
+        self.fitness.par_iter_mut().with_min_len(few(leaders)).enumerate().for_each(|(team, fitness)| {
+            let score = |leader| f64::from(mean_score(scores, episodes, population + 1, team, leaders, leader));
+            *fitness = ((0..leaders).map(score).sum::<f64>() / leaders as f64) as f32;
+        });
+    }
+}
+
+/// The score of one leader of a team, averaged over episodes; `scores` are `[episodes][teams][leaders]`.
+#[inline(always)]
+fn mean_score(scores: &[AtomicU32], episodes: usize, teams: usize, team: usize, leaders: usize, leader: usize) -> f32 {
+    let score =
+        |episode: usize| f64::from(f32::from_bits(scores[(episode * teams + team) * leaders + leader].load(Relaxed)));
+    let total: f64 = (0..episodes).map(score).sum();
+    (total / episodes as f64) as f32
 }
 
 /// Slots that one thread fills at a time.

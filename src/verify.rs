@@ -5,11 +5,13 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Mutex;
 
+use glam::Vec2;
+
 use crate::backend::compare::{Mismatch, first_mismatch};
 use crate::backend::{Backend, BackendError, Group, Need};
 use crate::config::{Config, Paradigm};
 use crate::credit::{Credit, Scores};
-use crate::evolve::{Breeding, Key, Purpose, UNCHANGED};
+use crate::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use crate::sample;
 use crate::trainer::{Row, Trainer};
 use crate::world::World;
@@ -74,22 +76,32 @@ struct Teams {
     policies: usize,
     weights: Vec<f32>,
     choice: Vec<u32>,
+    /// See [`Group::starts`].
+    places: Vec<Vec2>,
+    /// Of every other world also who was seen at which step, which kernels of their own record.
+    need: Need,
 }
 
 impl Teams {
-    fn new(config: &Config, teams: usize, seed: u64) -> Teams {
+    fn new(config: &Config, teams: usize, seed: u64, sights: bool) -> Teams {
         let world = World::new(config);
         let policies = teams.min(64);
         let leaders = world.leaders();
         let policy = |place: usize| ((place / leaders + place % leaders) % policies) as u32;
         let choice = (0..teams * leaders).map(policy).collect();
-        Teams { policies, weights: sample::weights(&world, policies, seed), choice, world }
+        let mut weights = sample::weights(&world, policies, seed);
+        // Of a shared population, teams mix policies all the same: that asks for more.
+        weights.truncate(config.populations() * policies * world.parameters());
+        let mut places = world.starts.clone();
+        let learning = &config.learning;
+        evolve::jitter_pois(Key::new(seed, 0, Purpose::Pois), 0, 0, &world, learning.poi_jitter, &mut places);
+        let need = if sights { Need::Sights } else { Need::Record };
+        Teams { policies, weights, choice, places, need, world }
     }
 
     fn group(&self) -> Group<'_> {
-        let Teams { world, policies, weights, choice } = self;
-        let need = Need::Record;
-        Group { world, starts: &world.starts, weights: weights[..].into(), policies: *policies, teams: choice, need }
+        let Teams { world, policies, weights, choice, places, need } = self;
+        Group { world, starts: places, weights: weights[..].into(), policies: *policies, teams: choice, need: *need }
     }
 }
 
@@ -106,7 +118,8 @@ pub fn compare(
     let mut outcome = Agreement::default();
     let mut all = Vec::with_capacity(plan.worlds.len());
     for (name, config) in &plan.worlds {
-        let teams = Teams::new(config, plan.teams, plan.seed);
+        // Stages train below; a stage's own world is that of its config.
+        let teams = Teams::new(config, plan.teams, plan.seed, outcome.worlds % 2 == 0);
         if let Some(mismatch) = compare_stages(&teams, reference, backend)? {
             outcome.mismatch = Some(format!("{name}: {mismatch}"));
             return Ok(outcome);
@@ -160,7 +173,7 @@ fn compare_batch(
         backend.rollout(groups, &|episode| {
             // A team that is visited twice has a record twice as long.
             let mut record = records[episode.group][episode.team].lock().expect("no visit panics");
-            record.extend(episode.sets.iter().chain(episode.seen.words().iter()));
+            record.extend(episode.sets.iter().chain(episode.seen.words().iter()).chain(episode.sights.iter()));
         })?;
         Ok::<_, BackendError>(records)
     };
@@ -174,33 +187,41 @@ fn compare_batch(
     Ok(teams.into_iter().find(differs))
 }
 
-/// Plays all groups as one batch of which only scores are wanted, of every kind by turns, and holds them against those
+/// Plays all groups as two batches of which only scores are wanted, of every kind by turns, and holds them against those
 /// of the reference's whole record; the first group and team that differs, and how.
 fn compare_scores(
     groups: &[Group<'_>],
     reference: &mut dyn Backend,
     backend: &mut dyn Backend,
 ) -> Result<Option<(usize, usize, String)>, BackendError> {
+    let need_of = |group: usize| Need::OF_SCORES[group % Need::OF_SCORES.len()];
+    // Records come home packed where all of a batch can.
+    let is_whole = |&group: &usize| need_of(group).least(1).is_none() || groups[group].world.rule.is_timed();
+    let (whole, packed): (Vec<usize>, Vec<usize>) = (0..groups.len()).partition(is_whole);
     let played = |backend: &mut dyn Backend, needs: &dyn Fn(usize) -> Need| {
-        let asked: Vec<Group<'_>> =
-            groups.iter().enumerate().map(|(index, group)| Group { need: needs(index), ..*group }).collect();
         let scores: Vec<Mutex<BTreeMap<usize, Scores>>> = groups.iter().map(|_| Mutex::default()).collect();
-        backend.rollout(&asked, &|episode| {
-            let (group, mut credit) = (&groups[episode.group], Credit::default());
-            let found = match Need::OF_SCORES[episode.group % Need::OF_SCORES.len()] {
-                Need::Record | Need::Scores => credit.all(&episode, group.world),
-                Need::Score(fitness) => {
-                    let mut one = vec![0.0; group.world.leaders()];
-                    let observed = credit.score(&episode, group.world, fitness, &mut one);
-                    Scores { observed, d: one, ..Scores::default() }
-                }
-            };
-            scores[episode.group].lock().expect("no visit panics").insert(episode.team, found);
-        })?;
+        for batch in [&whole, &packed] {
+            let asked: Vec<Group<'_>> =
+                batch.iter().map(|&index| Group { need: needs(index), ..groups[index] }).collect();
+            backend.rollout(&asked, &|episode| {
+                let index = batch[episode.group];
+                let (world, mut credit) = (groups[index].world, Credit::default());
+                let found = match need_of(index) {
+                    // Dt is not asked for, whatever the record tells.
+                    Need::Record | Need::Sights | Need::Scores => Scores { dt: vec![], ..credit.all(&episode, world) },
+                    Need::Score(fitness) => {
+                        let mut one = vec![0.0; world.leaders()];
+                        let observed = credit.score(&episode, world, fitness, &mut one);
+                        Scores { observed, d: one, ..Scores::default() }
+                    }
+                };
+                scores[index].lock().expect("no visit panics").insert(episode.team, found);
+            })?;
+        }
         Ok::<_, BackendError>(scores.into_iter().map(|scores| scores.into_inner().expect("no visit panics")))
     };
-    let expected = played(reference, &|_| Need::Record)?;
-    let found = played(backend, &|index| Need::OF_SCORES[index % Need::OF_SCORES.len()])?;
+    let expected = played(reference, &|_| Need::Sights)?;
+    let found = played(backend, &need_of)?;
     Ok(expected.zip(found).enumerate().find_map(|(group, (expected, found))| {
         let differs = |(team, expected): (&usize, &Scores)| {
             let found = found.get(team);
@@ -215,11 +236,11 @@ fn compare_scores(
 fn compare_breeding(config: &Config, teams: &Teams, backend: &mut dyn Backend) -> Result<Option<String>, BackendError> {
     let Teams { world, policies, weights, .. } = teams;
     let (slots, parameters) = (*policies, world.parameters());
-    let sizes = [world.leaders(), slots, parameters];
+    let sizes = [weights.len() / slots / parameters, slots, parameters];
     let Some(mut held) = backend.hold(weights, sizes)? else { return Ok(None) };
     // Each slot's parent is the slot after it, every fourth is kept as it is.
     let planned = |place: usize| ((place + 1) % slots) as u32 | if place % 4 == 3 { UNCHANGED } else { 0 };
-    let parents: Vec<u32> = (0..world.leaders()).flat_map(|_| (0..slots).map(planned)).collect();
+    let parents: Vec<u32> = (0..sizes[0]).flat_map(|_| (0..slots).map(planned)).collect();
     let (key, learning) = (Key::new(config.learning.seed, 0, Purpose::Mutation), &config.learning);
     let breeding = Breeding { parents: &parents, key, generation: 0, learning };
     held.breed(&breeding)?;

@@ -103,7 +103,7 @@ fn given_policies_are_played_and_traced_team_by_team() {
         let (config, teams) = (sample::world(seed), 1 + seed as usize * 3);
         let world = World::new(&config);
         let (leaders, parameters) = (world.leaders(), world.parameters());
-        let starts = Starts::Drawn { episodes: 5, seed, jitter: 0.4 };
+        let starts = Starts::Drawn { episodes: 5, seed, jitter: 0.4, poi_jitter: 0.0 };
         let weights = sample::weights(&world, teams, seed);
         let played = flotilla::play(&config, &mut backend, teams, &weights, &starts).expect("they fit");
         let sizes = [&played.d, &played.df, &played.dpp].map(Vec::len);
@@ -186,7 +186,7 @@ fn what_is_wrong_is_told() {
         }
     }
     for (episodes, jitter) in [(0, 0.1), (u32::MAX, 0.1), (1, f64::NAN), (1, f64::INFINITY), (1, -0.1)] {
-        let drawn = Starts::Drawn { episodes, seed: 1, jitter };
+        let drawn = Starts::Drawn { episodes, seed: 1, jitter, poi_jitter: 0.0 };
         assert!(matches!(play(&config, 2, &good, drawn), Err(Failure::Starts { .. })), "{episodes}, {jitter}");
     }
 

@@ -4,7 +4,7 @@
 //! `tests/golden.txt` says what each of its lines covers and when they may be minted anew.
 
 #[cfg(feature = "gpu")]
-mod common;
+mod support;
 
 use std::fmt::Write;
 use std::sync::LazyLock;
@@ -38,7 +38,7 @@ coupling = 4
 type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Which between them cover every choice that a config has, and sizes on both sides of every special case.
-const CASES: [Case; 17] = [
+const CASES: [Case; 25] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -121,6 +121,66 @@ const CASES: [Case; 17] = [
         FORTY_AGENTS,
         &[("world.after", "[[], [0], [1], [0], [3], [3]]"), ("world.coupling", "3")],
     ),
+    (
+        "behaviours",
+        "policies choose behaviours, G",
+        GENERALLY_FORWARD,
+        &[("policy.actions", "'behaviours'"), ("learning.fitness", "'G'")],
+    ),
+    (
+        "behaviours-of-all",
+        "20 leaders choose behaviours, no hidden layer",
+        CHAOTIC,
+        &[("policy.actions", "'behaviours'"), ("policy.hidden", "[]"), ("learning.paradigm", "'all-leaders'")],
+    ),
+    (
+        "shared",
+        "all leaders share a policy, D of two episodes",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.sharing", "'all'"),
+            ("learning.fitness", "'D'"),
+            ("learning.start_jitter", "0.5"),
+            ("learning.episodes_per_team", "2"),
+        ],
+    ),
+    (
+        "shared-by-all",
+        "twelve leaders share a policy that chooses behaviours",
+        GENERALLY_FORWARD,
+        &[("learning.sharing", "'all'"), ("learning.paradigm", "'all-leaders'"), ("policy.actions", "'behaviours'")],
+    ),
+    (
+        "moved-pois",
+        "two episodes a team with POIs elsewhere",
+        GENERALLY_FORWARD,
+        &[("learning.poi_jitter", "3.0"), ("learning.episodes_per_team", "2"), ("learning.population", "13")],
+    ),
+    (
+        "stages",
+        "coupling 1, from generation 3 on 3 with moved starts, from generation 6 on all of a team's speed",
+        GENERALLY_FORWARD,
+        &[(
+            "stages",
+            "[{from = 0, set = {'world.coupling' = 1}}, {from = 3, set = {'learning.start_jitter' = 0.5}}, \
+             {from = 6, set = {'motion.max_speed' = 10.0}}]",
+        )],
+    ),
+    ("led-step-by-step", "Dt, led by whom it saw most so far", CHAOTIC, &[("learning.fitness", "'Dt'")]),
+    (
+        "relay",
+        "Dt, led by any of the last 3 steps, only followers observe, one POI after the other",
+        FORTY_AGENTS,
+        &[
+            ("learning.fitness", "'Dt'"),
+            ("learning.led_within", "3"),
+            ("learning.led_by", "'any-seen'"),
+            ("world.observers", "'followers'"),
+            ("world.coupling", "2"),
+            ("world.after", "[[], [0], [], [2], [3], [4]]"),
+            ("world.windows", "[[1, 25], [2, 25], [3, 20], [1, 25], [1, 25], [10, 11]]"),
+        ],
+    ),
 ];
 
 static CONFIGS: LazyLock<Vec<Config>> = LazyLock::new(|| {
@@ -168,7 +228,7 @@ pub fn train(configs: &[Config], backend: &mut dyn Backend) -> Vec<(Golden, f64)
         let golden = Golden {
             bytes: text.len() + size_of_val(&policies[..]),
             sha256: hex(&hash.finalize()),
-            episodes: trace(backend, trainer.world(arm), &trainer.policies(arm)[0]),
+            episodes: trace(backend, &configs[arm], trainer.world(arm), &trainer.policies(arm)[0]),
         };
         (golden, most[arm])
     };
@@ -176,8 +236,8 @@ pub fn train(configs: &[Config], backend: &mut dyn Backend) -> Vec<(Golden, f64)
 }
 
 /// Plays a trial's policies, team j of the policies with index j, and hashes every float without the sign of a zero.
-fn trace(backend: &mut dyn Backend, world: &World, weights: &[f32]) -> String {
-    let policies = weights.len() / world.leaders() / world.parameters();
+fn trace(backend: &mut dyn Backend, config: &Config, world: &World, weights: &[f32]) -> String {
+    let policies = config.learning.population;
     let teams: Vec<u32> = (0..policies * world.leaders()).map(|place| (place / world.leaders()) as u32).collect();
     let group =
         Group { world, starts: &world.starts, weights: weights.into(), policies, teams: &teams, need: Need::Record };
@@ -252,7 +312,7 @@ fn every_instruction_set() {
 #[cfg(feature = "gpu")]
 #[test]
 fn every_adapter() {
-    for (request, info) in common::adapters("every_adapter") {
+    for (request, info) in support::adapters("every_adapter") {
         check(&info.to_string(), &mut GpuEpisodes::new(gpu::open(request).unwrap()).unwrap());
     }
 }

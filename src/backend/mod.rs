@@ -30,14 +30,15 @@ pub const BATCH_BYTES: u64 = 256 << 20;
 /// Weights that a GPU's thread reads at once.
 const FOUR: usize = 4;
 
-/// Words of a team's record: sets and counts.
-fn record_words(world: &World) -> usize {
-    world.set_words() + world.leaders() * world.followers()
+/// Words of a team's record: sets, counts and, where they are needed, sights.
+fn record_words(world: &World, need: Need) -> usize {
+    let sights = if need.sights() { world.sight_words() } else { 0 };
+    world.set_words() + world.leaders() * world.followers() + sights
 }
 
 /// Bytes of a team's record.
-pub fn record_bytes(world: &World) -> u64 {
-    (record_words(world) * size_of::<u32>()) as u64
+pub fn record_bytes(world: &World, need: Need) -> u64 {
+    (record_words(world, need) * size_of::<u32>()) as u64
 }
 
 /// Weights of a team as an episode on a GPU reads them, four at a time.
@@ -50,19 +51,19 @@ pub fn weight_bytes(world: &World) -> u64 {
     (fours(world) * size_of::<[f32; FOUR]>()) as u64
 }
 
-/// Bytes that a GPU holds of a trial's populations, `[leaders, slots, parameters]`, where it does: a buffer a leader and
-/// one more, and every slot's parent.
-pub fn held_bytes([leaders, slots, parameters]: [usize; 3]) -> u64 {
-    let [leaders, population, parents] =
-        [leaders, 4 * slots * parameters, 4 * leaders * slots].map(|count| count as u64);
-    if leaders * population < HELD_FROM { 0 } else { (leaders + 1) * population + parents }
+/// Bytes that a GPU holds of a trial's populations, `[populations, slots, parameters]`, where it does: a buffer a population
+/// and one more, and every slot's parent.
+pub fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {
+    let [populations, population, parents] =
+        [populations, 4 * slots * parameters, 4 * populations * slots].map(|count| count as u64);
+    if populations * population < HELD_FROM { 0 } else { (populations + 1) * population + parents }
 }
 
 /// Teams of one world that start alike and are made of one set of policies.
 #[derive(Clone, Copy, Debug)]
 pub struct Group<'a> {
     pub world: &'a World,
-    /// Start positions `[agents]`, leaders first.
+    /// Start positions `[agents]`, leaders first; after them places of the POIs, `[pois]`, unless these are the world's.
     pub starts: &'a [Vec2],
     pub weights: Weights<'a>,
     /// Policies a leader has to choose from.
@@ -76,9 +77,11 @@ pub struct Group<'a> {
 /// What is wanted of an episode. A backend may tell more, and does where that costs nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Need {
-    /// The whole record.
+    /// The whole record, but for who was seen at which step.
     Record,
-    /// What every fitness is worked out from.
+    /// The whole record: what every fitness is worked out from.
+    Sights,
+    /// What every fitness but Dt is worked out from.
     Scores,
     /// What this fitness is worked out from.
     Score(Fitness),
@@ -86,19 +89,21 @@ pub enum Need {
 
 impl Need {
     /// Every need of scores alone.
-    pub const OF_SCORES: [Need; 5] = [
+    pub const OF_SCORES: [Need; 6] = [
         Need::Scores,
         Need::Score(Fitness::G),
         Need::Score(Fitness::D),
         Need::Score(Fitness::Df),
         Need::Score(Fitness::Dpp),
+        Need::Score(Fitness::Dt),
     ];
 
     /// How many agents a set must have to make a difference, where so many must be near; none where the whole record
     /// is wanted.
     pub fn least(self, coupling: u32) -> Option<u32> {
         match self {
-            Need::Record => None,
+            // Dt asks when.
+            Need::Record | Need::Sights | Need::Score(Fitness::Dt) => None,
             // D++ asks how many are missing.
             Need::Scores | Need::Score(Fitness::Dpp) => Some(1),
             Need::Score(Fitness::G | Fitness::D | Fitness::Df) => Some(coupling),
@@ -107,14 +112,32 @@ impl Need {
 
     /// Whether it matters which leader a follower saw most.
     pub fn owners(self) -> bool {
-        matches!(self, Need::Record | Need::Scores | Need::Score(Fitness::Df))
+        matches!(self, Need::Record | Need::Sights | Need::Scores | Need::Score(Fitness::Df))
+    }
+
+    /// Whether it matters which leaders a follower saw at which step.
+    pub fn sights(self) -> bool {
+        matches!(self, Need::Sights | Need::Score(Fitness::Dt))
     }
 }
 
-impl Group<'_> {
+impl<'a> Group<'a> {
     /// How many teams play.
     pub fn team_count(&self) -> usize {
         self.teams.len() / self.world.leaders()
+    }
+
+    /// Where its POIs are, if not where the world has them.
+    pub fn moved_pois(&self) -> Option<&'a [Vec2]> {
+        Some(&self.starts[self.world.agents()..]).filter(|pois| !pois.is_empty())
+    }
+
+    /// Where the weights of a leader's policy start among those on the host.
+    #[inline]
+    pub(crate) fn place(&self, weights: &[f32], leader: usize, policy: usize) -> usize {
+        let parameters = self.world.parameters();
+        let shared = weights.len() == self.policies * parameters;
+        (if shared { policy } else { leader * self.policies + policy }) * parameters
     }
 
     /// Whether its parts fit each other. Every backend asks this before it plays.
@@ -128,15 +151,16 @@ impl Group<'_> {
             return misfit(format!("a world whose {what} do not fit the rest of it"));
         }
         let (agents, leaders) = (world.agents(), world.leaders());
-        if starts.len() != agents {
+        if starts.len() != agents && starts.len() != agents + world.pois.len() {
             return misfit(format!("{} start positions for {agents} agents", starts.len()));
         }
         if !teams.len().is_multiple_of(leaders) {
             return misfit(format!("{} choices of policies for teams of {leaders} leaders", teams.len()));
         }
-        let numbers = leaders * policies * world.parameters();
+        let shared = policies * world.parameters();
+        let numbers = leaders * shared;
         if let Weights::OnHost(weights) = weights
-            && weights.len() != numbers
+            && ![shared, numbers].contains(&weights.len())
         {
             return misfit(format!("{} weights, but {policies} policies a leader have {numbers}", weights.len()));
         }
@@ -152,7 +176,8 @@ impl Group<'_> {
     }
 }
 
-/// What the policies of a group are, `[leaders][policies][parameters]`: each number 0 or of size 2^-30 to 2^20.
+/// What the policies of a group are, `[leaders][policies][parameters]`, or `[1][policies][parameters]` where all leaders
+/// choose from the same: each number 0 or of size 2^-30 to 2^20.
 #[derive(Clone, Copy, Debug)]
 pub enum Weights<'a> {
     OnHost(&'a [f32]),
@@ -189,7 +214,7 @@ pub trait Held: Any + Debug + Send + Sync {
     /// The plan does not fit the populations, or the device failed.
     fn breed(&mut self, breeding: &Breeding<'_>) -> Result<(), BackendError>;
 
-    /// Copies all weights to the host, `[leaders][slots][parameters]`.
+    /// Copies all weights to the host, `[populations][slots][parameters]`.
     ///
     /// # Errors
     /// The device failed.
@@ -206,6 +231,9 @@ pub struct Episode<'a> {
     /// [needed](Need), there may be fewer steps, down to none, whose sets give the same scores, see [`crate::credit`].
     pub sets: Strided<'a>,
     pub seen: Seen<'a>,
+    /// The leaders that each follower saw before the move of each step, a bit a leader:
+    /// `[steps][followers][words of leaders]`. Empty where nobody [needs](Need::sights) it.
+    pub sights: Strided<'a>,
 }
 
 /// Which leaders the followers of one team saw.
@@ -241,6 +269,9 @@ pub struct Strided<'a> {
 }
 
 impl<'a> Strided<'a> {
+    /// No words.
+    pub const NONE: Strided<'static> = Strided { words: &[], stride: 1, offset: 0 };
+
     /// All words of this team.
     pub fn iter(self) -> impl Iterator<Item = u32> + 'a {
         (0..self.len()).map(move |index| self.get(index))
@@ -288,9 +319,11 @@ pub struct Trace {
     pub teams: usize,
     pub agents: usize,
     pub moments: Vec<Moment>,
-    /// The record of the rollout, team by team: `[teams][steps][pois][words]` and `[teams][followers][leaders]`.
+    /// The record of the rollout, team by team: `[teams][steps][pois][words]`, `[teams][followers][leaders]` and, where
+    /// [needed](Need::sights), `[teams][steps][followers][words of leaders]`.
     pub sets: Vec<u32>,
     pub seen: Vec<u32>,
+    pub sights: Vec<u32>,
 }
 
 impl Trace {
@@ -317,7 +350,7 @@ pub trait Backend: Send {
     /// As for [`Backend::rollout`].
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError>;
 
-    /// Takes the populations of one trial, `[leaders][slots][parameters]`, into memory of its own, to breed them there;
+    /// Takes the populations of one trial, `[populations][slots][parameters]`, a leader's each or one for all, into memory of its own, to breed them there;
     /// none where they had better stay on the host.
     ///
     /// # Errors

@@ -14,7 +14,7 @@ use crate::backend::gpu::probe;
 use crate::backend::{Backend, BackendError, Group, Need, Weights};
 use crate::config::{Config, Coupling};
 use crate::credit::Credit;
-use crate::evolve::{Key, Purpose, form_teams, random_policy};
+use crate::evolve::{Key, Purpose, random_policy, teams_of};
 use crate::host::Instant;
 use crate::sweep::layout::{self, MAX_FOLLOWERS, MAX_GROUPS};
 use crate::trainer::{Times, Trainer};
@@ -217,15 +217,14 @@ fn rollout(
 ) -> Result<([f64; 2], f64, Reach), BackendError> {
     thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
     let (population, leaders, seed) = (config.learning.population, world.leaders(), config.learning.seed);
-    let mut weights = vec![0.0; leaders * population * world.parameters()];
+    let mut weights = vec![0.0; config.populations() * population * world.parameters()];
     let key = Key::new(seed, 0, Purpose::Weights);
     for (policy, weights) in weights.chunks_exact_mut(world.parameters()).enumerate() {
         random_policy(Level::new(), key.at(0, policy / population, policy % population), weights);
     }
-    let mut teams = vec![0; population * leaders];
-    form_teams(Key::new(seed, 0, Purpose::Teams), 0, leaders, &mut teams);
+    let teams = teams_of(&config.learning, 0, 0, leaders);
     // Where generations play from the device's memory, so do rollouts.
-    let held = backend.hold(&weights, [leaders, population, world.parameters()])?;
+    let held = backend.hold(&weights, [config.populations(), population, world.parameters()])?;
     let played = held.as_deref().map_or(weights[..].into(), Weights::Held);
     let need = Need::Score(config.learning.fitness);
     let group = Group { world, starts: &world.starts, weights: played, policies: population, teams: &teams, need };

@@ -6,7 +6,7 @@ use std::ffi::OsString;
 use std::fmt::Display;
 use std::io::{self, Write};
 use std::path::PathBuf;
-use std::sync::LazyLock;
+use std::sync::{LazyLock, OnceLock};
 
 use clap::builder::PossibleValuesParser as Words;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
@@ -100,14 +100,39 @@ static VERSION: LazyLock<String> = LazyLock::new(|| {
     format!("{}\ncommit  {commit}\ntarget  {}", env!("CARGO_PKG_VERSION"), env!("FLOTILLA_TARGET"))
 });
 
+/// What was typed, the program's name first, where that is not what this process was started by.
+static WORDS: OnceLock<Vec<OsString>> = OnceLock::new();
+
+/// What was typed, the program's name first.
+fn words() -> Vec<OsString> {
+    WORDS.get().cloned().unwrap_or_else(|| std::env::args_os().collect())
+}
+
+/// The program to call for more of the same.
+fn program() -> PathBuf {
+    let named = WORDS.get().and_then(|words| words.first()).map(PathBuf::from);
+    named.or_else(|| std::env::current_exe().ok()).unwrap_or_else(|| "flotilla".into())
+}
+
 /// Does what was typed; wrong usage ends the program here, with exit code 2.
 ///
 /// # Errors
 /// The command failed.
 pub fn run() -> Result<(), Error> {
-    refuse_steering(std::env::args_os().skip(1))?;
-    let typed = Cli::from_arg_matches(&command().get_matches());
+    let words = words();
+    refuse_steering(words.iter().skip(1).cloned())?;
+    let typed = Cli::from_arg_matches(&command().get_matches_from(words));
     typed.unwrap_or_else(|error| error.format(&mut command()).exit()).command.run()
+}
+
+/// [`run`] within a process that was started by other words: the first is the program that they would be typed to. Only
+/// the first call's words count.
+///
+/// # Errors
+/// The command failed.
+pub fn run_as(words: Vec<OsString>) -> Result<(), Error> {
+    WORDS.get_or_init(|| words);
+    run()
 }
 
 /// The command line, to be parsed or described without being run.

@@ -99,7 +99,7 @@ const MOST: usize = 1 << 13;
 
 /// What was typed, as a shell reads it.
 pub fn typed() -> String {
-    let line = shell::command(std::env::args_os().map(|word| word.to_string_lossy().into_owned()));
+    let line = shell::command(super::words().iter().map(|word| word.to_string_lossy().into_owned()));
     match line.char_indices().nth(MOST) {
         Some((end, _)) => format!("{} …", &line[..end]),
         None => line,

@@ -36,10 +36,13 @@ pub struct Args {
     /// Take the tensor `weights.N` [default: `weights`, or else `weights.0`]
     #[arg(long, value_name = "N", value_parser = whole)]
     trial: Option<usize>,
+    /// Play in the world of the config's stage N, from 0 [default: that of the file's own keys]
+    #[arg(long, value_name = "N", value_parser = whole)]
+    stage: Option<usize>,
     /// Write every agent's state after every step, and what leaders sense and answer there
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
-    /// Write every leader's scores: team,leader,g,d,df,dpp; of several episodes their means, and the spread of POIs
+    /// Write every leader's scores: team,leader,g,d,df,dpp,dt; of several episodes their means, and the spread of POIs
     #[arg(long, value_name = "FILE")]
     scores: Option<PathBuf>,
     /// Print one JSON object
@@ -60,19 +63,22 @@ pub struct Args {
     /// How far a start is moved at most, on each axis [default: the config's learning.start_jitter]
     #[arg(long, value_name = "J", requires = "episodes", help_heading = HELD_OUT)]
     start_jitter: Option<f64>,
+    /// How far a POI is moved at most, on each axis [default: the config's learning.poi_jitter]
+    #[arg(long, value_name = "J", requires = "episodes", help_heading = HELD_OUT)]
+    poi_jitter: Option<f64>,
 }
 
 impl Args {
-    /// Where episodes start, given the config's jitter.
-    fn starts(&self, jitter: f64) -> Result<Starts, Error> {
+    /// Where episodes start, given the config's jitters.
+    fn starts(&self, jitter: f64, poi_jitter: f64) -> Result<Starts, Error> {
         let (Some(episodes), seed) = (self.episodes, self.seed.unwrap_or(0)) else { return Ok(Starts::Own) };
-        if jitter == 0.0 && (episodes > 1 || self.seed.is_some()) {
+        if jitter == 0.0 && poi_jitter == 0.0 && (episodes > 1 || self.seed.is_some()) {
             return Err(Error::Usage(format!(
                 "--episodes {episodes}: learning.start_jitter is 0, so all episodes are the same; \
-                 set it in the config, or give --start-jitter"
+                 set it or learning.poi_jitter in the config, or give --start-jitter or --poi-jitter"
             )));
         }
-        Ok(Starts::Drawn { episodes, seed, jitter })
+        Ok(Starts::Drawn { episodes, seed, jitter, poi_jitter })
     }
 }
 
@@ -86,9 +92,21 @@ pub fn run(args: Args) -> Result<(), Error> {
     let overrides = [
         set("paradigm", args.paradigm.clone().map(toml::Value::from)),
         set("start_jitter", args.start_jitter.map(toml::Value::from)),
+        set("poi_jitter", args.poi_jitter.map(toml::Value::from)),
     ];
     let config = args.config.load(&overrides.into_iter().flatten().collect::<Vec<_>>())?;
-    let starts = args.starts(config.learning.start_jitter)?;
+    let config = match args.stage {
+        None => config,
+        Some(stage) => {
+            let mut staged = config.staged();
+            if stage >= staged.len() {
+                let stages = staged.len();
+                return Err(Error::Usage(format!("--stage {stage}: the config has {stages}, 0 to {}", stages - 1)));
+            }
+            staged.swap_remove(stage).1
+        }
+    };
+    let starts = args.starts(config.learning.start_jitter, config.learning.poi_jitter)?;
     let policies = policies::read(&args.policies, &config, args.trial)?;
     let world = World::new(&config);
     let (mut backend, machine) = backend::open(&args.run)?;
@@ -102,7 +120,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         weights: policies.weights[..].into(),
         policies: policies.policies,
         teams: &teams,
-        need: Need::Record,
+        need: if args.scores.is_some() { Need::Sights } else { Need::Scores },
     };
 
     let meter = Mutex::new(Meter::new(args.quiet));
@@ -144,7 +162,12 @@ fn in_words(evaluation: &Evaluation, starts: &Starts) -> String {
         );
     }
     let from = match starts {
-        Starts::Drawn { seed, jitter, .. } => format!(", starts moved by up to {jitter} (seed {seed})"),
+        Starts::Drawn { seed, jitter, poi_jitter: 0.0, .. } => {
+            format!(", starts moved by up to {jitter} (seed {seed})")
+        }
+        Starts::Drawn { seed, jitter, poi_jitter, .. } => {
+            format!(", starts moved by up to {jitter}, POIs by up to {poi_jitter} (seed {seed})")
+        }
         Starts::Own => String::new(),
     };
     let names = ["team 0".into(), format!("best (team {best})"), "mean of all teams".into()];
@@ -172,6 +195,7 @@ fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> Strin
         "episodes": evaluation.episodes,
         "seed": null,
         "start_jitter": null,
+        "poi_jitter": null,
         "backend": machine.backend,
         "adapter": machine.adapter,
         "team_0": spread(evaluation.team(0)),
@@ -179,8 +203,9 @@ fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> Strin
         "mean": spread(evaluation.mean()),
     });
     object["best"]["team"] = json!(best);
-    if let Starts::Drawn { seed, jitter, .. } = starts {
-        (object["seed"], object["start_jitter"]) = (json!(seed), json!(jitter));
+    if let Starts::Drawn { seed, jitter, poi_jitter, .. } = starts {
+        (object["seed"], object["start_jitter"], object["poi_jitter"]) =
+            (json!(seed), json!(jitter), json!(poi_jitter));
     }
     format!("{object}\n")
 }
@@ -189,7 +214,7 @@ fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> Strin
 fn write_scores(file: &mut dyn Write, evaluation: &Evaluation) -> io::Result<()> {
     let Evaluation { episodes, leaders, observed, .. } = evaluation;
     let several = if *episodes > 1 { ",episodes,pois,pois_deviation,pois_low,pois_high" } else { "" };
-    writeln!(file, "team,leader,g,d,df,dpp{several}")?;
+    writeln!(file, "team,leader,g,d,df,dpp,dt{several}")?;
     for team in 0..observed.len() {
         let several = match evaluation.team(team) {
             Spread { mean, deviation: Some(deviation), interval: Some([low, high]) } => {
@@ -199,7 +224,8 @@ fn write_scores(file: &mut dyn Write, evaluation: &Evaluation) -> io::Result<()>
         };
         for leader in 0..*leaders {
             let [g, d, df, dpp] = evaluation.scores(team, leader);
-            writeln!(file, "{team},{leader},{g},{d},{df},{dpp}{several}")?;
+            let dt = evaluation.dt(team, leader).unwrap_or(f32::NAN);
+            writeln!(file, "{team},{leader},{g},{d},{df},{dpp},{dt}{several}")?;
         }
     }
     Ok(())
@@ -221,7 +247,7 @@ fn write_trace(
         for episode in 0..episodes {
             let starts = starts.of(episode, group.world);
             let last = if episodes > 1 { format!(",{episode}") } else { String::new() };
-            for (first, part) in evaluate::parts(&Group { starts: &starts, ..*group }) {
+            for (first, part) in evaluate::parts(&Group { starts: &starts, need: Need::Record, ..*group }) {
                 let trace = match backend.trace(&part) {
                     Ok(trace) => trace,
                     Err(error) => {

@@ -511,10 +511,10 @@ fn list(sweep: &Sweep, shards: usize) -> Result<(), Error> {
 fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> Result<(), Error> {
     output::check(&[("--slurm", file)], &[&args.sweep])?;
     let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.into());
-    let program = std::env::current_exe().unwrap_or_else(|_| "flotilla".into());
     let out = absolute(out);
     let cpu = args.run.backend == super::BackendChoice::Cpu;
-    let command = [program.display().to_string()].into_iter().chain(args.words(&absolute(&args.sweep), &out)).collect();
+    let command =
+        [super::program().display().to_string()].into_iter().chain(args.words(&absolute(&args.sweep), &out)).collect();
     let job = Job {
         name: &sweep.name,
         command,

@@ -196,7 +196,11 @@ fn plan(args: &Args) -> Result<Plan, Error> {
     Ok(match &args.config {
         None => Plan::random(seed..seed + u64::from(args.worlds), teams),
         Some(path) => {
-            let worlds = vec![(config::name(path), Config::load(path)?)];
+            let config = Config::load(path)?;
+            let stages = config.staged().into_iter().enumerate().skip(1);
+            let stages: Vec<_> =
+                stages.map(|(stage, (_, config))| (format!("{}, stage {stage}", config::name(path)), config)).collect();
+            let worlds = [vec![(config::name(path), config)], stages].concat();
             Plan { worlds, teams, seed, generations: 5 }
         }
     })

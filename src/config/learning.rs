@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::MAX_STEPS;
 use crate::declare::choice;
 use crate::model::{LEAST, LONGEST};
 use crate::reader::{Reader, between};
@@ -18,6 +19,7 @@ pub const MAX_EPISODES: usize = 1000;
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Learning {
     pub paradigm: Paradigm,
+    pub sharing: Sharing,
     pub fitness: Fitness,
     pub population: usize,
     pub generations: usize,
@@ -26,8 +28,12 @@ pub struct Learning {
     pub mutation: Mutation,
     pub mutation_probability: f64,
     pub mutation_sigma: f64,
+    /// See [`Led`](crate::world::Led).
+    pub led_within: usize,
+    pub led_by: LedBy,
     pub episodes_per_team: usize,
     pub start_jitter: f64,
+    pub poi_jitter: f64,
     pub seed: u64,
 }
 
@@ -42,6 +48,16 @@ choice! {
 }
 
 choice! {
+    /// Which leaders have a policy in common.
+    Sharing {
+        /// None: each has a population of its own.
+        None = "none",
+        /// All: there is one population, and every leader of a team plays the same policy.
+        All = "all",
+    }
+}
+
+choice! {
     /// Which score a policy is selected by (see [`crate::credit`]).
     Fitness {
         /// The team's score.
@@ -52,6 +68,18 @@ choice! {
         Df = "Df",
         /// Difference evaluation with copies of the leader as stepping stones.
         Dpp = "D++",
+        /// Difference evaluation that takes a leader's followers out with it at the steps at which it leads them.
+        Dt = "Dt",
+    }
+}
+
+choice! {
+    /// By which of the leaders that it saw a follower is led.
+    LedBy {
+        /// The one that it saw at most steps.
+        MostSeen = "most-seen",
+        /// All of them.
+        AnySeen = "any-seen",
     }
 }
 
@@ -80,12 +108,22 @@ impl Learning {
             .number(between(2, MAX_POPULATION), 50);
         Learning {
             paradigm,
+            sharing: r
+                .key(
+                    "learning.sharing",
+                    "",
+                    "whose policy is the same: nobody's, or all leaders': then there is one population, whose policies are \
+                     selected by the mean of their leaders' scores",
+                    "2.1",
+                )
+                .choice(Sharing::None),
             fitness: r
                 .key(
                     "learning.fitness",
                     "",
                     "what policies are selected by: the team's score G, D without a leader, Df without a leader \
-                     and its followers, or D++ with copies of a leader",
+                     and its followers, D++ with copies of a leader, or Dt without a leader and, at each step, the \
+                     followers that it leads then",
                     "3.2, Eq. 1; 4.2, Eq. 5; 2.2",
                 )
                 .choice(Fitness::Df),
@@ -118,6 +156,23 @@ impl Learning {
             mutation_sigma: r
                 .key("learning.mutation_sigma", "", "σ: standard deviation of a mutation", "2.4, 4.3")
                 .number(between(LEAST, 100.0).or_zero(), 0.1),
+            led_within: r
+                .key(
+                    "learning.led_within",
+                    "steps",
+                    "for Dt: how many of the last steps tell who leads a follower, the present one among them; 0 is all \
+                     since the start",
+                    "",
+                )
+                .number(between(0, MAX_STEPS), 0),
+            led_by: r
+                .key(
+                    "learning.led_by",
+                    "",
+                    "for Dt: the leader that a follower saw at most of these steps leads it, or any that it saw",
+                    "4.2, 5",
+                )
+                .choice(LedBy::MostSeen),
             episodes_per_team: r
                 .key("learning.episodes_per_team", "episodes", "over which a team's scores are averaged", "")
                 .number(between(1, MAX_EPISODES), 1),
@@ -127,6 +182,14 @@ impl Learning {
                     "units",
                     "j: in every episode each agent's start is moved by a uniform offset in −j to j on both axes, \
                      the same for all teams of a generation",
+                    "",
+                )
+                .number(between(LEAST, LONGEST).or_zero(), 0.0),
+            poi_jitter: r
+                .key(
+                    "learning.poi_jitter",
+                    "units",
+                    "likewise, of each POI",
                     "",
                 )
                 .number(between(LEAST, LONGEST).or_zero(), 0.0),

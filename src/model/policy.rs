@@ -1,21 +1,25 @@
-//! A leader's policy: a fully connected network with a bias and tanh in every layer (Sections 2.4 and 3.1).
+//! A leader's policy: a fully connected network with a bias and tanh in every layer (Sections 2.4 and 3.1), whose outputs
+//! are what it does, or choose among known behaviours.
 
-use fearless_simd::Simd;
+use fearless_simd::{Simd, prelude::*};
 use serde::Serialize;
 
 use super::{Lanes, sense::INPUTS};
-use crate::declare::shared;
+use crate::declare::{choice, shared};
 use crate::kernels::{
     math,
     operations::{FLUSH, TANH},
+    select, splat,
 };
 use crate::reader::{Reader, between};
 
 /// The shader's part.
 pub const WGSL: &str = include_str!("../../shaders/policy.wgsl");
 
-/// Outputs of a policy: wanted change of heading and wanted speed.
+/// What a leader answers to its inputs: wanted change of heading and wanted speed.
 pub const OUTPUTS: usize = 2;
+/// Behaviours to choose among: hold, towards POIs, away from POIs, towards agents, away from agents.
+pub const BEHAVIOURS: usize = 5;
 /// Most hidden layers of a policy.
 pub const MAX_HIDDEN_LAYERS: usize = 3;
 /// Most units in one hidden layer.
@@ -25,6 +29,27 @@ pub const MAX_HIDDEN_UNITS: usize = 64;
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Policy {
     pub hidden: Vec<usize>,
+    pub actions: Actions,
+}
+
+choice! {
+    /// What a policy's outputs are.
+    Actions {
+        /// What the leader does: its wanted change of heading and its wanted speed.
+        Direct = "direct",
+        /// How much each behaviour is wanted: the leader does the most wanted one, ties to the first.
+        Behaviours = "behaviours",
+    }
+}
+
+impl Actions {
+    /// Outputs of the network.
+    pub const fn outputs(self) -> usize {
+        match self {
+            Actions::Direct => OUTPUTS,
+            Actions::Behaviours => BEHAVIOURS,
+        }
+    }
 }
 
 impl Policy {
@@ -35,17 +60,30 @@ impl Policy {
                 .key(
                     "policy.hidden",
                     "units of a layer",
-                    "hidden layers of a policy, between 8 inputs and 2 outputs",
+                    "hidden layers of a policy, between 8 inputs and 2 outputs, or 5 that choose a behaviour",
                     "2.4, 3.1",
                 )
                 .numbers(0..=MAX_HIDDEN_LAYERS, between(1, MAX_HIDDEN_UNITS), vec![10]),
+            actions: r
+                .key(
+                    "policy.actions",
+                    "",
+                    "what the outputs are: a wanted turn and speed, or how much each of 5 behaviours is wanted: hold, \
+                     towards or away from most POIs, towards or away from most agents",
+                    "1, 2.4",
+                )
+                .choice(Actions::Direct),
         }
+    }
+
+    /// The widths of all layers, inputs and outputs included.
+    pub fn widths(&self) -> Vec<usize> {
+        [&[INPUTS], &self.hidden[..], &[self.actions.outputs()]].concat()
     }
 
     /// Weights of one policy, biases included.
     pub fn parameters(&self) -> usize {
-        let widths = [&[INPUTS], &self.hidden[..], &[OUTPUTS]].concat();
-        widths.windows(2).map(|w| (w[0] + 1) * w[1]).sum()
+        self.widths().windows(2).map(|w| (w[0] + 1) * w[1]).sum()
     }
 }
 
@@ -64,13 +102,16 @@ impl PolicyConstants {
     /// Of a valid section.
     pub fn new(policy: &Policy) -> PolicyConstants {
         let mut widths = [0; MAX_HIDDEN_LAYERS + 2];
-        let layers = policy.hidden.len() + 1;
-        widths[0] = INPUTS as u32;
-        for (width, &units) in widths[1..].iter_mut().zip(&policy.hidden) {
+        for (width, units) in widths.iter_mut().zip(policy.widths()) {
             *width = units as u32;
         }
-        widths[layers] = OUTPUTS as u32;
-        PolicyConstants { layers: layers as u32, widths, parameters: policy.parameters() as u32 }
+        PolicyConstants { layers: policy.hidden.len() as u32 + 1, widths, parameters: policy.parameters() as u32 }
+    }
+
+    /// What the last layer is; none where it is neither.
+    pub fn actions(&self) -> Option<Actions> {
+        let outputs = *self.widths.get(self.layers as usize)? as usize;
+        [Actions::Direct, Actions::Behaviours].into_iter().find(|actions| actions.outputs() == outputs)
     }
 
     /// Units of the widest layer, inputs included.
@@ -87,7 +128,8 @@ impl PolicyConstants {
     /// activation, and what is wanted of the outputs.
     pub fn operations(&self) -> u32 {
         let layers = self.widths[..=self.layers as usize].windows(2);
-        layers.map(|widths| widths[1] * (2 * widths[0] + FLUSH + TANH)).sum::<u32>() + 1 + 3
+        let chosen = if self.actions() == Some(Actions::Behaviours) { CHOICE } else { 0 };
+        layers.map(|widths| widths[1] * (2 * widths[0] + FLUSH + TANH)).sum::<u32>() + chosen + 1 + 3
     }
 }
 
@@ -114,6 +156,43 @@ pub fn tame<S: Simd>(sum: S::f32s) -> S::f32s {
 
 /// Sums under this size (2^-30) count as 0.
 pub const TINY: f32 = 1.0 / 1_073_741_824.0;
+
+/// Lane operations of a choice: 4 comparisons with 2 selections each; of both classes 3 such, the opposite quadrant (a
+/// comparison, a selection, a sum) and whether there is any (2); and the class, the direction and the two answers.
+const CHOICE: u32 = 4 * 3 + 2 * (3 * 3 + 3 + 2) + 8;
+
+/// What the most wanted behaviour is as a direct answer: the first of the largest `wanted`, each in -1..1.
+///
+/// Behaviours: hold; towards and away from the quadrant of most POIs; towards and away from that of most agents, the first
+/// where several are alike. Where nothing is sensed, straight ahead.
+#[inline(always)]
+pub fn choose<S: Simd>(inputs: &[S::f32s; INPUTS], wanted: &[S::f32s; BEHAVIOURS]) -> [S::f32s; OUTPUTS] {
+    let simd = wanted[0].token();
+    let number = |number: f32| splat(simd, number);
+    let (mut most, mut behaviour) = (wanted[0], number(0.0));
+    for (index, &wanted) in (1u8..).zip(&wanted[1..]) {
+        let more = wanted.simd_gt(most);
+        most = select::<S>(most, wanted, more);
+        behaviour = select::<S>(behaviour, number(index.into()), more);
+    }
+    let [pois, agents] = [[0, 1, 2, 3], [4, 5, 6, 7]].map(
+        #[inline(always)]
+        |quadrants: [usize; 4]| {
+            let (mut most, mut turn) = (inputs[quadrants[0]], number(-0.75));
+            for (middle, quadrant) in [(-0.25, quadrants[1]), (0.25, quadrants[2]), (0.75, quadrants[3])] {
+                let more = inputs[quadrant].simd_gt(most);
+                most = select::<S>(most, inputs[quadrant], more);
+                turn = select::<S>(turn, number(middle), more);
+            }
+            let back = turn + select::<S>(number(-1.0), number(1.0), turn.simd_lt(0.0));
+            let away = behaviour.simd_eq(2.0) | behaviour.simd_eq(4.0);
+            select::<S>(number(0.0), select::<S>(turn, back, away), most.simd_gt(0.0))
+        },
+    );
+    let turn = select::<S>(agents, pois, behaviour.simd_lt(3.0));
+    let moves = behaviour.simd_gt(0.0);
+    [select::<S>(number(0.0), turn, moves), select::<S>(number(-1.0), number(1.0), moves)]
+}
 
 /// The wanted turn, in radians to the left, of the policy's first output in -1..1.
 #[inline(always)]

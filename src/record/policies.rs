@@ -1,7 +1,7 @@
 //! `policies.safetensors`: what a run learned.
 //!
-//! One f32 tensor `weights.N` a trial, `[leaders, policies, parameters]`, best policy first in each population, so
-//! that the team of all first policies is the trial's champion; metadata `layers` is the policies' network, "8,10,2",
+//! One f32 tensor `weights.N` a trial, `[leaders, policies, parameters]`, or `[1, policies, parameters]` where all leaders
+//! share a policy; best policy first in each population, so that the team of all first policies is the trial's champion; metadata `layers` is the policies' network, "8,10,2",
 //! and `config` the digest of the config that they were trained by.
 //! Other programs may write such files too, also with a single tensor `weights`.
 
@@ -10,6 +10,7 @@ use std::io::{Read, Seek};
 use std::path::Path;
 
 use safetensors::tensor::Dtype;
+use sha2::{Digest, Sha256};
 
 use super::RecordError;
 use super::disk::Disk;
@@ -17,9 +18,10 @@ use super::tensors::{self, Tensor, TensorFile};
 use crate::config::{Config, MAX_POPULATION};
 use crate::escape;
 use crate::evolve::{MAX_WEIGHT, admit};
-use crate::world::{INPUTS, OUTPUTS};
 
 const KIND: &str = "policies 1";
+/// The tensor of a file for all trials.
+const ALL: &str = "weights";
 /// Metadata: [`super::config_digest`] of the config.
 pub(super) const CONFIG: &str = "config";
 
@@ -28,7 +30,7 @@ pub(super) const CONFIG: &str = "config";
 pub struct Policies {
     /// How many each leader has.
     pub policies: usize,
-    /// `[leaders][policies][parameters]`.
+    /// `[leaders][policies][parameters]`, or `[1][policies][parameters]` for all leaders.
     pub weights: Vec<f32>,
 }
 
@@ -39,16 +41,15 @@ fn tensor(trial: usize) -> String {
 
 /// Widths of a config's policies, "8,10,2".
 pub fn layers(config: &Config) -> String {
-    let widths = [&[INPUTS], &config.policy.hidden[..], &[OUTPUTS]].concat();
-    widths.iter().map(ToString::to_string).collect::<Vec<_>>().join(",")
+    config.policy.widths().iter().map(ToString::to_string).collect::<Vec<_>>().join(",")
 }
 
-/// Writes the policies of all trials of a config, each `[leaders][population][parameters]`.
+/// Writes the policies of all trials of a config, each `[populations][population][parameters]`.
 ///
 /// # Errors
 /// The file cannot be written; the one before it is then still there.
 pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f32]>]) -> Result<(), RecordError> {
-    let shape = vec![config.learners(), config.learning.population, config.parameters()];
+    let shape = vec![config.populations(), config.learning.population, config.parameters()];
     let tensor = |(trial, weights)| Tensor::floats(format!("weights.{trial}"), shape.clone(), [weights]);
     let tensors: Vec<_> = trials.iter().map(AsRef::as_ref).enumerate().map(tensor).collect();
     let metadata =
@@ -56,13 +57,14 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
     tensors::write(disk, path, KIND, &metadata, &tensors).map_err(RecordError::write(path))
 }
 
-/// Reads the policies of one trial for a config: tensor `weights.N`, or without a number `weights`, else `weights.0`.
+/// Reads the policies of one trial for teams of a config: tensor `weights.N`, or without a number `weights`, else
+/// `weights.0`. A policy that all leaders share fits any number of them.
 ///
 /// # Errors
 /// No such file, damage, another shape than the config's, or weights that no policy may have.
 pub fn read(path: &Path, config: &Config, trial: Option<usize>) -> Result<Policies, RecordError> {
     let mut file = tensors::open(path)?;
-    from_file(&mut file, config, trial).map_err(|reason| match trial {
+    from_file(&mut file, config, &[config.learners(), 1], trial).map_err(|reason| match trial {
         Some(trial) if file.kind().is_none_or(|kind| kind == KIND) && file.info(&tensor(trial)).is_none() => {
             RecordError::NoTrial { path: path.into(), reason }
         }
@@ -70,13 +72,54 @@ pub fn read(path: &Path, config: &Config, trial: Option<usize>) -> Result<Polici
     })
 }
 
-/// [`read`] of all trials of a config.
+/// What a run starts from, in place of policies drawn at random.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Init {
+    /// SHA-256 of the file.
+    pub digest: String,
+    /// A trial each, of as many populations as the config has.
+    pub trials: Vec<Policies>,
+}
+
+/// Reads what all trials of a config start from: trial i from tensor `weights.i`, or where there is none from `weights`.
+///
+/// # Errors
+/// See [`read`].
+pub fn read_init(path: &Path, config: &Config) -> Result<Init, RecordError> {
+    let mut hash = Sha256::new();
+    std::io::copy(&mut crate::file::open(path).map_err(RecordError::read(path))?, &mut HashWriter(&mut hash))
+        .map_err(RecordError::read(path))?;
+    let mut file = tensors::open(path)?;
+    let trial = |trial| {
+        let own = file.info(&tensor(trial)).is_some() || file.info(ALL).is_none();
+        from_file(&mut file, config, &[config.populations()], own.then_some(trial))
+    };
+    let trials = (0..config.learning.trials).map(trial).collect::<Result<_, String>>();
+    let trials = trials.map_err(|reason| RecordError::damaged(path, reason))?;
+    Ok(Init { digest: super::hex(&hash.finalize()), trials })
+}
+
+/// Takes what is written into a digest.
+struct HashWriter<'a>(&'a mut Sha256);
+
+impl std::io::Write for HashWriter<'_> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.update(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Reads the policies of all trials of a config's own training.
 ///
 /// # Errors
 /// See [`read`].
 pub fn read_all(path: &Path, config: &Config) -> Result<Vec<Vec<f32>>, RecordError> {
     let mut file = tensors::open(path)?;
-    let trial = |trial| Ok(from_file(&mut file, config, Some(trial))?.weights);
+    let trial = |trial| Ok(from_file(&mut file, config, &[config.populations()], Some(trial))?.weights);
     (0..config.learning.trials)
         .map(trial)
         .collect::<Result<_, String>>()
@@ -88,23 +131,24 @@ pub fn read_all(path: &Path, config: &Config) -> Result<Vec<Vec<f32>>, RecordErr
 /// # Errors
 /// What is wrong, in words.
 pub fn from_source(source: impl Read + Seek, config: &Config, trial: Option<usize>) -> Result<Policies, String> {
-    from_file(&mut TensorFile::open(source)?, config, trial)
+    from_file(&mut TensorFile::open(source)?, config, &[config.learners(), 1], trial)
 }
 
-/// [`read`], from a file that is open.
+/// [`read`], from a file that is open, which has one of so many populations.
 ///
 /// # Errors
 /// What is wrong, in words.
 pub fn from_file(
     file: &mut TensorFile<impl Read + Seek>,
     config: &Config,
+    populations: &[usize],
     trial: Option<usize>,
 ) -> Result<Policies, String> {
     if let Some(kind) = file.kind().filter(|kind| *kind != KIND) {
         return Err(format!("it holds {kind:?}, not {KIND:?}"));
     }
     let name = match trial {
-        None if file.info("weights").is_some() => "weights".to_string(),
+        None if file.info(ALL).is_some() => ALL.to_string(),
         trial => tensor(trial.unwrap_or(0)),
     };
     let Some(info) = file.info(&name) else {
@@ -114,15 +158,17 @@ pub fn from_file(
         names.iter_mut().for_each(|name| *name = escape::line(name).into());
         return Err(format!("it has no tensor {name}; it has {}{more}", names.join(", ")));
     };
-    let (leaders, parameters) = (config.learners(), config.parameters());
+    let parameters = config.parameters();
     let fits = info.dtype == Dtype::F32
-        && matches!(info.shape[..], [l, p, w] if l == leaders && w == parameters && (1..=MAX_POPULATION).contains(&p));
+        && matches!(info.shape[..], [l, p, w] if populations.contains(&l) && w == parameters && (1..=MAX_POPULATION).contains(&p));
     if !fits {
         return Err(format!(
-            "{name} is {:?} {:?}, but the config needs F32 [{leaders}, 1 to {MAX_POPULATION}, {parameters}] \
-             (leaders, policies, parameters of layers {})",
+            "{name} is {:?} {:?}, but the config needs F32 [{}, 1 to {MAX_POPULATION}, {parameters}] \
+             (leaders{}, policies, parameters of layers {})",
             info.dtype,
             info.shape,
+            populations[0],
+            if populations.contains(&1) && populations[0] > 1 { ", or 1 for all" } else { "" },
             layers(config)
         ));
     }

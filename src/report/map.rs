@@ -487,6 +487,9 @@ pub fn layout(name: &str, config: &Config) -> Scene {
     if config.learning.start_jitter > 0.0 {
         legend.note(format!("starts move by up to {} on each axis", config.learning.start_jitter));
     }
+    if config.learning.poi_jitter > 0.0 {
+        legend.note(format!("POIs move by up to {} on each axis", config.learning.poi_jitter));
+    }
     let whole = LEFT + width.max(50.0) + EDGE;
     let room = whole - 2.0 * EDGE;
     let mut scene = Scene::new(whole, HEAD + height + 9.5 + legend.height(room) + 0.5);

@@ -139,7 +139,12 @@ impl Kernels {
         weights: &wgpu::Buffer,
     ) -> Result<Dispatch<'_>, DeviceError> {
         // Where there are fewer leaders, nobody reads the buffers that are left.
-        let leader = |index: u32| &population.buffers[(stretch.first + index.min(stretch.count - 1)) as usize];
+        let last = population.leaders - 1;
+        let leader = |index: u32| {
+            let leader = (stretch.first + index.min(stretch.count - 1)) as usize;
+            // All leaders may choose from the same.
+            &population.buffers[leader.min(last)]
+        };
         let [first, second, third, fourth] = [0, 1, 2, 3].map(|index| leader(index).as_entire_buffer_binding());
         let (choices, weights) = (choices.as_entire_buffer_binding(), weights.as_entire_buffer_binding());
         let buffers = [part_of::<Stretch>(stretches, part), choices, first, weights, second, third, fourth];
@@ -181,12 +186,12 @@ impl Population {
         Arc::ptr_eq(&self.kernels, kernels)
     }
 
-    /// Whether it has these sizes, `[leaders, slots, parameters]`.
+    /// Whether teams of these sizes, `[leaders, slots, parameters]`, may choose from it.
     ///
     /// # Errors
     /// It has others.
     pub fn check(&self, sizes: [usize; 3]) -> Result<(), BackendError> {
-        let own = [self.leaders, self.slots, self.parameters];
+        let own = [if self.leaders == 1 { sizes[0] } else { self.leaders }, self.slots, self.parameters];
         let text = || format!("populations of {own:?} leaders, policies and weights stand for some of {sizes:?}");
         if own == sizes { Ok(()) } else { Err(BackendError::Misfit(text())) }
     }

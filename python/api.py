@@ -1,0 +1,116 @@
+"""Prints docs/python.md: what the package's docstrings and signatures say."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import textwrap
+
+import flotilla
+
+OPENING = """\
+# flotilla in Python
+
+Everything that `import flotilla` gives. [The package's own page](../python/README.md) starts with what it is for. Arrays are
+NumPy's; shapes are written `[teams, leaders, 8]`. Every example here is run by the package's tests, with `np` for NumPy.
+
+This page is made from the docstrings by `python python/api.py > docs/python.md`, and a test fails where they differ.
+"""
+ORDER = [
+    ("Configs", ["Config", "Key", "ConfigError", "Problem"]),
+    ("Training", ["train", "Run", "Generation", "Error", "loggers"]),
+    ("Looking", ["Replay", "Episode", "Figure", "plot", "compare"]),
+    ("Evaluating", ["rollout", "Rollout", "Trace", "forward", "to_onnx"]),
+    ("Environments", ["VectorEnv", "parallel_env"]),
+    ("Many runs", ["sweep", "Sweep", "Point", "paper"]),
+    ("The machine", ["devices", "verify"]),
+]
+
+
+def markdown(text: str) -> str:
+    """A docstring as Markdown: its sections as paragraphs and lists, its examples as code."""
+    text = re.sub(r":(?:func|meth|class):`([^`]*)`", r"`\1`", text).replace("``", "`")
+    lines, made, section = text.splitlines(), [], None
+    index = 0
+    while index < len(lines):
+        line = lines[index]
+        if re.fullmatch(r"(Args|Returns|Raises|Attributes|Example):", line):
+            section = line[:-1]
+            block = []
+            index += 1
+            while index < len(lines) and (not lines[index] or lines[index].startswith(" ")):
+                block.append(lines[index])
+                index += 1
+            body = textwrap.dedent("\n".join(block)).strip("\n")
+            if section == "Example":
+                made += ["```python", *body.splitlines(), "```", ""]
+            else:
+                made += [f"**{section}**", ""]
+                entries = re.split(r"\n(?! )", body)
+                bullet = section != "Returns"
+                for entry in entries:
+                    joined = " ".join(part.strip() for part in entry.splitlines() if part.strip())
+                    if bullet:
+                        joined = re.sub(r"^([\w*]+): ", r"`\1`: ", joined)
+                        joined = "- " + joined
+                    made.append(joined)
+                made.append("")
+            continue
+        made.append(line)
+        index += 1
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(made)).strip() + "\n"
+
+
+def signature(name: str, thing: object) -> str:
+    try:
+        found = str(inspect.signature(thing))  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return name
+    found = re.sub(r"'([^']*)'", lambda part: part.group(0) if part.group(1) in ("", *WORDS) else part.group(1), found)
+    found = found.replace("(cls, ", "(").replace("(cls)", "()")
+    return name + found.replace("(self, ", "(").replace("(self)", "()")
+
+
+WORDS = {"auto", "last", "Df", "G", "generally_forward", "leader-follower", "best_g", "the config", "paper", "next_step"}
+
+
+def told(name: str, thing: object, level: str) -> str:
+    title = f"{level} `{name}`\n\n"
+    if isinstance(thing, property):
+        return title + markdown(inspect.getdoc(thing) or "")
+    if inspect.ismodule(thing):
+        return title + markdown(inspect.getdoc(thing) or "")
+    shown = ""
+    if not (inspect.isclass(thing) and (issubclass(thing, tuple) or issubclass(thing, Exception) or name in HIDDEN)):
+        shown = f"```text\n{textwrap.fill(signature(name, thing), 116, subsequent_indent='    ')}\n```\n\n"
+    return title + shown + markdown(inspect.getdoc(thing) or "")
+
+
+# Made by functions, not by whoever reads this.
+HIDDEN = {"Run", "Replay", "Figure", "Rollout", "Trace", "Sweep", "Generation"}
+
+
+def page() -> str:
+    parts = [OPENING]
+    for title, names in ORDER:
+        parts.append(f"## {title}\n")
+        for name in names:
+            thing = getattr(flotilla, name)
+            parts.append(told(name, thing, "###"))
+            if inspect.isclass(thing):
+                members = [(member, value) for member, value in vars(thing).items() if not member.startswith("_")]
+                for member, value in members:
+                    function = getattr(value, "__func__", value)
+                    if inspect.isfunction(function) or (isinstance(value, property) and inspect.getdoc(value)):
+                        parts.append(told(f"{name}.{member}", function, "####"))
+            elif inspect.ismodule(thing):
+                for member, value in vars(thing).items():
+                    if inspect.isfunction(value) and value.__module__ == thing.__name__:
+                        parts.append(told(f"{name}.{member}", value, "####"))
+    missing = set(flotilla.__all__) - {name for _, names in ORDER for name in names}
+    assert not missing, f"the page leaves out {missing}"
+    return "\n".join(parts)
+
+
+if __name__ == "__main__":
+    print(page(), end="")

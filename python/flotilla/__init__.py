@@ -1,0 +1,90 @@
+"""flotilla trains cooperative teams by coevolution: thousands at a time, on any GPU, with the same bits on a CPU.
+
+Example:
+    >>> config = flotilla.Config.paper("generally_forward").replace(learning={"generations": 20})
+    >>> run = flotilla.train(config, seed=7)
+    >>> run.metrics["best_g"].shape
+    (5, 21)
+"""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+from flotilla import _native, loggers
+from flotilla._config import Config, Key
+from flotilla._errors import ConfigError, Error, Problem
+from flotilla._play import Rollout, Trace, forward, rollout, to_onnx
+from flotilla._program import compare, devices, paper, verify
+from flotilla._run import Generation, Run, train
+from flotilla._show import Episode, Figure, Replay, plot
+from flotilla._sweep import Point, Sweep, sweep
+from flotilla._vector import VectorEnv
+
+if TYPE_CHECKING:
+    from flotilla._parallel import TeamEnv
+
+__version__: str = _native.__version__
+
+__all__ = [
+    "Config",
+    "ConfigError",
+    "Episode",
+    "Error",
+    "Figure",
+    "Generation",
+    "Key",
+    "Point",
+    "Problem",
+    "Replay",
+    "Rollout",
+    "Run",
+    "Sweep",
+    "Trace",
+    "VectorEnv",
+    "compare",
+    "devices",
+    "forward",
+    "loggers",
+    "paper",
+    "parallel_env",
+    "plot",
+    "rollout",
+    "sweep",
+    "to_onnx",
+    "train",
+    "verify",
+]
+
+
+def parallel_env(config: Config, render_mode: str | None = None, reward: str = "G") -> TeamEnv:
+    """One team as a PettingZoo ``ParallelEnv``: agents ``leader_0``, ``leader_1``, …
+
+    Needs PettingZoo (``pip install flotilla-teams[pettingzoo]``). Observations are float32 ``[8]``, actions float32 ``[2]``
+    in -1..1, ``state()`` is float32 ``[agents * 5 + pois]``: everyone's x, y, heading and speed, and which POIs have been
+    observed. An episode takes ``world.steps`` steps, and is *truncated* then.
+
+    Args:
+        config: the world.
+        render_mode: None or ``"rgb_array"``.
+        reward: as of :class:`VectorEnv`.
+
+    Raises:
+        ImportError: PettingZoo is not installed.
+        ValueError: a word is not allowed.
+
+    Example:
+        >>> env = flotilla.parallel_env(flotilla.Config.paper())
+        >>> observations, infos = env.reset(seed=1)
+        >>> env.agents, observations["leader_0"].shape
+        (['leader_0', 'leader_1', 'leader_2', 'leader_3'], (8,))
+    """
+    from flotilla._parallel import TeamEnv
+
+    return TeamEnv(config, render_mode, reward)
+
+
+if hasattr(os, "register_at_fork"):
+    # Threads and devices are not copied to a forked process.
+    os.register_at_fork(after_in_child=_native.forked)

@@ -1,0 +1,63 @@
+"""What arrays may be given."""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float32]
+
+
+def floats(what: str, values: ArrayLike, axes: int) -> Floats:
+    """An array of float32 with so many axes, without a copy where it is one already."""
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise ValueError(f"{what} are no array: {error}") from None
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"{what} are {array.dtype}, allowed are float32 (other numbers are converted to it)")
+    if array.ndim != axes:
+        raise ValueError(f"{what} have the shape {array.shape}, allowed are {axes} axes")
+    with np.errstate(over="ignore"):
+        return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def whole(what: str, value: Any, least: int, most: int) -> int:
+    """A whole number within bounds."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise TypeError(f"{what} is {type(value).__name__}, allowed is a whole number") from None
+    if isinstance(value, bool) or not least <= number <= most:
+        raise ValueError(f"{what} is {value}, allowed is {least} to {most}")
+    return number
+
+
+def number(what: str, value: Any, least: float, most: float) -> float:
+    """A number within bounds."""
+    try:
+        found = float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise TypeError(f"{what} is {type(value).__name__}, allowed is a number") from None
+    if not least <= found <= most:
+        raise ValueError(f"{what} is {value}, allowed is {least} to {most}")
+    return found
+
+
+def text(what: str, value: Any) -> str:
+    """Text that names something."""
+    if not isinstance(value, str):
+        raise TypeError(f"{what} is {type(value).__name__}, allowed is text")
+    if any(ord(letter) < 32 or 0xD800 <= ord(letter) <= 0xDFFF for letter in value):
+        raise ValueError(f"{what} holds a line break or another character that no name has")
+    return value
+
+
+def backend_name(value: Any) -> str:
+    """What to play on, as a name."""
+    if isinstance(value, int) and not isinstance(value, bool):
+        return str(value)
+    return text("backend", value)

@@ -1,0 +1,205 @@
+"""What an experiment is."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from flotilla import _native as native
+
+
+class Key(NamedTuple):
+    """A key of a config.
+
+    Example:
+        >>> [key for key in flotilla.Config.keys() if key.name == "world.steps"][0].range
+        '1 to 10000'
+    """
+
+    name: str
+    """Dotted: ``world.steps``."""
+    unit: str
+    kind: str
+    """What its value is: a whole number, a list, one of some words."""
+    range: str
+    """What is allowed."""
+    default: str | None
+    """As a config file has it; None where it has to be given."""
+    meaning: str
+    paper: str
+    """Section and equation of the paper; empty where it says nothing of the key."""
+
+
+def _flat(sections: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    keys = []
+    for section, entries in sections.items():
+        if isinstance(entries, Mapping):
+            keys += [(f"{section}.{key}", value) for key, value in entries.items()]
+        else:
+            keys.append((section, entries))
+    return keys
+
+
+class Config:
+    """One experiment: its world, its agents, its learning. A config cannot be changed; :meth:`replace` makes another.
+
+    Keys that are not given have the defaults of ``docs/reference.md``. A config can be compared, hashed, copied and
+    pickled.
+
+    Args:
+        sections: a mapping for every section of a config file: ``world={"leaders": [[5, 5]], "pois": [[5, 15]]}``.
+            Positions may be lists or NumPy arrays ``[n, 2]``, in map units.
+
+    Raises:
+        ConfigError: everything that is wrong, at once.
+
+    Example:
+        >>> config = flotilla.Config(world={"leaders": [[10, 5], [30, 5]], "pois": [[20, 20]], "coupling": 2})
+        >>> config["world.coupling"], config["learning.population"]
+        (2, 50)
+    """
+
+    __slots__ = ("_native",)
+    _native: native.Config
+
+    def __init__(self, **sections: Mapping[str, Any]) -> None:
+        self._native = native.Config.build(_flat(sections))
+
+    @classmethod
+    def _of(cls, made: native.Config) -> Config:
+        config = object.__new__(cls)
+        config._native = made
+        return config
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Config:
+        """Reads a config file (TOML).
+
+        Raises:
+            ConfigError: the file cannot be read, or everything that is wrong with it, by line.
+
+        Example:
+            >>> flotilla.Config.load("configs/chaotic.toml")["world.steps"]
+            50
+        """
+        path = os.fspath(path)
+        return cls._of(native.Config.load("./-" if path == "-" else path))
+
+    @classmethod
+    def parse(cls, text: str, name: str = "the config") -> Config:
+        """Reads a config from its text (TOML); ``name`` is what errors call it.
+
+        Raises:
+            ConfigError: everything that is wrong with the text, by line.
+
+        Example:
+            >>> flotilla.Config.parse("[world]\\nleaders = [[1, 1]]\\npois = [[2, 2]]").leaders
+            1
+        """
+        return cls._of(native.Config.parse(text, name))
+
+    @classmethod
+    def paper(cls, layout: str = "generally_forward", fitness: str = "Df", paradigm: str = "leader-follower") -> Config:
+        """One of the paper's experiments: ``"generally_forward"``, ``"strictly_forward"`` or ``"chaotic"``.
+
+        Raises:
+            ValueError: there is no such layout, fitness or paradigm.
+
+        Example:
+            >>> flotilla.Config.paper("chaotic", fitness="G")
+            <flotilla.Config: 4 leaders, 16 followers, 4 POIs; leader-follower by G, 50 teams, 100 generations, 5 trials, seed 0>
+        """
+        config = cls._of(native.Config.paper(layout))
+        return config.replace(learning={"fitness": fitness, "paradigm": paradigm})
+
+    @staticmethod
+    def keys() -> list[Key]:
+        """Every key that a config has.
+
+        Example:
+            >>> flotilla.Config.keys()[0].name
+            'world.map'
+        """
+        return [Key(*key) for key in native.keys()]
+
+    def replace(self, **sections: Mapping[str, Any]) -> Config:
+        """This config with some keys changed; those of a section that are not named stay.
+
+        Raises:
+            ConfigError: everything that is wrong with the keys.
+
+        Example:
+            >>> config = flotilla.Config.paper("chaotic")
+            >>> config.replace(learning={"fitness": "D", "generations": 50})["learning.generations"]
+            50
+        """
+        return Config._of(self._native.replace(_flat(sections)))
+
+    def to_toml(self) -> str:
+        """The config file that says this, every key written out.
+
+        Example:
+            >>> config = flotilla.Config.paper()
+            >>> flotilla.Config.parse(config.to_toml()) == config
+            True
+        """
+        return self._native.to_toml()
+
+    def to_dict(self) -> dict[str, Any]:
+        """All sections with all keys.
+
+        Example:
+            >>> flotilla.Config.paper("chaotic").to_dict()["world"]["pois"][0]
+            [10.0, 15.0]
+        """
+        sections: dict[str, Any] = self._native.to_dict()
+        return sections
+
+    def __getitem__(self, key: str) -> Any:
+        """A key's value by its dotted name, or a section: ``config["world.steps"]``, ``config["world"]``."""
+        found: Any = self.to_dict()
+        for part in str(key).split("."):
+            if not isinstance(found, dict) or part not in found:
+                raise KeyError(key)
+            found = found[part]
+        return found
+
+    @property
+    def leaders(self) -> int:
+        """How many learn: the leaders and, in the all-leaders paradigm, everyone."""
+        return self._native.learners
+
+    @property
+    def parameters(self) -> int:
+        """Weights of one policy, biases included."""
+        return self._native.parameters
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Config) and self._native == other._native
+
+    def __hash__(self) -> int:
+        return hash(self.to_toml())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Config.parse, (self.to_toml(),)
+
+    def __copy__(self) -> Config:
+        return self
+
+    def __deepcopy__(self, memo: object) -> Config:
+        return self
+
+    def __repr__(self) -> str:
+        sections = self.to_dict()
+        world, learning = sections["world"], sections["learning"]
+
+        def count(number: int, what: str) -> str:
+            return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+        return (
+            f"<flotilla.Config: {count(len(world['leaders']), 'leader')}, {count(len(world['followers']), 'follower')}, "
+            f"{count(len(world['pois']), 'POI')}; {learning['paradigm']} by {learning['fitness']}, "
+            f"{count(learning['population'], 'team')}, {count(learning['generations'], 'generation')}, "
+            f"{count(learning['trials'], 'trial')}, seed {learning['seed']}>"
+        )

@@ -1,0 +1,157 @@
+"""Replays and curves, to be looked at."""
+
+from __future__ import annotations
+
+import html
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from flotilla import _native
+from flotilla._arrays import whole
+
+if TYPE_CHECKING:
+    from flotilla._run import Run
+
+
+def _write(path: str | os.PathLike[str], content: bytes) -> None:
+    """Whole, or not at all."""
+    place = os.fspath(path)
+    beside = f"{place}.{os.getpid()}.part"
+    try:
+        with open(beside, "wb") as file:
+            file.write(content)
+        os.replace(beside, place)
+    finally:
+        if os.path.exists(beside):
+            os.remove(beside)
+
+
+class Figure:
+    """A picture: it shows itself in a notebook.
+
+    Example:
+        >>> run = flotilla.train(flotilla.Config.paper().replace(learning={"generations": 2}))
+        >>> flotilla.plot([run]).save("curves.png")
+    """
+
+    def __init__(self, made: _native.Figure) -> None:
+        self._native = made
+
+    def svg(self) -> str:
+        """The picture as SVG text."""
+        return self._native.svg()
+
+    def _repr_svg_(self) -> str:
+        return self.svg()
+
+    def save(self, path: str | os.PathLike[str], width: int | None = None) -> None:
+        """Writes the picture.
+
+        Args:
+            path: a file that ends in .svg, .pdf or .png.
+            width: pixels across, 100 to 8192, of a .png; None is 300 an inch.
+
+        Raises:
+            ValueError: the name ends in something else.
+            OSError: the file cannot be written.
+        """
+        pixels = None if width is None else whole("width", width, 100, 8192)
+        _write(path, self._native.file(os.fspath(path), pixels))
+
+    def __repr__(self) -> str:
+        return "<flotilla.Figure: .save(path) writes it as .svg, .pdf or .png>"
+
+
+class Episode(NamedTuple):
+    """One episode of a replay."""
+
+    trial: int
+    generation: int
+    team: int
+    """The best of its generation."""
+    best_g: float
+    """Its G, as in the run's metrics."""
+    observed: int
+    """POIs that it observed."""
+
+
+class Replay:
+    """The very episodes that generations' best teams were scored on: they show themselves in a notebook, to be played.
+
+    Example:
+        >>> run = flotilla.train(flotilla.Config.paper().replace(learning={"generations": 5}))
+        >>> run.replay(trial=0).save("team.gif", width=300)
+    """
+
+    def __init__(self, made: _native.Replay) -> None:
+        self._native = made
+
+    @property
+    def episodes(self) -> list[Episode]:
+        """What is played, side by side."""
+        return [Episode(*episode) for episode in self._native.episodes]
+
+    def page(self) -> str:
+        """A page that plays the episodes, as HTML that needs nothing else."""
+        return self._native.page()
+
+    def _repr_html_(self) -> str:
+        page = html.escape(self.page(), quote=True)
+        return f'<iframe srcdoc="{page}" width="100%" height="640" style="border: 0"></iframe>'
+
+    def still(self, step: int | None = None) -> Figure:
+        """The episodes at a step, with their trails up to there; None is the last.
+
+        Raises:
+            ValueError: there is no such step.
+        """
+        return Figure(self._native.still(None if step is None else whole("step", step, 0, 10_000)))
+
+    def save(
+        self, path: str | os.PathLike[str], *, step: int | None = None, width: int | None = None, fps: int = 20
+    ) -> None:
+        """Writes the episodes.
+
+        Args:
+            path: a file that ends in .html (to be played), .gif (moving), .svg, .pdf or .png (still).
+            step: of a still: None is the last.
+            width: pixels across, 100 to 8192, of a .gif or .png.
+            fps: pictures a second of a .gif, 1 to 50.
+
+        Raises:
+            ValueError: the name ends in something else, or there is no such step.
+            OSError: the file cannot be written.
+        """
+        kind = os.path.splitext(os.fspath(path))[1].lower()
+        if kind == ".html":
+            _write(path, self.page().encode())
+        elif kind == ".gif":
+            pixels = None if width is None else whole("width", width, 100, 8192)
+            _write(path, self._native.gif(pixels, whole("fps", fps, 1, 50)))
+        elif kind in (".svg", ".pdf", ".png"):
+            self.still(step).save(path, width)
+        else:
+            raise ValueError(f"{os.fspath(path)}: its name must end in .html, .gif, .svg, .pdf or .png")
+
+    def __repr__(self) -> str:
+        told = ", ".join(f"trial {e.trial} generation {e.generation} (G {e.best_g:.2f})" for e in self.episodes)
+        return f"<flotilla.Replay: {told}>"
+
+
+def plot(runs: Sequence[Run]) -> Figure:
+    """The learning curves of one run, or the best teams of several side by side.
+
+    Raises:
+        Error: a run cannot be read.
+
+    Example:
+        >>> config = flotilla.Config.paper().replace(learning={"generations": 3})
+        >>> runs = [flotilla.train(config.replace(learning={"fitness": fitness})) for fitness in ("G", "Df")]
+        >>> flotilla.plot(runs).svg()[:4]
+        '<svg'
+    """
+    folders = [run.folder for run in runs]
+    if not 1 <= len(folders) <= 24:
+        raise ValueError(f"{len(folders)} runs, allowed are 1 to 24")
+    return Figure(_native.figure(folders))

@@ -1,0 +1,184 @@
+"""A grid of runs: here, in other processes, or on other machines."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flotilla import _native
+from flotilla._arrays import backend_name
+from flotilla._config import Config
+from flotilla._errors import Error
+from flotilla._program import _machine, program
+from flotilla._run import Run, train
+
+if TYPE_CHECKING:
+    import pandas
+
+# How often a point is handed out again when a worker is lost with it; after that it is played here.
+TRIES = 3
+
+
+class Point(NamedTuple):
+    """One run of a sweep."""
+
+    number: int
+    """Its place among all combinations."""
+    values: dict[str, Any]
+    """By the axes' keys."""
+    run: Run
+
+
+class Sweep:
+    """What a sweep came to; ``len()`` and iteration are over its points.
+
+    Attributes:
+        axes: the keys that vary.
+        points: every :class:`Point`, in the order of the grid.
+    """
+
+    def __init__(self, axes: list[str], points: list[Point]) -> None:
+        self.axes, self.points = axes, points
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __iter__(self) -> Iterator[Point]:
+        return iter(self.points)
+
+    def metric(self, name: str = "best_g") -> NDArray[np.float64]:
+        """A metric of the last generation, float64 ``[points, trials]``; of points with fewer trials, NaN."""
+        rows = [point.run.metrics[name][:, -1] for point in self.points]
+        table = np.full((len(rows), max(map(len, rows), default=0)), np.nan)
+        for row, values in zip(table, rows):
+            row[: len(values)] = values
+        return table
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """A row a point and trial: the axes' values, and the last generation's metrics."""
+        import pandas
+
+        rows = []
+        for point in self.points:
+            for trial in range(len(point.run.policies)):
+                last = {name: values[trial, -1] for name, values in point.run.metrics.items()}
+                rows.append({"point": point.number, **point.values, "trial": trial, **last})
+        return pandas.DataFrame(rows)
+
+    def __repr__(self) -> str:
+        return f"<flotilla.Sweep: {len(self)} points over {', '.join(self.axes)}>"
+
+
+def _play(config: str, backend: str) -> Run:
+    """A point, as a worker plays it."""
+    return train(Config.parse(config), backend=backend, progress=False)
+
+
+def sweep(
+    sweep: str | os.PathLike[str],
+    executor: Any = None,
+    *,
+    out: str | os.PathLike[str] | None = None,
+    skip_impossible: bool = False,
+    backend: str | int = "auto",
+    progress: Callable[[int, int], Any] | None = None,
+) -> Sweep:
+    """Trains every point of a grid.
+
+    Args:
+        sweep: a sweep file, or its text: a config with a section ``[grid]`` of lists of values.
+        executor: who plays the points: any ``concurrent.futures.Executor``, of processes or of Dask's, MPI's or Slurm's
+            (submitit) workers. Points travel as configs, and results come back as arrays. Where a worker is lost, its
+            points are played again, to the same bits. None trains them here, side by side.
+        out: a folder to keep the sweep in, as ``flotilla sweep SWEEP --out DIR`` does; without ``executor`` alone.
+        skip_impossible: leave out points that cannot run.
+        backend: as of :func:`train`.
+        progress: told how many points of how many are done.
+
+    Raises:
+        ConfigError: everything that is wrong with the sweep and any of its points.
+        Error: a point cannot be played.
+
+    Example:
+        >>> text = flotilla.Config.paper("chaotic").replace(learning={"trials": 1, "generations": 2}).to_toml()
+        >>> text = text.replace("coupling = 3", "") + '[grid]\\n"world.coupling" = [1, 3]\\n'
+        >>> [point.values for point in flotilla.sweep(text)]
+        [{'world.coupling': 1}, {'world.coupling': 3}]
+    """
+    given = os.fspath(sweep)
+    is_text = isinstance(sweep, str) and "\n" in sweep
+    name, text = ("the sweep", given) if is_text else (given, _text(given))
+    machine = backend_name(backend)
+    axes, points, normal = _native.sweep(text, name, skip_impossible)
+    values = [dict(zip(axes, of)) for _, of, _ in points]
+    if executor is None:
+        runs = _here(normal, len(points), [index for index, _, _ in points], out, machine)
+        if progress is not None:
+            progress(len(points), len(points))
+    elif out is not None:
+        raise ValueError("out keeps what is trained here; save the runs of an executor one by one")
+    else:
+        runs = _there(executor, [config.to_toml() for _, _, config in points], machine, progress)
+    return Sweep(axes, [Point(point[0], of, run) for point, of, run in zip(points, values, runs)])
+
+
+def _text(path: str) -> str:
+    try:
+        with open(path, encoding="utf-8") as file:
+            return file.read()
+    except OSError as error:
+        raise Error(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise Error(f"{path}: it is not UTF-8 text") from None
+
+
+def _here(text: str, count: int, indices: list[int], out: str | os.PathLike[str] | None, backend: str) -> list[Run]:
+    with tempfile.TemporaryDirectory(prefix="flotilla-") as folder:
+        file = os.path.join(folder, "sweep.toml")
+        with open(file, "w", encoding="utf-8") as to:
+            to.write(text)
+        kept = os.path.join(folder, "out") if out is None else os.fspath(out)
+        found = program("sweep", file, out=kept, resume=out is not None, **_machine(backend))
+        runs = [Run.open(point["folder"]) for point in found["points"]]
+        if out is None:
+            for run in runs:
+                run._folder = None
+        return runs
+
+
+def _there(executor: Any, configs: list[str], backend: str, progress: Callable[[int, int], Any] | None) -> list[Run]:
+    handed: list[Any] = [_hand(executor, config, backend) for config in configs]
+    runs: list[Run] = []
+    for config, future in zip(configs, handed):
+        runs.append(_taken(executor, config, backend, future))
+        if progress is not None:
+            progress(len(runs), len(configs))
+    return runs
+
+
+def _hand(executor: Any, config: str, backend: str) -> Any:
+    try:
+        return executor.submit(_play, config, backend)
+    except (RuntimeError, OSError):
+        # Nobody is left there to play anything.
+        return None
+
+
+def _taken(executor: Any, config: str, backend: str, future: Any) -> Run:
+    for _ in range(TRIES):
+        if future is None:
+            break
+        try:
+            run: Run = future.result()
+            return run
+        except (Error, ValueError, TypeError, MemoryError):
+            raise
+        except Exception:
+            # A worker is lost.
+            future = _hand(executor, config, backend)
+    return _play(config, backend)

@@ -1,0 +1,72 @@
+"""Callbacks for :func:`flotilla.train` that log every generation elsewhere, each some ten lines to start from."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+from flotilla._config import Config
+from flotilla._run import Generation
+
+Logger = Callable[[Generation], None]
+
+
+def scalars(generation: Generation) -> dict[str, float]:
+    """A generation's numbers, means over trials.
+
+    Example:
+        >>> told = []
+        >>> config = flotilla.Config.paper().replace(learning={"generations": 1})
+        >>> run = flotilla.train(config, callback=lambda generation: told.append(flotilla.loggers.scalars(generation)))
+        >>> sorted(told[0])
+        ['best_g', 'champion_g', 'mean_g']
+    """
+    return {
+        "best_g": float(generation.best_g.mean()),
+        "mean_g": float(generation.mean_g.mean()),
+        "champion_g": float(generation.champion_g.mean()),
+    }
+
+
+def tensorboard(folder: str | os.PathLike[str]) -> Logger:
+    """Event files in a folder, by tensorboardX (``pip install flotilla-teams[tensorboard]``)."""
+    from tensorboardX import SummaryWriter
+
+    writer = SummaryWriter(os.fspath(folder))
+
+    def log(generation: Generation) -> None:
+        for name, value in scalars(generation).items():
+            writer.add_scalar(name, value, generation.generation)
+        writer.flush()
+
+    return log
+
+
+def wandb(config: Config, **options: Any) -> Logger:
+    """A run of Weights & Biases; ``options`` are those of ``wandb.init``, as ``mode="offline"``."""
+    import wandb as client
+
+    run = client.init(config=config.to_dict(), **options)
+
+    def log(generation: Generation) -> None:
+        run.log(scalars(generation), step=generation.generation)
+        if generation.generation == generation.last:
+            run.finish()
+
+    return log
+
+
+def mlflow(config: Config, **options: Any) -> Logger:
+    """A run of MLflow where ``mlflow.set_tracking_uri`` says; ``options`` are those of ``mlflow.start_run``."""
+    import mlflow as client
+
+    run = client.start_run(**options)
+    client.log_dict(config.to_dict(), "config.json")
+
+    def log(generation: Generation) -> None:
+        client.log_metrics(scalars(generation), step=generation.generation, run_id=run.info.run_id)
+        if generation.generation == generation.last:
+            client.end_run()
+
+    return log

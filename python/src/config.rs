@@ -1,0 +1,187 @@
+//! Configs, made of text or of Python's values.
+
+use std::path::PathBuf;
+
+use flotilla::config::{self, Definition, Override};
+use flotilla::report::paper::{Experiment, arms};
+use flotilla::sweep::Sweep;
+use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyBool, PyDict, PyFloat, PyInt, PyList, PyString, PyTuple};
+use toml::Value;
+
+use crate::errors::Raise;
+
+/// A config that may be trained.
+#[pyclass(frozen, eq)]
+#[derive(PartialEq)]
+pub struct Config(pub flotilla::Config);
+
+#[pymethods]
+impl Config {
+    #[staticmethod]
+    fn load(path: PathBuf) -> PyResult<Config> {
+        flotilla::Config::load(&path).raise().map(Config)
+    }
+
+    #[staticmethod]
+    fn parse(text: &str, name: &str) -> PyResult<Config> {
+        flotilla::Config::parse(text, name).raise().map(Config)
+    }
+
+    /// One of the paper's layouts.
+    #[staticmethod]
+    fn paper(layout: &str) -> PyResult<Config> {
+        let arms = arms(&[]).raise()?;
+        let name = |arm: &Experiment| arm.layout.name.replace(' ', "_");
+        let found = arms.iter().find(|arm| name(arm) == layout.replace([' ', '-'], "_"));
+        found.map(|arm| Config(arm.config.clone())).ok_or_else(|| {
+            let mut names: Vec<_> = arms.iter().map(name).collect();
+            names.dedup();
+            PyValueError::new_err(format!("layout {layout:?}, allowed are {}", names.join(", ")))
+        })
+    }
+
+    /// Of dotted keys and their values alone.
+    #[staticmethod]
+    fn build(keys: Vec<(String, Bound<'_, PyAny>)>) -> PyResult<Config> {
+        flotilla::Config::read("", "the config", &[], &overrides(keys)?).raise().map(Config)
+    }
+
+    fn replace(&self, keys: Vec<(String, Bound<'_, PyAny>)>) -> PyResult<Config> {
+        self.0.with(&overrides(keys)?).raise().map(Config)
+    }
+
+    fn to_toml(&self) -> String {
+        self.0.to_toml()
+    }
+
+    fn to_dict<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let table =
+            self.0.to_toml().parse::<toml::Table>().map_err(|error| PyValueError::new_err(error.to_string()))?;
+        to_python(py, Value::Table(table))
+    }
+
+    #[getter]
+    fn learners(&self) -> usize {
+        self.0.learners()
+    }
+
+    /// Of a policy's layers, inputs and outputs included.
+    #[getter]
+    fn widths(&self) -> Vec<usize> {
+        self.0.policy.widths()
+    }
+
+    #[getter]
+    fn parameters(&self) -> usize {
+        self.0.parameters()
+    }
+}
+
+/// Every key of a config: its name, unit, kind, range, default, meaning and where the paper has it.
+#[pyfunction]
+pub fn keys() -> Vec<(String, String, String, String, Option<String>, String, String)> {
+    let row = |Definition { name, unit, kind, range, default, meaning, paper }| {
+        let [name, unit, meaning, paper] = [name, unit, meaning, paper].map(String::from);
+        (name, unit, kind, range, default, meaning, paper)
+    };
+    config::keys().into_iter().map(row).collect()
+}
+
+/// The points of a sweep: its axes' keys, and for every point its number, its values and its config.
+#[pyfunction]
+#[expect(clippy::type_complexity, reason = "it is taken apart at once")]
+pub fn sweep<'py>(
+    py: Python<'py>,
+    text: &str,
+    name: &str,
+    skip_impossible: bool,
+) -> PyResult<(Vec<String>, Vec<(usize, Vec<Bound<'py, PyAny>>, Config)>, String)> {
+    let sweep = Sweep::read(text, name, &[], skip_impossible).raise()?;
+    let values = |point: &flotilla::sweep::Point| {
+        let pairs = sweep.axes.iter().zip(&point.values);
+        pairs.map(|(axis, &value)| to_python(py, axis.values[value].clone())).collect::<PyResult<Vec<_>>>()
+    };
+    let points = sweep.points.iter().map(|point| Ok((point.index, values(point)?, Config(point.config.clone()))));
+    let points = points.collect::<PyResult<Vec<_>>>()?;
+    Ok((sweep.axes.iter().map(|axis| axis.key.clone()).collect(), points, sweep.text))
+}
+
+fn overrides(keys: Vec<(String, Bound<'_, PyAny>)>) -> PyResult<Vec<Override>> {
+    let set = |(key, value): (String, Bound<'_, PyAny>)| {
+        let value = to_toml(&value, 0).map_err(|error| match error {
+            Odd::Value(what) => PyTypeError::new_err(format!("{key}: {what}, allowed is what a config file may hold")),
+            Odd::Python(error) => error,
+        })?;
+        Ok(Override::new(key.clone(), value, key))
+    };
+    keys.into_iter().map(set).collect()
+}
+
+/// Why a value is none of a config's.
+enum Odd {
+    Value(String),
+    Python(PyErr),
+}
+
+impl From<PyErr> for Odd {
+    fn from(error: PyErr) -> Odd {
+        Odd::Python(error)
+    }
+}
+
+/// Most lists and tables within each other.
+const DEEPEST: usize = 8;
+
+fn to_toml(value: &Bound<'_, PyAny>, depth: usize) -> Result<Value, Odd> {
+    if depth > DEEPEST {
+        return Err(Odd::Value("lists within lists".into()));
+    }
+    if value.is_instance_of::<PyBool>() {
+        Ok(Value::Boolean(value.extract()?))
+    } else if value.is_instance_of::<PyInt>() {
+        let whole = value.extract::<i64>();
+        whole.map(Value::Integer).map_err(|_| Odd::Value("found a whole number of more than 63 bits".into()))
+    } else if value.is_instance_of::<PyFloat>() {
+        Ok(Value::Float(value.extract()?))
+    } else if value.is_instance_of::<PyString>() {
+        Ok(Value::String(value.extract().map_err(|_| Odd::Value("found text that is not Unicode".into()))?))
+    } else if let Ok(table) = value.cast::<PyDict>() {
+        let mut entries = toml::Table::new();
+        for (key, value) in table.iter() {
+            let Ok(key) = key.extract::<String>() else { return Err(Odd::Value("found a key that is no text".into())) };
+            entries.insert(key, to_toml(&value, depth + 1)?);
+        }
+        Ok(Value::Table(entries))
+    } else if value.is_instance_of::<PyList>() || value.is_instance_of::<PyTuple>() {
+        let values = value.try_iter()?.map(|value| to_toml(&value?, depth + 1));
+        Ok(Value::Array(values.collect::<Result<_, _>>()?))
+    } else if let Ok(plain) = value.call_method0("tolist") {
+        // NumPy's arrays and numbers.
+        to_toml(&plain, depth + 1)
+    } else {
+        Err(Odd::Value(format!("found {}", value.get_type().name()?)))
+    }
+}
+
+fn to_python(py: Python<'_>, value: Value) -> PyResult<Bound<'_, PyAny>> {
+    Ok(match value {
+        Value::String(text) => text.into_pyobject(py)?.into_any(),
+        Value::Integer(whole) => whole.into_pyobject(py)?.into_any(),
+        Value::Float(number) => number.into_pyobject(py)?.into_any(),
+        Value::Boolean(truth) => truth.into_pyobject(py)?.to_owned().into_any(),
+        Value::Datetime(date) => date.to_string().into_pyobject(py)?.into_any(),
+        Value::Array(values) => {
+            let values = values.into_iter().map(|value| to_python(py, value)).collect::<PyResult<Vec<_>>>()?;
+            PyList::new(py, values)?.into_any()
+        }
+        Value::Table(table) => {
+            let entries = PyDict::new(py);
+            for (key, value) in table {
+                entries.set_item(key, to_python(py, value)?)?;
+            }
+            entries.into_any()
+        }
+    })
+}

@@ -1,0 +1,135 @@
+//! The crate's errors as Python's exceptions, with the crate's own words.
+
+use flotilla::backend::BackendError;
+use flotilla::backend::gpu::device::DeviceError;
+use flotilla::config::{ConfigError, Problem};
+use flotilla::front::Failure;
+use flotilla::record::RecordError;
+use flotilla::report::replay::ReplayError;
+use flotilla::report::runs;
+use flotilla::run::RunError;
+use flotilla::stepping::StepError;
+use pyo3::exceptions::{PyFileExistsError, PyMemoryError, PyValueError};
+use pyo3::prelude::*;
+
+/// What becomes of a crate's error in Python.
+pub trait Raised {
+    fn raised(self) -> PyErr;
+}
+
+/// Results whose errors are Python's.
+pub trait Raise<T> {
+    fn raise(self) -> PyResult<T>;
+}
+
+impl<T, E: Raised> Raise<T> for Result<T, E> {
+    fn raise(self) -> PyResult<T> {
+        self.map_err(Raised::raised)
+    }
+}
+
+/// An exception that `flotilla/_errors.py` makes.
+fn made(by: &str, arguments: impl for<'py> pyo3::call::PyCallArgs<'py>) -> PyErr {
+    Python::attach(|py| {
+        let made = py.import("flotilla._errors").and_then(|module| module.call_method1(by, arguments));
+        made.map_or_else(|error| error, PyErr::from_value)
+    })
+}
+
+/// `flotilla.Error`: what was asked for was right, but could not be done.
+pub fn failed(text: impl ToString) -> PyErr {
+    made("Error", (text.to_string(),))
+}
+
+impl Raised for ConfigError {
+    fn raised(self) -> PyErr {
+        let text = self.to_string();
+        let problems = match self {
+            ConfigError::Invalid { problems, .. } => problems,
+            ConfigError::Unreadable { reason, .. } => vec![Problem { line: None, key: String::new(), message: reason }],
+        };
+        let problems: Vec<_> =
+            problems.into_iter().map(|Problem { line, key, message }| (line, key, message)).collect();
+        made("config_error", (text, problems))
+    }
+}
+
+impl Raised for StepError {
+    fn raised(self) -> PyErr {
+        match self {
+            StepError::Memory { .. } => PyMemoryError::new_err(self.to_string()),
+            _ => PyValueError::new_err(self.to_string()),
+        }
+    }
+}
+
+impl Raised for Failure {
+    fn raised(self) -> PyErr {
+        let text = self.to_string();
+        match self {
+            Failure::Config(error) => error.raised(),
+            Failure::Step(error) => error.raised(),
+            Failure::Run(error) => error.raised(),
+            Failure::Record(error) => error.raised(),
+            Failure::TooLittle(_) | Failure::Memory { .. } => PyMemoryError::new_err(text),
+            Failure::Backend(_) => failed(text),
+            _ => PyValueError::new_err(text),
+        }
+    }
+}
+
+impl Raised for RunError {
+    fn raised(self) -> PyErr {
+        match self {
+            RunError::Record(error) => error.raised(),
+            RunError::TooLittle(_) | RunError::Memory { .. } => PyMemoryError::new_err(self.to_string()),
+            _ => failed(self),
+        }
+    }
+}
+
+impl Raised for RecordError {
+    fn raised(self) -> PyErr {
+        match self {
+            RecordError::Exists { .. } => PyFileExistsError::new_err(self.to_string()),
+            _ => failed(self),
+        }
+    }
+}
+
+impl Raised for ReplayError {
+    fn raised(self) -> PyErr {
+        match self {
+            ReplayError::Run(error) => error.raised(),
+            ReplayError::NoTrial { .. } | ReplayError::NoGeneration { .. } => PyValueError::new_err(self.to_string()),
+            _ => failed(self),
+        }
+    }
+}
+
+impl Raised for runs::ReadError {
+    fn raised(self) -> PyErr {
+        failed(self)
+    }
+}
+
+impl Raised for BackendError {
+    fn raised(self) -> PyErr {
+        failed(self)
+    }
+}
+
+impl Raised for DeviceError {
+    fn raised(self) -> PyErr {
+        match self {
+            DeviceError::UnknownAdapter { .. } => PyValueError::new_err(self.to_string()),
+            _ => failed(self),
+        }
+    }
+}
+
+impl Raised for std::io::Error {
+    fn raised(self) -> PyErr {
+        self.into()
+    }
+}

@@ -1,0 +1,112 @@
+//! Replays and curves, to be looked at.
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use flotilla::report::curves::PRINT;
+use flotilla::report::replay::{self as again, Film, ReplayError, Replayed};
+use flotilla::report::runs;
+use flotilla::report::scene::{Format, Scene};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyBytes;
+
+use crate::errors::Raise;
+use crate::workers;
+
+/// Episodes that were played again.
+#[pyclass(frozen)]
+pub struct Replay {
+    name: String,
+    config: flotilla::Config,
+    played: Vec<Replayed>,
+}
+
+/// Plays the best teams of some generations of a trial again.
+#[pyfunction]
+pub fn replay(
+    py: Python<'_>,
+    folder: PathBuf,
+    trial: usize,
+    generations: Vec<usize>,
+    backend: &str,
+) -> PyResult<Replay> {
+    let (mut interrupted, mut asked) = (None, Instant::now());
+    let played = workers::play(py, backend, |(backend, _)| {
+        let mut watch = |_| {
+            if asked.elapsed() > Duration::from_millis(50) {
+                interrupted = Python::attach(|py| py.check_signals()).err();
+                asked = Instant::now();
+            }
+            interrupted.is_none()
+        };
+        match again::replay(&folder, trial, &generations, &mut **backend, &mut watch) {
+            Err(ReplayError::Stopped) if interrupted.is_some() => Ok(vec![]),
+            played => played.raise(),
+        }
+    })?;
+    if let Some(error) = interrupted {
+        return Err(error);
+    }
+    let name = folder.file_name().map_or("run".into(), |name| name.to_string_lossy().into_owned());
+    Ok(Replay { name, config: runs::config(&folder).raise()?, played })
+}
+
+#[pymethods]
+impl Replay {
+    /// Trial, generation, team, G and POIs observed of each episode.
+    #[getter]
+    fn episodes(&self) -> Vec<(usize, usize, usize, f64, usize)> {
+        let row = |played: &Replayed| {
+            let Replayed { trial, generation, team, best_g, ref observed, .. } = *played;
+            (trial, generation, team, best_g, observed.iter().flatten().count())
+        };
+        self.played.iter().map(row).collect()
+    }
+
+    fn page(&self, py: Python<'_>) -> String {
+        workers::aside(py, || again::page(&self.name, &self.config, &self.played))
+    }
+
+    fn gif<'py>(&self, py: Python<'py>, width: Option<u32>, fps: u32) -> PyResult<Bound<'py, PyBytes>> {
+        let motion = Film { width, fps };
+        let bytes = workers::aside(py, || again::gif(&self.config, &self.played, motion)).raise()?;
+        Ok(PyBytes::new(py, &bytes))
+    }
+
+    fn still(&self, step: Option<usize>) -> PyResult<Figure> {
+        let steps = self.config.world.steps;
+        match step.unwrap_or(steps) {
+            step if step <= steps => Ok(Figure(again::still(&self.config, &self.played, step))),
+            step => Err(PyValueError::new_err(format!("step {step}: the episode has steps 0 to {steps}"))),
+        }
+    }
+}
+
+/// A picture.
+#[pyclass(frozen)]
+pub struct Figure(Scene);
+
+/// The learning curves of one run, or of several side by side.
+#[pyfunction]
+pub fn figure(py: Python<'_>, folders: Vec<PathBuf>) -> PyResult<Figure> {
+    workers::aside(py, || runs::figure(&folders).map(|figure| Figure(figure.scene()))).raise()
+}
+
+#[pymethods]
+impl Figure {
+    fn svg(&self) -> String {
+        self.0.svg()
+    }
+
+    /// The picture as the file that a path's ending says, of so many pixels across.
+    fn file<'py>(&self, py: Python<'py>, path: PathBuf, width: Option<u32>) -> PyResult<Bound<'py, PyBytes>> {
+        let Some(kind) = Format::of(&path) else {
+            let text = format!("{}: its name must end in .svg, .pdf or .png", path.display());
+            return Err(PyValueError::new_err(text));
+        };
+        let per_mm = width.map_or(PRINT, |width| f64::from(width.clamp(100, 8192)) / self.0.width);
+        let bytes = workers::aside(py, || self.0.file(kind, per_mm)).raise()?;
+        Ok(PyBytes::new(py, &bytes))
+    }
+}

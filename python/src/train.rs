@@ -1,0 +1,328 @@
+//! Training: in memory, or kept in a folder as the program keeps it.
+
+use std::ops::ControlFlow;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+
+use flotilla::backend::Player;
+use flotilla::front::{self, Trained};
+use flotilla::memory::Peaks;
+use flotilla::record::disk::Disk;
+use flotilla::record::folder::{self, Folder, METRICS, POLICIES, Start, Status};
+use flotilla::record::{RecordError, metrics, policies};
+use flotilla::report::runs;
+use flotilla::run::{Ended, Options, RunError, Session};
+use flotilla::trainer::Row;
+use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
+use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::PyBool;
+
+use crate::config::Config;
+use crate::errors::{Raise, failed};
+use crate::workers;
+
+/// How often Ctrl-C is looked for.
+const PATIENCE: Duration = Duration::from_millis(50);
+
+/// A generation that has been played, as a callback of :func:`train` is told of it.
+///
+/// Attributes:
+///     generation: its number; 0 is the random start.
+///     last: the number of the last that there will be.
+///     best_g: G of its best team, float64 ``[trials]``.
+///     mean_g: of its mean team, likewise.
+///     champion_g: of the team of every population's best policy, likewise.
+///
+/// Example:
+///     >>> seen = []
+///     >>> config = flotilla.Config.paper().replace(learning={"generations": 2})
+///     >>> run = flotilla.train(config, callback=seen.append)
+///     >>> [generation.generation for generation in seen]
+///     [0, 1, 2]
+#[pyclass(frozen, module = "flotilla")]
+pub struct Generation {
+    #[pyo3(get)]
+    generation: usize,
+    #[pyo3(get)]
+    last: usize,
+    rows: Vec<Row>,
+}
+
+impl Generation {
+    fn column<'py>(&self, py: Python<'py>, of: impl Fn(&Row) -> f64) -> Bound<'py, PyArray1<f64>> {
+        PyArray1::from_iter(py, self.rows.iter().map(of))
+    }
+}
+
+#[pymethods]
+impl Generation {
+    #[getter]
+    fn best_g<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        self.column(py, |row| row.best_g)
+    }
+
+    #[getter]
+    fn mean_g<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        self.column(py, |row| row.mean_g)
+    }
+
+    #[getter]
+    fn champion_g<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        self.column(py, |row| row.champion_g)
+    }
+
+    fn __repr__(&self) -> String {
+        let best = self.rows.iter().map(|row| row.best_g).fold(0.0, f64::max);
+        format!("<flotilla.Generation {} of {}: best G {best:.3}>", self.generation, self.last)
+    }
+}
+
+/// Who is told of every generation: the callback, and whoever presses Ctrl-C.
+struct Watcher<'a> {
+    callback: Option<&'a Py<PyAny>>,
+    asked: Instant,
+    error: Option<PyErr>,
+    /// When each generation was complete, in seconds.
+    times: Vec<f64>,
+    since: Instant,
+}
+
+impl<'a> Watcher<'a> {
+    fn new(callback: Option<&'a Py<PyAny>>) -> Watcher<'a> {
+        Watcher { callback, asked: Instant::now(), error: None, times: vec![], since: Instant::now() }
+    }
+
+    /// Tells of a generation; whether to stop.
+    fn tell(&mut self, rows: &[Row], last: usize) -> bool {
+        self.times.push(self.since.elapsed().as_secs_f64());
+        if self.callback.is_none() && self.asked.elapsed() < PATIENCE {
+            return false;
+        }
+        let told = Python::attach(|py| {
+            py.check_signals()?;
+            let (Some(callback), Some(row)) = (self.callback, rows.first()) else { return Ok(false) };
+            let answer =
+                callback.bind(py).call1((Generation { generation: row.generation, last, rows: rows.into() },))?;
+            if answer.is_none() {
+                return Ok(false);
+            }
+            let named = |name: &str| answer.get_type().name().is_ok_and(|found| found == name);
+            if answer.is_instance_of::<PyBool>() || named("bool") || named("bool_") {
+                return answer.is_truthy();
+            }
+            let text = format!("the callback gave {answer:.60}, allowed are True to stop, False and None");
+            Err(PyTypeError::new_err(text))
+        });
+        self.asked = Instant::now();
+        told.unwrap_or_else(|error| {
+            self.error = Some(error);
+            true
+        })
+    }
+}
+
+/// What a training came to: its config, the three metrics `[trials, generations + 1]`, every trial's policies `[leaders or 1,
+/// policies, parameters]`, and its digest.
+type Outcomes<'py> = (Config, [Bound<'py, PyArray2<f64>>; 3], Vec<Bound<'py, PyArray3<f32>>>, String);
+
+fn outcomes(py: Python<'_>, trained: Trained, digest: String) -> PyResult<Outcomes<'_>> {
+    let Trained { config, best_g, mean_g, champion_g, policies, .. } = trained;
+    let learning = &config.learning;
+    let table = |values| PyArray1::from_vec(py, values).reshape([learning.trials, learning.generations + 1]);
+    let shape = [config.populations(), learning.population, config.parameters()];
+    let policies = policies.into_iter().map(|trial| PyArray1::from_vec(py, trial).reshape(shape));
+    let metrics = [table(best_g)?, table(mean_g)?, table(champion_g)?];
+    let policies = policies.collect::<PyResult<_>>()?;
+    Ok((Config(config), metrics, policies, digest))
+}
+
+/// What plays, in words: "cpu" or "gpu", and its description.
+type Played = (String, String);
+
+fn named((backend, machine): &Player) -> Played {
+    (machine.backend.clone(), backend.describe())
+}
+
+/// Trains in memory; also tells by what, and when each generation was complete.
+#[pyfunction]
+pub fn train<'py>(
+    py: Python<'py>,
+    config: &Config,
+    backend: &str,
+    callback: Option<Py<PyAny>>,
+) -> PyResult<(Outcomes<'py>, Played, Vec<f64>)> {
+    let mut watcher = Watcher::new(callback.as_ref());
+    let (trained, digest, played) = workers::play(py, backend, |player| {
+        let played = named(player);
+        let trained = front::train(&config.0, &mut *player.0, |generation| {
+            let stop = watcher.error.is_none() && watcher.tell(generation.rows, generation.last);
+            if stop { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        });
+        let trained = trained.raise()?;
+        let digest = trained.digest();
+        Ok((trained, digest, played))
+    })?;
+    if let Some(error) = watcher.error {
+        return Err(error);
+    }
+    // The generation that a stop is followed by was not told of.
+    watcher.times.resize(trained.config.learning.generations + 1, watcher.since.elapsed().as_secs_f64());
+    Ok((outcomes(py, trained, digest)?, played, watcher.times))
+}
+
+/// Trains in a folder, as `flotilla train` does; what there is to tell about it comes back. What came out is there to be
+/// opened.
+#[pyfunction]
+pub fn train_into(
+    py: Python<'_>,
+    config: &Config,
+    out: PathBuf,
+    start: &str,
+    backend: &str,
+    command: &str,
+    callback: Option<Py<PyAny>>,
+) -> PyResult<Vec<String>> {
+    let start = match start {
+        "resume" => Start::Resume,
+        "force" => Start::Force,
+        _ => Start::Fresh,
+    };
+    if let Some(what) = folder::collection(&out) {
+        return Err(failed(format!("{} holds {what}, not a run; choose another folder", out.display())));
+    }
+    let mut watcher = Watcher::new(callback.as_ref());
+    let notes = workers::play(py, backend, |player| {
+        Peaks::of([&config.0], rayon::current_num_threads())
+            .check(player.1.backend == "gpu")
+            .map_err(RunError::from)
+            .raise()?;
+        let runs = vec![(config.0.clone(), out.clone())];
+        let (mut session, notes) = Session::open(runs, start, &Disk::default()).raise()?;
+        let (stop, save, mut last) = (AtomicBool::new(false), AtomicBool::new(false), config.0.learning.generations);
+        while !session.is_done() {
+            let mut watch = |progress: &flotilla::run::Progress<'_>| {
+                for rows in progress.rows.chunk_by(|a, b| a.generation == b.generation) {
+                    if !stop.load(Relaxed) {
+                        stop.store(watcher.tell(rows, last), Relaxed);
+                    }
+                }
+            };
+            let mut options = Options {
+                command,
+                stop: &stop,
+                save: &save,
+                instead: &mut |_| None,
+                setback: &mut |_| (),
+                watch: &mut watch,
+            };
+            let outcome = session.train(player, &mut options).raise()?;
+            if watcher.error.is_some() {
+                break;
+            }
+            if outcome == Ended::Stopped {
+                // The callback's wish: as much as there is, and its champions, is what the run comes to.
+                last = session.end().raise()?;
+                watcher.callback = None;
+                stop.store(false, Relaxed);
+            }
+        }
+        Ok(notes.into_iter().filter(|(_, note)| note.is_damage()).map(|(_, note)| note.to_string()).collect())
+    })?;
+    if let Some(error) = watcher.error {
+        return Err(error);
+    }
+    workers::aside(py, || draw(&out))?;
+    Ok(notes)
+}
+
+/// Draws a run's curves beside it, as the program does.
+fn draw(folder: &PathBuf) -> PyResult<()> {
+    let svg = runs::figure(std::slice::from_ref(folder)).raise()?.scene().svg();
+    let path = folder.join("curves.svg");
+    Disk::default().replace(&path, |output| output.write_all(svg.as_bytes())).raise()
+}
+
+/// Reads a run that is done.
+#[pyfunction]
+pub fn open(py: Python<'_>, folder: PathBuf) -> PyResult<(Outcomes<'_>, Played)> {
+    let (trained, digest, run) = workers::aside(py, || {
+        let trained = Trained::read(&folder).raise()?;
+        let run = folder::Run::read(&folder.join(folder::RUN)).raise()?;
+        let digest = trained.digest();
+        Ok::<_, PyErr>((trained, digest, run))
+    })?;
+    Ok((outcomes(py, trained, digest)?, (run.backend, run.description)))
+}
+
+/// Writes what a training in memory came to as the folder of a run; gives its digest.
+#[pyfunction]
+#[expect(clippy::too_many_arguments, reason = "these are all that a run is")]
+pub fn save(
+    py: Python<'_>,
+    config: &Config,
+    metrics: [PyReadonlyArray2<'_, f64>; 3],
+    policies: Vec<PyReadonlyArray3<'_, f32>>,
+    times: Vec<f64>,
+    played: Played,
+    folder: PathBuf,
+    force: bool,
+    command: &str,
+) -> PyResult<String> {
+    let (config, learning) = (&config.0, &config.0.learning);
+    let (trials, columns) = (learning.trials, learning.generations + 1);
+    let shape = [config.populations(), learning.population, config.parameters()];
+    let fits = metrics.iter().all(|metrics| metrics.shape() == [trials, columns])
+        && policies.len() == trials
+        && policies.iter().all(|policies| policies.shape() == shape)
+        && times.len() == columns;
+    let slices = |fits: bool| {
+        let metrics = metrics.iter().map(|metrics| metrics.as_slice().ok()).collect::<Option<Vec<_>>>()?;
+        let policies = policies.iter().map(|policies| policies.as_slice().ok()).collect::<Option<Vec<_>>>()?;
+        fits.then_some((metrics, policies))
+    };
+    let Some((scores, weights)) = slices(fits) else {
+        return Err(PyValueError::new_err("the run's arrays no longer have the shapes that its config gives them"));
+    };
+    workers::aside(py, || {
+        let disk = Disk::default();
+        let start = if force { Start::Force } else { Start::Fresh };
+        let (kept, _) = Folder::open(&folder, start, config, disk.clone()).raise()?;
+        let path = kept.file(METRICS);
+        let write = || {
+            let mut writer = metrics::Writer::create(&disk, &path)?;
+            for (generation, &seconds) in times.iter().enumerate() {
+                let row = |trial: usize| {
+                    let of = |score: &[f64]| score[trial * columns + generation];
+                    let (best_g, mean_g, champion_g) = (of(scores[0]), of(scores[1]), of(scores[2]));
+                    Row { arm: 0, trial, generation, best_g, mean_g, champion_g }
+                };
+                writer.add(&(0..trials).map(row).collect::<Vec<_>>(), seconds)?;
+            }
+            writer.flush()
+        };
+        write().map_err(|error| RecordError::Write { path: path.clone(), error }).raise()?;
+        policies::write(&disk, &kept.file(POLICIES), config, &weights).raise()?;
+        let (_, digest) = kept.digest(config, &weights).raise()?;
+        let (backend, description) = played;
+        let run = folder::Run {
+            version: env!("CARGO_PKG_VERSION").into(),
+            state: Status::Done,
+            backend,
+            description,
+            threads: rayon::current_num_threads(),
+            updated: folder::now(),
+            seconds: times.last().copied().unwrap_or(0.0),
+            sessions: 1,
+            generations: columns,
+            digest: Some(digest.clone()),
+            command: command.into(),
+            commit: flotilla::COMMIT.map(String::from),
+            ..folder::Run::new(config)
+        };
+        kept.write_run(&run).raise()?;
+        draw(&folder)?;
+        Ok(digest)
+    })
+}

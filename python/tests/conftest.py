@@ -1,0 +1,78 @@
+"""What the tests share. They run against the package that is installed, never against the source tree."""
+
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import flotilla
+
+ROOT = pathlib.Path(os.environ.get("FLOTILLA_ROOT") or pathlib.Path(__file__).parents[2])
+SOURCE = pathlib.Path(__file__).parents[1] / "flotilla"
+
+
+def pytest_sessionstart() -> None:
+    found = pathlib.Path(flotilla.__file__).parent
+    if found == SOURCE and os.environ.get("FLOTILLA_IN_PLACE") != "1":
+        pytest.exit(f"the tests are of the installed package, but flotilla is {found}", 3)
+
+
+@pytest.fixture
+def config() -> flotilla.Config:
+    return flotilla.Config.paper("generally_forward").replace(learning={"trials": 2, "generations": 6, "population": 20})
+
+
+@pytest.fixture
+def program():
+    """Runs the program as in a shell, and gives what it printed."""
+
+    def run(*words, status=0, cwd=None) -> str:
+        command = [sys.executable, "-m", "flotilla", *map(os.fspath, words)]
+        ended = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
+        assert ended.returncode == status, ended.stderr
+        return ended.stdout if status == 0 else ended.stderr
+
+    return run
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def random_policies(config: flotilla.Config, teams: int, seed: int = 0, leaders: int | None = None) -> np.ndarray:
+    shape = (leaders or config.leaders, teams, config.parameters)
+    return np.random.default_rng(seed).normal(0, 1.5, shape).astype(np.float32)
+
+
+def random_config(seed: int) -> flotilla.Config:
+    """A small config of some kind."""
+    rng = np.random.default_rng(seed)
+    leaders, followers, pois = rng.integers(1, 5), rng.integers(0, 9), rng.integers(1, 6)
+    world = {
+        "leaders": rng.uniform(0, 50, (leaders, 2)),
+        "followers": rng.uniform(0, 50, (followers, 2)),
+        "pois": rng.uniform(0, 50, (pois, 2)),
+        "coupling": int(rng.integers(1, leaders + followers + 1)),
+        "steps": int(rng.integers(1, 40)),
+        "observation_radius": float(rng.uniform(2, 15)),
+    }
+    learning = {
+        "fitness": str(rng.choice(["G", "D", "Df", "D++"])),
+        "paradigm": str(rng.choice(["leader-follower", "all-leaders"])),
+        "population": int(rng.integers(2, 30)),
+        "generations": int(rng.integers(0, 5)),
+        "trials": int(rng.integers(1, 4)),
+        "seed": int(rng.integers(0, 1 << 40)),
+        "start_jitter": float(rng.choice([0, 1.5])),
+        "poi_jitter": float(rng.choice([0, 1.0])),
+        "sharing": str(rng.choice(["none", "all"])),
+        "episodes_per_team": int(rng.integers(1, 3)),
+    }
+    hidden = [int(units) for units in rng.integers(1, 12, rng.integers(0, 3))]
+    policy = {"hidden": hidden, "actions": str(rng.choice(["direct", "behaviours"]))}
+    return flotilla.Config(world=world, learning=learning, policy=policy)

@@ -1,0 +1,82 @@
+"""The program's commands, and the program as it comes with the package."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import sysconfig
+import time
+
+import pytest
+
+import flotilla
+from flotilla import Run, train
+
+
+def test_the_command_comes_with_the_package():
+    command = os.path.join(sysconfig.get_path("scripts"), "flotilla")
+    told = subprocess.run([command, "--version"], capture_output=True, text=True, check=True).stdout
+    assert told.startswith(f"flotilla {flotilla.__version__}")
+    wrong = subprocess.run([command, "train"], capture_output=True, text=True)
+    assert wrong.returncode == 2 and "CONFIG" in wrong.stderr
+    failed = subprocess.run([command, "train", "nowhere.toml"], capture_output=True, text=True)
+    assert failed.returncode == 1 and failed.stderr.startswith("error: nowhere.toml: cannot be read")
+
+
+def test_the_program_s_record_says_what_was_typed(config, program, tmp_path):
+    (tmp_path / "c.toml").write_text(config.to_toml())
+    program("train", "c.toml", "--out", "run", "--quiet")
+    command = json.loads((tmp_path / "run/run.json").read_text())["command"]
+    assert command.split()[0].endswith("flotilla") and command.endswith("train c.toml --out run --quiet")
+    (tmp_path / "s.toml").write_text(config.to_toml().replace("coupling = 3", "") + '[grid]\n"world.coupling" = [1, 2]\n')
+    script = program("sweep", "s.toml", "--slurm", "--shards", "2")
+    assert command.split()[0] in script
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are another thing there")
+def test_the_command_saves_before_it_stops(config, tmp_path):
+    (tmp_path / "c.toml").write_text(config.replace(learning={"generations": 100_000}).to_toml())
+    words = [sys.executable, "-m", "flotilla", "train", "c.toml", "--out", "run", "--quiet", "--backend", "cpu"]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as running:
+        while not os.path.exists("run/metrics.csv") or os.path.getsize("run/metrics.csv") < 2000:
+            assert running.poll() is None
+            time.sleep(0.05)
+        running.send_signal(signal.SIGINT)
+        told = running.communicate(timeout=60)[1]
+    assert running.returncode == 75 and told.startswith("stopped: ") and "--resume" in told
+
+
+def test_runs_are_compared(config):
+    runs = [train(config.replace(learning={"fitness": fitness})) for fitness in ("G", "Df")]
+    found = flotilla.compare(runs)
+    assert found["test"] == "mann-whitney" and len(found["comparisons"][0]["arms"]) == 2
+    best = found["comparisons"][0]["measures"][0]["arms"][0]
+    assert best["value"] == pytest.approx(runs[0].metrics["best_g"][:, -1].mean())
+    assert flotilla.compare(runs, paired=True)["test"] == "wilcoxon"
+    with pytest.raises(ValueError):
+        flotilla.compare(runs, at=99)
+    with pytest.raises(ValueError, match="no runs"):
+        flotilla.compare([])
+    with pytest.raises(flotilla.Error, match="no such folder"):
+        flotilla.compare(["one", "two"])
+
+
+def test_the_paper_is_played():
+    found = flotilla.paper("paper", trials=2, generations=2, backend="cpu")
+    assert len(found["arms"]) >= 18 and os.path.exists("paper/claims.md")
+    for arm in found["arms"][:3]:
+        assert Run.open(arm["folder"]).digest == arm["digest"]
+    with pytest.raises(flotilla.Error, match="paper"):
+        flotilla.paper("paper", trials=2, generations=2)
+
+
+def test_devices_and_verify():
+    devices = flotilla.devices()
+    assert [device["index"] for device in devices] == list(range(len(devices)))
+    if not devices:
+        with pytest.raises(flotilla.Error, match="no GPU"):
+            flotilla.verify(worlds=2)
+        pytest.skip("there is no GPU here to compare with the CPU")
+    found = flotilla.verify(worlds=2, teams=8, adapter=0)
+    assert found["equal"] and found["comparisons"][0]["worlds"] == 2

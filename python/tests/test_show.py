@@ -1,0 +1,44 @@
+import os
+
+import pytest
+
+import flotilla
+from flotilla import Run, train
+
+
+def test_a_replay_is_shown_and_written(config):
+    for run in (train(config), train(config, out="run")):
+        replay = run.replay(trial=1, compare=0)
+        assert [(episode.trial, episode.generation) for episode in replay.episodes] == [(1, 0), (1, 6)]
+        assert [episode.best_g for episode in replay.episodes] == [run.metrics["best_g"][1, g] for g in (0, 6)]
+        assert replay._repr_html_().startswith("<iframe srcdoc=") and "<script" in replay.page()
+        starts = {"html": b"<!", "gif": b"GIF89a", "svg": b"<svg", "pdf": b"%PDF", "png": b"\x89PNG"}
+        for kind, start in starts.items():
+            replay.save(f"team.{kind}", width=200 if kind in ("gif", "png") else None)
+            with open(f"team.{kind}", "rb") as file:
+                assert file.read(200).lstrip().startswith(start), kind
+        assert replay.still(0).svg() != replay.still().svg()
+        with pytest.raises(ValueError, match="its name must end in .html"):
+            replay.save("team.txt")
+        with pytest.raises(ValueError, match="step 26"):
+            replay.still(26)
+    for wrong in ({"trial": 2}, {"generation": 7}, {"trial": -1}):
+        with pytest.raises(ValueError):
+            run.replay(**wrong)
+
+
+def test_curves_are_drawn(config):
+    runs = [train(config), train(config.replace(learning={"fitness": "G"}))]
+    assert runs[0].plot()._repr_svg_() != flotilla.plot(runs).svg()
+    flotilla.plot(runs).save("curves.png", width=400)
+    assert os.path.getsize("curves.png") > 1000
+    with pytest.raises(ValueError, match="0 runs"):
+        flotilla.plot([])
+
+
+def test_a_run_in_memory_leaves_nothing_behind(config):
+    run = train(config)
+    folder = run.folder
+    assert Run.open(folder).digest == run.digest
+    del run
+    assert not os.path.exists(folder)

@@ -1,0 +1,227 @@
+import filecmp
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from conftest import random_config
+
+import flotilla
+from flotilla import Config, Run, train
+
+PAPER = [(layout, paradigm) for layout in ("generally_forward", "strictly_forward", "chaotic") for paradigm in ("leader-follower", "all-leaders")]
+
+
+def same_as_the_program(config, program, tmp_path):
+    """Trains in memory, in a folder and by the program: one digest, and one file of policies."""
+    (tmp_path / "config.toml").write_text(config.to_toml())
+    program("train", "config.toml", "--out", "theirs", "--backend", "cpu", "--quiet")
+    theirs = Run.open("theirs")
+    ours = train(config, backend="cpu", progress=False)
+    ours.save("saved")
+    kept = train(config, out="kept", backend="cpu")
+    told = json.loads((tmp_path / "theirs/run.json").read_text())["digest"]
+    assert {ours.digest, kept.digest, theirs.digest, Run.open("saved").digest} == {told}
+    for folder in ("saved", "kept"):
+        assert filecmp.cmp("theirs/policies.safetensors", f"{folder}/policies.safetensors", shallow=False)
+        assert filecmp.cmp("theirs/config.toml", f"{folder}/config.toml", shallow=False)
+    for one, other in zip(ours.policies, theirs.policies):
+        assert np.array_equal(one.view(np.uint32), other.view(np.uint32))
+    for name, values in ours.metrics.items():
+        assert np.array_equal(values, theirs.metrics[name])
+    assert ours.config == theirs.config == config
+
+
+@pytest.mark.parametrize("layout, paradigm", PAPER)
+def test_the_paper_s_configs_come_to_what_the_program_comes_to(layout, paradigm, program, tmp_path):
+    config = Config.paper(layout, paradigm=paradigm).replace(learning={"generations": 4, "trials": 2})
+    same_as_the_program(config, program, tmp_path)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_random_configs_come_to_what_the_program_comes_to(seed, program, tmp_path):
+    same_as_the_program(random_config(seed), program, tmp_path)
+
+
+def test_arrays_have_their_shapes(config):
+    run = train(config, seed=3)
+    assert run.config["learning.seed"] == 3
+    for name in ("best_g", "mean_g", "champion_g"):
+        assert run.metrics[name].shape == (2, 7) and run.metrics[name].dtype == np.float64
+    assert [trial.shape for trial in run.policies] == [(4, 20, 112)] * 2
+    assert run.policies[0].dtype == np.float32 and run.policies[0].flags.c_contiguous
+    assert run.digest != train(config, seed=4).digest
+    again = pickle.loads(pickle.dumps(run))
+    assert again.digest == run.digest and again.config == run.config
+    assert repr(run).startswith("<flotilla.Run: 2 trials, 6 generations, best G ")
+
+
+def test_the_program_goes_on_with_what_was_trained_here(config, program):
+    train(config, out="run")
+    program("train", "run/config.toml", "--out", "run", "--resume", "--generations", "9", "--quiet")
+    longer = config.replace(learning={"generations": 9})
+    assert Run.open("run").digest == train(longer).digest
+    train(config).save("memory")
+    program("train", "memory/config.toml", "--out", "memory", "--resume", "--generations", "9", "--quiet")
+    assert Run.open("memory").digest == train(longer).digest
+    program("plot", "memory")
+    program("replay", "memory")
+    assert os.path.exists("memory/replay.html")
+
+
+def test_a_folder_is_gone_on_with_or_written_over(config):
+    first = train(config, out="run")
+    with pytest.raises(FileExistsError, match="run"):
+        train(config, out="run")
+    assert train(config, out="run", resume=True).digest == first.digest
+    other = config.replace(learning={"seed": 5})
+    with pytest.raises(flotilla.Error, match="learning.seed"):
+        train(other, out="run", resume=True)
+    assert train(other, out="run", force=True).digest != first.digest
+    with pytest.raises(FileExistsError):
+        first.save("run")
+    first.save("run", force=True)
+    assert Run.open("run").digest == first.digest
+    with pytest.raises(ValueError, match="out"):
+        train(config, resume=True)
+
+
+@pytest.mark.parametrize("out", [None, "run"])
+def test_a_callback_sees_every_generation_and_may_stop(config, out):
+    seen = []
+
+    def stop_at_three(generation):
+        seen.append((generation.generation, generation.last, generation.best_g, generation.mean_g, generation.champion_g))
+        return generation.generation == 3
+
+    run = train(config, out=out, callback=stop_at_three)
+    assert [row[:2] for row in seen] == [(generation, 6) for generation in range(4)]
+    for number, _, best, mean, champion in seen:
+        assert np.array_equal(best, run.metrics["best_g"][:, number])
+        assert np.array_equal(mean, run.metrics["mean_g"][:, number])
+        assert np.array_equal(champion, run.metrics["champion_g"][:, number])
+    last = run.config["learning.generations"]
+    assert 3 <= last <= 5
+    assert run.digest == train(config.replace(learning={"generations": last})).digest
+    if out is not None:
+        assert train(config, out=out, resume=True).digest == train(config).digest
+
+
+@pytest.mark.parametrize("out", [None, "run"])
+def test_a_callback_s_error_comes_through(config, out):
+    def fail(generation):
+        if generation.generation == 2:
+            raise LookupError("mine")
+
+    with pytest.raises(LookupError, match="mine"):
+        train(config, out=out, callback=fail)
+    with pytest.raises(TypeError, match="the callback gave go on, allowed are True to stop"):
+        train(config, callback=lambda generation: "go on")
+    if out is not None:
+        assert train(config, out=out, resume=True).digest == train(config).digest
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are another thing there")
+def test_ctrl_c_saves_everything(config, tmp_path):
+    long = config.replace(learning={"generations": 100_000, "population": 50})
+    (tmp_path / "config.toml").write_text(long.to_toml())
+    script = (
+        "import flotilla\n"
+        "config = flotilla.Config.load('config.toml')\n"
+        "try:\n"
+        "    flotilla.train(config, out='run', backend='cpu')\n"
+        "except KeyboardInterrupt:\n"
+        "    print('interrupted')\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as running:
+        while not os.path.exists("run/metrics.csv") or os.path.getsize("run/metrics.csv") < 5000:
+            assert running.poll() is None
+            time.sleep(0.05)
+        running.send_signal(signal.SIGINT)
+        assert running.communicate(timeout=60)[0] == "interrupted\n"
+    told = json.loads((tmp_path / "run/run.json").read_text())
+    assert told["state"] == "stopped" and os.listdir("run/checkpoints")
+    reached = told["generations"]
+    with pytest.raises(flotilla.Error, match="run"):
+        Run.open("run")
+    short = []
+
+    def soon(generation):
+        short.append(generation.generation)
+        return True
+
+    run = train(long, out="run", resume=True, callback=soon)
+    assert short[0] >= reached - 1 > 10
+    assert run.digest == train(run.config, backend="cpu").digest
+
+
+def test_two_threads_train_at_once(config):
+    runs, configs = {}, [config.replace(learning={"seed": seed}) for seed in range(4)]
+    threads = [threading.Thread(target=lambda own=own: runs.update({own["learning.seed"]: train(own)})) for own in configs]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for own in configs:
+        assert runs[own["learning.seed"]].digest == train(own).digest
+
+
+def test_other_threads_run_meanwhile(config):
+    """The interpreter is free while teams are trained."""
+    ticks, done = [], threading.Event()
+
+    def tick():
+        while not done.is_set():
+            ticks.append(time.perf_counter())
+            time.sleep(0.001)
+
+    thread = threading.Thread(target=tick)
+    thread.start()
+    start = time.perf_counter()
+    train(config.replace(learning={"generations": 400, "population": 50}), backend="cpu")
+    took = time.perf_counter() - start
+    done.set()
+    thread.join()
+    assert took > 0.05 and len(ticks) > took / 0.05
+
+
+def test_what_is_no_run_is_told(tmp_path):
+    with pytest.raises(flotilla.Error, match="nowhere: no such folder"):
+        Run.open("nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(flotilla.Error, match="it has no config.toml"):
+        Run.open("empty")
+    with pytest.raises(TypeError, match="config is str"):
+        train("chaotic.toml")
+    with pytest.raises(ValueError, match="no-such-gpu|adapter"):
+        train(Config.paper(), backend="no-such-gpu")
+
+
+def test_metrics_as_a_table(config):
+    pandas = pytest.importorskip("pandas", reason="pandas is not installed")
+    run = train(config, out="run")
+    table, file = run.to_pandas(), pandas.read_csv("run/metrics.csv")
+    pandas.testing.assert_frame_equal(table, file.drop(columns="seconds"), check_dtype=False)
+
+
+def test_a_bar_is_drawn(config, monkeypatch):
+    auto = pytest.importorskip("tqdm.auto", reason="tqdm is not installed")
+    bars = []
+
+    class Bar(auto.tqdm):
+        def __init__(self, *arguments, **named):
+            super().__init__(*arguments, **named)
+            bars.append(self)
+
+    monkeypatch.setattr(auto, "tqdm", Bar)
+    seen = []
+    train(config, progress=True, callback=lambda generation: seen.append(generation.generation))
+    assert [(bar.n, bar.total) for bar in bars] == [(7, 7)] and seen == list(range(7))
+    train(config, progress=False)
+    assert len(bars) == 1
