@@ -96,9 +96,9 @@ pub fn page(folder: &Path) -> Result<String, String> {
         [(Tier::Executed, "Executed"), (Tier::MachineCodeRead, "Machine code read"), (Tier::Compiled, "Compiled")]
     {
         text += &format!("\n## {title}\n");
-        for (name, evidence) in rows.iter().filter(|(_, evidence)| evidence.tier == tier) {
-            text += &section(name, evidence);
-        }
+        let there: Vec<_> = rows.iter().filter(|(_, evidence)| evidence.tier == tier).collect();
+        there.iter().for_each(|(name, evidence)| text += &section(name, evidence));
+        text += if there.is_empty() { "\nNothing so far.\n" } else { "" };
     }
     Ok(format!("{text}\n{TAIL}"))
 }

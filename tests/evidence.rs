@@ -136,7 +136,7 @@ fn the_tests_that_the_page_names_are_there() {
         }
     }
     for name in names {
-        assert!(code.contains(&format!("fn {name}()")), "there is no test {name}");
+        assert!(code.contains(&format!("fn {name}(")), "there is no test {name}");
     }
 }
 

@@ -3,7 +3,7 @@
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::Backend;
 
-#[allow(dead_code, reason = "its tests are not built here")]
+#[allow(dead_code, unused_imports, reason = "its tests are not built here")]
 #[path = "../golden.rs"]
 mod golden;
 
