@@ -369,8 +369,6 @@ struct Room<S: Simd> {
     sets: Vec<u32>,
     /// Which leaders each follower sees, `[followers][words of leaders][lanes]`.
     sights: Vec<u32>,
-    /// What is turned into rows.
-    columns: Vec<S::f32s>,
     /// Agents and counts before a step, where some teams are over.
     kept: (Vec<Agent<S>>, Vec<S::u32s>),
 }
@@ -379,19 +377,14 @@ struct Room<S: Simd> {
 struct Batch<S: Simd> {
     simd: S,
     parts: Vec<Part<S>>,
-    idle: Mutex<Vec<Room<S>>>,
+    idle: Mutex<Vec<Box<Room<S>>>>,
 }
 
 fn vectors<S: Simd>(simd: S, world: &World, teams: usize, record: usize) -> Box<dyn Vectors> {
     let part = |first: usize| {
         let teams = S::f32s::LEN.min(teams - first);
-        Part {
-            first,
-            teams,
-            standing: Block::new(simd, world).into_standing(),
-            record: vec![0; teams * record],
-            sights: vec![],
-        }
+        let standing = Block::new(simd, world).into_standing(record > 0);
+        Part { first, teams, standing, record: vec![0; teams * record], sights: vec![] }
     };
     let parts = (0..teams).step_by(S::f32s::LEN).map(part).collect();
     Box::new(Batch { simd, parts, idle: Mutex::default() })
@@ -423,10 +416,10 @@ impl<S: Simd> Vectors for Batch<S> {
 
     fn states(&mut self, world: &World, shown: &mut Shown) {
         let simd = self.simd;
-        self.each(world, shown, &|room, part, shown| {
+        self.each(world, shown, &|_, part, shown| {
             simd.vectorize(
                 #[inline(always)]
-                || room.states(simd, part, shown),
+                || show(simd, &part.standing.agents, shown),
             );
         });
     }
@@ -461,7 +454,7 @@ impl<S: Simd> Batch<S> {
         let (simd, parts, idle) = (self.simd, &mut self.parts, &self.idle);
         View::new(parts, shown).each(world, &|parts, mut shown| {
             let room = idle.lock().unwrap_or_else(PoisonError::into_inner).pop();
-            let mut room = room.unwrap_or_else(|| Room::new(simd, world));
+            let mut room = room.unwrap_or_else(|| Box::new(Room::new(simd, world)));
             for part in parts {
                 let own = shown.split(part.teams, world);
                 act(&mut room, part, own);
@@ -547,7 +540,7 @@ impl<S: Simd> Room<S> {
     fn new(simd: S, world: &World) -> Room<S> {
         let sets = vec![0; world.pois.len() * world.constants.words as usize * S::f32s::LEN];
         let sights = vec![0; world.followers() * world.leader_words() * S::f32s::LEN];
-        Room { block: Block::new(simd, world), sets, sights, columns: vec![], kept: Default::default() }
+        Room { block: Block::new(simd, world), sets, sights, kept: Default::default() }
     }
 
     #[inline(always)]
@@ -568,10 +561,16 @@ impl<S: Simd> Room<S> {
             return;
         }
         self.block.swap(standing);
+        let all = (first..first + teams).all(is_chosen);
+        if all {
+            self.block.start();
+        }
         for (lane, team) in lanes::<S>(teams).filter(|&(_, team)| is_chosen(first + team)) {
             let at = (first + team) * agents;
             self.block.place(lane, starts.map_or(&world.starts, |starts| &starts[at..at + agents]));
-            self.block.start_lane(lane);
+            if !all {
+                self.block.start_lane(lane);
+            }
         }
         let (size, seen) = (record.len() / teams, sights.len() / teams);
         for team in (0..teams).filter(|team| is_chosen(first + team)) {
@@ -590,10 +589,10 @@ impl<S: Simd> Room<S> {
     fn step(&mut self, simd: S, world: &World, part: &mut Part<S>, actions: &[f32], shown: Slices<'_>) {
         let Slices { inputs, near, newly, observed, steps, .. } = shown;
         let last = world.constants.steps;
-        let over = steps.iter().filter(|&&step| step >= last).count();
+        let playing = (0..).zip(&*steps).map(|(team, &step)| u64::from(step < last) << team).sum::<u64>();
         newly.fill(false);
         let Part { first, teams, ref mut standing, ref mut record, ref mut sights } = *part;
-        if over == teams {
+        if playing == 0 {
             return;
         }
         self.block.swap(standing);
@@ -601,7 +600,7 @@ impl<S: Simd> Room<S> {
         if !sights.is_empty() {
             self.watch(world, steps, sights);
         }
-        if over == 0 {
+        if playing.count_ones() as usize == teams {
             self.block.go();
         } else {
             let (agents, counts) = &mut self.kept;
@@ -612,37 +611,38 @@ impl<S: Simd> Room<S> {
         }
         self.block.couple(&world.pois, &mut self.sets);
         let (pois, words) = (world.pois.len(), world.constants.words as usize);
-        let sets = bytemuck::cast_slice::<u32, f32>(&self.sets).chunks_exact(S::f32s::LEN);
-        self.columns.clear();
-        self.columns.extend(sets.map(|lanes| S::f32s::from_slice(simd, lanes)));
-        to_rows(simd, &self.columns, bytemuck::cast_slice_mut(near));
+        let width = S::f32s::LEN;
+        let sets = bytemuck::cast_slice::<u32, f32>(&self.sets);
+        to_rows(
+            simd,
+            pois * words,
+            #[inline(always)]
+            |column| &sets[column * width..][..width],
+            bytemuck::cast_slice_mut(near),
+        );
+        // What is observed by a step opens no other POI before the next.
         let rule = &world.rule;
-        for (team, step) in steps.iter_mut().enumerate().filter(|(_, step)| **step < last) {
-            let near = &near[team * pois * words..][..pois * words];
-            let newly = &mut newly[team * pois..][..pois];
-            let observed = &mut observed[team * pois..][..pois];
-            if rule.is_plain() {
-                for (poi, &coupling) in world.coupling.iter().enumerate() {
-                    let count: u32 = near[poi * words..][..words].iter().map(|word| word.count_ones()).sum();
-                    if count >= coupling && !observed[poi] {
-                        (newly[poi], observed[poi]) = (true, true);
-                    }
-                }
-            } else {
-                for (poi, &coupling) in world.coupling.iter().enumerate() {
-                    let near = near[poi * words..][..words].iter().copied();
-                    newly[poi] =
-                        !observed[poi] && rule.is_open(poi, *step + 1, observed) && rule.count(near) >= coupling;
-                }
-                // What is observed by a step opens no other POI before the next.
-                observed.iter_mut().zip(&*newly).for_each(|(observed, newly)| *observed |= newly);
+        for (poi, (sets, &coupling)) in self.sets.chunks_exact(words * width).zip(&world.coupling).enumerate() {
+            let count = sets.chunks_exact(width).enumerate().fold(S::u32s::splat(simd, 0), |count, (word, sets)| {
+                count + ones::<S>(S::u32s::from_slice(simd, sets) & rule.counted(word, u32::MAX))
+            });
+            let mut enough = count.simd_ge(coupling).to_bitmask() & playing;
+            while enough != 0 {
+                let team = enough.trailing_zeros() as usize;
+                let before = &observed[team * pois..][..pois];
+                newly[team * pois + poi] = !before[poi] && rule.is_open(poi, steps[team] + 1, before);
+                enough &= enough - 1;
             }
-            if !record.is_empty() {
-                let at = team * world.set_words() + *step as usize * near.len();
-                record[at..at + near.len()].copy_from_slice(near);
-            }
-            *step += 1;
         }
+        observed.iter_mut().zip(newly).for_each(|(observed, newly)| *observed |= *newly);
+        if !record.is_empty() {
+            let size = pois * words;
+            for (team, &step) in steps.iter().enumerate().filter(|(_, step)| **step < last) {
+                let at = team * world.set_words() + step as usize * size;
+                record[at..at + size].copy_from_slice(&near[team * size..][..size]);
+            }
+        }
+        steps.iter_mut().for_each(|step| *step = last.min(*step + 1));
         self.sense(simd, world, inputs);
         self.block.swap(standing);
     }
@@ -697,58 +697,74 @@ impl<S: Simd> Room<S> {
     #[inline(always)]
     fn sense(&mut self, simd: S, world: &World, inputs: &mut [f32]) {
         self.block.look(&world.pois);
-        to_rows(simd, self.block.inputs.as_flattened(), inputs);
+        let columns = self.block.inputs.as_flattened();
+        to_rows(
+            simd,
+            columns.len(),
+            #[inline(always)]
+            |column| columns[column].as_slice(),
+            inputs,
+        );
     }
+}
 
-    #[inline(always)]
-    fn states(&mut self, simd: S, part: &Part<S>, shown: Slices<'_>) {
-        let (columns, agents) = (&mut self.columns, &part.standing.agents);
-        columns.clear();
-        for agent in agents {
-            columns.extend_from_slice(&[agent.x, agent.y]);
-        }
-        to_rows(simd, columns, shown.positions);
-        columns.clear();
-        for agent in agents {
-            columns.extend_from_slice(&[agent.hx, agent.hy]);
-        }
-        to_rows(simd, columns, shown.headings);
-        columns.clear();
-        for agent in agents {
-            columns.push(agent.speed);
-        }
-        to_rows(simd, columns, shown.speeds);
-    }
+/// Shows everyone's places, headings and speeds.
+#[inline(always)]
+fn show<S: Simd>(simd: S, agents: &[Agent<S>], shown: Slices<'_>) {
+    to_rows(
+        simd,
+        2 * agents.len(),
+        #[inline(always)]
+        |column| if column % 2 == 0 { agents[column / 2].x.as_slice() } else { agents[column / 2].y.as_slice() },
+        shown.positions,
+    );
+    to_rows(
+        simd,
+        2 * agents.len(),
+        #[inline(always)]
+        |column| if column % 2 == 0 { agents[column / 2].hx.as_slice() } else { agents[column / 2].hy.as_slice() },
+        shown.headings,
+    );
+    to_rows(
+        simd,
+        agents.len(),
+        #[inline(always)]
+        |column| agents[column].speed.as_slice(),
+        shown.speeds,
+    );
+}
+
+/// How many bits of each lane are set.
+#[inline(always)]
+fn ones<S: Simd>(bits: S::u32s) -> S::u32s {
+    let pairs = bits - ((bits >> 1) & 0x5555_5555);
+    let fours = (pairs & 0x3333_3333) + ((pairs >> 2) & 0x3333_3333);
+    let eights = (fours + (fours >> 4)) & 0x0f0f_0f0f;
+    let halves = eights + (eights >> 8);
+    (halves + (halves >> 16)) & 0x3f
 }
 
 /// Turns columns, a lane a team, into a row of numbers a team; lanes that have no row are left out.
 #[inline(always)]
-fn to_rows<S: Simd>(simd: S, columns: &[S::f32s], rows: &mut [f32]) {
-    let count = columns.len();
-    let (fours, rest) = columns.as_chunks::<4>();
-    for (quad, rows) in rows.chunks_mut(count * 4).enumerate() {
-        let lanes = quad * 4..quad * 4 + 4;
-        for (at, [a, b, c, d]) in (0..).step_by(4).zip(fours) {
-            let turned = transposed([
-                f32x4::from_slice(simd, &a.as_slice()[lanes.clone()]),
-                f32x4::from_slice(simd, &b.as_slice()[lanes.clone()]),
-                f32x4::from_slice(simd, &c.as_slice()[lanes.clone()]),
-                f32x4::from_slice(simd, &d.as_slice()[lanes.clone()]),
-            ]);
-            let mut to = at;
-            for four in &turned {
-                if let Some(row) = rows.get_mut(to..to + 4) {
-                    four.store_slice(row);
-                }
-                to += count;
+fn to_rows<'a, S: Simd>(simd: S, count: usize, column: impl Fn(usize) -> &'a [f32], rows: &mut [f32]) {
+    let whole = count / 4 * 4;
+    for (first, rows) in (0..).step_by(4).zip(rows.chunks_mut(count * 4)) {
+        let mut start = 0;
+        if rows.len() == count * 4 {
+            let (ab, cd) = rows.split_at_mut(count * 2);
+            let ((a, b), (c, d)) = (ab.split_at_mut(count), cd.split_at_mut(count));
+            for at in (0..whole).step_by(4) {
+                let four = |at: usize| f32x4::from_slice(simd, &column(at)[first..first + 4]);
+                let turned = transposed([four(at), four(at + 1), four(at + 2), four(at + 3)]);
+                turned[0].store_slice(&mut a[at..at + 4]);
+                turned[1].store_slice(&mut b[at..at + 4]);
+                turned[2].store_slice(&mut c[at..at + 4]);
+                turned[3].store_slice(&mut d[at..at + 4]);
             }
+            start = whole;
         }
-        for (at, column) in (fours.len() * 4..).zip(rest) {
-            for (row, &number) in column.as_slice()[lanes.clone()].iter().enumerate() {
-                if let Some(to) = rows.get_mut(row * count + at) {
-                    *to = number;
-                }
-            }
+        for at in start..count {
+            rows.chunks_exact_mut(count).zip(&column(at)[first..]).for_each(|(row, &number)| row[at] = number);
         }
     }
 }

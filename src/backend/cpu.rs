@@ -455,6 +455,8 @@ pub(crate) struct Block<S: Simd> {
     pub agents: Vec<Agent<S>>,
     pub inputs: Vec<[S::f32s; INPUTS]>,
     pub outputs: Vec<[S::f32s; OUTPUTS]>,
+    /// The speed that each agent wants next.
+    wanted: Vec<S::f32s>,
     followers: Vec<Follower<S>>,
     /// At how many steps each follower saw each leader, `[followers][leaders]`.
     pub counts: Vec<S::u32s>,
@@ -466,6 +468,7 @@ pub(crate) struct Block<S: Simd> {
 /// What of a [`Block`] must be kept from one step to the next, once it has looked.
 pub(crate) struct Standing<S: Simd> {
     pub agents: Vec<Agent<S>>,
+    /// None where nobody asks for them.
     pub counts: Vec<S::u32s>,
     near: Vec<u64>,
 }
@@ -477,8 +480,6 @@ pub(crate) struct Agent<S: Simd> {
     pub hx: S::f32s,
     pub hy: S::f32s,
     pub speed: S::f32s,
-    /// The speed it wants next.
-    wanted: S::f32s,
 }
 
 #[derive(Clone, Copy)]
@@ -496,9 +497,10 @@ impl<S: Simd> Block<S> {
         Block {
             simd,
             world: Lanes::new(simd, world.constants),
-            agents: vec![Agent { x: zero, y: zero, hx: zero, hy: zero, speed: zero, wanted: zero }; agents],
+            agents: vec![Agent { x: zero, y: zero, hx: zero, hy: zero, speed: zero }; agents],
             inputs: vec![[zero; INPUTS]; leaders],
             outputs: vec![[zero; OUTPUTS]; leaders],
+            wanted: vec![zero; agents],
             followers: vec![Follower { sums: follow::Sums::new(simd), pull, sizes: (zero, zero) }; followers],
             counts: vec![S::u32s::splat(simd, 0); followers * leaders],
             near: vec![0; agents.div_ceil(64) * agents],
@@ -506,17 +508,19 @@ impl<S: Simd> Block<S> {
         }
     }
 
-    /// Only what is kept.
-    pub fn into_standing(self) -> Standing<S> {
+    /// Only what is kept, with the counts or without.
+    pub fn into_standing(self, counted: bool) -> Standing<S> {
         let Block { agents, counts, near, .. } = self;
-        Standing { agents, counts, near }
+        Standing { agents, counts: if counted { counts } else { vec![] }, near }
     }
 
     /// Takes on what stands of other teams, for what stands of these.
     #[inline(always)]
     pub fn swap(&mut self, standing: &mut Standing<S>) {
         std::mem::swap(&mut self.agents, &mut standing.agents);
-        std::mem::swap(&mut self.counts, &mut standing.counts);
+        if !standing.counts.is_empty() {
+            std::mem::swap(&mut self.counts, &mut standing.counts);
+        }
         std::mem::swap(&mut self.near, &mut standing.near);
     }
 
@@ -668,17 +672,17 @@ impl<S: Simd> Block<S> {
     /// Leaders turn and wish for a speed as their policies say.
     #[inline(always)]
     fn act(&mut self) {
-        let Block { world, agents, outputs, .. } = self;
-        for (agent, &[turn, speed]) in agents.iter_mut().zip(&*outputs) {
+        let Block { world, agents, outputs, wanted, .. } = self;
+        for ((agent, wanted), &[turn, speed]) in agents.iter_mut().zip(wanted).zip(&*outputs) {
             (agent.hx, agent.hy) = motion::turn::<S>(world, agent.hx, agent.hy, policy::wanted_turn::<S>(turn));
-            agent.wanted = policy::wanted_speed::<S>(world, speed);
+            *wanted = policy::wanted_speed::<S>(world, speed);
         }
     }
 
     /// Followers count the leaders they see and follow whoever is near.
     #[inline(always)]
     fn follow(&mut self) {
-        let Block { simd, world, agents, near, followers, counts, .. } = self;
+        let Block { simd, world, agents, wanted, near, followers, counts, .. } = self;
         let leaders = world.constants.leaders as usize;
         for (index, (follower, counts)) in followers.iter_mut().zip(counts.chunks_exact_mut(leaders)).enumerate() {
             let &Agent { x, y, .. } = &agents[leaders + index];
@@ -697,11 +701,11 @@ impl<S: Simd> Block<S> {
             );
             follower.sums = sums;
         }
-        let agents = &mut agents[leaders..];
+        let (agents, wanted) = (&mut agents[leaders..], &mut wanted[leaders..]);
         if world.constants.variant.by_sine != 0 {
-            steer::<S, true>(world, agents, followers);
+            steer::<S, true>(world, agents, followers, wanted);
         } else {
-            steer::<S, false>(world, agents, followers);
+            steer::<S, false>(world, agents, followers, wanted);
         }
     }
 
@@ -726,9 +730,9 @@ impl<S: Simd> Block<S> {
     #[inline(always)]
     fn advance(&mut self) {
         let world = &self.world;
-        for agent in &mut self.agents {
+        for (agent, &wanted) in self.agents.iter_mut().zip(&self.wanted) {
             (agent.hx, agent.hy) = motion::renormalize::<S>(agent.hx, agent.hy);
-            agent.speed = motion::accelerate::<S>(world, agent.speed, agent.wanted);
+            agent.speed = motion::accelerate::<S>(world, agent.speed, wanted);
         }
         for agent in &mut self.agents {
             let step = agent.speed * world.motion.dt;
@@ -902,17 +906,22 @@ fn observe<'a, S: Simd, const N: usize>(
 
 /// Turns followers to where they are pulled. In short loops: the processor sees far enough ahead to keep its units busy.
 #[inline(always)]
-fn steer<S: Simd, const BY_SINE: bool>(world: &Lanes<S>, agents: &mut [Agent<S>], followers: &mut [Follower<S>]) {
+fn steer<S: Simd, const BY_SINE: bool>(
+    world: &Lanes<S>,
+    agents: &mut [Agent<S>],
+    followers: &mut [Follower<S>],
+    wanted: &mut [S::f32s],
+) {
     for (agent, follower) in agents.iter().zip(&mut *followers) {
         follower.pull = follow::force::<S>(world, &follower.sums, agent.x, agent.y);
     }
     for follower in &mut *followers {
         follower.sizes = follow::sizes::<S>(&follower.pull);
     }
-    for (agent, follower) in agents.iter_mut().zip(followers) {
+    for ((agent, wanted), follower) in agents.iter_mut().zip(wanted).zip(followers) {
         let &mut Agent { hx, hy, speed, .. } = agent;
         let &mut Follower { pull, sizes, .. } = follower;
-        (agent.hx, agent.hy, agent.wanted) = follow::steer::<S, BY_SINE>(world, &pull, sizes, hx, hy, speed);
+        (agent.hx, agent.hy, *wanted) = follow::steer::<S, BY_SINE>(world, &pull, sizes, hx, hy, speed);
     }
 }
 
