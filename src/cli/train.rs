@@ -286,8 +286,11 @@ impl Extremes {
 /// What a person wants to know at the end.
 fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> String {
     let Results { story, digest } = results;
-    let pois = config.world.pois.len();
-    let mut text = format!("{trained}.\n\nPOIs observed, of {pois}: mean over trials (lowest to highest trial)\n");
+    // Stages may have POIs of their own.
+    let counted = config.pois();
+    let what = counted.map_or("Share of POIs observed".into(), |pois| format!("POIs observed, of {pois}"));
+    let pois = counted.unwrap_or(1);
+    let mut text = format!("{trained}.\n\n{what}: mean over trials (lowest to highest trial)\n");
     let last = format!("generation {}", config.learning.generations);
     let mut table = vec![["", SCORES[0].0, SCORES[1].0, SCORES[2].0].map(String::from)];
     for (name, rows) in [("start", &story.first), (&*last, &story.last)] {
