@@ -3,7 +3,7 @@
 #![cfg(feature = "cli")]
 #![expect(unsafe_code, reason = "shaders of the test's own are compiled without bounds checks")]
 
-mod common;
+mod support;
 
 use std::path::{Path, PathBuf};
 
@@ -238,7 +238,7 @@ fn all_of_the_core_can_be_guarded() {
     let guarded = exact::guarded(&module).unwrap_or_else(|error| panic!("{error}"));
     assert!(exact::unguarded(&module).expect("it is valid") > 10);
     assert_eq!(exact::unguarded(&guarded).expect("it is valid"), 0);
-    for (request, _) in common::adapters("all_of_the_core_can_be_guarded") {
+    for (request, _) in support::adapters("all_of_the_core_can_be_guarded") {
         for (pass, checked) in [(BOTH[0], false), (BOTH[0], true), (BOTH[1], false), (BOTH[1], true)] {
             let gpu = match gpu::open(Request { pass: Some(pass), checked, ..request.clone() }) {
                 Err(DeviceError::Refused { .. }) if pass == Pass::NoContraction => continue,
@@ -266,7 +266,7 @@ fn shaders_that_no_pass_can_save_are_refused() {
 
 #[test]
 fn devices_are_exact_under_both_passes() {
-    for (request, info) in common::adapters("devices_are_exact_under_both_passes") {
+    for (request, info) in support::adapters("devices_are_exact_under_both_passes") {
         for pass in BOTH {
             for checked in [false, true] {
                 match gpu::open(Request { pass: Some(pass), checked, ..request.clone() }) {
@@ -284,7 +284,7 @@ fn devices_are_exact_under_both_passes() {
 /// The canary: a device known to be inexact has to be caught, or the probes are blind.
 #[test]
 fn the_probes_catch_a_device_without_a_pass() {
-    for (request, info) in common::adapters("the_probes_catch_a_device_without_a_pass") {
+    for (request, info) in support::adapters("the_probes_catch_a_device_without_a_pass") {
         let gpu = gpu::open(Request { pass: Some(Pass::Plain), ..request }).unwrap_or_else(|error| panic!("{error}"));
         let mismatch = gpu::self_test(&gpu).unwrap_or_else(|error| panic!("{error}"));
         if ["llvmpipe", "SwiftShader"].iter().any(|known| info.name.contains(known)) {
@@ -296,7 +296,7 @@ fn the_probes_catch_a_device_without_a_pass() {
 
 #[test]
 fn webgpus_default_limits_are_enough() {
-    for (request, _) in common::adapters("webgpus_default_limits_are_enough") {
+    for (request, _) in support::adapters("webgpus_default_limits_are_enough") {
         let gpu = gpu::open(Request { default_limits: true, ..request }).unwrap_or_else(|error| panic!("{error}"));
         assert_eq!(gpu.limits, wgpu::Limits::defaults());
         let error = gpu.buffer("the weights", (128 << 20) + 4, BufferUsages::STORAGE).expect_err("it is over 128 MiB");
@@ -308,7 +308,7 @@ fn webgpus_default_limits_are_enough() {
 
 #[test]
 fn a_shader_over_the_devices_limits_is_refused() {
-    for (request, _) in common::adapters("a_shader_over_the_devices_limits_is_refused") {
+    for (request, _) in support::adapters("a_shader_over_the_devices_limits_is_refused") {
         for pass in BOTH {
             let request = Request { default_limits: true, pass: Some(pass), ..request.clone() };
             let gpu = match gpu::open(request) {
@@ -337,7 +337,7 @@ fn an_unknown_adapter_lists_those_there_are() {
     for info in device::adapters() {
         assert!(message.contains(&info.name), "{message}");
     }
-    for (request, info) in common::adapters("an_unknown_adapter_lists_those_there_are") {
+    for (request, info) in support::adapters("an_unknown_adapter_lists_those_there_are") {
         let by_name = Wanted::Named(info.name.to_uppercase());
         let gpu = gpu::open(Request { choice: by_name, ..request }).unwrap_or_else(|error| panic!("{error}"));
         assert_eq!(gpu.adapter.name, info.name);
@@ -395,7 +395,7 @@ fn a_real_gpu_is_never_a_software_renderer() {
 
 #[test]
 fn a_lost_device_is_an_error() {
-    for (request, info) in common::adapters("a_lost_device_is_an_error") {
+    for (request, info) in support::adapters("a_lost_device_is_an_error") {
         let gpu = gpu::open(request).unwrap_or_else(|error| panic!("{error}"));
         gpu.check().expect("nothing has happened yet");
         gpu.device.destroy();
@@ -408,7 +408,7 @@ fn a_lost_device_is_an_error() {
 
 #[test]
 fn running_out_of_memory_is_an_error() {
-    for (request, info) in common::adapters("running_out_of_memory_is_an_error") {
+    for (request, info) in support::adapters("running_out_of_memory_is_an_error") {
         let gpu = gpu::open(request).unwrap_or_else(|error| panic!("{error}"));
         let bytes = gpu.limits.max_storage_buffer_binding_size.min(gpu.limits.max_buffer_size) & !3;
         // SwiftShader has less memory than one buffer may take; elsewhere two of the largest may well fit.

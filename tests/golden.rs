@@ -4,7 +4,7 @@
 //! `tests/golden.txt` says what each of its lines covers and when they may be minted anew.
 
 #[cfg(feature = "gpu")]
-mod common;
+mod support;
 
 use std::fmt::Write;
 use std::sync::LazyLock;
@@ -130,12 +130,10 @@ fn train(backend: &mut dyn Backend) -> Vec<Golden> {
     let mut trainer = Trainer::new(CONFIGS.clone());
     let mut texts = vec![String::from("trial,generation,best_g,mean_g,champion_g\n"); CONFIGS.len()];
     let mut most = vec![0f64; CONFIGS.len()];
-    while !trainer.is_done() {
-        for row in trainer.advance(backend).unwrap() {
-            most[row.arm] = most[row.arm].max(row.best_g);
-            let Row { arm, trial, generation, best_g, mean_g, champion_g } = row;
-            writeln!(texts[arm], "{trial},{generation},{best_g},{mean_g},{champion_g}").unwrap();
-        }
+    for row in trainer.finish(backend).unwrap() {
+        most[row.arm] = most[row.arm].max(row.best_g);
+        let Row { arm, trial, generation, best_g, mean_g, champion_g } = row;
+        writeln!(texts[arm], "{trial},{generation},{best_g},{mean_g},{champion_g}").unwrap();
     }
     let golden = |(arm, text): (usize, &String)| {
         assert!(most[arm] > 0.0, "{}: nothing was observed, so selection had nothing to go by", CASES[arm].0);
@@ -225,7 +223,7 @@ fn every_instruction_set() {
 #[cfg(feature = "gpu")]
 #[test]
 fn every_adapter() {
-    for (request, info) in common::adapters("every_adapter") {
+    for (request, info) in support::adapters("every_adapter") {
         check(&info.to_string(), &mut GpuEpisodes::new(gpu::open(request).unwrap()).unwrap());
     }
 }

@@ -5,7 +5,7 @@
 
 #![cfg(feature = "gpu")]
 
-mod common;
+mod support;
 
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::device::Request;
@@ -38,7 +38,7 @@ fn check(plan: &Plan, mut backend: GpuEpisodes) -> Agreement {
 /// Caught an empty slice of moments that was cast at the wrong alignment in rollouts.
 #[test]
 fn random_worlds_agree_under_both_passes_and_kernels() {
-    for (request, info) in common::adapters("random_worlds_agree_under_both_passes_and_kernels") {
+    for (request, info) in support::adapters("random_worlds_agree_under_both_passes_and_kernels") {
         for pass in [Pass::NoContraction, Pass::Guarded] {
             for (kernel, seeds) in KERNELS.into_iter().zip([0..40, 0..12]) {
                 let outcome = check(&Plan::random(seeds, 9), open(&request, pass, kernel));
@@ -51,7 +51,7 @@ fn random_worlds_agree_under_both_passes_and_kernels() {
 
 #[test]
 fn checked_shaders_and_default_limits_agree() {
-    for (request, info) in common::adapters("checked_shaders_and_default_limits_agree") {
+    for (request, info) in support::adapters("checked_shaders_and_default_limits_agree") {
         for request in
             [Request { checked: true, ..request.clone() }, Request { default_limits: true, ..request.clone() }]
         {
@@ -78,7 +78,7 @@ fn a_changed_twin_is_named_by_its_stage() {
         ("influence", |text| replaced(text, "seen = u32(", "seen = 2u * u32(")),
         ("breed", |text| replaced(text, "* brood.sigma", "* 1.0000001 * brood.sigma")),
     ];
-    for (request, info) in common::adapters("a_changed_twin_is_named_by_its_stage") {
+    for (request, info) in support::adapters("a_changed_twin_is_named_by_its_stage") {
         for ((stage, edit), kernel) in edits.into_iter().zip(KERNELS.into_iter().cycle()) {
             let backend = open(&request, Pass::NoContraction, kernel).edited(edit);
             let mismatch = check(&Plan::random(0..40, 9), backend).mismatch;
@@ -112,7 +112,7 @@ fn large_worlds_agree() {
         places(257, 5.0),
         places(33, 20.0)
     ));
-    for (request, info) in common::adapters("large_worlds_agree") {
+    for (request, info) in support::adapters("large_worlds_agree") {
         let worlds = vec![("crowd".into(), crowd.clone()), ("leaders only".into(), leaders_only.clone())];
         let plan = Plan { worlds, teams: 2, seed: 0, generations: 0 };
         let backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().bringing(Records::Packed);
@@ -133,7 +133,7 @@ fn long_episodes_agree() {
     let text = "[world]\nleaders = [[10.0, 5.0], [20.0, 5.0]]\nfollowers = [[12.0, 2.0], [8.0, 2.0]]\n\
                 pois = [[10.0, 15.0], [30.0, 40.0]]\nsteps = 3000\n[learning]\npopulation = 2\ntrials = 1";
     let config = Config::parse(text, "long.toml").unwrap();
-    for (request, info) in common::adapters("long_episodes_agree") {
+    for (request, info) in support::adapters("long_episodes_agree") {
         for kernel in KERNELS {
             let plan = Plan { worlds: vec![("long".into(), config.clone())], teams: 9, seed: 0, generations: 0 };
             let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap().playing(kernel);
@@ -164,7 +164,7 @@ fn batches_cut_small_give_the_same_record() {
         record.into_inner().unwrap()
     };
     let expected = record(&mut Cpu::default());
-    for (request, info) in common::adapters("batches_cut_small_give_the_same_record") {
+    for (request, info) in support::adapters("batches_cut_small_give_the_same_record") {
         for bytes in [1 << 12, 1 << 15, 1 << 28] {
             let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
             assert_eq!(record(&mut backend.batched(bytes)), expected, "{info}, batches of {bytes} bytes");
@@ -175,18 +175,15 @@ fn batches_cut_small_give_the_same_record() {
 /// Several experiments side by side end in the bits of each alone, on the GPU as on the CPU.
 #[test]
 fn training_gives_the_same_metrics_and_weights() {
-    let mut config = Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap();
+    let mut config = support::layout("generally_forward");
     (config.learning.trials, config.learning.generations, config.learning.population) = (2, 4, 20);
-    let mut jittered = Config::parse(include_str!("../configs/chaotic.toml"), "config").unwrap();
+    let mut jittered = support::layout("chaotic");
     (jittered.learning.trials, jittered.learning.generations, jittered.learning.population) = (1, 2, 20);
     (jittered.learning.start_jitter, jittered.learning.episodes_per_team) = (0.5, 3);
     jittered.learning.fitness = Fitness::Dpp;
     let train = |backend: &mut dyn Backend, configs: &[Config]| {
         let mut trainer = Trainer::new(configs.to_vec());
-        let mut rows = Vec::new();
-        while !trainer.is_done() {
-            rows.extend(trainer.advance(backend).unwrap());
-        }
+        let rows = trainer.finish(backend).unwrap();
         let weights: Vec<Vec<Vec<f32>>> = (0..configs.len()).map(|arm| trainer.policies(arm)).collect();
         (rows, weights)
     };
@@ -196,7 +193,7 @@ fn training_gives_the_same_metrics_and_weights() {
     for (arm, config) in both.iter().enumerate() {
         assert_eq!(train(&mut Cpu::default(), std::slice::from_ref(config)).1[0], weights[arm]);
     }
-    for (request, info) in common::adapters("training_gives_the_same_metrics_and_weights") {
+    for (request, info) in support::adapters("training_gives_the_same_metrics_and_weights") {
         let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap();
         assert_eq!(train(&mut backend, &both), (rows.clone(), weights.clone()), "{info}");
     }
@@ -224,7 +221,7 @@ fn structs_lie_alike_on_both_sides() {
 /// Drawn starts make one group an episode: batches of many groups, of which each has a few teams.
 #[test]
 fn held_out_episodes_come_to_the_same_on_every_backend() {
-    let mut config = Config::parse(include_str!("../configs/generally_forward.toml"), "generally forward").unwrap();
+    let mut config = support::layout("generally_forward");
     // Agents see each other at steps of their own.
     config.world.steps = 40;
     let world = World::new(&config);
@@ -238,7 +235,7 @@ fn held_out_episodes_come_to_the_same_on_every_backend() {
     let expected = evaluate(&mut Cpu::default(), &group, &starts, &|_| ()).unwrap();
     let spreads: Vec<_> = (0..policies).map(|team| expected.team(team)).collect();
     assert!(spreads.iter().any(|spread| spread.deviation > Some(0.0)), "nobody observes anything: {spreads:?}");
-    for (request, info) in common::adapters("held_out_episodes_come_to_the_same_on_every_backend") {
+    for (request, info) in support::adapters("held_out_episodes_come_to_the_same_on_every_backend") {
         let found = evaluate(&mut open(&request, Pass::Guarded, Kernel::Best), &group, &starts, &|_| ()).unwrap();
         assert_eq!(found, expected, "{info}");
     }
@@ -246,7 +243,7 @@ fn held_out_episodes_come_to_the_same_on_every_backend() {
 
 #[test]
 fn verify_tells_as_json_what_it_compared() {
-    for (index, (_, info)) in common::adapters("verify_tells_as_json_what_it_compared").into_iter().enumerate() {
+    for (index, (_, info)) in support::adapters("verify_tells_as_json_what_it_compared").into_iter().enumerate() {
         let adapter = index.to_string();
         let line = ["verify", "--worlds", "2", "--teams", "3", "--json", "-q", "--adapter", &adapter];
         let output = assert_cmd::cargo::cargo_bin_cmd!("flotilla").args(line).output().unwrap();
@@ -265,7 +262,7 @@ fn verify_tells_as_json_what_it_compared() {
 /// What does not fit together is an error that says what, on every backend, before anything is played.
 #[test]
 fn a_wrong_index_is_an_error() {
-    let world = World::new(&Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap());
+    let world = World::new(&support::layout("generally_forward"));
     let (policies, leaders) = (3, world.leaders());
     let weights = sample::weights(&world, policies, 1);
     let teams: Vec<u32> = (0..2 * leaders as u32).map(|place| place % 3).collect();
@@ -282,7 +279,7 @@ fn a_wrong_index_is_an_error() {
         (Group { weights: few.into(), ..good }, "weights"),
     ];
     let mut backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::default())];
-    for (request, _) in common::adapters("a_wrong_index_is_an_error") {
+    for (request, _) in support::adapters("a_wrong_index_is_an_error") {
         backends.push(Box::new(GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().holding(Holding::Always)));
     }
     for backend in &mut backends {
@@ -295,7 +292,7 @@ fn a_wrong_index_is_an_error() {
         backend.rollout(&[good], &|_| ()).unwrap();
         let sizes = [leaders, policies, world.parameters()];
         let Some(mut held) = backend.hold(&weights, sizes).unwrap() else { continue };
-        let learning = Config::parse(include_str!("../configs/chaotic.toml"), "config").unwrap().learning;
+        let learning = support::layout("chaotic").learning;
         let key = Key::new(0, 0, Purpose::Mutation);
         for (parents, named) in [(vec![0; 11], "11 parents"), ([vec![0; 11], vec![3]].concat(), "policy 3 of 3")] {
             let breeding = Breeding { parents: &parents, key, generation: 0, learning: &learning };
@@ -345,7 +342,7 @@ fn kernels_are_compiled_for_few_worlds_and_shared() {
         World::new(&config)
     });
     let (gains, sizes): (Vec<_>, Vec<_>) = (gains.collect(), sizes.collect());
-    for (request, info) in common::adapters("kernels_are_compiled_for_few_worlds_and_shared") {
+    for (request, info) in support::adapters("kernels_are_compiled_for_few_worlds_and_shared") {
         let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().playing(Kernel::Best);
         assert_eq!(play(&mut backend, &gains), [0, 1], "{info}: only the numbers differ");
         assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: the other worlds share the generic kernel");

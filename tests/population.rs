@@ -2,7 +2,7 @@
 
 #![cfg(feature = "cli")]
 
-mod common;
+mod support;
 
 use std::any::Any;
 use std::sync::Arc;
@@ -23,7 +23,7 @@ use flotilla::run::{Ended, Options, Session};
 use flotilla::trainer::{Row, Snapshot, SnapshotError, Trainer};
 
 fn learning() -> Learning {
-    Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap().learning
+    support::layout("generally_forward").learning
 }
 
 /// Weights `[leaders][slots][parameters]`, of all sizes that there may be.
@@ -56,7 +56,7 @@ fn parents([leaders, slots, _]: [usize; 3], generation: usize) -> Vec<u32> {
 
 #[test]
 fn breeding_gives_the_same_bits() {
-    for (request, info) in common::adapters("breeding_gives_the_same_bits") {
+    for (request, info) in support::adapters("breeding_gives_the_same_bits") {
         let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().holding(Holding::Always);
         let mut mutated = 0;
         for sizes in [[1, 2, 1], [3, 5, 97], [4, 51, 112], [2, 301, 64], [2, 17, 1000], [1, 300, 65], [257, 2, 18]] {
@@ -90,15 +90,14 @@ fn breeding_gives_the_same_bits() {
 
 /// Experiments that differ in all that breeding and gathering depend on, and in length.
 fn arms() -> Vec<Config> {
-    let parse = |text| Config::parse(text, "config").unwrap();
-    let mut first = parse(include_str!("../configs/generally_forward.toml"));
+    let mut first = support::layout("generally_forward");
     (first.learning.trials, first.learning.generations, first.learning.population) = (2, 5, 21);
-    let mut second = parse(include_str!("../configs/chaotic.toml"));
+    let mut second = support::layout("chaotic");
     (second.learning.trials, second.learning.generations, second.learning.population) = (1, 3, 40);
     (second.learning.start_jitter, second.learning.episodes_per_team) = (0.5, 2);
     (second.learning.fitness, second.learning.elites) = (Fitness::D, 0);
     second.learning.mutation = Mutation::Additive;
-    let mut third = parse(include_str!("../configs/strictly_forward.toml"));
+    let mut third = support::layout("strictly_forward");
     (third.learning.trials, third.learning.generations, third.learning.population) = (1, 6, 7);
     (third.learning.paradigm, third.learning.mutation_probability) = (Paradigm::AllLeaders, 1.0);
     third.policy.hidden = vec![5, 30, 3];
@@ -130,11 +129,7 @@ fn restored(snapshots: &[Snapshot]) -> Trainer {
 }
 
 fn train(trainer: &mut Trainer, backend: &mut dyn Backend) -> Story {
-    let mut rows = Vec::new();
-    while !trainer.is_done() {
-        rows.extend(trainer.advance(backend).unwrap());
-    }
-    Story { rows, policies: policies(trainer) }
+    Story { rows: trainer.finish(backend).unwrap(), policies: policies(trainer) }
 }
 
 /// What the CPU comes to, and its snapshots before each generation.
@@ -151,7 +146,7 @@ fn reference() -> (Story, Vec<Vec<Snapshot>>) {
 fn training_comes_to_the_same_wherever_populations_are() {
     let (expected, snapshots) = reference();
     assert!(expected.rows.iter().any(|row| row.best_g > 0.0), "nothing was observed");
-    for (request, info) in common::adapters("training_comes_to_the_same_wherever_populations_are") {
+    for (request, info) in support::adapters("training_comes_to_the_same_wherever_populations_are") {
         let gpu = gpu::open(request).unwrap();
         let open = |holding| GpuEpisodes::new(gpu.clone()).unwrap().holding(holding);
         // The populations of some arms take more than this, of others less.
@@ -234,7 +229,7 @@ fn a_setback_is_told() {
 /// Leaders' populations over the size of a buffer stay on the host, unless that is ruled out.
 #[test]
 fn what_does_not_fit_the_device_is_declined() {
-    for (request, info) in common::adapters("what_does_not_fit_the_device_is_declined") {
+    for (request, info) in support::adapters("what_does_not_fit_the_device_is_declined") {
         let gpu = gpu::open(device::Request { default_limits: true, ..request }).unwrap();
         // The least over WebGPU's 128 MiB; a backend that declines does not look at the weights.
         let sizes = [1, (128 << 20) / 4 / 112 + 1, 112];

@@ -3,7 +3,7 @@
 
 #![cfg(feature = "cli")]
 
-mod common;
+mod support;
 
 use std::collections::BTreeMap;
 use std::sync::Mutex;
@@ -124,7 +124,7 @@ fn scores_are_the_same_from_whole_and_packed_records() {
     let expected: Vec<Scores> = (0..2).map(|first| expected(&all, first)).collect();
     let different = expected[0].values().filter(|(observed, _)| *observed > 0).count();
     assert!(different > 100, "only {different} teams observe anything");
-    for (request, info) in common::adapters("scores_are_the_same_from_whole_and_packed_records") {
+    for (request, info) in support::adapters("scores_are_the_same_from_whole_and_packed_records") {
         for (first, expected) in expected.iter().enumerate() {
             for (records, bytes) in [(Records::Whole, 1 << 28), (Records::Packed, 1 << 28), (Records::Packed, 1 << 15)]
             {
@@ -150,7 +150,7 @@ fn a_changed_rule_is_noticed() {
     ];
     let all: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37, true)).collect();
     let expected = expected(&all, 0);
-    for (request, info) in common::adapters("a_changed_rule_is_noticed") {
+    for (request, info) in support::adapters("a_changed_rule_is_noticed") {
         for (index, edit) in edits.into_iter().enumerate() {
             let mut backend = open(&request, Records::Packed).edited(edit);
             assert!(scores(&mut backend, &all, 0, |need| need) != expected, "{info}: edit {index} was not noticed");
@@ -174,7 +174,7 @@ fn everything_or_nothing_may_matter() {
     let [for_dense, for_empty] = [&dense, &empty].map(|teams| expected(teams, 0));
     assert!(for_dense.values().all(|(observed, _)| *observed == 1) && for_empty.values().all(|(o, _)| *o == 0));
     let (whole, table) = (dense[0].whole(), 501 * 4);
-    for (request, info) in common::adapters("everything_or_nothing_may_matter") {
+    for (request, info) in support::adapters("everything_or_nothing_may_matter") {
         let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
         let mut play = |all: &[Teams], expected: &Scores| {
             assert!(scores(&mut backend, all, 0, |need| need) == *expected, "{info}");
@@ -203,7 +203,7 @@ fn whole_records_come_where_they_must() {
     let of = |steps: usize| vec![Teams::new(&config(&text(steps)), 20, true)];
     let (short, long, longest) = (of(100), of(3000), of(10_000));
     let [for_short, for_long, for_longest] = [&short, &long, &longest].map(|teams| expected(teams, 0));
-    for (request, info) in common::adapters("whole_records_come_where_they_must") {
+    for (request, info) in support::adapters("whole_records_come_where_they_must") {
         let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
         assert!(scores(&mut backend, &short, 0, |_| Need::Record) == for_short, "{info}");
         assert_eq!(down(&mut backend), short[0].whole(), "{info}: the record was asked for");
@@ -222,11 +222,11 @@ fn whole_records_come_where_they_must() {
 /// at 2^20 teams 100 MB are 95. More teams by `FLOTILLA_TEAMS`.
 #[test]
 fn a_generation_moves_less_than_95_bytes_a_team() {
-    let mut config = config(include_str!("../configs/generally_forward.toml"));
+    let mut config = support::layout("generally_forward");
     let teams = std::env::var("FLOTILLA_TEAMS").map_or(1 << 11, |teams| teams.parse().unwrap());
     (config.learning.trials, config.learning.population, config.learning.generations) = (1, teams, 60);
     config.learning.fitness = Fitness::Df;
-    for (request, info) in common::adapters("a_generation_moves_less_than_95_bytes_a_team") {
+    for (request, info) in support::adapters("a_generation_moves_less_than_95_bytes_a_team") {
         let mut backend = open(&request, Records::PackedFrom(0)).holding(Holding::Always);
         let mut trainer = Trainer::new(vec![config.clone()]);
         let mut before = backend.gpu().traffic();
@@ -285,7 +285,7 @@ fn compiling() {
     }
     let sweep = Sweep::read(include_str!("../configs/sweeps/large.toml"), "large.toml", &[], false).unwrap();
     cases.push(("large.toml".into(), sweep.points.into_iter().map(|point| small(point.config)).collect()));
-    for (request, info) in common::adapters("compiling") {
+    for (request, info) in support::adapters("compiling") {
         for (name, configs) in &cases {
             let backend = || GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
             let gpu = backend().playing(Kernel::Best).holding(Holding::Always).bringing(Records::PackedFrom(0));

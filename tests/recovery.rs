@@ -4,7 +4,7 @@
 
 #![cfg(feature = "cli")]
 
-mod common;
+mod support;
 
 use std::fs;
 use std::io::{self, Cursor, Read};
@@ -620,7 +620,7 @@ fn a_lost_device_costs_nothing() {
 fn a_run_may_change_to_another_processor_and_back() {
     let config = small();
     let expected = reference(&config);
-    for (request, info) in common::adapters("a_run_may_change_to_another_processor_and_back") {
+    for (request, info) in support::adapters("a_run_may_change_to_another_processor_and_back") {
         let gpu = || -> Player {
             let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
             (Box::new(backend), Machine { backend: "gpu".into(), ..Machine::default() })
@@ -639,7 +639,7 @@ fn a_run_may_change_to_another_processor_and_back() {
 
 /// The real program.
 fn flotilla() -> Command {
-    let mut command = Command::new(assert_cmd::cargo::cargo_bin!("flotilla"));
+    let mut command = support::flotilla();
     command.stdout(Stdio::piped()).stderr(Stdio::piped());
     command
 }
