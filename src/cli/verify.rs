@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde_json::json;
 
-use super::{Error, print};
+use super::{Error, between, print};
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu;
 use crate::backend::gpu::device::{self, AdapterInfo, DeviceError, Request, Wanted};
@@ -19,13 +19,13 @@ pub struct Args {
     /// Compare this experiment alone (- is standard input), instead of random worlds of every kind
     config: Option<PathBuf>,
     /// Random teams of each world
-    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    #[arg(long, value_name = "N", default_value_t = 48, value_parser = between(1..=65_536u32))]
     teams: u32,
     /// Random worlds
-    #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = between(1..=100_000u32))]
     worlds: u32,
     /// Start of all randomness
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = between(0..=u32::MAX))]
     seed: u32,
     /// Only the adapter whose name contains this, or of this number
     #[arg(long, value_name = "NAME")]
