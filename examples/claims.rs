@@ -51,11 +51,9 @@ fn measure(keys: &[Override]) -> Result<String, String> {
     let (configs, places) = paper::trained(&arms);
     let mut backend = Cpu::default();
     let mut trainer = Trainer::new(configs);
-    while !trainer.is_done() {
-        for row in trainer.advance(&mut backend).map_err(|error| error.to_string())? {
-            for (arm, _) in places.iter().enumerate().filter(|&(_, &place)| place == row.arm) {
-                arms[arm].add(&Row { arm, ..row });
-            }
+    for row in trainer.finish(&mut backend).map_err(|error| error.to_string())? {
+        for (arm, _) in places.iter().enumerate().filter(|&(_, &place)| place == row.arm) {
+            arms[arm].add(&Row { arm, ..row });
         }
     }
     let mut baselines = Baselines::new(paper::grounds(&arms));

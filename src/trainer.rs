@@ -202,6 +202,18 @@ impl Trainer {
         })
     }
 
+    /// Plays every generation that is left; gives all rows, as [`Trainer::advance`] does.
+    ///
+    /// # Errors
+    /// When the backend fails; the trainer then stands before that generation, and the rows before it are lost.
+    pub fn finish(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
+        let mut rows = Vec::new();
+        while !self.is_done() {
+            rows.extend(self.advance(backend)?);
+        }
+        Ok(rows)
+    }
+
     /// Plays every arm from where its populations are to the end of its next generation; gives the rows of that alone,
     /// since all before were given when those generations first played.
     fn catch_up(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {

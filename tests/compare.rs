@@ -2,26 +2,26 @@
 
 #![cfg(feature = "cli")]
 
+mod support;
+
 use std::fmt::Write;
 use std::fs;
-use std::path::Path;
 
-use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::config::{Config, Override};
 use flotilla::record::metrics::HEADER;
 use flotilla::statistics;
 use serde_json::Value;
-use tempfile::TempDir;
+use support::Place;
 
 const WORLD: &str = "[world]\nleaders = [[10, 5], [20, 5]]\nfollowers = [[12, 2]]\npois = [[10, 15], [20, 15]]\n";
 
 /// A run in a folder: G of the best team by trial and generation, that of the champion half as much.
-fn run(folder: &TempDir, name: &str, keys: &[(&str, &str)], trials: &[&[f64]]) {
+fn run(place: &Place, name: &str, keys: &[(&str, &str)], trials: &[&[f64]]) {
     let set = |(key, value): &(&str, &str)| Override { key: (*key).into(), text: (*value).into(), name: (*key).into() };
     let count = trials.len().to_string();
     let all: Vec<Override> = [("learning.trials", &*count)].iter().chain(keys).map(set).collect();
     let config = Config::read(WORLD, name, &[], &all).unwrap();
-    let path = folder.path().join(name);
+    let path = place.path(name);
     fs::create_dir_all(&path).unwrap();
     fs::write(path.join("config.toml"), config.to_toml()).unwrap();
     let mut metrics = format!("{HEADER}\n");
@@ -34,28 +34,13 @@ fn run(folder: &TempDir, name: &str, keys: &[(&str, &str)], trials: &[&[f64]]) {
     fs::write(path.join("metrics.csv"), metrics).unwrap();
 }
 
-/// What a command line prints, and what it tells on standard error.
-fn flotilla(folder: &Path, line: &str) -> (i32, String, String) {
-    let mut command = cargo_bin_cmd!("flotilla");
-    let output = command.current_dir(folder).args(line.split(' ')).output().unwrap();
-    let [out, told] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
-    (output.status.code().unwrap(), out, told)
-}
-
-fn good(folder: &TempDir, line: &str) -> (String, String) {
-    let (code, out, told) = flotilla(folder.path(), line);
-    assert_eq!(code, 0, "{line}: {told}");
-    (out, told)
-}
-
-fn json(folder: &TempDir, line: &str) -> Value {
-    serde_json::from_str(&good(folder, &format!("{line} --json")).0).unwrap()
+fn json(place: &Place, line: &str) -> Value {
+    serde_json::from_str(&place.good(&format!("{line} --json")).0).unwrap()
 }
 
 /// Fails with an exit code and a line that has these words.
-fn bad(folder: &TempDir, line: &str, code: i32, words: &[&str]) {
-    let (found, out, told) = flotilla(folder.path(), line);
-    assert_eq!((found, &*out), (code, ""), "{line}: {told}");
+fn bad(place: &Place, line: &str, code: i32, words: &[&str]) {
+    let told = place.refused(code, line);
     for word in words {
         let error = told.lines().position(|line| line.starts_with("error: ")).expect("an error is told");
         // Only notes come before it.
@@ -83,11 +68,11 @@ fn slices(trials: &[[f64; 2]]) -> Vec<&[f64]> {
 
 #[test]
 fn two_arms_are_told_with_intervals_and_a_test() {
-    let folder = tempfile::tempdir().unwrap();
+    let place = Place::new(&[]);
     let (one, other) = ([1.0, 1.0, 0.75, 1.0, 1.0], [0.5, 0.75, 0.5, 0.5, 0.25]);
-    run(&folder, "df", &[GENERATIONS], &slices(&two(&one)));
-    run(&folder, "g", &[GENERATIONS, FITNESS_G, SEED_1], &slices(&two(&other)));
-    let (text, told) = good(&folder, "compare df g");
+    run(&place, "df", &[GENERATIONS], &slices(&two(&one)));
+    run(&place, "g", &[GENERATIONS, FITNESS_G, SEED_1], &slices(&two(&other)));
+    let (text, told) = place.good("compare df g");
     assert_eq!(told, "");
     for words in [
         "| arm                | trials | best team's G, generation 1 | champion's G, generation 1 | generations to G 0.75",
@@ -101,7 +86,7 @@ fn two_arms_are_told_with_intervals_and_a_test() {
     ] {
         assert!(text.contains(words), "{words:?} is not in\n{text}");
     }
-    let told = json(&folder, "compare df g");
+    let told = json(&place, "compare df g");
     let comparison = &told["comparisons"][0];
     assert_eq!((&told["test"], &comparison["generation"]), (&"mann-whitney".into(), &1.into()));
     let [best, champion, reach] = [0, 1, 2].map(|measure| &comparison["measures"][measure]);
@@ -118,7 +103,7 @@ fn two_arms_are_told_with_intervals_and_a_test() {
     assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["value"])), [1.0, 1.8]);
     assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["reached"])), [5.0, 1.0]);
     // The other way round is the same with the other sign.
-    let turned = &json(&folder, "compare g df")["comparisons"][0]["measures"][0]["pairs"][0];
+    let turned = &json(&place, "compare g df")["comparisons"][0]["measures"][0]["pairs"][0];
     assert!((number(&turned["value"]) + difference.value).abs() < 1e-12);
     assert_eq!(number(&turned["p"]), number(&pair["p"]));
     assert!((number(&turned["a"]) - 0.02).abs() < 1e-12);
@@ -126,43 +111,43 @@ fn two_arms_are_told_with_intervals_and_a_test() {
 
 #[test]
 fn pairs_are_told_of_and_compared_as_pairs_where_that_is_asked_for() {
-    let folder = tempfile::tempdir().unwrap();
+    let place = Place::new(&[]);
     let (one, other) = ([1.0, 0.75, 0.5, 1.0, 0.25], [0.75, 0.5, 0.25, 0.75, 0.0]);
-    run(&folder, "df", &[GENERATIONS], &slices(&two(&one)));
-    run(&folder, "g", &[GENERATIONS, FITNESS_G], &slices(&two(&other)));
-    let (_, told) = good(&folder, "compare df g");
+    run(&place, "df", &[GENERATIONS], &slices(&two(&one)));
+    run(&place, "g", &[GENERATIONS, FITNESS_G], &slices(&two(&other)));
+    let (_, told) = place.good("compare df g");
     assert!(told.contains("note: these arms have the same seeds") && told.contains("--paired"), "{told}");
-    let (text, told) = good(&folder, "compare df g --paired");
+    let (text, told) = place.good("compare df g --paired");
     assert!(told.is_empty() && text.contains("Wilcoxon's signed ranks"), "{told}{text}");
-    let told = json(&folder, "compare df g --paired");
+    let told = json(&place, "compare df g --paired");
     let pair = &told["comparisons"][0]["measures"][0]["pairs"][0];
     // Every pair a quarter apart: the least p of five.
     assert_eq!(["value", "low", "high", "a", "p"].map(|key| number(&pair[key])), [0.25, 0.25, 0.25, 1.0, 2.0 / 32.0]);
-    let loose = &json(&folder, "compare df g")["comparisons"][0]["measures"][0]["pairs"][0];
+    let loose = &json(&place, "compare df g")["comparisons"][0]["measures"][0]["pairs"][0];
     assert!(number(&loose["p"]) > 0.3 && number(&loose["a"]) < 0.8, "{loose}");
 
-    run(&folder, "seed", &[GENERATIONS, SEED_1], &slices(&two(&one)));
-    run(&folder, "more", &[GENERATIONS, FITNESS_G], &slices(&two(&[1.0; 6])));
-    bad(&folder, "compare df seed --paired", 2, &["--paired: ", "no pairs"]);
-    bad(&folder, "compare df more --paired", 2, &["--paired: ", "numbers of trials"]);
-    let uneven = &json(&folder, "compare df more")["comparisons"][0];
+    run(&place, "seed", &[GENERATIONS, SEED_1], &slices(&two(&one)));
+    run(&place, "more", &[GENERATIONS, FITNESS_G], &slices(&two(&[1.0; 6])));
+    bad(&place, "compare df seed --paired", 2, &["--paired: ", "no pairs"]);
+    bad(&place, "compare df more --paired", 2, &["--paired: ", "numbers of trials"]);
+    let uneven = &json(&place, "compare df more")["comparisons"][0];
     assert_eq!([0, 1].map(|arm| number(&uneven["arms"][arm]["trials"])), [5.0, 6.0]);
 }
 
 #[test]
 fn arms_that_are_alike_do_not_differ() {
-    let folder = tempfile::tempdir().unwrap();
+    let place = Place::new(&[]);
     for name in ["a", "b_50%"] {
-        run(&folder, name, &[GENERATIONS], &slices(&two(&[0.5; 4])));
+        run(&place, name, &[GENERATIONS], &slices(&two(&[0.5; 4])));
     }
-    let told = json(&folder, "compare a b_50%");
+    let told = json(&place, "compare a b_50%");
     for measure in told["comparisons"][0]["measures"].as_array().unwrap() {
         let pair = &measure["pairs"][0];
         let found = ["value", "low", "high", "a", "p", "p_holm"].map(|key| number(&pair[key]));
         assert_eq!(found, [0.0, 0.0, 0.0, 0.5, 1.0, 1.0], "{measure}");
     }
     // Nothing sets them apart but where they are.
-    let (text, _) = good(&folder, "compare a b_50% --latex");
+    let (text, _) = place.good("compare a b_50% --latex");
     assert!(
         text.starts_with("% Means over trials")
             && text.contains(r"best team's G, generation 1 & a $-$ b\_50\% & +0.000")
@@ -177,12 +162,12 @@ fn arms_that_are_alike_do_not_differ() {
 
 #[test]
 fn many_pairs_are_corrected_and_every_form_says_the_same() {
-    let folder = tempfile::tempdir().unwrap();
+    let place = Place::new(&[]);
     let ends = [[0.0, 0.25, 0.25, 0.0, 0.5, 0.25], [0.5, 0.75, 0.5, 0.5, 0.25, 0.5], [1.0, 1.0, 0.75, 1.0, 1.0, 0.5]];
     for (name, ends) in ["x", "y", "z"].into_iter().zip(&ends) {
-        run(&folder, name, &[GENERATIONS], &slices(&two(ends)));
+        run(&place, name, &[GENERATIONS], &slices(&two(ends)));
     }
-    let told = json(&folder, "compare x y z --at 0,last,1 --reach 1");
+    let told = json(&place, "compare x y z --at 0,last,1 --reach 1");
     let measures = told["comparisons"][0]["measures"].as_array().unwrap();
     // The last generation is 1, and told once.
     let names: Vec<_> =
@@ -197,7 +182,7 @@ fn many_pairs_are_corrected_and_every_form_says_the_same() {
     assert_eq!(pairs.iter().map(|pair| number(&pair["p_holm"])).collect::<Vec<_>>(), statistics::holm(&p));
     assert!(number(&pairs[0]["p_holm"]) > p[0], "{pairs:?}");
 
-    let (text, _) = good(&folder, "compare x y z --at 0,last,1 --reach 1 --csv");
+    let (text, _) = place.good("compare x y z --at 0,last,1 --reach 1 --csv");
     let mut table = csv::Reader::from_reader(text.as_bytes());
     let rows: Vec<std::collections::HashMap<String, String>> = table.deserialize().map(Result::unwrap).collect();
     assert_eq!(rows.len(), 5 * (3 + 3));
@@ -213,28 +198,28 @@ fn many_pairs_are_corrected_and_every_form_says_the_same() {
 
 #[test]
 fn unfinished_runs_are_compared_as_far_as_they_are_and_that_is_told() {
-    let folder = tempfile::tempdir().unwrap();
+    let place = Place::new(&[]);
     const WHOLE: [f64; 11] = [0.0, 0.5, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0];
     let ten = ("learning.generations", "10");
-    run(&folder, "whole", &[ten], &[&WHOLE[..]; 3]);
+    run(&place, "whole", &[ten], &[&WHOLE[..]; 3]);
     // The last trial is a generation behind, and a line is cut short.
-    run(&folder, "part", &[ten, FITNESS_G], &[&[0.0, 0.5, 0.75, 1.0], &[0.0, 0.0, 0.0, 1.0], &[0.5, 0.75, 0.5]]);
-    let metrics = folder.path().join("part/metrics.csv");
+    run(&place, "part", &[ten, FITNESS_G], &[&[0.0, 0.5, 0.75, 1.0], &[0.0, 0.0, 0.0, 1.0], &[0.5, 0.75, 0.5]]);
+    let metrics = place.path("part/metrics.csv");
     fs::write(&metrics, fs::read_to_string(&metrics).unwrap() + "2,3,1,0.").unwrap();
-    let (text, told) = good(&folder, "compare whole part");
+    let (text, told) = place.good("compare whole part");
     assert!(told.contains("note: fitness G has come to generation 2 of 10\n"), "{told}");
     assert!(told.contains("note: arms are compared up to generation 2, which all have come to\n"), "{told}");
     assert!(text.contains("best team's G, generation 2"), "{text}");
-    let told = json(&folder, "compare whole part");
+    let told = json(&place, "compare whole part");
     let reach = &told["comparisons"][0]["measures"][2];
     // What is reached later is not known of all: 3, 3, 3, and 2, 3, 1.
     assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["value"])), [3.0, 2.0]);
     assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["reached"])), [0.0, 2.0]);
-    bad(&folder, "compare whole part --at 3", 2, &["--at 3: ", "generation 2"]);
+    bad(&place, "compare whole part --at 3", 2, &["--at 3: ", "generation 2"]);
 
     // Runs of different lengths are told of, too.
-    run(&folder, "short", &[GENERATIONS], &slices(&two(&[0.5, 1.0])));
-    let (_, told) = good(&folder, "compare whole short");
+    run(&place, "short", &[GENERATIONS], &slices(&two(&[0.5, 1.0])));
+    let (_, told) = place.good("compare whole short");
     assert_eq!(
         told.lines().next(),
         Some("note: arms are compared up to generation 1, which all have come to"),
@@ -242,33 +227,33 @@ fn unfinished_runs_are_compared_as_far_as_they_are_and_that_is_told() {
     );
 
     fs::write(&metrics, fs::read_to_string(&metrics).unwrap().replace("\n1,1,", "\n1,2,")).unwrap();
-    bad(&folder, "compare whole part", 1, &["metrics.csv: trial 1 of generation 2 is out of turn"]);
+    bad(&place, "compare whole part", 1, &["metrics.csv: trial 1 of generation 2 is out of turn"]);
 }
 
 #[test]
 fn what_cannot_be_compared_is_refused_in_a_line() {
-    let folder = tempfile::tempdir().unwrap();
-    run(&folder, "a", &[GENERATIONS], &slices(&two(&[0.5; 4])));
-    run(&folder, "b", &[GENERATIONS, FITNESS_G], &slices(&two(&[0.5; 4])));
-    run(&folder, "one", &[GENERATIONS, FITNESS_G], &slices(&two(&[0.5])));
-    run(&folder, "torn", &[GENERATIONS, FITNESS_G], &[&[0.5, 0.5], &[]]);
-    fs::create_dir(folder.path().join("paper")).unwrap();
-    fs::write(folder.path().join("paper/paper.toml"), "seed = 0\n").unwrap();
-    bad(&folder, "compare a", 2, &["a is one run", "another"]);
-    bad(&folder, "compare a b ./a", 2, &["./a is named twice"]);
-    bad(&folder, "compare a one", 1, &["one trial", "--trials"]);
-    bad(&folder, "compare a torn", 1, &["no generation that every trial has come to"]);
-    bad(&folder, "compare a none", 1, &["none: no such folder", "flotilla train"]);
-    bad(&folder, "compare none", 1, &["none: no such folder"]);
-    bad(&folder, "compare paper a", 1, &["paper holds a paper", "arms/"]);
-    bad(&folder, "compare a b --at 2", 2, &["--at 2: ", "generation 1"]);
-    bad(&folder, "compare a b --at then", 2, &["allowed generations, from 0, or last"]);
-    bad(&folder, "compare a b --reach 2", 2, &["0..1"]);
-    bad(&folder, "compare a b --by fitness", 2, &["--by fitness: ", "sweep"]);
-    bad(&folder, "compare a b --json --csv", 2, &["--json", "--csv"]);
+    let place = Place::new(&[]);
+    run(&place, "a", &[GENERATIONS], &slices(&two(&[0.5; 4])));
+    run(&place, "b", &[GENERATIONS, FITNESS_G], &slices(&two(&[0.5; 4])));
+    run(&place, "one", &[GENERATIONS, FITNESS_G], &slices(&two(&[0.5])));
+    run(&place, "torn", &[GENERATIONS, FITNESS_G], &[&[0.5, 0.5], &[]]);
+    fs::create_dir(place.path("paper")).unwrap();
+    fs::write(place.path("paper/paper.toml"), "seed = 0\n").unwrap();
+    bad(&place, "compare a", 2, &["a is one run", "another"]);
+    bad(&place, "compare a b ./a", 2, &["./a is named twice"]);
+    bad(&place, "compare a one", 1, &["one trial", "--trials"]);
+    bad(&place, "compare a torn", 1, &["no generation that every trial has come to"]);
+    bad(&place, "compare a none", 1, &["none: no such folder", "flotilla train"]);
+    bad(&place, "compare none", 1, &["none: no such folder"]);
+    bad(&place, "compare paper a", 1, &["paper holds a paper", "arms/"]);
+    bad(&place, "compare a b --at 2", 2, &["--at 2: ", "generation 1"]);
+    bad(&place, "compare a b --at then", 2, &["allowed generations, from 0, or last"]);
+    bad(&place, "compare a b --reach 2", 2, &["0..1"]);
+    bad(&place, "compare a b --by fitness", 2, &["--by fitness: ", "sweep"]);
+    bad(&place, "compare a b --json --csv", 2, &["--json", "--csv"]);
     let many = (0..25).map(|at| format!(" r{at}")).collect::<String>();
-    bad(&folder, &format!("compare{many}"), 2, &["25 runs are too many", "24 at most"]);
-    assert_eq!(flotilla(folder.path(), "compare").0, 2);
+    bad(&place, &format!("compare{many}"), 2, &["25 runs are too many", "24 at most"]);
+    assert_eq!(place.run("compare").status.code(), Some(2));
 }
 
 /// Two couplings, two fitnesses and two seeds, by which trials are only more.
@@ -285,12 +270,12 @@ generations = 2
 
 #[test]
 fn a_sweep_is_compared_along_an_axis_and_seeds_are_more_trials() {
-    let folder = tempfile::tempdir().unwrap();
-    fs::write(folder.path().join("x.toml"), format!("{WORLD}{SWEEP}")).unwrap();
-    good(&folder, "sweep x.toml --out s --backend cpu --quiet");
-    bad(&folder, "compare s", 2, &["several axes", "--by", "world.coupling, learning.fitness, learning.seed"]);
-    bad(&folder, "compare s --by steps", 2, &["--by steps: ", "world.coupling, learning.fitness"]);
-    let told = json(&folder, "compare s --by fitness");
+    let place = Place::new(&[]);
+    fs::write(place.path("x.toml"), format!("{WORLD}{SWEEP}")).unwrap();
+    place.good("sweep x.toml --out s --backend cpu --quiet");
+    bad(&place, "compare s", 2, &["several axes", "--by", "world.coupling, learning.fitness, learning.seed"]);
+    bad(&place, "compare s --by steps", 2, &["--by steps: ", "world.coupling, learning.fitness"]);
+    let told = json(&place, "compare s --by fitness");
     let comparisons = told["comparisons"].as_array().unwrap();
     let places: Vec<_> = comparisons.iter().map(|comparison| &comparison["where"]).collect();
     assert_eq!(places, ["coupling 1", "coupling 2"]);
@@ -301,7 +286,7 @@ fn a_sweep_is_compared_along_an_axis_and_seeds_are_more_trials() {
     let ends: Vec<f64> = ["0006", "0007"]
         .iter()
         .flat_map(|point| {
-            let text = fs::read_to_string(folder.path().join("s/points").join(point).join("metrics.csv")).unwrap();
+            let text = fs::read_to_string(place.path("s/points").join(point).join("metrics.csv")).unwrap();
             let last = text.lines().filter(|line| line.split(',').nth(1) == Some("2"));
             last.map(|line| line.split(',').nth(2).unwrap().parse().unwrap()).collect::<Vec<f64>>()
         })
@@ -309,22 +294,22 @@ fn a_sweep_is_compared_along_an_axis_and_seeds_are_more_trials() {
     assert_eq!(ends.len(), 6);
     let value = &comparisons[1]["measures"][0]["arms"][1]["value"];
     assert_eq!(number(value), statistics::bootstrap(&[&ends]).unwrap().value);
-    let (text, _) = good(&folder, "compare s --by learning.fitness --paired");
+    let (text, _) = place.good("compare s --by learning.fitness --paired");
     assert!(text.starts_with("coupling 1\n\n| arm") && text.contains("\ncoupling 2\n\n"), "{text}");
     // Seeds themselves are compared where that is asked for, fitness by fitness.
-    assert_eq!(json(&folder, "compare s --by seed")["comparisons"].as_array().unwrap().len(), 4);
+    assert_eq!(json(&place, "compare s --by seed")["comparisons"].as_array().unwrap().len(), 4);
 
-    fs::remove_dir_all(folder.path().join("s/points/0006")).unwrap();
-    fs::remove_dir_all(folder.path().join("s/points/0002")).unwrap();
-    fs::remove_dir_all(folder.path().join("s/points/0003")).unwrap();
-    let (_, note) = good(&folder, "compare s --by fitness");
+    fs::remove_dir_all(place.path("s/points/0006")).unwrap();
+    fs::remove_dir_all(place.path("s/points/0002")).unwrap();
+    fs::remove_dir_all(place.path("s/points/0003")).unwrap();
+    let (_, note) = place.good("compare s --by fitness");
     assert!(note.contains("note: s/points/0006 was not run, and is left out: world.coupling = 2"), "{note}");
-    let told = json(&folder, "compare s --by fitness");
+    let told = json(&place, "compare s --by fitness");
     assert_eq!(told["comparisons"].as_array().unwrap().len(), 1);
     assert_eq!(told["comparisons"][0]["arms"][1]["trials"], 3);
-    fs::remove_dir_all(folder.path().join("s/points")).unwrap();
+    fs::remove_dir_all(place.path("s/points")).unwrap();
     bad(
-        &folder,
+        &place,
         "compare s --by fitness",
         1,
         &["no two values of learning.fitness", "flotilla sweep s/sweep.toml --out s --resume"],
@@ -333,12 +318,12 @@ fn a_sweep_is_compared_along_an_axis_and_seeds_are_more_trials() {
 
 #[test]
 fn a_varied_key_is_compared_with_the_files_own_value() {
-    let folder = tempfile::tempdir().unwrap();
+    let place = Place::new(&[]);
     let text = "[learning]\npopulation = 8\ntrials = 2\ngenerations = 1\n[grid]\n\"learning.fitness\" = [\"G\", \"Df\"]\n\
                 [vary]\n\"motion.max_speed\" = [2.0, 5.0]\n\"world.steps\" = [8]\n";
-    fs::write(folder.path().join("x.toml"), format!("{WORLD}{text}")).unwrap();
-    good(&folder, "sweep x.toml --out s --backend cpu --quiet");
-    let told = json(&folder, "compare s --by max_speed");
+    fs::write(place.path("x.toml"), format!("{WORLD}{text}")).unwrap();
+    place.good("sweep x.toml --out s --backend cpu --quiet");
+    let told = json(&place, "compare s --by max_speed");
     let names = |comparison: &Value| {
         let arms = comparison["arms"].as_array().unwrap().iter();
         arms.map(|arm| arm["name"].as_str().unwrap().to_string()).collect::<Vec<_>>()
@@ -350,7 +335,7 @@ fn a_varied_key_is_compared_with_the_files_own_value() {
     );
     assert_eq!(names(&comparisons[0]), ["max_speed 3.0", "max_speed 2.0", "max_speed 5.0"]);
     // By a key of the grid: also where one of the others is varied.
-    let told = json(&folder, "compare s --by fitness");
+    let told = json(&place, "compare s --by fitness");
     let places: Vec<_> =
         told["comparisons"].as_array().unwrap().iter().map(|comparison| &comparison["where"]).collect();
     assert_eq!(places, ["as in the file", "steps 8", "max_speed 2.0", "max_speed 5.0"]);
@@ -358,11 +343,11 @@ fn a_varied_key_is_compared_with_the_files_own_value() {
 
 #[test]
 fn different_layouts_are_told_and_are_no_pairs() {
-    let folder = tempfile::tempdir().unwrap();
+    let place = Place::new(&[]);
     let trials = [&[0.0, 0.5][..], &[0.0, 1.0]];
-    run(&folder, "here", &[GENERATIONS], &trials);
-    run(&folder, "there", &[GENERATIONS, ("world.pois", "[[10, 15], [20, 16]]")], &trials);
-    let (_, told) = good(&folder, "compare here there");
+    run(&place, "here", &[GENERATIONS], &trials);
+    run(&place, "there", &[GENERATIONS, ("world.pois", "[[10, 15], [20, 16]]")], &trials);
+    let (_, told) = place.good("compare here there");
     assert!(told.contains("note: the arms play in different layouts: world.pois differ"), "{told}");
     assert!(!told.contains("--paired"), "{told}");
 }
@@ -373,15 +358,25 @@ fn a_folder_whose_name_is_no_text_is_told_as_well_as_can_be() {
     use std::ffi::OsStr;
     use std::os::unix::ffi::OsStrExt;
 
-    let folder = tempfile::tempdir().unwrap();
+    let place = Place::new(&[]);
     let trials = [&[0.0, 0.5][..], &[0.0, 1.0]];
-    run(&folder, "one", &[GENERATIONS], &trials);
-    run(&folder, "two", &[GENERATIONS, FITNESS_G], &trials);
+    run(&place, "one", &[GENERATIONS], &trials);
+    run(&place, "two", &[GENERATIONS, FITNESS_G], &trials);
     let odd = OsStr::from_bytes(b"two\xff");
-    fs::rename(folder.path().join("two"), folder.path().join(odd)).unwrap();
-    let mut command = cargo_bin_cmd!("flotilla");
-    let output = command.current_dir(folder.path()).args(["compare", "--json", "one"]).arg(odd).output().unwrap();
+    fs::rename(place.path("two"), place.path(odd)).unwrap();
+    let output = place.command().args(["compare", "--json", "one"]).arg(odd).output().unwrap();
     assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
     let told: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!(told["comparisons"][0]["arms"][1]["folders"][0], "two\u{fffd}");
+}
+
+#[test]
+fn a_copied_run_is_told() {
+    let place = Place::new(&[("x.toml", &format!("{WORLD}[learning]\npopulation = 4\ngenerations = 1\ntrials = 2\n"))]);
+    for (folder, flags) in [("a", ""), ("b", "--seed 1"), ("c", "--checkpoint-generations 1")] {
+        place.good(&format!("train x.toml --out {folder} --backend cpu --quiet {flags}"));
+    }
+    let (_, told) = place.good("compare a b c");
+    assert_eq!(told, "note: c is a copy of a: the same run\n");
+    assert!(!place.good("compare b c").1.contains("copy"));
 }

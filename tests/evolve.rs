@@ -2,6 +2,8 @@
 //!
 //! Statistics are of seeded draws: counts and means have to lie within five standard deviations of what they should be.
 
+mod support;
+
 use std::collections::HashSet;
 
 use fearless_simd::Level;
@@ -17,12 +19,12 @@ use proptest::prelude::*;
 
 const PURPOSES: [Purpose; 5] =
     [Purpose::Weights, Purpose::Teams, Purpose::Starts, Purpose::Tournament, Purpose::Mutation];
-const GENERALLY_FORWARD: &str = include_str!("../configs/generally_forward.toml");
-const STRICTLY_FORWARD: &str = include_str!("../configs/strictly_forward.toml");
-const CHAOTIC: &str = include_str!("../configs/chaotic.toml");
+const GENERALLY_FORWARD: &str = "generally_forward";
+const STRICTLY_FORWARD: &str = "strictly_forward";
+const CHAOTIC: &str = "chaotic";
 
-fn config(text: &str, change: impl FnOnce(&mut Config)) -> Config {
-    let mut config = Config::parse(text, "config").unwrap();
+fn config(layout: &str, change: impl FnOnce(&mut Config)) -> Config {
+    let mut config = support::layout(layout);
     change(&mut config);
     // What a test asks for has to be what a user may ask for.
     config.with(&[]).unwrap()
@@ -504,10 +506,8 @@ set = { world.coupling = [1, 2], motion.max_speed = 5.0 }
 fn train(configs: &[Config]) -> Vec<(Vec<Row>, Vec<Vec<f32>>)> {
     let (mut trainer, mut backend) = (Trainer::new(configs.to_vec()), Cpu::default());
     let mut rows = vec![Vec::new(); configs.len()];
-    while !trainer.is_done() {
-        for row in trainer.advance(&mut backend).unwrap() {
-            rows[row.arm].push(row);
-        }
+    for row in trainer.finish(&mut backend).unwrap() {
+        rows[row.arm].push(row);
     }
     rows.into_iter().enumerate().map(|(arm, rows)| (rows, trainer.policies(arm))).collect()
 }

@@ -214,12 +214,10 @@ pub fn train(configs: &[Config], backend: &mut dyn Backend) -> Vec<(Golden, f64)
     let mut trainer = Trainer::new(configs.to_vec());
     let mut texts = vec![String::from("trial,generation,best_g,mean_g,champion_g\n"); configs.len()];
     let mut most = vec![0f64; configs.len()];
-    while !trainer.is_done() {
-        for row in trainer.advance(backend).unwrap() {
-            most[row.arm] = most[row.arm].max(row.best_g);
-            let Row { arm, trial, generation, best_g, mean_g, champion_g } = row;
-            writeln!(texts[arm], "{trial},{generation},{best_g},{mean_g},{champion_g}").unwrap();
-        }
+    for row in trainer.finish(backend).unwrap() {
+        most[row.arm] = most[row.arm].max(row.best_g);
+        let Row { arm, trial, generation, best_g, mean_g, champion_g } = row;
+        writeln!(texts[arm], "{trial},{generation},{best_g},{mean_g},{champion_g}").unwrap();
     }
     let golden = |(arm, text): (usize, &String)| {
         let mut hash = Sha256::new_with_prefix(text);

@@ -2,13 +2,15 @@
 
 #![cfg(feature = "cli")]
 
+mod support;
+
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::Command;
 
 use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::config::{self, Config};
-use tempfile::TempDir;
+use support::Place;
 
 #[allow(dead_code, reason = "its main is cargo's")]
 #[path = "../build.rs"]
@@ -104,15 +106,9 @@ fn without_git_the_commit_is_what_the_archive_says_or_nothing() {
     assert_eq!(build::commit(folder.path()).0, None);
 }
 
-/// Runs a command in a folder, with something on standard input.
-fn run(folder: &TempDir, line: &str, input: &str) -> Output {
-    let mut command = cargo_bin_cmd!("flotilla");
-    command.args(line.split_whitespace()).current_dir(folder.path()).write_stdin(input).output().unwrap()
-}
-
-/// Standard output and standard error of a command that must succeed.
-fn good(folder: &TempDir, line: &str, input: &str) -> (String, String) {
-    let output = run(folder, line, input);
+/// Standard output and standard error of a command that must succeed, with something on standard input.
+fn fed(place: &Place, line: &str, input: &str) -> (String, String) {
+    let output = place.command().args(line.split_whitespace()).write_stdin(input).output().unwrap();
     let told = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(0), "{line}: {told}");
     (String::from_utf8(output.stdout).unwrap(), told)
@@ -122,15 +118,15 @@ const LAYOUTS: [&str; 3] = ["generally_forward", "strictly_forward", "chaotic"];
 
 #[test]
 fn a_config_to_start_from_says_every_key_and_is_its_layouts() {
-    let folder = tempfile::tempdir().unwrap();
+    let place = Place::new(&[]);
     for layout in LAYOUTS {
-        let (text, told) = good(&folder, &format!("init {}", layout.replace('_', "-")), "");
+        let (text, told) = place.good(&format!("init {}", layout.replace('_', "-")));
         assert_eq!(told, "");
         assert!(text.lines().all(|line| line.chars().count() <= 120), "{text}");
         let from =
             fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("configs/{layout}.toml"))).unwrap();
         assert_eq!(text.lines().next(), from.lines().next(), "what it is, to begin with");
-        let checked = |text: &str| good(&folder, "check -", text).0;
+        let checked = |text: &str| fed(&place, "check -", text).0;
         assert_eq!(checked(&text), checked(&from));
         // Each key once, below all that there is to know of it.
         let mut told = String::new();
@@ -156,28 +152,28 @@ fn a_config_to_start_from_says_every_key_and_is_its_layouts() {
             }
         }
     }
-    assert_eq!(good(&folder, "init", ""), good(&folder, "init generally-forward", ""));
-    assert_eq!(run(&folder, "init spiral", "").status.code(), Some(2));
-    assert_eq!(run(&folder, "init --force", "").status.code(), Some(2), "there is no file to write over");
+    assert_eq!(place.good("init"), place.good("init generally-forward"));
+    assert_eq!(place.run("init spiral").status.code(), Some(2));
+    assert_eq!(place.run("init --force").status.code(), Some(2), "there is no file to write over");
 }
 
 #[test]
 fn a_config_to_start_from_trains_and_writes_over_nothing() {
-    let folder = tempfile::tempdir().unwrap();
-    assert_eq!(good(&folder, "init -o my.toml", "").0, "my.toml\n");
-    let there = fs::read_to_string(folder.path().join("my.toml")).unwrap();
-    assert_eq!(there, good(&folder, "init", "").0);
-    good(&folder, "train my.toml --backend cpu --generations 1 --trials 1 -q -o run", "");
-    let again = run(&folder, "init chaotic --out my.toml", "");
+    let place = Place::new(&[]);
+    assert_eq!(place.good("init -o my.toml").0, "my.toml\n");
+    let there = place.read("my.toml");
+    assert_eq!(there, place.good("init").0);
+    place.good("train my.toml --backend cpu --generations 1 --trials 1 -q -o run");
+    let again = place.run("init chaotic --out my.toml");
     let told = String::from_utf8(again.stderr).unwrap();
     assert_eq!(
         (again.status.code(), told.contains("it is there already; choose another --out, or --force")),
         (Some(1), true),
         "{told}"
     );
-    assert_eq!(fs::read_to_string(folder.path().join("my.toml")).unwrap(), there);
-    good(&folder, "init chaotic --out my.toml --force", "");
-    assert_eq!(fs::read_to_string(folder.path().join("my.toml")).unwrap(), good(&folder, "init chaotic", "").0);
+    assert_eq!(place.read("my.toml"), there);
+    place.good("init chaotic --out my.toml --force");
+    assert_eq!(place.read("my.toml"), place.good("init chaotic").0);
 }
 
 const SMALL: &str = "
@@ -195,33 +191,29 @@ trials = 1
 
 #[test]
 fn every_command_that_reads_a_config_reads_standard_input() {
-    let folder = tempfile::tempdir().unwrap();
-    let read = |name: &str| fs::read(folder.path().join(name)).unwrap();
-    let (_, told) = good(&folder, "train - --backend cpu --seed 3", SMALL);
+    let place = Place::new(&[]);
+    let read = |name: &str| fs::read(place.path(name)).unwrap();
+    let (_, told) = fed(&place, "train - --backend cpu --seed 3", SMALL);
     assert!(told.contains("into runs/config\n"), "{told}");
     // What is kept is a config like any other: training from it repeats the run.
-    assert!(Config::load(&folder.path().join("runs/config/config.toml")).is_ok());
-    good(&folder, "train runs/config/config.toml --backend cpu -q -o again", "");
+    assert!(Config::load(&place.path("runs/config/config.toml")).is_ok());
+    place.good("train runs/config/config.toml --backend cpu -q -o again");
     assert_eq!(read("again/policies.safetensors"), read("runs/config/policies.safetensors"));
-    let (done, _) = good(&folder, "train - --backend cpu --seed 3 --resume", SMALL);
+    let (done, _) = fed(&place, "train - --backend cpu --seed 3 --resume", SMALL);
     assert!(done.contains("runs/config"), "{done}");
     let policies = "--policies again/policies.safetensors";
-    let small = folder.path().join("small.toml");
+    let small = place.path("small.toml");
     fs::write(&small, SMALL).unwrap();
     for line in ["check FILE", "check FILE --json", &format!("rollout FILE --backend cpu {policies} --json")] {
-        let [from_file, from_input] =
-            ["small.toml", "-"].map(|name| good(&folder, &line.replace("FILE", name), SMALL).0);
+        let [from_file, from_input] = ["small.toml", "-"].map(|name| fed(&place, &line.replace("FILE", name), SMALL).0);
         assert_eq!(from_file, from_input, "{line}");
     }
-    good(&folder, "bench - --backend cpu --teams 2 --rollout-only --json", SMALL);
+    fed(&place, "bench - --backend cpu --teams 2 --rollout-only --json", SMALL);
     let wrong = SMALL.replace("steps = 4", "steps = 0");
     for line in ["check -", "train -", &format!("rollout - {policies}"), "verify -", "bench -", "sweep -"] {
-        let output = run(
-            &folder,
-            line,
-            &(wrong.clone() + "[grid]\n")
-                .replace("[grid]\n", if line == "sweep -" { "[grid]\n'learning.seed' = [1]\n" } else { "" }),
-        );
+        let grid = if line == "sweep -" { "[grid]\n'learning.seed' = [1]\n" } else { "" };
+        let input = wrong.clone() + grid;
+        let output = place.command().args(line.split_whitespace()).write_stdin(input).output().unwrap();
         let told = String::from_utf8(output.stderr).unwrap();
         assert!(told.contains("standard input:7: world.steps: found 0, allowed 1 to 10000"), "{line}: {told}");
         assert_eq!(output.status.code(), Some(1));
@@ -230,29 +222,29 @@ fn every_command_that_reads_a_config_reads_standard_input() {
 
 #[test]
 fn a_sweep_from_standard_input_is_gone_on_with_from_its_folder() {
-    let folder = tempfile::tempdir().unwrap();
+    let place = Place::new(&[]);
     let sweep = SMALL.to_string() + "[grid]\n'learning.seed' = [1, 2]\n";
-    let (told, _) = good(&folder, "sweep - --backend cpu -q --shard 1/2", &sweep);
+    let (told, _) = fed(&place, "sweep - --backend cpu -q --shard 1/2", &sweep);
     assert!(told.contains("flotilla sweep runs/sweep/sweep.toml --out runs/sweep --backend cpu --collect"), "{told}");
-    good(&folder, "sweep runs/sweep/sweep.toml --out runs/sweep --backend cpu -q --shard 2/2", "");
-    let (all, _) = good(&folder, "sweep - --collect", &sweep);
+    place.good("sweep runs/sweep/sweep.toml --out runs/sweep --backend cpu -q --shard 2/2");
+    let (all, _) = fed(&place, "sweep - --collect", &sweep);
     assert!(all.starts_with("2 of 2 points are done."), "{all}");
-    let (script, _) = good(&folder, "sweep - --slurm", &sweep);
+    let (script, _) = fed(&place, "sweep - --slurm", &sweep);
     assert!(script.contains("/runs/sweep/sweep.toml"), "{script}");
 }
 
 #[test]
 fn shells_complete_commands_and_flags() {
-    let folder = tempfile::tempdir().unwrap();
+    let place = Place::new(&[]);
     for shell in ["bash", "elvish", "fish", "powershell", "zsh"] {
-        let (script, _) = good(&folder, &format!("completions {shell}"), "");
+        let (script, _) = place.good(&format!("completions {shell}"));
         for word in ["rollout", "start-jitter", "completions"] {
             assert!(script.contains(word), "{word} in {shell}");
         }
     }
-    assert_eq!(run(&folder, "completions tcsh", "").status.code(), Some(2));
+    assert_eq!(place.run("completions tcsh").status.code(), Some(2));
     // As a shell would use it.
-    fs::write(folder.path().join("flotilla.bash"), good(&folder, "completions bash", "").0).unwrap();
+    fs::write(place.path("flotilla.bash"), place.good("completions bash").0).unwrap();
     let complete = |line: &str| {
         let words: Vec<&str> = line.split(' ').collect();
         let (last, before) = (words[words.len() - 1], words[words.len() - 2]);
@@ -261,7 +253,7 @@ fn shells_complete_commands_and_flags() {
              echo \"${{COMPREPLY[@]}}\"",
             words.len() - 1
         );
-        let output = Command::new("bash").args(["-c", &script]).current_dir(folder.path()).output().unwrap();
+        let output = Command::new("bash").args(["-c", &script]).current_dir(place.root()).output().unwrap();
         assert!(output.stderr.is_empty(), "{}", String::from_utf8_lossy(&output.stderr));
         String::from_utf8(output.stdout).unwrap().trim().to_string()
     };
@@ -272,9 +264,9 @@ fn shells_complete_commands_and_flags() {
 
 #[test]
 fn every_command_has_a_manual_page() {
-    let folder = tempfile::tempdir().unwrap();
-    good(&folder, "man -o pages", "");
-    let page = |name: &str| fs::read_to_string(folder.path().join("pages").join(name)).unwrap();
+    let place = Place::new(&[]);
+    place.good("man -o pages");
+    let page = |name: &str| fs::read_to_string(place.path("pages").join(name)).unwrap();
     let first = page("flotilla.1");
     let mut commands = 0;
     for command in flotilla::cli::command().get_subcommands() {
@@ -288,7 +280,7 @@ fn every_command_has_a_manual_page() {
         assert!(first.contains(&name.replace('-', "\\-")), "{name} in {first}");
         commands += 1;
     }
-    assert_eq!(fs::read_dir(folder.path().join("pages")).unwrap().count(), commands + 1);
+    assert_eq!(fs::read_dir(place.path("pages")).unwrap().count(), commands + 1);
 }
 
 /// Every command that writes a file takes it by `-o`, and every one that shows progress can be made quiet by `-q`.
@@ -308,19 +300,19 @@ fn the_same_letters_mean_the_same_everywhere() {
 
 #[test]
 fn pictures_and_replays_are_told_as_json() {
-    let folder = tempfile::tempdir().unwrap();
-    good(&folder, "train - --backend cpu -q -o run", SMALL);
+    let place = Place::new(&[]);
+    fed(&place, "train - --backend cpu -q -o run", SMALL);
     let json = |line: &str| -> serde_json::Value {
-        let (text, told) = good(&folder, line, "");
+        let (text, told) = place.good(line);
         assert_eq!(told, "", "{line}");
         serde_json::from_str(&text).unwrap()
     };
     let object = json("plot run --json -o curves.svg");
     assert_eq!((&object["out"], &object["runs"][0]), (&"curves.svg".into(), &"run".into()));
     let object = json("replay run --json -q --backend cpu --compare 0 -o replay.svg");
-    let bytes = fs::metadata(folder.path().join("replay.svg")).unwrap().len();
+    let bytes = fs::metadata(place.path("replay.svg")).unwrap().len();
     assert_eq!((&object["out"], &object["bytes"]), (&"replay.svg".into(), &bytes.into()));
-    let metrics = fs::read_to_string(folder.path().join("run/metrics.csv")).unwrap();
+    let metrics = place.read("run/metrics.csv");
     for (episode, generation) in [(0, 0), (1, 2)] {
         let episode = &object["episodes"][episode];
         assert_eq!((&episode["trial"], &episode["generation"]), (&0.into(), &generation.into()));

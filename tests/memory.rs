@@ -3,12 +3,13 @@
 
 #![cfg(feature = "cli")]
 
+mod support;
+
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use assert_cmd::cargo::cargo_bin;
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::Config;
 use flotilla::memory::{self, Peaks};
@@ -50,7 +51,7 @@ fn peak(command: &mut Command) -> Option<u64> {
 }
 
 fn foretold(config: &std::path::Path) -> u64 {
-    let output = Command::new(cargo_bin!("flotilla")).arg("check").arg(config).arg("--json").output().unwrap();
+    let output = support::flotilla().arg("check").arg(config).arg("--json").output().unwrap();
     let json: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     json["cost"]["host_bytes"].as_u64().unwrap()
 }
@@ -66,7 +67,7 @@ fn a_run_takes_what_was_foretold() {
         let folder = tempfile::tempdir().unwrap();
         let config = folder.path().join("config.toml");
         fs::write(&config, text(population, trials, 2, checkpoint)).unwrap();
-        let mut train = Command::new(cargo_bin!("flotilla"));
+        let mut train = support::flotilla();
         train.arg("train").arg(&config).args(["--backend", "cpu", "--quiet", "--out"]).arg(folder.path().join("run"));
         let Some(peak) = peak(&mut train) else {
             println!("skipped: this system does not tell what a process takes");
@@ -93,7 +94,7 @@ fn a_run_that_does_not_fit_does_not_start() {
         return;
     }
     fs::write(&path, text).unwrap();
-    let mut train = Command::new(cargo_bin!("flotilla"));
+    let mut train = support::flotilla();
     let output = train.arg("train").arg(&path).args(["--backend", "cpu", "--out"]).arg(&out).output().unwrap();
     assert_eq!(output.status.code(), Some(1));
     let told = String::from_utf8(output.stderr).unwrap();

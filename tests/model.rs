@@ -7,6 +7,8 @@
 
 #![cfg(feature = "cli")]
 
+mod support;
+
 use std::f64::consts::PI;
 
 use flotilla::backend::cpu::{Cpu, level_name};
@@ -603,7 +605,7 @@ actions = 'behaviours'";
 /// So do crowds, whose pairs are found by bounds: of just more than 32 agents, and around the ends of words and vectors.
 #[test]
 fn crowds_follow_the_mission() {
-    let layout = Config::parse(include_str!("../configs/generally_forward.toml"), "generally_forward.toml").unwrap();
+    let layout = support::layout("generally_forward");
     for agents in [33, 63, 64, 65, 127, 130] {
         let mut config = with_agents(&layout, agents).unwrap();
         config.world.steps = 8;

@@ -12,10 +12,12 @@
 
 #![cfg(feature = "cli")]
 
+mod support;
+
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
@@ -145,16 +147,10 @@ fn calls(line: &str) -> Vec<String> {
 
 /// Runs a command as a shell does; its output where it failed.
 fn run(command: &str, folder: &Path) -> Result<(), String> {
-    let program = assert_cmd::cargo::cargo_bin!("flotilla");
-    let path = std::env::var("PATH").unwrap_or_default();
-    let path = format!("{}:{path}", program.parent().unwrap().display());
     let said = folder.join(".said");
     let output = fs::File::create(&said).unwrap();
-    let mut bash = Command::new("bash");
-    bash.args(["-c", command]).current_dir(folder).env("PATH", path).stdin(Stdio::null());
-    for name in ["SLURM_ARRAY_TASK_ID", "JOB_COMPLETION_INDEX", "FLOTILLA_SHARDS"] {
-        bash.env_remove(name);
-    }
+    let mut bash = support::shell("bash", command);
+    bash.current_dir(folder).stdin(Stdio::null());
     let mut child = bash.stderr(output.try_clone().unwrap()).stdout(output).spawn().unwrap();
     let start = Instant::now();
     let status = loop {

@@ -179,9 +179,9 @@ fn batches_cut_small_give_the_same_record() {
 /// Several experiments side by side end in the bits of each alone, on the GPU as on the CPU.
 #[test]
 fn training_gives_the_same_metrics_and_weights() {
-    let mut config = Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap();
+    let mut config = support::layout("generally_forward");
     (config.learning.trials, config.learning.generations, config.learning.population) = (2, 4, 20);
-    let mut jittered = Config::parse(include_str!("../configs/chaotic.toml"), "config").unwrap();
+    let mut jittered = support::layout("chaotic");
     (jittered.learning.trials, jittered.learning.generations, jittered.learning.population) = (1, 2, 20);
     (jittered.learning.start_jitter, jittered.learning.episodes_per_team) = (0.5, 3);
     jittered.learning.fitness = Fitness::Dpp;
@@ -192,10 +192,7 @@ fn training_gives_the_same_metrics_and_weights() {
     (relay.world.steps, relay.world.after) = (40, vec![vec![], vec![0], vec![], vec![2]]);
     let train = |backend: &mut dyn Backend, configs: &[Config]| {
         let mut trainer = Trainer::new(configs.to_vec());
-        let mut rows = Vec::new();
-        while !trainer.is_done() {
-            rows.extend(trainer.advance(backend).unwrap());
-        }
+        let rows = trainer.finish(backend).unwrap();
         let weights: Vec<Vec<Vec<f32>>> = (0..configs.len()).map(|arm| trainer.policies(arm)).collect();
         (rows, weights)
     };
@@ -234,7 +231,7 @@ fn structs_lie_alike_on_both_sides() {
 /// Drawn starts make one group an episode: batches of many groups, of which each has a few teams.
 #[test]
 fn held_out_episodes_come_to_the_same_on_every_backend() {
-    let mut config = Config::parse(include_str!("../configs/generally_forward.toml"), "generally forward").unwrap();
+    let mut config = support::layout("generally_forward");
     // Agents see each other at steps of their own.
     config.world.steps = 40;
     let world = World::new(&config);
@@ -277,7 +274,7 @@ fn verify_tells_as_json_what_it_compared() {
 /// What does not fit together is an error that says what, on every backend, before anything is played.
 #[test]
 fn a_wrong_index_is_an_error() {
-    let world = World::new(&Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap());
+    let world = World::new(&support::layout("generally_forward"));
     let (policies, leaders) = (3, world.leaders());
     let weights = sample::weights(&world, policies, 1);
     let teams: Vec<u32> = (0..2 * leaders as u32).map(|place| place % 3).collect();
@@ -307,7 +304,7 @@ fn a_wrong_index_is_an_error() {
         backend.rollout(&[good], &|_| ()).unwrap();
         let sizes = [leaders, policies, world.parameters()];
         let Some(mut held) = backend.hold(&weights, sizes).unwrap() else { continue };
-        let learning = Config::parse(include_str!("../configs/chaotic.toml"), "config").unwrap().learning;
+        let learning = support::layout("chaotic").learning;
         let key = Key::new(0, 0, Purpose::Mutation);
         for (parents, named) in [(vec![0; 11], "11 parents"), ([vec![0; 11], vec![3]].concat(), "policy 3 of 3")] {
             let breeding = Breeding { parents: &parents, key, generation: 0, learning: &learning };

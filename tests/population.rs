@@ -23,7 +23,7 @@ use flotilla::run::{Ended, Options, Session};
 use flotilla::trainer::{Row, Snapshot, SnapshotError, Trainer};
 
 fn learning() -> Learning {
-    Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap().learning
+    support::layout("generally_forward").learning
 }
 
 /// Weights `[leaders][slots][parameters]`, of all sizes that there may be.
@@ -90,20 +90,19 @@ fn breeding_gives_the_same_bits() {
 
 /// Experiments that differ in all that breeding and gathering depend on, and in length.
 fn arms() -> Vec<Config> {
-    let parse = |text| Config::parse(text, "config").unwrap();
-    let mut first = parse(include_str!("../configs/generally_forward.toml"));
+    let mut first = support::layout("generally_forward");
     (first.learning.trials, first.learning.generations, first.learning.population) = (2, 5, 21);
-    let mut second = parse(include_str!("../configs/chaotic.toml"));
+    let mut second = support::layout("chaotic");
     (second.learning.trials, second.learning.generations, second.learning.population) = (1, 3, 40);
     (second.learning.start_jitter, second.learning.episodes_per_team) = (0.5, 2);
     (second.learning.fitness, second.learning.elites) = (Fitness::D, 0);
     second.learning.mutation = Mutation::Additive;
-    let mut third = parse(include_str!("../configs/strictly_forward.toml"));
+    let mut third = support::layout("strictly_forward");
     (third.learning.trials, third.learning.generations, third.learning.population) = (1, 6, 7);
     (third.learning.paradigm, third.learning.mutation_probability) = (Paradigm::AllLeaders, 1.0);
     third.policy.hidden = vec![5, 30, 3];
     // Six leaders, more than are gathered at a time, share a population.
-    let mut fourth = parse(include_str!("../configs/strictly_forward.toml"));
+    let mut fourth = support::layout("strictly_forward");
     (fourth.learning.trials, fourth.learning.generations, fourth.learning.population) = (2, 4, 35);
     (fourth.learning.paradigm, fourth.learning.sharing) = (Paradigm::AllLeaders, Sharing::All);
     vec![first, second, third, fourth]
@@ -134,11 +133,7 @@ fn restored(snapshots: &[Snapshot]) -> Trainer {
 }
 
 fn train(trainer: &mut Trainer, backend: &mut dyn Backend) -> Story {
-    let mut rows = Vec::new();
-    while !trainer.is_done() {
-        rows.extend(trainer.advance(backend).unwrap());
-    }
-    Story { rows, policies: policies(trainer) }
+    Story { rows: trainer.finish(backend).unwrap(), policies: policies(trainer) }
 }
 
 /// What the CPU comes to, and its snapshots before each generation.

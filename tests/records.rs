@@ -238,7 +238,7 @@ fn whole_records_come_where_they_must() {
 /// at 2^20 teams 100 MB are 95. More teams by `FLOTILLA_TEAMS`.
 #[test]
 fn a_generation_moves_less_than_95_bytes_a_team() {
-    let mut config = config(include_str!("../configs/generally_forward.toml"));
+    let mut config = support::layout("generally_forward");
     let teams = std::env::var("FLOTILLA_TEAMS").map_or(1 << 11, |teams| teams.parse().unwrap());
     (config.learning.trials, config.learning.population, config.learning.generations) = (1, teams, 60);
     config.learning.fitness = Fitness::Df;

@@ -639,7 +639,7 @@ fn a_run_may_change_to_another_processor_and_back() {
 
 /// The real program.
 fn flotilla() -> Command {
-    let mut command = Command::new(assert_cmd::cargo::cargo_bin!("flotilla"));
+    let mut command = support::flotilla();
     command.stdout(Stdio::piped()).stderr(Stdio::piped());
     command
 }

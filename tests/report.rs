@@ -2,12 +2,13 @@
 
 #![cfg(feature = "cli")]
 
+mod support;
+
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
-use assert_cmd::Command;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use flotilla::backend::cpu::Cpu;
@@ -20,7 +21,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 fn flotilla(arguments: &[&str]) -> Output {
-    Command::cargo_bin("flotilla").unwrap().args(arguments).output().unwrap()
+    support::flotilla().args(arguments).output().unwrap()
 }
 
 fn succeed(arguments: &[&str]) -> String {
@@ -754,9 +755,7 @@ fn what_is_trained_once_for_two_arms_is_the_same_for_both() {
     assert_eq!((configs.len(), places.len()), (15, 18));
     let course = |config: &Config| {
         let mut trainer = Trainer::new(vec![config.clone()]);
-        while !trainer.is_done() {
-            trainer.advance(&mut Cpu::default()).unwrap();
-        }
+        trainer.finish(&mut Cpu::default()).unwrap();
         trainer.policies(0)
     };
     let mut told_apart = 0;

@@ -1,6 +1,10 @@
 //! Teams stepped by hand come to what a backend's traces say, whatever instruction set, number of teams and order of
 //! resets; what cannot be stepped is told, and nothing moves then.
 
+mod support;
+
+use std::ops::Range;
+
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, BackendError, Episode, Group, Moment, Need, Seen, Strided, Trace};
 use flotilla::config::{Config, Fitness, MAX_POPULATION};
@@ -174,8 +178,7 @@ fn each_team_has_its_own_time() {
 }
 
 fn world() -> World {
-    let text = include_str!("../configs/generally_forward.toml");
-    World::new(&Config::parse(text, "generally_forward.toml").expect("the project's own config"))
+    World::new(&support::layout("generally_forward"))
 }
 
 #[test]

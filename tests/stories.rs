@@ -26,11 +26,9 @@ fn the_pages_tell_what_comes_out() {
     assert_eq!((learning.population, learning.generations), (50, 100));
     let (configs, places) = paper::trained(&arms);
     let (mut trainer, mut backend) = (Trainer::new(configs), Cpu::default());
-    while !trainer.is_done() {
-        for row in trainer.advance(&mut backend).unwrap() {
-            let of = (0..arms.len()).filter(|&arm| places[arm] == row.arm);
-            of.for_each(|arm| arms[arm].add(&Row { arm, ..row }));
-        }
+    for row in trainer.finish(&mut backend).unwrap() {
+        let of = (0..arms.len()).filter(|&arm| places[arm] == row.arm);
+        of.for_each(|arm| arms[arm].add(&Row { arm, ..row }));
     }
     let mut baselines = Baselines::new(paper::grounds(&arms));
     while !baselines.is_done() {

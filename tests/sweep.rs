@@ -3,6 +3,8 @@
 
 #![cfg(feature = "cli")]
 
+mod support;
+
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -53,11 +55,8 @@ fn written(text: &str) -> (TempDir, PathBuf) {
 }
 
 fn command(sweep: &Path, out: &Path, flags: &[&str]) -> Command {
-    let mut command = Command::new(assert_cmd::cargo::cargo_bin!("flotilla"));
+    let mut command = support::flotilla();
     command.arg("sweep").arg(sweep).arg("--out").arg(out).args(["--backend", "cpu"]).args(flags);
-    for name in ["SLURM_ARRAY_TASK_ID", "JOB_COMPLETION_INDEX", "FLOTILLA_SHARDS"] {
-        command.env_remove(name);
-    }
     command
 }
 
@@ -431,10 +430,7 @@ fn points_come_out_of_one_batch_as_they_do_alone() {
     let train = |configs: Vec<Config>| {
         let arms = configs.len();
         let mut trainer = Trainer::new(configs);
-        let mut rows = Vec::new();
-        while !trainer.is_done() {
-            rows.extend(trainer.advance(&mut Cpu::default()).unwrap());
-        }
+        let rows = trainer.finish(&mut Cpu::default()).unwrap();
         (0..arms)
             .map(|arm| {
                 let rows = rows.iter().filter(|row| row.arm == arm);
@@ -524,7 +520,7 @@ fn the_union_of_any_shards_is_the_unsharded_run() {
     // A point is a run like any other.
     let point = whole.join("points/0003");
     let alone = folder.path().join("alone");
-    let mut train = Command::new(assert_cmd::cargo::cargo_bin!("flotilla"));
+    let mut train = support::flotilla();
     train.arg("train").arg(point.join("config.toml")).arg("--out").arg(&alone).args(["--quiet", "--backend", "cpu"]);
     done(train.output().unwrap());
     assert_eq!(timeless(&alone.join("metrics.csv")), timeless(&point.join("metrics.csv")));
@@ -838,9 +834,7 @@ fn a_batch_of_unequal_points_costs_what_its_parts_do() {
         let mut trainer = Trainer::new(configs);
         let mut backend = Cpu::default();
         let start = Instant::now();
-        while !trainer.is_done() {
-            trainer.advance(&mut backend).unwrap();
-        }
+        trainer.finish(&mut backend).unwrap();
         start.elapsed().as_secs_f64()
     };
     let mut best = [f64::INFINITY; 2];

@@ -2,17 +2,17 @@
 
 #![cfg(feature = "cli")]
 
+mod support;
+
 use std::collections::HashMap;
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::Output;
+use std::path::PathBuf;
 
-use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::record::hex;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use sha2::{Digest, Sha256};
-use tempfile::TempDir;
+use support::Place;
 
 const CONFIG: &str = "
 [world]
@@ -30,58 +30,20 @@ trials = 3
 ";
 const PARAMETERS: usize = 9 * 5 + 6 * 2;
 
-/// A folder with `small.toml` in it, where commands run.
-struct Place(TempDir);
+/// A folder with `small.toml` in it. A GPU's driver may have things to tell of its own, so nothing is played on one.
+fn place() -> Place {
+    Place::new(&[("small.toml", CONFIG)]).on_cpu()
+}
 
-impl Place {
-    fn new() -> Place {
-        let place = Place(tempfile::tempdir().unwrap());
-        fs::write(place.path("small.toml"), CONFIG).unwrap();
-        place
-    }
+/// Writes a safetensors file with one tensor, as another program would.
+fn tensor(path: PathBuf, tensor: &str, dtype: Dtype, shape: &[usize], data: &[u8], layers: Option<&str>) {
+    let view = TensorView::new(dtype, shape.to_vec(), data).unwrap();
+    let metadata = layers.map(|layers| HashMap::from([("layers".to_string(), layers.to_string())]));
+    fs::write(path, safetensors::serialize([(tensor, view)], metadata).unwrap()).unwrap();
+}
 
-    fn path(&self, name: impl AsRef<Path>) -> PathBuf {
-        self.0.path().join(name)
-    }
-
-    /// Runs a command, on the CPU unless it says otherwise: a GPU's driver may have things to tell of its own.
-    fn run(&self, line: &str) -> Output {
-        let backend = if line.contains("--backend") { "" } else { " --backend cpu" };
-        let line = line.to_string() + backend;
-        cargo_bin_cmd!("flotilla").args(line.split_whitespace()).current_dir(self.0.path()).output().unwrap()
-    }
-
-    /// Standard output and standard error of a command that must succeed.
-    fn good(&self, line: &str) -> (String, String) {
-        let output = self.run(line);
-        let told = String::from_utf8(output.stderr).unwrap();
-        assert_eq!(output.status.code(), Some(0), "{line}: {told}");
-        (String::from_utf8(output.stdout).unwrap(), told)
-    }
-
-    /// The error of a command that must fail with a code and say nothing on standard output.
-    fn refused(&self, line: &str, code: i32) -> String {
-        let output = self.run(line);
-        let told = String::from_utf8(output.stderr).unwrap();
-        assert_eq!(output.status.code(), Some(code), "{line}: {told}");
-        assert!(output.stdout.is_empty(), "{line}");
-        told[told.find("error: ").unwrap_or_else(|| panic!("{line}: {told}"))..].to_string()
-    }
-
-    fn read(&self, name: &str) -> String {
-        fs::read_to_string(self.path(name)).unwrap()
-    }
-
-    /// Writes a safetensors file with one tensor, as another program would.
-    fn tensor(&self, name: &str, tensor: &str, dtype: Dtype, shape: &[usize], data: &[u8], layers: Option<&str>) {
-        let view = TensorView::new(dtype, shape.to_vec(), data).unwrap();
-        let metadata = layers.map(|layers| HashMap::from([("layers".to_string(), layers.to_string())]));
-        fs::write(self.path(name), safetensors::serialize([(tensor, view)], metadata).unwrap()).unwrap();
-    }
-
-    fn weights(&self, name: &str, shape: [usize; 3], weights: &[f32]) {
-        self.tensor(name, "weights", Dtype::F32, &shape, bytemuck::cast_slice(weights), None);
-    }
+fn weights(path: PathBuf, shape: [usize; 3], weights: &[f32]) {
+    tensor(path, "weights", Dtype::F32, &shape, bytemuck::cast_slice(weights), None);
 }
 
 /// Rows of a CSV file as text, and its header.
@@ -92,7 +54,7 @@ fn rows(text: &str) -> (&str, Vec<Vec<&str>>) {
 
 #[test]
 fn training_writes_a_folder_that_says_everything() {
-    let place = Place::new();
+    let place = place();
     let (summary, told) = place.good("train small.toml --backend cpu");
     assert!(told.starts_with("training on cpu ("), "{told}");
     let files = ["config.toml", "run.json", "metrics.csv", "policies.safetensors", "checkpoints"];
@@ -151,7 +113,7 @@ fn training_writes_a_folder_that_says_everything() {
 
 #[test]
 fn flags_stand_in_the_resolved_config_and_quiet_is_quiet() {
-    let place = Place::new();
+    let place = place();
     let (_, told) = place.good(
         "train small.toml --seed 4 --trials 1 --generations 2 --population 5 --fitness D++ --paradigm all-leaders \
          --checkpoint-generations 1 --checkpoint-seconds 0.5 --quiet --backend cpu",
@@ -170,7 +132,7 @@ fn flags_stand_in_the_resolved_config_and_quiet_is_quiet() {
         assert!(config.contains(line), "{line}: {config}");
     }
     assert_eq!(place.read("runs/small/metrics.csv").lines().count(), 1 + 3);
-    let error = place.refused("train small.toml --checkpoint-seconds -1", 2);
+    let error = place.refused(2, "train small.toml --checkpoint-seconds -1");
     assert!(error.contains("--checkpoint-seconds: found -1"), "{error}");
     // A config that is refused leaves no folder.
     assert!(!place.path("runs/small-2").exists());
@@ -178,16 +140,16 @@ fn flags_stand_in_the_resolved_config_and_quiet_is_quiet() {
 
 #[test]
 fn a_run_is_written_over_only_when_that_is_asked_for() {
-    let place = Place::new();
+    let place = place();
     let short = "--generations 1 --quiet";
     place.good(&format!("train small.toml {short}"));
     // Without --out, a free folder is taken.
     place.good(&format!("train small.toml {short}"));
     place.good(&format!("train small.toml {short}"));
     assert!(place.path("runs/small-2/run.json").exists() && place.path("runs/small-3/run.json").exists());
-    let error = place.refused(&format!("train small.toml --out runs/small {short}"), 1);
+    let error = place.refused(1, &format!("train small.toml --out runs/small {short}"));
     assert!(error.contains("runs/small holds a run already"), "{error}");
-    let error = place.refused(&format!("train small.toml --out runs/small --resume --seed 9 {short}"), 1);
+    let error = place.refused(1, &format!("train small.toml --out runs/small --resume --seed 9 {short}"));
     assert!(error.contains("learning.seed: 0 there, 9 here"), "{error}");
     place.good(&format!("train small.toml --out runs/small --force --seed 9 {short}"));
     assert!(place.read("runs/small/config.toml").contains("seed = 9"));
@@ -204,7 +166,7 @@ fn a_run_is_written_over_only_when_that_is_asked_for() {
 
 #[test]
 fn an_adapter_is_for_gpus() {
-    let place = Place::new();
+    let place = place();
     let output = place.run("train small.toml --backend cpu --adapter Voodoo");
     assert_eq!(output.status.code(), Some(2));
     assert!(!place.path("runs").exists());
@@ -212,7 +174,7 @@ fn an_adapter_is_for_gpus() {
 
 #[test]
 fn the_first_team_of_a_rollout_is_the_trials_champion() {
-    let place = Place::new();
+    let place = place();
     place.good("train small.toml --out run --generations 9 --quiet");
     let metrics = place.read("run/metrics.csv");
     for trial in 0..3 {
@@ -252,10 +214,10 @@ fn the_first_team_of_a_rollout_is_the_trials_champion() {
 
 #[test]
 fn rollout_takes_other_programs_files_and_refuses_what_it_cannot_play() {
-    let place = Place::new();
+    let place = place();
     let count = 2 * 3 * PARAMETERS;
     let good: Vec<f32> = (0..count).map(|index| (index as f32 - 90.0) / 50.0).collect();
-    place.weights("good.safetensors", [2, 3, PARAMETERS], &good);
+    weights(place.path("good.safetensors"), [2, 3, PARAMETERS], &good);
     let line = |file: &str| format!("rollout small.toml --policies {file}.safetensors --scores scores.csv");
     place.good(&line("good"));
     let scores = place.read("scores.csv");
@@ -264,9 +226,9 @@ fn rollout_takes_other_programs_files_and_refuses_what_it_cannot_play() {
     // Weights too small for the kernels are 0.
     let mut tiny = good.clone();
     tiny[5] = 0.0;
-    place.weights("zero.safetensors", [2, 3, PARAMETERS], &tiny);
+    weights(place.path("zero.safetensors"), [2, 3, PARAMETERS], &tiny);
     tiny[5] = 1e-40;
-    place.weights("tiny.safetensors", [2, 3, PARAMETERS], &tiny);
+    weights(place.path("tiny.safetensors"), [2, 3, PARAMETERS], &tiny);
     let [zero, tiny] = ["zero", "tiny"].map(|name| {
         place.good(&(line(name) + " --trace trace.csv"));
         (place.read("scores.csv"), place.read("trace.csv"))
@@ -276,8 +238,8 @@ fn rollout_takes_other_programs_files_and_refuses_what_it_cannot_play() {
     for (value, text) in [(f32::NAN, "NaN"), (f32::NEG_INFINITY, "-inf"), (2e6, "2000000")] {
         let mut bad = good.clone();
         bad[PARAMETERS * 4 + 7] = value;
-        place.weights("bad.safetensors", [2, 3, PARAMETERS], &bad);
-        let error = place.refused(&line("bad"), 1);
+        weights(place.path("bad.safetensors"), [2, 3, PARAMETERS], &bad);
+        let error = place.refused(1, &line("bad"));
         assert!(
             error.contains(&format!("weights[1, 1, 7] is {text}, allowed are numbers of size up to 1048576")),
             "{error}"
@@ -293,39 +255,39 @@ fn rollout_takes_other_programs_files_and_refuses_what_it_cannot_play() {
         (Dtype::F64, vec![1, 3, PARAMETERS], format!("weights is F64 [1, 3, {PARAMETERS}]")),
         (Dtype::I32, vec![2, 3, PARAMETERS], format!("weights is I32 [2, 3, {PARAMETERS}]")),
     ] {
-        place.tensor("bad.safetensors", "weights", dtype, &shape, bytes, None);
-        let error = place.refused(&line("bad"), 1);
+        tensor(place.path("bad.safetensors"), "weights", dtype, &shape, bytes, None);
+        let error = place.refused(1, &line("bad"));
         assert!(error.contains(&found) && error.contains(&needs), "{error}");
     }
-    place.tensor("bad.safetensors", "weights", Dtype::F32, &[2, 0, PARAMETERS], &[], None);
-    assert!(place.refused(&line("bad"), 1).contains(&needs));
-    place.tensor("bad.safetensors", "weights", Dtype::F32, &[2, 3, PARAMETERS], bytes, Some("8,4,1,2"));
-    assert!(place.refused(&line("bad"), 1).contains("layers \"8,4,1,2\", but the config's have \"8,5,2\""));
-    place.tensor("bad.safetensors", "w", Dtype::F32, &[2, 3, PARAMETERS], bytes, None);
-    assert!(place.refused(&line("bad"), 1).contains("it has no tensor weights.0; it has w"));
-    assert!(place.refused(&(line("good") + " --trial 2"), 2).contains("it has no tensor weights.2; it has weights"));
+    tensor(place.path("bad.safetensors"), "weights", Dtype::F32, &[2, 0, PARAMETERS], &[], None);
+    assert!(place.refused(1, &line("bad")).contains(&needs));
+    tensor(place.path("bad.safetensors"), "weights", Dtype::F32, &[2, 3, PARAMETERS], bytes, Some("8,4,1,2"));
+    assert!(place.refused(1, &line("bad")).contains("layers \"8,4,1,2\", but the config's have \"8,5,2\""));
+    tensor(place.path("bad.safetensors"), "w", Dtype::F32, &[2, 3, PARAMETERS], bytes, None);
+    assert!(place.refused(1, &line("bad")).contains("it has no tensor weights.0; it has w"));
+    assert!(place.refused(2, &(line("good") + " --trial 2")).contains("it has no tensor weights.2; it has weights"));
     // Every learner needs policies.
-    assert!(place.refused(&(line("good") + " --paradigm all-leaders"), 1).contains("needs F32 [5, "));
+    assert!(place.refused(1, &(line("good") + " --paradigm all-leaders")).contains("needs F32 [5, "));
 
     let whole = fs::read(place.path("good.safetensors")).unwrap();
     for cut in [0, 7, 8, 40, whole.len() - 1] {
         fs::write(place.path("bad.safetensors"), &whole[..cut]).unwrap();
-        let error = place.refused(&line("bad"), 1);
+        let error = place.refused(1, &line("bad"));
         assert!(error.contains("bad.safetensors: it is cut short"), "{error}");
     }
     fs::write(place.path("bad.safetensors"), "not tensors at all").unwrap();
-    assert!(place.refused(&line("bad"), 1).contains("it is no safetensors file"));
-    assert!(place.refused(&line("missing"), 1).contains("missing.safetensors: cannot be read"));
-    place.refused("rollout small.toml --policies good.safetensors --scores no/such/folder.csv", 1);
+    assert!(place.refused(1, &line("bad")).contains("it is no safetensors file"));
+    assert!(place.refused(1, &line("missing")).contains("missing.safetensors: cannot be read"));
+    place.refused(1, "rollout small.toml --policies good.safetensors --scores no/such/folder.csv");
     assert_eq!(place.run("rollout small.toml").status.code(), Some(2));
 }
 
 #[test]
 fn a_finished_run_is_extended() {
-    let place = Place::new();
+    let place = place();
     place.good("train small.toml --out whole --generations 11 --quiet");
     place.good("train small.toml --out run --quiet");
-    let error = place.refused("train small.toml --out run --resume --generations 5", 1);
+    let error = place.refused(1, "train small.toml --out run --resume --generations 5");
     assert!(error.contains("run is a run of 6 generations, which cannot become one of 5"), "{error}");
     let (summary, told) = place.good("train small.toml --out run --resume --generations 11");
     assert!(told.contains("going on before generation 7"), "{told}");
@@ -344,46 +306,38 @@ fn a_finished_run_is_extended() {
     place.good("replay run --trial 1 --generation 9");
 }
 
-/// A command as a shell runs it, on the CPU, with the program on its path.
-#[cfg(unix)]
-fn shell(place: &Place, line: &str) -> Output {
-    let program = assert_cmd::cargo::cargo_bin!("flotilla");
-    let path = format!("{}:{}", program.parent().unwrap().display(), std::env::var("PATH").unwrap());
-    std::process::Command::new("sh").args(["-c", line]).env("PATH", path).current_dir(place.0.path()).output().unwrap()
-}
-
 #[cfg(unix)]
 #[test]
 fn commands_that_are_told_run_as_they_are_told() {
-    let place = Place::new();
+    let place = place();
     let typed = r#"flotilla train small.toml --backend cpu --quiet --out "it's my \$HOME; run""#;
-    let output = shell(&place, typed);
+    let output = place.shell(typed);
     let said = String::from_utf8(output.stdout).unwrap();
     let (_, next) = said.split_once("Next:\n").expect(&said);
     let commands: Vec<&str> = next.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
     assert_eq!(commands.len(), 2, "{said}");
     for command in commands {
-        let output = shell(&place, &format!("{command} --backend cpu"));
+        let output = place.shell(&format!("{command} --backend cpu"));
         assert!(output.status.success(), "{command}: {}", String::from_utf8_lossy(&output.stderr));
     }
     // The run's record says what was typed, so that a shell reads it as it was.
     let record: serde_json::Value = serde_json::from_str(&place.read("it's my $HOME; run/run.json")).unwrap();
     let again = record["command"].as_str().unwrap().to_string() + " --force";
-    let output = shell(&place, &again);
+    let output = place.shell(&again);
     assert!(output.status.success(), "{again}: {}", String::from_utf8_lossy(&output.stderr));
     assert!(record.get("commit").is_some_and(|commit| *commit != ""));
     // What is refused says what to type, too.
-    let output = shell(&place, &format!("{typed} --tensorboard"));
+    let output = place.shell(&format!("{typed} --tensorboard"));
     let told = String::from_utf8(output.stderr).unwrap();
     let command = told.lines().last().unwrap();
     assert!(told.contains("holds a run already") && command.contains("--resume --tensorboard"), "{told}");
-    assert!(shell(&place, command).status.success(), "{command}");
+    assert!(place.shell(command).status.success(), "{command}");
     assert!(place.path("it's my $HOME; run/tensorboard/trial-0").exists());
 }
 
 #[test]
 fn a_summary_may_be_json() {
-    let place = Place::new();
+    let place = place();
     let (said, told) = place.good("train small.toml --out run --json --quiet");
     assert_eq!(told, "");
     let found: serde_json::Value = serde_json::from_str(&said).unwrap();
@@ -424,7 +378,7 @@ const JITTERY: &str = "rollout small.toml --policies run/policies.safetensors --
 
 /// Trained policies in `run/`.
 fn trained() -> Place {
-    let place = Place::new();
+    let place = place();
     place.good("train small.toml --out run --generations 4 --trials 1 --quiet");
     place
 }
@@ -577,15 +531,15 @@ fn rollout_refuses_flags_that_would_change_nothing() {
     let place = trained();
     let line = "rollout small.toml --policies run/policies.safetensors";
     for flags in ["--trials 2", "--generations 3", "--population 4", "--fitness D", "--seed 5", "--start-jitter 1"] {
-        place.refused(&format!("{line} {flags}"), 2);
+        place.refused(2, &format!("{line} {flags}"));
     }
     for flags in ["--episodes 2", "--episodes 1 --seed 5", "--episodes 2 --start-jitter 0"] {
-        let error = place.refused(&format!("{line} {flags}"), 2);
+        let error = place.refused(2, &format!("{line} {flags}"));
         assert!(error.contains("learning.start_jitter is 0, so all episodes are the same"), "{error}");
         assert!(error.contains("--start-jitter"), "what to do: {error}");
     }
-    place.refused(&format!("{line} --episodes 0"), 2);
-    let error = place.refused(&format!("{line} --episodes 2 --start-jitter -1"), 2);
+    place.refused(2, &format!("{line} --episodes 0"));
+    let error = place.refused(2, &format!("{line} --episodes 2 --start-jitter -1"));
     assert!(error.contains("--start-jitter: found -1"), "{error}");
     place.good(&format!("{line} --episodes 1"));
     // Where the config moves starts, no flag is needed.

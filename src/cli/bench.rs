@@ -7,7 +7,7 @@ use std::time::Duration;
 use fearless_simd::Level;
 use serde_json::json;
 
-use super::{BackendChoice, Breed, Error, Overrides, RunOptions, backend, print};
+use super::{BackendChoice, Breed, Error, Overrides, RunOptions, backend, between, print};
 use crate::backend::Machine;
 use crate::backend::cpu::{Cpu, level_name};
 use crate::bench::{self, Generations, Profile, Subject, Timing};
@@ -30,16 +30,16 @@ pub struct Args {
     run: RunOptions,
     /// Teams of a generation, one or several [default: 50,4096,131072; with --json, 4096]
     #[arg(long, value_name = "N,…", value_delimiter = ',',
-        value_parser = clap::value_parser!(u32).range(2..=config::MAX_POPULATION as i64))]
+        value_parser = between(2..=config::MAX_POPULATION as u32))]
     teams: Vec<u32>,
     /// Steps of an episode, one or several [default: the config's]
     #[arg(long, value_name = "N,…", value_delimiter = ',',
-        value_parser = clap::value_parser!(u32).range(1..=config::MAX_STEPS as i64))]
+        value_parser = between(1..=config::MAX_STEPS as u32))]
     steps: Vec<u32>,
     /// Agents of a team, one or several: leaders and followers in the config's ratio, laid out in groups as by
     /// `flotilla sweep` [default: the config's]
     #[arg(long, value_name = "N,…", value_delimiter = ',',
-        value_parser = clap::value_parser!(u32).range(1..=config::MAX_AGENTS as i64))]
+        value_parser = between(1..=config::MAX_AGENTS as u32))]
     agents: Vec<u32>,
     /// Leave whole generations out
     #[arg(long)]

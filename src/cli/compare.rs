@@ -7,9 +7,10 @@ use serde_json::json;
 
 use super::sweep::share;
 use super::{Error, print, say};
-use crate::config::Domain;
+use crate::config::{Config, Domain};
 use crate::file;
-use crate::record::folder::{self, SWEEP};
+use crate::record;
+use crate::record::folder::{self, RUN, Run, SWEEP};
 use crate::report::comparison::{self, At, Cohort, Comparison, ComparisonError, Question};
 use crate::report::runs::{self, MAX_RUNS, ReadError};
 use crate::sweep::{Sweep, results};
@@ -77,7 +78,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         let place = if comparison.place.is_empty() { String::new() } else { format!("{}: ", comparison.place) };
         notes.extend(comparison.notes.iter().map(|note| format!("{place}{note}")));
     }
-    // Of runs, all that there was to tell yet is that their layouts differ.
+    // Of runs, all that there was to tell yet is that their layouts differ or that one is another.
     let alike = args.folders.len() == 1 || told == 0;
     if !args.paired && alike && groups.iter().all(|(_, arms)| comparison::paired(arms)) {
         notes.push("these arms have the same seeds, so their trials are pairs: --paired compares pair by pair".into());
@@ -133,8 +134,22 @@ fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<
     if !layouts.is_empty() {
         notes.push(format!("the arms play in different layouts: {} differ", layouts.join(", ")));
     }
+    notes.extend(copies(folders, &configs));
     let arms = runs::labels(folders, &configs).into_iter().zip(folders);
     Ok(arms.map(|(name, folder)| Cohort::read(name, vec![folder.clone()])).collect::<Result<_, _>>()?)
+}
+
+/// What is to be told of runs that are one and the same: between them there is nothing to compare.
+fn copies(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
+    let digest = |folder: &PathBuf| Run::read(&folder.join(RUN)).ok()?.digest;
+    let runs: Vec<_> = folders.iter().zip(configs.iter().map(record::without_checkpoint)).collect();
+    let digests: Vec<_> = folders.iter().map(digest).collect();
+    let original = |place: usize| {
+        let first = (0..place).find(|&first| runs[first].1 == runs[place].1 && digests[first] == digests[place])?;
+        digests[place].as_ref()?;
+        Some(format!("{} is a copy of {}: the same run", folders[place].display(), folders[first].display()))
+    };
+    (0..folders.len()).filter_map(original).collect()
 }
 
 /// The values of an axis as arms, for each combination of the others; those without runs are noted.

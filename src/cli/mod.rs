@@ -5,7 +5,9 @@
 use std::ffi::OsString;
 use std::fmt::Display;
 use std::io::{self, Write};
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
+use std::str::FromStr;
 use std::sync::{LazyLock, OnceLock};
 
 use clap::builder::PossibleValuesParser as Words;
@@ -155,6 +157,22 @@ fn number(text: &str) -> Result<toml::Value, String> {
 /// A count, or a place from 0.
 fn whole(text: &str) -> Result<usize, String> {
     text.parse().map_err(|_| "allowed a whole number, from 0".into())
+}
+
+/// A whole number of a range.
+fn between<T>(allowed: RangeInclusive<T>) -> impl Fn(&str) -> Result<T, String> + Clone + Send + Sync
+where
+    T: FromStr + PartialOrd + Display + Clone + Send + Sync,
+{
+    move |text| {
+        let number = text.parse().ok().filter(|number| allowed.contains(number));
+        number.ok_or_else(|| format!("allowed a whole number from {} to {}", allowed.start(), allowed.end()))
+    }
+}
+
+/// A number.
+fn real(text: &str) -> Result<f64, String> {
+    text.parse().map_err(|_| "allowed a number".into())
 }
 
 /// Refuses names and values that hold line breaks or escape sequences: none is needed, and any could end up in a
@@ -354,7 +372,7 @@ pub struct RunOptions {
     #[arg(long, help_heading = WHERE, value_enum, default_value_t = Breed::Auto)]
     pub breed: Breed,
     /// CPU threads [default: all]
-    #[arg(long, help_heading = WHERE, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    #[arg(long, help_heading = WHERE, value_name = "N", value_parser = between(1..=1024u16))]
     pub threads: Option<u16>,
 }
 

@@ -9,6 +9,7 @@ use crate::record::folder::CONFIG;
 use crate::report::replay::ReplayError;
 use crate::report::runs;
 use crate::run::RunError;
+use crate::shell;
 
 /// About a device that cannot be had, or failed.
 pub fn device(error: &DeviceError) -> &'static str {
@@ -88,7 +89,8 @@ pub fn run(error: &RunError) -> String {
 pub fn shown(error: &runs::ReadError) -> String {
     match error {
         runs::ReadError::Missing(folder) => {
-            format!("; `flotilla train CONFIG --out {}` makes a run there", folder.display())
+            let command = shell::command(["flotilla", "train", "CONFIG", "--out", &folder.to_string_lossy()]);
+            format!("; `{command}` makes a run there")
         }
         runs::ReadError::NoFolder(_) => ", which `flotilla train` makes".into(),
         runs::ReadError::Foreign { .. } => "; `flotilla train CONFIG --out DIR` makes one that has".into(),
@@ -96,8 +98,9 @@ pub fn shown(error: &runs::ReadError) -> String {
             "\nfind a config that is whole, and repeat the run with `flotilla train CONFIG --out DIR`".into()
         }
         runs::ReadError::Unfinished { folder, .. } => {
-            let folder = folder.display();
-            format!("; finish the run with `flotilla train {folder}/{CONFIG} --out {folder} --resume`")
+            let [config, out] = [folder.join(CONFIG), folder.clone()].map(|path| path.to_string_lossy().into_owned());
+            let command = shell::command(["flotilla", "train", &config, "--out", &out, "--resume"]);
+            format!("; finish the run with `{command}`")
         }
         runs::ReadError::Record(error) => record(error, "try again"),
         runs::ReadError::Collection { .. } => String::new(),

@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use serde_json::json;
 
 use super::recovery::Signals;
-use super::{Error, RunOptions, backend, output, print, whole};
+use super::{Error, RunOptions, backend, between, output, print, whole};
 use crate::file;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
@@ -38,10 +38,10 @@ pub struct Args {
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Pixels across, of a .gif or .png [default: a .gif fits into 960 x 720, a .png has 300 an inch]
-    #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(100..=8192))]
+    #[arg(long, value_name = "PIXELS", value_parser = between(100..=8192u32))]
     width: Option<u32>,
     /// Pictures a second, of a .gif or a film [default: 20]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=50))]
+    #[arg(long, value_name = "N", value_parser = between(1..=50u32))]
     fps: Option<u32>,
     /// Print one JSON object
     #[arg(long)]

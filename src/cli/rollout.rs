@@ -7,7 +7,7 @@ use std::sync::Mutex;
 use clap::builder::PossibleValuesParser as Words;
 use serde_json::json;
 
-use super::{ConfigFile, Error, RunOptions, backend, output, print, say, whole};
+use super::{ConfigFile, Error, RunOptions, backend, between, output, print, real, say, whole};
 use crate::backend::{Backend, Group, Machine, Moment, Need};
 use crate::config::{Choice, Override, Paradigm};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Spread, Starts};
@@ -53,15 +53,15 @@ pub struct Args {
     quiet: bool,
 
     /// Play every team from so many jittered starts [default: once, from the config's own]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_EPISODES)),
+    #[arg(long, value_name = "N", value_parser = between(1..=MAX_EPISODES),
         help_heading = HELD_OUT)]
     episodes: Option<u32>,
     /// Start of these starts' randomness [default: 0, so that policies of any run meet the same starts]
-    #[arg(long, value_name = "S", requires = "episodes", value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64),
+    #[arg(long, value_name = "S", requires = "episodes", value_parser = between(0..=i64::MAX as u64),
         help_heading = HELD_OUT)]
     seed: Option<u64>,
     /// How far a start is moved at most, on each axis [default: the config's learning.start_jitter]
-    #[arg(long, value_name = "J", requires = "episodes", help_heading = HELD_OUT)]
+    #[arg(long, value_name = "J", requires = "episodes", value_parser = real, help_heading = HELD_OUT)]
     start_jitter: Option<f64>,
     /// How far a POI is moved at most, on each axis [default: the config's learning.poi_jitter]
     #[arg(long, value_name = "J", requires = "episodes", help_heading = HELD_OUT)]

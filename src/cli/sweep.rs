@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 
 use super::recovery::{self, Loss, Signals};
-use super::{Error, Overrides, RunOptions, backend, output, print, say, whole};
+use super::{Error, Overrides, RunOptions, backend, between, output, print, say, whole};
 use crate::config::{self, ConfigError, Problem};
 use crate::file;
 use crate::memory;
@@ -86,7 +86,7 @@ pub struct Args {
     sbatch: Vec<String>,
 
     /// A row of results.csv every N generations, and one for the last
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..), help_heading = RESULTS)]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = between(1..=u32::MAX), help_heading = RESULTS)]
     every: u32,
     /// G whose first generation is told, in 0..1
     #[arg(long, value_name = "G", default_value_t = 0.75, value_parser = share, help_heading = RESULTS)]

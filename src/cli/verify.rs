@@ -7,7 +7,7 @@ use std::process::Command;
 use fearless_simd::Level;
 use serde_json::json;
 
-use super::{Error, output, print};
+use super::{Error, between, output, print};
 use crate::backend::Backend;
 use crate::backend::cpu::{Cpu, level_name};
 use crate::backend::gpu;
@@ -26,13 +26,13 @@ pub struct Args {
     /// Compare this experiment alone (- is standard input), instead of random worlds of every kind
     config: Option<PathBuf>,
     /// Random teams of each world
-    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    #[arg(long, value_name = "N", default_value_t = 48, value_parser = between(1..=65_536u32))]
     teams: u32,
     /// Random worlds
-    #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = between(1..=100_000u32))]
     worlds: u32,
     /// Start of all randomness
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = between(0..=u32::MAX))]
     seed: u32,
     /// Only the adapter whose name contains this, or of this number
     #[arg(long, value_name = "NAME")]

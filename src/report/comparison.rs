@@ -47,6 +47,19 @@ impl Cohort {
         Ok(arm)
     }
 
+    /// Its name, and where its runs are.
+    fn told(&self) -> String {
+        const MOST: usize = 3;
+        let folders: Vec<String> = self.folders.iter().map(|folder| folder.display().to_string()).collect();
+        match folders.len().checked_sub(MOST) {
+            _ if folders == [&*self.name] || self.name.ends_with(&format!("({})", folders.concat())) => {
+                self.name.clone()
+            }
+            None | Some(0) => format!("{} ({})", self.name, folders.join(", ")),
+            Some(more) => format!("{} ({} and {more} more)", self.name, folders[..MOST].join(", ")),
+        }
+    }
+
     /// The last generation that all its trials have come to.
     fn last(&self) -> Option<usize> {
         self.trials.iter().map(|trial| trial.course.len()).min()?.checked_sub(1)
@@ -217,12 +230,12 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
     let mut last = usize::MAX;
     for arm in arms {
         if arm.trials.len() < 2 {
-            return Err(ComparisonError::OneTrial(arm.name.clone()));
+            return Err(ComparisonError::OneTrial(arm.told()));
         }
-        last = last.min(arm.last().ok_or_else(|| ComparisonError::TooShort(arm.name.clone()))?);
+        last = last.min(arm.last().ok_or_else(|| ComparisonError::TooShort(arm.told()))?);
     }
     if let Some(other) = arms.iter().find(|arm| options.paired && arm.keys() != arms[0].keys()) {
-        return Err(ComparisonError::NoPairs(arms[0].name.clone(), other.name.clone()));
+        return Err(ComparisonError::NoPairs(arms[0].told(), other.told()));
     }
     let mut generations = Vec::new();
     for &at in &options.at {
