@@ -348,10 +348,10 @@ fn hard_names_stay_names_in_scripts_pages_pictures_and_tables() {
     assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
     assert!(!place.path("x").exists() && !place.path("y").exists());
     place.good(&["sweep", &*sweep, "--out", &format!("sweep {hard}"), "--collect"]);
-    let mut table = csv::Reader::from_path(place.path(&format!("sweep {hard}")).join("results.csv")).unwrap();
+    let mut table = csv::Reader::from_path(place.path(format!("sweep {hard}")).join("results.csv")).unwrap();
     assert_eq!(table.headers().unwrap().iter().take(2).collect::<Vec<_>>(), ["world.coupling", "learning.fitness"]);
     assert_eq!(table.records().map(Result::unwrap).count(), 4 * 2 * 5);
-    let svg = fs::read_to_string(place.path(&format!("sweep {hard}")).join("curves.svg")).unwrap();
+    let svg = fs::read_to_string(place.path(format!("sweep {hard}")).join("curves.svg")).unwrap();
     assert!(!svg.contains("<b>"));
 }
 
