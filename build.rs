@@ -1,14 +1,19 @@
-//! Tells the program what it is built from: `FLOTILLA_TARGET`, and `FLOTILLA_COMMIT`, empty where it is not known.
+//! Tells the program what it is built from: `FLOTILLA_TARGET`, `FLOTILLA_RUSTC`, and `FLOTILLA_COMMIT`, empty where it is
+//! not known.
 //!
 //! Only release builds are told the commit: whoever embeds it is compiled anew at every commit.
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 fn main() {
     let variable = |name| std::env::var(name).unwrap_or_default();
     println!("cargo::rerun-if-changed=build.rs");
     println!("cargo::rustc-env=FLOTILLA_TARGET={}", variable("TARGET"));
+    let compiler = Command::new(variable("RUSTC")).arg("--version").output();
+    let compiler = compiler.map_or(String::new(), |output| String::from_utf8_lossy(&output.stdout).trim().into());
+    println!("cargo::rustc-env=FLOTILLA_RUSTC={compiler}");
     let (commit, files) = match variable("PROFILE").as_str() {
         "release" => commit(Path::new(&variable("CARGO_MANIFEST_DIR"))),
         _ => Default::default(),

@@ -7,6 +7,7 @@
 //   SLOTS      agents a thread plays, one after another
 //   SHARED     agents of a workgroup's teams
 //   TRACE      whether every stage of every step is kept
+//   SIGHTED    whether it is recorded which leaders each follower sees at each step
 //   TALLY      whether a follower counts the leaders that it sees in registers (SIGHTS of them), not in the record
 //   shape      the sizes
 //   variant    what the step has code of its own for
@@ -171,6 +172,31 @@ fn couple(task: Task, step: u32, now: u32, thread: u32) {
     }
 }
 
+// Records which leaders each follower sees before a step, of positions from `now` on: one thread a follower, word and
+// team.
+fn watch(task: Task, step: u32, now: u32, thread: u32) {
+    let followers = shape.agents - shape.leaders;
+    let words = (shape.leaders + 31u) / 32u;
+    let rows = followers * words;
+    // Behind the counts.
+    let sights = task.seen + followers * shape.leaders * task.teams;
+    for (var item = thread; item < rows * shape.teams; item += WORKGROUP) {
+        let team = item % shape.teams;
+        let row = item / shape.teams;
+        if team < task.teams {
+            let at = positions[now + (shape.leaders + row / words) * shape.teams + team];
+            let first = row % words * 32u;
+            let last = min(first + 32u, shape.leaders);
+            var seen = 0u;
+            for (var leader = first; leader < last; leader++) {
+                let place = positions[now + leader * shape.teams + team];
+                seen |= select(0u, 1u << (leader - first), sees(place.x - at.x, place.y - at.y));
+            }
+            record[sights + (step * rows + row) * task.teams + team] = seen;
+        }
+    }
+}
+
 fn trace(task: Task, step: u32, me: ptr<function, Agent>) {
     var moment: Moment;
     moment.inputs = (*me).inputs;
@@ -252,6 +278,9 @@ fn episode(
     var now = 0u;
     for (var step = task.first; step < task.end; step++) {
         let next = SHARED - now;
+        if SIGHTED {
+            watch(task, step, now, thread);
+        }
         for (var slot = 0u; slot < SLOTS; slot++) {
             var me = crew[slot];
             if me.plays {

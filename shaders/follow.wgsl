@@ -17,6 +17,12 @@ struct Course {
     speed: f32,
 }
 
+// Whether a follower sees the agent at offset (`dx`, `dy`): whether it is within the attraction radius.
+fn sees(dx: f32, dy: f32) -> bool {
+    let d2 = dx * dx + dy * dy;
+    return d2 <= world.attraction_radius2;
+}
+
 // Adds the agent at offset (`dx`, `dy`); tells whether it is within the attraction radius.
 fn influence(dx: f32, dy: f32, sums: ptr<function, Sums>) -> bool {
     let d2 = dx * dx + dy * dy;

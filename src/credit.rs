@@ -12,9 +12,9 @@
 use std::ops::RangeInclusive;
 
 use crate::backend::{Episode, Seen, Strided, owner_bits};
-use crate::config::Fitness;
+use crate::config::{Fitness, LedBy};
 use crate::model::couple::NEVER;
-use crate::world::World;
+use crate::world::{Led, World};
 
 /// Owner of an agent that belongs to no group.
 pub const NOBODY: u32 = u32::MAX;
@@ -32,6 +32,9 @@ pub struct Scores {
     pub df: Vec<f32>,
     /// D, or what copies of the leader would add, each its share (Rahmattalabi et al., the paper's reference 12).
     pub dpp: Vec<f32>,
+    /// G less G without the leader and, at each step, the followers that it [leads](lead) then. Empty where the
+    /// [sights](Episode::sights) were not recorded, unless nobody follows: then it is D.
+    pub dt: Vec<f32>,
 }
 
 /// Scratch for scoring one episode after another without allocating; one a thread.
@@ -56,13 +59,15 @@ pub struct Credit {
     /// By another rule than the default: the step at which each POI was observed, and would be otherwise, `[pois]`.
     observed_at: Vec<u32>,
     otherwise: Vec<u32>,
+    /// See [`lead`].
+    led: Vec<u32>,
 }
 
 impl Credit {
     /// Scores every leader of the team by `fitness` into `scores`, `[leaders]`, and returns how many POIs the team
     /// observed. The episode must be one of `world`, played with that fitness as a [need](crate::backend::Need).
     pub fn score(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
-        if !world.rule.is_plain() {
+        if !world.rule.is_plain() || fitness == Fitness::Dt {
             return self.replay(episode, world, fitness, scores);
         }
         self.observed.clear();
@@ -81,6 +86,7 @@ impl Credit {
                 self.count_lost(world);
                 scores.iter_mut().zip(&self.lost).for_each(|(score, &lost)| *score = share(lost, pois));
             }
+            Fitness::Dt => unreachable!("it was replayed"),
             Fitness::Dpp => {
                 self.add_copies(episode, world);
                 self.count_lost(world);
@@ -101,7 +107,12 @@ impl Credit {
             (observed, scores)
         };
         let ((observed, d), (_, df), (_, dpp)) = (by(Fitness::D), by(Fitness::Df), by(Fitness::Dpp));
-        Scores { observed, g: share(observed, world.pois.len()), d, df, dpp }
+        let dt = match (world.followers(), episode.sights.is_empty()) {
+            (0, _) => d.clone(),
+            (_, true) => vec![],
+            (_, false) => by(Fitness::Dt).1,
+        };
+        Scores { observed, g: share(observed, world.pois.len()), d, df, dpp, dt }
     }
 
     /// Which POIs were observed.
@@ -222,34 +233,54 @@ impl Credit {
     }
 }
 
-/// By any other rule than the default.
+/// By any other rule than the default, and Dt.
 impl Credit {
     /// [`Credit::score`], each fitness by its definition.
     fn replay(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
-        let Credit { owner, groups, observed_at, otherwise, .. } = self;
-        let (pois, words) = (world.pois.len(), world.constants.words as usize);
+        let Credit { owner, groups, observed_at, otherwise, led, .. } = self;
+        let (pois, words, leaders) = (world.pois.len(), world.constants.words as usize, world.leaders());
         let replay = Replay { sets: episode.sets, world };
         replay.observe(observed_at);
         let observed = count(observed_at);
-        let in_groups = fitness == Fitness::Df && world.followers() > 0;
-        if in_groups {
-            assign(&episode.seen, world, owner);
-            groups.clear();
-            gather(owner, world, groups);
+        // Whom else D takes out; nobody is missed where nothing was observed.
+        let taken = if world.followers() == 0 || observed == 0 { Fitness::D } else { fitness };
+        match taken {
+            Fitness::Df => {
+                assign(&episode.seen, world, owner);
+                groups.clear();
+                gather(owner, world, groups);
+            }
+            Fitness::Dt => lead(&episode.sights, world, led),
+            _ => {}
         }
-        for (leader, score) in scores.iter_mut().enumerate().take(world.leaders()) {
-            let mut lost = |out: &dyn Fn(usize) -> u32| {
-                replay.observe_without(observed_at, |_, word, agents| agents & !out(word), otherwise);
+        for (leader, score) in scores.iter_mut().enumerate().take(leaders) {
+            let mut lost = || {
+                let alone = |_, word, agents| agents & !alone(leader, word);
+                match taken {
+                    Fitness::Df => {
+                        let group = &groups[leader * words..][..words];
+                        replay.observe_without(observed_at, |_, word, agents| agents & !group[word], otherwise);
+                    }
+                    Fitness::Dt => {
+                        let stay = |step, word, agents| {
+                            let follow = each_bit(alone(step, word, agents)).filter(|bit| {
+                                let agent = word * 32 + bit;
+                                agent < leaders || !leads(led, world, step as usize - 1, agent - leaders, leader)
+                            });
+                            follow.map(|bit| 1 << bit).sum()
+                        };
+                        replay.observe_without(observed_at, stay, otherwise);
+                    }
+                    _ => replay.observe_without(observed_at, alone, otherwise),
+                }
                 observed - count(otherwise)
             };
             *score = match fitness {
                 Fitness::G => share(observed, pois),
-                Fitness::Df if in_groups => share(lost(&|word| groups[leader * words + word]), pois),
-                Fitness::D | Fitness::Df => share(lost(&|word| alone(leader, word)), pois),
+                Fitness::D | Fitness::Df | Fitness::Dt => share(lost(), pois),
                 Fitness::Dpp => {
-                    let lost = lost(&|word| alone(leader, word));
-                    let most = world.coupling.iter().copied().max().unwrap_or(0);
-                    let mut gain = |copies: u32| {
+                    let (lost, most) = (lost(), world.coupling.iter().copied().max().unwrap_or(0));
+                    let mut gain = |copies| {
                         replay.observe_with(observed_at, leader, copies, otherwise);
                         count(otherwise) - observed
                     };
@@ -259,6 +290,49 @@ impl Credit {
         }
         observed
     }
+}
+
+/// Which leaders lead each follower at each step, laid out as the sights are, `[steps][followers][words of leaders]`:
+/// of those that the follower saw at the steps that [count](crate::world::Led), the one that it saw at most, ties to the
+/// lower index, or all.
+pub fn lead(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
+    let (followers, words) = (world.followers(), world.leader_words());
+    let (steps, Led { within, by }) = (sights.len() / (followers * words).max(1), world.led);
+    led.clear();
+    led.resize(sights.len(), 0);
+    let mut counts = vec![0u32; world.leaders()];
+    for follower in 0..followers {
+        counts.fill(0);
+        for step in 0..steps {
+            let place = |step: usize| (step * followers + follower) * words;
+            let seen = |step: usize| {
+                (0..words)
+                    .flat_map(move |word| each_bit(sights.get(place(step) + word)).map(move |bit| word * 32 + bit))
+            };
+            seen(step).for_each(|leader| counts[leader] += 1);
+            if within > 0 && step >= within {
+                seen(step - within).for_each(|leader| counts[leader] -= 1);
+            }
+            let leading = &mut led[place(step)..][..words];
+            let mut lead = |leader: usize| leading[leader / 32] |= 1 << (leader % 32);
+            let mut counted = counts.iter().enumerate().filter(|(_, count)| **count > 0);
+            match by {
+                LedBy::AnySeen => counted.for_each(|(leader, _)| lead(leader)),
+                LedBy::MostSeen => {
+                    let first = counted.next();
+                    let most =
+                        first.map(|first| counted.fold(first, |most, next| if next.1 > most.1 { next } else { most }));
+                    most.into_iter().for_each(|(leader, _)| lead(leader));
+                }
+            }
+        }
+    }
+}
+
+/// Whether a leader leads a follower at a step, from 0, as [`lead`] found.
+pub fn leads(led: &[u32], world: &World, step: usize, follower: usize, leader: usize) -> bool {
+    let place = (step * world.followers() + follower) * world.leader_words() + leader / 32;
+    led[place] >> (leader % 32) & 1 != 0
 }
 
 /// Who was near which POI at which step, by a rule that is replayed.
@@ -445,9 +519,12 @@ fn narrow(critical: &mut [u32], set: &[u32], needed: bool) {
 
 /// The agents of a set, in ascending order.
 fn bits(set: &[u32]) -> impl Iterator<Item = usize> {
-    set.iter().enumerate().flat_map(|(index, &word)| {
-        std::iter::successors(Some(word), |word| Some(word & word.wrapping_sub(1)))
-            .take_while(|&word| word != 0)
-            .map(move |word| index * 32 + word.trailing_zeros() as usize)
-    })
+    set.iter().enumerate().flat_map(|(index, &word)| each_bit(word).map(move |bit| index * 32 + bit))
+}
+
+/// The places of a word's bits, in ascending order.
+fn each_bit(word: u32) -> impl Iterator<Item = usize> {
+    std::iter::successors(Some(word), |word| Some(word & word.wrapping_sub(1)))
+        .take_while(|&word| word != 0)
+        .map(|word| word.trailing_zeros() as usize)
 }

@@ -123,8 +123,10 @@ pub struct Evaluation {
     pub observed: Vec<Tally>,
     /// POIs observed by all teams of an episode together.
     pub together: Tally,
-    /// Sums over episodes of D, Df and D++, `[teams][leaders]`.
-    credits: Vec<[f64; 3]>,
+    /// Sums over episodes of D, Df, D++ and, where it was asked for, Dt, `[teams][leaders]`.
+    credits: Vec<[f64; 4]>,
+    /// Whether it was.
+    timed: bool,
 }
 
 impl Evaluation {
@@ -147,13 +149,18 @@ impl Evaluation {
     /// Means over episodes of G, D, Df and D++ of a leader of a team.
     pub fn scores(&self, team: usize, leader: usize) -> [f32; 4] {
         let g = self.observed[team].mean() / self.pois as f64;
-        let [d, df, dpp] = self.credits[team * self.leaders + leader].map(|sum| sum / self.episodes as f64);
+        let [d, df, dpp, _] = self.credits[team * self.leaders + leader].map(|sum| sum / self.episodes as f64);
         [g, d, df, dpp].map(|score| score as f32)
+    }
+
+    /// The mean over episodes of Dt of a leader of a team, if the group [needed](Need::sights) sights.
+    pub fn dt(&self, team: usize, leader: usize) -> Option<f32> {
+        self.timed.then(|| (self.credits[team * self.leaders + leader][3] / self.episodes as f64) as f32)
     }
 }
 
-/// Plays every team of a group from every start, in batches of as many episodes as memory bears; `watch` is told
-/// the share that is done, from any thread.
+/// Plays every team of a group from every start, in batches of as many episodes as memory bears, and works out every
+/// fitness, Dt only where the group needs sights; `watch` is told the share that is done, from any thread.
 ///
 /// # Errors
 /// When the backend fails.
@@ -166,7 +173,7 @@ pub fn evaluate(
     thread_local! { static CREDIT: RefCell<Credit> = RefCell::default(); }
     let world = group.world;
     let (teams, leaders, episodes) = (group.team_count(), world.leaders(), starts.episodes());
-    let at_once = BATCH_BYTES / (teams * leaders * size_of::<[f32; 3]>()).max(1);
+    let at_once = BATCH_BYTES / (teams * leaders * size_of::<[f32; 4]>()).max(1);
     let at_once = at_once.clamp(1, BATCH_EPISODES).min(episodes);
     let mut evaluation = Evaluation {
         episodes,
@@ -174,22 +181,24 @@ pub fn evaluate(
         pois: world.pois.len(),
         observed: vec![Tally::default(); teams],
         together: Tally::default(),
-        credits: vec![[0.0; 3]; teams * leaders],
+        credits: vec![[0.0; 4]; teams * leaders],
+        timed: group.need.sights(),
     };
+    let need = if group.need.sights() { Need::Sights } else { Need::Scores };
     let done = AtomicUsize::new(0);
     for first in (0..episodes).step_by(at_once) {
         let batch: Vec<Vec<Vec2>> =
             (first..episodes.min(first + at_once)).map(|episode| starts.of(episode, world)).collect();
-        let groups: Vec<Group<'_>> =
-            batch.iter().map(|starts| Group { starts, need: Need::Scores, ..*group }).collect();
-        let scored = Mutex::new((vec![0; batch.len() * teams], vec![[0_f32; 3]; batch.len() * teams * leaders]));
+        let groups: Vec<Group<'_>> = batch.iter().map(|starts| Group { starts, need, ..*group }).collect();
+        let scored = Mutex::new((vec![0; batch.len() * teams], vec![[0_f32; 4]; batch.len() * teams * leaders]));
         backend.rollout(&groups, &|episode| {
             let scores = CREDIT.with_borrow_mut(|credit| credit.all(&episode, world));
             let place = episode.group * teams + episode.team;
             let mut scored = scored.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
             scored.0[place] = scores.observed;
             for (leader, to) in scored.1[place * leaders..][..leaders].iter_mut().enumerate() {
-                *to = [scores.d[leader], scores.df[leader], scores.dpp[leader]];
+                let dt = scores.dt.get(leader).copied().unwrap_or(0.0);
+                *to = [scores.d[leader], scores.df[leader], scores.dpp[leader], dt];
             }
             drop(scored);
             watch((done.fetch_add(1, Relaxed) + 1) as f64 / (teams * episodes) as f64);

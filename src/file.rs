@@ -1,7 +1,7 @@
 //! Paths that a user or a folder names: what stands there is looked at before it is opened.
 
 use std::fs::{self, File};
-use std::io::{self, ErrorKind};
+use std::io::{self, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
 /// Opens a plain file to read it. Anything else is refused, since opening a pipe that nobody writes to waits for ever;
@@ -19,6 +19,33 @@ pub fn open(path: &Path) -> io::Result<File> {
         return Err(io::Error::new(ErrorKind::InvalidInput, "it is a pipe or a device, where a file is needed"));
     }
     File::open(path)
+}
+
+/// Why a text could not be read.
+#[derive(Debug, thiserror::Error)]
+pub enum TextError {
+    #[error(transparent)]
+    Read(#[from] io::Error),
+    #[error("it is larger than {0} bytes, the most that such a file may have")]
+    TooLarge(u64),
+    #[error("line {0} is not UTF-8 text")]
+    NotText(usize),
+}
+
+/// A text of `most` bytes at most.
+///
+/// # Errors
+/// It cannot be read, is larger, or is no UTF-8.
+pub fn text(file: impl Read, most: u64) -> Result<String, TextError> {
+    let mut bytes = Vec::new();
+    file.take(most + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > most {
+        return Err(TextError::TooLarge(most));
+    }
+    String::from_utf8(bytes).map_err(|error| {
+        let before = &error.as_bytes()[..error.utf8_error().valid_up_to()];
+        TextError::NotText(before.iter().filter(|&&byte| byte == b'\n').count() + 1)
+    })
 }
 
 /// Whether something stands at a path.

@@ -17,7 +17,7 @@ use crate::backend::gpu::{
     episode::{GpuEpisodes, Holding},
 };
 use crate::backend::{Backend, BackendError, Group, Machine, Need, Player};
-use crate::config::{Config, ConfigError, MAX_POPULATION};
+use crate::config::{Config, ConfigError, Fitness, MAX_POPULATION};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
 use crate::evolve::{self, MAX_WEIGHT};
 use crate::memory::{self, Peaks, TooLittle};
@@ -257,6 +257,7 @@ pub fn train(
             stopped = watch(Generation { generation, last, rows: &played }).is_break();
             if stopped {
                 config.learning.generations = trainer.end(0);
+                config.stages.retain(|stage| stage.from <= config.learning.generations);
             }
         }
         rows.extend(played);
@@ -275,6 +276,8 @@ pub struct Played {
     pub d: Vec<f32>,
     pub df: Vec<f32>,
     pub dpp: Vec<f32>,
+    /// Only where it is the config's fitness, else empty: it takes a record of who was seen at every step.
+    pub dt: Vec<f32>,
 }
 
 /// Plays teams of given policies, `[leaders][teams][parameters]`: team `t` is made of every leader's policy `t`. Where
@@ -291,7 +294,9 @@ pub fn play(
     starts: &Starts,
 ) -> Result<Played, Failure> {
     let cast = Cast::new(config, teams, weights, starts)?;
-    let evaluation = evaluate::evaluate(backend, &cast.group(&cast.world.starts), starts, &|_| ())?;
+    let need = if config.learning.fitness == Fitness::Dt { Need::Sights } else { Need::Scores };
+    let group = Group { need, ..cast.group(&cast.world.starts) };
+    let evaluation = evaluate::evaluate(backend, &group, starts, &|_| ())?;
     let Evaluation { leaders, .. } = evaluation;
     let scores: Vec<[f32; 4]> =
         (0..teams * leaders).map(|place| evaluation.scores(place / leaders, place % leaders)).collect();
@@ -301,6 +306,7 @@ pub fn play(
         d: scores.iter().map(|&[_, d, ..]| d).collect(),
         df: scores.iter().map(|&[_, _, df, _]| df).collect(),
         dpp: scores.iter().map(|&[.., dpp]| dpp).collect(),
+        dt: (0..teams * leaders).filter_map(|place| evaluation.dt(place / leaders, place % leaders)).collect(),
     })
 }
 
@@ -374,13 +380,18 @@ pub fn trace(
     Ok(traced)
 }
 
-/// Teams to be stepped by given actions, all at the world's start; with a record, they can be scored.
+/// Teams to be stepped by given actions, all at the world's start; with a record, they can be scored, by Dt where that is
+/// the config's fitness.
 ///
 /// # Errors
 /// The config is wrong, or there may not be so many teams.
 pub fn stepper(config: &Config, teams: usize, recording: bool) -> Result<Stepper, Failure> {
     let world = World::new(&checked(config)?);
-    Ok(if recording { Stepper::recording(world, teams)? } else { Stepper::new(world, teams)? })
+    Ok(match (recording, config.learning.fitness) {
+        (false, _) => Stepper::new(world, teams)?,
+        (true, Fitness::Dt) => Stepper::recording(world, teams)?.with_sights()?,
+        (true, _) => Stepper::recording(world, teams)?,
+    })
 }
 
 /// A config that may have been built by hand, as if it had been read from a file.

@@ -48,7 +48,7 @@
 //! 4. The backend plays each team's whole episode: by [`model`] on the CPU, by its twins under `shaders/` on a GPU.
 //!    It reports who was near which POI at which step, and which leader each follower saw, or as much of that as is
 //!    needed.
-//! 5. [`credit`] turns that record into G, D, Df and D++.
+//! 5. [`credit`] turns that record into G, D, Df, D++ and Dt.
 //! 6. [`evolve`] selects and mutates, or has a GPU that holds the populations do the latter; [`run`] keeps what came out
 //!    by [`record`]; [`report`] draws it.
 //!
@@ -69,7 +69,7 @@
 //! | [`evolve`] | | teams, selection and mutation, by counters |
 //! | [`sample`] | | random worlds for tests |
 //! | [`backend`] | | whole episodes of many teams: on the CPU, and with `gpu` on a GPU |
-//! | [`credit`] | | G, D, Df and D++ |
+//! | [`credit`] | | G, D, Df, D++ and Dt |
 //! | [`trainer`] | | the generation loop |
 //! | [`verify`] | | whether two backends agree to the bit |
 //! | [`statistics`] | | what chance leaves open |
@@ -92,6 +92,7 @@
 //! | feature | brings | crates in all, about |
 //! |---|---|---|
 //! | (none) | training, evaluation and verification by the CPU, on one thread; on WebAssembly too | 30 |
+//! | `scalar` | episodes without vector instructions, too, for `verify --report` | 30 |
 //! | `parallel` | all threads, by rayon; the bits stay | 35 |
 //! | `gpu` | any GPU, by wgpu | 80 |
 //! | `record` | runs on disk | 55 |

@@ -7,7 +7,7 @@
 use std::fs;
 use std::path::Path;
 
-use crate::backend::{self, BATCH_BYTES, PACKED_FROM, cpu};
+use crate::backend::{self, BATCH_BYTES, Need, PACKED_FROM, cpu};
 use crate::config::Config;
 use crate::trainer;
 use crate::world::World;
@@ -51,18 +51,30 @@ impl Peaks {
         let [mut training, mut checkpoint, mut queue, mut weights, mut record] = [0_u64; 5];
         let [mut block, mut order, mut populations, mut held] = [0_u64; 4];
         for config in configs {
-            let world = World::new(config);
+            let staged: Vec<(Config, World)> = (config.staged().into_iter())
+                .map(|(_, config)| {
+                    let world = World::new(&config);
+                    (config, world)
+                })
+                .collect();
+            let need = |config: &Config| Need::Score(config.learning.fitness);
+            // Of what a stage decides, the largest counts.
+            let most = |size: &dyn Fn(&Config, &World) -> u64| {
+                staged.iter().map(|(config, world)| size(config, world)).max().unwrap_or(0)
+            };
             let (trials, policies) = (config.learning.trials as u64, config.learning.population);
-            let teams = trials * config.learning.episodes_per_team as u64 * (policies as u64 + 1);
+            let teams = |config: &Config| trials * config.learning.episodes_per_team as u64 * (policies as u64 + 1);
             training += trainer::bytes(config);
             checkpoint += checkpoint_bytes(config);
-            queue += teams.div_ceil(lanes) * 16;
-            block = block.max(cpu::block_bytes(&world));
+            queue += most(&|config, _| teams(config).div_ceil(lanes) * 16);
+            block = block.max(most(&|config, world| cpu::block_bytes(world, need(config))));
             order = order.max((policies * size_of::<usize>()) as u64);
             populations += trials * config.populations() as u64;
-            held += trials * backend::held_bytes([config.populations(), policies + 1, world.parameters()]);
-            weights = weights.saturating_add(teams * backend::weight_bytes(&world));
-            record = teams.saturating_mul(backend::record_bytes(&world)).saturating_add(record);
+            held += trials * backend::held_bytes([config.populations(), policies + 1, config.parameters()]);
+            weights = weights.saturating_add(most(&|config, world| teams(config) * backend::weight_bytes(world)));
+            record = record.saturating_add(most(&|config, world| {
+                teams(config).saturating_mul(backend::record_bytes(world, need(config)))
+            }));
         }
         // Episodes and the final sorting of each population take turns.
         let playing = threads as u64 * block + queue;

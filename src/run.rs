@@ -12,7 +12,7 @@ use crate::record::checkpoint::{Checkpoint, Keeper, Schedule};
 use crate::record::disk::Disk;
 use crate::record::folder::{self, Folder, METRICS, Note, POLICIES, Run, Start, Status, Story};
 use crate::record::metrics::{self, Extent};
-use crate::record::policies;
+use crate::record::policies::{self, Init, Policies};
 use crate::record::{RecordError, config_digest};
 use crate::trainer::{Row, Snapshot, SnapshotError, Trainer};
 
@@ -137,21 +137,34 @@ impl Session {
         start: Start,
         disk: &Disk,
     ) -> Result<(Session, Vec<(usize, Note)>), RunError> {
+        let runs = runs.into_iter().map(|(config, path)| (config, path, None)).collect();
+        Session::open_from(runs, start, disk)
+    }
+
+    /// [`Session::open`], each run from given policies if there are any, read for its config.
+    ///
+    /// # Errors
+    /// See [`Session::open`]; or a run to go on with started from others, or has no checkpoint and needs them.
+    pub fn open_from(
+        runs: Vec<(Config, PathBuf, Option<Init>)>,
+        start: Start,
+        disk: &Disk,
+    ) -> Result<(Session, Vec<(usize, Note)>), RunError> {
         // This generation and the next one; asked for first, since later a refusal would be an abort.
-        let bytes = 2 * runs.iter().map(|(config, _)| config.policy_bytes()).sum::<u64>();
+        let bytes = 2 * runs.iter().map(|(config, ..)| config.policy_bytes()).sum::<u64>();
         Vec::<u8>::new()
             .try_reserve_exact(bytes.try_into().unwrap_or(usize::MAX))
             .map_err(|_| RunError::Memory { what: "twice the policies of all trials", bytes })?;
         // Before any of them is touched.
-        for (_, path) in runs.iter().filter(|_| start == Start::Fresh) {
+        for (_, path, _) in runs.iter().filter(|_| start == Start::Fresh) {
             if folder::holds_run(path)? {
                 return Err(RecordError::Exists { path: path.clone() }.into());
             }
         }
-        for (_, path) in runs.iter().filter(|(_, path)| start == Start::Force && path.is_dir()) {
+        for (_, path, _) in runs.iter().filter(|(_, path, _)| start == Start::Force && path.is_dir()) {
             folder::lock(path)?;
         }
-        let opened = side_by_side(runs, |(config, path)| Member::open(config, path, start, disk))?;
+        let opened = side_by_side(runs, |(config, path, init)| Member::open(config, path, init, start, disk))?;
         let (mut members, mut snapshots, mut notes) = (Vec::new(), Vec::new(), Vec::new());
         for (member, snapshot, told) in opened {
             notes.extend(told.into_iter().map(|note| (members.len(), note)));
@@ -169,8 +182,17 @@ impl Session {
             };
             going.arm = arms.len();
             arms.push(run);
-            if snapshot.is_some_and(|snapshot| !trainer.restore(going.arm, snapshot)) {
-                unreachable!("a checkpoint is read in the sizes of its config");
+            let fits = match snapshot {
+                Origin::Checkpoint(snapshot) => trainer.restore(going.arm, snapshot),
+                Origin::Policies(Init { trials, .. }) => {
+                    (trials.into_iter().enumerate()).all(|(trial, Policies { policies, weights })| {
+                        trainer.start_from(going.arm, trial, policies, &weights)
+                    })
+                }
+                Origin::Chance => true,
+            };
+            if !fits {
+                unreachable!("checkpoints and policies are read in the sizes of their config");
             }
             generations.push(trainer.generation(going.arm));
         }
@@ -209,6 +231,7 @@ impl Session {
         }
         self.settle_on(player);
         self.write_runs(Status::Running)?;
+        self.save_starts()?;
         let (mut flushed, mut setback, mut told) = (Instant::now(), None, false);
         // Once, and only what a generation has made up for: a device that is gone for good is told of as such.
         let mut tell = |error: Option<BackendError>| {
@@ -351,6 +374,19 @@ impl Session {
         held
     }
 
+    /// Starts writing a checkpoint of every run that starts from given policies now, so that it can go on without them.
+    fn save_starts(&mut self) -> Result<(), RunError> {
+        let seconds = self.seconds();
+        for run in self.going().collect::<Vec<_>>() {
+            let member = &mut self.members[run];
+            let first = member.going.as_ref().is_some_and(|going| going.keeper.newest().is_none());
+            if member.run.init.is_some() && first && self.generations[run] == 0 {
+                member.save(&mut self.trainer, 0, seconds)?;
+            }
+        }
+        Ok(())
+    }
+
     /// Saves and waits until all is on the disk.
     fn stop(&mut self) -> Result<(), RunError> {
         let saved = self.save();
@@ -372,32 +408,52 @@ impl Session {
     }
 }
 
+/// What a run goes on from, or starts from.
+enum Origin {
+    Checkpoint(Snapshot),
+    Policies(Init),
+    Chance,
+}
+
 impl Member {
     /// A run, where it goes on, and what there is to tell about its folder.
     fn open(
         config: Config,
         path: PathBuf,
+        init: Option<Init>,
         start: Start,
         disk: &Disk,
-    ) -> Result<(Member, Option<Snapshot>, Vec<Note>), RunError> {
+    ) -> Result<(Member, Origin, Vec<Note>), RunError> {
         let (folder, found) = Folder::open(&path, start, &config, disk.clone())?;
-        let run = found.run.unwrap_or_else(|| Run::new(&config));
+        let checkpoint = found.checkpoint.as_ref().map(|(checkpoint, _)| checkpoint);
+        let begun = checkpoint.is_some() || found.run.is_some();
+        let mut run = found.run.unwrap_or_else(|| Run::new(&config));
+        let there = checkpoint.map_or(&run.init, |checkpoint| &checkpoint.init).clone();
+        let whole = checkpoint.is_some() || found.finished.is_some();
+        match (&init, there) {
+            (Some(Init { digest, .. }), there) if begun && there.as_ref() != Some(digest) => {
+                return Err(RecordError::InitDiffers { path, there, here: digest.clone() }.into());
+            }
+            (None, Some(there)) if !whole => return Err(RecordError::InitNeeded { path, there }.into()),
+            (Some(Init { digest, .. }), _) => run.init = Some(digest.clone()),
+            (None, there) => run.init = there,
+        }
         let member = Member { config, going: None, folder, run, results: None, before: 0.0 };
         if let Some((story, digest)) = found.finished.zip(member.run.digest.clone()) {
-            return Ok((Member { results: Some(Results { story, digest }), ..member }, None, found.notes));
+            return Ok((Member { results: Some(Results { story, digest }), ..member }, Origin::Chance, found.notes));
         }
-        let (metrics, before, snapshot) = match found.checkpoint {
-            Some((Checkpoint { snapshot, seconds, .. }, metrics)) => (metrics, seconds, Some(snapshot)),
+        let (metrics, before, from) = match found.checkpoint {
+            Some((Checkpoint { snapshot, seconds, .. }, metrics)) => (metrics, seconds, Origin::Checkpoint(snapshot)),
             None => {
-                let metrics = metrics::Writer::create(disk, &member.folder.file(METRICS));
-                (metrics.map_err(member.metrics_failed())?, 0.0, None)
+                let metrics = metrics::Writer::create(disk, &member.folder.file(METRICS), &member.config);
+                (metrics.map_err(member.metrics_failed())?, 0.0, init.map_or(Origin::Chance, Origin::Policies))
             }
         };
-        let generation = snapshot.as_ref().map_or(0, |snapshot| snapshot.generation);
+        let generation = if let Origin::Checkpoint(snapshot) = &from { snapshot.generation } else { 0 };
         let checkpoints = member.folder.file(folder::CHECKPOINTS);
         let keeper = Keeper::new(disk.clone(), checkpoints, member.config.clone(), found.kept, generation);
         let going = Some(Going { arm: 0, metrics, keeper, ending: None });
-        Ok((Member { going, before, ..member }, snapshot, found.notes))
+        Ok((Member { going, before, ..member }, from, found.notes))
     }
 
     fn flush(&mut self) -> Result<(), RunError> {
@@ -442,15 +498,15 @@ impl Member {
         }
         let since = Instant::now();
         let (metrics, output) = metrics.mark().map_err(failed)?;
-        let (config, seconds) = (config_digest(&self.config), self.before + seconds);
+        let (config, init, seconds) = (config_digest(&self.config), self.run.init.clone(), self.before + seconds);
         if !memory::copies_checkpoint([&self.config]) {
             let snapshot = trainer.view(*arm).map_err(RunError::Held)?;
-            return Ok(keeper.save_now(&Checkpoint { config, seconds, metrics, snapshot }, &output, since)?);
+            return Ok(keeper.save_now(&Checkpoint { config, init, seconds, metrics, snapshot }, &output, since)?);
         }
         let bytes = self.config.policy_bytes();
         let of_snapshot = |error| RunError::of_snapshot(error, "a checkpoint beside training", bytes);
         let snapshot = trainer.snapshot(*arm).map_err(of_snapshot)?;
-        Ok(keeper.save(Checkpoint { config, seconds, metrics, snapshot }, output, since)?)
+        Ok(keeper.save(Checkpoint { config, init, seconds, metrics, snapshot }, output, since)?)
     }
 
     /// Writes what came out, so that at any moment there is something whole to go on from.
@@ -463,7 +519,8 @@ impl Member {
         let fitness = fitness.into_iter().map(<[f32]>::to_vec).collect();
         let snapshot = Snapshot { generation, last, weights: vec![], fitness, pending };
         let (config, metrics) = (config_digest(&self.config), ending.take().unwrap_or(mark));
-        keeper.save(Checkpoint { config, seconds: self.before + seconds, metrics, snapshot }, output, since)?;
+        let (init, seconds_in_all) = (self.run.init.clone(), self.before + seconds);
+        keeper.save(Checkpoint { config, init, seconds: seconds_in_all, metrics, snapshot }, output, since)?;
         let path = self.folder.file(POLICIES);
         if path.exists() {
             // What this run was extended from goes with them: only now is there something else.

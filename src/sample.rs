@@ -48,6 +48,8 @@ pub fn world(seed: u64) -> Config {
     if rng.random_bool(0.5) {
         observe_otherwise(rng, &mut config);
     }
+    config.learning.led_within = [0, 1, rng.random_range(2..=10)][rng.random_range(0..3)];
+    config.learning.led_by = word(rng);
     config
 }
 
@@ -183,6 +185,18 @@ fn plain_world(seed: u64) -> Config {
     // What came later has draws of its own: the worlds of the seeds stay as they were in all else.
     let later = &mut ChaCha8Rng::seed_from_u64(!seed);
     let actions = if later.random_bool(0.3) { Actions::Behaviours } else { Actions::Direct };
+    // Of the generations that are trained when worlds are compared, the last may be shorter and elsewhere.
+    let stages = match later.random_bool(0.2) {
+        true => {
+            let set = [
+                ("world.steps", toml::Value::Integer(later.random_range(5..=30))),
+                ("learning.poi_jitter", toml::Value::Float(1.5)),
+                ("learning.episodes_per_team", toml::Value::Integer(later.random_range(1..=2))),
+            ];
+            vec![Stage { from: 2, set: set.map(|(key, value)| (key.to_string(), value)).into() }]
+        }
+        false => vec![],
+    };
     let gain = |rng: &mut ChaCha8Rng, high: f64| if rng.random_bool(0.1) { 0.0 } else { rng.random_range(0.1..high) };
     Config {
         world: crate::config::Domain {
@@ -243,12 +257,15 @@ fn plain_world(seed: u64) -> Config {
             mutation: if rng.random_bool(0.5) { Mutation::Scaled } else { Mutation::Additive },
             mutation_probability: 0.15,
             mutation_sigma: 0.1,
+            led_within: 0,
+            led_by: LedBy::MostSeen,
             episodes_per_team: 1,
             start_jitter: 0.0,
             poi_jitter: if later.random_bool(0.3) { later.random_range(0.5..5.0) } else { 0.0 },
             seed,
         },
         checkpoint: Saving::default(),
+        stages,
     }
 }
 

@@ -131,7 +131,7 @@ pub fn bootstrap(samples: &[&[f64]]) -> Option<Estimate> {
     if spread == 0.0 {
         return Some(Estimate::exact(value));
     }
-    let acceleration = moment(3) / spread.powf(1.5) / 6.0;
+    let acceleration = moment(3) / (spread * spread.sqrt()) / 6.0;
 
     let mut random = ChaCha8Rng::seed_from_u64(0);
     let mut draw = |sample: &[f64], sign: f64| {

@@ -86,6 +86,8 @@ pub enum StepError {
     NoTeam { team: usize, teams: usize },
     #[error("no record was kept to score teams by")]
     NotRecorded,
+    #[error("no record was kept of who saw whom at which step, which Dt asks; make the stepper `with_sights`")]
+    NotSeen,
 }
 
 impl Stepper {
@@ -144,6 +146,22 @@ impl Stepper {
         Ok(stepper)
     }
 
+    /// The same, all at the world's start, with a record of which leaders each follower saw at which step, too, for Dt.
+    ///
+    /// # Errors
+    /// There is no memory for it.
+    pub fn with_sights(mut self) -> Result<Stepper, StepError> {
+        let teams = self.teams();
+        let bytes = self.world.sight_words() as u128 * 4 * teams as u128;
+        usize::try_from(bytes)
+            .ok()
+            .and_then(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).ok())
+            .ok_or(StepError::Memory { teams, bytes })?;
+        self.vectors.keep_sights(&self.world);
+        self.reset();
+        Ok(self)
+    }
+
     /// The world that all teams are in.
     pub fn world(&self) -> &World {
         &self.world
@@ -183,7 +201,9 @@ impl Stepper {
     }
 
     /// Plays one step by what every leader is to do, `[teams][leaders][2]`: a turn, in parts of a half turn to the left, and
-    /// a speed, from -1 for standing still to 1 for the highest. Numbers beyond -1..1 are taken as -1 or 1.
+    /// a speed, from -1 for standing still to 1 for the highest. Numbers beyond -1..1 are taken as -1 or 1. Where policies of the
+    /// world choose behaviours, these are still the actions: each behaviour comes to a turn of 0, ±0.25 or ±0.75 and a speed of
+    /// -1 or 1, see [`crate::model::policy::choose`].
     ///
     /// A team that has played its last step stays as it is, whatever is asked of it, until it is reset.
     ///
@@ -247,7 +267,8 @@ impl Stepper {
         States { positions, headings, speeds }
     }
 
-    /// Every fitness of a team's episode as far as it has been played.
+    /// Every fitness of a team's episode as far as it has been played; Dt only with a record [of
+    /// sights](Stepper::with_sights), or where nobody follows.
     ///
     /// # Errors
     /// There is no such team, or no record was kept.
@@ -263,7 +284,7 @@ impl Stepper {
     /// What every leader was worth, by one fitness, as far as its team's episode has been played: `[teams][leaders]`.
     ///
     /// # Errors
-    /// There is room for fewer or more numbers, or no record was kept.
+    /// There is room for fewer or more numbers, no record was kept, or none of sights for Dt.
     pub fn fitness(&self, fitness: Fitness, scores: &mut [f32]) -> Result<(), StepError> {
         thread_local! { static CREDIT: RefCell<(Credit, Vec<u32>)> = RefCell::default(); }
         let leaders = self.world.leaders();
@@ -271,6 +292,9 @@ impl Stepper {
         scores.par_chunks_exact_mut(leaders).with_min_len(FEW).enumerate().try_for_each(|(team, scores)| {
             CREDIT.with_borrow_mut(|(credit, seen)| {
                 let episode = self.vectors.episode(team, &self.world, seen).ok_or(StepError::NotRecorded)?;
+                if fitness == Fitness::Dt && self.world.followers() > 0 && episode.sights.is_empty() {
+                    return Err(StepError::NotSeen);
+                }
                 credit.score(&episode, &self.world, fitness, scores);
                 Ok(())
             })
@@ -320,6 +344,8 @@ trait Vectors: Send + Sync {
     fn reset(&mut self, world: &World, chosen: Option<&[bool]>, starts: Option<&[Vec2]>, shown: &mut Shown);
     fn step(&mut self, world: &World, actions: &[f32], shown: &mut Shown);
     fn states(&mut self, world: &World, shown: &mut Shown);
+    /// Makes room for the sights of all steps.
+    fn keep_sights(&mut self, world: &World);
     /// The record of a team, if one is kept; `seen` takes a part of it.
     fn episode<'a>(&'a self, team: usize, world: &World, seen: &'a mut Vec<u32>) -> Option<Episode<'a>>;
 }
@@ -332,6 +358,8 @@ struct Part<S: Simd> {
     standing: Standing<S>,
     /// Who was near each POI at each step, `[teams][steps][pois][words]`, if that is kept.
     record: Vec<u32>,
+    /// Which leaders each follower saw at each step, `[teams][steps][followers][words of leaders]`, if that is kept.
+    sights: Vec<u32>,
 }
 
 /// What a thread plays a step with: the block takes on what stands of one vector of teams after the other.
@@ -339,6 +367,8 @@ struct Room<S: Simd> {
     block: Block<S>,
     /// Who is near each POI, `[pois][words][lanes]`.
     sets: Vec<u32>,
+    /// Which leaders each follower sees, `[followers][words of leaders][lanes]`.
+    sights: Vec<u32>,
     /// What is turned into rows.
     columns: Vec<S::f32s>,
     /// Agents and counts before a step, where some teams are over.
@@ -355,7 +385,13 @@ struct Batch<S: Simd> {
 fn vectors<S: Simd>(simd: S, world: &World, teams: usize, record: usize) -> Box<dyn Vectors> {
     let part = |first: usize| {
         let teams = S::f32s::LEN.min(teams - first);
-        Part { first, teams, standing: Block::new(simd, world).into_standing(), record: vec![0; teams * record] }
+        Part {
+            first,
+            teams,
+            standing: Block::new(simd, world).into_standing(),
+            record: vec![0; teams * record],
+            sights: vec![],
+        }
     };
     let parts = (0..teams).step_by(S::f32s::LEN).map(part).collect();
     Box::new(Batch { simd, parts, idle: Mutex::default() })
@@ -395,6 +431,12 @@ impl<S: Simd> Vectors for Batch<S> {
         });
     }
 
+    fn keep_sights(&mut self, world: &World) {
+        for part in &mut self.parts {
+            part.sights = vec![0; part.teams * world.sight_words()];
+        }
+    }
+
     fn episode<'a>(&'a self, team: usize, world: &World, seen: &'a mut Vec<u32>) -> Option<Episode<'a>> {
         let (part, lane) = (&self.parts[team / S::f32s::LEN], team % S::f32s::LEN);
         let words = world.set_words();
@@ -402,7 +444,9 @@ impl<S: Simd> Vectors for Batch<S> {
         seen.clear();
         seen.extend(part.standing.counts.iter().map(|count| count[lane]));
         let plain = |words| Strided { words, stride: 1, offset: 0 };
-        Some(Episode { group: 0, team, sets: plain(sets), seen: Seen::Counts(plain(seen)) })
+        let (first, words) = (lane * world.sight_words(), world.sight_words());
+        let sights = plain(part.sights.get(first..first + words).unwrap_or_default());
+        Some(Episode { group: 0, team, sets: plain(sets), seen: Seen::Counts(plain(seen)), sights })
     }
 }
 
@@ -502,7 +546,8 @@ fn lanes<S: Simd>(teams: usize) -> impl Iterator<Item = (usize, usize)> {
 impl<S: Simd> Room<S> {
     fn new(simd: S, world: &World) -> Room<S> {
         let sets = vec![0; world.pois.len() * world.constants.words as usize * S::f32s::LEN];
-        Room { block: Block::new(simd, world), sets, columns: vec![], kept: Default::default() }
+        let sights = vec![0; world.followers() * world.leader_words() * S::f32s::LEN];
+        Room { block: Block::new(simd, world), sets, sights, columns: vec![], kept: Default::default() }
     }
 
     #[inline(always)]
@@ -517,7 +562,7 @@ impl<S: Simd> Room<S> {
     ) {
         let Slices { inputs, near, newly, observed, steps, .. } = shown;
         let (agents, pois, words) = (world.agents(), world.pois.len(), world.constants.words as usize);
-        let Part { first, teams, ref mut standing, ref mut record } = *part;
+        let Part { first, teams, ref mut standing, ref mut record, ref mut sights } = *part;
         let is_chosen = |team: usize| chosen.is_none_or(|chosen| chosen[team]);
         if !(first..first + teams).any(is_chosen) {
             return;
@@ -528,13 +573,14 @@ impl<S: Simd> Room<S> {
             self.block.place(lane, starts.map_or(&world.starts, |starts| &starts[at..at + agents]));
             self.block.start_lane(lane);
         }
-        let size = record.len() / teams;
+        let (size, seen) = (record.len() / teams, sights.len() / teams);
         for team in (0..teams).filter(|team| is_chosen(first + team)) {
             near[team * pois * words..][..pois * words].fill(0);
             newly[team * pois..][..pois].fill(false);
             observed[team * pois..][..pois].fill(false);
             steps[team] = 0;
             record[team * size..][..size].fill(0);
+            sights[team * seen..][..seen].fill(0);
         }
         self.sense(simd, world, inputs);
         self.block.swap(standing);
@@ -546,12 +592,15 @@ impl<S: Simd> Room<S> {
         let last = world.constants.steps;
         let over = steps.iter().filter(|&&step| step >= last).count();
         newly.fill(false);
-        let Part { first, teams, ref mut standing, ref mut record } = *part;
+        let Part { first, teams, ref mut standing, ref mut record, ref mut sights } = *part;
         if over == teams {
             return;
         }
         self.block.swap(standing);
         self.take(simd, world, &actions[first * world.leaders() * OUTPUTS..], teams);
+        if !sights.is_empty() {
+            self.watch(world, steps, sights);
+        }
         if over == 0 {
             self.block.go();
         } else {
@@ -596,6 +645,17 @@ impl<S: Simd> Room<S> {
         }
         self.sense(simd, world, inputs);
         self.block.swap(standing);
+    }
+
+    /// Records who sees whom before this step of each team that has not played its last.
+    #[inline(always)]
+    fn watch(&mut self, world: &World, steps: &[u32], sights: &mut [u32]) {
+        self.block.watch(&mut self.sights);
+        let size = world.followers() * world.leader_words();
+        for (team, &step) in steps.iter().enumerate().filter(|(_, step)| **step < world.constants.steps) {
+            let to = &mut sights[team * world.sight_words() + step as usize * size..][..size];
+            to.iter_mut().zip(self.sights[team..].iter().step_by(S::f32s::LEN)).for_each(|(to, &seen)| *to = seen);
+        }
     }
 
     /// Takes the actions of so many teams as the policies' answers.

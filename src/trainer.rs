@@ -70,8 +70,14 @@ pub struct Times {
 
 /// One experiment and its trials.
 struct Arm {
+    /// Those of the stage that plays.
     config: Config,
     world: World,
+    /// All stages, each with its first generation, and which of them plays.
+    stages: Vec<(usize, Config, World)>,
+    stage: usize,
+    /// The stage whose champions play beside the first generation of this one.
+    leaving: Option<usize>,
     trials: Vec<Lineage>,
     /// The generation that plays next, two past the last when all is done.
     generation: usize,
@@ -113,6 +119,8 @@ struct Lineage {
     teams: Vec<u32>,
     /// Start positions, and where POIs are if they move, `[episodes][agents + pois]`.
     starts: Vec<Vec<Vec2>>,
+    /// Likewise of the champions of the stage before, where one ends.
+    farewell: Vec<Vec<Vec2>>,
     /// POIs observed, `[episodes][policies + 1]`, and f32 scores as bits, `[episodes][policies + 1][leaders]`.
     observed: Vec<AtomicU32>,
     scores: Vec<AtomicU32>,
@@ -294,9 +302,10 @@ impl Trainer {
         Ok(&arm.trials[trial].weights)
     }
 
-    /// The world that an arm trains in.
+    /// The world that an arm's next generation plays in.
     pub fn world(&self, arm: usize) -> &World {
-        &self.arms[arm].world
+        let arm = &self.arms[arm];
+        &arm.stages[arm.stage_of(arm.generation.min(arm.last()))].2
     }
 
     /// What [`Trainer::restore`] needs of an arm, where it lies.
@@ -325,6 +334,26 @@ impl Trainer {
         Ok(Snapshot { generation, last, weights: each(weights)?, fitness: each(fitness)?, pending })
     }
 
+    /// Puts given policies, `[populations][policies][parameters]`, in the first slots of a trial's populations, in their order:
+    /// as many as there is room for. The others stay as they were drawn. False where the arm has played already, or sizes do
+    /// not fit.
+    #[must_use]
+    pub fn start_from(&mut self, arm: usize, trial: usize, policies: usize, weights: &[f32]) -> bool {
+        let arm = &mut self.arms[arm];
+        let (populations, parameters) = (arm.config.populations(), arm.world.parameters());
+        let population = arm.config.learning.population;
+        let Some(trial) = arm.trials.get_mut(trial) else { return false };
+        if arm.generation > 0 || arm.offered || policies == 0 || weights.len() != populations * policies * parameters {
+            return false;
+        }
+        let taken = policies.min(population) * parameters;
+        let slots = trial.weights.chunks_exact_mut((population + 1) * parameters);
+        for (slots, policies) in slots.zip(weights.chunks_exact(policies * parameters)) {
+            slots[..taken].copy_from_slice(&policies[..taken]);
+        }
+        true
+    }
+
     /// Goes on with an arm from a snapshot of an arm of the same config, but for its number of generations, which may have
     /// been smaller; false where the sizes do not fit.
     #[must_use]
@@ -351,6 +380,7 @@ impl Trainer {
         if generation == last + 1 && last < arm.last() {
             // There the policies stayed, here they have a next generation.
             (arm.age, arm.host_age) = (last, last);
+            arm.enter();
             // Nobody holds them, so nobody can fail.
             let _ = arm.breed(level);
         }
@@ -361,8 +391,12 @@ impl Trainer {
 /// Words that an episode of a trial takes in a batch, whoever plays it.
 const EPISODE: u64 = 40;
 
-/// Bytes that the trials of a (valid) config take, whoever plays their episodes.
+/// Bytes that the trials of a (valid) config take, whoever plays their episodes: in the stage that takes most.
 pub fn bytes(config: &Config) -> u64 {
+    config.staged().iter().map(|(_, config)| bytes_of_stage(config)).max().unwrap_or(0)
+}
+
+fn bytes_of_stage(config: &Config) -> u64 {
     let ([trials, populations, policies, parameters], leaders) = (sizes(config), config.learners() as u64);
     let (slots, episodes) = (policies + 1, config.learning.episodes_per_team as u64);
     let agents = (config.world.leaders.len() + config.world.followers.len()) as u64;
@@ -389,9 +423,9 @@ fn sizes(config: &Config) -> [u64; 4] {
 }
 
 /// Plays a range of the teams of every trial, given the population, all as one batch; keeps what they scored.
-fn play(
+fn play<'a>(
     backend: &mut dyn Backend,
-    arms: &[(usize, &mut Arm)],
+    arms: &'a [(usize, &'a mut Arm)],
     range: impl Fn(&Arm) -> Range<usize>,
 ) -> Result<(), BackendError> {
     thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
@@ -402,20 +436,27 @@ fn play(
         let range = range(arm);
         for (index, trial) in arm.trials.iter().enumerate() {
             let weights = arm.held.get(index).map_or(trial.weights[..].into(), |held| Weights::Held(&**held));
-            let teams = &trial.teams[range.start * leaders..range.end * leaders];
-            for (episode, starts) in trial.starts.iter().enumerate() {
-                let (world, need) = (&arm.world, Need::Score(arm.config.learning.fitness));
-                groups.push(Group { world, starts, weights, policies: population + 1, teams, need });
-                places.push((&**arm, trial, episode * (population + 1) + range.start));
+            let mut cast = |world, fitness, starts: &'a [Vec<Vec2>], range: Range<usize>| {
+                let (teams, need) = (&trial.teams[range.start * leaders..range.end * leaders], Need::Score(fitness));
+                for (episode, starts) in starts.iter().enumerate() {
+                    groups.push(Group { world, starts, weights, policies: population + 1, teams, need });
+                    places.push((world, fitness, trial, episode * (population + 1) + range.start));
+                }
+            };
+            // Champions play in their own stage.
+            let end = if arm.leaving.is_some() { population } else { range.end };
+            cast(&arm.world, arm.config.learning.fitness, &trial.starts, range.start..end);
+            if let Some((_, config, world)) = arm.leaving.map(|stage| &arm.stages[stage]) {
+                cast(world, config.learning.fitness, &trial.farewell, population..population + 1);
             }
         }
     }
     backend.rollout(&groups, &|episode: Episode<'_>| {
-        let (arm, trial, first) = places[episode.group];
-        let (team, leaders) = (first + episode.team, arm.world.leaders());
+        let (world, fitness, trial, first) = places[episode.group];
+        let (team, leaders) = (first + episode.team, world.leaders());
         CREDIT.with_borrow_mut(|(credit, scores)| {
             scores.resize(leaders, 0.0);
-            let observed = credit.score(&episode, &arm.world, arm.config.learning.fitness, scores);
+            let observed = credit.score(&episode, world, fitness, scores);
             trial.observed[team].store(observed, Relaxed);
             for (to, score) in trial.scores[team * leaders..].iter().zip(&*scores) {
                 to.store(score.to_bits(), Relaxed);
@@ -426,17 +467,51 @@ fn play(
 
 impl Arm {
     fn new(config: Config, trials: Range<usize>, level: Level) -> Arm {
-        let world = World::new(&config);
-        let trials = trials.into_par_iter().map(|index| Lineage::new(&config, &world, index, level));
+        let stages = config.staged().into_iter().map(|(from, config)| {
+            let world = World::new(&config);
+            (from, config, world)
+        });
+        let stages: Vec<_> = stages.collect();
+        let most = stages.iter().map(|(_, config, _)| config.learning.episodes_per_team).max().unwrap_or(1);
+        let (_, config, world) = stages[0].clone();
+        let trials = trials.into_par_iter().map(|index| Lineage::new(&config, &world, most, index, level));
         Arm {
             trials: trials.collect(),
             world,
             config,
+            stages,
+            stage: 0,
+            leaving: None,
             generation: 0,
             age: 0,
             host_age: 0,
             held: vec![],
             offered: false,
+        }
+    }
+
+    /// The stage of a generation.
+    fn stage_of(&self, generation: usize) -> usize {
+        self.stages.iter().rposition(|stage| stage.0 <= generation).unwrap_or(0)
+    }
+
+    /// Takes on the stage of the populations that are about to play.
+    fn enter(&mut self) {
+        let (age, last) = (self.age, self.last());
+        let stage = self.stage_of(age.min(last));
+        if stage != self.stage {
+            let (_, config, world) = self.stages[stage].clone();
+            (self.config, self.world, self.stage) = (config, world, stage);
+            // A run may end sooner than it was to.
+            self.config.learning.generations = last;
+        }
+        let before = if age == 0 { stage } else { self.stage_of(age - 1) };
+        self.leaving = (before != stage).then_some(before);
+        let episodes = self.config.learning.episodes_per_team;
+        let of_champions = self.leaving.map_or(0, |stage| self.stages[stage].1.learning.episodes_per_team);
+        for trial in &mut self.trials {
+            trial.starts.resize(episodes, vec![]);
+            trial.farewell.resize(of_champions, vec![]);
         }
     }
 
@@ -530,7 +605,8 @@ impl Arm {
 
     /// Forms the teams of a generation and draws its starts.
     fn prepare(&mut self, level: Level) {
-        let Arm { config, world, trials, age: generation, .. } = self;
+        self.enter();
+        let Arm { config, world, stages, leaving, trials, age: generation, .. } = self;
         let generation = *generation;
         let Learning { seed, population, sharing, .. } = config.learning;
         let leaders = world.leaders();
@@ -551,17 +627,24 @@ impl Arm {
             for (episode, starts) in trial.starts.iter_mut().enumerate() {
                 evolve::places(&config.learning, trial.index, generation, episode, world, starts);
             }
+            if let Some((_, config, world)) = leaving.map(|stage| &stages[stage]) {
+                for (episode, starts) in trial.farewell.iter_mut().enumerate() {
+                    evolve::places(&config.learning, trial.index, generation, episode, world, starts);
+                }
+            }
         });
     }
 
     /// Turns what was observed into fitness and rows.
     fn conclude(&mut self, arm: usize) -> Vec<Row> {
-        let Arm { config, world, trials, age: generation, .. } = self;
+        let Arm { config, world, stages, leaving, trials, age: generation, .. } = self;
         let generation = *generation;
         let population = config.learning.population;
+        let pois_before = leaving.map_or(world.pois.len(), |stage| stages[stage].2.pois.len());
         let mut rows = Vec::with_capacity(trials.len());
         for trial in trials {
-            let [best_g, mean_g, champion_g] = trial.summary(world.pois.len(), population);
+            let [best_g, mean_g] = trial.summary(world.pois.len(), population);
+            let champion_g = trial.champion(pois_before, population);
             rows.extend(trial.pending.map(|row| Row { champion_g, ..row }));
             trial.pending = Some(Row { arm, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
             match config.learning.sharing {
@@ -576,7 +659,7 @@ impl Arm {
     fn finish(&mut self) -> Vec<Row> {
         let (pois, population) = (self.world.pois.len(), self.config.learning.population);
         let row = |trial: &mut Lineage| {
-            let [_, _, champion_g] = trial.summary(pois, population);
+            let champion_g = trial.champion(pois, population);
             trial.pending.map(|row| Row { champion_g, ..row })
         };
         let rows = self.trials.iter_mut().filter_map(row).collect();
@@ -664,8 +747,9 @@ impl Arm {
 }
 
 impl Lineage {
-    fn new(config: &Config, world: &World, index: usize, level: Level) -> Lineage {
-        let Learning { seed, population, episodes_per_team, .. } = config.learning;
+    /// With room for so many episodes a team.
+    fn new(config: &Config, world: &World, episodes: usize, index: usize, level: Level) -> Lineage {
+        let Learning { seed, population, .. } = config.learning;
         let (leaders, populations, parameters) = (world.leaders(), config.populations(), world.parameters());
         let key = Key::new(seed, index, Purpose::Weights);
         let mut weights = vec![0.0; populations * (population + 1) * parameters];
@@ -676,7 +760,7 @@ impl Lineage {
                 .enumerate()
                 .for_each(|(slot, policy)| evolve::random_policy(level, key.at(0, leader, slot), policy));
         });
-        let slots = episodes_per_team * (population + 1);
+        let slots = episodes * (population + 1);
         Lineage {
             index,
             children: vec![0.0; weights.len()],
@@ -684,7 +768,8 @@ impl Lineage {
             orders: vec![0; populations * population],
             // The champion's team, the last, is made of every population's last slot.
             teams: evolve::one_policy_a_team(population + 1, leaders),
-            starts: vec![Vec::new(); episodes_per_team],
+            starts: vec![],
+            farewell: vec![],
             observed: std::iter::repeat_with(AtomicU32::default).take(slots).collect(),
             scores: std::iter::repeat_with(AtomicU32::default).take(slots * leaders).collect(),
             fitness: vec![0.0; populations * population],
@@ -693,16 +778,25 @@ impl Lineage {
         }
     }
 
-    /// G of the best team, of the mean team and of the champion's team.
-    fn summary(&self, pois: usize, population: usize) -> [f64; 3] {
+    /// G of the best team and of the mean team.
+    fn summary(&self, pois: usize, population: usize) -> [f64; 2] {
         let episodes = self.starts.len();
-        let observed = |team: usize| -> u64 {
-            (0..episodes).map(|episode| u64::from(self.observed[episode * (population + 1) + team].load(Relaxed))).sum()
-        };
+        let observed = |team: usize| self.observed(team, episodes, population);
         let whole = (pois * episodes) as f64;
         let best = (0..population).map(observed).max().unwrap_or(0);
         let total: u64 = (0..population).map(observed).sum();
-        [best as f64 / whole, total as f64 / (whole * population as f64), observed(population) as f64 / whole]
+        [best as f64 / whole, total as f64 / (whole * population as f64)]
+    }
+
+    /// G of the champion's team, which may have played in the stage before.
+    fn champion(&self, pois: usize, population: usize) -> f64 {
+        let episodes = if self.farewell.is_empty() { self.starts.len() } else { self.farewell.len() };
+        self.observed(population, episodes, population) as f64 / (pois * episodes) as f64
+    }
+
+    /// POIs that a team observed in all episodes.
+    fn observed(&self, team: usize, episodes: usize, population: usize) -> u64 {
+        (0..episodes).map(|episode| u64::from(self.observed[episode * (population + 1) + team].load(Relaxed))).sum()
     }
 
     /// Hands each team's scores, averaged over its episodes, back to its policies.

@@ -9,7 +9,7 @@ use glam::Vec2;
 
 use crate::backend::compare::{Mismatch, first_mismatch};
 use crate::backend::{Backend, BackendError, Group, Need};
-use crate::config::Config;
+use crate::config::{Config, Paradigm};
 use crate::credit::{Credit, Scores};
 use crate::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use crate::sample;
@@ -41,6 +41,26 @@ impl Plan {
     }
 }
 
+/// Short trainings of the paper's six experiments, each with its name: what they come to is the same on every machine, so
+/// that their digests compare machines that never meet.
+pub fn short_trainings() -> Vec<(String, Config)> {
+    const LAYOUTS: [(&str, &str); 3] = [
+        ("generally forward", include_str!("../configs/generally_forward.toml")),
+        ("strictly forward", include_str!("../configs/strictly_forward.toml")),
+        ("chaotic", include_str!("../configs/chaotic.toml")),
+    ];
+    let mut trainings = Vec::new();
+    for (name, text) in LAYOUTS {
+        for paradigm in [Paradigm::LeaderFollower, Paradigm::AllLeaders] {
+            let mut config = Config::parse(text, name).expect("the paper's own config");
+            config.learning.paradigm = paradigm;
+            (config.learning.trials, config.learning.generations) = (2, 10);
+            trainings.push((format!("{name}, {paradigm}"), config));
+        }
+    }
+    trainings
+}
+
 /// How much was compared, and the first difference, if any.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Agreement {
@@ -58,10 +78,12 @@ struct Teams {
     choice: Vec<u32>,
     /// See [`Group::starts`].
     places: Vec<Vec2>,
+    /// Of every other world also who was seen at which step, which kernels of their own record.
+    need: Need,
 }
 
 impl Teams {
-    fn new(config: &Config, teams: usize, seed: u64) -> Teams {
+    fn new(config: &Config, teams: usize, seed: u64, sights: bool) -> Teams {
         let world = World::new(config);
         let policies = teams.min(64);
         let leaders = world.leaders();
@@ -73,13 +95,13 @@ impl Teams {
         let mut places = world.starts.clone();
         let learning = &config.learning;
         evolve::jitter_pois(Key::new(seed, 0, Purpose::Pois), 0, 0, &world, learning.poi_jitter, &mut places);
-        Teams { policies, weights, choice, places, world }
+        let need = if sights { Need::Sights } else { Need::Record };
+        Teams { policies, weights, choice, places, need, world }
     }
 
     fn group(&self) -> Group<'_> {
-        let Teams { world, policies, weights, choice, places } = self;
-        let need = Need::Record;
-        Group { world, starts: places, weights: weights[..].into(), policies: *policies, teams: choice, need }
+        let Teams { world, policies, weights, choice, places, need } = self;
+        Group { world, starts: places, weights: weights[..].into(), policies: *policies, teams: choice, need: *need }
     }
 }
 
@@ -96,7 +118,8 @@ pub fn compare(
     let mut outcome = Agreement::default();
     let mut all = Vec::with_capacity(plan.worlds.len());
     for (name, config) in &plan.worlds {
-        let teams = Teams::new(config, plan.teams, plan.seed);
+        // Stages train below; a stage's own world is that of its config.
+        let teams = Teams::new(config, plan.teams, plan.seed, outcome.worlds % 2 == 0);
         if let Some(mismatch) = compare_stages(&teams, reference, backend)? {
             outcome.mismatch = Some(format!("{name}: {mismatch}"));
             return Ok(outcome);
@@ -150,7 +173,7 @@ fn compare_batch(
         backend.rollout(groups, &|episode| {
             // A team that is visited twice has a record twice as long.
             let mut record = records[episode.group][episode.team].lock().expect("no visit panics");
-            record.extend(episode.sets.iter().chain(episode.seen.words().iter()));
+            record.extend(episode.sets.iter().chain(episode.seen.words().iter()).chain(episode.sights.iter()));
         })?;
         Ok::<_, BackendError>(records)
     };
@@ -164,33 +187,41 @@ fn compare_batch(
     Ok(teams.into_iter().find(differs))
 }
 
-/// Plays all groups as one batch of which only scores are wanted, of every kind by turns, and holds them against those
+/// Plays all groups as two batches of which only scores are wanted, of every kind by turns, and holds them against those
 /// of the reference's whole record; the first group and team that differs, and how.
 fn compare_scores(
     groups: &[Group<'_>],
     reference: &mut dyn Backend,
     backend: &mut dyn Backend,
 ) -> Result<Option<(usize, usize, String)>, BackendError> {
+    let need_of = |group: usize| Need::OF_SCORES[group % Need::OF_SCORES.len()];
+    // Records come home packed where all of a batch can.
+    let is_whole = |&group: &usize| need_of(group).least(1).is_none() || groups[group].world.rule.is_timed();
+    let (whole, packed): (Vec<usize>, Vec<usize>) = (0..groups.len()).partition(is_whole);
     let played = |backend: &mut dyn Backend, needs: &dyn Fn(usize) -> Need| {
-        let asked: Vec<Group<'_>> =
-            groups.iter().enumerate().map(|(index, group)| Group { need: needs(index), ..*group }).collect();
         let scores: Vec<Mutex<BTreeMap<usize, Scores>>> = groups.iter().map(|_| Mutex::default()).collect();
-        backend.rollout(&asked, &|episode| {
-            let (group, mut credit) = (&groups[episode.group], Credit::default());
-            let found = match Need::OF_SCORES[episode.group % Need::OF_SCORES.len()] {
-                Need::Record | Need::Scores => credit.all(&episode, group.world),
-                Need::Score(fitness) => {
-                    let mut one = vec![0.0; group.world.leaders()];
-                    let observed = credit.score(&episode, group.world, fitness, &mut one);
-                    Scores { observed, d: one, ..Scores::default() }
-                }
-            };
-            scores[episode.group].lock().expect("no visit panics").insert(episode.team, found);
-        })?;
+        for batch in [&whole, &packed] {
+            let asked: Vec<Group<'_>> =
+                batch.iter().map(|&index| Group { need: needs(index), ..groups[index] }).collect();
+            backend.rollout(&asked, &|episode| {
+                let index = batch[episode.group];
+                let (world, mut credit) = (groups[index].world, Credit::default());
+                let found = match need_of(index) {
+                    // Dt is not asked for, whatever the record tells.
+                    Need::Record | Need::Sights | Need::Scores => Scores { dt: vec![], ..credit.all(&episode, world) },
+                    Need::Score(fitness) => {
+                        let mut one = vec![0.0; world.leaders()];
+                        let observed = credit.score(&episode, world, fitness, &mut one);
+                        Scores { observed, d: one, ..Scores::default() }
+                    }
+                };
+                scores[index].lock().expect("no visit panics").insert(episode.team, found);
+            })?;
+        }
         Ok::<_, BackendError>(scores.into_iter().map(|scores| scores.into_inner().expect("no visit panics")))
     };
-    let expected = played(reference, &|_| Need::Record)?;
-    let found = played(backend, &|index| Need::OF_SCORES[index % Need::OF_SCORES.len()])?;
+    let expected = played(reference, &|_| Need::Sights)?;
+    let found = played(backend, &need_of)?;
     Ok(expected.zip(found).enumerate().find_map(|(group, (expected, found))| {
         let differs = |(team, expected): (&usize, &Scores)| {
             let found = found.get(team);

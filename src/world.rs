@@ -2,7 +2,7 @@
 
 use glam::{DVec2, Vec2};
 
-use crate::config::{Config, MAX_AGENTS, MAX_HIDDEN_UNITS, MAX_POIS, MAX_STEPS};
+use crate::config::{Config, LedBy, MAX_AGENTS, MAX_HIDDEN_UNITS, MAX_POIS, MAX_STEPS};
 use crate::declare::Choice;
 use crate::model::couple::{CoupleConstants, Rule};
 use crate::model::follow::FollowConstants;
@@ -24,6 +24,22 @@ pub struct World {
     pub pois: Vec<Vec2>,
     pub coupling: Vec<u32>,
     pub rule: Rule,
+    pub led: Led,
+}
+
+/// Whom a follower is led by at a step, which [`Dt`](crate::config::Fitness::Dt) asks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Led {
+    /// Steps that tell it, the last ones up to this; 0 is all since the start.
+    pub within: usize,
+    /// By which of the leaders that it saw at these.
+    pub by: LedBy,
+}
+
+impl Default for Led {
+    fn default() -> Led {
+        Led { within: 0, by: LedBy::MostSeen }
+    }
 }
 
 impl World {
@@ -58,6 +74,7 @@ impl World {
             starts: [points(&world.leaders), points(&world.followers)].concat(),
             pois: points(&world.pois),
             coupling: world.coupling.of_each(pois),
+            led: Led { within: config.learning.led_within, by: config.learning.led_by },
             rule: Rule::new(world.observers.among(leaders, agents - leaders), agents, &world.windows, &world.after),
         }
     }
@@ -123,6 +140,16 @@ impl World {
     /// Weights of one policy.
     pub fn parameters(&self) -> usize {
         self.constants.policy.parameters as usize
+    }
+
+    /// Words of a bit a leader.
+    pub fn leader_words(&self) -> usize {
+        self.leaders().div_ceil(32)
+    }
+
+    /// Words in one team's record of sights: steps × followers × words of leaders.
+    pub fn sight_words(&self) -> usize {
+        self.steps() * self.followers() * self.leader_words()
     }
 
     /// Words in one team's record of sets: steps × POIs × words a set.

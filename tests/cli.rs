@@ -152,7 +152,7 @@ fn every_wrong_value_is_named_with_line_and_range() {
         (3, "leaders = [[1, 'a']]", "world.leaders[0][1]: found 'a', allowed a number, 0 or 0.000001 to 40 (the map)"),
         (19, "density = 3", "sense.density: found 3, allowed \"linear\" or \"inverse\""),
         (19, "density = 'flat'", "sense.density: found 'flat', allowed \"linear\" or \"inverse\""),
-        (23, "fitness = 'd'", "learning.fitness: found 'd', allowed \"G\" or \"D\" or \"Df\" or \"D++\""),
+        (23, "fitness = 'd'", "learning.fitness: found 'd', allowed \"G\" or \"D\" or \"Df\" or \"D++\" or \"Dt\""),
         (23, "mutation = ''", "learning.mutation: found '', allowed \"scaled\" or \"additive\""),
         (23, "paradigm = 'x'", "learning.paradigm: found 'x', allowed \"leader-follower\" or \"all-leaders\""),
         // NaN and infinity
@@ -251,8 +251,8 @@ x.toml:6: world.coupling: found 9, allowed 1 to 6 (the number of agents)
 x.toml:13: motion.max_sped: unknown key, did you mean `motion.max_speed`?
 x.toml:21: policy.hidden[0]: found 65, allowed 1 to 64
 x.toml:24: learning.trials: found 0, allowed 1 to 4096
-x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, fitness, generations, mutation, \
-         mutation_probability, mutation_sigma, paradigm, population, seed, start_jitter, trials
+x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, fitness, generations, led_by, \
+         led_within, mutation, mutation_probability, mutation_sigma, paradigm, population, seed, start_jitter, trials
 --population: found 1, allowed 2 to 1048576"
     );
 }

@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use flotilla::config::{
-    Actions, Config, ConfigError, Coupling, Density, Domain, Fitness, Follow, Learning, MAX_EPISODES, MAX_GENERATIONS,
-    MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion, Mutation, Observers, Override,
-    Paradigm, Policy, Problem, Saving, Sense, Sharing,
+    Actions, Config, ConfigError, Coupling, Density, Domain, Fitness, Follow, Learning, LedBy, MAX_EPISODES,
+    MAX_GENERATIONS, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion, Mutation,
+    Observers, Override, Paradigm, Policy, Problem, Saving, Sense, Sharing,
 };
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -65,12 +65,15 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             mutation: Mutation::Scaled,
             mutation_probability: 0.15,
             mutation_sigma: 0.1,
+            led_within: 0,
+            led_by: LedBy::MostSeen,
             episodes_per_team: 1,
             start_jitter: 0.0,
             poi_jitter: 0.0,
             seed: 0,
         },
         checkpoint: Saving { generations: 0, seconds: 30.0 },
+        stages: vec![],
     };
     assert_eq!(config, expected);
 }
@@ -125,6 +128,7 @@ fn a_faulty_value_is_blamed_alone() {
         ("[world]\nmap = [1e9, 50]\nleaders = [[900, 2]]\npois = [[3, 4]]", "world.map[0]"),
         ("[world]\nleaders = 3\npois = [[3, 4]]\ncoupling = 7", "world.leaders"),
         ("[world]\nleaders = [[3, 4]]\npois = 3\ncoupling = [1, 1, 1]", "world.pois"),
+        ("[world]\nleaders = [[3, 4]]\npois = 3\nafter = [[7], [1]]\nwindows = [[1, 2]]", "world.pois"),
         (&format!("{SMALLEST}speed = 2\n[motion]\nmin_speed = 'x'"), "motion.min_speed"),
         (&format!("{SMALLEST}[motion]\nmax_speed = -1\nmin_speed = 9"), "motion.max_speed"),
         (&format!("{SMALLEST}[follow]\nattraction_radius = nan\nrepulsion_radius = 9"), "follow.attraction_radius"),
@@ -277,6 +281,7 @@ fn configs() -> impl Strategy<Value = Config> {
         .prop_map(|(hidden, actions)| Policy { hidden, actions });
     let sizes = (2..=5000usize, 0..=MAX_GENERATIONS, 1..=9usize, 0.0..=1.0f64, 1..=MAX_EPISODES);
     let mutation = (word(), size_or_zero(1e-6, 1.0), size_or_zero(1e-6, 100.0));
+    let mutation = (mutation, 0..=MAX_STEPS, word());
     let jitters = (size_or_zero(1e-6, 1e4), size_or_zero(1e-6, 1e4));
     let learning = ((word(), word()), word(), sizes, mutation, jitters, 0..=i64::MAX as u64).prop_map(
         |(
@@ -287,7 +292,7 @@ fn configs() -> impl Strategy<Value = Config> {
             (start_jitter, poi_jitter),
             seed,
         )| {
-            let (mutation, mutation_probability, mutation_sigma) = mutation;
+            let ((mutation, mutation_probability, mutation_sigma), led_within, led_by) = mutation;
             Learning {
                 paradigm,
                 sharing,
@@ -299,6 +304,8 @@ fn configs() -> impl Strategy<Value = Config> {
                 mutation,
                 mutation_probability,
                 mutation_sigma,
+                led_within,
+                led_by,
                 episodes_per_team,
                 start_jitter,
                 poi_jitter,
@@ -313,7 +320,7 @@ fn configs() -> impl Strategy<Value = Config> {
             if learning.paradigm == Paradigm::AllLeaders && world.observers == Observers::Followers {
                 world.observers = Observers::Leaders;
             }
-            Config { world, motion, follow, sense, policy, learning, checkpoint }
+            Config { world, motion, follow, sense, policy, learning, checkpoint, stages: vec![] }
         },
     )
 }

@@ -2,10 +2,10 @@
 //! as the rule has it.
 
 use flotilla::backend::{Episode, Need, Seen, Strided, owner_bits};
-use flotilla::config::{Fitness, Observers};
+use flotilla::config::{Fitness, LedBy, Observers};
 use flotilla::credit::{Credit, Scores};
 use flotilla::model::couple;
-use flotilla::world::{Constants, World};
+use flotilla::world::{Constants, Led, World};
 use glam::Vec2;
 use rand::rngs::ChaCha8Rng;
 use rand::seq::SliceRandom;
@@ -19,7 +19,10 @@ struct Record {
     coupling: Vec<u32>,
     near: Vec<Vec<Vec<usize>>>,
     seen: Vec<Vec<u32>>,
+    /// The leaders that each follower saw at each step, `[steps][followers]`.
+    sights: Vec<Vec<Vec<usize>>>,
     rule: Rule,
+    led: Led,
 }
 
 /// By what rule POIs are observed, as a config has it.
@@ -29,6 +32,18 @@ struct Rule {
     windows: Vec<[usize; 2]>,
     after: Vec<Vec<usize>>,
 }
+
+/// What a record by hand leaves out.
+const EMPTY: Record = Record {
+    leaders: 0,
+    followers: 0,
+    coupling: vec![],
+    near: vec![],
+    seen: vec![],
+    sights: vec![],
+    rule: PLAIN,
+    led: Led { within: 0, by: LedBy::MostSeen },
+};
 
 const PLAIN: Rule = Rule { observers: Observers::All, windows: vec![], after: vec![] };
 
@@ -51,25 +66,31 @@ impl Record {
                 let Rule { observers, windows, after } = &self.rule;
                 couple::Rule::new(observers.among(self.leaders, self.followers), agents, windows, after)
             },
+            led: self.led,
         }
     }
 
-    /// The record as a backend lays it out, among neighbours whose words are noise.
-    fn words(&self, stride: usize, offset: usize, rng: &mut ChaCha8Rng) -> (Vec<u32>, Vec<u32>) {
+    /// The record as a backend lays it out, among neighbours whose words are noise: sets, counts and sights.
+    fn words(&self, stride: usize, offset: usize, rng: &mut ChaCha8Rng) -> [Vec<u32>; 3] {
+        let mut noise = |words: usize| -> Vec<u32> { (0..words * stride).map(|_| rng.random()).collect() };
+        let set = |set: &[usize], word: usize| -> u32 {
+            set.iter().filter(|&&member| member / 32 == word).map(|member| 1 << (member % 32)).sum()
+        };
         let words = (self.leaders + self.followers).div_ceil(32);
-        let pois = self.coupling.len();
-        let mut sets: Vec<u32> = (0..self.near.len() * pois * words * stride).map(|_| rng.random()).collect();
-        for (index, set) in self.near.iter().flatten().enumerate() {
-            for word in 0..words {
-                let bits = set.iter().filter(|&&agent| agent / 32 == word).map(|agent| 1 << (agent % 32)).sum();
-                sets[(index * words + word) * stride + offset] = bits;
-            }
+        let mut sets = noise(self.near.len() * self.coupling.len() * words);
+        for (index, near) in self.near.iter().flatten().enumerate() {
+            (0..words).for_each(|word| sets[(index * words + word) * stride + offset] = set(near, word));
         }
-        let mut seen: Vec<u32> = (0..self.followers * self.leaders * stride).map(|_| rng.random()).collect();
+        let mut seen = noise(self.followers * self.leaders);
         for (index, &steps) in self.seen.iter().flatten().enumerate() {
             seen[index * stride + offset] = steps;
         }
-        (sets, seen)
+        let words = self.leaders.div_ceil(32);
+        let mut sights = noise(self.near.len() * self.followers * words);
+        for (index, seen) in self.sights.iter().flatten().enumerate() {
+            (0..words).for_each(|word| sights[(index * words + word) * stride + offset] = set(seen, word));
+        }
+        [sets, seen, sights]
     }
 
     /// What a need leaves of the record: of each POI the sets that are large enough and that no other contains, and the
@@ -114,7 +135,7 @@ impl Record {
             let before = observed.clone();
             for (poi, set) in sets.iter().enumerate() {
                 let Rule { observers, windows, after } = &self.rule;
-                let at_its_time = windows.is_empty() || (windows[poi][0] <= step + 1 && step + 1 <= windows[poi][1]);
+                let at_its_time = windows.is_empty() || (windows[poi][0]..=windows[poi][1]).contains(&(step + 1));
                 let in_its_turn = after.is_empty() || after[poi].iter().all(|&other| before[other]);
                 let counts = |&&agent: &&usize| match observers {
                     Observers::All => true,
@@ -138,6 +159,22 @@ impl Record {
         (most > 0).then(|| seen.iter().position(|&steps| steps == most).unwrap())
     }
 
+    /// Whether a leader leads an agent at a step, from 0.
+    fn leads(&self, leader: usize, step: usize, agent: usize) -> bool {
+        let Some(follower) = agent.checked_sub(self.leaders) else { return leader == agent };
+        let first = if self.led.within == 0 { 0 } else { (step + 1).saturating_sub(self.led.within) };
+        let count =
+            |leader: usize| (first..=step).filter(|&step| self.sights[step][follower].contains(&leader)).count();
+        match self.led.by {
+            LedBy::AnySeen => count(leader) > 0,
+            LedBy::MostSeen => {
+                count(leader) > 0
+                    && (0..leader).all(|other| count(other) < count(leader))
+                    && (leader + 1..self.leaders).all(|other| count(other) <= count(leader))
+            }
+        }
+    }
+
     fn scores(&self) -> Scores {
         let share = |count: u32, of: u32| count as f32 / of as f32;
         let pois = self.coupling.len() as u32;
@@ -145,6 +182,7 @@ impl Record {
         let owners: Vec<_> = (0..self.leaders + self.followers).map(|agent| self.owner(agent)).collect();
         let without = |leader| observed - self.observed(|_, agent| (agent != leader) as u32);
         let without_group = |leader| observed - self.observed(|_, agent| (owners[agent] != Some(leader)) as u32);
+        let without_led = |leader| observed - self.observed(|step, agent| !self.leads(leader, step, agent) as u32);
         let gain = |leader, copies| self.observed(|_, agent| 1 + if agent == leader { copies } else { 0 }) - observed;
         // a/b is bettered by c/d
         let bettered =
@@ -163,6 +201,7 @@ impl Record {
             d: (0..self.leaders).map(|leader| share(without(leader), pois)).collect(),
             df: (0..self.leaders).map(|leader| share(without_group(leader), pois)).collect(),
             dpp: (0..self.leaders).map(stepping_stone).collect(),
+            dt: (0..self.leaders).map(|leader| share(without_led(leader), pois)).collect(),
         }
     }
 }
@@ -216,7 +255,20 @@ fn random(rng: &mut ChaCha8Rng, agents: usize) -> Record {
         _ => (0..leaders).map(|_| rng.random_range(0..=most)).collect(),
     };
     let seen = (0..followers).map(|_| row(rng)).collect();
-    Record { leaders, followers, coupling, near, seen, rule: PLAIN }
+    // Whom a follower sees, it mostly saw before.
+    let (change, many) = (rng.random_range(0.05..0.6), rng.random_range(0.1..0.7));
+    let mut sights: Vec<Vec<Vec<usize>>> = Vec::new();
+    for step in 0..steps {
+        let of = |follower: usize| match step > 0 && !rng.random_bool(change) {
+            true => sights[step - 1][follower].clone(),
+            false => (0..leaders).filter(|_| rng.random_bool(many)).take(6).collect(),
+        };
+        let now = (0..followers).map(of).collect();
+        sights.push(now);
+    }
+    let within = if rng.random_bool(0.3) { 0 } else { rng.random_range(1..=steps + 1) };
+    let led = Led { within, by: if rng.random_bool(0.5) { LedBy::MostSeen } else { LedBy::AnySeen } };
+    Record { leaders, followers, coupling, near, seen, sights, rule: PLAIN, led }
 }
 
 /// The same with another rule, of every kind.
@@ -248,14 +300,21 @@ fn ruled(rng: &mut ChaCha8Rng, record: Record) -> Record {
 fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: usize) -> Scores {
     let world = record.world();
     let offset = rng.random_range(0..stride);
-    let (sets, seen) = record.words(stride, offset, rng);
+    let [sets, seen, sights] = record.words(stride, offset, rng);
     let strided = |words| Strided { words, stride, offset };
-    let episode = Episode { group: 0, team: 0, sets: strided(&sets), seen: Seen::Counts(strided(&seen)) };
+    let (sights, seen) = (strided(&sights), Seen::Counts(strided(&seen)));
+    let episode = Episode { group: 0, team: 0, sets: strided(&sets), seen, sights };
     let expected = record.scores();
     assert_eq!(credit.all(&episode, &world), expected);
+    let without = Episode { sights: Strided::NONE, ..episode };
+    let dt = if record.followers == 0 { expected.dt.clone() } else { vec![] };
+    assert_eq!(credit.all(&without, &world), Scores { dt, ..expected.clone() });
     let mut g = vec![f32::NAN; record.leaders];
     assert_eq!(credit.score(&episode, &world, Fitness::G, &mut g), expected.observed);
     assert_eq!(g, vec![expected.g; record.leaders]);
+    let mut dt = vec![f32::NAN; record.leaders];
+    assert_eq!(credit.score(&episode, &world, Fitness::Dt, &mut dt), expected.observed);
+    assert_eq!(dt, expected.dt);
     if world.rule.is_timed() {
         return expected;
     }
@@ -263,9 +322,11 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
     for need in [Need::Scores].into_iter().chain(needs) {
         let (sets, owners) = record.packed(need);
         let whole = |words| Strided { words, stride: 1, offset: 0 };
-        let episode = Episode { group: 0, team: 0, sets: whole(&sets), seen: Seen::Most(whole(&owners)) };
+        let seen = Seen::Most(whole(&owners));
+        let episode = Episode { group: 0, team: 0, sets: whole(&sets), seen, sights: Strided::NONE };
         let Need::Score(fitness) = need else {
-            assert_eq!(credit.all(&episode, &world), expected, "packed");
+            let found = Scores { dt: expected.dt.clone(), ..credit.all(&episode, &world) };
+            assert_eq!(found, expected, "packed");
             continue;
         };
         let mut scores = vec![f32::NAN; record.leaders];
@@ -275,7 +336,7 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
             Fitness::G => &of_g,
             Fitness::D => &expected.d,
             Fitness::Df => &expected.df,
-            Fitness::Dpp => &expected.dpp,
+            Fitness::Dpp | Fitness::Dt => &expected.dpp,
         };
         assert_eq!(&scores, wanted, "{need:?}");
     }
@@ -286,9 +347,9 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
 fn every_fitness_is_its_definition() {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut credit = Credit::default();
-    let mut differ = [0; 5];
-    // Of records by another rule: scores that are not those by the default, and D, Df, D++ that are not 0.
-    let mut by_rule = [0; 4];
+    let mut differ = [0; 7];
+    // Of records by another rule: with scores that are not those by the default, and with D, Df, D++ and Dt that differ.
+    let mut by_rule = [0; 5];
     for case in 0..6000 {
         let agents = [3, 12, 20, 32, 33, 70][case % 6];
         let record = random(&mut rng, agents);
@@ -297,13 +358,15 @@ fn every_fitness_is_its_definition() {
         let stride = [1, 8, 16][case % 3];
         let scores = compare(&record, &mut credit, &mut rng, stride);
         let any = |list: &[f32]| list.iter().any(|&score| score > 0.0);
-        let kinds = [found != scores, any(&found.d), found.df != found.d, found.dpp != found.d];
+        let kinds = [found != scores, any(&found.d), found.df != found.d, found.dpp != found.d, found.dt != found.df];
         by_rule.iter_mut().zip(kinds).for_each(|(count, is)| *count += is as u32);
         differ[0] += any(&scores.d) as u32;
         differ[1] += (scores.df != scores.d) as u32;
         differ[2] += (scores.dpp != scores.d) as u32;
         differ[3] += (scores.observed as usize == record.coupling.len()) as u32;
         differ[4] += (scores.observed == 0) as u32;
+        differ[5] += (scores.dt != scores.d) as u32;
+        differ[6] += (scores.dt != scores.df) as u32;
     }
     // The records are of every kind: with critical leaders, with critical groups, with stepping stones, all, none.
     assert!(differ.iter().all(|&cases| cases > 300), "{differ:?}");
@@ -322,14 +385,18 @@ fn a_thousand_agents() {
 }
 
 fn by_hand(record: &Record) -> Scores {
-    compare(record, &mut Credit::default(), &mut ChaCha8Rng::seed_from_u64(0), 8)
+    let mut record = record.clone();
+    // Where it is not said, nobody saw anybody.
+    record.sights.resize(record.near.len(), vec![vec![]; record.followers]);
+    compare(&record, &mut Credit::default(), &mut ChaCha8Rng::seed_from_u64(0), 8)
 }
 
 /// Equations 1 and 2 with C = 2: a pair at one step observes, the same two at different steps do not.
 #[test]
 fn a_pair_must_meet() {
     let near = vec![vec![vec![0, 1], vec![0]], vec![vec![], vec![1]]];
-    let scores = by_hand(&Record { leaders: 2, followers: 0, coupling: vec![2, 2], near, seen: vec![], rule: PLAIN });
+    let scores =
+        by_hand(&Record { leaders: 2, followers: 0, coupling: vec![2, 2], near, seen: vec![], rule: PLAIN, ..EMPTY });
     assert_eq!((scores.observed, scores.g), (1, 0.5));
     assert_eq!((scores.d, scores.df), (vec![0.5, 0.5], vec![0.5, 0.5]));
 }
@@ -338,7 +405,8 @@ fn a_pair_must_meet() {
 #[test]
 fn a_spare_agent_hides_a_leader_but_not_its_group() {
     let near = vec![vec![vec![0, 1, 2]]];
-    let record = Record { leaders: 2, followers: 1, coupling: vec![2], near, seen: vec![vec![3, 1]], rule: PLAIN };
+    let record =
+        Record { leaders: 2, followers: 1, coupling: vec![2], near, seen: vec![vec![3, 1]], rule: PLAIN, ..EMPTY };
     let scores = by_hand(&record);
     assert_eq!(scores.d, [0.0, 0.0]);
     assert_eq!(scores.df, [1.0, 0.0]);
@@ -357,6 +425,7 @@ fn an_unled_follower_is_nobodys() {
         near,
         seen: vec![vec![0], vec![0]],
         rule: PLAIN,
+        ..EMPTY
     });
     assert_eq!((scores.g, scores.d, scores.df), (1.0, vec![0.0], vec![0.0]));
 }
@@ -365,7 +434,8 @@ fn an_unled_follower_is_nobodys() {
 #[test]
 fn a_second_pair_at_another_step_is_enough() {
     let near = vec![vec![vec![0, 1]], vec![vec![2, 3]]];
-    let scores = by_hand(&Record { leaders: 4, followers: 0, coupling: vec![2], near, seen: vec![], rule: PLAIN });
+    let scores =
+        by_hand(&Record { leaders: 4, followers: 0, coupling: vec![2], near, seen: vec![], rule: PLAIN, ..EMPTY });
     assert_eq!((scores.g, scores.d), (1.0, vec![0.0; 4]));
 }
 
@@ -373,7 +443,8 @@ fn a_second_pair_at_another_step_is_enough() {
 #[test]
 fn stepping_stones() {
     let near = vec![vec![vec![0], vec![0, 1]]];
-    let scores = by_hand(&Record { leaders: 3, followers: 0, coupling: vec![3, 3], near, seen: vec![], rule: PLAIN });
+    let scores =
+        by_hand(&Record { leaders: 3, followers: 0, coupling: vec![3, 3], near, seen: vec![], rule: PLAIN, ..EMPTY });
     // Leader 0: one copy completes 1 of 2 POIs (value 1/2), two copies both (2/2 over 2 = 1/2): not bettered.
     // Leader 1: one copy completes the second POI. Leader 2 was near nothing.
     assert_eq!((scores.d, scores.dpp), (vec![0.0; 3], vec![0.5, 0.5, 0.0]));
@@ -390,6 +461,7 @@ fn a_stepping_stone_two_copies_away_is_found_and_three_away_is_not() {
         near: near(&[0]),
         seen: vec![],
         rule: PLAIN,
+        ..EMPTY
     };
     assert_eq!(by_hand(&alone(2)).dpp, [1.0]);
     assert_eq!(by_hand(&alone(3)).dpp, [0.5]);
@@ -402,7 +474,7 @@ fn who_opens_a_poi_is_missed_at_those_behind_it() {
     // Leader 0 alone observes POI 0 at step 1; leader 1 is at POI 1 at steps 1 and 2, which is observed at step 2.
     let near = vec![vec![vec![0], vec![1]], vec![vec![], vec![1]]];
     let rule = Rule { after: vec![vec![], vec![0]], ..PLAIN };
-    let record = Record { leaders: 2, followers: 0, coupling: vec![1, 1], near, seen: vec![], rule };
+    let record = Record { leaders: 2, followers: 0, coupling: vec![1, 1], near, seen: vec![], rule, ..EMPTY };
     let scores = by_hand(&record);
     assert_eq!((scores.observed, scores.d), (2, vec![1.0, 0.5]));
     // Observed at the same step, one opens no other.
@@ -419,7 +491,8 @@ fn who_opens_a_poi_is_missed_at_those_behind_it() {
 fn a_leader_that_does_not_observe_is_worth_its_followers() {
     let near = vec![vec![vec![0, 1, 2]]];
     let rule = Rule { observers: Observers::Followers, ..PLAIN };
-    let record = Record { leaders: 1, followers: 2, coupling: vec![2], near, seen: vec![vec![0], vec![1]], rule };
+    let record =
+        Record { leaders: 1, followers: 2, coupling: vec![2], near, seen: vec![vec![0], vec![1]], rule, ..EMPTY };
     let scores = by_hand(&record);
     assert_eq!(
         (scores.observed, &scores.d[..], &scores.df[..], &scores.dpp[..]),
@@ -427,4 +500,27 @@ fn a_leader_that_does_not_observe_is_worth_its_followers() {
     );
     let near = vec![vec![vec![0, 1]]];
     assert_eq!(by_hand(&Record { near, ..record }).observed, 0);
+}
+
+/// A follower that one leader brings to a POI and another to the next: Df gives both POIs to whom it saw most, Dt each to
+/// whoever led it there.
+#[test]
+fn a_relay_is_told_apart_step_by_step() {
+    // The follower, agent 2, is at POI 0 at step 3, led by leader 0, and at POI 1 at step 5, led by leader 1.
+    let mut near = vec![vec![vec![], vec![]]; 5];
+    (near[2][0], near[4][1]) = (vec![2], vec![2]);
+    let sights = [0, 0, 0, 1, 1].map(|leader| vec![vec![leader]]).to_vec();
+    let led = Led { within: 2, by: LedBy::MostSeen };
+    let record =
+        Record { leaders: 2, followers: 1, coupling: vec![1, 1], near, seen: vec![vec![3, 2]], sights, led, ..EMPTY };
+    let scores = by_hand(&record);
+    assert_eq!((scores.d, scores.df, scores.dt), (vec![0.0; 2], vec![1.0, 0.0], vec![0.5, 0.5]));
+    // Over all steps, leader 0 leads to the end, and of any both lead from step 4 on.
+    let of = |led: Led| by_hand(&Record { led, ..record.clone() }).dt;
+    assert_eq!(of(Led { within: 0, by: LedBy::MostSeen }), [1.0, 0.0]);
+    assert_eq!(of(Led { within: 0, by: LedBy::AnySeen }), [1.0, 0.5]);
+    assert_eq!(of(Led { within: 1, by: LedBy::AnySeen }), [0.5, 0.5]);
+    // Behind the first POI, the second is lost with it.
+    let rule = Rule { after: vec![vec![], vec![0]], ..PLAIN };
+    assert_eq!(by_hand(&Record { rule, ..record.clone() }).dt, [1.0, 0.5]);
 }

@@ -411,6 +411,12 @@ fn policies_depend_on_no_instruction_set() {
     }
 }
 
+/// A layout with a `[learning]` and stages of its own.
+fn staged(layout: &str, rest: &str) -> Config {
+    let world = layout.split("[learning]").next().unwrap();
+    Config::parse(&format!("{world}\n{rest}"), "staged").unwrap_or_else(|error| panic!("{error}"))
+}
+
 /// Arms of every kind that end at different generations.
 fn arms() -> Vec<Config> {
     let small = |config: &mut Config, population, generations, trials| {
@@ -437,6 +443,11 @@ fn arms() -> Vec<Config> {
             small(config, 2, 0, 1);
             config.learning.fitness = Fitness::G;
         }),
+        config(CHAOTIC, |config| {
+            small(config, 10, 3, 1);
+            (config.learning.fitness, config.learning.led_within) = (Fitness::Dt, 5);
+            config.world.windows = vec![[1, 50], [10, 30], [1, 20], [1, 50]];
+        }),
         config(GENERALLY_FORWARD, |config| {
             small(config, 6, 2, 1);
             config.learning.elites = 6;
@@ -453,6 +464,39 @@ fn arms() -> Vec<Config> {
             (config.learning.poi_jitter, config.learning.episodes_per_team) = (3.0, 3);
             config.world.coupling = flotilla::config::Coupling::Same(2);
         }),
+        staged(
+            GENERALLY_FORWARD,
+            "[learning]
+population = 12
+generations = 7
+trials = 2
+fitness = 'D'
+[[stages]]
+from = 2
+set = { 'world.coupling' = 1, 'world.steps' = 12, 'learning.episodes_per_team' = 3, 'learning.start_jitter' = 0.5 }
+[[stages]]
+from = 3
+set = { 'world.pois' = [[10, 12], [40, 20]], 'learning.fitness' = 'D++', 'learning.mutation' = 'additive' }
+[[stages]]
+from = 6
+set = { 'learning.poi_jitter' = 2.0, 'learning.episodes_per_team' = 2 }
+",
+        ),
+        // Its first stage begins at once, its last is its last generation.
+        staged(
+            STRICTLY_FORWARD,
+            "[learning]
+population = 9
+generations = 4
+trials = 1
+[[stages]]
+from = 0
+set = { world.coupling = 1 }
+[[stages]]
+from = 4
+set = { world.coupling = [1, 2], motion.max_speed = 5.0 }
+",
+        ),
     ]
 }
 
@@ -499,9 +543,11 @@ impl Plain<'_> {
         Key::new(self.config.learning.seed, self.trial, purpose)
     }
 
-    /// Observed POIs over all episodes of a generation, and each leader's mean score.
-    fn play(&self, generation: usize, team: &[usize]) -> (u32, Vec<f32>) {
-        let Learning { fitness, episodes_per_team, start_jitter, poi_jitter, .. } = self.config.learning;
+    /// Observed POIs over all episodes with a generation's draws, played in a stage, over all that could be observed; and each
+    /// leader's mean score.
+    fn play(&self, generation: usize, stage: &Config, team: &[usize]) -> (f64, Vec<f32>) {
+        let Learning { fitness, episodes_per_team, start_jitter, poi_jitter, .. } = stage.learning;
+        let of_stage = World::new(stage);
         let population = |leader: usize| &self.policies[if self.policies.len() == 1 { 0 } else { leader }];
         let weights: Vec<f32> =
             team.iter().enumerate().flat_map(|(leader, &policy)| population(leader)[policy].clone()).collect();
@@ -509,19 +555,20 @@ impl Plain<'_> {
         for episode in 0..episodes_per_team {
             let mut starts = Vec::new();
             let key = self.key(Purpose::Starts);
-            evolve::jitter_starts(key, generation, episode, &self.world, start_jitter, &mut starts);
-            evolve::jitter_pois(self.key(Purpose::Pois), generation, episode, &self.world, poi_jitter, &mut starts);
+            evolve::jitter_starts(key, generation, episode, &of_stage, start_jitter, &mut starts);
+            evolve::jitter_pois(self.key(Purpose::Pois), generation, episode, &of_stage, poi_jitter, &mut starts);
             let teams = vec![0; team.len()];
-            let (world, weights, need) = (&self.world, weights[..].into(), Need::Scores);
+            let (world, weights, need) = (&of_stage, weights[..].into(), Need::Sights);
             let group = Group { world, starts: &starts, weights, policies: 1, teams: &teams, need };
             let found = std::sync::Mutex::new(None);
             let visit = |episode: flotilla::backend::Episode<'_>| {
-                let scores = Credit::default().all(&episode, &self.world);
+                let scores = Credit::default().all(&episode, &of_stage);
                 let mine = match fitness {
                     Fitness::G => vec![scores.g; team.len()],
                     Fitness::D => scores.d,
                     Fitness::Df => scores.df,
                     Fitness::Dpp => scores.dpp,
+                    Fitness::Dt => scores.dt,
                 };
                 assert!(found.lock().unwrap().replace((scores.observed, mine)).is_none(), "one visit a team");
             };
@@ -530,16 +577,19 @@ impl Plain<'_> {
             observed += pois;
             totals.iter_mut().zip(scores).for_each(|(total, score)| *total += f64::from(score));
         }
-        (observed, totals.iter().map(|total| (total / episodes_per_team as f64) as f32).collect())
+        (
+            f64::from(observed) / (of_stage.pois.len() * episodes_per_team) as f64,
+            totals.iter().map(|total| (total / episodes_per_team as f64) as f32).collect(),
+        )
     }
 
     /// Rows, then the policies best first.
     fn train(mut self) -> (Vec<Row>, Vec<f32>) {
-        let Learning { population, generations, elites, episodes_per_team, .. } = self.config.learning;
+        let Learning { population, generations, elites, .. } = self.config.learning;
         let leaders = self.world.leaders();
-        let whole = (self.world.pois.len() * episodes_per_team) as f64;
         let mut rows = Vec::new();
         for generation in 0..=generations {
+            let stage = self.config.at(generation);
             let mut teams = vec![0; population * leaders];
             evolve::form_teams(self.key(Purpose::Teams), generation, leaders, &mut teams);
             let shared = self.config.learning.sharing == Sharing::All;
@@ -547,8 +597,8 @@ impl Plain<'_> {
             for (index, team) in teams.chunks(leaders).enumerate() {
                 let team: Vec<usize> =
                     team.iter().map(|&policy| if shared { index } else { policy as usize }).collect();
-                let (pois, scores) = self.play(generation, &team);
-                observed.push(pois);
+                let (share, scores) = self.play(generation, &stage, &team);
+                observed.push(share);
                 if shared {
                     let sum = scores.iter().fold(0.0, |sum, &score| sum + f64::from(score));
                     fitness[0][index] = (sum / leaders as f64) as f32;
@@ -568,15 +618,14 @@ impl Plain<'_> {
                 .collect();
             // The champion plays along with the next generation, so from the starts of that.
             let champion: Vec<usize> = (0..leaders).map(|leader| ranked[if shared { 0 } else { leader }][0]).collect();
-            let (champion, _) = self.play(generation + 1, &champion);
-            let total: u32 = observed.iter().sum();
+            let (champion, _) = self.play(generation + 1, &stage, &champion);
             rows.push(Row {
                 arm: 0,
                 trial: self.trial,
                 generation,
-                best_g: f64::from(*observed.iter().max().unwrap()) / whole,
-                mean_g: f64::from(total) / (whole * population as f64),
-                champion_g: f64::from(champion) / whole,
+                best_g: observed.iter().copied().fold(0.0, f64::max),
+                mean_g: mean(&observed, &stage),
+                champion_g: champion,
             });
             for (leader, (policies, order)) in self.policies.clone().iter().zip(&ranked).enumerate() {
                 let sorted = order.iter().map(|&policy| policies[policy].clone());
@@ -585,13 +634,20 @@ impl Plain<'_> {
                     let key = self.key(Purpose::Tournament).at(generation, leader, slot);
                     let mut child = policies[evolve::tournament(key, &fitness[leader])].clone();
                     let key = self.key(Purpose::Mutation).at(generation, leader, slot);
-                    mutate(Level::baseline(), key, &self.config.learning, &mut child);
+                    mutate(Level::baseline(), key, &stage.learning, &mut child);
                     self.policies[leader][slot] = child;
                 }
             }
         }
         (rows, self.policies.concat().concat())
     }
+}
+
+/// The mean of shares, by what was observed in all.
+fn mean(shares: &[f64], stage: &Config) -> f64 {
+    let whole = (stage.world.pois.len() * stage.learning.episodes_per_team) as f64;
+    let total: f64 = shares.iter().map(|share| (share * whole).round()).sum();
+    total / (whole * shares.len() as f64)
 }
 
 /// POIs move as starts do, by draws of their own, and nothing is said of them where they stay.

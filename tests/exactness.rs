@@ -3,13 +3,20 @@
 #![cfg(feature = "cli")]
 #![expect(unsafe_code, reason = "shaders of the test's own are compiled without bounds checks")]
 
-mod common;
+mod support;
 
 use std::path::{Path, PathBuf};
 
 use flotilla::backend::gpu::device::{self, AdapterInfo, Binding, DeviceError, Kind, Request, Wanted};
+use flotilla::backend::gpu::episode::{self, Kernel};
 use flotilla::backend::gpu::exact::{self, Pass, ShaderError};
 use flotilla::backend::gpu::{self, probe, shaders};
+use flotilla::verify::short_trainings;
+use flotilla::world::World;
+use naga::back::{hlsl, msl};
+use naga::proc::{BoundsCheckPolicies, BoundsCheckPolicy};
+use naga::valid::{Capabilities, FunctionInfo, ValidationFlags, Validator};
+use naga::{BinaryOperator, Expression, Function, Module, ScalarKind};
 use wgpu::BufferUsages;
 
 const BOTH: [Pass; 2] = [Pass::NoContraction, Pass::Guarded];
@@ -132,16 +139,18 @@ fn a_foreign_operation_inside_a_function_and_a_loop_is_found() {
     assert_eq!(exact::foreign_operations(&module), ["deep: float Divide"]);
 }
 
-/// Functions that Rust takes from the platform's mathematical library, which rounds them as it likes.
+/// Functions that Rust takes from the platform's mathematical library, which rounds them as it likes: results and
+/// pictures would hang on it.
 #[test]
-fn nothing_that_decides_results_asks_the_platform() {
-    const PLATFORM: [&str; 20] = [
+fn nothing_asks_the_platform_for_a_function() {
+    const PLATFORM: [&str; 22] = [
         "sin", "cos", "tan", "sin_cos", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2",
-        "exp_m1", "ln", "ln_1p", "log2", "log10", "powf", "cbrt",
+        "exp_m1", "ln", "ln_1p", "log", "log2", "log10", "powf", "cbrt", "hypot",
     ];
-    let decides = ["backend", "kernels", "model"].map(|folder| files(&Path::new("src").join(folder))).concat();
-    let single = ["world", "credit", "evolve", "trainer"].map(|name| PathBuf::from(format!("src/{name}.rs")));
-    for path in decides.into_iter().chain(single) {
+    let code = files(Path::new("src")).into_iter().filter(|path| path.extension().is_some_and(|ending| ending == "rs"));
+    let code: Vec<PathBuf> = code.collect();
+    assert!(code.len() > 50, "only {code:?} were read");
+    for path in code {
         let text = std::fs::read_to_string(&path).unwrap();
         for name in PLATFORM {
             for call in [format!(".{name}("), format!("f32::{name}("), format!("f64::{name}(")] {
@@ -183,6 +192,117 @@ fn every_sum_and_product_is_guarded() {
         assert!(exact::unguarded(&module).expect("shaders are valid") > 0 || name == INTEGERS, "{name}");
         let guarded = exact::guarded(&module).unwrap_or_else(|error| panic!("{name} {error}"));
         assert_eq!(exact::unguarded(&guarded).expect("guarded shaders are valid"), 0, "{name}");
+    }
+}
+
+/// Every shader, and the episode's kernels that are made for the paper's layouts.
+fn kernels() -> Vec<(String, String)> {
+    let made = short_trainings().into_iter().flat_map(|(name, config)| {
+        let world = World::new(&config);
+        [64, 256, 1024].map(|threads| {
+            let text = episode::shader_of(&world, Kernel::Specialised, threads);
+            (format!("{name}, {threads} threads"), text)
+        })
+    });
+    shaders().into_iter().map(|(name, text)| (name.to_string(), text)).chain(made).collect()
+}
+
+/// How many sums, differences and products of floats a module has.
+fn rounding_operations(module: &Module) -> usize {
+    let info = Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(module).expect("it is valid");
+    let floats = |function: &Function, info: &FunctionInfo| {
+        let rounds = function.expressions.iter().filter(|(handle, expression)| {
+            let float = info[*handle].ty.inner_with(&module.types).scalar_kind() == Some(ScalarKind::Float);
+            let op = match expression {
+                Expression::Binary { op, .. } => *op,
+                _ => return false,
+            };
+            float && matches!(op, BinaryOperator::Add | BinaryOperator::Subtract | BinaryOperator::Multiply)
+        });
+        rounds.filter(|(handle, _)| info[*handle].ref_count > 0).count()
+    };
+    let functions = module.functions.iter().map(|(handle, function)| floats(function, &info[handle]));
+    let entries = module.entry_points.iter().enumerate();
+    functions.chain(entries.map(|(at, entry)| floats(&entry.function, info.get_entry_point(at)))).sum()
+}
+
+/// How often a text takes a sum, difference or product by its bits, `cast`, and joins these with something by `|`.
+fn guarded_operations(text: &str, casts: &[&str]) -> usize {
+    let guarded = |inside: &str| {
+        let (mut depth, mut operator) = (0, false);
+        for (at, letter) in inside.char_indices() {
+            let (before, after) = (&inside[..at], &inside[at + letter.len_utf8()..]);
+            match letter {
+                '(' | '[' => depth += 1,
+                ')' if depth == 0 => return operator && after.trim_start_matches(')').starts_with(" | "),
+                ')' | ']' => depth -= 1,
+                '+' | '-' | '*' => operator |= depth == 0 && before.ends_with(' ') && after.starts_with(' '),
+                _ => {}
+            }
+        }
+        false
+    };
+    let found = casts.iter().flat_map(|cast| text.match_indices(cast));
+    found.filter(|(at, cast)| guarded(&text[at + cast.len()..])).count()
+}
+
+/// Metal and DirectX compile texts, and by default Metal's compiler may fuse and reorder: a guard has to stand in the text
+/// around every single sum and product, whatever options the text was written by.
+#[test]
+fn every_product_is_guarded_in_metals_and_directx_text() {
+    for (name, text) in kernels() {
+        let (module, _) = exact::parse(&text).unwrap_or_else(|error| panic!("{name} {error}"));
+        let guarded = exact::guarded(&module).unwrap_or_else(|error| panic!("{name} {error}"));
+        let info =
+            Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&guarded).expect("it is valid");
+        let there = rounding_operations(&guarded);
+        assert!(there > 0 || name == INTEGERS, "{name}: nothing to guard");
+        let policy = |checked| match checked {
+            true => BoundsCheckPolicy::Restrict,
+            false => BoundsCheckPolicy::Unchecked,
+        };
+        for (lang_version, checked) in [((2, 0), false), ((2, 0), true), ((3, 2), false)] {
+            let policy = policy(checked);
+            let options = msl::Options {
+                lang_version,
+                bounds_check_policies: BoundsCheckPolicies {
+                    index: policy,
+                    buffer: policy,
+                    image_load: policy,
+                    binding_array: policy,
+                },
+                zero_initialize_workgroup_memory: checked,
+                force_loop_bounding: checked,
+                emit_int_div_checks: checked,
+                ..Default::default()
+            };
+            let (metal, _) =
+                msl::write_string(&guarded, &info, &options, &Default::default()).expect("it has Metal text");
+            check_text(
+                &format!("{name}, Metal {lang_version:?}"),
+                &metal,
+                there,
+                &["as_type<uint>(", "as_type<metal::uint2>(", "as_type<metal::uint3>(", "as_type<metal::uint4>("],
+            );
+        }
+        let mut directx = String::new();
+        let (options, pipeline) = (hlsl::Options::default(), hlsl::PipelineOptions::default());
+        let written = hlsl::Writer::new(&mut directx, &options, &pipeline).write(&guarded, &info, None);
+        written.unwrap_or_else(|error| panic!("{name}: {error}"));
+        check_text(&format!("{name}, DirectX"), &directx, there, &["asuint(("]);
+        // Without the pass nothing is guarded, or this test shows nothing.
+        let info =
+            Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&module).expect("it is valid");
+        let (plain, _) =
+            msl::write_string(&module, &info, &Default::default(), &Default::default()).expect("it has text");
+        assert_eq!(guarded_operations(&plain, &["as_type<uint>("]), 0, "{name}");
+    }
+}
+
+fn check_text(name: &str, text: &str, there: usize, casts: &[&str]) {
+    assert_eq!(guarded_operations(text, casts), there, "{name}: operations that stand guarded in\n{text}");
+    for never in ["fma(", "mad(", "fast::", "dot(", "mix(", "lerp(", "#pragma"] {
+        assert!(!text.contains(never), "{name} has {never}");
     }
 }
 
@@ -238,7 +358,7 @@ fn all_of_the_core_can_be_guarded() {
     let guarded = exact::guarded(&module).unwrap_or_else(|error| panic!("{error}"));
     assert!(exact::unguarded(&module).expect("it is valid") > 10);
     assert_eq!(exact::unguarded(&guarded).expect("it is valid"), 0);
-    for (request, _) in common::adapters("all_of_the_core_can_be_guarded") {
+    for (request, _) in support::adapters("all_of_the_core_can_be_guarded") {
         for (pass, checked) in [(BOTH[0], false), (BOTH[0], true), (BOTH[1], false), (BOTH[1], true)] {
             let gpu = match gpu::open(Request { pass: Some(pass), checked, ..request.clone() }) {
                 Err(DeviceError::Refused { .. }) if pass == Pass::NoContraction => continue,
@@ -266,7 +386,7 @@ fn shaders_that_no_pass_can_save_are_refused() {
 
 #[test]
 fn devices_are_exact_under_both_passes() {
-    for (request, info) in common::adapters("devices_are_exact_under_both_passes") {
+    for (request, info) in support::adapters("devices_are_exact_under_both_passes") {
         for pass in BOTH {
             for checked in [false, true] {
                 match gpu::open(Request { pass: Some(pass), checked, ..request.clone() }) {
@@ -284,7 +404,7 @@ fn devices_are_exact_under_both_passes() {
 /// The canary: a device known to be inexact has to be caught, or the probes are blind.
 #[test]
 fn the_probes_catch_a_device_without_a_pass() {
-    for (request, info) in common::adapters("the_probes_catch_a_device_without_a_pass") {
+    for (request, info) in support::adapters("the_probes_catch_a_device_without_a_pass") {
         let gpu = gpu::open(Request { pass: Some(Pass::Plain), ..request }).unwrap_or_else(|error| panic!("{error}"));
         let mismatch = gpu::self_test(&gpu).unwrap_or_else(|error| panic!("{error}"));
         if ["llvmpipe", "SwiftShader"].iter().any(|known| info.name.contains(known)) {
@@ -296,7 +416,7 @@ fn the_probes_catch_a_device_without_a_pass() {
 
 #[test]
 fn webgpus_default_limits_are_enough() {
-    for (request, _) in common::adapters("webgpus_default_limits_are_enough") {
+    for (request, _) in support::adapters("webgpus_default_limits_are_enough") {
         let gpu = gpu::open(Request { default_limits: true, ..request }).unwrap_or_else(|error| panic!("{error}"));
         assert_eq!(gpu.limits, wgpu::Limits::defaults());
         let error = gpu.buffer("the weights", (128 << 20) + 4, BufferUsages::STORAGE).expect_err("it is over 128 MiB");
@@ -308,7 +428,7 @@ fn webgpus_default_limits_are_enough() {
 
 #[test]
 fn a_shader_over_the_devices_limits_is_refused() {
-    for (request, _) in common::adapters("a_shader_over_the_devices_limits_is_refused") {
+    for (request, _) in support::adapters("a_shader_over_the_devices_limits_is_refused") {
         for pass in BOTH {
             let request = Request { default_limits: true, pass: Some(pass), ..request.clone() };
             let gpu = match gpu::open(request) {
@@ -337,7 +457,7 @@ fn an_unknown_adapter_lists_those_there_are() {
     for info in device::adapters() {
         assert!(message.contains(&info.name), "{message}");
     }
-    for (request, info) in common::adapters("an_unknown_adapter_lists_those_there_are") {
+    for (request, info) in support::adapters("an_unknown_adapter_lists_those_there_are") {
         let by_name = Wanted::Named(info.name.to_uppercase());
         let gpu = gpu::open(Request { choice: by_name, ..request }).unwrap_or_else(|error| panic!("{error}"));
         assert_eq!(gpu.adapter.name, info.name);
@@ -395,7 +515,7 @@ fn a_real_gpu_is_never_a_software_renderer() {
 
 #[test]
 fn a_lost_device_is_an_error() {
-    for (request, info) in common::adapters("a_lost_device_is_an_error") {
+    for (request, info) in support::adapters("a_lost_device_is_an_error") {
         let gpu = gpu::open(request).unwrap_or_else(|error| panic!("{error}"));
         gpu.check().expect("nothing has happened yet");
         gpu.device.destroy();
@@ -408,7 +528,7 @@ fn a_lost_device_is_an_error() {
 
 #[test]
 fn running_out_of_memory_is_an_error() {
-    for (request, info) in common::adapters("running_out_of_memory_is_an_error") {
+    for (request, info) in support::adapters("running_out_of_memory_is_an_error") {
         let gpu = gpu::open(request).unwrap_or_else(|error| panic!("{error}"));
         let bytes = gpu.limits.max_storage_buffer_binding_size.min(gpu.limits.max_buffer_size) & !3;
         // SwiftShader has less memory than one buffer may take; elsewhere two of the largest may well fit.

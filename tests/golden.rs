@@ -4,7 +4,7 @@
 //! `tests/golden.txt` says what each of its lines covers and when they may be minted anew.
 
 #[cfg(feature = "gpu")]
-mod common;
+mod support;
 
 use std::fmt::Write;
 use std::sync::LazyLock;
@@ -38,7 +38,7 @@ coupling = 4
 type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Which between them cover every choice that a config has, and sizes on both sides of every special case.
-const CASES: [Case; 22] = [
+const CASES: [Case; 25] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -156,6 +156,31 @@ const CASES: [Case; 22] = [
         GENERALLY_FORWARD,
         &[("learning.poi_jitter", "3.0"), ("learning.episodes_per_team", "2"), ("learning.population", "13")],
     ),
+    (
+        "stages",
+        "coupling 1, from generation 3 on 3 with moved starts, from generation 6 on all of a team's speed",
+        GENERALLY_FORWARD,
+        &[(
+            "stages",
+            "[{from = 0, set = {'world.coupling' = 1}}, {from = 3, set = {'learning.start_jitter' = 0.5}}, \
+             {from = 6, set = {'motion.max_speed' = 10.0}}]",
+        )],
+    ),
+    ("led-step-by-step", "Dt, led by whom it saw most so far", CHAOTIC, &[("learning.fitness", "'Dt'")]),
+    (
+        "relay",
+        "Dt, led by any of the last 3 steps, only followers observe, one POI after the other",
+        FORTY_AGENTS,
+        &[
+            ("learning.fitness", "'Dt'"),
+            ("learning.led_within", "3"),
+            ("learning.led_by", "'any-seen'"),
+            ("world.observers", "'followers'"),
+            ("world.coupling", "2"),
+            ("world.after", "[[], [0], [], [2], [3], [4]]"),
+            ("world.windows", "[[1, 25], [2, 25], [3, 20], [1, 25], [1, 25], [10, 11]]"),
+        ],
+    ),
 ];
 
 static CONFIGS: LazyLock<Vec<Config>> = LazyLock::new(|| {
@@ -176,19 +201,19 @@ fn hex(bytes: &[u8]) -> String {
 
 /// What a run came to.
 #[derive(Clone, Debug, PartialEq)]
-struct Golden {
+pub struct Golden {
     /// Bytes hashed and their SHA-256, as `flotilla train` tells it.
-    bytes: usize,
-    sha256: String,
+    pub bytes: usize,
+    pub sha256: String,
     /// SHA-256 of every stage of every step of the last policies: one flipped bit need not change what is selected.
-    episodes: String,
+    pub episodes: String,
 }
 
-/// Trains all cases side by side.
-fn train(backend: &mut dyn Backend) -> Vec<Golden> {
-    let mut trainer = Trainer::new(CONFIGS.clone());
-    let mut texts = vec![String::from("trial,generation,best_g,mean_g,champion_g\n"); CONFIGS.len()];
-    let mut most = vec![0f64; CONFIGS.len()];
+/// Trains all configs side by side: what each came to, and the most that a team of it observed.
+pub fn train(configs: &[Config], backend: &mut dyn Backend) -> Vec<(Golden, f64)> {
+    let mut trainer = Trainer::new(configs.to_vec());
+    let mut texts = vec![String::from("trial,generation,best_g,mean_g,champion_g\n"); configs.len()];
+    let mut most = vec![0f64; configs.len()];
     while !trainer.is_done() {
         for row in trainer.advance(backend).unwrap() {
             most[row.arm] = most[row.arm].max(row.best_g);
@@ -197,15 +222,15 @@ fn train(backend: &mut dyn Backend) -> Vec<Golden> {
         }
     }
     let golden = |(arm, text): (usize, &String)| {
-        assert!(most[arm] > 0.0, "{}: nothing was observed, so selection had nothing to go by", CASES[arm].0);
         let mut hash = Sha256::new_with_prefix(text);
         let policies = trainer.policies(arm).concat();
         hash.update(bytemuck::cast_slice::<f32, u8>(&policies));
-        Golden {
+        let golden = Golden {
             bytes: text.len() + size_of_val(&policies[..]),
             sha256: hex(&hash.finalize()),
-            episodes: trace(backend, &CONFIGS[arm], trainer.world(arm), &trainer.policies(arm)[0]),
-        }
+            episodes: trace(backend, &configs[arm], trainer.world(arm), &trainer.policies(arm)[0]),
+        };
+        (golden, most[arm])
     };
     texts.iter().enumerate().map(golden).collect()
 }
@@ -224,14 +249,16 @@ fn trace(backend: &mut dyn Backend, config: &Config, world: &World, weights: &[f
 /// What it takes to compare runs with those of the past, or to mint them.
 static GOLDEN: LazyLock<Vec<Golden>> = LazyLock::new(|| {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden.txt");
+    // Not read from disk, where there is none.
+    let mut text = String::from(include_str!("golden.txt"));
     if std::env::var("FLOTILLA_MINT").as_deref() == Ok("1") {
-        let mut text = String::from(HEADER);
-        for ((name, what, ..), Golden { bytes, sha256, episodes }) in CASES.iter().zip(train(&mut Cpu::default())) {
+        text = HEADER.into();
+        let minted = train(&CONFIGS, &mut Cpu::default());
+        for ((name, what, ..), (Golden { bytes, sha256, episodes }, _)) in CASES.iter().zip(minted) {
             writeln!(text, "{name:<20} {bytes:>6} {sha256} {episodes}  {what}").unwrap();
         }
-        std::fs::write(path, text).unwrap();
+        std::fs::write(path, &text).unwrap();
     }
-    let text = std::fs::read_to_string(path).unwrap();
     let lines: Vec<&str> = text.lines().filter(|line| !line.starts_with('#')).collect();
     assert_eq!(lines.len(), CASES.len(), "{path} has a line a case");
     let golden = |((name, ..), line): (&Case, &&str)| {
@@ -255,8 +282,9 @@ const HEADER: &str = "\
 # mint them anew: FLOTILLA_MINT=1 cargo test --test golden
 ";
 
-fn check(what: &str, backend: &mut dyn Backend) {
-    for (((name, ..), golden), found) in CASES.iter().zip(&*GOLDEN).zip(train(backend)) {
+pub fn check(what: &str, backend: &mut dyn Backend) {
+    for (((name, ..), golden), (found, most)) in CASES.iter().zip(&*GOLDEN).zip(train(&CONFIGS, backend)) {
+        assert!(most > 0.0, "{name}: nothing was observed, so selection had nothing to go by");
         assert_eq!(found, *golden, "{name}, {what}");
     }
 }
@@ -284,7 +312,7 @@ fn every_instruction_set() {
 #[cfg(feature = "gpu")]
 #[test]
 fn every_adapter() {
-    for (request, info) in common::adapters("every_adapter") {
+    for (request, info) in support::adapters("every_adapter") {
         check(&info.to_string(), &mut GpuEpisodes::new(gpu::open(request).unwrap()).unwrap());
     }
 }

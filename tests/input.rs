@@ -187,7 +187,7 @@ fn outputs_are_whole_or_not_there_and_devices_stay_devices() {
         assert!(!fs::metadata("/dev/full").unwrap().is_file());
     }
     let scores = place.good(&[&rollout[..], &["--scores", "/dev/stdout"]].concat());
-    assert!(scores.starts_with("team,leader,g,d,df,dpp\n0,0,"), "{scores}");
+    assert!(scores.starts_with("team,leader,g,d,df,dpp,dt\n0,0,"), "{scores}");
     // A file that is cut off leaves the one before.
     fs::write(place.path("trace.csv"), "before").unwrap();
     let names = place.names();

@@ -143,7 +143,7 @@ fn checkpoints_need_no_copy() {
     }
     let folder = tempfile::tempdir().unwrap();
     let disk = Disk::default();
-    let mut metrics = metrics::Writer::create(&disk, &folder.path().join("metrics.csv")).unwrap();
+    let mut metrics = metrics::Writer::create(&disk, &folder.path().join("metrics.csv"), &config).unwrap();
     let files = ["copy", "view"].map(|name| {
         let path = folder.path().join(name);
         fs::create_dir(&path).unwrap();
@@ -153,12 +153,13 @@ fn checkpoints_need_no_copy() {
         match name {
             "copy" => {
                 let snapshot = trainer.snapshot(0).unwrap();
-                let checkpoint = Checkpoint { config, seconds, metrics, snapshot };
+                let checkpoint = Checkpoint { config, init: None, seconds, metrics, snapshot };
                 keeper.save(checkpoint, output, Instant::now()).unwrap();
                 keeper.wait().unwrap();
             }
             _ => {
-                let checkpoint = Checkpoint { config, seconds, metrics, snapshot: trainer.view(0).unwrap() };
+                let checkpoint =
+                    Checkpoint { config, init: None, seconds, metrics, snapshot: trainer.view(0).unwrap() };
                 keeper.save_now(&checkpoint, &output, Instant::now()).unwrap();
             }
         }

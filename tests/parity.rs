@@ -5,7 +5,7 @@
 
 #![cfg(feature = "gpu")]
 
-mod common;
+mod support;
 
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::device::Request;
@@ -13,7 +13,7 @@ use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records, Sta
 use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::population::{Brood, Stretch};
 use flotilla::backend::{Backend, Group, Moment, Need, Weights};
-use flotilla::config::{Config, Fitness};
+use flotilla::config::{Config, Coupling, Fitness, Observers};
 use flotilla::declare::Shared;
 use flotilla::evaluate::{Starts, evaluate};
 use flotilla::evolve::{Breeding, Key, Purpose};
@@ -38,7 +38,7 @@ fn check(plan: &Plan, mut backend: GpuEpisodes) -> Agreement {
 /// Caught an empty slice of moments that was cast at the wrong alignment in rollouts.
 #[test]
 fn random_worlds_agree_under_both_passes_and_kernels() {
-    for (request, info) in common::adapters("random_worlds_agree_under_both_passes_and_kernels") {
+    for (request, info) in support::adapters("random_worlds_agree_under_both_passes_and_kernels") {
         for pass in [Pass::NoContraction, Pass::Guarded] {
             for (kernel, seeds) in KERNELS.into_iter().zip([0..40, 0..12]) {
                 let outcome = check(&Plan::random(seeds, 9), open(&request, pass, kernel));
@@ -51,7 +51,7 @@ fn random_worlds_agree_under_both_passes_and_kernels() {
 
 #[test]
 fn checked_shaders_and_default_limits_agree() {
-    for (request, info) in common::adapters("checked_shaders_and_default_limits_agree") {
+    for (request, info) in support::adapters("checked_shaders_and_default_limits_agree") {
         for request in
             [Request { checked: true, ..request.clone() }, Request { default_limits: true, ..request.clone() }]
         {
@@ -69,7 +69,7 @@ fn checked_shaders_and_default_limits_agree() {
 #[test]
 fn a_changed_twin_is_named_by_its_stage() {
     type Edit = fn(String) -> String;
-    let edits: [(&str, Edit); 9] = [
+    let edits: [(&str, Edit); 11] = [
         ("sense", |text| replaced(text, "density = 1.0 - root(d2)", "density = 1.0000001 - root(d2)")),
         ("policy", |text| replaced(text, "14.7163315", "14.716334")),
         ("follow", |text| replaced(text, "vec2(push * world.wall_gain", "vec2(push * 1.01 * world.wall_gain")),
@@ -79,8 +79,10 @@ fn a_changed_twin_is_named_by_its_stage() {
         ("policy", |text| replaced(text, "if wanted[3] > most", "if wanted[3] >= most")),
         ("policy", |text| replaced(text, "if densities.y > most", "if densities.y >= most")),
         ("breed", |text| replaced(text, "* brood.sigma", "* 1.0000001 * brood.sigma")),
+        ("sight", |text| replaced(text, "return d2 <= world.attr", "return 1.01 * d2 <= world.attr")),
+        ("sight", |text| replaced(text, "sights + (step * rows + row)", "sights + (step * rows + rows - 1u - row)")),
     ];
-    for (request, info) in common::adapters("a_changed_twin_is_named_by_its_stage") {
+    for (request, info) in support::adapters("a_changed_twin_is_named_by_its_stage") {
         for ((stage, edit), kernel) in edits.into_iter().zip(KERNELS.into_iter().cycle()) {
             let backend = open(&request, Pass::NoContraction, kernel).edited(edit);
             let mismatch = check(&Plan::random(0..40, 9), backend).mismatch;
@@ -114,7 +116,7 @@ fn large_worlds_agree() {
         places(257, 5.0),
         places(33, 20.0)
     ));
-    for (request, info) in common::adapters("large_worlds_agree") {
+    for (request, info) in support::adapters("large_worlds_agree") {
         let worlds = vec![("crowd".into(), crowd.clone()), ("leaders only".into(), leaders_only.clone())];
         let plan = Plan { worlds, teams: 2, seed: 0, generations: 0 };
         let backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().bringing(Records::Packed);
@@ -135,7 +137,7 @@ fn long_episodes_agree() {
     let text = "[world]\nleaders = [[10.0, 5.0], [20.0, 5.0]]\nfollowers = [[12.0, 2.0], [8.0, 2.0]]\n\
                 pois = [[10.0, 15.0], [30.0, 40.0]]\nsteps = 3000\n[learning]\npopulation = 2\ntrials = 1";
     let config = Config::parse(text, "long.toml").unwrap();
-    for (request, info) in common::adapters("long_episodes_agree") {
+    for (request, info) in support::adapters("long_episodes_agree") {
         for kernel in KERNELS {
             let plan = Plan { worlds: vec![("long".into(), config.clone())], teams: 9, seed: 0, generations: 0 };
             let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap().playing(kernel);
@@ -166,7 +168,7 @@ fn batches_cut_small_give_the_same_record() {
         record.into_inner().unwrap()
     };
     let expected = record(&mut Cpu::default());
-    for (request, info) in common::adapters("batches_cut_small_give_the_same_record") {
+    for (request, info) in support::adapters("batches_cut_small_give_the_same_record") {
         for bytes in [1 << 12, 1 << 15, 1 << 28] {
             let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
             assert_eq!(record(&mut backend.batched(bytes)), expected, "{info}, batches of {bytes} bytes");
@@ -183,6 +185,11 @@ fn training_gives_the_same_metrics_and_weights() {
     (jittered.learning.trials, jittered.learning.generations, jittered.learning.population) = (1, 2, 20);
     (jittered.learning.start_jitter, jittered.learning.episodes_per_team) = (0.5, 3);
     jittered.learning.fitness = Fitness::Dpp;
+    let mut relay = Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap();
+    (relay.learning.trials, relay.learning.generations, relay.learning.population) = (1, 3, 20);
+    (relay.learning.fitness, relay.learning.led_within) = (Fitness::Dt, 4);
+    (relay.world.observers, relay.world.coupling) = (Observers::Followers, Coupling::Same(1));
+    (relay.world.steps, relay.world.after) = (40, vec![vec![], vec![0], vec![], vec![2]]);
     let train = |backend: &mut dyn Backend, configs: &[Config]| {
         let mut trainer = Trainer::new(configs.to_vec());
         let mut rows = Vec::new();
@@ -192,13 +199,14 @@ fn training_gives_the_same_metrics_and_weights() {
         let weights: Vec<Vec<Vec<f32>>> = (0..configs.len()).map(|arm| trainer.policies(arm)).collect();
         (rows, weights)
     };
-    let both = [config.clone(), jittered.clone()];
+    let both = [config.clone(), jittered.clone(), relay.clone()];
     let (rows, weights) = train(&mut Cpu::default(), &both);
+    assert!(rows.iter().any(|row| row.arm == 2 && row.best_g > 0.0), "nothing was relayed: {rows:?}");
     assert!(rows.iter().any(|row| row.best_g > 0.0), "nothing was observed: {rows:?}");
     for (arm, config) in both.iter().enumerate() {
         assert_eq!(train(&mut Cpu::default(), std::slice::from_ref(config)).1[0], weights[arm]);
     }
-    for (request, info) in common::adapters("training_gives_the_same_metrics_and_weights") {
+    for (request, info) in support::adapters("training_gives_the_same_metrics_and_weights") {
         let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap();
         assert_eq!(train(&mut backend, &both), (rows.clone(), weights.clone()), "{info}");
     }
@@ -242,7 +250,7 @@ fn held_out_episodes_come_to_the_same_on_every_backend() {
     assert_ne!(evaluate(&mut Cpu::default(), &group, &others, &|_| ()).unwrap(), expected, "moved POIs matter");
     let spreads: Vec<_> = (0..policies).map(|team| expected.team(team)).collect();
     assert!(spreads.iter().any(|spread| spread.deviation > Some(0.0)), "nobody observes anything: {spreads:?}");
-    for (request, info) in common::adapters("held_out_episodes_come_to_the_same_on_every_backend") {
+    for (request, info) in support::adapters("held_out_episodes_come_to_the_same_on_every_backend") {
         let found = evaluate(&mut open(&request, Pass::Guarded, Kernel::Best), &group, &starts, &|_| ()).unwrap();
         assert_eq!(found, expected, "{info}");
     }
@@ -250,7 +258,7 @@ fn held_out_episodes_come_to_the_same_on_every_backend() {
 
 #[test]
 fn verify_tells_as_json_what_it_compared() {
-    for (index, (_, info)) in common::adapters("verify_tells_as_json_what_it_compared").into_iter().enumerate() {
+    for (index, (_, info)) in support::adapters("verify_tells_as_json_what_it_compared").into_iter().enumerate() {
         let adapter = index.to_string();
         let line = ["verify", "--worlds", "2", "--teams", "3", "--json", "-q", "--adapter", &adapter];
         let output = assert_cmd::cargo::cargo_bin_cmd!("flotilla").args(line).output().unwrap();
@@ -286,7 +294,7 @@ fn a_wrong_index_is_an_error() {
         (Group { weights: few.into(), ..good }, "weights"),
     ];
     let mut backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::default())];
-    for (request, _) in common::adapters("a_wrong_index_is_an_error") {
+    for (request, _) in support::adapters("a_wrong_index_is_an_error") {
         backends.push(Box::new(GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().holding(Holding::Always)));
     }
     for backend in &mut backends {
@@ -349,7 +357,7 @@ fn kernels_are_compiled_for_few_worlds_and_shared() {
         World::new(&config)
     });
     let (gains, sizes): (Vec<_>, Vec<_>) = (gains.collect(), sizes.collect());
-    for (request, info) in common::adapters("kernels_are_compiled_for_few_worlds_and_shared") {
+    for (request, info) in support::adapters("kernels_are_compiled_for_few_worlds_and_shared") {
         let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().playing(Kernel::Best);
         assert_eq!(play(&mut backend, &gains), [0, 1], "{info}: only the numbers differ");
         assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: the other worlds share the generic kernel");

@@ -2,7 +2,7 @@
 
 #![cfg(feature = "cli")]
 
-mod common;
+mod support;
 
 use std::any::Any;
 use std::sync::Arc;
@@ -56,7 +56,7 @@ fn parents([leaders, slots, _]: [usize; 3], generation: usize) -> Vec<u32> {
 
 #[test]
 fn breeding_gives_the_same_bits() {
-    for (request, info) in common::adapters("breeding_gives_the_same_bits") {
+    for (request, info) in support::adapters("breeding_gives_the_same_bits") {
         let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().holding(Holding::Always);
         let mut mutated = 0;
         for sizes in [[1, 2, 1], [3, 5, 97], [4, 51, 112], [2, 301, 64], [2, 17, 1000], [1, 300, 65], [257, 2, 18]] {
@@ -155,7 +155,7 @@ fn reference() -> (Story, Vec<Vec<Snapshot>>) {
 fn training_comes_to_the_same_wherever_populations_are() {
     let (expected, snapshots) = reference();
     assert!(expected.rows.iter().any(|row| row.best_g > 0.0), "nothing was observed");
-    for (request, info) in common::adapters("training_comes_to_the_same_wherever_populations_are") {
+    for (request, info) in support::adapters("training_comes_to_the_same_wherever_populations_are") {
         let gpu = gpu::open(request).unwrap();
         let open = |holding| GpuEpisodes::new(gpu.clone()).unwrap().holding(holding);
         // The populations of some arms take more than this, of others less.
@@ -238,7 +238,7 @@ fn a_setback_is_told() {
 /// Leaders' populations over the size of a buffer stay on the host, unless that is ruled out.
 #[test]
 fn what_does_not_fit_the_device_is_declined() {
-    for (request, info) in common::adapters("what_does_not_fit_the_device_is_declined") {
+    for (request, info) in support::adapters("what_does_not_fit_the_device_is_declined") {
         let gpu = gpu::open(device::Request { default_limits: true, ..request }).unwrap();
         // The least over WebGPU's 128 MiB; a backend that declines does not look at the weights.
         let sizes = [1, (128 << 20) / 4 / 112 + 1, 112];

@@ -3,7 +3,7 @@
 
 #![cfg(feature = "cli")]
 
-mod common;
+mod support;
 
 use std::collections::BTreeMap;
 use std::sync::Mutex;
@@ -51,9 +51,17 @@ impl Teams {
 /// POIs observed and what the need asks for, of every team of every group.
 type Scores = BTreeMap<(usize, usize), (u32, Vec<Vec<f32>>)>;
 
+/// The need of a group where those that a packed record answers come by turns, from `first` on; or Dt, which none does.
+fn need_of(group: usize, first: usize) -> Need {
+    let (packed, _) = Need::OF_SCORES.split_at(5);
+    if first == DT { Need::Score(Fitness::Dt) } else { packed[(group + first) % packed.len()] }
+}
+
+const DT: usize = usize::MAX;
+
 /// Plays all teams as one batch, the needs of the groups by turns from `first` on; `asked` is what the backend is told.
 fn scores(backend: &mut dyn Backend, all: &[Teams], first: usize, asked: impl Fn(Need) -> Need) -> Scores {
-    let need = |group: usize| Need::OF_SCORES[(group + first) % Need::OF_SCORES.len()];
+    let need = |group: usize| need_of(group, first);
     let groups: Vec<_> = all.iter().enumerate().map(|(index, teams)| teams.group(asked(need(index)))).collect();
     let scores = Mutex::new(Scores::new());
     let visit = |episode: flotilla::backend::Episode<'_>| {
@@ -64,6 +72,7 @@ fn scores(backend: &mut dyn Backend, all: &[Teams], first: usize, asked: impl Fn
                 (credit.score(&episode, world, fitness, &mut one), vec![one])
             }
             _ => {
+                // Dt is not asked for, whatever the record tells.
                 let all = credit.all(&episode, world);
                 (all.observed, vec![all.d, all.df, all.dpp])
             }
@@ -76,7 +85,7 @@ fn scores(backend: &mut dyn Backend, all: &[Teams], first: usize, asked: impl Fn
 }
 
 fn expected(all: &[Teams], first: usize) -> Scores {
-    scores(&mut Cpu::default(), all, first, |_| Need::Record)
+    scores(&mut Cpu::default(), all, first, |_| Need::Sights)
 }
 
 fn open(request: &Request, records: Records) -> GpuEpisodes {
@@ -115,7 +124,14 @@ fn worlds() -> Vec<Config> {
             line(70, [5.0, 6.0], [0.5, 0.1])
         ),
     ];
-    (0..28).map(sample::world).chain(odd.iter().map(|text| config(text))).collect()
+    let random = (0..28).map(|seed| {
+        let mut config = sample::world(seed);
+        // By such rules no record is packed.
+        config.world.windows.clear();
+        config.world.after.clear();
+        config
+    });
+    random.chain(odd.iter().map(|text| config(text))).collect()
 }
 
 #[test]
@@ -124,7 +140,7 @@ fn scores_are_the_same_from_whole_and_packed_records() {
     let expected: Vec<Scores> = (0..2).map(|first| expected(&all, first)).collect();
     let different = expected[0].values().filter(|(observed, _)| *observed > 0).count();
     assert!(different > 100, "only {different} teams observe anything");
-    for (request, info) in common::adapters("scores_are_the_same_from_whole_and_packed_records") {
+    for (request, info) in support::adapters("scores_are_the_same_from_whole_and_packed_records") {
         for (first, expected) in expected.iter().enumerate() {
             for (records, bytes) in [(Records::Whole, 1 << 28), (Records::Packed, 1 << 28), (Records::Packed, 1 << 15)]
             {
@@ -150,7 +166,7 @@ fn a_changed_rule_is_noticed() {
     ];
     let all: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37, true)).collect();
     let expected = expected(&all, 0);
-    for (request, info) in common::adapters("a_changed_rule_is_noticed") {
+    for (request, info) in support::adapters("a_changed_rule_is_noticed") {
         for (index, edit) in edits.into_iter().enumerate() {
             let mut backend = open(&request, Records::Packed).edited(edit);
             assert!(scores(&mut backend, &all, 0, |need| need) != expected, "{info}: edit {index} was not noticed");
@@ -174,7 +190,7 @@ fn everything_or_nothing_may_matter() {
     let [for_dense, for_empty] = [&dense, &empty].map(|teams| expected(teams, 0));
     assert!(for_dense.values().all(|(observed, _)| *observed == 1) && for_empty.values().all(|(o, _)| *o == 0));
     let (whole, table) = (dense[0].whole(), 501 * 4);
-    for (request, info) in common::adapters("everything_or_nothing_may_matter") {
+    for (request, info) in support::adapters("everything_or_nothing_may_matter") {
         let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
         let mut play = |all: &[Teams], expected: &Scores| {
             assert!(scores(&mut backend, all, 0, |need| need) == *expected, "{info}");
@@ -203,7 +219,7 @@ fn whole_records_come_where_they_must() {
     let of = |steps: usize| vec![Teams::new(&config(&text(steps)), 20, true)];
     let (short, long, longest) = (of(100), of(3000), of(10_000));
     let [for_short, for_long, for_longest] = [&short, &long, &longest].map(|teams| expected(teams, 0));
-    for (request, info) in common::adapters("whole_records_come_where_they_must") {
+    for (request, info) in support::adapters("whole_records_come_where_they_must") {
         let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
         assert!(scores(&mut backend, &short, 0, |_| Need::Record) == for_short, "{info}");
         assert_eq!(down(&mut backend), short[0].whole(), "{info}: the record was asked for");
@@ -226,7 +242,7 @@ fn a_generation_moves_less_than_95_bytes_a_team() {
     let teams = std::env::var("FLOTILLA_TEAMS").map_or(1 << 11, |teams| teams.parse().unwrap());
     (config.learning.trials, config.learning.population, config.learning.generations) = (1, teams, 60);
     config.learning.fitness = Fitness::Df;
-    for (request, info) in common::adapters("a_generation_moves_less_than_95_bytes_a_team") {
+    for (request, info) in support::adapters("a_generation_moves_less_than_95_bytes_a_team") {
         let mut backend = open(&request, Records::PackedFrom(0)).holding(Holding::Always);
         let mut trainer = Trainer::new(vec![config.clone()]);
         let mut before = backend.gpu().traffic();
@@ -270,15 +286,20 @@ fn records_are_packed_only_where_time_does_not_matter() {
         ("at some steps", false, |config| config.world.windows = vec![[20, 40]; 4]),
         ("one after the other", false, |config| config.world.after = vec![vec![], vec![0], vec![0], vec![0]]),
     ];
-    for (request, info) in common::adapters("records_are_packed_only_where_time_does_not_matter") {
+    for (request, info) in support::adapters("records_are_packed_only_where_time_does_not_matter") {
         for (what, packed, change) in cases {
             let all = of(change);
             let expected = expected(&all, 0);
             assert!(expected.values().any(|(observed, _)| *observed > 0), "{what}: nothing is observed");
             let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
             assert!(scores(&mut backend, &all, 0, |need| need) == expected, "{info}, {what}");
-            let down = down(&mut backend);
-            assert_eq!(down < all[0].whole() / 2, packed, "{info}, {what}: {down} bytes");
+            let moved = down(&mut backend);
+            assert_eq!(moved < all[0].whole() / 2, packed, "{info}, {what}: {moved} bytes");
+            // Dt asks when its followers were led: nothing is packed, and sights come with the rest.
+            let expected = scores(&mut Cpu::default(), &all, DT, |_| Need::Sights);
+            assert!(scores(&mut backend, &all, DT, |need| need) == expected, "{info}, {what}, Dt");
+            let sights = (200 * 4 * all[0].world.sight_words()) as u64;
+            assert_eq!(down(&mut backend), all[0].whole() + sights, "{info}, {what}, Dt");
         }
     }
 }
@@ -315,7 +336,7 @@ fn compiling() {
     }
     let sweep = Sweep::read(include_str!("../configs/sweeps/large.toml"), "large.toml", &[], false).unwrap();
     cases.push(("large.toml".into(), sweep.points.into_iter().map(|point| small(point.config)).collect()));
-    for (request, info) in common::adapters("compiling") {
+    for (request, info) in support::adapters("compiling") {
         for (name, configs) in &cases {
             let backend = || GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
             let gpu = backend().playing(Kernel::Best).holding(Holding::Always).bringing(Records::PackedFrom(0));

@@ -4,7 +4,7 @@
 
 #![cfg(feature = "cli")]
 
-mod common;
+mod support;
 
 use std::fs;
 use std::io::{self, Cursor, Read};
@@ -620,7 +620,7 @@ fn a_lost_device_costs_nothing() {
 fn a_run_may_change_to_another_processor_and_back() {
     let config = small();
     let expected = reference(&config);
-    for (request, info) in common::adapters("a_run_may_change_to_another_processor_and_back") {
+    for (request, info) in support::adapters("a_run_may_change_to_another_processor_and_back") {
         let gpu = || -> Player {
             let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
             (Box::new(backend), Machine { backend: "gpu".into(), ..Machine::default() })

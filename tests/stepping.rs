@@ -29,7 +29,7 @@ impl Played {
         let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; world.leaders()]).collect();
         let weights = weights[..].into();
         let group =
-            Group { world: &world, starts: &starts, weights, policies: teams, teams: &order, need: Need::Record };
+            Group { world: &world, starts: &starts, weights, policies: teams, teams: &order, need: Need::Sights };
         let trace = Cpu::default().trace(&group).expect("the group fits the world");
         Played { world, starts, trace }
     }
@@ -93,6 +93,7 @@ impl Played {
             team,
             sets: plain(&self.trace.sets[team * sets..][..sets]),
             seen: Seen::Counts(plain(&self.trace.seen[team * seen..][..seen])),
+            sights: plain(&self.trace.sights[team * self.world.sight_words()..][..self.world.sight_words()]),
         };
         Credit::default().all(&episode, &self.world)
     }
@@ -105,7 +106,7 @@ fn a_policys_own_answers_give_the_bits_of_its_trace() {
         for (seed, teams) in (0..40).zip([1, 3, 16, 17, 37, 150].into_iter().cycle()) {
             let played = Played::new(seed, teams);
             let about = format!("seed {seed}, {teams} teams, {}", level_name(level));
-            let stepper = Stepper::at_level(level, played.world.clone(), teams, true);
+            let stepper = Stepper::at_level(level, played.world.clone(), teams, true).and_then(Stepper::with_sights);
             let mut stepper = stepper.unwrap_or_else(|error| panic!("{about}: {error}"));
             stepper.reset_to(&played.starts_of(teams)).expect("they are on the map");
             let mut observed = vec![0; teams];
@@ -123,10 +124,13 @@ fn a_policys_own_answers_give_the_bits_of_its_trace() {
             let leaders = played.world.leaders();
             let mut dpp = vec![-1.0; teams * leaders];
             stepper.fitness(Fitness::Dpp, &mut dpp).expect("a record is kept");
+            let mut dt = vec![-1.0; teams * leaders];
+            stepper.fitness(Fitness::Dt, &mut dt).expect("sights are kept");
             for (team, dpp) in dpp.chunks(leaders).enumerate() {
                 let scores = played.scores(team);
                 assert_eq!(stepper.scores(team).as_ref(), Ok(&scores), "{about}, team {team}");
                 assert_eq!((scores.observed, &scores.dpp[..]), (observed[team], dpp), "{about}, team {team}");
+                assert_eq!(scores.dt, dt[team * leaders..][..leaders], "{about}, team {team}");
             }
         }
     }
@@ -139,7 +143,7 @@ fn each_team_has_its_own_time() {
         let teams = 21;
         let played = Played::new(seed, teams);
         let (last, starts) = (played.world.steps(), played.starts_of(teams));
-        let stepper = Stepper::at_level(level, played.world.clone(), teams, true);
+        let stepper = Stepper::at_level(level, played.world.clone(), teams, true).and_then(Stepper::with_sights);
         let mut stepper = stepper.unwrap_or_else(|error| panic!("{error}"));
         stepper.reset_to(&starts).expect("they are on the map");
         let mut steps = vec![0; teams];

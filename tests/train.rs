@@ -226,7 +226,7 @@ fn the_first_team_of_a_rollout_is_the_trials_champion() {
         let champion: f64 = row.split(',').nth(4).unwrap().parse().unwrap();
         let scores = place.read("scores.csv");
         let (header, scores) = rows(&scores);
-        assert_eq!(header, "team,leader,g,d,df,dpp");
+        assert_eq!(header, "team,leader,g,d,df,dpp,dt");
         assert_eq!(scores.len(), 8 * 2);
         assert_eq!(scores[0][2].parse::<f64>().unwrap(), champion);
         for (index, row) in scores.iter().enumerate() {
@@ -494,7 +494,7 @@ fn held_out_episodes_are_told_by_mean_spread_and_interval() {
     let teams: Vec<Vec<f64>> =
         (0..8).map(|team| episodes.iter().map(|episode| observed(&episode[team])).collect()).collect();
     let (header, rows) = rows(&scores);
-    assert_eq!(header, "team,leader,g,d,df,dpp,episodes,pois,pois_deviation,pois_low,pois_high");
+    assert_eq!(header, "team,leader,g,d,df,dpp,dt,episodes,pois,pois_deviation,pois_low,pois_high");
     assert_eq!(rows.len(), 8 * 2);
     let mut spreads = 0;
     for (index, row) in rows.iter().enumerate() {
@@ -559,7 +559,7 @@ fn held_out_episodes_are_told_by_mean_spread_and_interval() {
 fn one_episode_of_rollout_keeps_its_columns_and_says_so_in_json() {
     let place = trained();
     place.good(&format!("{JITTERY} --episodes 1 --scores scores.csv --trace trace.csv"));
-    assert!(place.read("scores.csv").starts_with("team,leader,g,d,df,dpp\n0,0,"));
+    assert!(place.read("scores.csv").starts_with("team,leader,g,d,df,dpp,dt\n0,0,"));
     let moved = place.read("trace.csv");
     place.good("rollout small.toml --policies run/policies.safetensors --trace trace.csv");
     assert_ne!(place.read("trace.csv"), moved, "--episodes draws even one start");

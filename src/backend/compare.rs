@@ -13,6 +13,8 @@ pub enum Quantity {
     Sense,
     /// What the policy answered.
     Policy,
+    /// Which leaders a follower saw at the step.
+    Sight,
     /// The force on a follower.
     Follow,
     /// Position, heading and speed after the step.
@@ -28,6 +30,7 @@ impl fmt::Display for Quantity {
         f.pad(match self {
             Quantity::Sense => "sense",
             Quantity::Policy => "policy",
+            Quantity::Sight => "sight",
             Quantity::Follow => "follow",
             Quantity::Move => "move",
             Quantity::Couple => "couple",
@@ -90,6 +93,15 @@ pub fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<
             let (step, poi, word) = (row / pois / set_words, row / set_words % pois, row % set_words);
             let place = format!("POI {poi}, agents from {}", word * 32);
             note(Mismatch { step: step + 1, team, stage: Quantity::Couple, place, expected: a, found: b });
+        }
+    }
+    let (words, of_team) = (world.leader_words(), world.sight_words());
+    for (index, (&a, &b)) in expected.sights.iter().zip(&found.sights).enumerate() {
+        if a != b {
+            let (team, row) = (index / of_team, index % of_team / words);
+            let (step, follower) = (row / world.followers(), row % world.followers());
+            let place = format!("follower {follower}, leaders from {}", index % words * 32);
+            note(Mismatch { step: step + 1, team, stage: Quantity::Sight, place, expected: a, found: b });
         }
     }
     let pairs = world.leaders() * world.followers();

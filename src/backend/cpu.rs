@@ -9,7 +9,7 @@ use std::sync::{Mutex, PoisonError};
 use fearless_simd::{Level, Simd, SimdMask, dispatch, f32x4, prelude::*};
 use glam::Vec2;
 
-use super::{Backend, BackendError, Episode, Group, Moment, Seen, Strided, Trace, Visit, Weights};
+use super::{Backend, BackendError, Episode, Group, Moment, Need, Seen, Strided, Trace, Visit, Weights};
 use crate::declare::Fixed;
 use crate::kernels::{math, splat};
 use crate::model::policy::PolicyConstants;
@@ -34,10 +34,14 @@ impl Cpu {
         Cpu { level }
     }
 
-    /// Every instruction set that this processor has, narrowest first.
+    /// Every instruction set that this processor has, narrowest first; with the feature `scalar` also doing without one.
     pub fn levels() -> Vec<Level> {
         let best = Level::new();
         let mut levels = vec![Level::baseline()];
+        #[cfg(feature = "scalar")]
+        if !levels[0].is_fallback() {
+            levels.insert(0, Level::fallback());
+        }
         #[cfg(target_arch = "x86_64")]
         {
             levels.extend(best.as_sse4_2().map(Level::Sse4_2));
@@ -64,6 +68,10 @@ pub fn level_name(level: Level) -> &'static str {
     #[cfg(target_arch = "aarch64")]
     if level.as_neon().is_some() {
         return "NEON";
+    }
+    #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+    if level.as_wasm_simd128().is_some() {
+        return "SIMD128";
     }
     let _ = level;
     "scalar"
@@ -97,6 +105,8 @@ struct Chain<'a> {
     first: usize,
     groups: &'a [Group<'a>],
     teams: usize,
+    /// Whether sights are recorded.
+    sighted: bool,
 }
 
 impl Chain<'_> {
@@ -117,7 +127,8 @@ fn runs<'a>(groups: &'a [Group<'a>]) -> Vec<Chain<'a>> {
     let mut runs = Vec::new();
     for groups in groups.chunk_by(|a, b| std::ptr::eq(a.world, b.world)) {
         let teams = groups.iter().map(Group::team_count).sum();
-        runs.push(Chain { world: groups[0].world, first, groups, teams });
+        let sighted = groups.iter().any(|group| group.need.sights());
+        runs.push(Chain { world: groups[0].world, first, groups, teams, sighted });
         first += groups.len();
     }
     runs
@@ -130,9 +141,12 @@ fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
         runs.iter().flat_map(|run| (0..run.teams).step_by(width).map(move |team| (run, team))).collect();
     // A thread takes whatever lies idle: as many are made as threads play at once.
     let idle: Mutex<Vec<Whole<S>>> = Mutex::default();
-    let take = |world: &World| {
+    let take = |&Chain { world, sighted, .. }: &Chain<'_>| {
         let mut idle = idle.lock().unwrap_or_else(PoisonError::into_inner);
-        let fits = idle.iter().position(|whole| whole.block.world.constants == world.constants);
+        let fits = idle.iter().position(|whole| {
+            whole.block.world.constants == world.constants
+                && whole.sights.len() == sight_words(world, sighted) * S::f32s::LEN
+        });
         if fits.is_none() {
             // Left over from a world that is done.
             idle.clear();
@@ -140,7 +154,7 @@ fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
         fits.map(|index| idle.swap_remove(index))
     };
     blocks.par_iter().with_max_len(1).for_each(|&(run, first)| {
-        let mut whole = take(run.world).unwrap_or_else(|| Whole::new(simd, run.world));
+        let mut whole = take(run).unwrap_or_else(|| Whole::new(simd, run.world, run.sighted));
         let teams = width.min(run.teams - first);
         simd.vectorize(
             #[inline(always)]
@@ -160,10 +174,11 @@ fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
 fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
     let world = group.world;
     let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
-    let run = Chain { world, first: 0, groups: std::slice::from_ref(group), teams };
+    let sighted = group.need.sights();
+    let run = Chain { world, first: 0, groups: std::slice::from_ref(group), teams, sighted };
     let mut moments = vec![bytemuck::Zeroable::zeroed(); (steps + 1) * teams * agents];
-    let (mut sets, mut seen) = (Vec::new(), Vec::new());
-    let mut whole = Whole::new(simd, world);
+    let (mut sets, mut seen, mut sights) = (Vec::new(), Vec::new(), Vec::new());
+    let mut whole = Whole::new(simd, world, sighted);
     for first in (0..teams).step_by(S::f32s::LEN) {
         let lanes = S::f32s::LEN.min(teams - first);
         whole.load(&run, first, lanes);
@@ -183,9 +198,10 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
             let episode = whole.episode(lane, 0, first + lane);
             sets.extend(episode.sets.iter());
             seen.extend(episode.seen.words().iter());
+            sights.extend(episode.sights.iter());
         }
     }
-    Trace { teams, agents, moments, sets, seen }
+    Trace { teams, agents, moments, sets, seen, sights }
 }
 
 /// Whole episodes of one vector of teams: their policies, and their record.
@@ -199,10 +215,17 @@ struct Whole<S: Simd> {
     /// `[steps][pois][words][lanes]`, and the counts when they are complete, `[followers][leaders][lanes]`.
     sets: Vec<u32>,
     seen: Vec<u32>,
+    /// `[steps][followers][words of leaders][lanes]`, where they are recorded.
+    sights: Vec<u32>,
+}
+
+/// Words of a team's sights, if they are recorded.
+fn sight_words(world: &World, sighted: bool) -> usize {
+    if sighted { world.sight_words() } else { 0 }
 }
 
 impl<S: Simd> Whole<S> {
-    fn new(simd: S, world: &World) -> Whole<S> {
+    fn new(simd: S, world: &World, sighted: bool) -> Whole<S> {
         Whole {
             block: Block::new(simd, world),
             network: Network::new(simd, world),
@@ -210,6 +233,7 @@ impl<S: Simd> Whole<S> {
             moved: Vec::new(),
             sets: vec![0; world.set_words() * S::f32s::LEN],
             seen: vec![0; world.followers() * world.leaders() * S::f32s::LEN],
+            sights: vec![0; sight_words(world, sighted) * S::f32s::LEN],
         }
     }
 
@@ -239,11 +263,11 @@ impl<S: Simd> Whole<S> {
     /// Plays some steps.
     #[inline(always)]
     fn play(&mut self, world: &World, steps: Range<usize>) {
-        let Whole { block, network, moved, sets, seen, .. } = self;
+        let Whole { block, network, moved, sets, seen, sights, .. } = self;
         if moved.is_empty() {
-            play(block, network, &world.pois, sets, steps);
+            play(block, network, &world.pois, sets, sights, steps);
         } else {
-            play(block, network, moved, sets, steps);
+            play(block, network, moved, sets, sights, steps);
         }
         for (words, count) in seen.chunks_exact_mut(S::f32s::LEN).zip(&block.counts) {
             count.store_slice(words);
@@ -253,36 +277,42 @@ impl<S: Simd> Whole<S> {
     /// One lane's record.
     fn episode(&self, lane: usize, group: usize, team: usize) -> Episode<'_> {
         let strided = |words| Strided { words, stride: S::f32s::LEN, offset: lane };
-        Episode { group, team, sets: strided(&self.sets), seen: Seen::Counts(strided(&self.seen)) }
+        let seen = Seen::Counts(strided(&self.seen));
+        Episode { group, team, sets: strided(&self.sets), seen, sights: strided(&self.sights) }
     }
 }
 
-/// Plays some steps; the sets are of all steps.
+/// Plays some steps; the sets are of all steps, and so are the sights, if there are any.
 #[inline(always)]
 fn play<S: Simd>(
     block: &mut Block<S>,
     network: &mut Network<S>,
-    pois: &[impl Place<S>],
+    pois: &[impl Spot<S>],
     sets: &mut [u32],
+    sights: &mut [u32],
     steps: Range<usize>,
 ) {
     let size = pois.len() * block.world.constants.words as usize * S::f32s::LEN;
+    let of_step = sights.len() / block.world.constants.steps as usize;
     for step in steps {
         block.look(pois);
         network.decide(&block.inputs, &mut block.outputs);
+        if of_step > 0 {
+            block.watch(&mut sights[step * of_step..]);
+        }
         block.go();
         block.couple(pois, &mut sets[step * size..]);
     }
 }
 
 /// Where a POI is.
-pub(crate) trait Place<S: Simd>: Copy {
+pub(crate) trait Spot<S: Simd>: Copy {
     /// One team a lane.
     fn lanes(self, simd: S) -> [S::f32s; 2];
 }
 
 /// The same in all teams.
-impl<S: Simd> Place<S> for Vec2 {
+impl<S: Simd> Spot<S> for Vec2 {
     #[inline(always)]
     fn lanes(self, simd: S) -> [S::f32s; 2] {
         [splat(simd, self.x), splat(simd, self.y)]
@@ -290,7 +320,7 @@ impl<S: Simd> Place<S> for Vec2 {
 }
 
 /// In each team its own.
-impl<S: Simd> Place<S> for [S::f32s; 2] {
+impl<S: Simd> Spot<S> for [S::f32s; 2] {
     #[inline(always)]
     fn lanes(self, _: S) -> [S::f32s; 2] {
         self
@@ -523,7 +553,7 @@ impl<S: Simd> Block<S> {
 
     /// What leaders sense, for the policies to answer.
     #[inline(always)]
-    pub fn look(&mut self, pois: &[impl Place<S>]) {
+    pub fn look(&mut self, pois: &[impl Spot<S>]) {
         self.find_near();
         self.sense(pois);
     }
@@ -589,12 +619,12 @@ impl<S: Simd> Block<S> {
 
     /// Leaders sense: all POIs, then the other agents, each in ascending order.
     #[inline(always)]
-    fn sense(&mut self, pois: &[impl Place<S>]) {
+    fn sense(&mut self, pois: &[impl Spot<S>]) {
         self.world.constants.variant.density().fix(Sensing { block: self, pois });
     }
 
     #[inline(always)]
-    fn sense_by<P: Place<S>, const DENSITY: u32>(&mut self, pois: &[P]) {
+    fn sense_by<P: Spot<S>, const DENSITY: u32>(&mut self, pois: &[P]) {
         let Block { simd, world, agents, near, inputs, .. } = self;
         for (leader, (agent, inputs)) in agents.iter().zip(inputs).enumerate() {
             let &Agent { x, y, hx, hy, .. } = agent;
@@ -675,6 +705,23 @@ impl<S: Simd> Block<S> {
         }
     }
 
+    /// Records which leaders each follower sees, `[followers][words of leaders][lanes]`.
+    #[inline(always)]
+    pub fn watch(&self, sights: &mut [u32]) {
+        let Block { simd, world, agents, .. } = self;
+        let (leaders, followers) = agents.split_at(world.constants.leaders as usize);
+        let pairs = followers.iter().flat_map(|follower| leaders.chunks(32).map(move |leaders| (follower, leaders)));
+        for ((follower, leaders), words) in pairs.zip(sights.chunks_exact_mut(S::f32s::LEN)) {
+            let (mut seen, mut bit) = (S::u32s::splat(*simd, 0), S::u32s::splat(*simd, 1));
+            for leader in leaders {
+                let sees = follow::sees::<S>(world, leader.x - follower.x, leader.y - follower.y);
+                seen |= sees.to_vector().bitcast::<S::u32s>() & bit;
+                bit += bit;
+            }
+            seen.store_slice(words);
+        }
+    }
+
     /// Everyone moves.
     #[inline(always)]
     fn advance(&mut self) {
@@ -692,7 +739,7 @@ impl<S: Simd> Block<S> {
 
     /// Records who is near each POI, `[pois][words][lanes]`.
     #[inline(always)]
-    pub fn couple(&mut self, pois: &[impl Place<S>], mut sets: &mut [u32]) {
+    pub fn couple(&mut self, pois: &[impl Spot<S>], mut sets: &mut [u32]) {
         let (fours, rest) = pois.as_chunks::<4>();
         for pois in fours {
             sets = observe(self.simd, &self.world, &self.agents, pois, sets);
@@ -726,7 +773,7 @@ struct Sensing<'a, S: Simd, P> {
     pois: &'a [P],
 }
 
-impl<S: Simd, P: Place<S>> Fixed for Sensing<'_, S, P> {
+impl<S: Simd, P: Spot<S>> Fixed for Sensing<'_, S, P> {
     type Output = ();
 
     #[inline(always)]
@@ -766,11 +813,11 @@ pub fn lanes() -> u64 {
     dispatch!(Level::new(), simd => count(simd))
 }
 
-/// Bytes that one vector of teams takes.
-pub fn block_bytes(world: &World) -> u64 {
+/// Bytes that one vector of teams takes, of whom this is needed.
+pub fn block_bytes(world: &World, need: Need) -> u64 {
     let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
-    let words =
-        8 * agents + leaders * world.constants.policy.words() + 3 * followers + world.set_words() + followers * leaders;
+    let record = world.set_words() + followers * leaders + sight_words(world, need.sights());
+    let words = 8 * agents + leaders * world.constants.policy.words() + 3 * followers + record;
     words as u64 * lanes() * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8) as u64
 }
 
@@ -829,7 +876,7 @@ fn observe<'a, S: Simd, const N: usize>(
     simd: S,
     world: &Lanes<S>,
     agents: &[Agent<S>],
-    pois: &[impl Place<S>; N],
+    pois: &[impl Spot<S>; N],
     sets: &'a mut [u32],
 ) -> &'a mut [u32] {
     let mut places = [[splat(simd, 0.0); 2]; N];

@@ -30,14 +30,15 @@ pub const BATCH_BYTES: u64 = 256 << 20;
 /// Weights that a GPU's thread reads at once.
 const FOUR: usize = 4;
 
-/// Words of a team's record: sets and counts.
-fn record_words(world: &World) -> usize {
-    world.set_words() + world.leaders() * world.followers()
+/// Words of a team's record: sets, counts and, where they are needed, sights.
+fn record_words(world: &World, need: Need) -> usize {
+    let sights = if need.sights() { world.sight_words() } else { 0 };
+    world.set_words() + world.leaders() * world.followers() + sights
 }
 
 /// Bytes of a team's record.
-pub fn record_bytes(world: &World) -> u64 {
-    (record_words(world) * size_of::<u32>()) as u64
+pub fn record_bytes(world: &World, need: Need) -> u64 {
+    (record_words(world, need) * size_of::<u32>()) as u64
 }
 
 /// Weights of a team as an episode on a GPU reads them, four at a time.
@@ -76,9 +77,11 @@ pub struct Group<'a> {
 /// What is wanted of an episode. A backend may tell more, and does where that costs nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Need {
-    /// The whole record.
+    /// The whole record, but for who was seen at which step.
     Record,
-    /// What every fitness is worked out from.
+    /// The whole record: what every fitness is worked out from.
+    Sights,
+    /// What every fitness but Dt is worked out from.
     Scores,
     /// What this fitness is worked out from.
     Score(Fitness),
@@ -86,19 +89,21 @@ pub enum Need {
 
 impl Need {
     /// Every need of scores alone.
-    pub const OF_SCORES: [Need; 5] = [
+    pub const OF_SCORES: [Need; 6] = [
         Need::Scores,
         Need::Score(Fitness::G),
         Need::Score(Fitness::D),
         Need::Score(Fitness::Df),
         Need::Score(Fitness::Dpp),
+        Need::Score(Fitness::Dt),
     ];
 
     /// How many agents a set must have to make a difference, where so many must be near; none where the whole record
     /// is wanted.
     pub fn least(self, coupling: u32) -> Option<u32> {
         match self {
-            Need::Record => None,
+            // Dt asks when.
+            Need::Record | Need::Sights | Need::Score(Fitness::Dt) => None,
             // D++ asks how many are missing.
             Need::Scores | Need::Score(Fitness::Dpp) => Some(1),
             Need::Score(Fitness::G | Fitness::D | Fitness::Df) => Some(coupling),
@@ -107,7 +112,12 @@ impl Need {
 
     /// Whether it matters which leader a follower saw most.
     pub fn owners(self) -> bool {
-        matches!(self, Need::Record | Need::Scores | Need::Score(Fitness::Df))
+        matches!(self, Need::Record | Need::Sights | Need::Scores | Need::Score(Fitness::Df))
+    }
+
+    /// Whether it matters which leaders a follower saw at which step.
+    pub fn sights(self) -> bool {
+        matches!(self, Need::Sights | Need::Score(Fitness::Dt))
     }
 }
 
@@ -221,6 +231,9 @@ pub struct Episode<'a> {
     /// [needed](Need), there may be fewer steps, down to none, whose sets give the same scores, see [`crate::credit`].
     pub sets: Strided<'a>,
     pub seen: Seen<'a>,
+    /// The leaders that each follower saw before the move of each step, a bit a leader:
+    /// `[steps][followers][words of leaders]`. Empty where nobody [needs](Need::sights) it.
+    pub sights: Strided<'a>,
 }
 
 /// Which leaders the followers of one team saw.
@@ -256,6 +269,9 @@ pub struct Strided<'a> {
 }
 
 impl<'a> Strided<'a> {
+    /// No words.
+    pub const NONE: Strided<'static> = Strided { words: &[], stride: 1, offset: 0 };
+
     /// All words of this team.
     pub fn iter(self) -> impl Iterator<Item = u32> + 'a {
         (0..self.len()).map(move |index| self.get(index))
@@ -303,9 +319,11 @@ pub struct Trace {
     pub teams: usize,
     pub agents: usize,
     pub moments: Vec<Moment>,
-    /// The record of the rollout, team by team: `[teams][steps][pois][words]` and `[teams][followers][leaders]`.
+    /// The record of the rollout, team by team: `[teams][steps][pois][words]`, `[teams][followers][leaders]` and, where
+    /// [needed](Need::sights), `[teams][steps][followers][words of leaders]`.
     pub sets: Vec<u32>,
     pub seen: Vec<u32>,
+    pub sights: Vec<u32>,
 }
 
 impl Trace {

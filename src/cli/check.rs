@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::{ConfigArgs, Error, output, plot, print};
+use crate::backend::{self, Need};
 use crate::config::Config;
 use crate::memory::Peaks;
 use crate::report::map;
@@ -35,8 +36,8 @@ struct Cost {
     parameters: usize,
     /// Bytes of all trials' policies.
     policy_bytes: u64,
-    /// Bytes of one team's record: who was near which POI at which step, and which leader each follower saw.
-    record_bytes: usize,
+    /// Bytes of one team's record: who was near which POI at which step, which leader each follower saw and, for Dt, when.
+    record_bytes: u64,
     /// Peak of the process where the CPU plays, and how much of it only while a checkpoint is written.
     host_bytes: u64,
     checkpoint_bytes: u64,
@@ -47,24 +48,32 @@ struct Cost {
 
 impl Cost {
     fn of(config: &Config) -> Cost {
-        let world = World::new(config);
-        let learning = &config.learning;
         let wide = |count: usize| count as u128;
-        let teams = wide(learning.trials)
-            * wide(learning.generations + 1)
-            * wide(learning.population + 1)
-            * wide(learning.episodes_per_team);
-        let team_steps = teams * wide(world.steps());
+        let [mut teams, mut team_steps, mut agent_steps] = [0; 3];
+        let (mut agents, mut record_bytes) = (0, 0);
+        // Of stages all that they play, and the size of the largest.
+        for share in config.shares() {
+            let (world, learning) = (World::new(&share), &share.learning);
+            let played = wide(learning.trials)
+                * wide(learning.generations + 1)
+                * wide(learning.population + 1)
+                * wide(learning.episodes_per_team);
+            teams += played;
+            team_steps += played * wide(world.steps());
+            agent_steps += played * wide(world.steps()) * wide(world.agents());
+            agents = agents.max(world.agents());
+            record_bytes = record_bytes.max(backend::record_bytes(&world, Need::Score(learning.fitness)));
+        }
         let plan = Peaks::of([config], rayon::current_num_threads());
         Cost {
-            agents: world.agents(),
+            agents,
             learners: config.learners(),
             teams,
             team_steps,
-            agent_steps: team_steps * wide(world.agents()),
+            agent_steps,
             parameters: config.parameters(),
             policy_bytes: config.policy_bytes(),
-            record_bytes: (world.set_words() + world.followers() * world.leaders()) * size_of::<u32>(),
+            record_bytes,
             host_bytes: plan.host,
             checkpoint_bytes: plan.checkpoint,
             gpu_host_bytes: plan.gpu_host,

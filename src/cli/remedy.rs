@@ -60,6 +60,11 @@ pub fn record(error: &RecordError, again: &str) -> String {
             "\nresume with the config it was started with ({}/{CONFIG}), or choose another --out",
             path.display()
         ),
+        RecordError::InitDiffers { there: Some(_), .. } => {
+            "; resume without --init or with that file, or choose another --out".into()
+        }
+        RecordError::InitDiffers { there: None, .. } => "; resume without --init, or choose another --out".into(),
+        RecordError::InitNeeded { .. } => "; give that file by --init".into(),
         RecordError::Read { .. } | RecordError::Damaged { .. } | RecordError::NoTrial { .. } => String::new(),
     }
 }

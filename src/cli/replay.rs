@@ -59,16 +59,27 @@ pub fn run(args: Args) -> Result<(), Error> {
     let kind = Form::of(&out)?;
     kind.takes(&out, width, fps, step)?;
     let config = runs::config(&folder)?;
-    let steps = config.world.steps;
-    if let Some(step) = step.filter(|&step| step > steps) {
-        return Err(Error::Usage(format!("--step {step}: the episode has steps 0 to {steps}")));
-    }
     let generation = match generation {
         Some(generation) => generation,
         None if trial < config.learning.trials => History::read(&folder, &config, trial)?.newest().unwrap_or(0),
         None => 0,
     };
     let generations: Vec<usize> = compare.into_iter().chain([generation]).collect();
+    if let Some(other) = generations.iter().find(|&&other| config.stage_of(other) != config.stage_of(generation)) {
+        return Err(Error::Usage(format!(
+            "generations {other} and {generation} are of different stages: show one alone"
+        )));
+    }
+    let config = config.at(generation);
+    if generations.len() > 1 && config.learning.poi_jitter > 0.0 {
+        return Err(Error::Usage(
+            "POIs are elsewhere in every generation (learning.poi_jitter): show one alone".into(),
+        ));
+    }
+    let steps = config.world.steps;
+    if let Some(step) = step.filter(|&step| step > steps) {
+        return Err(Error::Usage(format!("--step {step}: the episode has steps 0 to {steps}")));
+    }
     let (mut backend, _) = backend::open(&run)?;
     let signals = Signals::listen()?;
     let (mut meter, last) = (Meter::new(quiet), generations.iter().max().copied().unwrap_or(0));

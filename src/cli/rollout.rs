@@ -36,10 +36,13 @@ pub struct Args {
     /// Take the tensor `weights.N` [default: `weights`, or else `weights.0`]
     #[arg(long, value_name = "N", value_parser = whole)]
     trial: Option<usize>,
+    /// Play in the world of the config's stage N, from 0 [default: that of the file's own keys]
+    #[arg(long, value_name = "N", value_parser = whole)]
+    stage: Option<usize>,
     /// Write every agent's state after every step, and what leaders sense and answer there
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
-    /// Write every leader's scores: team,leader,g,d,df,dpp; of several episodes their means, and the spread of POIs
+    /// Write every leader's scores: team,leader,g,d,df,dpp,dt; of several episodes their means, and the spread of POIs
     #[arg(long, value_name = "FILE")]
     scores: Option<PathBuf>,
     /// Print one JSON object
@@ -92,6 +95,17 @@ pub fn run(args: Args) -> Result<(), Error> {
         set("poi_jitter", args.poi_jitter.map(toml::Value::from)),
     ];
     let config = args.config.load(&overrides.into_iter().flatten().collect::<Vec<_>>())?;
+    let config = match args.stage {
+        None => config,
+        Some(stage) => {
+            let mut staged = config.staged();
+            if stage >= staged.len() {
+                let stages = staged.len();
+                return Err(Error::Usage(format!("--stage {stage}: the config has {stages}, 0 to {}", stages - 1)));
+            }
+            staged.swap_remove(stage).1
+        }
+    };
     let starts = args.starts(config.learning.start_jitter, config.learning.poi_jitter)?;
     let policies = policies::read(&args.policies, &config, args.trial)?;
     let world = World::new(&config);
@@ -106,7 +120,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         weights: policies.weights[..].into(),
         policies: policies.policies,
         teams: &teams,
-        need: Need::Record,
+        need: if args.scores.is_some() { Need::Sights } else { Need::Scores },
     };
 
     let meter = Mutex::new(Meter::new(args.quiet));
@@ -200,7 +214,7 @@ fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> Strin
 fn write_scores(file: &mut dyn Write, evaluation: &Evaluation) -> io::Result<()> {
     let Evaluation { episodes, leaders, observed, .. } = evaluation;
     let several = if *episodes > 1 { ",episodes,pois,pois_deviation,pois_low,pois_high" } else { "" };
-    writeln!(file, "team,leader,g,d,df,dpp{several}")?;
+    writeln!(file, "team,leader,g,d,df,dpp,dt{several}")?;
     for team in 0..observed.len() {
         let several = match evaluation.team(team) {
             Spread { mean, deviation: Some(deviation), interval: Some([low, high]) } => {
@@ -210,7 +224,8 @@ fn write_scores(file: &mut dyn Write, evaluation: &Evaluation) -> io::Result<()>
         };
         for leader in 0..*leaders {
             let [g, d, df, dpp] = evaluation.scores(team, leader);
-            writeln!(file, "{team},{leader},{g},{d},{df},{dpp}{several}")?;
+            let dt = evaluation.dt(team, leader).unwrap_or(f32::NAN);
+            writeln!(file, "{team},{leader},{g},{d},{df},{dpp},{dt}{several}")?;
         }
     }
     Ok(())
@@ -232,7 +247,7 @@ fn write_trace(
         for episode in 0..episodes {
             let starts = starts.of(episode, group.world);
             let last = if episodes > 1 { format!(",{episode}") } else { String::new() };
-            for (first, part) in evaluate::parts(&Group { starts: &starts, ..*group }) {
+            for (first, part) in evaluate::parts(&Group { starts: &starts, need: Need::Record, ..*group }) {
                 let trace = match backend.trace(&part) {
                     Ok(trace) => trace,
                     Err(error) => {

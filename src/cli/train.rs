@@ -13,6 +13,7 @@ use crate::memory::Peaks;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, METRICS, POLICIES, Start};
+use crate::record::policies;
 use crate::report::progress::Board;
 use crate::report::runs;
 use crate::report::tensorboard::Events;
@@ -40,6 +41,10 @@ pub struct Args {
     /// Go on with the run in the folder (without --out the latest of this config's name), or start it if there is none
     #[arg(long, conflicts_with = "force")]
     resume: bool,
+    /// Start from the policies of a safetensors file, in place of random ones: trial i from its tensor `weights.i`, or all from
+    /// `weights`, f32 [leaders, policies, parameters]; fewer policies than a population takes are joined by random ones
+    #[arg(long, value_name = "FILE")]
+    init: Option<PathBuf>,
     /// Write over the run in the folder (without --out in runs/NAME of the config)
     #[arg(long)]
     force: bool,
@@ -91,12 +96,13 @@ pub fn run(args: Args) -> Result<(), Error> {
     let mut player = backend::open(&args.run)?;
     Peaks::of([&config], rayon::current_num_threads()).check(player.1.backend == "gpu").map_err(RunError::from)?;
     let runs_on = player.0.describe();
+    let init = args.init.as_deref().map(|path| policies::read_init(path, &config)).transpose()?;
     let (folder, start) = args.folder()?;
     if let Some(what) = folder::collection(&folder) {
         return Err(Error::Refused(format!("{} holds {what}, not a run; choose another --out", folder.display())));
     }
     let signals = Signals::listen()?;
-    let opened = Session::open(vec![(config.clone(), folder.clone())], start, &Disk::default());
+    let opened = Session::open_from(vec![(config.clone(), folder.clone(), init)], start, &Disk::default());
     let (mut session, notes) = opened.map_err(|error| match error {
         RunError::Record(RecordError::Exists { .. }) if args.tensorboard => Error::Refused(format!(
             "{error}\nfor event files of the run that is there:\n  {}",

@@ -1,18 +1,25 @@
 //! `flotilla verify`: every adapter against the CPU, bit for bit.
 
+use std::ops::ControlFlow::Continue;
 use std::path::PathBuf;
+use std::process::Command;
 
+use fearless_simd::Level;
 use serde_json::json;
 
-use super::{Error, print};
-use crate::backend::cpu::Cpu;
+use super::{Error, output, print};
+use crate::backend::Backend;
+use crate::backend::cpu::{Cpu, level_name};
 use crate::backend::gpu;
 use crate::backend::gpu::device::{self, AdapterInfo, DeviceError, Request, Wanted};
 use crate::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records};
 use crate::backend::gpu::exact::Pass;
 use crate::config::{self, Config};
+use crate::escape;
+use crate::front::{self, Failure};
+use crate::record::evidence::{Compared, ShortTraining, Sighting, Tier};
 use crate::report::progress::Meter;
-use crate::verify::{Agreement, Plan, compare};
+use crate::verify::{Agreement, Plan, compare, short_trainings};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -36,6 +43,13 @@ pub struct Args {
     /// Only this kernel, instead of both
     #[arg(long, value_name = "KERNEL", value_parser = ["generic", "specialised"])]
     kernel: Option<String>,
+    /// Write what was compared, on what, and what short trainings come to, as a row of docs/evidence.md; compares the
+    /// processor's instruction sets, too, and needs no adapter
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+    /// What else there is to know of the machine, for the report
+    #[arg(long, value_name = "TEXT", requires = "report")]
+    note: Option<String>,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -44,45 +58,39 @@ pub struct Args {
     quiet: bool,
 }
 
-/// One line of the table; an error of the device counts as a failure.
-struct Line {
-    adapter: String,
-    pass: Pass,
-    kernel: Kernel,
-    result: Result<Agreement, Error>,
-}
-
-impl Line {
-    /// What differs, or went wrong.
-    fn failure(&self) -> Option<String> {
-        match &self.result {
-            Ok(outcome) => outcome.mismatch.clone(),
-            Err(error) => Some(error.to_string()),
-        }
-    }
-
-    /// Worlds and agent-steps compared.
-    fn compared(&self) -> (usize, u64) {
-        self.result.as_ref().map_or((0, 0), |outcome| (outcome.worlds, outcome.agent_steps))
-    }
-}
-
 /// Prints a table of adapters, passes and kernels, and after it what differs.
 pub fn run(args: Args) -> Result<(), Error> {
+    let config = args.config.as_deref().filter(|path| !config::is_standard_input(path));
+    output::check(&[("--report", args.report.as_deref())], config.as_slice())?;
     let plan = plan(&args)?;
-    let adapters = adapters(args.adapter.as_deref())?;
     let mut lines = Vec::new();
+    if args.report.is_some() {
+        lines.extend(instruction_sets(&plan, args.quiet));
+    }
+    let adapters = match adapters(args.adapter.as_deref()) {
+        // Then the processor alone has something to tell.
+        Err(Error::Device(DeviceError::NoAdapter)) if args.report.is_some() => vec![],
+        adapters => adapters?,
+    };
     for (choice, info) in adapters {
         for pass in passes(args.pass.as_deref(), &info) {
             for kernel in kernels(args.kernel.as_deref()) {
                 let request = Request { pass: Some(pass), ..choice.clone().into() };
                 let result = verify(&plan, request, kernel, &info, args.quiet);
-                lines.push(Line { adapter: info.to_string(), pass, kernel, result });
+                lines.push(Compared {
+                    pass: Some(pass.to_string()),
+                    kernel: Some(kernel.to_string()),
+                    ..line(info.to_string(), &Cpu::default(), result)
+                });
             }
         }
     }
+    if let Some(path) = &args.report {
+        let evidence = evidence(&lines, args.note.clone(), args.quiet)?;
+        output::write(path, |file| file.write_all(evidence.to_json().as_bytes()))?;
+    }
     print(&if args.json { in_json(&lines) } else { in_words(&lines) })?;
-    match lines.iter().filter(|line| line.failure().is_some()).count() {
+    match lines.iter().filter(|line| !line.equal).count() {
         0 => Ok(()),
         failed => Err(Error::Different(format!(
             "{failed} of {} comparisons found other bits than the CPU's; until that is mended, use --backend cpu",
@@ -91,38 +99,96 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
 }
 
+/// One line of the table; an error of the device counts as a failure.
+fn line(adapter: String, reference: &Cpu, result: Result<Agreement, Error>) -> Compared {
+    let against = reference.describe();
+    let outcome =
+        result.unwrap_or_else(|error| Agreement { mismatch: Some(error.to_string()), ..Agreement::default() });
+    let Agreement { worlds, agent_steps, mismatch: failure } = outcome;
+    let equal = failure.is_none();
+    Compared { adapter, pass: None, kernel: None, against, worlds, agent_steps, equal, failure }
+}
+
+/// Every instruction set of the processor against the narrowest.
+fn instruction_sets(plan: &Plan, quiet: bool) -> Vec<Compared> {
+    let levels = Cpu::levels();
+    let wider = levels[1..].iter().map(|&level| {
+        let (mut reference, mut wider) = (Cpu::at_level(levels[0]), Cpu::at_level(level));
+        let mut meter = Meter::new(quiet);
+        let compared = compare(plan, &mut reference, &mut wider, meter_of(&mut meter, plan, level_name(level).into()));
+        meter.clear();
+        line(wider.describe(), &reference, compared.map_err(Error::from))
+    });
+    wider.collect()
+}
+
+/// Shows how far a comparison has come.
+fn meter_of<'a>(meter: &'a mut Meter, plan: &'a Plan, what: String) -> impl FnMut(&Agreement) + 'a {
+    move |outcome| {
+        let (done, all) = (outcome.worlds, plan.worlds.len());
+        meter.show(done as f64 / all as f64, || format!("{what}: {done} of {all} worlds"));
+    }
+}
+
+/// What was compared, on what, and what short trainings come to here.
+fn evidence(lines: &[Compared], note: Option<String>, quiet: bool) -> Result<Sighting, Error> {
+    let (mut trained, mut meter) = (Vec::new(), Meter::new(quiet));
+    let trainings = short_trainings();
+    for (index, (name, config)) in trainings.iter().enumerate() {
+        meter.show(index as f64 / trainings.len() as f64, || format!("training {name}"));
+        let came = front::train(config, &mut Cpu::default(), |_| Continue(())).map_err(|error| match error {
+            Failure::Backend(error) => Error::Backend(error),
+            other => Error::Refused(other.to_string()),
+        })?;
+        trained.push(ShortTraining { config: name.clone(), digest: came.digest() });
+    }
+    meter.clear();
+    Ok(Sighting {
+        processor: processor(),
+        instructions: Some(level_name(Level::new()).into()),
+        note,
+        comparisons: lines.to_vec(),
+        trained,
+        ..Sighting::new(Tier::Executed)
+    })
+}
+
+/// What the processor calls itself, where the system says.
+fn processor() -> Option<String> {
+    let told = match std::env::consts::OS {
+        "linux" => std::fs::read_to_string("/proc/cpuinfo").ok().and_then(|text| {
+            let names = text.lines().filter_map(|line| line.split_once(':'));
+            names.into_iter().find(|(key, _)| key.trim() == "model name").map(|(_, name)| name.to_string())
+        }),
+        "macos" => Command::new("/usr/sbin/sysctl")
+            .args(["-n", "machdep.cpu.brand_string"])
+            .output()
+            .ok()
+            .map(|output| String::from_utf8_lossy(&output.stdout).into_owned()),
+        _ => std::env::var("PROCESSOR_IDENTIFIER").ok(),
+    };
+    told.map(|name| escape::line(name.trim()).into_owned()).filter(|name| !name.is_empty())
+}
+
 /// A table, and below it what differs.
-fn in_words(lines: &[Line]) -> String {
+fn in_words(lines: &[Compared]) -> String {
     let mut text =
         format!("{:<15} {:<12} {:>7} {:>13} {:<10} adapter\n", "pass", "kernel", "worlds", "agent-steps", "result");
     let mut failures = String::new();
-    for line in lines {
-        let Line { adapter, pass, kernel, .. } = line;
-        let (worlds, agent_steps) = line.compared();
-        let failure = line.failure();
-        let result = if failure.is_some() { "DIFFERENT" } else { "equal" };
+    for Compared { adapter, pass, kernel, against, worlds, agent_steps, equal, failure } in lines {
+        let result = if *equal { "equal" } else { "DIFFERENT" };
+        let [pass, kernel] = [pass, kernel].map(|name| name.as_deref().unwrap_or("-"));
         text += &format!("{pass:<15} {kernel:<12} {worlds:>7} {agent_steps:>13} {result:<10} {adapter}\n");
-        failures.extend(failure.map(|what| format!("\n{adapter}, {pass} pass, {kernel} kernel:\n  {what}\n")));
+        failures.extend(failure.iter().map(|what| match pass {
+            "-" => format!("\n{adapter}, against {against}:\n  {what}\n"),
+            pass => format!("\n{adapter}, {pass} pass, {kernel} kernel:\n  {what}\n"),
+        }));
     }
     text + &failures
 }
 
-fn in_json(lines: &[Line]) -> String {
-    let comparison = |line: &Line| {
-        let ((worlds, agent_steps), failure) = (line.compared(), line.failure());
-        json!({
-            "adapter": line.adapter,
-            "pass": line.pass.to_string(),
-            "kernel": line.kernel.to_string(),
-            "worlds": worlds,
-            "agent_steps": agent_steps,
-            "equal": failure.is_none(),
-            "failure": failure,
-        })
-    };
-    let equal = lines.iter().all(|line| line.failure().is_none());
-    let comparisons: Vec<_> = lines.iter().map(comparison).collect();
-    format!("{}\n", json!({ "equal": equal, "comparisons": comparisons }))
+fn in_json(lines: &[Compared]) -> String {
+    format!("{}\n", json!({ "equal": lines.iter().all(|line| line.equal), "comparisons": lines }))
 }
 
 fn plan(args: &Args) -> Result<Plan, Error> {
@@ -130,7 +196,11 @@ fn plan(args: &Args) -> Result<Plan, Error> {
     Ok(match &args.config {
         None => Plan::random(seed..seed + u64::from(args.worlds), teams),
         Some(path) => {
-            let worlds = vec![(config::name(path), Config::load(path)?)];
+            let config = Config::load(path)?;
+            let stages = config.staged().into_iter().enumerate().skip(1);
+            let stages: Vec<_> =
+                stages.map(|(stage, (_, config))| (format!("{}, stage {stage}", config::name(path)), config)).collect();
+            let worlds = [vec![(config::name(path), config)], stages].concat();
             Plan { worlds, teams, seed, generations: 5 }
         }
     })
@@ -173,10 +243,8 @@ fn verify(plan: &Plan, request: Request, kernel: Kernel, info: &AdapterInfo, qui
         return Ok(Agreement { mismatch: Some(mismatch.to_string()), ..Agreement::default() });
     }
     let mut gpu = GpuEpisodes::new(gpu)?.playing(kernel).holding(Holding::Always).bringing(Records::Packed);
-    let compared = compare(plan, &mut Cpu::default(), &mut gpu, |outcome| {
-        let (done, all) = (outcome.worlds, plan.worlds.len());
-        meter.show(done as f64 / all as f64, || format!("{}{pass}: {done} of {all} worlds", info.name));
-    });
+    let shown = meter_of(&mut meter, plan, format!("{}{pass}", info.name));
+    let compared = compare(plan, &mut Cpu::default(), &mut gpu, shown);
     meter.clear();
     Ok(compared?)
 }

@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::MAX_STEPS;
 use crate::declare::choice;
 use crate::model::{LEAST, LONGEST};
 use crate::reader::{Reader, between};
@@ -27,6 +28,9 @@ pub struct Learning {
     pub mutation: Mutation,
     pub mutation_probability: f64,
     pub mutation_sigma: f64,
+    /// See [`Led`](crate::world::Led).
+    pub led_within: usize,
+    pub led_by: LedBy,
     pub episodes_per_team: usize,
     pub start_jitter: f64,
     pub poi_jitter: f64,
@@ -64,6 +68,18 @@ choice! {
         Df = "Df",
         /// Difference evaluation with copies of the leader as stepping stones.
         Dpp = "D++",
+        /// Difference evaluation that takes a leader's followers out with it at the steps at which it leads them.
+        Dt = "Dt",
+    }
+}
+
+choice! {
+    /// By which of the leaders that it saw a follower is led.
+    LedBy {
+        /// The one that it saw at most steps.
+        MostSeen = "most-seen",
+        /// All of them.
+        AnySeen = "any-seen",
     }
 }
 
@@ -106,7 +122,8 @@ impl Learning {
                     "learning.fitness",
                     "",
                     "what policies are selected by: the team's score G, D without a leader, Df without a leader \
-                     and its followers, or D++ with copies of a leader",
+                     and its followers, D++ with copies of a leader, or Dt without a leader and, at each step, the \
+                     followers that it leads then",
                     "3.2, Eq. 1; 4.2, Eq. 5; 2.2",
                 )
                 .choice(Fitness::Df),
@@ -139,6 +156,23 @@ impl Learning {
             mutation_sigma: r
                 .key("learning.mutation_sigma", "", "σ: standard deviation of a mutation", "2.4, 4.3")
                 .number(between(LEAST, 100.0).or_zero(), 0.1),
+            led_within: r
+                .key(
+                    "learning.led_within",
+                    "steps",
+                    "for Dt: how many of the last steps tell who leads a follower, the present one among them; 0 is all \
+                     since the start",
+                    "",
+                )
+                .number(between(0, MAX_STEPS), 0),
+            led_by: r
+                .key(
+                    "learning.led_by",
+                    "",
+                    "for Dt: the leader that a follower saw at most of these steps leads it, or any that it saw",
+                    "4.2, 5",
+                )
+                .choice(LedBy::MostSeen),
             episodes_per_team: r
                 .key("learning.episodes_per_team", "episodes", "over which a team's scores are averaged", "")
                 .number(between(1, MAX_EPISODES), 1),

@@ -35,7 +35,6 @@ pub fn name(path: &Path) -> String {
 /// No such file, not a file, larger than [`MAX_FILE_BYTES`], not UTF-8.
 pub fn read_file(path: &Path) -> Result<String, ConfigError> {
     let fail = |reason: String| ConfigError::Unreadable { name: name(path), reason };
-    let mut bytes = Vec::new();
     let file: Box<dyn Read> = if is_standard_input(path) {
         Box::new(std::io::stdin())
     } else if path.is_dir() {
@@ -43,13 +42,5 @@ pub fn read_file(path: &Path) -> Result<String, ConfigError> {
     } else {
         Box::new(file::open(path).map_err(|error| fail(error.to_string()))?)
     };
-    file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes).map_err(|error| fail(error.to_string()))?;
-    if bytes.len() as u64 > MAX_FILE_BYTES {
-        return Err(fail(format!("it is larger than {MAX_FILE_BYTES} bytes, the most a config file may have")));
-    }
-    String::from_utf8(bytes).map_err(|error| {
-        let line =
-            error.as_bytes()[..error.utf8_error().valid_up_to()].iter().filter(|&&byte| byte == b'\n').count() + 1;
-        fail(format!("line {line} is not UTF-8 text"))
-    })
+    file::text(file, MAX_FILE_BYTES).map_err(|error| fail(error.to_string()))
 }

@@ -17,13 +17,16 @@ pub use crate::model::policy::{Actions, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Pol
 pub use crate::model::sense::{Density, Sense};
 pub use crate::reader::{Definition, Override, Problem};
 pub use learning::{
-    Fitness, Learning, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm, Saving, Sharing,
+    Fitness, Learning, LedBy, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm, Saving,
+    Sharing,
 };
 pub use load::{MAX_FILE_BYTES, is_standard_input, name, read_file};
+pub use stages::{MAX_STAGES, Stage};
 pub use world::{Domain, MAX_AGENTS, MAX_POIS, MAX_STEPS};
 
 mod learning;
 mod load;
+mod stages;
 mod world;
 
 /// Most bytes that the policies of all trials of a run may take.
@@ -59,6 +62,9 @@ pub struct Config {
     pub policy: Policy,
     pub learning: Learning,
     pub checkpoint: Saving,
+    /// What changes from some generations on, see [`Config::staged`].
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub stages: Vec<Stage>,
 }
 
 impl Config {
@@ -82,9 +88,16 @@ impl Config {
             refused: if foreign.contains(&GRID) { &[] } else { &[GRID, VARY] },
             message: "this makes the file a sweep, of many configs; use `flotilla sweep`",
         };
-        reader::read(text, others, overrides, Config::ask).map_err(|reader::Problems { listed, unlisted }| {
-            ConfigError::Invalid { name: name.to_string(), problems: listed, unlisted }
-        })
+        // Stages are of the config that the other keys make.
+        let others = reader::Others { foreign: &[foreign, &[stages::STAGES]].concat(), ..others };
+        let (staging, overrides): (Vec<_>, Vec<_>) =
+            overrides.iter().cloned().partition(|set| set.key == stages::STAGES);
+        let invalid = |problems, unlisted| ConfigError::Invalid { name: name.to_string(), problems, unlisted };
+        let own = reader::read(text, others, &overrides, Config::ask)
+            .map_err(|reader::Problems { listed, unlisted }| invalid(listed, unlisted))?;
+        let staging = staging.last().map(|set| format!("{} = {}", stages::STAGES, set.text));
+        let stages = stages::read(staging.as_deref().unwrap_or(text), staging.is_some(), &own);
+        Ok(Config { stages: stages.map_err(|problems| invalid(problems, 0))?, ..own })
     }
 
     /// This config with some keys changed.
@@ -140,6 +153,7 @@ impl Config {
             policy: Policy::read(r),
             learning: Learning::read(r, paradigm),
             checkpoint: Saving::read(r),
+            stages: vec![],
         };
         if r.faults() == 0 && config.policy_bytes() > MAX_POLICY_BYTES {
             let gib = |bytes: u64| bytes.div_ceil(1 << 30);

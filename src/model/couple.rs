@@ -112,6 +112,10 @@ pub(crate) fn after(r: &mut Reader<'_>, pois: Option<usize>) -> Vec<Vec<usize>> 
     );
     let most = pois.map_or(usize::MAX, |pois| pois - 1);
     let wrong = |after: &[Vec<usize>]| {
+        if pois.is_none() {
+            // There is something else to be mended first.
+            return vec![];
+        }
         let own = after.iter().enumerate().filter(|(poi, after)| after.contains(poi));
         let mut blamed: Vec<_> =
             own.map(|(poi, _)| (poi, "found the POI itself, allowed others".to_string())).collect();
@@ -121,8 +125,8 @@ pub(crate) fn after(r: &mut Reader<'_>, pois: Option<usize>) -> Vec<Vec<usize>> 
         }
         blamed
     };
-    let (pois, lengths) = (("world.pois", pois), 0..=pois.unwrap_or(usize::MAX));
-    asked.lists("lists of POIs", pois, lengths, between(0, most).because("the last POI"), wrong)
+    let lengths = 0..=pois.unwrap_or(usize::MAX);
+    asked.lists("lists of POIs", ("world.pois", pois), lengths, between(0, most).because("the last POI"), wrong)
 }
 
 /// All POIs, each behind those it comes after; and those for which there is no such order.
@@ -190,12 +194,14 @@ impl Rule {
         }
     }
 
-    /// Whether it fits so many words a set and POIs: it is of as many, and no POI waits for itself.
+    /// Whether it fits so many words a set and POIs: it is of as many, no window starts before the first step, and no POI
+    /// waits for itself.
     pub fn fits(&self, words: usize, pois: usize) -> bool {
         let fits = |len: usize, wanted: usize| len == 0 || len == wanted;
         fits(self.counted.len(), words)
             && fits(self.windows.len(), pois)
             && fits(self.after.len(), pois)
+            && self.windows.iter().all(|&[first, _]| first > 0)
             && self.order.len() == self.after.len()
     }
 

@@ -129,6 +129,13 @@ impl<S: Simd> Sums<S> {
     }
 }
 
+/// In which lanes a follower sees the agent at offset (`dx`, `dy`): where it is within the attraction radius.
+#[inline(always)]
+pub fn sees<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::mask32s {
+    let d2 = dx * dx + dy * dy;
+    d2.simd_le(world.follow.attraction_radius2)
+}
+
 /// Adds the agent at offset (`dx`, `dy`); tells in which lanes it is within the attraction radius.
 #[inline(always)]
 pub fn influence<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s, sums: &mut Sums<S>) -> S::mask32s {

@@ -34,6 +34,8 @@ const FITNESS: &str = "fitness.0";
 const PENDING: &str = "pending.0";
 /// Metadata: [`Snapshot::last`].
 const LAST: &str = "generations";
+/// Metadata: [`Checkpoint::init`].
+const INIT: &str = "init";
 const EXTENSION: &str = ".safetensors";
 /// Digits of the generation in a checkpoint's name.
 const DIGITS: usize = 9;
@@ -47,6 +49,8 @@ const SHARE: u32 = 20;
 pub struct Checkpoint<N = Vec<f32>> {
     /// [`config_digest`] of the run's config.
     pub config: String,
+    /// [`policies::Init::digest`] of what the run started from, if not at random.
+    pub init: Option<String>,
     /// Time trained.
     pub seconds: f64,
     pub metrics: Extent,
@@ -75,8 +79,8 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
     /// # Errors
     /// The file cannot be written; nothing else was touched then.
     pub fn write(&self, disk: &Disk, path: &Path, of: &Config) -> std::io::Result<()> {
-        let Checkpoint { config, seconds, metrics, snapshot } = self;
-        let metadata = BTreeMap::from(
+        let Checkpoint { config, init, seconds, metrics, snapshot } = self;
+        let mut metadata = BTreeMap::from(
             [
                 ("config", config.clone()),
                 ("generation", snapshot.generation.to_string()),
@@ -87,6 +91,7 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
             ]
             .map(|(key, value)| (key.to_string(), value)),
         );
+        metadata.extend(init.iter().map(|digest| (INIT.to_string(), digest.clone())));
         let Shapes { weights, fitness, .. } = Shapes::of(of);
         let pending: Vec<[f64; 2]> = snapshot.pending.iter().flatten().map(|row| [row.best_g, row.mean_g]).collect();
         let mut list = Vec::new();
@@ -156,7 +161,8 @@ impl Checkpoint {
         let pending = (0..learning.trials).map(row).collect();
         let seconds = seconds.ok_or("its seconds are no number that can be")?;
         let snapshot = Snapshot { generation, last, weights, fitness, pending };
-        Ok(Checkpoint { config, seconds, metrics, snapshot })
+        let init = file.metadata(INIT).map(String::from);
+        Ok(Checkpoint { config, init, seconds, metrics, snapshot })
     }
 
     /// Takes the weights that it lacks from `policies.safetensors`; false where that is not of the same run.
@@ -343,10 +349,12 @@ impl Keeper {
     fn keep(&mut self, generation: usize) -> Result<(), RecordError> {
         self.kept.retain(|&kept| kept != generation);
         self.kept.push(generation);
-        while self.kept.len() > KEPT {
-            let path = path(&self.folder, self.kept[0]);
+        // What a run started from is kept beside them: its first generations cannot be played again without it.
+        let first = usize::from(self.kept.first() == Some(&0));
+        while self.kept.len() > first + KEPT {
+            let path = path(&self.folder, self.kept[first]);
             self.disk.remove(&path).map_err(RecordError::write(&path))?;
-            self.kept.remove(0);
+            self.kept.remove(first);
         }
         Ok(())
     }

@@ -80,6 +80,9 @@ pub struct Run {
     pub generations: usize,
     /// See [`Folder::digest`]; once the run is done.
     pub digest: Option<String>,
+    /// [`policies::Init::digest`] of what it started from, if not at random.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub init: Option<String>,
     /// What the last session was started by, as a shell reads it.
     #[serde(default)]
     pub command: String,
@@ -116,6 +119,7 @@ impl Run {
             sessions: 0,
             generations: 0,
             digest: None,
+            init: None,
             command: String::new(),
             commit: None,
         }
@@ -277,7 +281,7 @@ impl Folder {
             let reason = match checkpoint::read(&path, &self.file(POLICIES), before.as_ref().unwrap_or(config)) {
                 Ok(Some(checkpoint)) if checkpoint.is_of(config) => {
                     let metrics = self.file(METRICS);
-                    let resumed = metrics::Writer::resume(&self.disk, &metrics, &checkpoint.metrics);
+                    let resumed = metrics::Writer::resume(&self.disk, &metrics, &checkpoint.metrics, config);
                     match resumed.map_err(RecordError::write(&metrics))? {
                         Some(metrics) => {
                             found.checkpoint = Some((checkpoint, metrics));
@@ -513,6 +517,10 @@ pub fn differences(old: &Config, new: &Config) -> Vec<String> {
                 differences.push(format!("  {section}.{key}: {before} there, {} here", shorten(value)));
             }
         }
+    }
+    let stages = |table: &toml::Table| table.get("stages").map_or("none".to_string(), shorten);
+    if old.get("stages") != new.get("stages") {
+        differences.push(format!("  stages: {} there, {} here", stages(&old), stages(&new)));
     }
     differences
 }

@@ -1,7 +1,8 @@
 //! `metrics.csv`: how every trial came on, generation by generation.
 //!
 //! One line a trial and generation, generation by generation and in each trial by trial. G is in 0..1; `seconds` is
-//! the time trained until the line was complete, earlier sessions of a resumed run included. All but `seconds` is the
+//! the time trained until the line was complete, earlier sessions of a resumed run included. Where the config has stages,
+//! a last column `stage` tells of which a generation is, from 0: G is of that stage's POIs. All but `seconds` is the
 //! same bits on every backend.
 
 use std::fs::File;
@@ -12,12 +13,14 @@ use sha2::{Digest, Sha256};
 
 use super::disk::{Disk, Output};
 use super::{RecordError, hex};
-use crate::config::{MAX_GENERATIONS, MAX_TRIALS};
+use crate::config::{Config, MAX_GENERATIONS, MAX_TRIALS};
 use crate::file;
 use crate::trainer::Row;
 
 /// The first line.
 pub const HEADER: &str = "trial,generation,best_g,mean_g,champion_g,seconds";
+/// The first line, where a config has stages.
+pub const STAGED: &str = "trial,generation,best_g,mean_g,champion_g,seconds,stage";
 /// Most bytes in one line.
 const MAX_LINE: u64 = 256;
 
@@ -34,16 +37,25 @@ pub struct Writer {
     output: BufWriter<Output>,
     bytes: u64,
     hash: Sha256,
+    /// The first generation of each stage after stage 0, and whether there is a column for it.
+    stages: Vec<usize>,
+    staged: bool,
 }
 
 impl Writer {
+    fn new(output: BufWriter<Output>, bytes: u64, hash: Sha256, config: &Config) -> Writer {
+        let stages = config.stages.iter().map(|stage| stage.from).filter(|&from| from > 0).collect();
+        Writer { output, bytes, hash, stages, staged: !config.stages.is_empty() }
+    }
+
     /// Starts a file with its header, in the place of any other.
     ///
     /// # Errors
     /// What the system says.
-    pub fn create(disk: &Disk, path: &Path) -> io::Result<Writer> {
-        let mut writer = Writer { output: BufWriter::new(disk.create(path)?), bytes: 0, hash: Sha256::new() };
-        writer.line(HEADER)?;
+    pub fn create(disk: &Disk, path: &Path, config: &Config) -> io::Result<Writer> {
+        let output = BufWriter::new(disk.create(path)?);
+        let mut writer = Writer::new(output, 0, Sha256::new(), config);
+        writer.line(if writer.staged { STAGED } else { HEADER })?;
         writer.output.flush()?;
         Ok(writer)
     }
@@ -52,7 +64,7 @@ impl Writer {
     ///
     /// # Errors
     /// What the system says.
-    pub fn resume(disk: &Disk, path: &Path, mark: &Extent) -> io::Result<Option<Writer>> {
+    pub fn resume(disk: &Disk, path: &Path, mark: &Extent, config: &Config) -> io::Result<Option<Writer>> {
         let mut hash = Sha256::new();
         let mut file = match file::open(path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -69,7 +81,7 @@ impl Writer {
             return Ok(None);
         }
         let output = BufWriter::new(disk.append(path, mark.bytes)?);
-        Ok(Some(Writer { output, bytes: mark.bytes, hash }))
+        Ok(Some(Writer::new(output, mark.bytes, hash, config)))
     }
 
     fn line(&mut self, line: &str) -> io::Result<()> {
@@ -84,7 +96,11 @@ impl Writer {
     /// # Errors
     /// What the system says.
     pub fn add(&mut self, rows: &[Row], seconds: f64) -> io::Result<()> {
-        rows.iter().try_for_each(|row| self.line(&format!("{},{seconds:.3}", shared(row))))
+        rows.iter().try_for_each(|row| {
+            let stage = self.stages.partition_point(|&from| from <= row.generation);
+            let stage = if self.staged { format!(",{stage}") } else { String::new() };
+            self.line(&format!("{},{seconds:.3}{stage}", shared(row)))
+        })
     }
 
     /// Hands all lines to the system, so that others can read them.
@@ -115,8 +131,7 @@ fn shared(row: &Row) -> String {
 /// SHA-256 over rows as in a file, without their seconds, and then over policies: a run's digest.
 pub fn digest(rows: impl Iterator<Item = Row>, policies: &[impl AsRef<[f32]>]) -> [u8; 32] {
     let mut hash = Sha256::new();
-    let header = HEADER.rsplit_once(',').map_or("", |(shared, _)| shared);
-    for line in std::iter::once(header.to_string()).chain(rows.map(|row| shared(&row))) {
+    for line in std::iter::once(without_last(HEADER).to_string()).chain(rows.map(|row| shared(&row))) {
         hash.update(line);
         hash.update("\n");
     }
@@ -141,7 +156,9 @@ pub struct Rows<R> {
     source: R,
     line: usize,
     done: bool,
-    /// SHA-256 of every line without its seconds.
+    /// Whether lines have a stage after the seconds.
+    staged: bool,
+    /// SHA-256 of every line without its seconds and its stage.
     hash: Sha256,
 }
 
@@ -149,9 +166,16 @@ impl<R: BufRead> Rows<R> {
     /// # Errors
     /// The first line is not the header.
     pub fn new(source: R) -> Result<Rows<R>, RowsError> {
-        let mut rows = Rows { source, line: 0, done: false, hash: Sha256::new() };
+        let mut rows = Rows { source, line: 0, done: false, staged: false, hash: Sha256::new() };
         match rows.line() {
             Ok(Some(header)) if header == HEADER => Ok(rows),
+            Ok(Some(header)) if header == STAGED => {
+                // The first line's part, too, is that of any other file.
+                let mut hash = Sha256::new();
+                hash.update(without_last(HEADER));
+                hash.update("\n");
+                Ok(Rows { staged: true, hash, ..rows })
+            }
             Err(error @ RowsError::Read(_)) => Err(error),
             _ => Err(RowsError::Wrong { line: 1, what: HEADER.into() }),
         }
@@ -167,8 +191,7 @@ impl<R: BufRead> Rows<R> {
             return Err(RowsError::CutShort(self.line));
         }
         let line = String::from_utf8(line).map_err(|_| self.wrong("UTF-8 text"))?;
-        let shared = line.rsplit_once(',').map_or("", |(shared, _)| shared);
-        self.hash.update(shared);
+        self.hash.update(without_last(if self.staged { without_last(&line) } else { &line }));
         self.hash.update("\n");
         Ok(Some(line))
     }
@@ -191,15 +214,22 @@ impl<R: BufRead> Rows<R> {
                 champion_g: share(field()?)?,
             };
             let seconds = field()?.parse().ok().filter(|seconds: &f64| seconds.is_finite() && *seconds >= 0.0)?;
-            fields.next().is_none().then_some((row, seconds))
+            let whole = !self.staged || field()?.parse::<usize>().is_ok();
+            (whole && fields.next().is_none()).then_some((row, seconds))
         };
-        parse().map(Some).ok_or_else(|| self.wrong(format!("{HEADER} with every G in 0..1")))
+        let header = if self.staged { STAGED } else { HEADER };
+        parse().map(Some).ok_or_else(|| self.wrong(format!("{header} with every G in 0..1")))
     }
 
     /// SHA-256 over all that was read, without the seconds.
     pub fn digest(self) -> Sha256 {
         self.hash
     }
+}
+
+/// A line without its last field.
+fn without_last(line: &str) -> &str {
+    line.rsplit_once(',').map_or("", |(before, _)| before)
 }
 
 fn share(text: &str) -> Option<f64> {

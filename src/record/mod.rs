@@ -8,21 +8,23 @@
 //! | [`metrics`] | `metrics.csv` |
 //! | [`checkpoint`] | `checkpoints/`, written beside training |
 //! | [`folder`] | the run's folder, its lock and `run.json` |
+//! | [`evidence`] | what was seen on a machine, for `docs/evidence.md` |
 //!
 //! Every file that is read is taken as hostile: its size is checked before memory is taken, what it says is checked
 //! before it is used, and nothing in it names another file.
 
 use std::fmt::Display;
-use std::io::{self, Read};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
 use crate::config::{self, Config};
-use crate::file;
+use crate::file::{self, TextError};
 
 pub mod checkpoint;
 pub mod disk;
+pub mod evidence;
 pub mod folder;
 pub mod metrics;
 pub mod policies;
@@ -50,11 +52,32 @@ pub enum RecordError {
     Shorter { path: PathBuf, there: usize, here: usize },
     #[error("another process is training in {path}")]
     Locked { path: PathBuf },
+    /// A run that started from given policies, or that did not, cannot go on as if it had started from others.
+    #[error("{path} {}, so it cannot go on as a run {}", started(there), started_from(here))]
+    InitDiffers { path: PathBuf, there: Option<String>, here: String },
+    #[error("{path} {}, and has no checkpoint yet: it starts over from these alone", started(&Some(there.clone())))]
+    InitNeeded { path: PathBuf, there: String },
     #[error(
         "{path} is a run of another config, so it cannot go on with this one; what differs:\n{}",
         differences.join("\n")
     )]
     ConfigDiffers { path: PathBuf, differences: Vec<String> },
+}
+
+fn started(digest: &Option<String>) -> String {
+    match digest {
+        Some(digest) => format!("started from a file of policies with SHA-256 {}", brief(digest)),
+        None => "did not start from a file of policies".into(),
+    }
+}
+
+fn started_from(digest: &str) -> String {
+    format!("from the file with SHA-256 {}", brief(digest))
+}
+
+/// The start of a digest, enough to tell files apart.
+fn brief(digest: &str) -> String {
+    digest.chars().take(16).chain(['…']).collect()
 }
 
 impl RecordError {
@@ -73,21 +96,25 @@ impl RecordError {
 
 /// A small text file, refused where it is larger than `most` bytes.
 fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
-    let mut bytes = Vec::new();
     let file = file::open(path).map_err(RecordError::read(path))?;
-    file.take(most + 1).read_to_end(&mut bytes).map_err(RecordError::read(path))?;
-    if bytes.len() as u64 > most {
-        return Err(RecordError::damaged(
-            path,
-            format_args!("it is larger than the {most} bytes such a file may have"),
-        ));
-    }
-    String::from_utf8(bytes).map_err(|_| RecordError::damaged(path, "it is not UTF-8 text"))
+    file::text(file, most).map_err(|error| match error {
+        TextError::Read(error) => RecordError::read(path)(error),
+        wrong => RecordError::damaged(path, wrong),
+    })
 }
 
 /// Keys that came later, at their defaults: they are left out of a config's digest, so that a run of an earlier version
 /// can go on.
-const LATER: [&str; 3] = ["observers = \"all\"\n", "windows = []\n", "after = []\n"];
+const LATER: [&str; 8] = [
+    "observers = \"all\"\n",
+    "windows = []\n",
+    "after = []\n",
+    "actions = \"direct\"\n",
+    "sharing = \"none\"\n",
+    "led_within = 0\n",
+    "led_by = \"most-seen\"\n",
+    "poi_jitter = 0.0\n",
+];
 
 /// SHA-256 of all of a config that has a say in the results.
 pub fn config_digest(config: &Config) -> String {

@@ -10,6 +10,7 @@ use std::io::{Read, Seek};
 use std::path::Path;
 
 use safetensors::tensor::Dtype;
+use sha2::{Digest, Sha256};
 
 use super::RecordError;
 use super::disk::Disk;
@@ -19,6 +20,8 @@ use crate::escape;
 use crate::evolve::{MAX_WEIGHT, admit};
 
 const KIND: &str = "policies 1";
+/// The tensor of a file for all trials.
+const ALL: &str = "weights";
 /// Metadata: [`super::config_digest`] of the config.
 pub(super) const CONFIG: &str = "config";
 
@@ -69,6 +72,47 @@ pub fn read(path: &Path, config: &Config, trial: Option<usize>) -> Result<Polici
     })
 }
 
+/// What a run starts from, in place of policies drawn at random.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Init {
+    /// SHA-256 of the file.
+    pub digest: String,
+    /// A trial each, of as many populations as the config has.
+    pub trials: Vec<Policies>,
+}
+
+/// Reads what all trials of a config start from: trial i from tensor `weights.i`, or where there is none from `weights`.
+///
+/// # Errors
+/// See [`read`].
+pub fn read_init(path: &Path, config: &Config) -> Result<Init, RecordError> {
+    let mut hash = Sha256::new();
+    std::io::copy(&mut crate::file::open(path).map_err(RecordError::read(path))?, &mut HashWriter(&mut hash))
+        .map_err(RecordError::read(path))?;
+    let mut file = tensors::open(path)?;
+    let trial = |trial| {
+        let own = file.info(&tensor(trial)).is_some() || file.info(ALL).is_none();
+        from_file(&mut file, config, &[config.populations()], own.then_some(trial))
+    };
+    let trials = (0..config.learning.trials).map(trial).collect::<Result<_, String>>();
+    let trials = trials.map_err(|reason| RecordError::damaged(path, reason))?;
+    Ok(Init { digest: super::hex(&hash.finalize()), trials })
+}
+
+/// Takes what is written into a digest.
+struct HashWriter<'a>(&'a mut Sha256);
+
+impl std::io::Write for HashWriter<'_> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.update(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
 /// Reads the policies of all trials of a config's own training.
 ///
 /// # Errors
@@ -104,7 +148,7 @@ pub fn from_file(
         return Err(format!("it holds {kind:?}, not {KIND:?}"));
     }
     let name = match trial {
-        None if file.info("weights").is_some() => "weights".to_string(),
+        None if file.info(ALL).is_some() => ALL.to_string(),
         trial => tensor(trial.unwrap_or(0)),
     };
     let Some(info) = file.info(&name) else {

@@ -361,7 +361,7 @@ impl Look {
 
 /// The least round number (1, 2 or 5 times a power of ten) that is no less than another.
 pub fn round_step(least: f64) -> f64 {
-    let power = 10f64.powf(least.log10().floor());
+    let power = libm::pow(10.0, libm::log10(least).floor());
     [1.0, 2.0, 5.0].into_iter().map(|step| step * power).find(|&step| step >= least * 0.999).unwrap_or(10.0 * power)
 }
 

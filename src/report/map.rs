@@ -210,7 +210,7 @@ impl Viewport {
         scene.circle([x, y], ring, Some(WHITE.into()), Some(Pen::new(LIGHT, 0.35 * ring)));
         if share > 0.0 {
             let full = (share.min(1.0) * 32.0).ceil();
-            let turn = |step: f64| (std::f64::consts::TAU * share.min(1.0) * step / full).sin_cos();
+            let turn = |step: f64| libm::sincos(std::f64::consts::TAU * share.min(1.0) * step / full);
             let arc =
                 (0..=full as usize).map(|step| turn(step as f64)).map(|(sin, cos)| [x + ring * sin, y - ring * cos]);
             scene.line(arc.collect(), Pen::new(color, 0.35 * ring));
@@ -445,7 +445,7 @@ pub fn layout(name: &str, config: &Config) -> Scene {
     const EDGE: f64 = 3.0;
     const HEAD: f64 = 6.5;
     let world = World::new(config);
-    let heading = DVec2::new(config.world.heading.cos(), config.world.heading.sin());
+    let heading = DVec2::new(libm::cos(config.world.heading), libm::sin(config.world.heading));
     let leaders = world.leaders();
     let agent = |(index, start): (usize, &glam::Vec2)| Marker {
         place: start.as_dvec2(),

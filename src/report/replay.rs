@@ -15,7 +15,7 @@ use super::map::{self, FAINT, Legend, Marker, Poi, Team, Viewport};
 use super::runs::{self, ReadError};
 use super::scene::{Anchor, BLACK, Color, Scene};
 use crate::backend::{Backend, BackendError, Episode, Group, Need, Seen, Strided, Trace};
-use crate::config::Config;
+use crate::config::{Config, Fitness, Observers};
 use crate::credit::{self, Credit, Scores};
 use crate::evolve;
 use crate::record::checkpoint;
@@ -68,6 +68,8 @@ pub struct Replayed {
     pub scores: Scores,
     /// The leader in whose group each agent is for Df, or [`credit::NOBODY`].
     pub owner: Vec<u32>,
+    /// Where the run's fitness is Dt: whom each follower is led by at each step, as [`credit::lead`] finds it.
+    pub led: Vec<u32>,
     /// The step at which each POI was observed first.
     pub observed: Vec<Option<usize>>,
 }
@@ -138,7 +140,9 @@ pub fn replay(
     let mut trainer = Trainer::of_trial(config.clone(), trial);
     for index in order {
         let generation = generations[index];
-        if let Some(snapshot) = nearest(folder, &config, trial, trainer.generation(0) + 1..=generation) {
+        // A run that started from given policies has those of generation 0.
+        let next = trainer.generation(0);
+        if let Some(snapshot) = nearest(folder, &config, trial, next + usize::from(next > 0)..=generation) {
             // A checkpoint of other sizes is of another config: training on from the start does without.
             let _ = trainer.restore(0, snapshot);
         }
@@ -148,7 +152,7 @@ pub fn replay(
             }
             trainer.advance(backend)?;
         }
-        let found = play_best(&config, &mut trainer, trial, backend)?;
+        let found = play_best(&config.at(generation), &mut trainer, trial, backend)?;
         let expected = rows.get(generation).unwrap_or(f64::NAN);
         if found.best_g != expected {
             let found = found.best_g;
@@ -223,19 +227,23 @@ fn play_best(
     }
     let best_g = f64::from(most) / (world.pois.len() * starts.len()) as f64;
 
-    let shown = group(&starts[0], &teams[team * leaders..(team + 1) * leaders]);
+    let need = if learning.fitness == Fitness::Dt { Need::Sights } else { need };
+    let shown = Group { need, ..group(&starts[0], &teams[team * leaders..(team + 1) * leaders]) };
     let trace = backend.trace(&shown)?;
     // POIs are drawn where they were.
     let moved = shown.moved_pois().map(<[Vec2]>::to_vec);
     let whole = |words| Strided { words, stride: 1, offset: 0 };
-    let episode = Episode { group: 0, team: 0, sets: whole(&trace.sets), seen: Seen::Counts(whole(&trace.seen)) };
+    let (sets, seen, sights) = (whole(&trace.sets), Seen::Counts(whole(&trace.seen)), whole(&trace.sights));
+    let episode = Episode { group: 0, team: 0, sets, seen, sights };
     let scores = Credit::default().all(&episode, &world);
     let mut owner = Vec::new();
     credit::assign(&episode.seen, &world, &mut owner);
+    let mut led = Vec::new();
+    credit::lead(&episode.sights, &world, &mut led);
     let observed = credit::observed_at(episode.sets, &world);
     let episodes = starts.len();
     let world = World { pois: moved.unwrap_or(world.pois.clone()), ..world };
-    Ok(Replayed { trial, generation, team, best_g, episodes, scores, owner, observed, trace, world })
+    Ok(Replayed { trial, generation, team, best_g, episodes, scores, owner, led, observed, trace, world })
 }
 
 /// Observers in one set.
@@ -259,6 +267,17 @@ impl Replayed {
         self.trace.moment(step, 0, agent).heading
     }
 
+    /// The leader in whose group an agent is after a step: for Dt the first of those that lead it then, else for Df.
+    fn group(&self, step: usize, agent: usize) -> Option<usize> {
+        let leaders = self.world.leaders();
+        match agent.checked_sub(leaders).filter(|_| !self.led.is_empty()) {
+            // The start is like the first step, which nobody has moved before.
+            Some(follower) => (0..leaders)
+                .find(|&leader| credit::leads(&self.led, &self.world, step.saturating_sub(1), follower, leader)),
+            None => (self.owner[agent] != credit::NOBODY).then_some(self.owner[agent] as usize),
+        }
+    }
+
     /// The team `place` steps from the start, with its trails up to there.
     fn team(&self, place: f64) -> Team {
         // Long trails of many agents are drawn by fewer points.
@@ -273,7 +292,7 @@ impl Replayed {
             let mut trail: Vec<_> = shown.iter().filter(|&&shown| shown <= step).map(|&step| at(step, agent)).collect();
             let place = at(step, agent).lerp(at(next, agent), part);
             trail.push(place);
-            let group = (self.owner[agent] != credit::NOBODY).then_some(self.owner[agent] as usize);
+            let group = self.group(step, agent);
             let counts = world.rule.counts(agent);
             Marker { place, heading: toward(step, agent).lerp(toward(next, agent), part), group, counts, trail }
         };
@@ -331,22 +350,30 @@ impl Replayed {
 /// A page that plays episodes of one run, side by side; `name` is the run's.
 pub fn page(name: &str, config: &Config, played: &[Replayed]) -> String {
     let count = played.len().max(1);
-    let size = |per_agent: usize, world: &World| world.agents() * per_agent + world.pois.len() * 2;
-    let exact = played.iter().map(|p| (p.world.steps() + 1) * size(16, &p.world)).sum::<usize>() <= EXACT_BYTES;
+    let size = |per_agent: usize, played: &Replayed| {
+        let world = &played.world;
+        world.agents() * per_agent + world.pois.len() * 2 + played.led.len() / world.steps() * 4
+    };
+    let exact = played.iter().map(|p| (p.world.steps() + 1) * size(16, p)).sum::<usize>() <= EXACT_BYTES;
     let episodes: Vec<_> = played
         .iter()
         .map(|played| {
-            let room = if exact { usize::MAX } else { MOTION_BYTES / count / size(5, &played.world) };
+            let room = if exact { usize::MAX } else { MOTION_BYTES / count / size(5, played) };
             episode(played, &played.shown(room), exact)
         })
         .collect();
     let world = &config.world;
+    // Where they move, they are where the first episode has them.
+    let pois = match played.first().filter(|_| config.learning.poi_jitter > 0.0) {
+        Some(first) => first.world.pois.iter().map(|poi| poi.as_dvec2().to_array()).collect(),
+        None => world.pois.clone(),
+    };
     let data = json!({
         "run": name,
         "paradigm": config.learning.paradigm,
         "fitness": config.learning.fitness,
         "map": world.map,
-        "pois": world.pois,
+        "pois": pois,
         "observation_radius": world.observation_radius,
         "observers": world.observers,
         "windows": world.windows,
@@ -371,8 +398,12 @@ fn hex(colors: &[Color]) -> Vec<String> {
 fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value {
     let Replayed { world, scores, .. } = played;
     let map = world.map().to_array();
-    let (mut positions, mut headings, mut near) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut positions, mut headings, mut near, mut led) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for &step in shown {
+        // Of the step that led here, as `Replayed::group` has it.
+        let words = played.led.len() / world.steps();
+        let of_step = &played.led[step.saturating_sub(1) * words..][..words];
+        led.extend(of_step.iter().flat_map(|word| word.to_le_bytes()));
         for agent in 0..world.agents() {
             let (place, heading) = (played.position(step, agent), played.heading(step, agent));
             if exact {
@@ -381,7 +412,7 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
             } else {
                 let share = |axis: usize| (f64::from(place[axis]) / f64::from(map[axis]) * 65535.0).round() as u16;
                 positions.extend([share(0), share(1)].iter().flat_map(|share| share.to_le_bytes()));
-                let turn = f64::from(heading[1]).atan2(f64::from(heading[0])) / std::f64::consts::TAU;
+                let turn = libm::atan2(f64::from(heading[1]), f64::from(heading[0])) / std::f64::consts::TAU;
                 headings.push((turn.rem_euclid(1.0) * 256.0).round() as u32 as u8);
             }
         }
@@ -398,6 +429,7 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
         "g": scores.g,
         "d": scores.d,
         "df": scores.df,
+        "dt": scores.dt,
         "leaders": world.leaders(),
         "agents": world.agents(),
         "coupling": world.coupling,
@@ -407,6 +439,7 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
         "positions": BASE64_STANDARD.encode(positions),
         "headings": BASE64_STANDARD.encode(headings),
         "near": BASE64_STANDARD.encode(near),
+        "led": BASE64_STANDARD.encode(led),
     })
 }
 
@@ -428,7 +461,10 @@ impl<'a> Screen<'a> {
         let view = Viewport::new(config, busy(config, played), Self::SIDE);
         let width = view.size()[0].max(60.0);
         let teams: Vec<Team> = played.iter().map(|played| played.team(played.world.steps() as f64)).collect();
-        let mut legend = view.legend(&teams, "2/3: 2 agents near of 3 needed");
+        let who = if config.world.observers == Observers::All { "agents" } else { "observers" };
+        let timed = played.iter().any(|played| played.world.rule.is_timed());
+        let label = if timed { "0: 2/3: POI 0," } else { "2/3:" };
+        let mut legend = view.legend(&teams, &format!("{label} 2 {who} near of 3 needed"));
         note.into_iter().for_each(|note| legend.note(note));
         Screen { played, view, width, legend }
     }

@@ -153,8 +153,10 @@ pub fn figure(folders: &[PathBuf]) -> Result<Figure, ReadError> {
     let configs = folders.iter().map(|folder| config(folder)).collect::<Result<Vec<_>, _>>()?;
     let all = folders.iter().zip(&configs).map(|(folder, config)| Courses::read(folder, config));
     let all = all.collect::<Result<Vec<_>, _>>()?;
-    let pois = configs.first().map_or(1, |config| config.world.pois.len());
-    let same = configs.iter().all(|config| config.world.pois.len() == pois);
+    // Stages may have POIs of their own.
+    let counts: Vec<Option<usize>> = configs.iter().map(Config::pois).collect();
+    let pois = counts.first().copied().flatten().unwrap_or(1);
+    let same = counts.iter().all(|count| *count == Some(pois));
     let scale = if same { pois as f64 } else { 1.0 };
     let curve = |tallies: &[Average]| Curve::new(tallies).scaled(scale);
     let (legend, curves): (Vec<String>, Vec<Curve>) = match &*all {

@@ -186,7 +186,7 @@ impl<'a> Facets<'a> {
     fn reach(&self, options: &Detail) -> HeatMap {
         let all = self.panels.iter().flat_map(|(_, points)| points).flatten();
         let last = all.map(|(point, _)| point.config.learning.generations).max().unwrap_or(0).max(1) as f64;
-        let place = |generation: f64| generation.ln_1p() / last.ln_1p();
+        let place = |generation: f64| libm::log1p(generation) / libm::log1p(last);
         let mut ticks = vec![0.0];
         ticks.extend([1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e5].into_iter().filter(|&tick| tick < last * 0.75));
         ticks.push(last);

@@ -46,8 +46,8 @@ pub struct Headway {
 /// teams score.
 pub fn bytes(config: &Config) -> usize {
     let learning = &config.learning;
-    let scores =
-        learning.trials * (learning.population + 1) * (config.learners() + 1) * (learning.episodes_per_team + 2);
+    let episodes = config.staged().iter().map(|(_, config)| config.learning.episodes_per_team).max().unwrap_or(1);
+    let scores = learning.trials * (learning.population + 1) * (config.learners() + 1) * (episodes + 2);
     let champions = learning.trials * config.populations() * config.parameters();
     let bytes = 3 * config.policy_bytes() + ((3 * champions + scores) * size_of::<f32>()) as u64;
     bytes.try_into().unwrap_or(usize::MAX)
@@ -55,9 +55,12 @@ pub fn bytes(config: &Config) -> usize {
 
 /// Steps of a team that a point takes until it is done.
 fn team_steps(config: &Config) -> u128 {
-    let learning = &config.learning;
-    let teams = learning.trials * (learning.population + 1) * learning.episodes_per_team;
-    teams as u128 * config.world.steps as u128 * (learning.generations + 1) as u128
+    let of_stage = |config: Config| {
+        let learning = &config.learning;
+        let teams = learning.trials * (learning.population + 1) * learning.episodes_per_team;
+        teams as u128 * config.world.steps as u128 * (learning.generations + 1) as u128
+    };
+    config.shares().into_iter().map(of_stage).sum()
 }
 
 /// Cuts points into batches that fit in memory, in order; a point that does not fit is a batch of its own.

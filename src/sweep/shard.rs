@@ -6,6 +6,7 @@ use std::fmt::{self, Display};
 use std::str::FromStr;
 
 use super::Point;
+use crate::config::Config;
 use crate::world::World;
 
 /// Most shards of a sweep.
@@ -114,8 +115,12 @@ impl Display for Shard {
 /// About how many operations a point takes: teams played, times steps, times what an agent does in one, with the
 /// counts of a step's arithmetic (networks, pairs of agents, sensing, coupling).
 pub fn cost(point: &Point) -> u128 {
-    let learning = &point.config.learning;
-    let world = World::new(&point.config);
+    point.config.shares().iter().map(cost_of_stage).sum()
+}
+
+fn cost_of_stage(config: &Config) -> u128 {
+    let learning = &config.learning;
+    let world = World::new(config);
     let wide = |count: usize| count as u128;
     let teams = wide(learning.trials)
         * wide(learning.generations + 1)

@@ -5,6 +5,8 @@
 //! process of its own: this program once more, as the test `compile`. Without RADV all is skipped in plain sight, or
 //! fails where `FLOTILLA_REQUIRE_RADV=1` says that it is needed.
 //!
+//! With `FLOTILLA_EVIDENCE=FOLDER` what was read is noted there, as a row of `docs/evidence.md`.
+//!
 //! `cargo test --test radv -- table --ignored --nocapture` makes the table of `benches/README.md`.
 
 #![cfg(feature = "gpu")]
@@ -228,11 +230,16 @@ fn the_reader_of_assembly_knows_what_is_fused() {
 #[test]
 fn no_shader_is_fused_spills_or_is_large() {
     let Some(manifest) = radv("no_shader_is_fused_spills_or_is_large") else { return };
+    let mut read = Vec::new();
     for pass in PASSES {
         let jobs = jobs(pass);
         for chip in CHIPS {
             let (version, results) = compiled(&manifest, chip, &jobs);
             println!("{}: {version}, {} shaders, {pass} pass", chip.family, results.len());
+            read.push((
+                version.clone(),
+                format!("{}, {pass} pass: {} shaders, none fused", chip.family, results.len()),
+            ));
             for (name, Compiled { statistics, assembly }) in &results {
                 let what = format!("{} under the {pass} pass, {name} ({version})", chip.family);
                 assert!(has_arithmetic(assembly), "{what}: this is no assembly: {assembly}");
@@ -255,7 +262,22 @@ fn no_shader_is_fused_spills_or_is_large() {
             }
         }
     }
+    note(read);
 }
+
+/// Notes what was read where `FLOTILLA_EVIDENCE` says, each with the driver that compiled it.
+#[cfg(feature = "record")]
+fn note(read: Vec<(String, String)>) {
+    use flotilla::record::evidence::{Sighting, Tier};
+    let Some(folder) = std::env::var_os("FLOTILLA_EVIDENCE") else { return };
+    let note = read.first().map(|(version, _)| format!("Mesa's RADV, {version}, for chips that were not there"));
+    let findings = read.into_iter().map(|(_, finding)| finding).collect();
+    let sighting = Sighting { note, findings, ..Sighting::new(Tier::MachineCodeRead) };
+    fs::write(Path::new(&folder).join("radv.json"), sighting.to_json()).expect("the folder takes a file");
+}
+
+#[cfg(not(feature = "record"))]
+fn note(_: Vec<(String, String)>) {}
 
 /// The canary: without a pass the compiler fuses, and it shows.
 #[test]

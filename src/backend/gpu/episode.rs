@@ -115,8 +115,23 @@ struct Shape {
     workgroup: usize,
     /// Agents a thread plays, one after another.
     slots: usize,
-    trace: bool,
+    records: Kept,
     sizes: Sizes,
+}
+
+/// What a kernel keeps beside sets and counts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+struct Kept {
+    /// Every stage of every step.
+    trace: bool,
+    /// Which leaders each follower sees at each step.
+    sights: bool,
+}
+
+impl Kept {
+    fn of(group: &Group<'_>, trace: bool) -> Kept {
+        Kept { trace, sights: group.need.sights() && group.world.followers() > 0 }
+    }
 }
 
 /// What a kernel knows of the worlds that it plays.
@@ -135,18 +150,18 @@ impl Shape {
         matches!(self.sizes, Sizes::Fixed { .. })
     }
 
-    fn generic(world: &World, packing: Packing, trace: bool) -> Shape {
+    fn generic(world: &World, packing: Packing, records: Kept) -> Shape {
         let policy = &world.constants.policy;
         let chooses = policy.actions() == Some(Actions::Behaviours);
         let sizes = Sizes::Any { widest: policy.widest().next_power_of_two(), chooses };
-        Shape { workgroup: packing.workgroup, slots: packing.slots, trace, sizes }
+        Shape { workgroup: packing.workgroup, slots: packing.slots, records, sizes }
     }
 
-    fn specialised(world: &World, packing: Packing, trace: bool) -> Shape {
+    fn specialised(world: &World, packing: Packing, records: Kept) -> Shape {
         let Constants { leaders, followers, pois, variant, policy: PolicyConstants { widths, .. }, .. } =
             world.constants;
         let sizes = Sizes::Fixed { teams: packing.teams, leaders, agents: leaders + followers, pois, widths, variant };
-        Shape { workgroup: packing.workgroup, slots: packing.slots, trace, sizes }
+        Shape { workgroup: packing.workgroup, slots: packing.slots, records, sizes }
     }
 }
 
@@ -192,11 +207,13 @@ impl Packing {
 }
 
 /// Steps that one dispatch may play, see [`TURNS`].
-fn steps_a_dispatch(world: &World, packing: Packing) -> usize {
+fn steps_a_dispatch(world: &World, packing: Packing, records: Kept) -> usize {
     let Constants { words, policy: PolicyConstants { widths, .. }, .. } = world.constants;
     let network: u32 = widths.windows(2).map(|w| (w[0] + 2) * w[1]).sum();
     let agent = world.pois.len() + world.agents() + network as usize + 20;
-    let items = (world.pois.len() * words as usize * packing.teams).div_ceil(packing.workgroup);
+    let sights = if records.sights { world.followers() * world.leader_words() } else { 0 };
+    let items = |rows: usize| (rows * packing.teams).div_ceil(packing.workgroup);
+    let items = items(world.pois.len() * words as usize) + items(sights);
     (TURNS / (packing.slots * agent + items * 33)).max(1)
 }
 
@@ -335,9 +352,10 @@ fn plan(
     let mut batches = vec![Work::default()];
     for (index, group) in groups.iter().enumerate() {
         let world = group.world;
+        let kept = Kept::of(group, trace);
         let moments_a_team = if trace { (world.steps() + 1) * world.agents() } else { 0 };
         let bytes_a_team = [
-            record_words(world) * size_of::<u32>(),
+            record_words(world, group.need) * size_of::<u32>(),
             fours(world) * size_of::<[f32; FOUR]>(),
             moments_a_team * size_of::<Moment>(),
         ]
@@ -352,13 +370,13 @@ fn plan(
             )));
         }
         let for_it =
-            Packing::specialised(world, room).map(|packing| (packing, Shape::specialised(world, packing, trace)));
+            Packing::specialised(world, room).map(|packing| (packing, Shape::specialised(world, packing, kept)));
         let (packing, shape) = for_it.filter(|(_, shape)| specialised.contains(shape)).unwrap_or_else(|| {
             let packing = Packing::generic(world, room.workgroup);
-            (packing, Shape::generic(world, packing, trace))
+            (packing, Shape::generic(world, packing, kept))
         });
         let teams_a_task = packing.teams.min((target / bytes_a_team.max(1)).max(1) as usize);
-        let steps_a_dispatch = steps_a_dispatch(world, packing);
+        let steps_a_dispatch = steps_a_dispatch(world, packing, kept);
         // A group's world, starts and POIs are stored once a batch.
         let mut stored: Option<(usize, Task)> = None;
         for first_team in (0..group.team_count()).step_by(teams_a_task) {
@@ -395,7 +413,7 @@ fn plan(
                 ..base
             };
             work.weights += fours(world) * teams;
-            work.record += record_words(world) * teams;
+            work.record += record_words(world, group.need) * teams;
             work.sets += world.set_words() * teams;
             work.moments += moments_a_team * teams;
             if world.steps() > steps_a_dispatch {
@@ -681,7 +699,8 @@ impl GpuEpisodes {
         for group in groups {
             if let Some(packing) = Packing::specialised(group.world, self.room()) {
                 let agent_steps = group.team_count() * group.world.agents() * group.world.steps();
-                *work.entry(Shape::specialised(group.world, packing, trace)).or_default() += agent_steps as u64;
+                let shape = Shape::specialised(group.world, packing, Kept::of(group, trace));
+                *work.entry(shape).or_default() += agent_steps as u64;
             }
         }
         match self.kernel {
@@ -1010,7 +1029,7 @@ fn is_on_host(groups: &[Group<'_>], share: &Share) -> bool {
 
 /// The whole shader, with what it has in front.
 fn source(shape: Shape) -> String {
-    let Shape { workgroup, slots, trace, sizes } = shape;
+    let Shape { workgroup, slots, records: Kept { trace, sights: sighted }, sizes } = shape;
     let (shared, tally, sights) = match sizes {
         // As many agents as one team may have, or several teams on a thread each.
         Sizes::Any { .. } => ((workgroup * slots).min(MAX_AGENTS), false, 1),
@@ -1021,7 +1040,7 @@ fn source(shape: Shape) -> String {
     };
     let constants = format!(
         "const WORKGROUP: u32 = {workgroup}u;\nconst SLOTS: u32 = {slots}u;\nconst SHARED: u32 = {shared}u;\n\
-         const TRACE: bool = {trace};\nconst TALLY: bool = {tally};\nconst SIGHTS: u32 = {sights}u;"
+         const TRACE: bool = {trace};\nconst SIGHTED: bool = {sighted};\nconst TALLY: bool = {tally};\nconst SIGHTS: u32 = {sights}u;"
     );
     let front = match sizes {
         Sizes::Any { widest, chooses } => {
@@ -1091,22 +1110,25 @@ const AXES: [&str; FOUR] = ["x", "y", "z", "w"];
 
 /// The episode's shader in a few of its variants, generic and specialised for the paper's first layout.
 pub fn shaders() -> Vec<(&'static str, String)> {
-    let generic = |workgroup, slots, widest, trace| {
-        source(Shape { workgroup, slots, trace, sizes: Sizes::Any { widest, chooses: trace } })
+    let generic = |workgroup, slots, widest, records: Kept| {
+        source(Shape { workgroup, slots, records, sizes: Sizes::Any { widest, chooses: records.trace } })
     };
-    let specialised = |trace, actions: Actions| {
+    let specialised = |records, actions: Actions| {
         let widths = [INPUTS as u32, 10, actions.outputs() as u32, 0, 0];
         let variant = Variant { density: 0, by_sine: 1 };
         let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, variant };
-        source(Shape { workgroup: 384, slots: 1, trace, sizes })
+        source(Shape { workgroup: 384, slots: 1, records, sizes })
     };
+    let [little, sights, trace] =
+        [(false, false), (false, true), (true, true)].map(|(trace, sights)| Kept { trace, sights });
     vec![
-        ("episode", generic(64, 1, 16, false)),
-        ("episode, traced", generic(128, 1, 64, true)),
-        ("episode, large teams", generic(256, 5, 64, false)),
-        ("episode, specialised", specialised(false, Actions::Direct)),
-        ("episode, specialised, behaviours", specialised(false, Actions::Behaviours)),
-        ("episode, specialised, traced", specialised(true, Actions::Direct)),
+        ("episode", generic(64, 1, 16, little)),
+        ("episode, traced", generic(128, 1, 64, trace)),
+        ("episode, large teams", generic(256, 5, 64, little)),
+        ("episode, specialised", specialised(little, Actions::Direct)),
+        ("episode, specialised, behaviours", specialised(little, Actions::Behaviours)),
+        ("episode, specialised, with sights", specialised(sights, Actions::Direct)),
+        ("episode, specialised, traced", specialised(trace, Actions::Direct)),
         ("pack", packing()),
     ]
 }
@@ -1116,10 +1138,11 @@ pub fn shaders() -> Vec<(&'static str, String)> {
 #[doc(hidden)]
 pub fn shader_of(world: &World, kernel: Kernel, threads: usize) -> String {
     let room = Capacity { batch: 0, buffer: 0, workgroup: threads, workgroup_bytes: 16 << 10 };
+    let little = Kept { trace: false, sights: false };
     let made = Packing::specialised(world, room).filter(|_| kernel != Kernel::Generic);
     source(made.map_or_else(
-        || Shape::generic(world, Packing::generic(world, threads), false),
-        |packing| Shape::specialised(world, packing, false),
+        || Shape::generic(world, Packing::generic(world, threads), little),
+        |packing| Shape::specialised(world, packing, little),
     ))
 }
 
@@ -1127,18 +1150,20 @@ impl Backend for GpuEpisodes {
     fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
         groups.iter().try_for_each(Group::check)?;
         self.play(groups, false, &|share, home, _| {
-            let world = groups[share.group].world;
+            let Group { world, need, .. } = groups[share.group];
             let Task { sets, seen, table, owners, .. } = share.task;
             let stride = share.task.teams as usize;
             let (group, first) = (share.group, share.first_team);
             match home {
                 Home::Whole(record) => {
                     let sets = &record[sets as usize..][..world.set_words() * stride];
-                    let seen = &record[seen as usize..][..world.leaders() * world.followers() * stride];
+                    let sight_words = if need.sights() { world.sight_words() } else { 0 };
+                    let (seen, sights) = record[seen as usize..].split_at(world.leaders() * world.followers() * stride);
+                    let sights = &sights[..sight_words * stride];
                     for offset in 0..stride {
                         let strided = |words| Strided { words, stride, offset };
-                        let (sets, seen) = (strided(sets), Seen::Counts(strided(seen)));
-                        visit(Episode { group, team: first + offset, sets, seen });
+                        let (sets, seen, sights) = (strided(sets), Seen::Counts(strided(seen)), strided(sights));
+                        visit(Episode { group, team: first + offset, sets, seen, sights });
                     }
                 }
                 Home::Packed(words) => {
@@ -1151,7 +1176,7 @@ impl Backend for GpuEpisodes {
                         let words = &words[ends[0] as usize..ends[1] as usize];
                         let sets = Strided { words, stride: 1, offset: 0 };
                         let seen = Seen::Most(Strided { words: owners, stride, offset });
-                        visit(Episode { group, team: first + offset, sets, seen });
+                        visit(Episode { group, team: first + offset, sets, seen, sights: Strided::NONE });
                     }
                 }
             }
@@ -1163,12 +1188,14 @@ impl Backend for GpuEpisodes {
         let world = group.world;
         let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
         let (set_words, seen_words) = (world.set_words(), world.leaders() * world.followers());
+        let sight_words = if group.need.sights() { world.sight_words() } else { 0 };
         let trace = std::sync::Mutex::new(Trace {
             teams,
             agents,
             moments: vec![Moment::zeroed(); (steps + 1) * teams * agents],
             sets: vec![0; teams * set_words],
             seen: vec![0; teams * seen_words],
+            sights: vec![0; teams * sight_words],
         });
         self.play(std::slice::from_ref(group), true, &|share, home, moments| {
             let Home::Whole(record) = home else { unreachable!("no trace is packed") };
@@ -1187,6 +1214,10 @@ impl Backend for GpuEpisodes {
                 }
                 for word in 0..seen_words {
                     trace.seen[team * seen_words + word] = record[task.seen as usize + word * stride + offset];
+                }
+                for word in 0..sight_words {
+                    let at = task.seen as usize + (seen_words + word) * stride + offset;
+                    trace.sights[team * sight_words + word] = record[at];
                 }
             }
         })?;

@@ -1,0 +1,212 @@
+//! `[[stages]]`: what changes from which generation on.
+//!
+//! Each stage starts from the file, not from the stage before: its config is the file's with some keys set. What makes the
+//! populations, and the plan of the run, is the same in all of them.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+use toml::de::{DeTable, DeValue};
+
+use super::{Config, MAX_GENERATIONS, Override, Problem};
+use crate::reader::Number;
+
+/// The list that a config has them in.
+pub const STAGES: &str = "stages";
+/// Most stages of a config.
+pub const MAX_STAGES: usize = 256;
+/// What is the same in all stages.
+const FIXED: [&str; 9] = [
+    "policy.",
+    "checkpoint.",
+    "learning.paradigm",
+    "learning.sharing",
+    "learning.population",
+    "learning.elites",
+    "learning.generations",
+    "learning.trials",
+    "learning.seed",
+];
+
+/// One of them, as written.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Stage {
+    /// The first of its generations.
+    pub from: usize,
+    /// Dotted keys, and what they are set to.
+    pub set: BTreeMap<String, toml::Value>,
+}
+
+impl Stage {
+    /// Its keys; errors call each by its place.
+    fn overrides(&self, index: usize) -> Vec<Override> {
+        let one = |(key, value): (&String, &toml::Value)| {
+            Override::new(key.clone(), value.clone(), format!("{STAGES}[{index}].set.{key}"))
+        };
+        self.set.iter().map(one).collect()
+    }
+}
+
+impl Config {
+    /// The configs that play, each with the first of its generations: where the first stage comes later than generation 0,
+    /// the file's own plays before it. Of a valid config, whose stages were seen to be valid too.
+    pub fn staged(&self) -> Vec<(usize, Config)> {
+        let own = Config { stages: vec![], ..self.clone() };
+        let mut staged = Vec::with_capacity(self.stages.len() + 1);
+        if self.stages.first().is_none_or(|first| first.from > 0) {
+            staged.push((0, own.clone()));
+        }
+        for (index, stage) in self.stages.iter().enumerate() {
+            let config = own.with(&stage.overrides(index)).expect("stages are read with their config");
+            staged.push((stage.from, config));
+        }
+        staged
+    }
+
+    /// Which of [`Config::staged`] a generation belongs to.
+    pub fn stage_of(&self, generation: usize) -> usize {
+        let begun = self.stages.iter().filter(|stage| stage.from <= generation).count();
+        begun - usize::from(self.stages.first().is_some_and(|first| first.from == 0))
+    }
+
+    /// The config by which a generation plays.
+    pub fn at(&self, generation: usize) -> Config {
+        self.staged().swap_remove(self.stage_of(generation)).1
+    }
+
+    /// The configs that play, each with as many generations as are its own.
+    pub fn shares(&self) -> Vec<Config> {
+        let mut staged = self.staged();
+        let mut end = self.learning.generations + 1;
+        for (from, config) in staged.iter_mut().rev() {
+            config.learning.generations = end.saturating_sub(*from + 1);
+            end = *from;
+        }
+        staged.into_iter().map(|(_, config)| config).collect()
+    }
+
+    /// How many POIs there are, if as many in all stages.
+    pub fn pois(&self) -> Option<usize> {
+        let staged = self.staged();
+        let count = |(_, config): &(usize, Config)| config.world.pois.len();
+        staged.windows(2).all(|pair| count(&pair[0]) == count(&pair[1])).then(|| count(&staged[0]))
+    }
+}
+
+/// A key of a stage, as written: its line, and its value's text.
+struct Written<'a> {
+    line: Option<usize>,
+    text: &'a str,
+}
+
+/// Reads the stages of a text whose other keys make a valid config; all that is wrong with them, by line.
+pub(super) fn read(text: &str, outside: bool, own: &Config) -> Result<Vec<Stage>, Vec<Problem>> {
+    let line_of =
+        |offset: usize| (!outside).then(|| text.bytes().take(offset).filter(|&byte| byte == b'\n').count() + 1);
+    let (document, _) = DeTable::parse_recoverable(text);
+    let Some(list) = document.get_ref().get(STAGES) else { return Ok(vec![]) };
+    let problems = RefCell::new(Vec::new());
+    let blame_line = |line, key, message| problems.borrow_mut().push(Problem { line, key, message });
+    let blame = |offset: usize, key: String, message: String| blame_line(line_of(offset), key, message);
+    let Some(tables) = list.get_ref().as_array().filter(|tables| tables.len() <= MAX_STAGES) else {
+        let message = format!("allowed a list of up to {MAX_STAGES} tables [[{STAGES}]], each with `from` and `set`");
+        return Err(vec![Problem { line: line_of(list.span().start), key: STAGES.into(), message }]);
+    };
+    let mut stages: Vec<Stage> = Vec::new();
+    for (index, table) in tables.iter().enumerate() {
+        let (name, start) = (format!("{STAGES}[{index}]"), table.span().start);
+        let Some(keys) = table.get_ref().as_table() else {
+            blame(start, name, "allowed a table with `from` and `set`".into());
+            continue;
+        };
+        let (mut from, mut written) = (None, BTreeMap::new());
+        for (key, value) in keys {
+            let (place, offset) = (format!("{name}.{}", key.get_ref()), key.span().start);
+            match (key.get_ref().as_ref(), value.get_ref()) {
+                ("from", number) => {
+                    let least = stages.last().map_or(0, |before| before.from + 1);
+                    let most = own.learning.generations.min(MAX_GENERATIONS);
+                    match <usize as Number>::read(number).flatten() {
+                        Some(number) if (least..=most).contains(&number) => from = Some(number),
+                        found => {
+                            let found = found.map_or("something else".into(), |found| found.to_string());
+                            let after = if least > 0 { ", after the stage before" } else { "" };
+                            let message = format!(
+                                "found {found}, allowed a whole number, {least} to {most} (learning.generations){after}"
+                            );
+                            blame(offset, place, message);
+                            from = Some(least);
+                        }
+                    }
+                }
+                ("set", DeValue::Table(set)) => {
+                    for (key, value) in set {
+                        let line = line_of(key.span().start);
+                        match value.get_ref() {
+                            // `set = { world.coupling = 1 }` says the same without quotes.
+                            DeValue::Table(leaves) => {
+                                for (leaf, value) in leaves {
+                                    let text = text.get(value.span()).unwrap_or_default();
+                                    let key = format!("{}.{}", key.get_ref(), leaf.get_ref());
+                                    written.insert(key, Written { line, text });
+                                }
+                            }
+                            _ => {
+                                let text = text.get(value.span()).unwrap_or_default();
+                                written.insert(key.get_ref().to_string(), Written { line, text });
+                            }
+                        }
+                    }
+                }
+                ("set", _) => blame(offset, place, "allowed a table of dotted keys in quotes".into()),
+                _ => blame(offset, place, "unknown key; a stage has from, set".into()),
+            }
+        }
+        if from.is_none() {
+            blame(start, name.clone(), "missing `from`, the first of its generations".into());
+        }
+        let mut overrides = Vec::new();
+        for (key, Written { line, text }) in &written {
+            let name = format!("{name}.set.{key}");
+            if FIXED.iter().any(|fixed| key == fixed || fixed.ends_with('.') && key.starts_with(fixed)) {
+                let message = "this is the same in all stages, for it makes the populations or the run".into();
+                blame_line(*line, name, message);
+            } else {
+                overrides.push(Override { key: key.clone(), text: text.to_string(), name });
+            }
+        }
+        let line = |key: &str| {
+            let within = |(name, _): &(&String, &Written)| key.starts_with(&format!("{STAGES}[{index}].set.{name}"));
+            written.iter().find(within).map_or(line_of(start), |(_, written)| written.line)
+        };
+        match own.with(&overrides) {
+            Ok(config) => {
+                let counts = |config: &Config| [config.learners(), config.world.leaders.len()];
+                if counts(&config) != counts(own) {
+                    let key = if written.contains_key("world.leaders") { "world.leaders" } else { "world.followers" };
+                    let [found, expected] = [&config, own].map(Config::learners);
+                    let key = format!("{name}.set.{key}");
+                    let message = format!("{found} leaders learn in this stage, {expected} in all others");
+                    blame_line(line(&key), key, message);
+                }
+            }
+            Err(super::ConfigError::Invalid { problems: found, .. }) => {
+                for Problem { key, message, .. } in found {
+                    let line = line(&key);
+                    let key = if key.starts_with(STAGES) { key } else { format!("{name}: {key}") };
+                    blame_line(line, key, message);
+                }
+            }
+            Err(error) => blame(start, name, error.to_string()),
+        }
+        let value = |text: &str| {
+            let table: Option<toml::Table> = format!("value = {text}").parse().ok();
+            table.and_then(|mut table| table.remove("value"))
+        };
+        let set = written.iter().filter_map(|(key, written)| Some((key.clone(), value(written.text)?))).collect();
+        stages.push(Stage { from: from.unwrap_or(0), set });
+    }
+    let problems = problems.into_inner();
+    if problems.is_empty() { Ok(stages) } else { Err(problems) }
+}

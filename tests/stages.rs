@@ -1,0 +1,305 @@
+//! Curricula and warm starts: what is wrong with them by line, and that a run goes on through either to the same results.
+
+#![cfg(feature = "cli")]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+
+use assert_cmd::cargo::cargo_bin_cmd;
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::{Machine, Player};
+use flotilla::config::{Config, Sharing};
+use flotilla::record::disk::Disk;
+use flotilla::record::folder::{Folder, METRICS, POLICIES, RUN, Run, Start};
+use flotilla::record::policies::{self, Init, read_init};
+use flotilla::run::{Ended, Options, Results, RunError, Session};
+use flotilla::trainer::Trainer;
+use tempfile::TempDir;
+
+const WORLD: &str = "
+[world]
+leaders = [[10, 5], [20, 5]]
+followers = [[12, 2], [22, 2], [30, 2]]
+pois = [[10, 9], [20, 9]]
+coupling = 2
+steps = 9
+[policy]
+hidden = [5]
+[learning]
+population = 8
+generations = 6
+trials = 3
+";
+const STAGES: &str = "
+[[stages]]
+from = 2
+set = { 'world.coupling' = 3, 'world.steps' = 14, 'learning.episodes_per_team' = 2, 'learning.start_jitter' = 0.5 }
+[[stages]]
+from = 4
+set = { 'world.pois' = [[10, 9], [20, 9], [30, 12]], 'learning.poi_jitter' = 1.0 }
+";
+
+fn config(text: &str) -> Config {
+    Config::parse(text, "test.toml").unwrap_or_else(|error| panic!("{error}"))
+}
+
+fn staged() -> Config {
+    config(&[WORLD, STAGES].concat())
+}
+
+/// Every error of a text, a line each.
+fn wrong(text: &str) -> Vec<String> {
+    Config::parse(text, "test.toml").expect_err(text).to_string().lines().map(String::from).collect()
+}
+
+#[test]
+fn stages_start_from_the_file() {
+    let config = staged();
+    assert_eq!(Config::parse(&config.to_toml(), "again").unwrap(), config, "{}", config.to_toml());
+    let all = config.staged();
+    let froms: Vec<usize> = all.iter().map(|(from, _)| *from).collect();
+    assert_eq!(froms, [0, 2, 4]);
+    let own = Config { stages: vec![], ..config.clone() };
+    assert_eq!(all[0].1, own);
+    // Not from the stage before.
+    assert_eq!((all[1].1.world.steps, all[2].1.world.steps), (14, 9));
+    assert_eq!((all[1].1.world.pois.len(), all[2].1.world.pois.len(), config.pois()), (2, 3, None));
+    assert_eq!((0..7).map(|generation| config.stage_of(generation)).collect::<Vec<_>>(), [0, 0, 1, 1, 2, 2, 2]);
+    let shares: Vec<usize> = config.shares().iter().map(|share| share.learning.generations + 1).collect();
+    assert_eq!(shares, [2, 2, 3]);
+    let at_once = self::config(&format!("{WORLD}[[stages]]\nfrom = 0\nset = {{ world.coupling = 1 }}\n"));
+    assert_eq!((at_once.staged().len(), at_once.stage_of(6)), (1, 0));
+    assert_eq!(at_once.at(0).world.coupling, flotilla::config::Coupling::Same(1));
+}
+
+#[test]
+fn what_is_wrong_with_a_stage_is_told_by_its_line() {
+    let lines = WORLD.lines().count();
+    let stage = |from: &str, set: &str| format!("[[stages]]\nfrom = {from}\nset = {{ {set} }}\n");
+    let cases = [
+        (
+            stage("0", "'world.copling' = 1"),
+            3,
+            "stages[0].set.world.copling: unknown key, did you mean `world.coupling`?",
+        ),
+        (stage("0", "'world.coupling' = 9"), 3, "stages[0].set.world.coupling: found 9, allowed"),
+        (
+            stage("0", "'learning.population' = 9"),
+            3,
+            "stages[0].set.learning.population: this is the same in all stages",
+        ),
+        (stage("0", "'policy.hidden' = [3]"), 3, "stages[0].set.policy.hidden: this is the same in all stages"),
+        (stage("0", "'checkpoint.seconds' = 3"), 3, "stages[0].set.checkpoint.seconds: this is the same"),
+        (stage("0", "'world.leaders' = [[1, 1]]"), 3, "stages[0].set.world.leaders: 1 leaders learn in this stage, 2"),
+        (stage("7", ""), 2, "stages[0].from: found 7, allowed a whole number, 0 to 6 (learning.generations)"),
+        (stage("-1", ""), 2, "stages[0].from: found something else"),
+        (stage("3", "") + &stage("3", ""), 5, "stages[1].from: found 3, allowed a whole number, 4 to 6"),
+        ("[[stages]]\nset = {}\n".into(), 1, "stages[0]: missing `from`"),
+        (stage("1", "").replace("set", "sett"), 3, "stages[0].sett: unknown key; a stage has from, set"),
+        ("[[stages]]\nfrom = 1\nset = 3\n".into(), 3, "stages[0].set: allowed a table"),
+    ];
+    for (text, line, message) in cases {
+        let found = wrong(&[WORLD, &text].concat());
+        let expected = format!("test.toml:{}: {message}", lines + line);
+        assert!(found.len() == 1 && found[0].starts_with(&expected), "{text}: {found:?} is not {expected}");
+    }
+    assert!(wrong(&["stages = 3\n", WORLD].concat())[0].starts_with("test.toml:1: stages: allowed a list"));
+    // In all-leaders, everyone is a learner.
+    let all = WORLD.replace("population", "paradigm = 'all-leaders'\npopulation");
+    let text = format!("{all}{}", stage("1", "'world.followers' = [[1, 2]]"));
+    assert!(wrong(&text)[0].contains("world.followers: 3 leaders learn in this stage, 5 in all others"), "{text}");
+}
+
+/// Trains until a generation has been played, or to the end.
+fn train(
+    config: &Config,
+    path: &Path,
+    init: Option<Init>,
+    start: Start,
+    until: usize,
+) -> Result<Option<Results>, RunError> {
+    let (mut session, _) =
+        Session::open_from(vec![(config.clone(), path.to_path_buf(), init)], start, &Disk::default())?;
+    let (stop, save) = (AtomicBool::new(until == 0), AtomicBool::new(false));
+    let mut options = Options {
+        command: "",
+        stop: &stop,
+        save: &save,
+        instead: &mut |_| None,
+        setback: &mut |_| {},
+        watch: &mut |progress| stop.store(progress.generations[0] >= until, Relaxed),
+    };
+    let mut player: Player = (Box::new(Cpu::default()), Machine::default());
+    let ended = session.train(&mut player, &mut options)?;
+    Ok((ended == Ended::Done).then(|| session.results(0).cloned().unwrap()))
+}
+
+/// The metrics, the seconds left out.
+fn rows(path: &Path) -> Vec<Vec<String>> {
+    let text = fs::read_to_string(path.join(METRICS)).unwrap();
+    let fields = |line: &str| line.split(',').enumerate().filter(|&(at, _)| at != 5).map(|(_, f)| f.into()).collect();
+    text.lines().map(fields).collect()
+}
+
+fn bytes(path: &Path) -> Vec<u8> {
+    fs::read(path.join(POLICIES)).unwrap()
+}
+
+#[test]
+fn a_run_goes_on_through_its_stages() {
+    let place = tempfile::tempdir().unwrap();
+    let (config, whole) = (staged(), place.path().join("whole"));
+    let expected = train(&config, &whole, None, Start::Fresh, 99).unwrap().unwrap();
+    let told = rows(&whole);
+    assert_eq!(told[0], ["trial", "generation", "best_g", "mean_g", "champion_g", "stage"]);
+    for row in &told[1..] {
+        assert_eq!(row[5], config.stage_of(row[1].parse().unwrap()).to_string());
+    }
+    // Up to where the first stage ends it is, champions too, a run without stages.
+    let plain = place.path().join("plain");
+    train(&Config { stages: vec![], ..config.clone() }, &plain, None, Start::Fresh, 99).unwrap();
+    let without: Vec<_> = rows(&plain).iter().map(|row| row.to_vec()).collect();
+    assert!((1..7).all(|row| told[row][..5] == without[row][..5]) && told[7][..5] != without[7][..5]);
+    for until in 1..=7 {
+        let path = place.path().join(format!("stopped-{until}"));
+        let stopped = train(&config, &path, None, Start::Fresh, until).unwrap();
+        assert_eq!(stopped, None, "{until}");
+        assert_eq!(train(&config, &path, None, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
+        assert_eq!((rows(&path), bytes(&path)), (told.clone(), bytes(&whole)), "{until}");
+    }
+    // Other stages are another run.
+    let mut other = config.clone();
+    other.stages[1].from = 5;
+    let error = train(&other, &whole, None, Start::Resume, 99).unwrap_err().to_string();
+    assert!(error.contains("stages: ") && error.contains("from = 4"), "{error}");
+}
+
+#[test]
+fn a_run_goes_on_from_the_policies_that_it_started_from() {
+    let place = tempfile::tempdir().unwrap();
+    let (config, first) = (config(WORLD), place.path().join("first"));
+    train(&config, &first, None, Start::Fresh, 99).unwrap();
+    let file = first.join(POLICIES);
+    let init = || Some(read_init(&file, &config).unwrap());
+    let digest = init().unwrap().digest;
+    // As generation 0, in the file's order.
+    let learned = policies::read_all(&file, &config).unwrap();
+    let whole = place.path().join("whole");
+    let expected = train(&config, &whole, init(), Start::Fresh, 99).unwrap().unwrap();
+    let mut trainer = Trainer::new(vec![config.clone()]);
+    let (policies, parameters) = (8, config.parameters());
+    for (trial, weights) in learned.iter().enumerate() {
+        assert!(trainer.start_from(0, trial, policies, weights));
+        let slots = trainer.weights(0, trial).unwrap();
+        for (slots, given) in slots.chunks(9 * parameters).zip(weights.chunks(8 * parameters)) {
+            assert_eq!(&slots[..8 * parameters], given);
+        }
+    }
+    assert!(!trainer.start_from(0, 0, policies, &learned[0][1..]));
+    let row = trainer.advance(&mut Cpu::default()).and_then(|_| trainer.advance(&mut Cpu::default())).unwrap()[0];
+    assert_eq!(rows(&whole)[1][2..4], [row.best_g.to_string(), row.mean_g.to_string()]);
+    assert_eq!(Run::read(&whole.join(RUN)).unwrap().init, Some(digest.clone()));
+    for until in 0..=7 {
+        let path = place.path().join(format!("stopped-{until}"));
+        train(&config, &path, init(), Start::Fresh, until).unwrap();
+        // With the file or without it.
+        let again = if until % 2 == 0 { init() } else { None };
+        assert_eq!(train(&config, &path, again, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
+        assert_eq!((rows(&path), bytes(&path)), (rows(&whole), bytes(&whole)), "{until}");
+    }
+    // Not from another file, nor where there is nothing yet to go on from, nor a run that started otherwise.
+    let other = read_init(&whole.join(POLICIES), &config).unwrap();
+    let error = train(&config, &whole, Some(other), Start::Resume, 99).unwrap_err().to_string();
+    assert!(error.contains("started from a file of policies with SHA-256") && !error.contains('\n'), "{error}");
+    let error = train(&config, &first, init(), Start::Resume, 99).unwrap_err().to_string();
+    assert!(error.contains("did not start from a file"), "{error}");
+    let bare = place.path().join("bare");
+    let (folder, _) = Folder::open(&bare, Start::Fresh, &config, Disk::default()).unwrap();
+    folder.write_run(&Run { init: Some(digest), ..Run::new(&config) }).unwrap();
+    drop(folder);
+    let error = train(&config, &bare, None, Start::Resume, 99).unwrap_err().to_string();
+    assert!(error.contains("has no checkpoint yet"), "{error}");
+    assert_eq!(train(&config, &bare, init(), Start::Resume, 99).unwrap().as_ref(), Some(&expected));
+}
+
+/// A folder with two configs and a run of the first.
+fn place() -> (TempDir, PathBuf) {
+    let place = tempfile::tempdir().unwrap();
+    fs::write(place.path().join("small.toml"), WORLD).unwrap();
+    let shared = WORLD.replace("population = 8", "population = 8\nsharing = 'all'");
+    fs::write(place.path().join("shared.toml"), &shared).unwrap();
+    let more = shared.replace("[[10, 5], [20, 5]]", "[[10, 5], [20, 5], [40, 5]]").replace("trials = 3", "trials = 2");
+    fs::write(place.path().join("more.toml"), more.replace("population = 8", "population = 12")).unwrap();
+    let path = place.path().to_path_buf();
+    (place, path)
+}
+
+fn run(folder: &Path, line: &str) -> (Option<i32>, String, String) {
+    let line = format!("{line} --backend cpu");
+    let output = cargo_bin_cmd!("flotilla").args(line.split_whitespace()).current_dir(folder).output().unwrap();
+    let text = |bytes| String::from_utf8(bytes).unwrap();
+    (output.status.code(), text(output.stdout), text(output.stderr))
+}
+
+#[test]
+fn a_shared_policy_fits_any_number_of_leaders() {
+    let (_place, folder) = place();
+    let good = |line: &str| {
+        let (code, out, told) = run(&folder, line);
+        assert_eq!(code, Some(0), "{line}: {told}");
+        out
+    };
+    good("train shared.toml --out run");
+    let bytes = fs::read(folder.join("run").join(POLICIES)).unwrap();
+    let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+    assert_eq!(tensors.tensor("weights.1").unwrap().shape(), [1, 8, 57]);
+    // By its own config, by one without sharing, and by one of more leaders.
+    let own = good("rollout shared.toml --policies run/policies.safetensors --scores own.csv");
+    assert_eq!(good("rollout small.toml --policies run/policies.safetensors --scores other.csv"), own);
+    assert_eq!(fs::read(folder.join("own.csv")).unwrap(), fs::read(folder.join("other.csv")).unwrap());
+    good("rollout more.toml --policies run/policies.safetensors --scores more.csv");
+    assert_eq!(fs::read_to_string(folder.join("more.csv")).unwrap().lines().count(), 1 + 8 * 3);
+    // A smaller file is joined by random policies; it fits more leaders where these share.
+    good("train more.toml --out warm --init run/policies.safetensors");
+    good("replay warm --generation 1 --out replay.html");
+    let (code, _, told) = run(&folder, "train small.toml --out cold --init run/policies.safetensors");
+    let reason = "weights.0 is F32 [1, 8, 57], but the config needs F32 [2, 1 to 1048576, 57]";
+    assert!(code == Some(1) && told.contains(reason) && told.lines().count() == 1, "{told}");
+    let (code, _, told) = run(&folder, "train small.toml --out cold --init small.toml");
+    assert!(code == Some(1) && told.starts_with("error: small.toml: ") && told.lines().count() == 1, "{told}");
+    let (code, _, told) = run(&folder, "train small.toml --out cold --init missing.safetensors");
+    assert!(code == Some(1) && told.contains("missing.safetensors: cannot be read"), "{told}");
+    assert!(!folder.join("cold").exists());
+    assert_eq!(Config::load(&folder.join("run/config.toml")).unwrap().learning.sharing, Sharing::All);
+}
+
+#[test]
+fn stages_are_seen_by_every_command() {
+    let (_place, folder) = place();
+    fs::write(folder.join("staged.toml"), [WORLD, STAGES].concat()).unwrap();
+    let good = |line: &str| {
+        let (code, out, told) = run(&folder, line);
+        assert_eq!(code, Some(0), "{line}: {told}");
+        out
+    };
+    good("train staged.toml --out run");
+    // Each generation is played again as it was.
+    for generation in [1, 2, 3, 4, 6] {
+        good(&format!("replay run --generation {generation} --out replay.html"));
+    }
+    let (code, _, told) = run(&folder, "replay run --generation 6 --compare 1");
+    assert!(code == Some(2) && told.contains("different stages"), "{told}");
+    good("plot run --out curves.svg");
+    good("rollout staged.toml --policies run/policies.safetensors");
+    assert!(good("rollout staged.toml --policies run/policies.safetensors --stage 2").contains("of 3"));
+    let (code, _, told) = run(&folder, "rollout staged.toml --policies run/policies.safetensors --stage 3");
+    assert!(code == Some(2) && told.contains("the config has 3, 0 to 2"), "{told}");
+    // 2 generations of 9 steps, 2 of twice 14, 3 of 9, each of 27 teams.
+    let output = cargo_bin_cmd!("flotilla").args(["check", "staged.toml"]).current_dir(&folder).output().unwrap();
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert!(text.contains(&format!("team-steps            {}\n", 27 * (2 * 9 + 2 * 2 * 14 + 3 * 9))), "{text}");
+    // A stage too many, by flag.
+    let (code, _, told) = run(&folder, "train staged.toml --generations 3 --out short");
+    assert!(code.is_some_and(|code| code > 0) && told.contains("stages[1].from: found 4, allowed"), "{told}");
+}
