@@ -301,7 +301,9 @@ impl Session {
         let mut last = 0;
         for member in &mut self.members {
             if let Some(Going { arm, .. }) = member.going {
-                member.config.learning.generations = self.trainer.end(arm);
+                let last = self.trainer.end(arm);
+                member.config.learning.generations = last;
+                member.config.stages.retain(|stage| stage.from <= last);
                 member.folder.write_config(&member.config)?;
             }
             last = last.max(member.config.learning.generations);

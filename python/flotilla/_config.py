@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from flotilla import _native as native
@@ -48,8 +48,8 @@ class Config:
     pickled.
 
     Args:
-        sections: a mapping for every section of a config file: ``world={"leaders": [[5, 5]], "pois": [[5, 15]]}``.
-            Positions may be lists or NumPy arrays ``[n, 2]``, in map units.
+        sections: a mapping for every section of a config file: ``world={"leaders": [[5, 5]], "pois": [[5, 15]]}``, and a
+            list for ``stages``. Positions may be lists or NumPy arrays ``[n, 2]``, in map units.
 
     Raises:
         ConfigError: everything that is wrong, at once.
@@ -63,7 +63,7 @@ class Config:
     __slots__ = ("_native",)
     _native: native.Config
 
-    def __init__(self, **sections: Mapping[str, Any]) -> None:
+    def __init__(self, **sections: Mapping[str, Any] | Sequence[Any]) -> None:
         self._native = native.Config.build(_flat(sections))
 
     @classmethod
@@ -123,7 +123,7 @@ class Config:
         """
         return [Key(*key) for key in native.keys()]
 
-    def replace(self, **sections: Mapping[str, Any]) -> Config:
+    def replace(self, **sections: Mapping[str, Any] | Sequence[Any]) -> Config:
         """This config with some keys changed; those of a section that are not named stay.
 
         Raises:

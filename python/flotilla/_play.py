@@ -53,6 +53,7 @@ class Rollout:
         d: what the team would have lost without each leader, ``[teams, leaders]``, as the next two.
         df: without it and the followers that it led.
         dpp: what it would have gained by copies of it, where that is more.
+        dt: without it and, at each step, the followers that it led then; None but where the config's fitness is Dt.
         trace: all that the teams did, if that was asked for.
 
     Example:
@@ -67,6 +68,7 @@ class Rollout:
     d: Floats
     df: Floats
     dpp: Floats
+    dt: Floats | None = None
     trace: Trace | None = None
 
     def __repr__(self) -> str:
@@ -135,12 +137,12 @@ def rollout(
         )
     elif jitter is not None or poi_jitter is not None:
         raise ValueError("a jitter is of starts that are drawn, say how many by episodes")
-    observed, g, d, df, dpp = _native.rollout(config._native, array, starts, name)
+    observed, g, d, df, dpp, dt = _native.rollout(config._native, array, starts, name)
     traced = None
     if trace:
         positions, headings, speeds, inputs, outputs, near = _native.trace(config._native, array, starts, 0, name)
         traced = Trace(positions, headings, speeds, inputs, outputs, _near(near, positions.shape[2]))
-    return Rollout(observed, g, d, df, dpp, traced)
+    return Rollout(observed, g, d, df, dpp, dt, traced)
 
 
 def _layers(config: Config | None, parameters: int) -> list[int]:

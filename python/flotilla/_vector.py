@@ -35,7 +35,9 @@ class Teams:
             raise ValueError(f"render_mode {render_mode!r}, allowed are None and 'rgb_array'")
         self.config, self.reward, self.render_mode = config, reward, render_mode
         self.count = whole("the number of teams", teams, 1, MAX_TEAMS)
-        self.stepper = _native.Stepper(config._native, self.count, reward != "G")
+        # What is recorded hangs on what is to be scored by.
+        scored = config.replace(learning={"fitness": reward})
+        self.stepper = _native.Stepper(scored._native, self.count, reward != "G")
         self.leaders, self.length = config.leaders, int(config["world.steps"])
         self.agents = len(config["world.leaders"]) + len(config["world.followers"])
         self.jitter = float(config["learning.start_jitter"])
@@ -94,7 +96,7 @@ class VectorEnv:
         config: the world. Of its learning only who leads and the jitter of starts counts here.
         num_envs: how many teams.
         reward: ``"G"`` gives the newly observed share of POIs at each step, the same to all leaders, which adds up to G;
-            ``"D"``, ``"Df"`` and ``"D++"`` give each leader that fitness at the last step, and 0 before.
+            ``"D"``, ``"Df"``, ``"D++"`` and ``"Dt"`` give each leader that fitness at the last step, and 0 before.
         autoreset: what becomes of a team whose episode is over, as gymnasium has it (``metadata["autoreset_mode"]``):
             ``"next_step"`` starts it at the step after the last, whose action counts for nothing; ``"same_step"`` starts it
             at once, with what it saw last in ``infos["final_obs"]``; ``"disabled"`` leaves it until ``reset`` with

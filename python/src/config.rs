@@ -81,6 +81,7 @@ impl Config {
 
 /// Every key of a config: its name, unit, kind, range, default, meaning and where the paper has it.
 #[pyfunction]
+#[expect(clippy::type_complexity, reason = "it is taken apart at once")]
 pub fn keys() -> Vec<(String, String, String, String, Option<String>, String, String)> {
     let row = |Definition { name, unit, kind, range, default, meaning, paper }| {
         let [name, unit, meaning, paper] = [name, unit, meaning, paper].map(String::from);

@@ -40,9 +40,11 @@ type Scores<'py> = (
     Bound<'py, PyArray2<f32>>,
     Bound<'py, PyArray2<f32>>,
     Bound<'py, PyArray2<f32>>,
+    Option<Bound<'py, PyArray2<f32>>>,
 );
 
-/// What teams score: POIs observed and G `[teams]`, and D, Df and D++ `[teams, leaders]`.
+/// What teams score: POIs observed and G `[teams]`, and D, Df, D++ and, where it is the config's fitness, Dt `[teams,
+/// leaders]`.
 #[pyfunction]
 pub fn rollout<'py>(
     py: Python<'py>,
@@ -56,10 +58,18 @@ pub fn rollout<'py>(
     let played = workers::play(py, backend, |(backend, _)| {
         front::play(&config.0, &mut **backend, teams, weights, &starts).raise()
     })?;
-    let Played { observed, g, d, df, dpp, .. } = played;
+    let Played { observed, g, d, df, dpp, dt, .. } = played;
+    let timed = !dt.is_empty();
     let shape = [teams, config.0.learners()];
     let rows = |scores: Vec<f32>| PyArray1::from_vec(py, scores).reshape(shape);
-    Ok((PyArray1::from_vec(py, observed), PyArray1::from_vec(py, g), rows(d)?, rows(df)?, rows(dpp)?))
+    Ok((
+        PyArray1::from_vec(py, observed),
+        PyArray1::from_vec(py, g),
+        rows(d)?,
+        rows(df)?,
+        rows(dpp)?,
+        timed.then(|| rows(dt)).transpose()?,
+    ))
 }
 
 type Motion<'py> = (

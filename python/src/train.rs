@@ -291,7 +291,7 @@ pub fn save(
         let (kept, _) = Folder::open(&folder, start, config, disk.clone()).raise()?;
         let path = kept.file(METRICS);
         let write = || {
-            let mut writer = metrics::Writer::create(&disk, &path)?;
+            let mut writer = metrics::Writer::create(&disk, &path, config)?;
             for (generation, &seconds) in times.iter().enumerate() {
                 let row = |trial: usize| {
                     let of = |score: &[f64]| score[trial * columns + generation];

@@ -62,7 +62,7 @@ def random_config(seed: int) -> flotilla.Config:
         "observation_radius": float(rng.uniform(2, 15)),
     }
     learning = {
-        "fitness": str(rng.choice(["G", "D", "Df", "D++"])),
+        "fitness": str(rng.choice(flotilla._native.FITNESSES)),
         "paradigm": str(rng.choice(["leader-follower", "all-leaders"])),
         "population": int(rng.integers(2, 30)),
         "generations": int(rng.integers(0, 5)),
@@ -75,4 +75,5 @@ def random_config(seed: int) -> flotilla.Config:
     }
     hidden = [int(units) for units in rng.integers(1, 12, rng.integers(0, 3))]
     policy = {"hidden": hidden, "actions": str(rng.choice(["direct", "behaviours"]))}
-    return flotilla.Config(world=world, learning=learning, policy=policy)
+    stages = [{"from": 2, "set": {"world.coupling": 1}}] if rng.random() < 0.3 else []
+    return flotilla.Config(world=world, learning=learning, policy=policy, stages=stages)

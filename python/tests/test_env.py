@@ -12,9 +12,9 @@ def by_policies(env, trace, step):
 
 
 @pytest.mark.parametrize("seed", range(10))
-@pytest.mark.parametrize("reward", ["G", "D", "Df", "D++"])
+@pytest.mark.parametrize("reward", ["G", "D", "Df", "D++", "Dt"])
 def test_fed_with_a_policy_s_answers_it_gives_the_bits_of_a_rollout(seed, reward):
-    config = random_config(seed).replace(learning={"start_jitter": 0.0})
+    config = random_config(seed).replace(learning={"start_jitter": 0.0, "fitness": reward})
     policies = random_policies(config, 11, seed)
     scores = rollout(config, policies, trace=True)
     trace, steps = scores.trace, config["world.steps"]
@@ -36,7 +36,7 @@ def test_fed_with_a_policy_s_answers_it_gives_the_bits_of_a_rollout(seed, reward
     if reward == "G":
         assert np.allclose(total, scores.g[:, None], atol=1e-6)
     else:
-        expected = {"D": scores.d, "Df": scores.df, "D++": scores.dpp}[reward]
+        expected = {"D": scores.d, "Df": scores.df, "D++": scores.dpp, "Dt": scores.dt}[reward]
         assert np.array_equal(rewards.view(np.uint32), expected.view(np.uint32))
     assert np.array_equal(env.observed.sum(1), scores.observed)
 

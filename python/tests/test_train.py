@@ -100,6 +100,7 @@ def test_a_callback_sees_every_generation_and_may_stop(config, out):
         seen.append((generation.generation, generation.last, generation.best_g, generation.mean_g, generation.champion_g))
         return generation.generation == 3
 
+    config = config.replace(stages=[{"from": number, "set": {"world.coupling": 2}} for number in (1, 6)])
     run = train(config, out=out, callback=stop_at_three)
     assert [row[:2] for row in seen] == [(generation, 6) for generation in range(4)]
     for number, _, best, mean, champion in seen:
@@ -108,6 +109,7 @@ def test_a_callback_sees_every_generation_and_may_stop(config, out):
         assert np.array_equal(champion, run.metrics["champion_g"][:, number])
     last = run.config["learning.generations"]
     assert 3 <= last <= 5
+    config = config.replace(stages=config.to_dict()["stages"][:1])
     assert run.digest == train(config.replace(learning={"generations": last})).digest
     if out is not None:
         assert train(config, out=out, resume=True).digest == train(config).digest
