@@ -3,11 +3,10 @@
 
 mod support;
 
-use std::ops::Range;
 
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, BackendError, Episode, Group, Moment, Need, Seen, Strided, Trace};
-use flotilla::config::{Config, Fitness, MAX_POPULATION};
+use flotilla::config::{Fitness, MAX_POPULATION};
 use flotilla::credit::{self, Credit, Scores};
 use flotilla::evaluate::Starts;
 use flotilla::sample;
