@@ -137,7 +137,7 @@ fn every_wrong_value_is_named_with_line_and_range() {
         (13, "max_sped = 3", "motion.max_sped: unknown key, did you mean `motion.max_speed`?"),
         (10, "max_speed = 3", "world.max_speed: unknown key, did you mean `motion.max_speed`?"),
         (21, "hiden = [10]", "policy.hiden: unknown key, did you mean `policy.hidden`?"),
-        (21, "qwertz = 1", "policy.qwertz: unknown key; [policy] has hidden"),
+        (21, "qwertz = 1", "policy.qwertz: unknown key; [policy] has actions, hidden"),
         (20, "[polcy]", "polcy: unknown section, did you mean `policy`?"),
         // wrong types
         (8, "dt = 'fast'", "world.dt: found 'fast', allowed a number, 0.0001 to 10"),
@@ -253,7 +253,7 @@ x.toml:13: motion.max_sped: unknown key, did you mean `motion.max_speed`?
 x.toml:21: policy.hidden[0]: found 65, allowed 1 to 64
 x.toml:24: learning.trials: found 0, allowed 1 to 4096
 x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, fitness, generations, led_by, \
-         led_within, mutation, mutation_probability, mutation_sigma, paradigm, population, seed, start_jitter, trials
+         led_within, mutation, mutation_probability, mutation_sigma, paradigm, poi_jitter, population, seed, sharing, start_jitter, trials
 --population: found 1, allowed 2 to 1048576"
     );
 }

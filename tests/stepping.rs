@@ -3,7 +3,6 @@
 
 mod support;
 
-
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, BackendError, Episode, Group, Moment, Need, Seen, Strided, Trace};
 use flotilla::config::{Fitness, MAX_POPULATION};
