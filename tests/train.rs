@@ -453,8 +453,8 @@ fn held_out_episodes_are_told_by_mean_spread_and_interval() {
     let mut spreads = 0;
     for (index, row) in rows.iter().enumerate() {
         let expected = spread(&teams[index / 2]);
-        assert_eq!(row[6], "12");
-        close(&[7, 8, 9, 10].map(|column| row[column].parse().unwrap()), &expected);
+        assert_eq!(row[7], "12");
+        close(&[8, 9, 10, 11].map(|column| row[column].parse().unwrap()), &expected);
         close(&[row[2].parse().unwrap()], &[expected[0] / 2.0]);
         spreads += usize::from(expected[1] > 0.0);
     }
