@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import inspect
 import re
+import sys
 import textwrap
 
+# The package that is installed is looked at, not the sources beside this file, which have no native part.
+sys.path = sys.path[1:]
 import flotilla
 
 OPENING = """\

@@ -75,5 +75,6 @@ def random_config(seed: int) -> flotilla.Config:
     }
     hidden = [int(units) for units in rng.integers(1, 12, rng.integers(0, 3))]
     policy = {"hidden": hidden, "actions": str(rng.choice(["direct", "behaviours"]))}
-    stages = [{"from": 2, "set": {"world.coupling": 1}}] if rng.random() < 0.3 else []
+    first = min(2, learning["generations"])
+    stages = [{"from": first, "set": {"world.coupling": 1}}] if rng.random() < 0.3 else []
     return flotilla.Config(world=world, learning=learning, policy=policy, stages=stages)
