@@ -2,6 +2,8 @@
 
 #![cfg(feature = "cli")]
 
+mod support;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -15,22 +17,9 @@ use flotilla::record::folder::{Folder, METRICS, POLICIES, RUN, Run, Start};
 use flotilla::record::policies::{self, Init, read_init};
 use flotilla::run::{Ended, Options, Results, RunError, Session};
 use flotilla::trainer::Trainer;
+use support::SMALL;
 use tempfile::TempDir;
 
-const WORLD: &str = "
-[world]
-leaders = [[10, 5], [20, 5]]
-followers = [[12, 2], [22, 2], [30, 2]]
-pois = [[10, 9], [20, 9]]
-coupling = 2
-steps = 9
-[policy]
-hidden = [5]
-[learning]
-population = 8
-generations = 6
-trials = 3
-";
 const STAGES: &str = "
 [[stages]]
 from = 2
@@ -45,7 +34,7 @@ fn config(text: &str) -> Config {
 }
 
 fn staged() -> Config {
-    config(&[WORLD, STAGES].concat())
+    config(&[SMALL, STAGES].concat())
 }
 
 /// Every error of a text, a line each.
@@ -68,14 +57,14 @@ fn stages_start_from_the_file() {
     assert_eq!((0..7).map(|generation| config.stage_of(generation)).collect::<Vec<_>>(), [0, 0, 1, 1, 2, 2, 2]);
     let shares: Vec<usize> = config.shares().iter().map(|share| share.learning.generations + 1).collect();
     assert_eq!(shares, [2, 2, 3]);
-    let at_once = self::config(&format!("{WORLD}[[stages]]\nfrom = 0\nset = {{ world.coupling = 1 }}\n"));
+    let at_once = self::config(&format!("{SMALL}[[stages]]\nfrom = 0\nset = {{ world.coupling = 1 }}\n"));
     assert_eq!((at_once.staged().len(), at_once.stage_of(6)), (1, 0));
     assert_eq!(at_once.at(0).world.coupling, flotilla::config::Coupling::Same(1));
 }
 
 #[test]
 fn what_is_wrong_with_a_stage_is_told_by_its_line() {
-    let lines = WORLD.lines().count();
+    let lines = SMALL.lines().count();
     let stage = |from: &str, set: &str| format!("[[stages]]\nfrom = {from}\nset = {{ {set} }}\n");
     let cases = [
         (
@@ -100,13 +89,13 @@ fn what_is_wrong_with_a_stage_is_told_by_its_line() {
         ("[[stages]]\nfrom = 1\nset = 3\n".into(), 3, "stages[0].set: allowed a table"),
     ];
     for (text, line, message) in cases {
-        let found = wrong(&[WORLD, &text].concat());
+        let found = wrong(&[SMALL, &text].concat());
         let expected = format!("test.toml:{}: {message}", lines + line);
         assert!(found.len() == 1 && found[0].starts_with(&expected), "{text}: {found:?} is not {expected}");
     }
-    assert!(wrong(&["stages = 3\n", WORLD].concat())[0].starts_with("test.toml:1: stages: allowed a list"));
+    assert!(wrong(&["stages = 3\n", SMALL].concat())[0].starts_with("test.toml:1: stages: allowed a list"));
     // In all-leaders, everyone is a learner.
-    let all = WORLD.replace("population", "paradigm = 'all-leaders'\npopulation");
+    let all = SMALL.replace("population", "paradigm = 'all-leaders'\npopulation");
     let text = format!("{all}{}", stage("1", "'world.followers' = [[1, 2]]"));
     assert!(wrong(&text)[0].contains("world.followers: 3 leaders learn in this stage, 5 in all others"), "{text}");
 }
@@ -178,7 +167,7 @@ fn a_run_goes_on_through_its_stages() {
 #[test]
 fn a_run_goes_on_from_the_policies_that_it_started_from() {
     let place = tempfile::tempdir().unwrap();
-    let (config, first) = (config(WORLD), place.path().join("first"));
+    let (config, first) = (config(SMALL), place.path().join("first"));
     train(&config, &first, None, Start::Fresh, 99).unwrap();
     let file = first.join(POLICIES);
     let init = || Some(read_init(&file, &config).unwrap());
@@ -226,8 +215,8 @@ fn a_run_goes_on_from_the_policies_that_it_started_from() {
 /// A folder with two configs and a run of the first.
 fn place() -> (TempDir, PathBuf) {
     let place = tempfile::tempdir().unwrap();
-    fs::write(place.path().join("small.toml"), WORLD).unwrap();
-    let shared = WORLD.replace("population = 8", "population = 8\nsharing = 'all'");
+    fs::write(place.path().join("small.toml"), SMALL).unwrap();
+    let shared = SMALL.replace("population = 8", "population = 8\nsharing = 'all'");
     fs::write(place.path().join("shared.toml"), &shared).unwrap();
     let more = shared.replace("[[10, 5], [20, 5]]", "[[10, 5], [20, 5], [40, 5]]").replace("trials = 3", "trials = 2");
     fs::write(place.path().join("more.toml"), more.replace("population = 8", "population = 12")).unwrap();
@@ -277,7 +266,7 @@ fn a_shared_policy_fits_any_number_of_leaders() {
 #[test]
 fn stages_are_seen_by_every_command() {
     let (_place, folder) = place();
-    fs::write(folder.join("staged.toml"), [WORLD, STAGES].concat()).unwrap();
+    fs::write(folder.join("staged.toml"), [SMALL, STAGES].concat()).unwrap();
     let good = |line: &str| {
         let (code, out, told) = run(&folder, line);
         assert_eq!(code, Some(0), "{line}: {told}");

@@ -12,27 +12,13 @@ use flotilla::record::hex;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use sha2::{Digest, Sha256};
-use support::Place;
+use support::{Place, SMALL};
 
-const CONFIG: &str = "
-[world]
-leaders = [[10, 5], [20, 5]]
-followers = [[12, 2], [22, 2], [30, 2]]
-pois = [[10, 9], [20, 9]]
-coupling = 2
-steps = 9
-[policy]
-hidden = [5]
-[learning]
-population = 8
-generations = 6
-trials = 3
-";
 const PARAMETERS: usize = 9 * 5 + 6 * 2;
 
 /// A folder with `small.toml` in it. A GPU's driver may have things to tell of its own, so nothing is played on one.
 fn place() -> Place {
-    Place::new(&[("small.toml", CONFIG)]).on_cpu()
+    Place::new(&[("small.toml", SMALL)]).on_cpu()
 }
 
 /// Writes a safetensors file with one tensor, as another program would.
@@ -401,7 +387,7 @@ fn traced(text: &str, episodes: usize) -> Vec<Vec<Vec<Vec<Vec<f64>>>>> {
     all
 }
 
-/// POIs of [`CONFIG`] that a traced team observed.
+/// POIs of [`SMALL`] that a traced team observed.
 fn observed(steps: &[Vec<Vec<f64>>]) -> f64 {
     let near = |agent: &[f64], [x, y]: [f64; 2]| (agent[0] - x).powi(2) + (agent[1] - y).powi(2) <= 25.0;
     let seen = |poi| steps[1..].iter().any(|agents| agents.iter().filter(|agent| near(agent, poi)).count() >= 2);
@@ -494,7 +480,7 @@ fn held_out_episodes_are_told_by_mean_spread_and_interval() {
     // A score is the mean of what single episodes from these starts score.
     let mut sums = vec![[0.0; 4]; 16];
     for start in &starts {
-        let moved = CONFIG
+        let moved = SMALL
             .replace("[[10, 5], [20, 5]]", &format!("{:?}", &start[..2]))
             .replace("[[12, 2], [22, 2], [30, 2]]", &format!("{:?}", &start[2..]));
         fs::write(place.path("moved.toml"), moved).unwrap();
@@ -543,7 +529,7 @@ fn rollout_refuses_flags_that_would_change_nothing() {
     assert!(error.contains("--start-jitter: found -1"), "{error}");
     place.good(&format!("{line} --episodes 1"));
     // Where the config moves starts, no flag is needed.
-    fs::write(place.path("small.toml"), CONFIG.to_string() + "start_jitter = 1.5\n").unwrap();
+    fs::write(place.path("small.toml"), SMALL.to_string() + "start_jitter = 1.5\n").unwrap();
     let (summary, _) = place.good(&format!("{line} --episodes 3"));
     assert!(summary.contains("starts moved by up to 1.5 (seed 0)"), "{summary}");
 }
@@ -620,7 +606,7 @@ fn no_training_starts_where_teams_are_evaluated() {
     use flotilla::evolve::{Key, Purpose, jitter_starts};
     use flotilla::world::World;
 
-    let world = World::new(&Config::parse(CONFIG, "small").unwrap());
+    let world = World::new(&Config::parse(SMALL, "small").unwrap());
     let bits = |starts: &[glam::Vec2]| -> Vec<u32> {
         starts.iter().flat_map(|start| [start.x.to_bits(), start.y.to_bits()]).collect()
     };

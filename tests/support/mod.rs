@@ -10,6 +10,22 @@ pub use commands::*;
 use flotilla::backend::gpu::device::{self, AdapterInfo, Request, Wanted};
 use flotilla::config::Config;
 
+/// A config that is small and played at once.
+pub const SMALL: &str = "
+[world]
+leaders = [[10, 5], [20, 5]]
+followers = [[12, 2], [22, 2], [30, 2]]
+pois = [[10, 9], [20, 9]]
+coupling = 2
+steps = 9
+[policy]
+hidden = [5]
+[learning]
+population = 8
+generations = 6
+trials = 3
+";
+
 /// One of the project's own configs, by its name.
 pub fn layout(name: &str) -> Config {
     let path = format!("{}/configs/{name}.toml", env!("CARGO_MANIFEST_DIR"));
