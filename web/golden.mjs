@@ -1,0 +1,76 @@
+// Trains in Node what the page trains, by its own worker, and compares the digests with the program's and with those of
+// tests/golden.txt.
+//
+//     node web/golden.mjs PAGE FLOTILLA
+//
+// PAGE is the index.html that web/build makes.
+
+import assert from "node:assert/strict";
+import { execFileSync } from "node:child_process";
+import { mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { tmpdir } from "node:os";
+import { join } from "node:path";
+import { inflateSync } from "node:zlib";
+
+const [page, flotilla] = process.argv.slice(2);
+const html = readFileSync(page, "utf8");
+const text = id => html.split(`<script type="text/plain" id="${id}">`)[1].split("</script>")[0];
+const source = name => readFileSync(new URL(name, import.meta.url), "utf8");
+
+// The worker, with this in its page's place.
+class Player {
+  constructor() {
+    this.asked = [];
+    this.self = { postMessage: message => this.asked.shift()?.(message) };
+    new Function("self", text("worker"))(this.self);
+  }
+  async ask(words, bytes, more = {}) {
+    const answered = new Promise(resolve => this.asked.push(resolve));
+    this.self.onmessage({ data: { words, bytes, ...more } });
+    const answer = await answered;
+    if (answer.words?.error) throw new Error(answer.words.error);
+    return answer;
+  }
+}
+
+const Training = new Function(`${source("page/training.js")} return Training;`)();
+const player = new Player();
+await player.ask({}, undefined, { module: new WebAssembly.Module(inflateSync(Buffer.from(text("wasm"), "base64"))) });
+const { words: machine } = await player.ask({ ask: "open", gpu: false, pass: null });
+assert.equal(machine.description, "cpu (SIMD128, 1 thread)");
+
+const SMALL = [["learning.trials", "2"], ["learning.generations", "8"], ["learning.population", "20"]];
+async function digest(layout, changes) {
+  const { words } = await player.ask({ ask: "resolve", text: text(`layout-${layout}`), name: layout, changes: [...SMALL, ...changes] });
+  const training = new Training([{ ...words, label: layout, command: "" }], machine);
+  await training.start([player]);
+  await training.play(() => Infinity, () => {});
+  assert.equal(training.state, "done");
+  return { toml: words.toml, digest: training.arms[0].digest };
+}
+
+const golden = Object.fromEntries(source("../tests/golden.txt").split("\n").map(line => line.split(/\s+/)).map(words => [words[0], words[2]]));
+for (const [name, layout, changes] of [
+  ["generally-forward", "generally_forward", []],
+  ["strictly-forward", "strictly_forward", [["learning.fitness", "'D++'"]]],
+  ["chaotic", "chaotic", [["learning.fitness", "'G'"]]],
+]) {
+  assert.equal((await digest(layout, changes)).digest, golden[name], `golden digest ${name}`);
+  console.log(`${name}: the golden digest`);
+}
+
+const folder = mkdtempSync(join(tmpdir(), "flotilla-web-"));
+try {
+  for (const layout of ["generally_forward", "strictly_forward", "chaotic"]) {
+    for (const paradigm of ["leader-follower", "all-leaders"]) {
+      const { toml, digest: found } = await digest(layout, [["learning.paradigm", `'${paradigm}'`], ["learning.seed", "7"]]);
+      const config = join(folder, "config.toml"), out = join(folder, `${layout}-${paradigm}`);
+      writeFileSync(config, toml);
+      execFileSync(flotilla, ["train", config, "--out", out, "--quiet", "--backend", "cpu"], { stdio: ["ignore", "ignore", "inherit"] });
+      assert.equal(found, JSON.parse(readFileSync(join(out, "run.json"), "utf8")).digest, `${layout}, ${paradigm}`);
+      console.log(`${layout}, ${paradigm}: the program's digest`);
+    }
+  }
+} finally {
+  rmSync(folder, { recursive: true });
+}
