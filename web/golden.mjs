@@ -59,6 +59,21 @@ for (const [name, layout, changes] of [
   console.log(`${name}: the golden digest`);
 }
 
+// Whoever takes a leader plays with teammates that do what they learned.
+const { words: resolved } = await player.ask({ ask: "resolve", text: text("layout-generally_forward"), name: "", changes: SMALL });
+const trained = new Training([{ ...resolved, label: "", command: "" }], machine);
+await trained.start([player]);
+await trained.play(() => Infinity, () => {});
+const { policies } = trained.arms[0].ended[0], weights = new Uint8Array(policies.slice().buffer);
+const numbers = text => new Float32Array(Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer);
+const { words: whole } = await player.ask({ ask: "play", text: resolved.toml }, weights);
+const { agents, headings } = whole.episodes[0], after = numbers(headings).slice(2 * agents, 4 * agents);
+await player.ask({ ask: "drive", text: resolved.toml, leader: 0 }, weights);
+const { words: driven } = await player.ask({ ask: "step", turn: 0, speed: 0 });
+for (const leader of [1, 2, 3])
+  for (const axis of [0, 1]) assert.ok(Math.abs(driven.headings[2 * leader + axis] - after[2 * leader + axis]) < 1e-3, `leader ${leader} does not do what it learned`);
+console.log("teammates do what they learned");
+
 const folder = mkdtempSync(join(tmpdir(), "flotilla-web-"));
 try {
   for (const layout of ["generally_forward", "strictly_forward", "chaotic"]) {

@@ -87,11 +87,12 @@ fn act(policy: &[f32], widths: &[usize], inputs: &[f32]) -> [f32; 2] {
     let (mut layer, mut policy) = (inputs.to_vec(), policy);
     for width in widths.windows(2) {
         let (weights, rest) = policy.split_at((width[0] + 1) * width[1]);
-        let unit = |unit: &[f32]| {
-            let sum = layer.iter().zip(unit).fold(unit[layer.len()], |sum, (input, weight)| sum + input * weight);
-            sum.tanh()
+        // A row of units an input, then the biases.
+        let sum = |unit: usize| {
+            let inputs = layer.iter().zip(weights[unit..].iter().step_by(width[1]));
+            inputs.fold(weights[width[0] * width[1] + unit], |sum, (input, weight)| sum + input * weight)
         };
-        layer = weights.chunks_exact(width[0] + 1).map(unit).collect();
+        layer = (0..width[1]).map(|unit| sum(unit).tanh()).collect();
         policy = rest;
     }
     match layer[..] {
