@@ -69,7 +69,7 @@ class Browser:
         for domain in ["Page", "Runtime", "Log", "Network"]:
             self.call(f"{domain}.enable")
 
-    def message(self, seconds=30):
+    def message(self, seconds=120):
         deadline = time.monotonic() + seconds
         while b"\0" not in self.buffer:
             ready, _, _ = select.select([self.answers], [], [], max(0, deadline - time.monotonic()))
@@ -115,7 +115,7 @@ class Browser:
         for kind in ["mousePressed", "mouseReleased"]:
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
-    def wait(self, script, seconds=20):
+    def wait(self, script, seconds=120):
         deadline = time.monotonic() + seconds
         while not self.evaluate(script):
             assert time.monotonic() < deadline, f"never came true: {script}"

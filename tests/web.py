@@ -12,7 +12,6 @@ PAGE is the index.html that web/build makes. Python's standard library and a Chr
 
 import itertools
 import json
-import os
 import pathlib
 import subprocess
 import sys
@@ -27,13 +26,27 @@ CONFIGS = pathlib.Path(__file__).parent.parent / "configs"
 WEBGPU = ["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"]
 SMALL = {"trials": 2, "generations": 6, "population": 20, "seed": 7}
 READY = "document.body.dataset.ready !== undefined"
+STAGED = """
+[world]
+leaders = [[5, 5]]
+followers = [[4, 4], [6, 4]]
+pois = [[5, 12], [12, 5]]
+coupling = 2
+[learning]
+population = 12
+generations = 5
+trials = 2
+[[stages]]
+from = 3
+set = { world.pois = [[40, 30]], world.coupling = 1, learning.poi_jitter = 1.0 }
+"""
 DONE = "page.state.training && page.state.training.state === 'done' && document.querySelectorAll('.sha').length > 0"
 
 
 class Tab(Browser):
     def load(self, page, **words):
         self.open(page.as_uri() + "#" + "&".join(f"{key}={value}" for key, value in words.items()))
-        self.wait(READY, 90)
+        self.wait(READY)
 
     def calm(self):
         found = list(self.complaints())
@@ -72,7 +85,27 @@ class Tab(Browser):
             f" const [x, y] = page.state.config.world.{list_}[{index}]; return [box.left + X(x) + 1, box.top + Y(y) + 1]; }})()"
         )
 
-    def train(self, seconds=120):
+    def lose_gpu(self):
+        session, self.session = self.session, None
+        self.call("Browser.crashGpuProcess")
+        self.session = session
+
+    def tasks(self, act):
+        """Tasks of the page's main thread while something is done: each one's milliseconds by the clock, and of the processor."""
+        kept = len(self.events)
+        self.call("Tracing.start", traceConfig={"includedCategories": ["toplevel"]}, transferMode="ReportEvents")
+        act()
+        self.call("Tracing.end")
+        while not any(event["method"] == "Tracing.tracingComplete" for event in self.events[kept:]):
+            self.events.append(self.message())
+        chunks = [event["params"]["value"] for event in self.events if event["method"] == "Tracing.dataCollected"]
+        self.events = [event for event in self.events if not event["method"].startswith("Tracing.")]
+        found = list(itertools.chain(*chunks))
+        mains = {(e["pid"], e["tid"]) for e in found if e["name"] == "thread_name" and e["args"]["name"] == "CrRendererMain"}
+        whole = [e for e in found if e["name"].endswith("RunTask") and (e["pid"], e["tid"]) in mains and "tdur" in e]
+        return [(e["dur"] / 1000, e["tdur"] / 1000) for e in whole]
+
+    def train(self, seconds=300):
         self.click("#train")
         self.wait(DONE, seconds)
         return {
@@ -118,7 +151,7 @@ def main():
         # The program's digests, by the CPU and by WebGPU.
         for on, layout in itertools.product(["cpu", "gpu"], layouts):
             tab.load(page, layout=layout, on=on, pace="full", **SMALL)
-            for paradigm, digest in tab.train(240).items():
+            for paradigm, digest in tab.train().items():
                 assert digest == expected[layout, paradigm], (on, layout, paradigm, digest)
             machine = tab.text("#machine")
             assert ("WebGPU" in machine and "exact" in machine) == (on == "gpu"), machine
@@ -128,19 +161,32 @@ def main():
 
         # Verify: equal under the pass, and different without.
         tab.click("#verify")
-        tab.wait("!document.querySelector('#verify').disabled", 300)
+        tab.wait("!document.querySelector('#verify').disabled", 400)
         assert tab.text("#verified").startswith("Equal: "), tab.text("#verified")
         tab.click("#plain")
         tab.click("#verify")
-        tab.wait("!document.querySelector('#verify').disabled", 300)
+        tab.wait("!document.querySelector('#verify').disabled", 400)
         assert tab.text("#verified").startswith("DIFFERENT: "), tab.text("#verified")
         tab.calm()
         print("Verify is green, and red without the pass")
 
+        # The GPU is lost while it trains: that is told, and the same comes out of training again.
+        tab.load(page, layout="chaotic", on="gpu", pace="full", **SMALL)
+        tab.set("#generations", "100000")
+        tab.wait("page.state.config.learning.generations === 100000")
+        tab.click("#train")
+        tab.wait("page.state.training && page.state.training.reached >= 1")
+        tab.lose_gpu()
+        tab.wait("document.querySelector('#trouble').textContent.includes('Train again')")
+        tab.set("#generations", str(SMALL["generations"]))
+        tab.wait(f"page.state.config.learning.generations === {SMALL['generations']}")
+        assert tab.train()["leader-follower"] == expected["chaotic", "leader-follower"]
+        print("a lost GPU is told, and survived")
+
         # Train to watch, pause, scrub.
         tab.load(page, on="cpu", layout="generally_forward")
         tab.click("#train")
-        tab.wait("page.state.training && page.state.training.reached >= 5", 60)
+        tab.wait("page.state.training && page.state.training.reached >= 5")
         tab.click("#pause")
         reached = tab.evaluate("page.state.training.reached")
         time.sleep(0.5)
@@ -154,7 +200,7 @@ def main():
         played = "page.state.views.map(view => view.data.episodes[0].best_g)"
         assert tab.evaluate(best) == tab.evaluate(played), "the episode is not the one that was scored"
         tab.click("#pause")
-        tab.wait(DONE, 60)
+        tab.wait(DONE)
         tab.calm()
         print("training pauses, goes on, and is scrubbed")
 
@@ -193,7 +239,7 @@ def main():
         tab.wait("document.querySelector('#said').textContent !== ''")
         link, text = tab.evaluate("location.href"), tab.evaluate("page.state.text")
         tab.open(link)
-        tab.wait(READY, 60)
+        tab.wait(READY)
         assert tab.evaluate("page.state.text") == text
         print("a link holds the experiment")
 
@@ -202,13 +248,8 @@ def main():
         tab.train()
         tab.click("[data-mode=drive]")
         tab.click("#again")
-        x, y = tab.place("pois", 0)
-        for _ in range(200):
-            tab.mouse("mouseMoved", x, y)
-            time.sleep(0.05)
-            if "observed" in tab.text("#driven"):
-                break
-        assert "Yours: D = " in tab.text("#driven"), tab.text("#driven")
+        tab.mouse("mouseMoved", *tab.place("pois", 0))
+        tab.wait("document.querySelector('#driven').textContent.includes('Yours: D = ')")
         episode = "page.state.views[0].data.episodes[0]"
         steps = tab.evaluate(f"{episode}.shown.length")
         assert steps == 26, steps
@@ -222,7 +263,7 @@ def main():
         digests = tab.train()
         tab.click(".home")
         archive = downloads / "strictly_forward-leader-follower.zip"
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 120
         while not archive.exists() and time.monotonic() < deadline:
             time.sleep(0.05)
         run = folder / "home"
@@ -252,6 +293,13 @@ def main():
         tab.drop("mine.toml", base64(b"[world]\nleaders = [[5, 5]]\nfollowers = [[4, 4], [6, 4]]\npois = [[5, 12]]\n"))
         tab.wait("page.state.config.world.leaders.length === 1 && document.querySelector('#layout').value === 'own'")
         tab.calm()
+        tab.drop("stages.toml", base64(STAGED.encode()))
+        tab.wait("page.state.config.stages.length === 1")
+        staged = folder / "stages.toml"
+        staged.write_text(STAGED)
+        assert tab.train()["leader-follower"] == native("stages", staged), "stages come to something else"
+        assert "share of POIs" in tab.text("#legend"), tab.text("#legend")
+        tab.calm()
         tab.drop("broken.toml", base64(b"[world]\nleaders = [[5, 5]]\npois = [[5, 120]]\nstep = 3\n"))
         tab.wait("document.querySelectorAll('#problems li').length === 2")
         told = tab.text("#problems")
@@ -261,17 +309,18 @@ def main():
         assert not list(tab.complaints())
         print("a broken config tells its problems beside their lines")
 
-        # 4096 teams, and the page stays responsive.
+        # 4096 teams, and the page stays responsive. Its observer goes by the clock, and so tells of other programs, too, that had
+        # the processor: what the page itself did in a task is told by its thread's time.
         tab.load(page, layout="generally_forward", on="cpu", pace="full", trials=1, generations=6, population=4096)
-        tab.evaluate("window.long = []; new PerformanceObserver(list => long.push(...list.getEntries().map(e => e.duration))).observe({ type: 'longtask' }); 0")
-        tab.train(400)
+        tab.evaluate(
+            "window.long = []; new PerformanceObserver(list => long.push(...list.getEntries().map(e => e.duration)))"
+            ".observe({ type: 'longtask' }); 0"
+        )
+        tasks = tab.tasks(lambda: tab.train(600))
         tab.calm()
-        # Tasks are told by the clock on the wall: where other programs have the processor, it tells of those.
-        if os.getloadavg()[0] > 2 * os.cpu_count():
-            print("skipped: whether the page stutters cannot be told, for this machine is busy with other things")
-        else:
-            assert tab.evaluate("long") == [], tab.evaluate("long")
-            print("no task of the page takes 50 ms while 4096 teams train")
+        long, busiest = tab.evaluate("long"), max(used for _, used in tasks)
+        assert len(tasks) > 100 and busiest < 50, (len(tasks), busiest, long)
+        print(f"no task of the page takes 50 ms while 4096 teams train: {busiest:.0f} ms at most of {len(tasks)}; {len(long)} by the clock")
 
         # What it looks like.
         for (width, height), dark in itertools.product([(390, 844), (820, 1180), (1440, 900)], [False, True]):
@@ -279,7 +328,7 @@ def main():
             tab.load(page, layout="generally_forward", on="cpu", pace="full", seed=1)
             tab.train()
             tab.set("#scrub", 100)
-            tab.wait("page.state.views.every(view => view.data.episodes[0].generation === 100 && !view.playing)", 60)
+            tab.wait("page.state.views.every(view => view.data.episodes[0].generation === 100 && !view.playing)")
             assert tab.evaluate("document.documentElement.scrollWidth") <= width, "the page is wider than the window"
             colours = tab.evaluate(COLOURS.replace("replay.data.colors[scheme]", "stage.palette(page.state.views[0].data)"))
             for least, what, ink, ground in colours:

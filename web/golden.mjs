@@ -10,32 +10,14 @@ import { execFileSync } from "node:child_process";
 import { mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
-import { inflateSync } from "node:zlib";
+import { Player, contents } from "./player.mjs";
 
 const [page, flotilla] = process.argv.slice(2);
-const html = readFileSync(page, "utf8");
-const text = id => html.split(`<script type="text/plain" id="${id}">`)[1].split("</script>")[0];
+const text = contents(page);
 const source = name => readFileSync(new URL(name, import.meta.url), "utf8");
 
-// The worker, with this in its page's place.
-class Player {
-  constructor() {
-    this.asked = [];
-    this.self = { postMessage: message => this.asked.shift()?.(message) };
-    new Function("self", text("worker"))(this.self);
-  }
-  async ask(words, bytes, more = {}) {
-    const answered = new Promise(resolve => this.asked.push(resolve));
-    this.self.onmessage({ data: { words, bytes, ...more } });
-    const answer = await answered;
-    if (answer.words?.error) throw new Error(answer.words.error);
-    return answer;
-  }
-}
-
 const Training = new Function(`${source("page/training.js")} return Training;`)();
-const player = new Player();
-await player.ask({}, undefined, { module: new WebAssembly.Module(inflateSync(Buffer.from(text("wasm"), "base64"))) });
+const player = await Player.of(text);
 const { words: machine } = await player.ask({ ask: "open", gpu: false, pass: null });
 assert.equal(machine.description, "cpu (SIMD128, 1 thread)");
 
@@ -64,11 +46,11 @@ const { words: resolved } = await player.ask({ ask: "resolve", text: text("layou
 const trained = new Training([{ ...resolved, label: "", command: "" }], machine);
 await trained.start([player]);
 await trained.play(() => Infinity, () => {});
-const { policies } = trained.arms[0].ended[0], weights = new Uint8Array(policies.slice().buffer);
+const weights = trained.arms[0].ended[0];
 const numbers = text => new Float32Array(Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer);
-const { words: whole } = await player.ask({ ask: "play", text: resolved.toml }, weights);
+const { words: whole } = await player.ask({ ask: "play", text: resolved.toml, policies: 1 }, weights);
 const { agents, headings } = whole.episodes[0], after = numbers(headings).slice(2 * agents, 4 * agents);
-await player.ask({ ask: "drive", text: resolved.toml, leader: 0 }, weights);
+await player.ask({ ask: "drive", text: resolved.toml, leader: 0, policies: 1 }, weights);
 const { words: driven } = await player.ask({ ask: "step", turn: 0, speed: 0 });
 for (const leader of [1, 2, 3])
   for (const axis of [0, 1]) assert.ok(Math.abs(driven.headings[2 * leader + axis] - after[2 * leader + axis]) < 1e-3, `leader ${leader} does not do what it learned`);

@@ -1,10 +1,8 @@
 // Learning curves: of each arm the mean over trials of the best team's POIs, and every trial thin behind it.
 const chart = (() => {
   "use strict";
-  const TONES = ["--led", "--alone"];
-
-  // `arms` are { label, tone, trials: [[POIs by generation]] }; `cursor` is a generation to mark, or none.
-  function paint(canvas, arms, last, pois, cursor) {
+  // `arms` are { tone, trials: [[POIs by generation]] }, of every so manieth generation; `cursor` is a generation to mark, or none.
+  function paint(canvas, arms, every, last, pois, cursor) {
     const wide = canvas.clientWidth, tall = canvas.clientHeight, dots = window.devicePixelRatio || 1;
     if (canvas.width !== Math.round(wide * dots) || canvas.height !== Math.round(tall * dots)) {
       canvas.width = Math.round(wide * dots);
@@ -44,7 +42,7 @@ const chart = (() => {
       draw.strokeStyle = color(tone);
       draw.lineWidth = 1;
       draw.globalAlpha = 0.32;
-      for (const trial of trials) line(draw, trial, X, Y);
+      for (const trial of trials) line(draw, trial, every, X, Y);
       draw.globalAlpha = 1;
     }
     arms.forEach(({ tone, trials }, index) => {
@@ -53,18 +51,18 @@ const chart = (() => {
       draw.strokeStyle = color(tone);
       draw.lineWidth = 2.5;
       draw.setLineDash(index ? [7, 3] : []);
-      line(draw, means, X, Y);
+      line(draw, means, every, X, Y);
       draw.setLineDash([]);
       const end = means.length - 1;
       draw.fillStyle = color(tone);
-      draw.beginPath(); draw.arc(X(end), Y(means[end]), 4, 0, 2 * Math.PI); draw.fill();
+      draw.beginPath(); draw.arc(X(end * every), Y(means[end]), 4, 0, 2 * Math.PI); draw.fill();
     });
     return { generation: x => Math.round(Math.max(0, Math.min(1, (x - left) / (wide - left - right))) * last) };
   }
 
-  function line(draw, values, X, Y) {
+  function line(draw, values, every, X, Y) {
     draw.beginPath();
-    values.forEach((value, generation) => draw.lineTo(X(generation), Y(value)));
+    values.forEach((value, index) => draw.lineTo(X(index * every), Y(value)));
     draw.stroke();
   }
 
@@ -74,5 +72,5 @@ const chart = (() => {
     return Array.from({ length }, (_, generation) => trials.reduce((sum, trial) => sum + trial[generation], 0) / trials.length);
   }
 
-  return { paint, mean, TONES };
+  return { paint };
 })();

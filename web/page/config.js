@@ -28,7 +28,7 @@ const configs = (() => {
     const header = new RegExp(`^[ \\t]*\\[${section}\\][ \\t]*(#.*)?$`, "m").exec(text);
     if (!header) return `${text.trimEnd()}\n\n[${section}]\n${leaf} = ${value}\n`;
     const from = header.index + header[0].length;
-    const next = /^[ \t]*\[[A-Za-z_.]+\][ \t]*(#.*)?$/m.exec(text.slice(from));
+    const next = /^[ \t]*\[{1,2}[A-Za-z_.]+\]{1,2}[ \t]*(#.*)?$/m.exec(text.slice(from));
     const to = next ? from + next.index : text.length;
     const found = new RegExp(`^[ \\t]*${leaf}[ \\t]*=[ \\t]*`, "m").exec(text.slice(from, to));
     if (!found) return `${text.slice(0, from)}\n${leaf} = ${value}${text.slice(from)}`;

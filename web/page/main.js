@@ -18,7 +18,7 @@ const page = (() => {
   const quote = key => key === "fitness" ? value => `"${value}"` : value => String(value);
 
   const state = {
-    text: "", config: null, toml: null, bytes: 0, both: true, file: null, mode: "watch",
+    text: "", config: null, toml: null, pois: 4, both: true, file: null, mode: "watch",
     training: null, follow: true, generation: 0, trial: 0, views: [], gpu: {}, machine: null, settled: null, players: [], policies: null,
   };
 
@@ -39,7 +39,7 @@ const page = (() => {
     }
     if (turn !== newest) return false;
     mark([]);
-    Object.assign(state, { config: resolved.config, toml: resolved.toml, bytes: resolved.bytes });
+    Object.assign(state, { config: resolved.config, toml: resolved.toml, pois: resolved.pois });
     $("train").disabled = false;
     fill();
     remember();
@@ -152,6 +152,9 @@ const page = (() => {
     const learners = words.get("learners");
     state.both = !(learners in NAMES);
     if (!state.both) text = configs.set(text, "learning.paradigm", `"${learners}"`);
+    if (await take(text) || state.config) return;
+    // Where the link's config is wrong, there is a map to look at nevertheless.
+    await take(configs.layout("generally_forward"));
     await take(text);
   }
 
@@ -190,7 +193,7 @@ const page = (() => {
   async function renew() {
     state.players.forEach(player => player.stop());
     state.settled = null;
-    const many = Math.max(1, Math.min(8, navigator.hardwareConcurrency || 2));
+    const many = Math.max(1, Math.min(16, navigator.hardwareConcurrency || 2));
     state.players = await Promise.all(Array.from({ length: many }, () => pool.open()));
   }
 
@@ -210,7 +213,7 @@ const page = (() => {
         const changes = [["learning.paradigm", `"${paradigm}"`]];
         const { words } = await state.players[0].ask({ ask: "resolve", text: state.text, name: "config.toml", changes });
         if (words.bytes > 3 * 2 ** 30) throw new Error(`This config takes ${(words.bytes / 2 ** 30).toFixed(1)} GiB, and a tab has at most 4. Choose a smaller population or fewer trials, or train it by the command line.`);
-        return { label: paradigm, toml: words.toml, config: words.config, command: command(words.config), name: name_of() };
+        return { label: paradigm, toml: words.toml, config: words.config, pois: words.pois, parameters: words.parameters, command: command(words.config), name: name_of() };
       }));
       training = state.training = new Training(arms, state.machine);
       Object.assign(state, { follow: true, generation: 0, trial: 0, policies: null });
@@ -252,6 +255,17 @@ const page = (() => {
     follow();
     told();
     if (training.state === "done") digests();
+  }
+
+  // Leaves a training and what came out of it.
+  function forget() {
+    if (state.training) state.training.stop();
+    Object.assign(state, { training: null, policies: null });
+    $("digests").replaceChildren();
+    $("scrub").value = 0;
+    $("generation").textContent = "";
+    $("trial").replaceChildren();
+    controls();
   }
 
   const name_of = () => state.file || ($("layout").value === "own" ? "config" : $("layout").value);
@@ -303,9 +317,11 @@ const page = (() => {
     const starts = [...world.leaders, ...world.followers].map(place => [...place, far]);
     const all = [...starts, ...world.pois.map(place => [...place, world.observation_radius + 1])];
     const side = (axis, sign) => all.map(place => place[axis] + sign * place[2]);
-    let [left, below, right, above] = [Math.max(0, Math.min(...side(0, -1))), Math.max(0, Math.min(...side(1, -1))), Math.min(width, Math.max(...side(0, 1))), Math.min(height, Math.max(...side(1, 1)))];
+    // Beyond a wall there is room for whoever stands at it.
+    const low = axis => Math.max(-1, Math.min(...side(axis, -1))), high = (axis, end) => Math.min(end + 1, Math.max(...side(axis, 1)));
+    let [left, below, right, above] = [low(0), low(1), high(0, width), high(1, height)];
     const least = (right - left) * 0.42;
-    if (above - below < least) { above = Math.min(height, below + least); below = Math.max(0, above - least); }
+    if (above - below < least) { above = Math.min(height + 1, below + least); below = Math.max(-1, above - least); }
     return [left, below, right, above];
   }
 
@@ -360,7 +376,9 @@ const page = (() => {
   // Shows an episode from its start, or where nothing shall move its end.
   function show(view, data, moving = true) {
     const last = data.episodes[0].shown.length - 1;
-    const plays = moving && !still.matches;
+    const plays = moving && !still.matches, [left, below, right, above] = view.crop;
+    // Stages and jitter may put POIs elsewhere.
+    if (data.pois.some(([x, y]) => x < left || x > right || y < below || y > above)) view.crop = stage.whole(data);
     Object.assign(view, { data, place: plays ? 0 : last, playing: plays, ended: plays ? null : performance.now() });
     draw(view);
     wake_up();
@@ -466,23 +484,26 @@ const page = (() => {
   let drawn_chart = null;
   function curves() {
     const { training } = state;
-    const arms = training ? training.arms.map(arm => {
-      const pois = arm.config.world.pois.length;
-      return { label: arm.label, tone: TONES[arm.label], pois, trials: arm.trials.map(trial => trial.map(row => row.best * pois)) };
-    }) : [];
-    const pois = training ? arms[0].pois : state.config ? state.config.world.pois.length : 4;
+    // Shares of them, where stages have more and fewer.
+    const pois = (training ? training.arms[0].pois : state.pois) ?? 1;
+    // No more points than can be told apart.
+    const every = training ? Math.ceil(Math.max(1, training.reached) / 1000) : 1;
+    const sample = trial => Array.from({ length: Math.ceil(trial.length / every) }, (_, index) => trial[index * every].best * pois);
+    const arms = (training ? training.arms : []).map(({ label, trials }) => ({ tone: TONES[label], trials: trials.map(sample) }));
     const last = training ? training.last : state.config ? state.config.learning.generations : 100;
-    drawn_chart = chart.paint($("curves"), arms, last, pois, training && !state.follow ? state.generation : null);
+    drawn_chart = chart.paint($("curves"), arms, every, last, pois, training && !state.follow ? state.generation : null);
     $("legend").replaceChildren();
-    const words = arms.map(({ label, tone, trials }, index) => {
-      const means = chart.mean(trials), at = state.follow ? means.length - 1 : Math.min(state.generation, means.length - 1);
+    const many = training && training.arms[0].pois === null ? "share of POIs" : "POIs";
+    const words = (training ? training.arms : []).map(({ label, trials }, index) => {
+      const reached = Math.min(...trials.map(trial => trial.length)) - 1, at = state.follow ? reached : Math.min(state.generation, reached);
       const item = make("span", "", $("legend"));
-      make("span", "", item, { className: `key${index ? " dashed" : ""}` }).style.color = `var(${tone})`;
-      const value = means.length ? `${means[Math.max(0, at)].toFixed(2)} of ${pois}` : "–";
+      make("span", "", item, { className: `key${index ? " dashed" : ""}` }).style.color = `var(${TONES[label]})`;
+      const mean = at >= 0 && trials.reduce((sum, trial) => sum + trial[at].best, 0) / trials.length * pois;
+      const value = at >= 0 ? `${mean.toFixed(2)} of ${pois}` : "–";
       make("span", ` ${label}: ${value}`, item);
-      return `${label} ${value} POIs at generation ${Math.max(0, at)}`;
+      return `${label} ${value} ${many} at generation ${Math.max(0, at)}`;
     });
-    make("span", "POIs observed by the best team, mean over trials; thin: each trial", $("legend"));
+    make("span", `${many} observed by the best team, mean over trials; thin: each trial`, $("legend"));
     $("curves").setAttribute("aria-label", `Learning curves, best team, mean over trials: ${words.join("; ") || "nothing trained yet"}`);
     if (training) told();
   }
@@ -696,7 +717,7 @@ const page = (() => {
     return only;
   }
 
-  // What the hand wants: a turn in parts of a half turn, and a speed from -1 to 1.
+  // What the hand wants: a turn in parts of a half turn, and a speed from -1 to 1; nothing while it rests.
   function wish(positions, headings, leader) {
     const [x, y] = positions.slice(2 * leader, 2 * leader + 2), [cos, sin] = headings.slice(2 * leader, 2 * leader + 2);
     if (drive.pointer) {
@@ -705,8 +726,9 @@ const page = (() => {
       const angle = Math.atan2(cos * dy - sin * dx, cos * dx + sin * dy);
       return [Math.max(-1, Math.min(1, angle / Math.PI)), Math.max(-1, Math.min(1, away / 2 - 1))];
     }
+    if (!drive.keys.size) return null;
     const turn = (drive.keys.has("ArrowLeft") ? 0.4 : 0) - (drive.keys.has("ArrowRight") ? 0.4 : 0);
-    return [turn, drive.keys.has("ArrowUp") ? 1 : drive.keys.has("ArrowDown") ? -1 : drive.keys.size ? 0.2 : -1];
+    return [turn, drive.keys.has("ArrowUp") ? 1 : drive.keys.has("ArrowDown") ? -1 : 0.2];
   }
 
   async function drive_on() {
@@ -718,10 +740,10 @@ const page = (() => {
     $("again").textContent = "Start over";
     $("driven").textContent = state.policies ? "The other leaders do what they learned." : "The other leaders go straight ahead: train first, and they do what they learned.";
     const player = state.players[0], toml = configs.set(state.toml, "learning.paradigm", '"leader-follower"');
-    const { each, weights } = state.policies || { each: 0 }, bytes = weights && new Uint8Array(weights.slice().buffer);
+    const { each, weights } = state.policies || { each: 0 };
     let told;
     try {
-      told = (await player.ask({ ask: "drive", text: toml, leader, policies: each }, bytes)).words;
+      told = (await player.ask({ ask: "drive", text: toml, leader, policies: each }, weights)).words;
     } catch (error) {
       drive_off();
       return trouble(error.message);
@@ -743,7 +765,9 @@ const page = (() => {
     const pace = Math.max(60, data.dt * 1000 * 0.75);
     const step = async () => {
       if (drive.turn !== turn || state.mode !== "drive") return;
-      const from = performance.now(), [angle, speed] = wish(told.positions, told.headings, leader);
+      const from = performance.now(), wanted = wish(told.positions, told.headings, leader);
+      if (!wanted) return void (drive.timer = setTimeout(step, 30));
+      const [angle, speed] = wanted;
       try { told = (await player.ask({ ask: "step", turn: angle, speed })).words; } catch (error) { return trouble(error.message); }
       if (drive.turn !== turn) return;
       take(told);
@@ -772,7 +796,7 @@ const page = (() => {
 
   const HINTS = {
     watch: "", arrange: "Drag leaders, followers and POIs, then train again.",
-    drive: "Point where your leader shall go, or use the arrow keys; followers are drawn along.",
+    drive: "Point where your leader shall go, or use the arrow keys; followers are drawn along. Time stands still while you do.",
   };
 
   function mode(wanted) {
@@ -791,7 +815,7 @@ const page = (() => {
     } else if (wanted === "drive") {
       if (training && training.state === "training") { training.paused = true; controls(); }
       const led = training && training.arms.find(arm => arm.label === "leader-follower" && arm.ended.length);
-      if (led) state.policies = { each: led.config.learning.population, weights: led.ended[Math.min(state.trial, led.ended.length - 1)].policies };
+      if (led) state.policies = { each: 1, weights: led.ended[Math.min(state.trial, led.ended.length - 1)] };
       if (led && led.toml !== state.toml && led.config.world.leaders.length !== state.config.world.leaders.length) state.policies = null;
       options();
       drive_view();
@@ -815,7 +839,7 @@ const page = (() => {
     $("said").textContent = "";
     try {
       if (/\.zip$/i.test(file.name) || bytes[0] === 0x50 && bytes[1] === 0x4b) {
-        const found = await state.players[0].ask({ ask: "read", text: null }, bytes);
+        const found = await state.players[0].ask({ ask: "read", text: null }, bytes, {}, [bytes.buffer]);
         await settle();
         const training = await Training.read(state.players[0], state.machine, file.name, found);
         if (state.training) state.training.stop();
@@ -831,9 +855,8 @@ const page = (() => {
         $("said").textContent = `${file.name}: the run is whole, its digest is right.`;
       } else if (/\.safetensors$/i.test(file.name)) {
         const { words, bytes: weights } = await state.players[0].ask({ ask: "read", text: state.toml }, bytes);
-        if (state.training) state.training.stop();
-        state.training = null;
-        state.policies = { each: words.policies, weights: new Float32Array(weights.buffer) };
+        forget();
+        state.policies = { each: words.policies, weights };
         const { words: data } = await state.players[0].ask({ ask: "play", text: state.toml, policies: words.policies }, weights);
         mode("watch");
         clear();
@@ -851,8 +874,9 @@ const page = (() => {
         state.file = file.name.replace(/\.toml$/i, "");
         const text = new TextDecoder().decode(bytes);
         state.both = false;
-        if (state.training) { state.training.stop(); state.training = null; }
+        forget();
         mode("watch");
+        show_start();
         const taken = await take(text);
         $("said").textContent = taken ? `${file.name} is the config now.` : `${file.name} has problems; they stand beside its lines.`;
       }
@@ -890,10 +914,8 @@ const page = (() => {
       const { fitness, seed } = state.config ? state.config.learning : {};
       let text = configs.layout($("layout").value);
       if (fitness) text = configs.set(configs.set(text, "learning.fitness", `"${fitness}"`), "learning.seed", String(seed));
-      if (state.training) { state.training.stop(); state.training = null; }
+      forget();
       state.file = null;
-      controls();
-      $("digests").replaceChildren();
       const arranging = state.mode === "arrange";
       mode(arranging ? "arrange" : "watch");
       await take(text);
@@ -965,7 +987,7 @@ const page = (() => {
     palettes = (await state.players[0].ask({ ask: "colors" })).words;
     $("verify").disabled = !state.gpu.name;
     $("plain-label").hidden = !state.gpu.name;
-    if (!state.gpu.name) $("verified").textContent = `There is no GPU to verify: ${state.gpu.reason}.`;
+    $("verified").textContent = state.gpu.name ? "Compares this browser's GPU with its CPU, bit for bit." : `There is no GPU to verify: ${state.gpu.reason}.`;
     $("on").querySelector("[value=gpu]").disabled = !state.gpu.name;
     listen();
     await recall();

@@ -34,11 +34,12 @@ const pool = (() => {
       this.asked.clear();
       this.failed = true;
     }
-    ask(words, bytes, more = {}) {
+    // What is transferred is no longer here.
+    ask(words, bytes, more = {}, transferred = []) {
       if (this.failed) return Promise.reject(new Error("the worker has failed; load the page again"));
       const id = this.count++;
       const answered = new Promise((resolve, reject) => this.asked.set(id, { resolve, reject }));
-      this.worker.postMessage({ id, words, bytes, ...more });
+      this.worker.postMessage({ id, words, bytes, ...more }, transferred);
       return answered;
     }
     stop() {

@@ -64,55 +64,56 @@ class Training {
     changed();
   }
 
-  // Brings home what came out, and its digest.
+  // Puts each run's folder together, and brings home its digest. All of the policies may be much: they go from worker to
+  // worker, and only the champions stay.
   async finish() {
-    for (const player of this.players) {
-      const { words, bytes } = await player.ask({ ask: "ends" });
-      let at = bytes.byteOffset;
-      for (const { run, trial, policies, fitness, pending } of words) {
-        const take = count => { const part = new Float32Array(bytes.buffer, at, count); at += 4 * count; return part; };
-        this.arms[run].ended[trial] = { policies: take(policies), fitness: take(fitness), pending };
-      }
+    for (const [run, arm] of this.arms.entries()) {
+      const answers = await Promise.all(this.players.map(player => player.ask({ ask: "ends", run })));
+      const trials = answers.flatMap(({ words, bytes }) => {
+        let at = 0;
+        return words.map(({ trial, policies, fitness, pending }) => {
+          const part = bytes.subarray(at, at += 4 * (policies + fitness));
+          return { trial, part, pending, champions: champions(arm, part, policies) };
+        });
+      }).sort((a, b) => a.trial - b.trial);
+      arm.ended = trials.map(({ champions }) => champions);
+      await this.record(arm, trials, answers.map(({ bytes }) => bytes.buffer));
     }
-    await Promise.all(this.arms.map(arm => this.record(arm)));
     this.state = "done";
   }
 
-  async record(arm) {
-    const { trials, ended } = arm, rows = [];
-    for (let generation = 0; generation <= arm.config.learning.generations; generation++) {
-      const seconds = Math.max(...trials.map(trial => trial[generation].seconds));
-      trials.forEach((trial, index) => {
-        const { best, mean, champion } = trial[generation];
-        rows.push(0, index, generation, best, mean, champion, seconds);
-      });
+  async record(arm, ended, buffers) {
+    const { trials, toml: text, command } = arm, last = arm.config.learning.generations;
+    const rows = new Float64Array((last + 1) * trials.length * 7);
+    let at = 0;
+    for (let generation = 0; generation <= last; generation++) {
+      let latest = 0;
+      for (const trial of trials) latest = Math.max(latest, trial[generation].seconds);
+      for (let trial = 0; trial < trials.length; trial++) {
+        const { best, mean, champion } = trials[trial][generation];
+        for (const value of [0, trial, generation, best, mean, champion, latest]) rows[at++] = value;
+      }
     }
-    const parts = ended.flatMap(({ policies, fitness }) => [policies, fitness]);
-    const bytes = new Uint8Array(rows.length * 8 + parts.reduce((sum, part) => sum + part.byteLength, 0));
-    bytes.set(new Uint8Array(Float64Array.from(rows).buffer));
-    let at = rows.length * 8;
-    for (const part of parts) { bytes.set(new Uint8Array(part.buffer, part.byteOffset, part.byteLength), at); at += part.byteLength; }
     const { description, backend, adapter, driver, threads } = this.machine;
     const { words, bytes: zip } = await this.players[0].ask({
-      ask: "record", text: arm.toml, command: arm.command, description, backend, adapter, driver, threads,
+      ask: "record", text, command, description, backend, adapter, driver, threads,
       started: this.started, rows: rows.length / 7, pending: ended.map(({ pending }) => pending),
-    }, bytes);
+    }, [new Uint8Array(rows.buffer), ...ended.map(({ part }) => part)], {}, [rows.buffer, ...buffers]);
     Object.assign(arm, { digest: words.digest, zip });
   }
 
   // A run from a file, that nothing is left to do of.
   static async read(player, machine, name, { words, bytes }) {
-    const arm = { name, label: words.config.learning.paradigm, toml: words.toml, config: words.config, digest: words.digest };
+    const arm = { name, label: words.config.learning.paradigm, toml: words.toml, config: words.config, pois: words.pois, parameters: words.parameters, digest: words.digest };
     const training = new Training([arm], machine), [own] = training.arms;
     const numbers = new Float64Array(bytes.buffer, bytes.byteOffset, words.rows * 7);
     for (let at = 0; at < numbers.length; at += 7) {
       const [, trial, generation, best, mean, champion, seconds] = numbers.subarray(at, at + 7);
       own.trials[trial][generation] = { best, mean, champion, seconds };
     }
-    const size = (bytes.byteLength - words.rows * 56) / 4 / own.trials.length;
+    const start = words.rows * 56, size = (bytes.byteLength - start) / own.trials.length;
     own.trials.forEach((_, trial) => {
-      const start = bytes.byteOffset + words.rows * 56 + trial * size * 4;
-      own.ended[trial] = { policies: new Float32Array(bytes.buffer.slice(start, start + size * 4)) };
+      own.ended[trial] = champions(own, bytes.subarray(start + trial * size, start + (trial + 1) * size), size / 4);
       training.owners.set(`0/${trial}`, player);
     });
     training.players = [player];
@@ -128,4 +129,11 @@ class Training {
   }
 
   stop() { if (this.state !== "done") this.state = "stopped"; }
+}
+
+// The first policy of each population, of bytes that start with `[populations][policies][parameters]` of so many numbers.
+function champions({ config, parameters }, bytes, numbers) {
+  const each = 4 * config.learning.population * parameters, many = numbers * 4 / each, own = new Uint8Array(many * 4 * parameters);
+  for (let at = 0; at < many; at++) own.set(bytes.subarray(at * each, at * each + 4 * parameters), at * 4 * parameters);
+  return own;
 }

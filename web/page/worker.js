@@ -25,6 +25,13 @@ if (suspends) {
   };
 }
 
+// Numbers may come in parts.
+function joined(parts) {
+  const whole = new Uint8Array(parts.reduce((sum, part) => sum + part.byteLength, 0));
+  parts.reduce((at, part) => (whole.set(part, at), at + part.byteLength), 0);
+  return whole;
+}
+
 let call = null;
 async function answer({ id, words, bytes, module }) {
   try {
@@ -34,7 +41,7 @@ async function answer({ id, words, bytes, module }) {
       call = suspends ? WebAssembly.promising(wasm.call) : async () => wasm.call();
       return self.postMessage({ id, words: { suspends } });
     }
-    wasm_bindgen.put(JSON.stringify(words), bytes || new Uint8Array());
+    wasm_bindgen.put(JSON.stringify(words), Array.isArray(bytes) ? joined(bytes) : bytes || new Uint8Array());
     await call();
     const answered = JSON.parse(wasm_bindgen.answer()), numbers = wasm_bindgen.bytes();
     self.postMessage({ id, words: answered, bytes: numbers }, [numbers.buffer]);

@@ -17,7 +17,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use zip::{ZipArchive, ZipWriter, write::SimpleFileOptions};
 
-use crate::ask::{Answer, Refusal, floats, refuse};
+use crate::ask::{Answer, Refusal, described, floats, refuse};
 
 /// Most bytes of a file of an archive.
 const MOST: u64 = 1 << 30;
@@ -178,7 +178,9 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
     let count = numbers.len() / 7;
     let mut bytes: Vec<u8> = bytemuck::cast_slice(&numbers).to_vec();
     weights.iter().for_each(|weights| bytes.extend_from_slice(bytemuck::cast_slice(weights)));
-    let words = json!({ "toml": config.to_toml(), "config": config, "rows": count, "digest": digest });
+    let mut words = described(&config);
+    words["rows"] = count.into();
+    words["digest"] = digest.into();
     Ok((words, bytes))
 }
 

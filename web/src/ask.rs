@@ -63,8 +63,8 @@ enum Ask {
     Advance { generations: usize, milliseconds: f64 },
     /// The best team of a generation of a trial, the generation that is at hand where none is named.
     Best { run: usize, trial: usize, generation: Option<usize> },
-    /// What came out of runs that are done; numbers are policies and fitness.
-    Ends,
+    /// What came out of a run's trials that are done; numbers are policies and fitness.
+    Ends { run: usize },
     /// A finished run's folder as an archive, from its rows, policies and fitness.
     Record(Recorded),
     /// What such an archive or a file of policies holds, see [`archive::read`].
@@ -122,7 +122,7 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
             session.training.advance(&mut *session.player.0, generations, milliseconds)
         }
         Ask::Best { run, trial, generation } => words(session.training.best(run, trial, generation)?),
-        Ask::Ends => session.training.ends(),
+        Ask::Ends { run } => session.training.ends(run),
         Ask::Record(recorded) => archive::write(&recorded, bytes),
         Ask::Read { text } => archive::read(text.as_deref(), bytes),
         Ask::Play { text, policies } => words(archive::play(&parse(&text)?, policies, floats(bytes))?),
@@ -143,9 +143,15 @@ fn resolve(text: &str, name: &str, changes: Vec<(String, String)>) -> Result<Val
     let change = |(key, text): (String, String)| Override { name: key.clone(), key, text };
     let changes: Vec<Override> = changes.into_iter().map(change).collect();
     let config = Config::read(text, name, &[], &changes)?;
-    let bytes = flotilla::memory::Peaks::of([&config], 1).host;
-    let agents = config.world.leaders.len() + config.world.followers.len();
-    Ok(json!({ "toml": config.to_toml(), "config": config, "bytes": bytes, "agents": agents }))
+    let mut words = described(&config);
+    words["bytes"] = flotilla::memory::Peaks::of([&config], 1).host.into();
+    Ok(words)
+}
+
+/// A config as a page needs it: as text, as a tree, and what is worked out from it.
+pub fn described(config: &Config) -> Value {
+    let (toml, pois, parameters) = (config.to_toml(), config.pois(), config.parameters());
+    json!({ "toml": toml, "config": config, "pois": pois, "parameters": parameters })
 }
 
 fn machine((backend, machine): &Player) -> Value {

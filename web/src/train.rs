@@ -150,18 +150,17 @@ impl Training {
         Ok(replay::data("", &config, &[played]))
     }
 
-    /// What every trial came to that is done here; its numbers are the policies, then the fitness.
-    pub fn ends(&mut self) -> Result<Answer, Refusal> {
+    /// What every trial of a run came to that is done here; its numbers are the policies, then the fitness.
+    pub fn ends(&mut self, run: usize) -> Result<Answer, Refusal> {
         let (mut words, mut numbers) = (Vec::new(), Vec::<u8>::new());
         for Batch { trainer, arms } in self.batches.iter_mut().filter(|batch| batch.trainer.is_done()) {
-            let all: Vec<usize> = (0..arms.len()).collect();
-            for ((policies, end), &(run, alone)) in trainer.ends(&all).into_iter().zip(&*arms) {
+            let own: Vec<usize> = (0..arms.len()).filter(|&arm| arms[arm].0 == run).collect();
+            for ((policies, end), &arm) in trainer.ends(&own).into_iter().zip(&own) {
                 let trials = policies.iter().zip(&end.fitness).zip(&end.pending).enumerate();
                 for (trial, ((policies, fitness), pending)) in trials {
                     let pending = pending.map(|row| [row.best_g, row.mean_g]);
                     words.push(json!({
-                        "run": run,
-                        "trial": alone.unwrap_or(trial),
+                        "trial": arms[arm].1.unwrap_or(trial),
                         "policies": policies.len(),
                         "fitness": fitness.len(),
                         "pending": pending,
