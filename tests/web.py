@@ -294,7 +294,7 @@ def main():
         tab.wait("page.state.config.world.leaders.length === 1 && document.querySelector('#layout').value === 'own'")
         tab.calm()
         tab.drop("stages.toml", base64(STAGED.encode()))
-        tab.wait("page.state.config.stages.length === 1")
+        tab.wait("(page.state.config.stages || []).length === 1")
         staged = folder / "stages.toml"
         staged.write_text(STAGED)
         assert tab.train()["leader-follower"] == native("stages", staged), "stages come to something else"

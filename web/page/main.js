@@ -191,10 +191,10 @@ const page = (() => {
 
   // Workers that do not answer any more are replaced.
   async function renew() {
-    state.players.forEach(player => player.stop());
-    state.settled = null;
-    const many = Math.max(1, Math.min(16, navigator.hardwareConcurrency || 2));
+    const many = Math.max(1, Math.min(16, navigator.hardwareConcurrency || 2)), old = state.players;
     state.players = await Promise.all(Array.from({ length: many }, () => pool.open()));
+    state.settled = null;
+    old.forEach(player => player.stop());
   }
 
   // ---- Training ----
@@ -245,8 +245,8 @@ const page = (() => {
     } catch (error) {
       if (!error.stopped && state.training === training) {
         training.stop();
-        trouble(`${error.message}\nTraining stopped there. ${state.machine.backend === "gpu" ? "Train again, on the CPU if need be: it comes to the same." : "Train again: it comes to the same."}`);
         if (error.fatal || state.machine.backend === "gpu") await renew();
+        trouble(`${error.message}\nTraining stopped there. ${state.machine.backend === "gpu" ? "Train again, on the CPU if need be: it comes to the same." : "Train again: it comes to the same."}`);
       }
     }
     if (state.training !== training) return;

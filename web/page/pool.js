@@ -44,6 +44,7 @@ const pool = (() => {
     }
     stop() {
       this.worker.terminate();
+      this.failed = true;
       for (const { reject } of this.asked.values()) reject(Object.assign(new Error("stopped"), { problems: [], stopped: true }));
       this.asked.clear();
     }
