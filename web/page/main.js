@@ -265,6 +265,7 @@ const page = (() => {
     $("scrub").value = 0;
     $("generation").textContent = "";
     $("trial").replaceChildren();
+    clear();
     controls();
   }
 
@@ -318,10 +319,10 @@ const page = (() => {
     const all = [...starts, ...world.pois.map(place => [...place, world.observation_radius + 1])];
     const side = (axis, sign) => all.map(place => place[axis] + sign * place[2]);
     // Beyond a wall there is room for whoever stands at it.
-    const low = axis => Math.max(-1, Math.min(...side(axis, -1))), high = (axis, end) => Math.min(end + 1, Math.max(...side(axis, 1)));
+    const low = axis => Math.max(-1.5, Math.min(...side(axis, -1))), high = (axis, end) => Math.min(end + 1.5, Math.max(...side(axis, 1)));
     let [left, below, right, above] = [low(0), low(1), high(0, width), high(1, height)];
     const least = (right - left) * 0.42;
-    if (above - below < least) { above = Math.min(height + 1, below + least); below = Math.max(-1, above - least); }
+    if (above - below < least) { above = Math.min(height + 1.5, below + least); below = Math.max(-1.5, above - least); }
     return [left, below, right, above];
   }
 
@@ -796,7 +797,7 @@ const page = (() => {
 
   const HINTS = {
     watch: "", arrange: "Drag leaders, followers and POIs, then train again.",
-    drive: "Point where your leader shall go, or use the arrow keys; followers are drawn along. Time stands still while you do.",
+    drive: "Point where your leader shall go, or use the arrow keys; time waits for you.",
   };
 
   function mode(wanted) {
@@ -828,7 +829,10 @@ const page = (() => {
       if (training.state === "done" || !state.follow) {
         state.views.forEach((view, run) => ask(view, run, state.follow ? training.last : generation));
       } else follow();
-    } else show_start();
+    } else {
+      clear();
+      show_start();
+    }
   }
 
   // ---- Files ----
