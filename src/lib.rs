@@ -105,6 +105,9 @@ pub const COMMIT: Option<&str> = {
     if commit.is_empty() { None } else { Some(commit) }
 };
 
+/// The version of this crate, as `run.json` has it.
+pub const VERSION: &str = env!("CARGO_PKG_VERSION");
+
 pub mod backend;
 pub mod baseline;
 #[cfg(feature = "cli")]

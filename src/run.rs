@@ -320,7 +320,7 @@ impl Session {
     fn settle_on(&mut self, (backend, machine): &Player) {
         for run in self.members.iter_mut().filter(|member| member.going.is_some()).map(|member| &mut member.run) {
             let Machine { backend: kind, adapter, driver, threads } = machine.clone();
-            let (version, commit) = (env!("CARGO_PKG_VERSION").into(), crate::COMMIT.map(String::from));
+            let (version, commit) = (crate::VERSION.into(), crate::COMMIT.map(String::from));
             let description = backend.describe();
             *run = Run { version, commit, description, backend: kind, adapter, driver, threads, ..run.clone() };
         }

@@ -39,7 +39,7 @@ STEPS, AGENTS = 25, 6
 class Browser:
     """Chromium with one page."""
 
-    def __init__(self, profile):
+    def __init__(self, profile, flags=("--disable-gpu",)):
         names = ["chromium", "chromium-browser", "google-chrome"]
         program = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
         if program is None:
@@ -54,7 +54,7 @@ class Browser:
             os.dup2(low, 3)
             os.dup2(high, 4)
 
-        arguments = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--remote-debugging-pipe"]
+        arguments = ["--headless", "--no-sandbox", "--hide-scrollbars", "--remote-debugging-pipe", *flags]
         self.process = subprocess.Popen(
             [program, *arguments, f"--user-data-dir={profile}", "about:blank"],
             preexec_fn=pipes, close_fds=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -69,7 +69,7 @@ class Browser:
         for domain in ["Page", "Runtime", "Log", "Network"]:
             self.call(f"{domain}.enable")
 
-    def message(self, seconds=30):
+    def message(self, seconds=120):
         deadline = time.monotonic() + seconds
         while b"\0" not in self.buffer:
             ready, _, _ = select.select([self.answers], [], [], max(0, deadline - time.monotonic()))
@@ -115,7 +115,7 @@ class Browser:
         for kind in ["mousePressed", "mouseReleased"]:
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
-    def wait(self, script, seconds=20):
+    def wait(self, script, seconds=120):
         deadline = time.monotonic() + seconds
         while not self.evaluate(script):
             assert time.monotonic() < deadline, f"never came true: {script}"
@@ -142,7 +142,7 @@ class Browser:
                 yield parameters["entry"]["text"]
             elif method == "Network.requestWillBeSent":
                 url = parameters["request"]["url"]
-                if not url.startswith(("file:", "data:")):
+                if not url.startswith(("file:", "data:", "blob:")):
                     yield f"asked for {url}"
 
     def close(self):
@@ -312,4 +312,5 @@ def main():
         print("pages load without complaint, play, scrub, and show what rollout traces")
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -12,7 +12,7 @@
 
 use fearless_simd::prelude::*;
 
-use super::except;
+use super::{except, larger, smaller};
 
 /// 1/√x for x in 2^-80..2^40 within 2 ULP; some finite value for 0. 12 operations.
 ///
@@ -64,7 +64,7 @@ fn rough_twice_recip<S: Simd>(x: S::f32s) -> S::f32s {
 pub fn limit_tanh<S: Simd>(x: S::f32s) -> S::f32s {
     let limit = S::f32s::splat(x.token(), 7.5501223);
     // For numbers this is the shader's pair of selects, in half the operations.
-    x.min(limit).max(-limit)
+    larger::<S>(smaller::<S>(x, limit), -limit)
 }
 
 /// n and d with tanh(x/2) = n/d, for an x from [`limit_tanh`]; [`whole_tanh`] goes on with them. 9 operations.

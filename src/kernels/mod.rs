@@ -34,11 +34,24 @@ pub fn splat<S: Simd>(simd: S, value: f32) -> S::f32s {
     S::f32s::simd_from(simd, value)
 }
 
+/// The larger of two numbers, for zeros of different signs either. WebAssembly's own maximum minds NaN and those signs, by
+/// eight instructions where processors have no such one.
+#[inline(always)]
+pub fn larger<S: Simd>(a: S::f32s, b: S::f32s) -> S::f32s {
+    if cfg!(target_family = "wasm") { select::<S>(b, a, a.simd_gt(b)) } else { a.max(b) }
+}
+
+/// The smaller of two numbers, likewise.
+#[inline(always)]
+pub fn smaller<S: Simd>(a: S::f32s, b: S::f32s) -> S::f32s {
+    if cfg!(target_family = "wasm") { select::<S>(b, a, a.simd_lt(b)) } else { a.min(b) }
+}
+
 /// `x` moved into `low..=high`: for numbers this is the shader's pair of selects, in half the operations. Where `x` and a
 /// bound are zeros of different signs, either may come out.
 #[inline(always)]
 pub fn bound<S: Simd>(x: S::f32s, low: S::f32s, high: S::f32s) -> S::f32s {
-    x.max(low).min(high)
+    smaller::<S>(larger::<S>(x, low), high)
 }
 
 /// Lane operations of each function here: an f32 or integer operation, comparison or selection is one.

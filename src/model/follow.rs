@@ -6,6 +6,7 @@ use serde::Serialize;
 use super::{LONGEST, Lanes, motion::rotate};
 use crate::declare::shared;
 use crate::kernels::{
+    larger,
     math::{flush, recip, rsqrt},
     only,
     operations::{FLUSH, RECIP, ROTATE, RSQRT, SQUARED_DISTANCE},
@@ -167,7 +168,7 @@ fn walls<S: Simd>(world: &Lanes<S>, at: S::f32s, size: S::f32s) -> (S::f32s, S::
     let zero = splat(at.token(), 0.0);
     let low = world.follow.repulsion_radius - at;
     let high = world.follow.repulsion_radius - (size - at);
-    ((low.max(zero) - high.max(zero)) * world.follow.wall_gain, low.max(high))
+    ((larger::<S>(low, zero) - larger::<S>(high, zero)) * world.follow.wall_gain, larger::<S>(low, high))
 }
 
 /// The sum of repulsion, attraction and wall push at a place: mean offsets, scaled by gain over radius.
@@ -182,7 +183,7 @@ pub fn force<S: Simd>(world: &Lanes<S>, sums: &Sums<S>, x: S::f32s, y: S::f32s) 
     Pull {
         x: flush::<S>(force_x, TINY),
         y: flush::<S>(force_y, TINY),
-        influenced: (sums.repel_count + sums.attract_count).simd_gt(0) | near_x.max(near_y).simd_ge(0.0),
+        influenced: (sums.repel_count + sums.attract_count).simd_gt(0) | larger::<S>(near_x, near_y).simd_ge(0.0),
     }
 }
 

@@ -8,7 +8,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::{Read, Seek};
+use std::io::{Read, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -79,6 +79,14 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
     /// # Errors
     /// The file cannot be written; nothing else was touched then.
     pub fn write(&self, disk: &Disk, path: &Path, of: &Config) -> std::io::Result<()> {
+        disk.replace(path, |output| self.put(output, of))
+    }
+
+    /// Writes what such a file holds into a stream.
+    ///
+    /// # Errors
+    /// The stream refuses it.
+    pub fn put(&self, output: &mut dyn Write, of: &Config) -> std::io::Result<()> {
         let Checkpoint { config, init, seconds, metrics, snapshot } = self;
         let mut metadata = BTreeMap::from(
             [
@@ -106,7 +114,7 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
         }
         let trials = snapshot.fitness.iter().map(AsRef::as_ref);
         list.push(Tensor::floats(FITNESS.into(), fitness.into(), trials));
-        tensors::write(disk, path, KIND, &metadata, &list)
+        tensors::put(output, KIND, &metadata, &list)
     }
 }
 

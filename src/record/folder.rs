@@ -140,6 +140,11 @@ impl Run {
     pub fn parse(text: &str) -> Result<Run, String> {
         serde_json::from_str(text).map_err(|error| format!("it is no record of a run: {error}"))
     }
+
+    /// The text of `run.json`.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string_pretty(self).expect("plain fields are JSON") + "\n"
+    }
 }
 
 /// A folder that this process, and no other, trains in.
@@ -355,8 +360,7 @@ impl Folder {
     /// # Errors
     /// It cannot be written.
     pub fn write_run(&self, run: &Run) -> Result<(), RecordError> {
-        let text = serde_json::to_string_pretty(run).expect("plain fields are JSON");
-        self.write_text(RUN, &(text + "\n"))
+        self.write_text(RUN, &run.to_json())
     }
 
     /// Where a file of the folder is.

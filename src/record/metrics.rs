@@ -32,30 +32,56 @@ pub struct Extent {
     pub sha256: String,
 }
 
-/// A file being written.
-pub struct Writer {
-    output: BufWriter<Output>,
-    bytes: u64,
-    hash: Sha256,
+impl Extent {
+    /// The end of a text.
+    pub fn after(text: &str) -> Extent {
+        Extent { bytes: text.len() as u64, sha256: hex(&Sha256::digest(text)) }
+    }
+}
+
+/// The lines of a config's file, each with its end.
+pub struct Lines {
     /// The first generation of each stage after stage 0, and whether there is a column for it.
     stages: Vec<usize>,
     staged: bool,
 }
 
-impl Writer {
-    fn new(output: BufWriter<Output>, bytes: u64, hash: Sha256, config: &Config) -> Writer {
+impl Lines {
+    pub fn of(config: &Config) -> Lines {
         let stages = config.stages.iter().map(|stage| stage.from).filter(|&from| from > 0).collect();
-        Writer { output, bytes, hash, stages, staged: !config.stages.is_empty() }
+        Lines { stages, staged: !config.stages.is_empty() }
     }
 
+    /// The first line.
+    pub fn header(&self) -> String {
+        format!("{}\n", if self.staged { STAGED } else { HEADER })
+    }
+
+    /// A row's line; `seconds` is the time trained until it was complete.
+    pub fn line(&self, row: &Row, seconds: f64) -> String {
+        let stage = self.stages.partition_point(|&from| from <= row.generation);
+        let stage = if self.staged { format!(",{stage}") } else { String::new() };
+        format!("{},{seconds:.3}{stage}\n", shared(row))
+    }
+}
+
+/// A file being written.
+pub struct Writer {
+    output: BufWriter<Output>,
+    bytes: u64,
+    hash: Sha256,
+    lines: Lines,
+}
+
+impl Writer {
     /// Starts a file with its header, in the place of any other.
     ///
     /// # Errors
     /// What the system says.
     pub fn create(disk: &Disk, path: &Path, config: &Config) -> io::Result<Writer> {
         let output = BufWriter::new(disk.create(path)?);
-        let mut writer = Writer::new(output, 0, Sha256::new(), config);
-        writer.line(if writer.staged { STAGED } else { HEADER })?;
+        let mut writer = Writer { output, bytes: 0, hash: Sha256::new(), lines: Lines::of(config) };
+        writer.write(&writer.lines.header())?;
         writer.output.flush()?;
         Ok(writer)
     }
@@ -81,13 +107,12 @@ impl Writer {
             return Ok(None);
         }
         let output = BufWriter::new(disk.append(path, mark.bytes)?);
-        Ok(Some(Writer::new(output, mark.bytes, hash, config)))
+        Ok(Some(Writer { output, bytes: mark.bytes, hash, lines: Lines::of(config) }))
     }
 
-    fn line(&mut self, line: &str) -> io::Result<()> {
-        let line = format!("{line}\n");
+    fn write(&mut self, line: &str) -> io::Result<()> {
         self.bytes += line.len() as u64;
-        self.hash.update(&line);
+        self.hash.update(line);
         self.output.write_all(line.as_bytes())
     }
 
@@ -96,11 +121,7 @@ impl Writer {
     /// # Errors
     /// What the system says.
     pub fn add(&mut self, rows: &[Row], seconds: f64) -> io::Result<()> {
-        rows.iter().try_for_each(|row| {
-            let stage = self.stages.partition_point(|&from| from <= row.generation);
-            let stage = if self.staged { format!(",{stage}") } else { String::new() };
-            self.line(&format!("{},{seconds:.3}{stage}", shared(row)))
-        })
+        rows.iter().try_for_each(|row| self.write(&self.lines.line(row, seconds)))
     }
 
     /// Hands all lines to the system, so that others can read them.

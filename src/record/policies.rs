@@ -6,7 +6,7 @@
 //! Other programs may write such files too, also with a single tensor `weights`.
 
 use std::collections::BTreeMap;
-use std::io::{Read, Seek};
+use std::io::{self, Read, Seek, Write};
 use std::path::Path;
 
 use safetensors::tensor::Dtype;
@@ -49,12 +49,20 @@ pub fn layers(config: &Config) -> String {
 /// # Errors
 /// The file cannot be written; the one before it is then still there.
 pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f32]>]) -> Result<(), RecordError> {
+    disk.replace(path, |output| put(output, config, trials)).map_err(RecordError::write(path))
+}
+
+/// Writes what such a file holds into a stream.
+///
+/// # Errors
+/// The stream refuses it.
+pub fn put(output: &mut dyn Write, config: &Config, trials: &[impl AsRef<[f32]>]) -> io::Result<()> {
     let shape = vec![config.populations(), config.learning.population, config.parameters()];
     let tensor = |(trial, weights)| Tensor::floats(format!("weights.{trial}"), shape.clone(), [weights]);
     let tensors: Vec<_> = trials.iter().map(AsRef::as_ref).enumerate().map(tensor).collect();
     let metadata =
         BTreeMap::from([("layers".to_string(), layers(config)), (CONFIG.to_string(), super::config_digest(config))]);
-    tensors::write(disk, path, KIND, &metadata, &tensors).map_err(RecordError::write(path))
+    tensors::put(output, KIND, &metadata, &tensors)
 }
 
 /// Reads the policies of one trial for teams of a config: tensor `weights.N`, or without a number `weights`, else
@@ -87,7 +95,7 @@ pub struct Init {
 /// See [`read`].
 pub fn read_init(path: &Path, config: &Config) -> Result<Init, RecordError> {
     let mut hash = Sha256::new();
-    std::io::copy(&mut crate::file::open(path).map_err(RecordError::read(path))?, &mut HashWriter(&mut hash))
+    io::copy(&mut crate::file::open(path).map_err(RecordError::read(path))?, &mut HashWriter(&mut hash))
         .map_err(RecordError::read(path))?;
     let mut file = tensors::open(path)?;
     let trial = |trial| {
@@ -102,13 +110,13 @@ pub fn read_init(path: &Path, config: &Config) -> Result<Init, RecordError> {
 /// Takes what is written into a digest.
 struct HashWriter<'a>(&'a mut Sha256);
 
-impl std::io::Write for HashWriter<'_> {
-    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+impl Write for HashWriter<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.0.update(bytes);
         Ok(bytes.len())
     }
 
-    fn flush(&mut self) -> std::io::Result<()> {
+    fn flush(&mut self) -> io::Result<()> {
         Ok(())
     }
 }

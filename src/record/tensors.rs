@@ -5,7 +5,7 @@
 //! of other programs have neither, and are read without a check; a damaged byte cannot hide both.
 
 use std::collections::BTreeMap;
-use std::io::{self, BufReader, Read, Seek, SeekFrom};
+use std::io::{self, BufReader, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use safetensors::tensor::{Dtype, Metadata, TensorInfo};
@@ -51,6 +51,19 @@ pub fn write(
     metadata: &BTreeMap<String, String>,
     tensors: &[Tensor<'_>],
 ) -> io::Result<()> {
+    disk.replace(path, |output| put(output, kind, metadata, tensors))
+}
+
+/// Writes what such a file holds into a stream.
+///
+/// # Errors
+/// The stream refuses it.
+pub fn put(
+    output: &mut dyn Write,
+    kind: &str,
+    metadata: &BTreeMap<String, String>,
+    tensors: &[Tensor<'_>],
+) -> io::Result<()> {
     let mut metadata: Map<_, _> = metadata.iter().map(|(key, value)| (key.clone(), json!(value))).collect();
     metadata.insert(KIND.into(), kind.into());
     metadata.insert(CHECKSUM.into(), NO_CHECKSUM.into());
@@ -73,11 +86,9 @@ pub fn write(
     let parts = || tensors.iter().flat_map(|tensor| &tensor.parts);
     parts().for_each(|part| hash.update(part));
     let header = header.replacen(NO_CHECKSUM, &hex(&hash.finalize()), 1);
-    disk.replace(path, |output| {
-        output.write_all(&length)?;
-        output.write_all(header.as_bytes())?;
-        parts().try_for_each(|part| output.write_all(part))
-    })
+    output.write_all(&length)?;
+    output.write_all(header.as_bytes())?;
+    parts().try_for_each(|part| output.write_all(part))
 }
 
 /// A file whose header was read and, where it has a checksum, found whole.

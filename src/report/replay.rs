@@ -152,7 +152,7 @@ pub fn replay(
             }
             trainer.advance(backend)?;
         }
-        let found = play_best(&config.at(generation), &mut trainer, trial, backend)?;
+        let found = best(&config.at(generation), &mut trainer, trial, backend)?;
         let expected = rows.get(generation).unwrap_or(f64::NAN);
         if found.best_g != expected {
             let found = found.best_g;
@@ -189,13 +189,16 @@ fn nearest(
     })
 }
 
-/// Plays the teams of the generation before which a trial's trainer stands, and traces the best.
-fn play_best(
+/// Plays the teams of the generation before which a trial's trainer (of that trial alone) stands, and traces the best.
+///
+/// # Errors
+/// The backend fails.
+pub fn best(
     config: &Config,
     trainer: &mut Trainer,
     trial: usize,
     backend: &mut dyn Backend,
-) -> Result<Replayed, ReplayError> {
+) -> Result<Replayed, BackendError> {
     use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
     let learning = &config.learning;
     let (generation, world) = (trainer.generation(0), trainer.world(0).clone());
@@ -226,24 +229,32 @@ fn play_best(
         }
     }
     let best_g = f64::from(most) / (world.pois.len() * starts.len()) as f64;
-
     let need = if learning.fitness == Fitness::Dt { Need::Sights } else { need };
     let shown = Group { need, ..group(&starts[0], &teams[team * leaders..(team + 1) * leaders]) };
-    let trace = backend.trace(&shown)?;
-    // POIs are drawn where they were.
-    let moved = shown.moved_pois().map(<[Vec2]>::to_vec);
+    let played = one(&shown, backend)?;
+    Ok(Replayed { trial, generation, team, best_g, episodes: starts.len(), ..played })
+}
+
+/// Plays one team, a group of its own, and traces it; who leads at each step is told where the group needs sights.
+///
+/// # Errors
+/// The backend fails.
+pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, BackendError> {
+    let (world, trace) = (group.world, backend.trace(group)?);
     let whole = |words| Strided { words, stride: 1, offset: 0 };
     let (sets, seen, sights) = (whole(&trace.sets), Seen::Counts(whole(&trace.seen)), whole(&trace.sights));
     let episode = Episode { group: 0, team: 0, sets, seen, sights };
-    let scores = Credit::default().all(&episode, &world);
+    let scores = Credit::default().all(&episode, world);
     let mut owner = Vec::new();
-    credit::assign(&episode.seen, &world, &mut owner);
+    credit::assign(&episode.seen, world, &mut owner);
     let mut led = Vec::new();
-    credit::lead(&episode.sights, &world, &mut led);
-    let observed = credit::observed_at(episode.sets, &world);
-    let episodes = starts.len();
-    let world = World { pois: moved.unwrap_or(world.pois.clone()), ..world };
-    Ok(Replayed { trial, generation, team, best_g, episodes, scores, owner, led, observed, trace, world })
+    credit::lead(&episode.sights, world, &mut led);
+    let observed = credit::observed_at(episode.sets, world);
+    let best_g = f64::from(scores.observed) / world.pois.len() as f64;
+    // POIs are drawn where they were.
+    let pois = group.moved_pois().unwrap_or(&world.pois).to_vec();
+    let world = World { pois, ..world.clone() };
+    Ok(Replayed { trial: 0, generation: 0, team: 0, best_g, episodes: 1, scores, owner, led, observed, trace, world })
 }
 
 /// Observers in one set.
@@ -349,6 +360,16 @@ impl Replayed {
 
 /// A page that plays episodes of one run, side by side; `name` is the run's.
 pub fn page(name: &str, config: &Config, played: &[Replayed]) -> String {
+    // Inside a script element, only "<" could end it early.
+    let data = data(name, config, played).to_string().replace('<', "\\u003c");
+    include_str!("replay.html").replacen("\"STAGE\"", STAGE, 1).replacen("\"DATA\"", &data, 1)
+}
+
+/// The script that draws episodes, on this page and wherever else they are shown.
+pub const STAGE: &str = include_str!("stage.js");
+
+/// What a page needs to play episodes of one run, side by side.
+pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Value {
     let count = played.len().max(1);
     let size = |per_agent: usize, played: &Replayed| {
         let world = &played.world;
@@ -368,7 +389,7 @@ pub fn page(name: &str, config: &Config, played: &[Replayed]) -> String {
         Some(first) => first.world.pois.iter().map(|poi| poi.as_dvec2().to_array()).collect(),
         None => world.pois.clone(),
     };
-    let data = json!({
+    json!({
         "run": name,
         "paradigm": config.learning.paradigm,
         "fitness": config.learning.fitness,
@@ -382,12 +403,14 @@ pub fn page(name: &str, config: &Config, played: &[Replayed]) -> String {
         "dt": world.dt,
         "steps": world.steps,
         "exact": exact,
-        "colors": { "light": hex(&map::GROUPS), "dark": hex(&map::GROUPS_DARK) },
+        "colors": colors(),
         "episodes": episodes,
-    });
-    // Inside a script element, only "<" could end it early.
-    let data = data.to_string().replace('<', "\\u003c");
-    include_str!("replay.html").replacen("\"DATA\"", &data, 1)
+    })
+}
+
+/// The colours of leaders and their followers, on a light and on a dark ground.
+pub fn colors() -> serde_json::Value {
+    json!({ "light": hex(&map::GROUPS), "dark": hex(&map::GROUPS_DARK) })
 }
 
 fn hex(colors: &[Color]) -> Vec<String> {

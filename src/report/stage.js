@@ -1,0 +1,290 @@
+// Draws episodes: shared by every page that shows them. A scene's motion lies in flat arrays, [frames][agents].
+const stage = (() => {
+  "use strict";
+  // Once a group's colours are used up, they come again in dashes, for which there are the numbers, too.
+  const DASHES = [[], [5, 3], [1.5, 2]];
+  const night = matchMedia("(prefers-color-scheme: dark)");
+  const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer;
+  const turn = Array.from({ length: 256 }, (_, index) => index / 256 * 2 * Math.PI);
+
+  // Turns what was sent as text into arrays, in place.
+  function unpack(data) {
+    for (const episode of data.episodes) {
+      episode.positions = data.exact ? new Float32Array(bytes(episode.positions)) : new Uint16Array(bytes(episode.positions));
+      episode.headings = data.exact ? new Float32Array(bytes(episode.headings)) : new Uint8Array(bytes(episode.headings));
+      episode.near = new Uint16Array(bytes(episode.near));
+      episode.led = new Uint32Array(bytes(episode.led));
+    }
+    return data;
+  }
+
+  // Position and heading of an agent at a frame.
+  function moment(data, episode, frame, agent) {
+    const at = frame * episode.agents + agent, { positions, headings } = episode;
+    if (data.exact) return [positions[2 * at], positions[2 * at + 1], headings[2 * at], headings[2 * at + 1]];
+    const angle = turn[headings[at]], [width, height] = data.map;
+    return [positions[2 * at] * (width / 65535), positions[2 * at + 1] * (height / 65535), Math.cos(angle), Math.sin(angle)];
+  }
+
+  // Between two frames.
+  function between(data, episode, place, agent) {
+    const last = episode.shown.length - 1, frame = Math.min(Math.floor(place), last), part = place - frame;
+    const now = moment(data, episode, frame, agent);
+    if (part === 0 || frame === last) return now;
+    const next = moment(data, episode, frame + 1, agent);
+    return now.map((value, index) => value + (next[index] - value) * part);
+  }
+
+  // The part of the map where anything happens, in all episodes; at least half as high as wide, or the other way round.
+  function busy(data) {
+    const [width, height] = data.map;
+    let [left, below, right, above] = [Infinity, Infinity, -Infinity, -Infinity];
+    const include = (x, y, margin) => {
+      left = Math.min(left, x - margin); right = Math.max(right, x + margin);
+      below = Math.min(below, y - margin); above = Math.max(above, y + margin);
+    };
+    for (const [x, y] of data.pois) include(x, y, data.observation_radius + 1);
+    for (const episode of data.episodes)
+      for (let frame = 0; frame < episode.shown.length; frame++)
+        for (let agent = 0; agent < episode.agents; agent++) { const [x, y] = moment(data, episode, frame, agent); include(x, y, 2); }
+    const grow = (low, high, least, end) => {
+      const more = Math.max(0, (least - (high - low)) / 2);
+      low -= more; high += more;
+      const shift = low < 0 ? -low : Math.min(0, end - high);
+      return [Math.max(0, low + shift), Math.min(end, high + shift)];
+    };
+    [left, right] = grow(left, right, (above - below) / 2, width);
+    [below, above] = grow(below, above, (right - left) / 2, height);
+    return [left, below, right, above];
+  }
+
+  // The leaders that lead an agent at a frame: for Dt those of that step, else the one in whose group it is for Df.
+  function leaders_of(episode, frame, agent) {
+    if (agent < episode.leaders) return [agent];
+    if (episode.led.length === 0) return episode.owner[agent] < 0 ? [] : [episode.owner[agent]];
+    const words = Math.ceil(episode.leaders / 32), followers = episode.agents - episode.leaders;
+    const first = (frame * followers + agent - episode.leaders) * words, found = [];
+    for (let leader = 0; leader < episode.leaders; leader++)
+      if (episode.led[first + (leader >> 5)] >>> (leader & 31) & 1) found.push(leader);
+    return found;
+  }
+
+  // Whether a POI can be observed by a step, and when, in words.
+  function is_open(data, episode, poi, step) {
+    const [first, end] = data.windows[poi] || [1, data.steps], others = data.after[poi] || [];
+    const done = other => episode.observed[other] !== null && episode.observed[other] < step;
+    return step >= first && step <= end && others.every(done);
+  }
+  function when(data, poi) {
+    const window = data.windows[poi], others = data.after[poi] || [];
+    return (window ? `, steps ${window[0]} to ${window[1]}` : "") + (others.length ? `, after ${others.join(" and ")}` : "");
+  }
+  const counts_at_pois = (data, episode, agent) =>
+    data.observers === "all" || (data.observers === "leaders") === (agent < episode.leaders);
+
+  const whole = data => [0, 0, ...data.map];
+
+  // How places of a part of the map become places of a canvas.
+  function place_on(canvas, [left, below, right, above]) {
+    const wide = canvas.clientWidth, scale = wide / (right - left);
+    return { wide, tall: (above - below) * scale, scale, X: x => (x - left) * scale, Y: y => (above - y) * scale };
+  }
+
+  const overlap = (a, b) => a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
+
+  const palette = data => night.matches ? data.colors.dark : data.colors.light;
+
+  // Draws an episode `place` frames from its start onto a canvas as wide as its room. `look` says what to show: `crop` (a
+  // part of the map), `trails`, `radii`, `groups`, and `over`, the POI that the pointer is at, or none.
+  function paint(data, episode, canvas, place, look) {
+    const { wide, tall, scale, X, Y } = place_on(canvas, look.crop);
+    const dots = window.devicePixelRatio || 1;
+    if (canvas.width !== Math.round(wide * dots) || canvas.height !== Math.round(tall * dots)) {
+      canvas.style.height = `${tall}px`;
+      canvas.width = Math.round(wide * dots);
+      canvas.height = Math.round(tall * dots);
+    }
+    const style = getComputedStyle(document.documentElement), color = name => style.getPropertyValue(name).trim();
+    const colors = palette(data);
+    const led = Array.from({ length: episode.agents }, (_, agent) => leaders_of(episode, Math.floor(place), agent));
+    const dashes = agent => DASHES[Math.floor((led[agent][0] || 0) / colors.length) % DASHES.length];
+    const group = agent => led[agent].length === 0 ? color("--faint") : colors[led[agent][0] % colors.length];
+    const draw = canvas.getContext("2d");
+    const taken = [];
+    // Letters on a pale edge; none, where they would hide others and may be left out.
+    const label = (text, x, y, align, spare) => {
+      draw.font = "600 12px system-ui, sans-serif";
+      const half = draw.measureText(text).width / 2, middle = align === "left" ? x + half : x;
+      const area = [middle - half - 1, y - 11, middle + half + 1, y + 3];
+      if (spare && taken.some(other => overlap(area, other))) return;
+      taken.push(area);
+      draw.textAlign = "center";
+      draw.lineWidth = 3;
+      draw.strokeStyle = color("--sea");
+      draw.strokeText(text, middle, y);
+      draw.fillStyle = color("--ink");
+      draw.fillText(text, middle, y);
+    };
+    draw.setTransform(dots, 0, 0, dots, 0, 0);
+    draw.clearRect(0, 0, wide, tall);
+    draw.lineJoin = "round";
+    // The walls.
+    const [width, height] = data.map;
+    draw.strokeStyle = color("--ink");
+    draw.lineWidth = 2;
+    draw.strokeRect(X(0), Y(height), width * scale, height * scale);
+    const frame = Math.floor(place), step = episode.shown[frame];
+    const circle = (x, y, radius) => { draw.beginPath(); draw.arc(X(x), Y(y), radius * scale, 0, 2 * Math.PI); };
+
+    // POIs: a ring fills as agents arrive, and the disc turns once it is observed.
+    const pois = data.pois.length, near = episode.near.slice(frame * pois, (frame + 1) * pois);
+    const ring = Math.max(7, Math.min(12, 1.3 * scale));
+    const counts = data.pois.map(([x, y], poi) => {
+      const done = episode.observed[poi] !== null && episode.observed[poi] <= step, needed = episode.coupling[poi];
+      const closed = !done && !is_open(data, episode, poi, Math.max(1, step)), tone = color(done ? "--seen" : "--poi");
+      circle(x, y, data.observation_radius);
+      draw.fillStyle = tone;
+      draw.globalAlpha = done ? 0.22 : closed ? 0.02 : 0.07;
+      draw.fill();
+      draw.globalAlpha = 1;
+      if (look.radii) {
+        draw.strokeStyle = tone;
+        draw.lineWidth = 1.2;
+        draw.setLineDash(done ? [] : closed ? [1.5, 6] : [5, 4]);
+        draw.stroke();
+        draw.setLineDash([]);
+      }
+      draw.lineWidth = 4;
+      draw.strokeStyle = color("--line");
+      draw.beginPath(); draw.arc(X(x), Y(y), ring, 0, 2 * Math.PI); draw.stroke();
+      draw.strokeStyle = tone;
+      if (near[poi] > 0) {
+        const full = Math.min(near[poi] / needed, 1) * 2 * Math.PI;
+        draw.beginPath(); draw.arc(X(x), Y(y), ring, -Math.PI / 2, full - Math.PI / 2); draw.stroke();
+      }
+      return [`${near[poi]}/${needed}${done ? " ✓" : ""}`, X(x), Y(y) - ring - 6];
+    });
+
+    const many = episode.agents > 100;
+    if (look.trails) {
+      draw.lineWidth = 1.4;
+      draw.globalAlpha = many ? 0.3 : 0.6;
+      const from = many ? Math.max(0, frame - 40) : 0;
+      for (let agent = 0; agent < episode.agents; agent++) {
+        draw.strokeStyle = group(agent);
+        draw.setLineDash(dashes(agent));
+        draw.beginPath();
+        for (let past = from; past <= frame; past++) {
+          const [x, y] = moment(data, episode, past, agent);
+          draw.lineTo(X(x), Y(y));
+        }
+        const [x, y] = between(data, episode, place, agent);
+        draw.lineTo(X(x), Y(y));
+        draw.stroke();
+      }
+      draw.setLineDash([]);
+      draw.globalAlpha = 1;
+    }
+
+    const now = Array.from({ length: episode.agents }, (_, agent) => between(data, episode, place, agent));
+    const followers = episode.agents > episode.leaders;
+    for (let leader = 0; leader < episode.leaders && followers && look.radii; leader++) {
+      circle(now[leader][0], now[leader][1], data.attraction_radius);
+      draw.strokeStyle = group(leader);
+      draw.globalAlpha = many ? 0.3 : 0.7;
+      draw.lineWidth = 1;
+      draw.setLineDash([1.5, 4]);
+      draw.stroke();
+      draw.setLineDash([]);
+      draw.globalAlpha = 1;
+    }
+    if (look.groups) {
+      draw.lineWidth = 1;
+      draw.globalAlpha = 0.55;
+      for (let agent = episode.leaders; agent < episode.agents; agent++) {
+        for (const leader of led[agent]) {
+          draw.strokeStyle = group(leader);
+          draw.beginPath();
+          draw.moveTo(X(now[agent][0]), Y(now[agent][1]));
+          draw.lineTo(X(now[leader][0]), Y(now[leader][1]));
+          draw.stroke();
+        }
+      }
+      draw.globalAlpha = 1;
+    }
+    // Leaders last, on top.
+    const size = Math.max(many ? 2.5 : 5, Math.min(9, 0.8 * scale));
+    for (let agent = episode.agents - 1; agent >= 0; agent--) {
+      const [x, y, ahead, aside] = now[agent], leads = agent < episode.leaders;
+      const long = Math.hypot(ahead, aside) || 1, cos = ahead / long, sin = aside / long;
+      const point = (a, b) => [X(x) + (leads ? 1.35 : 1) * size * (a * cos - b * sin), Y(y) - (leads ? 1.35 : 1) * size * (a * sin + b * cos)];
+      draw.beginPath();
+      for (const [a, b] of [[1.1, 0], [-0.8, 0.75], [-0.4, 0], [-0.8, -0.75]]) draw.lineTo(...point(a, b));
+      draw.closePath();
+      draw.fillStyle = leads ? group(agent) : color("--card");
+      draw.strokeStyle = leads ? color("--ink") : group(agent);
+      draw.lineWidth = leads ? 1.2 : 1.6;
+      draw.fill();
+      draw.stroke();
+      if (!counts_at_pois(data, episode, agent)) {
+        for (const [tone, wide] of [[color("--sea"), 4], [color("--ink"), 1.6]]) {
+          draw.strokeStyle = tone;
+          draw.lineWidth = wide;
+          draw.beginPath(); draw.moveTo(...point(0, 1.1)); draw.lineTo(...point(0, -1.1)); draw.stroke();
+        }
+      }
+    }
+    // Words last: counts if all of them have room, else the one under the pointer; then the leaders' numbers.
+    draw.font = "600 12px system-ui, sans-serif";
+    const told = counts.map(([text], poi) => when(data, poi) ? `${poi}: ${text}${when(data, poi)}` : text);
+    const areas = counts.map(([, x, y], poi) => {
+      const text = told[poi], half = draw.measureText(text).width / 2;
+      return [x - half - 2, y - 11, x + half + 2, y + 3];
+    });
+    const clear = areas.every((area, index) => areas.slice(0, index).every(other => !overlap(area, other)));
+    if (clear) counts.forEach(([, x, y], poi) => { if (poi !== look.over) label(told[poi], x, y); });
+    if (look.over !== null) {
+      const [text, x, y] = counts[look.over];
+      const words = `POI ${look.over}: ${text}${when(data, look.over)}`, half = Math.max(40, draw.measureText(words).width / 2 + 4);
+      label(words, Math.max(half, Math.min(wide - half, x)), Math.max(12, y));
+    }
+    for (let agent = 0; agent < episode.leaders; agent++) {
+      const [x, y] = now[agent];
+      label(String(agent), X(x) + size * 1.5, Y(y) + size * 1.6, "left", episode.leaders > 12);
+    }
+    return { step, near, led, positions: now.map(([x, y]) => [x, y]) };
+  }
+
+  // POIs that were observed by a step, in words after their number.
+  function say(episode, step) {
+    const seen = episode.observed.flatMap((at, poi) => at !== null && at <= step ? [`POI ${poi} at step ${at}`] : []);
+    const list = seen.slice(0, 12).join(", ") + (seen.length > 12 ? " and more" : "");
+    return [seen.length, `${seen.length} of ${episode.observed.length} POIs observed${list ? ": " + list : ""}`];
+  }
+
+  // The POI under a place on a canvas, the nearest within its radius.
+  function poi_at(data, canvas, crop, x, y) {
+    const { scale, X, Y } = place_on(canvas, crop);
+    let [best, least] = [null, Math.max(14, data.observation_radius * scale)];
+    data.pois.forEach(([px, py], poi) => {
+      const away = Math.hypot(X(px) - x, Y(py) - y);
+      if (away <= least) [best, least] = [poi, away];
+    });
+    return best;
+  }
+
+  // The place that is so many seconds of play on. Frames are not all as many steps apart: the last may be nearer.
+  function later(data, episode, place, seconds) {
+    const { shown } = episode, last = shown.length - 1;
+    let left = seconds / data.dt;
+    while (left > 0 && place < last) {
+      const frame = Math.floor(place), gap = shown[frame + 1] - shown[frame];
+      const part = Math.min(left, (frame + 1 - place) * gap);
+      place = part === (frame + 1 - place) * gap ? frame + 1 : place + part / gap;
+      left -= part;
+    }
+    return place;
+  }
+
+  return { night, unpack, busy, whole, place_on, palette, paint, say, poi_at, later };
+})();

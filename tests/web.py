@@ -1,0 +1,348 @@
+#!/usr/bin/env python3
+"""Opens the page that trains in a browser tab in headless Chromium, and clicks through it.
+
+Teams train by the browser's CPU and by WebGPU (SwiftShader) to the program's digests, and Verify tells the exact pass from
+none. Training can be paused, scrubbed, rearranged and steered; configs, broken ones too, runs and links go in and out; what
+goes out, the program takes. Nothing complains, the page never stutters, and it can be read in light and dark (WCAG AA).
+
+    python3 tests/web.py PAGE FLOTILLA [FOLDER for screenshots]
+
+PAGE is the index.html that web/build makes. Python's standard library and a Chromium are all that is needed.
+"""
+
+import itertools
+import json
+import pathlib
+import subprocess
+import sys
+import tempfile
+import time
+import zipfile
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from replay import COLOURS, Browser, contrast
+
+CONFIGS = pathlib.Path(__file__).parent.parent / "configs"
+WEBGPU = ["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"]
+SMALL = {"trials": 2, "generations": 6, "population": 20, "seed": 7}
+READY = "document.body.dataset.ready !== undefined"
+STAGED = """
+[world]
+leaders = [[5, 5]]
+followers = [[4, 4], [6, 4]]
+pois = [[5, 12], [12, 5]]
+coupling = 2
+[learning]
+population = 12
+generations = 5
+trials = 2
+[[stages]]
+from = 3
+set = { world.pois = [[40, 30]], world.coupling = 1, learning.poi_jitter = 1.0 }
+"""
+DONE = "page.state.training && page.state.training.state === 'done' && document.querySelectorAll('.sha').length > 0"
+
+
+class Tab(Browser):
+    def load(self, page, **words):
+        self.open(page.as_uri() + "#" + "&".join(f"{key}={value}" for key, value in words.items()))
+        self.wait(READY)
+
+    def calm(self):
+        found = list(self.complaints())
+        assert not found, found
+        trouble = self.evaluate("document.querySelector('#trouble').textContent")
+        assert not trouble, trouble
+
+    def text(self, selector):
+        return self.evaluate(f"document.querySelector('{selector}').textContent")
+
+    def set(self, selector, value):
+        self.evaluate(
+            f"(() => {{ const e = document.querySelector('{selector}'); e.value = {json.dumps(value)};"
+            " e.dispatchEvent(new Event('input', { bubbles: true })); e.dispatchEvent(new Event('change', { bubbles: true })); })()"
+        )
+
+    def click(self, selector):
+        self.evaluate(f"document.querySelector('{selector}').scrollIntoView({{ block: 'center' }})")
+        super().click(selector)
+
+    def drop(self, name, content):
+        self.evaluate(
+            f"(() => {{ const data = new DataTransfer(); const bytes = Uint8Array.from(atob('{content}'), c => c.charCodeAt(0));"
+            f" data.items.add(new File([bytes], {json.dumps(name)}));"
+            " dispatchEvent(new DragEvent('drop', { dataTransfer: data, bubbles: true, cancelable: true })); })()"
+        )
+
+    def mouse(self, kind, x, y):
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="none" if kind == "mouseMoved" else "left", clickCount=1)
+
+    def place(self, list_, index):
+        """Where on the screen something of the map lies."""
+        return self.evaluate(
+            "(() => { const v = page.state.views[0]; v.canvas.scrollIntoView({ block: 'center' });"
+            " const { X, Y } = stage.place_on(v.canvas, v.crop), box = v.canvas.getBoundingClientRect();"
+            f" const [x, y] = page.state.config.world.{list_}[{index}]; return [box.left + X(x) + 1, box.top + Y(y) + 1]; }})()"
+        )
+
+    def lose_gpu(self):
+        session, self.session = self.session, None
+        self.call("Browser.crashGpuProcess")
+        self.session = session
+
+    def tasks(self, act):
+        """Tasks of the page's main thread while something is done: each one's milliseconds by the clock, and of the processor."""
+        kept = len(self.events)
+        self.call("Tracing.start", traceConfig={"includedCategories": ["toplevel"]}, transferMode="ReportEvents")
+        act()
+        self.call("Tracing.end")
+        while not any(event["method"] == "Tracing.tracingComplete" for event in self.events[kept:]):
+            self.events.append(self.message())
+        chunks = [event["params"]["value"] for event in self.events if event["method"] == "Tracing.dataCollected"]
+        self.events = [event for event in self.events if not event["method"].startswith("Tracing.")]
+        found = list(itertools.chain(*chunks))
+        mains = {(e["pid"], e["tid"]) for e in found if e["name"] == "thread_name" and e["args"]["name"] == "CrRendererMain"}
+        whole = [e for e in found if e["name"].endswith("RunTask") and (e["pid"], e["tid"]) in mains and "tdur" in e]
+        return [(e["dur"] / 1000, e["tdur"] / 1000) for e in whole]
+
+    def train(self, seconds=300):
+        self.click("#train")
+        self.wait(DONE, seconds)
+        return {
+            arm["label"]: arm["digest"]
+            for arm in self.evaluate("page.state.training.arms.map(({ label, digest }) => ({ label, digest }))")
+        }
+
+
+def base64(content):
+    import base64
+
+    return base64.b64encode(content).decode()
+
+
+def main():
+    page, flotilla = (pathlib.Path(argument).resolve() for argument in sys.argv[1:3])
+    with tempfile.TemporaryDirectory() as folder:
+        folder = pathlib.Path(folder)
+        pictures = pathlib.Path(sys.argv[3]) if len(sys.argv) > 3 else folder
+        pictures.mkdir(parents=True, exist_ok=True)
+
+        def call(*arguments):
+            subprocess.run([flotilla, *map(str, arguments)], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+        def native(name, *arguments):
+            out = folder / name
+            call("train", *arguments, "--out", out, "--quiet", "--backend", "cpu")
+            return json.loads((out / "run.json").read_text())["digest"]
+
+        flags = [part for key, value in SMALL.items() for part in (f"--{key}", value)]
+        layouts = ["generally_forward", "strictly_forward", "chaotic"]
+        expected = {
+            (layout, paradigm): native(f"{layout}-{paradigm}", CONFIGS / f"{layout}.toml", "--paradigm", paradigm, *flags)
+            for layout, paradigm in itertools.product(layouts, ["leader-follower", "all-leaders"])
+        }
+
+        tab = Tab(folder / "profile", WEBGPU)
+        tab.window(1280, 900, dark=False)
+        downloads = folder / "downloads"
+        downloads.mkdir()
+        tab.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))
+
+        # The program's digests, by the CPU and by WebGPU.
+        for on, layout in itertools.product(["cpu", "gpu"], layouts):
+            tab.load(page, layout=layout, on=on, pace="full", **SMALL)
+            for paradigm, digest in tab.train().items():
+                assert digest == expected[layout, paradigm], (on, layout, paradigm, digest)
+            machine = tab.text("#machine")
+            assert ("WebGPU" in machine and "exact" in machine) == (on == "gpu"), machine
+            assert on == "gpu" or "SIMD128" in machine, machine
+            tab.calm()
+            print(f"{layout} by {on}: the program's digests")
+
+        # Verify: equal under the pass, and different without.
+        tab.click("#verify")
+        tab.wait("!document.querySelector('#verify').disabled", 400)
+        assert tab.text("#verified").startswith("Equal: "), tab.text("#verified")
+        tab.click("#plain")
+        tab.click("#verify")
+        tab.wait("!document.querySelector('#verify').disabled", 400)
+        assert tab.text("#verified").startswith("DIFFERENT: "), tab.text("#verified")
+        tab.calm()
+        print("Verify is green, and red without the pass")
+
+        # The GPU is lost while it trains: that is told, and the same comes out of training again.
+        tab.load(page, layout="chaotic", on="gpu", pace="full", **SMALL)
+        tab.set("#generations", "100000")
+        tab.wait("page.state.config.learning.generations === 100000")
+        tab.click("#train")
+        tab.wait("page.state.training && page.state.training.reached >= 1")
+        tab.lose_gpu()
+        tab.wait("document.querySelector('#trouble').textContent.includes('Train again')")
+        tab.set("#generations", str(SMALL["generations"]))
+        tab.wait(f"page.state.config.learning.generations === {SMALL['generations']}")
+        assert tab.train()["leader-follower"] == expected["chaotic", "leader-follower"]
+        print("a lost GPU is told, and survived")
+
+        # Train to watch, pause, scrub.
+        tab.load(page, on="cpu", layout="generally_forward")
+        tab.click("#train")
+        tab.wait("page.state.training && page.state.training.reached >= 5")
+        tab.click("#pause")
+        reached = tab.evaluate("page.state.training.reached")
+        time.sleep(0.5)
+        assert tab.evaluate("page.state.training.reached") <= reached + 2, "it does not pause"
+        tab.set("#scrub", 3)
+        shown = "page.state.views.map(view => view.data && view.data.episodes[0].generation)"
+        tab.wait(f"{shown}.every(generation => generation === 3)")
+        tab.set("#trial", "2")
+        tab.wait("page.state.views.every(view => view.data.episodes[0].trial === 2 && view.data.episodes[0].generation === 3)")
+        best = "page.state.training.arms.map(arm => arm.trials[2][3].best)"
+        played = "page.state.views.map(view => view.data.episodes[0].best_g)"
+        assert tab.evaluate(best) == tab.evaluate(played), "the episode is not the one that was scored"
+        tab.click("#pause")
+        tab.wait(DONE)
+        tab.calm()
+        print("training pauses, goes on, and is scrubbed")
+
+        # Drag a POI, train again.
+        tab.click("[data-mode=arrange]")
+        x, y = tab.place("pois", 0)
+        tab.mouse("mousePressed", x, y)
+        tab.mouse("mouseMoved", x + 30, y - 20)
+        tab.mouse("mouseReleased", x + 30, y - 20)
+        tab.wait("document.querySelector('#layout').value === 'own'")
+        moved = tab.evaluate("page.state.config.world.pois[0]")
+        assert moved != [10, 15] and moved[0] > 10, moved
+        tab.set("#coupling", "2")
+        tab.wait("page.state.config.world.coupling === 2")
+        tab.set("#generations", "12")
+        tab.set("#pace", "full")
+        tab.wait("page.state.config.learning.generations === 12")
+        own = tab.train()
+        config = folder / "own.toml"
+        config.write_text(tab.evaluate("page.state.text"))
+        assert "# " in config.read_text(), "the config has lost its comments"
+        assert own["leader-follower"] == native("own", config, "--paradigm", "leader-follower")
+        # By keys.
+        tab.click("[data-mode=arrange]")
+        tab.evaluate("page.state.views[0].canvas.focus()")
+        tab.press("]", "BracketRight")
+        before = tab.evaluate("page.state.config.world.leaders[0]")
+        tab.press("ArrowRight", "ArrowRight")
+        tab.wait(f"page.state.config.world.leaders[0][0] === {before[0] + 1}")
+        tab.calm()
+        print("a POI is dragged, and what is trained then is the program's")
+
+        # A link brings all of it to another tab.
+        tab.evaluate("document.querySelector('#said').textContent = ''")
+        tab.click("#share")
+        tab.wait("document.querySelector('#said').textContent !== ''")
+        link, text = tab.evaluate("location.href"), tab.evaluate("page.state.text")
+        tab.open(link)
+        tab.wait(READY)
+        assert tab.evaluate("page.state.text") == text
+        print("a link holds the experiment")
+
+        # Take a leader: followers follow, and the POIs ahead are observed.
+        tab.load(page, layout="generally_forward", on="cpu", pace="full", **SMALL)
+        tab.train()
+        tab.click("[data-mode=drive]")
+        tab.click("#again")
+        tab.mouse("mouseMoved", *tab.place("pois", 0))
+        tab.wait("document.querySelector('#driven').textContent.includes('Yours: D = ')")
+        episode = "page.state.views[0].data.episodes[0]"
+        steps = tab.evaluate(f"{episode}.shown.length")
+        assert steps == 26, steps
+        near = tab.evaluate(f"[...{episode}.near.slice(-4)]")
+        assert near[0] >= 3, f"leader 0 was steered to POI 0, but near the POIs are {near}"
+        tab.calm()
+        print("a leader is taken, and its followers follow")
+
+        # Out, into the program, and in again.
+        tab.load(page, layout="strictly_forward", on="cpu", pace="full", **SMALL)
+        digests = tab.train()
+        tab.click(".home")
+        archive = downloads / "strictly_forward-leader-follower.zip"
+        deadline = time.monotonic() + 120
+        while not archive.exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        run = folder / "home"
+        with zipfile.ZipFile(archive) as files:
+            files.extractall(run)
+        assert json.loads((run / "run.json").read_text())["digest"] == digests["leader-follower"]
+        call("plot", run, "--out", folder / "curves.svg")
+        call("replay", run, "--out", folder / "replay.html", "--backend", "cpu")
+        call("train", run / "config.toml", "--out", run, "--resume", "--generations", "9", "--quiet", "--backend", "cpu")
+        longer = native("longer", run / "config.toml")
+        assert json.loads((run / "run.json").read_text())["digest"] == longer, "it does not go on to the same"
+        tab.load(page)
+        tab.drop("run.zip", base64(archive.read_bytes()))
+        tab.wait("document.querySelector('#said').textContent.includes('its digest is right')")
+        assert tab.text(".sha") == digests["leader-follower"]
+        tab.wait("page.state.views[0].data.episodes[0].generation === 6")
+        tab.set("#scrub", 2)
+        tab.wait("page.state.views[0].data.episodes[0].generation === 2")
+        with zipfile.ZipFile(archive) as files:
+            policies = files.read("policies.safetensors")
+        tab.drop("policies.safetensors", base64(policies))
+        tab.wait("document.querySelector('#said').textContent.includes('Take a leader')")
+        tab.calm()
+        print("a run goes home, on from there, and in again")
+
+        # A config, and a broken one.
+        tab.drop("mine.toml", base64(b"[world]\nleaders = [[5, 5]]\nfollowers = [[4, 4], [6, 4]]\npois = [[5, 12]]\n"))
+        tab.wait("page.state.config.world.leaders.length === 1 && document.querySelector('#layout').value === 'own'")
+        tab.calm()
+        tab.drop("stages.toml", base64(STAGED.encode()))
+        tab.wait("(page.state.config.stages || []).length === 1")
+        staged = folder / "stages.toml"
+        staged.write_text(STAGED)
+        assert tab.train()["leader-follower"] == native("stages", staged), "stages come to something else"
+        assert "share of POIs" in tab.text("#legend"), tab.text("#legend")
+        tab.calm()
+        tab.drop("broken.toml", base64(b"[world]\nleaders = [[5, 5]]\npois = [[5, 120]]\nstep = 3\n"))
+        tab.wait("document.querySelectorAll('#problems li').length === 2")
+        told = tab.text("#problems")
+        assert "Line 3: world.pois[0][1]" in told and "Line 4: world.step" in told, told
+        assert tab.evaluate("document.querySelector('#train').disabled")
+        assert tab.evaluate("[...document.querySelectorAll('.mark')].map(mark => mark.style.top)") == ["48px", "68px"]
+        assert not list(tab.complaints())
+        print("a broken config tells its problems beside their lines")
+
+        # 4096 teams, and the page stays responsive. Its observer goes by the clock, and so tells of other programs, too, that had
+        # the processor: what the page itself did in a task is told by its thread's time.
+        tab.load(page, layout="generally_forward", on="cpu", pace="full", trials=1, generations=6, population=4096)
+        tab.evaluate(
+            "window.long = []; new PerformanceObserver(list => long.push(...list.getEntries().map(e => e.duration)))"
+            ".observe({ type: 'longtask' }); 0"
+        )
+        tasks = tab.tasks(lambda: tab.train(600))
+        tab.calm()
+        long, busiest = tab.evaluate("long"), max(used for _, used in tasks)
+        assert len(tasks) > 100 and busiest < 50, (len(tasks), busiest, long)
+        print(f"no task of the page takes 50 ms while 4096 teams train: {busiest:.0f} ms at most of {len(tasks)}; {len(long)} by the clock")
+
+        # What it looks like.
+        for (width, height), dark in itertools.product([(390, 844), (820, 1180), (1440, 900)], [False, True]):
+            tab.window(width, height, dark)
+            tab.load(page, layout="generally_forward", on="cpu", pace="full", seed=1)
+            tab.train()
+            tab.set("#scrub", 100)
+            tab.wait("page.state.views.every(view => view.data.episodes[0].generation === 100 && !view.playing)")
+            assert tab.evaluate("document.documentElement.scrollWidth") <= width, "the page is wider than the window"
+            colours = tab.evaluate(COLOURS.replace("replay.data.colors[scheme]", "stage.palette(page.state.views[0].data)"))
+            for least, what, ink, ground in colours:
+                assert contrast(ink, ground) >= least, (what, ink, ground, contrast(ink, ground), dark)
+            unnamed = tab.evaluate(
+                "[...document.querySelectorAll('button, select, input, canvas, textarea')].filter(e => e.checkVisibility() &&"
+                " !(e.textContent.trim() || e.getAttribute('aria-label') || (e.labels && e.labels.length))).map(e => e.outerHTML)"
+            )
+            assert not unnamed, unnamed
+            tab.calm()
+            tab.screenshot(pictures / f"web-{width}-{'dark' if dark else 'light'}.png")
+        tab.close()
+        print("the page can be read and used at three sizes, in light and dark")
+
+
+if __name__ == "__main__":
+    main()

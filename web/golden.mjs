@@ -1,0 +1,73 @@
+// Trains in Node what the page trains, by its own worker, and compares the digests with the program's and with those of
+// tests/golden.txt.
+//
+//     node web/golden.mjs PAGE FLOTILLA
+//
+// PAGE is the index.html that web/build makes.
+
+import assert from "node:assert/strict";
+import { execFileSync } from "node:child_process";
+import { mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { tmpdir } from "node:os";
+import { join } from "node:path";
+import { Player, contents } from "./player.mjs";
+
+const [page, flotilla] = process.argv.slice(2);
+const text = contents(page);
+const source = name => readFileSync(new URL(name, import.meta.url), "utf8");
+
+const Training = new Function(`${source("page/training.js")} return Training;`)();
+const player = await Player.of(text);
+const { words: machine } = await player.ask({ ask: "open", gpu: false, pass: null });
+assert.equal(machine.description, "cpu (SIMD128, 1 thread)");
+
+const SMALL = [["learning.trials", "2"], ["learning.generations", "8"], ["learning.population", "20"]];
+async function digest(layout, changes) {
+  const { words } = await player.ask({ ask: "resolve", text: text(`layout-${layout}`), name: layout, changes: [...SMALL, ...changes] });
+  const training = new Training([{ ...words, label: layout, command: "" }], machine);
+  await training.start([player]);
+  await training.play(() => Infinity, () => {});
+  assert.equal(training.state, "done");
+  return { toml: words.toml, digest: training.arms[0].digest };
+}
+
+const golden = Object.fromEntries(source("../tests/golden.txt").split("\n").map(line => line.split(/\s+/)).map(words => [words[0], words[2]]));
+for (const [name, layout, changes] of [
+  ["generally-forward", "generally_forward", []],
+  ["strictly-forward", "strictly_forward", [["learning.fitness", "'D++'"]]],
+  ["chaotic", "chaotic", [["learning.fitness", "'G'"]]],
+]) {
+  assert.equal((await digest(layout, changes)).digest, golden[name], `golden digest ${name}`);
+  console.log(`${name}: the golden digest`);
+}
+
+// Whoever takes a leader plays with teammates that do what they learned.
+const { words: resolved } = await player.ask({ ask: "resolve", text: text("layout-generally_forward"), name: "", changes: SMALL });
+const trained = new Training([{ ...resolved, label: "", command: "" }], machine);
+await trained.start([player]);
+await trained.play(() => Infinity, () => {});
+const weights = trained.arms[0].ended[0];
+const numbers = text => new Float32Array(Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer);
+const { words: whole } = await player.ask({ ask: "play", text: resolved.toml, policies: 1 }, weights);
+const { agents, headings } = whole.episodes[0], after = numbers(headings).slice(2 * agents, 4 * agents);
+await player.ask({ ask: "drive", text: resolved.toml, leader: 0, policies: 1 }, weights);
+const { words: driven } = await player.ask({ ask: "step", turn: 0, speed: 0 });
+for (const leader of [1, 2, 3])
+  for (const axis of [0, 1]) assert.ok(Math.abs(driven.headings[2 * leader + axis] - after[2 * leader + axis]) < 1e-3, `leader ${leader} does not do what it learned`);
+console.log("teammates do what they learned");
+
+const folder = mkdtempSync(join(tmpdir(), "flotilla-web-"));
+try {
+  for (const layout of ["generally_forward", "strictly_forward", "chaotic"]) {
+    for (const paradigm of ["leader-follower", "all-leaders"]) {
+      const { toml, digest: found } = await digest(layout, [["learning.paradigm", `'${paradigm}'`], ["learning.seed", "7"]]);
+      const config = join(folder, "config.toml"), out = join(folder, `${layout}-${paradigm}`);
+      writeFileSync(config, toml);
+      execFileSync(flotilla, ["train", config, "--out", out, "--quiet", "--backend", "cpu"], { stdio: ["ignore", "ignore", "inherit"] });
+      assert.equal(found, JSON.parse(readFileSync(join(out, "run.json"), "utf8")).digest, `${layout}, ${paradigm}`);
+      console.log(`${layout}, ${paradigm}: the program's digest`);
+    }
+  }
+} finally {
+  rmSync(folder, { recursive: true });
+}

@@ -1,0 +1,76 @@
+// Learning curves: of each arm the mean over trials of the best team's POIs, and every trial thin behind it.
+const chart = (() => {
+  "use strict";
+  // `arms` are { tone, trials: [[POIs by generation]] }, of every so manieth generation; `cursor` is a generation to mark, or none.
+  function paint(canvas, arms, every, last, pois, cursor) {
+    const wide = canvas.clientWidth, tall = canvas.clientHeight, dots = window.devicePixelRatio || 1;
+    if (canvas.width !== Math.round(wide * dots) || canvas.height !== Math.round(tall * dots)) {
+      canvas.width = Math.round(wide * dots);
+      canvas.height = Math.round(tall * dots);
+    }
+    const style = getComputedStyle(document.documentElement), color = name => style.getPropertyValue(name).trim();
+    const draw = canvas.getContext("2d");
+    draw.setTransform(dots, 0, 0, dots, 0, 0);
+    draw.clearRect(0, 0, wide, tall);
+    const [left, right, above, below] = [30, 14, 12, 36];
+    const X = generation => left + (wide - left - right) * (last > 0 ? generation / last : 0);
+    const Y = value => tall - below - (tall - above - below) * (pois > 0 ? value / pois : 0);
+    draw.font = "12px system-ui, sans-serif";
+    draw.lineWidth = 1;
+    draw.textBaseline = "middle";
+    draw.textAlign = "right";
+    const step = Math.max(1, Math.ceil(pois / 5));
+    for (let value = 0; value <= pois; value += step) {
+      draw.strokeStyle = color("--line");
+      draw.beginPath(); draw.moveTo(left, Y(value)); draw.lineTo(wide - right, Y(value)); draw.stroke();
+      draw.fillStyle = color("--faint");
+      draw.fillText(String(value), left - 7, Y(value));
+    }
+    draw.textAlign = "center";
+    const rough = Math.max(1, last) / Math.max(2, Math.min(10, Math.floor(wide / 90)));
+    const size = 10 ** Math.floor(Math.log10(rough)), apart = Math.max(1, [1, 2, 5, 10].find(n => n * size >= rough) * size);
+    for (let generation = 0; generation <= last; generation += apart) draw.fillText(String(Math.round(generation)), X(generation), tall - below + 13);
+    draw.fillText("generation", (left + wide - right) / 2, tall - 7);
+    if (cursor !== null) {
+      draw.strokeStyle = color("--edge");
+      draw.setLineDash([3, 3]);
+      draw.beginPath(); draw.moveTo(X(cursor), above); draw.lineTo(X(cursor), tall - below); draw.stroke();
+      draw.setLineDash([]);
+    }
+    draw.lineJoin = "round";
+    for (const { tone, trials } of arms) {
+      draw.strokeStyle = color(tone);
+      draw.lineWidth = 1;
+      draw.globalAlpha = 0.32;
+      for (const trial of trials) line(draw, trial, every, X, Y);
+      draw.globalAlpha = 1;
+    }
+    arms.forEach(({ tone, trials }, index) => {
+      const means = mean(trials);
+      if (!means.length) return;
+      draw.strokeStyle = color(tone);
+      draw.lineWidth = 2.5;
+      draw.setLineDash(index ? [7, 3] : []);
+      line(draw, means, every, X, Y);
+      draw.setLineDash([]);
+      const end = means.length - 1;
+      draw.fillStyle = color(tone);
+      draw.beginPath(); draw.arc(X(end * every), Y(means[end]), 4, 0, 2 * Math.PI); draw.fill();
+    });
+    return { generation: x => Math.round(Math.max(0, Math.min(1, (x - left) / (wide - left - right))) * last) };
+  }
+
+  function line(draw, values, every, X, Y) {
+    draw.beginPath();
+    values.forEach((value, index) => draw.lineTo(X(index * every), Y(value)));
+    draw.stroke();
+  }
+
+  // By generation, as far as all trials have come.
+  function mean(trials) {
+    const length = trials.length ? Math.min(...trials.map(trial => trial.length)) : 0;
+    return Array.from({ length }, (_, generation) => trials.reduce((sum, trial) => sum + trial[generation], 0) / trials.length);
+  }
+
+  return { paint };
+})();

@@ -1,0 +1,74 @@
+// Workers that run flotilla, and what they can play on.
+const pool = (() => {
+  "use strict";
+  const text = id => document.getElementById(id).textContent;
+  let compiled = null, script = null;
+
+  // WebAssembly is on the page, compressed: it is unpacked and compiled once, for all workers.
+  async function compile() {
+    const packed = await fetch(`data:application/octet-stream;base64,${text("wasm")}`);
+    const plain = packed.body.pipeThrough(new DecompressionStream("deflate"));
+    return WebAssembly.compile(await new Response(plain).arrayBuffer());
+  }
+
+  class Player {
+    constructor() {
+      this.asked = new Map();
+      this.count = 0;
+      this.told = () => {};
+      script ??= URL.createObjectURL(new Blob([text("worker")], { type: "text/javascript" }));
+      this.worker = new Worker(script);
+      this.worker.onerror = event => this.fail(event.message || "the worker could not be started");
+      this.worker.onmessage = ({ data }) => {
+        if (data.told) return data.told.panic ? this.fail(data.told.panic) : this.told(data.told);
+        const asked = this.asked.get(data.id);
+        this.asked.delete(data.id);
+        if (!asked) return;
+        if (data.words && data.words.error) {
+          asked.reject(Object.assign(new Error(data.words.error), { problems: data.words.problems || [], fatal: data.words.fatal }));
+        } else asked.resolve(data);
+      };
+    }
+    fail(reason) {
+      for (const { reject } of this.asked.values()) reject(Object.assign(new Error(reason), { problems: [], fatal: true }));
+      this.asked.clear();
+      this.failed = true;
+    }
+    // What is transferred is no longer here.
+    ask(words, bytes, more = {}, transferred = []) {
+      if (this.failed) return Promise.reject(new Error("the worker has failed; load the page again"));
+      const id = this.count++;
+      const answered = new Promise((resolve, reject) => this.asked.set(id, { resolve, reject }));
+      this.worker.postMessage({ id, words, bytes, ...more }, transferred);
+      return answered;
+    }
+    stop() {
+      this.worker.terminate();
+      this.failed = true;
+      for (const { reject } of this.asked.values()) reject(Object.assign(new Error("stopped"), { problems: [], stopped: true }));
+      this.asked.clear();
+    }
+  }
+
+  // A worker that is ready to be asked.
+  async function open() {
+    compiled ??= compile();
+    const player = new Player();
+    const { words } = await player.ask({}, undefined, { module: await compiled });
+    player.suspends = words.suspends;
+    return player;
+  }
+
+  // What the browser's GPU is, or why there is none to play on.
+  async function gpu() {
+    if (!navigator.gpu) return { reason: "this browser has no WebGPU, or keeps it to pages of https and localhost" };
+    if (typeof WebAssembly.Suspending !== "function") return { reason: "this browser cannot suspend WebAssembly, which waiting for a GPU takes" };
+    const adapter = await navigator.gpu.requestAdapter().catch(() => null);
+    if (!adapter) return { reason: "this browser offers no GPU" };
+    const { vendor = "", architecture = "", device = "", description = "", isFallbackAdapter = adapter.isFallbackAdapter } = adapter.info || {};
+    const name = description || [vendor, architecture, device].filter(Boolean).join(" ") || "GPU";
+    return { name, software: Boolean(isFallbackAdapter) || /swiftshader|llvmpipe|software/i.test(`${architecture} ${description}`) };
+  }
+
+  return { open, gpu };
+})();

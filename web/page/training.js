@@ -1,0 +1,139 @@
+// One training of one or two arms: on the GPU all of it as one batch by one worker, on the CPU trial by trial by as many
+// workers as there are cores. Which of them plays what changes no bit.
+class Training {
+  constructor(arms, machine) {
+    this.arms = arms.map(arm => ({ ...arm, trials: Array.from({ length: arm.config.learning.trials }, () => []), ended: [] }));
+    this.machine = machine;
+    this.players = [];
+    this.owners = new Map();
+    this.paused = false;
+    this.state = "starting";
+    this.teams = 0;
+    this.busy = [];
+    this.started = new Date().toISOString().replace(/\.\d+Z$/, "Z");
+  }
+
+  get last() { return Math.max(...this.arms.map(arm => arm.config.learning.generations)); }
+  // The generation that all trials have reached.
+  get reached() { return Math.min(...this.arms.flatMap(arm => arm.trials.map(trial => trial.length))) - 1; }
+  get rate() { return this.teams / Math.max(1e-9, Math.max(0, ...this.busy)); }
+
+  // Divides the work among players, and starts it.
+  async start(players) {
+    const tasks = this.arms.flatMap((arm, run) => arm.trials.map((_, trial) => [run, trial]));
+    const whole = this.machine.backend === "gpu";
+    this.players = whole ? players.slice(0, 1) : players.slice(0, Math.min(players.length, tasks.length));
+    await Promise.all(this.players.map((player, index) => {
+      const own = tasks.filter((_, task) => whole || task % this.players.length === index);
+      for (const [run, trial] of own) this.owners.set(`${run}/${trial}`, player);
+      const trials = run => whole ? null : own.filter(([of]) => of === run).map(([, trial]) => trial);
+      return player.ask({ ask: "train", runs: this.arms.map((arm, run) => ({ text: arm.toml, trials: trials(run) })) });
+    }));
+    this.busy = this.players.map(() => 0);
+    this.state = "training";
+  }
+
+  // Plays on until all is done or it is stopped; `allowed` tells up to which generation, `changed` is told of news.
+  async play(allowed, changed) {
+    const from = performance.now();
+    let idle = 0;
+    const work = async (player, index) => {
+      for (let next = 0; this.state === "training";) {
+        const most = Math.floor(allowed()) - next;
+        if (this.paused || most <= 0) {
+          await new Promise(done => setTimeout(done, 15));
+          idle += 15 / this.players.length;
+          continue;
+        }
+        const { words, bytes } = await player.ask({ ask: "advance", generations: Math.min(most, 1000), milliseconds: 40 });
+        const numbers = new Float64Array(bytes.buffer), seconds = (performance.now() - from - idle) / 1000;
+        for (let at = 0; at < numbers.length; at += 6) {
+          const [run, trial, generation, best, mean, champion] = numbers.subarray(at, at + 6);
+          this.arms[run].trials[trial][generation] = { best, mean, champion, seconds };
+          const { population, episodes_per_team } = this.arms[run].config.learning;
+          this.teams += (population + 1) * episodes_per_team;
+        }
+        this.busy[index] += words.seconds;
+        next = words.next;
+        changed();
+        if (words.done) return;
+      }
+    };
+    await Promise.all(this.players.map(work));
+    if (this.state === "training") await this.finish();
+    changed();
+  }
+
+  // Puts each run's folder together, and brings home its digest. All of the policies may be much: they go from worker to
+  // worker, and only the champions stay.
+  async finish() {
+    for (const [run, arm] of this.arms.entries()) {
+      const answers = await Promise.all(this.players.map(player => player.ask({ ask: "ends", run })));
+      const trials = answers.flatMap(({ words, bytes }) => {
+        let at = 0;
+        return words.map(({ trial, policies, fitness, pending }) => {
+          const part = bytes.subarray(at, at += 4 * (policies + fitness));
+          return { trial, part, pending, champions: champions(arm, part, policies) };
+        });
+      }).sort((a, b) => a.trial - b.trial);
+      arm.ended = trials.map(({ champions }) => champions);
+      await this.record(arm, trials, answers.map(({ bytes }) => bytes.buffer));
+    }
+    this.state = "done";
+  }
+
+  async record(arm, ended, buffers) {
+    const { trials, toml: text, command } = arm, last = arm.config.learning.generations;
+    const rows = new Float64Array((last + 1) * trials.length * 7);
+    let at = 0;
+    for (let generation = 0; generation <= last; generation++) {
+      let latest = 0;
+      for (const trial of trials) latest = Math.max(latest, trial[generation].seconds);
+      for (let trial = 0; trial < trials.length; trial++) {
+        const { best, mean, champion } = trials[trial][generation];
+        for (const value of [0, trial, generation, best, mean, champion, latest]) rows[at++] = value;
+      }
+    }
+    const { description, backend, adapter, driver, threads } = this.machine;
+    const { words, bytes: zip } = await this.players[0].ask({
+      ask: "record", text, command, description, backend, adapter, driver, threads,
+      started: this.started, rows: rows.length / 7, pending: ended.map(({ pending }) => pending),
+    }, [new Uint8Array(rows.buffer), ...ended.map(({ part }) => part)], {}, [rows.buffer, ...buffers]);
+    Object.assign(arm, { digest: words.digest, zip });
+  }
+
+  // A run from a file, that nothing is left to do of.
+  static async read(player, machine, name, { words, bytes }) {
+    const arm = { name, label: words.config.learning.paradigm, toml: words.toml, config: words.config, pois: words.pois, parameters: words.parameters, digest: words.digest };
+    const training = new Training([arm], machine), [own] = training.arms;
+    const numbers = new Float64Array(bytes.buffer, bytes.byteOffset, words.rows * 7);
+    for (let at = 0; at < numbers.length; at += 7) {
+      const [, trial, generation, best, mean, champion, seconds] = numbers.subarray(at, at + 7);
+      own.trials[trial][generation] = { best, mean, champion, seconds };
+    }
+    const start = words.rows * 56, size = (bytes.byteLength - start) / own.trials.length;
+    own.trials.forEach((_, trial) => {
+      own.ended[trial] = champions(own, bytes.subarray(start + trial * size, start + (trial + 1) * size), size / 4);
+      training.owners.set(`0/${trial}`, player);
+    });
+    training.players = [player];
+    await player.ask({ ask: "train", runs: [{ text: words.toml, trials: [] }] });
+    training.state = "done";
+    return training;
+  }
+
+  // The best team of a generation of a trial, as a page shows it; the one that is at hand where none is named.
+  async best(run, trial, generation) {
+    const { words } = await this.owners.get(`${run}/${trial}`).ask({ ask: "best", run, trial, generation });
+    return stage.unpack(words);
+  }
+
+  stop() { if (this.state !== "done") this.state = "stopped"; }
+}
+
+// The first policy of each population, of bytes that start with `[populations][policies][parameters]` of so many numbers.
+function champions({ config, parameters }, bytes, numbers) {
+  const each = 4 * config.learning.population * parameters, many = numbers * 4 / each, own = new Uint8Array(many * 4 * parameters);
+  for (let at = 0; at < many; at++) own.set(bytes.subarray(at * each, at * each + 4 * parameters), at * 4 * parameters);
+  return own;
+}

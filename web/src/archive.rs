@@ -1,0 +1,203 @@
+//! Runs on their way out of a tab and into it: a run's folder as a zip archive, as the program would have written it.
+
+use std::io::{Cursor, Read, Write};
+
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::{Group, Need};
+use flotilla::config::{Config, Fitness};
+use flotilla::evolve;
+use flotilla::record::checkpoint::{self, Checkpoint};
+use flotilla::record::folder::{self, Run, Status};
+use flotilla::record::metrics::{self, Extent, Lines};
+use flotilla::record::{config_digest, hex, policies};
+use flotilla::report::replay;
+use flotilla::trainer::{Row, Snapshot};
+use flotilla::world::World;
+use serde::Deserialize;
+use serde_json::{Value, json};
+use zip::{ZipArchive, ZipWriter, write::SimpleFileOptions};
+
+use crate::ask::{Answer, Refusal, described, floats, refuse};
+
+/// Most bytes of a file of an archive.
+const MOST: u64 = 1 << 30;
+
+/// A finished run; its numbers are the rows, `[rows][7]` f64 (run, trial, generation, best, mean and champion G, seconds) in
+/// the order of `metrics.csv`, and then every trial's policies and its fitness, as f32.
+#[derive(Deserialize)]
+pub struct Recorded {
+    text: String,
+    command: String,
+    description: String,
+    backend: String,
+    adapter: Option<String>,
+    driver: Option<String>,
+    threads: usize,
+    started: String,
+    rows: usize,
+    /// Each trial's, of the last generation: best and mean G.
+    pending: Vec<Option<[f64; 2]>>,
+}
+
+/// The folder of a finished run, and its digest.
+pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
+    let config = Config::parse(&recorded.text, "the config")?;
+    let (trials, last) = (config.learning.trials, config.learning.generations);
+    let fitness = config.populations() * config.learning.population;
+    let policies = fitness * config.parameters();
+    let numbers = recorded.rows * 7 * size_of::<f64>();
+    if bytes.len() != numbers + trials * (policies + fitness) * size_of::<f32>()
+        || recorded.rows != trials * (last + 1)
+        || recorded.pending.len() != trials
+    {
+        return Err(refuse("what came out of the run does not fit its config"));
+    }
+    let (numbers, rest) = bytes.split_at(numbers);
+    let rows: Vec<(Row, f64)> = bytemuck::pod_collect_to_vec::<u8, f64>(numbers)
+        .as_chunks::<7>()
+        .0
+        .iter()
+        .map(|&[_, trial, generation, best_g, mean_g, champion_g, seconds]| {
+            let (trial, generation) = (trial as usize, generation as usize);
+            (Row { arm: 0, trial, generation, best_g, mean_g, champion_g }, seconds)
+        })
+        .collect();
+    let trial = |bytes: &[u8]| {
+        let mut policies_and_fitness = floats(bytes);
+        let fitness = policies_and_fitness.split_off(policies);
+        (policies_and_fitness, fitness)
+    };
+    let (policies, fitness): (Vec<_>, Vec<_>) =
+        rest.chunks_exact((policies + fitness) * size_of::<f32>()).map(trial).unzip();
+    let digest = hex(&metrics::digest(rows.iter().map(|&(row, _)| row), &policies));
+
+    let lines = Lines::of(&config);
+    let mut text = lines.header();
+    // Where a longer run would go on: before the rows of the last generation.
+    let mut ending = None;
+    for (row, seconds) in &rows {
+        if row.generation == last && ending.is_none() {
+            ending = Some(Extent::after(&text));
+        }
+        text += &lines.line(row, *seconds);
+    }
+    let seconds = rows.last().map_or(0.0, |&(_, seconds)| seconds);
+    let pending = recorded.pending.iter().enumerate().map(|(trial, pending)| {
+        let [best_g, mean_g] = (*pending)?;
+        Some(Row { arm: 0, trial, generation: last, best_g, mean_g, champion_g: 0.0 })
+    });
+    let end = Checkpoint {
+        config: config_digest(&config),
+        init: None,
+        seconds,
+        metrics: ending.unwrap_or_else(|| Extent::after(&text)),
+        snapshot: Snapshot { generation: last + 1, last, weights: vec![], fitness, pending: pending.collect() },
+    };
+    let run = Run {
+        version: flotilla::VERSION.into(),
+        commit: flotilla::COMMIT.map(String::from),
+        state: Status::Done,
+        description: recorded.description.clone(),
+        backend: recorded.backend.clone(),
+        adapter: recorded.adapter.clone(),
+        driver: recorded.driver.clone(),
+        threads: recorded.threads,
+        command: recorded.command.clone(),
+        started: recorded.started.clone(),
+        updated: folder::now(),
+        seconds,
+        sessions: 1,
+        generations: last + 1,
+        digest: Some(digest.clone()),
+        ..Run::new(&config)
+    };
+    let (mut weights, mut checkpoint) = (Vec::new(), Vec::new());
+    policies::put(&mut weights, &config, &policies).map_err(refuse)?;
+    end.put(&mut checkpoint, &config).map_err(refuse)?;
+    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
+    let path = checkpoint::path(folder::CHECKPOINTS.as_ref(), last + 1);
+    for (name, content) in [
+        (folder::CONFIG, config.to_toml().as_bytes()),
+        (folder::METRICS, text.as_bytes()),
+        (folder::POLICIES, &weights[..]),
+        (folder::RUN, run.to_json().as_bytes()),
+        (path.to_str().unwrap_or_default(), &checkpoint[..]),
+    ] {
+        zip.start_file(name, SimpleFileOptions::default()).map_err(refuse)?;
+        zip.write_all(content).map_err(refuse)?;
+    }
+    let archive = zip.finish().map_err(refuse)?.into_inner();
+    Ok((json!({ "digest": digest }), archive))
+}
+
+/// What a dropped file holds: a run's archive gives its config, the rows as `[rows][7]` and every trial's policies; a file of
+/// policies, for the config that is at hand, gives these.
+pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
+    if !bytes.starts_with(b"PK") {
+        let config = Config::parse(text.unwrap_or_default(), "the config")?;
+        let found = policies::from_source(Cursor::new(bytes), &config, None)
+            .map_err(|reason| refuse(format!("these policies are not for this config: {reason}")))?;
+        let numbers = bytemuck::cast_slice(&found.weights).to_vec();
+        return Ok((json!({ "policies": found.policies }), numbers));
+    }
+    let mut zip =
+        ZipArchive::new(Cursor::new(bytes)).map_err(|error| refuse(format!("no archive of a run: {error}")))?;
+    let names: Vec<String> = zip.file_names().flatten().map(Into::into).collect();
+    let mut file = |name: &str| -> Result<Vec<u8>, Refusal> {
+        // Whoever packs a folder may have its name in front.
+        let found = names.iter().find(|found| found.rsplit('/').next() == Some(name));
+        let found = found.ok_or_else(|| refuse(format!("the archive has no {name}: it is no run's")))?;
+        let mut content = Vec::new();
+        let file = zip.by_name(found).map_err(refuse)?;
+        file.take(MOST).read_to_end(&mut content).map_err(refuse)?;
+        Ok(content)
+    };
+    let text = String::from_utf8(file(folder::CONFIG)?).map_err(|_| refuse("config.toml is not UTF-8 text"))?;
+    let config = Config::parse(&text, "config.toml")?;
+    let (metrics, weights) = (file(folder::METRICS)?, file(folder::POLICIES)?);
+    let run = file(folder::RUN).ok().and_then(|text| Run::parse(&String::from_utf8_lossy(&text)).ok());
+    let mut numbers: Vec<f64> = Vec::new();
+    let mut rows = metrics::Rows::new(&metrics[..]).map_err(|error| refuse(format!("metrics.csv: {error}")))?;
+    let mut plain = Vec::new();
+    for row in &mut rows {
+        let (row, seconds) = row.map_err(|error| refuse(format!("metrics.csv: {error}")))?;
+        let Row { trial, generation, best_g, mean_g, champion_g, .. } = row;
+        numbers.extend([0.0, trial as f64, generation as f64, best_g, mean_g, champion_g, seconds]);
+        plain.push(row);
+    }
+    let trial = |trial| policies::from_source(Cursor::new(&weights), &config, Some(trial));
+    let trials: Result<Vec<_>, String> = (0..config.learning.trials).map(trial).collect();
+    let trials = trials.map_err(|reason| refuse(format!("policies.safetensors: {reason}")))?;
+    let weights: Vec<&[f32]> = trials.iter().map(|trial| &trial.weights[..]).collect();
+    let digest = hex(&metrics::digest(plain.into_iter(), &weights));
+    if let Some(expected) = run.and_then(|run| run.digest)
+        && expected != digest
+    {
+        return Err(refuse(format!("the run is damaged: its digest is {digest}, run.json says {expected}")));
+    }
+    let count = numbers.len() / 7;
+    let mut bytes: Vec<u8> = bytemuck::cast_slice(&numbers).to_vec();
+    weights.iter().for_each(|weights| bytes.extend_from_slice(bytemuck::cast_slice(weights)));
+    let mut words = described(&config);
+    words["rows"] = count.into();
+    words["digest"] = digest.into();
+    Ok((words, bytes))
+}
+
+/// The episode of the champions, the first policy of every leader, in the world of the last generation:
+/// `[leaders][policies][parameters]`, or `[1][policies][parameters]` for all leaders.
+pub fn play(config: &Config, policies: usize, mut weights: Vec<f32>) -> Result<Value, Refusal> {
+    let config = &config.at(config.learning.generations);
+    let world = World::new(config);
+    let (leaders, numbers) = (world.leaders(), policies.saturating_mul(world.parameters()));
+    let fits = policies > 0 && [numbers, numbers.saturating_mul(leaders)].contains(&weights.len());
+    if !fits || evolve::admit(&mut weights).is_some() {
+        return Err(refuse("these policies are not for this config"));
+    }
+    let need = if config.learning.fitness == Fitness::Dt { Need::Sights } else { Need::Record };
+    let weights = weights[..].into();
+    let group = Group { world: &world, starts: &world.starts, weights, policies, teams: &vec![0; leaders], need };
+    let played = replay::one(&group, &mut Cpu::default()).map_err(refuse)?;
+    let generation = config.learning.generations;
+    Ok(replay::data("", config, &[replay::Replayed { generation, ..played }]))
+}

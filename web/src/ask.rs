@@ -1,0 +1,190 @@
+//! What a page may ask, and who answers.
+
+use std::fmt::Display;
+
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::gpu::device::{Gpu, Request, Wanted};
+use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Records};
+use flotilla::backend::gpu::{self, exact::Pass};
+use flotilla::backend::{Machine, Player};
+use flotilla::config::{Config, ConfigError, Override};
+use flotilla::front;
+use flotilla::report::replay;
+use flotilla::verify::{self, Plan};
+use serde::Deserialize;
+use serde_json::{Value, json};
+
+use crate::archive::{self, Recorded};
+use crate::drive::Drive;
+use crate::train::{Chosen, Training};
+
+/// Words and numbers.
+pub type Answer = (Value, Vec<u8>);
+
+/// Why there is no answer: words for people, or what is wrong with a config, line by line.
+pub struct Refusal(Value);
+
+impl From<Refusal> for Value {
+    fn from(refusal: Refusal) -> Value {
+        refusal.0
+    }
+}
+
+impl From<ConfigError> for Refusal {
+    fn from(error: ConfigError) -> Refusal {
+        let mut words = json!({ "error": error.to_string() });
+        if let ConfigError::Invalid { problems, unlisted, .. } = error {
+            let problem = |problem: flotilla::config::Problem| json!({ "line": problem.line, "key": problem.key, "message": problem.message });
+            words["problems"] = problems.into_iter().map(problem).collect();
+            words["unlisted"] = unlisted.into();
+        }
+        Refusal(words)
+    }
+}
+
+/// Whatever else went wrong.
+pub fn refuse(error: impl Display) -> Refusal {
+    Refusal(json!({ "error": error.to_string() }))
+}
+
+/// Everything that a page may ask.
+#[derive(Deserialize)]
+#[serde(tag = "ask", rename_all = "snake_case")]
+enum Ask {
+    /// What a config comes to, with some keys changed: all of it as TOML and as JSON.
+    Resolve { text: String, name: String, changes: Vec<(String, String)> },
+    /// The colours of leaders and their followers.
+    Colors,
+    /// Chooses what plays: the CPU, or the browser's GPU under a pass or the first that proves exact.
+    Open { gpu: bool, pass: Option<String> },
+    /// Starts the training of some trials of each of some configs.
+    Train { runs: Vec<Chosen> },
+    /// Plays up to so many generations, and no longer than so many milliseconds; numbers are the rows.
+    Advance { generations: usize, milliseconds: f64 },
+    /// The best team of a generation of a trial, the generation that is at hand where none is named.
+    Best { run: usize, trial: usize, generation: Option<usize> },
+    /// What came out of a run's trials that are done; numbers are policies and fitness.
+    Ends { run: usize },
+    /// A finished run's folder as an archive, from its rows, policies and fitness.
+    Record(Recorded),
+    /// What such an archive or a file of policies holds, see [`archive::read`].
+    Read { text: Option<String> },
+    /// The episode of the team of every first policy.
+    Play { text: String, policies: usize },
+    /// Compares the GPU, under a pass, with the CPU over so many random worlds.
+    Verify { worlds: u64, teams: usize, seed: u64, pass: Option<String> },
+    /// Takes one leader of a team whose others play the policies that the numbers are, or go straight ahead.
+    Drive { text: String, leader: usize, policies: usize },
+    /// Plays one step of it.
+    Step { turn: f32, speed: f32 },
+}
+
+/// Bytes of one buffer that a batch aims for: few enough that slow devices are done in a frame or two, and tabs have room.
+/// An estimate, not a measurement.
+const BATCH_BYTES: u64 = 16 << 20;
+
+/// What a worker keeps between questions.
+pub struct Session {
+    player: Player,
+    training: Training,
+    drive: Option<Drive>,
+}
+
+impl Default for Session {
+    fn default() -> Session {
+        Session { player: front::cpu(), training: Training::default(), drive: None }
+    }
+}
+
+fn parse(text: &str) -> Result<Config, Refusal> {
+    Ok(Config::parse(text, "the config")?)
+}
+
+/// Numbers, from wherever they lie.
+pub fn floats(bytes: &[u8]) -> Vec<f32> {
+    bytemuck::pod_collect_to_vec(&bytes[..bytes.len() / 4 * 4])
+}
+
+pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer, Refusal> {
+    let words = |words: Value| Ok((words, vec![]));
+    match serde_json::from_str(text).map_err(refuse)? {
+        Ask::Resolve { text, name, changes } => words(resolve(&text, &name, changes)?),
+        Ask::Colors => words(replay::colors()),
+        Ask::Open { gpu, pass } => {
+            session.player = if gpu { front::on_gpu(episodes(open_gpu(pass.as_deref())?)?) } else { front::cpu() };
+            words(machine(&session.player))
+        }
+        Ask::Train { runs } => {
+            session.training = Training::new(runs)?;
+            words(json!({}))
+        }
+        Ask::Advance { generations, milliseconds } => {
+            session.training.advance(&mut *session.player.0, generations, milliseconds)
+        }
+        Ask::Best { run, trial, generation } => words(session.training.best(run, trial, generation)?),
+        Ask::Ends { run } => session.training.ends(run),
+        Ask::Record(recorded) => archive::write(&recorded, bytes),
+        Ask::Read { text } => archive::read(text.as_deref(), bytes),
+        Ask::Play { text, policies } => words(archive::play(&parse(&text)?, policies, floats(bytes))?),
+        Ask::Verify { worlds, teams, seed, pass } => words(verify(worlds, teams, seed, pass.as_deref())?),
+        Ask::Drive { text, leader, policies } => {
+            let drive = session.drive.insert(Drive::new(&parse(&text)?, leader, policies, floats(bytes))?);
+            words(drive.state()?)
+        }
+        Ask::Step { turn, speed } => {
+            let drive = session.drive.as_mut().ok_or_else(|| refuse("nobody drives a leader yet"))?;
+            drive.step([turn, speed])?;
+            words(drive.state()?)
+        }
+    }
+}
+
+fn resolve(text: &str, name: &str, changes: Vec<(String, String)>) -> Result<Value, Refusal> {
+    let change = |(key, text): (String, String)| Override { name: key.clone(), key, text };
+    let changes: Vec<Override> = changes.into_iter().map(change).collect();
+    let config = Config::read(text, name, &[], &changes)?;
+    let mut words = described(&config);
+    words["bytes"] = flotilla::memory::Peaks::of([&config], 1).host.into();
+    Ok(words)
+}
+
+/// A config as a page needs it: as text, as a tree, and what is worked out from it.
+pub fn described(config: &Config) -> Value {
+    let (toml, pois, parameters) = (config.to_toml(), config.pois(), config.parameters());
+    json!({ "toml": toml, "config": config, "pois": pois, "parameters": parameters })
+}
+
+fn machine((backend, machine): &Player) -> Value {
+    let Machine { backend: kind, adapter, driver, threads } = machine;
+    json!({ "description": backend.describe(), "backend": kind, "adapter": adapter, "driver": driver, "threads": threads })
+}
+
+/// The browser's GPU: there is one at most, and the page has looked whether it is a software renderer.
+fn open_gpu(pass: Option<&str>) -> Result<Gpu, Refusal> {
+    let pass = pass.map(|name| {
+        let all = [Pass::NoContraction, Pass::Guarded, Pass::Plain];
+        all.into_iter().find(|pass| pass.to_string() == name).ok_or_else(|| refuse(format!("no pass {name}")))
+    });
+    let request = Request { pass: pass.transpose()?, ..Wanted::Named("0".into()).into() };
+    gpu::open(request).map_err(refuse)
+}
+
+fn episodes(gpu: Gpu) -> Result<GpuEpisodes, Refusal> {
+    Ok(GpuEpisodes::new(gpu).map_err(refuse)?.batched(BATCH_BYTES))
+}
+
+fn verify(worlds: u64, teams: usize, seed: u64, pass: Option<&str>) -> Result<Value, Refusal> {
+    let gpu = open_gpu(pass)?;
+    // The probes come first, for the canary's sake: a pass that is no good may be lucky in few worlds.
+    if let Some(mismatch) = gpu::self_test(&gpu).map_err(refuse)? {
+        return Ok(json!({ "worlds": 0, "agent_steps": 0, "mismatch": mismatch.to_string() }));
+    }
+    let mut gpu = episodes(gpu)?.holding(Holding::Always).bringing(Records::Packed);
+    let plan = Plan::random(seed..seed + worlds, teams);
+    let told = |outcome: &verify::Agreement| {
+        crate::progress(json!({ "verified": outcome.worlds, "worlds": worlds }));
+    };
+    let outcome = verify::compare(&plan, &mut Cpu::default(), &mut gpu, told).map_err(refuse)?;
+    let verify::Agreement { worlds, agent_steps, mismatch } = outcome;
+    Ok(json!({ "worlds": worlds, "agent_steps": agent_steps, "mismatch": mismatch }))
+}

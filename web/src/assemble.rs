@@ -1,0 +1,90 @@
+//! Makes the page: one file that needs no server, no network and nobody else.
+//!
+//!     assemble WASM FOLDER
+//!
+//! `FOLDER/index.html` holds the style, the scripts, the paper's layouts, and WebAssembly, compressed, as text.
+
+#[cfg(target_family = "wasm")]
+fn main() {}
+
+#[cfg(not(target_family = "wasm"))]
+fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [wasm, folder] = &arguments[..] else {
+        eprintln!("usage: assemble WASM FOLDER");
+        std::process::exit(2);
+    };
+    if let Err(error) = page::make(wasm.as_ref(), folder.as_ref()) {
+        eprintln!("error: {error}");
+        std::process::exit(1);
+    }
+}
+
+#[cfg(not(target_family = "wasm"))]
+mod page {
+    use std::error::Error;
+    use std::fs;
+    use std::path::Path;
+
+    use base64::Engine;
+    use base64::prelude::BASE64_STANDARD;
+    use miniz_oxide::deflate::compress_to_vec_zlib;
+    use wasm_bindgen_cli_support::Bindgen;
+
+    /// The scripts of the page, in their order.
+    const SCRIPTS: [&str; 6] = [
+        "../src/report/stage.js",
+        "page/pool.js",
+        "page/config.js",
+        "page/chart.js",
+        "page/training.js",
+        "page/main.js",
+    ];
+    const LAYOUTS: [&str; 3] = ["generally_forward", "strictly_forward", "chaotic"];
+
+    fn source(name: &str) -> Result<String, Box<dyn Error>> {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(name);
+        fs::read_to_string(&path).map_err(|error| format!("{}: cannot be read: {error}", path.display()).into())
+    }
+
+    pub fn make(wasm: &Path, folder: &Path) -> Result<(), Box<dyn Error>> {
+        let mut made = Bindgen::new()
+            .input_path(wasm)
+            .no_modules(true)?
+            .typescript(false)
+            .remove_name_section(true)
+            .remove_producers_section(true)
+            .generate_output()?;
+        let glue = made.js().to_string();
+        let wasm = made.wasm_mut().emit_wasm();
+        let packed = compress_to_vec_zlib(&wasm, 10);
+        let worker = format!("{glue}\n{}", source("page/worker.js")?);
+        let mut texts = vec![("wasm".to_string(), BASE64_STANDARD.encode(&packed)), ("worker".to_string(), worker)];
+        for layout in LAYOUTS {
+            texts.push((format!("layout-{layout}"), source(&format!("../configs/{layout}.toml"))?));
+        }
+        let scripts = SCRIPTS.map(source).into_iter().collect::<Result<Vec<_>, _>>()?.join("\n");
+        let mut page = source("page/index.html")?;
+        page = page.replacen("/* STYLE */", &source("page/style.css")?, 1).replacen("/* SCRIPTS */", &scripts, 1);
+        let mut inert = String::new();
+        for (name, text) in texts {
+            if text.contains("</") && text.to_lowercase().contains("</script") {
+                return Err(format!("{name} would end its element early").into());
+            }
+            inert += &format!("<script type=\"text/plain\" id=\"{name}\">{text}</script>\n");
+        }
+        page = page.replacen("<!-- TEXTS -->", &inert, 1);
+        fs::create_dir_all(folder)?;
+        fs::write(folder.join("index.html"), &page)?;
+        let all = compress_to_vec_zlib(page.as_bytes(), 9).len();
+        println!(
+            "{}: {} KB, {} KB compressed ({} KB of WebAssembly, {} KB compressed)",
+            folder.join("index.html").display(),
+            page.len() / 1000,
+            all / 1000,
+            wasm.len() / 1000,
+            packed.len() / 1000
+        );
+        Ok(())
+    }
+}

@@ -1,0 +1,82 @@
+//! flotilla in a browser tab: the crate, compiled to WebAssembly, and what a page asks of it.
+//!
+//! One worker has one of these. It is asked by [`put`] and [`call`], and answers by [`answer`] and [`bytes`]: words as
+//! JSON, numbers as little-endian bytes. `call` alone may wait for a GPU: a page calls it as a promise where the browser
+//! can suspend WebAssembly, and else plays on the CPU, which never waits.
+#![cfg(target_family = "wasm")]
+
+use std::cell::RefCell;
+use std::time::Duration;
+
+use flotilla::host::{self, Host};
+use serde_json::{Value, json};
+use wasm_bindgen::prelude::*;
+
+mod archive;
+mod ask;
+mod drive;
+mod train;
+
+use ask::{Answer, Session};
+
+#[wasm_bindgen]
+extern "C" {
+    /// Milliseconds since the worker started.
+    fn now() -> f64;
+    /// Milliseconds since the start of 1970.
+    #[wasm_bindgen(js_namespace = Date, js_name = now)]
+    fn date() -> f64;
+    /// Waits until `wake` is called; the page makes it one that suspends.
+    fn park();
+    fn wake();
+    /// Hands progress to the page, as JSON.
+    fn tell(text: &str);
+}
+
+thread_local! {
+    static SESSION: RefCell<Session> = RefCell::default();
+    static ASKED: RefCell<(String, Vec<u8>)> = RefCell::default();
+    static ANSWERED: RefCell<Answer> = RefCell::default();
+}
+
+fn milliseconds(count: f64) -> Duration {
+    Duration::from_secs_f64(count / 1000.0)
+}
+
+/// To be called once, before all else.
+#[wasm_bindgen]
+pub fn start() {
+    std::panic::set_hook(Box::new(|info| tell(&json!({ "panic": info.to_string() }).to_string())));
+    let since_1970 = || milliseconds(date());
+    host::install(Host { now: || milliseconds(now()), since_1970, park: || park(), wake: || wake() });
+}
+
+/// Takes a question, which [`call`] answers.
+#[wasm_bindgen]
+pub fn put(text: String, bytes: Vec<u8>) {
+    ASKED.set((text, bytes));
+}
+
+/// Answers the question that was put last.
+#[wasm_bindgen]
+pub fn call() {
+    let (text, bytes) = ASKED.take();
+    let answered = SESSION.with_borrow_mut(|session| ask::answer(session, &text, &bytes));
+    ANSWERED.set(answered.unwrap_or_else(|error| (error.into(), vec![])));
+}
+
+/// The answer's words.
+#[wasm_bindgen]
+pub fn answer() -> String {
+    ANSWERED.with_borrow_mut(|(words, _)| std::mem::take(words).to_string())
+}
+
+/// The answer's numbers.
+#[wasm_bindgen]
+pub fn bytes() -> Vec<u8> {
+    ANSWERED.with_borrow_mut(|(_, bytes)| std::mem::take(bytes))
+}
+
+fn progress(words: Value) {
+    tell(&words.to_string());
+}

@@ -1,0 +1,196 @@
+//! Training, generation by generation, and any generation's best team again.
+
+use std::collections::BTreeMap;
+
+use flotilla::backend::Backend;
+use flotilla::backend::cpu::Cpu;
+use flotilla::config::Config;
+use flotilla::host::Instant;
+use flotilla::report::replay;
+use flotilla::trainer::{Row, Snapshot, Trainer};
+use serde::Deserialize;
+use serde_json::{Value, json};
+
+use crate::ask::{Answer, Refusal, refuse};
+
+/// A config, and the trials of it that are to be trained here; all where none is named.
+#[derive(Deserialize)]
+pub struct Chosen {
+    text: String,
+    trials: Option<Vec<usize>>,
+}
+
+/// Bytes of snapshots that are kept to replay generations from.
+const KEPT_BYTES: usize = 48 << 20;
+
+/// Trials that advance together: all of several configs, or one of one.
+struct Batch {
+    trainer: Trainer,
+    /// Which run each arm is, and which trial it is alone of.
+    arms: Vec<(usize, Option<usize>)>,
+}
+
+/// Where trials stood at some generations, each trial by itself.
+struct Kept {
+    snapshots: BTreeMap<(usize, usize, usize), Snapshot>,
+    /// Generations from one snapshot to the next.
+    every: usize,
+}
+
+/// All that is being trained by one worker.
+#[derive(Default)]
+pub struct Training {
+    configs: Vec<Config>,
+    batches: Vec<Batch>,
+    kept: Kept,
+}
+
+impl Default for Kept {
+    fn default() -> Kept {
+        Kept { snapshots: BTreeMap::new(), every: 5 }
+    }
+}
+
+impl Training {
+    pub fn new(runs: Vec<Chosen>) -> Result<Training, Refusal> {
+        let parse = |chosen: &Chosen| Ok(Config::parse(&chosen.text, "the config")?);
+        let configs = runs.iter().map(parse).collect::<Result<Vec<_>, Refusal>>()?;
+        let mut batches = Vec::new();
+        let whole: Vec<usize> = (0..runs.len()).filter(|&run| runs[run].trials.is_none()).collect();
+        if !whole.is_empty() {
+            let trainer = Trainer::new(whole.iter().map(|&run| configs[run].clone()).collect());
+            batches.push(Batch { trainer, arms: whole.into_iter().map(|run| (run, None)).collect() });
+        }
+        for (run, chosen) in runs.iter().enumerate() {
+            for &trial in chosen.trials.iter().flatten() {
+                if trial >= configs[run].learning.trials {
+                    return Err(refuse(format!("no trial {trial}")));
+                }
+                let trainer = Trainer::of_trial(configs[run].clone(), trial);
+                batches.push(Batch { trainer, arms: vec![(run, Some(trial))] });
+            }
+        }
+        let mut training = Training { configs, batches, kept: Kept::default() };
+        training.keep()?;
+        Ok(training)
+    }
+
+    /// Numbers of the answer: run, trial, generation, best, mean and champion G of every row, as f64.
+    pub fn advance(&mut self, backend: &mut dyn Backend, most: usize, time: f64) -> Result<Answer, Refusal> {
+        let (start, mut rows, mut played) = (Instant::now(), Vec::new(), 0);
+        while played < most && !self.is_done() && (played == 0 || start.elapsed().as_secs_f64() * 1000.0 < time) {
+            for Batch { trainer, arms } in self.batches.iter_mut().filter(|batch| !batch.trainer.is_done()) {
+                for Row { arm, trial, generation, best_g, mean_g, champion_g } in
+                    trainer.advance(backend).map_err(refuse)?
+                {
+                    rows.extend([arms[arm].0 as f64, trial as f64, generation as f64, best_g, mean_g, champion_g]);
+                }
+            }
+            played += 1;
+            self.keep()?;
+        }
+        let next = self.batches.iter().map(|batch| batch.trainer.generation(0)).min();
+        let words =
+            json!({ "next": next, "played": played, "done": self.is_done(), "seconds": start.elapsed().as_secs_f64() });
+        Ok((words, bytemuck::cast_slice(&rows).to_vec()))
+    }
+
+    fn is_done(&self) -> bool {
+        self.batches.iter().all(|batch| batch.trainer.is_done())
+    }
+
+    /// Keeps where all trials stand, if it is their turn.
+    fn keep(&mut self) -> Result<(), Refusal> {
+        for batch in &mut self.batches {
+            for arm in 0..batch.arms.len() {
+                let generation = batch.trainer.generation(arm);
+                let last = self.configs[batch.arms[arm].0].learning.generations;
+                if generation.is_multiple_of(self.kept.every) && generation <= last {
+                    batch.keep(arm, &mut self.kept)?;
+                }
+            }
+        }
+        while self.kept.bytes() > KEPT_BYTES {
+            let every = 2 * self.kept.every;
+            self.kept.every = every;
+            self.kept.snapshots.retain(|(_, _, generation), _| generation.is_multiple_of(every));
+            if self.kept.snapshots.keys().all(|(_, _, generation)| *generation == 0) {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// The best team of a generation, as [`replay::data`] tells it. It is played by the CPU: the bits are the same.
+    pub fn best(&mut self, run: usize, trial: usize, generation: Option<usize>) -> Result<Value, Refusal> {
+        let config = self.configs.get(run).ok_or_else(|| refuse(format!("no run {run}")))?;
+        if trial >= config.learning.trials {
+            return Err(refuse(format!("no trial {trial}")));
+        }
+        let is_of = |&(of, alone): &(usize, Option<usize>)| of == run && alone.is_none_or(|alone| alone == trial);
+        let batch = self.batches.iter_mut().find_map(|batch| Some((batch.arms.iter().position(is_of)?, batch)));
+        let last = config.learning.generations;
+        let at_hand = batch.as_ref().map_or(last, |(arm, batch)| batch.trainer.generation(*arm));
+        let generation = generation.unwrap_or(at_hand).min(last);
+        if let Some((arm, batch)) = batch.filter(|_| at_hand == generation) {
+            batch.keep(arm, &mut self.kept)?;
+        }
+        let mut trainer = Trainer::of_trial(config.clone(), trial);
+        let before = self.kept.snapshots.range((run, trial, 0)..=(run, trial, generation)).next_back();
+        if let Some((_, snapshot)) = before {
+            // One of other sizes cannot be; from the start it comes to the same.
+            let _ = trainer.restore(0, snapshot.clone());
+        }
+        let mut cpu = Cpu::default();
+        while trainer.generation(0) < generation {
+            trainer.advance(&mut cpu).map_err(refuse)?;
+        }
+        let config = config.at(generation);
+        let played = replay::best(&config, &mut trainer, trial, &mut cpu).map_err(refuse)?;
+        Ok(replay::data("", &config, &[played]))
+    }
+
+    /// What every trial of a run came to that is done here; its numbers are the policies, then the fitness.
+    pub fn ends(&mut self, run: usize) -> Result<Answer, Refusal> {
+        let (mut words, mut numbers) = (Vec::new(), Vec::<u8>::new());
+        for Batch { trainer, arms } in self.batches.iter_mut().filter(|batch| batch.trainer.is_done()) {
+            let own: Vec<usize> = (0..arms.len()).filter(|&arm| arms[arm].0 == run).collect();
+            for ((policies, end), &arm) in trainer.ends(&own).into_iter().zip(&own) {
+                let trials = policies.iter().zip(&end.fitness).zip(&end.pending).enumerate();
+                for (trial, ((policies, fitness), pending)) in trials {
+                    let pending = pending.map(|row| [row.best_g, row.mean_g]);
+                    words.push(json!({
+                        "trial": arms[arm].1.unwrap_or(trial),
+                        "policies": policies.len(),
+                        "fitness": fitness.len(),
+                        "pending": pending,
+                    }));
+                    numbers.extend_from_slice(bytemuck::cast_slice(policies));
+                    numbers.extend_from_slice(bytemuck::cast_slice(fitness));
+                }
+            }
+        }
+        Ok((words.into(), numbers))
+    }
+}
+
+impl Batch {
+    /// Keeps where the trials of an arm stand.
+    fn keep(&mut self, arm: usize, kept: &mut Kept) -> Result<(), Refusal> {
+        let (run, alone) = self.arms[arm];
+        let Snapshot { generation, last, weights, fitness, pending } = self.trainer.snapshot(arm).map_err(refuse)?;
+        for (trial, ((weights, fitness), pending)) in weights.into_iter().zip(fitness).zip(pending).enumerate() {
+            let snapshot =
+                Snapshot { generation, last, weights: vec![weights], fitness: vec![fitness], pending: vec![pending] };
+            kept.snapshots.insert((run, alone.unwrap_or(trial), generation), snapshot);
+        }
+        Ok(())
+    }
+}
+
+impl Kept {
+    fn bytes(&self) -> usize {
+        let bytes = |snapshot: &Snapshot| snapshot.weights.iter().map(Vec::len).sum::<usize>() * size_of::<f32>();
+        self.snapshots.values().map(bytes).sum()
+    }
+}
