@@ -29,7 +29,16 @@ pub enum Starts {
     Own,
     /// So many episodes, every start moved by a uniform offset in `-jitter..jitter` on both axes, and every POI likewise by
     /// `poi_jitter`, drawn from the seed. No training draws from where these are drawn, whatever its seed.
-    Drawn { episodes: u32, seed: u64, jitter: f64, poi_jitter: f64 },
+    Drawn {
+        /// Of each team.
+        episodes: u32,
+        /// What they are drawn from.
+        seed: u64,
+        /// Of agents, in units.
+        jitter: f64,
+        /// Of POIs, in units.
+        poi_jitter: f64,
+    },
 }
 
 impl Starts {
@@ -73,9 +82,11 @@ pub struct Tally {
 /// Mean, spread and what the mean would be over all episodes there could be, of a [`Tally`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spread {
+    /// Over episodes.
     pub mean: f64,
-    /// Sample standard deviation over episodes, and the 95 % interval of the mean ([`statistics::mean`]'s); none of one episode.
+    /// Sample standard deviation over episodes; none of one.
     pub deviation: Option<f64>,
+    /// The 95 % interval of the mean ([`statistics::mean`]'s); none of one episode.
     pub interval: Option<[f64; 2]>,
 }
 
@@ -116,8 +127,11 @@ impl Tally {
 /// What teams came to over all episodes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Evaluation {
+    /// Of each team.
     pub episodes: usize,
+    /// Of a team.
     pub leaders: usize,
+    /// Of the world.
     pub pois: usize,
     /// POIs observed, `[teams]`.
     pub observed: Vec<Tally>,

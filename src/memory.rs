@@ -20,8 +20,9 @@ const COPIED: u64 = 64 << 20;
 /// Peaks, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Peaks {
-    /// Of the process, where the CPU plays; and how much of that only while a checkpoint is written.
+    /// Of the process, where the CPU plays.
     pub host: u64,
+    /// How much of that is only while a checkpoint is written.
     pub checkpoint: u64,
     /// Of the process, where a GPU plays, without what its driver keeps there.
     pub gpu_host: u64,
@@ -38,7 +39,9 @@ pub struct Peaks {
     if *checkpoint > 0 { format!(", no checkpoints (they take {} of it)", human(*checkpoint)) } else { String::new() }
 )]
 pub struct TooLittle {
+    /// Bytes at the run's peak.
     pub needed: u64,
+    /// Bytes that the system has to give.
     pub available: u64,
     /// How much of what is needed is for checkpoints.
     pub checkpoint: u64,

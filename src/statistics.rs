@@ -22,8 +22,11 @@ pub const EXACT: usize = 100;
 /// A number with its 95 % interval, both ends included.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Estimate {
+    /// The number itself.
     pub value: f64,
+    /// The interval's lower end.
     pub low: f64,
+    /// The interval's upper end.
     pub high: f64,
 }
 

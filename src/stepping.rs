@@ -69,23 +69,66 @@ pub struct States<'a> {
 /// Why teams could not be made, started, stepped or scored. They are then as they were.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum StepError {
+    /// No team, or more than there may be.
     #[error("{0} teams; there may be 1 to {MAX_POPULATION}")]
     Teams(usize),
     /// A world that [`World::new`] did not make of a valid config.
     #[error("the world's {0} do not fit its numbers of agents and POIs")]
     World(&'static str),
+    /// The system gives no memory for them.
     #[error("there is no memory for {teams} teams, {bytes} bytes")]
-    Memory { teams: usize, bytes: u128 },
+    Memory {
+        /// How many were asked for.
+        teams: usize,
+        /// What these take.
+        bytes: u128,
+    },
+    /// An array of another length.
     #[error("{found} {what}, but {shape} are {expected}")]
-    Length { what: &'static str, shape: &'static str, expected: usize, found: usize },
+    Length {
+        /// What it holds.
+        what: &'static str,
+        /// Its indices.
+        shape: &'static str,
+        /// How many numbers that makes.
+        expected: usize,
+        /// How many were given.
+        found: usize,
+    },
+    /// An action that is infinite or no number.
     #[error("the {} of leader {leader} in team {team} is {value}, which is no finite number", ["turn", "speed"][*.output])]
-    Action { team: usize, leader: usize, output: usize, value: f32 },
+    Action {
+        /// Which team, from 0.
+        team: usize,
+        /// Which leader of it, from 0.
+        leader: usize,
+        /// 0 for the turn, 1 for the speed.
+        output: usize,
+        /// What was given.
+        value: f32,
+    },
+    /// A start that is not on the map.
     #[error("agent {agent} of team {team} would start at ({}, {}), which is not on the map", at[0], at[1])]
-    Start { team: usize, agent: usize, at: [f32; 2] },
+    Start {
+        /// Which team, from 0.
+        team: usize,
+        /// Which agent of it, leaders first.
+        agent: usize,
+        /// Where, in units.
+        at: [f32; 2],
+    },
+    /// A team that there is not.
     #[error("team {team} of {teams} (they count from 0)")]
-    NoTeam { team: usize, teams: usize },
+    NoTeam {
+        /// Which team, from 0.
+        team: usize,
+        /// How many there are.
+        teams: usize,
+    },
+    /// Scores need a record, which [`Stepper::recording`] keeps.
     #[error("no record was kept to score teams by")]
     NotRecorded,
+    /// Dt needs a record of sights, which [`Stepper::with_sights`] keeps.
     #[error("no record was kept of who saw whom at which step, which Dt asks; make the stepper `with_sights`")]
     NotSeen,
 }

@@ -28,11 +28,15 @@ pub struct Trainer {
 /// What one generation of one trial came to; every G is in 0..1.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Row {
+    /// Whose it is, by place among the trainer's; 0 of a run alone.
     pub arm: usize,
+    /// From 0.
     pub trial: usize,
+    /// From 0, the random start.
     pub generation: usize,
-    /// The best and the mean team of the generation.
+    /// The best team of the generation.
     pub best_g: f64,
+    /// The mean over the generation's teams.
     pub mean_g: f64,
     /// The team of every population's best policy.
     pub champion_g: f64,
@@ -98,6 +102,7 @@ pub type End<'a> = (Vec<&'a [f32]>, Snapshot<&'a [f32]>);
 /// Why there is no snapshot.
 #[derive(Debug, thiserror::Error)]
 pub enum SnapshotError {
+    /// The system gives no memory for it.
     #[error(transparent)]
     Memory(#[from] TryReserveError),
     /// The populations cannot be brought to the host.

@@ -64,7 +64,9 @@ pub fn short_trainings() -> Vec<(String, Config)> {
 /// How much was compared, and the first difference, if any.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Agreement {
+    /// Worlds played on both.
     pub worlds: usize,
+    /// Steps of agents in these.
     pub agent_steps: u64,
     /// Where, in words.
     pub mismatch: Option<String>,

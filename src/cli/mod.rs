@@ -192,22 +192,31 @@ fn refuse_steering(words: impl Iterator<Item = OsString>) -> Result<(), Error> {
 /// Why a command failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
+    /// A config that cannot be read or is wrong.
     #[error(transparent)]
     Config(#[from] ConfigError),
+    /// Episodes that could not be played.
     #[error("{}{}", .0, remedy::backend(.0))]
     Backend(#[from] BackendError),
+    /// A GPU that could not be had, or that failed.
     #[error("{}{}", .0, remedy::device(.0))]
     Device(#[from] DeviceError),
+    /// Files of runs that could not be written, read or used.
     #[error("{}{}", .0, remedy::record(.0, "run it again"))]
     Record(#[from] RecordError),
+    /// A run that could not go on.
     #[error("{}{}", .0, remedy::run(.0))]
     Run(#[from] RunError),
+    /// A run that could not be read to be shown.
     #[error("{}{}", .0, remedy::shown(.0))]
     Shown(#[from] crate::report::runs::ReadError),
+    /// An episode that could not be replayed.
     #[error("{}{}", .0, remedy::replayed(.0))]
     Replayed(#[from] ReplayError),
+    /// Results that could not be printed.
     #[error("standard output cannot be written: {0}")]
     Output(io::Error),
+    /// The system does not let signals be listened for.
     #[error("signals cannot be listened for: {0}")]
     Signals(io::Error),
     /// Wrong usage that only shows once flags are read together.
@@ -289,8 +298,10 @@ impl ConfigFile {
 /// A config file and the flags that change it.
 #[derive(clap::Args)]
 pub struct ConfigArgs {
+    /// The file.
     #[command(flatten)]
     pub file: ConfigFile,
+    /// The flags.
     #[command(flatten)]
     pub overrides: Overrides,
 }

@@ -55,12 +55,19 @@ pub fn keys() -> Vec<Definition> {
 /// One experiment, as written in a config file.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Config {
+    /// `[world]`: where everything starts.
     pub world: Domain,
+    /// `[motion]`: how agents move.
     pub motion: Motion,
+    /// `[follow]`: what followers do.
     pub follow: Follow,
+    /// `[sense]`: what leaders sense.
     pub sense: Sense,
+    /// `[policy]`: the leaders' network.
     pub policy: Policy,
+    /// `[learning]`: the coevolution.
     pub learning: Learning,
+    /// `[checkpoint]`: how often a run saves.
     pub checkpoint: Saving,
     /// What changes from some generations on, see [`Config::staged`].
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -169,11 +176,24 @@ impl Config {
 /// Why there is no config.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ConfigError {
+    /// There is no such file, it is no text, or it is too large.
     #[error("{name}: cannot be read: {reason}")]
-    Unreadable { name: String, reason: String },
+    Unreadable {
+        /// What errors call the file.
+        name: String,
+        /// The system's words.
+        reason: String,
+    },
     /// All that is wrong, by line; what came from outside the file (see [`Override`]) last.
     #[error("{}", list(name, problems, *unlisted))]
-    Invalid { name: String, problems: Vec<Problem>, unlisted: usize },
+    Invalid {
+        /// What errors call the file.
+        name: String,
+        /// What is wrong; where that is much, the first of it.
+        problems: Vec<Problem>,
+        /// How much more there is.
+        unlisted: usize,
+    },
 }
 
 impl ConfigError {

@@ -17,7 +17,9 @@ pub const WGSL: &str = include_str!("../../shaders/couple.wgsl");
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(untagged)]
 pub enum Coupling {
+    /// As many at every POI.
     Same(usize),
+    /// So many at each, `[pois]`.
     Each(Vec<usize>),
 }
 
@@ -53,7 +55,9 @@ choice! {
     Observers {
         /// Every agent's.
         All = "all",
+        /// Leaders' alone.
         Leaders = "leaders",
+        /// Followers' alone.
         Followers = "followers",
     }
 }

@@ -1,7 +1,6 @@
 //! A follower's preset behaviour: drawn to agents in sight, pushed off close ones and walls (Section 4.1, Figure 2b).
 
 use fearless_simd::{Simd, prelude::*};
-use serde::Serialize;
 
 use super::{LONGEST, Lanes, motion::rotate};
 use crate::declare::shared;
@@ -11,48 +10,39 @@ use crate::kernels::{
     operations::{FLUSH, RECIP, ROTATE, RSQRT, SQUARED_DISTANCE},
     select, splat,
 };
-use crate::reader::{Reader, between};
+use crate::reader::{Reader, between, section};
 
 /// The shader's part.
 pub const WGSL: &str = include_str!("../../shaders/follow.wgsl");
 
-/// `[follow]`: the followers' preset behaviour.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Follow {
-    pub attraction_radius: f64,
-    pub repulsion_radius: f64,
-    pub attraction_gain: f64,
-    pub repulsion_gain: f64,
-    pub wall_gain: f64,
+section! {
+    /// `[follow]`: the followers' preset behaviour.
+    Follow = "follow" {
+        /// within it a follower sees others: it is drawn to them, and counts the leaders among them for Df
+        attraction_radius: f64 = "units", "4.1, 4.2",
+        /// within it others, and walls, push a follower away
+        repulsion_radius: f64 = "units", "4.1",
+        /// pull of others at the attraction radius
+        attraction_gain: f64 = "units/s", "4.1, Fig. 2b",
+        /// push of others at the repulsion radius
+        repulsion_gain: f64 = "units/s", "4.1, Fig. 2b",
+        /// push of a wall for each unit nearer than the repulsion radius
+        wall_gain: f64 = "1/s", "",
+    }
 }
 
 impl Follow {
     /// Reads the section.
     pub(crate) fn read(r: &mut Reader<'_>) -> Follow {
-        let attraction_radius = r
-            .key(
-                "follow.attraction_radius",
-                "units",
-                "within it a follower sees others: it is drawn to them, and counts the leaders among them for Df",
-                "4.1, 4.2",
-            )
-            .number(between(0.01, LONGEST), 5.0);
+        let attraction_radius = Follow::attraction_radius(r).number(between(0.01, LONGEST), 5.0);
         let closest = between(0.01, attraction_radius).because("follow.attraction_radius");
         let gain = between(1e-3, 1e3).or_zero();
         Follow {
             attraction_radius,
-            repulsion_radius: r
-                .key("follow.repulsion_radius", "units", "within it others, and walls, push a follower away", "4.1")
-                .number(closest, 1.0),
-            attraction_gain: r
-                .key("follow.attraction_gain", "units/s", "pull of others at the attraction radius", "4.1, Fig. 2b")
-                .number(gain, 5.0),
-            repulsion_gain: r
-                .key("follow.repulsion_gain", "units/s", "push of others at the repulsion radius", "4.1, Fig. 2b")
-                .number(gain, 1.0),
-            wall_gain: r
-                .key("follow.wall_gain", "1/s", "push of a wall for each unit nearer than the repulsion radius", "")
-                .number(gain, 1.0),
+            repulsion_radius: Follow::repulsion_radius(r).number(closest, 1.0),
+            attraction_gain: Follow::attraction_gain(r).number(gain, 5.0),
+            repulsion_gain: Follow::repulsion_gain(r).number(gain, 1.0),
+            wall_gain: Follow::wall_gain(r).number(gain, 1.0),
         }
     }
 }
@@ -60,14 +50,17 @@ impl Follow {
 shared! {
     /// What following reads.
     pub struct FollowConstants as FollowLanes {
-        /// Squared radii.
+        /// The attraction radius, squared.
         pub attraction_radius2: f32,
+        /// The repulsion radius, squared.
         pub repulsion_radius2: f32,
         /// Walls push within this distance.
         pub repulsion_radius: f32,
-        /// Gain over radius of each force.
+        /// Attraction's gain over its radius.
         pub attraction_scale: f32,
+        /// Repulsion's gain over its radius.
         pub repulsion_scale: f32,
+        /// Push for each unit that a wall is nearer than the repulsion radius.
         pub wall_gain: f32,
     }
 }
@@ -112,11 +105,17 @@ pub const TINY: f32 = 1.0 / 1_073_741_824.0;
 /// Offsets to the agents within a follower's radii, summed and counted.
 #[derive(Clone, Copy)]
 pub struct Sums<S: Simd> {
+    /// Within the repulsion radius.
     pub repel_x: S::f32s,
+    /// Likewise.
     pub repel_y: S::f32s,
+    /// How many these are.
     pub repel_count: S::i32s,
+    /// Within the attraction radius alone.
     pub attract_x: S::f32s,
+    /// Likewise.
     pub attract_y: S::f32s,
+    /// How many these are.
     pub attract_count: S::i32s,
 }
 
@@ -155,8 +154,11 @@ pub fn influence<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s, sums: &mut
 /// What acts on a follower: the force, and in which lanes any agent or wall is near.
 #[derive(Clone, Copy)]
 pub struct Pull<S: Simd> {
+    /// The force along x, in units a second.
     pub x: S::f32s,
+    /// The force along y.
     pub y: S::f32s,
+    /// Where any agent or wall is near.
     pub influenced: S::mask32s,
 }
 

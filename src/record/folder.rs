@@ -61,16 +61,23 @@ pub enum Start {
 pub struct Run {
     /// Of the program.
     pub version: String,
+    /// How far it came.
     pub state: Status,
+    /// Its config's.
     pub seed: u64,
-    /// "cpu" or "gpu", and in words.
+    /// "cpu" or "gpu".
     pub backend: String,
+    /// What it runs on, in words.
     pub description: String,
+    /// The GPU, if one was used.
     pub adapter: Option<String>,
+    /// Its driver.
     pub driver: Option<String>,
+    /// Threads of the CPU that work.
     pub threads: usize,
-    /// UTC, of the first session's start and of this file.
+    /// UTC, of the first session's start.
     pub started: String,
+    /// UTC, of this file's writing.
     pub updated: String,
     /// Time trained in all sessions.
     pub seconds: f64,
@@ -91,13 +98,15 @@ pub struct Run {
     pub commit: Option<String>,
 }
 
+/// How far a run came.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Status {
-    /// Or killed.
+    /// It trains, or was killed.
     Running,
     /// By a signal or an error, after saving.
     Stopped,
+    /// It has played its last generation.
     Done,
 }
 
@@ -144,7 +153,9 @@ impl Run {
 
 /// A folder that this process, and no other, trains in.
 pub struct Folder {
+    /// Where it is.
     pub path: PathBuf,
+    /// What it is written through.
     pub disk: Disk,
     lock: Option<File>,
 }
@@ -170,7 +181,9 @@ pub enum Note {
     SetAside(String),
     /// A small file that cannot be read, for this reason.
     WrittenAnew(String),
+    /// There is a whole checkpoint.
     GoingOn {
+        /// The one that plays next.
         generation: usize,
     },
     /// None of the checkpoints can be used.
@@ -201,7 +214,9 @@ impl fmt::Display for Note {
 /// Where a run came from and to, `[trials]` each.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Story {
+    /// Of the random start.
     pub first: Vec<Row>,
+    /// Of the last generation.
     pub last: Vec<Row>,
 }
 

@@ -19,7 +19,9 @@ const DASHES: [&[f64]; 5] = [&[], &[1.6, 0.7], &[1.8, 0.6, 0.4, 0.6], &[0.5, 0.5
 /// Mean and standard deviation of any number of values, gathered one by one.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Average {
+    /// How many values there were.
     pub count: u32,
+    /// Theirs; 0 of none.
     pub mean: f64,
     /// Sum of squared distances from the mean.
     squares: f64,
@@ -48,8 +50,11 @@ impl Average {
 /// Mean and standard error over trials, at some generations.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Curve {
+    /// Places on the x axis, from 0.
     pub generation: Vec<f64>,
+    /// At each of these.
     pub mean: Vec<f64>,
+    /// Standard error of the mean, at each.
     pub error: Vec<f64>,
     /// How many trials these are of, at most.
     #[serde(skip)]
@@ -89,6 +94,7 @@ impl Curve {
 /// One set of axes.
 #[derive(Clone, Debug, Default)]
 pub struct Panel {
+    /// Above it.
     pub title: String,
     /// Each with its place in the legend, which gives it its look.
     pub curves: Vec<(usize, Curve)>,
@@ -97,10 +103,13 @@ pub struct Panel {
 /// Panels side by side that share a legend and the y axis.
 #[derive(Clone, Debug, Default)]
 pub struct Figure {
+    /// From left to right.
     pub panels: Vec<Panel>,
+    /// What curves are, by their place.
     pub legend: Vec<String>,
     /// What curves are held against: the next places in the legend, in grey, with neither bands nor marks.
     pub references: Vec<String>,
+    /// Of the axis that they share.
     pub y_label: String,
     /// The y axis runs from 0 to this.
     pub y_max: f64,

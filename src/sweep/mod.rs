@@ -47,6 +47,7 @@ pub struct Sweep {
     pub name: String,
     /// Those of the grid, then those varied, each in the order of the file; the first changes slowest from point to point.
     pub axes: Vec<Axis>,
+    /// Every combination that is not left out, in order.
     pub points: Vec<Point>,
     /// Combinations left out because they cannot run.
     pub skipped: usize,
@@ -97,6 +98,7 @@ pub struct Point {
     pub index: usize,
     /// The index of its value on each axis.
     pub values: Vec<usize>,
+    /// What it runs.
     pub config: Config,
 }
 

@@ -24,8 +24,9 @@ pub struct Detail {
 /// What a point's trials came to, by the best team.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Outcome {
-    /// Best G in the last generation of every trial, and its champion's.
+    /// The best team's G in the last generation of every trial.
     pub best: Vec<f64>,
+    /// The champion's G in the last generation of every trial.
     pub champion: Vec<f64>,
     /// The first generation of every trial whose best G is at least [`Detail::reach`].
     pub reached: Vec<Option<usize>>,
@@ -60,10 +61,13 @@ pub fn point_folder(out: &Path, point: &Point) -> PathBuf {
 /// A point that cannot be put together, and why.
 #[derive(Debug, thiserror::Error)]
 pub enum Missing {
+    /// Its folder has no run.
     #[error("it was not run")]
     NotRun,
+    /// Its run has come to the first generation, not yet to the second.
     #[error("it has come to generation {0} of {1}")]
     Unfinished(usize, usize),
+    /// Its files cannot be used, for this reason.
     #[error("{0}")]
     Damaged(String),
 }

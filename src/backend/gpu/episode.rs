@@ -58,31 +58,47 @@ shared! {
     /// One workgroup's share of the work: some teams of one group.
     #[derive(Default)]
     pub struct Task {
+        /// Which of the batch's worlds they play in.
         pub world: u32,
-        /// Where each of these starts in its buffer, in elements.
+        /// Where the agents' start positions begin in their buffer; all such places are in elements.
         pub starts: u32,
+        /// Where the POIs begin.
         pub pois: u32,
+        /// Where the weights begin.
         pub weights: u32,
+        /// Where the agents near each POI are recorded.
         pub sets: u32,
+        /// Where it is recorded whom followers saw.
         pub seen: u32,
+        /// Where a trace's moments go.
         pub moments: u32,
+        /// Where agents stand between two dispatches.
         pub states: u32,
+        /// How many teams it has.
         pub teams: u32,
-        /// The steps that a dispatch plays: from `first` on, before `end`.
+        /// The first step that a dispatch plays.
         pub first: u32,
+        /// The one before which it ends.
         pub end: u32,
-        /// Where packing finds and leaves what, see `shaders/pack.wgsl`.
+        /// Where packing finds how many agents each POI needs, see `shaders/pack.wgsl`.
         pub least: u32,
+        /// Where packing leaves the table of where each team's kept sets are.
         pub table: u32,
+        /// Where packing leaves the leaders that followers saw most, or all ones for nowhere.
         pub owners: u32,
     }
 
     /// An agent between two dispatches.
     pub struct State {
+        /// Where it is, in units.
         pub x: f32,
+        /// Likewise.
         pub y: f32,
+        /// Where it heads, a unit vector.
         pub hx: f32,
+        /// Likewise.
         pub hy: f32,
+        /// How fast it is, in units a second.
         pub speed: f32,
     }
 }

@@ -47,16 +47,29 @@ impl std::fmt::Display for Pass {
 /// Why a shader could not be compiled.
 #[derive(Debug, thiserror::Error)]
 pub enum ShaderError {
+    /// The text is no WGSL; naga's words.
     #[error("does not parse:\n{0}")]
     Parse(String),
+    /// naga's validation refuses it; its words.
     #[error("is not valid: {0}")]
     Invalid(String),
+    /// These operations are not known to be exact on every device.
     #[error("leaves the exact core: {}", .0.join("; "))]
     Foreign(Vec<String>),
+    /// It uses the binding of the guard itself.
     #[error("binds group 0 binding 0, which is the guard's")]
     GuardTaken,
+    /// It is beyond a limit of the device.
     #[error("needs {what} {needed}, the device allows {allowed}")]
-    Limit { what: &'static str, needed: u64, allowed: u64 },
+    Limit {
+        /// Which limit.
+        what: &'static str,
+        /// How much the shader takes.
+        needed: u64,
+        /// How much there may be.
+        allowed: u64,
+    },
+    /// naga cannot write it as SPIR-V.
     #[error("no SPIR-V: {0}")]
     Spirv(#[from] spv::Error),
 }

@@ -26,7 +26,9 @@ pub struct Deviation {
     pub probe: Cow<'static, str>,
     /// From which values, in the order `x, y, z, w`.
     pub values: Vec<u32>,
+    /// The bits that the CPU came to.
     pub cpu: u32,
+    /// The bits that the device came to.
     pub gpu: u32,
 }
 
