@@ -9,7 +9,7 @@ use glam::Vec2;
 use crate::backend::{Backend, BackendError, Group, Moment, Need};
 use crate::credit::Credit;
 use crate::evolve::{self, Key, Purpose};
-use crate::statistics;
+use crate::statistics::{self, Estimate};
 use crate::world::World;
 
 pub use crate::evolve::one_policy_a_team;
@@ -113,12 +113,9 @@ impl Tally {
             (squares as f64 / (count * (count - 1.0))).sqrt() / unit
         });
         let interval = deviation.map(|deviation| {
-            let half = match deviation {
-                // Of values that are all alike, as many may be off by one part as could have gone unseen.
-                0.0 => statistics::share(0, self.count as usize).map_or(0.0, |share| share.high) / unit,
-                deviation => statistics::reach(self.count as usize) * deviation / count.sqrt(),
-            };
-            [(mean - half).max(0.0), (mean + half).min(most as f64)]
+            let error = deviation / count.sqrt();
+            let Estimate { low, high, .. } = statistics::interval(mean, error, self.count as usize, 1.0 / unit);
+            [low.max(0.0), high.min(most as f64)]
         });
         Spread { mean, deviation, interval }
     }

@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
+use crate::statistics::Average;
 
 /// A column of a two-column paper, in millimetres.
 pub const COLUMN: f64 = 85.0;
@@ -15,37 +16,6 @@ pub const SMALL: f64 = 2.47;
 const NORMAL: f64 = 2.82;
 const REFERENCES: [&[f64]; 2] = [&[2.6, 1.0], &[0.7, 0.7]];
 const DASHES: [&[f64]; 5] = [&[], &[1.6, 0.7], &[1.8, 0.6, 0.4, 0.6], &[0.5, 0.5], &[3.0, 0.8]];
-
-/// Mean and standard deviation of any number of values, gathered one by one.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Average {
-    /// How many values there were.
-    pub count: u32,
-    /// Theirs; 0 of none.
-    pub mean: f64,
-    /// Sum of squared distances from the mean.
-    squares: f64,
-}
-
-impl Average {
-    /// Adds a value.
-    pub fn add(&mut self, value: f64) {
-        self.count += 1;
-        let before = value - self.mean;
-        self.mean += before / f64::from(self.count);
-        self.squares += before * (value - self.mean);
-    }
-
-    /// Of the sample; 0 of fewer than two values.
-    pub fn deviation(&self) -> f64 {
-        if self.count < 2 { 0.0 } else { (self.squares / f64::from(self.count - 1)).sqrt() }
-    }
-
-    /// Of the mean.
-    pub fn error(&self) -> f64 {
-        if self.count == 0 { 0.0 } else { self.deviation() / f64::from(self.count).sqrt() }
-    }
-}
 
 /// Mean and standard error over trials, at some generations.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -65,11 +35,11 @@ impl Curve {
     /// One tally a generation, from generation 0; generations without values are left out.
     pub fn new(tallies: &[Average]) -> Curve {
         let mut curve = Curve::default();
-        for (generation, tally) in tallies.iter().enumerate().filter(|(_, tally)| tally.count > 0) {
+        for (generation, tally) in tallies.iter().enumerate().filter(|(_, tally)| tally.count() > 0) {
             curve.generation.push(generation as f64);
-            curve.mean.push(tally.mean);
+            curve.mean.push(tally.mean());
             curve.error.push(tally.error());
-            curve.trials = curve.trials.max(tally.count);
+            curve.trials = curve.trials.max(tally.count());
         }
         curve
     }

@@ -3,12 +3,13 @@
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use super::curves::{Average, Curve, Figure, Panel};
+use super::curves::{Curve, Figure, Panel};
 use crate::config::{Config, ConfigError};
 use crate::file;
 use crate::record::RecordError;
 use crate::record::folder::{self, CONFIG, METRICS};
 use crate::record::metrics::{self, RowsError};
+use crate::statistics::Average;
 use crate::trainer::Row;
 
 /// Most runs that one figure can tell apart.

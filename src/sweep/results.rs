@@ -10,6 +10,7 @@ use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{CONFIG, METRICS, POINTS, RESULTS};
 use crate::record::metrics;
+use crate::statistics::Average;
 use crate::trainer::Row;
 
 /// What [`write()`] makes of the points that are complete.
@@ -35,6 +36,16 @@ pub struct Outcome {
 }
 
 impl Outcome {
+    /// The best team's G in the last generation, over the trials.
+    pub fn best(&self) -> Average {
+        self.best.iter().collect()
+    }
+
+    /// The champion's.
+    pub fn champion(&self) -> Average {
+        self.champion.iter().collect()
+    }
+
     /// The median over the trials of the generations to reach G, where trials that never do count as later than all;
     /// none where it is one of these.
     pub fn median_reached(&self) -> Option<f64> {
@@ -43,14 +54,6 @@ impl Outcome {
         let middle = [reached[(reached.len() - 1) / 2], reached[reached.len() / 2]];
         (middle[1] < usize::MAX).then(|| (middle[0] + middle[1]) as f64 / 2.0)
     }
-}
-
-/// Mean and standard error of the mean (0 for a single value).
-pub fn mean_and_error(values: &[f64]) -> (f64, f64) {
-    let count = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / count;
-    let squares: f64 = values.iter().map(|value| (value - mean) * (value - mean)).sum();
-    (mean, if values.len() > 1 { (squares / (count - 1.0) / count).sqrt() } else { 0.0 })
 }
 
 /// Where a point's run is in a sweep's folder.
@@ -125,14 +128,14 @@ fn summary(
     table.write_record(sweep.axes.iter().map(|axis| &*axis.key).chain(columns))?;
     for (point, outcome) in sweep.points.iter().zip(outcomes) {
         let Ok(outcome) = outcome else { continue };
-        let (best, error) = mean_and_error(&outcome.best);
+        let best = outcome.best();
         let fields = [
             point.index.to_string(),
             outcome.best.len().to_string(),
             point.config.learning.generations.to_string(),
-            best.to_string(),
-            error.to_string(),
-            mean_and_error(&outcome.champion).0.to_string(),
+            best.mean().to_string(),
+            best.error().to_string(),
+            outcome.champion().mean().to_string(),
             options.reach.to_string(),
             outcome.reached.iter().flatten().count().to_string(),
             outcome.median_reached().map_or(String::new(), |median| median.to_string()),
@@ -180,8 +183,8 @@ fn read(point: &Point, out: &Path, options: &Detail) -> Result<(Vec<Row>, Outcom
     }
     let ends = || rows.iter().filter_map(|rows| rows.last());
     let curve = (0..rows[0].len()).map(|at| {
-        let (mean, error) = mean_and_error(&rows.iter().map(|rows| rows[at].best_g).collect::<Vec<_>>());
-        (rows[0][at].generation, mean, error)
+        let best: Average = rows.iter().map(|rows| &rows[at].best_g).collect();
+        (rows[0][at].generation, best.mean(), best.error())
     });
     let outcome = Outcome {
         best: ends().map(|row| row.best_g).collect(),

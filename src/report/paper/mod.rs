@@ -8,9 +8,10 @@
 
 use serde::Serialize;
 
-use super::curves::{Average, Curve, Figure, Panel};
+use super::curves::{Curve, Figure, Panel};
 use crate::baseline::Baseline;
 use crate::config::{Config, ConfigError, Fitness, Override, Paradigm};
+use crate::statistics::Average;
 use crate::trainer::Row;
 
 pub mod claims;
