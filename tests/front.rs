@@ -2,6 +2,7 @@
 
 #![cfg(feature = "cli")]
 
+use std::fs;
 use std::ops::ControlFlow::{Break, Continue};
 use std::path::Path;
 
@@ -78,6 +79,20 @@ fn training_comes_to_what_a_run_comes_to() {
         assert_eq!(Trained::read(&path).expect("the run is whole"), trained, "seed {seed}");
     }
     assert!(matches!(Trained::read(folder.path()), Err(Failure::Run(_))));
+
+    // A row that is missing, and two that changed places.
+    let (run, path) = (folder.path().join("0"), folder.path().join("0/metrics.csv"));
+    let rows = fs::read_to_string(&path).expect("the run has metrics");
+    let mut lines: Vec<&str> = rows.lines().collect();
+    let mut read = |lines: &[&str]| {
+        fs::write(&path, lines.join("\n") + "\n").expect("the folder can be written");
+        Trained::read(&run).expect_err("rows are not as they were").to_string()
+    };
+    let short = read(&lines[..lines.len() - 1]);
+    assert!(short.contains("metrics.csv has 20 rows of 21"), "{short}");
+    lines.swap(1, 4);
+    let mixed = read(&lines);
+    assert!(mixed.contains("its rows are not one a trial and generation, in their order"), "{mixed}");
 }
 
 #[test]
@@ -190,6 +205,11 @@ fn what_is_wrong_is_told() {
         assert!(matches!(play(&config, 2, &good, drawn), Err(Failure::Starts { .. })), "{episodes}, {jitter}");
     }
 
+    let drawn = Starts::Drawn { episodes: 2, seed: 1, jitter: 0.1, poi_jitter: 0.0 };
+    let mut trace = |episode| flotilla::trace(&config, &mut Cpu::default(), 2, &good, &drawn, episode);
+    trace(1).expect("it is the last");
+    assert!(matches!(trace(2), Err(Failure::NoEpisode { episode: 2, episodes: 2 })));
+
     // Configs built by hand are checked like files.
     let broken: [fn(&mut Config); 6] = [
         |config| config.policy.hidden = vec![3; 9],
@@ -223,7 +243,7 @@ fn a_processor_is_found() {
 #[test]
 fn errors_of_the_library_speak_of_no_flags() {
     fn walk(folder: &Path, found: &mut Vec<String>) {
-        for entry in std::fs::read_dir(folder).expect("a folder of sources") {
+        for entry in fs::read_dir(folder).expect("a folder of sources") {
             let path = entry.expect("its entries").path();
             if path.is_dir() {
                 if !path.ends_with("src/cli") {
@@ -231,7 +251,7 @@ fn errors_of_the_library_speak_of_no_flags() {
                 }
                 continue;
             }
-            let Ok(text) = std::fs::read_to_string(&path) else { continue };
+            let Ok(text) = fs::read_to_string(&path) else { continue };
             for error in text.split("#[error(").skip(1) {
                 let error = error.split(")]").next().unwrap_or_default();
                 let flag = error.split("--").skip(1).any(|rest| rest.starts_with(|c: char| c.is_ascii_lowercase()));
