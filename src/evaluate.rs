@@ -27,8 +27,8 @@ const TRACE_BYTES: usize = 1 << 26;
 pub enum Starts {
     /// One episode, from where the config says.
     Own,
-    /// So many episodes, every start moved by a uniform offset in `-jitter..jitter` on both axes, and every POI likewise by
-    /// `poi_jitter`, drawn from the seed. No training draws from where these are drawn, whatever its seed.
+    /// So many episodes, every start moved by a uniform offset in `-jitter..jitter` on both axes, and every POI
+    /// likewise by `poi_jitter`, drawn from the seed. No training draws from where these are drawn, whatever its seed.
     Drawn {
         /// Of each team.
         episodes: u32,

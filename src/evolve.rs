@@ -129,8 +129,8 @@ pub fn form_teams(key: Key, generation: usize, leaders: usize, teams: &mut [u32]
     }
 }
 
-/// Teams of one generation of a trial, `[teams][leaders]`: by [`form_teams`], or where all leaders share a policy, team `t`
-/// of policy `t`.
+/// Teams of one generation of a trial, `[teams][leaders]`: by [`form_teams`], or where all leaders share a policy, team
+/// `t` of policy `t`.
 pub fn teams_of(learning: &Learning, trial: usize, generation: usize, leaders: usize) -> Vec<u32> {
     let mut teams = one_policy_a_team(learning.population, leaders);
     if learning.sharing == Sharing::None {
@@ -163,8 +163,8 @@ fn shuffle_lanes<S: Simd>(simd: S, key: Key, order: &mut [u32]) {
     }
 }
 
-/// Places of one episode of a trial's generation, as a [`crate::backend::Group`] has them: where agents start, and if POIs
-/// move, where these are.
+/// Places of one episode of a trial's generation, as a [`crate::backend::Group`] has them: where agents start, and if
+/// POIs move, where these are.
 pub fn places(
     learning: &Learning,
     trial: usize,

@@ -1,8 +1,10 @@
-//! What programs need, in a few lines: train with a callback, play and trace given policies, step teams by hand, read runs.
+//! What programs need, in a few lines: train with a callback, play and trace given policies, step teams by hand, read
+//! runs.
 //!
-//! Everything here checks what it is given, and hands back plain arrays; their shapes are written `[teams][leaders][8]`, the
-//! last index moving fastest. Beneath are [`crate::trainer`], [`crate::evaluate`], [`crate::stepping`] and [`crate::record`].
-//! Runs that keep their files as they train, to be gone on with after anything, are [`crate::run`]'s.
+//! Everything here checks what it is given, and hands back plain arrays; their shapes are written
+//! `[teams][leaders][8]`, the last index moving fastest. Beneath are [`crate::trainer`], [`crate::evaluate`],
+//! [`crate::stepping`] and [`crate::record`]. Runs that keep their files as they train, to be gone on with after
+//! anything, are [`crate::run`]'s.
 
 use std::borrow::Cow;
 use std::ops::ControlFlow;
@@ -332,8 +334,8 @@ pub struct Played {
 }
 
 /// Plays teams of given policies, `[leaders][teams][parameters]`: team `t` is made of every leader's policy `t`. Where
-/// all leaders of a team share one, `[1][teams][parameters]` will do. A policy's parameters stand layer by layer, in each
-/// input by input with the bias last, in each unit by unit.
+/// all leaders of a team share one, `[1][teams][parameters]` will do. A policy's parameters stand layer by layer, in
+/// each input by input with the bias last, in each unit by unit.
 ///
 /// # Errors
 /// The config, the weights or the starts are wrong, or the backend fails.
@@ -431,8 +433,8 @@ pub fn trace(
     Ok(traced)
 }
 
-/// Teams to be stepped by given actions, all at the world's start; with a record, they can be scored, by Dt where that is
-/// the config's fitness.
+/// Teams to be stepped by given actions, all at the world's start; with a record, they can be scored, by Dt where that
+/// is the config's fitness.
 ///
 /// # Errors
 /// The config is wrong, or there may not be so many teams.

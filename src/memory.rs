@@ -1,8 +1,9 @@
 //! What a run takes in memory at its peak, told before it starts.
 //!
-//! Every array that grows with the run is counted where it lives: [`trainer`] tells what every run has, [`backend`] what
-//! episodes take. What does not grow is [`PROGRAM`]. Nothing else is as large: checkpoints and policies are written
-//! straight from the populations, or from one copy, see [`copies_checkpoint`]. A sweep keeps its batches to half of what is available.
+//! Every array that grows with the run is counted where it lives: [`trainer`] tells what every run has, [`backend`]
+//! what episodes take. What does not grow is [`PROGRAM`]. Nothing else is as large: checkpoints and policies are
+//! written straight from the populations, or from one copy, see [`copies_checkpoint`]. A sweep keeps its batches to
+//! half of what is available.
 
 use std::fs;
 use std::path::Path;
@@ -108,8 +109,8 @@ impl Peaks {
     }
 }
 
-/// Refuses a peak, so much of it for checkpoints, that does not fit in the memory that is available now; lets pass where the
-/// system does not tell.
+/// Refuses a peak, so much of it for checkpoints, that does not fit in the memory that is available now; lets pass
+/// where the system does not tell.
 ///
 /// # Errors
 /// There is less.

@@ -329,8 +329,8 @@ pub struct Reader<'a> {
     table: Option<Vec<Definition>>,
 }
 
-/// Declares a section of a config, and of its keys all that is to be known but what they allow: each entry makes a field,
-/// its documentation, and a function by the field's name that asks a [`Reader`] for the key.
+/// Declares a section of a config, and of its keys all that is to be known but what they allow: each entry makes a
+/// field, its documentation, and a function by the field's name that asks a [`Reader`] for the key.
 ///
 /// An entry is what the key means, without a full stop; the field; and the key's unit and its place in the paper, empty
 /// where it has none. A field whose key another part asks for has neither, and words of its own.
@@ -599,8 +599,8 @@ impl<'a> Asked<'_, 'a> {
     }
 
     /// A list of as many lists of numbers as `of`, another key, has items (any number where that is not known), or of
-    /// none, which is the default. `blame` tells what is wrong with lists whose numbers are allowed, each fault with its
-    /// list.
+    /// none, which is the default. `blame` tells what is wrong with lists whose numbers are allowed, each fault with
+    /// its list.
     pub fn lists<T: Number>(
         mut self,
         what: &str,

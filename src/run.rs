@@ -1,4 +1,5 @@
-//! Recorded runs, side by side: one trainer, and for each run its folder and its checkpoints. One run is a batch of one.
+//! Recorded runs, side by side: one trainer, and for each run its folder and its checkpoints. One run is a batch of
+//! one.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -309,8 +310,8 @@ impl Session {
         Ok(Ended::Done)
     }
 
-    /// Makes the generation that is played next the last of each run, or leaves it at an earlier one; gives the last of all.
-    /// What each then comes to is what a run of so many generations comes to.
+    /// Makes the generation that is played next the last of each run, or leaves it at an earlier one; gives the last of
+    /// all. What each then comes to is what a run of so many generations comes to.
     ///
     /// # Errors
     /// A config cannot be written.

@@ -1,7 +1,7 @@
 //! Estimates from trials, with what chance leaves open, and tests of differences.
 //!
-//! Trials of two arms with one seed are pairs: the same starts and, where sizes agree, the same first populations. Their
-//! differences are one sample, of which [`mean`] gives the interval and [`p_value`] the test.
+//! Trials of two arms with one seed are pairs: the same starts and, where sizes agree, the same first populations.
+//! Their differences are one sample, of which [`mean`] gives the interval and [`p_value`] the test.
 //!
 //! Whatever else has a mean and an error has them of an [`Average`].
 //!
@@ -46,8 +46,8 @@ impl Estimate {
 
 /// Mean, standard deviation and standard error of any number of values, gathered one by one.
 ///
-/// Values that are all alike come to exactly themselves, without any error; others to the same mean in any order, as long
-/// as their sum is exact, as that of shares in halves and quarters is.
+/// Values that are all alike come to exactly themselves, without any error; others to the same mean in any order, as
+/// long as their sum is exact, as that of shares in halves and quarters is.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Average {
     count: u32,
@@ -158,9 +158,9 @@ fn student(count: usize) -> StudentsT {
     StudentsT::new(0.0, 1.0, (count - 1) as f64).expect("two values leave a degree of freedom")
 }
 
-/// The mean of the first sample, less that of the second where there is one, with its bootstrap interval: bias-corrected
-/// and accelerated (BCa) over [`RESAMPLES`] samples, by one seed, so that the same values always have the same interval.
-/// None where a sample has fewer than two values.
+/// The mean of the first sample, less that of the second where there is one, with its bootstrap interval:
+/// bias-corrected and accelerated (BCa) over [`RESAMPLES`] samples, by one seed, so that the same values always have
+/// the same interval. None where a sample has fewer than two values.
 ///
 /// Where all values of each sample are alike, the interval has no width.
 pub fn bootstrap(samples: &[&[f64]]) -> Option<Estimate> {
@@ -221,8 +221,8 @@ pub struct Tested {
 
 /// Mann and Whitney's test, over all pairings of two samples; none where one is empty.
 ///
-/// The p is exact up to [`EXACT`] values: twice the smaller tail over all ways to deal the values out, ties as they are.
-/// Above, it is by the normal distribution, corrected for ties and continuity.
+/// The p is exact up to [`EXACT`] values: twice the smaller tail over all ways to deal the values out, ties as they
+/// are. Above, it is by the normal distribution, corrected for ties and continuity.
 pub fn rank_sum(one: &[f64], other: &[f64]) -> Option<Tested> {
     if one.is_empty() || other.is_empty() || !one.iter().chain(other).all(|value| value.is_finite()) {
         return None;
@@ -246,8 +246,8 @@ pub fn rank_sum(one: &[f64], other: &[f64]) -> Option<Tested> {
 
 /// Wilcoxon's signed-rank test of the differences between pairs; none of none.
 ///
-/// Pairs without a difference have no say in p; it is exact for up to [`EXACT`] others, over all their signs, and by the
-/// normal distribution above, as in [`rank_sum`]. A is over the pairs themselves.
+/// Pairs without a difference have no say in p; it is exact for up to [`EXACT`] others, over all their signs, and by
+/// the normal distribution above, as in [`rank_sum`]. A is over the pairs themselves.
 pub fn signed_rank(differences: &[f64]) -> Option<Tested> {
     if !differences.iter().all(|difference| difference.is_finite()) {
         return None;

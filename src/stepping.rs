@@ -1,7 +1,7 @@
 //! Step by step: teams whose leaders do what the caller says, on the CPU.
 //!
-//! A [`Stepper`] plays the episodes of [`crate::backend`], by the same kernels on the same vectors of teams, but in place
-//! of policies' answers it takes actions. Given a policy's own answers, it comes to the bits of
+//! A [`Stepper`] plays the episodes of [`crate::backend`], by the same kernels on the same vectors of teams, but in
+//! place of policies' answers it takes actions. Given a policy's own answers, it comes to the bits of
 //! [`Backend::trace`](crate::backend::Backend::trace).
 //!
 //! ```
@@ -151,7 +151,8 @@ impl Stepper {
         Stepper::at_level(Level::new(), world, teams, true)
     }
 
-    /// [`Stepper::new`] or [`Stepper::recording`], by a chosen instruction set (tests compare them; benches choose one).
+    /// [`Stepper::new`] or [`Stepper::recording`], by a chosen instruction set (tests compare them; benches choose
+    /// one).
     ///
     /// # Errors
     /// No team or more than [`MAX_POPULATION`], or there is no memory for them.
@@ -231,8 +232,8 @@ impl Stepper {
         Ok(())
     }
 
-    /// Puts the chosen teams, `[teams]`, at the world's start or where they are told to, as [`Stepper::reset_to`] does; the
-    /// others' places are not looked at, and they stay as they are.
+    /// Puts the chosen teams, `[teams]`, at the world's start or where they are told to, as [`Stepper::reset_to`] does;
+    /// the others' places are not looked at, and they stay as they are.
     ///
     /// # Errors
     /// Too few or too many choices or numbers, or a place that is not on the map.
@@ -243,9 +244,10 @@ impl Stepper {
         Ok(())
     }
 
-    /// Plays one step by what every leader is to do, `[teams][leaders][2]`: a turn, in parts of a half turn to the left, and
-    /// a speed, from -1 for standing still to 1 for the highest. Numbers beyond -1..1 are taken as -1 or 1. Where policies of the
-    /// world choose behaviours, these are still the actions: each behaviour comes to a turn of 0, ±0.25 or ±0.75 and a speed of
+    /// Plays one step by what every leader is to do, `[teams][leaders][2]`: a turn, in parts of a half turn to the
+    /// left, and a speed, from -1 for standing still to 1 for the highest. Numbers beyond -1..1 are taken as -1 or 1.
+    /// Where policies of the world choose behaviours, these are still the actions: each behaviour comes to a turn of 0,
+    /// ±0.25 or ±0.75 and a speed of
     /// -1 or 1, see [`crate::model::policy::choose`].
     ///
     /// A team that has played its last step stays as it is, whatever is asked of it, until it is reset.
@@ -271,14 +273,14 @@ impl Stepper {
         Ok(())
     }
 
-    /// What every leader senses where it is, `[teams][leaders][8]`: the density of POIs, then of agents, in four quadrants
-    /// around its heading, back right, front right, front left, back left.
+    /// What every leader senses where it is, `[teams][leaders][8]`: the density of POIs, then of agents, in four
+    /// quadrants around its heading, back right, front right, front left, back left.
     pub fn inputs(&self) -> &[f32] {
         &self.shown.inputs
     }
 
-    /// The agents near each POI after the last step, `[teams][pois][words]`, a bit an agent, 32 a word. A start counts for
-    /// nothing: before its first step a team is near none.
+    /// The agents near each POI after the last step, `[teams][pois][words]`, a bit an agent, 32 a word. A start counts
+    /// for nothing: before its first step a team is near none.
     pub fn near(&self) -> &[u32] {
         &self.shown.near
     }
@@ -293,7 +295,8 @@ impl Stepper {
         &self.shown.observed
     }
 
-    /// How many steps each team has played since its start, `[teams]`: after as many as the world's, its episode is over.
+    /// How many steps each team has played since its start, `[teams]`: after as many as the world's, its episode is
+    /// over.
     pub fn steps(&self) -> &[u32] {
         &self.shown.steps
     }

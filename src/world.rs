@@ -15,8 +15,8 @@ pub use crate::model::policy::{BEHAVIOURS, OUTPUTS};
 pub use crate::model::sense::INPUTS;
 pub use crate::model::{Constants, Variant};
 
-/// One world: constants, start positions of all agents (leaders first), POIs, how many agents each needs, and by what rule
-/// these observe.
+/// One world: constants, start positions of all agents (leaders first), POIs, how many agents each needs, and by what
+/// rule these observe.
 #[derive(Clone, Debug, PartialEq)]
 pub struct World {
     /// What kernels read.

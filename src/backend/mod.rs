@@ -51,8 +51,8 @@ pub fn weight_bytes(world: &World) -> u64 {
     (fours(world) * size_of::<[f32; FOUR]>()) as u64
 }
 
-/// Bytes that a GPU holds of a trial's populations, `[populations, slots, parameters]`, where it does: a buffer a population
-/// and one more, and every slot's parent.
+/// Bytes that a GPU holds of a trial's populations, `[populations, slots, parameters]`, where it does: a buffer a
+/// population and one more, and every slot's parent.
 pub fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {
     let [populations, population, parents] =
         [populations, 4 * slots * parameters, 4 * populations * slots].map(|count| count as u64);
@@ -64,7 +64,8 @@ pub fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {
 pub struct Group<'a> {
     /// The world that they play in.
     pub world: &'a World,
-    /// Start positions `[agents]`, leaders first; after them places of the POIs, `[pois]`, unless these are the world's.
+    /// Start positions `[agents]`, leaders first; after them places of the POIs, `[pois]`, unless these are the
+    /// world's.
     pub starts: &'a [Vec2],
     /// The policies.
     pub weights: Weights<'a>,
@@ -178,8 +179,8 @@ impl<'a> Group<'a> {
     }
 }
 
-/// What the policies of a group are, `[leaders][policies][parameters]`, or `[1][policies][parameters]` where all leaders
-/// choose from the same: each number 0 or of size 2^-30 to 2^20.
+/// What the policies of a group are, `[leaders][policies][parameters]`, or `[1][policies][parameters]` where all
+/// leaders choose from the same: each number 0 or of size 2^-30 to 2^20.
 #[derive(Clone, Copy, Debug)]
 pub enum Weights<'a> {
     /// In the host's memory.
@@ -365,8 +366,8 @@ pub trait Backend: Send {
     /// As for [`Backend::rollout`].
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError>;
 
-    /// Takes the populations of one trial, `[populations][slots][parameters]`, a leader's each or one for all, into memory of its own, to breed them there;
-    /// none where they had better stay on the host.
+    /// Takes the populations of one trial, `[populations][slots][parameters]`, a leader's each or one for all, into
+    /// memory of its own, to breed them there; none where they had better stay on the host.
     ///
     /// # Errors
     /// They were asked to be held here and do not fit, or the device failed.

@@ -222,8 +222,8 @@ fn generations(config: &Config, player: &mut Subject) -> Result<(f64, Profile), 
     Ok((seconds, Profile { generations, traffic: profile.traffic - before.traffic, ..profile }))
 }
 
-/// Seconds of one rollout of random policies, scored as in training, with the ceiling meanwhile; the mean G; and who was
-/// in reach of whom.
+/// Seconds of one rollout of random policies, scored as in training, with the ceiling meanwhile; the mean G; and who
+/// was in reach of whom.
 fn rollout(
     config: &Config,
     world: &World,

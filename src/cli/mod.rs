@@ -239,8 +239,8 @@ pub enum Error {
 impl Error {
     /// The process's exit code: 1 failed, 2 wrong usage, 75 stopped and ready to be resumed.
     ///
-    /// A value given by a flag is wrong usage wherever that is found: also one that does not fit the file or the machine
-    /// that it is used with. Where the file is wrong as well, the run failed.
+    /// A value given by a flag is wrong usage wherever that is found: also one that does not fit the file or the
+    /// machine that it is used with. Where the file is wrong as well, the run failed.
     pub fn exit_code(&self) -> u8 {
         match self {
             Error::Usage(_)
@@ -401,7 +401,8 @@ pub enum BackendChoice {
 /// Where populations are kept between generations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Breed {
-    /// With a GPU, in its memory from 1 MiB a trial on and where they fit (an estimate, not measured); else in the host's
+    /// With a GPU, in its memory from 1 MiB a trial on and where they fit (an estimate, not measured); else in the
+    /// host's
     Auto,
     /// In the host's memory
     Host,

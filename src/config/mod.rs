@@ -1,9 +1,10 @@
 //! The config: what an experiment is, with every default of the paper's calibration.
 //!
-//! A config is read from a file by [`Config::load`], or from text by [`Config::read`] where flags or a sweep change some
-//! of its keys. Each section is plain data beside its keys, and each key stands once, with its unit, its meaning, where the
-//! paper has it, what it allows and its default: those of a step's parts with these parts, in [`crate::model`], the others
-//! here. Everything wrong with a text is found in one pass and reported by line, see [`crate::reader`].
+//! A config is read from a file by [`Config::load`], or from text by [`Config::read`] where flags or a sweep change
+//! some of its keys. Each section is plain data beside its keys, and each key stands once, with its unit, its meaning,
+//! where the paper has it, what it allows and its default: those of a step's parts with these parts, in
+//! [`crate::model`], the others here. Everything wrong with a text is found in one pass and reported by line, see
+//! [`crate::reader`].
 
 use serde::Serialize;
 
@@ -147,8 +148,8 @@ impl Config {
         counts.map(|count| count as u64).iter().product::<u64>() * size_of::<f32>() as u64
     }
 
-    /// Asks for every key. A faulty number reads as the most that is allowed, a faulty list as none, so that what depends
-    /// on it is not blamed as well.
+    /// Asks for every key. A faulty number reads as the most that is allowed, a faulty list as none, so that what
+    /// depends on it is not blamed as well.
     fn ask(r: &mut Reader<'_>) -> Config {
         let (motion, start_speed) = Motion::read(r);
         let paradigm = Paradigm::read(r);

@@ -21,8 +21,8 @@ const _: () = {
 };
 
 section! {
-    /// `[world]`: where everything starts, how long an episode is, and who observes a POI. Positions are `[x, y]` in map
-    /// units, time is in seconds, angles in radians.
+    /// `[world]`: where everything starts, how long an episode is, and who observes a POI. Positions are `[x, y]` in
+    /// map units, time is in seconds, angles in radians.
     Domain = "world" {
         /// width and height; positions stay within 0 to these
         map: [f64; 2] = "units", "3.1",

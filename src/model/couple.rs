@@ -198,8 +198,8 @@ impl Rule {
         }
     }
 
-    /// Whether it fits so many words a set and POIs: it is of as many, no window starts before the first step, and no POI
-    /// waits for itself.
+    /// Whether it fits so many words a set and POIs: it is of as many, no window starts before the first step, and no
+    /// POI waits for itself.
     pub fn fits(&self, words: usize, pois: usize) -> bool {
         let fits = |len: usize, wanted: usize| len == 0 || len == wanted;
         fits(self.counted.len(), words)

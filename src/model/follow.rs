@@ -80,8 +80,8 @@ impl FollowConstants {
     }
 }
 
-/// Lane operations of meeting an agent within the attraction radius: 2 tests and their difference, 4 selections, 4 sums,
-/// 2 counts.
+/// Lane operations of meeting an agent within the attraction radius: 2 tests and their difference, 4 selections, 4
+/// sums, 2 counts.
 pub const INFLUENCE: u32 = SQUARED_DISTANCE + 3 + 4 + 4 + 2;
 /// That agent is a leader: counted.
 pub const SEEN: u32 = 1;
@@ -92,9 +92,9 @@ pub const FOLLOW: u32 = FORCE + INFLUENCED + STEER;
 const FORCE: u32 = 2 * (RECIP + 3) + 2 * (4 + 7 + FLUSH);
 /// Whether anything is near: the counts' sum and test, the nearest of 4 walls and its test, and joining them.
 const INFLUENCED: u32 = 2 + 3 + 1 + 1;
-/// Steering: the force's square and direction (3, an inverse root, 2), along and across (6), the largest turn to its side
-/// (2 and a rotation), whether the force lies within it, 4 selections of the heading, the speed ahead (2) and 3 selections
-/// of the speed, 2 tests of the force.
+/// Steering: the force's square and direction (3, an inverse root, 2), along and across (6), the largest turn to its
+/// side (2 and a rotation), whether the force lies within it, 4 selections of the heading, the speed ahead (2) and 3
+/// selections of the speed, 2 tests of the force.
 const STEER: u32 = 3 + RSQRT + 2 + 6 + 2 + ROTATE + WITHIN + 4 + 2 + 3 + 2;
 /// A test of the sine and its size, joined to one that is counted already.
 const WITHIN: u32 = 3;
@@ -200,8 +200,8 @@ pub fn sizes<S: Simd>(pull: &Pull<S>) -> (S::f32s, S::f32s) {
 /// No angle is needed: the force's direction is taken where it lies within the largest turn (by its sine or cosine),
 /// else the heading turns by that much, to the side of the force.
 ///
-/// A cosine near 1 cannot tell small angles apart, a sine near 1 cannot tell large ones: `BY_SINE` where the largest turn
-/// is small.
+/// A cosine near 1 cannot tell small angles apart, a sine near 1 cannot tell large ones: `BY_SINE` where the largest
+/// turn is small.
 #[inline(always)]
 pub fn steer<S: Simd, const BY_SINE: bool>(
     world: &Lanes<S>,
@@ -225,7 +225,8 @@ pub fn steer<S: Simd, const BY_SINE: bool>(
     } else {
         along.simd_ge(world.motion.max_turn_cos) & pulled
     };
-    // In this order of selection no heading is selected last: the compiler would make a masked store of that, which is slow.
+    // In this order of selection no heading is selected last: the compiler would make a masked store of that, which is
+    // slow.
     let next_x = select::<S>(select::<S>(hx, turned_x, pulled), ux, reached);
     let next_y = select::<S>(select::<S>(hy, turned_y, pulled), uy, reached);
     let ahead = select::<S>(world.motion.min_speed, force2 * inverse, along.simd_gt(zero));

@@ -105,8 +105,8 @@ pub const GRID: f32 = 262_144.0;
 /// Lane operations of a leader's turn: bounded, and rotated.
 pub const TURN: u32 = BOUND + SIN_COS + operations::ROTATE;
 /// Lane operations of an agent's move: the heading renormalized (its square 3, a scale 2, 2 products, 2 flushes), the
-/// speed brought up within 2 bounds, and on each axis a step (after one common product), snapped to the grid (4) and kept
-/// on the map.
+/// speed brought up within 2 bounds, and on each axis a step (after one common product), snapped to the grid (4) and
+/// kept on the map.
 pub const MOVE: u32 = 3 + 2 + 2 + 2 * FLUSH + (2 + 2 * BOUND) + 1 + 2 * (2 + 4 + BOUND);
 
 /// Heading components under this size (2^-30) count as 0.

@@ -1,5 +1,5 @@
-//! A leader's policy: a fully connected network with a bias and tanh in every layer (Sections 2.4 and 3.1), whose outputs
-//! are what it does, or choose among known behaviours.
+//! A leader's policy: a fully connected network with a bias and tanh in every layer (Sections 2.4 and 3.1), whose
+//! outputs are what it does, or choose among known behaviours.
 
 use fearless_simd::{Simd, prelude::*};
 
@@ -153,8 +153,8 @@ const CHOICE: u32 = 4 * 3 + 2 * (3 * 3 + 3 + 2) + 8;
 
 /// What the most wanted behaviour is as a direct answer: the first of the largest `wanted`, each in -1..1.
 ///
-/// Behaviours: hold; towards and away from the quadrant of most POIs; towards and away from that of most agents, the first
-/// where several are alike. Where nothing is sensed, straight ahead.
+/// Behaviours: hold; towards and away from the quadrant of most POIs; towards and away from that of most agents, the
+/// first where several are alike. Where nothing is sensed, straight ahead.
 #[inline(always)]
 pub fn choose<S: Simd>(inputs: &[S::f32s; INPUTS], wanted: &[S::f32s; BEHAVIOURS]) -> [S::f32s; OUTPUTS] {
     let simd = wanted[0].token();

@@ -97,8 +97,8 @@ impl SenseConstants {
 }
 
 /// Lane operations of a leader that senses an entity: the range's test and selection, the quadrant's 4 tests and what
-/// joins them (4), 2 selections by the side and 4 by the front, 4 sums; and the density: a root, scaled and taken from 1,
-/// or an inverse root of at least 1.
+/// joins them (4), 2 selections by the side and 4 by the front, 4 sums; and the density: a root, scaled and taken from
+/// 1, or an inverse root of at least 1.
 pub fn operations(density: Density) -> u32 {
     let density = match density {
         Density::Linear => ROOT + 2,
@@ -122,8 +122,8 @@ pub fn density<S: Simd, const DENSITY: u32>(world: &Lanes<S>, range2: S::f32s, d
     only::<S>(density, d2.simd_le(range2))
 }
 
-/// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant, in the order of the policy's inputs:
-/// back-right, front-right, front-left, back-left.
+/// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant, in the order of the policy's
+/// inputs: back-right, front-right, front-left, back-left.
 ///
 /// The quadrant is read off the signs of the offset along the heading and to its left; a tie goes to the quadrant
 /// counterclockwise of it, so that each boundary belongs to exactly one quadrant.

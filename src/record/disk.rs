@@ -104,8 +104,8 @@ impl Disk {
         })
     }
 
-    /// Writes a file that the user named, whole or not at all; a link to a file is followed. What is no file (a device, a
-    /// pipe, `/dev/stdout`) is written to as it stands.
+    /// Writes a file that the user named, whole or not at all; a link to a file is followed. What is no file (a device,
+    /// a pipe, `/dev/stdout`) is written to as it stands.
     ///
     /// # Errors
     /// What the system says.

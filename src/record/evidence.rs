@@ -1,4 +1,5 @@
-//! What was seen on a machine: the small file that `flotilla verify --report` writes. `docs/evidence.md` is made of such.
+//! What was seen on a machine: the small file that `flotilla verify --report` writes. `docs/evidence.md` is made of
+//! such.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,9 +1,9 @@
 //! `metrics.csv`: how every trial came on, generation by generation.
 //!
-//! One line a trial and generation, generation by generation and in each trial by trial. G is in 0..1; `seconds` is
-//! the time trained until the line was complete, earlier sessions of a resumed run included. Where the config has stages,
-//! a last column `stage` tells of which a generation is, from 0: G is of that stage's POIs. All but `seconds` is the
-//! same bits on every backend.
+//! One line a trial and generation, generation by generation and in each trial by trial. G is in 0..1; `seconds` is the
+//! time trained until the line was complete, earlier sessions of a resumed run included. Where the config has stages, a
+//! last column `stage` tells of which a generation is, from 0: G is of that stage's POIs. All but `seconds` is the same
+//! bits on every backend.
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};

@@ -298,8 +298,8 @@ impl Curves {
 /// A share in 0..1 with the ends of its interval.
 pub type Interval = [f64; 3];
 
-/// One value with its interval for each value of each of several keys, beside that of what was not varied, in a panel for
-/// each of several settings.
+/// One value with its interval for each value of each of several keys, beside that of what was not varied, in a panel
+/// for each of several settings.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Dots {
     /// Above everything.

@@ -1,5 +1,5 @@
-//! What a sweep came to, as figures: `final`, `reach` and `curves`, or where keys are varied `final` alone, each as SVG,
-//! PNG and PDF.
+//! What a sweep came to, as figures: `final`, `reach` and `curves`, or where keys are varied `final` alone, each as
+//! SVG, PNG and PDF.
 
 use std::path::Path;
 
@@ -69,8 +69,8 @@ pub fn draw(
     Ok((names, None))
 }
 
-/// The best team's G in the last generation for every value of every varied key, with a panel for each combination of the
-/// grid.
+/// The best team's G in the last generation for every value of every varied key, with a panel for each combination of
+/// the grid.
 fn dots(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>]) -> Result<Dots, String> {
     let (varied, grid): (Vec<usize>, Vec<usize>) = (0..sweep.axes.len()).partition(|&axis| sweep.axes[axis].varied);
     let rows: usize = varied.iter().map(|&axis| sweep.axes[axis].values.len() - 1).sum();

@@ -636,8 +636,8 @@ impl Gpu {
         entry: &str,
         layout: &Bindings,
     ) -> Result<wgpu::ComputePipeline, DeviceError> {
-        // SAFETY: the loops of the crate's own shaders end, their bindings are those of their layouts, and their indices
-        // are in bounds for groups and plans that were checked, as the checked builds in the tests show.
+        // SAFETY: the loops of the crate's own shaders end, their bindings are those of their layouts, and their
+        // indices are in bounds for groups and plans that were checked, as the checked builds in the tests show.
         #[expect(unsafe_code, reason = "shaders of the crate's own are compiled without bounds checks")]
         unsafe {
             self.pipeline(label, wgsl, entry, layout)
@@ -647,9 +647,9 @@ impl Gpu {
     /// Compiles an entry point under the device's pass. Workgroup memory starts undefined unless `checked`.
     ///
     /// # Safety
-    /// Unless `checked`, nothing keeps the shader within its buffers: its indices must be in bounds, its loops must end, it
-    /// must divide no integer by zero, and read no workgroup memory that it did not write. Its bindings must be those of
-    /// the layout, `checked` or not.
+    /// Unless `checked`, nothing keeps the shader within its buffers: its indices must be in bounds, its loops must
+    /// end, it must divide no integer by zero, and read no workgroup memory that it did not write. Its bindings must be
+    /// those of the layout, `checked` or not.
     ///
     /// # Errors
     /// The shader leaves the exact core, or asks for more than the device allows; or the driver refuses it.

@@ -407,8 +407,9 @@ fn parts(statement: &mut Statement) -> Option<Parts<'_>> {
 
 /// Every operation of a module outside the exact core, as `function: operation`; empty if it is sound.
 ///
-/// The core: f32 `+ - *`, negation, comparison, `select`, `abs`, `floor`, bit casts; all integer arithmetic; conversions
-/// between u32, i32 and f32; vectors of these, loads, stores, integer atomics, calls, control flow, workgroup barriers.
+/// The core: f32 `+ - *`, negation, comparison, `select`, `abs`, `floor`, bit casts; all integer arithmetic;
+/// conversions between u32, i32 and f32; vectors of these, loads, stores, integer atomics, calls, control flow,
+/// workgroup barriers.
 pub fn foreign_operations(module: &Module) -> Vec<String> {
     match validate(module) {
         Ok(info) => foreign_in(module, &info),
