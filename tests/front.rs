@@ -84,7 +84,7 @@ fn training_comes_to_what_a_run_comes_to() {
     let (run, path) = (folder.path().join("0"), folder.path().join("0/metrics.csv"));
     let rows = fs::read_to_string(&path).expect("the run has metrics");
     let mut lines: Vec<&str> = rows.lines().collect();
-    let mut read = |lines: &[&str]| {
+    let read = |lines: &[&str]| {
         fs::write(&path, lines.join("\n") + "\n").expect("the folder can be written");
         Trained::read(&run).expect_err("rows are not as they were").to_string()
     };
@@ -206,7 +206,7 @@ fn what_is_wrong_is_told() {
     }
 
     let drawn = Starts::Drawn { episodes: 2, seed: 1, jitter: 0.1, poi_jitter: 0.0 };
-    let mut trace = |episode| flotilla::trace(&config, &mut Cpu::default(), 2, &good, &drawn, episode);
+    let trace = |episode| flotilla::trace(&config, &mut Cpu::default(), 2, &good, &drawn, episode);
     trace(1).expect("it is the last");
     assert!(matches!(trace(2), Err(Failure::NoEpisode { episode: 2, episodes: 2 })));
 

@@ -64,7 +64,7 @@ pub struct Args {
     loss: Loss,
 
     /// Run shard I of N, dealt out by cost; else what a Slurm array or a Kubernetes indexed job says
-    #[arg(long, value_name = "I/N", help_heading = SCALE_OUT)]
+    #[arg(long, value_name = "I/N", allow_hyphen_values = true, help_heading = SCALE_OUT)]
     shard: Option<Shard>,
     /// Put the results of all shards together and say which points are missing
     #[arg(long, conflicts_with_all = ["shard", "resume", "force", "list", "slurm"], help_heading = SCALE_OUT)]

@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 
 use super::checkpoint::{self, Checkpoint};
 use super::disk::Disk;
-use super::metrics;
+use super::metrics::{self, RowsError};
 use super::{RecordError, hex, policies, read_text};
 use crate::config::{Config, MAX_STAGES};
 use crate::file;
@@ -283,9 +283,10 @@ impl Folder {
         match Run::read(&self.file(RUN)) {
             Ok(run) => found.run = Some(run),
             Err(RecordError::Read { error, .. }) if error.kind() == ErrorKind::NotFound => {}
-            Err(error) => found.notes.push(Note::WrittenAnew(error.to_string())),
+            Err(error @ RecordError::Damaged { .. }) => found.notes.push(Note::WrittenAnew(error.to_string())),
+            Err(error) => return Err(error),
         }
-        found.finished = found.run.as_ref().and_then(|run| self.finished(run, config));
+        found.finished = found.run.as_ref().map_or(Ok(None), |run| self.finished(run, config))?;
         if found.finished.is_some() {
             return Ok(());
         }
@@ -394,7 +395,10 @@ impl Folder {
         let mut story = Story { first: vec![], last: vec![] };
         let mut count = 0;
         for row in &mut rows {
-            let (row, _) = row.map_err(|error| RecordError::damaged(&path, error))?;
+            let (row, _) = row.map_err(|error| match error {
+                RowsError::Read(error) => RecordError::read(&path)(error),
+                wrong => RecordError::damaged(&path, wrong),
+            })?;
             if (row.generation, row.trial) != (count / trials, count % trials) {
                 let (generation, trial) = (count / trials, count % trials);
                 return Err(damaged(format!("line {} is not trial {trial}, generation {generation}", count + 2)));
@@ -416,14 +420,20 @@ impl Folder {
     }
 
     /// What a run that is done came to; none where its files are not all as it left them.
-    fn finished(&self, run: &Run, config: &Config) -> Option<Story> {
-        let digest = run.digest.as_ref().filter(|_| run.state == Status::Done)?;
+    fn finished(&self, run: &Run, config: &Config) -> Result<Option<Story>, RecordError> {
+        let Some(digest) = run.digest.as_ref().filter(|_| run.state == Status::Done) else { return Ok(None) };
         if run.generations != config.learning.generations + 1 {
-            return None;
+            return Ok(None);
         }
-        let policies = policies::read_all(&self.file(POLICIES), config).ok()?;
-        let (story, found) = self.digest(config, &policies).ok()?;
-        (found == *digest).then_some(story)
+        let policies = policies::read_all(&self.file(POLICIES), config);
+        match policies.and_then(|policies| self.digest(config, &policies)) {
+            Ok((story, found)) => Ok((found == *digest).then_some(story)),
+            // What is gone or damaged is made again; what cannot be read now may be whole.
+            Err(RecordError::Read { path, error }) if error.kind() != ErrorKind::NotFound => {
+                Err(RecordError::Read { path, error })
+            }
+            Err(_) => Ok(None),
+        }
     }
 }
 
