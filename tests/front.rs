@@ -188,6 +188,8 @@ fn what_is_wrong_is_told() {
     assert!(matches!(play(&config, 0, &[], Starts::Own), Err(Failure::Teams(0))));
     assert!(matches!(play(&config, usize::MAX, &good, Starts::Own), Err(Failure::Teams(_))));
     assert!(matches!(play(&config, 2, &good[1..], Starts::Own), Err(Failure::Weights { teams: 2, .. })));
+    let more = [&good[..], &[0.5]].concat();
+    assert!(matches!(play(&config, 2, &more, Starts::Own), Err(Failure::Weights { teams: 2, .. })));
     assert!(matches!(play(&config, 5, &[], Starts::Own), Err(Failure::Weights { found: 0, .. })));
     for (bad, fine) in [(f32::NAN, false), (f32::INFINITY, false), (2e6, false), (1e-20, true), (-0.0, true)] {
         let mut weights = good.clone();
