@@ -15,8 +15,8 @@
 //   decide     a leader's policy
 //
 // Neighbouring threads play the same agent of neighbouring teams: they do the same, read neighbouring weights, and are
-// often all out of reach of the same agent. Leaders come first, followers start at the next multiple of ROLE threads, so
-// that the two rarely share a warp.
+// often all out of reach of the same agent. Leaders come first, followers start at the next multiple of ROLE threads,
+// so that the two rarely share a warp.
 
 const ROLE: u32 = 32u;
 

@@ -87,7 +87,8 @@ fn steer(pull: Pull, sizes: vec2<f32>, hx: f32, hy: f32, speed: f32) -> Course {
     let sine = select(0.0 - world.max_turn_sin, world.max_turn_sin, across >= 0.0);
     let turned = rotate(hx, hy, world.max_turn_cos, sine);
     let pulled = force2 > 0.0;
-    // A cosine near 1 cannot tell small angles apart, a sine near 1 cannot tell large ones. Without a force, `along` is 0.
+    // A cosine near 1 cannot tell small angles apart, a sine near 1 cannot tell large ones. Without a force, `along` is
+    // 0.
     var reached = along >= world.max_turn_cos && pulled;
     if variant.by_sine != 0u {
         reached = along > 0.0 && abs(across) <= world.max_turn_sin;

@@ -13,8 +13,8 @@ struct Packed {
     // Words taken, more than `room` if they did not fit.
     used: atomic<u32>,
     room: u32,
-    // Of each task a table `[teams + 1]` of where its teams' sets start and end, and where that is asked for the leaders
-    // that followers saw most, `[words][teams]`. After all that the sets, `[rows][pois][words]` of each team.
+    // Of each task a table `[teams + 1]` of where its teams' sets start and end, and where that is asked for the
+    // leaders that followers saw most, `[words][teams]`. After all that the sets, `[rows][pois][words]` of each team.
     words: array<u32>,
 }
 
@@ -26,8 +26,8 @@ struct Packed {
 var<workgroup> rows: array<atomic<u32>, TEAMS>;
 var<workgroup> homes: array<u32, TEAMS>;
 
-// Goes through the sets of one POI of one team and returns how many are kept. Unless `home` is NOWHERE, they go there, and
-// rows up to `all` are filled with empty sets.
+// Goes through the sets of one POI of one team and returns how many are kept. Unless `home` is NOWHERE, they go there,
+// and rows up to `all` are filled with empty sets.
 fn keep(task: Task, sizes: Sizes, team: u32, poi: u32, home: u32, all: u32) -> u32 {
     let row = sizes.pois * sizes.words * task.teams;
     let first = task.sets + poi * sizes.words * task.teams + team;

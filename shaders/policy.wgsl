@@ -11,8 +11,8 @@ fn activate(sum: f32) -> f32 {
 // Behaviours to choose among: hold, towards POIs, away from POIs, towards agents, away from agents.
 const BEHAVIOURS: u32 = 5u;
 
-// The turn to the middle of the quadrant of most, in half turns to the left, or to the one opposite; straight ahead where
-// there is nothing.
+// The turn to the middle of the quadrant of most, in half turns to the left, or to the one opposite; straight ahead
+// where there is nothing.
 fn quadrant(densities: vec4<f32>, away: bool) -> f32 {
     var most = densities.x;
     var turn = -0.75;

@@ -89,8 +89,8 @@ fn breed(
 
 const TILE: u32 = 32u;
 
-// Weights of some teams' leaders, `[leaders][teams][parameters]`, rows apart by one more word so that columns spread over
-// all banks.
+// Weights of some teams' leaders, `[leaders][teams][parameters]`, rows apart by one more word so that columns spread
+// over all banks.
 var<workgroup> tile: array<f32, TILE * (TILE + 1u)>;
 
 // A weight of one of the leaders gathered.

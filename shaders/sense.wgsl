@@ -12,8 +12,8 @@ fn density(range2: f32, dx: f32, dy: f32) -> f32 {
     return select(0.0, density, d2 <= range2);
 }
 
-// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant, in the order of the policy's inputs:
-// back-right, front-right, front-left, back-left.
+// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant, in the order of the policy's
+// inputs: back-right, front-right, front-left, back-left.
 //
 // The quadrant is read off the signs of the offset along the heading and to its left; a tie goes to the quadrant
 // counterclockwise of it, so that each boundary belongs to exactly one quadrant.

@@ -1,8 +1,8 @@
 //! What a layout gives without any learning: a team that goes straight ahead, and the best of as many random teams as
 //! evolution evaluates.
 //!
-//! Both are played by a backend like any team, from the starts of the trial that they are held against. Random teams are
-//! drawn as generation 0 draws policies, by a purpose of their own, so that no result of a training changes.
+//! Both are played by a backend like any team, from the starts of the trial that they are held against. Random teams
+//! are drawn as generation 0 draws policies, by a purpose of their own, so that no result of a training changes.
 
 use std::cell::RefCell;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};

@@ -99,7 +99,8 @@ impl Credit {
         self.count_observed()
     }
 
-    /// Every fitness of every leader. The episode must be one of `world`, played with all scores or the record as a need.
+    /// Every fitness of every leader. The episode must be one of `world`, played with all scores or the record as a
+    /// need.
     pub fn all(&mut self, episode: &Episode<'_>, world: &World) -> Scores {
         let leaders = world.leaders();
         let mut by = |fitness| {
@@ -294,8 +295,8 @@ impl Credit {
 }
 
 /// Which leaders lead each follower at each step, laid out as the sights are, `[steps][followers][words of leaders]`:
-/// of those that the follower saw at the steps that [count](crate::world::Led), the one that it saw at most, ties to the
-/// lower index, or all.
+/// of those that the follower saw at the steps that [count](crate::world::Led), the one that it saw at most, ties to
+/// the lower index, or all.
 pub fn lead(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
     let (followers, words) = (world.followers(), world.leader_words());
     let (steps, Led { within, by }) = (sights.len() / (followers * words).max(1), world.led);
@@ -352,8 +353,8 @@ impl Replay<'_> {
         world.rule.count((0..words).map(|word| stay(word, sets.get(first + word))))
     }
 
-    /// At which step each POI is observed, where it has `enough` agents after one, which is asked for the steps that are
-    /// `worth` asking among those at which the rule lets it be.
+    /// At which step each POI is observed, where it has `enough` agents after one, which is asked for the steps that
+    /// are `worth` asking among those at which the rule lets it be.
     fn play(
         &self,
         observed_at: &mut Vec<u32>,

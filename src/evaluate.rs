@@ -9,7 +9,7 @@ use glam::Vec2;
 use crate::backend::{Backend, BackendError, Group, Moment, Need};
 use crate::credit::Credit;
 use crate::evolve::{self, Key, Purpose};
-use crate::statistics;
+use crate::statistics::{self, Estimate};
 use crate::world::World;
 
 pub use crate::evolve::one_policy_a_team;
@@ -27,9 +27,18 @@ const TRACE_BYTES: usize = 1 << 26;
 pub enum Starts {
     /// One episode, from where the config says.
     Own,
-    /// So many episodes, every start moved by a uniform offset in `-jitter..jitter` on both axes, and every POI likewise by
-    /// `poi_jitter`, drawn from the seed. No training draws from where these are drawn, whatever its seed.
-    Drawn { episodes: u32, seed: u64, jitter: f64, poi_jitter: f64 },
+    /// So many episodes, every start moved by a uniform offset in `-jitter..jitter` on both axes, and every POI
+    /// likewise by `poi_jitter`, drawn from the seed. No training draws from where these are drawn, whatever its seed.
+    Drawn {
+        /// Of each team.
+        episodes: u32,
+        /// What they are drawn from.
+        seed: u64,
+        /// Of agents, in units.
+        jitter: f64,
+        /// Of POIs, in units.
+        poi_jitter: f64,
+    },
 }
 
 impl Starts {
@@ -73,9 +82,11 @@ pub struct Tally {
 /// Mean, spread and what the mean would be over all episodes there could be, of a [`Tally`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spread {
+    /// Over episodes.
     pub mean: f64,
-    /// Sample standard deviation over episodes, and the 95 % interval of the mean ([`statistics::mean`]'s); none of one episode.
+    /// Sample standard deviation over episodes; none of one.
     pub deviation: Option<f64>,
+    /// The 95 % interval of the mean ([`statistics::mean`]'s); none of one episode.
     pub interval: Option<[f64; 2]>,
 }
 
@@ -102,12 +113,9 @@ impl Tally {
             (squares as f64 / (count * (count - 1.0))).sqrt() / unit
         });
         let interval = deviation.map(|deviation| {
-            let half = match deviation {
-                // Of values that are all alike, as many may be off by one part as could have gone unseen.
-                0.0 => statistics::share(0, self.count as usize).map_or(0.0, |share| share.high) / unit,
-                deviation => statistics::reach(self.count as usize) * deviation / count.sqrt(),
-            };
-            [(mean - half).max(0.0), (mean + half).min(most as f64)]
+            let error = deviation / count.sqrt();
+            let Estimate { low, high, .. } = statistics::interval(mean, error, self.count as usize, 1.0 / unit);
+            [low.max(0.0), high.min(most as f64)]
         });
         Spread { mean, deviation, interval }
     }
@@ -116,8 +124,11 @@ impl Tally {
 /// What teams came to over all episodes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Evaluation {
+    /// Of each team.
     pub episodes: usize,
+    /// Of a team.
     pub leaders: usize,
+    /// Of the world.
     pub pois: usize,
     /// POIs observed, `[teams]`.
     pub observed: Vec<Tally>,

@@ -41,15 +41,21 @@ const WIDEST: usize = 16;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Purpose {
+    /// The weights that a run starts from.
     Weights = 1,
+    /// Which policies play together, [`form_teams`].
     Teams = 2,
+    /// Agents' starts in training, [`jitter_starts`].
     Starts = 3,
+    /// Which policies become parents, [`draw_parents`].
     Tournament = 4,
+    /// Which weights change, and by how much, [`mutate`].
     Mutation = 5,
     /// Weights of random teams that evolution is held against.
     Baseline = 6,
     /// Starts that teams are evaluated from, not trained.
     HeldOut = 7,
+    /// POIs' places in training, [`jitter_pois`].
     Pois = 8,
     /// Places of POIs that teams are evaluated at, not trained.
     HeldOutPois = 9,
@@ -123,8 +129,8 @@ pub fn form_teams(key: Key, generation: usize, leaders: usize, teams: &mut [u32]
     }
 }
 
-/// Teams of one generation of a trial, `[teams][leaders]`: by [`form_teams`], or where all leaders share a policy, team `t`
-/// of policy `t`.
+/// Teams of one generation of a trial, `[teams][leaders]`: by [`form_teams`], or where all leaders share a policy, team
+/// `t` of policy `t`.
 pub fn teams_of(learning: &Learning, trial: usize, generation: usize, leaders: usize) -> Vec<u32> {
     let mut teams = one_policy_a_team(learning.population, leaders);
     if learning.sharing == Sharing::None {
@@ -157,8 +163,8 @@ fn shuffle_lanes<S: Simd>(simd: S, key: Key, order: &mut [u32]) {
     }
 }
 
-/// Places of one episode of a trial's generation, as a [`crate::backend::Group`] has them: where agents start, and if POIs
-/// move, where these are.
+/// Places of one episode of a trial's generation, as a [`crate::backend::Group`] has them: where agents start, and if
+/// POIs move, where these are.
 pub fn places(
     learning: &Learning,
     trial: usize,
@@ -350,9 +356,11 @@ pub struct Misfit(String);
 pub struct Breeding<'a> {
     /// The plan, `[populations][slots]`, see [`draw_parents`].
     pub parents: &'a [u32],
-    /// The trial's key of [`Purpose::Mutation`], and the generation to draw for.
+    /// The trial's key of [`Purpose::Mutation`].
     pub key: Key,
+    /// The generation that ends.
     pub generation: usize,
+    /// By which a weight mutates.
     pub learning: &'a Learning,
 }
 
@@ -404,11 +412,13 @@ impl Breeding<'_> {
 pub struct Offspring<'a> {
     /// Of purpose [`Purpose::Mutation`].
     pub key: Key,
-    /// The generation that ends, and the population.
+    /// The generation that ends.
     pub generation: usize,
+    /// Its place among the trial's.
     pub population: usize,
-    /// The first of the slots, and each one's entry of the plan of [`draw_parents`].
+    /// The first of the slots.
     pub first: usize,
+    /// Each slot's entry of the plan of [`draw_parents`].
     pub parents: &'a [u32],
     /// `[policies + 1][parameters]`.
     pub policies: &'a [f32],

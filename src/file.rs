@@ -24,10 +24,13 @@ pub fn open(path: &Path) -> io::Result<File> {
 /// Why a text could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum TextError {
+    /// It cannot be read.
     #[error(transparent)]
     Read(#[from] io::Error),
+    /// It is larger than so many bytes.
     #[error("it is larger than {0} bytes, the most that such a file may have")]
     TooLarge(u64),
+    /// This line, from 1, is not UTF-8.
     #[error("line {0} is not UTF-8 text")]
     NotText(usize),
 }

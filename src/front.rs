@@ -1,8 +1,10 @@
-//! What programs need, in a few lines: train with a callback, play and trace given policies, step teams by hand, read runs.
+//! What programs need, in a few lines: train with a callback, play and trace given policies, step teams by hand, read
+//! runs.
 //!
-//! Everything here checks what it is given, and hands back plain arrays; their shapes are written `[teams][leaders][8]`, the
-//! last index moving fastest. Beneath are [`crate::trainer`], [`crate::evaluate`], [`crate::stepping`] and [`crate::record`].
-//! Runs that keep their files as they train, to be gone on with after anything, are [`crate::run`]'s.
+//! Everything here checks what it is given, and hands back plain arrays; their shapes are written
+//! `[teams][leaders][8]`, the last index moving fastest. Beneath are [`crate::trainer`], [`crate::evaluate`],
+//! [`crate::stepping`] and [`crate::record`]. Runs that keep their files as they train, to be gone on with after
+//! anything, are [`crate::run`]'s.
 
 use std::borrow::Cow;
 use std::ops::ControlFlow;
@@ -41,34 +43,78 @@ pub enum Failure {
     /// A number that no config file could hold.
     #[error("the config cannot be written down: {0}")]
     Unwritten(String),
+    /// The machine has less memory than a training takes.
     #[error(transparent)]
     TooLittle(#[from] TooLittle),
+    /// The system gives no memory for this.
     #[error("there is no memory for {what}, {bytes} bytes")]
-    Memory { what: &'static str, bytes: u128 },
+    Memory {
+        /// What it is for.
+        what: &'static str,
+        /// How much was asked for.
+        bytes: u128,
+    },
+    /// Episodes could not be played.
     #[error(transparent)]
     Backend(#[from] BackendError),
+    /// No team, or more than there may be.
     #[error("{0} teams; there may be 1 to {MAX_POPULATION}")]
     Teams(usize),
+    /// Too few or too many weights for the teams.
     #[error(
         "{found} weights for {teams} teams; [leaders][teams][parameters] are [{leaders}][{teams}][{parameters}], or \
          [1][{teams}][{parameters}] where leaders share a policy"
     )]
-    Weights { found: usize, leaders: usize, teams: usize, parameters: usize },
+    Weights {
+        /// How many were given.
+        found: usize,
+        /// Of a team.
+        leaders: usize,
+        /// How many were asked for.
+        teams: usize,
+        /// Weights of a policy.
+        parameters: usize,
+    },
+    /// A weight that no policy may have.
     #[error(
         "weight {parameter} of the policy of leader {leader} in team {team} is {value}, allowed is a size up to {MAX_WEIGHT}"
     )]
-    Weight { leader: usize, team: usize, parameter: usize, value: f32 },
+    Weight {
+        /// Its place in the team.
+        leader: usize,
+        /// From 0.
+        team: usize,
+        /// Its place in the policy.
+        parameter: usize,
+        /// What was given.
+        value: f32,
+    },
+    /// Starts that cannot be drawn.
     #[error(
         "{episodes} episodes from starts moved by up to {jitter}; there may be 1 to {MAX_EPISODES}, and a jitter from 0 on"
     )]
-    Starts { episodes: u32, jitter: f64 },
+    Starts {
+        /// Of each team.
+        episodes: u32,
+        /// In units.
+        jitter: f64,
+    },
+    /// An episode that [`Starts`] do not have.
     #[error("episode {episode} of {episodes} (they count from 0)")]
-    NoEpisode { episode: usize, episodes: usize },
+    NoEpisode {
+        /// The one asked for, from 0.
+        episode: usize,
+        /// How many they have.
+        episodes: usize,
+    },
+    /// Teams could not be made.
     #[error(transparent)]
     Step(#[from] StepError),
+    /// A run's folder could not be read.
     #[cfg(feature = "report")]
     #[error(transparent)]
     Run(#[from] runs::ReadError),
+    /// A run's files could not be read or written.
     #[cfg(feature = "record")]
     #[error(transparent)]
     Record(#[from] RecordError),
@@ -81,6 +127,7 @@ pub enum Processor {
     /// A GPU where there is one that can, else the CPU.
     #[default]
     Auto,
+    /// The CPU.
     Cpu,
     /// A GPU that is no software renderer.
     Gpu,
@@ -91,6 +138,7 @@ pub enum Processor {
 /// What was found to play on besides the CPU.
 #[cfg(feature = "gpu")]
 pub struct Found {
+    /// The GPU, opened.
     pub gpu: Option<GpuEpisodes>,
     /// Why a GPU that is there was passed over.
     pub passed_over: Option<DeviceError>,
@@ -150,6 +198,7 @@ pub fn on_gpu(backend: GpuEpisodes) -> Player {
 /// A generation of all trials that has been played, its champions too.
 #[derive(Clone, Copy, Debug)]
 pub struct Generation<'a> {
+    /// Which one, from 0, the random start.
     pub generation: usize,
     /// The last that there will be.
     pub last: usize,
@@ -162,10 +211,11 @@ pub struct Generation<'a> {
 pub struct Trained {
     /// What was trained; where the training was stopped, of fewer generations.
     pub config: Config,
-    /// G of each generation's best and mean team, and of the team of every population's best policy, in 0..1:
-    /// `[trials][generations + 1]`, the random start first.
+    /// G of each generation's best team, in 0..1: `[trials][generations + 1]`, the random start first.
     pub best_g: Vec<f64>,
+    /// The mean of a generation's teams, likewise.
     pub mean_g: Vec<f64>,
+    /// The team of every population's best policy, likewise.
     pub champion_g: Vec<f64>,
     /// The last generation's policies, best first in each population: `[trials]` of `[leaders][policies][parameters]`.
     pub policies: Vec<Vec<f32>>,
@@ -269,20 +319,23 @@ pub fn train(
 /// What teams scored: of several episodes, means.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Played {
-    /// POIs observed, `[teams]`, and these over all POIs.
+    /// POIs observed, `[teams]`.
     pub observed: Vec<f64>,
+    /// Share of the POIs observed, in 0..1, `[teams]`.
     pub g: Vec<f32>,
-    /// `[teams][leaders]`.
+    /// D, `[teams][leaders]`.
     pub d: Vec<f32>,
+    /// Df, likewise.
     pub df: Vec<f32>,
+    /// D++, likewise.
     pub dpp: Vec<f32>,
-    /// Only where it is the config's fitness, else empty: it takes a record of who was seen at every step.
+    /// Dt, likewise, where it is the config's fitness, else empty: it takes a record of who was seen at every step.
     pub dt: Vec<f32>,
 }
 
 /// Plays teams of given policies, `[leaders][teams][parameters]`: team `t` is made of every leader's policy `t`. Where
-/// all leaders of a team share one, `[1][teams][parameters]` will do. A policy's parameters stand layer by layer, in each
-/// input by input with the bias last, in each unit by unit.
+/// all leaders of a team share one, `[1][teams][parameters]` will do. A policy's parameters stand layer by layer, in
+/// each input by input with the bias last, in each unit by unit.
 ///
 /// # Errors
 /// The config, the weights or the starts are wrong, or the backend fails.
@@ -317,11 +370,11 @@ pub struct Traced {
     pub positions: Vec<f32>,
     /// Unit vectors, likewise.
     pub headings: Vec<f32>,
-    /// `[teams][steps + 1][agents]`.
+    /// Units a second, `[teams][steps + 1][agents]`.
     pub speeds: Vec<f32>,
-    /// What leaders sensed there, `[teams][steps][leaders][8]`, and what their policies answered,
-    /// `[teams][steps][leaders][2]`: that leads to the next step's states.
+    /// What leaders sensed there, `[teams][steps][leaders][8]`.
     pub inputs: Vec<f32>,
+    /// What their policies answered to these, `[teams][steps][leaders][2]`: that leads to the next step's states.
     pub outputs: Vec<f32>,
     /// The agents near each POI after each step, a bit an agent: `[teams][steps][pois][words]`.
     pub near: Vec<u32>,
@@ -380,8 +433,8 @@ pub fn trace(
     Ok(traced)
 }
 
-/// Teams to be stepped by given actions, all at the world's start; with a record, they can be scored, by Dt where that is
-/// the config's fitness.
+/// Teams to be stepped by given actions, all at the world's start; with a record, they can be scored, by Dt where that
+/// is the config's fitness.
 ///
 /// # Errors
 /// The config is wrong, or there may not be so many teams.

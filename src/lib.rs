@@ -99,6 +99,8 @@
 //! | `report` | `record`, and pictures | 75 |
 //! | `cli` (default) | the program, with all of these | 145 |
 
+#![deny(missing_docs)]
+
 /// The commit that this was built from, where that is known; a debug build does not know it.
 pub const COMMIT: Option<&str> = {
     let commit = env!("FLOTILLA_COMMIT");

@@ -1,8 +1,9 @@
 //! What a run takes in memory at its peak, told before it starts.
 //!
-//! Every array that grows with the run is counted where it lives: [`trainer`] tells what every run has, [`backend`] what
-//! episodes take. What does not grow is [`PROGRAM`]. Nothing else is as large: checkpoints and policies are written
-//! straight from the populations, or from one copy, see [`copies_checkpoint`]. A sweep keeps its batches to half of what is available.
+//! Every array that grows with the run is counted where it lives: [`trainer`] tells what every run has, [`backend`]
+//! what episodes take. What does not grow is [`PROGRAM`]. Nothing else is as large: checkpoints and policies are
+//! written straight from the populations, or from one copy, see [`copies_checkpoint`]. A sweep keeps its batches to
+//! half of what is available.
 
 use std::fs;
 use std::path::Path;
@@ -20,8 +21,9 @@ const COPIED: u64 = 64 << 20;
 /// Peaks, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Peaks {
-    /// Of the process, where the CPU plays; and how much of that only while a checkpoint is written.
+    /// Of the process, where the CPU plays.
     pub host: u64,
+    /// How much of that is only while a checkpoint is written.
     pub checkpoint: u64,
     /// Of the process, where a GPU plays, without what its driver keeps there.
     pub gpu_host: u64,
@@ -38,7 +40,9 @@ pub struct Peaks {
     if *checkpoint > 0 { format!(", no checkpoints (they take {} of it)", human(*checkpoint)) } else { String::new() }
 )]
 pub struct TooLittle {
+    /// Bytes at the run's peak.
     pub needed: u64,
+    /// Bytes that the system has to give.
     pub available: u64,
     /// How much of what is needed is for checkpoints.
     pub checkpoint: u64,
@@ -105,8 +109,8 @@ impl Peaks {
     }
 }
 
-/// Refuses a peak, so much of it for checkpoints, that does not fit in the memory that is available now; lets pass where the
-/// system does not tell.
+/// Refuses a peak, so much of it for checkpoints, that does not fit in the memory that is available now; lets pass
+/// where the system does not tell.
 ///
 /// # Errors
 /// There is less.

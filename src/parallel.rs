@@ -3,32 +3,32 @@
 //! No result depends on it: whatever runs in parallel writes to places of its own.
 
 #[cfg(feature = "parallel")]
-pub use rayon::{current_num_threads, join, prelude::*, scope};
+pub(crate) use rayon::{current_num_threads, join, prelude::*, scope};
 
 #[cfg(not(feature = "parallel"))]
-pub use sequential::*;
+pub(crate) use sequential::*;
 
 #[cfg(not(feature = "parallel"))]
 mod sequential {
     use std::slice::{ChunksExact, ChunksExactMut, ChunksMut, Iter, IterMut};
 
     /// Threads that work is shared between.
-    pub fn current_num_threads() -> usize {
+    pub(crate) fn current_num_threads() -> usize {
         1
     }
 
     /// Runs both.
-    pub fn join<A, B>(one: impl FnOnce() -> A, other: impl FnOnce() -> B) -> (A, B) {
+    pub(crate) fn join<A, B>(one: impl FnOnce() -> A, other: impl FnOnce() -> B) -> (A, B) {
         (one(), other())
     }
 
     /// Runs this where all that it shares is shared.
-    pub fn scope<R>(run: impl FnOnce(&()) -> R) -> R {
+    pub(crate) fn scope<R>(run: impl FnOnce(&()) -> R) -> R {
         run(&())
     }
 
     /// rayon's names for what slices have.
-    pub trait ParallelSlices<T> {
+    pub(crate) trait ParallelSlices<T> {
         fn par_iter(&self) -> Iter<'_, T>;
         fn par_iter_mut(&mut self) -> IterMut<'_, T>;
         fn par_chunks_mut(&mut self, size: usize) -> ChunksMut<'_, T>;
@@ -64,7 +64,7 @@ mod sequential {
     }
 
     /// rayon's names for what iterators have.
-    pub trait ParallelItems: IntoIterator + Sized {
+    pub(crate) trait ParallelItems: IntoIterator + Sized {
         fn into_par_iter(self) -> Self::IntoIter {
             self.into_iter()
         }
@@ -73,7 +73,7 @@ mod sequential {
     impl<I: IntoIterator> ParallelItems for I {}
 
     /// What rayon wants to know of how work is cut up.
-    pub trait ParallelCut: Iterator + Sized {
+    pub(crate) trait ParallelCut: Iterator + Sized {
         fn with_min_len(self, _: usize) -> Self {
             self
         }

@@ -67,6 +67,7 @@ pub struct Problem {
 /// All that is wrong with a text, by line; what came from outside it (see [`Override`]) last.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Problems {
+    /// As many as anyone reads.
     pub listed: Vec<Problem>,
     /// How many more there are.
     pub unlisted: usize,
@@ -79,6 +80,7 @@ pub struct Others<'a> {
     pub foreign: &'a [&'a str],
     /// With any of these the text is something else, as the message says; of that nothing else is worth saying.
     pub refused: &'a [&'a str],
+    /// What is said of such a text.
     pub message: &'a str,
 }
 
@@ -327,6 +329,43 @@ pub struct Reader<'a> {
     table: Option<Vec<Definition>>,
 }
 
+/// Declares a section of a config, and of its keys all that is to be known but what they allow: each entry makes a
+/// field, its documentation, and a function by the field's name that asks a [`Reader`] for the key.
+///
+/// An entry is what the key means, without a full stop; the field; and the key's unit and its place in the paper, empty
+/// where it has none. A field whose key another part asks for has neither, and words of its own.
+macro_rules! section {
+    ($(#[$($about:tt)*])* $name:ident = $section:literal {
+        $($(#[doc = $words:literal])+ $field:ident: $type:ty $(= $unit:tt, $paper:tt)?,)+
+    }) => {
+        $(#[$($about)*])*
+        #[derive(Clone, Debug, PartialEq, serde::Serialize)]
+        pub struct $name {
+            $(
+                $(#[doc = $words])+
+                $(#[doc = concat!("\n\n`", $section, ".", stringify!($field), "`", section!(@source $unit, $paper), ".")])?
+                pub $field: $type,
+            )+
+        }
+
+        impl $name {
+            $(section! { @key $section, $field { $($words),+ } $($unit, $paper)? })+
+        }
+    };
+    (@key $section:tt, $field:ident { $($words:tt)+ }) => {};
+    (@key $section:tt, $field:ident { $($words:tt)+ } $unit:tt, $paper:tt) => {
+        fn $field<'r, 'a>(r: &'r mut $crate::reader::Reader<'a>) -> $crate::reader::Asked<'r, 'a> {
+            let meaning = const { concat!($($words)+).trim_ascii() };
+            r.key(concat!($section, ".", stringify!($field)), $unit, meaning, $paper)
+        }
+    };
+    (@source "", "") => { "" };
+    (@source $unit:tt, "") => { concat!(", in ", $unit) };
+    (@source "", $paper:tt) => { concat!("; Section ", $paper) };
+    (@source $unit:tt, $paper:tt) => { concat!(", in ", $unit, "; Section ", $paper) };
+}
+pub(crate) use section;
+
 /// A key that is being asked for; what it allows and its default are yet to be said.
 pub struct Asked<'r, 'a> {
     reader: &'r mut Reader<'a>,
@@ -443,7 +482,7 @@ impl<'a> Reader<'a> {
 
     /// Blames a key that was asked for; where it is missing, at its section's start.
     pub fn blame_key(&mut self, key: &'static str, message: String) {
-        let section = || self.sections.get(section(key)).copied().unwrap_or(0);
+        let section = || self.sections.get(section_of(key)).copied().unwrap_or(0);
         let known = self.known.get(key).cloned().flatten();
         let (place, name) = known.unwrap_or_else(|| (Place::Offset(section()), key.to_string()));
         self.blame(place, &name, message);
@@ -452,7 +491,7 @@ impl<'a> Reader<'a> {
     /// Blames all that was not asked for.
     fn blame_unknown(&mut self) {
         let known: Vec<&str> = self.known.keys().copied().collect();
-        let mut sections: Vec<&str> = known.iter().map(|key| section(key)).collect();
+        let mut sections: Vec<&str> = known.iter().map(|key| section_of(key)).collect();
         sections.dedup();
         for entry in std::mem::take(&mut self.strays) {
             let name = &entry.name;
@@ -467,7 +506,7 @@ impl<'a> Reader<'a> {
             if !sections.contains(&name.as_str()) {
                 let message = format!("unknown section{}", hint(&name, &sections));
                 self.blame(Place::Offset(start), &shorten(&name), message);
-                self.entries.retain(|key, entry| entry.outside || section(key) != name);
+                self.entries.retain(|key, entry| entry.outside || section_of(key) != name);
             }
         }
         for (key, entry) in std::mem::take(&mut self.entries) {
@@ -560,8 +599,8 @@ impl<'a> Asked<'_, 'a> {
     }
 
     /// A list of as many lists of numbers as `of`, another key, has items (any number where that is not known), or of
-    /// none, which is the default. `blame` tells what is wrong with lists whose numbers are allowed, each fault with its
-    /// list.
+    /// none, which is the default. `blame` tells what is wrong with lists whose numbers are allowed, each fault with
+    /// its list.
     pub fn lists<T: Number>(
         mut self,
         what: &str,
@@ -609,7 +648,9 @@ impl<'a> Asked<'_, 'a> {
 
 /// What a key holds that takes both.
 pub enum OneOrList<T> {
+    /// One value for all.
     One(T),
+    /// A value for each.
     List(Vec<T>),
 }
 
@@ -624,7 +665,7 @@ fn written<T: Serialize>(value: &T) -> String {
 }
 
 /// The section of a dotted key.
-fn section(key: &str) -> &str {
+fn section_of(key: &str) -> &str {
     key.split_once('.').map_or(key, |(section, _)| section)
 }
 
@@ -633,7 +674,7 @@ fn hint(name: &str, known: &[&str]) -> String {
     const LONGEST_NAME: usize = 64;
     let last = |key: &'_ str| key.rsplit('.').next().unwrap_or_default().to_lowercase();
     let leaf = last(name);
-    let same_section = |key: &str| section(key) == section(name);
+    let same_section = |key: &str| section_of(key) == section_of(name);
     let distance = |key: &str| (strsim::damerau_levenshtein(&last(key), &leaf), !same_section(key));
     let nearest = known.iter().filter(|_| name.len() <= LONGEST_NAME).min_by_key(|key| distance(key));
     if let Some(key) = nearest.filter(|key| distance(key).0 <= leaf.len() / 3) {
@@ -642,6 +683,6 @@ fn hint(name: &str, known: &[&str]) -> String {
     let siblings: Vec<String> = known.iter().filter(|key| same_section(key)).map(|key| last(key)).collect();
     match siblings.is_empty() {
         true => String::new(),
-        false => format!("; [{}] has {}", section(name), siblings.join(", ")),
+        false => format!("; [{}] has {}", section_of(name), siblings.join(", ")),
     }
 }

@@ -1,4 +1,5 @@
-//! Recorded runs, side by side: one trainer, and for each run its folder and its checkpoints. One run is a batch of one.
+//! Recorded runs, side by side: one trainer, and for each run its folder and its checkpoints. One run is a batch of
+//! one.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -23,17 +24,32 @@ const MAX_WRITERS: usize = 32;
 /// Why a run could not go on.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
+    /// Its files could not be written, read or used.
     #[error(transparent)]
     Record(#[from] RecordError),
+    /// The machine has less memory than it takes.
     #[error(transparent)]
     TooLittle(#[from] TooLittle),
     /// Whether all before the generation is saved, is told too.
     #[error("{error}\ngeneration {generation} could not be played{}", after(saved))]
-    Backend { error: BackendError, generation: usize, saved: Result<(), Box<RunError>> },
+    Backend {
+        /// What failed.
+        error: BackendError,
+        /// The one that was to be played.
+        generation: usize,
+        /// Why not, if it is not.
+        saved: Result<(), Box<RunError>>,
+    },
+    /// The system gives no memory for this.
     #[error(
         "there is no memory for {what}, {bytes} bytes; choose a smaller population, fewer trials or another machine"
     )]
-    Memory { what: &'static str, bytes: u64 },
+    Memory {
+        /// What it is for.
+        what: &'static str,
+        /// How much was asked for.
+        bytes: u64,
+    },
     /// Populations cannot be brought to the host to be saved.
     #[error("no checkpoint could be made: {0}")]
     Held(BackendError),
@@ -83,6 +99,7 @@ pub struct Progress<'a> {
 /// What a run came to.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Results {
+    /// The first and the last generation of every trial.
     pub story: Story,
     /// See [`Folder::digest`].
     pub digest: String,
@@ -91,6 +108,7 @@ pub struct Results {
 /// How a session ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ended {
+    /// Every run to its last generation.
     Done,
     /// Everything is saved.
     Stopped,
@@ -292,8 +310,8 @@ impl Session {
         Ok(Ended::Done)
     }
 
-    /// Makes the generation that is played next the last of each run, or leaves it at an earlier one; gives the last of all.
-    /// What each then comes to is what a run of so many generations comes to.
+    /// Makes the generation that is played next the last of each run, or leaves it at an earlier one; gives the last of
+    /// all. What each then comes to is what a run of so many generations comes to.
     ///
     /// # Errors
     /// A config cannot be written.
@@ -552,10 +570,13 @@ impl Member {
 
 /// A run that is the same training as another, under another config.
 pub struct Twin {
-    /// The folder of the other, which is done, and its config.
+    /// The folder of the other, which is done.
     pub of: PathBuf,
+    /// The other's config.
     pub of_config: Config,
+    /// Its own folder.
     pub folder: PathBuf,
+    /// Its own config.
     pub config: Config,
 }
 

@@ -39,8 +39,8 @@ const LAYOUTS: [Placing; 10] = [
 ];
 
 /// A valid config of 1 to 40 agents and 1 to 8 POIs, a pure function of the seed: a hundred seeds in a row hold every
-/// kind of layout, both paradigms and densities, 0 to 3 hidden layers, gains, speeds and turn rates down to 0, and every
-/// kind of observers, windows and orders of POIs, beside worlds with none of these.
+/// kind of layout, both paradigms and densities, 0 to 3 hidden layers, gains, speeds and turn rates down to 0, and
+/// every kind of observers, windows and orders of POIs, beside worlds with none of these.
 pub fn world(seed: u64) -> Config {
     let mut config = plain_world(seed);
     // By a stream of its own, so that the world is otherwise as it would be without.
@@ -185,7 +185,8 @@ fn plain_world(seed: u64) -> Config {
     // What came later has draws of its own: the worlds of the seeds stay as they were in all else.
     let later = &mut ChaCha8Rng::seed_from_u64(!seed);
     let actions = if later.random_bool(0.3) { Actions::Behaviours } else { Actions::Direct };
-    // Of the generations that are trained when worlds are compared, the last may be longer and elsewhere: windows stay within it.
+    // Of the generations that are trained when worlds are compared, the last may be longer and elsewhere: windows stay
+    // within it.
     let stages = match later.random_bool(0.2) {
         true => {
             let set = [

@@ -1,7 +1,9 @@
 //! Estimates from trials, with what chance leaves open, and tests of differences.
 //!
-//! Trials of two arms with one seed are pairs: the same starts and, where sizes agree, the same first populations. Their
-//! differences are one sample, of which [`mean`] gives the interval and [`p_value`] the test.
+//! Trials of two arms with one seed are pairs: the same starts and, where sizes agree, the same first populations.
+//! Their differences are one sample, of which [`mean`] gives the interval and [`p_value`] the test.
+//!
+//! Whatever else has a mean and an error has them of an [`Average`].
 //!
 //! What asks less of the samples: [`bootstrap`] gives the interval of a mean or a difference, [`rank_sum`] tests two
 //! samples, [`signed_rank`] pairs, and [`holm`] corrects for many tests. A G takes few values, so ranks are full of
@@ -22,8 +24,11 @@ pub const EXACT: usize = 100;
 /// A number with its 95 % interval, both ends included.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Estimate {
+    /// The number itself.
     pub value: f64,
+    /// The interval's lower end.
     pub low: f64,
+    /// The interval's upper end.
     pub high: f64,
 }
 
@@ -39,22 +44,74 @@ impl Estimate {
     }
 }
 
+/// Mean, standard deviation and standard error of any number of values, gathered one by one.
+///
+/// Values that are all alike come to exactly themselves, without any error; others to the same mean in any order, as
+/// long as their sum is exact, as that of shares in halves and quarters is.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Average {
+    count: u32,
+    sum: f64,
+    /// The mean so far, and the sum of squared distances from it, by Welford's recurrence.
+    mean: f64,
+    squares: f64,
+}
+
+impl Average {
+    /// Adds a value.
+    pub fn add(&mut self, value: f64) {
+        self.count += 1;
+        self.sum += value;
+        let before = value - self.mean;
+        self.mean += before / f64::from(self.count);
+        self.squares += before * (value - self.mean);
+    }
+
+    /// How many values there were.
+    pub fn count(&self) -> u32 {
+        self.count
+    }
+
+    /// Theirs; 0 of none.
+    pub fn mean(&self) -> f64 {
+        if self.squares == 0.0 { self.mean } else { self.sum / f64::from(self.count) }
+    }
+
+    /// Of the sample; 0 of fewer than two values.
+    pub fn deviation(&self) -> f64 {
+        if self.count < 2 { 0.0 } else { (self.squares / f64::from(self.count - 1)).sqrt() }
+    }
+
+    /// Of the mean; 0 of fewer than two values.
+    pub fn error(&self) -> f64 {
+        if self.count < 2 { 0.0 } else { self.deviation() / f64::from(self.count).sqrt() }
+    }
+}
+
+impl<'a> FromIterator<&'a f64> for Average {
+    fn from_iter<I: IntoIterator<Item = &'a f64>>(values: I) -> Average {
+        let mut average = Average::default();
+        values.into_iter().for_each(|&value| average.add(value));
+        average
+    }
+}
+
 /// The mean of a sample by Student's t; none of fewer than two values.
 ///
 /// Values that are all alike say nothing of how far they may lie apart. Then as many are taken to be off by one `step`,
 /// the least by which two can differ, as could have gone unseen: none of n by [`share`].
 pub fn mean(values: &[f64], step: f64) -> Option<Estimate> {
     let (value, error) = moments(values)?;
-    let room = match error {
-        0.0 => step * share(0, values.len())?.high,
-        error => error * reach(values.len()),
-    };
-    Some(Estimate { value, low: value - room, high: value + room })
+    Some(interval(value, error, values.len(), step))
 }
 
-/// How many standard errors the interval of a mean of so many values, two at least, reaches to either side.
-pub fn reach(count: usize) -> f64 {
-    student(count).inverse_cdf(1.0 - (1.0 - CONFIDENCE) / 2.0)
+/// The interval of [`mean`], of so many values, two at least, whose mean and standard error are known.
+pub fn interval(value: f64, error: f64, count: usize, step: f64) -> Estimate {
+    let room = match error {
+        0.0 => step * share(0, count).map_or(0.0, |share| share.high),
+        error => error * student(count).inverse_cdf(1.0 - (1.0 - CONFIDENCE) / 2.0),
+    };
+    Estimate { value, low: value - room, high: value + room }
 }
 
 /// A share by Clopper and Pearson's exact interval; none of nothing.
@@ -92,11 +149,8 @@ pub fn distances(values: &[f64]) -> Vec<f64> {
 
 /// Mean and standard error; none of fewer than two values.
 fn moments(values: &[f64]) -> Option<(f64, f64)> {
-    let (first, count) = (*values.first()?, values.len() as f64);
-    // Of the distances from the first: values that are alike come to exactly no error.
-    let off = values.iter().map(|value| value - first).sum::<f64>() / count;
-    let squares: f64 = values.iter().map(|value| (value - first - off).powi(2)).sum();
-    (values.len() > 1).then(|| (first + off, (squares / (count - 1.0) / count).sqrt()))
+    let average: Average = values.iter().collect();
+    (average.count > 1).then(|| (average.mean(), average.error()))
 }
 
 /// Student's distribution for the mean of so many values, two at least.
@@ -104,9 +158,9 @@ fn student(count: usize) -> StudentsT {
     StudentsT::new(0.0, 1.0, (count - 1) as f64).expect("two values leave a degree of freedom")
 }
 
-/// The mean of the first sample, less that of the second where there is one, with its bootstrap interval: bias-corrected
-/// and accelerated (BCa) over [`RESAMPLES`] samples, by one seed, so that the same values always have the same interval.
-/// None where a sample has fewer than two values.
+/// The mean of the first sample, less that of the second where there is one, with its bootstrap interval:
+/// bias-corrected and accelerated (BCa) over [`RESAMPLES`] samples, by one seed, so that the same values always have
+/// the same interval. None where a sample has fewer than two values.
 ///
 /// Where all values of each sample are alike, the interval has no width.
 pub fn bootstrap(samples: &[&[f64]]) -> Option<Estimate> {
@@ -167,8 +221,8 @@ pub struct Tested {
 
 /// Mann and Whitney's test, over all pairings of two samples; none where one is empty.
 ///
-/// The p is exact up to [`EXACT`] values: twice the smaller tail over all ways to deal the values out, ties as they are.
-/// Above, it is by the normal distribution, corrected for ties and continuity.
+/// The p is exact up to [`EXACT`] values: twice the smaller tail over all ways to deal the values out, ties as they
+/// are. Above, it is by the normal distribution, corrected for ties and continuity.
 pub fn rank_sum(one: &[f64], other: &[f64]) -> Option<Tested> {
     if one.is_empty() || other.is_empty() || !one.iter().chain(other).all(|value| value.is_finite()) {
         return None;
@@ -192,8 +246,8 @@ pub fn rank_sum(one: &[f64], other: &[f64]) -> Option<Tested> {
 
 /// Wilcoxon's signed-rank test of the differences between pairs; none of none.
 ///
-/// Pairs without a difference have no say in p; it is exact for up to [`EXACT`] others, over all their signs, and by the
-/// normal distribution above, as in [`rank_sum`]. A is over the pairs themselves.
+/// Pairs without a difference have no say in p; it is exact for up to [`EXACT`] others, over all their signs, and by
+/// the normal distribution above, as in [`rank_sum`]. A is over the pairs themselves.
 pub fn signed_rank(differences: &[f64]) -> Option<Tested> {
     if !differences.iter().all(|difference| difference.is_finite()) {
         return None;

@@ -1,7 +1,7 @@
 //! Step by step: teams whose leaders do what the caller says, on the CPU.
 //!
-//! A [`Stepper`] plays the episodes of [`crate::backend`], by the same kernels on the same vectors of teams, but in place
-//! of policies' answers it takes actions. Given a policy's own answers, it comes to the bits of
+//! A [`Stepper`] plays the episodes of [`crate::backend`], by the same kernels on the same vectors of teams, but in
+//! place of policies' answers it takes actions. Given a policy's own answers, it comes to the bits of
 //! [`Backend::trace`](crate::backend::Backend::trace).
 //!
 //! ```
@@ -69,23 +69,66 @@ pub struct States<'a> {
 /// Why teams could not be made, started, stepped or scored. They are then as they were.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum StepError {
+    /// No team, or more than there may be.
     #[error("{0} teams; there may be 1 to {MAX_POPULATION}")]
     Teams(usize),
     /// A world that [`World::new`] did not make of a valid config.
     #[error("the world's {0} do not fit its numbers of agents and POIs")]
     World(&'static str),
+    /// The system gives no memory for them.
     #[error("there is no memory for {teams} teams, {bytes} bytes")]
-    Memory { teams: usize, bytes: u128 },
+    Memory {
+        /// How many were asked for.
+        teams: usize,
+        /// What these take.
+        bytes: u128,
+    },
+    /// An array of another length.
     #[error("{found} {what}, but {shape} are {expected}")]
-    Length { what: &'static str, shape: &'static str, expected: usize, found: usize },
+    Length {
+        /// What it holds.
+        what: &'static str,
+        /// Its indices.
+        shape: &'static str,
+        /// How many numbers that makes.
+        expected: usize,
+        /// How many were given.
+        found: usize,
+    },
+    /// An action that is infinite or no number.
     #[error("the {} of leader {leader} in team {team} is {value}, which is no finite number", ["turn", "speed"][*.output])]
-    Action { team: usize, leader: usize, output: usize, value: f32 },
+    Action {
+        /// Which team, from 0.
+        team: usize,
+        /// Which leader of it, from 0.
+        leader: usize,
+        /// 0 for the turn, 1 for the speed.
+        output: usize,
+        /// What was given.
+        value: f32,
+    },
+    /// A start that is not on the map.
     #[error("agent {agent} of team {team} would start at ({}, {}), which is not on the map", at[0], at[1])]
-    Start { team: usize, agent: usize, at: [f32; 2] },
+    Start {
+        /// Which team, from 0.
+        team: usize,
+        /// Which agent of it, leaders first.
+        agent: usize,
+        /// Where, in units.
+        at: [f32; 2],
+    },
+    /// A team that there is not.
     #[error("team {team} of {teams} (they count from 0)")]
-    NoTeam { team: usize, teams: usize },
+    NoTeam {
+        /// Which team, from 0.
+        team: usize,
+        /// How many there are.
+        teams: usize,
+    },
+    /// Scores need a record, which [`Stepper::recording`] keeps.
     #[error("no record was kept to score teams by")]
     NotRecorded,
+    /// Dt needs a record of sights, which [`Stepper::with_sights`] keeps.
     #[error("no record was kept of who saw whom at which step, which Dt asks; make the stepper `with_sights`")]
     NotSeen,
 }
@@ -108,7 +151,8 @@ impl Stepper {
         Stepper::at_level(Level::new(), world, teams, true)
     }
 
-    /// [`Stepper::new`] or [`Stepper::recording`], by a chosen instruction set (tests compare them; benches choose one).
+    /// [`Stepper::new`] or [`Stepper::recording`], by a chosen instruction set (tests compare them; benches choose
+    /// one).
     ///
     /// # Errors
     /// No team or more than [`MAX_POPULATION`], or there is no memory for them.
@@ -188,8 +232,8 @@ impl Stepper {
         Ok(())
     }
 
-    /// Puts the chosen teams, `[teams]`, at the world's start or where they are told to, as [`Stepper::reset_to`] does; the
-    /// others' places are not looked at, and they stay as they are.
+    /// Puts the chosen teams, `[teams]`, at the world's start or where they are told to, as [`Stepper::reset_to`] does;
+    /// the others' places are not looked at, and they stay as they are.
     ///
     /// # Errors
     /// Too few or too many choices or numbers, or a place that is not on the map.
@@ -200,9 +244,10 @@ impl Stepper {
         Ok(())
     }
 
-    /// Plays one step by what every leader is to do, `[teams][leaders][2]`: a turn, in parts of a half turn to the left, and
-    /// a speed, from -1 for standing still to 1 for the highest. Numbers beyond -1..1 are taken as -1 or 1. Where policies of the
-    /// world choose behaviours, these are still the actions: each behaviour comes to a turn of 0, ±0.25 or ±0.75 and a speed of
+    /// Plays one step by what every leader is to do, `[teams][leaders][2]`: a turn, in parts of a half turn to the
+    /// left, and a speed, from -1 for standing still to 1 for the highest. Numbers beyond -1..1 are taken as -1 or 1.
+    /// Where policies of the world choose behaviours, these are still the actions: each behaviour comes to a turn of 0,
+    /// ±0.25 or ±0.75 and a speed of
     /// -1 or 1, see [`crate::model::policy::choose`].
     ///
     /// A team that has played its last step stays as it is, whatever is asked of it, until it is reset.
@@ -228,14 +273,14 @@ impl Stepper {
         Ok(())
     }
 
-    /// What every leader senses where it is, `[teams][leaders][8]`: the density of POIs, then of agents, in four quadrants
-    /// around its heading, back right, front right, front left, back left.
+    /// What every leader senses where it is, `[teams][leaders][8]`: the density of POIs, then of agents, in four
+    /// quadrants around its heading, back right, front right, front left, back left.
     pub fn inputs(&self) -> &[f32] {
         &self.shown.inputs
     }
 
-    /// The agents near each POI after the last step, `[teams][pois][words]`, a bit an agent, 32 a word. A start counts for
-    /// nothing: before its first step a team is near none.
+    /// The agents near each POI after the last step, `[teams][pois][words]`, a bit an agent, 32 a word. A start counts
+    /// for nothing: before its first step a team is near none.
     pub fn near(&self) -> &[u32] {
         &self.shown.near
     }
@@ -250,7 +295,8 @@ impl Stepper {
         &self.shown.observed
     }
 
-    /// How many steps each team has played since its start, `[teams]`: after as many as the world's, its episode is over.
+    /// How many steps each team has played since its start, `[teams]`: after as many as the world's, its episode is
+    /// over.
     pub fn steps(&self) -> &[u32] {
         &self.shown.steps
     }

@@ -28,11 +28,15 @@ pub struct Trainer {
 /// What one generation of one trial came to; every G is in 0..1.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Row {
+    /// Whose it is, by place among the trainer's; 0 of a run alone.
     pub arm: usize,
+    /// From 0.
     pub trial: usize,
+    /// From 0, the random start.
     pub generation: usize,
-    /// The best and the mean team of the generation.
+    /// The best team of the generation.
     pub best_g: f64,
+    /// The mean over the generation's teams.
     pub mean_g: f64,
     /// The team of every population's best policy.
     pub champion_g: f64,
@@ -98,6 +102,7 @@ pub type End<'a> = (Vec<&'a [f32]>, Snapshot<&'a [f32]>);
 /// Why there is no snapshot.
 #[derive(Debug, thiserror::Error)]
 pub enum SnapshotError {
+    /// The system gives no memory for it.
     #[error(transparent)]
     Memory(#[from] TryReserveError),
     /// The populations cannot be brought to the host.
@@ -155,8 +160,8 @@ impl Trainer {
         self.arms[arm].generation
     }
 
-    /// Makes the generation that an arm plays next its last, or leaves it at an earlier one; gives the last. What comes out is
-    /// what a config of so many generations comes to.
+    /// Makes the generation that an arm plays next its last, or leaves it at an earlier one; gives the last. What comes
+    /// out is what a config of so many generations comes to.
     pub fn end(&mut self, arm: usize) -> usize {
         let Arm { config, generation, .. } = &mut self.arms[arm];
         config.learning.generations = config.learning.generations.min(*generation);
@@ -346,9 +351,9 @@ impl Trainer {
         Ok(Snapshot { generation, last, weights: each(weights)?, fitness: each(fitness)?, pending })
     }
 
-    /// Puts given policies, `[populations][policies][parameters]`, in the first slots of a trial's populations, in their order:
-    /// as many as there is room for. The others stay as they were drawn. False where the arm has played already, or sizes do
-    /// not fit.
+    /// Puts given policies, `[populations][policies][parameters]`, in the first slots of a trial's populations, in
+    /// their order: as many as there is room for. The others stay as they were drawn. False where the arm has played
+    /// already, or sizes do not fit.
     #[must_use]
     pub fn start_from(&mut self, arm: usize, trial: usize, policies: usize, weights: &[f32]) -> bool {
         let arm = &mut self.arms[arm];
@@ -366,8 +371,8 @@ impl Trainer {
         true
     }
 
-    /// Goes on with an arm from a snapshot of an arm of the same config, but for its number of generations, which may have
-    /// been smaller; false where the sizes do not fit.
+    /// Goes on with an arm from a snapshot of an arm of the same config, but for its number of generations, which may
+    /// have been smaller; false where the sizes do not fit.
     #[must_use]
     pub fn restore(&mut self, arm: usize, snapshot: Snapshot) -> bool {
         let (index, level, arm) = (arm, self.level, &mut self.arms[arm]);
@@ -685,8 +690,8 @@ impl Arm {
     /// After the last, policies stay, and the champion plays.
     ///
     /// # Errors
-    /// The backend that holds the populations failed. This generation is told by now: the next makes up for the loss, or
-    /// fails.
+    /// The backend that holds the populations failed. This generation is told by now: the next makes up for the loss,
+    /// or fails.
     fn breed(&mut self, level: Level) -> Result<(), BackendError> {
         thread_local! { static SCRATCH: RefCell<Vec<u32>> = const { RefCell::new(Vec::new()) }; }
         let generation = self.age;

@@ -1,5 +1,5 @@
-//! Whether a backend agrees with the CPU, bit for bit: random worlds stage by stage, all of them as one batch, once by the
-//! record and once by the scores, breeding where the backend holds populations, and short training runs.
+//! Whether a backend agrees with the CPU, bit for bit: random worlds stage by stage, all of them as one batch, once by
+//! the record and once by the scores, breeding where the backend holds populations, and short training runs.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -41,8 +41,8 @@ impl Plan {
     }
 }
 
-/// Short trainings of the paper's six experiments, each with its name: what they come to is the same on every machine, so
-/// that their digests compare machines that never meet.
+/// Short trainings of the paper's six experiments, each with its name: what they come to is the same on every machine,
+/// so that their digests compare machines that never meet.
 pub fn short_trainings() -> Vec<(String, Config)> {
     const LAYOUTS: [(&str, &str); 3] = [
         ("generally forward", include_str!("../configs/generally_forward.toml")),
@@ -64,7 +64,9 @@ pub fn short_trainings() -> Vec<(String, Config)> {
 /// How much was compared, and the first difference, if any.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Agreement {
+    /// Worlds played on both.
     pub worlds: usize,
+    /// Steps of agents in these.
     pub agent_steps: u64,
     /// Where, in words.
     pub mismatch: Option<String>,
@@ -187,8 +189,8 @@ fn compare_batch(
     Ok(teams.into_iter().find(differs))
 }
 
-/// Plays all groups as two batches of which only scores are wanted, of every kind by turns, and holds them against those
-/// of the reference's whole record; the first group and team that differs, and how.
+/// Plays all groups as two batches of which only scores are wanted, of every kind by turns, and holds them against
+/// those of the reference's whole record; the first group and team that differs, and how.
 fn compare_scores(
     groups: &[Group<'_>],
     reference: &mut dyn Backend,

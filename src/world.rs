@@ -15,15 +15,21 @@ pub use crate::model::policy::{BEHAVIOURS, OUTPUTS};
 pub use crate::model::sense::INPUTS;
 pub use crate::model::{Constants, Variant};
 
-/// One world: constants, start positions of all agents (leaders first), POIs, how many agents each needs, and by what rule
-/// these observe.
+/// One world: constants, start positions of all agents (leaders first), POIs, how many agents each needs, and by what
+/// rule these observe.
 #[derive(Clone, Debug, PartialEq)]
 pub struct World {
+    /// What kernels read.
     pub constants: Constants,
+    /// In units, on the kernels' grid: `[agents]`.
     pub starts: Vec<Vec2>,
+    /// In units, on the kernels' grid: `[pois]`.
     pub pois: Vec<Vec2>,
+    /// Agents that each POI needs at once (C): `[pois]`.
     pub coupling: Vec<u32>,
+    /// Who observes, when and in what order.
     pub rule: Rule,
+    /// Whom Dt counts as led.
     pub led: Led,
 }
 

@@ -13,7 +13,7 @@ use flotilla::credit::Credit;
 use flotilla::evolve::{self, Key, Purpose};
 use flotilla::report::paper::claims::{Claim, Verdict, claims};
 use flotilla::report::paper::{self, Evidence, Experiment, LAYOUTS, SOURCES, Source, tables};
-use flotilla::statistics::{self, Tested};
+use flotilla::statistics::{self, Average, Tested};
 use flotilla::world::World;
 use serde_json::Value;
 
@@ -97,6 +97,24 @@ fn tests_of_samples_without_a_difference_say_so() {
     // A third less than nothing, and two thirds less than a third, are ties but for rounding.
     let thirds = [1.0 / 3.0, 2.0 / 3.0 - 1.0 / 3.0, 2.0 / 3.0 - 1.0, 1.0 - 2.0 / 3.0];
     assert_eq!(statistics::signed_rank(&thirds), statistics::signed_rank(&[1.0, 1.0, -1.0, 1.0]));
+}
+
+#[test]
+fn an_average_is_that_of_its_values_in_any_order() {
+    let of = |values: &[f64]| {
+        let average: Average = values.iter().collect();
+        (average.count(), average.mean(), average.deviation(), average.error())
+    };
+    assert_eq!(of(&[]), (0, 0.0, 0.0, 0.0));
+    // Seven tenths are not 0.7 as a sum.
+    assert_eq!(of(&[0.1; 7]), (7, 0.1, 0.0, 0.0));
+    for values in [[0.0, 0.5, 1.0, 0.5], [0.5, 1.0, 0.5, 0.0]] {
+        let (count, mean, deviation, error) = of(&values);
+        assert_eq!((count, mean), (4, 0.5));
+        assert!((deviation - (0.5f64 / 3.0).sqrt()).abs() < 1e-15, "{deviation}");
+        assert!((error - deviation / 2.0).abs() < 1e-15, "{error}");
+    }
+    assert_eq!([[0.75, 1.0, 0.0, 0.0], [0.0, 0.75, 0.0, 1.0]].map(|values| of(&values).1), [0.4375; 2]);
 }
 
 #[test]

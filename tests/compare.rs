@@ -346,10 +346,19 @@ fn different_layouts_are_told_and_are_no_pairs() {
     let place = Place::new(&[]);
     let trials = [&[0.0, 0.5][..], &[0.0, 1.0]];
     run(&place, "here", &[GENERATIONS], &trials);
-    run(&place, "there", &[GENERATIONS, ("world.pois", "[[10, 15], [20, 16]]")], &trials);
-    let (_, told) = place.good("compare here there");
-    assert!(told.contains("note: the arms play in different layouts: world.pois differ"), "{told}");
-    assert!(!told.contains("--paired"), "{told}");
+    run(&place, "again", &[GENERATIONS, ("learning.seed", "1")], &trials);
+    assert!(!place.good("compare here again").1.contains("layouts"));
+    for (key, value) in [
+        ("world.map", "[50, 51]"),
+        ("world.leaders", "[[20, 2], [30, 2]]"),
+        ("world.followers", "[[25, 4]]"),
+        ("world.pois", "[[10, 15], [20, 16]]"),
+    ] {
+        run(&place, key, &[GENERATIONS, (key, value)], &trials);
+        let (_, told) = place.good(&format!("compare here {key}"));
+        assert!(told.contains(&format!("note: the arms play in different layouts: {key} differ")), "{told}");
+        assert!(!told.contains("--paired"), "{told}");
+    }
 }
 
 #[cfg(target_os = "linux")]

@@ -2,6 +2,7 @@
 
 #![cfg(feature = "cli")]
 
+use std::fs;
 use std::ops::ControlFlow::{Break, Continue};
 use std::path::Path;
 
@@ -78,6 +79,20 @@ fn training_comes_to_what_a_run_comes_to() {
         assert_eq!(Trained::read(&path).expect("the run is whole"), trained, "seed {seed}");
     }
     assert!(matches!(Trained::read(folder.path()), Err(Failure::Run(_))));
+
+    // A row that is missing, and two that changed places.
+    let (run, path) = (folder.path().join("0"), folder.path().join("0/metrics.csv"));
+    let rows = fs::read_to_string(&path).expect("the run has metrics");
+    let mut lines: Vec<&str> = rows.lines().collect();
+    let read = |lines: &[&str]| {
+        fs::write(&path, lines.join("\n") + "\n").expect("the folder can be written");
+        Trained::read(&run).expect_err("rows are not as they were").to_string()
+    };
+    let short = read(&lines[..lines.len() - 1]);
+    assert!(short.contains("metrics.csv has 20 rows of 21"), "{short}");
+    lines.swap(1, 4);
+    let mixed = read(&lines);
+    assert!(mixed.contains("its rows are not one a trial and generation, in their order"), "{mixed}");
 }
 
 #[test]
@@ -173,6 +188,8 @@ fn what_is_wrong_is_told() {
     assert!(matches!(play(&config, 0, &[], Starts::Own), Err(Failure::Teams(0))));
     assert!(matches!(play(&config, usize::MAX, &good, Starts::Own), Err(Failure::Teams(_))));
     assert!(matches!(play(&config, 2, &good[1..], Starts::Own), Err(Failure::Weights { teams: 2, .. })));
+    let more = [&good[..], &[0.5]].concat();
+    assert!(matches!(play(&config, 2, &more, Starts::Own), Err(Failure::Weights { teams: 2, .. })));
     assert!(matches!(play(&config, 5, &[], Starts::Own), Err(Failure::Weights { found: 0, .. })));
     for (bad, fine) in [(f32::NAN, false), (f32::INFINITY, false), (2e6, false), (1e-20, true), (-0.0, true)] {
         let mut weights = good.clone();
@@ -189,6 +206,11 @@ fn what_is_wrong_is_told() {
         let drawn = Starts::Drawn { episodes, seed: 1, jitter, poi_jitter: 0.0 };
         assert!(matches!(play(&config, 2, &good, drawn), Err(Failure::Starts { .. })), "{episodes}, {jitter}");
     }
+
+    let drawn = Starts::Drawn { episodes: 2, seed: 1, jitter: 0.1, poi_jitter: 0.0 };
+    let trace = |episode| flotilla::trace(&config, &mut Cpu::default(), 2, &good, &drawn, episode);
+    trace(1).expect("it is the last");
+    assert!(matches!(trace(2), Err(Failure::NoEpisode { episode: 2, episodes: 2 })));
 
     // Configs built by hand are checked like files.
     let broken: [fn(&mut Config); 6] = [
@@ -223,7 +245,7 @@ fn a_processor_is_found() {
 #[test]
 fn errors_of_the_library_speak_of_no_flags() {
     fn walk(folder: &Path, found: &mut Vec<String>) {
-        for entry in std::fs::read_dir(folder).expect("a folder of sources") {
+        for entry in fs::read_dir(folder).expect("a folder of sources") {
             let path = entry.expect("its entries").path();
             if path.is_dir() {
                 if !path.ends_with("src/cli") {
@@ -231,7 +253,7 @@ fn errors_of_the_library_speak_of_no_flags() {
                 }
                 continue;
             }
-            let Ok(text) = std::fs::read_to_string(&path) else { continue };
+            let Ok(text) = fs::read_to_string(&path) else { continue };
             for error in text.split("#[error(").skip(1) {
                 let error = error.split(")]").next().unwrap_or_default();
                 let flag = error.split("--").skip(1).any(|rest| rest.starts_with(|c: char| c.is_ascii_lowercase()));

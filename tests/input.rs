@@ -175,6 +175,23 @@ fn what_is_no_file_is_not_waited_for() {
 }
 
 #[test]
+fn a_done_run_that_cannot_be_read_for_a_moment_is_not_trained_again() {
+    let place = with_run();
+    let seconds = |place: &Place| fs::read_to_string(place.path("run/metrics.csv")).unwrap();
+    let before = seconds(&place);
+    for name in ["run.json", "policies.safetensors", "metrics.csv"] {
+        let (path, away) = (place.path("run").join(name), place.path("away"));
+        fs::rename(&path, &away).unwrap();
+        assert!(Command::new("mkfifo").arg(&path).status().unwrap().success());
+        let told = place.refused(1, "train small.toml --out run --resume --quiet");
+        assert!(told.contains(name) && told.contains("cannot be read"), "{told}");
+        fs::rename(&away, &path).unwrap();
+        place.good("train small.toml --out run --resume --quiet");
+        assert!(seconds(&place) == before, "{name}: it was trained again");
+    }
+}
+
+#[test]
 fn a_sweep_and_a_config_are_told_apart() {
     let place = place();
     for command in ["check", "train", "verify"] {

@@ -5,9 +5,10 @@ mod support;
 
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, BackendError, Episode, Group, Moment, Need, Seen, Strided, Trace};
-use flotilla::config::{Fitness, MAX_POPULATION};
+use flotilla::config::{Fitness, MAX_AGENTS, MAX_POIS, MAX_POPULATION};
 use flotilla::credit::{self, Credit, Scores};
 use flotilla::evaluate::Starts;
+use flotilla::model::couple::Rule;
 use flotilla::sample;
 use flotilla::stepping::{StepError, Stepper};
 use flotilla::world::World;
@@ -179,6 +180,14 @@ fn world() -> World {
     World::new(&support::layout("generally_forward"))
 }
 
+const RULE: &str = "observers, windows and order of POIs";
+
+/// Puts a network with one hidden layer into a world.
+fn network(world: &mut World, widths: [u32; 5]) {
+    let policy = &mut world.constants.policy;
+    (policy.widths, policy.parameters) = (widths, (widths[0] + 1) * widths[1] + (widths[1] + 1) * widths[2]);
+}
+
 #[test]
 fn what_cannot_be_stepped_is_told_and_nothing_moves() {
     let world = world();
@@ -204,18 +213,37 @@ fn what_cannot_be_stepped_is_told_and_nothing_moves() {
         error
     };
     for (what, change) in [
-        ("POIs", (|world| world.coupling.clear()) as fn(&mut World)),
-        ("POIs", |world| (world.pois, world.coupling) = (vec![], vec![])),
+        ("leaders", (|world| world.constants.leaders = 0) as fn(&mut World)),
+        ("agents", |world| world.constants.followers = u32::MAX),
+        ("agents", |world| world.constants.followers = MAX_AGENTS as u32),
+        ("POIs", |world| world.coupling.clear()),
+        ("POIs", |world| (world.pois, world.coupling, world.constants.pois) = (vec![], vec![], 0)),
+        ("POIs", |world| {
+            let (poi, count) = (world.pois[0], MAX_POIS + 1);
+            (world.pois, world.coupling, world.constants.pois) = (vec![poi; count], vec![1; count], count as u32);
+        }),
         ("POIs", |world| world.constants.pois += 1),
+        ("steps", |world| world.constants.steps = 0),
+        ("steps", |world| world.constants.steps = u32::MAX),
         ("start positions", |world| _ = world.starts.pop()),
         ("start positions", |world| world.constants.followers += 1),
-        ("agents", |world| world.constants.followers = u32::MAX),
         ("sets", |world| world.constants.words = 2),
+        // Of more agents, of fewer POIs, from before the first step on, and each after the other.
+        (RULE, |world| world.rule = Rule::new(0..1, 64, &[], &[])),
+        (RULE, |world| world.rule = Rule::new(0..12, 12, &[[1, 2]; 3], &[])),
+        (RULE, |world| world.rule = Rule::new(0..12, 12, &[[0, 2]; 4], &[])),
+        (RULE, |world| world.rule = Rule::new(0..12, 12, &[], &[vec![], vec![0]])),
+        (RULE, |world| world.rule = Rule::new(0..12, 12, &[], &[vec![1], vec![0], vec![], vec![]])),
         ("density", |world| world.constants.variant.density = 9),
-        ("steps", |world| world.constants.steps = u32::MAX),
         ("policies", |world| world.constants.policy.parameters += 1),
         ("policies", |world| world.constants.policy.layers = 9),
+        ("policies", |world| world.constants.policy.layers = 0),
         ("policies", |world| world.constants.policy.widths[1] = u32::MAX),
+        // Networks whose weights are counted right: too wide, of 9 inputs, of 3 outputs, with a width left over.
+        ("policies", |world| network(world, [8, 65, 2, 0, 0])),
+        ("policies", |world| network(world, [9, 10, 2, 0, 0])),
+        ("policies", |world| network(world, [8, 10, 3, 0, 0])),
+        ("policies", |world| network(world, [8, 10, 2, 1, 0])),
     ] {
         let error = changed(change);
         assert!(matches!(error, StepError::World(found) if found == what), "{what}: {error}");
@@ -285,11 +313,25 @@ fn actions_are_taken_within_their_range_and_starts_on_the_grid() {
     assert_eq!(positions([-1.5, -9.0], None), positions([-1.0, -1.0], None));
     assert_ne!(positions([1.0, 0.9], None), positions([1.0, 1.0], None));
 
+    // Rounding leaves this speed a bit short of the highest, however much more is asked for.
+    let mut config = support::layout("generally_forward");
+    (config.motion.max_speed, config.motion.max_acceleration) = (f64::from(3f32.next_up()), 100.0);
+    config.world.speed = 0.5 + f64::from(f32::EPSILON);
+    let speed = |wanted: f32| {
+        let mut stepper = Stepper::new(World::new(&config), 1).expect("a team is few");
+        stepper.step(&[0.0, wanted].repeat(stepper.world().leaders())).expect("they are actions");
+        stepper.states().speeds[0]
+    };
+    assert_eq!((speed(1.0), speed(7.0)), (3.0, 3.0));
+
     let on_grid: Vec<f32> = bytemuck::cast_slice(&world.starts).repeat(5);
     assert_eq!(positions([0.1, 0.2], Some(&on_grid)), positions([0.1, 0.2], None));
     // Between two places of the grid, nearer to the first.
     let beside: Vec<f32> =
         on_grid.iter().map(|at| at + if *at < 16.0 { 1.0 / (1 << 20) as f32 } else { 0.0 }).collect();
     assert_ne!(beside, on_grid);
+    let mut stepper = Stepper::new(world.clone(), 5).expect("five teams are few");
+    stepper.reset_to(&beside).expect("they are on the map");
+    assert_eq!(stepper.states().positions, on_grid);
     assert_eq!(positions([0.1, 0.2], Some(&beside)), positions([0.1, 0.2], None));
 }

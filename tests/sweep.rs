@@ -658,6 +658,7 @@ fn wrong_usage_is_refused_before_any_work() {
         ("0/4", "there is no shard 0 of 4"),
         ("1/0", "found 0 shards"),
         ("x", "allowed I/N"),
+        ("-1/2", "allowed I/N"),
         ("1/99999999999", "allowed 1 to 65536"),
     ] {
         let error = failed(flotilla(&sweep, &out, &["--shard", shard]), 2);

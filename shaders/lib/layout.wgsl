@@ -6,8 +6,8 @@
 @group(0) @binding(3) var<storage, read> places: array<vec2<f32>>;
 // Of each task `[fours of a policy's weights][leaders][teams]`: neighbouring threads read neighbouring weights.
 @group(0) @binding(4) var<storage, read> weights: array<vec4<f32>>;
-// Of each task the sets `[steps][pois][words][teams]`, the counts `[followers][leaders][teams]` and, where SIGHTED holds,
-// the sights `[steps][followers][words of leaders][teams]`.
+// Of each task the sets `[steps][pois][words][teams]`, the counts `[followers][leaders][teams]` and, where SIGHTED
+// holds, the sights `[steps][followers][words of leaders][teams]`.
 @group(0) @binding(5) var<storage, read_write> record: array<u32>;
 // Of each task `[steps + 1][teams][agents]`; written only where TRACE holds.
 @group(0) @binding(6) var<storage, read_write> moments: array<Moment>;

@@ -42,13 +42,17 @@ impl fmt::Display for Quantity {
 /// The first place where a trace differs from the reference.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Mismatch {
+    /// The step, from 1; of counts over an episode, the last.
     pub step: usize,
+    /// Its place in the group.
     pub team: usize,
+    /// What differs.
     pub stage: Quantity,
     /// Which number of the stage: "agent 3, input 2".
     pub place: String,
-    /// Both bit patterns.
+    /// The bits of the reference.
     pub expected: u32,
+    /// The bits of the other trace.
     pub found: u32,
 }
 

@@ -34,7 +34,8 @@ impl Cpu {
         Cpu { level }
     }
 
-    /// Every instruction set that this processor has, narrowest first; with the feature `scalar` also doing without one.
+    /// Every instruction set that this processor has, narrowest first; with the feature `scalar` also doing without
+    /// one.
     pub fn levels() -> Vec<Level> {
         let best = Level::new();
         let mut levels = vec![Level::baseline()];
@@ -417,7 +418,8 @@ impl<S: Simd> Network<S> {
                     }
                 }
             }
-            // All leaders' tanh at once, and in short loops: the processor sees far enough ahead to keep its units busy.
+            // All leaders' tanh at once, and in short loops: the processor sees far enough ahead to keep its units
+            // busy.
             for unit in &mut *units {
                 *unit = policy::tame::<S>(*unit);
             }
@@ -904,7 +906,8 @@ fn observe<'a, S: Simd, const N: usize>(
     &mut sets[N * words * S::f32s::LEN..]
 }
 
-/// Turns followers to where they are pulled. In short loops: the processor sees far enough ahead to keep its units busy.
+/// Turns followers to where they are pulled. In short loops: the processor sees far enough ahead to keep its units
+/// busy.
 #[inline(always)]
 fn steer<S: Simd, const BY_SINE: bool>(
     world: &Lanes<S>,

@@ -51,8 +51,8 @@ pub fn weight_bytes(world: &World) -> u64 {
     (fours(world) * size_of::<[f32; FOUR]>()) as u64
 }
 
-/// Bytes that a GPU holds of a trial's populations, `[populations, slots, parameters]`, where it does: a buffer a population
-/// and one more, and every slot's parent.
+/// Bytes that a GPU holds of a trial's populations, `[populations, slots, parameters]`, where it does: a buffer a
+/// population and one more, and every slot's parent.
 pub fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {
     let [populations, population, parents] =
         [populations, 4 * slots * parameters, 4 * populations * slots].map(|count| count as u64);
@@ -62,9 +62,12 @@ pub fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {
 /// Teams of one world that start alike and are made of one set of policies.
 #[derive(Clone, Copy, Debug)]
 pub struct Group<'a> {
+    /// The world that they play in.
     pub world: &'a World,
-    /// Start positions `[agents]`, leaders first; after them places of the POIs, `[pois]`, unless these are the world's.
+    /// Start positions `[agents]`, leaders first; after them places of the POIs, `[pois]`, unless these are the
+    /// world's.
     pub starts: &'a [Vec2],
+    /// The policies.
     pub weights: Weights<'a>,
     /// Policies a leader has to choose from.
     pub policies: usize,
@@ -176,10 +179,11 @@ impl<'a> Group<'a> {
     }
 }
 
-/// What the policies of a group are, `[leaders][policies][parameters]`, or `[1][policies][parameters]` where all leaders
-/// choose from the same: each number 0 or of size 2^-30 to 2^20.
+/// What the policies of a group are, `[leaders][policies][parameters]`, or `[1][policies][parameters]` where all
+/// leaders choose from the same: each number 0 or of size 2^-30 to 2^20.
 #[derive(Clone, Copy, Debug)]
 pub enum Weights<'a> {
+    /// In the host's memory.
     OnHost(&'a [f32]),
     /// In the memory of the backend that plays.
     Held(&'a (dyn Held + 'static)),
@@ -224,12 +228,14 @@ pub trait Held: Any + Debug + Send + Sync {
 /// What one team did, as far as credit needs it.
 #[derive(Clone, Copy, Debug)]
 pub struct Episode<'a> {
-    /// Index of its group in the batch, and of the team in the group.
+    /// Index of its group in the batch.
     pub group: usize,
+    /// Index of the team in the group.
     pub team: usize,
     /// The agents near each POI after each step, a bit an agent: `[steps][pois][words]`. Where only scores are
     /// [needed](Need), there may be fewer steps, down to none, whose sets give the same scores, see [`crate::credit`].
     pub sets: Strided<'a>,
+    /// Which leaders its followers saw, as counts or as what [is needed](Need) of them.
     pub seen: Seen<'a>,
     /// The leaders that each follower saw before the move of each step, a bit a leader:
     /// `[steps][followers][words of leaders]`. Empty where nobody [needs](Need::sights) it.
@@ -263,8 +269,11 @@ pub fn owner_bits(leaders: u32) -> u32 {
 /// Words of one team among those of its neighbours: word i of this team is `words[i * stride + offset]`.
 #[derive(Clone, Copy, Debug)]
 pub struct Strided<'a> {
+    /// The words of all these teams.
     pub words: &'a [u32],
+    /// How many words on a team's next word is.
     pub stride: usize,
+    /// Where this team's first word is, under the stride.
     pub offset: usize,
 }
 
@@ -306,9 +315,11 @@ shared! {
         pub outputs: [f32; OUTPUTS],
         /// Attraction, repulsion and wall push together.
         pub force: [f32; 2],
-        /// State after the step.
+        /// Where the agent is after the step, x and y in units.
         pub position: [f32; 2],
+        /// Where it heads then, a unit vector.
         pub heading: [f32; 2],
+        /// How fast it is then, in units a second.
         pub speed: f32,
     }
 }
@@ -316,13 +327,18 @@ shared! {
 /// Every stage of every step: `moments[(step * teams + team) * agents + agent]`, steps `0..=steps`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trace {
+    /// Teams of the group.
     pub teams: usize,
+    /// Agents of a team.
     pub agents: usize,
+    /// `[steps + 1][teams][agents]`.
     pub moments: Vec<Moment>,
-    /// The record of the rollout, team by team: `[teams][steps][pois][words]`, `[teams][followers][leaders]` and, where
-    /// [needed](Need::sights), `[teams][steps][followers][words of leaders]`.
+    /// The agents near each POI after each step, a bit an agent: `[teams][steps][pois][words]`.
     pub sets: Vec<u32>,
+    /// At how many steps each follower saw each leader, `[teams][followers][leaders]`.
     pub seen: Vec<u32>,
+    /// Where [needed](Need::sights), which leaders each follower saw before each step's move, a bit a leader:
+    /// `[teams][steps][followers][words of leaders]`.
     pub sights: Vec<u32>,
 }
 
@@ -350,8 +366,8 @@ pub trait Backend: Send {
     /// As for [`Backend::rollout`].
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError>;
 
-    /// Takes the populations of one trial, `[populations][slots][parameters]`, a leader's each or one for all, into memory of its own, to breed them there;
-    /// none where they had better stay on the host.
+    /// Takes the populations of one trial, `[populations][slots][parameters]`, a leader's each or one for all, into
+    /// memory of its own, to breed them there; none where they had better stay on the host.
     ///
     /// # Errors
     /// They were asked to be held here and do not fit, or the device failed.
@@ -374,8 +390,11 @@ impl From<evolve::Misfit> for BackendError {
 pub struct Machine {
     /// "cpu" or "gpu".
     pub backend: String,
+    /// What the GPU calls itself.
     pub adapter: Option<String>,
+    /// The GPU's driver and its version.
     pub driver: Option<String>,
+    /// Threads of the CPU that work.
     pub threads: usize,
 }
 

@@ -11,8 +11,8 @@ use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
 use crate::host::Instant;
 
-/// Chains of products, and as many of sums: with factor and term they fill 16 registers. Two units of either kind with a
-/// latency of 3 need 6; where there are 32 registers, there may be 4 units.
+/// Chains of products, and as many of sums: with factor and term they fill 16 registers. Two units of either kind with
+/// a latency of 3 need 6; where there are 32 registers, there may be 4 units.
 const CHAINS: usize = if cfg!(target_arch = "aarch64") { 14 } else { 7 };
 /// Links of every chain between two looks at the clock.
 const LINKS: usize = 20_000;

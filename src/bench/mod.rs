@@ -37,7 +37,9 @@ const TRACED_PAIRS: usize = 1 << 28;
 
 /// What is measured.
 pub enum Subject {
+    /// The CPU, by this instruction set.
     Cpu(Cpu, Level),
+    /// A GPU.
     Gpu(Box<GpuEpisodes>),
 }
 
@@ -69,27 +71,37 @@ type Peak = dyn FnMut() -> Result<f64, BackendError>;
 
 /// What was measured of one config.
 pub struct Timing {
+    /// Teams that play at once.
     pub teams: usize,
+    /// Of a team.
     pub leaders: usize,
+    /// Of a team.
     pub followers: usize,
+    /// Of the world.
     pub pois: usize,
+    /// Of an episode.
     pub steps: usize,
     /// Seconds of one rollout (episodes, record and scores).
     pub rollout: f64,
     /// Seconds of one generation (that, selection and mutation), where it was asked for.
     pub generation: Option<f64>,
+    /// Where the time of generations went, where it was asked for.
     pub profile: Option<Profile>,
     /// Mean G of the random teams of the rollout.
     pub mean_g: f64,
+    /// Who was in reach of whom, on which the work depends.
     pub reach: Reach,
-    /// Lane operations of a team-step, and how many a second the machine can do.
+    /// Lane operations of a team-step.
     pub operations: f64,
+    /// Lane operations a second that the machine can do at most.
     pub ceiling: f64,
 }
 
 /// Where the time of some generations went.
 pub struct Profile {
+    /// How many these times are of, together.
     pub generations: usize,
+    /// By what was done.
     pub times: Times,
     /// What a GPU's rollouts are made of.
     pub stages: Option<Stages>,
@@ -100,8 +112,11 @@ pub struct Profile {
 /// What to measure of whole generations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Generations {
+    /// Only rollouts.
     LeftOut,
+    /// How long one takes.
     Timed,
+    /// How long one takes, and where that time goes.
     Profiled,
 }
 
@@ -207,8 +222,8 @@ fn generations(config: &Config, player: &mut Subject) -> Result<(f64, Profile), 
     Ok((seconds, Profile { generations, traffic: profile.traffic - before.traffic, ..profile }))
 }
 
-/// Seconds of one rollout of random policies, scored as in training, with the ceiling meanwhile; the mean G; and who was
-/// in reach of whom.
+/// Seconds of one rollout of random policies, scored as in training, with the ceiling meanwhile; the mean G; and who
+/// was in reach of whom.
 fn rollout(
     config: &Config,
     world: &World,

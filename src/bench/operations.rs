@@ -14,11 +14,13 @@ use crate::world::World;
 /// Who is in reach of whom, in the mean over a trace's teams and steps.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Reach {
-    /// POIs and agents within the ranges of a leader, summed over leaders.
+    /// POIs within the range of a leader, summed over leaders.
     pub sensed_pois: f64,
+    /// Agents within the range of a leader, summed over leaders.
     pub sensed_agents: f64,
-    /// Agents within the attraction radius of a follower, summed over followers, and how many of those are leaders.
+    /// Agents within the attraction radius of a follower, summed over followers.
     pub drawn: f64,
+    /// How many of those are leaders.
     pub seen: f64,
     /// Pairs of agents of which one senses or is drawn to the other, each counted once.
     pub pairs: f64,

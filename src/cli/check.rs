@@ -36,7 +36,8 @@ struct Cost {
     parameters: usize,
     /// Bytes of all trials' policies.
     policy_bytes: u64,
-    /// Bytes of one team's record: who was near which POI at which step, which leader each follower saw and, for Dt, when.
+    /// Bytes of one team's record: who was near which POI at which step, which leader each follower saw and, for Dt,
+    /// when.
     record_bytes: u64,
     /// Peak of the process where the CPU plays, and how much of it only while a checkpoint is written.
     host_bytes: u64,

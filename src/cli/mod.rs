@@ -192,22 +192,31 @@ fn refuse_steering(words: impl Iterator<Item = OsString>) -> Result<(), Error> {
 /// Why a command failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
+    /// A config that cannot be read or is wrong.
     #[error(transparent)]
     Config(#[from] ConfigError),
+    /// Episodes that could not be played.
     #[error("{}{}", .0, remedy::backend(.0))]
     Backend(#[from] BackendError),
+    /// A GPU that could not be had, or that failed.
     #[error("{}{}", .0, remedy::device(.0))]
     Device(#[from] DeviceError),
+    /// Files of runs that could not be written, read or used.
     #[error("{}{}", .0, remedy::record(.0, "run it again"))]
     Record(#[from] RecordError),
+    /// A run that could not go on.
     #[error("{}{}", .0, remedy::run(.0))]
     Run(#[from] RunError),
+    /// A run that could not be read to be shown.
     #[error("{}{}", .0, remedy::shown(.0))]
     Shown(#[from] crate::report::runs::ReadError),
+    /// An episode that could not be replayed.
     #[error("{}{}", .0, remedy::replayed(.0))]
     Replayed(#[from] ReplayError),
+    /// Results that could not be printed.
     #[error("standard output cannot be written: {0}")]
     Output(io::Error),
+    /// The system does not let signals be listened for.
     #[error("signals cannot be listened for: {0}")]
     Signals(io::Error),
     /// Wrong usage that only shows once flags are read together.
@@ -230,8 +239,8 @@ pub enum Error {
 impl Error {
     /// The process's exit code: 1 failed, 2 wrong usage, 75 stopped and ready to be resumed.
     ///
-    /// A value given by a flag is wrong usage wherever that is found: also one that does not fit the file or the machine
-    /// that it is used with. Where the file is wrong as well, the run failed.
+    /// A value given by a flag is wrong usage wherever that is found: also one that does not fit the file or the
+    /// machine that it is used with. Where the file is wrong as well, the run failed.
     pub fn exit_code(&self) -> u8 {
         match self {
             Error::Usage(_)
@@ -289,8 +298,10 @@ impl ConfigFile {
 /// A config file and the flags that change it.
 #[derive(clap::Args)]
 pub struct ConfigArgs {
+    /// The file.
     #[command(flatten)]
     pub file: ConfigFile,
+    /// The flags.
     #[command(flatten)]
     pub overrides: Overrides,
 }
@@ -390,7 +401,8 @@ pub enum BackendChoice {
 /// Where populations are kept between generations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Breed {
-    /// With a GPU, in its memory from 1 MiB a trial on and where they fit (an estimate, not measured); else in the host's
+    /// With a GPU, in its memory from 1 MiB a trial on and where they fit (an estimate, not measured); else in the
+    /// host's
     Auto,
     /// In the host's memory
     Host,

@@ -13,7 +13,8 @@ pub struct Args {
     /// Folders that `flotilla train` made
     #[arg(required = true, value_name = "RUN")]
     runs: Vec<PathBuf>,
-    /// Picture to write, .svg, .pdf or .png [default: curves.svg in the folder of one run, comparison.svg here of several]
+    /// Picture to write, .svg, .pdf or .png [default: curves.svg in the folder of one run, comparison.svg here of
+    /// several]
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Print one JSON object

@@ -1,4 +1,5 @@
-//! What to type about an error of the library, which knows of no flags: each gives what is added to the error's own text.
+//! What to type about an error of the library, which knows of no flags: each gives what is added to the error's own
+//! text.
 
 use std::io::ErrorKind::{FileTooLarge, PermissionDenied, QuotaExceeded, ReadOnlyFilesystem, StorageFull};
 

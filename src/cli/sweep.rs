@@ -64,7 +64,7 @@ pub struct Args {
     loss: Loss,
 
     /// Run shard I of N, dealt out by cost; else what a Slurm array or a Kubernetes indexed job says
-    #[arg(long, value_name = "I/N", help_heading = SCALE_OUT)]
+    #[arg(long, value_name = "I/N", allow_hyphen_values = true, help_heading = SCALE_OUT)]
     shard: Option<Shard>,
     /// Put the results of all shards together and say which points are missing
     #[arg(long, conflicts_with_all = ["shard", "resume", "force", "list", "slurm"], help_heading = SCALE_OUT)]
@@ -429,11 +429,10 @@ fn as_json(
         match outcome {
             Err(missing) => told["missing"] = json!(missing.to_string()),
             Ok(outcome) => {
-                let (best_g, error) = results::mean_and_error(&outcome.best);
                 told["digest"] = json!(Run::read(&folder.join(RUN)).ok().and_then(|run| run.digest));
-                told["best_g"] = json!(best_g);
-                told["best_g_error"] = json!(error);
-                told["champion_g"] = json!(results::mean_and_error(&outcome.champion).0);
+                told["best_g"] = json!(outcome.best().mean());
+                told["best_g_error"] = json!(outcome.best().error());
+                told["champion_g"] = json!(outcome.champion().mean());
                 told["reached"] = json!(outcome.reached.iter().flatten().count());
                 told["median"] = json!(outcome.median_reached());
             }
@@ -458,9 +457,8 @@ fn as_json(
 fn summary(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>], options: &results::Detail) -> String {
     const LISTED: usize = 12;
     let done = sweep.points.iter().zip(outcomes).filter_map(|(point, outcome)| Some((point, outcome.as_ref().ok()?)));
-    let mut done: Vec<_> =
-        done.map(|(point, outcome)| (results::mean_and_error(&outcome.best), point, outcome)).collect();
-    done.sort_by(|(a, ..), (b, ..)| b.0.total_cmp(&a.0));
+    let mut done: Vec<_> = done.map(|(point, outcome)| (outcome.best(), point, outcome)).collect();
+    done.sort_by(|(a, ..), (b, ..)| b.mean().total_cmp(&a.mean()));
     let mut text = format!(
         "{} of {} points are done. G of the best team in the last generation, mean over trials ± standard error,\n\
          and the median generation that reached G = {}:\n",
@@ -468,12 +466,13 @@ fn summary(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>], options: &resul
         sweep.points.len(),
         options.reach
     );
-    for (at, ((mean, error), point, outcome)) in done.iter().enumerate() {
+    for (at, (best, point, outcome)) in done.iter().enumerate() {
         if done.len() > LISTED && at == LISTED / 2 {
             let _ = writeln!(text, "  … ({} more)", done.len() - LISTED);
         }
         if done.len() <= LISTED || at < LISTED / 2 || at >= done.len() - LISTED / 2 {
             let reached = outcome.median_reached().map_or("never".into(), |median| median.to_string());
+            let (mean, error) = (best.mean(), best.error());
             let _ = writeln!(text, "  {mean:.3} ± {error:.3}  {reached:>6}  {}", sweep.describe(point));
         }
     }

@@ -41,8 +41,9 @@ pub struct Args {
     /// Go on with the run in the folder (without --out the latest of this config's name), or start it if there is none
     #[arg(long, conflicts_with = "force")]
     resume: bool,
-    /// Start from the policies of a safetensors file, in place of random ones: trial i from its tensor `weights.i`, or all from
-    /// `weights`, f32 [leaders, policies, parameters]; fewer policies than a population takes are joined by random ones
+    /// Start from the policies of a safetensors file, in place of random ones: trial i from its tensor `weights.i`, or
+    /// all from `weights`, f32 [leaders, policies, parameters]; fewer policies than a population takes are joined by
+    /// random ones
     #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
     /// Write over the run in the folder (without --out in runs/NAME of the config)

@@ -1,9 +1,10 @@
 //! The config: what an experiment is, with every default of the paper's calibration.
 //!
-//! A config is read from a file by [`Config::load`], or from text by [`Config::read`] where flags or a sweep change some
-//! of its keys. Each section is plain data beside its keys, and each key stands once, with its unit, its meaning, where the
-//! paper has it, what it allows and its default: those of a step's parts with these parts, in [`crate::model`], the others
-//! here. Everything wrong with a text is found in one pass and reported by line, see [`crate::reader`].
+//! A config is read from a file by [`Config::load`], or from text by [`Config::read`] where flags or a sweep change
+//! some of its keys. Each section is plain data beside its keys, and each key stands once, with its unit, its meaning,
+//! where the paper has it, what it allows and its default: those of a step's parts with these parts, in
+//! [`crate::model`], the others here. Everything wrong with a text is found in one pass and reported by line, see
+//! [`crate::reader`].
 
 use serde::Serialize;
 
@@ -55,12 +56,19 @@ pub fn keys() -> Vec<Definition> {
 /// One experiment, as written in a config file.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Config {
+    /// `[world]`: where everything starts.
     pub world: Domain,
+    /// `[motion]`: how agents move.
     pub motion: Motion,
+    /// `[follow]`: what followers do.
     pub follow: Follow,
+    /// `[sense]`: what leaders sense.
     pub sense: Sense,
+    /// `[policy]`: the leaders' network.
     pub policy: Policy,
+    /// `[learning]`: the coevolution.
     pub learning: Learning,
+    /// `[checkpoint]`: how often a run saves.
     pub checkpoint: Saving,
     /// What changes from some generations on, see [`Config::staged`].
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -140,8 +148,8 @@ impl Config {
         counts.map(|count| count as u64).iter().product::<u64>() * size_of::<f32>() as u64
     }
 
-    /// Asks for every key. A faulty number reads as the most that is allowed, a faulty list as none, so that what depends
-    /// on it is not blamed as well.
+    /// Asks for every key. A faulty number reads as the most that is allowed, a faulty list as none, so that what
+    /// depends on it is not blamed as well.
     fn ask(r: &mut Reader<'_>) -> Config {
         let (motion, start_speed) = Motion::read(r);
         let paradigm = Paradigm::read(r);
@@ -169,11 +177,24 @@ impl Config {
 /// Why there is no config.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ConfigError {
+    /// There is no such file, it is no text, or it is too large.
     #[error("{name}: cannot be read: {reason}")]
-    Unreadable { name: String, reason: String },
+    Unreadable {
+        /// What errors call the file.
+        name: String,
+        /// The system's words.
+        reason: String,
+    },
     /// All that is wrong, by line; what came from outside the file (see [`Override`]) last.
     #[error("{}", list(name, problems, *unlisted))]
-    Invalid { name: String, problems: Vec<Problem>, unlisted: usize },
+    Invalid {
+        /// What errors call the file.
+        name: String,
+        /// What is wrong; where that is much, the first of it.
+        problems: Vec<Problem>,
+        /// How much more there is.
+        unlisted: usize,
+    },
 }
 
 impl ConfigError {

@@ -1,7 +1,7 @@
 //! `[[stages]]`: what changes from which generation on.
 //!
-//! Each stage starts from the file, not from the stage before: its config is the file's with some keys set. What makes the
-//! populations, and the plan of the run, is the same in all of them.
+//! Each stage starts from the file, not from the stage before: its config is the file's with some keys set. What makes
+//! the populations, and the plan of the run, is the same in all of them.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -49,8 +49,8 @@ impl Stage {
 }
 
 impl Config {
-    /// The configs that play, each with the first of its generations: where the first stage comes later than generation 0,
-    /// the file's own plays before it. Of a valid config, whose stages were seen to be valid too.
+    /// The configs that play, each with the first of its generations: where the first stage comes later than generation
+    /// 0, the file's own plays before it. Of a valid config, whose stages were seen to be valid too.
     pub fn staged(&self) -> Vec<(usize, Config)> {
         let own = Config { stages: vec![], ..self.clone() };
         let mut staged = Vec::with_capacity(self.stages.len() + 1);

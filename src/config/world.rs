@@ -2,12 +2,10 @@
 
 use std::f64::consts::FRAC_PI_2;
 
-use serde::Serialize;
-
 use super::{Coupling, Observers, Paradigm};
 use crate::model::couple::{after, observation_radius, windows};
 use crate::model::{LEAST, LONGEST};
-use crate::reader::{Allowed, Reader, between};
+use crate::reader::{Allowed, Reader, between, section};
 
 /// Most agents (leaders and followers) in a team.
 pub const MAX_AGENTS: usize = 1024;
@@ -22,52 +20,47 @@ const _: () = {
     assert!(MAX_STEPS * (sets + sights) * size_of::<u32>() < 1 << 30);
 };
 
-/// `[world]`: where everything starts. Lengths in map units, time in seconds, angles in radians.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Domain {
-    pub map: [f64; 2],
-    pub leaders: Vec<[f64; 2]>,
-    pub followers: Vec<[f64; 2]>,
-    pub pois: Vec<[f64; 2]>,
-    pub coupling: Coupling,
-    pub observation_radius: f64,
-    pub observers: Observers,
-    /// The first and the last step, from 1, at which each POI can be observed; empty where that is any.
-    pub windows: Vec<[usize; 2]>,
-    /// The POIs that each comes after; empty where none comes after any.
-    pub after: Vec<Vec<usize>>,
-    pub steps: usize,
-    pub dt: f64,
-    pub heading: f64,
-    pub speed: f64,
+section! {
+    /// `[world]`: where everything starts, how long an episode is, and who observes a POI. Positions are `[x, y]` in
+    /// map units, time is in seconds, angles in radians.
+    Domain = "world" {
+        /// width and height; positions stay within 0 to these
+        map: [f64; 2] = "units", "3.1",
+        /// start positions of the leaders, which are agents 0 to L − 1
+        leaders: Vec<[f64; 2]> = "units", "4.1, Fig. 3",
+        /// start positions of the followers, agents L to N − 1; in the all-leaders paradigm leaders stand there
+        followers: Vec<[f64; 2]> = "units", "4.1, Fig. 3",
+        /// positions of the P points of interest, which stay where they are
+        pois: Vec<[f64; 2]> = "units", "3.1, Fig. 3",
+        /// Agents needed at each POI (C).
+        coupling: Coupling,
+        /// Within this distance of a POI an agent is at it (σ₀), in units.
+        observation_radius: f64,
+        /// Whose presence at a POI counts.
+        observers: Observers,
+        /// The first and the last step, from 1, at which each POI can be observed; empty where that is any.
+        windows: Vec<[usize; 2]>,
+        /// The POIs that each comes after; empty where none comes after any.
+        after: Vec<Vec<usize>>,
+        /// T: length of an episode
+        steps: usize = "steps", "3.2, Eq. 2",
+        /// time that a step takes
+        dt: f64 = "s", "",
+        /// every agent's heading at the start, from the x axis towards the y axis: π/2 faces the POIs
+        heading: f64 = "rad", "3.1, Fig. 3",
+        /// every agent's speed at the start
+        speed: f64 = "units/s", "3.1",
+    }
 }
 
 impl Domain {
     /// Reads the section; agents start with one of these speeds, and learn by this paradigm.
     pub(super) fn read(r: &mut Reader<'_>, start_speed: Allowed<f64>, paradigm: Paradigm) -> Domain {
-        let map = r
-            .key("world.map", "units", "width and height; positions stay within 0 to these", "3.1")
-            .pair(between(1.0, LONGEST), [50.0, 50.0]);
+        let map = Domain::map(r).pair(between(1.0, LONGEST), [50.0, 50.0]);
         let sides = map.map(|side| between(LEAST, side).or_zero().because("the map"));
-        let leaders = r
-            .key("world.leaders", "units", "start positions of the leaders, which are agents 0 to L − 1", "4.1, Fig. 3")
-            .positions(1..=MAX_AGENTS, sides, None);
-        let followers = r
-            .key(
-                "world.followers",
-                "units",
-                "start positions of the followers, agents L to N − 1; in the all-leaders paradigm leaders stand there",
-                "4.1, Fig. 3",
-            )
-            .positions(0..=MAX_AGENTS - 1, sides, Some(vec![]));
-        let pois = r
-            .key(
-                "world.pois",
-                "units",
-                "positions of the P points of interest, which stay where they are",
-                "3.1, Fig. 3",
-            )
-            .positions(1..=MAX_POIS, sides, None);
+        let leaders = Domain::leaders(r).positions(1..=MAX_AGENTS, sides, None);
+        let followers = Domain::followers(r).positions(0..=MAX_AGENTS - 1, sides, Some(vec![]));
+        let pois = Domain::pois(r).positions(1..=MAX_POIS, sides, None);
         let agents = leaders.as_ref().zip(followers.as_ref()).map_or(MAX_AGENTS, |(l, f)| l.len() + f.len());
         if agents > MAX_AGENTS {
             let message = format!("found {agents} agents with the leaders, allowed 1 to {MAX_AGENTS}");
@@ -86,8 +79,7 @@ impl Domain {
             r.blame_key("world.observers", format!("found \"{observers}\", but {why}, so nobody would observe"));
         }
         let places = pois.as_ref().map(Vec::len);
-        let steps =
-            r.key("world.steps", "steps", "T: length of an episode", "3.2, Eq. 2").number(between(1, MAX_STEPS), 25);
+        let steps = Domain::steps(r).number(between(1, MAX_STEPS), 25);
         Domain {
             map,
             coupling: Coupling::read(r, counted.clamp(1, MAX_AGENTS), observers.counted(), places),
@@ -99,16 +91,9 @@ impl Domain {
             pois: pois.unwrap_or_default(),
             observation_radius: observation_radius(r),
             steps,
-            dt: r.key("world.dt", "s", "time that a step takes", "").number(between(1e-4, 10.0), 0.2),
-            heading: r
-                .key(
-                    "world.heading",
-                    "rad",
-                    "every agent's heading at the start, from the x axis towards the y axis: π/2 faces the POIs",
-                    "3.1, Fig. 3",
-                )
-                .number(between(-1e3, 1e3), FRAC_PI_2),
-            speed: r.key("world.speed", "units/s", "every agent's speed at the start", "3.1").number(start_speed, 0.0),
+            dt: Domain::dt(r).number(between(1e-4, 10.0), 0.2),
+            heading: Domain::heading(r).number(between(-1e3, 1e3), FRAC_PI_2),
+            speed: Domain::speed(r).number(start_speed, 0.0),
         }
     }
 }

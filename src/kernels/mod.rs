@@ -47,8 +47,8 @@ pub fn smaller<S: Simd>(a: S::f32s, b: S::f32s) -> S::f32s {
     if cfg!(target_family = "wasm") { select::<S>(b, a, a.simd_lt(b)) } else { a.min(b) }
 }
 
-/// `x` moved into `low..=high`: for numbers this is the shader's pair of selects, in half the operations. Where `x` and a
-/// bound are zeros of different signs, either may come out.
+/// `x` moved into `low..=high`: for numbers this is the shader's pair of selects, in half the operations. Where `x` and
+/// a bound are zeros of different signs, either may come out.
 #[inline(always)]
 pub fn bound<S: Simd>(x: S::f32s, low: S::f32s, high: S::f32s) -> S::f32s {
     smaller::<S>(larger::<S>(x, low), high)
@@ -62,7 +62,8 @@ pub mod operations {
     pub const ROOT: u32 = 12;
     /// [`recip`](super::math::recip).
     pub const RECIP: u32 = 8;
-    /// A bound, a square, 5 and 3 for numerator and denominator; their squares' sum, its rough reciprocal (4) and 6 more.
+    /// A bound, a square, 5 and 3 for numerator and denominator; their squares' sum, its rough reciprocal (4) and 6
+    /// more.
     pub const TANH: u32 = BOUND + 1 + 5 + 3 + 3 + 4 + 6;
     /// [`sin_cos`](super::math::sin_cos).
     pub const SIN_COS: u32 = 26;

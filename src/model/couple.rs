@@ -17,7 +17,9 @@ pub const WGSL: &str = include_str!("../../shaders/couple.wgsl");
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(untagged)]
 pub enum Coupling {
+    /// As many at every POI.
     Same(usize),
+    /// So many at each, `[pois]`.
     Each(Vec<usize>),
 }
 
@@ -53,7 +55,9 @@ choice! {
     Observers {
         /// Every agent's.
         All = "all",
+        /// Leaders' alone.
         Leaders = "leaders",
+        /// Followers' alone.
         Followers = "followers",
     }
 }
@@ -194,8 +198,8 @@ impl Rule {
         }
     }
 
-    /// Whether it fits so many words a set and POIs: it is of as many, no window starts before the first step, and no POI
-    /// waits for itself.
+    /// Whether it fits so many words a set and POIs: it is of as many, no window starts before the first step, and no
+    /// POI waits for itself.
     pub fn fits(&self, words: usize, pois: usize) -> bool {
         let fits = |len: usize, wanted: usize| len == 0 || len == wanted;
         fits(self.counted.len(), words)

@@ -1,7 +1,6 @@
 //! A follower's preset behaviour: drawn to agents in sight, pushed off close ones and walls (Section 4.1, Figure 2b).
 
 use fearless_simd::{Simd, prelude::*};
-use serde::Serialize;
 
 use super::{LONGEST, Lanes, motion::rotate};
 use crate::declare::shared;
@@ -12,48 +11,39 @@ use crate::kernels::{
     operations::{FLUSH, RECIP, ROTATE, RSQRT, SQUARED_DISTANCE},
     select, splat,
 };
-use crate::reader::{Reader, between};
+use crate::reader::{Reader, between, section};
 
 /// The shader's part.
 pub const WGSL: &str = include_str!("../../shaders/follow.wgsl");
 
-/// `[follow]`: the followers' preset behaviour.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Follow {
-    pub attraction_radius: f64,
-    pub repulsion_radius: f64,
-    pub attraction_gain: f64,
-    pub repulsion_gain: f64,
-    pub wall_gain: f64,
+section! {
+    /// `[follow]`: the followers' preset behaviour.
+    Follow = "follow" {
+        /// within it a follower sees others: it is drawn to them, and counts the leaders among them for Df
+        attraction_radius: f64 = "units", "4.1, 4.2",
+        /// within it others, and walls, push a follower away
+        repulsion_radius: f64 = "units", "4.1",
+        /// pull of others at the attraction radius
+        attraction_gain: f64 = "units/s", "4.1, Fig. 2b",
+        /// push of others at the repulsion radius
+        repulsion_gain: f64 = "units/s", "4.1, Fig. 2b",
+        /// push of a wall for each unit nearer than the repulsion radius
+        wall_gain: f64 = "1/s", "",
+    }
 }
 
 impl Follow {
     /// Reads the section.
     pub(crate) fn read(r: &mut Reader<'_>) -> Follow {
-        let attraction_radius = r
-            .key(
-                "follow.attraction_radius",
-                "units",
-                "within it a follower sees others: it is drawn to them, and counts the leaders among them for Df",
-                "4.1, 4.2",
-            )
-            .number(between(0.01, LONGEST), 5.0);
+        let attraction_radius = Follow::attraction_radius(r).number(between(0.01, LONGEST), 5.0);
         let closest = between(0.01, attraction_radius).because("follow.attraction_radius");
         let gain = between(1e-3, 1e3).or_zero();
         Follow {
             attraction_radius,
-            repulsion_radius: r
-                .key("follow.repulsion_radius", "units", "within it others, and walls, push a follower away", "4.1")
-                .number(closest, 1.0),
-            attraction_gain: r
-                .key("follow.attraction_gain", "units/s", "pull of others at the attraction radius", "4.1, Fig. 2b")
-                .number(gain, 5.0),
-            repulsion_gain: r
-                .key("follow.repulsion_gain", "units/s", "push of others at the repulsion radius", "4.1, Fig. 2b")
-                .number(gain, 1.0),
-            wall_gain: r
-                .key("follow.wall_gain", "1/s", "push of a wall for each unit nearer than the repulsion radius", "")
-                .number(gain, 1.0),
+            repulsion_radius: Follow::repulsion_radius(r).number(closest, 1.0),
+            attraction_gain: Follow::attraction_gain(r).number(gain, 5.0),
+            repulsion_gain: Follow::repulsion_gain(r).number(gain, 1.0),
+            wall_gain: Follow::wall_gain(r).number(gain, 1.0),
         }
     }
 }
@@ -61,14 +51,17 @@ impl Follow {
 shared! {
     /// What following reads.
     pub struct FollowConstants as FollowLanes {
-        /// Squared radii.
+        /// The attraction radius, squared.
         pub attraction_radius2: f32,
+        /// The repulsion radius, squared.
         pub repulsion_radius2: f32,
         /// Walls push within this distance.
         pub repulsion_radius: f32,
-        /// Gain over radius of each force.
+        /// Attraction's gain over its radius.
         pub attraction_scale: f32,
+        /// Repulsion's gain over its radius.
         pub repulsion_scale: f32,
+        /// Push for each unit that a wall is nearer than the repulsion radius.
         pub wall_gain: f32,
     }
 }
@@ -88,8 +81,8 @@ impl FollowConstants {
     }
 }
 
-/// Lane operations of meeting an agent within the attraction radius: 2 tests and their difference, 4 selections, 4 sums,
-/// 2 counts.
+/// Lane operations of meeting an agent within the attraction radius: 2 tests and their difference, 4 selections, 4
+/// sums, 2 counts.
 pub const INFLUENCE: u32 = SQUARED_DISTANCE + 3 + 4 + 4 + 2;
 /// That agent is a leader: counted.
 pub const SEEN: u32 = 1;
@@ -100,9 +93,9 @@ pub const FOLLOW: u32 = FORCE + INFLUENCED + STEER;
 const FORCE: u32 = 2 * (RECIP + 3) + 2 * (4 + 7 + FLUSH);
 /// Whether anything is near: the counts' sum and test, the nearest of 4 walls and its test, and joining them.
 const INFLUENCED: u32 = 2 + 3 + 1 + 1;
-/// Steering: the force's square and direction (3, an inverse root, 2), along and across (6), the largest turn to its side
-/// (2 and a rotation), whether the force lies within it, 4 selections of the heading, the speed ahead (2) and 3 selections
-/// of the speed, 2 tests of the force.
+/// Steering: the force's square and direction (3, an inverse root, 2), along and across (6), the largest turn to its
+/// side (2 and a rotation), whether the force lies within it, 4 selections of the heading, the speed ahead (2) and 3
+/// selections of the speed, 2 tests of the force.
 const STEER: u32 = 3 + RSQRT + 2 + 6 + 2 + ROTATE + WITHIN + 4 + 2 + 3 + 2;
 /// A test of the sine and its size, joined to one that is counted already.
 const WITHIN: u32 = 3;
@@ -113,11 +106,17 @@ pub const TINY: f32 = 1.0 / 1_073_741_824.0;
 /// Offsets to the agents within a follower's radii, summed and counted.
 #[derive(Clone, Copy)]
 pub struct Sums<S: Simd> {
+    /// Within the repulsion radius.
     pub repel_x: S::f32s,
+    /// Likewise.
     pub repel_y: S::f32s,
+    /// How many these are.
     pub repel_count: S::i32s,
+    /// Within the attraction radius alone.
     pub attract_x: S::f32s,
+    /// Likewise.
     pub attract_y: S::f32s,
+    /// How many these are.
     pub attract_count: S::i32s,
 }
 
@@ -156,8 +155,11 @@ pub fn influence<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s, sums: &mut
 /// What acts on a follower: the force, and in which lanes any agent or wall is near.
 #[derive(Clone, Copy)]
 pub struct Pull<S: Simd> {
+    /// The force along x, in units a second.
     pub x: S::f32s,
+    /// The force along y.
     pub y: S::f32s,
+    /// Where any agent or wall is near.
     pub influenced: S::mask32s,
 }
 
@@ -199,8 +201,8 @@ pub fn sizes<S: Simd>(pull: &Pull<S>) -> (S::f32s, S::f32s) {
 /// No angle is needed: the force's direction is taken where it lies within the largest turn (by its sine or cosine),
 /// else the heading turns by that much, to the side of the force.
 ///
-/// A cosine near 1 cannot tell small angles apart, a sine near 1 cannot tell large ones: `BY_SINE` where the largest turn
-/// is small.
+/// A cosine near 1 cannot tell small angles apart, a sine near 1 cannot tell large ones: `BY_SINE` where the largest
+/// turn is small.
 #[inline(always)]
 pub fn steer<S: Simd, const BY_SINE: bool>(
     world: &Lanes<S>,
@@ -224,7 +226,8 @@ pub fn steer<S: Simd, const BY_SINE: bool>(
     } else {
         along.simd_ge(world.motion.max_turn_cos) & pulled
     };
-    // In this order of selection no heading is selected last: the compiler would make a masked store of that, which is slow.
+    // In this order of selection no heading is selected last: the compiler would make a masked store of that, which is
+    // slow.
     let next_x = select::<S>(select::<S>(hx, turned_x, pulled), ux, reached);
     let next_y = select::<S>(select::<S>(hy, turned_y, pulled), uy, reached);
     let ahead = select::<S>(world.motion.min_speed, force2 * inverse, along.simd_gt(zero));

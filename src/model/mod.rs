@@ -27,21 +27,33 @@ pub(crate) const LEAST: f64 = 1e-6;
 shared! {
     /// What every kernel reads; in the shaders the fields of all parts stand side by side.
     pub struct Constants {
+        /// Learners of a team, agents 0 on.
         pub leaders: u32,
+        /// Agents after them.
         pub followers: u32,
+        /// Points of interest.
         pub pois: u32,
+        /// T, of an episode.
         pub steps: u32,
         /// u32 words in the set of agents near one POI.
         pub words: u32,
-        /// Heading and speed at the start.
+        /// The heading at the start: its cosine.
         pub heading_x: f32,
+        /// Its sine.
         pub heading_y: f32,
+        /// At the start, units a second.
         pub speed: f32,
+        /// What kernels have code of their own for.
         pub variant: Variant,
+        /// Sizes of a policy.
         pub policy: PolicyConstants,
+        /// How agents move.
         pub motion: MotionConstants,
+        /// Who is at a POI.
         pub couple: CoupleConstants,
+        /// What followers do.
         pub follow: FollowConstants,
+        /// What leaders sense.
         pub sense: SenseConstants,
     }
 
@@ -65,10 +77,15 @@ impl Variant {
 /// The constants, and those of the parts with every float in all lanes.
 #[derive(Clone, Copy)]
 pub struct Lanes<S: Simd> {
+    /// As they are.
     pub constants: Constants,
+    /// In all lanes.
     pub motion: MotionLanes<S>,
+    /// In all lanes.
     pub couple: CoupleLanes<S>,
+    /// In all lanes.
     pub follow: FollowLanes<S>,
+    /// In all lanes.
     pub sense: SenseLanes<S>,
 }
 

@@ -3,7 +3,6 @@
 use std::f64::consts::{FRAC_PI_2, PI};
 
 use fearless_simd::{Simd, prelude::*};
-use serde::Serialize;
 
 use super::{LEAST, Lanes};
 use crate::declare::shared;
@@ -13,48 +12,40 @@ use crate::kernels::{
     operations::{self, BOUND, FLUSH, SIN_COS},
     splat,
 };
-use crate::reader::{Allowed, Reader, between};
+use crate::reader::{Allowed, Reader, between, section};
 
 /// The shader's part.
 pub const WGSL: &str = include_str!("../../shaders/motion.wgsl");
 
-/// `[motion]`: the limits of every agent's movement.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Motion {
-    pub min_speed: f64,
-    pub max_speed: f64,
-    pub max_acceleration: f64,
-    pub max_turn_rate: f64,
+section! {
+    /// `[motion]`: the limits of every agent's movement.
+    Motion = "motion" {
+        /// smallest speed of any agent: above 0, nobody can stop
+        min_speed: f64 = "units/s", "3.1",
+        /// largest speed of any agent, and a leader's wanted speed at most
+        max_speed: f64 = "units/s", "3.1",
+        /// an agent's speed changes by at most this times dt
+        max_acceleration: f64 = "units/s²", "3.1",
+        /// an agent's heading turns by at most this times dt
+        max_turn_rate: f64 = "rad/s", "3.1",
+    }
 }
 
 impl Motion {
     /// Reads the section; also the speeds that agents may start with.
     pub(crate) fn read(r: &mut Reader<'_>) -> (Motion, Allowed<f64>) {
-        let max_speed = r
-            .key(
-                "motion.max_speed",
-                "units/s",
-                "largest speed of any agent, and a leader's wanted speed at most",
-                "3.1",
-            )
-            .number(between(LEAST, 1e3).or_zero(), 3.0);
+        let max_speed = Motion::max_speed(r).number(between(LEAST, 1e3).or_zero(), 3.0);
         let slowest = between(LEAST, max_speed).or_zero().because("motion.max_speed");
         let before = r.faults();
-        let min_speed = r
-            .key("motion.min_speed", "units/s", "smallest speed of any agent: above 0, nobody can stop", "3.1")
-            .number(slowest, 0.0);
+        let min_speed = Motion::min_speed(r).number(slowest, 0.0);
         let least = if r.faults() > before { 0.0 } else { min_speed };
         let start_speed = between(least.max(LEAST), max_speed).because("motion.min_speed to motion.max_speed");
         let start_speed = if least == 0.0 { start_speed.or_zero() } else { start_speed };
         let motion = Motion {
             min_speed,
             max_speed,
-            max_acceleration: r
-                .key("motion.max_acceleration", "units/s²", "an agent's speed changes by at most this times dt", "3.1")
-                .number(between(1e-3, 1e3).or_zero(), 5.0),
-            max_turn_rate: r
-                .key("motion.max_turn_rate", "rad/s", "an agent's heading turns by at most this times dt", "3.1")
-                .number(between(1e-3, 1e3).or_zero(), FRAC_PI_2),
+            max_acceleration: Motion::max_acceleration(r).number(between(1e-3, 1e3).or_zero(), 5.0),
+            max_turn_rate: Motion::max_turn_rate(r).number(between(1e-3, 1e3).or_zero(), FRAC_PI_2),
         };
         (motion, start_speed)
     }
@@ -63,17 +54,23 @@ impl Motion {
 shared! {
     /// What moving reads.
     pub struct MotionConstants as MotionLanes {
+        /// Width of the map, in units.
         pub map_x: f32,
+        /// Height of the map, in units.
         pub map_y: f32,
-        /// Speed times `dt` is the length of a step.
+        /// Seconds of a step: a speed times this is how far it goes.
         pub dt: f32,
+        /// Units a second, as its key has it.
         pub min_speed: f32,
+        /// Units a second, as its key has it.
         pub max_speed: f32,
-        /// Largest change of speed in a step.
+        /// Largest change of speed in a step, in units a second.
         pub max_speed_change: f32,
-        /// Largest turn in a step, at most π, with its cosine and sine (cosine -2 where any turn is allowed).
+        /// Largest turn in a step, in radians, at most π.
         pub max_turn: f32,
+        /// Its cosine; -2, which any cosine is above, where any turn is allowed.
         pub max_turn_cos: f32,
+        /// Its sine; 0 where any turn is allowed.
         pub max_turn_sin: f32,
     }
 }
@@ -108,8 +105,8 @@ pub const GRID: f32 = 262_144.0;
 /// Lane operations of a leader's turn: bounded, and rotated.
 pub const TURN: u32 = BOUND + SIN_COS + operations::ROTATE;
 /// Lane operations of an agent's move: the heading renormalized (its square 3, a scale 2, 2 products, 2 flushes), the
-/// speed brought up within 2 bounds, and on each axis a step (after one common product), snapped to the grid (4) and kept
-/// on the map.
+/// speed brought up within 2 bounds, and on each axis a step (after one common product), snapped to the grid (4) and
+/// kept on the map.
 pub const MOVE: u32 = 3 + 2 + 2 + 2 * FLUSH + (2 + 2 * BOUND) + 1 + 2 * (2 + 4 + BOUND);
 
 /// Heading components under this size (2^-30) count as 0.

@@ -1,8 +1,7 @@
-//! A leader's policy: a fully connected network with a bias and tanh in every layer (Sections 2.4 and 3.1), whose outputs
-//! are what it does, or choose among known behaviours.
+//! A leader's policy: a fully connected network with a bias and tanh in every layer (Sections 2.4 and 3.1), whose
+//! outputs are what it does, or choose among known behaviours.
 
 use fearless_simd::{Simd, prelude::*};
-use serde::Serialize;
 
 use super::{Lanes, sense::INPUTS};
 use crate::declare::{choice, shared};
@@ -11,7 +10,7 @@ use crate::kernels::{
     operations::{FLUSH, TANH},
     select, splat,
 };
-use crate::reader::{Reader, between};
+use crate::reader::{Reader, between, section};
 
 /// The shader's part.
 pub const WGSL: &str = include_str!("../../shaders/policy.wgsl");
@@ -25,11 +24,16 @@ pub const MAX_HIDDEN_LAYERS: usize = 3;
 /// Most units in one hidden layer.
 pub const MAX_HIDDEN_UNITS: usize = 64;
 
-/// `[policy]`: the leaders' network, `inputs, hidden…, outputs`.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Policy {
-    pub hidden: Vec<usize>,
-    pub actions: Actions,
+section! {
+    /// `[policy]`: the leaders' network, `inputs, hidden…, outputs`.
+    #[derive(Eq)]
+    Policy = "policy" {
+        /// hidden layers of a policy, between 8 inputs and 2 outputs, or 5 that choose a behaviour
+        hidden: Vec<usize> = "units of a layer", "2.4, 3.1",
+        /// what the outputs are: a wanted turn and speed, or how much each of 5 behaviours is wanted: hold, towards or
+        /// away from most POIs, towards or away from most agents
+        actions: Actions = "", "1, 2.4",
+    }
 }
 
 choice! {
@@ -56,23 +60,8 @@ impl Policy {
     /// Reads the section.
     pub(crate) fn read(r: &mut Reader<'_>) -> Policy {
         Policy {
-            hidden: r
-                .key(
-                    "policy.hidden",
-                    "units of a layer",
-                    "hidden layers of a policy, between 8 inputs and 2 outputs, or 5 that choose a behaviour",
-                    "2.4, 3.1",
-                )
-                .numbers(0..=MAX_HIDDEN_LAYERS, between(1, MAX_HIDDEN_UNITS), vec![10]),
-            actions: r
-                .key(
-                    "policy.actions",
-                    "",
-                    "what the outputs are: a wanted turn and speed, or how much each of 5 behaviours is wanted: hold, \
-                     towards or away from most POIs, towards or away from most agents",
-                    "1, 2.4",
-                )
-                .choice(Actions::Direct),
+            hidden: Policy::hidden(r).numbers(0..=MAX_HIDDEN_LAYERS, between(1, MAX_HIDDEN_UNITS), vec![10]),
+            actions: Policy::actions(r).choice(Actions::Direct),
         }
     }
 
@@ -90,10 +79,11 @@ impl Policy {
 shared! {
     /// The sizes of a policy.
     pub struct PolicyConstants as PolicyLanes {
-        /// Weight layers, and the widths `inputs, hidden…, outputs` (unused entries 0).
+        /// Layers of weights.
         pub layers: u32,
+        /// `inputs, hidden…, outputs`; unused entries are 0.
         pub widths: [u32; MAX_HIDDEN_LAYERS + 2],
-        /// Weights.
+        /// Weights, biases included.
         pub parameters: u32,
     }
 }
@@ -163,8 +153,8 @@ const CHOICE: u32 = 4 * 3 + 2 * (3 * 3 + 3 + 2) + 8;
 
 /// What the most wanted behaviour is as a direct answer: the first of the largest `wanted`, each in -1..1.
 ///
-/// Behaviours: hold; towards and away from the quadrant of most POIs; towards and away from that of most agents, the first
-/// where several are alike. Where nothing is sensed, straight ahead.
+/// Behaviours: hold; towards and away from the quadrant of most POIs; towards and away from that of most agents, the
+/// first where several are alike. Where nothing is sensed, straight ahead.
 #[inline(always)]
 pub fn choose<S: Simd>(inputs: &[S::f32s; INPUTS], wanted: &[S::f32s; BEHAVIOURS]) -> [S::f32s; OUTPUTS] {
     let simd = wanted[0].token();

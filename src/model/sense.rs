@@ -1,7 +1,6 @@
 //! What a leader senses: the density of POIs and of agents in four quadrants around its heading (Section 3.1).
 
 use fearless_simd::{Simd, prelude::*};
-use serde::Serialize;
 
 use super::{LONGEST, Lanes};
 use crate::declare::{choice, shared};
@@ -12,7 +11,7 @@ use crate::kernels::{
     operations::{ROOT, ROTATE, RSQRT, SQUARED_DISTANCE},
     select, splat,
 };
-use crate::reader::{Reader, between};
+use crate::reader::{Reader, between, section};
 
 /// The shader's part.
 pub const WGSL: &str = include_str!("../../shaders/sense.wgsl");
@@ -33,33 +32,26 @@ pub const NAMES: [&str; INPUTS] = [
 /// A squared range no distance on a map reaches.
 const UNLIMITED: f32 = 1e30;
 
-/// `[sense]`: what a leader senses. An infinite range is unlimited; a config file says so with `inf`.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Sense {
-    pub poi_range: f64,
-    pub agent_range: f64,
-    pub density: Density,
+section! {
+    /// `[sense]`: what a leader senses. An infinite range is unlimited; a config file says so with `inf`.
+    Sense = "sense" {
+        /// how far leaders sense POIs
+        poi_range: f64 = "units", "3.1",
+        /// how far leaders sense other agents
+        agent_range: f64 = "units", "3.1",
+        /// what something at distance d adds to its quadrant's density: 1 − d/(√2·max(map)) if linear, 1/max(d, 1) if
+        /// inverse
+        density: Density = "", "3.1",
+    }
 }
 
 impl Sense {
     /// Reads the section.
     pub(crate) fn read(r: &mut Reader<'_>) -> Sense {
         Sense {
-            poi_range: r
-                .key("sense.poi_range", "units", "how far leaders sense POIs", "3.1")
-                .number(between(0.01, LONGEST).or_unlimited(), f64::INFINITY),
-            agent_range: r
-                .key("sense.agent_range", "units", "how far leaders sense other agents", "3.1")
-                .number(between(0.01, LONGEST).or_unlimited(), 5.0),
-            density: r
-                .key(
-                    "sense.density",
-                    "",
-                    "what something at distance d adds to its quadrant's density: 1 − d/(√2·max(map)) if linear, \
-                     1/max(d, 1) if inverse",
-                    "3.1",
-                )
-                .choice(Density::Linear),
+            poi_range: Sense::poi_range(r).number(between(0.01, LONGEST).or_unlimited(), f64::INFINITY),
+            agent_range: Sense::agent_range(r).number(between(0.01, LONGEST).or_unlimited(), 5.0),
+            density: Sense::density(r).choice(Density::Linear),
         }
     }
 }
@@ -77,11 +69,13 @@ choice! {
 shared! {
     /// What sensing reads.
     pub struct SenseConstants as SenseLanes {
-        /// Squared ranges.
+        /// The range of POIs, squared.
         pub poi_range2: f32,
+        /// The range of agents, squared.
         pub agent_range2: f32,
-        /// 1/P and 1/N.
+        /// 1/P, by which a sum over POIs is weighed.
         pub poi_share: f32,
+        /// 1/N, by which a sum over agents is weighed.
         pub agent_share: f32,
         /// 1/D with D = √2·max(map).
         pub inverse_diagonal: f32,
@@ -103,8 +97,8 @@ impl SenseConstants {
 }
 
 /// Lane operations of a leader that senses an entity: the range's test and selection, the quadrant's 4 tests and what
-/// joins them (4), 2 selections by the side and 4 by the front, 4 sums; and the density: a root, scaled and taken from 1,
-/// or an inverse root of at least 1.
+/// joins them (4), 2 selections by the side and 4 by the front, 4 sums; and the density: a root, scaled and taken from
+/// 1, or an inverse root of at least 1.
 pub fn operations(density: Density) -> u32 {
     let density = match density {
         Density::Linear => ROOT + 2,
@@ -128,8 +122,8 @@ pub fn density<S: Simd, const DENSITY: u32>(world: &Lanes<S>, range2: S::f32s, d
     only::<S>(density, d2.simd_le(range2))
 }
 
-/// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant, in the order of the policy's inputs:
-/// back-right, front-right, front-left, back-left.
+/// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant, in the order of the policy's
+/// inputs: back-right, front-right, front-left, back-left.
 ///
 /// The quadrant is read off the signs of the offset along the heading and to its left; a tie goes to the quadrant
 /// counterclockwise of it, so that each boundary belongs to exactly one quadrant.

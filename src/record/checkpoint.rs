@@ -53,6 +53,7 @@ pub struct Checkpoint<N = Vec<f32>> {
     pub init: Option<String>,
     /// Time trained.
     pub seconds: f64,
+    /// How far `metrics.csv` had come.
     pub metrics: Extent,
     /// Without weights where these are kept in `policies.safetensors`.
     pub snapshot: Snapshot<N>,

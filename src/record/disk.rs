@@ -11,12 +11,19 @@ use crate::file;
 /// One thing done to a disk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Operation {
+    /// A folder, and those above it.
     CreateFolder,
+    /// A file, to be written.
     Create,
+    /// Some bytes to a file.
     Write,
+    /// A file's or a folder's contents to the disk.
     Flush,
+    /// A file cut to a length.
     Truncate,
+    /// A file to its final name.
     Rename,
+    /// A file or a folder.
     Remove,
 }
 
@@ -97,8 +104,8 @@ impl Disk {
         })
     }
 
-    /// Writes a file that the user named, whole or not at all; a link to a file is followed. What is no file (a device, a
-    /// pipe, `/dev/stdout`) is written to as it stands.
+    /// Writes a file that the user named, whole or not at all; a link to a file is followed. What is no file (a device,
+    /// a pipe, `/dev/stdout`) is written to as it stands.
     ///
     /// # Errors
     /// What the system says.

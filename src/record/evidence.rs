@@ -1,4 +1,5 @@
-//! What was seen on a machine: the small file that `flotilla verify --report` writes. `docs/evidence.md` is made of such.
+//! What was seen on a machine: the small file that `flotilla verify --report` writes. `docs/evidence.md` is made of
+//! such.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,6 +14,7 @@ pub const SCHEMA: u32 = 1;
 pub struct Sighting {
     /// [`SCHEMA`].
     pub schema: u32,
+    /// How much it is worth.
     pub tier: Tier,
     /// Day, UTC: "2026-01-31".
     pub date: String,
@@ -33,6 +35,7 @@ pub struct Sighting {
     /// What was done and found besides comparing, in words.
     #[serde(default)]
     pub findings: Vec<String>,
+    /// Backends compared, bit by bit.
     #[serde(default)]
     pub comparisons: Vec<Compared>,
     /// What short trainings came to.
@@ -60,12 +63,15 @@ pub struct Compared {
     pub adapter: String,
     /// Where that is a GPU.
     pub pass: Option<String>,
+    /// How its shaders were made: `generic`, or `specialised` for each world.
     pub kernel: Option<String>,
     /// What it was compared with: "cpu (SSE2)".
     pub against: String,
-    /// Worlds and agent-steps that were found equal.
+    /// Worlds that were found equal.
     pub worlds: usize,
+    /// Steps of agents in these.
     pub agent_steps: u64,
+    /// Whether every bit was the same.
     pub equal: bool,
     /// What differs, or went wrong.
     pub failure: Option<String>,
@@ -75,7 +81,9 @@ pub struct Compared {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ShortTraining {
+    /// What was trained.
     pub config: String,
+    /// SHA-256 of its results.
     pub digest: String,
 }
 

@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 
 use super::checkpoint::{self, Checkpoint};
 use super::disk::Disk;
-use super::metrics;
+use super::metrics::{self, RowsError};
 use super::{RecordError, hex, policies, read_text};
 use crate::config::{Config, MAX_STAGES};
 use crate::file;
@@ -61,16 +61,23 @@ pub enum Start {
 pub struct Run {
     /// Of the program.
     pub version: String,
+    /// How far it came.
     pub state: Status,
+    /// Its config's.
     pub seed: u64,
-    /// "cpu" or "gpu", and in words.
+    /// "cpu" or "gpu".
     pub backend: String,
+    /// What it runs on, in words.
     pub description: String,
+    /// The GPU, if one was used.
     pub adapter: Option<String>,
+    /// Its driver.
     pub driver: Option<String>,
+    /// Threads of the CPU that work.
     pub threads: usize,
-    /// UTC, of the first session's start and of this file.
+    /// UTC, of the first session's start.
     pub started: String,
+    /// UTC, of this file's writing.
     pub updated: String,
     /// Time trained in all sessions.
     pub seconds: f64,
@@ -91,13 +98,15 @@ pub struct Run {
     pub commit: Option<String>,
 }
 
+/// How far a run came.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Status {
-    /// Or killed.
+    /// It trains, or was killed.
     Running,
     /// By a signal or an error, after saving.
     Stopped,
+    /// It has played its last generation.
     Done,
 }
 
@@ -149,7 +158,9 @@ impl Run {
 
 /// A folder that this process, and no other, trains in.
 pub struct Folder {
+    /// Where it is.
     pub path: PathBuf,
+    /// What it is written through.
     pub disk: Disk,
     lock: Option<File>,
 }
@@ -175,7 +186,9 @@ pub enum Note {
     SetAside(String),
     /// A small file that cannot be read, for this reason.
     WrittenAnew(String),
+    /// There is a whole checkpoint.
     GoingOn {
+        /// The one that plays next.
         generation: usize,
     },
     /// None of the checkpoints can be used.
@@ -206,7 +219,9 @@ impl fmt::Display for Note {
 /// Where a run came from and to, `[trials]` each.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Story {
+    /// Of the random start.
     pub first: Vec<Row>,
+    /// Of the last generation.
     pub last: Vec<Row>,
 }
 
@@ -273,9 +288,10 @@ impl Folder {
         match Run::read(&self.file(RUN)) {
             Ok(run) => found.run = Some(run),
             Err(RecordError::Read { error, .. }) if error.kind() == ErrorKind::NotFound => {}
-            Err(error) => found.notes.push(Note::WrittenAnew(error.to_string())),
+            Err(error @ RecordError::Damaged { .. }) => found.notes.push(Note::WrittenAnew(error.to_string())),
+            Err(error) => return Err(error),
         }
-        found.finished = found.run.as_ref().and_then(|run| self.finished(run, config));
+        found.finished = found.run.as_ref().map_or(Ok(None), |run| self.finished(run, config))?;
         if found.finished.is_some() {
             return Ok(());
         }
@@ -383,7 +399,10 @@ impl Folder {
         let mut story = Story { first: vec![], last: vec![] };
         let mut count = 0;
         for row in &mut rows {
-            let (row, _) = row.map_err(|error| RecordError::damaged(&path, error))?;
+            let (row, _) = row.map_err(|error| match error {
+                RowsError::Read(error) => RecordError::read(&path)(error),
+                wrong => RecordError::damaged(&path, wrong),
+            })?;
             if (row.generation, row.trial) != (count / trials, count % trials) {
                 let (generation, trial) = (count / trials, count % trials);
                 return Err(damaged(format!("line {} is not trial {trial}, generation {generation}", count + 2)));
@@ -405,14 +424,20 @@ impl Folder {
     }
 
     /// What a run that is done came to; none where its files are not all as it left them.
-    fn finished(&self, run: &Run, config: &Config) -> Option<Story> {
-        let digest = run.digest.as_ref().filter(|_| run.state == Status::Done)?;
+    fn finished(&self, run: &Run, config: &Config) -> Result<Option<Story>, RecordError> {
+        let Some(digest) = run.digest.as_ref().filter(|_| run.state == Status::Done) else { return Ok(None) };
         if run.generations != config.learning.generations + 1 {
-            return None;
+            return Ok(None);
         }
-        let policies = policies::read_all(&self.file(POLICIES), config).ok()?;
-        let (story, found) = self.digest(config, &policies).ok()?;
-        (found == *digest).then_some(story)
+        let policies = policies::read_all(&self.file(POLICIES), config);
+        match policies.and_then(|policies| self.digest(config, &policies)) {
+            Ok((story, found)) => Ok((found == *digest).then_some(story)),
+            // What is gone or damaged is made again; what cannot be read now may be whole.
+            Err(RecordError::Read { path, error }) if error.kind() != ErrorKind::NotFound => {
+                Err(RecordError::Read { path, error })
+            }
+            Err(_) => Ok(None),
+        }
     }
 }
 

@@ -1,9 +1,9 @@
 //! `metrics.csv`: how every trial came on, generation by generation.
 //!
-//! One line a trial and generation, generation by generation and in each trial by trial. G is in 0..1; `seconds` is
-//! the time trained until the line was complete, earlier sessions of a resumed run included. Where the config has stages,
-//! a last column `stage` tells of which a generation is, from 0: G is of that stage's POIs. All but `seconds` is the
-//! same bits on every backend.
+//! One line a trial and generation, generation by generation and in each trial by trial. G is in 0..1; `seconds` is the
+//! time trained until the line was complete, earlier sessions of a resumed run included. Where the config has stages, a
+//! last column `stage` tells of which a generation is, from 0: G is of that stage's POIs. All but `seconds` is the same
+//! bits on every backend.
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
@@ -27,6 +27,7 @@ const MAX_LINE: u64 = 256;
 /// How far a file has come, to be found there again.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Extent {
+    /// Its first so many.
     pub bytes: u64,
     /// SHA-256 of these bytes.
     pub sha256: String,
@@ -166,8 +167,15 @@ pub enum RowsError {
     /// As the last line of a file that is still being written.
     #[error("line {0} is cut short or longer than {MAX_LINE} bytes")]
     CutShort(usize),
+    /// A line that is no row, or a row out of its place.
     #[error("line {line} is not {what}")]
-    Wrong { line: usize, what: String },
+    Wrong {
+        /// From 1.
+        line: usize,
+        /// What should stand there.
+        what: String,
+    },
+    /// The system's words.
     #[error("cannot be read: {0}")]
     Read(#[from] io::Error),
 }

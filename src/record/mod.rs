@@ -35,33 +35,93 @@ pub mod tensors;
 pub enum RecordError {
     /// What to do about it depends on the command.
     #[error("{path}: cannot be written: {error}")]
-    Write { path: PathBuf, error: io::Error },
+    Write {
+        /// The file or the folder.
+        path: PathBuf,
+        /// The system's words.
+        error: io::Error,
+    },
+    /// The system does not let it be read.
     #[error("{path}: cannot be read: {error}")]
-    Read { path: PathBuf, error: io::Error },
+    Read {
+        /// The file or the folder.
+        path: PathBuf,
+        /// The system's words.
+        error: io::Error,
+    },
     /// The file is not what it should be; `reason` says in what.
     #[error("{path}: {reason}")]
-    Damaged { path: PathBuf, reason: String },
+    Damaged {
+        /// The file or the folder.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
     /// Policies of a trial that the file does not have.
     #[error("{path}: {reason}")]
-    NoTrial { path: PathBuf, reason: String },
+    NoTrial {
+        /// The file or the folder.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A run that would be written over.
     #[error("{path} holds a run already")]
-    Exists { path: PathBuf },
+    Exists {
+        /// The file or the folder.
+        path: PathBuf,
+    },
+    /// A file where the folder should be.
     #[error("{path} is a file")]
-    NoFolder { path: PathBuf },
+    NoFolder {
+        /// The file or the folder.
+        path: PathBuf,
+    },
+    /// A run that has more generations than are asked for.
     #[error("{path} is a run of {there} generations, which cannot become one of {here}")]
-    Shorter { path: PathBuf, there: usize, here: usize },
+    Shorter {
+        /// The file or the folder.
+        path: PathBuf,
+        /// Generations that it has.
+        there: usize,
+        /// Generations asked for.
+        here: usize,
+    },
+    /// Two processes would write the same files.
     #[error("another process is training in {path}")]
-    Locked { path: PathBuf },
+    Locked {
+        /// The file or the folder.
+        path: PathBuf,
+    },
     /// A run that started from given policies, or that did not, cannot go on as if it had started from others.
     #[error("{path} {}, so it cannot go on as a run {}", started(there), started_from(here))]
-    InitDiffers { path: PathBuf, there: Option<String>, here: String },
+    InitDiffers {
+        /// The file or the folder.
+        path: PathBuf,
+        /// [`policies::Init::digest`] of what it started from, if not at random.
+        there: Option<String>,
+        /// The digest of what was given.
+        here: String,
+    },
+    /// A run that starts over needs the policies that it started from.
     #[error("{path} {}, and has no checkpoint yet: it starts over from these alone", started(&Some(there.clone())))]
-    InitNeeded { path: PathBuf, there: String },
+    InitNeeded {
+        /// The file or the folder.
+        path: PathBuf,
+        /// [`policies::Init::digest`] of these.
+        there: String,
+    },
+    /// A run that cannot go on under the config given.
     #[error(
         "{path} is a run of another config, so it cannot go on with this one; what differs:\n{}",
         differences.join("\n")
     )]
-    ConfigDiffers { path: PathBuf, differences: Vec<String> },
+    ConfigDiffers {
+        /// The file or the folder.
+        path: PathBuf,
+        /// A line for each key.
+        differences: Vec<String>,
+    },
 }
 
 fn started(digest: &Option<String>) -> String {

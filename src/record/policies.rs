@@ -1,9 +1,9 @@
 //! `policies.safetensors`: what a run learned.
 //!
-//! One f32 tensor `weights.N` a trial, `[leaders, policies, parameters]`, or `[1, policies, parameters]` where all leaders
-//! share a policy; best policy first in each population, so that the team of all first policies is the trial's champion; metadata `layers` is the policies' network, "8,10,2",
-//! and `config` the digest of the config that they were trained by.
-//! Other programs may write such files too, also with a single tensor `weights`.
+//! One f32 tensor `weights.N` a trial, `[leaders, policies, parameters]`, or `[1, policies, parameters]` where all
+//! leaders share a policy; best policy first in each population, so that the team of all first policies is the trial's
+//! champion; metadata `layers` is the policies' network, "8,10,2", and `config` the digest of the config that they were
+//! trained by. Other programs may write such files too, also with a single tensor `weights`.
 
 use std::collections::BTreeMap;
 use std::io::{self, Read, Seek, Write};
@@ -89,7 +89,8 @@ pub struct Init {
     pub trials: Vec<Policies>,
 }
 
-/// Reads what all trials of a config start from: trial i from tensor `weights.i`, or where there is none from `weights`.
+/// Reads what all trials of a config start from: trial i from tensor `weights.i`, or where there is none from
+/// `weights`.
 ///
 /// # Errors
 /// See [`read`].

@@ -27,9 +27,13 @@ compile_error!("safetensors hold little-endian numbers, which are read and writt
 
 /// A tensor to write: its data in parts, one after another.
 pub struct Tensor<'a> {
+    /// As the file has it: `weights.0`.
     pub name: String,
+    /// What its numbers are.
     pub dtype: Dtype,
+    /// The last index moves fastest.
     pub shape: Vec<usize>,
+    /// Little-endian; together as long as the shape says.
     pub parts: Vec<&'a [u8]>,
 }
 

@@ -19,6 +19,7 @@ pub struct Cohort {
     pub folders: Vec<PathBuf>,
     /// Generations that these were to have.
     pub planned: usize,
+    /// All of them, run by run.
     pub trials: Vec<Trial>,
 }
 
@@ -78,6 +79,7 @@ pub fn paired(arms: &[Cohort]) -> bool {
 /// A generation to compare at.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum At {
+    /// This one, from 0.
     Generation(usize),
     /// The last one that all trials of all arms have come to.
     Last,
@@ -86,6 +88,7 @@ pub enum At {
 /// What is compared, and how.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Question {
+    /// At which generations G is compared.
     pub at: Vec<At>,
     /// The best team's G (in 0..1) whose first generation is compared.
     pub reach: f64,
@@ -96,12 +99,21 @@ pub struct Question {
 /// Why arms cannot be compared.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ComparisonError {
+    /// An arm, by its name, of a single trial.
     #[error("{0} has one trial, of which no interval can be had; that takes two or more")]
     OneTrial(String),
+    /// An arm, by its name, whose trials have no generation in common.
     #[error("{0} has no generation that every trial has come to")]
     TooShort(String),
+    /// A generation that the arms have not come to.
     #[error("the arms have come to generation {last}")]
-    Beyond { at: usize, last: usize },
+    Beyond {
+        /// The one asked for.
+        at: usize,
+        /// The last that all have.
+        last: usize,
+    },
+    /// Two arms, by their names, that cannot be compared pair by pair.
     #[error("{0} and {1} have not the same seeds and numbers of trials, so their trials are no pairs")]
     NoPairs(String, String),
 }
@@ -111,12 +123,23 @@ pub enum ComparisonError {
 #[serde(tag = "measure", rename_all = "snake_case")]
 pub enum Measure {
     /// G of the best team at a generation.
-    BestG { generation: usize },
+    BestG {
+        /// From 0.
+        generation: usize,
+    },
     /// G of the champion.
-    ChampionG { generation: usize },
+    ChampionG {
+        /// From 0.
+        generation: usize,
+    },
     /// The first generation at which the best team's G is at least this. A trial that does not come to it up to a last
     /// generation counts as one that does at the next.
-    GenerationsToReach { reach: f64, generation: usize },
+    GenerationsToReach {
+        /// In 0..1.
+        reach: f64,
+        /// The last that is looked at.
+        generation: usize,
+    },
 }
 
 impl Measure {
@@ -173,7 +196,9 @@ pub struct Comparison {
     pub place: String,
     /// The last generation that all have come to.
     pub generation: usize,
+    /// In the order given.
     pub arms: Vec<Named>,
+    /// What was measured of them.
     pub measures: Vec<Measured>,
     /// What a reader has to know.
     pub notes: Vec<String>,
@@ -182,14 +207,18 @@ pub struct Comparison {
 /// An arm as it is told of.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Named {
+    /// What sets it apart.
     pub name: String,
+    /// The runs whose trials these are.
     pub folders: Vec<String>,
+    /// How many.
     pub trials: usize,
 }
 
 /// What one measure came to.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Measured {
+    /// Which one.
     #[serde(flatten)]
     pub measure: Measure,
     /// By arm.
@@ -201,6 +230,7 @@ pub struct Measured {
 /// The mean over an arm's trials.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Mean {
+    /// With its 95 % interval.
     #[serde(flatten)]
     pub mean: Estimate,
     /// In how many trials a G was reached.
@@ -216,6 +246,7 @@ pub struct Versus {
     /// The first's mean less the second's.
     #[serde(flatten)]
     pub difference: Estimate,
+    /// Whether that is more than chance.
     #[serde(flatten)]
     pub test: Tested,
     /// Corrected for the number of pairs.

@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
+use crate::statistics::Average;
 
 /// A column of a two-column paper, in millimetres.
 pub const COLUMN: f64 = 85.0;
@@ -16,40 +17,14 @@ const NORMAL: f64 = 2.82;
 const REFERENCES: [&[f64]; 2] = [&[2.6, 1.0], &[0.7, 0.7]];
 const DASHES: [&[f64]; 5] = [&[], &[1.6, 0.7], &[1.8, 0.6, 0.4, 0.6], &[0.5, 0.5], &[3.0, 0.8]];
 
-/// Mean and standard deviation of any number of values, gathered one by one.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Average {
-    pub count: u32,
-    pub mean: f64,
-    /// Sum of squared distances from the mean.
-    squares: f64,
-}
-
-impl Average {
-    /// Adds a value.
-    pub fn add(&mut self, value: f64) {
-        self.count += 1;
-        let before = value - self.mean;
-        self.mean += before / f64::from(self.count);
-        self.squares += before * (value - self.mean);
-    }
-
-    /// Of the sample; 0 of fewer than two values.
-    pub fn deviation(&self) -> f64 {
-        if self.count < 2 { 0.0 } else { (self.squares / f64::from(self.count - 1)).sqrt() }
-    }
-
-    /// Of the mean.
-    pub fn error(&self) -> f64 {
-        if self.count == 0 { 0.0 } else { self.deviation() / f64::from(self.count).sqrt() }
-    }
-}
-
 /// Mean and standard error over trials, at some generations.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Curve {
+    /// Places on the x axis, from 0.
     pub generation: Vec<f64>,
+    /// At each of these.
     pub mean: Vec<f64>,
+    /// Standard error of the mean, at each.
     pub error: Vec<f64>,
     /// How many trials these are of, at most.
     #[serde(skip)]
@@ -60,11 +35,11 @@ impl Curve {
     /// One tally a generation, from generation 0; generations without values are left out.
     pub fn new(tallies: &[Average]) -> Curve {
         let mut curve = Curve::default();
-        for (generation, tally) in tallies.iter().enumerate().filter(|(_, tally)| tally.count > 0) {
+        for (generation, tally) in tallies.iter().enumerate().filter(|(_, tally)| tally.count() > 0) {
             curve.generation.push(generation as f64);
-            curve.mean.push(tally.mean);
+            curve.mean.push(tally.mean());
             curve.error.push(tally.error());
-            curve.trials = curve.trials.max(tally.count);
+            curve.trials = curve.trials.max(tally.count());
         }
         curve
     }
@@ -89,6 +64,7 @@ impl Curve {
 /// One set of axes.
 #[derive(Clone, Debug, Default)]
 pub struct Panel {
+    /// Above it.
     pub title: String,
     /// Each with its place in the legend, which gives it its look.
     pub curves: Vec<(usize, Curve)>,
@@ -97,10 +73,13 @@ pub struct Panel {
 /// Panels side by side that share a legend and the y axis.
 #[derive(Clone, Debug, Default)]
 pub struct Figure {
+    /// From left to right.
     pub panels: Vec<Panel>,
+    /// What curves are, by their place.
     pub legend: Vec<String>,
     /// What curves are held against: the next places in the legend, in grey, with neither bands nor marks.
     pub references: Vec<String>,
+    /// Of the axis that they share.
     pub y_label: String,
     /// The y axis runs from 0 to this.
     pub y_max: f64,

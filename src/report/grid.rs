@@ -42,7 +42,9 @@ fn ink(on: Color) -> Color {
 /// The values of one axis.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Scale {
+    /// The axis's key.
     pub label: String,
+    /// As they are written.
     pub values: Vec<String>,
 }
 
@@ -61,7 +63,9 @@ pub enum Cell {
 /// A value for each pair of values of two axes, in a panel for each value of the rest.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct HeatMap {
+    /// Above everything.
     pub title: String,
+    /// To the right.
     pub x: Scale,
     /// Without values: a single row.
     pub y: Scale,
@@ -166,8 +170,11 @@ impl HeatMap {
 /// Curves of G in 0..1 by generation, one for each value of an axis, in a panel for each value of the rest.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Curves {
+    /// Above everything.
     pub title: String,
+    /// What G is the G of.
     pub y_label: String,
+    /// What sets the curves apart.
     pub by: Scale,
     /// Panels in a row, as many as fit where it is 0.
     pub columns: usize,
@@ -291,11 +298,13 @@ impl Curves {
 /// A share in 0..1 with the ends of its interval.
 pub type Interval = [f64; 3];
 
-/// One value with its interval for each value of each of several keys, beside that of what was not varied, in a panel for
-/// each of several settings.
+/// One value with its interval for each value of each of several keys, beside that of what was not varied, in a panel
+/// for each of several settings.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Dots {
+    /// Above everything.
     pub title: String,
+    /// What the values are.
     pub x_label: String,
     /// Down the side: a key with its own value, and its other values.
     pub groups: Vec<(String, Vec<String>)>,

@@ -64,6 +64,7 @@ pub const FAINT: Color = [95, 95, 95];
 
 /// One agent.
 pub struct Marker {
+    /// Where it is, in units.
     pub place: DVec2,
     /// Its heading, of any length but 0.
     pub heading: DVec2,
@@ -77,10 +78,13 @@ pub struct Marker {
 
 /// One POI.
 pub struct Poi {
+    /// Where it is, in units.
     pub place: DVec2,
+    /// What stands beside it.
     pub label: String,
     /// How much of what it needs is there, 0 to 1; none before an episode.
     pub share: Option<f64>,
+    /// Whether it has been observed by now.
     pub observed: bool,
     /// Whether enough agents would observe it now: it is its time, and those that it comes after are observed.
     pub open: bool,
@@ -104,7 +108,9 @@ pub fn poi_label(rule: &Rule, poi: usize, needs: String) -> String {
 pub struct Team {
     /// The first of the agents lead.
     pub leaders: usize,
+    /// Leaders first.
     pub agents: Vec<Marker>,
+    /// All of the world's.
     pub pois: Vec<Poi>,
 }
 

@@ -31,30 +31,65 @@ const EXACT_BYTES: usize = 600_000;
 /// Why an episode could not be replayed.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
+    /// The run cannot be read.
     #[error(transparent)]
     Run(#[from] ReadError),
+    /// Its generations could not be played.
     #[error(transparent)]
     Backend(#[from] BackendError),
+    /// The run has fewer trials.
     #[error("{folder} has no trial {trial}: its config has {trials}, 0 to {}", trials - 1)]
-    NoTrial { folder: String, trial: usize, trials: usize },
+    NoTrial {
+        /// The run's.
+        folder: String,
+        /// The one asked for, from 0.
+        trial: usize,
+        /// How many it has.
+        trials: usize,
+    },
+    /// The run has not come to the generation.
     #[error(
         "{folder}: metrics.csv has no generation {generation} of trial {trial}{}",
         newest.map_or(String::new(), |newest| format!("; the newest is {newest}: choose one up to that"))
     )]
-    NoGeneration { folder: String, trial: usize, generation: usize, newest: Option<usize> },
+    NoGeneration {
+        /// The run's.
+        folder: String,
+        /// The one asked for, from 0.
+        trial: usize,
+        /// The one asked for, from 0.
+        generation: usize,
+        /// The newest that it has.
+        newest: Option<usize>,
+    },
+    /// Trained again, it comes to something else.
     #[error(
         "{folder}: trained again, the best team of trial {trial}, generation {generation} has G = {found}, but metrics.csv \
          says {expected}: it was made with another config or another version of this program; repeat the run, then \
          replay it"
     )]
-    Differs { folder: String, trial: usize, generation: usize, found: f64, expected: f64 },
+    Differs {
+        /// The run's.
+        folder: String,
+        /// The one asked for, from 0.
+        trial: usize,
+        /// The one asked for, from 0.
+        generation: usize,
+        /// G now.
+        found: f64,
+        /// G as the run has it.
+        expected: f64,
+    },
+    /// Whoever watched said stop.
     #[error("stopped")]
     Stopped,
 }
 
 /// One team's episode, with what it was worth.
 pub struct Replayed {
+    /// Which trial it is of.
     pub trial: usize,
+    /// Which generation it is of.
     pub generation: usize,
     /// Index of the team among those of its generation.
     pub team: usize,
@@ -62,9 +97,11 @@ pub struct Replayed {
     pub best_g: f64,
     /// Episodes that the team's G is the mean of; this is the first.
     pub episodes: usize,
+    /// The one that this generation played in.
     pub world: World,
     /// Of this team alone.
     pub trace: Trace,
+    /// What the episode was worth.
     pub scores: Scores,
     /// The leader in whose group each agent is for Df, or [`credit::NOBODY`].
     pub owner: Vec<u32>,
@@ -76,6 +113,7 @@ pub struct Replayed {
 
 /// The metrics of one trial.
 pub struct History {
+    /// By generation; none where there is no row.
     pub best_g: Vec<Option<f64>>,
 }
 
@@ -555,6 +593,7 @@ fn busy(config: &Config, played: &[Replayed]) -> [DVec2; 2] {
 pub struct Film {
     /// As many as fit into 960 by 720 pixels where it is not given.
     pub width: Option<u32>,
+    /// Pictures a second.
     pub fps: u32,
 }
 

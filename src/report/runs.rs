@@ -3,12 +3,13 @@
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use super::curves::{Average, Curve, Figure, Panel};
+use super::curves::{Curve, Figure, Panel};
 use crate::config::{Config, ConfigError};
 use crate::file;
 use crate::record::RecordError;
 use crate::record::folder::{self, CONFIG, METRICS};
 use crate::record::metrics::{self, RowsError};
+use crate::statistics::Average;
 use crate::trainer::Row;
 
 /// Most runs that one figure can tell apart.
@@ -17,18 +18,47 @@ pub const MAX_RUNS: usize = 24;
 /// Why a run could not be shown.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadError {
+    /// There is nothing of this name.
     #[error("{0}: no such folder")]
     Missing(PathBuf),
+    /// A run is a folder.
     #[error("{0} is a file; name the folder of a run")]
     NoFolder(PathBuf),
+    /// A folder of something else.
     #[error("{folder} is no run's folder: it has no {name}")]
-    Foreign { folder: PathBuf, name: &'static str },
+    Foreign {
+        /// The one named.
+        folder: PathBuf,
+        /// The file that every run has.
+        name: &'static str,
+    },
+    /// A run whose config is wrong.
     #[error("{folder}: {error}")]
-    Config { folder: PathBuf, error: ConfigError },
+    Config {
+        /// The one named.
+        folder: PathBuf,
+        /// What is wrong with it.
+        error: ConfigError,
+    },
+    /// A folder of several runs.
     #[error("{folder} holds {what}; name one of the runs in it, as {folder}/{example}")]
-    Collection { folder: PathBuf, what: &'static str, example: &'static str },
+    Collection {
+        /// The one named.
+        folder: PathBuf,
+        /// What it holds: "a sweep".
+        what: &'static str,
+        /// A run in it.
+        example: &'static str,
+    },
+    /// A run without what is to be shown.
     #[error("{folder}: {reason}")]
-    Unfinished { folder: PathBuf, reason: String },
+    Unfinished {
+        /// The one named.
+        folder: PathBuf,
+        /// What it lacks.
+        reason: String,
+    },
+    /// Its files cannot be read.
     #[error(transparent)]
     Record(#[from] RecordError),
 }
@@ -97,8 +127,11 @@ pub fn metrics(folder: &Path, config: &Config, mut each: impl FnMut(&Row)) -> Re
 /// What a run's metrics came to, by generation: shares of the POIs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Courses {
+    /// Of the best team, over trials.
     pub best: Vec<Average>,
+    /// Of the mean team.
     pub mean: Vec<Average>,
+    /// Of the champion.
     pub champion: Vec<Average>,
 }
 

@@ -39,11 +39,13 @@ pub const COLORS: [Color; 7] =
 /// How a line is drawn.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pen {
+    /// Of the line.
     pub color: Color,
     /// Millimetres.
     pub width: f64,
     /// Lengths of dashes and gaps in turn, in millimetres; none for a solid line.
     pub dash: &'static [f64],
+    /// From 0, nothing, to 1.
     pub opacity: f64,
 }
 
@@ -57,7 +59,9 @@ impl Pen {
 /// What an area is filled with.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fill {
+    /// Of the area.
     pub color: Color,
+    /// From 0, nothing, to 1.
     pub opacity: f64,
 }
 
@@ -70,8 +74,11 @@ impl From<Color> for Fill {
 /// Which part of a text stands at its place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Anchor {
+    /// Its left end.
     Start,
+    /// The middle of its width.
     Middle,
+    /// Its right end.
     End,
 }
 
@@ -106,7 +113,9 @@ pub(super) enum Mark {
 /// A picture; places are millimetres from its left and upper edge.
 #[derive(Clone, Debug)]
 pub struct Scene {
+    /// Millimetres.
     pub width: f64,
+    /// Millimetres.
     pub height: f64,
     /// What the picture is, in a few words.
     pub title: String,
@@ -118,8 +127,11 @@ pub struct Scene {
 /// What a picture is written as.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
+    /// Vectors, for the web.
     Svg,
+    /// Pixels.
     Png,
+    /// Vectors, for print.
     Pdf,
 }
 

@@ -30,8 +30,8 @@ pub struct Events {
 }
 
 impl Events {
-    /// Starts event files in `folder/trial-N`, a folder a trial, with all that is in `metrics` so far; they take the place
-    /// of any others.
+    /// Starts event files in `folder/trial-N`, a folder a trial, with all that is in `metrics` so far; they take the
+    /// place of any others.
     ///
     /// # Errors
     /// They cannot be written.

@@ -23,7 +23,8 @@ impl Sweep {
         self.axes.iter().position(|axis| axis.key == name || axis.leaf() == name)
     }
 
-    /// The points by the values of an axis, a group for each combination of the other axes that has two or more of them.
+    /// The points by the values of an axis, a group for each combination of the other axes that has two or more of
+    /// them.
     pub fn arms(&self, by: usize) -> Vec<Series<'_>> {
         let told =
             |axis: &Axis, value: usize| escape::line(&format!("{} {}", axis.leaf(), axis.label(value))).to_string();

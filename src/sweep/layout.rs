@@ -50,10 +50,13 @@ pub fn places() -> Vec<[i32; 2]> {
 
 /// Where everything stands.
 pub struct Positions {
+    /// In units.
     pub leaders: Vec<[i32; 2]>,
     /// Group by group.
     pub followers: Vec<[i32; 2]>,
+    /// One a group.
     pub pois: Vec<[i32; 2]>,
+    /// Width and height.
     pub map: [i32; 2],
 }
 

@@ -3,8 +3,8 @@
 //! A sweep file is a config with a section `[grid]`, whose keys are dotted config keys with lists of values, or the
 //! special axes of [`layout`]. Every combination of values is a [`Point`]: one config, trained as a run of its own in
 //! `points/NNNN`, whose results do not depend on which other points trained beside it. A section `[vary]` has keys that
-//! are changed one at a time: for every combination of `[grid]` there is a point with the file's own values, and one for
-//! each value of each key of `[vary]`.
+//! are changed one at a time: for every combination of `[grid]` there is a point with the file's own values, and one
+//! for each value of each key of `[vary]`.
 //!
 //! | module | holds |
 //! |---|---|
@@ -45,8 +45,10 @@ const MAX_LISTED: usize = 50;
 pub struct Sweep {
     /// What its file is called, without folder and extension.
     pub name: String,
-    /// Those of the grid, then those varied, each in the order of the file; the first changes slowest from point to point.
+    /// Those of the grid, then those varied, each in the order of the file; the first changes slowest from point to
+    /// point.
     pub axes: Vec<Axis>,
+    /// Every combination that is not left out, in order.
     pub points: Vec<Point>,
     /// Combinations left out because they cannot run.
     pub skipped: usize,
@@ -97,6 +99,7 @@ pub struct Point {
     pub index: usize,
     /// The index of its value on each axis.
     pub values: Vec<usize>,
+    /// What it runs.
     pub config: Config,
 }
 

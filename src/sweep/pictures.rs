@@ -1,9 +1,9 @@
-//! What a sweep came to, as figures: `final`, `reach` and `curves`, or where keys are varied `final` alone, each as SVG,
-//! PNG and PDF.
+//! What a sweep came to, as figures: `final`, `reach` and `curves`, or where keys are varied `final` alone, each as
+//! SVG, PNG and PDF.
 
 use std::path::Path;
 
-use super::results::{Detail, Missing, Outcome, mean_and_error};
+use super::results::{Detail, Missing, Outcome};
 use super::{Axis, Point, Sweep};
 use crate::record::RecordError;
 use crate::record::disk::Disk;
@@ -69,8 +69,8 @@ pub fn draw(
     Ok((names, None))
 }
 
-/// The best team's G in the last generation for every value of every varied key, with a panel for each combination of the
-/// grid.
+/// The best team's G in the last generation for every value of every varied key, with a panel for each combination of
+/// the grid.
 fn dots(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>]) -> Result<Dots, String> {
     let (varied, grid): (Vec<usize>, Vec<usize>) = (0..sweep.axes.len()).partition(|&axis| sweep.axes[axis].varied);
     let rows: usize = varied.iter().map(|&axis| sweep.axes[axis].values.len() - 1).sum();
@@ -95,7 +95,7 @@ fn dots(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>]) -> Result<Dots, St
             *title = words.collect::<Vec<_>>().join(", ");
         }
         let Ok(outcome) = outcome else { continue };
-        let (mean, error) = mean_and_error(&outcome.best);
+        let (mean, error) = (outcome.best().mean(), outcome.best().error());
         let spread: Interval = [mean, mean - 2.0 * error, mean + 2.0 * error];
         let mut row = 0;
         let changed = varied.iter().find_map(|&axis| {
@@ -177,7 +177,7 @@ impl<'a> Facets<'a> {
     fn last(&self) -> HeatMap {
         let key = [0.0, 0.25, 0.5, 0.75, 1.0].map(|g| (g, g.to_string())).to_vec();
         self.heat_map("G of the best team, last generation, mean over trials".into(), key, |_, outcome| {
-            let (mean, _) = mean_and_error(&outcome.best);
+            let mean = outcome.best().mean();
             Cell::Value(mean, format!("{mean:.2}"))
         })
     }

@@ -10,6 +10,7 @@ use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{CONFIG, METRICS, POINTS, RESULTS};
 use crate::record::metrics;
+use crate::statistics::Average;
 use crate::trainer::Row;
 
 /// What [`write()`] makes of the points that are complete.
@@ -24,8 +25,9 @@ pub struct Detail {
 /// What a point's trials came to, by the best team.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Outcome {
-    /// Best G in the last generation of every trial, and its champion's.
+    /// The best team's G in the last generation of every trial.
     pub best: Vec<f64>,
+    /// The champion's G in the last generation of every trial.
     pub champion: Vec<f64>,
     /// The first generation of every trial whose best G is at least [`Detail::reach`].
     pub reached: Vec<Option<usize>>,
@@ -34,6 +36,16 @@ pub struct Outcome {
 }
 
 impl Outcome {
+    /// The best team's G in the last generation, over the trials.
+    pub fn best(&self) -> Average {
+        self.best.iter().collect()
+    }
+
+    /// The champion's.
+    pub fn champion(&self) -> Average {
+        self.champion.iter().collect()
+    }
+
     /// The median over the trials of the generations to reach G, where trials that never do count as later than all;
     /// none where it is one of these.
     pub fn median_reached(&self) -> Option<f64> {
@@ -44,14 +56,6 @@ impl Outcome {
     }
 }
 
-/// Mean and standard error of the mean (0 for a single value).
-pub fn mean_and_error(values: &[f64]) -> (f64, f64) {
-    let count = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / count;
-    let squares: f64 = values.iter().map(|value| (value - mean) * (value - mean)).sum();
-    (mean, if values.len() > 1 { (squares / (count - 1.0) / count).sqrt() } else { 0.0 })
-}
-
 /// Where a point's run is in a sweep's folder.
 pub fn point_folder(out: &Path, point: &Point) -> PathBuf {
     out.join("points").join(format!("{:04}", point.index))
@@ -60,10 +64,13 @@ pub fn point_folder(out: &Path, point: &Point) -> PathBuf {
 /// A point that cannot be put together, and why.
 #[derive(Debug, thiserror::Error)]
 pub enum Missing {
+    /// Its folder has no run.
     #[error("it was not run")]
     NotRun,
+    /// Its run has come to the first generation, not yet to the second.
     #[error("it has come to generation {0} of {1}")]
     Unfinished(usize, usize),
+    /// Its files cannot be used, for this reason.
     #[error("{0}")]
     Damaged(String),
 }
@@ -121,14 +128,14 @@ fn summary(
     table.write_record(sweep.axes.iter().map(|axis| &*axis.key).chain(columns))?;
     for (point, outcome) in sweep.points.iter().zip(outcomes) {
         let Ok(outcome) = outcome else { continue };
-        let (best, error) = mean_and_error(&outcome.best);
+        let best = outcome.best();
         let fields = [
             point.index.to_string(),
             outcome.best.len().to_string(),
             point.config.learning.generations.to_string(),
-            best.to_string(),
-            error.to_string(),
-            mean_and_error(&outcome.champion).0.to_string(),
+            best.mean().to_string(),
+            best.error().to_string(),
+            outcome.champion().mean().to_string(),
             options.reach.to_string(),
             outcome.reached.iter().flatten().count().to_string(),
             outcome.median_reached().map_or(String::new(), |median| median.to_string()),
@@ -176,8 +183,8 @@ fn read(point: &Point, out: &Path, options: &Detail) -> Result<(Vec<Row>, Outcom
     }
     let ends = || rows.iter().filter_map(|rows| rows.last());
     let curve = (0..rows[0].len()).map(|at| {
-        let (mean, error) = mean_and_error(&rows.iter().map(|rows| rows[at].best_g).collect::<Vec<_>>());
-        (rows[0][at].generation, mean, error)
+        let best: Average = rows.iter().map(|rows| &rows[at].best_g).collect();
+        (rows[0][at].generation, best.mean(), best.error())
     });
     let outcome = Outcome {
         best: ends().map(|row| row.best_g).collect(),

@@ -16,6 +16,7 @@ const MAX_BATCH: usize = 400;
 
 /// How points are run.
 pub struct Manner<'a> {
+    /// What is to be done about runs that are there.
     pub start: Start,
     /// Bytes that the points of a batch may take; more points than fit run in several batches, to the same results.
     pub memory: usize,
@@ -30,15 +31,19 @@ pub struct Manner<'a> {
 /// How far the points have come.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Headway {
-    /// Points done, those found done included, of all.
+    /// Points done, those found done included.
     pub done: usize,
+    /// Points in all.
     pub points: usize,
-    /// Points in the batch, the generation that the first of them plays next, and the last of any of them.
+    /// Points in the batch.
     pub batch: usize,
+    /// The generation that the first of the batch plays next.
     pub generation: usize,
+    /// The last generation of any of the batch.
     pub last: usize,
-    /// Steps of a team played so far, by all points that are being or have been run now, and still to play.
+    /// Steps of a team played so far, by all points that are being or have been run now.
     pub played: u128,
+    /// Steps of a team, those to be played included.
     pub total: u128,
 }
 

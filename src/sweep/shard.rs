@@ -15,7 +15,9 @@ pub const MAX_SHARDS: usize = 1 << 16;
 /// Shard `index` (from 1) of `count`; written `1/4` to `4/4`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shard {
+    /// Which part, from 1.
     pub index: usize,
+    /// Parts in all.
     pub count: usize,
 }
 

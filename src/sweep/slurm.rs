@@ -11,11 +11,15 @@ pub struct Job<'a> {
     pub name: &'a str,
     /// The command line that runs a shard, without `--shard` and `--resume`.
     pub command: Vec<String>,
+    /// The sweep's folder.
     pub out: &'a Path,
+    /// Tasks of the array.
     pub shards: usize,
     /// Time limit of a task, as Slurm reads it: `01:00:00`.
     pub time: &'a str,
+    /// GPUs of a task.
     pub gpus: usize,
+    /// Processors of a task.
     pub cpus: usize,
     /// More `#SBATCH` options: `--partition=…`, `--account=…`.
     pub options: &'a [String],

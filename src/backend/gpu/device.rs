@@ -28,15 +28,20 @@ pub struct AdapterInfo {
     pub driver: String,
     /// "vulkan", "metal", "dx12".
     pub backend: String,
+    /// What it runs on.
     pub kind: Kind,
 }
 
 /// What an adapter runs on, the most wanted first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
+    /// A GPU with memory of its own.
     Discrete,
+    /// A GPU that shares the host's memory.
     Integrated,
+    /// A GPU passed to a virtual machine.
     Virtual,
+    /// The driver does not say.
     Unknown,
     /// A renderer that runs on the CPU.
     Software,
@@ -96,26 +101,85 @@ impl From<&wgpu::AdapterInfo> for AdapterInfo {
 /// Why a GPU could not be had, or failed at work.
 #[derive(Debug, thiserror::Error)]
 pub enum DeviceError {
+    /// There is no adapter at all.
     #[error("no GPU adapter found (is a Vulkan, Metal or DirectX 12 driver installed?)")]
     NoAdapter,
+    /// There are only software renderers, which are opened only if asked for.
     #[error("no GPU among the adapters, only {}", list(.found))]
-    NoRealAdapter { found: Vec<AdapterInfo> },
+    NoRealAdapter {
+        /// The adapters that there are.
+        found: Vec<AdapterInfo>,
+    },
+    /// No adapter has the name or number asked for.
     #[error("no adapter {} \"{name}\"; there {}", if is_index(name) { "has the number" } else { "matches" }, there_are(.found))]
-    UnknownAdapter { name: String, found: Vec<AdapterInfo> },
+    UnknownAdapter {
+        /// The name or number asked for.
+        name: String,
+        /// The adapters that there are.
+        found: Vec<AdapterInfo>,
+    },
+    /// The driver does not open it.
     #[error("{adapter}: cannot be opened: {reason}")]
-    Refused { adapter: String, reason: String },
+    Refused {
+        /// The adapter, with its driver.
+        adapter: String,
+        /// The driver's words.
+        reason: String,
+    },
+    /// Its arithmetic differs from the CPU's under every pass.
     #[error("{adapter}: not bit-exact, so it cannot be used: {}", inexact(.failures))]
-    Inexact { adapter: String, failures: Vec<(Pass, String)> },
+    Inexact {
+        /// The adapter, with its driver.
+        adapter: String,
+        /// By each pass, where it first differed.
+        failures: Vec<(Pass, String)>,
+    },
+    /// The driver gave the device up; whatever it held is gone.
     #[error("{adapter}: the device was lost ({reason})")]
-    Lost { adapter: String, reason: String },
+    Lost {
+        /// The adapter, with its driver.
+        adapter: String,
+        /// The driver's words.
+        reason: String,
+    },
+    /// The device has no room for a buffer.
     #[error("{adapter}: out of memory for {what}; use a smaller batch")]
-    OutOfMemory { adapter: String, what: String },
+    OutOfMemory {
+        /// The adapter, with its driver.
+        adapter: String,
+        /// What it was needed for.
+        what: String,
+    },
+    /// A buffer or binding is larger than the device can have at all.
     #[error("{adapter}: {what} needs {bytes} bytes, the device allows {allowed}; use a smaller batch")]
-    TooLarge { adapter: String, what: String, bytes: u64, allowed: u64 },
+    TooLarge {
+        /// The adapter, with its driver.
+        adapter: String,
+        /// What it was needed for.
+        what: String,
+        /// How many were needed.
+        bytes: u64,
+        /// How many the device allows.
+        allowed: u64,
+    },
+    /// A shader of the program does not compile for it.
     #[error("shader {label} {source}")]
-    Shader { label: String, source: ShaderError },
+    Shader {
+        /// The shader's name.
+        label: String,
+        /// What is wrong with it.
+        source: ShaderError,
+    },
+    /// Whatever else wgpu reports.
     #[error("{adapter}: {what} failed: {reason}")]
-    Failed { adapter: String, what: String, reason: String },
+    Failed {
+        /// The adapter, with its driver.
+        adapter: String,
+        /// What was being done.
+        what: String,
+        /// The driver's words.
+        reason: String,
+    },
 }
 
 fn list(found: &[AdapterInfo]) -> String {
@@ -180,6 +244,7 @@ pub enum Wanted {
 /// What to open, and how. Only tests and `verify` need more than a [`Wanted`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Request {
+    /// Which adapter.
     pub choice: Wanted,
     /// This pass alone instead of the first that is exact. [`Pass::Plain`] is opened untested.
     pub pass: Option<Pass>,
@@ -205,13 +270,17 @@ struct Trouble {
 /// An opened device whose arithmetic was seen to be exact under `pass`; a clone is the same device.
 #[derive(Clone)]
 pub struct Gpu {
+    /// Which one it is.
     pub adapter: AdapterInfo,
     /// What may be asked of the device.
     pub limits: wgpu::Limits,
     /// How shaders are compiled.
     pub pass: Pass,
+    /// Whether shaders keep their checks, see [`Request::checked`].
     pub checked: bool,
+    /// The wgpu device.
     pub device: wgpu::Device,
+    /// Its only queue.
     pub queue: wgpu::Queue,
     /// The zero that guarded arithmetic is masked with: binding 0 of every bind group.
     guard: wgpu::Buffer,
@@ -287,6 +356,7 @@ pub(super) const BINDING_ALIGNMENT: usize = 256;
 /// How a shader uses a buffer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Binding {
+    /// `var<uniform>`.
     Uniform,
     /// `var<storage, read>`.
     Read,
@@ -566,8 +636,8 @@ impl Gpu {
         entry: &str,
         layout: &Bindings,
     ) -> Result<wgpu::ComputePipeline, DeviceError> {
-        // SAFETY: the loops of the crate's own shaders end, their bindings are those of their layouts, and their indices
-        // are in bounds for groups and plans that were checked, as the checked builds in the tests show.
+        // SAFETY: the loops of the crate's own shaders end, their bindings are those of their layouts, and their
+        // indices are in bounds for groups and plans that were checked, as the checked builds in the tests show.
         #[expect(unsafe_code, reason = "shaders of the crate's own are compiled without bounds checks")]
         unsafe {
             self.pipeline(label, wgsl, entry, layout)
@@ -577,9 +647,9 @@ impl Gpu {
     /// Compiles an entry point under the device's pass. Workgroup memory starts undefined unless `checked`.
     ///
     /// # Safety
-    /// Unless `checked`, nothing keeps the shader within its buffers: its indices must be in bounds, its loops must end, it
-    /// must divide no integer by zero, and read no workgroup memory that it did not write. Its bindings must be those of
-    /// the layout, `checked` or not.
+    /// Unless `checked`, nothing keeps the shader within its buffers: its indices must be in bounds, its loops must
+    /// end, it must divide no integer by zero, and read no workgroup memory that it did not write. Its bindings must be
+    /// those of the layout, `checked` or not.
     ///
     /// # Errors
     /// The shader leaves the exact core, or asks for more than the device allows; or the driver refuses it.

@@ -1,10 +1,10 @@
 //! Whole episodes on a GPU: teams are packed into workgroups, workgroups into batches that fit the device.
 //!
-//! One shader text makes two kernels: the generic one, which plays any world, and the specialised one, made for a world's
-//! sizes, in which all loops have constant bounds and the policy is straight-line code. See [`Kernel`].
+//! One shader text makes two kernels: the generic one, which plays any world, and the specialised one, made for a
+//! world's sizes, in which all loops have constant bounds and the policy is straight-line code. See [`Kernel`].
 //!
-//! While the GPU plays one batch, the CPU reads the record of the batch before it. Where only scores are wanted, the GPU
-//! keeps the record and hands over what of it they hang on, see [`Records`].
+//! While the GPU plays one batch, the CPU reads the record of the batch before it. Where only scores are wanted, the
+//! GPU keeps the record and hands over what of it they hang on, see [`Records`].
 
 use std::any::Any;
 use std::cmp::Reverse;
@@ -58,31 +58,47 @@ shared! {
     /// One workgroup's share of the work: some teams of one group.
     #[derive(Default)]
     pub struct Task {
+        /// Which of the batch's worlds they play in.
         pub world: u32,
-        /// Where each of these starts in its buffer, in elements.
+        /// Where the agents' start positions begin in their buffer; all such places are in elements.
         pub starts: u32,
+        /// Where the POIs begin.
         pub pois: u32,
+        /// Where the weights begin.
         pub weights: u32,
+        /// Where the agents near each POI are recorded.
         pub sets: u32,
+        /// Where it is recorded whom followers saw.
         pub seen: u32,
+        /// Where a trace's moments go.
         pub moments: u32,
+        /// Where agents stand between two dispatches.
         pub states: u32,
+        /// How many teams it has.
         pub teams: u32,
-        /// The steps that a dispatch plays: from `first` on, before `end`.
+        /// The first step that a dispatch plays.
         pub first: u32,
+        /// The one before which it ends.
         pub end: u32,
-        /// Where packing finds and leaves what, see `shaders/pack.wgsl`.
+        /// Where packing finds how many agents each POI needs, see `shaders/pack.wgsl`.
         pub least: u32,
+        /// Where packing leaves the table of where each team's kept sets are.
         pub table: u32,
+        /// Where packing leaves the leaders that followers saw most, or all ones for nowhere.
         pub owners: u32,
     }
 
     /// An agent between two dispatches.
     pub struct State {
+        /// Where it is, in units.
         pub x: f32,
+        /// Likewise.
         pub y: f32,
+        /// Where it heads, a unit vector.
         pub hx: f32,
+        /// Likewise.
         pub hy: f32,
+        /// How fast it is, in units a second.
         pub speed: f32,
     }
 }
@@ -272,8 +288,8 @@ struct Work {
 }
 
 impl Work {
-    /// Finds a place for what is packed of the record; none where the whole record is wanted, where it matters when sets
-    /// stood, where packing takes too long for one dispatch, or where there is nothing to gain.
+    /// Finds a place for what is packed of the record; none where the whole record is wanted, where it matters when
+    /// sets stood, where packing takes too long for one dispatch, or where there is nothing to gain.
     fn pack(&mut self, groups: &[Group<'_>], records: Records) {
         let packs = |share: &Share| {
             let Group { world, need, .. } = groups[share.group];
@@ -912,7 +928,8 @@ impl GpuEpisodes {
                 }
                 used
             })?;
-            // Half as much again, since the next generation may keep more; and a batch that did stays in mind for a while.
+            // Half as much again, since the next generation may keep more; and a batch that did stays in mind for a
+            // while.
             let kept = 1.5 * used.saturating_sub(head) as f64 / work.sets as f64;
             self.kept = kept.max(0.9 * self.kept);
         }
@@ -1067,9 +1084,9 @@ fn source(shape: Shape) -> String {
     exact::assemble(&parts.collect::<Vec<_>>())
 }
 
-/// A policy of these widths as straight-line code: `decide` of `shaders/generic.wgsl`, its loops written out. Each unit is
-/// a variable, and four weights at a time are read in the order in which they are needed, so that a compiler may read
-/// many before it waits for any.
+/// A policy of these widths as straight-line code: `decide` of `shaders/generic.wgsl`, its loops written out. Each unit
+/// is a variable, and four weights at a time are read in the order in which they are needed, so that a compiler may
+/// read many before it waits for any.
 fn straight_policy(widths: &[u32; WIDTHS]) -> String {
     let mut text = String::from("fn decide(start: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
     let mut line = |line: std::fmt::Arguments<'_>| writeln!(text, "    {line}").expect("a string takes a line");

@@ -47,16 +47,29 @@ impl std::fmt::Display for Pass {
 /// Why a shader could not be compiled.
 #[derive(Debug, thiserror::Error)]
 pub enum ShaderError {
+    /// The text is no WGSL; naga's words.
     #[error("does not parse:\n{0}")]
     Parse(String),
+    /// naga's validation refuses it; its words.
     #[error("is not valid: {0}")]
     Invalid(String),
+    /// These operations are not known to be exact on every device.
     #[error("leaves the exact core: {}", .0.join("; "))]
     Foreign(Vec<String>),
+    /// It uses the binding of the guard itself.
     #[error("binds group 0 binding 0, which is the guard's")]
     GuardTaken,
+    /// It is beyond a limit of the device.
     #[error("needs {what} {needed}, the device allows {allowed}")]
-    Limit { what: &'static str, needed: u64, allowed: u64 },
+    Limit {
+        /// Which limit.
+        what: &'static str,
+        /// How much the shader takes.
+        needed: u64,
+        /// How much there may be.
+        allowed: u64,
+    },
+    /// naga cannot write it as SPIR-V.
     #[error("no SPIR-V: {0}")]
     Spirv(#[from] spv::Error),
 }
@@ -394,8 +407,9 @@ fn parts(statement: &mut Statement) -> Option<Parts<'_>> {
 
 /// Every operation of a module outside the exact core, as `function: operation`; empty if it is sound.
 ///
-/// The core: f32 `+ - *`, negation, comparison, `select`, `abs`, `floor`, bit casts; all integer arithmetic; conversions
-/// between u32, i32 and f32; vectors of these, loads, stores, integer atomics, calls, control flow, workgroup barriers.
+/// The core: f32 `+ - *`, negation, comparison, `select`, `abs`, `floor`, bit casts; all integer arithmetic;
+/// conversions between u32, i32 and f32; vectors of these, loads, stores, integer atomics, calls, control flow,
+/// workgroup barriers.
 pub fn foreign_operations(module: &Module) -> Vec<String> {
     match validate(module) {
         Ok(info) => foreign_in(module, &info),

@@ -27,15 +27,19 @@ shared! {
     pub struct Brood {
         /// The slots' key, which has the generation and the population in it but not the slot.
         pub key: [u32; 4],
+        /// Policies of the leader, the champion's place included.
         pub slots: u32,
+        /// Weights of a policy.
         pub parameters: u32,
         /// Where the leader's parents start in the plan.
         pub parents: u32,
-        /// Weights whose word is below it mutate, or all of them.
+        /// Weights whose random word is below it mutate.
         pub threshold: u32,
+        /// Not 0 where all weights do.
         pub all: u32,
         /// Whether noise is of a weight's own size.
         pub scaled: u32,
+        /// The noise's standard deviation.
         pub sigma: f32,
     }
 
@@ -43,15 +47,19 @@ shared! {
     pub struct Stretch {
         /// Leaders of a team.
         pub leaders: u32,
-        /// Those gathered: the first, and how many, up to [`TOGETHER`].
+        /// The first of those gathered.
         pub first: u32,
+        /// How many are gathered, up to [`TOGETHER`].
         pub count: u32,
+        /// Weights of a policy.
         pub parameters: u32,
+        /// Teams of the group that these tasks play.
         pub teams: u32,
         /// Every task has so many, the last what is left.
         pub teams_a_task: u32,
-        /// Where the stretch starts in its buffers.
+        /// Where the teams' choices of policies start in their buffer.
         pub choices: u32,
+        /// Where the weights go in theirs.
         pub weights: u32,
     }
 }

@@ -26,7 +26,9 @@ pub struct Deviation {
     pub probe: Cow<'static, str>,
     /// From which values, in the order `x, y, z, w`.
     pub values: Vec<u32>,
+    /// The bits that the CPU came to.
     pub cpu: u32,
+    /// The bits that the device came to.
     pub gpu: u32,
 }
 
@@ -53,8 +55,8 @@ pub type Probe = fn(&Gpu) -> Result<Option<Deviation>, DeviceError>;
 /// A new one is a function here: it compiles through `gpu.own_pipeline`, so that the pass under test applies to it.
 pub const ALL: &[Probe] = &[arithmetic, episode, breeding];
 
-/// Opens an adapter and finds the first pass under which every probe gives the CPU's bits: no contraction on Vulkan, else
-/// guarded.
+/// Opens an adapter and finds the first pass under which every probe gives the CPU's bits: no contraction on Vulkan,
+/// else guarded.
 ///
 /// # Errors
 /// There is no such adapter, it cannot be opened, or it is not exact under any pass.

@@ -21,8 +21,10 @@ pub const END: usize = 100;
 /// Whether a claim came out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub enum Verdict {
+    /// It did, beyond what chance leaves open.
     #[serde(rename = "yes")]
     Yes,
+    /// It did not, beyond what chance leaves open.
     #[serde(rename = "no")]
     No,
     /// The interval holds the threshold.
@@ -52,9 +54,11 @@ pub struct Finding {
     pub column: usize,
     /// What was measured: the source, or the two that are compared ("Df − G").
     pub of: String,
+    /// Whether the claim came out.
     pub verdict: Verdict,
     /// For people: "3.58 [3.43, 3.73]".
     pub measured: String,
+    /// The number behind it, where there is one.
     #[serde(flatten)]
     pub estimate: Option<Estimate>,
     /// Of a test of difference, two-sided.
@@ -67,11 +71,13 @@ pub struct Finding {
 pub struct Claim {
     /// Where it stands in the paper.
     pub place: &'static str,
+    /// Of which layout it is said.
     pub layout: &'static str,
     /// The paper's words.
     pub words: &'static str,
     /// What they are taken to say of the best teams.
     pub measure: &'static str,
+    /// What came out, by source.
     pub findings: Vec<Finding>,
 }
 

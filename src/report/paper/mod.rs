@@ -8,9 +8,10 @@
 
 use serde::Serialize;
 
-use super::curves::{Average, Curve, Figure, Panel};
+use super::curves::{Curve, Figure, Panel};
 use crate::baseline::Baseline;
 use crate::config::{Config, ConfigError, Fitness, Override, Paradigm};
+use crate::statistics::Average;
 use crate::trainer::Row;
 
 pub mod claims;
@@ -19,6 +20,7 @@ pub mod tables;
 /// A layout of the paper's section 4.4.
 #[derive(Clone, Copy, Debug)]
 pub struct Layout {
+    /// As the paper calls it.
     pub name: &'static str,
     /// The paper's figure with its results.
     pub figure: usize,
@@ -39,9 +41,13 @@ pub const FITNESSES: [Fitness; 3] = [Fitness::G, Fitness::D, Fitness::Df];
 /// One experiment: a curve of one of the figures.
 #[derive(Clone, Debug)]
 pub struct Experiment {
+    /// Where it is played.
     pub layout: Layout,
+    /// Who learns.
     pub paradigm: Paradigm,
+    /// By which score.
     pub fitness: Fitness,
+    /// All of it.
     pub config: Config,
     /// G of the best team, `[trials][generations + 1]`.
     pub best: Vec<Vec<f64>>,
@@ -123,6 +129,7 @@ pub enum Source {
     Straight,
     /// The best so far of as many random teams as evolution evaluated.
     Random,
+    /// The best of a generation that evolved by this fitness.
     Evolved(Fitness),
 }
 
@@ -150,6 +157,7 @@ impl std::fmt::Display for Source {
 pub struct Course<'a> {
     /// G of the best team, `[trials][generations + 1]`.
     pub best: &'a [Vec<f64>],
+    /// Of the layout.
     pub pois: usize,
     /// Whether chance has no part in it: every trial is the same.
     pub certain: bool,
@@ -233,30 +241,40 @@ fn title(paradigm: Paradigm) -> &'static str {
 /// Everything measured, for `summary.json`.
 #[derive(Serialize)]
 pub struct Summary<'a> {
+    /// Of the program.
     pub version: &'static str,
     /// What it ran on.
     pub backend: String,
+    /// From start to end.
     pub seconds: f64,
+    /// Of every experiment.
     pub seed: u64,
+    /// Of every experiment.
     pub trials: usize,
+    /// Of every experiment.
     pub generations: usize,
     /// Of every arm, and of what needs no learning.
     #[serde(rename = "arms")]
     pub curves: Vec<Trajectory>,
+    /// The paper's, checked.
     pub claims: &'a [claims::Claim],
 }
 
 /// One curve, in POIs observed by the best team of each generation; of random teams, by the best so far.
 #[derive(Serialize)]
 pub struct Trajectory {
+    /// Its name.
     pub layout: &'static str,
+    /// Who learns.
     pub paradigm: Paradigm,
     /// `straight ahead`, `random teams`, or the fitness.
     pub source: String,
     /// Of what evolved.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fitness: Option<Fitness>,
+    /// Of the layout.
     pub pois: usize,
+    /// Means and standard errors, by generation.
     #[serde(flatten)]
     pub curve: Curve,
     /// Over trials.
