@@ -309,7 +309,6 @@ fn nothing_is_fused_and_little_spills_on_nvidia() {
     note(findings);
 }
 
-
 /// The canary: without a pass the compiler fuses, and it shows.
 #[test]
 fn without_a_pass_nvidias_compiler_fuses() {
