@@ -48,6 +48,7 @@ pub struct Lines {
 }
 
 impl Lines {
+    /// How the lines of this config's runs are written.
     pub fn of(config: &Config) -> Lines {
         let stages = config.stages.iter().map(|stage| stage.from).filter(|&from| from > 0).collect();
         Lines { stages, staged: !config.stages.is_empty() }
