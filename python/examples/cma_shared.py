@@ -26,7 +26,7 @@ def main(generations: int = 60) -> None:
         strategy.tell(candidates, list(-scores.g - 0.05 * scores.dpp.mean(axis=1)))
         best = max(best, float(scores.g.max()))
         if generation % 10 == 0 or generation == generations - 1:
-            print(f"generation {generation:3}: best G {scores.g.max():.2f}, mean {scores.g.mean():.2f}")
+            print(f"generation {generation:3}: G {scores.g.max():.2f} of the best, mean {scores.g.mean():.2f}")
     print(f"best G {best:.2f} after {time.perf_counter() - start:.1f} s")
 
 

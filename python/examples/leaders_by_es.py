@@ -31,7 +31,7 @@ def main(generations: int = 60) -> None:
         means += RATE / SIGMA * np.einsum("lc,lcp->lp", ranks, noise)[:, None] / CANDIDATES
         if generation % 10 == 0 or generation == generations - 1:
             alone = flotilla.rollout(config, means, backend="cpu")
-            print(f"generation {generation:3}: G of the means {alone.g[0]:.2f}, of their candidates {scores.g.mean():.2f}")
+            print(f"generation {generation:3}: G {alone.g[0]:.2f} of the means, of their candidates {scores.g.mean():.2f}")
     print(f"{time.perf_counter() - start:.1f} s")
 
 

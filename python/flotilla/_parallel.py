@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from flotilla import _native
@@ -14,10 +14,12 @@ from flotilla._arrays import Floats
 from flotilla._config import Config
 from flotilla._vector import PIXELS, RENDER_MODES, Teams
 
-Box = spaces.Box
+# What a Box holds, as its types have it.
+Array = NDArray[Any]
+Space = spaces.Space[Array]
 
 
-class TeamEnv(ParallelEnv[str, Floats, Floats]):  # type: ignore[misc, unused-ignore]
+class TeamEnv(ParallelEnv[str, Array, Array]):  # type: ignore[misc, unused-ignore]
     """See :func:`flotilla.parallel_env`."""
 
     def __init__(self, config: Config, render_mode: str | None = None, reward: str = "G") -> None:
@@ -38,26 +40,26 @@ class TeamEnv(ParallelEnv[str, Floats, Floats]):  # type: ignore[misc, unused-ig
         size = self._teams.agents * 5 + len(config["world.pois"])
         self.state_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
-    def observation_space(self, agent: str) -> Box:
+    def observation_space(self, agent: str) -> Space:
         return self.observation_spaces[agent]
 
-    def action_space(self, agent: str) -> Box:
+    def action_space(self, agent: str) -> Space:
         return self.action_spaces[agent]
 
-    def _observations(self) -> dict[str, Floats]:
+    def _observations(self) -> dict[str, Array]:
         return dict(zip(self.agents, self._teams.inputs[0].copy()))
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Floats], dict[str, dict[str, Any]]]:
+    ) -> tuple[dict[str, Array], dict[str, dict[str, Any]]]:
         self._teams.reset(seed)
         self.agents = list(self.possible_agents)
         return self._observations(), {agent: {} for agent in self.agents}
 
     def step(
-        self, actions: dict[str, ArrayLike]
+        self, actions: dict[str, Array]
     ) -> tuple[
-        dict[str, Floats], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
+        dict[str, Array], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
     ]:
         if not self.agents:
             return {}, {}, {}, {}, {}

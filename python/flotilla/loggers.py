@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 from collections.abc import Callable
 from typing import Any
@@ -33,12 +34,15 @@ def tensorboard(folder: str | os.PathLike[str]) -> Logger:
     """Event files in a folder, by tensorboardX (``pip install flotilla-teams[tensorboard]``)."""
     from tensorboardX import SummaryWriter
 
-    writer = SummaryWriter(os.fspath(folder))
+    # It writes from a thread of its own, whose rows a flush does not wait for, but its end does.
+    writer = SummaryWriter(os.fspath(folder), flush_secs=1)
+    atexit.register(writer.close)
 
     def log(generation: Generation) -> None:
         for name, value in scalars(generation).items():
             writer.add_scalar(name, value, generation.generation)
-        writer.flush()
+        if generation.generation == generation.last:
+            writer.close()
 
     return log
 

@@ -1,11 +1,14 @@
 """The notebooks and the examples run; where what they need is small."""
 
+import os
+import re
 import subprocess
 import sys
 
 import pytest
 from conftest import ROOT
 
+long = pytest.mark.skipif(not os.environ.get("FLOTILLA_LONG"), reason="by request: FLOTILLA_LONG=1")
 NOTEBOOKS = sorted((ROOT / "python/notebooks").glob("*.ipynb"))
 
 
@@ -25,9 +28,18 @@ def test_there_are_notebooks():
     assert len(NOTEBOOKS) == 4
 
 
-@pytest.mark.parametrize("name, needs", [("leaders_by_es", None), ("cma_shared", "cma")])
+@pytest.mark.parametrize(
+    "name, needs",
+    [
+        ("leaders_by_es", "numpy"),
+        ("cma_shared", "cma"),
+        # These bring hundreds of megabytes: by request.
+        pytest.param("leaders_by_evosax", "evosax", marks=long),
+        pytest.param("ppo", "torch", marks=long),
+    ],
+)
 def test_examples_run(name, needs):
-    if needs:
-        pytest.importorskip(needs, reason=f"{needs} is not installed")
+    pytest.importorskip(needs, reason=f"{needs} is not installed")
     words = [sys.executable, ROOT / f"python/examples/{name}.py", "2"]
-    assert "generation   1" in subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    said = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    assert re.search(r"^(generation|iteration)   1: G", said, re.M), said

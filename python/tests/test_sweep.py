@@ -58,13 +58,17 @@ class Losing(concurrent.futures.ProcessPoolExecutor):
         return future
 
 
-@pytest.mark.skipif(os.name == "nt", reason="a process cannot be killed like this there")
+unix = pytest.mark.skipif(os.name == "nt", reason="a process cannot be killed like this there")
+
+
+@unix
 def test_a_lost_worker_s_points_are_played_again(config, grid):
     with Losing(2, multiprocessing.get_context("spawn")) as executor:
         found = sweep(grid, executor, backend="cpu")
     assert executor.lost and [point.run.digest for point in found] == digests(config)
 
 
+@unix
 def test_dask_plays_points(config, grid):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
     with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
@@ -80,6 +84,7 @@ def test_dask_plays_points(config, grid):
     assert [point.run.digest for point in found] == digests(config)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="submitit is for Unix")
 def test_submitit_plays_points(config, grid):
     submitit = pytest.importorskip("submitit", reason="submitit is not installed")
     executor = submitit.LocalExecutor("jobs")

@@ -129,6 +129,24 @@ def test_a_callback_s_error_comes_through(config, out):
         assert train(config, out=out, resume=True).digest == train(config).digest
 
 
+def test_a_callback_costs_less_than_a_fiftieth():
+    """Of a run of 50 teams: what calls take is told by a tiny world's many generations, where it would be seen."""
+
+    def least(config, callback=None):
+        took = []
+        for _ in range(5):
+            start = time.process_time()
+            train(config, backend="cpu", callback=callback, progress=False)
+            took.append(time.process_time() - start)
+        return min(took)
+
+    paper = Config.paper()
+    place = {"leaders": [[5, 5]], "followers": [], "pois": [[9, 9]], "coupling": 1, "steps": 1}
+    tiny = paper.replace(world=place, learning={"population": 2, "generations": 3000})
+    call = (least(tiny, lambda generation: None) - least(tiny)) / 3001
+    assert call < 0.02 * least(paper) / 101
+
+
 @pytest.mark.skipif(os.name == "nt", reason="signals are another thing there")
 def test_ctrl_c_saves_everything(config, tmp_path):
     long = config.replace(learning={"generations": 100_000, "population": 50})

@@ -1,0 +1,50 @@
+"""Leaders' policies by evosax, a strategy a leader, each told its own leader's credit.
+
+    pip install evosax
+    python leaders_by_evosax.py [GENERATIONS]
+
+Team t is made of every leader's candidate t, and a leader's strategy is told that leader's Df, as in leaders_by_es.py; here
+the strategies are evosax's, all leaders' asked and told at once by JAX.
+"""
+
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from evosax.algorithms import Open_ES
+
+import flotilla
+
+CANDIDATES = 200
+
+
+def main(generations: int = 60) -> None:
+    config = flotilla.Config.paper("generally_forward")
+    rate = optax.adam(0.05)
+    strategy = Open_ES(CANDIDATES, jnp.zeros(config.parameters), optimizer=rate, std_schedule=optax.constant_schedule(0.3))
+    params = strategy.default_params
+    init, ask = (jax.jit(jax.vmap(call, (0, 0, None))) for call in (strategy.init, strategy.ask))
+    tell = jax.jit(jax.vmap(strategy.tell, (0, 0, 0, 0, None)))
+    start, key = time.perf_counter(), jax.random.key(1)
+
+    def keys(number: int) -> jax.Array:
+        return jax.random.split(jax.random.fold_in(key, number), config.leaders)
+
+    means = 0.5 * jax.random.normal(key, (config.leaders, config.parameters))
+    state = init(keys(0), means, params)
+    for generation in range(generations):
+        candidates, state = ask(keys(2 * generation + 1), state, params)
+        scores = flotilla.rollout(config, np.asarray(candidates), backend="cpu")
+        # It makes small what it is told.
+        state, _ = tell(keys(2 * generation + 2), candidates, -jnp.asarray(scores.df.T), state, params)
+        if generation % 10 == 0 or generation == generations - 1:
+            alone = flotilla.rollout(config, np.asarray(state.mean)[:, None], backend="cpu")
+            print(f"generation {generation:3}: G {alone.g[0]:.2f} of the means, of their candidates {scores.g.mean():.2f}")
+    print(f"{time.perf_counter() - start:.1f} s")
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
