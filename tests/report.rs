@@ -752,7 +752,7 @@ fn what_is_trained_once_for_two_arms_is_the_same_for_both() {
     let few = few.map(|(key, value)| Override::new(key, value, key));
     let arms = paper::arms(&few).unwrap();
     let (configs, places) = paper::trained(&arms);
-    assert_eq!((configs.len(), places.len()), (15, 18));
+    assert_eq!((configs.len(), places.len()), (26, 33));
     let course = |config: &Config| {
         let mut trainer = Trainer::new(vec![config.clone()]);
         trainer.finish(&mut Cpu::default()).unwrap();
@@ -794,7 +794,7 @@ fn the_papers_figures_come_with_its_claims() {
     }
     let summary: Value = serde_json::from_str(&fs::read_to_string(out.join("summary.json")).unwrap()).unwrap();
     let arms = summary["arms"].as_array().unwrap();
-    assert_eq!(arms.len(), 18 + 12);
+    assert_eq!(arms.len(), 33 + 16);
     for arm in arms {
         for curve in ["generation", "mean", "error", "deviation"] {
             assert_eq!(arm[curve].as_array().unwrap().len(), 4, "{curve}");

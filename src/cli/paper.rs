@@ -201,9 +201,10 @@ pub fn run(args: Args) -> Result<(), Error> {
         Ok(disk.replace(&path, |output| output.write_all(content)).map_err(failed(&path))?)
     };
     for (index, layout) in paper::LAYOUTS.iter().enumerate() {
+        let Some(number) = layout.figure else { continue };
         let scene = paper::figure(found, index).scene();
         for kind in Format::ALL {
-            let name = format!("figure{}.{}", layout.figure, kind.extension());
+            let name = format!("figure{number}.{}", kind.extension());
             let picture = scene.file(kind, PRINT).map_err(failed(&out.join(&name)))?;
             write(name, &picture)?;
         }
@@ -233,6 +234,7 @@ pub fn run(args: Args) -> Result<(), Error> {
                 "folder": folders[index].display().to_string(),
                 "layout": arm.layout.name,
                 "paradigm": arm.paradigm,
+                "actions": arm.config.policy.actions,
                 "fitness": arm.fitness,
                 "pois": arm.pois(),
                 "digest": session.results(places[index]).map(|results| &results.digest),
@@ -276,7 +278,7 @@ const FIGURES: [&str; 9] = [
 
 /// An arm's folder: "chaotic-all-leaders-Df".
 fn arm_name(arm: &Experiment) -> String {
-    format!("{}-{}-{}", arm.layout.name.replace(' ', "-"), arm.paradigm, arm.fitness)
+    arm.name().replace(", ", "-").replace(' ', "-")
 }
 
 /// What all arms of a paper have in common, as its folder says it.
