@@ -20,6 +20,7 @@ use crate::escape;
 use crate::record::RecordError;
 use crate::report::replay::ReplayError;
 use crate::run::RunError;
+use crate::sweep::questions::Unanswered;
 
 mod backend;
 mod bench;
@@ -32,6 +33,7 @@ mod man;
 mod output;
 mod paper;
 mod plot;
+mod questions;
 mod recovery;
 mod remedy;
 mod replay;
@@ -204,6 +206,8 @@ pub enum Error {
     Run(#[from] RunError),
     #[error("{}{}", .0, remedy::shown(.0))]
     Shown(#[from] crate::report::runs::ReadError),
+    #[error(transparent)]
+    Unanswered(#[from] Unanswered),
     #[error("{}{}", .0, remedy::replayed(.0))]
     Replayed(#[from] ReplayError),
     #[error("standard output cannot be written: {0}")]

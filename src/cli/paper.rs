@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use serde_json::json;
 
 use super::recovery::{self, Checkpoints, Loss, Signals};
-use super::{Error, Overrides, RunOptions, backend, number, print, say};
+use super::{Error, Overrides, RunOptions, backend, number, print, questions, say};
 use crate::baseline::Baselines;
 use crate::config::{self, Override};
 use crate::memory;
@@ -30,11 +30,16 @@ const SUMMARY: &str = "summary.json";
 pub struct Args {
     /// Folder for the figures, the claims and the curves
     #[arg(long, short, value_name = "DIR", default_value = "paper")]
-    out: PathBuf,
-    /// Independent repetitions [default: 5]
+    pub(super) out: PathBuf,
+    /// Instead of the paper's experiments, train what answers the questions that it leaves open, or =a,c some of them
+    /// (docs/questions.md)
+    #[arg(long, value_name = "LETTERS", num_args = 0..=1, require_equals = true, value_delimiter = ',',
+        default_missing_value = "a,b,c,d,e,f,g", value_parser = questions::letter)]
+    pub(super) questions: Vec<char>,
+    /// Independent repetitions [default: 5, or 30 of questions]
     #[arg(long, value_name = "N", value_parser = number)]
     trials: Option<toml::Value>,
-    /// Generations after the random start [default: 100]
+    /// Generations after the random start [default: 100, or what a question's config says]
     #[arg(long, value_name = "N", value_parser = number)]
     generations: Option<toml::Value>,
     /// Start of all randomness [default: 0]
@@ -42,36 +47,48 @@ pub struct Args {
     seed: Option<toml::Value>,
     /// Go on with the paper in the folder, or start it; of one that is done, draw figures and claims again
     #[arg(long, conflicts_with = "force")]
-    resume: bool,
+    pub(super) resume: bool,
     /// Write over the paper in the folder
     #[arg(long)]
-    force: bool,
+    pub(super) force: bool,
     /// No progress on standard error
     #[arg(long, short)]
-    quiet: bool,
+    pub(super) quiet: bool,
     /// Print what came out as one JSON object (docs/json.md)
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
     #[command(flatten)]
     checkpoints: Checkpoints,
     #[command(flatten)]
-    loss: Loss,
+    pub(super) loss: Loss,
     #[command(flatten)]
-    run: RunOptions,
+    pub(super) run: RunOptions,
 }
 
 impl Args {
-    fn overrides(&self) -> Vec<Override> {
+    pub(super) fn overrides(&self) -> Vec<Override> {
         let Args { seed, trials, generations, .. } = self;
         let [seed, trials, generations] = [seed, trials, generations].map(Clone::clone);
         let overrides = Overrides { seed, trials, generations, ..Overrides::default() };
         [overrides.list(), self.checkpoints.list()].concat()
     }
 
+    /// What to do with what is in the folder.
+    pub(super) fn start(&self) -> Start {
+        match (self.resume, self.force) {
+            (true, _) => Start::Resume,
+            (_, true) => Start::Force,
+            _ => Start::Fresh,
+        }
+    }
+
     /// What to type to go on.
-    fn command_to_resume(&self) -> String {
+    pub(super) fn command_to_resume(&self) -> String {
         let (overrides, out) = (self.overrides(), self.out.display().to_string());
-        let words = ["flotilla", "paper", "--out", &out].map(String::from).into_iter();
+        let letters: Vec<String> = self.questions.iter().map(char::to_string).collect();
+        let questions = (!letters.is_empty()).then(|| format!("--questions={}", letters.join(",")));
+        let words = ["flotilla", "paper"].map(String::from).into_iter().chain(questions);
+        let words = words.chain(["--out".into(), out]);
         let machine = recovery::words_of_machine(&self.run, self.loss);
         shell::command(words.chain(recovery::words_of(&overrides)).chain(["--resume".into()]).chain(machine))
     }
@@ -79,13 +96,12 @@ impl Args {
 
 /// Trains every experiment side by side, each as a run, and writes what came out.
 pub fn run(args: Args) -> Result<(), Error> {
+    if !args.questions.is_empty() {
+        return questions::run(&args);
+    }
     let Args { ref out, quiet, .. } = args;
     let mut arms = paper::arms(&args.overrides())?;
-    let start = match (args.resume, args.force) {
-        (true, _) => Start::Resume,
-        (_, true) => Start::Force,
-        _ => Start::Fresh,
-    };
+    let start = args.start();
     let marks = Marks::of(&arms[0].config.learning);
     marks.compare(out, start)?;
     let mut player = backend::open(&args.run)?;
@@ -126,7 +142,7 @@ pub fn run(args: Args) -> Result<(), Error> {
                 out.display()
             ));
         }
-        let names = arms.iter().map(|arm| (arm.name(), arm.pois())).collect();
+        let names = arms.iter().map(|arm| (arm.name(), Some(arm.pois()))).collect();
         let next = |generations: &[usize]| generations.iter().min().copied().unwrap_or(0);
         let mut progress = Board::new(names, next(session.generations()), learning.generations, quiet);
         let of_arms = |row: &Row| {
