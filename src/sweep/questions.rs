@@ -311,16 +311,19 @@ impl Part {
     pub fn answer(&self, sweep: &Sweep, out: &Path, backend: &mut dyn Backend) -> Result<Answer, Unanswered> {
         let by = sweep.axis(self.by);
         // By the values of the axes that are no arms, in their order.
-        let mut places: Vec<(Vec<(usize, usize)>, Vec<&Point>)> = Vec::new();
+        let place = |point: &Point| -> Vec<(usize, usize)> {
+            point.values.iter().copied().enumerate().filter(|&(axis, _)| Some(axis) != by).collect()
+        };
+        let mut places: Vec<Vec<&Point>> = Vec::new();
         for point in &sweep.points {
-            let values = point.values.iter().copied().enumerate().filter(|&(axis, _)| Some(axis) != by).collect();
-            match places.iter_mut().find(|(place, _)| *place == values) {
-                Some((_, points)) => points.push(point),
-                None => places.push((values, vec![point])),
+            match places.iter_mut().find(|points| place(points[0]) == place(point)) {
+                Some(points) => points.push(point),
+                None => places.push(vec![point]),
             }
         }
         let mut rows = Vec::new();
-        for (place, points) in places {
+        for points in places {
+            let place = place(points[0]);
             let words = || place.iter().map(|&(axis, value)| (&sweep.axes[axis], value));
             let is_panel = |axis: &Axis| Some(axis.leaf()) == self.panels;
             let panel = words().find(|(axis, _)| is_panel(axis)).map(|(axis, value)| self.word(axis, value));
