@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::report::comparison;
 use flotilla::statistics::Estimate;
-use flotilla::sweep::questions::{END, Part, QUESTIONS, mark, parts};
+use flotilla::sweep::questions::{END, QUESTIONS, Study, mark, parts};
 use tempfile::TempDir;
 
 fn run(folder: &Path, line: &str) -> (Option<i32>, String, String) {
@@ -31,7 +31,7 @@ fn good(folder: &Path, line: &str) -> String {
 }
 
 /// What a page has of a part, its marks included.
-fn block<'a>(page: &'a str, part: &Part) -> &'a str {
+fn block<'a>(page: &'a str, part: &Study) -> &'a str {
     let start = page.find(&mark(part.name)).unwrap_or_else(|| panic!("no {}", mark(part.name)));
     &page[start..start + page[start..].find(END).unwrap() + END.len()]
 }
@@ -92,7 +92,7 @@ fn docs(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("docs").join(name)
 }
 
-fn named(part: &Part, ending: &str) -> String {
+fn named(part: &Study, ending: &str) -> String {
     format!("questions/{}.{ending}", part.name)
 }
 

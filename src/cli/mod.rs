@@ -126,7 +126,10 @@ pub fn run() -> Result<(), Error> {
     let words = words();
     refuse_steering(words.iter().skip(1).cloned())?;
     let typed = Cli::from_arg_matches(&command().get_matches_from(words));
-    typed.unwrap_or_else(|error| error.format(&mut command()).exit()).command.run()
+    match typed.unwrap_or_else(|error| error.format(&mut command()).exit()).command {
+        Command::Paper(args) if !args.questions.is_empty() => questions::run(&args),
+        command => command.run(),
+    }
 }
 
 /// [`run`] within a process that was started by other words: the first is the program that they would be typed to. Only

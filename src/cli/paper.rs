@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use serde_json::json;
 
 use super::recovery::{self, Checkpoints, Loss, Signals};
-use super::{Error, Overrides, RunOptions, backend, number, print, questions, say};
+use super::{Error, Overrides, RunOptions, backend, number, print, say};
 use crate::baseline::Baselines;
 use crate::config::{self, Override};
 use crate::memory;
@@ -20,6 +20,7 @@ use crate::report::runs;
 use crate::report::scene::Format;
 use crate::run::{self, Ended, Options, RunError, Session, Twin};
 use crate::shell;
+use crate::sweep::questions::letter;
 use crate::trainer::Row;
 
 /// What a paper's folder holds: of which trials, generations and seed its arms are, and the arms themselves.
@@ -34,7 +35,7 @@ pub struct Args {
     /// Instead of the paper's experiments, train what answers the questions that it leaves open, or =a,c some of them
     /// (docs/questions.md)
     #[arg(long, value_name = "LETTERS", num_args = 0..=1, require_equals = true, value_delimiter = ',',
-        default_missing_value = "a,b,c,d,e,f,g", value_parser = questions::letter)]
+        default_missing_value = "a,b,c,d,e,f,g", value_parser = letter)]
     pub(super) questions: Vec<char>,
     /// Independent repetitions [default: 5, or 30 of questions]
     #[arg(long, value_name = "N", value_parser = number)]
@@ -96,9 +97,6 @@ impl Args {
 
 /// Trains every experiment side by side, each as a run, and writes what came out.
 pub fn run(args: Args) -> Result<(), Error> {
-    if !args.questions.is_empty() {
-        return questions::run(&args);
-    }
     let Args { ref out, quiet, .. } = args;
     let mut arms = paper::arms(&args.overrides())?;
     let start = args.start();

@@ -18,24 +18,17 @@ use crate::report::curves::PRINT;
 use crate::report::progress::Meter;
 use crate::report::scene::Format;
 use crate::run::{Ended, Options, RunError, Session};
-use crate::sweep::questions::{self, Answer, Part, QUESTIONS, Question};
+use crate::sweep::questions::{self, Answer, OpenQuestion, QUESTIONS, Study};
 use crate::sweep::run::{self, Manner};
 use crate::sweep::{Sweep, shard};
 
 /// What came out, as a page.
 const PAGE: &str = "questions.md";
 
-/// A question's letter.
-pub fn letter(text: &str) -> Result<char, String> {
-    let is = |question: &&Question| text == question.letter.to_string();
-    let letters = || QUESTIONS.iter().map(|question| question.letter.to_string()).collect::<Vec<_>>().join(", ");
-    QUESTIONS.iter().find(is).map(|question| question.letter).ok_or_else(|| format!("allowed {}", letters()))
-}
-
 /// Trains every part of the questions, each as a sweep in a folder of its own, and writes what came out.
 pub fn run(args: &Args) -> Result<(), Error> {
     let (out, start) = (&args.out, args.start());
-    let parts: Vec<(&Part, Sweep)> = questions::parts(&args.questions)
+    let parts: Vec<(&Study, Sweep)> = questions::parts(&args.questions)
         .into_iter()
         .map(|part| Ok((part, part.sweep(&args.overrides())?)))
         .collect::<Result<_, Error>>()?;
@@ -121,7 +114,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
         before += cost(sweep) * (times(at) - 1.0);
     }
 
-    let mut answers: Vec<(Question, Vec<Answer>)> = Vec::new();
+    let mut answers: Vec<(OpenQuestion, Vec<Answer>)> = Vec::new();
     for question in QUESTIONS.iter().filter(|question| args.questions.contains(&question.letter)) {
         let mut of_parts = Vec::new();
         for part in question.parts {

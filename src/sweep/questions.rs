@@ -1,6 +1,6 @@
 //! The questions that the paper leaves open, as sweeps in `configs/questions/`, and what they came to.
 //!
-//! A [`Part`] is one sweep, whose arms are compared along one axis as [`comparison`] does it; its rows are what it came to
+//! A [`Study`] is one sweep, whose arms are compared along one axis as [`comparison`] does it; its rows are what it came to
 //! at each combination of the others. What no sweep can say is added here: runs that start from what others learned, and
 //! champions that play where they did not learn.
 
@@ -28,15 +28,15 @@ pub const END: &str = "<!-- so far -->";
 
 /// A question, with the parts that answer it.
 #[derive(Clone, Copy, Debug)]
-pub struct Question {
+pub struct OpenQuestion {
     pub letter: char,
     pub title: &'static str,
-    pub parts: &'static [Part],
+    pub parts: &'static [Study],
 }
 
 /// One sweep and what is told of it.
 #[derive(Clone, Copy, Debug)]
-pub struct Part {
+pub struct Study {
     /// What its config, folder and files are called.
     pub name: &'static str,
     config: &'static str,
@@ -64,7 +64,7 @@ pub struct Part {
     moved: Option<f64>,
 }
 
-const PLAIN: Part = Part {
+const PLAIN: Study = Study {
     name: "",
     config: "",
     title: "",
@@ -81,7 +81,7 @@ const PLAIN: Part = Part {
 
 macro_rules! part {
     ($name:literal, $($field:ident: $value:expr),* $(,)?) => {
-        Part {
+        Study {
             name: $name,
             config: include_str!(concat!("../../configs/questions/", $name, ".toml")),
             $($field: $value,)*
@@ -95,8 +95,8 @@ const SHARING: (&str, &[&str]) = ("sharing", &["own policies", "one policy"]);
 const OF_CREDIT: &[[usize; 2]] = &[[0, 2], [0, 3], [2, 3]];
 
 /// All of them.
-pub const QUESTIONS: &[Question] = &[
-    Question {
+pub const QUESTIONS: &[OpenQuestion] = &[
+    OpenQuestion {
         letter: 'a',
         title: "One policy or many, as groups and asymmetry grow",
         parts: &[
@@ -118,7 +118,7 @@ pub const QUESTIONS: &[Question] = &[
             ),
         ],
     },
-    Question {
+    OpenQuestion {
         letter: 'b',
         title: "Known behaviours against direct control",
         parts: &[part!(
@@ -130,7 +130,7 @@ pub const QUESTIONS: &[Question] = &[
             reach: Some(0.75),
         )],
     },
-    Question {
+    OpenQuestion {
         letter: 'c',
         title: "Relays: the same followers, led by different leaders in turn",
         parts: &[
@@ -182,14 +182,14 @@ pub const QUESTIONS: &[Question] = &[
             ),
         ],
     },
-    Question {
+    OpenQuestion {
         letter: 'd',
         title: "Followers as the only observers",
         parts: &[
             part!("observers", title: "Only followers count, by followers of each leader", by: "fitness", pairs: OF_CREDIT),
         ],
     },
-    Question {
+    OpenQuestion {
         letter: 'e',
         title: "Curricula over coupling",
         parts: &[part!(
@@ -200,7 +200,7 @@ pub const QUESTIONS: &[Question] = &[
             words: &[("stages", &["at once", "step by step"])],
         )],
     },
-    Question {
+    OpenQuestion {
         letter: 'f',
         title: "Warm starts from one layout to another",
         parts: &[part!(
@@ -212,7 +212,7 @@ pub const QUESTIONS: &[Question] = &[
             warm_from: Some(("asymmetry", &[(0, "from ahead"), (2, "from either side"), (4, "from ahead and behind")])),
         )],
     },
-    Question {
+    OpenQuestion {
         letter: 'g',
         title: "Learned on fixed POIs, played on moved ones, and the other way round",
         parts: &[part!(
@@ -249,9 +249,19 @@ pub struct Warm {
     pub policies: PathBuf,
 }
 
+/// A question's letter.
+///
+/// # Errors
+/// There is no such question.
+pub fn letter(text: &str) -> Result<char, String> {
+    let is = |question: &&OpenQuestion| text == question.letter.to_string();
+    let letters = || QUESTIONS.iter().map(|question| question.letter.to_string()).collect::<Vec<_>>().join(", ");
+    QUESTIONS.iter().find(is).map(|question| question.letter).ok_or_else(|| format!("allowed {}", letters()))
+}
+
 /// The parts that questions of these letters take, each once, sources of others first.
-pub fn parts(letters: &[char]) -> Vec<&'static Part> {
-    let mut parts: Vec<&'static Part> = Vec::new();
+pub fn parts(letters: &[char]) -> Vec<&'static Study> {
+    let mut parts: Vec<&'static Study> = Vec::new();
     for part in QUESTIONS.iter().filter(|question| letters.contains(&question.letter)).flat_map(|asked| asked.parts) {
         for part in part.source().into_iter().chain([part]) {
             if !parts.iter().any(|other| other.name == part.name) {
@@ -262,7 +272,7 @@ pub fn parts(letters: &[char]) -> Vec<&'static Part> {
     parts
 }
 
-impl Part {
+impl Study {
     /// Its sweep, with some keys changed.
     ///
     /// # Errors
@@ -272,7 +282,7 @@ impl Part {
     }
 
     /// The part whose runs those here start from, if any.
-    pub fn source(&self) -> Option<&'static Part> {
+    pub fn source(&self) -> Option<&'static Study> {
         let (name, _) = self.warm_from?;
         QUESTIONS.iter().flat_map(|question| question.parts).find(|part| part.name == name)
     }
@@ -355,7 +365,7 @@ impl Part {
                     comparison::compare(&place, &arms, &comparison::Question { at, reach, paired: false })?
                 }
             };
-            rows.push(Row { panel, name, comparison });
+            rows.push(Place { panel, name, comparison });
         }
         Ok(Answer { part: *self, rows })
     }
@@ -420,12 +430,12 @@ fn champions(path: &Path, config: &Config) -> Result<Vec<f32>, RecordError> {
 
 /// What a part came to.
 pub struct Answer {
-    part: Part,
-    rows: Vec<Row>,
+    part: Study,
+    rows: Vec<Place>,
 }
 
 /// Arms at one place.
-struct Row {
+struct Place {
     panel: Option<String>,
     name: String,
     comparison: Comparison,
@@ -458,7 +468,7 @@ impl Answer {
             head.extend(
                 self.part.pairs.iter().map(|&[one, other]| format!("{} − {}", arms[one].name, arms[other].name)),
             );
-            let rows = self.rows.iter().map(|Row { panel, name, comparison }| {
+            let rows = self.rows.iter().map(|Place { panel, name, comparison }| {
                 let Measured { arms, pairs, .. } = &comparison.measures[at];
                 let place: Vec<&str> =
                     panel.iter().chain(Some(name).filter(|name| !name.is_empty())).map(|word| &**word).collect();
@@ -491,7 +501,7 @@ impl Answer {
     pub fn scene(&self) -> Scene {
         let told: Vec<_> = self.told().into_iter().filter(|(_, measure)| measure.digits() > 1).collect();
         let mut groups: Vec<(String, Vec<String>)> = Vec::new();
-        for Row { name, comparison, .. } in &self.rows {
+        for Place { name, comparison, .. } in &self.rows {
             if !groups.iter().any(|(other, _)| other == name) {
                 groups.push((name.clone(), comparison.arms.iter().map(|arm| arm.name.clone()).collect()));
             }
@@ -526,12 +536,12 @@ pub fn mark(name: &str) -> String {
 }
 
 /// All that came out, a section a question.
-pub fn page(answers: &[(Question, Vec<Answer>)], heading: &str) -> String {
+pub fn page(answers: &[(OpenQuestion, Vec<Answer>)], heading: &str) -> String {
     let mut page = format!("# The questions that the paper leaves open\n\n{heading}\n");
-    for (Question { letter, title, .. }, answers) in answers {
+    for (OpenQuestion { letter, title, .. }, answers) in answers {
         page += &format!("\n## ({letter}) {title}\n");
         for answer in answers {
-            let Part { title, name, .. } = answer.part;
+            let Study { title, name, .. } = answer.part;
             page += &format!("\n![{title}]({name}.svg)\n\n{}", answer.block());
         }
     }
