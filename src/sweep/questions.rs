@@ -365,7 +365,7 @@ impl Study {
                     comparison::compare(&place, &arms, &comparison::Question { at, reach, paired: false })?
                 }
             };
-            rows.push(Compared { panel, name, comparison });
+            rows.push(OfPlace { panel, name, comparison });
         }
         Ok(Answer { part: *self, rows })
     }
@@ -431,11 +431,11 @@ fn champions(path: &Path, config: &Config) -> Result<Vec<f32>, RecordError> {
 /// What a part came to.
 pub struct Answer {
     part: Study,
-    rows: Vec<Compared>,
+    rows: Vec<OfPlace>,
 }
 
 /// Arms at one place.
-struct Compared {
+struct OfPlace {
     panel: Option<String>,
     name: String,
     comparison: Comparison,
@@ -468,7 +468,7 @@ impl Answer {
             head.extend(
                 self.part.pairs.iter().map(|&[one, other]| format!("{} − {}", arms[one].name, arms[other].name)),
             );
-            let rows = self.rows.iter().map(|Compared { panel, name, comparison }| {
+            let rows = self.rows.iter().map(|OfPlace { panel, name, comparison }| {
                 let Measured { arms, pairs, .. } = &comparison.measures[at];
                 let place: Vec<&str> =
                     panel.iter().chain(Some(name).filter(|name| !name.is_empty())).map(|word| &**word).collect();
@@ -501,7 +501,7 @@ impl Answer {
     pub fn scene(&self) -> Scene {
         let told: Vec<_> = self.told().into_iter().filter(|(_, measure)| measure.digits() > 1).collect();
         let mut groups: Vec<(String, Vec<String>)> = Vec::new();
-        for Compared { name, comparison, .. } in &self.rows {
+        for OfPlace { name, comparison, .. } in &self.rows {
             if !groups.iter().any(|(other, _)| other == name) {
                 groups.push((name.clone(), comparison.arms.iter().map(|arm| arm.name.clone()).collect()));
             }
