@@ -26,7 +26,8 @@ pub struct Baseline {
     pub random: Vec<Vec<f64>>,
 }
 
-/// Plays the baselines of any number of configs side by side, generation by generation.
+/// Plays the baselines of any number of configs side by side, generation by generation: each in the world of the file's own
+/// keys, whatever its stages change.
 pub struct Baselines {
     places: Vec<Setting>,
     generation: usize,

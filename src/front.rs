@@ -290,6 +290,22 @@ impl Trained {
 pub fn train(
     config: &Config,
     backend: &mut dyn Backend,
+    watch: impl FnMut(Generation<'_>) -> ControlFlow<()>,
+) -> Result<Trained, Failure> {
+    train_from(config, backend, 0, &[], watch)
+}
+
+/// [`train`], from given policies in place of random ones: one `[leaders][policies][parameters]` for each trial, or one for
+/// all; where leaders share a policy, `[1][policies][parameters]`. Populations that take more are filled up at random, and
+/// those that take fewer take the first.
+///
+/// # Errors
+/// See [`train`]; or the policies do not fit the config.
+pub fn train_from(
+    config: &Config,
+    backend: &mut dyn Backend,
+    policies: usize,
+    first: &[Vec<f32>],
     mut watch: impl FnMut(Generation<'_>) -> ControlFlow<()>,
 ) -> Result<Trained, Failure> {
     let mut config = checked(config)?;
@@ -300,6 +316,20 @@ pub fn train(
     let needed = (plan.host.min(plan.gpu_host) - plan.checkpoint).saturating_add(kept);
     memory::check(needed, 0)?;
     let (mut trainer, mut rows, mut stopped) = (Trainer::new(vec![config.clone()]), Vec::new(), false);
+    let (leaders, parameters) = (config.populations(), config.parameters());
+    for trial in (0..config.learning.trials).filter(|_| !first.is_empty()) {
+        let mut weights = first.get(if first.len() == 1 { 0 } else { trial }).cloned().unwrap_or_default();
+        if weights.len() != leaders * policies * parameters || weights.is_empty() {
+            return Err(Failure::Weights { found: weights.len(), leaders, teams: policies, parameters });
+        }
+        if let Some(place) = evolve::admit(&mut weights) {
+            let (policy, parameter, value) = (place / parameters, place % parameters, weights[place]);
+            return Err(Failure::Weight { leader: policy / policies, team: policy % policies, parameter, value });
+        }
+        if !trainer.start_from(0, trial, policies, &weights) {
+            unreachable!("the weights are as many as the config takes");
+        }
+    }
     while !trainer.is_done() {
         let played = trainer.advance(backend)?;
         if let Some(&Row { generation, .. }) = played.first().filter(|_| !stopped) {

@@ -153,7 +153,7 @@ fn straight_ahead_solves_what_the_tables_say_and_random_teams_are_played() {
     let found = baselines.found();
     // All-leaders, then leader-follower, of each layout.
     let straight: Vec<f64> = found.iter().map(|found| found.straight[1][2]).collect();
-    assert_eq!(straight, [0.0, 1.0, 0.0, 1.0, 1.0, 1.0]);
+    assert_eq!(straight, [0.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0]);
     assert!(found.iter().any(|found| found.random[0] != found.random[1]), "trials draw the same");
     for (config, found) in configs.iter().zip(&found) {
         let world = World::new(config);
@@ -199,7 +199,7 @@ fn judged(trials: u32, generations: u32, g: impl Fn(&Experiment, usize, usize) -
         arm.best = (0..trials as usize).map(course).collect();
     }
     let none = vec![vec![0.0; generations as usize + 1]; trials as usize];
-    let baselines = vec![Baseline { straight: none.clone(), random: none }; 6];
+    let baselines = vec![Baseline { straight: none.clone(), random: none }; 8];
     claims(Evidence { arms: &arms, baselines: &baselines })
 }
 
@@ -268,6 +268,42 @@ fn verdicts_are_as_strict_as_the_words() {
     let calm = judged(40, 100, |arm, trial, _| if !df(arm) && trial % 2 > 0 { 0.0 } else { 1.0 });
     assert_eq!(verdict(&calm, 1, "significantly higher", G), Verdict::No);
     assert_eq!(verdict(&calm, 2, "some of the time", G), Verdict::Yes);
+
+    // Those who select: as good and as soon as led teams, then later, then never as good.
+    let to_select = "learning to select between policies";
+    let rival = |from: usize, up_to: f64| {
+        judged(30, 100, move |arm, _, at| {
+            if arm.selects && at < from {
+                0.0
+            } else if arm.selects {
+                up_to
+            } else {
+                1.0
+            }
+        })
+    };
+    for (rivals, faster, better) in [
+        (rival(0, 1.0), Verdict::No, Verdict::Undecided),
+        (rival(50, 1.0), Verdict::Yes, Verdict::Undecided),
+        (rival(0, 0.75), Verdict::Yes, Verdict::Yes),
+    ] {
+        let words = ["“faster” than “those ", "“a more optimal solution” than “those "]
+            .map(|word| word.to_string() + to_select);
+        for layout in 0..3 {
+            for source in [G, Source::Evolved(Fitness::Df)] {
+                assert_eq!(verdict(&rivals, layout, &words[0], source), faster, "{layout}");
+                assert_eq!(verdict(&rivals, layout, &words[1], source), better, "{layout}");
+            }
+        }
+    }
+    // Many followers: led as good as alone and later, then sooner and worse.
+    let slow = judged(30, 100, |arm, _, at| if led(arm) && at < 9 { 0.0 } else { 1.0 });
+    let worse =
+        judged(30, 100, |arm, _, at| if led(arm) { if at == 9 { 1.0 } else { 0.5 } } else { 0.0 + f64::from(at > 50) });
+    for (claims, performant, faster) in [(slow, Verdict::Yes, Verdict::No), (worse, Verdict::No, Verdict::Yes)] {
+        assert_eq!(verdict(&claims, 3, "a similarly performant policy", G), performant);
+        assert_eq!(verdict(&claims, 3, "“faster than when using all learners”", G), faster);
+    }
     assert_eq!(verdict(&calm, 2, "rather large variance", G), Verdict::Yes);
 }
 

@@ -13,6 +13,7 @@ use flotilla::evaluate::Starts;
 use flotilla::front::{self, Failure, Processor, Trained};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::Start;
+use flotilla::record::policies::{Init, Policies};
 use flotilla::run::{Ended, Options, Session};
 use flotilla::sample;
 use flotilla::stepping::StepError;
@@ -41,8 +42,12 @@ fn config(seed: u64) -> Config {
 
 /// What the program makes of a config in a folder.
 fn recorded(config: &Config, folder: &Path) -> String {
-    let runs = vec![(config.clone(), folder.to_path_buf())];
-    let (mut session, _) = Session::open(runs, Start::Fresh, &Disk::default()).expect("the folder is free");
+    recorded_from(config, folder, None)
+}
+
+fn recorded_from(config: &Config, folder: &Path, init: Option<Init>) -> String {
+    let runs = vec![(config.clone(), folder.to_path_buf(), init)];
+    let (mut session, _) = Session::open_from(runs, Start::Fresh, &Disk::default()).expect("the folder is free");
     let none = std::sync::atomic::AtomicBool::default();
     let ended = session.train(
         &mut front::cpu(),
@@ -109,6 +114,28 @@ fn a_training_that_is_stopped_is_one_of_fewer_generations() {
         let whole = flotilla::train(&stopped.config, &mut Cpu::default(), |_| Continue(()));
         assert_eq!(whole.unwrap_or_else(|error| panic!("seed {seed}: {error}")), stopped, "after {after}");
     }
+}
+
+#[test]
+fn a_training_starts_from_given_policies() {
+    let config = config(5);
+    let learned = flotilla::train(&config, &mut Cpu::default(), |_| Continue(())).unwrap();
+    let policies = config.learning.population;
+    let from = |policies: usize, first: &[Vec<f32>]| {
+        flotilla::front::train_from(&config, &mut Cpu::default(), policies, first, |_| Continue(()))
+    };
+    let warm = from(policies, &learned.policies).unwrap();
+    let trials = learned.policies.iter().map(|weights| Policies { policies, weights: weights.clone() }).collect();
+    let folder = tempfile::tempdir().unwrap();
+    let init = Init { digest: "of no file".into(), trials };
+    assert_eq!(warm.digest(), recorded_from(&config, folder.path(), Some(init)));
+    assert_ne!(warm.digest(), learned.digest());
+    let columns = config.learning.generations + 1;
+    assert_eq!(from(policies, &learned.policies[..1]).unwrap().best_g[..columns], warm.best_g[..columns]);
+    assert!(matches!(from(policies + 1, &learned.policies), Err(Failure::Weights { .. })));
+    let mut wrong = learned.policies.clone();
+    wrong[1][3] = f32::NAN;
+    assert!(matches!(from(policies, &wrong), Err(Failure::Weight { leader: 0, team: 0, parameter: 3, .. })));
 }
 
 #[test]

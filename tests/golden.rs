@@ -170,15 +170,15 @@ const CASES: [Case; 25] = [
     (
         "relay",
         "Dt, led by any of the last 3 steps, only followers observe, one POI after the other",
-        FORTY_AGENTS,
+        CHAOTIC,
         &[
             ("learning.fitness", "'Dt'"),
             ("learning.led_within", "3"),
             ("learning.led_by", "'any-seen'"),
             ("world.observers", "'followers'"),
             ("world.coupling", "2"),
-            ("world.after", "[[], [0], [], [2], [3], [4]]"),
-            ("world.windows", "[[1, 25], [2, 25], [3, 20], [1, 25], [1, 25], [10, 11]]"),
+            ("world.after", "[[], [0], [1], []]"),
+            ("world.windows", "[[1, 50], [20, 50], [25, 50], [10, 30]]"),
         ],
     ),
 ];

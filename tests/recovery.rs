@@ -110,8 +110,11 @@ fn resume(config: &Config, path: &Path) -> (Results, Told) {
 /// The metrics without the seconds, and the policies.
 fn what_came_out(path: &Path) -> (String, Vec<u8>) {
     let metrics = fs::read_to_string(path.join(METRICS)).unwrap();
-    let shared = metrics.lines().map(|line| line.rsplit_once(',').unwrap().0.to_string() + "\n").collect();
-    (shared, fs::read(path.join(POLICIES)).unwrap())
+    let shared = |line: &str| {
+        let fields = line.split(',').enumerate().filter(|&(at, _)| at != 5).map(|(_, field)| field);
+        fields.collect::<Vec<_>>().join(",") + "\n"
+    };
+    (metrics.lines().map(shared).collect(), fs::read(path.join(POLICIES)).unwrap())
 }
 
 /// An uninterrupted run: its results and files.
@@ -751,6 +754,76 @@ fn a_killed_run_goes_on_to_the_same_results() {
         fs::remove_dir_all(out).unwrap();
     }
     println!("killed {killed} times, {inside} of them inside writing a file, in {runs} runs");
+}
+
+/// Kills a run some milliseconds after its start, again and again, until it comes to its end.
+fn finish_under_kills(file: &Path, out: &Path, flags: &[&str], kills: usize) -> usize {
+    let mut random = ChaCha8Rng::seed_from_u64(2);
+    let mut killed = 0;
+    loop {
+        let mut child = flotilla_train(file, out, &[&["--resume"], flags].concat()).spawn().unwrap();
+        let before = generations_recorded(out);
+        let start = Instant::now();
+        // Killed once it has come further, at the latest after a while: so that it ever comes to its end.
+        let over = loop {
+            let further = generations_recorded(out) > before + random.random_range(0..9);
+            match child.try_wait().unwrap() {
+                Some(status) => break Some(status),
+                None if killed < kills && (further || start.elapsed() > Duration::from_secs(20)) => {
+                    child.kill().unwrap();
+                    child.wait().unwrap();
+                    break None;
+                }
+                None => std::thread::sleep(Duration::from_micros(200)),
+            }
+        };
+        let told = read_all(child.stderr.take());
+        assert!(!told.contains("set aside") && !told.contains("anew"), "{told}");
+        match over {
+            None => killed += 1,
+            Some(status) => {
+                assert_eq!(status.code(), Some(0), "{told}");
+                return killed;
+            }
+        }
+    }
+}
+
+#[test]
+fn a_run_killed_around_a_change_of_stage_goes_on_to_the_same_results() {
+    let staged = (1..20).map(|stage| {
+        let (from, coupling) = (3 * stage, 1 + stage % 3);
+        format!("[[stages]]\nfrom = {from}\nset = {{ world.coupling = {coupling}, learning.start_jitter = 0.5 }}\n")
+    });
+    let text = [HEAVY.to_string()].into_iter().chain(staged).collect::<String>();
+    let expected = reference(&Config::parse(&text, "staged.toml").unwrap());
+    let folder = tempfile::tempdir().unwrap();
+    let (file, out) = (config_file(folder.path(), &text), folder.path().join("run"));
+    let killed = finish_under_kills(&file, &out, &[], 8);
+    assert!(killed >= 4, "killed {killed} times");
+    assert_eq!(what_came_out(&out), expected.1);
+    assert_eq!(Run::read(&out.join("run.json")).unwrap().digest, Some(expected.0.digest));
+}
+
+#[test]
+fn a_killed_run_that_started_warm_goes_on_to_the_same_results() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = config_file(folder.path(), HEAVY);
+    let [source, whole, out] = ["source", "whole", "run"].map(|name| folder.path().join(name));
+    let run = |out: &Path, flags: &[&str]| {
+        let done = flotilla_train(&file, out, flags).output().unwrap();
+        assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
+    };
+    run(&source, &["--generations", "3"]);
+    let policies = source.join("policies.safetensors");
+    let init = ["--init", policies.to_str().unwrap()];
+    run(&whole, &init);
+    let killed = finish_under_kills(&file, &out, &init, 5);
+    assert!(killed >= 3, "killed {killed} times");
+    assert_eq!(what_came_out(&out), what_came_out(&whole));
+    let digest = |path: &Path| Run::read(&path.join("run.json")).unwrap().digest;
+    assert_eq!(digest(&out), digest(&whole));
+    assert_ne!(digest(&out), Some(reference(&Config::parse(HEAVY, "heavy.toml").unwrap()).0.digest));
 }
 
 fn read_all(pipe: Option<impl Read>) -> String {

@@ -20,6 +20,18 @@ This page is made from the program's own table of keys by `FLOTILLA_WRITE=1 carg
 where they differ.
 ";
 
+const CLOSING: &str = "
+## `[[stages]]`
+
+Any number of these, in order of `from`, each of the file's own keys with some changed from a generation on
+([model.md](model.md#learning-section-43-algorithm-1)).
+
+| key | unit | type | range | default | meaning | paper |
+|---|---|---|---|---|---|---|
+| `from` | generations | whole number | 0 to learning.generations, more than that of the stage before | none: it has to be given | the first generation of the stage; it lasts until that of the next | 2.1 |
+| `set` |  | table of keys | any of the keys above but `policy.*`, `checkpoint.*`, `learning.paradigm`, `sharing`, `population`, `elites`, `generations`, `trials` and `seed`; as many leaders learn | `{}` | what is another than in the file, `{ \"world.coupling\" = 1 }` | 2.1 |
+";
+
 /// A cell of a Markdown table.
 fn cell(text: &str) -> String {
     text.replace('|', "\\|")
@@ -38,7 +50,7 @@ fn page() -> String {
             let _ = writeln!(page, "| {} |", cells.join(" | "));
         }
     }
-    page
+    page + CLOSING
 }
 
 fn section(key: &Definition) -> &str {

@@ -752,7 +752,7 @@ fn what_is_trained_once_for_two_arms_is_the_same_for_both() {
     let few = few.map(|(key, value)| Override::new(key, value, key));
     let arms = paper::arms(&few).unwrap();
     let (configs, places) = paper::trained(&arms);
-    assert_eq!((configs.len(), places.len()), (15, 18));
+    assert_eq!((configs.len(), places.len()), (26, 33));
     let course = |config: &Config| {
         let mut trainer = Trainer::new(vec![config.clone()]);
         trainer.finish(&mut Cpu::default()).unwrap();
@@ -794,7 +794,7 @@ fn the_papers_figures_come_with_its_claims() {
     }
     let summary: Value = serde_json::from_str(&fs::read_to_string(out.join("summary.json")).unwrap()).unwrap();
     let arms = summary["arms"].as_array().unwrap();
-    assert_eq!(arms.len(), 18 + 12);
+    assert_eq!(arms.len(), 33 + 16);
     for arm in arms {
         for curve in ["generation", "mean", "error", "deviation"] {
             assert_eq!(arm[curve].as_array().unwrap().len(), 4, "{curve}");
@@ -802,11 +802,12 @@ fn the_papers_figures_come_with_its_claims() {
     }
     // Every arm is a run, also those that another one stands for.
     let folders: Vec<PathBuf> = fs::read_dir(out.join("arms")).unwrap().map(|entry| entry.unwrap().path()).collect();
-    assert_eq!(folders.len(), 18);
+    assert_eq!(folders.len(), 33);
     let last = |folder: &str| {
         let is_it = |arm: &&Value| {
             let [layout, paradigm, fitness] = ["layout", "paradigm", "source"].map(|key| arm[key].as_str().unwrap());
-            folder == format!("{}-{paradigm}-{fitness}", layout.replace(' ', "-"))
+            let behaviours = if arm["selects"] == true { "-behaviours" } else { "" };
+            folder == format!("{}-{paradigm}{behaviours}-{fitness}", layout.replace(' ', "-"))
         };
         let arm = arms.iter().find(is_it).unwrap();
         arm["mean"][3].as_f64().unwrap() / arm["pois"].as_f64().unwrap()
@@ -845,14 +846,14 @@ fn the_papers_figures_come_with_its_claims() {
     // Three generations cannot say what happens after 100, and the table says that.
     assert!(said.contains(" open (too few generations or trials)"), "{said}");
     let claims = fs::read_to_string(out.join("claims.md")).unwrap();
-    assert_eq!(claims.lines().filter(|line| line.starts_with("| ")).count(), (2 + 6) + (2 + 6) + (2 + 28));
+    assert_eq!(claims.lines().filter(|line| line.starts_with("| ")).count(), (2 + 8) + (2 + 8) + (2 + 36));
     // What needs no learning comes first, wherever something is shown.
     assert!(claims.find("straight ahead").unwrap() < claims.find("The paper says").unwrap());
     assert!(said.find("straight ahead").unwrap() < said.find("The paper says").unwrap());
     let straight = arms.iter().filter(|arm| arm["source"] == "straight ahead");
     let solved = straight
         .filter(|arm| arm["mean"].as_array().unwrap().iter().all(|mean| *mean == arm["pois"].as_f64().unwrap()));
-    assert_eq!(solved.count(), 4);
+    assert_eq!(solved.count(), 6);
 }
 
 /// A paper's folder and what it holds.

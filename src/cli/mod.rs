@@ -20,6 +20,7 @@ use crate::escape;
 use crate::record::RecordError;
 use crate::report::replay::ReplayError;
 use crate::run::RunError;
+use crate::sweep::questions::Unanswered;
 
 mod backend;
 mod bench;
@@ -32,6 +33,7 @@ mod man;
 mod output;
 mod paper;
 mod plot;
+mod questions;
 mod recovery;
 mod remedy;
 mod replay;
@@ -124,7 +126,10 @@ pub fn run() -> Result<(), Error> {
     let words = words();
     refuse_steering(words.iter().skip(1).cloned())?;
     let typed = Cli::from_arg_matches(&command().get_matches_from(words));
-    typed.unwrap_or_else(|error| error.format(&mut command()).exit()).command.run()
+    match typed.unwrap_or_else(|error| error.format(&mut command()).exit()).command {
+        Command::Paper(args) if !args.questions.is_empty() => questions::run(&args),
+        command => command.run(),
+    }
 }
 
 /// [`run`] within a process that was started by other words: the first is the program that they would be typed to. Only
@@ -210,6 +215,9 @@ pub enum Error {
     /// A run that could not be read to be shown.
     #[error("{}{}", .0, remedy::shown(.0))]
     Shown(#[from] crate::report::runs::ReadError),
+    /// A question that could not be answered.
+    #[error(transparent)]
+    Unanswered(#[from] Unanswered),
     /// An episode that could not be replayed.
     #[error("{}{}", .0, remedy::replayed(.0))]
     Replayed(#[from] ReplayError),

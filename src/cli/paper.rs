@@ -20,6 +20,7 @@ use crate::report::runs;
 use crate::report::scene::Format;
 use crate::run::{self, Ended, Options, RunError, Session, Twin};
 use crate::shell;
+use crate::sweep::questions::letter;
 use crate::trainer::Row;
 
 /// What a paper's folder holds: of which trials, generations and seed its arms are, and the arms themselves.
@@ -30,11 +31,16 @@ const SUMMARY: &str = "summary.json";
 pub struct Args {
     /// Folder for the figures, the claims and the curves
     #[arg(long, short, value_name = "DIR", default_value = "paper")]
-    out: PathBuf,
-    /// Independent repetitions [default: 5]
+    pub(super) out: PathBuf,
+    /// Instead of the paper's experiments, train what answers the questions that it leaves open, or =a,c some of them
+    /// (docs/questions.md)
+    #[arg(long, value_name = "LETTERS", num_args = 0..=1, require_equals = true, value_delimiter = ',',
+        default_missing_value = "a,b,c,d,e,f,g", value_parser = letter)]
+    pub(super) questions: Vec<char>,
+    /// Independent repetitions [default: 5, or 30 of questions]
     #[arg(long, value_name = "N", value_parser = number)]
     trials: Option<toml::Value>,
-    /// Generations after the random start [default: 100]
+    /// Generations after the random start [default: 100, or what a question's config says]
     #[arg(long, value_name = "N", value_parser = number)]
     generations: Option<toml::Value>,
     /// Start of all randomness [default: 0]
@@ -42,36 +48,48 @@ pub struct Args {
     seed: Option<toml::Value>,
     /// Go on with the paper in the folder, or start it; of one that is done, draw figures and claims again
     #[arg(long, conflicts_with = "force")]
-    resume: bool,
+    pub(super) resume: bool,
     /// Write over the paper in the folder
     #[arg(long)]
-    force: bool,
+    pub(super) force: bool,
     /// No progress on standard error
     #[arg(long, short)]
-    quiet: bool,
+    pub(super) quiet: bool,
     /// Print what came out as one JSON object (docs/json.md)
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
     #[command(flatten)]
     checkpoints: Checkpoints,
     #[command(flatten)]
-    loss: Loss,
+    pub(super) loss: Loss,
     #[command(flatten)]
-    run: RunOptions,
+    pub(super) run: RunOptions,
 }
 
 impl Args {
-    fn overrides(&self) -> Vec<Override> {
+    pub(super) fn overrides(&self) -> Vec<Override> {
         let Args { seed, trials, generations, .. } = self;
         let [seed, trials, generations] = [seed, trials, generations].map(Clone::clone);
         let overrides = Overrides { seed, trials, generations, ..Overrides::default() };
         [overrides.list(), self.checkpoints.list()].concat()
     }
 
+    /// What to do with what is in the folder.
+    pub(super) fn start(&self) -> Start {
+        match (self.resume, self.force) {
+            (true, _) => Start::Resume,
+            (_, true) => Start::Force,
+            _ => Start::Fresh,
+        }
+    }
+
     /// What to type to go on.
-    fn command_to_resume(&self) -> String {
+    pub(super) fn command_to_resume(&self) -> String {
         let (overrides, out) = (self.overrides(), self.out.display().to_string());
-        let words = ["flotilla", "paper", "--out", &out].map(String::from).into_iter();
+        let letters: Vec<String> = self.questions.iter().map(char::to_string).collect();
+        let questions = (!letters.is_empty()).then(|| format!("--questions={}", letters.join(",")));
+        let words = ["flotilla", "paper"].map(String::from).into_iter().chain(questions);
+        let words = words.chain(["--out".into(), out]);
         let machine = recovery::words_of_machine(&self.run, self.loss);
         shell::command(words.chain(recovery::words_of(&overrides)).chain(["--resume".into()]).chain(machine))
     }
@@ -81,11 +99,7 @@ impl Args {
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { ref out, quiet, .. } = args;
     let mut arms = paper::arms(&args.overrides())?;
-    let start = match (args.resume, args.force) {
-        (true, _) => Start::Resume,
-        (_, true) => Start::Force,
-        _ => Start::Fresh,
-    };
+    let start = args.start();
     let marks = Marks::of(&arms[0].config.learning);
     marks.compare(out, start)?;
     let mut player = backend::open(&args.run)?;
@@ -126,7 +140,7 @@ pub fn run(args: Args) -> Result<(), Error> {
                 out.display()
             ));
         }
-        let names = arms.iter().map(|arm| (arm.name(), arm.pois())).collect();
+        let names = arms.iter().map(|arm| (arm.name(), Some(arm.pois()))).collect();
         let next = |generations: &[usize]| generations.iter().min().copied().unwrap_or(0);
         let mut progress = Board::new(names, next(session.generations()), learning.generations, quiet);
         let of_arms = |row: &Row| {
@@ -201,9 +215,10 @@ pub fn run(args: Args) -> Result<(), Error> {
         Ok(disk.replace(&path, |output| output.write_all(content)).map_err(failed(&path))?)
     };
     for (index, layout) in paper::LAYOUTS.iter().enumerate() {
+        let Some(number) = layout.figure else { continue };
         let scene = paper::figure(found, index).scene();
         for kind in Format::ALL {
-            let name = format!("figure{}.{}", layout.figure, kind.extension());
+            let name = format!("figure{number}.{}", kind.extension());
             let picture = scene.file(kind, PRINT).map_err(failed(&out.join(&name)))?;
             write(name, &picture)?;
         }
@@ -233,6 +248,7 @@ pub fn run(args: Args) -> Result<(), Error> {
                 "folder": folders[index].display().to_string(),
                 "layout": arm.layout.name,
                 "paradigm": arm.paradigm,
+                "actions": arm.config.policy.actions,
                 "fitness": arm.fitness,
                 "pois": arm.pois(),
                 "digest": session.results(places[index]).map(|results| &results.digest),
@@ -276,7 +292,7 @@ const FIGURES: [&str; 9] = [
 
 /// An arm's folder: "chaotic-all-leaders-Df".
 fn arm_name(arm: &Experiment) -> String {
-    format!("{}-{}-{}", arm.layout.name.replace(' ', "-"), arm.paradigm, arm.fitness)
+    arm.name().replace(", ", "-").replace(' ', "-")
 }
 
 /// What all arms of a paper have in common, as its folder says it.

@@ -227,7 +227,7 @@ fn there(path: &Path) -> Result<bool, RecordError> {
 }
 
 /// Refuses a folder that holds something else.
-fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
+pub(super) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let path = out.join(SWEEP);
     if out.is_file() {
         return Err(RecordError::NoFolder { path: out.into() }.into());
@@ -265,7 +265,7 @@ fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
 }
 
 /// Marks the folder as this sweep's. Shards that start at the same moment all write the same.
-fn claim(sweep: &Sweep, out: &Path) -> Result<(), Error> {
+pub(super) fn claim(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let path = out.join(SWEEP);
     let write = || -> io::Result<()> {
         std::fs::create_dir_all(out)?;
@@ -351,7 +351,7 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
 }
 
 /// Half of the memory that is free now, or 2 GiB where the system does not tell.
-fn free_memory() -> usize {
+pub(super) fn free_memory() -> usize {
     memory::available().map_or(2 << 30, |bytes| (bytes / 2) as usize)
 }
 

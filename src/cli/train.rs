@@ -135,7 +135,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
 
     let (since, from, last) = (Instant::now(), session.generations()[0], config.learning.generations);
-    let mut shown = Board::new(vec![(String::new(), config.world.pois.len())], from, last, args.quiet);
+    let mut shown = Board::new(vec![(String::new(), config.pois())], from, last, args.quiet);
     let ended = session.train(
         &mut player,
         &mut Options {
@@ -241,7 +241,7 @@ impl Told<'_> {
             "trials": learning.trials,
             "population": learning.population,
             "generations": learning.generations,
-            "pois": self.config.world.pois.len(),
+            "pois": self.config.pois(),
             "trained_generations": trained,
             "seconds": seconds,
             "backend": self.runs_on,

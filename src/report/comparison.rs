@@ -140,17 +140,27 @@ pub enum Measure {
         /// The last that is looked at.
         generation: usize,
     },
+    /// G of the last champion over so many episodes in which each POI is moved by up to `poi_jitter` on both axes; of one
+    /// episode where POIs stand.
+    Played {
+        /// In world units.
+        poi_jitter: f64,
+        /// How many.
+        episodes: u32,
+    },
 }
 
 impl Measure {
-    fn of(self, trial: &Trial) -> f64 {
+    /// None where the course of a trial does not tell.
+    fn of(self, trial: &Trial) -> Option<f64> {
         match self {
-            Measure::BestG { generation } => trial.course[generation][0],
-            Measure::ChampionG { generation } => trial.course[generation][1],
+            Measure::BestG { generation } => Some(trial.course[generation][0]),
+            Measure::ChampionG { generation } => Some(trial.course[generation][1]),
             Measure::GenerationsToReach { reach, generation } => {
                 let reached = trial.course[..=generation].iter().position(|[best, _]| *best >= reach);
-                reached.unwrap_or(generation + 1) as f64
+                Some(reached.unwrap_or(generation + 1) as f64)
             }
+            Measure::Played { .. } => None,
         }
     }
 
@@ -164,7 +174,8 @@ impl Measure {
         }
     }
 
-    fn digits(self) -> usize {
+    /// Digits that are told of it.
+    pub fn digits(self) -> usize {
         if let Measure::GenerationsToReach { .. } = self { 1 } else { 3 }
     }
 
@@ -174,6 +185,8 @@ impl Measure {
             Measure::BestG { .. } => "best_g",
             Measure::ChampionG { .. } => "champion_g",
             Measure::GenerationsToReach { .. } => "generations_to_reach",
+            Measure::Played { poi_jitter: 0.0, .. } => "fixed_pois_g",
+            Measure::Played { .. } => "moved_pois_g",
         }
     }
 }
@@ -184,6 +197,8 @@ impl std::fmt::Display for Measure {
             Measure::BestG { generation } => write!(f, "best team's G, generation {generation}"),
             Measure::ChampionG { generation } => write!(f, "champion's G, generation {generation}"),
             Measure::GenerationsToReach { reach, .. } => write!(f, "generations to G {reach}"),
+            Measure::Played { poi_jitter: 0.0, .. } => f.write_str("champion's G, POIs where they stand"),
+            Measure::Played { poi_jitter, .. } => write!(f, "champion's G, POIs moved by up to {poi_jitter}"),
         }
     }
 }
@@ -281,7 +296,11 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
     let best = generations.iter().map(|&generation| Measure::BestG { generation });
     let champion = generations.iter().map(|&generation| Measure::ChampionG { generation });
     let reach = Measure::GenerationsToReach { reach: options.reach, generation: last };
-    let measures = best.chain(champion).chain([reach]).map(|measure| measured(measure, arms, options.paired)).collect();
+    let measures = best.chain(champion).chain([reach]).map(|measure| {
+        let values = |arm: &Cohort| arm.trials.iter().filter_map(|trial| measure.of(trial)).collect();
+        measured(measure, &arms.iter().map(values).collect::<Vec<_>>(), options.paired)
+    });
+    let measures = measures.collect();
 
     let mut notes: Vec<String> = arms
         .iter()
@@ -299,9 +318,25 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
     Ok(Comparison { place: place.into(), generation: last, arms: arms.iter().map(named).collect(), measures, notes })
 }
 
-fn measured(measure: Measure, arms: &[Cohort], paired: bool) -> Measured {
-    let values = |arm: &Cohort| arm.trials.iter().map(|trial| measure.of(trial)).collect::<Vec<_>>();
-    let values: Vec<Vec<f64>> = arms.iter().map(values).collect();
+/// Compares what trials of two or more arms came to by other measures than those of their courses, `[arms][trials]` each.
+///
+/// # Errors
+/// An arm has fewer than two trials.
+pub fn of_values(
+    place: &str,
+    generation: usize,
+    arms: Vec<Named>,
+    values: Vec<(Measure, Vec<Vec<f64>>)>,
+) -> Result<Comparison, ComparisonError> {
+    if let Some(arm) = arms.iter().find(|arm| arm.trials < 2) {
+        return Err(ComparisonError::OneTrial(arm.name.clone()));
+    }
+    let measures = values.iter().map(|(measure, values)| measured(*measure, values, false)).collect();
+    Ok(Comparison { place: place.into(), generation, arms, measures, notes: vec![] })
+}
+
+/// Of `[arms][trials]`, two trials each at least.
+fn measured(measure: Measure, values: &[Vec<f64>], paired: bool) -> Measured {
     let two = "arms of two trials or more";
     let means = values
         .iter()
@@ -357,7 +392,7 @@ impl Comparison {
 }
 
 /// "0.92 [0.86, 0.97]", with minus signs as typeset.
-fn estimate(Estimate { value, low, high }: Estimate, digits: usize, signed: bool) -> String {
+pub fn estimate(Estimate { value, low, high }: Estimate, digits: usize, signed: bool) -> String {
     // No "-0.000".
     let [value, low, high] = [value, low, high].map(|x| {
         let tens = 10f64.powi(digits as i32);
@@ -367,7 +402,8 @@ fn estimate(Estimate { value, low, high }: Estimate, digits: usize, signed: bool
     format!("{value} [{low:.digits$}, {high:.digits$}]").replace('-', "−")
 }
 
-fn probability(p: f64) -> String {
+/// "0.042", or "< 0.001".
+pub fn probability(p: f64) -> String {
     if p < 0.001 { "< 0.001".into() } else { format!("{p:.3}") }
 }
 
@@ -440,11 +476,12 @@ pub fn csv(all: &[Comparison], output: impl io::Write) -> io::Result<()> {
         "p",
         "p_holm",
     ])?;
-    for Comparison { place, arms: named, measures, .. } in all {
+    for Comparison { place, generation: last, arms: named, measures, .. } in all {
         for Measured { measure, arms, pairs } in measures {
             let (generation, reach) = match *measure {
                 Measure::BestG { generation } | Measure::ChampionG { generation } => (generation, String::new()),
                 Measure::GenerationsToReach { reach, generation } => (generation, reach.to_string()),
+                Measure::Played { .. } => (*last, String::new()),
             };
             let place = || [place.clone(), measure.key().into(), generation.to_string(), reach.clone()];
             let numbers = |Estimate { value, low, high }| [value, low, high].map(|number: f64| number.to_string());

@@ -123,7 +123,8 @@ struct Terminal {
 /// One arm's curve so far: the best teams' G, summed, by part of the run.
 struct Growing {
     name: String,
-    pois: usize,
+    /// None where stages differ in them.
+    pois: Option<usize>,
     parts: Vec<(f64, u32)>,
     newest: Newest,
 }
@@ -163,17 +164,19 @@ impl Growing {
     /// What the newest generation came to, over trials: in POIs of the best team, or also in words.
     fn value(&self, in_words: bool) -> String {
         let Newest { best, mean, trials, .. } = self.newest;
-        let pois = |sum: f64| sum / f64::from(trials.max(1)) * self.pois as f64;
-        match in_words {
-            true => format!("best {:.2}, mean {:.2} of {} POIs", pois(best), pois(mean), self.pois),
-            false => format!("{:.2}/{}", pois(best), self.pois),
+        let pois = |sum: f64| sum / f64::from(trials.max(1)) * self.pois.unwrap_or(1) as f64;
+        match (in_words, self.pois) {
+            (true, Some(all)) => format!("best {:.2}, mean {:.2} of {all} POIs", pois(best), pois(mean)),
+            (true, None) => format!("best {:.2}, mean {:.2} of the POIs", pois(best), pois(mean)),
+            (false, Some(all)) => format!("{:.2}/{all}", pois(best)),
+            (false, None) => format!("{:.2}", pois(best)),
         }
     }
 }
 
 impl Board {
-    /// Arms by name and number of POIs, which train to generation `last`, this time from generation `from`.
-    pub fn new(arms: Vec<(String, usize)>, from: usize, last: usize, quiet: bool) -> Board {
+    /// Arms by name and number of POIs, none where that changes on the way, which train to generation `last`, this time from generation `from`.
+    pub fn new(arms: Vec<(String, Option<usize>)>, from: usize, last: usize, quiet: bool) -> Board {
         let parts = vec![(0.0, 0); CURVE.min(last + 1)];
         let arms: Vec<Growing> = arms
             .into_iter()

@@ -15,6 +15,7 @@
 //! | [`pictures`] | heat maps and curves of them |
 //! | [`arms`] | points by the values of one axis, to be compared |
 //! | [`slurm`] | the batch script of a job array |
+//! | [`questions`] | the questions that the paper leaves open, as sweeps |
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -28,6 +29,7 @@ use crate::escape;
 pub mod arms;
 pub mod layout;
 pub mod pictures;
+pub mod questions;
 pub mod results;
 pub mod run;
 pub mod shard;

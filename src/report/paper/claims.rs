@@ -203,6 +203,12 @@ impl<'a> Lookup<'a> {
         Some(less(&measure(&course(by)?), &measure(&course(other)?)))
     }
 
+    /// What agents came to that all lead and choose among known behaviours.
+    fn selecting(&'a self) -> Option<Course<'a>> {
+        let Source::Evolved(fitness) = self.source else { return None };
+        self.results.selecting(self.layout, fitness)
+    }
+
     /// A share of the POIs.
     fn pois(&self, share: f64) -> f64 {
         share * self.led().map_or(0, |course| course.pois) as f64
@@ -249,9 +255,14 @@ const G: Source = SOURCES[2];
 const D: Source = SOURCES[3];
 const DF: Source = SOURCES[4];
 
+/// Each fitness held against itself where everyone leads and chooses among behaviours; [`EVOLVED`] holds them against
+/// each other.
+const AGAINST_SELECTING: &[Source] = &[DF, D, G];
+
 const GENERAL: usize = 0;
 const STRICT: usize = 1;
 const CHAOTIC: usize = 2;
+const EIGHT: usize = 3;
 
 const MORE_OPTIMAL: &str = "“a more optimal joint policy” led than alone";
 const MORE_POIS: &str = "POIs at generation 100, leader-follower less all-leaders, by pair: above 0";
@@ -281,6 +292,31 @@ fn more_reliably(view: Lookup<'_>) -> Option<Criterion> {
     let pairs = || led.iter().zip(&all).map(|(led, all)| (*led >= pois, *all >= pois));
     let odd = pairs().filter(|(led, all)| led != all).count();
     Some(Criterion::Share(pairs().filter(|pair| *pair == (true, false)).count(), odd, MOST))
+}
+
+const MORE_OPTIMAL_THAN_SELECTING: &str =
+    "led, “a more optimal solution” than “those learning to select between policies”";
+const MORE_POIS_THAN_SELECTING: &str =
+    "POIs at generation 100, leader-follower less all-leaders who choose among behaviours, by pair: above 0";
+const FASTER_THAN_SELECTING: &str = "led, “faster” than “those learning to select between policies”";
+const SOONER_THAN_SELECTING: &str =
+    "pairs in which leader-follower observes all POIs before all-leaders who choose among behaviours do: over half";
+
+fn more_optimal_than_selecting(view: Lookup<'_>) -> Option<Criterion> {
+    Some(Criterion::Difference(less(&view.led()?.observed(END)?, &view.selecting()?.observed(END)?), ABOVE_0))
+}
+
+fn faster_than_selecting(view: Lookup<'_>) -> Option<Criterion> {
+    sooner(view.led()?, view.selecting()?)
+}
+
+/// In how many pairs the first observes all POIs before the second does, if that ever does.
+fn sooner(one: Course<'_>, other: Course<'_>) -> Option<Criterion> {
+    let (one, other) = (one.solved(END)?, other.solved(END)?);
+    let pairs = one.iter().zip(&other);
+    let sooner =
+        |(one, other): &(&Option<usize>, &Option<usize>)| one.is_some_and(|one| other.is_none_or(|other| one < other));
+    Some(Criterion::Share(pairs.filter(sooner).count(), one.len(), MOST))
 }
 
 /// The other fitness that one is compared with, so that every two are once.
@@ -581,6 +617,78 @@ const TESTS: &[Test] = &[
         needs: END,
         sources: &[Source::Straight, Source::Random, G],
         find: |view| Some(Criterion::All(view.led()?.count_solved(END)?, view.led()?.trials())),
+    },
+    Test {
+        place: "§1",
+        layout: GENERAL,
+        words: MORE_OPTIMAL_THAN_SELECTING,
+        measure: MORE_POIS_THAN_SELECTING,
+        needs: END,
+        sources: AGAINST_SELECTING,
+        find: more_optimal_than_selecting,
+    },
+    Test {
+        place: "§1",
+        layout: GENERAL,
+        words: FASTER_THAN_SELECTING,
+        measure: SOONER_THAN_SELECTING,
+        needs: END,
+        sources: AGAINST_SELECTING,
+        find: faster_than_selecting,
+    },
+    Test {
+        place: "§1",
+        layout: STRICT,
+        words: MORE_OPTIMAL_THAN_SELECTING,
+        measure: MORE_POIS_THAN_SELECTING,
+        needs: END,
+        sources: AGAINST_SELECTING,
+        find: more_optimal_than_selecting,
+    },
+    Test {
+        place: "§1",
+        layout: STRICT,
+        words: FASTER_THAN_SELECTING,
+        measure: SOONER_THAN_SELECTING,
+        needs: END,
+        sources: AGAINST_SELECTING,
+        find: faster_than_selecting,
+    },
+    Test {
+        place: "§1",
+        layout: CHAOTIC,
+        words: MORE_OPTIMAL_THAN_SELECTING,
+        measure: MORE_POIS_THAN_SELECTING,
+        needs: END,
+        sources: AGAINST_SELECTING,
+        find: more_optimal_than_selecting,
+    },
+    Test {
+        place: "§1",
+        layout: CHAOTIC,
+        words: FASTER_THAN_SELECTING,
+        measure: SOONER_THAN_SELECTING,
+        needs: END,
+        sources: AGAINST_SELECTING,
+        find: faster_than_selecting,
+    },
+    Test {
+        place: "§6",
+        layout: EIGHT,
+        words: "led, “a similarly performant policy”, “even as this ratio of followers to leaders is increased”",
+        measure: "POIs at generation 100, leader-follower less all-leaders, by pair: above −0.2",
+        needs: END,
+        sources: &SOURCES,
+        find: |view| Some(Criterion::Difference(view.lead()?, [-view.pois(SMALL), f64::INFINITY])),
+    },
+    Test {
+        place: "§6",
+        layout: EIGHT,
+        words: "led, “faster than when using all learners”, “even as this ratio of followers to leaders is increased”",
+        measure: "pairs in which leader-follower observes all POIs before all-leaders do: over half",
+        needs: END,
+        sources: &SOURCES,
+        find: |view| sooner(view.led()?, view.all()?),
     },
 ];
 

@@ -11,40 +11,56 @@ use serde::Serialize;
 use super::curves::{Curve, Figure, Panel};
 use crate::baseline::Baseline;
 use crate::config::{Config, ConfigError, Fitness, Override, Paradigm};
+use crate::model::policy::Actions;
 use crate::statistics::Average;
 use crate::trainer::Row;
 
 pub mod claims;
 pub mod tables;
 
-/// A layout of the paper's section 4.4.
+/// A layout of the paper's section 4.4, or one that its conclusion speaks of.
 #[derive(Clone, Copy, Debug)]
 pub struct Layout {
     /// As the paper calls it.
     pub name: &'static str,
-    /// The paper's figure with its results.
-    pub figure: usize,
+    /// The paper's figure with its results, if it shows any.
+    pub figure: Option<usize>,
     config: &'static str,
 }
 
-/// The paper's layouts, in its order.
-pub const LAYOUTS: [Layout; 3] = [
-    Layout { name: "generally forward", figure: 4, config: include_str!("../../../configs/generally_forward.toml") },
-    Layout { name: "strictly forward", figure: 5, config: include_str!("../../../configs/strictly_forward.toml") },
-    Layout { name: "chaotic", figure: 6, config: include_str!("../../../configs/chaotic.toml") },
+/// The paper's layouts, in its order, and one with more followers to a leader than any of them.
+pub const LAYOUTS: [Layout; 4] = [
+    Layout {
+        name: "generally forward",
+        figure: Some(4),
+        config: include_str!("../../../configs/generally_forward.toml"),
+    },
+    Layout {
+        name: "strictly forward",
+        figure: Some(5),
+        config: include_str!("../../../configs/strictly_forward.toml"),
+    },
+    Layout { name: "chaotic", figure: Some(6), config: include_str!("../../../configs/chaotic.toml") },
+    Layout {
+        name: "eight followers",
+        figure: None,
+        config: include_str!("../../../configs/questions/eight_followers.toml"),
+    },
 ];
 /// Panels (a) and (b) of each figure.
 pub const PARADIGMS: [Paradigm; 2] = [Paradigm::AllLeaders, Paradigm::LeaderFollower];
 /// One curve each.
 pub const FITNESSES: [Fitness; 3] = [Fitness::G, Fitness::D, Fitness::Df];
 
-/// One experiment: a curve of one of the figures.
+/// One experiment: a curve of one of the figures, or what these are held against.
 #[derive(Clone, Debug)]
 pub struct Experiment {
     /// Where it is played.
     pub layout: Layout,
     /// Who learns.
     pub paradigm: Paradigm,
+    /// Whether its agents learn to choose among known behaviours.
+    pub selects: bool,
     /// By which score.
     pub fitness: Fitness,
     /// All of it.
@@ -53,22 +69,26 @@ pub struct Experiment {
     pub best: Vec<Vec<f64>>,
 }
 
-/// All of the paper's experiments, with some keys changed in each: layouts, in each the paradigms, in each the fitnesses.
+/// All of the paper's experiments, with some keys changed in each: layouts, in each the paradigms, in each the fitnesses;
+/// then, of the layouts that it shows, those "learning to select between policies", where everyone leads.
 ///
 /// # Errors
 /// What is wrong with the overrides.
 pub fn arms(overrides: &[Override]) -> Result<Vec<Experiment>, ConfigError> {
+    let shown = |layout: &Layout| layout.figure.is_some();
+    let places = LAYOUTS.into_iter().flat_map(|layout| PARADIGMS.map(|paradigm| (layout, paradigm, false)));
+    let rivals = LAYOUTS.into_iter().filter(shown).map(|layout| (layout, Paradigm::AllLeaders, true));
     let mut arms = Vec::new();
-    for layout in LAYOUTS {
-        for paradigm in PARADIGMS {
-            for fitness in FITNESSES {
-                let name = format!("configs/{}.toml", layout.name.replace(' ', "_"));
-                let mut config = Config::read(layout.config, &name, &[], overrides)?;
-                config.learning.paradigm = paradigm;
-                config.learning.fitness = fitness;
-                let best = vec![Vec::with_capacity(config.learning.generations + 1); config.learning.trials];
-                arms.push(Experiment { layout, paradigm, fitness, config, best });
+    for (layout, paradigm, selects) in places.chain(rivals) {
+        for fitness in FITNESSES {
+            let name = format!("configs/{}.toml", layout.name.replace(' ', "_"));
+            let mut config = Config::read(layout.config, &name, &[], overrides)?;
+            (config.learning.paradigm, config.learning.fitness) = (paradigm, fitness);
+            if selects {
+                config.policy.actions = Actions::Behaviours;
             }
+            let best = vec![Vec::with_capacity(config.learning.generations + 1); config.learning.trials];
+            arms.push(Experiment { layout, paradigm, selects, fitness, config, best });
         }
     }
     Ok(arms)
@@ -99,7 +119,8 @@ impl Experiment {
 
     /// "chaotic, all-leaders, Df".
     pub fn name(&self) -> String {
-        format!("{}, {}, {}", self.layout.name, self.paradigm, self.fitness)
+        let behaviours = if self.selects { ", behaviours" } else { "" };
+        format!("{}, {}{behaviours}, {}", self.layout.name, self.paradigm, self.fitness)
     }
 
     /// POIs of its layout.
@@ -110,7 +131,8 @@ impl Experiment {
 
 /// The configs to play baselines of, one a layout and paradigm, in their order: fitness has no say in them.
 pub fn grounds(arms: &[Experiment]) -> Vec<Config> {
-    arms.iter().filter(|arm| arm.fitness == FITNESSES[0]).map(|arm| arm.config.clone()).collect()
+    let firsts = arms.iter().filter(|arm| arm.fitness == FITNESSES[0] && !arm.selects);
+    firsts.map(|arm| arm.config.clone()).collect()
 }
 
 /// All that came out.
@@ -166,8 +188,8 @@ pub struct Course<'a> {
 impl Evidence<'_> {
     /// What a source came to in one of [`LAYOUTS`]; none where there are no such arms.
     pub fn course(&self, layout: usize, paradigm: Paradigm, source: Source) -> Option<Course<'_>> {
-        let figure = LAYOUTS.get(layout)?.figure;
-        let is_here = |arm: &&Experiment| (arm.layout.figure, arm.paradigm) == (figure, paradigm);
+        let name = LAYOUTS.get(layout)?.name;
+        let is_here = |arm: &&Experiment| (arm.layout.name, arm.paradigm, arm.selects) == (name, paradigm, false);
         let mut here = self.arms.iter().filter(is_here);
         let pois = here.clone().next()?.pois();
         let ground = PARADIGMS.len() * layout + PARADIGMS.iter().position(|&other| other == paradigm)?;
@@ -178,6 +200,13 @@ impl Evidence<'_> {
         };
         // The paper's starts are fixed.
         Some(Course { best, pois, certain: source == Source::Straight })
+    }
+
+    /// What agents came to in one of [`LAYOUTS`] that all lead and choose among known behaviours.
+    pub fn selecting(&self, layout: usize, fitness: Fitness) -> Option<Course<'_>> {
+        let name = LAYOUTS.get(layout)?.name;
+        let arm = self.arms.iter().find(|arm| (arm.layout.name, arm.selects, arm.fitness) == (name, true, fitness))?;
+        Some(Course { best: &arm.best, pois: arm.pois(), certain: false })
     }
 }
 
@@ -272,6 +301,9 @@ pub struct Trajectory {
     /// Of what evolved.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fitness: Option<Fitness>,
+    /// Whether it chose among known behaviours.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub selects: bool,
     /// Of the layout.
     pub pois: usize,
     /// Means and standard errors, by generation.
@@ -282,24 +314,34 @@ pub struct Trajectory {
 }
 
 impl Trajectory {
-    /// Every curve, by layout, paradigm and source.
+    /// Every curve, by layout, paradigm and source; then of those who choose among behaviours.
     pub fn all(results: Evidence<'_>) -> Vec<Trajectory> {
         let mut all = Vec::new();
-        for (index, layout) in LAYOUTS.iter().enumerate() {
+        let mut add = |layout: usize, paradigm, source: Source, selects, course: Option<Course<'_>>| {
+            let Some(course) = course else { return };
+            let fitness = if let Source::Evolved(fitness) = source { Some(fitness) } else { None };
+            all.push(Trajectory {
+                layout: LAYOUTS[layout].name,
+                paradigm,
+                source: source.to_string(),
+                fitness,
+                selects,
+                pois: course.pois,
+                curve: course.curve(),
+                deviation: course.tallies().iter().map(Average::deviation).collect(),
+            });
+        };
+        for layout in 0..LAYOUTS.len() {
             for paradigm in PARADIGMS {
                 for source in SOURCES {
-                    let Some(course) = results.course(index, paradigm, source) else { continue };
-                    let fitness = if let Source::Evolved(fitness) = source { Some(fitness) } else { None };
-                    all.push(Trajectory {
-                        layout: layout.name,
-                        paradigm,
-                        source: source.to_string(),
-                        fitness,
-                        pois: course.pois,
-                        curve: course.curve(),
-                        deviation: course.tallies().iter().map(Average::deviation).collect(),
-                    });
+                    add(layout, paradigm, source, false, results.course(layout, paradigm, source));
                 }
+            }
+        }
+        for layout in 0..LAYOUTS.len() {
+            for fitness in FITNESSES {
+                let rival = results.selecting(layout, fitness);
+                add(layout, Paradigm::AllLeaders, Source::Evolved(fitness), true, rival);
             }
         }
         all

@@ -1,0 +1,175 @@
+//! `flotilla paper --questions`: what answers the questions that the paper leaves open.
+
+use std::path::Path;
+use std::sync::atomic::Ordering::Relaxed;
+
+use serde_json::json;
+
+use super::paper::Args;
+use super::recovery::{self, Signals};
+use super::sweep::{claim, free_memory, same_sweep};
+use super::{Error, backend, print, say};
+use crate::memory::Peaks;
+use crate::record::disk::Disk;
+use crate::record::folder;
+use crate::record::{RecordError, policies};
+use crate::report::comparison;
+use crate::report::curves::PRINT;
+use crate::report::progress::Meter;
+use crate::report::scene::Format;
+use crate::run::{Ended, Options, RunError, Session};
+use crate::sweep::questions::{self, Answer, OpenQuestion, QUESTIONS, Study};
+use crate::sweep::run::{self, Manner};
+use crate::sweep::{Sweep, shard};
+
+/// What came out, as a page.
+const PAGE: &str = "questions.md";
+
+/// Trains every part of the questions, each as a sweep in a folder of its own, and writes what came out.
+pub fn run(args: &Args) -> Result<(), Error> {
+    let (out, start) = (&args.out, args.start());
+    let parts: Vec<(&Study, Sweep)> = questions::parts(&args.questions)
+        .into_iter()
+        .map(|part| Ok((part, part.sweep(&args.overrides())?)))
+        .collect::<Result<_, Error>>()?;
+    if let Some(what) = folder::collection(out) {
+        return Err(Error::Refused(format!("{} holds {what}; choose another --out", out.display())));
+    }
+    if folder::holds_run(out)? {
+        return Err(Error::Refused(format!("{} holds a run; choose another --out", out.display())));
+    }
+    parts.iter().try_for_each(|(part, sweep)| same_sweep(sweep, &out.join(part.name)))?;
+    let mut player = backend::open(&args.run)?;
+    for config in parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config) {
+        Peaks::of([config], rayon::current_num_threads()).check(player.1.backend == "gpu").map_err(RunError::from)?;
+    }
+    let disk = Disk::default();
+    disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
+    let _lock = folder::lock(out)?;
+    if !args.quiet {
+        let points: usize = parts.iter().map(|(_, sweep)| sweep.points.len()).sum();
+        say(format_args!("training {points} experiments on {}, into {}", player.0.describe(), out.display()));
+    }
+
+    let signals = Signals::listen()?;
+    let mut meter = Meter::new(args.quiet);
+    let stopped = || Error::Stopped(format!("with everything saved; go on with\n  {}", args.command_to_resume()));
+    let warm: Vec<_> = parts.iter().map(|(part, sweep)| part.warm(sweep, out)).collect();
+    let cost = |sweep: &Sweep| sweep.points.iter().map(shard::cost).sum::<u128>() as f64;
+    // What starts from others' policies plays as much again, each time.
+    let times = |at: usize| 1.0 + warm[at].len() as f64 / parts[at].1.points.len() as f64;
+    let whole: f64 = parts.iter().enumerate().map(|(at, (_, sweep))| cost(sweep) * times(at)).sum();
+    let mut before = 0.0;
+    for (at, (part, sweep)) in parts.iter().enumerate() {
+        let folder = out.join(part.name);
+        claim(sweep, &folder)?;
+        let points: Vec<_> = sweep.points.iter().collect();
+        let mut manner = Manner {
+            start,
+            memory: free_memory(),
+            runs: Options {
+                command: &recovery::typed(),
+                stop: &signals.stop,
+                save: &signals.save,
+                instead: &mut |error| args.loss.instead(error),
+                setback: &mut recovery::setback,
+                watch: &mut |_| {},
+            },
+            watch: &mut |now| {
+                let share = now.played as f64 / now.total.max(1) as f64;
+                meter.show((before + share * cost(sweep)) / whole, || {
+                    format!("{}: {}/{} experiments done", part.name, now.done, now.points)
+                });
+            },
+            note: &mut |point, note| {
+                if note.is_damage() {
+                    say(format_args!("{}: {note}", sweep.describe(point)));
+                }
+            },
+        };
+        if run::run(&points, &folder, &mut player, &mut manner)? == Ended::Stopped {
+            meter.clear();
+            return Err(stopped());
+        }
+        before += cost(sweep);
+        if warm[at].is_empty() {
+            continue;
+        }
+        let runs = warm[at].iter().map(|run| {
+            Ok((run.config.clone(), run.folder.clone(), Some(policies::read_init(&run.policies, &run.config)?)))
+        });
+        let (mut session, _) = Session::open_from(runs.collect::<Result<_, RecordError>>()?, start, &disk)?;
+        let mut options = Options {
+            command: &recovery::typed(),
+            stop: &signals.stop,
+            save: &signals.save,
+            instead: &mut |error| args.loss.instead(error),
+            setback: &mut recovery::setback,
+            watch: &mut |_| meter.show(before / whole, || format!("{}: warm starts", part.name)),
+        };
+        if !session.is_done() && session.train(&mut player, &mut options)? == Ended::Stopped {
+            meter.clear();
+            return Err(stopped());
+        }
+        before += cost(sweep) * (times(at) - 1.0);
+    }
+
+    let mut answers: Vec<(OpenQuestion, Vec<Answer>)> = Vec::new();
+    for question in QUESTIONS.iter().filter(|question| args.questions.contains(&question.letter)) {
+        let mut of_parts = Vec::new();
+        for part in question.parts {
+            if signals.stop.load(Relaxed) {
+                meter.clear();
+                return Err(stopped());
+            }
+            let sweep = parts.iter().find(|(other, _)| other.name == part.name).map(|(_, sweep)| sweep);
+            let Some(sweep) = sweep else { continue };
+            meter.show(1.0, || format!("comparing {}", part.name));
+            let answer = part.answer(sweep, out, &mut *player.0)?;
+            for kind in Format::ALL {
+                let path = out.join(format!("{}.{}", part.name, kind.extension()));
+                let bytes = answer.scene().file(kind, PRINT);
+                write(&path, bytes)?;
+            }
+            let mut csv = Vec::new();
+            let all: Vec<_> = answer.comparisons().cloned().collect();
+            let path = out.join(format!("{}.csv", part.name));
+            write(&path, comparison::csv(&all, &mut csv).map(|()| csv))?;
+            of_parts.push(answer);
+        }
+        answers.push((*question, of_parts));
+    }
+    meter.clear();
+    let first = &parts[0].1.points[0].config.learning;
+    let heading = format!(
+        "Means over {} trials of seed {} with 95 % bootstrap intervals; p by Mann and Whitney's test, two-sided, by Holm's\n\
+         correction for all pairs of arms at one place.\n",
+        first.trials, first.seed
+    );
+    let page = questions::page(&answers, &heading);
+    write(&out.join(PAGE), Ok(page.clone().into_bytes()))?;
+    if args.json {
+        let all = answers.iter().map(|(question, answers)| {
+            let comparisons: Vec<_> = answers.iter().flat_map(Answer::comparisons).collect();
+            json!({ "letter": question.letter, "title": question.title, "comparisons": comparisons })
+        });
+        let told = json!({
+            "folder": out.display().to_string(),
+            "seed": first.seed,
+            "trials": first.trials,
+            "questions": all.collect::<Vec<_>>(),
+            "page": out.join(PAGE).display().to_string(),
+        });
+        return print(&format!("{told}\n"));
+    }
+    print(&format!(
+        "{page}\nFiles in {}: {PAGE}, for each table its figure (.svg, .png, .pdf) and every comparison (.csv), and the sweep \
+         that it is of, in a folder\n",
+        out.display()
+    ))
+}
+
+fn write(path: &Path, bytes: std::io::Result<Vec<u8>>) -> Result<(), Error> {
+    let written = bytes.and_then(|bytes| Disk::default().replace(path, |output| output.write_all(&bytes)));
+    Ok(written.map_err(|error| RecordError::Write { path: path.into(), error })?)
+}

@@ -1,0 +1,549 @@
+//! The questions that the paper leaves open, as sweeps in `configs/questions/`, and what they came to.
+//!
+//! A [`Study`] is one sweep, whose arms are compared along one axis as [`comparison`] does it; its rows are what it came to
+//! at each combination of the others. What no sweep can say is added here: runs that start from what others learned, and
+//! champions that play where they did not learn.
+
+use std::path::{Path, PathBuf};
+
+use super::results::point_folder;
+use super::{Axis, Point, Sweep};
+use crate::backend::{Backend, BackendError, Group, Need};
+use crate::config::{Config, ConfigError, Override};
+use crate::evaluate::{self, Starts};
+use crate::record::RecordError;
+use crate::record::folder::POLICIES;
+use crate::record::policies::{self, Policies};
+use crate::report::comparison::{self, At, Cohort, Comparison, ComparisonError, Mean, Measure, Measured, Named};
+use crate::report::grid::{Dots, Interval};
+use crate::report::runs::ReadError;
+use crate::report::scene::Scene;
+use crate::report::table;
+use crate::world::World;
+
+/// Episodes that champions play from moved POIs.
+pub const EPISODES: u32 = 200;
+/// What a question's page has around each part's table.
+pub const END: &str = "<!-- so far -->";
+
+/// A question, with the parts that answer it.
+#[derive(Clone, Copy, Debug)]
+pub struct OpenQuestion {
+    pub letter: char,
+    pub title: &'static str,
+    pub parts: &'static [Study],
+}
+
+/// One sweep and what is told of it.
+#[derive(Clone, Copy, Debug)]
+pub struct Study {
+    /// What its config, folder and files are called.
+    pub name: &'static str,
+    config: &'static str,
+    /// What its table and figure are of.
+    pub title: &'static str,
+    /// The axis whose values are its arms, if any.
+    by: &'static str,
+    /// The axis with a panel of the figure for each value, if any.
+    panels: Option<&'static str>,
+    /// Words for the values of axes, where these say little themselves.
+    words: &'static [(&'static str, &'static [&'static str])],
+    /// The two arms of each difference that the table tells.
+    pairs: &'static [[usize; 2]],
+    /// Generations at which the best team's G is told; the last where there are none.
+    at: &'static [usize],
+    /// Whether the generations to this G are told, too.
+    reach: Option<f64>,
+    /// Whether the champion's G is.
+    champion: bool,
+    /// A part whose points of these indices have policies for the points here to start from, each with a name: arms beside
+    /// those that start from random policies.
+    warm_from: Option<(&'static str, &'static [(usize, &'static str)])>,
+    /// How far POIs are moved where champions play, beside where they stand; then nothing else is measured, and a team that
+    /// goes straight ahead is one arm more.
+    moved: Option<f64>,
+}
+
+const PLAIN: Study = Study {
+    name: "",
+    config: "",
+    title: "",
+    by: "",
+    panels: None,
+    words: &[],
+    pairs: &[[0, 1]],
+    at: &[],
+    reach: None,
+    champion: false,
+    warm_from: None,
+    moved: None,
+};
+
+macro_rules! part {
+    ($name:literal, $($field:ident: $value:expr),* $(,)?) => {
+        Study {
+            name: $name,
+            config: include_str!(concat!("../../configs/questions/", $name, ".toml")),
+            $($field: $value,)*
+            ..PLAIN
+        }
+    };
+}
+
+const SHARING: (&str, &[&str]) = ("sharing", &["own policies", "one policy"]);
+/// Places among G, D, Df and Dt.
+const OF_CREDIT: &[[usize; 2]] = &[[0, 2], [0, 3], [2, 3]];
+
+/// All of them.
+pub const QUESTIONS: &[OpenQuestion] = &[
+    OpenQuestion {
+        letter: 'a',
+        title: "One policy or many, as groups and asymmetry grow",
+        parts: &[
+            part!(
+                "groups",
+                title: "One policy or many: groups with their POIs straight ahead",
+                by: "sharing",
+                panels: Some("paradigm"),
+                words: &[SHARING],
+                reach: Some(0.75),
+            ),
+            part!(
+                "asymmetry",
+                title: "One policy or many: four groups with less and less in common",
+                by: "sharing",
+                panels: Some("paradigm"),
+                words: &[SHARING, ("pois", &["ahead", "to either side", "ahead and behind", "each another way"])],
+                reach: Some(0.75),
+            ),
+        ],
+    },
+    OpenQuestion {
+        letter: 'b',
+        title: "Known behaviours against direct control",
+        parts: &[part!(
+            "behaviours",
+            title: "Known behaviours or direct control",
+            by: "actions",
+            panels: Some("paradigm"),
+            words: &[("pois", &["ahead", "each another way"])],
+            reach: Some(0.75),
+        )],
+    },
+    OpenQuestion {
+        letter: 'c',
+        title: "Relays: the same followers, led by different leaders in turn",
+        parts: &[
+            part!(
+                "relay",
+                title: "A relay of two leaders, by how long its last POIs can be observed",
+                by: "fitness",
+                words: &[("windows", &[
+                    "1 step",
+                    "5 steps",
+                    "10 steps",
+                    "20 steps",
+                    "30 steps",
+                    "no windows",
+                ])],
+                pairs: OF_CREDIT,
+                reach: Some(0.75),
+                champion: true,
+            ),
+            part!(
+                "relay_forced",
+                title: "A relay whose hand-over is forced",
+                by: "fitness",
+                words: &[("windows", &["1 step", "10 steps", "20 steps", "30 steps"])],
+                pairs: OF_CREDIT,
+                reach: Some(0.75),
+            ),
+            part!(
+                "relay_order",
+                title: "The relay's world with its POIs in order instead of in windows",
+                by: "fitness",
+                words: &[("after", &["any order", "in order"])],
+                pairs: OF_CREDIT,
+            ),
+            part!(
+                "relay_twice",
+                title: "Two relays side by side",
+                by: "fitness",
+                pairs: OF_CREDIT,
+                reach: Some(0.75),
+                champion: true,
+            ),
+            part!(
+                "relay_led",
+                title: "The relay by Dt, who leads a follower told in other ways",
+                by: "led_within",
+                words: &[("led_within", &["all steps", "the present step", "the last 10 steps"])],
+                pairs: &[[0, 1], [0, 2]],
+            ),
+        ],
+    },
+    OpenQuestion {
+        letter: 'd',
+        title: "Followers as the only observers",
+        parts: &[
+            part!("observers", title: "Only followers count, by followers of each leader", by: "fitness", pairs: OF_CREDIT),
+        ],
+    },
+    OpenQuestion {
+        letter: 'e',
+        title: "Curricula over coupling",
+        parts: &[part!(
+            "curricula",
+            title: "Coupling at once, or step by step",
+            by: "stages",
+            panels: Some("paradigm"),
+            words: &[("stages", &["at once", "step by step"])],
+        )],
+    },
+    OpenQuestion {
+        letter: 'f',
+        title: "Warm starts from one layout to another",
+        parts: &[part!(
+            "warm",
+            title: "POIs each another way, from random policies or from those of other layouts",
+            pairs: &[[0, 1], [0, 2], [0, 3]],
+            at: &[0, 10, 100],
+            // Leaders with followers, each with a policy of its own.
+            warm_from: Some(("asymmetry", &[(0, "from ahead"), (2, "from either side"), (4, "from ahead and behind")])),
+        )],
+    },
+    OpenQuestion {
+        letter: 'g',
+        title: "Learned on fixed POIs, played on moved ones, and the other way round",
+        parts: &[part!(
+            "places",
+            title: "Champions where POIs stand and where they are moved",
+            by: "poi_jitter",
+            words: &[("poi_jitter", &["learned on fixed POIs", "learned on moved POIs"])],
+            pairs: &[[0, 1], [0, 2], [1, 2]],
+            moved: Some(5.0),
+        )],
+    },
+];
+
+/// Why a question has no answer.
+#[derive(Debug, thiserror::Error)]
+pub enum Unanswered {
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    #[error(transparent)]
+    Record(#[from] RecordError),
+    #[error(transparent)]
+    Backend(#[from] BackendError),
+    #[error(transparent)]
+    Comparison(#[from] ComparisonError),
+}
+
+/// A run that starts from what another one learned.
+pub struct Warm {
+    /// What the arm is called.
+    pub from: &'static str,
+    pub config: Config,
+    pub folder: PathBuf,
+    /// The other run's policies.
+    pub policies: PathBuf,
+}
+
+/// A question's letter.
+///
+/// # Errors
+/// There is no such question.
+pub fn letter(text: &str) -> Result<char, String> {
+    let is = |question: &&OpenQuestion| text == question.letter.to_string();
+    let letters = || QUESTIONS.iter().map(|question| question.letter.to_string()).collect::<Vec<_>>().join(", ");
+    QUESTIONS.iter().find(is).map(|question| question.letter).ok_or_else(|| format!("allowed {}", letters()))
+}
+
+/// The parts that questions of these letters take, each once, sources of others first.
+pub fn parts(letters: &[char]) -> Vec<&'static Study> {
+    let mut parts: Vec<&'static Study> = Vec::new();
+    for part in QUESTIONS.iter().filter(|question| letters.contains(&question.letter)).flat_map(|asked| asked.parts) {
+        for part in part.source().into_iter().chain([part]) {
+            if !parts.iter().any(|other| other.name == part.name) {
+                parts.push(part);
+            }
+        }
+    }
+    parts
+}
+
+impl Study {
+    /// Its sweep, with some keys changed.
+    ///
+    /// # Errors
+    /// What is wrong with the overrides.
+    pub fn sweep(&self, overrides: &[Override]) -> Result<Sweep, ConfigError> {
+        Sweep::read(self.config, &format!("configs/questions/{}.toml", self.name), overrides, false)
+    }
+
+    /// The part whose runs those here start from, if any.
+    pub fn source(&self) -> Option<&'static Study> {
+        let (name, _) = self.warm_from?;
+        QUESTIONS.iter().flat_map(|question| question.parts).find(|part| part.name == name)
+    }
+
+    /// The runs that start from what others learned; `out` holds the folders of all parts.
+    pub fn warm(&self, sweep: &Sweep, out: &Path) -> Vec<Warm> {
+        sweep.points.iter().flat_map(|point| self.warm_of(point, out)).collect()
+    }
+
+    /// Those of one point.
+    fn warm_of(&self, point: &Point, out: &Path) -> Vec<Warm> {
+        let Some((source, places)) = self.warm_from else { return vec![] };
+        let run = |(at, &(index, from)): (usize, &(usize, &'static str))| Warm {
+            from,
+            config: point.config.clone(),
+            folder: out.join(self.name).join("warm").join(format!("{:04}-{at}", point.index)),
+            policies: out.join(source).join("points").join(format!("{index:04}")).join(POLICIES),
+        };
+        places.iter().enumerate().map(run).collect()
+    }
+
+    /// What the value of an axis is called.
+    fn word(&self, axis: &Axis, value: usize) -> String {
+        match self.words.iter().find(|(leaf, _)| *leaf == axis.leaf()) {
+            Some((_, words)) => words[value].into(),
+            None if axis.values[value].is_str() => axis.label(value),
+            None => format!("{} {}", axis.leaf().replace('_', " "), axis.label(value)),
+        }
+    }
+
+    /// What the part came to, once all its runs are in their folders: a comparison for each combination of the axes that
+    /// are no arms.
+    ///
+    /// # Errors
+    /// A run cannot be read, or a champion not be played.
+    pub fn answer(&self, sweep: &Sweep, out: &Path, backend: &mut dyn Backend) -> Result<Answer, Unanswered> {
+        let by = sweep.axis(self.by);
+        // By the values of the axes that are no arms, in their order.
+        let place = |point: &Point| -> Vec<(usize, usize)> {
+            point.values.iter().copied().enumerate().filter(|&(axis, _)| Some(axis) != by).collect()
+        };
+        let mut places: Vec<Vec<&Point>> = Vec::new();
+        for point in &sweep.points {
+            match places.iter_mut().find(|points| place(points[0]) == place(point)) {
+                Some(points) => points.push(point),
+                None => places.push(vec![point]),
+            }
+        }
+        let mut rows = Vec::new();
+        for points in places {
+            let place = place(points[0]);
+            let words = || place.iter().map(|&(axis, value)| (&sweep.axes[axis], value));
+            let is_panel = |axis: &Axis| Some(axis.leaf()) == self.panels;
+            let panel = words().find(|(axis, _)| is_panel(axis)).map(|(axis, value)| self.word(axis, value));
+            let name: Vec<_> =
+                words().filter(|(axis, _)| !is_panel(axis)).map(|(axis, value)| self.word(axis, value)).collect();
+            let name = name.join(", ");
+            let all = [Some(self.name), panel.as_deref(), Some(&*name).filter(|name| !name.is_empty())];
+            let place = all.into_iter().flatten().collect::<Vec<_>>().join(", ");
+
+            let name_of = |point: &Point| {
+                by.map_or("from random policies".into(), |by| self.word(&sweep.axes[by], point.values[by]))
+            };
+            let folder = |point: &Point| point_folder(&out.join(self.name), point);
+            let mut arms: Vec<_> = points.iter().map(|point| (name_of(point), folder(point))).collect();
+            for warm in points.iter().flat_map(|point| self.warm_of(point, out)) {
+                arms.push((warm.from.into(), warm.folder));
+            }
+            let learning = &points[0].config.learning;
+            let comparison = match self.moved {
+                Some(jitter) => self.played(&place, &points[0].config, &arms, jitter, backend)?,
+                None => {
+                    let read = |(name, folder)| Cohort::read(name, vec![folder]);
+                    let arms = arms.into_iter().map(read).collect::<Result<Vec<_>, _>>()?;
+                    let at = match self.at {
+                        [] => vec![At::Last],
+                        at => at.iter().map(|&at| At::Generation(at.min(learning.generations))).collect(),
+                    };
+                    let reach = self.reach.unwrap_or(0.75);
+                    comparison::compare(&place, &arms, &comparison::Question { at, reach, paired: false })?
+                }
+            };
+            rows.push(OfPlace { panel, name, comparison });
+        }
+        Ok(Answer { part: *self, rows })
+    }
+
+    /// Every trial's champion where POIs stand and where they are moved, and a team that goes straight ahead.
+    fn played(
+        &self,
+        place: &str,
+        config: &Config,
+        arms: &[(String, PathBuf)],
+        jitter: f64,
+        backend: &mut dyn Backend,
+    ) -> Result<Comparison, Unanswered> {
+        let trials = config.learning.trials;
+        let mut named = Vec::new();
+        let mut weights = Vec::new();
+        for (name, folder) in arms {
+            named.push(Named { name: name.clone(), folders: vec![folder.display().to_string()], trials });
+            weights.push(champions(&folder.join(POLICIES), config)?);
+        }
+        named.push(Named { name: "straight ahead".into(), folders: vec![], trials });
+        weights.push(vec![0.0; trials * config.learners() * config.parameters()]);
+        let mut values = Vec::new();
+        for (poi_jitter, episodes) in [(0.0, 1), (jitter, EPISODES)] {
+            let mut config = config.clone();
+            config.learning.poi_jitter = poi_jitter;
+            let world = World::new(&config);
+            let teams = evaluate::one_policy_a_team(trials, world.leaders());
+            let seed = config.learning.seed;
+            let starts = match episodes {
+                1 => Starts::Own,
+                _ => Starts::Drawn { episodes, seed, jitter: 0.0, poi_jitter },
+            };
+            let mut of_arms = Vec::new();
+            for weights in &weights {
+                let (weights, starts_here) = (weights[..].into(), &world.starts);
+                let need = Need::Scores;
+                let group =
+                    Group { world: &world, starts: starts_here, weights, policies: trials, teams: &teams, need };
+                let played = evaluate::evaluate(backend, &group, &starts, &|_| {})?;
+                of_arms.push((0..trials).map(|team| played.team(team).mean / played.pois as f64).collect());
+            }
+            values.push((Measure::Played { poi_jitter, episodes }, of_arms));
+        }
+        Ok(comparison::of_values(place, config.learning.generations, named, values)?)
+    }
+}
+
+/// The champion of every trial as a team each, `[leaders][trials][parameters]`.
+fn champions(path: &Path, config: &Config) -> Result<Vec<f32>, RecordError> {
+    let (leaders, trials, parameters) = (config.learners(), config.learning.trials, config.parameters());
+    let mut champions = vec![0.0; leaders * trials * parameters];
+    for trial in 0..trials {
+        let Policies { policies, weights } = policies::read(path, config, Some(trial))?;
+        for (leader, population) in weights.chunks(policies * parameters).enumerate() {
+            champions[(leader * trials + trial) * parameters..][..parameters]
+                .copy_from_slice(&population[..parameters]);
+        }
+    }
+    Ok(champions)
+}
+
+/// What a part came to.
+pub struct Answer {
+    part: Study,
+    rows: Vec<OfPlace>,
+}
+
+/// Arms at one place.
+struct OfPlace {
+    panel: Option<String>,
+    name: String,
+    comparison: Comparison,
+}
+
+impl Answer {
+    /// Everything that was compared.
+    pub fn comparisons(&self) -> impl Iterator<Item = &Comparison> {
+        self.rows.iter().map(|row| &row.comparison)
+    }
+
+    /// The measures that are told, by their place among all.
+    fn told(&self) -> Vec<(usize, Measure)> {
+        let measures = self.rows.first().map_or(&[][..], |row| &row.comparison.measures);
+        let is_told = |measure: &Measure| match measure {
+            Measure::BestG { .. } | Measure::Played { .. } => true,
+            Measure::GenerationsToReach { .. } => self.part.reach.is_some(),
+            Measure::ChampionG { .. } => self.part.champion,
+        };
+        let measures = measures.iter().map(|measured| measured.measure).enumerate();
+        measures.filter(|(_, measure)| is_told(measure)).collect()
+    }
+
+    /// For a page: a table a measure, of means and differences.
+    pub fn tables(&self) -> String {
+        let tables = self.told().into_iter().map(|(at, measure)| {
+            let arms = self.rows.first().map_or(&[][..], |row| &row.comparison.arms);
+            let mut head = vec![measure.to_string()];
+            head.extend(arms.iter().map(|arm| arm.name.clone()));
+            head.extend(
+                self.part.pairs.iter().map(|&[one, other]| format!("{} − {}", arms[one].name, arms[other].name)),
+            );
+            let rows = self.rows.iter().map(|OfPlace { panel, name, comparison }| {
+                let Measured { arms, pairs, .. } = &comparison.measures[at];
+                let place: Vec<&str> =
+                    panel.iter().chain(Some(name).filter(|name| !name.is_empty())).map(|word| &**word).collect();
+                let mean = |(mean, named): (&Mean, &Named)| {
+                    let reached = mean.reached.map_or(String::new(), |count| format!(" ({count} of {})", named.trials));
+                    comparison::estimate(mean.mean, measure.digits(), false) + &reached
+                };
+                let mut row = vec![place.join(", ")];
+                row.extend(arms.iter().zip(&comparison.arms).map(mean));
+                row.extend(self.part.pairs.iter().map(|pair| {
+                    pairs.iter().find(|versus| versus.arms == *pair).map_or(String::new(), |versus| {
+                        let p = comparison::probability(versus.p_holm);
+                        let sign = if p.starts_with('<') { "" } else { "= " };
+                        format!("{}, p {sign}{p}", comparison::estimate(versus.difference, measure.digits(), true))
+                    })
+                }));
+                row
+            });
+            table::markdown(&[head].into_iter().chain(rows).collect::<Vec<_>>())
+        });
+        tables.collect::<Vec<_>>().join("\n")
+    }
+
+    /// The table between the marks that a page has around it.
+    pub fn block(&self) -> String {
+        format!("{}\n\n{}\n{END}\n", mark(self.part.name), self.tables())
+    }
+
+    /// The means with their intervals.
+    pub fn scene(&self) -> Scene {
+        let told: Vec<_> = self.told().into_iter().filter(|(_, measure)| measure.digits() > 1).collect();
+        let mut groups: Vec<(String, Vec<String>)> = Vec::new();
+        for OfPlace { name, comparison, .. } in &self.rows {
+            if !groups.iter().any(|(other, _)| other == name) {
+                groups.push((name.clone(), comparison.arms.iter().map(|arm| arm.name.clone()).collect()));
+            }
+        }
+        let of = |panel: &Option<String>, at: usize| {
+            let rows = self.rows.iter().filter(|row| row.panel == *panel);
+            let interval = |mean: &Mean| -> Option<Interval> { Some([mean.mean.value, mean.mean.low, mean.mean.high]) };
+            rows.flat_map(|row| row.comparison.measures[at].arms.iter().map(interval)).collect::<Vec<_>>()
+        };
+        let mut panels: Vec<Option<String>> = self.rows.iter().map(|row| row.panel.clone()).collect();
+        panels.dedup();
+        let several = told.len() > 1;
+        let titled = told.iter().flat_map(|(at, measure)| {
+            panels.iter().map(move |panel| {
+                let measure = Some(measure.to_string()).filter(|_| several);
+                let title: Vec<_> = measure.into_iter().chain(panel.clone()).collect();
+                (title.join(", "), panel, *at)
+            })
+        });
+        let panels = titled.map(|(title, panel, at)| (title, None, of(panel, at))).collect();
+        let x_label = match &told[..] {
+            [(_, measure)] => format!("{measure}: mean and 95 % interval"),
+            _ => "G: mean and 95 % interval".into(),
+        };
+        Dots { title: self.part.title.into(), x_label, groups, panels }.scene()
+    }
+}
+
+/// What stands before a part's table in a page.
+pub fn mark(name: &str) -> String {
+    format!("<!-- {name}: flotilla paper --questions -->")
+}
+
+/// All that came out, a section a question.
+pub fn page(answers: &[(OpenQuestion, Vec<Answer>)], heading: &str) -> String {
+    let mut page = format!("# The questions that the paper leaves open\n\n{heading}\n");
+    for (OpenQuestion { letter, title, .. }, answers) in answers {
+        page += &format!("\n## ({letter}) {title}\n");
+        for answer in answers {
+            let Study { title, name, .. } = answer.part;
+            page += &format!("\n![{title}]({name}.svg)\n\n{}", answer.block());
+        }
+    }
+    page
+}
