@@ -29,8 +29,11 @@ pub const END: &str = "<!-- so far -->";
 /// A question, with the parts that answer it.
 #[derive(Clone, Copy, Debug)]
 pub struct OpenQuestion {
+    /// What it is asked for by.
     pub letter: char,
+    /// As a page's heading says it.
     pub title: &'static str,
+    /// Each a sweep of its own.
     pub parts: &'static [Study],
 }
 
@@ -229,12 +232,16 @@ pub const QUESTIONS: &[OpenQuestion] = &[
 /// Why a question has no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum Unanswered {
+    /// Runs of it cannot be read.
     #[error(transparent)]
     Read(#[from] ReadError),
+    /// Its files cannot be written.
     #[error(transparent)]
     Record(#[from] RecordError),
+    /// Champions could not be played.
     #[error(transparent)]
     Backend(#[from] BackendError),
+    /// Its arms cannot be compared.
     #[error(transparent)]
     Comparison(#[from] ComparisonError),
 }
@@ -243,7 +250,9 @@ pub enum Unanswered {
 pub struct Warm {
     /// What the arm is called.
     pub from: &'static str,
+    /// What it trains.
     pub config: Config,
+    /// Where its files are, or will be.
     pub folder: PathBuf,
     /// The other run's policies.
     pub policies: PathBuf,
