@@ -341,7 +341,8 @@ impl Dots {
         let left = 5.0 + values.chain(names).fold(0.0, f64::max);
         let titles = self.panels.iter().map(|(title, ..)| text_width(title, SMALL)).fold(0.0, f64::max);
         let rows: f64 = self.groups.iter().map(|(_, values)| 1.25 + values.len() as f64).sum();
-        let (plot, height) = (titles.max(34.0), HIGH * rows);
+        // What is written below a panel may reach as far as what is written beside it.
+        let (plot, height) = (titles.max(34.0).max(text_width(&self.x_label, SMALL) - WRITTEN), HIGH * rows);
         let panels = Panels::new(self.panels.len(), plot + WRITTEN, height, left, 15.0);
         let whole = panels.width().max(text_width(&self.title, 3.2) * 1.1 + 6.0);
         let mut scene = Scene::new(whole, panels.above + panels.height());
