@@ -110,7 +110,7 @@ def paper(
     Example:
         >>> found = flotilla.paper("short", trials=2, generations=2)
         >>> len(found["arms"]), flotilla.Run.open(found["arms"][0]["folder"]).config["learning.generations"]
-        (18, 2)
+        (33, 2)
     """
     machine = _machine(backend)
     return program(
