@@ -59,6 +59,7 @@ mod embedded {
     pub struct Instant(Duration);
 
     impl Instant {
+        /// This moment; the same one again and again where no host is installed.
         pub fn now() -> Instant {
             Instant(HOST.get().map_or(Duration::ZERO, |host| (host.now)()))
         }
