@@ -36,7 +36,7 @@ const LAYOUTS: [(&str, &str); 3] = [
 
 /// Bytes of local memory that a thread takes at most. Not for arrays: `ptxas` gives a few bytes of a thread away where that
 /// lets one more workgroup run beside it.
-const STACK: u64 = 24;
+const STACK: u64 = 16;
 
 /// What Metal's library gives, for CUDA.
 const HEADER: &str = "
