@@ -11,6 +11,8 @@
 
 #![cfg(feature = "gpu")]
 
+mod support;
+
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::Path;
@@ -18,21 +20,12 @@ use std::process::Command;
 
 use flotilla::backend::gpu::episode::{Kernel, shader_of};
 use flotilla::backend::gpu::exact::{self, Pass};
-use flotilla::config::{Config, Paradigm};
-use flotilla::world::World;
 use naga::back::msl;
 use naga::proc::{BoundsCheckPolicies, BoundsCheckPolicy};
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 
 /// Turing, Ampere, Hopper.
 const CHIPS: [&str; 3] = ["sm_75", "sm_86", "sm_90"];
-
-/// The paper's layouts.
-const LAYOUTS: [(&str, &str); 3] = [
-    ("generally forward", include_str!("../configs/generally_forward.toml")),
-    ("strictly forward", include_str!("../configs/strictly_forward.toml")),
-    ("chaotic", include_str!("../configs/chaotic.toml")),
-];
 
 /// Bytes of local memory that a thread takes at most. Not for arrays: `ptxas` gives a few bytes of a thread away where that
 /// lets one more workgroup run beside it.
@@ -268,25 +261,15 @@ fn count(assembly: &str, instruction: &str) -> usize {
 
 /// The specialised kernels of the paper's layouts, by the threads of the largest workgroup.
 fn episodes() -> Vec<(String, String)> {
-    let mut texts = Vec::new();
-    for (name, text) in LAYOUTS {
-        for paradigm in [Paradigm::LeaderFollower, Paradigm::AllLeaders] {
-            let mut config = Config::parse(text, name).expect("the project's own config");
-            config.learning.paradigm = paradigm;
-            let world = World::new(&config);
-            let leads = if paradigm == Paradigm::AllLeaders { ", all leaders" } else { "" };
-            for threads in [256, 1024] {
-                let shader = shader_of(&world, Kernel::Specialised, threads);
-                texts.push((format!("{name}{leads}, {threads}"), shader));
-            }
-        }
-    }
-    texts
+    let shaders = support::papers_worlds().into_iter().flat_map(|(name, world)| {
+        [256, 1024].map(|threads| (format!("{name}, {threads}"), shader_of(&world, Kernel::Specialised, threads)))
+    });
+    shaders.collect()
 }
 
 #[test]
-fn nothing_is_fused_and_little_spills_on_nvidia() {
-    if !nvcc("nothing_is_fused_and_little_spills_on_nvidia") {
+fn guards_hold_and_little_spills_on_nvidia() {
+    if !nvcc("guards_hold_and_little_spills_on_nvidia") {
         return;
     }
     let mut findings = Vec::new();
@@ -294,16 +277,18 @@ fn nothing_is_fused_and_little_spills_on_nvidia() {
         for chip in CHIPS {
             let (mut most, mut shaders) = (0, 0);
             for (name, text) in episodes() {
-                // Vulkan's decoration is an option here; the guard does without.
+                // Vulkan's decoration of every sum and product is one option of nvcc's, so only the guard is tried here.
                 let kernel = compile(&text, pass, chip, pass == Pass::Guarded);
                 let what = format!("{chip} under the {pass} pass, {name}");
                 assert!(count(&kernel.assembly, "FMUL") > 50, "{what}: this is no assembly: {}", kernel.assembly);
-                assert_eq!(count(&kernel.assembly, "FFMA"), 0, "{what}: fused");
+                assert!(pass != Pass::Guarded || count(&kernel.assembly, "FFMA") == 0, "{what}: fused");
                 assert!(kernel.stack <= STACK, "{what}: {} bytes of local memory", kernel.stack);
                 (most, shaders) = (most.max(kernel.registers), shaders + 1);
             }
             println!("{chip}: {shaders} shaders, {pass} pass, at most {most} registers");
-            findings.push(format!("{chip}, {pass} pass: {shaders} shaders, none fused, at most {most} registers"));
+            // Under the other pass it is nvcc that was told not to fuse, which says nothing of the pass.
+            let found = if pass == Pass::Guarded { "none fused though nvcc may, " } else { "" };
+            findings.push(format!("{chip}, {pass} pass: {shaders} shaders, {found}at most {most} registers"));
         }
     }
     note(findings);

@@ -13,6 +13,8 @@
 
 #[expect(unsafe_code, reason = "a Vulkan driver is called directly")]
 mod driver;
+#[path = "../support/mod.rs"]
+mod support;
 
 use std::collections::BTreeMap;
 use std::ffi::CString;
@@ -25,8 +27,6 @@ use driver::{Compiled, Driver};
 use flotilla::backend::gpu::episode::{Kernel, shader_of};
 use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::shaders;
-use flotilla::config::{Config, Paradigm};
-use flotilla::world::World;
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::{BinaryOperator, Expression, Module};
 
@@ -50,13 +50,6 @@ const PASSES: [Pass; 2] = [Pass::NoContraction, Pass::Guarded];
 /// measurements: with more registers fewer waves hide each other's waiting.
 const REGISTERS: u64 = 72;
 const INSTRUCTIONS: u64 = 3600;
-
-/// The paper's layouts.
-const LAYOUTS: [(&str, &str); 3] = [
-    ("generally forward", include_str!("../../configs/generally_forward.toml")),
-    ("strictly forward", include_str!("../../configs/strictly_forward.toml")),
-    ("chaotic", include_str!("../../configs/chaotic.toml")),
-];
 
 /// Where the loader looks for drivers' manifests.
 const MANIFESTS: [&str; 3] = ["/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d"];
@@ -153,19 +146,11 @@ fn under(pass: Pass, wgsl: &str) -> Vec<u32> {
 
 /// The kernels that play the paper's layouts: by the threads of the largest workgroup, generic and specialised.
 fn episodes() -> Vec<(String, String)> {
-    let mut texts = Vec::new();
-    for (name, text) in LAYOUTS {
-        for paradigm in [Paradigm::LeaderFollower, Paradigm::AllLeaders] {
-            let mut config = Config::parse(text, name).expect("the project's own config");
-            config.learning.paradigm = paradigm;
-            let world = World::new(&config);
-            let leads = if paradigm == Paradigm::AllLeaders { ", all leaders" } else { "" };
-            for (kernel, threads) in [(Kernel::Generic, 256), (Kernel::Specialised, 256), (Kernel::Specialised, 1024)] {
-                texts.push((format!("{name}{leads}, {kernel}, {threads}"), shader_of(&world, kernel, threads)));
-            }
-        }
-    }
-    texts
+    let shaders = support::papers_worlds().into_iter().flat_map(|(name, world)| {
+        [(Kernel::Generic, 256), (Kernel::Specialised, 256), (Kernel::Specialised, 1024)]
+            .map(|(kernel, threads)| (format!("{name}, {kernel}, {threads}"), shader_of(&world, kernel, threads)))
+    });
+    shaders.collect()
 }
 
 /// All of [`episodes`], and every other shader.

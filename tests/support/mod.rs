@@ -8,7 +8,8 @@ use std::io::Write;
 pub use commands::*;
 #[cfg(feature = "gpu")]
 use flotilla::backend::gpu::device::{self, AdapterInfo, Request, Wanted};
-use flotilla::config::Config;
+use flotilla::config::{Config, Paradigm};
+use flotilla::world::World;
 
 /// A config that is small and played at once.
 pub const SMALL: &str = "
@@ -30,6 +31,20 @@ trials = 3
 pub fn layout(name: &str) -> Config {
     let path = format!("{}/configs/{name}.toml", env!("CARGO_MANIFEST_DIR"));
     Config::load(path.as_ref()).unwrap_or_else(|error| panic!("{error}"))
+}
+
+/// The worlds of the paper's layouts, led and where everyone leads, by name.
+pub fn papers_worlds() -> Vec<(String, World)> {
+    let layouts = ["generally_forward", "strictly_forward", "chaotic"];
+    let paradigms = [(Paradigm::LeaderFollower, ""), (Paradigm::AllLeaders, ", all leaders")];
+    let pairs = layouts.into_iter().flat_map(|name| paradigms.map(|paradigm| (name, paradigm)));
+    pairs
+        .map(|(name, (paradigm, leads))| {
+            let mut config = layout(name);
+            config.learning.paradigm = paradigm;
+            (format!("{}{leads}", name.replace('_', " ")), World::new(&config))
+        })
+        .collect()
 }
 
 #[cfg(feature = "cli")]

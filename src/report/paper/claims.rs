@@ -294,21 +294,25 @@ fn more_reliably(view: Lookup<'_>) -> Option<Criterion> {
     Some(Criterion::Share(pairs().filter(|pair| *pair == (true, false)).count(), odd, MOST))
 }
 
-const MORE_OPTIMAL_THAN_SELECTING: &str =
-    "led, “a more optimal solution” than “those learning to select between policies”";
-const MORE_POIS_THAN_SELECTING: &str =
-    "POIs at generation 100, leader-follower less all-leaders who choose among behaviours, by pair: above 0";
-const FASTER_THAN_SELECTING: &str = "led, “faster” than “those learning to select between policies”";
-const SOONER_THAN_SELECTING: &str =
-    "pairs in which leader-follower observes all POIs before all-leaders who choose among behaviours do: over half";
-
-fn more_optimal_than_selecting(view: Lookup<'_>) -> Option<Criterion> {
-    Some(Criterion::Difference(less(&view.led()?.observed(END)?, &view.selecting()?.observed(END)?), ABOVE_0))
-}
-
-fn faster_than_selecting(view: Lookup<'_>) -> Option<Criterion> {
-    sooner(view.led()?, view.selecting()?)
-}
+/// What section 1 says of every layout, of agents who learn to select between known behaviours.
+const MORE_THAN_SELECTING: Test = Test {
+    place: "§1",
+    layout: GENERAL,
+    words: "led, “a more optimal solution” than “those learning to select between policies”",
+    measure: "POIs at generation 100, leader-follower less all-leaders who choose among behaviours, by pair: above 0",
+    needs: END,
+    sources: AGAINST_SELECTING,
+    find: |view| {
+        let (led, selecting) = (view.led()?.observed(END)?, view.selecting()?.observed(END)?);
+        Some(Criterion::Difference(less(&led, &selecting), ABOVE_0))
+    },
+};
+const FASTER_THAN_SELECTING: Test = Test {
+    words: "led, “faster” than “those learning to select between policies”",
+    measure: "pairs in which leader-follower observes all POIs before all-leaders who choose among behaviours do: over half",
+    find: |view| sooner(view.led()?, view.selecting()?),
+    ..MORE_THAN_SELECTING
+};
 
 /// In how many pairs the first observes all POIs before the second does, if that ever does.
 fn sooner(one: Course<'_>, other: Course<'_>) -> Option<Criterion> {
@@ -618,60 +622,12 @@ const TESTS: &[Test] = &[
         sources: &[Source::Straight, Source::Random, G],
         find: |view| Some(Criterion::All(view.led()?.count_solved(END)?, view.led()?.trials())),
     },
-    Test {
-        place: "§1",
-        layout: GENERAL,
-        words: MORE_OPTIMAL_THAN_SELECTING,
-        measure: MORE_POIS_THAN_SELECTING,
-        needs: END,
-        sources: AGAINST_SELECTING,
-        find: more_optimal_than_selecting,
-    },
-    Test {
-        place: "§1",
-        layout: GENERAL,
-        words: FASTER_THAN_SELECTING,
-        measure: SOONER_THAN_SELECTING,
-        needs: END,
-        sources: AGAINST_SELECTING,
-        find: faster_than_selecting,
-    },
-    Test {
-        place: "§1",
-        layout: STRICT,
-        words: MORE_OPTIMAL_THAN_SELECTING,
-        measure: MORE_POIS_THAN_SELECTING,
-        needs: END,
-        sources: AGAINST_SELECTING,
-        find: more_optimal_than_selecting,
-    },
-    Test {
-        place: "§1",
-        layout: STRICT,
-        words: FASTER_THAN_SELECTING,
-        measure: SOONER_THAN_SELECTING,
-        needs: END,
-        sources: AGAINST_SELECTING,
-        find: faster_than_selecting,
-    },
-    Test {
-        place: "§1",
-        layout: CHAOTIC,
-        words: MORE_OPTIMAL_THAN_SELECTING,
-        measure: MORE_POIS_THAN_SELECTING,
-        needs: END,
-        sources: AGAINST_SELECTING,
-        find: more_optimal_than_selecting,
-    },
-    Test {
-        place: "§1",
-        layout: CHAOTIC,
-        words: FASTER_THAN_SELECTING,
-        measure: SOONER_THAN_SELECTING,
-        needs: END,
-        sources: AGAINST_SELECTING,
-        find: faster_than_selecting,
-    },
+    MORE_THAN_SELECTING.within(GENERAL),
+    FASTER_THAN_SELECTING.within(GENERAL),
+    MORE_THAN_SELECTING.within(STRICT),
+    FASTER_THAN_SELECTING.within(STRICT),
+    MORE_THAN_SELECTING.within(CHAOTIC),
+    FASTER_THAN_SELECTING.within(CHAOTIC),
     Test {
         place: "§6",
         layout: EIGHT,
@@ -698,6 +654,11 @@ pub fn claims(results: Evidence<'_>) -> Vec<Claim> {
 }
 
 impl Test {
+    /// The same claim of another layout.
+    const fn within(self, layout: usize) -> Test {
+        Test { layout, ..self }
+    }
+
     fn claim(&self, results: Evidence<'_>) -> Claim {
         let findings = self.sources.iter().filter_map(|&source| self.finding(results, source)).collect();
         let Test { place, layout, words, measure, .. } = *self;
