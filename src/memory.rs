@@ -52,7 +52,7 @@ impl Peaks {
     /// What it takes to train these (valid) configs side by side, on so many threads.
     pub fn of<'a>(configs: impl IntoIterator<Item = &'a Config>, threads: usize) -> Peaks {
         let lanes = cpu::lanes();
-        let [mut training, mut checkpoint, mut queue, mut weights, mut record] = [0_u64; 5];
+        let [mut training, mut next, mut checkpoint, mut queue, mut weights, mut record] = [0_u64; 6];
         let [mut block, mut order, mut populations, mut held] = [0_u64; 4];
         for config in configs {
             let staged: Vec<(Config, World)> = (config.staged().into_iter())
@@ -69,6 +69,7 @@ impl Peaks {
             let (trials, policies) = (config.learning.trials as u64, config.learning.population);
             let teams = |config: &Config| trials * config.learning.episodes_per_team as u64 * (policies as u64 + 1);
             training += trainer::bytes(config);
+            next += trainer::next_bytes(config);
             checkpoint += checkpoint_bytes(config);
             queue += most(&|config, _| teams(config).div_ceil(lanes) * 16);
             block = block.max(most(&|config, world| cpu::block_bytes(world, need(config))));
@@ -95,7 +96,7 @@ impl Peaks {
             host: always + playing.max(sorting),
             checkpoint,
             // A batch is gathered, and two are on their way to the adapter or back.
-            gpu_host: always + (share(weights, 1) + share(weights, 2) + records).max(sorting),
+            gpu_host: always + next + (share(weights, 1) + share(weights, 2) + records).max(sorting),
             adapter: share(weights, 2) + records + held,
         }
     }

@@ -62,7 +62,7 @@ pub struct Snapshot<N = Vec<f32>> {
 /// Where the time of generations went.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Times {
-    /// Forming teams and drawing starts.
+    /// Forming teams and drawing starts, where that was not done while others played.
     pub prepare: Duration,
     /// Rollouts with their scores.
     pub play: Duration,
@@ -83,6 +83,9 @@ struct Arm {
     /// The stage whose champions play beside the first generation of this one.
     leaving: Option<usize>,
     trials: Vec<Lineage>,
+    /// Who plays this generation, one a trial, and the next: drawn meanwhile where a backend holds the populations.
+    lineups: Vec<Lineup>,
+    next: Vec<Lineup>,
     /// The generation that plays next, two past the last when all is done.
     generation: usize,
     /// The generation of the populations that are about to play: an earlier one after they were lost with the device
@@ -119,13 +122,6 @@ struct Lineage {
     /// `[populations][policies + 1][parameters]`, this generation's and the next.
     weights: Vec<f32>,
     children: Vec<f32>,
-    /// Policies of each team, `[populations][policies]`, and as the backend wants them, `[policies + 1][leaders]`.
-    orders: Vec<u32>,
-    teams: Vec<u32>,
-    /// Start positions, and where POIs are if they move, `[episodes][agents + pois]`.
-    starts: Vec<Vec<Vec2>>,
-    /// Likewise of the champions of the stage before, where one ends.
-    farewell: Vec<Vec<Vec2>>,
     /// POIs observed, `[episodes][policies + 1]`, and f32 scores as bits, `[episodes][policies + 1][leaders]`.
     observed: Vec<AtomicU32>,
     scores: Vec<AtomicU32>,
@@ -135,6 +131,19 @@ struct Lineage {
     parents: Vec<u32>,
     /// The last generation's row, whose champion has yet to play.
     pending: Option<Row>,
+}
+
+/// Who plays with whom in one generation of a trial, and from where; drawn by counters alone, whatever came out before.
+struct Lineup {
+    /// The generation and its stage; none before the first is drawn.
+    of: Option<[usize; 2]>,
+    /// Policies of each team, `[populations][policies]`, and as the backend wants them, `[policies + 1][leaders]`.
+    orders: Vec<u32>,
+    teams: Vec<u32>,
+    /// Start positions, and where POIs are if they move, `[episodes][agents + pois]`.
+    starts: Vec<Vec<Vec2>>,
+    /// Likewise of the champions of the stage before, where one ends.
+    farewell: Vec<Vec<Vec2>>,
 }
 
 impl Trainer {
@@ -251,12 +260,23 @@ impl Trainer {
         playing.iter_mut().try_for_each(|(_, arm)| arm.offer(backend))?;
         playing.par_iter_mut().for_each(|(_, arm)| arm.prepare(level));
         let prepared = Instant::now();
-        play(backend, &playing, |arm| {
-            let population = arm.config.learning.population;
-            let first = if arm.is_over() { population } else { 0 };
-            // The first generation has no champion before it.
-            first..population + usize::from(arm.age > 0)
-        })?;
+        let mut next: Vec<Vec<Lineup>> = playing.iter_mut().map(|(_, arm)| std::mem::take(&mut arm.next)).collect();
+        let (played, ()) = join(
+            || {
+                play(backend, &playing, |arm| {
+                    let population = arm.config.learning.population;
+                    let first = if arm.is_over() { population } else { 0 };
+                    // The first generation has no champion before it.
+                    first..population + usize::from(arm.age > 0)
+                })
+            },
+            || {
+                let held = next.iter_mut().zip(&playing).filter(|(_, (_, arm))| !arm.held.is_empty());
+                held.for_each(|(next, (_, arm))| arm.draw_next(level, next));
+            },
+        );
+        playing.iter_mut().zip(next).for_each(|((_, arm), next)| arm.next = next);
+        played?;
         let mut over = playing.iter_mut().filter(|(_, arm)| arm.is_over());
         over.try_for_each(|(_, arm)| arm.fetch())?;
         let played = Instant::now();
@@ -416,15 +436,23 @@ pub fn bytes(config: &Config) -> u64 {
 fn bytes_of_stage(config: &Config) -> u64 {
     let ([trials, populations, policies, parameters], leaders) = (sizes(config), config.learners() as u64);
     let (slots, episodes) = (policies + 1, config.learning.episodes_per_team as u64);
+    let weights = 2 * populations * slots * parameters;
+    let fitness_and_parents = populations * (policies + slots);
+    let observed_and_scores = episodes * slots * (1 + leaders);
+    4 * trials * (weights + fitness_and_parents + observed_and_scores + episodes * EPISODE) + lineup_bytes(config)
+}
+
+/// Bytes of the next generation's line-ups, drawn beside those that play where a backend holds the populations.
+pub fn next_bytes(config: &Config) -> u64 {
+    config.staged().iter().map(|(_, config)| lineup_bytes(config)).max().unwrap_or(0)
+}
+
+fn lineup_bytes(config: &Config) -> u64 {
+    let ([trials, populations, policies, _], leaders) = (sizes(config), config.learners() as u64);
     let agents = (config.world.leaders.len() + config.world.followers.len()) as u64;
     let moved = if config.learning.poi_jitter > 0.0 { config.world.pois.len() as u64 } else { 0 };
-    let weights = 2 * populations * slots * parameters;
-    let orders_and_fitness = 2 * populations * policies;
-    let teams_and_parents = (leaders + populations) * slots;
-    let observed_and_scores = episodes * slots * (1 + leaders);
-    // Each episode's places, and its own place in a batch.
-    let starts = episodes * (2 * (agents + moved) + EPISODE);
-    4 * trials * (weights + orders_and_fitness + teams_and_parents + observed_and_scores + starts)
+    let starts = config.learning.episodes_per_team as u64 * 2 * (agents + moved);
+    4 * trials * (populations * policies + leaders * (policies + 1) + starts)
 }
 
 /// Bytes of the numbers of a [`Snapshot`] of a (valid) config's arm.
@@ -451,10 +479,10 @@ fn play<'a>(
     for (_, arm) in arms {
         let (population, leaders) = (arm.config.learning.population, arm.world.leaders());
         let range = range(arm);
-        for (index, trial) in arm.trials.iter().enumerate() {
+        for (index, (trial, lineup)) in arm.trials.iter().zip(&arm.lineups).enumerate() {
             let weights = arm.held.get(index).map_or(trial.weights[..].into(), |held| Weights::Held(&**held));
             let mut cast = |world, fitness, starts: &'a [Vec<Vec2>], range: Range<usize>| {
-                let (teams, need) = (&trial.teams[range.start * leaders..range.end * leaders], Need::Score(fitness));
+                let (teams, need) = (&lineup.teams[range.start * leaders..range.end * leaders], Need::Score(fitness));
                 for (episode, starts) in starts.iter().enumerate() {
                     groups.push(Group { world, starts, weights, policies: population + 1, teams, need });
                     places.push((world, fitness, trial, episode * (population + 1) + range.start));
@@ -462,9 +490,9 @@ fn play<'a>(
             };
             // Champions play in their own stage.
             let end = if arm.leaving.is_some() { population } else { range.end };
-            cast(&arm.world, arm.config.learning.fitness, &trial.starts, range.start..end);
+            cast(&arm.world, arm.config.learning.fitness, &lineup.starts, range.start..end);
             if let Some((_, config, world)) = arm.leaving.map(|stage| &arm.stages[stage]) {
-                cast(world, config.learning.fitness, &trial.farewell, population..population + 1);
+                cast(world, config.learning.fitness, &lineup.farewell, population..population + 1);
             }
         }
     }
@@ -491,9 +519,13 @@ impl Arm {
         let stages: Vec<_> = stages.collect();
         let most = stages.iter().map(|(_, config, _)| config.learning.episodes_per_team).max().unwrap_or(1);
         let (_, config, world) = stages[0].clone();
+        let lineup = || Lineup::new(config.learning.population, config.populations(), world.leaders());
+        let lineups = std::iter::repeat_with(lineup).take(trials.len()).collect();
         let trials = trials.into_par_iter().map(|index| Lineage::new(&config, &world, most, index, level));
         Arm {
             trials: trials.collect(),
+            lineups,
+            next: vec![],
             world,
             config,
             stages,
@@ -512,24 +544,24 @@ impl Arm {
         self.stages.iter().rposition(|stage| stage.0 <= generation).unwrap_or(0)
     }
 
+    /// The stage that a generation plays in, and the one that ends with the generation before it.
+    fn stages_of(&self, generation: usize) -> (usize, Option<usize>) {
+        let stage = self.stage_of(generation.min(self.last()));
+        let before = if generation == 0 { stage } else { self.stage_of(generation - 1) };
+        (stage, (before != stage).then_some(before))
+    }
+
     /// Takes on the stage of the populations that are about to play.
     fn enter(&mut self) {
-        let (age, last) = (self.age, self.last());
-        let stage = self.stage_of(age.min(last));
+        let last = self.last();
+        let (stage, leaving) = self.stages_of(self.age);
         if stage != self.stage {
             let (_, config, world) = self.stages[stage].clone();
             (self.config, self.world, self.stage) = (config, world, stage);
             // A run may end sooner than it was to.
             self.config.learning.generations = last;
         }
-        let before = if age == 0 { stage } else { self.stage_of(age - 1) };
-        self.leaving = (before != stage).then_some(before);
-        let episodes = self.config.learning.episodes_per_team;
-        let of_champions = self.leaving.map_or(0, |stage| self.stages[stage].1.learning.episodes_per_team);
-        for trial in &mut self.trials {
-            trial.starts.resize(episodes, vec![]);
-            trial.farewell.resize(of_champions, vec![]);
-        }
+        self.leaving = leaving;
     }
 
     /// The last generation.
@@ -620,53 +652,65 @@ impl Arm {
         fetched
     }
 
-    /// Forms the teams of a generation and draws its starts.
+    /// Takes on the stage and the line-ups of the generation that is about to play.
     fn prepare(&mut self, level: Level) {
         self.enter();
-        let Arm { config, world, stages, leaving, trials, age: generation, .. } = self;
-        let generation = *generation;
-        let Learning { seed, population, sharing, .. } = config.learning;
-        let leaders = world.leaders();
-        trials.par_iter_mut().for_each(|trial| {
-            // Where all leaders share a policy, its team is the one that it has from the start.
-            if sharing == Sharing::None {
-                let key = Key::new(seed, trial.index, Purpose::Teams);
-                let orders = trial.orders.par_chunks_exact_mut(population).with_min_len(few(population)).enumerate();
-                orders.for_each(|(leader, order)| evolve::shuffle(level, key, generation, leader, order));
-                let orders = &trial.orders;
-                let teams = trial.teams[..population * leaders].par_chunks_exact_mut(leaders).with_min_len(CHUNK);
-                teams.enumerate().for_each(|(team, policies)| {
-                    for (policy, order) in policies.iter_mut().zip(orders.chunks_exact(population)) {
-                        *policy = order[team];
-                    }
-                });
-            }
-            for (episode, starts) in trial.starts.iter_mut().enumerate() {
-                evolve::places(&config.learning, trial.index, generation, episode, world, starts);
-            }
-            if let Some((_, config, world)) = leaving.map(|stage| &stages[stage]) {
-                for (episode, starts) in trial.farewell.iter_mut().enumerate() {
+        let of = Some([self.age, self.stage]);
+        if self.next.first().is_some_and(|next| next.of == of) {
+            std::mem::swap(&mut self.lineups, &mut self.next);
+        }
+        let mut lineups = std::mem::take(&mut self.lineups);
+        self.draw(level, self.age, &mut lineups);
+        self.lineups = lineups;
+    }
+
+    /// Draws the next generation's line-ups beside those of the one that plays.
+    fn draw_next(&self, level: Level, next: &mut Vec<Lineup>) {
+        if self.is_over() {
+            return;
+        }
+        let [population, leaders] = [self.config.learning.population, self.world.leaders()];
+        next.resize_with(self.trials.len(), || Lineup::new(population, self.config.populations(), leaders));
+        self.draw(level, self.age + 1, next);
+    }
+
+    /// Draws the trials' line-ups of a generation, unless they are that already.
+    fn draw(&self, level: Level, generation: usize, lineups: &mut [Lineup]) {
+        let (stage, leaving) = self.stages_of(generation);
+        let (_, config, world) = &self.stages[stage];
+        let of = Some([generation, stage]);
+        lineups.par_iter_mut().zip(&self.trials).filter(|(lineup, _)| lineup.of != of).for_each(|(lineup, trial)| {
+            lineup.of = of;
+            lineup.form(level, &config.learning, trial.index, generation);
+            let places = |config: &Config, world: &World, episodes: &mut Vec<Vec<Vec2>>| {
+                episodes.resize(config.learning.episodes_per_team, vec![]);
+                for (episode, starts) in episodes.iter_mut().enumerate() {
                     evolve::places(&config.learning, trial.index, generation, episode, world, starts);
                 }
+            };
+            places(config, world, &mut lineup.starts);
+            match leaving.map(|stage| &self.stages[stage]) {
+                Some((_, config, world)) => places(config, world, &mut lineup.farewell),
+                None => lineup.farewell.clear(),
             }
         });
     }
 
     /// Turns what was observed into fitness and rows.
     fn conclude(&mut self, arm: usize) -> Vec<Row> {
-        let Arm { config, world, stages, leaving, trials, age: generation, .. } = self;
+        let Arm { config, world, stages, leaving, trials, lineups, age: generation, .. } = self;
         let generation = *generation;
         let population = config.learning.population;
         let pois_before = leaving.map_or(world.pois.len(), |stage| stages[stage].2.pois.len());
         let mut rows = Vec::with_capacity(trials.len());
-        for trial in trials {
-            let [best_g, mean_g] = trial.summary(world.pois.len(), population);
-            let champion_g = trial.champion(pois_before, population);
+        for (trial, lineup) in trials.iter_mut().zip(lineups) {
+            let [best_g, mean_g] = trial.summary(lineup, world.pois.len(), population);
+            let champion_g = trial.champion(lineup, pois_before, population);
             rows.extend(trial.pending.map(|row| Row { champion_g, ..row }));
             trial.pending = Some(Row { arm, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
             match config.learning.sharing {
-                Sharing::None => trial.rate(world.leaders(), population),
-                Sharing::All => trial.rate_shared(world.leaders(), population),
+                Sharing::None => trial.rate(lineup, world.leaders(), population),
+                Sharing::All => trial.rate_shared(lineup, world.leaders(), population),
             }
         }
         rows
@@ -675,11 +719,11 @@ impl Arm {
     /// Completes the last generation's rows, whose champions have just played.
     fn finish(&mut self) -> Vec<Row> {
         let (pois, population) = (self.world.pois.len(), self.config.learning.population);
-        let row = |trial: &mut Lineage| {
-            let champion_g = trial.champion(pois, population);
+        let row = |(trial, lineup): (&Lineage, &Lineup)| {
+            let champion_g = trial.champion(lineup, pois, population);
             trial.pending.map(|row| Row { champion_g, ..row })
         };
-        let rows = self.trials.iter_mut().filter_map(row).collect();
+        let rows = self.trials.iter().zip(&self.lineups).filter_map(row).collect();
         self.held.clear();
         self.age += 1;
         self.host_age = self.age;
@@ -763,6 +807,39 @@ impl Arm {
     }
 }
 
+impl Lineup {
+    /// Nobody's yet.
+    fn new(population: usize, populations: usize, leaders: usize) -> Lineup {
+        Lineup {
+            of: None,
+            orders: vec![0; populations * population],
+            // The champion's team, the last, is made of every population's last slot.
+            teams: evolve::one_policy_a_team(population + 1, leaders),
+            starts: vec![],
+            farewell: vec![],
+        }
+    }
+
+    /// Forms the teams.
+    fn form(&mut self, level: Level, learning: &Learning, trial: usize, generation: usize) {
+        // Where all leaders share a policy, its team is the one that it has from the start.
+        if learning.sharing == Sharing::All {
+            return;
+        }
+        let population = learning.population;
+        let key = Key::new(learning.seed, trial, Purpose::Teams);
+        let orders = self.orders.par_chunks_exact_mut(population).with_min_len(few(population)).enumerate();
+        orders.for_each(|(leader, order)| evolve::shuffle(level, key, generation, leader, order));
+        let (orders, leaders) = (&self.orders, self.orders.len() / population);
+        let teams = self.teams[..population * leaders].par_chunks_exact_mut(leaders).with_min_len(CHUNK);
+        teams.enumerate().for_each(|(team, policies)| {
+            for (policy, order) in policies.iter_mut().zip(orders.chunks_exact(population)) {
+                *policy = order[team];
+            }
+        });
+    }
+}
+
 impl Lineage {
     /// With room for so many episodes a team.
     fn new(config: &Config, world: &World, episodes: usize, index: usize, level: Level) -> Lineage {
@@ -782,11 +859,6 @@ impl Lineage {
             index,
             children: vec![0.0; weights.len()],
             weights,
-            orders: vec![0; populations * population],
-            // The champion's team, the last, is made of every population's last slot.
-            teams: evolve::one_policy_a_team(population + 1, leaders),
-            starts: vec![],
-            farewell: vec![],
             observed: std::iter::repeat_with(AtomicU32::default).take(slots).collect(),
             scores: std::iter::repeat_with(AtomicU32::default).take(slots * leaders).collect(),
             fitness: vec![0.0; populations * population],
@@ -796,8 +868,8 @@ impl Lineage {
     }
 
     /// G of the best team and of the mean team.
-    fn summary(&self, pois: usize, population: usize) -> [f64; 2] {
-        let episodes = self.starts.len();
+    fn summary(&self, lineup: &Lineup, pois: usize, population: usize) -> [f64; 2] {
+        let episodes = lineup.starts.len();
         let observed = |team: usize| self.observed(team, episodes, population);
         let whole = (pois * episodes) as f64;
         let best = (0..population).map(observed).max().unwrap_or(0);
@@ -806,8 +878,8 @@ impl Lineage {
     }
 
     /// G of the champion's team, which may have played in the stage before.
-    fn champion(&self, pois: usize, population: usize) -> f64 {
-        let episodes = if self.farewell.is_empty() { self.starts.len() } else { self.farewell.len() };
+    fn champion(&self, lineup: &Lineup, pois: usize, population: usize) -> f64 {
+        let episodes = if lineup.farewell.is_empty() { &lineup.starts } else { &lineup.farewell }.len();
         self.observed(population, episodes, population) as f64 / (pois * episodes) as f64
     }
 
@@ -817,9 +889,10 @@ impl Lineage {
     }
 
     /// Hands each team's scores, averaged over its episodes, back to its policies.
-    fn rate(&mut self, leaders: usize, population: usize) {
-        let episodes = self.starts.len();
-        let Lineage { orders, scores, fitness, .. } = self;
+    fn rate(&mut self, lineup: &Lineup, leaders: usize, population: usize) {
+        let Lineup { orders, starts, .. } = lineup;
+        let Lineage { scores, fitness, .. } = self;
+        let episodes = starts.len();
         let populations = fitness.par_chunks_exact_mut(population).zip(orders.par_chunks_exact(population));
         populations.with_min_len(few(population)).enumerate().for_each(|(leader, (fitness, order))| {
             for (team, &policy) in order.iter().enumerate() {
@@ -829,8 +902,8 @@ impl Lineage {
     }
 
     /// [`Trial::rate`] where every leader of a team plays the same policy: its mean over them, in their order.
-    fn rate_shared(&mut self, leaders: usize, population: usize) {
-        let (episodes, scores) = (self.starts.len(), &self.scores);
+    fn rate_shared(&mut self, lineup: &Lineup, leaders: usize, population: usize) {
+        let (episodes, scores) = (lineup.starts.len(), &self.scores);
         self.fitness.par_iter_mut().with_min_len(few(leaders)).enumerate().for_each(|(team, fitness)| {
             let score = |leader| f64::from(mean_score(scores, episodes, population + 1, team, leaders, leader));
             *fitness = ((0..leaders).map(score).sum::<f64>() / leaders as f64) as f32;

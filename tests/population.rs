@@ -213,6 +213,38 @@ fn arms_of_different_ages_train_side_by_side() {
     }
 }
 
+/// Where a device holds populations the next generation's teams and starts are drawn while one plays: a stage that
+/// begins then counts, and so does an end that nobody knew of.
+#[test]
+fn stages_and_ends_count_wherever_populations_are() {
+    let mut config = support::layout("generally_forward");
+    (config.learning.trials, config.learning.generations, config.learning.population) = (2, 7, 15);
+    config.world.coupling = 1;
+    let text = config.to_toml()
+        + "[[stages]]\nfrom = 2\nset = { learning.start_jitter = 3.0, learning.episodes_per_team = 2 }\n"
+        + "[[stages]]\nfrom = 5\nset = { world.coupling = 2, learning.poi_jitter = 2.0 }\n";
+    let config = Config::parse(&text, "staged.toml").unwrap();
+    let story = |backend: &mut dyn Backend, end: usize| {
+        let (mut trainer, mut rows) = (Trainer::new(vec![config.clone()]), Vec::new());
+        while !trainer.is_done() {
+            rows.extend(trainer.advance(backend).unwrap());
+            if trainer.generation(0) == end {
+                assert_eq!(trainer.end(0), end.min(7));
+            }
+        }
+        (rows, trainer.policies(0))
+    };
+    for end in 1..=8 {
+        let expected = story(&mut Cpu::default(), end);
+        assert_eq!(story(&mut Device::failing_at(0, false), end), expected, "ended at {end}");
+        for (request, info) in support::adapters("stages_and_ends_count_wherever_populations_are") {
+            let mut gpu = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().holding(Holding::Always);
+            assert_eq!(story(&mut gpu, end), expected, "{info}, ended at {end}");
+        }
+        assert!(expected.0.iter().all(|row| row.champion_g > 0.0), "what champions start from does not show");
+    }
+}
+
 /// An error that was made up for is told, once, by whoever asks.
 #[test]
 fn a_setback_is_told() {
