@@ -135,8 +135,8 @@ struct Lineage {
 
 /// Who plays with whom in one generation of a trial, and from where; drawn by counters alone, whatever came out before.
 struct Lineup {
-    /// The generation and its stage; none before the first is drawn.
-    of: Option<[usize; 2]>,
+    /// Whose; none before the first is drawn.
+    generation: Option<usize>,
     /// Policies of each team, `[populations][policies]`, and as the backend wants them, `[policies + 1][leaders]`.
     orders: Vec<u32>,
     teams: Vec<u32>,
@@ -655,8 +655,7 @@ impl Arm {
     /// Takes on the stage and the line-ups of the generation that is about to play.
     fn prepare(&mut self, level: Level) {
         self.enter();
-        let of = Some([self.age, self.stage]);
-        if self.next.first().is_some_and(|next| next.of == of) {
+        if self.next.first().is_some_and(|next| next.generation == Some(self.age)) {
             std::mem::swap(&mut self.lineups, &mut self.next);
         }
         let mut lineups = std::mem::take(&mut self.lineups);
@@ -678,9 +677,10 @@ impl Arm {
     fn draw(&self, level: Level, generation: usize, lineups: &mut [Lineup]) {
         let (stage, leaving) = self.stages_of(generation);
         let (_, config, world) = &self.stages[stage];
-        let of = Some([generation, stage]);
-        lineups.par_iter_mut().zip(&self.trials).filter(|(lineup, _)| lineup.of != of).for_each(|(lineup, trial)| {
-            lineup.of = of;
+        let missing = lineups.par_iter_mut().zip(&self.trials);
+        let missing = missing.filter(|(lineup, _)| lineup.generation != Some(generation));
+        missing.for_each(|(lineup, trial)| {
+            lineup.generation = Some(generation);
             lineup.form(level, &config.learning, trial.index, generation);
             let places = |config: &Config, world: &World, episodes: &mut Vec<Vec<Vec2>>| {
                 episodes.resize(config.learning.episodes_per_team, vec![]);
@@ -811,7 +811,7 @@ impl Lineup {
     /// Nobody's yet.
     fn new(population: usize, populations: usize, leaders: usize) -> Lineup {
         Lineup {
-            of: None,
+            generation: None,
             orders: vec![0; populations * population],
             // The champion's team, the last, is made of every population's last slot.
             teams: evolve::one_policy_a_team(population + 1, leaders),

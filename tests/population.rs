@@ -15,7 +15,7 @@ use flotilla::backend::gpu::device::{self, DeviceError, Kind};
 use flotilla::backend::gpu::episode::{GpuEpisodes, Holding};
 use flotilla::backend::{Backend, BackendError, Group, HELD_FROM, Held, Trace, Visit, Weights};
 use flotilla::backend::{Machine, Player};
-use flotilla::config::{Config, Fitness, Learning, Mutation, Paradigm, Sharing};
+use flotilla::config::{Config, Coupling, Fitness, Learning, Mutation, Paradigm, Sharing};
 use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, Start};
@@ -219,7 +219,7 @@ fn arms_of_different_ages_train_side_by_side() {
 fn stages_and_ends_count_wherever_populations_are() {
     let mut config = support::layout("generally_forward");
     (config.learning.trials, config.learning.generations, config.learning.population) = (2, 7, 15);
-    config.world.coupling = 1;
+    config.world.coupling = Coupling::Same(1);
     let text = config.to_toml()
         + "[[stages]]\nfrom = 2\nset = { learning.start_jitter = 3.0, learning.episodes_per_team = 2 }\n"
         + "[[stages]]\nfrom = 5\nset = { world.coupling = 2, learning.poi_jitter = 2.0 }\n";
@@ -234,11 +234,12 @@ fn stages_and_ends_count_wherever_populations_are() {
         }
         (rows, trainer.policies(0))
     };
+    let adapters = support::adapters("stages_and_ends_count_wherever_populations_are");
     for end in 1..=8 {
         let expected = story(&mut Cpu::default(), end);
         assert_eq!(story(&mut Device::failing_at(0, false), end), expected, "ended at {end}");
-        for (request, info) in support::adapters("stages_and_ends_count_wherever_populations_are") {
-            let mut gpu = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().holding(Holding::Always);
+        for (request, info) in &adapters {
+            let mut gpu = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap().holding(Holding::Always);
             assert_eq!(story(&mut gpu, end), expected, "{info}, ended at {end}");
         }
         assert!(expected.0.iter().all(|row| row.champion_g > 0.0), "what champions start from does not show");
