@@ -220,6 +220,7 @@ def train(
     *,
     resume: bool = False,
     force: bool = False,
+    init: Run | str | os.PathLike[str] | None = None,
     backend: str | int = "auto",
     callback: Callback | None = None,
     progress: bool | None = None,
@@ -233,6 +234,9 @@ def train(
             with. None trains in memory; :meth:`Run.save` still writes it.
         resume: go on with the run in ``out``, or start it where there is none.
         force: write over the run in ``out``.
+        init: what to start from in place of random policies: a :class:`Run` in a folder, or a ``policies.safetensors``; trial i
+            starts from its trial i. It has as many leaders and parameters as the config; populations that take more policies
+            are filled up at random. Needs ``out``, where generation 0 is kept.
         backend: what to play on, to the same bits: ``"auto"`` (a GPU where there is one), ``"cpu"``, ``"gpu"``, or an
             adapter's number or name.
         callback: told of every :class:`Generation` once it is played; stops the training by returning True. What comes out
@@ -246,7 +250,7 @@ def train(
         ConfigError: the config or the seed is wrong.
         FileExistsError: ``out`` holds a run, and neither ``resume`` nor ``force`` was given.
         MemoryError: there is not enough for the populations.
-        Error: a folder cannot be used, or the backend fails.
+        Error: a folder or ``init`` cannot be used, or the backend fails.
         KeyboardInterrupt: Ctrl-C; a run in a folder is saved then, to be gone on with by ``resume``.
 
     Example:
@@ -263,6 +267,10 @@ def train(
         raise TypeError(f"callback is {type(callback).__name__}, allowed is what can be called with a generation")
     if out is None and (resume or force):
         raise ValueError("resume and force are of a run in a folder, say which by out")
+    if out is None and init is not None:
+        raise ValueError("a run that starts from policies is kept in a folder, say which by out")
+    if isinstance(init, Run):
+        init = os.path.join(init.folder, "policies.safetensors")
     if resume and force:
         raise ValueError("resume goes on with a run and force writes over it, leave out one of the two")
     if seed is not None:
@@ -275,7 +283,8 @@ def train(
             return Run(outcome, played, times, None)
         start = "resume" if resume else "force" if force else "fresh"
         folder = os.fspath(out)
-        for note in _native.train_into(config._native, folder, start, name, _command(), told):
+        first = None if init is None else os.fspath(init)
+        for note in _native.train_into(config._native, folder, start, first, name, _command(), told):
             warnings.warn(f"{folder}: {note}", RuntimeWarning, stacklevel=2)
         return Run.open(folder)
     finally:

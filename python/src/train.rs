@@ -175,11 +175,13 @@ pub fn train<'py>(
 /// Trains in a folder, as `flotilla train` does; what there is to tell about it comes back. What came out is there to be
 /// opened.
 #[pyfunction]
+#[expect(clippy::too_many_arguments, reason = "these are all that a run is")]
 pub fn train_into(
     py: Python<'_>,
     config: &Config,
     out: PathBuf,
     start: &str,
+    init: Option<PathBuf>,
     backend: &str,
     command: &str,
     callback: Option<Py<PyAny>>,
@@ -198,8 +200,9 @@ pub fn train_into(
             .check(player.1.backend == "gpu")
             .map_err(RunError::from)
             .raise()?;
-        let runs = vec![(config.0.clone(), out.clone())];
-        let (mut session, notes) = Session::open(runs, start, &Disk::default()).raise()?;
+        let init = init.map(|path| policies::read_init(&path, &config.0)).transpose().raise()?;
+        let runs = vec![(config.0.clone(), out.clone(), init)];
+        let (mut session, notes) = Session::open_from(runs, start, &Disk::default()).raise()?;
         let (stop, save, mut last) = (AtomicBool::new(false), AtomicBool::new(false), config.0.learning.generations);
         while !session.is_done() {
             let mut watch = |progress: &flotilla::run::Progress<'_>| {

@@ -92,6 +92,29 @@ def test_a_folder_is_gone_on_with_or_written_over(config):
         train(config, resume=True)
 
 
+def test_a_training_starts_from_what_another_came_to(config, program):
+    first = train(config, out="first")
+    second = config.replace(learning={"fitness": "G", "population": 30, "seed": 9})
+    warm = train(second, out="warm", init=first)
+    program("train", "warm/config.toml", "--init", "first/policies.safetensors", "--out", "theirs", "--backend", "cpu", "--quiet")
+    assert warm.digest == Run.open("theirs").digest != train(second).digest
+    assert train(second, out="again", init="first/policies.safetensors").digest == warm.digest
+    assert train(second, out="from memory", init=train(config)).digest == warm.digest
+    # Its generation 0 is kept, so that it is gone on with and replayed without what it started from.
+    assert train(second, out="warm", resume=True).digest == warm.digest
+    assert [episode.generation for episode in warm.replay(compare=0).episodes] == [0, 6]
+    with pytest.raises(ValueError, match="by out"):
+        train(second, init=first)
+    with pytest.raises(flotilla.Error, match="nowhere"):
+        train(second, out="other", init="nowhere/policies.safetensors")
+    wider = second.replace(policy={"hidden": [3]})
+    with pytest.raises(flotilla.Error, match="first/policies.safetensors"):
+        train(wider, out="other", init=first)
+    with pytest.raises(TypeError):
+        train(second, out="other", init=7)
+    assert not os.path.exists("other")
+
+
 @pytest.mark.parametrize("out", [None, "run"])
 def test_a_callback_sees_every_generation_and_may_stop(config, out):
     seen = []
