@@ -270,7 +270,7 @@ pub(super) fn claim(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let write = || -> io::Result<()> {
         std::fs::create_dir_all(out)?;
         if !path.exists() {
-            let mut builder = tempfile::Builder::new();
+            let builder = &mut tempfile::Builder::new();
             // As any other file: others may collect.
             #[cfg(unix)]
             builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
