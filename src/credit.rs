@@ -8,7 +8,7 @@
 //! a set make a difference to them that another set of its POI holds as a subset: without whomever, and with however
 //! many copies of whomever, the larger one still has at least as many agents. So of a record only the sets matter that
 //! no other of their POI contains; and of these, but for D++, only those with as many agents as the POI needs. A
-//! backend may leave out the others, see [`crate::backend::Need`]. Dt, and a rule that asks when, take the whole record.
+//! backend may leave out the others, see [`crate::backend::Need`]. Dt, and rules that ask when, take the whole record.
 
 use std::ops::RangeInclusive;
 
