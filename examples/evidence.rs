@@ -69,7 +69,7 @@ and does not control, with the test that would notice. Names are those of functi
 | naga writes no options and no function that fuses into Metal's and DirectX's text | a later version might | `every_product_is_guarded_in_metals_and_directx_text` |
 | a driver keeps `NoContraction` | Vulkan asks it of drivers | the probes; `every_float_result_is_decorated` |
 | numbers of normal size are not flushed to zero | they never are; those below 2^-126 may be, so none comes up | `flush_makes_small_values_positive_zero`, `no_value_comes_near_the_denormals`, `twins_have_the_same_numbers` |
-| `bitcast` of a NaN is never needed, nor is one ever made | WGSL may change a NaN's bits, and may assume that there is none | `a_valid_config_makes_normal_constants`, `kernels_follow_the_mission` |
+| `bitcast` of a NaN is never needed, nor is one ever made | WGSL may change a NaN's bits, and may assume that there is none | `a_valid_config_makes_normal_constants`, `kernels_follow_the_model` |
 | constants in shaders are what they look like | naga folds expressions of literals in f64, and built-ins by the host's library | `no_shader_leaves_the_core` |
 | sines, cosines and logarithms of the host | each platform's library rounds them as it likes | none is asked: `nothing_asks_the_platform_for_a_function` |
 | the compiler of Rust neither fuses nor reorders | it never does unless told to | golden digests by every instruction set: `every_instruction_set` |

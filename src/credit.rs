@@ -2,13 +2,13 @@
 //!
 //! Every fitness is a share of the world's P POIs, so it is counted in whole POIs and divided once. Nothing is
 //! simulated again: who stood near a POI at which step says what would have been observed without a leader, without
-//! its whole group, or with more of it.
+//! its whole group, without those that it led at each step, or with more of it.
 //!
-//! By the default [`Rule`](crate::model::couple::Rule) no fitness asks when a set stood, nor how often. Nor does a set
-//! make a difference that another set of its POI holds as a subset: without whomever, and with however many copies of
-//! whomever, the larger one still has at least as many agents. So of a record only the sets matter that no other of
-//! their POI contains; and of these, but for D++, only those with as many agents as the POI needs. A backend may leave
-//! out the others, see [`crate::backend::Need`].
+//! By the default [`Rule`](crate::model::couple::Rule) no fitness but Dt asks when a set stood, nor how often. Nor does
+//! a set make a difference to them that another set of its POI holds as a subset: without whomever, and with however
+//! many copies of whomever, the larger one still has at least as many agents. So of a record only the sets matter that
+//! no other of their POI contains; and of these, but for D++, only those with as many agents as the POI needs. A
+//! backend may leave out the others, see [`crate::backend::Need`]. Dt, and rules that ask when, take the whole record.
 
 use std::ops::RangeInclusive;
 

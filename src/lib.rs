@@ -37,7 +37,7 @@
 //!
 //! ```text
 //! config ─▶ world ─▶ trainer ──▶ backend.rollout(teams) ──▶ credit ──▶ evolve ─┐
-//!                       ▲              │ sense ▸ policy ▸ influence ▸ follow ▸ move ▸ couple
+//!                       ▲              │ sense ▸ policy ▸ follow ▸ motion ▸ couple
 //!                       └──────────────┴────────────── next generation ◀───────┘
 //! ```
 //!

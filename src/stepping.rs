@@ -247,8 +247,7 @@ impl Stepper {
     /// Plays one step by what every leader is to do, `[teams][leaders][2]`: a turn, in parts of a half turn to the
     /// left, and a speed, from -1 for standing still to 1 for the highest. Numbers beyond -1..1 are taken as -1 or 1.
     /// Where policies of the world choose behaviours, these are still the actions: each behaviour comes to a turn of 0,
-    /// ±0.25 or ±0.75 and a speed of
-    /// -1 or 1, see [`crate::model::policy::choose`].
+    /// ±0.25 or ±0.75 and a speed of -1 or 1, see [`crate::model::policy::choose`].
     ///
     /// A team that has played its last step stays as it is, whatever is asked of it, until it is reset.
     ///

@@ -901,7 +901,7 @@ impl Lineage {
         });
     }
 
-    /// [`Trial::rate`] where every leader of a team plays the same policy: its mean over them, in their order.
+    /// [`Lineage::rate`] where every leader of a team plays the same policy: its mean over them, in their order.
     fn rate_shared(&mut self, lineup: &Lineup, leaders: usize, population: usize) {
         let (episodes, scores) = (lineup.starts.len(), &self.scores);
         self.fitness.par_iter_mut().with_min_len(few(leaders)).enumerate().for_each(|(team, fitness)| {

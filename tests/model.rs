@@ -1,8 +1,8 @@
-//! One step of an episode in float64, as the mission states it, against the kernels on random worlds.
+//! One step of an episode in float64, as docs/model.md states it, against the kernels on random worlds.
 //!
 //! The model starts every step from the kernels' own state, since radii and quadrants turn roundings into units within
 //! a few steps. A step on which a threshold is met within rounding may fall on either side and is counted instead of
-//! compared, unless every operation before the threshold was exact: the ties of a layout must fall as the mission says.
+//! compared, unless every operation before the threshold was exact: the ties of a layout must fall as the page says.
 //! Counted too is a step on which roundings grow beyond [`STATE`]: a policy may be steep, and forces may cancel.
 
 #![cfg(feature = "cli")]
@@ -515,7 +515,7 @@ fn check_team<'a>(
 }
 
 #[test]
-fn kernels_follow_the_mission() {
+fn kernels_follow_the_model() {
     let tally = (0..400u64)
         .into_par_iter()
         .map_init(Cpu::default, |cpu, seed| {
@@ -613,7 +613,7 @@ actions = 'behaviours'";
 
 /// So do crowds, whose pairs are found by bounds: of just more than 32 agents, and around the ends of words and vectors.
 #[test]
-fn crowds_follow_the_mission() {
+fn crowds_follow_the_model() {
     let layout = support::layout("generally_forward");
     for agents in [33, 63, 64, 65, 127, 130] {
         let mut config = with_agents(&layout, agents).unwrap();

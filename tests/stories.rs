@@ -1,4 +1,4 @@
-//! The paper's three stories (Section 5, Figures 4 to 6) over thirty trials: the tables in README.md and docs/figures.md
+//! The paper's claims (Sections 1, 5 and 6, Figures 4 to 6) over thirty trials: tables in README.md and docs/figures.md
 //! are what comes out, verdict by verdict, whether the paper's claims hold or not.
 //!
 //! Where results change on purpose, `FLOTILLA_WRITE_CLAIMS=1 cargo test --test stories` writes the tables anew.

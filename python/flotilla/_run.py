@@ -158,7 +158,7 @@ class Run:
         return Replay(_native.replay(self.folder, number, generations, backend_name(backend)))
 
     def plot(self) -> Figure:
-        """The learning curves: best team, champion and mean team, mean and 95 % interval over trials.
+        """The learning curves: best team, champion and mean team, mean and standard error over trials.
 
         Example:
             >>> run = flotilla.train(flotilla.Config.paper().replace(learning={"generations": 2}))

@@ -1,11 +1,10 @@
 //! How many lane operations a team-step takes at least, counted from the formulas and from who is in reach of whom.
 //!
 //! Counted is what the episode's definition asks of any implementation of [`crate::model`], whose parts tell what they
-//! take: each f32 or integer
-//! operation, comparison and selection is one, constants and moves are free, and what two formulas share is counted
-//! once. An entity counts where it is in reach of its own team's agent, as a trace of random teams finds it. Not
-//! counted is what an implementation adds: testing pairs that turn out to be out of reach, lanes that wait for their
-//! neighbours, loading and storing, scoring.
+//! take: each f32 or integer operation, comparison and selection is one, constants and moves are free, and what two
+//! formulas share is counted once. An entity counts where it is in reach of its own team's agent, as a trace of random
+//! teams finds it. Not counted is what an implementation adds: testing pairs that turn out to be out of reach, lanes
+//! that wait for their neighbours, loading and storing, scoring.
 
 use crate::backend::Trace;
 use crate::model::{Constants, couple, follow, motion, sense};

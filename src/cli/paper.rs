@@ -23,7 +23,7 @@ use crate::shell;
 use crate::sweep::questions::letter;
 use crate::trainer::Row;
 
-/// What a paper's folder holds: of which trials, generations and seed its arms are, and the arms themselves.
+/// In a paper's folder: what came out, for people and for programs.
 const CLAIMS: &str = "claims.md";
 const SUMMARY: &str = "summary.json";
 

@@ -1,4 +1,4 @@
-//! The config: what an experiment is, with every default of the paper's calibration.
+//! The config: what an experiment is, with a default for every key but where leaders and POIs stand.
 //!
 //! A config is read from a file by [`Config::load`], or from text by [`Config::read`] where flags or a sweep change
 //! some of its keys. Each section is plain data beside its keys, and each key stands once, with its unit, its meaning,

@@ -386,8 +386,8 @@ impl Folder {
 
     /// Reads the whole of the metrics of a finished run: where it came from and to, and the run's digest.
     ///
-    /// The digest is SHA-256 over `metrics.csv` without its last column, then over every trial's policies as in their
-    /// file (f32, little-endian). It is the same for all runs of a config, on any backend, however often resumed.
+    /// The digest is SHA-256 over `metrics.csv` without `seconds` (and `stage`), then over every trial's policies as in
+    /// their file (f32, little-endian). It is the same for all runs of a config, on any backend, however often resumed.
     ///
     /// # Errors
     /// The metrics cannot be read, or have not one row for every trial and generation.

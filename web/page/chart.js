@@ -1,7 +1,7 @@
 // Learning curves: of each arm the mean over trials of the best team's POIs, and every trial thin behind it.
 const chart = (() => {
   "use strict";
-  // `arms` are { tone, trials: [[POIs by generation]] }, of every so manieth generation; `cursor` is a generation to mark, or none.
+  // `arms` are { tone, trials: [[POIs by generation]] }, of every so many generations; `cursor` is a generation to mark, or none.
   function paint(canvas, arms, every, last, pois, cursor) {
     const wide = canvas.clientWidth, tall = canvas.clientHeight, dots = window.devicePixelRatio || 1;
     if (canvas.width !== Math.round(wide * dots) || canvas.height !== Math.round(tall * dots)) {

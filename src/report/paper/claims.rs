@@ -1,8 +1,8 @@
 //! Every sentence of the paper that says something measurable of these experiments, held to its own words.
 //!
-//! Each gets one measure and one verdict a source of policies: *yes* where the 95 % interval
-//! lies within what the words allow, *no* where it lies without, *not decided* where it holds the threshold. Where the
-//! paper gives no number, [`SMALL`] and [`FEW`] stand for its words.
+//! Each gets one measure and, for each source of policies, a verdict: *yes* where the 95 % interval lies within what
+//! the words allow, *no* where it lies without, *not decided* where it holds the threshold. Where the paper gives no
+//! number, [`SMALL`] and [`FEW`] stand for its words.
 
 use serde::Serialize;
 
