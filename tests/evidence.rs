@@ -57,7 +57,11 @@ fn a_report_needs_no_gpu() {
 fn without_a_gpu_only_a_report_can_be_had() {
     let output = verify(&[]).output().unwrap();
     assert_eq!(output.status.code(), Some(1));
-    assert!(String::from_utf8_lossy(&output.stderr).contains("no GPU adapter"));
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert!(told.contains("no GPU adapter") && told.contains("--report") && !told.contains("--backend"), "{told}");
+    let output = verify(&["--adapter", "mine"]).output().unwrap();
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert!(told.contains("mine") && told.contains("--report") && !told.contains("--backend"), "{told}");
     let output = verify(&["--note", "no report"]).output().unwrap();
     assert_eq!(output.status.code(), Some(2));
 }

@@ -153,6 +153,7 @@ fn a_config_to_start_from_says_every_key_and_is_its_layouts() {
         }
     }
     assert_eq!(place.good("init"), place.good("init generally-forward"));
+    assert_eq!(place.good("init"), place.good("init generally_forward"));
     assert_eq!(place.run("init spiral").status.code(), Some(2));
     assert_eq!(place.run("init --force").status.code(), Some(2), "there is no file to write over");
 }

@@ -4,6 +4,7 @@ use std::fs::OpenOptions;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use clap::builder::{PossibleValue, PossibleValuesParser};
 use toml::{Table, Value};
 
 use super::{Error, output, print};
@@ -22,7 +23,7 @@ const WIDTH: usize = 110;
 #[derive(clap::Args)]
 pub struct Args {
     /// The paper's layout to start from
-    #[arg(default_value = LAYOUTS[0].0, value_parser = LAYOUTS.map(|(name, _)| name))]
+    #[arg(default_value = LAYOUTS[0].0, value_parser = layouts())]
     layout: String,
     /// File to write, which must not be there yet [default: standard output]
     #[arg(long, short, value_name = "FILE")]
@@ -32,8 +33,14 @@ pub struct Args {
     force: bool,
 }
 
+/// Their names, which may be written as those of the files, too.
+fn layouts() -> PossibleValuesParser {
+    PossibleValuesParser::new(LAYOUTS.map(|(name, _)| PossibleValue::new(name).alias(name.replace('-', "_"))))
+}
+
 pub fn run(args: Args) -> Result<(), Error> {
-    let (name, from) = LAYOUTS.into_iter().find(|(name, _)| *name == args.layout).expect("no other is taken");
+    let named = args.layout.replace('_', "-");
+    let (name, from) = LAYOUTS.into_iter().find(|(name, _)| *name == named).expect("no other is taken");
     let text = commented(from, &Config::parse(from, name)?);
     let Some(path) = args.out else { return print(&text) };
     output::check(&[("--out", Some(&path))], &[])?;

@@ -206,6 +206,9 @@ pub enum Error {
     /// A GPU that could not be had, or that failed.
     #[error("{}{}", .0, remedy::device(.0))]
     Device(#[from] DeviceError),
+    /// There is no GPU to compare with the CPU.
+    #[error("{0}; --report FILE compares the instruction sets of the processor alone")]
+    NoneToVerify(DeviceError),
     /// Files of runs that could not be written, read or used.
     #[error("{}{}", .0, remedy::record(.0, "run it again"))]
     Record(#[from] RecordError),
@@ -253,6 +256,7 @@ impl Error {
         match self {
             Error::Usage(_)
             | Error::Device(DeviceError::UnknownAdapter { .. })
+            | Error::NoneToVerify(DeviceError::UnknownAdapter { .. })
             | Error::Record(RecordError::NoTrial { .. })
             | Error::Replayed(ReplayError::NoTrial { .. } | ReplayError::NoGeneration { .. }) => 2,
             Error::Config(error) if error.is_usage() => 2,

@@ -69,7 +69,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
     let adapters = match adapters(args.adapter.as_deref()) {
         // Then the processor alone has something to tell.
-        Err(Error::Device(DeviceError::NoAdapter)) if args.report.is_some() => vec![],
+        Err(Error::NoneToVerify(DeviceError::NoAdapter)) if args.report.is_some() => vec![],
         adapters => adapters?,
     };
     for (choice, info) in adapters {
@@ -213,10 +213,13 @@ fn adapters(name: Option<&str>) -> Result<Vec<(Wanted, AdapterInfo)>, Error> {
     match name {
         Some(name) => {
             let named = Wanted::Named(name.into());
-            let index = device::position(&named, &found)?;
+            let index = device::position(&named, &found).map_err(|error| match found.is_empty() {
+                true => Error::NoneToVerify(error),
+                false => error.into(),
+            })?;
             Ok(vec![(named, found[index].clone())])
         }
-        None if found.is_empty() => Err(DeviceError::NoAdapter.into()),
+        None if found.is_empty() => Err(Error::NoneToVerify(DeviceError::NoAdapter)),
         None => Ok(all.collect()),
     }
 }

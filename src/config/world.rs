@@ -30,7 +30,7 @@ section! {
         leaders: Vec<[f64; 2]> = "units", "4.1, Fig. 3",
         /// start positions of the followers, agents L to N − 1; in the all-leaders paradigm leaders stand there
         followers: Vec<[f64; 2]> = "units", "4.1, Fig. 3",
-        /// positions of the P points of interest, which stay where they are
+        /// positions of the P points of interest, which do not move while teams play
         pois: Vec<[f64; 2]> = "units", "3.1, Fig. 3",
         /// Agents needed at each POI (C).
         coupling: Coupling,

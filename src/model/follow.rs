@@ -19,7 +19,7 @@ pub const WGSL: &str = include_str!("../../shaders/follow.wgsl");
 section! {
     /// `[follow]`: the followers' preset behaviour.
     Follow = "follow" {
-        /// within it a follower sees others: it is drawn to them, and counts the leaders among them for Df
+        /// within it a follower sees others: it is drawn to them, and counts the leaders among them for Df and Dt
         attraction_radius: f64 = "units", "4.1, 4.2",
         /// within it others, and walls, push a follower away
         repulsion_radius: f64 = "units", "4.1",
