@@ -11,11 +11,11 @@ use super::{Error, output, print};
 use crate::config::{self, Config, Definition};
 use crate::record::RecordError;
 
-/// The paper's layouts, with the text of each one's config file.
-const LAYOUTS: [(&str, &str); 3] = [
-    ("generally-forward", include_str!("../../configs/generally_forward.toml")),
-    ("strictly-forward", include_str!("../../configs/strictly_forward.toml")),
-    ("chaotic", include_str!("../../configs/chaotic.toml")),
+/// The paper's layouts, as they are asked for and as their config files are named, with the text of each.
+const LAYOUTS: [([&str; 2], &str); 3] = [
+    (["generally-forward", "generally_forward"], include_str!("../../configs/generally_forward.toml")),
+    (["strictly-forward", "strictly_forward"], include_str!("../../configs/strictly_forward.toml")),
+    (["chaotic"; 2], include_str!("../../configs/chaotic.toml")),
 ];
 /// Letters of a line at most.
 const WIDTH: usize = 110;
@@ -23,7 +23,7 @@ const WIDTH: usize = 110;
 #[derive(clap::Args)]
 pub struct Args {
     /// The paper's layout to start from
-    #[arg(default_value = LAYOUTS[0].0, value_parser = layouts())]
+    #[arg(default_value = LAYOUTS[0].0[0], value_parser = layouts())]
     layout: String,
     /// File to write, which must not be there yet [default: standard output]
     #[arg(long, short, value_name = "FILE")]
@@ -33,15 +33,15 @@ pub struct Args {
     force: bool,
 }
 
-/// Their names, which may be written as those of the files, too.
+/// Their names, by either of which they are found.
 fn layouts() -> PossibleValuesParser {
-    PossibleValuesParser::new(LAYOUTS.map(|(name, _)| PossibleValue::new(name).alias(name.replace('-', "_"))))
+    PossibleValuesParser::new(LAYOUTS.map(|([name, file], _)| PossibleValue::new(name).alias(file)))
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let named = args.layout.replace('_', "-");
-    let (name, from) = LAYOUTS.into_iter().find(|(name, _)| *name == named).expect("no other is taken");
-    let text = commented(from, &Config::parse(from, name)?);
+    let (names, from) =
+        LAYOUTS.into_iter().find(|(names, _)| names.contains(&&*args.layout)).expect("no other is taken");
+    let text = commented(from, &Config::parse(from, names[0])?);
     let Some(path) = args.out else { return print(&text) };
     output::check(&[("--out", Some(&path))], &[])?;
     match args.force {
