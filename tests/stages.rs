@@ -164,6 +164,23 @@ fn a_run_goes_on_through_its_stages() {
     assert!(error.contains("stages[1]: { from = 4") && error.contains("{ from = 5"), "{error}");
 }
 
+/// The populations after the last generation are bred as its stage says.
+#[test]
+fn a_finished_run_is_extended_from_the_stage_that_it_ended_in() {
+    let place = tempfile::tempdir().unwrap();
+    let stage = "[[stages]]\nfrom = 3\nset = { learning.mutation = 'additive', learning.mutation_probability = 0.9 }\n";
+    let config = config(&[SMALL, stage].concat());
+    let (whole, extended) = (place.path().join("whole"), place.path().join("extended"));
+    let expected = train(&config, &whole, None, Start::Fresh, 99).unwrap();
+    for generations in [3, 5] {
+        let mut short = config.clone();
+        short.learning.generations = generations;
+        assert!(train(&short, &extended, None, Start::Force, 99).unwrap().is_some());
+        assert_eq!(train(&config, &extended, None, Start::Resume, 99).unwrap(), expected, "from {generations} on");
+        assert_eq!((rows(&extended), bytes(&extended)), (rows(&whole), bytes(&whole)), "from {generations} on");
+    }
+}
+
 #[test]
 fn a_run_goes_on_from_the_policies_that_it_started_from() {
     let place = tempfile::tempdir().unwrap();
