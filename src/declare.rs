@@ -231,6 +231,7 @@ mod tests {
             pub first: u32,
             pub inner: Inner,
             pub list: [f32; 3],
+            pub numbers: [u32; 2],
         }
 
         pub struct Duo {
@@ -264,10 +265,11 @@ mod tests {
 
     #[test]
     fn a_shared_struct_reads_alike_in_wgsl() {
-        let text = "struct Outer {\n    first: u32,\n    size: f32,\n    count: u32,\n    list: array<f32, 3>,\n}\n";
+        let text = "struct Outer {\n    first: u32,\n    size: f32,\n    count: u32,\n    list: array<f32, 3>,\n    \
+                    numbers: array<u32, 2>,\n}\n";
         assert_eq!(Outer::wgsl(), text);
-        let outer = Outer { first: 1, inner: Inner { size: 2.5, count: 3 }, list: [4.0, 5.0, 6.0] };
-        let words = [1, 2.5f32.to_bits(), 3, 4f32.to_bits(), 5f32.to_bits(), 6f32.to_bits()];
+        let outer = Outer { first: 1, inner: Inner { size: 2.5, count: 3 }, list: [4.0, 5.0, 6.0], numbers: [7, 8] };
+        let words = [1, 2.5f32.to_bits(), 3, 4f32.to_bits(), 5f32.to_bits(), 6f32.to_bits(), 7, 8];
         assert_eq!(bytemuck::cast_slice::<_, u32>(&[outer]), words);
         assert_eq!(Duo { size: 7, count: 8 }.value(), "Duo(7u, 8u)");
         assert_eq!(Duo::copied_from("world"), "Duo(world.size, world.count)");

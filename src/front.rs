@@ -75,6 +75,14 @@ pub enum Failure {
         /// Weights of a policy.
         parameters: usize,
     },
+    /// Policies of fewer or more trials than are trained.
+    #[error("policies of {found} trials, where {trials} are trained; give each its own, or all the same")]
+    Trials {
+        /// How many were given.
+        found: usize,
+        /// Of the config.
+        trials: usize,
+    },
     /// A weight that no policy may have.
     #[error(
         "weight {parameter} of the policy of leader {leader} in team {team} is {value}, allowed is a size up to {MAX_WEIGHT}"
@@ -316,10 +324,13 @@ pub fn train_from(
     let needed = (plan.host.min(plan.gpu_host) - plan.checkpoint).saturating_add(kept);
     memory::check(needed, 0)?;
     let (mut trainer, mut rows, mut stopped) = (Trainer::new(vec![config.clone()]), Vec::new(), false);
-    let (leaders, parameters) = (config.populations(), config.parameters());
-    for trial in (0..config.learning.trials).filter(|_| !first.is_empty()) {
-        let mut weights = first.get(if first.len() == 1 { 0 } else { trial }).cloned().unwrap_or_default();
-        if weights.len() != leaders * policies * parameters || weights.is_empty() {
+    let (leaders, parameters, trials) = (config.populations(), config.parameters(), config.learning.trials);
+    if first.len() > 1 && first.len() != trials {
+        return Err(Failure::Trials { found: first.len(), trials });
+    }
+    for (trial, weights) in (0..trials).zip(first.iter().cycle()) {
+        let mut weights = weights.clone();
+        if weights.is_empty() || Some(weights.len()) != (leaders * parameters).checked_mul(policies) {
             return Err(Failure::Weights { found: weights.len(), leaders, teams: policies, parameters });
         }
         if let Some(place) = evolve::admit(&mut weights) {

@@ -174,14 +174,7 @@ impl Session {
             .try_reserve_exact(bytes.try_into().unwrap_or(usize::MAX))
             .map_err(|_| RunError::Memory { what: "twice the policies of all trials", bytes })?;
         // Before any of them is touched.
-        for (_, path, _) in runs.iter().filter(|_| start == Start::Fresh) {
-            if folder::holds_run(path)? {
-                return Err(RecordError::Exists { path: path.clone() }.into());
-            }
-        }
-        for (_, path, _) in runs.iter().filter(|(_, path, _)| start == Start::Force && path.is_dir()) {
-            folder::lock(path)?;
-        }
+        folder::check(runs.iter().map(|(_, path, _)| &**path), start)?;
         let opened = side_by_side(runs, |(config, path, init)| Member::open(config, path, init, start, disk))?;
         let (mut members, mut snapshots, mut notes) = (Vec::new(), Vec::new(), Vec::new());
         for (member, snapshot, told) in opened {

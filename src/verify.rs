@@ -189,7 +189,7 @@ fn compare_batch(
     Ok(teams.into_iter().find(differs))
 }
 
-/// Plays all groups as two batches of which only scores are wanted, of every kind by turns, and holds them against
+/// Plays all groups as three batches of which only scores are wanted, of every kind by turns, and holds them against
 /// those of the reference's whole record; the first group and team that differs, and how.
 fn compare_scores(
     groups: &[Group<'_>],
@@ -197,12 +197,15 @@ fn compare_scores(
     backend: &mut dyn Backend,
 ) -> Result<Option<(usize, usize, String)>, BackendError> {
     let need_of = |group: usize| Need::OF_SCORES[group % Need::OF_SCORES.len()];
-    // Records come home packed where all of a batch can.
-    let is_whole = |&group: &usize| need_of(group).least(1).is_none() || groups[group].world.rule.is_timed();
-    let (whole, packed): (Vec<usize>, Vec<usize>) = (0..groups.len()).partition(is_whole);
+    // Records come home packed where all of a batch can: those that must not for the sake of time are by themselves.
+    let mut batches = [vec![], vec![], vec![]];
+    for (index, group) in groups.iter().enumerate() {
+        let (whole, timed) = (need_of(index).least(1).is_none(), group.world.rule.is_timed());
+        batches[if whole { 0 } else { 1 + usize::from(timed) }].push(index);
+    }
     let played = |backend: &mut dyn Backend, needs: &dyn Fn(usize) -> Need| {
         let scores: Vec<Mutex<BTreeMap<usize, Scores>>> = groups.iter().map(|_| Mutex::default()).collect();
-        for batch in [&whole, &packed] {
+        for batch in &batches {
             let asked: Vec<Group<'_>> =
                 batch.iter().map(|&index| Group { need: needs(index), ..groups[index] }).collect();
             backend.rollout(&asked, &|episode| {

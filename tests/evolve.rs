@@ -17,8 +17,17 @@ use flotilla::world::{GRID, World};
 use glam::Vec2;
 use proptest::prelude::*;
 
-const PURPOSES: [Purpose; 5] =
-    [Purpose::Weights, Purpose::Teams, Purpose::Starts, Purpose::Tournament, Purpose::Mutation];
+const PURPOSES: [Purpose; 9] = [
+    Purpose::Weights,
+    Purpose::Teams,
+    Purpose::Starts,
+    Purpose::Tournament,
+    Purpose::Mutation,
+    Purpose::Baseline,
+    Purpose::HeldOut,
+    Purpose::Pois,
+    Purpose::HeldOutPois,
+];
 const GENERALLY_FORWARD: &str = "generally_forward";
 const STRICTLY_FORWARD: &str = "strictly_forward";
 const CHAOTIC: &str = "chaotic";
@@ -314,7 +323,7 @@ fn no_two_places_share_a_draw() {
     let values: [&[u64]; 7] = [
         &[0, 1, 1 << 32, 1 << 62],
         &[0, 1, 4095],
-        &[0, 1, 2, 3, 4],
+        &[0, 1, 2, 3, 4, 5, 6, 7, 8],
         &[0, 1, 1 << 19],
         &[0, 1, 1023],
         &[0, 1, 2, (1 << 20) - 1],
@@ -331,7 +340,7 @@ fn no_two_places_share_a_draw() {
         places = places.iter().flat_map(with).collect();
     }
     let draws: usize = places.iter().map(|&place| usize::from(seen.insert(draw(place)))).sum();
-    assert_eq!((draws, draws), (places.len(), 4 * 3 * 5 * 3 * 3 * 4 * 4));
+    assert_eq!((draws, draws), (places.len(), 4 * 3 * 9 * 3 * 3 * 4 * 4));
 }
 
 /// Draws at neighbouring places are no more alike than any two: neither bit by bit nor as numbers.
@@ -650,6 +659,31 @@ fn mean(shares: &[f64], stage: &Config) -> f64 {
     let whole = (stage.world.pois.len() * stage.learning.episodes_per_team) as f64;
     let total: f64 = shares.iter().map(|share| (share * whole).round()).sum();
     total / (whole * shares.len() as f64)
+}
+
+/// Where all leaders share a policy it scores their mean, not only something that ranks policies alike.
+#[test]
+fn a_shared_policy_scores_the_mean_of_its_leaders() {
+    let config = config(GENERALLY_FORWARD, |config| {
+        (config.learning.population, config.learning.trials) = (40, 1);
+        (config.learning.sharing, config.learning.fitness) = (Sharing::All, Fitness::D);
+        (config.world.coupling, config.world.steps) = (flotilla::config::Coupling::Same(1), 80);
+        config.world.observation_radius = 8.0;
+    });
+    let (world, leaders) = (World::new(&config), config.learners());
+    let mut trainer = Trainer::new(vec![config.clone()]);
+    let weights = trainer.weights(0, 0).unwrap().chunks(world.parameters()).map(<[f32]>::to_vec).collect();
+    let plain = Plain { config: &config, world, trial: 0, policies: vec![weights] };
+    trainer.advance(&mut Cpu::default()).unwrap();
+    let found = trainer.snapshot(0).unwrap().fitness.remove(0);
+    let mut differ = 0;
+    for (policy, found) in found.into_iter().enumerate() {
+        let (_, scores) = plain.play(0, &config, &vec![policy; leaders]);
+        let sum: f64 = scores.iter().map(|&score| f64::from(score)).sum();
+        assert_eq!(found, (sum / leaders as f64) as f32, "policy {policy}");
+        differ += usize::from(scores.iter().any(|&score| score != scores[0]));
+    }
+    assert!(differ > 3, "leaders of {differ} teams differ in what they score");
 }
 
 /// POIs move as starts do, by draws of their own, and nothing is said of them where they stay.

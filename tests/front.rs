@@ -2,6 +2,8 @@
 
 #![cfg(feature = "cli")]
 
+mod support;
+
 use std::fs;
 use std::ops::ControlFlow::{Break, Continue};
 use std::path::Path;
@@ -9,11 +11,12 @@ use std::path::Path;
 use flotilla::Config;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Backend, Group, Need};
+use flotilla::config::{Fitness, MAX_AGENTS, MAX_POPULATION, MAX_STEPS, Stage};
 use flotilla::evaluate::Starts;
 use flotilla::front::{self, Failure, Processor, Trained};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::Start;
-use flotilla::record::policies::{Init, Policies};
+use flotilla::record::policies::{self, Init, Policies};
 use flotilla::run::{Ended, Options, Session};
 use flotilla::sample;
 use flotilla::stepping::StepError;
@@ -95,9 +98,30 @@ fn training_comes_to_what_a_run_comes_to() {
     };
     let short = read(&lines[..lines.len() - 1]);
     assert!(short.contains("metrics.csv has 20 rows of 21"), "{short}");
+    let late = lines[lines.len() - 1].replacen("2,6,", "2,7,", 1);
+    let late = read(&[&lines[..], &[&late]].concat());
+    assert!(late.contains("line 23 is trial 2, generation 7, which the run's config.toml does not have"), "{late}");
+    let more = read(&[&lines[..], &lines[lines.len() - 1..]].concat());
+    assert!(more.contains("its rows are not one a trial and generation, in their order"), "{more}");
     lines.swap(1, 4);
     let mixed = read(&lines);
     assert!(mixed.contains("its rows are not one a trial and generation, in their order"), "{mixed}");
+    // Policies of another run: fewer of each leader, and of another network.
+    lines.swap(1, 4);
+    fs::write(&path, lines.join("\n") + "\n").expect("the folder can be written");
+    assert!(Trained::read(&run).is_ok());
+    let config = config(0);
+    for (change, told) in [
+        ((|config| config.learning.population += 1) as fn(&mut Config), "policies of each leader, not"),
+        (|config| config.policy.hidden = vec![9, 9], "but the config needs F32"),
+    ] {
+        let mut other = config.clone();
+        change(&mut other);
+        let trained = flotilla::train(&other, &mut Cpu::default(), |_| Continue(())).expect("it trains");
+        policies::write(&Disk::default(), &run.join("policies.safetensors"), &other, &trained.policies).unwrap();
+        let error = Trained::read(&run).expect_err("they are of another run").to_string();
+        assert!(error.contains("policies.safetensors: ") && error.contains(told), "{error}");
+    }
 }
 
 #[test]
@@ -113,6 +137,20 @@ fn a_training_that_is_stopped_is_one_of_fewer_generations() {
         assert_eq!((stopped.config.learning.generations, calls), (6.min(after + 2), after + 1), "after {after}");
         let whole = flotilla::train(&stopped.config, &mut Cpu::default(), |_| Continue(()));
         assert_eq!(whole.unwrap_or_else(|error| panic!("seed {seed}: {error}")), stopped, "after {after}");
+    }
+    // Nor does a stage that begins where it ends make it longer.
+    let mut config = config(3);
+    let stage = |from| Stage { from, set: [("world.steps".to_string(), toml::Value::from(60))].into() };
+    config.stages = vec![stage(2), stage(5)];
+    for after in 0..=6 {
+        let stopped = flotilla::train(&config, &mut Cpu::default(), |generation| {
+            if generation.generation == after { Break(()) } else { Continue(()) }
+        });
+        let stopped = stopped.unwrap_or_else(|error| panic!("{error}"));
+        let begun = [2, 5].into_iter().filter(|from| *from <= 6.min(after + 2)).count();
+        assert_eq!((stopped.config.learning.generations, stopped.config.stages.len()), (6.min(after + 2), begun));
+        let whole = flotilla::train(&stopped.config, &mut Cpu::default(), |_| Continue(()));
+        assert_eq!(whole.unwrap_or_else(|error| panic!("{error}")), stopped, "stages, after {after}");
     }
 }
 
@@ -132,7 +170,15 @@ fn a_training_starts_from_given_policies() {
     assert_ne!(warm.digest(), learned.digest());
     let columns = config.learning.generations + 1;
     assert_eq!(from(policies, &learned.policies[..1]).unwrap().best_g[..columns], warm.best_g[..columns]);
-    assert!(matches!(from(policies + 1, &learned.policies), Err(Failure::Weights { .. })));
+    for wrong in [0, policies - 1, policies + 1, usize::MAX, usize::MAX / config.parameters()] {
+        assert!(matches!(from(wrong, &learned.policies), Err(Failure::Weights { teams, .. }) if teams == wrong));
+    }
+    assert!(matches!(from(0, &[vec![]]), Err(Failure::Weights { found: 0, .. })));
+    let [two, four] = [learned.policies[..2].to_vec(), [&learned.policies[..], &learned.policies[..1]].concat()];
+    for (found, given) in [(2, two), (4, four)] {
+        let error = from(policies, &given).expect_err("three trials are trained").to_string();
+        assert!(error.starts_with(&format!("policies of {found} trials, where 3 are trained; ")), "{error}");
+    }
     let mut wrong = learned.policies.clone();
     wrong[1][3] = f32::NAN;
     assert!(matches!(from(policies, &wrong), Err(Failure::Weight { leader: 0, team: 0, parameter: 3, .. })));
@@ -232,12 +278,24 @@ fn what_is_wrong_is_told() {
     for (episodes, jitter) in [(0, 0.1), (u32::MAX, 0.1), (1, f64::NAN), (1, f64::INFINITY), (1, -0.1)] {
         let drawn = Starts::Drawn { episodes, seed: 1, jitter, poi_jitter: 0.0 };
         assert!(matches!(play(&config, 2, &good, drawn), Err(Failure::Starts { .. })), "{episodes}, {jitter}");
+        let moved = Starts::Drawn { episodes, seed: 1, jitter: 0.1, poi_jitter: jitter };
+        assert!(matches!(play(&config, 2, &good, moved), Err(Failure::Starts { .. })), "{episodes}, POIs by {jitter}");
     }
 
     let drawn = Starts::Drawn { episodes: 2, seed: 1, jitter: 0.1, poi_jitter: 0.0 };
     let trace = |episode| flotilla::trace(&config, &mut Cpu::default(), 2, &good, &drawn, episode);
     trace(1).expect("it is the last");
     assert!(matches!(trace(2), Err(Failure::NoEpisode { episode: 2, episodes: 2 })));
+
+    // All steps of a million large teams are more than any machine has.
+    let followers = "[1, 1], ".repeat(MAX_AGENTS - 1);
+    let text = format!(
+        "[world]\nleaders = [[2, 2]]\nfollowers = [{followers}]\npois = [[9, 9]]\nsteps = {MAX_STEPS}\n[policy]\nhidden = []"
+    );
+    let large = Config::parse(&text, "large.toml").expect("all is within bounds");
+    let weights = vec![0.5; large.parameters() * MAX_POPULATION];
+    let traced = flotilla::trace(&large, &mut Cpu::default(), MAX_POPULATION, &weights, &Starts::Own, 0);
+    assert!(matches!(traced, Err(Failure::Memory { what: "all steps of all teams", .. })));
 
     // Configs built by hand are checked like files.
     let broken: [fn(&mut Config); 6] = [
@@ -258,6 +316,13 @@ fn what_is_wrong_is_told() {
         assert!(flotilla::stepper(&config, 1, false).is_err_and(refused), "{index}");
     }
     assert!(matches!(flotilla::stepper(&config, 0, true), Err(Failure::Step(StepError::Teams(0)))));
+    // Sights are kept where they are asked for.
+    let mut led = support::layout("generally_forward");
+    for (fitness, kept) in [(Fitness::Df, false), (Fitness::Dt, true)] {
+        led.learning.fitness = fitness;
+        let stepper = flotilla::stepper(&led, 2, true).expect("two teams are few");
+        assert_eq!(stepper.fitness(Fitness::Dt, &mut [0.0; 8]).is_ok(), kept, "{fitness}");
+    }
 }
 
 #[test]

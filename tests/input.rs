@@ -156,6 +156,10 @@ fn what_is_no_file_is_not_waited_for() {
         let told = place.refused(1, command);
         assert!(told.contains("it is a pipe or a device, where a file is needed"), "{told}");
     }
+    for command in ["train small.toml", "sweep grid.toml", "paper --trials 1 --generations 1"] {
+        let told = place.refused(1, &format!("{command} --backend cpu --out pipe"));
+        assert!(told.ends_with("a file stands where a folder is needed; choose another name\n"), "{told}");
+    }
     for name in ["config.toml", "metrics.csv", ".lock"] {
         let place = with_run();
         fs::remove_file(place.path("run").join(name)).unwrap();
@@ -172,6 +176,19 @@ fn what_is_no_file_is_not_waited_for() {
     assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
     let output = place.shell("cat small.toml | flotilla check /dev/stdin");
     assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+/// Whoever is to read a pipe may come later: nothing is lost, and whoever waits is told what for.
+#[test]
+fn a_pipe_that_nobody_reads_from_is_waited_for_and_that_is_told() {
+    let place = with_run();
+    assert!(Command::new("mkfifo").arg(place.path("pipe")).status().unwrap().success());
+    let rollout = "flotilla rollout small.toml --policies run/policies.safetensors --quiet --scores";
+    for (reader, told) in [("cat pipe", ""), ("sleep 4; cat pipe", "waiting for somebody to read from pipe\n")] {
+        let output = place.shell(&format!("({reader}) > read.csv & {rollout} pipe && wait && {rollout} scores.csv"));
+        assert_eq!(String::from_utf8(output.stderr).unwrap(), told);
+        assert!(output.status.success() && place.read("read.csv") == place.read("scores.csv"));
+    }
 }
 
 #[test]

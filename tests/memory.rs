@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::Config;
+use flotilla::front::Failure;
 use flotilla::memory::{self, Peaks};
 use flotilla::record::checkpoint::{self, Checkpoint, Keeper};
 use flotilla::record::disk::Disk;
@@ -88,11 +89,14 @@ fn a_run_that_does_not_fit_does_not_start() {
     let folder = tempfile::tempdir().unwrap();
     let (path, out) = (folder.path().join("config.toml"), folder.path().join("run"));
     let text = text(1 << 20, 140, 1, "generations = 0\nseconds = 0.0");
-    let needed = Peaks::of([&Config::parse(&text, "config").unwrap()], 1).host;
+    let config = Config::parse(&text, "config").unwrap();
+    let needed = Peaks::of([&config], 1).host;
     if memory::available().is_none_or(|available| available >= needed) {
         println!("skipped: this system does not tell what is free, or has {needed} bytes");
         return;
     }
+    let trained = flotilla::train(&config, &mut Cpu::default(), |_| panic!("it has started"));
+    assert!(matches!(trained, Err(Failure::TooLittle(_))));
     fs::write(&path, text).unwrap();
     let mut train = support::flotilla();
     let output = train.arg("train").arg(&path).args(["--backend", "cpu", "--out"]).arg(&out).output().unwrap();
@@ -117,6 +121,20 @@ fn plans_add_up() {
     assert!(both.adapter > other.adapter && both.gpu_host > both.host - both.checkpoint);
     assert!(memory::copies_checkpoint([&small, &large]));
     assert!(!memory::copies_checkpoint(&[config(40_000)]));
+}
+
+/// Of stages, the one that takes most counts, whenever it comes.
+#[test]
+fn stages_take_what_the_largest_takes() {
+    let plain = text(1000, 2, 9, "generations = 1");
+    let config = |stages: &str| Config::parse(&[&plain, stages].concat(), "config").unwrap();
+    let stage = |from: usize, set: &str| format!("[[stages]]\nfrom = {from}\nset = {{ {set} }}\n");
+    let (large, small) = ("learning.episodes_per_team = 5, world.steps = 90", "world.steps = 5");
+    let all = Peaks::of([&config(&stage(0, large))], 3);
+    assert!(all.host > Peaks::of([&config("")], 3).host);
+    for stages in [stage(4, large), stage(2, large) + &stage(4, small), stage(2, small) + &stage(4, large)] {
+        assert_eq!(Peaks::of([&config(&stages)], 3), all, "{stages}");
+    }
 }
 
 /// Records that are large enough to be packed on a GPU take room twice: there may be as much again of what is packed.

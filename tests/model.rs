@@ -387,7 +387,7 @@ fn check(cpu: &mut Cpu, world: &Config, model: &Model, seed: u64) -> Tally {
         .map(|start| start + Vec2::new(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0)) * jitter)
         .map(|start| on_grid(start, model.map.as_vec2()))
         .collect();
-    let (world, need) = (&compiled, Need::Record);
+    let (world, need) = (&compiled, Need::Sights);
     // POIs of an episode may be elsewhere than the world's.
     let moved: Vec<Vec2> = model.moved.iter().flatten().map(|poi| poi.as_vec2()).collect();
     let places = [&starts[..], &moved].concat();
@@ -471,6 +471,12 @@ fn check_team<'a>(
                     let (least, most) = &mut seen[(agent - leaders) * leaders + leader];
                     *least += (near && !tie) as u32;
                     *most += (near || tie) as u32;
+                    let words = leaders.div_ceil(32);
+                    let row = (team * steps + step - 1) * (agents - leaders) + agent - leaders;
+                    let sees = trace.sights[row * words + leader / 32] >> (leader % 32) & 1 == 1;
+                    if sees != near && !tie {
+                        tally.wrong.push(format!("{place}: sees leader {leader} {sees}, expected {near}"));
+                    }
                 }
                 slack = (force.blur(), MARGIN * force.parts);
                 model.follow(&states[agent], &force, &mut shaky)

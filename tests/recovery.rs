@@ -868,6 +868,23 @@ fn a_second_process_is_refused_until_the_first_is_gone() {
     again.wait().unwrap();
 }
 
+#[test]
+fn where_one_of_several_runs_cannot_start_none_is_touched() {
+    let place = tempfile::tempdir().unwrap();
+    let [free, taken] = ["free", "taken"].map(|name| place.path().join(name));
+    let open = |start: Start| {
+        let runs = [&free, &taken].map(|path| (small(), path.clone()));
+        Session::open(runs.into(), start, &Disk::default()).err().expect("one is taken").to_string()
+    };
+    let held = Folder::open(&taken, Start::Fresh, &small(), Disk::default()).unwrap();
+    assert!(open(Start::Fresh).contains("holds a run already") && !free.exists());
+    fs::create_dir(&free).unwrap();
+    fs::write(free.join(METRICS), "of a run").unwrap();
+    assert!(open(Start::Force).starts_with("another process is training in"));
+    assert_eq!(fs::read_to_string(free.join(METRICS)).unwrap(), "of a run");
+    drop(held);
+}
+
 #[cfg(unix)]
 mod unix {
     use super::*;

@@ -164,6 +164,23 @@ fn a_run_goes_on_through_its_stages() {
     assert!(error.contains("stages[1]: { from = 4") && error.contains("{ from = 5"), "{error}");
 }
 
+/// The populations after the last generation are bred as its stage says.
+#[test]
+fn a_finished_run_is_extended_from_the_stage_that_it_ended_in() {
+    let place = tempfile::tempdir().unwrap();
+    let stage = "[[stages]]\nfrom = 3\nset = { learning.mutation = 'additive', learning.mutation_probability = 0.9 }\n";
+    let config = config(&[SMALL, stage].concat());
+    let (whole, extended) = (place.path().join("whole"), place.path().join("extended"));
+    let expected = train(&config, &whole, None, Start::Fresh, 99).unwrap();
+    for generations in [3, 5] {
+        let mut short = config.clone();
+        short.learning.generations = generations;
+        assert!(train(&short, &extended, None, Start::Force, 99).unwrap().is_some());
+        assert_eq!(train(&config, &extended, None, Start::Resume, 99).unwrap(), expected, "from {generations} on");
+        assert_eq!((rows(&extended), bytes(&extended)), (rows(&whole), bytes(&whole)), "from {generations} on");
+    }
+}
+
 #[test]
 fn a_run_goes_on_from_the_policies_that_it_started_from() {
     let place = tempfile::tempdir().unwrap();
@@ -186,8 +203,25 @@ fn a_run_goes_on_from_the_policies_that_it_started_from() {
         }
     }
     assert!(!trainer.start_from(0, 0, policies, &learned[0][1..]));
-    let row = trainer.advance(&mut Cpu::default()).and_then(|_| trainer.advance(&mut Cpu::default())).unwrap()[0];
-    assert_eq!(rows(&whole)[1][2..4], [row.best_g.to_string(), row.mean_g.to_string()]);
+    let begun = trainer.advance(&mut Cpu::default()).and_then(|_| trainer.advance(&mut Cpu::default())).unwrap();
+    for (told, row) in rows(&whole)[1..].iter().zip(&begun) {
+        assert_eq!(told[2..4], [row.best_g.to_string(), row.mean_g.to_string()], "trial {}", row.trial);
+    }
+    // Each trial from its own.
+    let given: Vec<Vec<f32>> = init().unwrap().trials.into_iter().map(|trial| trial.weights).collect();
+    assert!(given == learned && learned[0] != learned[1]);
+    // Of more policies the first, of fewer all, before those that are drawn as ever.
+    let drawn = Trainer::new(vec![config.clone()]).weights(0, 0).unwrap().to_vec();
+    for given in [3, 20] {
+        let mut trainer = Trainer::new(vec![config.clone()]);
+        let weights: Vec<f32> = (0..2 * given * parameters).map(|number| number as f32).collect();
+        assert!(trainer.start_from(0, 0, given, &weights));
+        let taken = given.min(policies) * parameters;
+        let slots = trainer.weights(0, 0).unwrap().chunks(9 * parameters).zip(drawn.chunks(9 * parameters));
+        for ((slots, drawn), weights) in slots.zip(weights.chunks(given * parameters)) {
+            assert_eq!((&slots[..taken], &slots[taken..]), (&weights[..taken], &drawn[taken..]), "{given} policies");
+        }
+    }
     assert_eq!(Run::read(&whole.join(RUN)).unwrap().init, Some(digest.clone()));
     for until in 0..=7 {
         let path = place.path().join(format!("stopped-{until}"));

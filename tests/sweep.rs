@@ -13,6 +13,8 @@ use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::{Config, Coupling, Override};
+use flotilla::record::disk::Disk;
+use flotilla::record::folder::{Folder, Start};
 use flotilla::sweep::shard::{Shard, cost};
 use flotilla::sweep::{Sweep, layout, run};
 use flotilla::trainer::Trainer;
@@ -705,6 +707,35 @@ fn a_folder_of_something_else_is_refused() {
     assert!(failed(flotilla(&sweep, &out, &["--quiet"]), 1).contains("--resume"));
     done(flotilla(&sweep, &out, &["--quiet", "--force"]));
     assert!(results(&out) == before);
+}
+
+/// Nothing is written over where another process trains one of the points, in whatever batch that is.
+#[test]
+fn what_another_process_trains_is_left_alone_with_all_else() {
+    let (folder, sweep) = written(SMALL);
+    let out = folder.path().join("out");
+    done(flotilla(&sweep, &out, &["--quiet"]));
+    let all = || {
+        let points = (0..8).map(|point| out.join(format!("points/{point:04}")));
+        let files = points.flat_map(|point| [results(&point), results(&point.join("checkpoints"))]);
+        (results(&out), files.collect::<Vec<_>>())
+    };
+    let before = all();
+    let point = out.join("points/0005");
+    let config = Config::load(&point.join("config.toml")).unwrap();
+    let held = Folder::open(&point, Start::Resume, &config, Disk::default()).unwrap();
+    for memory in ["1", "0.000001"] {
+        let error = failed(flotilla(&sweep, &out, &["--quiet", "--force", "--memory", memory]), 1);
+        let expected = format!("error: another process is training in {}; ", point.display());
+        assert!(error.starts_with(&expected) && error.lines().count() == 1, "{error}");
+        assert!(all() == before, "something was written over, in batches of {memory} GiB");
+    }
+    drop(held);
+    done(flotilla(&sweep, &out, &["--quiet", "--force", "--memory", "0.000001"]));
+    // Nor does a later batch come too late to say that runs are there.
+    fs::remove_dir_all(out.join("points/0000")).unwrap();
+    let error = failed(flotilla(&sweep, &out, &["--quiet", "--memory", "0.000001"]), 1);
+    assert!(error.contains("points/0001 holds a run already") && !out.join("points/0000").exists(), "{error}");
 }
 
 #[test]

@@ -252,6 +252,11 @@ fn rollout_takes_other_programs_files_and_refuses_what_it_cannot_play() {
     tensor(place.path("bad.safetensors"), "w", Dtype::F32, &[2, 3, PARAMETERS], bytes, None);
     assert!(place.refused(1, &line("bad")).contains("it has no tensor weights.0; it has w"));
     assert!(place.refused(2, &(line("good") + " --trial 2")).contains("it has no tensor weights.2; it has weights"));
+    // A checkpoint has weights, too.
+    place.good("train small.toml --out run --trials 1");
+    let newest = fs::read_dir(place.path("run/checkpoints")).unwrap().next().unwrap().unwrap().path();
+    let checkpoint = ["rollout", "small.toml", "--policies", newest.to_str().unwrap()];
+    assert!(place.refused(1, &checkpoint).contains("it holds \"checkpoint "));
     // Every learner needs policies.
     assert!(place.refused(1, &(line("good") + " --paradigm all-leaders")).contains("needs F32 [5, "));
 
@@ -603,25 +608,33 @@ fn a_trace_tells_what_leaders_sense_and_answer() {
 fn no_training_starts_where_teams_are_evaluated() {
     use flotilla::config::Config;
     use flotilla::evaluate::Starts;
-    use flotilla::evolve::{Key, Purpose, jitter_starts};
+    use flotilla::evolve::places;
     use flotilla::world::World;
 
-    let world = World::new(&Config::parse(SMALL, "small").unwrap());
-    let bits = |starts: &[glam::Vec2]| -> Vec<u32> {
-        starts.iter().flat_map(|start| [start.x.to_bits(), start.y.to_bits()]).collect()
+    let mut config = Config::parse(SMALL, "small").unwrap();
+    (config.learning.start_jitter, config.learning.poi_jitter) = (2.0, 2.0);
+    let world = World::new(&config);
+    // Of agents and of POIs.
+    let bits = |places: &[glam::Vec2]| -> [Vec<u32>; 2] {
+        let (starts, pois) = places.split_at(world.agents());
+        assert_eq!(pois.len(), world.pois.len());
+        [starts, pois].map(|places| places.iter().flat_map(|at| [at.x.to_bits(), at.y.to_bits()]).collect())
     };
     let mut held_out = std::collections::HashSet::new();
     for seed in 0..4 {
-        let starts = Starts::Drawn { episodes: 64, seed, jitter: 2.0, poi_jitter: 0.0 };
-        held_out.extend((0..64).map(|episode| bits(&starts.of(episode, &world))));
+        let starts = Starts::Drawn { episodes: 64, seed, jitter: 2.0, poi_jitter: 2.0 };
+        held_out.extend((0..64).flat_map(|episode| bits(&starts.of(episode, &world))));
     }
-    assert_eq!(held_out.len(), 4 * 64);
-    let mut starts = Vec::new();
+    assert_eq!(held_out.len(), 2 * 4 * 64);
+    let mut drawn = Vec::new();
     for (seed, trial) in (0..4).flat_map(|seed| (0..3).map(move |trial| (seed, trial))) {
-        let key = Key::new(seed, trial, Purpose::Starts);
+        config.learning.seed = seed;
         for (generation, episode) in (0..64).flat_map(|generation| (0..4).map(move |episode| (generation, episode))) {
-            jitter_starts(key, generation, episode, &world, 2.0, &mut starts);
-            assert!(!held_out.contains(&bits(&starts)), "seed {seed}, generation {generation}");
+            places(&config.learning, trial, generation, episode, &world, &mut drawn);
+            assert!(
+                bits(&drawn).iter().all(|places| !held_out.contains(places)),
+                "seed {seed}, generation {generation}"
+            );
         }
     }
 }

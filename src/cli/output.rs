@@ -1,9 +1,13 @@
 //! Files that a command was told to write.
 
+use std::fs;
 use std::io::{self, Write};
 use std::path::Path;
+use std::sync::mpsc;
+use std::thread;
+use std::time::Duration;
 
-use super::Error;
+use super::{Error, say};
 use crate::file;
 use crate::record::disk::Disk;
 use crate::record::{RecordError, folder};
@@ -21,7 +25,7 @@ pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), 
             continue;
         }
         // Better told before hours of playing than after.
-        if let Err(error) = std::fs::metadata(file::folder(path)) {
+        if let Err(error) = fs::metadata(file::folder(path)) {
             return Err(RecordError::Write { path: path.into(), error }.into());
         }
         let resolved = file::resolved(path);
@@ -38,10 +42,32 @@ pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), 
     Ok(())
 }
 
-/// Writes a file, whole or not at all.
+/// Writes a file, whole or not at all. A pipe is waited for until somebody reads from it.
 ///
 /// # Errors
 /// It cannot be written.
 pub fn write(path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Error> {
+    let opened = tell_of_waiting(path);
+    let content = |output: &mut dyn Write| {
+        drop(opened);
+        content(output)
+    };
     Ok(Disk::default().deliver(path, content).map_err(|error| RecordError::Write { path: path.into(), error })?)
 }
+
+/// Says that a pipe waits for somebody to read from it, unless what this gives is dropped soon, once it is open.
+fn tell_of_waiting(path: &Path) -> mpsc::Sender<()> {
+    let (opened, waiting) = mpsc::channel();
+    if fs::metadata(path).is_ok_and(|there| !there.is_file() && !there.is_dir()) {
+        let path = path.to_path_buf();
+        thread::spawn(move || {
+            if waiting.recv_timeout(PATIENCE) == Err(mpsc::RecvTimeoutError::Timeout) {
+                say(format_args!("waiting for somebody to read from {}", path.display()));
+            }
+        });
+    }
+    opened
+}
+
+/// Until it is told that somebody is waited for.
+const PATIENCE: Duration = Duration::from_secs(1);

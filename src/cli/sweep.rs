@@ -12,7 +12,7 @@ use crate::config::{self, ConfigError, Problem};
 use crate::file;
 use crate::memory;
 use crate::record::RecordError;
-use crate::record::disk;
+use crate::record::disk::{self, Disk};
 use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
 use crate::report::progress::Meter;
 use crate::run::{Ended, Options};
@@ -267,8 +267,8 @@ pub(super) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
 /// Marks the folder as this sweep's. Shards that start at the same moment all write the same.
 pub(super) fn claim(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let path = out.join(SWEEP);
+    Disk::default().create_folder(out).map_err(|error| RecordError::Write { path: out.into(), error })?;
     let write = || -> io::Result<()> {
-        std::fs::create_dir_all(out)?;
         if !path.exists() {
             let builder = &mut tempfile::Builder::new();
             // As any other file: others may collect.

@@ -455,6 +455,22 @@ pub fn holds_run(path: &Path) -> Result<bool, RecordError> {
     Ok(false)
 }
 
+/// Whether runs may be started in folders, of which none is touched: none holds a run where it is not to be written
+/// over, and where it is, nobody trains in it.
+///
+/// # Errors
+/// The first folder that may not be used, or that cannot be looked into.
+pub(crate) fn check<'a>(folders: impl IntoIterator<Item = &'a Path>, start: Start) -> Result<(), RecordError> {
+    for path in folders {
+        match start {
+            Start::Fresh if holds_run(path)? => return Err(RecordError::Exists { path: path.into() }),
+            Start::Force if path.is_dir() => drop(lock(path)?),
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
 impl Drop for Folder {
     fn drop(&mut self) {
         // Closing the file is not enough where a process being started has a copy of it for a moment.

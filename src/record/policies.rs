@@ -125,10 +125,17 @@ impl Write for HashWriter<'_> {
 /// Reads the policies of all trials of a config's own training.
 ///
 /// # Errors
-/// See [`read`].
+/// See [`read`]; or they are not as many as the config's populations have.
 pub fn read_all(path: &Path, config: &Config) -> Result<Vec<Vec<f32>>, RecordError> {
     let mut file = tensors::open(path)?;
-    let trial = |trial| Ok(from_file(&mut file, config, &[config.populations()], Some(trial))?.weights);
+    let trial = |trial| {
+        let Policies { policies, weights } = from_file(&mut file, config, &[config.populations()], Some(trial))?;
+        let population = config.learning.population;
+        match policies == population {
+            true => Ok(weights),
+            false => Err(format!("{} has {policies} policies of each leader, not {population}", tensor(trial))),
+        }
+    };
     (0..config.learning.trials)
         .map(trial)
         .collect::<Result<_, String>>()

@@ -1,6 +1,6 @@
 //! Trains points side by side, each recorded as a run of its own, in batches that fit in memory.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering::Relaxed;
 
 use super::Point;
@@ -8,7 +8,7 @@ use super::results::point_folder;
 use crate::backend::Player;
 use crate::config::Config;
 use crate::record::disk::Disk;
-use crate::record::folder::{Note, Start};
+use crate::record::folder::{self, Note, Start};
 use crate::run::{self, Ended, RunError, Session};
 
 /// Most points in one batch: each keeps two files open, and systems allow a process 1024.
@@ -92,6 +92,9 @@ pub fn batches<'a>(points: &'a [&'a Point], memory: usize) -> Vec<&'a [&'a Point
 pub fn run(points: &[&Point], out: &Path, player: &mut Player, options: &mut Manner<'_>) -> Result<Ended, RunError> {
     let total = points.iter().map(|point| team_steps(&point.config)).sum();
     let mut progress = Headway { done: 0, points: points.len(), batch: 0, generation: 0, last: 0, played: 0, total };
+    // Nothing of an earlier batch is lost, either, to a point that cannot be had.
+    let folders: Vec<PathBuf> = points.iter().map(|point| point_folder(out, point)).collect();
+    folder::check(folders.iter().map(|path| &**path), options.start).map_err(RunError::from)?;
     for batch in batches(points, options.memory) {
         if options.runs.stop.load(Relaxed) {
             return Ok(Ended::Stopped);
