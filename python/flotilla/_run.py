@@ -234,7 +234,7 @@ def train(
             with. None trains in memory; :meth:`Run.save` still writes it.
         resume: go on with the run in ``out``, or start it where there is none.
         force: write over the run in ``out``.
-        init: what to start from in place of random policies: a :class:`Run` in a folder, or a ``policies.safetensors``; trial i
+        init: what to start from in place of random policies: a :class:`Run`, or a ``policies.safetensors``; trial i
             starts from its trial i. It has as many leaders and parameters as the config; populations that take more policies
             are filled up at random. Needs ``out``, where generation 0 is kept.
         backend: what to play on, to the same bits: ``"auto"`` (a GPU where there is one), ``"cpu"``, ``"gpu"``, or an
