@@ -314,6 +314,9 @@ fn stages_are_seen_by_every_command() {
     let (code, _, told) = run(&folder, "replay run --generation 6 --compare 1");
     assert!(code == Some(2) && told.contains("different stages"), "{told}");
     good("plot run --out curves.svg");
+    let curves = fs::read_to_string(folder.join("curves.svg")).unwrap();
+    let told = "Stage 1 begins at generation 2. Stage 2 begins at generation 4.";
+    assert!(curves.contains(told), "{curves}");
     good("rollout staged.toml --policies run/policies.safetensors");
     assert!(good("rollout staged.toml --policies run/policies.safetensors --stage 2").contains("of 3"));
     let (code, _, told) = run(&folder, "rollout staged.toml --policies run/policies.safetensors --stage 3");

@@ -180,22 +180,27 @@ def table(layout, results, options):
 
 
 def paper(options):
-    """The complete paper: flotilla's whole command by the clock, against the NumPy program scaled up from a tenth."""
+    """The paper's 18 experiments: flotilla's whole commands, a sweep a layout, by the clock, against the NumPy program
+    scaled up from a tenth."""
+    grid = '\n[grid]\n"learning.paradigm" = ["leader-follower", "all-leaders"]\n"learning.fitness" = ["G", "D", "Df"]\n'
     batches = {"all": "all trials of an arm side by side", "run": "one training run at a time"}
     ours, theirs = [], {batch: [] for batch in batches}
     for number in range(options.rounds):
         with tempfile.TemporaryDirectory() as out:
-            command = [options.flotilla, "paper", "--trials", 5, "--backend", options.backend]
+            sweeps = [Path(out) / f"{layout}.toml" for layout in NAMES]
+            for sweep in sweeps:
+                sweep.write_text((ROOT / "configs" / sweep.name).read_text() + grid)
             begin = time.perf_counter()
-            call([*command, "--out", Path(out) / "paper"])
+            for sweep in sweeps:
+                call([options.flotilla, "sweep", sweep, "--backend", options.backend, "--out", Path(out) / sweep.stem])
             ours.append(time.perf_counter() - begin)
         for batch, seconds in theirs.items():
             command = [options.python, HERE / "paper_numpy.py", "--trials", 5, "--fraction", options.fraction]
             seconds.append(measure([*command, "--batch", batch, "--seed", number, "--json"])["paper_seconds"])
         numpy = ", ".join(f"{seconds[-1]:.1f} s ({batch})" for batch, seconds in theirs.items())
         tell(f"paper, round {number + 1} of {options.rounds}: flotilla {ours[-1]:.2f} s, NumPy {numpy}")
-    print("\n| the complete paper | seconds | flotilla is × |\n|---|---|---|")
-    print(f"| flotilla paper, start-up and pictures included | {statistics.median(ours):.2f} | |")
+    print("\n| the paper's 18 experiments | seconds | flotilla is × |\n|---|---|---|")
+    print(f"| flotilla sweep for each layout, start-up and pictures included | {statistics.median(ours):.2f} | |")
     for batch, seconds in theirs.items():
         times = statistics.median(b / a for a, b in zip(ours, seconds))
         name = f"NumPy, {batches[batch]}, from {options.fraction:g} of the generations"

@@ -68,6 +68,8 @@ pub struct Panel {
     pub title: String,
     /// Each with its place in the legend, which gives it its look.
     pub curves: Vec<(usize, Curve)>,
+    /// Generations with which a stage begins, from the second stage on.
+    pub stages: Vec<usize>,
 }
 
 /// Panels side by side that share a legend and the y axis.
@@ -133,6 +135,7 @@ impl Figure {
             let axes = Axes { left, above, width, height, x_max, y_max: self.y_max * 1.04 };
             scene.bold([left + width / 2.0, above - 1.3], &*panel.title, NORMAL, Anchor::Middle, BLACK);
             axes.draw(&mut scene, column == 0, self.y_max, self.shares);
+            axes.stages(&mut scene, &panel.stages);
             if column == 0 {
                 let label = match each {
                     1 => "Generation".to_string(),
@@ -192,6 +195,8 @@ impl Figure {
             let courses: Vec<_> = panel.curves.iter().filter_map(course).collect();
             let title = if panel.title.is_empty() { String::new() } else { format!("{}: ", panel.title) };
             text += &format!(" {title}{}.", courses.join("; "));
+            let stages = panel.stages.iter().enumerate();
+            text.extend(stages.map(|(index, from)| format!(" Stage {} begins at generation {from}.", index + 1)));
         }
         if let Some(caption) = band_caption(self.panels.iter().flat_map(|panel| &panel.curves).map(|(_, curve)| curve))
         {
@@ -274,6 +279,19 @@ impl Axes {
             scene.text([x.min(inside), below + 3.5], label, SMALL, Anchor::Middle, BLACK);
         }
         scene.line(vec![[left, above], [left, below], [right, below]], Pen::new(BLACK, 0.2));
+    }
+
+    /// A line where each stage begins, with its number where there is room.
+    fn stages(&self, scene: &mut Scene, stages: &[usize]) {
+        for (index, &from) in stages.iter().enumerate() {
+            let [x, below] = self.at(from as f64, 0.0);
+            scene.line(vec![[x, self.above], [x, below]], Pen { dash: &[0.5, 0.5], ..Pen::new(GREY, 0.2) });
+            let label = format!("stage {}", index + 1);
+            let end = stages.get(index + 1).map_or(self.left + self.width, |&next| self.at(next as f64, 0.0)[0]);
+            if x + 0.8 + text_width(&label, SMALL) < end {
+                scene.text([x + 0.8, below - 1.0], label, SMALL, Anchor::Start, GREY);
+            }
+        }
     }
 
     /// The standard error to both sides of the mean.

@@ -200,8 +200,16 @@ pub fn figure(folders: &[PathBuf]) -> Result<Figure, ReadError> {
         all => labels(folders, &configs).into_iter().zip(all.iter().map(|courses| curve(&courses.best))).unzip(),
     };
     let what = if all.len() == 1 { "" } else { " by the best team" };
+    // Where runs have stages from different generations on, no line is all of theirs.
+    let begun = |config: &Config| {
+        let froms = config.stages.iter().map(|stage| stage.from);
+        froms.filter(|from| (1..=config.learning.generations).contains(from)).collect()
+    };
+    let mut staged: Vec<Vec<usize>> = configs.iter().map(begun).filter(|stages: &Vec<_>| !stages.is_empty()).collect();
+    staged.dedup();
+    let stages = if staged.len() == 1 { staged.remove(0) } else { vec![] };
     Ok(Figure {
-        panels: vec![Panel { title: String::new(), curves: curves.into_iter().enumerate().collect() }],
+        panels: vec![Panel { title: String::new(), curves: curves.into_iter().enumerate().collect(), stages }],
         legend,
         references: vec![],
         y_label: if same { format!("POIs observed{what}") } else { format!("Share of POIs observed{what}") },

@@ -248,6 +248,7 @@ pub fn figure(results: Evidence<'_>, layout: usize) -> Figure {
             .map(|course| course.curve())
             .enumerate()
             .collect(),
+        stages: vec![],
     };
     let pois = |paradigm| results.course(layout, paradigm, evolved[0]).map_or(1.0, |course| course.pois as f64);
     Figure {
