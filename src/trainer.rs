@@ -172,8 +172,10 @@ impl Trainer {
     /// Makes the generation that an arm plays next its last, or leaves it at an earlier one; gives the last. What comes
     /// out is what a config of so many generations comes to.
     pub fn end(&mut self, arm: usize) -> usize {
-        let Arm { config, generation, .. } = &mut self.arms[arm];
+        let Arm { config, generation, next, .. } = &mut self.arms[arm];
         config.learning.generations = config.learning.generations.min(*generation);
+        // They may be of a stage that no longer comes.
+        next.clear();
         config.learning.generations
     }
 

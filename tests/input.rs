@@ -184,9 +184,12 @@ fn a_pipe_that_nobody_reads_from_is_waited_for_and_that_is_told() {
     let place = with_run();
     assert!(Command::new("mkfifo").arg(place.path("pipe")).status().unwrap().success());
     let rollout = "flotilla rollout small.toml --policies run/policies.safetensors --quiet --scores";
-    for (reader, told) in [("cat pipe", ""), ("sleep 4; cat pipe", "waiting for somebody to read from pipe\n")] {
-        let output = place.shell(&format!("({reader}) > read.csv & {rollout} pipe && wait && {rollout} scores.csv"));
-        assert_eq!(String::from_utf8(output.stderr).unwrap(), told);
+    let patient = "for _ in $(seq 600); do grep -q waiting told && break; sleep 0.1; done; cat pipe";
+    for (reader, told) in [("cat pipe", ""), (patient, "waiting for somebody to read from pipe\n")] {
+        place.write("told", "");
+        let output =
+            place.shell(&format!("({reader}) > read.csv & {rollout} pipe 2> told && wait && {rollout} scores.csv"));
+        assert_eq!(place.read("told"), told);
         assert!(output.status.success() && place.read("read.csv") == place.read("scores.csv"));
     }
 }

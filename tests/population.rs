@@ -246,6 +246,30 @@ fn stages_and_ends_count_wherever_populations_are() {
     }
 }
 
+/// Likewise where a trainer that has drawn ahead goes back, and ends before the stage that it drew for.
+#[test]
+fn what_was_drawn_for_a_stage_that_no_longer_comes_is_forgotten() {
+    let mut config = support::layout("generally_forward");
+    (config.learning.trials, config.learning.generations, config.learning.population) = (2, 7, 15);
+    config.world.coupling = Coupling::Same(1);
+    let text = config.to_toml() + "[[stages]]\nfrom = 3\nset = { learning.start_jitter = 3.0 }\n";
+    let config = Config::parse(&text, "staged.toml").unwrap();
+    let story = |backend: &mut dyn Backend| {
+        let mut trainer = Trainer::new(vec![config.clone()]);
+        while trainer.generation(0) < 2 {
+            trainer.advance(backend).unwrap();
+        }
+        let before = trainer.snapshot(0).unwrap();
+        trainer.advance(backend).unwrap();
+        assert!(trainer.restore(0, before));
+        assert_eq!(trainer.end(0), 2);
+        (trainer.finish(backend).unwrap(), trainer.policies(0))
+    };
+    let expected = story(&mut Cpu::default());
+    assert!(expected.0.iter().all(|row| row.champion_g > 0.0), "what champions start from does not show");
+    assert_eq!(story(&mut Device::failing_at(0, false)), expected);
+}
+
 /// An error that was made up for is told, once, by whoever asks.
 #[test]
 fn a_setback_is_told() {

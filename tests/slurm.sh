@@ -161,11 +161,12 @@ wait_for "$job" 120
 compare "$work/small.toml" "$work/plain" "$work/whole"
 say "same bytes as unsharded"
 
-# As many generations as keep one thread busy for about 120 s here: longer than the limit, whatever the machine, and
-# also if it is lent twice as much of the processor from now on.
-begin=$(date +%s%N)
-"$flotilla" sweep "$work/long.toml" --out "$work/probe" --backend cpu --threads 1 --generations 60 --quiet > /dev/null
-generations=$((120 * 1000000000 * 61 / ($(date +%s%N) - begin)))
+# As many generations as take one thread about 120 s of the processor here: longer than the limit, whatever the machine, and
+# whatever else it does meanwhile.
+TIMEFORMAT=%U
+seconds=$({ time "$flotilla" sweep "$work/long.toml" --out "$work/probe" --backend cpu --threads 1 --generations 60 --quiet \
+    > /dev/null 2>&1; } 2>&1)
+generations=$(awk -v seconds="$seconds" 'BEGIN { print int(120 * 61 / seconds) }')
 say "a task of $generations generations with a time limit of a minute"
 flags=(--generations "$generations")
 "$flotilla" sweep "$work/long.toml" --out "$work/limited" --backend cpu --threads 1 --time 00:01:00 \

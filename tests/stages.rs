@@ -317,6 +317,17 @@ fn stages_are_seen_by_every_command() {
     let curves = fs::read_to_string(folder.join("curves.svg")).unwrap();
     let told = "Stage 1 begins at generation 2. Stage 2 begins at generation 4.";
     assert!(curves.contains(told), "{curves}");
+    // Of a run that stopped before its last stage, those that it came to; of several runs, what is all of theirs.
+    let rows = fs::read_to_string(folder.join("run/metrics.csv")).unwrap();
+    let short: String = rows.split_inclusive('\n').take(1 + 3 * 3).collect();
+    good("train small.toml --out plain");
+    good("plot run plain --out both.svg");
+    assert!(!fs::read_to_string(folder.join("both.svg")).unwrap().contains("begins at"));
+    fs::write(folder.join("run/metrics.csv"), short).unwrap();
+    good("plot run --out short.svg");
+    let curves = fs::read_to_string(folder.join("short.svg")).unwrap();
+    assert!(curves.contains("Stage 1 begins") && !curves.contains("Stage 2 begins"), "{curves}");
+    fs::write(folder.join("run/metrics.csv"), rows).unwrap();
     good("rollout staged.toml --policies run/policies.safetensors");
     assert!(good("rollout staged.toml --policies run/policies.safetensors --stage 2").contains("of 3"));
     let (code, _, told) = run(&folder, "rollout staged.toml --policies run/policies.safetensors --stage 3");

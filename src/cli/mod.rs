@@ -207,7 +207,7 @@ pub enum Error {
     #[error("{}{}", .0, remedy::device(.0))]
     Device(#[from] DeviceError),
     /// There is no GPU to compare with the CPU.
-    #[error("{0}; --report FILE compares the instruction sets of the processor alone")]
+    #[error("{0}; --report FILE without --adapter compares the instruction sets of the processor alone")]
     NoneToVerify(DeviceError),
     /// Files of runs that could not be written, read or used.
     #[error("{}{}", .0, remedy::record(.0, "run it again"))]

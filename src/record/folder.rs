@@ -464,7 +464,13 @@ pub(crate) fn check<'a>(folders: impl IntoIterator<Item = &'a Path>, start: Star
     for path in folders {
         match start {
             Start::Fresh if holds_run(path)? => return Err(RecordError::Exists { path: path.into() }),
-            Start::Force if path.is_dir() => drop(lock(path)?),
+            // Where there is no lock, nobody has one.
+            Start::Force if path.join(LOCK).exists() => {
+                // Closing the file is not enough where a process being started has a copy of it for a moment.
+                if let Some(lock) = lock(path)? {
+                    let _ = lock.unlock();
+                }
+            }
             _ => {}
         }
     }
@@ -473,7 +479,7 @@ pub(crate) fn check<'a>(folders: impl IntoIterator<Item = &'a Path>, start: Star
 
 impl Drop for Folder {
     fn drop(&mut self) {
-        // Closing the file is not enough where a process being started has a copy of it for a moment.
+        // As in `check`.
         if let Some(lock) = &self.lock {
             let _ = lock.unlock();
         }

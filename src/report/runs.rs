@@ -200,12 +200,13 @@ pub fn figure(folders: &[PathBuf]) -> Result<Figure, ReadError> {
         all => labels(folders, &configs).into_iter().zip(all.iter().map(|courses| curve(&courses.best))).unzip(),
     };
     let what = if all.len() == 1 { "" } else { " by the best team" };
-    // Where runs have stages from different generations on, no line is all of theirs.
+    // A run may not have come to all of its stages. Where runs have different ones, no line is all of theirs.
+    let last = curves.iter().filter_map(|curve| curve.generation.last()).fold(0.0_f64, |most, &last| most.max(last));
     let begun = |config: &Config| {
         let froms = config.stages.iter().map(|stage| stage.from);
-        froms.filter(|from| (1..=config.learning.generations).contains(from)).collect()
+        froms.filter(|from| (1..=last as usize).contains(from)).collect()
     };
-    let mut staged: Vec<Vec<usize>> = configs.iter().map(begun).filter(|stages: &Vec<_>| !stages.is_empty()).collect();
+    let mut staged: Vec<Vec<usize>> = configs.iter().map(begun).collect();
     staged.dedup();
     let stages = if staged.len() == 1 { staged.remove(0) } else { vec![] };
     Ok(Figure {
