@@ -135,8 +135,8 @@ struct Lineage {
 
 /// Who plays with whom in one generation of a trial, and from where; drawn by counters alone, whatever came out before.
 struct Lineup {
-    /// Whose; none before the first is drawn.
-    generation: Option<usize>,
+    /// The generation and its stage, which is another where a run ends before it begins; none before the first is drawn.
+    of: Option<[usize; 2]>,
     /// Policies of each team, `[populations][policies]`, and as the backend wants them, `[policies + 1][leaders]`.
     orders: Vec<u32>,
     teams: Vec<u32>,
@@ -172,10 +172,8 @@ impl Trainer {
     /// Makes the generation that an arm plays next its last, or leaves it at an earlier one; gives the last. What comes
     /// out is what a config of so many generations comes to.
     pub fn end(&mut self, arm: usize) -> usize {
-        let Arm { config, generation, next, .. } = &mut self.arms[arm];
+        let Arm { config, generation, .. } = &mut self.arms[arm];
         config.learning.generations = config.learning.generations.min(*generation);
-        // They may be of a stage that no longer comes.
-        next.clear();
         config.learning.generations
     }
 
@@ -657,7 +655,7 @@ impl Arm {
     /// Takes on the stage and the line-ups of the generation that is about to play.
     fn prepare(&mut self, level: Level) {
         self.enter();
-        if self.next.first().is_some_and(|next| next.generation == Some(self.age)) {
+        if self.next.first().is_some_and(|next| next.of == Some([self.age, self.stage])) {
             std::mem::swap(&mut self.lineups, &mut self.next);
         }
         let mut lineups = std::mem::take(&mut self.lineups);
@@ -679,10 +677,9 @@ impl Arm {
     fn draw(&self, level: Level, generation: usize, lineups: &mut [Lineup]) {
         let (stage, leaving) = self.stages_of(generation);
         let (_, config, world) = &self.stages[stage];
-        let missing = lineups.par_iter_mut().zip(&self.trials);
-        let missing = missing.filter(|(lineup, _)| lineup.generation != Some(generation));
-        missing.for_each(|(lineup, trial)| {
-            lineup.generation = Some(generation);
+        let of = Some([generation, stage]);
+        lineups.par_iter_mut().zip(&self.trials).filter(|(lineup, _)| lineup.of != of).for_each(|(lineup, trial)| {
+            lineup.of = of;
             lineup.form(level, &config.learning, trial.index, generation);
             let places = |config: &Config, world: &World, episodes: &mut Vec<Vec<Vec2>>| {
                 episodes.resize(config.learning.episodes_per_team, vec![]);
@@ -813,7 +810,7 @@ impl Lineup {
     /// Nobody's yet.
     fn new(population: usize, populations: usize, leaders: usize) -> Lineup {
         Lineup {
-            generation: None,
+            of: None,
             orders: vec![0; populations * population],
             // The champion's team, the last, is made of every population's last slot.
             teams: evolve::one_policy_a_team(population + 1, leaders),

@@ -213,17 +213,22 @@ fn arms_of_different_ages_train_side_by_side() {
     }
 }
 
+/// A short training of a task so easy that champions observe POIs, with stages.
+fn staged(stages: &str) -> Config {
+    let mut config = support::layout("generally_forward");
+    (config.learning.trials, config.learning.generations, config.learning.population) = (2, 7, 15);
+    config.world.coupling = Coupling::Same(1);
+    Config::parse(&(config.to_toml() + stages), "staged.toml").unwrap()
+}
+
 /// Where a device holds populations the next generation's teams and starts are drawn while one plays: a stage that
 /// begins then counts, and so does an end that nobody knew of.
 #[test]
 fn stages_and_ends_count_wherever_populations_are() {
-    let mut config = support::layout("generally_forward");
-    (config.learning.trials, config.learning.generations, config.learning.population) = (2, 7, 15);
-    config.world.coupling = Coupling::Same(1);
-    let text = config.to_toml()
-        + "[[stages]]\nfrom = 2\nset = { learning.start_jitter = 3.0, learning.episodes_per_team = 2 }\n"
-        + "[[stages]]\nfrom = 5\nset = { world.coupling = 2, learning.poi_jitter = 2.0 }\n";
-    let config = Config::parse(&text, "staged.toml").unwrap();
+    let config = staged(
+        "[[stages]]\nfrom = 2\nset = { learning.start_jitter = 3.0, learning.episodes_per_team = 2 }\n\
+         [[stages]]\nfrom = 5\nset = { world.coupling = 2, learning.poi_jitter = 2.0 }\n",
+    );
     let story = |backend: &mut dyn Backend, end: usize| {
         let (mut trainer, mut rows) = (Trainer::new(vec![config.clone()]), Vec::new());
         while !trainer.is_done() {
@@ -249,11 +254,7 @@ fn stages_and_ends_count_wherever_populations_are() {
 /// Likewise where a trainer that has drawn ahead goes back, and ends before the stage that it drew for.
 #[test]
 fn what_was_drawn_for_a_stage_that_no_longer_comes_is_forgotten() {
-    let mut config = support::layout("generally_forward");
-    (config.learning.trials, config.learning.generations, config.learning.population) = (2, 7, 15);
-    config.world.coupling = Coupling::Same(1);
-    let text = config.to_toml() + "[[stages]]\nfrom = 3\nset = { learning.start_jitter = 3.0 }\n";
-    let config = Config::parse(&text, "staged.toml").unwrap();
+    let config = staged("[[stages]]\nfrom = 3\nset = { learning.start_jitter = 3.0 }\n");
     let story = |backend: &mut dyn Backend| {
         let mut trainer = Trainer::new(vec![config.clone()]);
         while trainer.generation(0) < 2 {
