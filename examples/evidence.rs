@@ -33,15 +33,15 @@ const HEAD: &str = "\
 
 <!-- made of the files in docs/evidence by: cargo run --example evidence -->
 
-Config and seed decide every bit of a run, on every machine. That is a claim about compilers, drivers and processors that
+Config and seed are to decide every bit of a run, on every machine. That is a claim about compilers, drivers and processors that
 nobody can try all of, so here is what was tried, each row by a program that wrote down what it found. A row holds for the
 machine, the driver *and* the toolchain that it names.
 
-- *executed*: it ran there, and its bits were compared;
-- *machine code read*: the driver's own compiler made code for a device that was not there, and a test read that code;
+- *executed*: it ran there, or under the emulator that the row names, and its bits were compared;
+- *machine code read*: a compiler for a device that was not there, its driver's own or its maker's, made code, and a test read it;
 - *compiled*: it compiles for there; nothing ran.
 
-What no row shows is argued [below](#what-it-relies-on). A GPU that is in no row has to pass `flotilla`'s own probes each time
+What no row shows is argued [below](#what-it-relies-on). Every GPU, in a row or not, has to pass `flotilla`'s own probes each time
 that it is opened, or it is refused.
 
 ## Add your machine
@@ -82,7 +82,7 @@ the `statrs` crate asks the platform for logarithms; and a process whose host ha
 On Metal the guarded pass alone is used. It hangs on no compile option: what stands between a product and the sum after it
 is an integer operation with a word that is read from a buffer, and no option lets a compiler guess that word. The other way
 would be `#pragma METAL fp contract(off)` at the head of the text, which on Apple's compilers has kept a product and a sum
-apart where no option did; naga has no place for it. Nobody has run flotilla on Metal or DirectX yet.
+apart where no option did; naga has no place for it. Nobody has run flotilla on a GPU of hardware, on Metal or on DirectX yet.
 ";
 
 /// The page, of all files of a folder.
