@@ -9,7 +9,7 @@ use crate::backend::{BackendError, Machine, Player};
 use crate::config::{self, Config};
 use crate::host::Instant;
 use crate::memory::{self, TooLittle};
-use crate::record::checkpoint::{Checkpoint, Keeper, Schedule};
+use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule};
 use crate::record::disk::Disk;
 use crate::record::folder::{self, Folder, METRICS, Note, POLICIES, Run, Start, Status, Story};
 use crate::record::metrics::{self, Extent};
@@ -307,15 +307,17 @@ impl Session {
     /// all. What each then comes to is what a run of so many generations comes to.
     ///
     /// # Errors
-    /// A config cannot be written.
+    /// A config or a checkpoint cannot be written.
     pub fn end(&mut self) -> Result<usize, RunError> {
         let mut last = 0;
         for member in &mut self.members {
-            if let Some(Going { arm, .. }) = member.going {
-                let last = self.trainer.end(arm);
-                member.config.learning.generations = last;
-                member.config.stages.retain(|stage| stage.from <= last);
-                member.folder.write_config(&member.config)?;
+            if let Some(Going { arm, keeper, .. }) = &mut member.going {
+                let shorter = checkpoint::of_length(&member.config, self.trainer.end(*arm));
+                if shorter != member.config {
+                    keeper.shorten(&shorter)?;
+                    member.folder.write_config(&shorter)?;
+                    member.config = shorter;
+                }
             }
             last = last.max(member.config.learning.generations);
         }
@@ -437,20 +439,11 @@ impl Member {
         start: Start,
         disk: &Disk,
     ) -> Result<(Member, Origin, Vec<Note>), RunError> {
-        let (folder, found) = Folder::open(&path, start, &config, disk.clone())?;
-        let checkpoint = found.checkpoint.as_ref().map(|(checkpoint, _)| checkpoint);
-        let begun = checkpoint.is_some() || found.run.is_some();
+        let given = init.as_ref().map(|init| init.digest.clone());
+        let (folder, found) = Folder::open(&path, start, &config, given.as_deref(), disk.clone())?;
         let mut run = found.run.unwrap_or_else(|| Run::new(&config));
-        let there = checkpoint.map_or(&run.init, |checkpoint| &checkpoint.init).clone();
-        let whole = checkpoint.is_some() || found.finished.is_some();
-        match (&init, there) {
-            (Some(Init { digest, .. }), there) if begun && there.as_ref() != Some(digest) => {
-                return Err(RecordError::InitDiffers { path, there, here: digest.clone() }.into());
-            }
-            (None, Some(there)) if !whole => return Err(RecordError::InitNeeded { path, there }.into()),
-            (Some(Init { digest, .. }), _) => run.init = Some(digest.clone()),
-            (None, there) => run.init = there,
-        }
+        let there = found.checkpoint.as_ref().map_or(&run.init, |(checkpoint, _)| &checkpoint.init).clone();
+        run.init = given.or(there);
         let member = Member { config, going: None, folder, run, results: None, before: 0.0 };
         if let Some((story, digest)) = found.finished.zip(member.run.digest.clone()) {
             return Ok((Member { results: Some(Results { story, digest }), ..member }, Origin::Chance, found.notes));
@@ -586,7 +579,7 @@ impl Twin {
     fn record(self, start: Start, disk: &Disk) -> Result<(), RunError> {
         let Twin { of, of_config, folder, config } = self;
         let run = Run::read(&of.join(folder::RUN))?;
-        let (folder, found) = Folder::open(&folder, start, &config, disk.clone())?;
+        let (folder, found) = Folder::open(&folder, start, &config, None, disk.clone())?;
         let there = found.run.filter(|_| found.finished.is_some());
         if there.is_some_and(|there| there.digest == run.digest) {
             return Ok(());

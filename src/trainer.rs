@@ -430,7 +430,11 @@ const EPISODE: u64 = 40;
 
 /// Bytes that the trials of a (valid) config take, whoever plays their episodes: in the stage that takes most.
 pub fn bytes(config: &Config) -> u64 {
-    config.staged().iter().map(|(_, config)| bytes_of_stage(config)).max().unwrap_or(0)
+    most_of_stages(config, bytes_of_stage) + farewell_bytes(config)
+}
+
+fn most_of_stages(config: &Config, bytes: fn(&Config) -> u64) -> u64 {
+    config.staged().iter().map(|(_, config)| bytes(config)).max().unwrap_or(0)
 }
 
 fn bytes_of_stage(config: &Config) -> u64 {
@@ -444,15 +448,23 @@ fn bytes_of_stage(config: &Config) -> u64 {
 
 /// Bytes of the next generation's line-ups, drawn beside those that play where a backend holds the populations.
 pub fn next_bytes(config: &Config) -> u64 {
-    config.staged().iter().map(|(_, config)| lineup_bytes(config)).max().unwrap_or(0)
+    most_of_stages(config, lineup_bytes) + farewell_bytes(config)
+}
+
+/// Bytes of where a stage's last champions start, beside where the next stage's teams do.
+fn farewell_bytes(config: &Config) -> u64 {
+    if config.stages.is_empty() { 0 } else { most_of_stages(config, start_bytes) }
 }
 
 fn lineup_bytes(config: &Config) -> u64 {
     let ([trials, populations, policies, _], leaders) = (sizes(config), config.learners() as u64);
+    4 * trials * (populations * policies + leaders * (policies + 1)) + start_bytes(config)
+}
+
+fn start_bytes(config: &Config) -> u64 {
     let agents = (config.world.leaders.len() + config.world.followers.len()) as u64;
     let moved = if config.learning.poi_jitter > 0.0 { config.world.pois.len() as u64 } else { 0 };
-    let starts = config.learning.episodes_per_team as u64 * 2 * (agents + moved);
-    4 * trials * (populations * policies + leaders * (policies + 1) + starts)
+    4 * config.learning.trials as u64 * config.learning.episodes_per_team as u64 * 2 * (agents + moved)
 }
 
 /// Bytes of the numbers of a [`Snapshot`] of a (valid) config's arm.

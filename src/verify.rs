@@ -120,8 +120,8 @@ pub fn compare(
     let mut outcome = Agreement::default();
     let mut all = Vec::with_capacity(plan.worlds.len());
     for (name, config) in &plan.worlds {
-        // Stages train below; a stage's own world is that of its config.
-        let teams = Teams::new(config, plan.teams, plan.seed, outcome.worlds % 2 == 0);
+        // Stages train below; here plays the world of the first.
+        let teams = Teams::new(&config.at(0), plan.teams, plan.seed, outcome.worlds % 2 == 0);
         if let Some(mismatch) = compare_stages(&teams, reference, backend)? {
             outcome.mismatch = Some(format!("{name}: {mismatch}"));
             return Ok(outcome);

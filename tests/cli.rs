@@ -366,6 +366,7 @@ fn wrong_usage_is_exit_code_2() {
         ("replay run --fps 1.5", "a whole number from 1 to 50"),
         ("rollout x.toml --policies p --episodes 0", "a whole number from 1 to 1000000"),
         ("rollout x.toml --policies p --episodes 2 --start-jitter far", "a number"),
+        ("rollout x.toml --policies p --episodes 2 --poi-jitter far", "a number"),
         ("train x.toml --trials far", "a number"),
     ] {
         let output = flotilla(&line.split(' ').collect::<Vec<_>>());

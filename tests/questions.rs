@@ -76,6 +76,11 @@ fn few_trials_of_every_question_come_to_a_page() {
     let (code, _, told) = run(folder, &format!("{short} --quiet --resume --seed 4"));
     assert!(code == Some(1) && told.contains("holds another sweep"), "{told}");
 
+    // What cannot be had is told before any part is trained.
+    good(folder, "--questions=b --trials 2 --generations 2 --out mixed --quiet");
+    let (code, _, told) = run(folder, "--questions=d,b --trials 2 --generations 2 --out mixed --quiet");
+    assert!(code == Some(1) && told.contains("--resume") && !folder.join("mixed/observers/points").exists(), "{told}");
+
     // Curricula take their stages.
     let (code, _, told) = run(folder, "--questions=e --trials 2 --generations 2 --out e");
     assert!(code == Some(1) && told.contains("stages[1].from: found 20"), "{told}");

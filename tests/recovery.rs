@@ -545,12 +545,12 @@ fn a_changed_config_is_refused_by_the_names_of_its_keys() {
 fn a_folder_is_one_process_at_a_time_and_one_run() {
     let config = small();
     let (_folder, path, _) = stopped_run(&config);
-    let refused = |start| match Folder::open(&path, start, &config, Disk::default()) {
+    let refused = |start| match Folder::open(&path, start, &config, None, Disk::default()) {
         Err(error) => error,
         Ok(_) => panic!("opened"),
     };
     assert!(matches!(refused(Start::Fresh), RecordError::Exists { .. }));
-    let held = Folder::open(&path, Start::Resume, &config, Disk::default()).unwrap();
+    let held = Folder::open(&path, Start::Resume, &config, None, Disk::default()).unwrap();
     assert!(matches!(refused(Start::Resume), RecordError::Locked { .. }));
     assert!(matches!(refused(Start::Force), RecordError::Locked { .. }));
     drop(held);
@@ -876,7 +876,7 @@ fn where_one_of_several_runs_cannot_start_none_is_touched() {
         let runs = [&free, &taken].map(|path| (small(), path.clone()));
         Session::open(runs.into(), start, &Disk::default()).err().expect("one is taken").to_string()
     };
-    let held = Folder::open(&taken, Start::Fresh, &small(), Disk::default()).unwrap();
+    let held = Folder::open(&taken, Start::Fresh, &small(), None, Disk::default()).unwrap();
     assert!(open(Start::Fresh).contains("holds a run already") && !free.exists());
     fs::create_dir(&free).unwrap();
     fs::write(free.join(METRICS), "of a run").unwrap();

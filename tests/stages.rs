@@ -15,8 +15,10 @@ use flotilla::config::{Config, Sharing};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{Folder, METRICS, POLICIES, RUN, Run, Start};
 use flotilla::record::policies::{self, Init, read_init};
+use flotilla::report::replay::replay;
 use flotilla::run::{Ended, Options, Results, RunError, Session};
 use flotilla::trainer::Trainer;
+use flotilla::verify;
 use support::SMALL;
 use tempfile::TempDir;
 
@@ -124,6 +126,44 @@ fn train(
     Ok((ended == Ended::Done).then(|| session.results(0).cloned().unwrap()))
 }
 
+/// Trains until a generation has been played and makes the next one the last; then to that end, if so asked. Gives the last.
+fn train_shorter(config: &Config, path: &Path, init: Option<Init>, until: usize, finish: bool) -> usize {
+    let runs = vec![(config.clone(), path.to_path_buf(), init)];
+    let (mut session, _) = Session::open_from(runs, Start::Fresh, &Disk::default()).unwrap();
+    let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
+    let mut options = Options {
+        command: "",
+        stop: &stop,
+        save: &save,
+        instead: &mut |_| None,
+        setback: &mut |_| {},
+        watch: &mut |progress| stop.store(progress.generations[0] == until, Relaxed),
+    };
+    let mut player: Player = (Box::new(Cpu::default()), Machine::default());
+    assert!(session.train(&mut player, &mut options).unwrap() == Ended::Stopped);
+    let last = session.end().unwrap();
+    stop.store(false, Relaxed);
+    if finish {
+        assert!(session.train(&mut player, &mut options).unwrap() == Ended::Done);
+    }
+    last
+}
+
+/// Every file of a folder but its lock, with its bytes.
+fn everything(path: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut all = Vec::new();
+    for entry in fs::read_dir(path).unwrap() {
+        let path = entry.unwrap().path();
+        match path.is_dir() {
+            true => all.extend(everything(&path)),
+            false if path.extension().is_some_and(|extension| extension == "lock") => {}
+            false => all.push((path.clone(), fs::read(&path).unwrap())),
+        }
+    }
+    all.sort();
+    all
+}
+
 /// The metrics, the seconds left out.
 fn rows(path: &Path) -> Vec<Vec<String>> {
     let text = fs::read_to_string(path.join(METRICS)).unwrap();
@@ -187,6 +227,8 @@ fn a_run_goes_on_from_the_policies_that_it_started_from() {
     let (config, first) = (config(SMALL), place.path().join("first"));
     train(&config, &first, None, Start::Fresh, 99).unwrap();
     let file = first.join(POLICIES);
+    let mut longer = config.clone();
+    longer.learning.generations += 2;
     let init = || Some(read_init(&file, &config).unwrap());
     let digest = init().unwrap().digest;
     // As generation 0, in the file's order.
@@ -233,17 +275,84 @@ fn a_run_goes_on_from_the_policies_that_it_started_from() {
     }
     // Not from another file, nor where there is nothing yet to go on from, nor a run that started otherwise.
     let other = read_init(&whole.join(POLICIES), &config).unwrap();
-    let error = train(&config, &whole, Some(other), Start::Resume, 99).unwrap_err().to_string();
-    assert!(error.contains("started from a file of policies with SHA-256") && !error.contains('\n'), "{error}");
-    let error = train(&config, &first, init(), Start::Resume, 99).unwrap_err().to_string();
-    assert!(error.contains("did not start from a file"), "{error}");
+    for config in [&config, &longer] {
+        let before = [&whole, &first].map(|path| everything(path));
+        let error = train(config, &whole, Some(other.clone()), Start::Resume, 99).unwrap_err().to_string();
+        assert!(error.contains("started from a file of policies with SHA-256") && !error.contains('\n'), "{error}");
+        let error = train(config, &first, init(), Start::Resume, 99).unwrap_err().to_string();
+        assert!(error.contains("did not start from a file"), "{error}");
+        assert!(before == [&whole, &first].map(|path| everything(path)), "what was refused was changed");
+    }
     let bare = place.path().join("bare");
-    let (folder, _) = Folder::open(&bare, Start::Fresh, &config, Disk::default()).unwrap();
+    let (folder, _) = Folder::open(&bare, Start::Fresh, &config, None, Disk::default()).unwrap();
     folder.write_run(&Run { init: Some(digest), ..Run::new(&config) }).unwrap();
     drop(folder);
     let error = train(&config, &bare, None, Start::Resume, 99).unwrap_err().to_string();
     assert!(error.contains("has no checkpoint yet"), "{error}");
     assert_eq!(train(&config, &bare, init(), Start::Resume, 99).unwrap().as_ref(), Some(&expected));
+}
+
+/// A run that was made to end early is a run of so many generations: it is gone on with, extended and replayed as one.
+#[test]
+fn a_run_that_ended_early_is_whole() {
+    let place = tempfile::tempdir().unwrap();
+    let first = place.path().join("first");
+    train(&config(SMALL), &first, None, Start::Fresh, 99).unwrap();
+    let init = Some(read_init(&first.join(POLICIES), &config(SMALL)).unwrap());
+    // No stage comes, one does, or there are none; from given policies, or not.
+    let late = "[[stages]]\nfrom = 6\nset = { 'world.coupling' = 3 }\n";
+    let cases = [(late, None), (late, init.clone()), (STAGES, init.clone()), ("", init)];
+    for (number, (stages, init)) in cases.into_iter().enumerate() {
+        let config = config(&[SMALL, stages].concat());
+        let [whole, done, killed] =
+            ["whole", "done", "killed"].map(|name| place.path().join(format!("{number}-{name}")));
+        let last = train_shorter(&config, &done, init.clone(), 3, true);
+        assert_eq!(last, 3);
+        let mut shorter = Config {
+            stages: config.stages.iter().filter(|stage| stage.from <= 3).cloned().collect(),
+            ..config.clone()
+        };
+        shorter.learning.generations = 3;
+        assert_eq!(Config::load(&done.join("config.toml")).unwrap(), shorter);
+        let expected = train(&shorter, &whole, init.clone(), Start::Fresh, 99).unwrap();
+        assert_eq!(train(&shorter, &done, None, Start::Resume, 99).unwrap(), expected, "{number}");
+        let mut backend = Cpu::default();
+        let replayed = replay(&done, 0, &[1, 3], &mut backend, &mut |_| true);
+        assert_eq!(replayed.unwrap_or_else(|error| panic!("{number}: {error}")).len(), 2);
+        // Killed before it could finish.
+        train_shorter(&config, &killed, init.clone(), 3, false);
+        let (session, notes) =
+            Session::open(vec![(shorter.clone(), killed.clone())], Start::Resume, &Disk::default()).unwrap();
+        assert!(notes.iter().all(|(_, note)| !note.is_damage()), "{number}: {notes:?}");
+        drop(session);
+        assert_eq!(train(&shorter, &killed, None, Start::Resume, 99).unwrap(), expected, "{number}");
+        // It is extended as any other.
+        let mut longer = shorter.clone();
+        longer.learning.generations = 5;
+        let expected =
+            train(&longer, &place.path().join(format!("{number}-longer")), init.clone(), Start::Fresh, 99).unwrap();
+        for path in [&done, &killed] {
+            let extended = train(&longer, path, None, Start::Resume, 99).unwrap();
+            assert_eq!(extended.map(|results| results.digest), expected.as_ref().map(|results| results.digest.clone()));
+        }
+    }
+    // Without what it started from there is nothing to replay.
+    let done = place.path().join("3-done");
+    fs::remove_dir_all(done.join("checkpoints")).unwrap();
+    let error = replay(&done, 0, &[2], &mut Cpu::default(), &mut |_| true).err().unwrap().to_string();
+    assert!(error.contains("started from given policies"), "{error}");
+}
+
+/// `verify` plays the world of the first stage, also where that begins at once.
+#[test]
+fn a_stage_from_the_start_on_is_verified() {
+    let config = config(&format!("{SMALL}[[stages]]\nfrom = 0\nset = {{ 'world.steps' = 17 }}\n"));
+    let worlds = vec![("at once".to_string(), config.clone())];
+    let plan = verify::Plan { worlds, teams: 3, seed: 0, generations: 1 };
+    let found = verify::compare(&plan, &mut Cpu::default(), &mut Cpu::default(), |_| {}).unwrap();
+    let agents = (config.world.leaders.len() + config.world.followers.len()) as u64;
+    assert!(found.mismatch.is_none() && config.world.steps != 17);
+    assert_eq!(found.agent_steps, 3 * 3 * agents * 17);
 }
 
 /// A folder with two configs and a run of the first.

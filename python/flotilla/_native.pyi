@@ -13,6 +13,7 @@ _F32 = NDArray[np.float32]
 _F64 = NDArray[np.float64]
 _Starts = tuple[int, int, float, float] | None
 
+Played = tuple[str, str, str | None]
 Outcome = tuple[Config, list[_F64], list[_F32], str]
 
 class Config:
@@ -86,17 +87,17 @@ def trace(
     config: Config, policies: _F32, starts: _Starts, episode: int, backend: str
 ) -> tuple[_F32, _F32, _F32, _F32, _F32, NDArray[np.uint32]]: ...
 def starts(config: Config, seed: int, jitter: float, first: int, count: int) -> _F32: ...
-def train(config: Config, backend: str, callback: Any) -> tuple[Outcome, tuple[str, str], list[float]]: ...
+def train(config: Config, backend: str, callback: Any) -> tuple[Outcome, Played, list[float]]: ...
 def train_into(
     config: Config, out: str, start: str, init: str | None, backend: str, command: str, callback: Any
 ) -> list[str]: ...
-def open(folder: str) -> tuple[Outcome, tuple[str, str]]: ...
+def open(folder: str) -> tuple[Outcome, Played]: ...
 def save(
     config: Config,
     metrics: list[_F64],
     policies: list[_F32],
     times: list[float],
-    played: tuple[str, str],
+    played: Played,
     folder: str,
     force: bool,
     command: str,

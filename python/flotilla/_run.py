@@ -46,7 +46,7 @@ class Run:
         ((2, 4), (4, 50, 112))
     """
 
-    def __init__(self, outcome: _native.Outcome, played: tuple[str, str], times: list[float] | None, folder: str | None):
+    def __init__(self, outcome: _native.Outcome, played: _native.Played, times: list[float] | None, folder: str | None):
         config, metrics, policies, digest = outcome
         self.config = Config._of(config)
         self.metrics: dict[str, NDArray[np.float64]] = dict(zip(METRICS, metrics))

@@ -138,11 +138,12 @@ fn outcomes(py: Python<'_>, trained: Trained, digest: String) -> PyResult<Outcom
     Ok((Config(config), metrics, policies, digest))
 }
 
-/// What plays, in words: "cpu" or "gpu", and its description.
-type Played = (String, String);
+/// What played, in words, "cpu" or "gpu" and its description; and the digest of the policies that it started from, if not at
+/// random.
+type Played = (String, String, Option<String>);
 
 fn named((backend, machine): &Player) -> Played {
-    (machine.backend.clone(), backend.describe())
+    (machine.backend.clone(), backend.describe(), None)
 }
 
 /// Trains in memory; also tells by what, and when each generation was complete.
@@ -236,8 +237,9 @@ pub fn train_into(
     if let Some(error) = watcher.error {
         return Err(error);
     }
-    workers::aside(py, || draw(&out))?;
-    Ok(notes)
+    // What was trained is whole without a picture of it.
+    let failed = workers::aside(py, || draw(&out)).err();
+    Ok(notes.into_iter().chain(failed.map(|error| error.to_string())).collect())
 }
 
 /// Draws a run's curves beside it, as the program does.
@@ -256,7 +258,7 @@ pub fn open(py: Python<'_>, folder: PathBuf) -> PyResult<(Outcomes<'_>, Played)>
         let digest = trained.digest();
         Ok::<_, PyErr>((trained, digest, run))
     })?;
-    Ok((outcomes(py, trained, digest)?, (run.backend, run.description)))
+    Ok((outcomes(py, trained, digest)?, (run.backend, run.description, run.init)))
 }
 
 /// Writes what a training in memory came to as the folder of a run; gives its digest.
@@ -291,7 +293,7 @@ pub fn save(
     workers::aside(py, || {
         let disk = Disk::default();
         let start = if force { Start::Force } else { Start::Fresh };
-        let (kept, _) = Folder::open(&folder, start, config, disk.clone()).raise()?;
+        let (kept, _) = Folder::open(&folder, start, config, None, disk.clone()).raise()?;
         let path = kept.file(METRICS);
         let write = || {
             let mut writer = metrics::Writer::create(&disk, &path, config)?;
@@ -308,7 +310,7 @@ pub fn save(
         write().map_err(|error| RecordError::Write { path: path.clone(), error }).raise()?;
         policies::write(&disk, &kept.file(POLICIES), config, &weights).raise()?;
         let (_, digest) = kept.digest(config, &weights).raise()?;
-        let (backend, description) = played;
+        let (backend, description, init) = played;
         let run = folder::Run {
             version: env!("CARGO_PKG_VERSION").into(),
             state: Status::Done,
@@ -322,6 +324,7 @@ pub fn save(
             digest: Some(digest.clone()),
             command: command.into(),
             commit: flotilla::COMMIT.map(String::from),
+            init,
             ..folder::Run::new(config)
         };
         kept.write_run(&run).raise()?;

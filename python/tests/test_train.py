@@ -103,6 +103,15 @@ def test_a_training_starts_from_what_another_came_to(config, program):
     # Its generation 0 is kept, so that it is gone on with and replayed without what it started from.
     assert train(second, out="warm", resume=True).digest == warm.digest
     assert [episode.generation for episode in warm.replay(compare=0).episodes] == [0, 6]
+    # A copy says what it started from, which it has not.
+    warm.save("copy")
+    assert Run.open("copy").digest == warm.digest
+    with pytest.raises(flotilla.Error, match="started from given policies"):
+        Run.open("copy").replay()
+    with pytest.raises(flotilla.Error, match="starts over from these alone"):
+        train(second.replace(learning={"generations": 9}), out="copy", resume=True)
+    stopped = train(second, out="stopped", init=first, callback=lambda generation: generation.generation == 2)
+    assert stopped.replay(compare=0).episodes[0].generation == 0
     with pytest.raises(ValueError, match="by out"):
         train(second, init=first)
     with pytest.raises(flotilla.Error, match="nowhere"):

@@ -28,6 +28,10 @@ pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), 
         if let Err(error) = fs::metadata(file::folder(path)) {
             return Err(RecordError::Write { path: path.into(), error }.into());
         }
+        if path.is_dir() {
+            let error = io::ErrorKind::IsADirectory.into();
+            return Err(RecordError::Write { path: path.into(), error }.into());
+        }
         let resolved = file::resolved(path);
         let refused =
             |why: &str| Err(Error::Usage(format!("{flag} {}: this file {why}; name another to write", path.display())));

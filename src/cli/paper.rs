@@ -127,7 +127,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     if start == Start::Force {
         // What is written over is gone before anything can stop this.
         for &arm in &twins {
-            Folder::open(&folders[arm], start, &arms[arm].config, disk.clone())?;
+            Folder::open(&folders[arm], start, &arms[arm].config, None, disk.clone())?;
         }
     }
     let learning = arms[0].config.learning.clone();

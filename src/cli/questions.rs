@@ -1,6 +1,6 @@
 //! `flotilla paper --questions`: what answers the questions that the paper leaves open.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering::Relaxed;
 
 use serde_json::json;
@@ -19,6 +19,7 @@ use crate::report::progress::Meter;
 use crate::report::scene::Format;
 use crate::run::{Ended, Options, RunError, Session};
 use crate::sweep::questions::{self, Answer, OpenQuestion, QUESTIONS, Study};
+use crate::sweep::results::point_folder;
 use crate::sweep::run::{self, Manner};
 use crate::sweep::{Sweep, shard};
 
@@ -51,10 +52,17 @@ pub fn run(args: &Args) -> Result<(), Error> {
         say(format_args!("training {points} experiments on {}, into {}", player.0.describe(), out.display()));
     }
 
+    let warm: Vec<_> = parts.iter().map(|(part, sweep)| part.warm(sweep, out)).collect();
+    // Nothing of one part is lost, and no time, to a folder of another that cannot be had.
+    let points = parts
+        .iter()
+        .flat_map(|(part, sweep)| sweep.points.iter().map(|point| point_folder(&out.join(part.name), point)));
+    let folders: Vec<PathBuf> = points.chain(warm.iter().flatten().map(|run| run.folder.clone())).collect();
+    folder::check(folders.iter().map(|path| &**path), start)?;
+
     let signals = Signals::listen()?;
     let mut meter = Meter::new(args.quiet);
     let stopped = || Error::Stopped(format!("with everything saved; go on with\n  {}", args.command_to_resume()));
-    let warm: Vec<_> = parts.iter().map(|(part, sweep)| part.warm(sweep, out)).collect();
     let cost = |sweep: &Sweep| sweep.points.iter().map(shard::cost).sum::<u128>() as f64;
     // What starts from others' policies plays as much again, each time.
     let times = |at: usize| 1.0 + warm[at].len() as f64 / parts[at].1.points.len() as f64;

@@ -64,7 +64,7 @@ pub struct Args {
     #[arg(long, value_name = "J", requires = "episodes", value_parser = real, help_heading = HELD_OUT)]
     start_jitter: Option<f64>,
     /// How far a POI is moved at most, on each axis [default: the config's learning.poi_jitter]
-    #[arg(long, value_name = "J", requires = "episodes", help_heading = HELD_OUT)]
+    #[arg(long, value_name = "J", requires = "episodes", value_parser = real, help_heading = HELD_OUT)]
     poi_jitter: Option<f64>,
 }
 

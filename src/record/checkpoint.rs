@@ -67,10 +67,11 @@ impl<N> Checkpoint<N> {
     }
 }
 
-/// The config of a run that is as long as this.
-fn of_length(config: &Config, last: usize) -> Config {
+/// The config of a run that is as long as this: stages that begin later are none of it.
+pub fn of_length(config: &Config, last: usize) -> Config {
     let mut config = config.clone();
     config.learning.generations = last;
+    config.stages.retain(|stage| stage.from <= last);
     config
 }
 
@@ -365,6 +366,25 @@ impl Keeper {
             self.disk.remove(&path).map_err(RecordError::write(&path))?;
             self.kept.remove(first);
         }
+        Ok(())
+    }
+
+    /// Makes all that are kept checkpoints of the same run, but as short as this config's.
+    ///
+    /// # Errors
+    /// One could not be read or written.
+    pub fn shorten(&mut self, config: &Config) -> Result<(), RecordError> {
+        self.wait()?;
+        for &generation in &self.kept {
+            let path = path(&self.folder, generation);
+            let file = file::open(&path).map_err(RecordError::read(&path))?;
+            let mut kept =
+                Checkpoint::read(file, &self.config).map_err(|reason| RecordError::damaged(&path, reason))?;
+            kept.config = config_digest(config);
+            kept.snapshot.last = config.learning.generations;
+            kept.write(&self.disk, &path, config).map_err(RecordError::write(&path))?;
+        }
+        self.config = Arc::new(config.clone());
         Ok(())
     }
 

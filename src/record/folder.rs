@@ -226,11 +226,19 @@ pub struct Story {
 }
 
 impl Folder {
-    /// Takes a folder for a run of a config, creating it where needed.
+    /// Takes a folder for a run of a config, creating it where needed; `init` is [`policies::Init::digest`] of what the
+    /// run is to start from, if that is given.
     ///
     /// # Errors
-    /// It holds a run that must not be written over, is in use, belongs to another config or cannot be written.
-    pub fn open(path: &Path, start: Start, config: &Config, disk: Disk) -> Result<(Folder, Resumed), RecordError> {
+    /// It holds a run that must not be written over, is in use, belongs to another config, started from other policies
+    /// or needs those that it started from; or it cannot be written.
+    pub fn open(
+        path: &Path,
+        start: Start,
+        config: &Config,
+        init: Option<&str>,
+        disk: Disk,
+    ) -> Result<(Folder, Resumed), RecordError> {
         let checkpoints = path.join(CHECKPOINTS);
         if path.is_file() {
             return Err(RecordError::NoFolder { path: path.into() });
@@ -251,7 +259,7 @@ impl Folder {
         }
         let mut found = Resumed { checkpoint: None, kept: vec![], run: None, finished: None, notes: vec![] };
         if start == Start::Resume {
-            folder.find(config, &mut found)?;
+            folder.find(config, init, &mut found)?;
         }
         if found.finished.is_some() && Config::load(&folder.file(CONFIG)).is_ok() {
             return Ok((folder, found));
@@ -280,8 +288,8 @@ impl Folder {
         Ok(())
     }
 
-    /// Finds where the run goes on.
-    fn find(&self, config: &Config, found: &mut Resumed) -> Result<(), RecordError> {
+    /// Finds where the run goes on; what cannot go on is left as it is.
+    fn find(&self, config: &Config, init: Option<&str>, found: &mut Resumed) -> Result<(), RecordError> {
         let checkpoints = self.file(CHECKPOINTS);
         let mut kept = checkpoint::tidy(&self.disk, &checkpoints)?;
         let before = self.compare(config, found, !kept.is_empty())?;
@@ -292,8 +300,9 @@ impl Folder {
             Err(error) => return Err(error),
         }
         found.finished = found.run.as_ref().map_or(Ok(None), |run| self.finished(run, config))?;
+        let began = found.run.as_ref().map(|run| run.init.clone());
         if found.finished.is_some() {
-            return Ok(());
+            return began.map_or(Ok(()), |there| self.started_alike(there, init));
         }
         let any = !kept.is_empty();
         while let Some(&generation) = kept.last() {
@@ -301,6 +310,7 @@ impl Folder {
             // Those of an earlier version do not say how long their run was to be, but the config there does.
             let reason = match checkpoint::read(&path, &self.file(POLICIES), before.as_ref().unwrap_or(config)) {
                 Ok(Some(checkpoint)) if checkpoint.is_of(config) => {
+                    self.started_alike(checkpoint.init.clone(), init)?;
                     let metrics = self.file(METRICS);
                     let resumed = metrics::Writer::resume(&self.disk, &metrics, &checkpoint.metrics, config);
                     match resumed.map_err(RecordError::write(&metrics))? {
@@ -330,6 +340,12 @@ impl Folder {
             self.disk.rename(&path, &aside).map_err(RecordError::write(&aside))?;
             kept.pop();
         }
+        if let Some(there) = began.filter(|_| found.checkpoint.is_none()) {
+            self.started_alike(there.clone(), init)?;
+            if let Some(there) = there.filter(|_| init.is_none()) {
+                return Err(RecordError::InitNeeded { path: self.path.clone(), there });
+            }
+        }
         found.notes.push(match &found.checkpoint {
             Some((checkpoint, _)) => Note::GoingOn { generation: checkpoint.snapshot.generation },
             None if any => Note::StartingOver,
@@ -337,6 +353,16 @@ impl Folder {
         });
         found.kept = kept;
         Ok(())
+    }
+
+    /// Refuses other policies to start from than the run's own.
+    fn started_alike(&self, there: Option<String>, here: Option<&str>) -> Result<(), RecordError> {
+        match here {
+            Some(here) if there.as_deref() != Some(here) => {
+                Err(RecordError::InitDiffers { path: self.path.clone(), there, here: here.into() })
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Refuses another config than the one the run was started with, but for more generations; gives that one, where it

@@ -96,8 +96,13 @@ impl Writer {
         let mut hash = Sha256::new();
         let mut file = match file::open(path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-            file => file?.take(mark.bytes),
+            file => BufReader::new(file?).take(mark.bytes),
         };
+        // A run that ended before its stages came keeps their column.
+        let mut first = Vec::new();
+        file.by_ref().take(MAX_LINE).read_until(b'\n', &mut first)?;
+        hash.update(&first);
+        let lines = Lines { staged: first.starts_with(STAGED.as_bytes()), ..Lines::of(config) };
         let mut chunk = [0; 1 << 14];
         loop {
             match file.read(&mut chunk)? {
@@ -109,7 +114,7 @@ impl Writer {
             return Ok(None);
         }
         let output = BufWriter::new(disk.append(path, mark.bytes)?);
-        Ok(Some(Writer { output, bytes: mark.bytes, hash, lines: Lines::of(config) }))
+        Ok(Some(Writer { output, bytes: mark.bytes, hash, lines }))
     }
 
     fn write(&mut self, line: &str) -> io::Result<()> {

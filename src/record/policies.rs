@@ -58,8 +58,8 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
 /// The stream refuses it.
 pub fn put(output: &mut dyn Write, config: &Config, trials: &[impl AsRef<[f32]>]) -> io::Result<()> {
     let shape = vec![config.populations(), config.learning.population, config.parameters()];
-    let tensor = |(trial, weights)| Tensor::floats(format!("weights.{trial}"), shape.clone(), [weights]);
-    let tensors: Vec<_> = trials.iter().map(AsRef::as_ref).enumerate().map(tensor).collect();
+    let of_trial = |(trial, weights)| Tensor::floats(tensor(trial), shape.clone(), [weights]);
+    let tensors: Vec<_> = trials.iter().map(AsRef::as_ref).enumerate().map(of_trial).collect();
     let metadata =
         BTreeMap::from([("layers".to_string(), layers(config)), (CONFIG.to_string(), super::config_digest(config))]);
     tensors::put(output, KIND, &metadata, &tensors)

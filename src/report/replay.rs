@@ -19,7 +19,7 @@ use crate::config::{Config, Fitness, Observers};
 use crate::credit::{self, Credit, Scores};
 use crate::evolve;
 use crate::record::checkpoint;
-use crate::record::folder::{CHECKPOINTS, POLICIES};
+use crate::record::folder::{CHECKPOINTS, POLICIES, RUN, Run};
 use crate::trainer::{Snapshot, Trainer};
 use crate::world::World;
 
@@ -61,6 +61,17 @@ pub enum ReplayError {
         generation: usize,
         /// The newest that it has.
         newest: Option<usize>,
+    },
+    /// What it started from is not there.
+    #[error(
+        "{folder} started from given policies, and no checkpoint that holds them or what came of them is left: it cannot be \
+         played again up to generation {generation}"
+    )]
+    NoStart {
+        /// The run's.
+        folder: String,
+        /// The one asked for, from 0.
+        generation: usize,
     },
     /// Trained again, it comes to something else.
     #[error(
@@ -183,6 +194,8 @@ pub fn replay(
         if let Some(snapshot) = nearest(folder, &config, trial, next + usize::from(next > 0)..=generation) {
             // A checkpoint of other sizes is of another config: training on from the start does without.
             let _ = trainer.restore(0, snapshot);
+        } else if next == 0 && Run::read(&folder.join(RUN)).is_ok_and(|run| run.init.is_some()) {
+            return Err(ReplayError::NoStart { folder: name(), generation });
         }
         while trainer.generation(0) < generation {
             if !watch(trainer.generation(0)) {
