@@ -77,9 +77,9 @@ fn few_trials_of_every_question_come_to_a_page() {
     assert!(code == Some(1) && told.contains("holds another sweep"), "{told}");
 
     // What cannot be had is told before any part is trained.
-    good(folder, "--questions=b --trials 2 --generations 2 --out mixed --quiet");
-    let (code, _, told) = run(folder, "--questions=d,b --trials 2 --generations 2 --out mixed --quiet");
-    assert!(code == Some(1) && told.contains("--resume") && !folder.join("mixed/observers/points").exists(), "{told}");
+    good(folder, "--questions=d --trials 2 --generations 2 --out mixed --quiet");
+    let (code, _, told) = run(folder, "--questions=b,d --trials 2 --generations 2 --out mixed --quiet");
+    assert!(code == Some(1) && told.contains("--resume") && !folder.join("mixed/behaviours/points").exists(), "{told}");
 
     // Curricula take their stages.
     let (code, _, told) = run(folder, "--questions=e --trials 2 --generations 2 --out e");

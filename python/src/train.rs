@@ -196,7 +196,7 @@ pub fn train_into(
         return Err(failed(format!("{} holds {what}, not a run; choose another folder", out.display())));
     }
     let mut watcher = Watcher::new(callback.as_ref());
-    let notes = workers::play(py, backend, |player| {
+    let mut notes: Vec<String> = workers::play(py, backend, |player| {
         Peaks::of([&config.0], rayon::current_num_threads())
             .check(player.1.backend == "gpu")
             .map_err(RunError::from)
@@ -239,7 +239,8 @@ pub fn train_into(
     }
     // What was trained is whole without a picture of it.
     let failed = workers::aside(py, || draw(&out)).err();
-    Ok(notes.into_iter().chain(failed.map(|error| error.to_string())).collect())
+    notes.extend(failed.map(|error| format!("curves.svg was not written: {error}")));
+    Ok(notes)
 }
 
 /// Draws a run's curves beside it, as the program does.

@@ -92,6 +92,13 @@ def test_a_folder_is_gone_on_with_or_written_over(config):
         train(config, resume=True)
 
 
+def test_a_run_is_whole_without_its_picture(config):
+    os.makedirs("run/curves.svg/full")
+    with pytest.warns(RuntimeWarning, match="curves.svg"):
+        run = train(config, out="run")
+    assert Run.open("run").digest == run.digest
+
+
 def test_a_training_starts_from_what_another_came_to(config, program):
     first = train(config, out="first")
     second = config.replace(learning={"fitness": "G", "population": 30, "seed": 9})
