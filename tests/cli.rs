@@ -441,6 +441,30 @@ fn bench_tells_where_a_generation_goes() {
     assert!(rollout > rest.into_iter().fold(0.0, f64::max), "what takes longest: {object}");
 }
 
+/// Of stages the first plays, however it is laid out; a generation is one episode, as a rollout is.
+#[test]
+fn bench_plays_the_first_stage() {
+    let text = format!(
+        "{}[[stages]]\nfrom = 0\nset = {{ 'learning.episodes_per_team' = 8, 'learning.start_jitter' = 1.0, 'world.windows' = [[20, 25], [1, 25]] }}\n",
+        include_str!("../configs/strictly_forward.toml").replace("[world]", "[world]\nwindows = [[1, 25], [1, 25]]")
+    );
+    let (_folder, path) = written(text);
+    let path = path.to_str().unwrap();
+    let objects = benched(&[path, "--teams", "50", "--steps", "30"]);
+    assert!(objects[0]["generation_share"].as_f64().is_some_and(|share| share > 0.3), "{objects:?}");
+    let short = flotilla(&["bench", "--backend", "cpu", path, "--steps", "10", "--teams", "50"]);
+    assert!(!String::from_utf8_lossy(&short.stderr).contains("panicked"), "{short:?}");
+}
+
+/// Fewer trials than an interval takes are told before any training.
+#[test]
+fn questions_take_two_trials() {
+    let output = flotilla(&["paper", "--questions", "--trials", "1", "--out", "nowhere/questions"]);
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.code() == Some(2) && error.contains("--trials 1"), "{error}");
+    assert!(!Path::new("nowhere").exists());
+}
+
 #[test]
 fn bench_refuses_what_it_cannot_lay_out() {
     for (flags, blamed) in [

@@ -109,6 +109,24 @@ fn two_arms_are_told_with_intervals_and_a_test() {
     assert!((number(&turned["a"]) - 0.02).abs() < 1e-12);
 }
 
+/// An easier stage's G is another G: what counts is when the last stage is mastered.
+#[test]
+fn generations_are_those_of_the_last_stage() {
+    let place = Place::new(&[]);
+    let course: [&[f64]; 2] = [&[1.0, 1.0, 1.0, 0.0, 1.0, 0.0], &[1.0, 1.0, 1.0, 0.0, 0.0, 0.0]];
+    let five = ("learning.generations", "5");
+    run(&place, "plain", &[five], &course);
+    run(&place, "staged", &[five, ("stages", "[{ from = 3, set = { 'world.coupling' = 1 } }]")], &course);
+    let told = json(&place, "compare plain staged");
+    let reach = &told["comparisons"][0]["measures"][2];
+    assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["value"])), [0.0, 5.0]);
+    assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["reached"])), [2.0, 1.0]);
+    assert_eq!(
+        [0, 1].map(|arm| told["comparisons"][0]["arms"][arm]["name"].as_str().unwrap()),
+        ["no stages", "1 stage"]
+    );
+}
+
 #[test]
 fn pairs_are_told_of_and_compared_as_pairs_where_that_is_asked_for() {
     let place = Place::new(&[]);

@@ -202,6 +202,12 @@ fn every_command_that_reads_a_config_reads_standard_input() {
     assert_eq!(read("again/policies.safetensors"), read("runs/config/policies.safetensors"));
     let (done, _) = fed(&place, "train - --backend cpu --seed 3 --resume", SMALL);
     assert!(done.contains("runs/config"), "{done}");
+    // The latest is the one of the highest number, whatever is gone.
+    fs::create_dir(place.path("runs/config-4")).unwrap();
+    let (_, told) = fed(&place, "train - --backend cpu", SMALL);
+    assert!(told.contains("into runs/config-5\n"), "{told}");
+    let (done, _) = fed(&place, "train - --backend cpu --resume", SMALL);
+    assert!(done.contains("runs/config-5"), "{done}");
     let policies = "--policies again/policies.safetensors";
     let small = place.path("small.toml");
     fs::write(&small, SMALL).unwrap();

@@ -23,7 +23,7 @@ use flotilla::backend::{Machine, Player};
 use flotilla::config::Config;
 use flotilla::record::checkpoint::{self, Checkpoint};
 use flotilla::record::disk::{Disk, Operation};
-use flotilla::record::folder::{Folder, METRICS, Note, POLICIES, Run, Start, Status};
+use flotilla::record::folder::{CONFIG, Folder, METRICS, Note, POLICIES, RUN, Run, Start, Status};
 use flotilla::record::{RecordError, policies};
 use flotilla::run::{Ended, Options, Results, RunError, Session};
 use rand::{RngExt, SeedableRng, rngs::ChaCha8Rng};
@@ -883,6 +883,90 @@ fn where_one_of_several_runs_cannot_start_none_is_touched() {
     assert!(open(Start::Force).starts_with("another process is training in"));
     assert_eq!(fs::read_to_string(free.join(METRICS)).unwrap(), "of a run");
     drop(held);
+}
+
+/// What is no run's is not written over, by whatever flag.
+#[test]
+fn other_files_are_left_alone() {
+    let place = tempfile::tempdir().unwrap();
+    let text = format!("# Mine.\n{}", small().to_toml());
+    let out = place.path().join("mine");
+    fs::create_dir(&out).unwrap();
+    let file = config_file(&out, &text);
+    // A config by itself is what a run may start from, and stays as it was written.
+    let done = flotilla_train(&file, &out, &["--resume", "--quiet"]).output().unwrap();
+    assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
+    assert_eq!(fs::read_to_string(&file).unwrap(), text);
+    for name in [CONFIG, METRICS, POLICIES] {
+        let out = place.path().join(format!("theirs {name}"));
+        fs::create_dir(&out).unwrap();
+        fs::write(out.join(name), "of another program").unwrap();
+        for flag in ["--resume", "--force"] {
+            let refused = flotilla_train(&file, &out, &[flag]).output().unwrap();
+            let told = stderr(&refused);
+            assert!(
+                refused.status.code() == Some(1) && told.contains("is not a run's, and would be written"),
+                "{told}"
+            );
+            assert!(told.contains(name) && told.contains("move it away"), "{told}");
+            assert_eq!(fs::read_to_string(out.join(name)).unwrap(), "of another program");
+            assert!(!out.join(RUN).exists());
+        }
+    }
+    // Nor is what a run starts from.
+    let policies = out.join(POLICIES);
+    let before = fs::read(&policies).unwrap();
+    for flag in ["--resume", "--force"] {
+        let refused = flotilla_train(&file, &out, &[flag, "--init", policies.to_str().unwrap()]).output().unwrap();
+        assert_eq!(refused.status.code(), Some(2), "{}", stderr(&refused));
+        assert!(stderr(&refused).contains("would be written over it"), "{}", stderr(&refused));
+        assert!(fs::read(&policies).unwrap() == before && out.join(RUN).exists());
+    }
+    // A run whose config is gone is still no other config's.
+    fs::remove_file(&file).unwrap();
+    let other = config_file(place.path(), &text);
+    let refused = flotilla_train(&other, &out, &["--resume", "--seed", "3"]).output().unwrap();
+    assert_eq!(refused.status.code(), Some(1), "{}", stderr(&refused));
+    let done = flotilla_train(&other, &out, &["--resume"]).output().unwrap();
+    assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
+    assert!(fs::read(&policies).unwrap() == before);
+}
+
+/// A paper that cannot be written over stays a paper.
+#[test]
+fn a_refused_paper_is_left_as_it_was() {
+    let place = tempfile::tempdir().unwrap();
+    let out = place.path().join("paper");
+    let paper = |flags: &[&str]| {
+        let mut command = flotilla();
+        command.args(["paper", "--trials", "1", "--backend", "cpu", "--quiet", "--out"]).arg(&out).args(flags);
+        command.output().unwrap()
+    };
+    let done = paper(&["--generations", "1"]);
+    assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
+    let files = || {
+        let names = fs::read_dir(&out).unwrap().map(|entry| entry.unwrap().path()).filter(|path| path.is_file());
+        let mut files: Vec<_> = names.map(|path| (fs::read(&path).unwrap(), path)).collect();
+        files.sort();
+        files
+    };
+    let before = files();
+    let mut arms: Vec<_> = fs::read_dir(out.join("arms")).unwrap().map(|entry| entry.unwrap().path()).collect();
+    arms.sort();
+    for arm in [&arms[0], &arms[arms.len() - 1]] {
+        let config = Config::load(&arm.join(CONFIG)).unwrap();
+        let held = Folder::open(arm, Start::Resume, &config, None, Disk::default()).unwrap();
+        let all = || arms.iter().map(|arm| what_came_out(arm)).collect::<Vec<_>>();
+        let runs = all();
+        for flags in
+            [&["--generations", "1", "--force", "--seed", "1"], &["--generations", "2", "--resume", "--seed", "0"]]
+        {
+            let refused = paper(flags);
+            assert!(stderr(&refused).contains("another process is training in"), "{}", stderr(&refused));
+            assert!(files() == before && all() == runs, "{flags:?}");
+        }
+        drop(held);
+    }
 }
 
 #[cfg(unix)]

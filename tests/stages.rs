@@ -289,6 +289,13 @@ fn a_run_goes_on_from_the_policies_that_it_started_from() {
     drop(folder);
     let error = train(&config, &bare, None, Start::Resume, 99).unwrap_err().to_string();
     assert!(error.contains("has no checkpoint yet"), "{error}");
+    // Nor one that was killed before it did anything.
+    let early = place.path().join("early");
+    let runs = vec![(config.clone(), early.clone(), init())];
+    drop(Session::open_from(runs, Start::Fresh, &Disk::default()).unwrap());
+    let error = train(&config, &early, None, Start::Resume, 99).unwrap_err().to_string();
+    assert!(error.contains("has no checkpoint yet"), "{error}");
+    assert_eq!(train(&config, &early, init(), Start::Resume, 99).unwrap().as_ref(), Some(&expected));
     assert_eq!(train(&config, &bare, init(), Start::Resume, 99).unwrap().as_ref(), Some(&expected));
 }
 

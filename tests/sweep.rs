@@ -709,6 +709,43 @@ fn a_folder_of_something_else_is_refused() {
     assert!(results(&out) == before);
 }
 
+/// Files that a sweep would write are a sweep's only beside its file; that may be written by hand.
+#[test]
+fn other_files_in_a_sweeps_folder_are_left_alone() {
+    let (folder, sweep) = written(SMALL);
+    for name in ["results.csv", "points.csv", "final.svg"] {
+        let out = folder.path().join(name);
+        fs::create_dir(&out).unwrap();
+        fs::write(out.join(name), "mine").unwrap();
+        let error = failed(flotilla(&sweep, &out, &["--quiet", "--force"]), 1);
+        assert!(error.contains(&format!("holds {name}, but no sweep.toml")), "{error}");
+        assert_eq!(fs::read_to_string(out.join(name)).unwrap(), "mine");
+    }
+    let own = folder.path().join("own");
+    fs::create_dir(&own).unwrap();
+    let text = format!("# Mine.\n{SMALL}");
+    fs::write(own.join("sweep.toml"), &text).unwrap();
+    done(flotilla(&own.join("sweep.toml"), &own, &["--quiet"]));
+    assert_eq!(fs::read_to_string(own.join("sweep.toml")).unwrap(), text);
+    // How often it is saved has no say in what a point came to.
+    let point = own.join("points/0000");
+    let config = point.join("config.toml");
+    fs::remove_file(point.join("run.json")).unwrap();
+    let mut again = support::flotilla();
+    again.arg("train").arg(&config).arg("--out").arg(&point);
+    done(again.args(["--resume", "--checkpoint-seconds", "5", "--backend", "cpu", "--quiet"]).output().unwrap());
+    done(flotilla(&own.join("sweep.toml"), &own, &["--collect"]));
+    // What no machine has is told before anything starts.
+    let (_large, huge) = written(&SMALL.replacen(
+        "[grid]",
+        "[grid]\n\"learning.population\" = [1048576]\n\"policy.hidden\" = [[64, 64]]\n\"learning.trials\" = [1000]",
+        1,
+    ));
+    let out = folder.path().join("huge");
+    let error = failed(flotilla(&huge, &out, &["--quiet"]), 1);
+    assert!(error.contains("GiB") && !out.join("sweep.toml").exists(), "{error}");
+}
+
 /// Nothing is written over where another process trains one of the points, in whatever batch that is.
 #[test]
 fn what_another_process_trains_is_left_alone_with_all_else() {

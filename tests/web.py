@@ -287,7 +287,34 @@ def main():
         tab.drop("policies.safetensors", base64(policies))
         tab.wait("document.querySelector('#said').textContent.includes('Take a leader')")
         tab.calm()
+        # Half a run, and what is nothing of ours, leave all as it is.
+        half = folder / "half.zip"
+        with zipfile.ZipFile(archive) as files, zipfile.ZipFile(half, "w") as to:
+            for name in files.namelist():
+                if not name.endswith("run.json"):
+                    to.writestr(name, files.read(name))
+        for name, content, told in [("half.zip", half.read_bytes(), "run.json"), ("curves.png", b"\x89PNG", "it is no config")]:
+            tab.drop(name, base64(content))
+            tab.wait(f"document.querySelector('#trouble').textContent.includes({json.dumps(told)})")
+            tab.evaluate("document.querySelector('#trouble').textContent = ''")
+        assert tab.evaluate("page.state.policies !== null")
+        assert not list(tab.complaints())
         print("a run goes home, on from there, and in again")
+
+        # What was entered a moment ago is what is trained, and every seed is one.
+        tab.load(page, layout="strictly_forward", on="cpu", pace="full", learners="leader-follower", **SMALL)
+        seed = 2**53 + 1
+        tab.evaluate(
+            f"(() => {{ const e = document.querySelector('#seed'); e.value = '{seed}'; e.dispatchEvent(new Event('change', {{ bubbles: true }}));"
+            " document.querySelector('#setup').requestSubmit(); })()"
+        )
+        tab.wait(DONE)
+        flags = [word for key, value in {**SMALL, "seed": seed}.items() for word in (f"--{key}", value)]
+        entered = native("entered", CONFIGS / "strictly_forward.toml", *flags)
+        assert tab.text(".sha") == entered, "it is not the seed entered that was trained"
+        assert str(seed) in tab.evaluate("location.href") and tab.evaluate("document.querySelector('#seed').value") == str(seed)
+        tab.calm()
+        print("what was entered last is trained")
 
         # A config, and a broken one.
         tab.drop("mine.toml", base64(b"[world]\nleaders = [[5, 5]]\nfollowers = [[4, 4], [6, 4]]\npois = [[5, 12]]\n"))

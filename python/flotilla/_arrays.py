@@ -22,7 +22,7 @@ def floats(what: str, values: ArrayLike, axes: int) -> Floats:
     if array.ndim != axes:
         raise ValueError(f"{what} have the shape {array.shape}, allowed are {axes} axes")
     with np.errstate(over="ignore"):
-        return np.ascontiguousarray(array, dtype=np.float32)
+        return np.require(array, np.float32, ["C", "A"])
 
 
 def whole(what: str, value: Any, least: int, most: int) -> int:

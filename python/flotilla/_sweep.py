@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -117,7 +118,7 @@ def sweep(
     axes, points, normal = _native.sweep(text, name, skip_impossible)
     values = [dict(zip(axes, of)) for _, of, _ in points]
     if executor is None:
-        runs = _here(normal, len(points), [index for index, _, _ in points], out, machine)
+        runs = _here(normal, out, machine)
         if progress is not None:
             progress(len(points), len(points))
     elif out is not None:
@@ -137,7 +138,7 @@ def _text(path: str) -> str:
         raise Error(f"{path}: it is not UTF-8 text") from None
 
 
-def _here(text: str, count: int, indices: list[int], out: str | os.PathLike[str] | None, backend: str) -> list[Run]:
+def _here(text: str, out: str | os.PathLike[str] | None, backend: str) -> list[Run]:
     with tempfile.TemporaryDirectory(prefix="flotilla-") as folder:
         file = os.path.join(folder, "sweep.toml")
         with open(file, "w", encoding="utf-8") as to:
@@ -154,10 +155,17 @@ def _here(text: str, count: int, indices: list[int], out: str | os.PathLike[str]
 def _there(executor: Any, configs: list[str], backend: str, progress: Callable[[int, int], Any] | None) -> list[Run]:
     handed: list[Any] = [_hand(executor, config, backend) for config in configs]
     runs: list[Run] = []
-    for config, future in zip(configs, handed):
-        runs.append(_taken(executor, config, backend, future))
-        if progress is not None:
-            progress(len(runs), len(configs))
+    try:
+        for config, future in zip(configs, handed):
+            runs.append(_taken(executor, config, backend, future))
+            if progress is not None:
+                progress(len(runs), len(configs))
+    except BaseException:
+        # Whoever waits for the executor waits for nothing more.
+        for future in handed:
+            if hasattr(future, "cancel"):
+                future.cancel()
+        raise
     return runs
 
 
@@ -170,15 +178,18 @@ def _hand(executor: Any, config: str, backend: str) -> Any:
 
 
 def _taken(executor: Any, config: str, backend: str, future: Any) -> Run:
+    lost: BaseException | None = None
     for _ in range(TRIES):
         if future is None:
             break
         try:
             run: Run = future.result()
             return run
-        except (Error, ValueError, TypeError, MemoryError):
+        except (Error, ValueError, TypeError, MemoryError, ImportError):
             raise
-        except Exception:
+        except Exception as error:
             # A worker is lost.
+            lost = error
             future = _hand(executor, config, backend)
+    warnings.warn(f"a point is trained here, since no worker plays it: {lost or 'none is left'!r}", RuntimeWarning, stacklevel=4)
     return _play(config, backend)

@@ -58,6 +58,7 @@ class Teams:
 
     def step(self, actions: Floats, rested: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
         """Plays a step, and rewards it; which teams but those that have rested have played their last one."""
+        before = self.steps >= self.length
         if self.reward == "G":
             self.stepper.step(actions, self.rewards)
         else:
@@ -68,7 +69,8 @@ class Teams:
         if self.reward != "G":
             if over.any():
                 self.stepper.fitness(self.reward, self.rewards)
-                self.rewards[~over] = 0
+                # Who was over before has had its reward.
+                self.rewards[~over | before] = 0
             else:
                 self.rewards.fill(0)
         return over
@@ -138,7 +140,6 @@ class VectorEnv:
             "render_fps": max(round(1 / config["world.dt"]), 1),
         }
         self.closed = False
-        self._terminated = np.zeros(self.num_envs, np.bool_)
         self._over = np.zeros(self.num_envs, np.bool_)
         self._any_over = False
 
@@ -197,7 +198,7 @@ class VectorEnv:
         """
         chosen = None
         if options and options.get("reset_mask") is not None:
-            chosen = np.ascontiguousarray(options["reset_mask"])
+            chosen = np.array(options["reset_mask"])
             if chosen.dtype != np.bool_ or chosen.shape != (self.num_envs,):
                 raise ValueError(f"reset_mask is {chosen.dtype} {chosen.shape}, allowed is bool ({self.num_envs},)")
         self._teams.reset(seed, chosen)
@@ -216,7 +217,7 @@ class VectorEnv:
 
         Returns:
             observations float32 ``[num_envs, leaders, 8]``, rewards float32 ``[num_envs, leaders]``, terminated and truncated
-            bool ``[num_envs]``, and infos. But for ``truncated`` the arrays are the same at every step, with other values,
+            bool ``[num_envs]``, and infos. Observations and rewards are the same arrays at every step, with other values,
             unless ``copy`` was asked for.
 
         Raises:
@@ -243,9 +244,9 @@ class VectorEnv:
         if self.autoreset == "same_step" and self._any_over:
             infos["final_obs"], infos["_final_obs"] = teams.inputs.copy(), over
             teams.reset(None, over)
-        self._over = over
+        self._over = over.copy()
         rewards = teams.rewards.copy() if self.copy else teams.rewards
-        return self._observations(), rewards, self._terminated, over, infos
+        return self._observations(), rewards, np.zeros(self.num_envs, np.bool_), over, infos
 
     def states(self) -> tuple[Floats, Floats, Floats]:
         """Where everyone is: positions and headings ``[num_envs, agents, 2]``, speeds ``[num_envs, agents]``, leaders first.

@@ -64,6 +64,23 @@ def test_arrays_are_reused_or_copied():
         seen[0] = 1
 
 
+def test_what_is_handed_out_may_be_written_to():
+    env, still = VectorEnv(Config.paper(), 3, "Df", autoreset="disabled"), np.zeros((3, 4, 2))
+    env.reset()
+    for step in range(28):
+        _, rewards, terminated, truncated, _ = env.step(still)
+        assert not terminated.any() and truncated.all() == (step >= 24)
+        # A team has its reward once, however often it is stepped after its end.
+        assert rewards.any() == (step == 24)
+        terminated |= truncated
+    env = VectorEnv(Config.paper(), 3)
+    first = env.reset()[0].copy()
+    for _ in range(25):
+        _, _, _, truncated, _ = env.step(still)
+    truncated[:] = False
+    assert np.array_equal(env.step(still)[0], first)
+
+
 def test_autoreset_at_the_next_step():
     config = Config.paper().replace(world={"steps": 3})
     env, actions = VectorEnv(config, 5), np.ones((5, 4, 2), np.float32)

@@ -63,7 +63,7 @@ unix = pytest.mark.skipif(os.name == "nt", reason="a process cannot be killed li
 
 @unix
 def test_a_lost_worker_s_points_are_played_again(config, grid):
-    with Losing(2, multiprocessing.get_context("spawn")) as executor:
+    with Losing(2, multiprocessing.get_context("spawn")) as executor, pytest.warns(RuntimeWarning, match="no worker plays it"):
         found = sweep(grid, executor, backend="cpu")
     assert executor.lost and [point.run.digest for point in found] == digests(config)
 

@@ -64,7 +64,8 @@ pub fn run(args: Args) -> Result<(), Error> {
             ("configs/generally_forward.toml".into(), text.into())
         }
     };
-    let config = Config::read(&text, &name, &[], &args.overrides.list())?;
+    // Of stages the first, as `verify` plays it.
+    let config = Config::read(&text, &name, &[], &args.overrides.list())?.at(0);
     let configs = combinations(&config, &args)?;
     let (mut player, machine) = open(&args)?;
     for config in &configs {
@@ -110,6 +111,7 @@ fn combinations(config: &Config, args: &Args) -> Result<Vec<Config>, Error> {
                 config.learning.population = teams as usize;
                 config.learning.elites = config.learning.elites.min(teams as usize);
                 config.learning.trials = 1;
+                config.learning.episodes_per_team = 1;
                 config.learning.generations = config::MAX_GENERATIONS;
                 configs.push(config);
             }

@@ -172,7 +172,9 @@ fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Cont
                 let folder = results::point_folder(out, point);
                 match runs::config(&folder).and_then(|config| runs::metrics(&folder, &config, |_| {}).map(|()| config))
                 {
-                    Ok(config) if config == point.config => folders.push(folder),
+                    Ok(config) if record::without_checkpoint(&config) == record::without_checkpoint(&point.config) => {
+                        folders.push(folder);
+                    }
                     Ok(_) => return Err(Error::Refused(format!("{} is a run of another config", folder.display()))),
                     Err(ReadError::Missing(_) | ReadError::Unfinished { .. }) => {
                         notes.push(format!(

@@ -111,9 +111,9 @@ pub fn run(args: Args) -> Result<(), Error> {
     let _lock = folder::lock(out)?;
     // Only now is nobody else writing here.
     marks.compare(out, start)?;
-    marks.claim(out, start, &disk)?;
-
     let folders: Vec<PathBuf> = arms.iter().map(|arm| out.join(ARMS).join(arm_name(arm))).collect();
+    folder::check(folders.iter().map(|path| &**path), start)?;
+    marks.claim(out, start, &disk)?;
     // The first arm of each training is trained, the others are the same.
     let trained: Vec<usize> =
         (0..configs.len()).filter_map(|place| places.iter().position(|at| *at == place)).collect();

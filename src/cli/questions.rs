@@ -11,7 +11,7 @@ use super::sweep::{claim, free_memory, same_sweep};
 use super::{Error, backend, print, say};
 use crate::memory::Peaks;
 use crate::record::disk::Disk;
-use crate::record::folder;
+use crate::record::folder::{self, SWEEP};
 use crate::record::{RecordError, policies};
 use crate::report::comparison;
 use crate::report::curves::PRINT;
@@ -33,6 +33,10 @@ pub fn run(args: &Args) -> Result<(), Error> {
         .into_iter()
         .map(|part| Ok((part, part.sweep(&args.overrides())?)))
         .collect::<Result<_, Error>>()?;
+    if let Some((_, sweep)) = parts.iter().find(|(_, sweep)| sweep.points[0].config.learning.trials < 2) {
+        let trials = sweep.points[0].config.learning.trials;
+        return Err(Error::Usage(format!("--trials {trials}: intervals and tests take two trials or more")));
+    }
     if let Some(what) = folder::collection(out) {
         return Err(Error::Refused(format!("{} holds {what}; choose another --out", out.display())));
     }
@@ -40,6 +44,17 @@ pub fn run(args: &Args) -> Result<(), Error> {
         return Err(Error::Refused(format!("{} holds a run; choose another --out", out.display())));
     }
     parts.iter().try_for_each(|(part, sweep)| same_sweep(sweep, &out.join(part.name)))?;
+    let all = || QUESTIONS.iter().flat_map(|question| question.parts);
+    if !all().any(|part| out.join(part.name).join(SWEEP).exists()) {
+        let endings = || Format::ALL.map(Format::extension).into_iter().chain(["csv"]);
+        let files = all().flat_map(|part| endings().map(|ending| format!("{}.{ending}", part.name)));
+        if let Some(theirs) = files.chain([PAGE.into()]).find(|name| out.join(name).exists()) {
+            return Err(Error::Refused(format!(
+                "{} holds {theirs}, but none of the questions' sweeps; choose another --out",
+                out.display()
+            )));
+        }
+    }
     let mut player = backend::open(&args.run)?;
     for config in parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config) {
         Peaks::of([config], rayon::current_num_threads()).check(player.1.backend == "gpu").map_err(RunError::from)?;

@@ -15,7 +15,7 @@ use crate::record::RecordError;
 use crate::record::disk::{self, Disk};
 use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
 use crate::report::progress::Meter;
-use crate::run::{Ended, Options};
+use crate::run::{Ended, Options, RunError};
 use crate::shell;
 use crate::sweep::pictures;
 use crate::sweep::results::{self, Missing, Outcome};
@@ -241,13 +241,24 @@ pub(super) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
             true => Some("a run"),
             false => folder::collection(out),
         };
-        return match holds {
-            Some(what) => refuse(format!("{} holds {what}, not a sweep; choose another --out", out.display())),
+        if let Some(what) = holds {
+            return refuse(format!("{} holds {what}, not a sweep; choose another --out", out.display()));
+        }
+        return match pictures::names()
+            .chain([folder::RESULTS, folder::POINTS].map(String::from))
+            .find(|name| out.join(name).exists())
+        {
+            Some(theirs) => refuse(format!(
+                "{} holds {theirs}, but no {SWEEP}, which would say that it is a sweep's; choose another --out",
+                out.display()
+            )),
             None => Ok(()),
         };
     }
     let there = config::read_file(&path)?;
-    if there == sweep.text {
+    // Somebody may have written it by hand.
+    let normal = |text: &str| Some(Sweep::read(text, SWEEP, &[], sweep.skipped > 0).ok()?.text);
+    if there == sweep.text || normal(&there).as_ref() == Some(&sweep.text) {
         return Ok(());
     }
     let missing = |from: &str, other: &str, where_: &str| {
@@ -257,7 +268,7 @@ pub(super) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         lines.concat() + more
     };
     refuse(format!(
-        "{} holds another sweep; what differs:{}{}\nchoose another --out, or remove that folder",
+        "{} holds another sweep; what differs:{}{}\nchoose another --out",
         out.display(),
         missing(&there, &sweep.text, "there"),
         missing(&sweep.text, &there, "here"),
@@ -288,6 +299,10 @@ pub(super) fn claim(sweep: &Sweep, out: &Path) -> Result<(), Error> {
 fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Error> {
     let points = shard.take(&sweep.points);
     let mut player = backend::open(&args.run)?;
+    for point in &points {
+        let plan = memory::Peaks::of([&point.config], rayon::current_num_threads());
+        plan.check(player.1.backend == "gpu").map_err(RunError::from)?;
+    }
     claim(sweep, out)?;
     let memory = args.memory.map_or_else(free_memory, |gib| (gib * f64::from(1 << 30)) as usize);
     if !args.quiet {

@@ -8,6 +8,7 @@ use serde_json::json;
 use super::recovery::{self, Checkpoints, Loss, Signals, quoted};
 use super::{ConfigArgs, Error, RunOptions, backend, print, say};
 use crate::config::Config;
+use crate::file;
 use crate::host::Instant;
 use crate::memory::Peaks;
 use crate::record::RecordError;
@@ -101,6 +102,14 @@ pub fn run(args: Args) -> Result<(), Error> {
     let (folder, start) = args.folder()?;
     if let Some(what) = folder::collection(&folder) {
         return Err(Error::Refused(format!("{} holds {what}, not a run; choose another --out", folder.display())));
+    }
+    if let Some(path) =
+        args.init.as_deref().filter(|path| file::resolved(path) == file::resolved(&folder.join(POLICIES)))
+    {
+        return Err(Error::Usage(format!(
+            "--init {}: this run would be written over it; choose another --out",
+            path.display()
+        )));
     }
     let signals = Signals::listen()?;
     let opened = Session::open_from(vec![(config.clone(), folder.clone(), init)], start, &Disk::default());

@@ -70,6 +70,11 @@ impl Config {
         begun - usize::from(self.stages.first().is_some_and(|first| first.from == 0))
     }
 
+    /// The first generation of the last stage; 0 without stages.
+    pub fn last_from(&self) -> usize {
+        self.stages.last().map_or(0, |stage| stage.from)
+    }
+
     /// The config by which a generation plays.
     pub fn at(&self, generation: usize) -> Config {
         self.staged().swap_remove(self.stage_of(generation)).1

@@ -254,6 +254,11 @@ impl Folder {
         }
         disk.create_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
         let folder = Folder { path: path.into(), disk, lock };
+        let run = folder.file(RUN);
+        let there = file::exists(&run).map_err(RecordError::read(&run))? || !checkpoint::list(&checkpoints)?.is_empty();
+        if start != Start::Fresh && !there {
+            folder.refuse_others(config)?;
+        }
         if start == Start::Force {
             folder.clear()?;
         }
@@ -261,10 +266,16 @@ impl Folder {
         if start == Start::Resume {
             folder.find(config, init, &mut found)?;
         }
-        if found.finished.is_some() && Config::load(&folder.file(CONFIG)).is_ok() {
-            return Ok((folder, found));
+        // So that whoever goes on knows that it takes these policies.
+        if let Some(init) = init.filter(|_| found.checkpoint.is_none() && found.finished.is_none()) {
+            folder
+                .write_run(&Run { init: Some(init.into()), ..found.run.clone().unwrap_or_else(|| Run::new(config)) })?;
         }
-        folder.write_config(config)?;
+        let there = Config::load(&folder.file(CONFIG)).ok();
+        // One that says the same may be somebody's own, with comments.
+        if there.as_ref() != Some(config) && (found.finished.is_none() || there.is_none()) {
+            folder.write_config(config)?;
+        }
         Ok((folder, found))
     }
 
@@ -281,7 +292,8 @@ impl Folder {
         let checkpoints = self.file(CHECKPOINTS);
         let generations = checkpoint::tidy(&self.disk, &checkpoints)?;
         let old = generations.into_iter().map(|generation| checkpoint::path(&checkpoints, generation));
-        let files = [RUN, METRICS, POLICIES, CONFIG].into_iter().chain(PICTURES).map(|name| self.file(name));
+        // The config is replaced whole, and may be what this run was read from.
+        let files = [RUN, METRICS, POLICIES].into_iter().chain(PICTURES).map(|name| self.file(name));
         for path in old.chain(files) {
             self.disk.remove(&path).map_err(RecordError::write(&path))?;
         }
@@ -352,6 +364,23 @@ impl Folder {
             None => Note::Starting,
         });
         found.kept = kept;
+        Ok(())
+    }
+
+    /// Refuses a folder without a run whose files are somebody else's, for a run would write over them.
+    fn refuse_others(&self, config: &Config) -> Result<(), RecordError> {
+        let is_there = |path: &Path| file::exists(path).map_err(RecordError::read(path));
+        let refuse = |path: PathBuf| Err(RecordError::NotOfARun { path });
+        let [toml, csv, tensors] = [CONFIG, METRICS, POLICIES].map(|name| self.file(name));
+        if is_there(&toml)? && Config::load(&toml).is_err() {
+            return refuse(toml);
+        }
+        if is_there(&csv)? && !metrics::begins(&csv).map_err(RecordError::read(&csv))? {
+            return refuse(csv);
+        }
+        if is_there(&tensors)? && !policies::are_of(&tensors, config) {
+            return refuse(tensors);
+        }
         Ok(())
     }
 
@@ -455,7 +484,11 @@ impl Folder {
         if run.generations != config.learning.generations + 1 {
             return Ok(None);
         }
-        let policies = policies::read_all(&self.file(POLICIES), config);
+        let path = self.file(POLICIES);
+        let policies = policies::read_all(&path, config);
+        if policies.is_ok() && !policies::are_of(&path, config) {
+            return Ok(None);
+        }
         match policies.and_then(|policies| self.digest(config, &policies)) {
             Ok((story, found)) => Ok((found == *digest).then_some(story)),
             // What is gone or damaged is made again; what cannot be read now may be whole.
@@ -482,7 +515,7 @@ pub fn holds_run(path: &Path) -> Result<bool, RecordError> {
 }
 
 /// Whether runs may be started in folders, of which none is touched: none holds a run where it is not to be written
-/// over, and where it is, nobody trains in it.
+/// over or gone on with, and where it is, nobody trains in it.
 ///
 /// # Errors
 /// The first folder that may not be used, or that cannot be looked into.
@@ -491,7 +524,7 @@ pub(crate) fn check<'a>(folders: impl IntoIterator<Item = &'a Path>, start: Star
         match start {
             Start::Fresh if holds_run(path)? => return Err(RecordError::Exists { path: path.into() }),
             // Where there is no lock, nobody has one.
-            Start::Force if path.join(LOCK).exists() => {
+            Start::Force | Start::Resume if path.join(LOCK).exists() => {
                 // Closing the file is not enough where a process being started has a copy of it for a moment.
                 if let Some(lock) = lock(path)? {
                     let _ = lock.unlock();
@@ -554,13 +587,13 @@ pub fn owner(path: &Path) -> Option<PathBuf> {
     }
 }
 
-/// Creates and gives the first of `stem`, `stem-2`, `stem-3`, … that does not exist.
+/// Creates and gives the one after the last of `stem`, `stem-2`, `stem-3`, … that exists.
 ///
 /// # Errors
 /// A folder cannot be created.
 pub fn next_free(parent: &Path, stem: &str) -> Result<PathBuf, RecordError> {
     fs::create_dir_all(parent).map_err(RecordError::write(parent))?;
-    let mut number = 1;
+    let mut number = newest(parent, stem) + 1;
     loop {
         let path = numbered(parent, stem, number);
         match fs::create_dir(&path) {
@@ -573,8 +606,17 @@ pub fn next_free(parent: &Path, stem: &str) -> Result<PathBuf, RecordError> {
 
 /// The last of `stem`, `stem-2`, … that exists, or else `stem`.
 pub fn latest(parent: &Path, stem: &str) -> PathBuf {
-    let paths = (1..).map(|number| numbered(parent, stem, number));
-    paths.take_while(|path| path.exists()).last().unwrap_or_else(|| numbered(parent, stem, 1))
+    numbered(parent, stem, newest(parent, stem).max(1))
+}
+
+/// The largest number of those that exist; 0 without any.
+fn newest(parent: &Path, stem: &str) -> usize {
+    let number = |name: &str| match name.strip_prefix(stem)? {
+        "" => Some(1),
+        rest => rest.strip_prefix('-')?.parse().ok().filter(|&number| name == format!("{stem}-{number}") && number > 1),
+    };
+    let entries = fs::read_dir(parent).into_iter().flatten().flatten();
+    entries.filter_map(|entry| number(entry.file_name().to_str()?)).max().unwrap_or(0)
 }
 
 fn numbered(parent: &Path, stem: &str, number: usize) -> PathBuf {

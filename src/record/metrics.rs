@@ -156,6 +156,16 @@ fn shared(row: &Row) -> String {
     format!("{trial},{generation},{best_g},{mean_g},{champion_g}")
 }
 
+/// Whether a file begins as one of these, as far as it goes: its first line may be torn.
+///
+/// # Errors
+/// What the system says.
+pub fn begins(path: &Path) -> io::Result<bool> {
+    let mut start = Vec::new();
+    file::open(path)?.take("trial,generation,".len() as u64).read_to_end(&mut start)?;
+    Ok(HEADER.as_bytes().starts_with(&start))
+}
+
 /// SHA-256 over rows as in a file, without their seconds, and then over policies: a run's digest.
 pub fn digest(rows: impl Iterator<Item = Row>, policies: &[impl AsRef<[f32]>]) -> [u8; 32] {
     let mut hash = Sha256::new();

@@ -71,6 +71,12 @@ pub enum RecordError {
         /// The file or the folder.
         path: PathBuf,
     },
+    /// A file that a run would write over, where there is no run.
+    #[error("{path} is not a run's, and would be written over")]
+    NotOfARun {
+        /// The file.
+        path: PathBuf,
+    },
     /// A file where the folder should be.
     #[error("{path} is a file")]
     NoFolder {

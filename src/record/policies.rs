@@ -52,6 +52,11 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
     disk.replace(path, |output| put(output, config, trials)).map_err(RecordError::write(path))
 }
 
+/// Whether a file can be read and says that it is of a run of this config.
+pub fn are_of(path: &Path, config: &Config) -> bool {
+    tensors::open(path).is_ok_and(|file| file.metadata(CONFIG) == Some(&super::config_digest(config)))
+}
+
 /// Writes what such a file holds into a stream.
 ///
 /// # Errors

@@ -30,6 +30,8 @@ pub struct Trial {
     pub key: (u64, usize),
     /// G of the best team and of the champion, by generation.
     pub course: Vec<[f64; 2]>,
+    /// The first generation of its last stage; 0 where it has none.
+    pub from: usize,
 }
 
 impl Cohort {
@@ -42,7 +44,12 @@ impl Cohort {
         for folder in &arm.folders {
             let config = runs::config(folder)?;
             let courses = runs::trials(folder, &config)?.into_iter().enumerate();
-            arm.trials.extend(courses.map(|(trial, course)| Trial { key: (config.learning.seed, trial), course }));
+            let from = config.last_from();
+            arm.trials.extend(courses.map(|(trial, course)| Trial {
+                key: (config.learning.seed, trial),
+                course,
+                from,
+            }));
             arm.planned = arm.planned.max(config.learning.generations);
         }
         Ok(arm)
@@ -132,8 +139,8 @@ pub enum Measure {
         /// From 0.
         generation: usize,
     },
-    /// The first generation at which the best team's G is at least this. A trial that does not come to it up to a last
-    /// generation counts as one that does at the next.
+    /// The first generation, of the last stage where there are stages, at which the best team's G is at least this. A
+    /// trial that does not come to it up to a last generation counts as one that does at the next.
     GenerationsToReach {
         /// In 0..1.
         reach: f64,
@@ -157,7 +164,7 @@ impl Measure {
             Measure::BestG { generation } => Some(trial.course[generation][0]),
             Measure::ChampionG { generation } => Some(trial.course[generation][1]),
             Measure::GenerationsToReach { reach, generation } => {
-                let reached = trial.course[..=generation].iter().position(|[best, _]| *best >= reach);
+                let reached = (trial.from..=generation).find(|&at| trial.course[at][0] >= reach);
                 Some(reached.unwrap_or(generation + 1) as f64)
             }
             Measure::Played { .. } => None,

@@ -316,16 +316,17 @@ impl Dots {
     /// What each panel has, row by row.
     fn description(&self) -> String {
         let told = |spread: &Option<Interval>| spread.map_or("missing".into(), |[mean, ..]| format!("{mean:.2}"));
+        let headed = |name: &str| if name.is_empty() { String::new() } else { format!("{name}: ") };
         let panel = |(title, base, found): &(String, Option<Interval>, Vec<Option<Interval>>)| {
             let mut found = found.iter();
             let group = |(name, values): &(String, Vec<String>)| {
                 let values: Vec<_> =
                     values.iter().zip(&mut found).map(|(value, spread)| format!("{value} {}", told(spread))).collect();
-                format!("{name}: {}", values.join(", "))
+                format!("{}{}", headed(name), values.join(", "))
             };
             let groups: Vec<_> = self.groups.iter().map(group).collect();
-            let title = if title.is_empty() { String::new() } else { format!("{title}: ") };
-            format!("{title}{} as in the file; {}.", told(base), groups.join("; "))
+            let base = base.map_or(String::new(), |[mean, ..]| format!("{mean:.2} as in the file; "));
+            format!("{}{base}{}.", headed(title), groups.join("; "))
         };
         self.panels.iter().map(panel).collect::<Vec<_>>().join(" ")
     }

@@ -430,7 +430,7 @@ impl Legend {
         (places, y + Self::ROW)
     }
 
-    /// How high a map of this width is, in points.
+    /// How high the legend below a map of this width is, in millimetres.
     pub fn height(&self, width: f64) -> f64 {
         self.places(width).1
     }

@@ -586,7 +586,11 @@ pub fn still(config: &Config, played: &[Replayed], step: usize) -> Scene {
 fn busy(config: &Config, played: &[Replayed]) -> [DVec2; 2] {
     let map = DVec2::from(config.world.map);
     let around = |at: DVec2, margin: f64| [at - margin, at + margin];
-    let pois = config.world.pois.iter().map(|&poi| around(poi.into(), config.world.observation_radius + 1.0));
+    let pois: Vec<DVec2> = match config.learning.poi_jitter > 0.0 {
+        true => played.iter().flat_map(|played| &played.world.pois).map(|poi| poi.as_dvec2()).collect(),
+        false => config.world.pois.iter().map(|&poi| poi.into()).collect(),
+    };
+    let pois = pois.into_iter().map(|poi| around(poi, config.world.observation_radius + 1.0));
     let agents = played.iter().flat_map(|played| &played.trace.moments);
     let agents = agents.map(|moment| around(Vec2::from(moment.position).as_dvec2(), 2.0));
     let [mut from, mut to] = pois

@@ -248,7 +248,13 @@ pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
             }
         }
     }
-    let label = |(folder, table): (&PathBuf, &toml::Table)| {
+    let staged = configs.iter().any(|config| config.stages != configs[0].stages);
+    let label = |((folder, table), config): ((&PathBuf, &toml::Table), &Config)| {
+        let stages = match config.stages.len() {
+            0 => "no stages".into(),
+            1 => "1 stage".into(),
+            several => format!("{several} stages"),
+        };
         let parts: Vec<String> = keys
             .iter()
             .map(|(section, key)| {
@@ -257,10 +263,11 @@ pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
                 if value.len() > 24 { String::new() } else { format!("{key} {value}") }
             })
             .filter(|part| !part.is_empty())
+            .chain(Some(stages).filter(|_| staged))
             .collect();
         if parts.is_empty() { folder.display().to_string() } else { parts.join(", ") }
     };
-    let labels: Vec<String> = folders.iter().zip(&tables).map(label).collect();
+    let labels: Vec<String> = folders.iter().zip(&tables).zip(configs).map(label).collect();
     // Runs that are labelled alike differ in something long: say where they are, too.
     let twice = |label: &String| labels.iter().filter(|other| *other == label).count() > 1;
     let full = |(label, folder): (&String, &PathBuf)| {

@@ -19,6 +19,8 @@ const MOST: usize = 1 << 16;
 const FLUSH: Duration = Duration::from_secs(2);
 /// What TensorBoard knows event files by.
 const MARK: &str = "tfevents";
+/// The end of the names of those that are written here.
+const OURS: &str = ".flotilla";
 
 /// The event files of one run.
 pub struct Events {
@@ -43,7 +45,7 @@ impl Events {
         for trial in 0..trials {
             let folder = folder.join(format!("trial-{trial:0digits$}"));
             fs::create_dir_all(&folder)?;
-            files.push(folder.join(format!("events.out.{MARK}.{seconds:010}.flotilla")));
+            files.push(folder.join(format!("events.out.{MARK}.{seconds:010}{OURS}")));
         }
         let first = record(&event(now(), 0, &Content::Version));
         let mut events = Events { files, new: vec![first; trials], flushed: Instant::now() };
@@ -74,7 +76,7 @@ impl Events {
             for entry in if is_ours && trial.is_dir() { Some(fs::read_dir(trial)?) } else { None }.into_iter().flatten()
             {
                 let path = entry?.path();
-                if path.file_name().is_some_and(|name| name.to_string_lossy().contains(MARK)) {
+                if path.file_name().is_some_and(|name| name.to_string_lossy().ends_with(OURS)) {
                     fs::remove_file(path)?;
                 }
             }

@@ -30,6 +30,14 @@ struct Facets<'a> {
     panels: Vec<(String, Vec<Spot<'a>>)>,
 }
 
+/// What came out at the end; of grids also when it was reached, and the way there.
+const FIGURES: [&str; 3] = ["final", "reach", "curves"];
+
+/// What the files of all figures are called.
+pub fn names() -> impl Iterator<Item = String> {
+    FIGURES.into_iter().flat_map(|name| Format::ALL.map(|kind| format!("{name}.{}", kind.extension())))
+}
+
 /// Draws the figures of the points that are done, over one or two axes; gives the files' names, and what was left out.
 ///
 /// # Errors
@@ -42,11 +50,11 @@ pub fn draw(
     out: &Path,
 ) -> Result<(Vec<String>, Option<String>), RecordError> {
     let scenes = if sweep.axes.iter().any(|axis| axis.varied) {
-        dots(sweep, outcomes).map(|dots| vec![("final", dots.scene())])
+        dots(sweep, outcomes).map(|dots| vec![(FIGURES[0], dots.scene())])
     } else {
         let of_grid = |grid: Facets<'_>| {
             let (last, reach) = (grid.last().scene(), grid.reach(options).scene());
-            vec![("final", last), ("reach", reach), ("curves", grid.curves(sweep).scene())]
+            FIGURES.into_iter().zip([last, reach, grid.curves(sweep).scene()]).collect()
         };
         Facets::new(sweep, outcomes, axes).map(of_grid)
     };
@@ -61,7 +69,7 @@ pub fn draw(
             let name = format!("{name}.{}", kind.extension());
             let path = out.join(&name);
             let bytes = scene.file(kind, PRINT);
-            let write = bytes.and_then(|bytes| disk.replace(&path, |output| output.write_all(&bytes)));
+            let write = bytes.and_then(|bytes| disk.deliver(&path, |output| output.write_all(&bytes)));
             write.map_err(|error| RecordError::Write { path, error })?;
             names.push(name);
         }

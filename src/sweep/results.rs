@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 use super::{Point, Sweep};
 use crate::config::Config;
 use crate::file;
-use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{CONFIG, METRICS, POINTS, RESULTS};
 use crate::record::metrics;
+use crate::record::{RecordError, without_checkpoint};
 use crate::statistics::Average;
 use crate::trainer::Row;
 
@@ -103,11 +103,11 @@ pub fn write(sweep: &Sweep, out: &Path, options: &Detail) -> Result<Vec<Result<O
         }
         table.flush()
     };
-    disk.replace(&path, rows).map_err(|error| RecordError::Write { path, error })?;
+    disk.deliver(&path, rows).map_err(|error| RecordError::Write { path, error })?;
 
     let path = out.join(POINTS);
     let summary = |output: &mut dyn Write| summary(sweep, &outcomes, options, output);
-    disk.replace(&path, summary).map_err(|error| RecordError::Write { path, error })?;
+    disk.deliver(&path, summary).map_err(|error| RecordError::Write { path, error })?;
     Ok(outcomes)
 }
 
@@ -154,7 +154,7 @@ fn read(point: &Point, out: &Path, options: &Detail) -> Result<(Vec<Row>, Outcom
         return Err(Missing::NotRun);
     }
     let config = Config::load(&folder.join(CONFIG)).map_err(|error| damaged(&error))?;
-    if config != point.config {
+    if without_checkpoint(&config) != without_checkpoint(&point.config) {
         return Err(Missing::Damaged(format!("{}: it is of another config", folder.display())));
     }
     let (trials, last) = (config.learning.trials, config.learning.generations);
@@ -171,7 +171,8 @@ fn read(point: &Point, out: &Path, options: &Detail) -> Result<(Vec<Row>, Outcom
             )));
         }
         next += 1;
-        if best_g >= options.reach && reached[trial].is_none() {
+        // In an easier stage it is another G.
+        if best_g >= options.reach && reached[trial].is_none() && generation >= config.last_from() {
             reached[trial] = Some(generation);
         }
         if generation % options.every == 0 || generation == last {

@@ -48,7 +48,7 @@ const page = (() => {
 
   // Sets keys of the config, its comments kept where that can be done; one change after the other.
   let changing = Promise.resolve();
-  const change = changes => (changing = changing.then(() => change_now(changes)));
+  const change = changes => (changing = changing.catch(() => {}).then(() => change_now(changes)));
   async function change_now(changes) {
     let text = state.text;
     for (const [key, value] of changes) text = configs.set(text, key, value);
@@ -60,6 +60,14 @@ const page = (() => {
       if (plain.words.toml !== wanted.words.toml) text = wanted.words.toml;
     } catch { /* What is wrong is shown with the text. */ }
     return take(text);
+  }
+
+  // What was typed or chosen a moment ago counts for whatever follows.
+  let typed = null;
+  const type = () => { typed = null; return take($("text").value, { edited: true }); };
+  async function entered() {
+    if (typed !== null) { clearTimeout(typed); await type(); }
+    await changing;
   }
 
   // Brings the controls to what the config says.
@@ -150,7 +158,7 @@ const page = (() => {
       for (const [id, key] of Object.entries(KEYS)) if (words.has(id)) text = configs.set(text, key, quote(id)(words.get(id)));
     }
     const learners = words.get("learners");
-    state.both = !(learners in NAMES);
+    state.both = !learners || !Object.hasOwn(NAMES, learners);
     if (!state.both) text = configs.set(text, "learning.paradigm", `"${learners}"`);
     if (await take(text) || state.config) return;
     // Where the link's config is wrong, there is a map to look at nevertheless.
@@ -207,6 +215,7 @@ const page = (() => {
     $("digests").replaceChildren();
     let training;
     try {
+      await entered();
       await settle();
       const paradigms = state.both && state.config.world.followers.length ? ["leader-follower", "all-leaders"] : [state.config.learning.paradigm];
       const arms = await Promise.all(paradigms.map(async paradigm => {
@@ -220,6 +229,7 @@ const page = (() => {
       build(training);
       await training.start(state.players);
     } catch (error) {
+      if (error.fatal) await renew();
       trouble(error.message);
       $("train").disabled = false;
       return;
@@ -739,12 +749,12 @@ const page = (() => {
     only.chosen = null;
     drive.on = true;
     $("again").textContent = "Start over";
-    $("driven").textContent = state.policies ? "The other leaders do what they learned." : "The other leaders go straight ahead: train first, and they do what they learned.";
     const player = state.players[0], toml = configs.set(state.toml, "learning.paradigm", '"leader-follower"');
     const { each, weights } = state.policies || { each: 0 };
     let told;
     try {
       told = (await player.ask({ ask: "drive", text: toml, leader, policies: each }, weights)).words;
+      $("driven").textContent = told.learned ? "The other leaders do what they learned." : state.policies ? "The other leaders go straight ahead: what was learned is not for these teams." : "The other leaders go straight ahead: train first, and they do what they learned.";
     } catch (error) {
       drive_off();
       return trouble(error.message);
@@ -838,10 +848,10 @@ const page = (() => {
   // ---- Files ----
 
   async function take_file(file) {
-    const bytes = new Uint8Array(await file.arrayBuffer());
     trouble("");
     $("said").textContent = "";
     try {
+      const bytes = new Uint8Array(await file.arrayBuffer());
       if (/\.zip$/i.test(file.name) || bytes[0] === 0x50 && bytes[1] === 0x4b) {
         const found = await state.players[0].ask({ ask: "read", text: null }, bytes, {}, [bytes.buffer]);
         await settle();
@@ -875,8 +885,9 @@ const page = (() => {
         show(only, stage.unpack(data));
         $("said").textContent = `${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} a leader. Take a leader to play with them.`;
       } else {
+        if (!/\.toml$/i.test(file.name)) throw new Error("it is no config (.toml), no run (.zip) and no policies (.safetensors)");
+        const text = new TextDecoder("utf-8", { fatal: true }).decode(bytes);
         state.file = file.name.replace(/\.toml$/i, "");
-        const text = new TextDecoder().decode(bytes);
         state.both = false;
         forget();
         mode("watch");
@@ -932,7 +943,8 @@ const page = (() => {
       $(id).addEventListener("change", () => { if ($(id).value !== "") change([[key, quote(id)($(id).value)]]); });
     }
     for (const id of ["on", "pace"]) $(id).addEventListener("change", remember);
-    $("on").addEventListener("change", settle);
+    // A training goes on where it is; the next one is elsewhere.
+    $("on").addEventListener("change", () => { if (!state.training || state.training.state === "done" || state.training.state === "stopped") settle().catch(error => trouble(error.message)); });
     for (const button of document.querySelectorAll("[data-mode]")) button.addEventListener("click", () => mode(button.dataset.mode));
     for (const button of document.querySelectorAll("[data-add]")) button.addEventListener("click", () => add(button.dataset.add));
     $("remove").addEventListener("click", remove);
@@ -955,11 +967,10 @@ const page = (() => {
     $("open").addEventListener("click", () => $("file").click());
     $("file").addEventListener("change", () => { if ($("file").files[0]) take_file($("file").files[0]); $("file").value = ""; });
     $("save").addEventListener("click", () => save("config.toml", state.text, "text/plain"));
-    let typed = null;
     $("text").addEventListener("input", () => {
       lines();
       clearTimeout(typed);
-      typed = setTimeout(() => take($("text").value, { edited: true }), 250);
+      typed = setTimeout(type, 250);
     });
     $("text").addEventListener("scroll", lines);
     $("config").addEventListener("toggle", lines);

@@ -36,7 +36,7 @@ const pool = (() => {
     }
     // What is transferred is no longer here.
     ask(words, bytes, more = {}, transferred = []) {
-      if (this.failed) return Promise.reject(new Error("the worker has failed; load the page again"));
+      if (this.failed) return Promise.reject(Object.assign(new Error("the worker has failed; load the page again"), { problems: [], fatal: true }));
       const id = this.count++;
       const answered = new Promise((resolve, reject) => this.asked.set(id, { resolve, reject }));
       this.worker.postMessage({ id, words, bytes, ...more }, transferred);

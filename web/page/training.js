@@ -125,6 +125,9 @@ class Training {
   // The best team of a generation of a trial, as a page shows it; the one that is at hand where none is named.
   async best(run, trial, generation) {
     const { words } = await this.owners.get(`${run}/${trial}`).ask({ ask: "best", run, trial, generation });
+    // What was read may have started from other policies than are drawn here, or be another version's.
+    const [episode] = words.episodes, told = this.arms[run].trials[trial][episode.generation];
+    if (told && told.best !== episode.best_g) throw new Error(`Trained again, generation ${episode.generation} comes to G = ${episode.best_g}, where the run says ${told.best}: it started from given policies, or another version made it.`);
     return stage.unpack(words);
   }
 

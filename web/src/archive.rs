@@ -155,7 +155,9 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
     let text = String::from_utf8(file(folder::CONFIG)?).map_err(|_| refuse("config.toml is not UTF-8 text"))?;
     let config = Config::parse(&text, "config.toml")?;
     let (metrics, weights) = (file(folder::METRICS)?, file(folder::POLICIES)?);
-    let run = file(folder::RUN).ok().and_then(|text| Run::parse(&String::from_utf8_lossy(&text)).ok());
+    let run = Run::parse(&String::from_utf8_lossy(&file(folder::RUN)?))
+        .map_err(|error| refuse(format!("run.json: {error}")))?;
+    let expected = run.digest.ok_or_else(|| refuse("run.json tells no digest: the run is not done"))?;
     let mut numbers: Vec<f64> = Vec::new();
     let mut rows = metrics::Rows::new(&metrics[..]).map_err(|error| refuse(format!("metrics.csv: {error}")))?;
     let mut plain = Vec::new();
@@ -165,14 +167,19 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
         numbers.extend([0.0, trial as f64, generation as f64, best_g, mean_g, champion_g, seconds]);
         plain.push(row);
     }
+    let (trials, whole) = (config.learning.trials, config.learning.trials * (config.learning.generations + 1));
+    let in_turn = |(at, row): (usize, &Row)| (row.generation, row.trial) == (at / trials, at % trials);
+    if plain.len() != whole || !plain.iter().enumerate().all(in_turn) {
+        return Err(refuse(format!(
+            "metrics.csv: these are not the {whole} rows of all trials, generation by generation"
+        )));
+    }
     let trial = |trial| policies::from_source(Cursor::new(&weights), &config, Some(trial));
     let trials: Result<Vec<_>, String> = (0..config.learning.trials).map(trial).collect();
     let trials = trials.map_err(|reason| refuse(format!("policies.safetensors: {reason}")))?;
     let weights: Vec<&[f32]> = trials.iter().map(|trial| &trial.weights[..]).collect();
     let digest = hex(&metrics::digest(plain.into_iter(), &weights));
-    if let Some(expected) = run.and_then(|run| run.digest)
-        && expected != digest
-    {
+    if expected != digest {
         return Err(refuse(format!("the run is damaged: its digest is {digest}, run.json says {expected}")));
     }
     let count = numbers.len() / 7;

@@ -144,14 +144,18 @@ fn resolve(text: &str, name: &str, changes: Vec<(String, String)>) -> Result<Val
     let changes: Vec<Override> = changes.into_iter().map(change).collect();
     let config = Config::read(text, name, &[], &changes)?;
     let mut words = described(&config);
-    words["bytes"] = flotilla::memory::Peaks::of([&config], 1).host.into();
+    // What it started from is kept, and in the end all of it is packed up.
+    words["bytes"] = (flotilla::memory::Peaks::of([&config], 1).host + 5 * config.policy_bytes()).into();
     Ok(words)
 }
 
 /// A config as a page needs it: as text, as a tree, and what is worked out from it.
 pub fn described(config: &Config) -> Value {
     let (toml, pois, parameters) = (config.to_toml(), config.pois(), config.parameters());
-    json!({ "toml": toml, "config": config, "pois": pois, "parameters": parameters })
+    let mut words = json!({ "toml": toml, "config": config, "pois": pois, "parameters": parameters });
+    // JavaScript's numbers do not hold every seed.
+    words["config"]["learning"]["seed"] = config.learning.seed.to_string().into();
+    words
 }
 
 fn machine((backend, machine): &Player) -> Value {

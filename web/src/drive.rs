@@ -11,6 +11,8 @@ use crate::ask::{Refusal, refuse};
 pub struct Drive {
     stepper: Stepper,
     leader: usize,
+    /// Whether the others do what they learned.
+    learned: bool,
     /// One policy a leader, `[leaders][parameters]`.
     policies: Vec<f32>,
     /// Widths of the policies' layers.
@@ -38,7 +40,7 @@ impl Drive {
         };
         let observed = vec![None; stepper.world().pois.len()];
         let widths = config.policy.widths();
-        Ok(Drive { stepper, leader, policies, widths, observed })
+        Ok(Drive { stepper, leader, learned: fits, policies, widths, observed })
     }
 
     /// Plays one step, with this turn and speed for the leader that was taken.
@@ -73,6 +75,7 @@ impl Drive {
         let states = self.stepper.states();
         Ok(json!({
             "step": step,
+            "learned": self.learned,
             "positions": states.positions,
             "headings": states.headings,
             "near": near,

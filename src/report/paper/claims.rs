@@ -632,10 +632,13 @@ const TESTS: &[Test] = &[
         place: "§6",
         layout: EIGHT,
         words: "led, “a similarly performant policy”, “even as this ratio of followers to leaders is increased”",
-        measure: "POIs at generation 100, leader-follower less all-leaders, by pair: above −0.2",
+        measure: "POIs at generation 100, leader-follower less all-leaders, by pair: less than 0.2 apart",
         needs: END,
         sources: &SOURCES,
-        find: |view| Some(Criterion::Difference(view.lead()?, [-view.pois(SMALL), f64::INFINITY])),
+        find: |view| {
+            let margin = view.pois(SMALL);
+            Some(Criterion::Difference(view.lead()?, [-margin, margin]))
+        },
     },
     Test {
         place: "§6",

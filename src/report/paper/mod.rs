@@ -81,7 +81,8 @@ pub fn arms(overrides: &[Override]) -> Result<Vec<Experiment>, ConfigError> {
     let mut arms = Vec::new();
     for (layout, paradigm, selects) in places.chain(rivals) {
         for fitness in FITNESSES {
-            let name = format!("configs/{}.toml", layout.name.replace(' ', "_"));
+            let folder = if shown(&layout) { "configs" } else { "configs/questions" };
+            let name = format!("{folder}/{}.toml", layout.name.replace(' ', "_"));
             let mut config = Config::read(layout.config, &name, &[], overrides)?;
             (config.learning.paradigm, config.learning.fitness) = (paradigm, fitness);
             if selects {
@@ -198,8 +199,9 @@ impl Evidence<'_> {
             Source::Random => &self.baselines.get(ground)?.random,
             Source::Evolved(fitness) => &here.find(|arm| arm.fitness == fitness)?.best,
         };
-        // The paper's starts are fixed.
-        Some(Course { best, pois, certain: source == Source::Straight })
+        // The paper's starts are fixed; where something moves, it hangs on the trial.
+        let certain = source == Source::Straight && best.windows(2).all(|pair| pair[0] == pair[1]);
+        Some(Course { best, pois, certain })
     }
 
     /// What agents came to in one of [`LAYOUTS`] that all lead and choose among known behaviours.
