@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
 use assert_cmd::cargo::cargo_bin_cmd;
+use flotilla::backend::Machine;
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::{Machine, Player};
 use flotilla::config::{Config, Sharing};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{Folder, METRICS, POLICIES, RUN, Run, Start};
@@ -102,6 +102,20 @@ fn what_is_wrong_with_a_stage_is_told_by_its_line() {
     assert!(wrong(&text)[0].contains("world.followers: 3 leaders learn in this stage, 5 in all others"), "{text}");
 }
 
+/// Trains until it may stop before a generation, or to the end.
+fn go_on(session: &mut Session, stops: impl Fn(usize) -> bool) -> Result<Ended, RunError> {
+    let (stop, save) = (AtomicBool::new(stops(0)), AtomicBool::new(false));
+    let mut options = Options {
+        command: "",
+        stop: &stop,
+        save: &save,
+        instead: &mut |_| None,
+        setback: &mut |_| {},
+        watch: &mut |progress| stop.store(stops(progress.generations[0]), Relaxed),
+    };
+    session.train(&mut (Box::new(Cpu::default()), Machine::default()), &mut options)
+}
+
 /// Trains until a generation has been played, or to the end.
 fn train(
     config: &Config,
@@ -112,17 +126,7 @@ fn train(
 ) -> Result<Option<Results>, RunError> {
     let (mut session, _) =
         Session::open_from(vec![(config.clone(), path.to_path_buf(), init)], start, &Disk::default())?;
-    let (stop, save) = (AtomicBool::new(until == 0), AtomicBool::new(false));
-    let mut options = Options {
-        command: "",
-        stop: &stop,
-        save: &save,
-        instead: &mut |_| None,
-        setback: &mut |_| {},
-        watch: &mut |progress| stop.store(progress.generations[0] >= until, Relaxed),
-    };
-    let mut player: Player = (Box::new(Cpu::default()), Machine::default());
-    let ended = session.train(&mut player, &mut options)?;
+    let ended = go_on(&mut session, |next| next >= until)?;
     Ok((ended == Ended::Done).then(|| session.results(0).cloned().unwrap()))
 }
 
@@ -130,21 +134,10 @@ fn train(
 fn train_shorter(config: &Config, path: &Path, init: Option<Init>, until: usize, finish: bool) -> usize {
     let runs = vec![(config.clone(), path.to_path_buf(), init)];
     let (mut session, _) = Session::open_from(runs, Start::Fresh, &Disk::default()).unwrap();
-    let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
-    let mut options = Options {
-        command: "",
-        stop: &stop,
-        save: &save,
-        instead: &mut |_| None,
-        setback: &mut |_| {},
-        watch: &mut |progress| stop.store(progress.generations[0] == until, Relaxed),
-    };
-    let mut player: Player = (Box::new(Cpu::default()), Machine::default());
-    assert!(session.train(&mut player, &mut options).unwrap() == Ended::Stopped);
+    assert!(go_on(&mut session, |next| next == until).unwrap() == Ended::Stopped);
     let last = session.end().unwrap();
-    stop.store(false, Relaxed);
     if finish {
-        assert!(session.train(&mut player, &mut options).unwrap() == Ended::Done);
+        assert!(go_on(&mut session, |_| false).unwrap() == Ended::Done);
     }
     last
 }

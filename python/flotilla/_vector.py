@@ -58,10 +58,10 @@ class Teams:
 
     def step(self, actions: Floats, rested: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
         """Plays a step, and rewards it; which teams but those that have rested have played their last one."""
-        before = self.steps >= self.length
         if self.reward == "G":
             self.stepper.step(actions, self.rewards)
         else:
+            before = self.steps >= self.length
             self.stepper.step(actions, None)
         over: NDArray[np.bool_] = self.steps >= self.length
         if rested is not None:
