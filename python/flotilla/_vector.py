@@ -58,21 +58,17 @@ class Teams:
 
     def step(self, actions: Floats, rested: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
         """Plays a step, and rewards it; which teams but those that have rested have played their last one."""
-        if self.reward == "G":
-            self.stepper.step(actions, self.rewards)
-        else:
-            before = self.steps >= self.length
-            self.stepper.step(actions, None)
+        had = None if self.reward == "G" else self.steps >= self.length
+        self.stepper.step(actions, self.rewards if had is None else None)
         over: NDArray[np.bool_] = self.steps >= self.length
         if rested is not None:
             over &= ~rested
-        if self.reward != "G":
-            if over.any():
-                self.stepper.fitness(self.reward, self.rewards)
-                # Who was over before has had its reward.
-                self.rewards[~over | before] = 0
-            else:
-                self.rewards.fill(0)
+        if had is not None and over.any():
+            self.stepper.fitness(self.reward, self.rewards)
+            # Who was over before has had its reward.
+            self.rewards[~over | had] = 0
+        elif had is not None:
+            self.rewards.fill(0)
         return over
 
     def state(self) -> Floats:
