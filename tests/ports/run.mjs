@@ -1,4 +1,4 @@
-// Runs the digests of tests/wasm in Node: node run.mjs FILE.wasm TOOLCHAIN VERSION [REPORT]
+// Runs the digests of tests/ports in Node: node run.mjs FILE.wasm TOOLCHAIN VERSION [REPORT]
 import { readFileSync, writeFileSync } from "node:fs";
 import { cpus } from "node:os";
 
