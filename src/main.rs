@@ -4,6 +4,8 @@ use flotilla::cli::{self, Error};
 
 fn main() -> ExitCode {
     calm_drivers();
+    #[cfg(unix)]
+    allow_many_files();
     match fail_large_files().and_then(|()| cli::run()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
@@ -25,6 +27,20 @@ fn calm_drivers() {
         unsafe {
             std::env::set_var(name, "/dev/null");
         }
+    }
+}
+
+/// A sweep keeps files of all its points open, and some systems allow a process 256 unless it asks for more.
+#[cfg(unix)]
+fn allow_many_files() {
+    use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+    /// macOS allows no more, whatever it says that it would.
+    const MOST: u64 = 10_240;
+    let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+    let wanted = maximum.map_or(MOST, |maximum| maximum.min(MOST));
+    if current.is_some_and(|current| current < wanted) {
+        // Refused, it stays as it was, and what is too much is told when it happens.
+        let _ = setrlimit(Resource::Nofile, Rlimit { current: Some(wanted), maximum });
     }
 }
 

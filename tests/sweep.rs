@@ -917,3 +917,22 @@ fn a_batch_of_unequal_points_costs_what_its_parts_do() {
     println!("batch / parts = {ratio:.2}");
     assert!(ratio <= 1.3, "{ratio}");
 }
+
+#[cfg(unix)]
+#[test]
+fn more_files_are_asked_for_than_a_process_is_given_and_too_few_are_told() {
+    let points = "1, 2, 3, 4, 5, 6, 7, 8";
+    let (folder, _) = written(&format!("{SMALL}\"learning.seed\" = [{points}]\n"));
+    let run = |limit: &str, out: &str, flags: &str| {
+        let script = format!("ulimit {limit} 48; exec flotilla sweep x.toml --quiet --backend cpu --out {out} {flags}");
+        support::shell("bash", &script).current_dir(folder.path()).output().unwrap()
+    };
+    // A limit that may be raised is.
+    done(run("-S -n", "soft", ""));
+    let error = failed(run("-n", "hard", ""), 1);
+    assert!(error.contains("ulimit -n") && error.contains("--resume"), "{error}");
+    assert_eq!(error.lines().count(), 1, "{error}");
+    // What was done stands.
+    done(run("-S -n", "hard", "--resume"));
+    assert_eq!(policies(&folder.path().join("hard")), policies(&folder.path().join("soft")));
+}

@@ -73,8 +73,8 @@ class Run:
             True
         """
         path = os.fspath(folder)
-        outcome, played = _native.open(path)
-        return cls(outcome, played, None, path)
+        outcome, played, times = _native.open(path)
+        return cls(outcome, played, times, path)
 
     @property
     def folder(self) -> str:

@@ -252,14 +252,19 @@ fn draw(folder: &PathBuf) -> PyResult<()> {
 
 /// Reads a run that is done.
 #[pyfunction]
-pub fn open(py: Python<'_>, folder: PathBuf) -> PyResult<(Outcomes<'_>, Played)> {
-    let (trained, digest, run) = workers::aside(py, || {
+pub fn open(py: Python<'_>, folder: PathBuf) -> PyResult<(Outcomes<'_>, Played, Vec<f64>)> {
+    let (trained, digest, run, times) = workers::aside(py, || {
         let trained = Trained::read(&folder).raise()?;
         let run = folder::Run::read(&folder.join(folder::RUN)).raise()?;
         let digest = trained.digest();
-        Ok::<_, PyErr>((trained, digest, run))
+        let path = folder.join(METRICS);
+        let times = metrics::open(&path).raise()?.filter_map(|row| match row {
+            Ok((row, seconds)) => (row.trial == 0).then_some(Ok(seconds)),
+            Err(reason) => Some(Err(RecordError::Damaged { path: path.clone(), reason: reason.to_string() })),
+        });
+        Ok::<_, PyErr>((trained, digest, run, times.collect::<Result<_, _>>().raise()?))
     })?;
-    Ok((outcomes(py, trained, digest)?, (run.backend, run.description, run.init)))
+    Ok((outcomes(py, trained, digest)?, (run.backend, run.description, run.init), times))
 }
 
 /// Writes what a training in memory came to as the folder of a run; gives its digest.

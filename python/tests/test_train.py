@@ -113,6 +113,8 @@ def test_a_training_starts_from_what_another_came_to(config, program):
     # A copy says what it started from, which it has not.
     warm.save("copy")
     assert Run.open("copy").digest == warm.digest
+    # With the times of the one that it was read from.
+    assert filecmp.cmp("copy/metrics.csv", "warm/metrics.csv", shallow=False)
     with pytest.raises(flotilla.Error, match="started from given policies"):
         Run.open("copy").replay()
     with pytest.raises(flotilla.Error, match="starts over from these alone"):

@@ -12,6 +12,9 @@ use crate::report::runs;
 use crate::run::RunError;
 use crate::shell;
 
+/// `EMFILE`, which every Unix gives this number and Rust no name.
+const TOO_MANY_FILES: i32 = 24;
+
 /// About a device that cannot be had, or failed.
 pub fn device(error: &DeviceError) -> &'static str {
     match error {
@@ -42,6 +45,11 @@ pub fn backend(error: &BackendError) -> &'static str {
 /// About files, before `again`.
 pub fn record(error: &RecordError, again: &str) -> String {
     match error {
+        RecordError::Write { error, .. } | RecordError::Read { error, .. }
+            if cfg!(unix) && error.raw_os_error() == Some(TOO_MANY_FILES) =>
+        {
+            format!("; the system allows no more open files here (see `ulimit -n`): raise that, then {again}")
+        }
         RecordError::Write { error, .. } => match error.kind() {
             StorageFull | QuotaExceeded => format!("; free some space, then {again}"),
             FileTooLarge => {

@@ -11,7 +11,8 @@ use crate::record::disk::Disk;
 use crate::record::folder::{self, Note, Start};
 use crate::run::{self, Ended, RunError, Session};
 
-/// Most points in one batch: each keeps two files open, and systems allow a process 1024.
+/// Most points in one batch: each keeps two files open, and most systems allow a process 1024 or, where it asks as the
+/// program does, more.
 const MAX_BATCH: usize = 400;
 
 /// How points are run.
