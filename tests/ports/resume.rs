@@ -1,0 +1,105 @@
+//! A process that is killed while it trains goes on to the same bytes: with what keeps runs and nothing of the program,
+//! for machines where building that takes long. What else is to be known of kills, `tests/recovery.rs` asks.
+
+use std::path::Path;
+use std::process::{Child, Command, ExitStatus};
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
+use std::{env, fs};
+
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::{Machine, Player};
+use flotilla::config::Config;
+use flotilla::record::disk::Disk;
+use flotilla::record::folder::{METRICS, POLICIES, Start};
+use flotilla::run::{Ended, Options, Session};
+
+const TEST: &str = "a_killed_process_goes_on_to_the_same_bytes";
+/// Names the folder to train in, to the processes that are killed.
+const FOLDER: &str = "FLOTILLA_PORTS_FOLDER";
+const KILLS: usize = 6;
+
+/// Runs that take seconds under an emulator, most of which go into checkpoints.
+fn config() -> Config {
+    let text = "
+[world]
+leaders = [[10, 5], [20, 5]]
+followers = [[12, 2], [22, 2]]
+pois = [[10, 9], [20, 9]]
+coupling = 2
+steps = 6
+[policy]
+hidden = [16]
+[learning]
+population = 20
+generations = 60
+trials = 2
+[checkpoint]
+generations = 1
+seconds = 0
+";
+    Config::parse(text, "ports.toml").unwrap()
+}
+
+fn train(folder: &Path) {
+    let (mut session, notes) = Session::open(vec![(config(), folder.into())], Start::Resume, &Disk::default()).unwrap();
+    assert!(!notes.iter().any(|(_, note)| note.is_damage()), "{notes:?}");
+    let mut player: Player = (Box::new(Cpu::default()), Machine::default());
+    let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
+    let mut options = Options {
+        command: "",
+        stop: &stop,
+        save: &save,
+        instead: &mut |_| None,
+        setback: &mut |_| {},
+        // Time to be killed in.
+        watch: &mut |_| std::thread::sleep(Duration::from_millis(10)),
+    };
+    assert_eq!(session.train(&mut player, &mut options).unwrap(), Ended::Done);
+}
+
+/// The policies, and the metrics without the seconds.
+fn what_came_out(folder: &Path) -> (Vec<u8>, Vec<String>) {
+    let metrics = fs::read_to_string(folder.join(METRICS)).unwrap();
+    let without_seconds = |line: &str| line.split(',').take(5).collect::<Vec<_>>().join(",");
+    (fs::read(folder.join(POLICIES)).unwrap(), metrics.lines().map(without_seconds).collect())
+}
+
+/// Kills a process once the run has two rows more, or waits for its end where none are to come.
+fn killed_or_done(child: &mut Child, metrics: &Path, kill: bool) -> Option<ExitStatus> {
+    let rows = || fs::read(metrics).map_or(0, |text| text.iter().filter(|&&byte| byte == b'\n').count());
+    let before = rows();
+    loop {
+        if let Some(status) = child.try_wait().unwrap() {
+            return Some(status);
+        }
+        if kill && rows() >= before + 2 {
+            child.kill().unwrap();
+            child.wait().unwrap();
+            return None;
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+#[test]
+fn a_killed_process_goes_on_to_the_same_bytes() {
+    if let Some(folder) = env::var_os(FOLDER) {
+        return train(Path::new(&folder));
+    }
+    let scratch = tempfile::tempdir().unwrap();
+    let [whole, killed] = ["whole", "killed"].map(|name| scratch.path().join(name));
+    train(&whole);
+    let mut kills = 0;
+    let status = loop {
+        let mut command = Command::new(env::current_exe().unwrap());
+        let mut child = command.args(["--exact", TEST]).env(FOLDER, &killed).spawn().unwrap();
+        match killed_or_done(&mut child, &killed.join(METRICS), kills < KILLS) {
+            None => kills += 1,
+            Some(status) => break status,
+        }
+    };
+    assert!(status.success(), "{status}");
+    assert_eq!(kills, KILLS);
+    assert!(what_came_out(&killed) == what_came_out(&whole), "{} differs", killed.display());
+}
