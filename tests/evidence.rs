@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 
 use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::backend::cpu::Cpu;
+use flotilla::backend::{Backend, BackendError, Group, Need, Trace, Visit};
 use flotilla::record::evidence::{Compared, SCHEMA, Sighting, Tier};
+use flotilla::verify::{self, Plan};
 
 #[path = "../examples/evidence.rs"]
 mod evidence;
@@ -16,7 +18,7 @@ fn root() -> PathBuf {
     env!("CARGO_MANIFEST_DIR").into()
 }
 
-fn verify(words: &[&str]) -> assert_cmd::Command {
+fn verify_command(words: &[&str]) -> assert_cmd::Command {
     let mut command = cargo_bin_cmd!("flotilla");
     command.args(["verify", "-q", "--worlds", "2", "--teams", "3"]).args(words);
     command.envs([("VK_DRIVER_FILES", "/nonexistent"), ("VK_ICD_FILENAMES", "/nonexistent")]);
@@ -28,7 +30,7 @@ fn verify(words: &[&str]) -> assert_cmd::Command {
 fn a_report_needs_no_gpu() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("here.json");
-    let output = verify(&["--note", "a test", "--report"]).arg(&file).output().unwrap();
+    let output = verify_command(&["--note", "a test", "--report"]).arg(&file).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let table = String::from_utf8(output.stdout).unwrap();
 
@@ -53,16 +55,52 @@ fn a_report_needs_no_gpu() {
     }
 }
 
+/// Right but where scores of one kind are asked for: there teams play each other's policies.
+struct Liar {
+    cpu: Cpu,
+    about: Need,
+}
+
+impl Backend for Liar {
+    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
+        let reversed: Vec<Vec<u32>> = groups.iter().map(|group| group.teams.iter().rev().copied().collect()).collect();
+        let told = groups.iter().zip(&reversed);
+        let told: Vec<Group<'_>> = told
+            .map(|(group, teams)| if group.need == self.about { Group { teams, ..*group } } else { *group })
+            .collect();
+        self.cpu.rollout(&told, visit)
+    }
+
+    fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
+        self.cpu.trace(group)
+    }
+
+    fn describe(&self) -> String {
+        "a liar".into()
+    }
+}
+
+#[test]
+fn one_world_is_asked_for_scores_of_every_kind() {
+    let worlds = verify::short_trainings().into_iter().take(1).collect();
+    let plan = Plan { worlds, teams: 64, seed: 0, generations: 0 };
+    for about in Need::OF_SCORES {
+        let mut liar = Liar { cpu: Cpu::default(), about };
+        let found = verify::compare(&plan, &mut Cpu::default(), &mut liar, |_| {}).unwrap();
+        assert!(found.mismatch.as_ref().is_some_and(|told| told.contains("stage credit")), "{about:?}: {found:?}");
+    }
+}
+
 #[test]
 fn without_a_gpu_only_a_report_can_be_had() {
-    let output = verify(&[]).output().unwrap();
+    let output = verify_command(&[]).output().unwrap();
     assert_eq!(output.status.code(), Some(1));
     let told = String::from_utf8_lossy(&output.stderr);
     assert!(told.contains("no GPU adapter") && told.contains("--report") && !told.contains("--backend"), "{told}");
-    let output = verify(&["--adapter", "mine"]).output().unwrap();
+    let output = verify_command(&["--adapter", "mine"]).output().unwrap();
     let told = String::from_utf8_lossy(&output.stderr);
     assert!(told.contains("mine") && told.contains("--report") && !told.contains("--backend"), "{told}");
-    let output = verify(&["--note", "no report"]).output().unwrap();
+    let output = verify_command(&["--note", "no report"]).output().unwrap();
     assert_eq!(output.status.code(), Some(2));
 }
 
@@ -71,10 +109,10 @@ fn a_report_is_written_over_no_input_and_nowhere() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("my.toml");
     fs::copy(root().join("configs/chaotic.toml"), &config).unwrap();
-    let output = verify(&["--report"]).arg(&config).arg(&config).output().unwrap();
+    let output = verify_command(&["--report"]).arg(&config).arg(&config).output().unwrap();
     assert_eq!(output.status.code(), Some(2), "{}", String::from_utf8_lossy(&output.stderr));
     assert!(String::from_utf8_lossy(&output.stderr).contains("is read from"));
-    let output = verify(&["--report"]).arg(folder.path().join("none/here.json")).output().unwrap();
+    let output = verify_command(&["--report"]).arg(folder.path().join("none/here.json")).output().unwrap();
     assert_eq!(output.status.code(), Some(1), "{}", String::from_utf8_lossy(&output.stderr));
 }
 

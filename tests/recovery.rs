@@ -246,6 +246,16 @@ fn a_run_is_extended_from_whatever_is_left_of_it() {
         assert_eq!((told.start, told.notes.len()), (7, 1), "{damage}: {:?}", told.notes);
         assert_eq!((results, what_came_out(&path)), expected);
     }
+    // They cannot be read now, but another time.
+    let (_folder, path, _) = run();
+    let (policies, elsewhere) = (path.join(POLICIES), path.join("elsewhere"));
+    fs::rename(&policies, &elsewhere).unwrap();
+    fs::create_dir(&policies).unwrap();
+    let error = session(&config, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err().to_string();
+    assert!(error.contains("policies.safetensors: cannot be read"), "{error}");
+    fs::remove_dir(&policies).unwrap();
+    fs::rename(&elsewhere, &policies).unwrap();
+    goes_on(&path, 8);
     // A checkpoint from after the last generation that has its weights.
     let stopped = tempfile::tempdir().unwrap();
     session(&short, stopped.path(), Start::Fresh, Disk::default(), cpu(), Some(8)).end.unwrap();

@@ -352,7 +352,8 @@ fn a_stage_from_the_start_on_is_verified() {
     let found = verify::compare(&plan, &mut Cpu::default(), &mut Cpu::default(), |_| {}).unwrap();
     let agents = (config.world.leaders.len() + config.world.followers.len()) as u64;
     assert!(found.mismatch.is_none() && config.world.steps != 17);
-    assert_eq!(found.agent_steps, 3 * 3 * agents * 17);
+    // Traced, recorded, and six kinds of scores.
+    assert_eq!(found.agent_steps, 8 * 3 * agents * 17);
 }
 
 /// A folder with two configs and a run of the first.

@@ -8,7 +8,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::{Read, Seek, Write};
+use std::io::{ErrorKind, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -177,8 +177,7 @@ impl Checkpoint {
 
     /// Takes the weights that it lacks from `policies.safetensors`; false where that is not of the same run.
     #[must_use]
-    fn complete(&mut self, policies: &Path, of: &Config) -> bool {
-        let Ok(mut file) = tensors::open(policies) else { return false };
+    fn complete(&mut self, mut file: TensorFile<impl Read + Seek>, of: &Config) -> bool {
         // One without a kind has no checksum either: another program's.
         if file.kind().is_none() || file.metadata(policies::CONFIG) != Some(&self.config) {
             return false;
@@ -232,7 +231,7 @@ impl Shapes {
 /// The folder cannot be read.
 pub fn list(folder: &Path) -> Result<Vec<usize>, RecordError> {
     let entries = match fs::read_dir(folder) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(vec![]),
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(vec![]),
         entries => entries.map_err(RecordError::read(folder))?,
     };
     let generation = |name: &str| -> Option<usize> {
@@ -259,11 +258,19 @@ pub fn path(folder: &Path, generation: usize) -> PathBuf {
 /// another run by now.
 ///
 /// # Errors
-/// It cannot be read, or is damaged.
+/// It or the policies cannot be read, or it is damaged.
 pub fn read(path: &Path, policies: &Path, config: &Config) -> Result<Option<Checkpoint>, RecordError> {
     let file = file::open(path).map_err(RecordError::read(path))?;
     let mut found = Checkpoint::read(file, config).map_err(|reason| RecordError::damaged(path, reason))?;
-    let whole = !found.snapshot.weights.is_empty() || found.complete(policies, config);
+    let whole = !found.snapshot.weights.is_empty()
+        || match tensors::open(policies) {
+            Ok(file) => found.complete(file, config),
+            // The system may let it be read another time.
+            Err(RecordError::Read { path, error }) if error.kind() != ErrorKind::NotFound => {
+                return Err(RecordError::Read { path, error });
+            }
+            Err(_) => false,
+        };
     Ok(whole.then_some(found))
 }
 
