@@ -194,8 +194,8 @@ fn compare_batch(
 }
 
 /// Plays all groups as three batches of which only scores are wanted, of every kind by turns, and holds them against
-/// those of the reference's whole record; the first group and team that differs, and how. Each group's turn is the
-/// `turn`th.
+/// those of the reference's whole record; the first group and team that differs, and how. From turn to turn a group is
+/// asked for another kind.
 fn compare_scores(
     groups: &[Group<'_>],
     turn: usize,
