@@ -66,6 +66,7 @@ and does not control, with the test that would notice. Names are those of functi
 | a float sum or product is rounded to nearest, ties to even | WGSL leaves the rounding of `+ - *` open | probes whenever a GPU is opened; `devices_are_exact_under_both_passes` |
 | no product is fused with a sum, no sum reordered | WGSL allows both, and drivers do both | the same probes; `the_probes_catch_a_device_without_a_pass`, `no_shader_is_fused_spills_or_is_large` |
 | a guard `x \\| 0` with a zero that only the run time knows stays | a compiler that knew the zero could drop it | `guards_are_not_cancelled`; `every_product_is_guarded_in_metals_and_directx_text` |
+| a sum has a guard, or nothing reads it but a comparison of whole numbers, by its bits | a compiler might take that for one of floats, and move the sum across it; none is known to | the probes; `only_what_is_compared_by_its_bits_needs_no_guard` |
 | naga writes no options and no function that fuses into Metal's and DirectX's text | a later version might | `every_product_is_guarded_in_metals_and_directx_text` |
 | a driver keeps `NoContraction` | Vulkan asks it of drivers | the probes; `every_float_result_is_decorated` |
 | numbers of normal size are not flushed to zero | they never are; those below 2^-126 may be, so none comes up | `flush_makes_small_values_positive_zero`, `no_value_comes_near_the_denormals`, `twins_have_the_same_numbers` |

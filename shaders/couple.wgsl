@@ -2,6 +2,5 @@
 
 // Whether the POI at offset (`dx`, `dy`) is within its observation radius.
 fn observes(dx: f32, dy: f32) -> bool {
-    let d2 = dx * dx + dy * dy;
-    return d2 <= world.observation_radius2;
+    return within(dx, dy, world.observation_radius2);
 }

@@ -71,6 +71,16 @@ fn find_seat(index: u32, teams: u32) -> Agent {
     return agent;
 }
 
+// Which of 32 agents from `base` on a leader at this place could sense, a bit each. Its team's positions start at `first`.
+fn reached(first: u32, base: u32, x: f32, y: f32) -> u32 {
+    var near = 0u;
+    for (var other = base; other < min(base + 32u, shape.agents); other++) {
+        let place = positions[first + other * shape.teams];
+        near |= select(0u, 1u << (other - base), within(place.x - x, place.y - y, world.agent_range2));
+    }
+    return near;
+}
+
 // A leader senses POIs, then the other agents, and decides. Its team's positions start at `first`.
 fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
     let leader = (*me).agent;
@@ -83,16 +93,22 @@ fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
         let place = places[task.pois + poi];
         let dx = place.x - x;
         let dy = place.y - y;
-        sense(density(world.poi_range2, dx, dy), dx, dy, hx, hy, &of_pois);
+        let sensed = select(0.0, density(dx, dy), within(dx, dy, world.poi_range2));
+        sense(sensed, dx, dy, hx, hy, &of_pois);
     }
     var of_agents = vec4(0.0);
-    for (var other = 0u; other < shape.agents; other++) {
-        let place = positions[first + other * shape.teams];
-        let dx = place.x - x;
-        let dy = place.y - y;
-        // Who is out of reach adds 0: a warp goes past whoever is out of reach of all of it.
-        if dx * dx + dy * dy <= world.agent_range2 && other != leader {
-            sense(density(world.agent_range2, dx, dy), dx, dy, hx, hy, &of_agents);
+    for (var word = 0u; word < shape.words; word++) {
+        // First who is in reach, then each thread goes through its own: a warp takes as many turns as one of its threads
+        // has others in reach at most, not as many as are in reach of any.
+        let base = word * 32u;
+        var near = reached(first, base, x, y);
+        near &= ~select(0u, 1u << (leader % 32u), leader / 32u == word);
+        while near != 0u {
+            let place = positions[first + (base + firstTrailingBit(near)) * shape.teams];
+            let dx = place.x - x;
+            let dy = place.y - y;
+            sense(density(dx, dy), dx, dy, hx, hy, &of_agents);
+            near &= near - 1u;
         }
     }
     let inputs = weigh_in(of_pois, of_agents);

@@ -19,21 +19,23 @@ struct Course {
 
 // Whether a follower sees the agent at offset (`dx`, `dy`): whether it is within the attraction radius.
 fn sees(dx: f32, dy: f32) -> bool {
-    let d2 = dx * dx + dy * dy;
-    return d2 <= world.attraction_radius2;
+    return within(dx, dy, world.attraction_radius2);
 }
 
 // Adds the agent at offset (`dx`, `dy`); tells whether it is within the attraction radius.
 fn influence(dx: f32, dy: f32, sums: ptr<function, Sums>) -> bool {
-    let d2 = dx * dx + dy * dy;
-    let seen = d2 <= world.attraction_radius2;
+    let seen = within(dx, dy, world.attraction_radius2);
     if seen {
-        let near = d2 <= world.repulsion_radius2;
-        (*sums).repel_x += select(0.0, dx, near);
-        (*sums).repel_y += select(0.0, dy, near);
+        let near = within(dx, dy, world.repulsion_radius2);
+        // One sum grows; the other would by 0, which changes no bit of it.
+        let old = *sums;
+        let x = select(old.attract_x, old.repel_x, near) + dx;
+        let y = select(old.attract_y, old.repel_y, near) + dy;
+        (*sums).repel_x = select(old.repel_x, x, near);
+        (*sums).repel_y = select(old.repel_y, y, near);
         (*sums).repel_count += u32(near);
-        (*sums).attract_x += select(dx, 0.0, near);
-        (*sums).attract_y += select(dy, 0.0, near);
+        (*sums).attract_x = select(x, old.attract_x, near);
+        (*sums).attract_y = select(y, old.attract_y, near);
         (*sums).attract_count += u32(!near);
     }
     return seen;

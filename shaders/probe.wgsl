@@ -1,7 +1,7 @@
 // Asks a device whether its arithmetic is the CPU's. One invocation takes four values and writes a word a probe.
 // The twin is `expected` in src/backend/gpu/probe.rs: same names, same order.
 
-const PROBES: u32 = 36u;
+const PROBES: u32 = 37u;
 
 @group(0) @binding(1) var<storage, read> values: array<f32>;
 @group(0) @binding(2) var<storage, read_write> words: array<u32>;
@@ -105,4 +105,6 @@ fn probe(@builtin(global_invocation_id) id: vec3<u32>) {
     words[out + 33u] = u32(x < y) | u32(x <= y) << 1u | u32(x == y) << 2u | u32(x >= y) << 3u | u32(x * y > z) << 4u;
     words[out + 34u] = bits(select(x, y, x <= y)) ^ bits(select(z, w, z >= w));
     words[out + 35u] = bits(bitcast<f32>(bitcast<u32>(z) & 0x7fffffffu) + bitcast<f32>(bitcast<u32>(w) & 0x7fff0000u));
+    let size = abs(x);
+    words[out + 36u] = u32(bitcast<i32>(size * 1.00001 + 4096.0) <= bitcast<i32>(size + 4096.0));
 }

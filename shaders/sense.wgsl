@@ -1,15 +1,12 @@
 // What a leader senses: the density of POIs and of agents in four quadrants around its heading (Section 3.1).
 
-// What an entity at offset (`dx`, `dy`) adds to the density of its quadrant: nothing beyond the range.
-fn density(range2: f32, dx: f32, dy: f32) -> f32 {
+// What an entity at offset (`dx`, `dy`) adds to the density of its quadrant, if it is in range.
+fn density(dx: f32, dy: f32) -> f32 {
     let d2 = dx * dx + dy * dy;
-    var density: f32;
     if variant.density == DENSITY_LINEAR {
-        density = 1.0 - root(d2) * world.inverse_diagonal;
-    } else {
-        density = rsqrt(select(1.0, d2, d2 > 1.0));
+        return 1.0 - root(d2) * world.inverse_diagonal;
     }
-    return select(0.0, density, d2 <= range2);
+    return rsqrt(select(1.0, d2, d2 > 1.0));
 }
 
 // Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant, in the order of the policy's
@@ -22,10 +19,13 @@ fn sense(density: f32, dx: f32, dy: f32, hx: f32, hy: f32, sums: ptr<function, v
     let fy = dy * hx - dx * hy;
     let left = fy > 0.0 || (fy >= 0.0 && fx >= 0.0);
     let front = fx > 0.0 || (fx >= 0.0 && !(fy > 0.0));
-    (*sums).x += select(0.0, density, !left && !front);
-    (*sums).y += select(0.0, density, !left && front);
-    (*sums).z += select(0.0, density, left && front);
-    (*sums).w += select(0.0, density, left && !front);
+    // One sum grows; the others would by 0, which changes no bit of them.
+    let old = *sums;
+    let grown = select(select(old.x, old.y, front), select(old.w, old.z, front), left) + density;
+    (*sums).x = select(old.x, grown, !left && !front);
+    (*sums).y = select(old.y, grown, !left && front);
+    (*sums).z = select(old.z, grown, left && front);
+    (*sums).w = select(old.w, grown, left && !front);
 }
 
 // The policy's inputs, of the sums over a leader's quadrants.

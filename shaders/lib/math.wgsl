@@ -99,6 +99,13 @@ fn bound(x: f32, low: f32, high: f32) -> f32 {
     return select(raised, high, raised > high);
 }
 
+// Whether an offset is at most as long as a radius, given squared: told by the bits, which are in the order of the
+// numbers where none is negative, so that no guard need stand between.
+fn within(dx: f32, dy: f32, radius2: f32) -> bool {
+    let d2 = dx * dx + dy * dy;
+    return bitcast<i32>(d2) <= bitcast<i32>(radius2);
+}
+
 // +0 where |x| < limit, else x.
 fn flush(x: f32, limit: f32) -> f32 {
     return select(x, 0.0, abs(x) < limit);

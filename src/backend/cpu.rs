@@ -11,7 +11,8 @@ use glam::Vec2;
 
 use super::{Backend, BackendError, Episode, Group, Moment, Need, Seen, Strided, Trace, Visit, Weights};
 use crate::declare::Fixed;
-use crate::kernels::{math, splat};
+use crate::kernels::math::{self, within};
+use crate::kernels::{only, splat};
 use crate::model::policy::PolicyConstants;
 use crate::model::{Constants, Lanes, couple, follow, motion, policy, sense};
 use crate::parallel::*;
@@ -599,7 +600,7 @@ impl<S: Simd> Block<S> {
                     while bits != 0 {
                         let j = first + bits.trailing_zeros() as usize;
                         // Without a branch: of those whose boxes are near, the processor cannot guess who is.
-                        let within = u64::from(within::<S>(agent, &agents[j], reach2));
+                        let within = u64::from(meet::<S>(agent, &agents[j], reach2));
                         row |= within << (j % 64);
                         near[i / 64 * count + j] |= within << (i % 64);
                         bits &= bits - 1;
@@ -613,7 +614,7 @@ impl<S: Simd> Block<S> {
                 let reach2 = reach2(i);
                 let mut row = 0;
                 for j in i + 1..count {
-                    if within::<S>(agent, &agents[j], reach2) {
+                    if meet::<S>(agent, &agents[j], reach2) {
                         row |= 1 << j;
                         near[j] |= 1 << i;
                     }
@@ -641,7 +642,7 @@ impl<S: Simd> Block<S> {
                 for (density, poi) in densities.iter_mut().zip(pois) {
                     let [px, py] = poi.lanes(*simd);
                     let [dx, dy] = [px - x, py - y];
-                    *density = sense::density::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
+                    *density = sensed::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
                 }
                 for (&density, poi) in densities.iter().zip(pois) {
                     let [px, py] = poi.lanes(*simd);
@@ -652,7 +653,7 @@ impl<S: Simd> Block<S> {
             for poi in rest {
                 let [px, py] = poi.lanes(*simd);
                 let [dx, dy] = [px - x, py - y];
-                let density = sense::density::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
+                let density = sensed::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
                 sense::sense::<S>(density, dx, dy, hx, hy, &mut of_pois);
             }
             let mut of_agents = [splat(*simd, 0.0); 4];
@@ -663,7 +664,7 @@ impl<S: Simd> Block<S> {
                 #[inline(always)]
                 |_, other| {
                     let (dx, dy) = (other.x - x, other.y - y);
-                    let density = sense::density::<S, DENSITY>(world, world.sense.agent_range2, dx, dy);
+                    let density = sensed::<S, DENSITY>(world, world.sense.agent_range2, dx, dy);
                     sense::sense::<S>(density, dx, dy, hx, hy, &mut of_agents);
                 },
             );
@@ -928,12 +929,16 @@ fn steer<S: Simd, const BY_SINE: bool>(
     }
 }
 
+/// What an entity at offset (`dx`, `dy`) adds to the density of its quadrant: nothing beyond the range.
+#[inline(always)]
+fn sensed<S: Simd, const DENSITY: u32>(world: &Lanes<S>, range2: S::f32s, dx: S::f32s, dy: S::f32s) -> S::f32s {
+    only::<S>(sense::density::<S, DENSITY>(world, dx, dy), within::<S>(dx, dy, range2))
+}
+
 /// Whether the squared distance of two agents is `reach2` at most, in any lane.
 #[inline(always)]
-fn within<S: Simd>(agent: &Agent<S>, other: &Agent<S>, reach2: f32) -> bool {
-    let dx = other.x - agent.x;
-    let dy = other.y - agent.y;
-    (dx * dx + dy * dy).simd_le(reach2).any_true()
+fn meet<S: Simd>(agent: &Agent<S>, other: &Agent<S>, reach2: f32) -> bool {
+    within::<S>(other.x - agent.x, other.y - agent.y, splat(agent.x.token(), reach2)).any_true()
 }
 
 /// The boxes around some agents' places in all lanes, an agent a lane.

@@ -148,6 +148,14 @@ pub fn normal_cosine<S: Simd>(b: S::u32s) -> S::f32s {
     cosine
 }
 
+/// Whether an offset is at most as long as a radius, given squared. 4 operations.
+#[inline(always)]
+pub fn within<S: Simd>(dx: S::f32s, dy: S::f32s, radius2: S::f32s) -> S::mask32s {
+    let d2 = dx * dx + dy * dy;
+    // For numbers that are not negative this is the shader's comparison of bits.
+    d2.simd_le(radius2)
+}
+
 /// +0 where |x| < `limit`, else x. 3 operations.
 #[inline(always)]
 pub fn flush<S: Simd>(x: S::f32s, limit: f32) -> S::f32s {

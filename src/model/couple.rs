@@ -2,12 +2,12 @@
 
 use std::ops::{Range, RangeInclusive};
 
-use fearless_simd::{Simd, prelude::*};
+use fearless_simd::Simd;
 use serde::Serialize;
 
 use super::{LONGEST, Lanes};
 use crate::declare::{choice, shared};
-use crate::kernels::operations::SQUARED_DISTANCE;
+use crate::kernels::{math::within, operations::SQUARED_DISTANCE};
 use crate::reader::{OneOrList, Reader, between};
 
 /// The shader's part.
@@ -299,6 +299,5 @@ pub const OBSERVE: u32 = SQUARED_DISTANCE + 3;
 /// In which lanes the POI at offset (`dx`, `dy`) is within its observation radius.
 #[inline(always)]
 pub fn observes<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::mask32s {
-    let d2 = dx * dx + dy * dy;
-    d2.simd_le(world.couple.observation_radius2)
+    within::<S>(dx, dy, world.couple.observation_radius2)
 }

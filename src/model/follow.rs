@@ -6,7 +6,7 @@ use super::{LONGEST, Lanes, motion::rotate};
 use crate::declare::shared;
 use crate::kernels::{
     larger,
-    math::{flush, recip, rsqrt},
+    math::{flush, recip, rsqrt, within},
     only,
     operations::{FLUSH, RECIP, ROTATE, RSQRT, SQUARED_DISTANCE},
     select, splat,
@@ -132,16 +132,14 @@ impl<S: Simd> Sums<S> {
 /// In which lanes a follower sees the agent at offset (`dx`, `dy`): where it is within the attraction radius.
 #[inline(always)]
 pub fn sees<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::mask32s {
-    let d2 = dx * dx + dy * dy;
-    d2.simd_le(world.follow.attraction_radius2)
+    within::<S>(dx, dy, world.follow.attraction_radius2)
 }
 
 /// Adds the agent at offset (`dx`, `dy`); tells in which lanes it is within the attraction radius.
 #[inline(always)]
 pub fn influence<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s, sums: &mut Sums<S>) -> S::mask32s {
-    let d2 = dx * dx + dy * dy;
-    let near = d2.simd_le(world.follow.repulsion_radius2);
-    let seen = d2.simd_le(world.follow.attraction_radius2);
+    let near = within::<S>(dx, dy, world.follow.repulsion_radius2);
+    let seen = within::<S>(dx, dy, world.follow.attraction_radius2);
     let far = seen & !near;
     sums.repel_x += only::<S>(dx, near);
     sums.repel_y += only::<S>(dy, near);

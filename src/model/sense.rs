@@ -110,16 +110,15 @@ pub fn operations(density: Density) -> u32 {
 /// Lane operations of a leader, whatever it senses: a density is weighed by the share of its kind.
 pub const WEIGHED: u32 = INPUTS as u32;
 
-/// What an entity at offset (`dx`, `dy`) adds to the density of its quadrant: nothing beyond the range.
+/// What an entity at offset (`dx`, `dy`) adds to the density of its quadrant, if it is in range.
 #[inline(always)]
-pub fn density<S: Simd, const DENSITY: u32>(world: &Lanes<S>, range2: S::f32s, dx: S::f32s, dy: S::f32s) -> S::f32s {
+pub fn density<S: Simd, const DENSITY: u32>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::f32s {
     let one = splat(dx.token(), 1.0);
     let d2 = dx * dx + dy * dy;
-    let density = match const { Density::of(DENSITY) } {
+    match const { Density::of(DENSITY) } {
         Density::Linear => one - root::<S>(d2) * world.sense.inverse_diagonal,
         Density::Inverse => rsqrt::<S>(select::<S>(one, d2, d2.simd_gt(one))),
-    };
-    only::<S>(density, d2.simd_le(range2))
+    }
 }
 
 /// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant, in the order of the policy's

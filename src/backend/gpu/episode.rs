@@ -9,7 +9,7 @@
 use std::any::Any;
 use std::cmp::Reverse;
 use std::collections::hash_map::Entry;
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::fmt::{self, Write};
 use std::sync::Arc;
 use std::time::Duration;
@@ -46,6 +46,8 @@ const MOST_WEIGHTS: usize = 512;
 const SIGHTS: usize = 8;
 /// Specialised kernels at most, where nobody asks for more: each takes a fraction of a second to compile.
 const SPECIALISED: usize = 16;
+/// Kernels at most that one batch takes and that stay compiled from one to the next: a driver keeps megabytes of each.
+const KEPT_KERNELS: usize = 64;
 /// Tasks, as many as end where a binding may start (their size is no power of two).
 const TASK_ALIGNMENT: usize = BINDING_ALIGNMENT / 4;
 /// Offsets within a buffer are u32 words.
@@ -226,7 +228,8 @@ impl Packing {
 fn steps_a_dispatch(world: &World, packing: Packing, records: Kept) -> usize {
     let Constants { words, policy: PolicyConstants { widths, .. }, .. } = world.constants;
     let network: u32 = widths.windows(2).map(|w| (w[0] + 2) * w[1]).sum();
-    let agent = world.pois.len() + world.agents() + network as usize + 20;
+    // A leader goes through the agents, and through those in reach.
+    let agent = world.pois.len() + 2 * world.agents() + words as usize + network as usize + 20;
     let sights = if records.sights { world.followers() * world.leader_words() } else { 0 };
     let items = |rows: usize| (rows * packing.teams).div_ceil(packing.workgroup);
     let items = items(world.pois.len() * words as usize) + items(sights);
@@ -273,6 +276,8 @@ impl Share {
 #[derive(Default)]
 struct Work {
     shares: Vec<Share>,
+    /// What its kernels are made for.
+    shapes: BTreeSet<Shape>,
     worlds: Vec<Constants>,
     places: Vec<Vec2>,
     /// In fours.
@@ -338,6 +343,8 @@ struct Capacity {
     batch: u64,
     /// Bytes of the largest buffer.
     buffer: u64,
+    /// Kernels of a batch.
+    kernels: usize,
     /// Threads of the largest workgroup, and bytes of its memory.
     workgroup: usize,
     workgroup_bytes: usize,
@@ -402,6 +409,7 @@ fn plan(
             if full(work.record, size_of::<u32>())
                 || full(work.weights, size_of::<[f32; FOUR]>())
                 || full(work.moments, size_of::<Moment>())
+                || work.shapes.len() >= room.kernels && !work.shapes.contains(&shape)
             {
                 batches.push(Work::default());
                 work = batches.last_mut().expect("just pushed");
@@ -435,6 +443,7 @@ fn plan(
             if world.steps() > steps_a_dispatch {
                 work.states += world.agents() * teams;
             }
+            work.shapes.insert(shape);
             work.shares.push(Share { group: index, first_team, shape, task, steps_a_dispatch });
         }
     }
@@ -523,6 +532,7 @@ pub struct GpuEpisodes {
     staging: Vec<[f32; FOUR]>,
     /// Bytes of one buffer that a batch aims for.
     batch_bytes: u64,
+    kept_kernels: usize,
     /// Changes the shader's text, so that tests can show that a change is noticed.
     edit: fn(String) -> String,
     stages: Stages,
@@ -640,6 +650,7 @@ impl GpuEpisodes {
             flights: Default::default(),
             staging: Vec::new(),
             batch_bytes: BATCH_BYTES,
+            kept_kernels: KEPT_KERNELS,
             edit: |text| text,
             stages: Stages::default(),
         })
@@ -656,7 +667,13 @@ impl GpuEpisodes {
         GpuEpisodes { kernel, ..self }
     }
 
-    /// How many generic and specialised kernels were compiled so far.
+    /// The same with other numbers of kernels, at least one, of a batch and from one batch to the next; no result depends
+    /// on them.
+    pub fn keeping(self, kernels: usize) -> GpuEpisodes {
+        GpuEpisodes { kept_kernels: kernels.max(1), ..self }
+    }
+
+    /// How many generic and specialised kernels are compiled and kept.
     pub fn compiled(&self) -> [usize; 2] {
         let specialised = self.pipelines.keys().filter(|shape| shape.is_specialised()).count();
         [self.pipelines.len() - specialised, specialised]
@@ -703,6 +720,7 @@ impl GpuEpisodes {
         let limits = &self.gpu.limits;
         Capacity {
             batch: self.batch_bytes,
+            kernels: self.kept_kernels,
             buffer: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(MAX_OFFSET),
             workgroup: limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x) as usize,
             workgroup_bytes: limits.max_compute_workgroup_storage_size as usize,
@@ -758,9 +776,11 @@ impl GpuEpisodes {
         let mut dispatches: Vec<(Shape, usize, [u32; 3])> = Vec::new();
         // Those that play every task once.
         let mut first_round = 0;
-        let mut shapes: Vec<Shape> = work.shares.iter().map(|share| share.shape).collect();
-        shapes.sort_unstable();
-        shapes.dedup();
+        let shapes = &work.shapes;
+        let new = shapes.iter().filter(|shape| !self.pipelines.contains_key(shape)).count();
+        if self.pipelines.len() + new > self.kept_kernels {
+            self.pipelines.retain(|shape, _| shapes.contains(shape));
+        }
         let rounds = work.shares.iter().map(|share| (share.task.end as usize).div_ceil(share.steps_a_dispatch)).max();
         for (round, &shape) in (0..rounds.unwrap_or(0)).flat_map(|round| shapes.iter().map(move |shape| (round, shape)))
         {
@@ -1154,7 +1174,7 @@ pub fn shaders() -> Vec<(&'static str, String)> {
 /// what compilers make of it. `threads` is the size of the largest workgroup.
 #[doc(hidden)]
 pub fn shader_of(world: &World, kernel: Kernel, threads: usize) -> String {
-    let room = Capacity { batch: 0, buffer: 0, workgroup: threads, workgroup_bytes: 16 << 10 };
+    let room = Capacity { batch: 0, buffer: 0, kernels: 1, workgroup: threads, workgroup_bytes: 16 << 10 };
     let little = Kept { trace: false, sights: false };
     let made = Packing::specialised(world, room).filter(|_| kernel != Kernel::Generic);
     source(made.map_or_else(

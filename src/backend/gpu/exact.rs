@@ -3,9 +3,9 @@
 //! A driver may fuse `a * b + c` and reassociate sums. Two ways take that freedom away:
 //!
 //! - [`Pass::NoContraction`] decorates every float result of the SPIR-V and hands it to a Vulkan driver unchanged.
-//! - [`Pass::Guarded`] rewrites the naga IR so that every float sum and product passes through the bits of an integer
-//!   `x | guard`, with `guard` a zero that only the run time knows. It works wherever wgpu does. See [`guarded`] for why
-//!   no compiler can take it away.
+//! - [`Pass::Guarded`] rewrites the naga IR so that every float sum and product that anything might be joined with passes
+//!   through the bits of an integer `x | guard`, with `guard` a zero that only the run time knows. It works wherever wgpu
+//!   does. See [`guarded`] for why no compiler can take it away.
 //!
 //! Shaders know of neither: they declare nothing for the passes, but leave `@group(0) @binding(0)` to the guard.
 //! Both passes refuse a shader that leaves the exact core (see [`foreign_operations`]), since no pass could save it.
@@ -28,7 +28,7 @@ use naga::{
 pub enum Pass {
     /// SPIR-V whose float results are all decorated `NoContraction`. Vulkan only; costs no instruction.
     NoContraction,
-    /// naga IR whose float sums and products all pass through integer bits. Everywhere; costs an `or` each.
+    /// naga IR whose float sums and products pass through integer bits. Everywhere; costs an `or` each.
     Guarded,
     /// Nothing is done. Only for showing that the tests notice; never chosen.
     Plain,
@@ -189,7 +189,10 @@ pub fn undecorated(words: &[u32]) -> usize {
     float_results(words).filter(|id| !decorated.contains(id)).count()
 }
 
-/// The module with every f32 sum and product passed through `bitcast<f32>(bitcast<u32>(x) | guard)`.
+/// The module with f32 sums and products passed through `bitcast<f32>(bitcast<u32>(x) | guard)`: all but those of which
+/// nothing but comparisons of whole numbers reads the bits, as of `bitcast<i32>(d2) <= bitcast<i32>(radius2)`. Behind such
+/// a one stands no float operation that it could be fused or reordered with; what it is made of is guarded. (A comparison
+/// of floats is no such end: `x + 1 <= y` might become `x <= y - 1`.)
 ///
 /// `guard` is a new uniform at group 0, binding 0, that must hold zero. Products alone would not do: a driver could
 /// still reassociate the sums.
@@ -201,7 +204,7 @@ pub fn undecorated(words: &[u32]) -> usize {
 /// away, as the first `0.0 + product` of an unrolled sum does: AMD's compiler then cancelled the two, and fused the
 /// bare product with the next sum. With `|` nothing can bring `x` back. A guard with a bit set makes that bit of
 /// `x | guard` the same for all `x`, so no function of `x | guard` and the guard is `x` for every guard; and the pass
-/// hands on nothing else of `x`. A fused or reordered sum needs a bare product or sum, so it would be wrong for some
+/// hands no float operation anything else of `x`. A fused or reordered sum needs a bare product or sum, so it would be wrong for some
 /// guard. Operation by operation, of those that may follow:
 ///
 /// - `| guard` again, the operation between having fallen away (`0.0 + x`, `1.0 * x`, a selection, a copy): the two are
@@ -224,8 +227,7 @@ pub fn guarded(module: &Module) -> Result<Module, ShaderError> {
     if !foreign.is_empty() {
         return Err(ShaderError::Foreign(foreign));
     }
-    let place = ResourceBinding { group: 0, binding: 0 };
-    if module.global_variables.iter().any(|(_, variable)| variable.binding == Some(place)) {
+    if module.global_variables.iter().any(|(_, variable)| variable.binding == Some(GUARD)) {
         return Err(ShaderError::GuardTaken);
     }
     let mut guarded = module.clone();
@@ -233,7 +235,7 @@ pub fn guarded(module: &Module) -> Result<Module, ShaderError> {
     let variable = GlobalVariable {
         name: Some("guard".into()),
         space: AddressSpace::Uniform,
-        binding: Some(place),
+        binding: Some(GUARD),
         ty: guarded.types.insert(word, Span::UNDEFINED),
         init: None,
         memory_decorations: Default::default(),
@@ -255,6 +257,7 @@ fn guard_function(function: &mut Function, info: &FunctionInfo, module: &Module,
     let zero = append(Expression::Load { pointer }, Span::UNDEFINED);
     // The first and the last expression that each old one became: the last holds its value.
     let mut moved: Vec<(Handle<Expression>, Handle<Expression>)> = Vec::new();
+    let exposed = exposed(function, info, module, None);
     for (old, expression) in function.expressions.iter() {
         let span = function.expressions.get_span(old);
         let mut expression = expression.clone();
@@ -262,9 +265,9 @@ fn guard_function(function: &mut Function, info: &FunctionInfo, module: &Module,
             *operand = moved[operand.index()].1;
         }
         let inner = info[old].ty.inner_with(&module.types);
-        let rounds = rounds(&expression, inner);
+        let guards = rounds(&expression, inner) && exposed[old.index()];
         let first = append(expression, span);
-        let last = if rounds {
+        let last = if guards {
             let zeros = match *inner {
                 TypeInner::Vector { size, .. } => append(Expression::Splat { size, value: zero }, span),
                 _ => zero,
@@ -289,39 +292,78 @@ fn guard_function(function: &mut Function, info: &FunctionInfo, module: &Module,
     function.body.splice(0..0, Block::from_vec(vec![load]));
 }
 
+/// Of each expression whether anything may read it but guards, and comparisons of whole numbers by its bits.
+fn exposed(
+    function: &Function,
+    info: &FunctionInfo,
+    module: &Module,
+    guard: Option<Handle<GlobalVariable>>,
+) -> Vec<bool> {
+    let expressions = &function.expressions;
+    let mut exposed = vec![false; expressions.len()];
+    let mut blocks = vec![function.body.clone()];
+    while let Some(mut block) = blocks.pop() {
+        for (handles, inside) in block.iter_mut().filter_map(parts) {
+            handles.into_iter().for_each(|handle| exposed[handle.index()] = true);
+            blocks.extend(inside.into_iter().map(|block| block.clone()));
+        }
+    }
+    let is_guard = |handle: Handle<Expression>| {
+        let zero = match expressions[handle] {
+            Expression::Splat { value, .. } => value,
+            _ => handle,
+        };
+        let Expression::Load { pointer } = expressions[zero] else { return false };
+        matches!(expressions[pointer], Expression::GlobalVariable(variable) if Some(variable) == guard)
+    };
+    // Whatever reads an expression stands behind it.
+    for (reader, expression) in expressions.iter().collect::<Vec<_>>().into_iter().rev() {
+        let exposes = match *expression {
+            Expression::Binary { op, left, .. } if compares(op) => is_float(info[left].ty.inner_with(&module.types)),
+            Expression::Binary { op: BinaryOperator::InclusiveOr, right, .. } => !is_guard(right),
+            Expression::As { kind: ScalarKind::Sint | ScalarKind::Uint, convert: None, .. } => exposed[reader.index()],
+            _ => true,
+        };
+        if exposes {
+            for operand in operands(&mut expression.clone()).into_iter().flatten() {
+                exposed[operand.index()] = true;
+            }
+        }
+    }
+    exposed
+}
+
+fn compares(op: BinaryOperator) -> bool {
+    use BinaryOperator::{Equal, Greater, GreaterEqual, Less, LessEqual, NotEqual};
+    matches!(op, Equal | NotEqual | Less | LessEqual | Greater | GreaterEqual)
+}
+
+/// Where the pass keeps its zero.
+const GUARD: ResourceBinding = ResourceBinding { group: 0, binding: 0 };
+
 /// Whether an expression is a float sum or product, a scalar or of vectors.
 fn rounds(expression: &Expression, inner: &TypeInner) -> bool {
     use BinaryOperator::{Add, Multiply, Subtract};
     matches!(expression, Expression::Binary { op: Add | Subtract | Multiply, .. }) && is_float(inner)
 }
 
-/// How often a module uses a float sum or product in any other way than by its bits; 0 after [`guarded`].
+/// How many float sums and products of a module have neither a guard nor are compared by their bits alone; 0 after
+/// [`guarded`].
 ///
 /// # Errors
 /// The module is not valid.
 pub fn unguarded(module: &Module) -> Result<usize, ShaderError> {
     let info = validate(module).map_err(|error| ShaderError::Invalid(error.to_string()))?;
-    Ok(functions(module, &info)
-        .map(|(_, function, info)| {
-            let rounded = |handle: Handle<Expression>| {
-                rounds(&function.expressions[handle], info[handle].ty.inner_with(&module.types))
-            };
-            let count = |handles: Vec<&mut Handle<Expression>>| handles.iter().filter(|h| rounded(***h)).count();
-            let expressions = function.expressions.iter().map(|(_, expression)| match expression {
-                Expression::As { kind: ScalarKind::Uint, convert: None, .. } => 0,
-                other => operands(&mut other.clone()).map_or(0, count),
-            });
-            let mut statements = 0;
-            let mut blocks = vec![function.body.clone()];
-            while let Some(mut block) = blocks.pop() {
-                for (handles, inside) in block.iter_mut().filter_map(parts) {
-                    statements += count(handles);
-                    blocks.extend(inside.into_iter().map(|block| block.clone()));
-                }
-            }
-            expressions.sum::<usize>() + statements
-        })
-        .sum())
+    let guard = module.global_variables.iter().find(|(_, variable)| variable.binding == Some(GUARD));
+    let guard = guard.map(|(handle, _)| handle);
+    let count = |(_, function, info): (&str, &Function, &FunctionInfo)| {
+        let exposed = exposed(function, info, module, guard);
+        let bare = |(handle, expression): &(Handle<Expression>, &Expression)| {
+            exposed[handle.index()] && rounds(expression, info[*handle].ty.inner_with(&module.types))
+        };
+        function.expressions.iter().filter(bare).count()
+    };
+    Ok(functions(module, &info).map(count).sum())
 }
 
 /// Every function of a module, entry points last, with its name and what the validator found.

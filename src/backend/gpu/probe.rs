@@ -107,7 +107,7 @@ pub fn self_test(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
 }
 
 /// Computations of `arithmetic`, in the order of `shaders/probe.wgsl`.
-const NAMES: [&str; 36] = [
+const NAMES: [&str; 37] = [
     "x*y + z",
     "x*y - z",
     "z - x*y",
@@ -144,6 +144,7 @@ const NAMES: [&str; 36] = [
     "comparisons",
     "selection by comparison",
     "bit casts",
+    "sums compared by their bits",
 ];
 
 /// The paper's first layout.
@@ -419,6 +420,7 @@ fn expected(values: &[f32], item: usize) -> [u32; NAMES.len()] {
         (0..).zip(flags).map(|(bit, flag)| u32::from(flag) << bit).sum(),
         bits(select(x, y, x <= y)) ^ bits(select(z, w, z >= w)),
         bits(f32::from_bits(z.to_bits() & 0x7fff_ffff) + f32::from_bits(w.to_bits() & 0x7fff_0000)),
+        u32::from(x.abs() * 1.00001 + 4096.0 <= x.abs() + 4096.0),
     ]
 }
 
@@ -452,7 +454,7 @@ mod tests {
             ("product(x, y) + z", |[x, y, z, _]| x.mul_add(y, z)),
             ("a product kept over a branch", |[x, y, z, w]| x.mul_add(y, if w > 0.0 { z } else { -w })),
         ];
-        let reassociated: [(&str, Formula); 10] = [
+        let reassociated: [(&str, Formula); 11] = [
             ("x*y + y*z", |[x, y, z, _]| y * (x + z)),
             ("x*y - x*z", |[x, y, z, _]| x * (y - z)),
             ("(x + y) - x", |[_, y, ..]| y),
@@ -463,6 +465,7 @@ mod tests {
             ("(x*0.1)*10", |[x, ..]| x),
             ("(x + 4096) - 4096", |[x, ..]| x),
             ("x*2.7 + x*0.3", |[x, ..]| x * 3.0),
+            ("sums compared by their bits", |[x, ..]| f32::from_bits(u32::from(x.abs() * 1.00001 <= x.abs()))),
         ];
         for (probe, formula) in fused.into_iter().chain(reassociated) {
             let groups = shown(probe, formula);
