@@ -297,7 +297,8 @@ fn guarded_operations(text: &str, casts: &[&str]) -> usize {
 }
 
 /// Metal and DirectX compile texts, and by default Metal's compiler may fuse and reorder: a guard has to stand in the text
-/// around every single sum and product but the few that are compared by their bits alone, whatever options the text was written by.
+/// around every single sum and product but the few that are compared by their bits alone, whatever options the text was
+/// written by.
 #[test]
 fn every_product_is_guarded_in_metals_and_directx_text() {
     for (name, text) in kernels() {
