@@ -394,25 +394,36 @@ fn few_kernels_are_kept() {
             need: Need::Record,
         })
         .into();
-    let play = |backend: &mut dyn Backend| {
+    let play = |backend: &mut dyn Backend, groups: &[Group<'_>]| {
         let records: Vec<Mutex<Vec<u32>>> = (0..groups.len() * 7).map(|_| Mutex::default()).collect();
         backend
-            .rollout(&groups, &|episode| {
+            .rollout(groups, &|episode| {
                 records[episode.group * 7 + episode.team].lock().unwrap().extend(episode.sets.iter());
             })
             .unwrap();
         records.into_iter().map(|record| record.into_inner().unwrap()).collect::<Vec<_>>()
     };
-    let expected = play(&mut Cpu::default());
+    let expected = play(&mut Cpu::default(), &groups);
     assert!(expected.iter().all(|record| !record.is_empty()));
     for (request, info) in support::adapters("few_kernels_are_kept") {
         for most in [1, 2, 64] {
             let gpu = gpu::open(request.clone()).unwrap();
-            let mut backend = GpuEpisodes::new(gpu).unwrap().playing(Kernel::Specialised).keeping(most);
+            let mut backend = GpuEpisodes::new(gpu).unwrap().playing(Kernel::Specialised).keeping(most, 1000);
             for _ in 0..2 {
-                assert_eq!(play(&mut backend), expected, "{info}, {most} kernels");
+                assert_eq!(play(&mut backend, &groups), expected, "{info}, {most} kernels");
                 assert_eq!(backend.compiled(), [0, most.min(5)], "{info}");
             }
         }
+        // Those that two plays had no use for are let go of.
+        let gpu = gpu::open(request.clone()).unwrap();
+        let mut backend = GpuEpisodes::new(gpu).unwrap().playing(Kernel::Best).keeping(64, 2);
+        assert_eq!(play(&mut backend, &groups), expected, "{info}");
+        for (world, left) in [(0, 5), (0, 5), (1, 2), (0, 2), (0, 2), (0, 1)] {
+            let records = &expected[7 * world..][..7];
+            assert_eq!(play(&mut backend, &groups[world..][..1]), records, "{info}");
+            assert_eq!(backend.compiled(), [0, left], "{info}");
+        }
+        assert_eq!(play(&mut backend, &groups), expected, "{info}");
+        assert_eq!(backend.compiled(), [0, 5], "{info}");
     }
 }

@@ -48,6 +48,9 @@ const SIGHTS: usize = 8;
 const SPECIALISED: usize = 16;
 /// Kernels at most that one batch takes and that stay compiled from one to the next: a driver keeps megabytes of each.
 const KEPT_KERNELS: usize = 64;
+/// Plays, of a generation as a rule, after which a kernel that none of them took is let go of: a process that trains one
+/// layout after another has kernels of its own for each, and one that plays ever new worlds seldom compiles.
+const IDLE_PLAYS: u64 = 1000;
 /// Tasks, as many as end where a binding may start (their size is no power of two).
 const TASK_ALIGNMENT: usize = BINDING_ALIGNMENT / 4;
 /// Offsets within a buffer are u32 words.
@@ -512,12 +515,20 @@ const NOWHERE: u32 = u32::MAX;
 const KEPT: f64 = 1.0 / 16.0;
 const KEPT_AT_LEAST: usize = 256;
 
+/// A kernel, and the last play that took it.
+struct Compiled {
+    pipeline: wgpu::ComputePipeline,
+    played: u64,
+}
+
 /// Plays episodes on a GPU.
 pub struct GpuEpisodes {
     gpu: Gpu,
     layout: Bindings,
     kernel: Kernel,
-    pipelines: HashMap<Shape, wgpu::ComputePipeline>,
+    pipelines: HashMap<Shape, Compiled>,
+    /// Calls of `play` so far.
+    plays: u64,
     holding: Holding,
     records: Records,
     /// Compiled once something is to be packed.
@@ -533,6 +544,7 @@ pub struct GpuEpisodes {
     /// Bytes of one buffer that a batch aims for.
     batch_bytes: u64,
     kept_kernels: usize,
+    idle_plays: u64,
     /// Changes the shader's text, so that tests can show that a change is noticed.
     edit: fn(String) -> String,
     stages: Stages,
@@ -642,6 +654,7 @@ impl GpuEpisodes {
             layout,
             kernel: if software { Kernel::Generic } else { Kernel::Best },
             pipelines: HashMap::new(),
+            plays: 0,
             holding: if software { Holding::Never } else { Holding::From(HELD_FROM) },
             records: if software { Records::Whole } else { Records::PackedFrom(PACKED_FROM) },
             pack: None,
@@ -651,6 +664,7 @@ impl GpuEpisodes {
             staging: Vec::new(),
             batch_bytes: BATCH_BYTES,
             kept_kernels: KEPT_KERNELS,
+            idle_plays: IDLE_PLAYS,
             edit: |text| text,
             stages: Stages::default(),
         })
@@ -667,10 +681,10 @@ impl GpuEpisodes {
         GpuEpisodes { kernel, ..self }
     }
 
-    /// The same with other numbers of kernels, at least one, of a batch and from one batch to the next; no result depends
-    /// on them.
-    pub fn keeping(self, kernels: usize) -> GpuEpisodes {
-        GpuEpisodes { kept_kernels: kernels.max(1), ..self }
+    /// The same with other numbers of kernels, at least one, of a batch and from one batch to the next, and of plays after
+    /// which one that none of them took is let go of; no result depends on them.
+    pub fn keeping(self, kernels: usize, plays: u64) -> GpuEpisodes {
+        GpuEpisodes { kept_kernels: kernels.max(1), idle_plays: plays, ..self }
     }
 
     /// How many generic and specialised kernels are compiled and kept.
@@ -749,6 +763,9 @@ impl GpuEpisodes {
     /// Plays all tasks; `done` gets each with the batch's record and moments.
     fn play(&mut self, groups: &[Group<'_>], trace: bool, done: &Done<'_>) -> Result<(), BackendError> {
         let (start, before) = (Instant::now(), self.gpu.traffic());
+        self.plays += 1;
+        let (plays, most) = (self.plays, self.idle_plays);
+        self.pipelines.retain(|_, compiled| plays - compiled.played <= most);
         let batches = plan(groups, trace, self.records, self.room(), &self.specialised(groups, trace))?;
         self.stages.gather += start.elapsed();
         for index in 0..=batches.len() {
@@ -892,7 +909,7 @@ impl GpuEpisodes {
             }
             let group =
                 gpu.bind("episode", &self.layout, &[worlds, tasks, places, weights, record, moments, states])?;
-            bound.push((&self.pipelines[&shape], group, grid));
+            bound.push((&self.pipelines[&shape].pipeline, group, grid));
         }
         let watch = buffers.watch.as_ref();
         let submitted = gpu.scoped("episodes", || {
@@ -1039,8 +1056,13 @@ impl GpuEpisodes {
     }
 
     fn prepare_pipeline(&mut self, shape: Shape) -> Result<(), DeviceError> {
-        if let Entry::Vacant(entry) = self.pipelines.entry(shape) {
-            entry.insert(self.gpu.own_pipeline("episode", &(self.edit)(source(shape)), "episode", &self.layout)?);
+        match self.pipelines.entry(shape) {
+            Entry::Occupied(mut entry) => entry.get_mut().played = self.plays,
+            Entry::Vacant(entry) => {
+                let pipeline =
+                    self.gpu.own_pipeline("episode", &(self.edit)(source(shape)), "episode", &self.layout)?;
+                entry.insert(Compiled { pipeline, played: self.plays });
+            }
         }
         Ok(())
     }
@@ -1181,6 +1203,60 @@ pub fn shader_of(world: &World, kernel: Kernel, threads: usize) -> String {
         || Shape::generic(world, Packing::generic(world, threads), little),
         |packing| Shape::specialised(world, packing, little),
     ))
+}
+
+/// What one workgroup gets to play a group's first teams, and where it leaves what comes of that; for running what
+/// compilers make of its shader.
+#[doc(hidden)]
+pub struct Workgroup {
+    /// Its shader.
+    pub shader: String,
+    /// How many threads it has, and how many teams they play.
+    pub threads: usize,
+    /// See `threads`.
+    pub teams: usize,
+    /// The words of each binding: nothing for the guard, worlds, tasks, places, weights, and yet to write the record,
+    /// moments and states.
+    pub buffers: [Vec<u32>; 8],
+}
+
+/// The workgroup that plays a group's first teams, policies on the host, in one dispatch: by a kernel made for their world
+/// if that is asked for and can be, or by the generic one. It takes another dispatch to follow, and leaves where the agents
+/// stand in the end. `threads` is the size of the largest workgroup.
+///
+/// # Errors
+/// A team is too large for any device.
+#[doc(hidden)]
+pub fn workgroup_of(group: &Group<'_>, kernel: Kernel, threads: usize) -> Result<Workgroup, BackendError> {
+    let bytes = MAX_OFFSET;
+    let room = Capacity { batch: bytes, buffer: bytes, kernels: 1, workgroup: threads, workgroup_bytes: 16 << 10 };
+    let made = Packing::specialised(group.world, room).filter(|_| kernel != Kernel::Generic);
+    let made = made.map(|packing| Shape::specialised(group.world, packing, Kept::of(group, false)));
+    let batches = plan(&[*group], false, Records::Whole, room, &made.into_iter().collect())?;
+    let work = &batches[0];
+    let Share { task, first_team, shape, .. } = work.shares[0];
+    let mut weights = vec![[0.0; FOUR]; fours(group.world) * task.teams as usize];
+    if let Weights::OnHost(policies) = group.weights {
+        gather(group, policies, first_team, task.teams as usize, &mut weights);
+    }
+    let words = |bytes: &[u8]| bytemuck::pod_collect_to_vec(bytes);
+    let world = Constants { steps: task.end + 1, ..work.worlds[0] };
+    let agents = group.world.agents() * task.teams as usize;
+    Ok(Workgroup {
+        shader: source(shape),
+        threads: shape.workgroup,
+        teams: task.teams as usize,
+        buffers: [
+            vec![0; 4],
+            words(bytemuck::bytes_of(&world)),
+            words(bytemuck::bytes_of(&task)),
+            words(bytemuck::cast_slice(&work.places)),
+            words(bytemuck::cast_slice(&weights)),
+            vec![0; record_words(group.world, group.need) * task.teams as usize],
+            Vec::new(),
+            vec![0; agents * size_of::<State>() / 4],
+        ],
+    })
 }
 
 impl Backend for GpuEpisodes {
