@@ -38,7 +38,8 @@ nobody can try all of, so here is what was tried, each row by a program that wro
 machine, the driver *and* the toolchain that it names.
 
 - *executed*: it ran there, or under the emulator that the row names, and its bits were compared;
-- *machine code read*: a compiler for a device that was not there, its driver's own or its maker's, made code, and a test read it;
+- *machine code read*: a compiler for a device that was not there, its driver's own or its maker's, made code, and a test read it
+  and ran it in an emulator, where the row says so;
 - *compiled*: it compiles for there; nothing ran.
 
 What no row shows is argued [below](#what-it-relies-on). Every GPU, in a row or not, has to pass `flotilla`'s own probes each time
@@ -64,7 +65,7 @@ and does not control, with the test that would notice. Names are those of functi
 | relied on | why it might not be so | noticed by |
 |---|---|---|
 | a float sum or product is rounded to nearest, ties to even | WGSL leaves the rounding of `+ - *` open | probes whenever a GPU is opened; `devices_are_exact_under_both_passes` |
-| no product is fused with a sum, no sum reordered | WGSL allows both, and drivers do both | the same probes; `the_probes_catch_a_device_without_a_pass`, `no_shader_is_fused_spills_or_is_large` |
+| no product is fused with a sum, no sum reordered | WGSL allows both, and drivers do both | the same probes; `the_probes_catch_a_device_without_a_pass`, `what_the_compiler_writes_is_exact_small_and_fast` |
 | a guard `x \\| 0` with a zero that only the run time knows stays | a compiler that knew the zero could drop it | `guards_are_not_cancelled`; `every_product_is_guarded_in_metals_and_directx_text` |
 | a sum has a guard, or nothing reads it but a comparison of whole numbers, by its bits | a compiler might take that for one of floats, and move the sum across it; none is known to | the probes; `only_what_is_compared_by_its_bits_needs_no_guard` |
 | naga writes no options and no function that fuses into Metal's and DirectX's text | a later version might | `every_product_is_guarded_in_metals_and_directx_text` |

@@ -45,7 +45,7 @@ pub struct Run {
 impl Case {
     /// The paper's layouts, by kernels and by the threads of the largest workgroup, where these make a difference.
     pub fn all() -> Vec<Case> {
-        let kernels = [(Kernel::Generic, 256), (Kernel::Specialised, 256), (Kernel::Specialised, 1024)];
+        let kernels = [(Kernel::Generic, 256), (Kernel::Specialised, 1024), (Kernel::Specialised, 256)];
         let layouts = support::papers_worlds().into_iter();
         let mut cases: Vec<Case> = layouts
             .flat_map(|(name, world)| kernels.map(|(kernel, threads)| Case::new(&name, &world, kernel, threads)))

@@ -12,6 +12,7 @@
 
 #![cfg(feature = "gpu")]
 
+mod assembly;
 mod case;
 #[expect(unsafe_code, reason = "a Vulkan driver is called directly")]
 mod driver;

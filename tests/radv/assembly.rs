@@ -1,0 +1,527 @@
+//! What the lines of RADV's assembly mean, for as many of AMD's instructions as the kernels take: whatever else turns up is a
+//! panic that names it.
+
+use std::collections::HashMap;
+use std::ops::Range;
+
+/// Where an operand is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Place {
+    /// So many vector registers from one on.
+    Vector(usize, usize),
+    Scalar(usize, usize),
+    /// As 32 bits and as 64.
+    Constant(u32, u64),
+    Condition,
+}
+
+/// Registers in one row: the vector ones, the scalar ones from here on, and the condition.
+pub const SCALAR: usize = 256;
+pub const CONDITION: usize = SCALAR + 128;
+
+/// Scalar registers with a name: the one of masks that comparisons leave, and the one of the lanes that take part.
+const VCC: usize = 106;
+pub const EXEC: usize = 126;
+const NAMED: [(&str, Place); 10] = [
+    ("vcc", Place::Scalar(VCC, 2)),
+    ("vcc_lo", Place::Scalar(VCC, 1)),
+    ("vcc_hi", Place::Scalar(VCC + 1, 1)),
+    ("exec", Place::Scalar(EXEC, 2)),
+    ("exec_lo", Place::Scalar(EXEC, 1)),
+    ("exec_hi", Place::Scalar(EXEC + 1, 1)),
+    ("m0", Place::Scalar(124, 1)),
+    ("null", Place::Constant(0, 0)),
+    ("off", Place::Constant(0, 0)),
+    ("src_scc", Place::Condition),
+];
+
+/// An operand; a float may be made positive, then turned around.
+#[derive(Clone, Copy, Debug)]
+pub struct Operand {
+    pub place: Place,
+    pub negative: bool,
+    pub absolute: bool,
+}
+
+impl Operand {
+    fn parse(text: &str) -> Option<Operand> {
+        if let Some(place) = constant(text) {
+            return Some(Operand { place, negative: false, absolute: false });
+        }
+        let (negative, rest) = text.strip_prefix('-').map_or((false, text), |rest| (true, rest));
+        let bare = rest.trim_matches('|');
+        let named = NAMED.into_iter().find(|(name, _)| *name == bare).map(|(_, place)| place);
+        Some(Operand { place: named.or_else(|| registers(bare))?, negative, absolute: bare != rest })
+    }
+
+    /// Its registers in their row.
+    pub fn registers(&self) -> Range<usize> {
+        match self.place {
+            Place::Vector(first, count) => first..first + count,
+            Place::Scalar(first, count) => SCALAR + first..SCALAR + first + count,
+            Place::Condition => CONDITION..CONDITION + 1,
+            Place::Constant(..) => 0..0,
+        }
+    }
+
+    /// The register of a kind that it starts at.
+    pub fn vector(&self) -> usize {
+        let Place::Vector(first, _) = self.place else { panic!("{self:?} is no vector register") };
+        first
+    }
+
+    pub fn scalar(&self) -> usize {
+        let Place::Scalar(first, _) = self.place else { panic!("{self:?} is no scalar register") };
+        first
+    }
+}
+
+/// `7`, `-7`, `0x7f` and `0.5`; a 64-bit operand has the sign's bits, or is a double.
+fn constant(text: &str) -> Option<Place> {
+    if let Some(hex) = text.strip_prefix("0x") {
+        return u32::from_str_radix(hex, 16).ok().map(|bits| Place::Constant(bits, bits.into()));
+    }
+    if let Ok(whole) = text.parse::<i64>() {
+        return Some(Place::Constant(whole as u32, whole as u64));
+    }
+    let float: f64 = text.contains('.').then(|| text.parse().ok())??;
+    Some(Place::Constant((float as f32).to_bits(), float.to_bits()))
+}
+
+/// `s7` and `v[4:7]`.
+fn registers(text: &str) -> Option<Place> {
+    let kind = text.get(..1)?;
+    let (first, last) = match text[1..].strip_prefix('[') {
+        Some(range) => range.strip_suffix(']')?.split_once(':')?,
+        None => (&text[1..], &text[1..]),
+    };
+    let (first, last): (usize, usize) = (first.parse().ok()?, last.parse().ok()?);
+    match kind {
+        "v" => Some(Place::Vector(first, last + 1 - first)),
+        "s" => Some(Place::Scalar(first, last + 1 - first)),
+        _ => None,
+    }
+}
+
+/// What an instruction does, and where its operands stand.
+#[derive(Clone, Copy)]
+pub enum Action {
+    /// To, from up to three, lane by lane; whether it rounds.
+    Lanes(fn([u32; 3]) -> u32, bool),
+    /// The same that takes what is there as its third.
+    Accumulates(fn([u32; 3]) -> u32),
+    /// A mask, or on RDNA none, of lanes for which it holds; whether the others are left out from then on.
+    Compare(fn(u32, u32) -> bool, bool),
+    Select,
+    /// To, the carries, two numbers, and the carries before if there are any.
+    AddWithCarry,
+    /// To two registers, carries, two factors, two registers.
+    MultiplyWide,
+    ShiftWide,
+    Swap,
+    FirstLane,
+    /// To, from two; by 64 bits if told; what the condition becomes.
+    Scalar(fn(u64, u64) -> u64, bool, Change),
+    ScalarCompare(fn(u64, u64) -> bool, bool),
+    ScalarSelect(bool),
+    /// To what the lanes were; those that are left.
+    SaveLanes(fn(u64, u64) -> u64),
+    LoadDescriptor,
+    LoadScalars,
+    Load,
+    Store,
+    /// So many words; the distance of two addresses' offsets in words, or one address.
+    LocalLoad(usize, Option<usize>),
+    LocalStore(usize, Option<usize>),
+    Branch(When),
+    Wait(Option<usize>, Option<usize>),
+    Barrier,
+    Nothing,
+    End,
+}
+
+/// When a branch is taken.
+#[derive(Clone, Copy)]
+pub enum When {
+    Always,
+    Condition(bool),
+    /// When the mask that starts at a scalar register has no lane, or has one.
+    Empty(usize, bool),
+}
+
+/// What a scalar instruction leaves as the condition.
+#[derive(Clone, Copy)]
+pub enum Change {
+    Kept,
+    NotZero,
+    Carry,
+    Borrow,
+    /// Of a sum of signed numbers, or of a difference.
+    Overflow,
+    OverflowDown,
+}
+
+pub struct Instruction {
+    pub text: String,
+    pub action: Action,
+    pub operands: Vec<Operand>,
+    /// Of memory; and of a workgroup's memory, in elements.
+    pub offset: u32,
+    pub offsets: [u32; 2],
+    /// Whether each lane has an address of its own.
+    pub addressed: bool,
+    /// Doubles or halves a float at the end.
+    pub scale: Option<f32>,
+    /// Where a branch goes.
+    pub target: usize,
+    /// Vector instructions that it takes the time of.
+    pub issues: u64,
+    pub is_vector: bool,
+    /// The registers in their row that it waits for, and those that wait for it.
+    pub reads: Vec<usize>,
+    pub writes: Vec<usize>,
+}
+
+pub struct Program(pub Vec<Instruction>);
+
+impl Program {
+    pub fn parse(assembly: &str, family: &str) -> Program {
+        let mut labels = HashMap::new();
+        let mut instructions: Vec<(Instruction, Option<String>)> = Vec::new();
+        for line in assembly.lines() {
+            let text = line.split(';').next().unwrap_or_default().trim();
+            if text.is_empty() {
+                continue;
+            }
+            if let Some(label) = text.strip_suffix(':') {
+                labels.insert(label.to_string(), instructions.len());
+            } else if text.starts_with("(then repeated") {
+                let times: usize = text.split(' ').find_map(|word| word.parse().ok()).expect("how often");
+                let last = line_before(assembly, line);
+                instructions.extend((0..times).map(|_| instruction(last, family)));
+            } else {
+                instructions.push(instruction(text, family));
+            }
+        }
+        let resolved = instructions.into_iter().map(|(mut instruction, label)| {
+            if let Some(label) = label {
+                instruction.target = labels[&label];
+            }
+            instruction
+        });
+        Program(resolved.collect())
+    }
+}
+
+fn line_before<'a>(assembly: &'a str, line: &str) -> &'a str {
+    let at = line.as_ptr() as usize - assembly.as_ptr() as usize;
+    let before = assembly[..at].lines().last().expect("something is repeated");
+    before.split(';').next().unwrap_or_default().trim()
+}
+
+/// One line; with the label that it names.
+fn instruction(text: &str, family: &str) -> (Instruction, Option<String>) {
+    let (name, rest) = text.split_once(' ').unwrap_or((text, ""));
+    let action = action(name, rest).unwrap_or_else(|| panic!("{}: nobody knows `{text}`", family));
+    let mut made = Instruction {
+        text: text.to_string(),
+        action,
+        operands: Vec::new(),
+        offset: 0,
+        offsets: [0, 0],
+        addressed: false,
+        scale: None,
+        target: 0,
+        issues: if name.starts_with("v_mul_lo") || name.starts_with("v_mul_hi") || name.starts_with("v_mad_u64") {
+            4
+        } else {
+            1
+        },
+        is_vector: name.starts_with("v_"),
+        reads: Vec::new(),
+        writes: Vec::new(),
+    };
+    if matches!(action, Action::Wait(..) | Action::Nothing | Action::Barrier | Action::End) {
+        return (made, None);
+    }
+    if let Action::Branch(when) = action {
+        made.reads = match when {
+            When::Always => Vec::new(),
+            When::Condition(_) => vec![CONDITION],
+            When::Empty(mask, _) => vec![SCALAR + mask, SCALAR + mask + 1],
+        };
+        return (made, Some(rest.trim().to_string()));
+    }
+    for word in rest.split([',', ' ']).filter(|word| !word.is_empty()) {
+        let number = |text: &str| match constant(text) {
+            Some(Place::Constant(bits, _)) => bits,
+            _ => panic!("{text} of `{}` is no number", made.text),
+        };
+        match word.split_once(':') {
+            Some(("offset", offset)) => made.offset = number(offset),
+            Some(("offset0", offset)) => made.offsets[0] = number(offset),
+            Some(("offset1", offset)) => made.offsets[1] = number(offset),
+            Some(("mul", by)) => made.scale = Some(number(by) as f32),
+            Some(("div", by)) => made.scale = Some(1.0 / number(by) as f32),
+            None if word == "offen" => made.addressed = true,
+            None if ["glc", "slc", "dlc"].contains(&word) => (),
+            _ => made.operands.push(Operand::parse(word).unwrap_or_else(|| panic!("{word} of `{text}` is unknown"))),
+        }
+    }
+    // Of 16 bits, with a sign.
+    if let ["s", kind, ..] = name.split('_').collect::<Vec<_>>()[..]
+        && ["movk", "mulk", "addk", "cmpk"].contains(&kind)
+        && !name.ends_with("u32")
+        && let Some(Operand { place: Place::Constant(bits, wide), .. }) = made.operands.last_mut()
+    {
+        (*bits, *wide) = (*bits as i16 as u32, *bits as i16 as u64);
+        if ["mulk", "addk"].contains(&kind) {
+            made.operands.insert(1, made.operands[0]);
+        }
+    }
+    made.depends();
+    (made, None)
+}
+
+impl Instruction {
+    /// Notes what it reads and writes.
+    fn depends(&mut self) {
+        use Action::*;
+        let of = |operands: &[Operand]| -> Vec<usize> { operands.iter().flat_map(Operand::registers).collect() };
+        let all = &self.operands[..];
+        let written = match self.action {
+            Store | LocalStore(..) | ScalarCompare(..) => 0,
+            Compare(..) if all.len() == 2 => 0,
+            AddWithCarry | MultiplyWide | Swap => 2,
+            _ => 1,
+        };
+        (self.writes, self.reads) = (of(&all[..written]), of(&all[written..]));
+        let lanes = [SCALAR + EXEC, SCALAR + EXEC + 1];
+        match self.action {
+            Swap | Accumulates(_) => self.reads.extend(of(&all[..written])),
+            Scalar(.., Change::Kept) => (),
+            Scalar(..) | ScalarCompare(..) => self.writes.push(CONDITION),
+            ScalarSelect(_) => self.reads.push(CONDITION),
+            SaveLanes(_) => {
+                self.reads.extend(lanes);
+                self.writes.extend(lanes);
+                self.writes.push(CONDITION);
+            }
+            Compare(_, true) => self.writes.extend(lanes),
+            _ => (),
+        }
+        if self.is_vector {
+            self.reads.extend(lanes);
+        }
+    }
+}
+
+pub fn f(bits: u32) -> f32 {
+    f32::from_bits(bits)
+}
+
+/// What an instruction of this name does.
+fn action(name: &str, rest: &str) -> Option<Action> {
+    if let Some(name) = name.strip_prefix("v_") {
+        return vector_action(name.trim_end_matches("_e32").trim_end_matches("_e64"));
+    }
+    if let Some(name) = name.strip_prefix("buffer_") {
+        return Some(if name.starts_with("load") { Action::Load } else { Action::Store })
+            .filter(|_| words(name).is_some());
+    }
+    if let Some(name) = name.strip_prefix("ds_") {
+        let words = words(name)?;
+        // Two addresses are told apart in elements, or in 64 of them.
+        let apart = if name.contains("st64") || name.contains("stride64") {
+            Some(64 * words)
+        } else {
+            (name.contains('2') && (name.contains("2addr") || name.starts_with("read2") || name.starts_with("write2")))
+                .then_some(words)
+        };
+        return match name.split('_').next()? {
+            "load" | "read" | "read2" | "read2st64" => Some(Action::LocalLoad(words, apart)),
+            "store" | "write" | "write2" | "write2st64" => Some(Action::LocalStore(words, apart)),
+            _ => None,
+        };
+    }
+    let name = name.strip_prefix("s_")?;
+    if name.starts_with("waitcnt") {
+        let count = |what: &str| {
+            let (_, rest) = rest.split_once(&format!("{what}("))?;
+            rest.split(')').next()?.parse().ok()
+        };
+        return Some(Action::Wait(count("vmcnt"), count("lgkmcnt")));
+    }
+    match name {
+        "endpgm" => Some(Action::End),
+        "barrier" => Some(Action::Barrier),
+        "clause" | "nop" | "inst_prefetch" | "set_inst_prefetch_distance" | "delay_alu" | "code_end" => {
+            Some(Action::Nothing)
+        }
+        "branch" => Some(Action::Branch(When::Always)),
+        "cbranch_scc0" => Some(Action::Branch(When::Condition(false))),
+        "cbranch_scc1" => Some(Action::Branch(When::Condition(true))),
+        "cbranch_execz" => Some(Action::Branch(When::Empty(EXEC, true))),
+        "cbranch_execnz" => Some(Action::Branch(When::Empty(EXEC, false))),
+        "cbranch_vccz" => Some(Action::Branch(When::Empty(VCC, true))),
+        "cbranch_vccnz" => Some(Action::Branch(When::Empty(VCC, false))),
+        _ if name.starts_with("buffer_load") => words(name).map(|_| Action::LoadScalars),
+        _ if name.starts_with("load") => words(name).map(|_| Action::LoadDescriptor),
+        _ => scalar_action(name),
+    }
+}
+
+/// Words that a load or a store takes at one address, by the end of its name.
+fn words(name: &str) -> Option<usize> {
+    match name.rsplit('_').next()? {
+        "dword" | "b32" => Some(1),
+        "dwordx2" | "b64" => Some(2),
+        "dwordx3" | "b96" => Some(3),
+        "dwordx4" | "b128" => Some(4),
+        "dwordx8" | "b256" => Some(8),
+        "dwordx16" | "b512" => Some(16),
+        _ => None,
+    }
+}
+
+fn vector_action(name: &str) -> Option<Action> {
+    use Action::{Accumulates, Compare, Lanes};
+    let float = |work| Some(Lanes(work, true));
+    let whole = |work| Some(Lanes(work, false));
+    if let Some(comparison) = name.strip_prefix("cmp") {
+        let (narrows, comparison) = comparison.strip_prefix('x').map_or((false, comparison), |rest| (true, rest));
+        let (relation, kind) = comparison.strip_prefix('_')?.split_once('_')?;
+        let holds: fn(u32, u32) -> bool = match (kind, relation) {
+            ("f32", "lt") => |a, b| f(a) < f(b),
+            ("f32", "le") => |a, b| f(a) <= f(b),
+            ("f32", "gt") => |a, b| f(a) > f(b),
+            ("f32", "ge") => |a, b| f(a) >= f(b),
+            ("f32", "eq") => |a, b| f(a) == f(b),
+            ("f32", "neq") => |a, b| f(a) != f(b),
+            ("i32", "lt") => |a, b| (a as i32) < b as i32,
+            ("i32", "le") => |a, b| a as i32 <= b as i32,
+            ("i32", "gt") => |a, b| a as i32 > b as i32,
+            ("i32", "ge") => |a, b| a as i32 >= b as i32,
+            ("u32", "lt") => |a, b| a < b,
+            ("u32", "le") => |a, b| a <= b,
+            ("u32", "gt") => |a, b| a > b,
+            ("u32", "ge") => |a, b| a >= b,
+            ("i32" | "u32", "eq") => |a, b| a == b,
+            ("i32" | "u32", "ne" | "lg") => |a, b| a != b,
+            _ => return None,
+        };
+        return Some(Compare(holds, narrows));
+    }
+    match name {
+        "mul_f32" => float(|[a, b, _]| (f(a) * f(b)).to_bits()),
+        "add_f32" => float(|[a, b, _]| (f(a) + f(b)).to_bits()),
+        "sub_f32" => float(|[a, b, _]| (f(a) - f(b)).to_bits()),
+        "subrev_f32" => float(|[a, b, _]| (f(b) - f(a)).to_bits()),
+        // Product and sum are rounded each.
+        "mad_f32" | "madak_f32" | "madmk_f32" => float(|[a, b, c]| (f(a) * f(b) + f(c)).to_bits()),
+        "mac_f32" => Some(Accumulates(|[a, b, c]| (f(a) * f(b) + f(c)).to_bits())),
+        "fma_f32" | "fmaak_f32" | "fmamk_f32" => float(|[a, b, c]| f(a).mul_add(f(b), f(c)).to_bits()),
+        "fmac_f32" => Some(Accumulates(|[a, b, c]| f(a).mul_add(f(b), f(c)).to_bits())),
+        "floor_f32" => float(|[a, ..]| f(a).floor().to_bits()),
+        "max_f32" => float(|[a, b, _]| f(a).max(f(b)).to_bits()),
+        "min_f32" => float(|[a, b, _]| f(a).min(f(b)).to_bits()),
+        // Chips are off by a unit in the last place: it is for dividing whole numbers, which makes up for that.
+        "rcp_f32" | "rcp_iflag_f32" => float(|[a, ..]| (1.0 / f(a)).to_bits()),
+        "cvt_f32_u32" => float(|[a, ..]| (a as f32).to_bits()),
+        "cvt_f32_i32" => float(|[a, ..]| (a as i32 as f32).to_bits()),
+        // To whole numbers, towards zero and within what they hold, as `as` does.
+        "cvt_u32_f32" => whole(|[a, ..]| f(a) as u32),
+        "cvt_i32_f32" => whole(|[a, ..]| f(a) as i32 as u32),
+        "mov_b32" => whole(|[a, ..]| a),
+        "not_b32" => whole(|[a, ..]| !a),
+        "and_b32" => whole(|[a, b, _]| a & b),
+        "or_b32" => whole(|[a, b, _]| a | b),
+        "xor_b32" => whole(|[a, b, _]| a ^ b),
+        "or3_b32" => whole(|[a, b, c]| a | b | c),
+        "and_or_b32" => whole(|[a, b, c]| a & b | c),
+        "add_u32" | "add_nc_u32" => whole(|[a, b, _]| a.wrapping_add(b)),
+        "sub_u32" | "sub_nc_u32" => whole(|[a, b, _]| a.wrapping_sub(b)),
+        "subrev_u32" | "subrev_nc_u32" => whole(|[a, b, _]| b.wrapping_sub(a)),
+        "add3_u32" => whole(|[a, b, c]| a.wrapping_add(b).wrapping_add(c)),
+        "add_lshl_u32" => whole(|[a, b, c]| a.wrapping_add(b) << (c & 31)),
+        "lshl_add_u32" => whole(|[a, b, c]| (a << (b & 31)).wrapping_add(c)),
+        "lshl_or_b32" => whole(|[a, b, c]| a << (b & 31) | c),
+        "lshlrev_b32" => whole(|[a, b, _]| b << (a & 31)),
+        "lshrrev_b32" => whole(|[a, b, _]| b >> (a & 31)),
+        "bfe_u32" => whole(|[a, b, c]| a >> (b & 31) & ((1u32 << (c & 31)) - 1)),
+        "bfi_b32" => whole(|[a, b, c]| a & b | !a & c),
+        "max_u32" => whole(|[a, b, _]| a.max(b)),
+        "min_u32" => whole(|[a, b, _]| a.min(b)),
+        "mul_lo_u32" => whole(|[a, b, _]| a.wrapping_mul(b)),
+        "mul_hi_u32" => whole(|[a, b, _]| (u64::from(a) * u64::from(b) >> 32) as u32),
+        "mul_u32_u24" => whole(|[a, b, _]| (a & 0xff_ffff).wrapping_mul(b & 0xff_ffff)),
+        "mad_u32_u24" => whole(|[a, b, c]| (a & 0xff_ffff).wrapping_mul(b & 0xff_ffff).wrapping_add(c)),
+        // The place of the lowest bit, or all ones.
+        "ffbl_b32" | "ctz_i32_b32" => whole(|[a, ..]| if a == 0 { u32::MAX } else { a.trailing_zeros() }),
+        "bcnt_u32_b32" => whole(|[a, b, _]| a.count_ones().wrapping_add(b)),
+        "cndmask_b32" => Some(Action::Select),
+        "add_co_u32" | "addc_co_u32" | "add_co_ci_u32" => Some(Action::AddWithCarry),
+        "mad_u64_u32" => Some(Action::MultiplyWide),
+        "lshrrev_b64" => Some(Action::ShiftWide),
+        "swap_b32" => Some(Action::Swap),
+        "readfirstlane_b32" => Some(Action::FirstLane),
+        "nop" => Some(Action::Nothing),
+        _ => None,
+    }
+}
+
+fn scalar_action(name: &str) -> Option<Action> {
+    use Change::{Borrow, Carry, Kept, NotZero, Overflow, OverflowDown};
+    let wide = name.ends_with("64");
+    let (stem, kind) = name.rsplit_once('_')?;
+    if let Some(relation) = stem.strip_prefix("cmp_").or(stem.strip_prefix("cmpk_")) {
+        let holds: fn(u64, u64) -> bool = match (kind, relation) {
+            ("i32", "lt") => |a, b| (a as i32) < b as i32,
+            ("i32", "le") => |a, b| a as i32 <= b as i32,
+            ("i32", "gt") => |a, b| a as i32 > b as i32,
+            ("i32", "ge") => |a, b| a as i32 >= b as i32,
+            ("u32", "lt") => |a, b| a < b,
+            ("u32", "le") => |a, b| a <= b,
+            ("u32", "gt") => |a, b| a > b,
+            ("u32", "ge") => |a, b| a >= b,
+            ("i32" | "u32" | "u64", "eq") => |a, b| a == b,
+            ("i32" | "u32" | "u64", "lg") => |a, b| a != b,
+            _ => return None,
+        };
+        return Some(Action::ScalarCompare(holds, wide));
+    }
+    let scalar = |work, condition| Some(Action::Scalar(work, wide, condition));
+    match (stem, kind) {
+        ("mov", "b32" | "b64") => scalar(|a, _| a, Kept),
+        ("movk", "i32") => scalar(|a, _| a, Kept),
+        ("not", "b32" | "b64") => scalar(|a, _| !a, NotZero),
+        ("and", "b32" | "b64") => scalar(|a, b| a & b, NotZero),
+        ("or", "b32" | "b64") => scalar(|a, b| a | b, NotZero),
+        ("xor", "b32" | "b64") => scalar(|a, b| a ^ b, NotZero),
+        ("andn2" | "and_not1", "b32" | "b64") => scalar(|a, b| a & !b, NotZero),
+        ("orn2" | "or_not1", "b32" | "b64") => scalar(|a, b| a | !b, NotZero),
+        ("nand", "b32" | "b64") => scalar(|a, b| !(a & b), NotZero),
+        ("nor", "b32" | "b64") => scalar(|a, b| !(a | b), NotZero),
+        ("xnor", "b32" | "b64") => scalar(|a, b| !(a ^ b), NotZero),
+        ("add", "u32") => scalar(|a, b| a + b, Carry),
+        ("sub", "u32") => scalar(|a, b| a.wrapping_sub(b), Borrow),
+        ("add", "i32") => scalar(|a, b| a.wrapping_add(b), Overflow),
+        ("sub", "i32") => scalar(|a, b| a.wrapping_sub(b), OverflowDown),
+        ("addk", "i32") => scalar(|a, b| a.wrapping_add(b), Overflow),
+        ("mul" | "mulk", "i32") => scalar(|a, b| a.wrapping_mul(b), Kept),
+        ("mul_hi", "u32") => scalar(|a, b| a * b >> 32, Kept),
+        ("lshl", "b32") => scalar(|a, b| a << (b & 31), NotZero),
+        ("lshr", "b32") => scalar(|a, b| a >> (b & 31), NotZero),
+        ("lshl1_add", "u32") => scalar(|a, b| (a << 1) + b, Carry),
+        ("lshl2_add", "u32") => scalar(|a, b| (a << 2) + b, Carry),
+        ("lshl3_add", "u32") => scalar(|a, b| (a << 3) + b, Carry),
+        ("lshl4_add", "u32") => scalar(|a, b| (a << 4) + b, Carry),
+        ("min", "u32") => scalar(|a, b| a.min(b), Kept),
+        ("max", "u32") => scalar(|a, b| a.max(b), Kept),
+        ("cselect", "b32" | "b64") => Some(Action::ScalarSelect(wide)),
+        ("and_saveexec", _) => Some(Action::SaveLanes(|lanes, mask| lanes & mask)),
+        ("or_saveexec", _) => Some(Action::SaveLanes(|lanes, mask| lanes | mask)),
+        ("andn2_saveexec" | "and_not1_saveexec", _) => Some(Action::SaveLanes(|lanes, mask| mask & !lanes)),
+        _ => None,
+    }
+}
