@@ -186,7 +186,7 @@ pub struct Program(pub Vec<Instruction>);
 
 impl Program {
     pub fn parse(assembly: &str, family: &str) -> Program {
-        let mut labels = HashMap::new();
+        let (mut labels, mut last) = (HashMap::new(), "");
         let mut instructions: Vec<(Instruction, Option<String>)> = Vec::new();
         for line in assembly.lines() {
             let text = line.split(';').next().unwrap_or_default().trim();
@@ -197,10 +197,10 @@ impl Program {
                 labels.insert(label.to_string(), instructions.len());
             } else if text.starts_with("(then repeated") {
                 let times: usize = text.split(' ').find_map(|word| word.parse().ok()).expect("how often");
-                let last = line_before(assembly, line);
                 instructions.extend((0..times).map(|_| instruction(last, family)));
             } else {
                 instructions.push(instruction(text, family));
+                last = text;
             }
         }
         let resolved = instructions.into_iter().map(|(mut instruction, label)| {
@@ -213,16 +213,10 @@ impl Program {
     }
 }
 
-fn line_before<'a>(assembly: &'a str, line: &str) -> &'a str {
-    let at = line.as_ptr() as usize - assembly.as_ptr() as usize;
-    let before = assembly[..at].lines().last().expect("something is repeated");
-    before.split(';').next().unwrap_or_default().trim()
-}
-
 /// One line; with the label that it names.
 fn instruction(text: &str, family: &str) -> (Instruction, Option<String>) {
     let (name, rest) = text.split_once(' ').unwrap_or((text, ""));
-    let action = action(name, rest).unwrap_or_else(|| panic!("{}: nobody knows `{text}`", family));
+    let action = action(name, rest).unwrap_or_else(|| panic!("{family}: nobody knows `{text}`"));
     let mut made = Instruction {
         text: text.to_string(),
         action,
@@ -453,7 +447,7 @@ fn vector_action(name: &str) -> Option<Action> {
         "max_u32" => whole(|[a, b, _]| a.max(b)),
         "min_u32" => whole(|[a, b, _]| a.min(b)),
         "mul_lo_u32" => whole(|[a, b, _]| a.wrapping_mul(b)),
-        "mul_hi_u32" => whole(|[a, b, _]| (u64::from(a) * u64::from(b) >> 32) as u32),
+        "mul_hi_u32" => whole(|[a, b, _]| ((u64::from(a) * u64::from(b)) >> 32) as u32),
         "mul_u32_u24" => whole(|[a, b, _]| (a & 0xff_ffff).wrapping_mul(b & 0xff_ffff)),
         "mad_u32_u24" => whole(|[a, b, c]| (a & 0xff_ffff).wrapping_mul(b & 0xff_ffff).wrapping_add(c)),
         // The place of the lowest bit, or all ones.
@@ -509,7 +503,7 @@ fn scalar_action(name: &str) -> Option<Action> {
         ("sub", "i32") => scalar(|a, b| a.wrapping_sub(b), OverflowDown),
         ("addk", "i32") => scalar(|a, b| a.wrapping_add(b), Overflow),
         ("mul" | "mulk", "i32") => scalar(|a, b| a.wrapping_mul(b), Kept),
-        ("mul_hi", "u32") => scalar(|a, b| a * b >> 32, Kept),
+        ("mul_hi", "u32") => scalar(|a, b| (a * b) >> 32, Kept),
         ("lshl", "b32") => scalar(|a, b| a << (b & 31), NotZero),
         ("lshr", "b32") => scalar(|a, b| a >> (b & 31), NotZero),
         ("lshl1_add", "u32") => scalar(|a, b| (a << 1) + b, Carry),
