@@ -1,6 +1,6 @@
 //! Runs what RADV wrote for one workgroup of a chip that is not there, and counts what that costs.
 //!
-//! Written by AMD's manuals of the Vega, RDNA 2 and RDNA 3 instruction sets. Floats round to nearest; a result that the chip would flush to zero
+//! After AMD's instruction sets of Vega, RDNA 2 and RDNA 3; that it is right shows in what it comes to. Floats round to nearest; a result that the chip would flush to zero
 //! is counted, since then nothing of it can be said here.
 //!
 //! Time is a model, and what it leaves out is much: caches, bandwidth, conflicts of banks, clocks, and waves that hinder
