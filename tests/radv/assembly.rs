@@ -22,14 +22,13 @@ pub const CONDITION: usize = SCALAR + 128;
 /// Scalar registers with a name: the one of masks that comparisons leave, and the one of the lanes that take part.
 const VCC: usize = 106;
 pub const EXEC: usize = 126;
-const NAMED: [(&str, Place); 10] = [
+const NAMED: [(&str, Place); 9] = [
     ("vcc", Place::Scalar(VCC, 2)),
     ("vcc_lo", Place::Scalar(VCC, 1)),
     ("vcc_hi", Place::Scalar(VCC + 1, 1)),
     ("exec", Place::Scalar(EXEC, 2)),
     ("exec_lo", Place::Scalar(EXEC, 1)),
     ("exec_hi", Place::Scalar(EXEC + 1, 1)),
-    ("m0", Place::Scalar(124, 1)),
     ("null", Place::Constant(0, 0)),
     ("off", Place::Constant(0, 0)),
     ("src_scc", Place::Condition),
@@ -113,26 +112,24 @@ pub enum Action {
     /// A mask, or on RDNA none, of lanes for which it holds; whether the others are left out from then on.
     Compare(fn(u32, u32) -> bool, bool),
     Select,
-    /// To, the carries, two numbers, and the carries before if there are any.
+    /// To, the carries, two numbers, the carries before.
     AddWithCarry,
-    /// To two registers, carries, two factors, two registers.
-    MultiplyWide,
     ShiftWide,
     Swap,
     FirstLane,
     /// To, from two; by 64 bits if told; what the condition becomes.
     Scalar(fn(u64, u64) -> u64, bool, Change),
-    ScalarCompare(fn(u64, u64) -> bool, bool),
+    ScalarCompare(fn(u32, u32) -> bool),
     ScalarSelect(bool),
-    /// To what the lanes were; those that are left.
-    SaveLanes(fn(u64, u64) -> u64),
+    /// To what the lanes were; those of a mask are left.
+    SaveLanes,
     LoadDescriptor,
     LoadScalars,
     Load,
     Store,
-    /// So many words; the distance of two addresses' offsets in words, or one address.
+    /// So many words; from two addresses if there are words that tell these apart.
     LocalLoad(usize, Option<usize>),
-    LocalStore(usize, Option<usize>),
+    LocalStore(usize),
     Branch(When),
     Wait(Option<usize>, Option<usize>),
     Barrier,
@@ -145,8 +142,8 @@ pub enum Action {
 pub enum When {
     Always,
     Condition(bool),
-    /// When the mask that starts at a scalar register has no lane, or has one.
-    Empty(usize, bool),
+    /// When no lane takes part.
+    Empty,
 }
 
 /// What a scalar instruction leaves as the condition.
@@ -155,7 +152,6 @@ pub enum Change {
     Kept,
     NotZero,
     Carry,
-    Borrow,
     /// Of a sum of signed numbers, or of a difference.
     Overflow,
     OverflowDown,
@@ -226,11 +222,7 @@ fn instruction(text: &str, family: &str) -> (Instruction, Option<String>) {
         addressed: false,
         scale: None,
         target: 0,
-        issues: if name.starts_with("v_mul_lo") || name.starts_with("v_mul_hi") || name.starts_with("v_mad_u64") {
-            4
-        } else {
-            1
-        },
+        issues: if name.starts_with("v_mul_lo") || name.starts_with("v_mul_hi") { 4 } else { 1 },
         is_vector: name.starts_with("v_"),
         reads: Vec::new(),
         writes: Vec::new(),
@@ -242,7 +234,7 @@ fn instruction(text: &str, family: &str) -> (Instruction, Option<String>) {
         made.reads = match when {
             When::Always => Vec::new(),
             When::Condition(_) => vec![CONDITION],
-            When::Empty(mask, _) => vec![SCALAR + mask, SCALAR + mask + 1],
+            When::Empty => vec![SCALAR + EXEC, SCALAR + EXEC + 1],
         };
         return (made, Some(rest.trim().to_string()));
     }
@@ -264,12 +256,11 @@ fn instruction(text: &str, family: &str) -> (Instruction, Option<String>) {
     }
     // Of 16 bits, with a sign.
     if let ["s", kind, ..] = name.split('_').collect::<Vec<_>>()[..]
-        && ["movk", "mulk", "addk", "cmpk"].contains(&kind)
-        && !name.ends_with("u32")
+        && ["movk", "mulk"].contains(&kind)
         && let Some(Operand { place: Place::Constant(bits, wide), .. }) = made.operands.last_mut()
     {
         (*bits, *wide) = (*bits as i16 as u32, *bits as i16 as u64);
-        if ["mulk", "addk"].contains(&kind) {
+        if kind == "mulk" {
             made.operands.insert(1, made.operands[0]);
         }
     }
@@ -284,9 +275,9 @@ impl Instruction {
         let of = |operands: &[Operand]| -> Vec<usize> { operands.iter().flat_map(Operand::registers).collect() };
         let all = &self.operands[..];
         let written = match self.action {
-            Store | LocalStore(..) | ScalarCompare(..) => 0,
+            Store | LocalStore(_) | ScalarCompare(_) => 0,
             Compare(..) if all.len() == 2 => 0,
-            AddWithCarry | MultiplyWide | Swap => 2,
+            AddWithCarry | Swap => 2,
             _ => 1,
         };
         (self.writes, self.reads) = (of(&all[..written]), of(&all[written..]));
@@ -294,9 +285,9 @@ impl Instruction {
         match self.action {
             Swap | Accumulates(_) => self.reads.extend(of(&all[..written])),
             Scalar(.., Change::Kept) => (),
-            Scalar(..) | ScalarCompare(..) => self.writes.push(CONDITION),
+            Scalar(..) | ScalarCompare(_) => self.writes.push(CONDITION),
             ScalarSelect(_) => self.reads.push(CONDITION),
-            SaveLanes(_) => {
+            SaveLanes => {
                 self.reads.extend(lanes);
                 self.writes.extend(lanes);
                 self.writes.push(CONDITION);
@@ -325,16 +316,12 @@ fn action(name: &str, rest: &str) -> Option<Action> {
     }
     if let Some(name) = name.strip_prefix("ds_") {
         let words = words(name)?;
-        // Two addresses are told apart in elements, or in 64 of them.
-        let apart = if name.contains("st64") || name.contains("stride64") {
-            Some(64 * words)
-        } else {
-            (name.contains('2') && (name.contains("2addr") || name.starts_with("read2") || name.starts_with("write2")))
-                .then_some(words)
-        };
-        return match name.split('_').next()? {
-            "load" | "read" | "read2" | "read2st64" => Some(Action::LocalLoad(words, apart)),
-            "store" | "write" | "write2" | "write2st64" => Some(Action::LocalStore(words, apart)),
+        return match name.rsplit_once('_')?.0 {
+            "load" | "read" => Some(Action::LocalLoad(words, None)),
+            // Two addresses are told apart in elements, or in 64 of them.
+            "load_2addr" | "read2" => Some(Action::LocalLoad(words, Some(words))),
+            "load_2addr_stride64" | "read2st64" => Some(Action::LocalLoad(words, Some(64 * words))),
+            "store" | "write" => Some(Action::LocalStore(words)),
             _ => None,
         };
     }
@@ -349,16 +336,11 @@ fn action(name: &str, rest: &str) -> Option<Action> {
     match name {
         "endpgm" => Some(Action::End),
         "barrier" => Some(Action::Barrier),
-        "clause" | "nop" | "inst_prefetch" | "set_inst_prefetch_distance" | "delay_alu" | "code_end" => {
-            Some(Action::Nothing)
-        }
+        "clause" => Some(Action::Nothing),
         "branch" => Some(Action::Branch(When::Always)),
         "cbranch_scc0" => Some(Action::Branch(When::Condition(false))),
         "cbranch_scc1" => Some(Action::Branch(When::Condition(true))),
-        "cbranch_execz" => Some(Action::Branch(When::Empty(EXEC, true))),
-        "cbranch_execnz" => Some(Action::Branch(When::Empty(EXEC, false))),
-        "cbranch_vccz" => Some(Action::Branch(When::Empty(VCC, true))),
-        "cbranch_vccnz" => Some(Action::Branch(When::Empty(VCC, false))),
+        "cbranch_execz" => Some(Action::Branch(When::Empty)),
         _ if name.starts_with("buffer_load") => words(name).map(|_| Action::LoadScalars),
         _ if name.starts_with("load") => words(name).map(|_| Action::LoadDescriptor),
         _ => scalar_action(name),
@@ -370,12 +352,24 @@ fn words(name: &str) -> Option<usize> {
     match name.rsplit('_').next()? {
         "dword" | "b32" => Some(1),
         "dwordx2" | "b64" => Some(2),
-        "dwordx3" | "b96" => Some(3),
         "dwordx4" | "b128" => Some(4),
-        "dwordx8" | "b256" => Some(8),
-        "dwordx16" | "b512" => Some(16),
         _ => None,
     }
+}
+
+/// How two whole numbers, with a sign or without, are compared.
+fn whole_comparison(kind: &str, relation: &str) -> Option<fn(u32, u32) -> bool> {
+    Some(match (kind, relation) {
+        ("i32", "lt") => |a, b| (a as i32) < b as i32,
+        ("i32", "ge") => |a, b| a as i32 >= b as i32,
+        ("u32", "lt") => |a, b| a < b,
+        ("u32", "le") => |a, b| a <= b,
+        ("u32", "gt") => |a, b| a > b,
+        ("u32", "ge") => |a, b| a >= b,
+        ("i32", "eq") => |a, b| a == b,
+        ("i32", "ne" | "lg") => |a, b| a != b,
+        _ => return None,
+    })
 }
 
 fn vector_action(name: &str) -> Option<Action> {
@@ -390,19 +384,7 @@ fn vector_action(name: &str) -> Option<Action> {
             ("f32", "le") => |a, b| f(a) <= f(b),
             ("f32", "gt") => |a, b| f(a) > f(b),
             ("f32", "ge") => |a, b| f(a) >= f(b),
-            ("f32", "eq") => |a, b| f(a) == f(b),
-            ("f32", "neq") => |a, b| f(a) != f(b),
-            ("i32", "lt") => |a, b| (a as i32) < b as i32,
-            ("i32", "le") => |a, b| a as i32 <= b as i32,
-            ("i32", "gt") => |a, b| a as i32 > b as i32,
-            ("i32", "ge") => |a, b| a as i32 >= b as i32,
-            ("u32", "lt") => |a, b| a < b,
-            ("u32", "le") => |a, b| a <= b,
-            ("u32", "gt") => |a, b| a > b,
-            ("u32", "ge") => |a, b| a >= b,
-            ("i32" | "u32", "eq") => |a, b| a == b,
-            ("i32" | "u32", "ne" | "lg") => |a, b| a != b,
-            _ => return None,
+            _ => whole_comparison(kind, relation)?,
         };
         return Some(Compare(holds, narrows));
     }
@@ -410,79 +392,53 @@ fn vector_action(name: &str) -> Option<Action> {
         "mul_f32" => float(|[a, b, _]| (f(a) * f(b)).to_bits()),
         "add_f32" => float(|[a, b, _]| (f(a) + f(b)).to_bits()),
         "sub_f32" => float(|[a, b, _]| (f(a) - f(b)).to_bits()),
-        "subrev_f32" => float(|[a, b, _]| (f(b) - f(a)).to_bits()),
         // Product and sum are rounded each.
-        "mad_f32" | "madak_f32" | "madmk_f32" => float(|[a, b, c]| (f(a) * f(b) + f(c)).to_bits()),
+        "mad_f32" | "madak_f32" => float(|[a, b, c]| (f(a) * f(b) + f(c)).to_bits()),
         "mac_f32" => Some(Accumulates(|[a, b, c]| (f(a) * f(b) + f(c)).to_bits())),
-        "fma_f32" | "fmaak_f32" | "fmamk_f32" => float(|[a, b, c]| f(a).mul_add(f(b), f(c)).to_bits()),
+        "fma_f32" | "fmaak_f32" => float(|[a, b, c]| f(a).mul_add(f(b), f(c)).to_bits()),
         "fmac_f32" => Some(Accumulates(|[a, b, c]| f(a).mul_add(f(b), f(c)).to_bits())),
         "floor_f32" => float(|[a, ..]| f(a).floor().to_bits()),
-        "max_f32" => float(|[a, b, _]| f(a).max(f(b)).to_bits()),
-        "min_f32" => float(|[a, b, _]| f(a).min(f(b)).to_bits()),
         // Chips are off by a unit in the last place: it is for dividing whole numbers, which makes up for that.
         "rcp_f32" | "rcp_iflag_f32" => float(|[a, ..]| (1.0 / f(a)).to_bits()),
         "cvt_f32_u32" => float(|[a, ..]| (a as f32).to_bits()),
-        "cvt_f32_i32" => float(|[a, ..]| (a as i32 as f32).to_bits()),
         // To whole numbers, towards zero and within what they hold, as `as` does.
         "cvt_u32_f32" => whole(|[a, ..]| f(a) as u32),
-        "cvt_i32_f32" => whole(|[a, ..]| f(a) as i32 as u32),
         "mov_b32" => whole(|[a, ..]| a),
         "not_b32" => whole(|[a, ..]| !a),
         "and_b32" => whole(|[a, b, _]| a & b),
         "or_b32" => whole(|[a, b, _]| a | b),
-        "xor_b32" => whole(|[a, b, _]| a ^ b),
         "or3_b32" => whole(|[a, b, c]| a | b | c),
-        "and_or_b32" => whole(|[a, b, c]| a & b | c),
         "add_u32" | "add_nc_u32" => whole(|[a, b, _]| a.wrapping_add(b)),
         "sub_u32" | "sub_nc_u32" => whole(|[a, b, _]| a.wrapping_sub(b)),
         "subrev_u32" | "subrev_nc_u32" => whole(|[a, b, _]| b.wrapping_sub(a)),
         "add3_u32" => whole(|[a, b, c]| a.wrapping_add(b).wrapping_add(c)),
         "add_lshl_u32" => whole(|[a, b, c]| a.wrapping_add(b) << (c & 31)),
         "lshl_add_u32" => whole(|[a, b, c]| (a << (b & 31)).wrapping_add(c)),
-        "lshl_or_b32" => whole(|[a, b, c]| a << (b & 31) | c),
         "lshlrev_b32" => whole(|[a, b, _]| b << (a & 31)),
         "lshrrev_b32" => whole(|[a, b, _]| b >> (a & 31)),
         "bfe_u32" => whole(|[a, b, c]| a >> (b & 31) & ((1u32 << (c & 31)) - 1)),
-        "bfi_b32" => whole(|[a, b, c]| a & b | !a & c),
         "max_u32" => whole(|[a, b, _]| a.max(b)),
         "min_u32" => whole(|[a, b, _]| a.min(b)),
         "mul_lo_u32" => whole(|[a, b, _]| a.wrapping_mul(b)),
         "mul_hi_u32" => whole(|[a, b, _]| ((u64::from(a) * u64::from(b)) >> 32) as u32),
-        "mul_u32_u24" => whole(|[a, b, _]| (a & 0xff_ffff).wrapping_mul(b & 0xff_ffff)),
         "mad_u32_u24" => whole(|[a, b, c]| (a & 0xff_ffff).wrapping_mul(b & 0xff_ffff).wrapping_add(c)),
         // The place of the lowest bit, or all ones.
         "ffbl_b32" | "ctz_i32_b32" => whole(|[a, ..]| if a == 0 { u32::MAX } else { a.trailing_zeros() }),
-        "bcnt_u32_b32" => whole(|[a, b, _]| a.count_ones().wrapping_add(b)),
         "cndmask_b32" => Some(Action::Select),
-        "add_co_u32" | "addc_co_u32" | "add_co_ci_u32" => Some(Action::AddWithCarry),
-        "mad_u64_u32" => Some(Action::MultiplyWide),
+        "addc_co_u32" | "add_co_ci_u32" => Some(Action::AddWithCarry),
         "lshrrev_b64" => Some(Action::ShiftWide),
         "swap_b32" => Some(Action::Swap),
         "readfirstlane_b32" => Some(Action::FirstLane),
-        "nop" => Some(Action::Nothing),
         _ => None,
     }
 }
 
 fn scalar_action(name: &str) -> Option<Action> {
-    use Change::{Borrow, Carry, Kept, NotZero, Overflow, OverflowDown};
+    use Change::{Carry, Kept, NotZero, Overflow, OverflowDown};
     let wide = name.ends_with("64");
     let (stem, kind) = name.rsplit_once('_')?;
-    if let Some(relation) = stem.strip_prefix("cmp_").or(stem.strip_prefix("cmpk_")) {
-        let holds: fn(u64, u64) -> bool = match (kind, relation) {
-            ("i32", "lt") => |a, b| (a as i32) < b as i32,
-            ("i32", "le") => |a, b| a as i32 <= b as i32,
-            ("i32", "gt") => |a, b| a as i32 > b as i32,
-            ("i32", "ge") => |a, b| a as i32 >= b as i32,
-            ("u32", "lt") => |a, b| a < b,
-            ("u32", "le") => |a, b| a <= b,
-            ("u32", "gt") => |a, b| a > b,
-            ("u32", "ge") => |a, b| a >= b,
-            ("i32" | "u32" | "u64", "eq") => |a, b| a == b,
-            ("i32" | "u32" | "u64", "lg") => |a, b| a != b,
-            _ => return None,
-        };
-        return Some(Action::ScalarCompare(holds, wide));
+    if let Some(relation) = stem.strip_prefix("cmp_") {
+        return whole_comparison(kind, relation).map(Action::ScalarCompare);
     }
     let scalar = |work, condition| Some(Action::Scalar(work, wide, condition));
     match (stem, kind) {
@@ -491,31 +447,19 @@ fn scalar_action(name: &str) -> Option<Action> {
         ("not", "b32" | "b64") => scalar(|a, _| !a, NotZero),
         ("and", "b32" | "b64") => scalar(|a, b| a & b, NotZero),
         ("or", "b32" | "b64") => scalar(|a, b| a | b, NotZero),
-        ("xor", "b32" | "b64") => scalar(|a, b| a ^ b, NotZero),
         ("andn2" | "and_not1", "b32" | "b64") => scalar(|a, b| a & !b, NotZero),
-        ("orn2" | "or_not1", "b32" | "b64") => scalar(|a, b| a | !b, NotZero),
-        ("nand", "b32" | "b64") => scalar(|a, b| !(a & b), NotZero),
-        ("nor", "b32" | "b64") => scalar(|a, b| !(a | b), NotZero),
-        ("xnor", "b32" | "b64") => scalar(|a, b| !(a ^ b), NotZero),
         ("add", "u32") => scalar(|a, b| a + b, Carry),
-        ("sub", "u32") => scalar(|a, b| a.wrapping_sub(b), Borrow),
         ("add", "i32") => scalar(|a, b| a.wrapping_add(b), Overflow),
         ("sub", "i32") => scalar(|a, b| a.wrapping_sub(b), OverflowDown),
-        ("addk", "i32") => scalar(|a, b| a.wrapping_add(b), Overflow),
         ("mul" | "mulk", "i32") => scalar(|a, b| a.wrapping_mul(b), Kept),
         ("mul_hi", "u32") => scalar(|a, b| (a * b) >> 32, Kept),
         ("lshl", "b32") => scalar(|a, b| a << (b & 31), NotZero),
         ("lshr", "b32") => scalar(|a, b| a >> (b & 31), NotZero),
-        ("lshl1_add", "u32") => scalar(|a, b| (a << 1) + b, Carry),
-        ("lshl2_add", "u32") => scalar(|a, b| (a << 2) + b, Carry),
         ("lshl3_add", "u32") => scalar(|a, b| (a << 3) + b, Carry),
-        ("lshl4_add", "u32") => scalar(|a, b| (a << 4) + b, Carry),
         ("min", "u32") => scalar(|a, b| a.min(b), Kept),
         ("max", "u32") => scalar(|a, b| a.max(b), Kept),
         ("cselect", "b32" | "b64") => Some(Action::ScalarSelect(wide)),
-        ("and_saveexec", _) => Some(Action::SaveLanes(|lanes, mask| lanes & mask)),
-        ("or_saveexec", _) => Some(Action::SaveLanes(|lanes, mask| lanes | mask)),
-        ("andn2_saveexec" | "and_not1_saveexec", _) => Some(Action::SaveLanes(|lanes, mask| mask & !lanes)),
+        ("and_saveexec", _) => Some(Action::SaveLanes),
         _ => None,
     }
 }

@@ -17,6 +17,8 @@ const SCALAR_MEMORY: u64 = 200;
 const LOCAL_MEMORY: u64 = 64;
 /// Bytes of a workgroup's own memory.
 const LOCAL_BYTES: usize = 64 << 10;
+/// What is in registers and memory that nothing has been written to: read as a float it is no number.
+pub const GARBAGE: u32 = 0xffff_dead;
 
 /// How a chip runs waves.
 #[derive(Clone, Copy, Debug)]
@@ -75,7 +77,7 @@ impl Chip {
     /// Runs a workgroup of so many threads, the grid's only one, on buffers by their binding.
     pub fn run(&self, assembly: &str, threads: usize, buffers: &mut [Vec<u32>]) -> Cost {
         let program = Program::parse(assembly, self.family);
-        let mut local = vec![0; LOCAL_BYTES / 4];
+        let mut local = vec![GARBAGE; LOCAL_BYTES / 4];
         let mut waves: Vec<Wave> =
             (0..threads).step_by(self.wave).map(|first| Wave::new(self, first, threads)).collect();
         // From barrier to barrier, one wave after the other.
@@ -134,7 +136,7 @@ impl Clock {
             // GCN counts them together.
             Store if chip.gcn => self.memory.push_back(self.now + MEMORY),
             LoadDescriptor | LoadScalars => self.others.push_back(self.now + SCALAR_MEMORY),
-            LocalLoad(..) | LocalStore(..) => self.others.push_back(self.now + LOCAL_MEMORY),
+            LocalLoad(..) | LocalStore(_) => self.others.push_back(self.now + LOCAL_MEMORY),
             _ => (),
         }
     }
@@ -161,7 +163,7 @@ impl Wave {
         let clock = Clock { now: 0, ready: [0; CONDITION + 1], memory: VecDeque::new(), others: VecDeque::new() };
         let mut wave = Wave {
             chip: *chip,
-            vector_registers: vec![[0; 64]; 256],
+            vector_registers: vec![[GARBAGE; 64]; 256],
             scalar_registers: [0; 128],
             condition: false,
             at: 0,
@@ -252,14 +254,14 @@ impl Wave {
                     let taken = match when {
                         When::Always => true,
                         When::Condition(held) => self.condition == held,
-                        When::Empty(mask, empty) => (self.mask(mask) == 0) == empty,
+                        When::Empty => self.mask(EXEC) == 0,
                     };
                     if taken {
                         self.at = instruction.target;
                     }
                 }
                 Action::Load | Action::Store => self.exchange(instruction, buffers),
-                Action::LocalLoad(..) | Action::LocalStore(..) => self.exchange_locally(instruction, local),
+                Action::LocalLoad(..) | Action::LocalStore(_) => self.exchange_locally(instruction, local),
                 Action::LoadScalars => {
                     let [to, descriptor, offset] = &instruction.operands[..] else { panic!("{}", instruction.text) };
                     let buffer = &buffers[self.scalar_registers[descriptor.scalar()] as usize];
@@ -330,7 +332,7 @@ impl Wave {
                 }
             }
             Action::AddWithCarry => {
-                let carried = operands.get(4).map_or(0, |mask| self.mask(mask.scalar()));
+                let carried = self.mask(operands[4].scalar());
                 let mut carries = 0;
                 for lane in self.lanes() {
                     let [a, b] = [2, 3].map(|index| u64::from(self.read(&operands[index], lane)));
@@ -339,13 +341,6 @@ impl Wave {
                     self.vector_registers[operands[0].vector()][lane] = sum as u32;
                 }
                 self.set_mask(operands[1].scalar(), carries);
-            }
-            Action::MultiplyWide => {
-                let [to, _, a, b, c] = operands else { panic!("{}", instruction.text) };
-                for lane in self.lanes() {
-                    let product = u64::from(self.read(a, lane)) * u64::from(self.read(b, lane));
-                    self.write_wide(to, lane, product.wrapping_add(self.read_wide(c, lane)));
-                }
             }
             Action::ShiftWide => {
                 let [to, by, from] = operands else { panic!("{}", instruction.text) };
@@ -376,25 +371,24 @@ impl Wave {
                     Change::Kept => (),
                     Change::NotZero => self.condition = result != 0,
                     Change::Carry => self.condition = exact >> 32 != 0,
-                    Change::Borrow => self.condition = b > a,
                     Change::Overflow => self.condition = sign(a) == sign(b) && sign(result) != sign(a),
                     Change::OverflowDown => self.condition = sign(a) != sign(b) && sign(result) != sign(a),
                 }
                 self.write_scalar(&operands[0], result, wide);
             }
-            Action::ScalarCompare(holds, wide) => {
-                self.condition = holds(self.read_scalar(&operands[0], wide), self.read_scalar(&operands[1], wide));
+            Action::ScalarCompare(holds) => {
+                self.condition = holds(self.read(&operands[0], 0), self.read(&operands[1], 0));
             }
             Action::ScalarSelect(wide) => {
                 let from = if self.condition { &operands[1] } else { &operands[2] };
                 let value = self.read_scalar(from, wide);
                 self.write_scalar(&operands[0], value, wide);
             }
-            Action::SaveLanes(left) => {
+            Action::SaveLanes => {
                 let wide = self.chip.wave == 64;
                 let (lanes, mask) = (self.mask(EXEC), self.read_scalar(&operands[1], wide));
                 self.write_scalar(&operands[0], lanes, wide);
-                self.set_mask(EXEC, left(lanes, mask));
+                self.set_mask(EXEC, lanes & mask);
                 self.condition = self.mask(EXEC) != 0;
             }
             _ => (),
@@ -414,7 +408,7 @@ impl Wave {
         }
     }
 
-    /// Loads from a buffer, or stores; nothing is outside of it.
+    /// Loads from a buffer, or stores; outside of it there are zeros, and what is stored there is lost.
     fn exchange(&mut self, instruction: &Instruction, buffers: &mut [Vec<u32>]) {
         let [data, address, descriptor, offset] = &instruction.operands[..] else { panic!("{}", instruction.text) };
         let Place::Vector(first, count) = data.place else { panic!("{}", instruction.text) };
@@ -436,16 +430,11 @@ impl Wave {
 
     /// The same with the workgroup's memory, at one address or two.
     fn exchange_locally(&mut self, instruction: &Instruction, local: &mut [u32]) {
-        let (loads, words, apart) = match instruction.action {
-            Action::LocalLoad(words, apart) => (true, words, apart),
-            Action::LocalStore(words, apart) => (false, words, apart),
+        let [a, b] = &instruction.operands[..] else { panic!("{}", instruction.text) };
+        let (loads, words, apart, data, address) = match instruction.action {
+            Action::LocalLoad(words, apart) => (true, words, apart, a.vector(), b),
+            Action::LocalStore(words) => (false, words, None, b.vector(), a),
             _ => unreachable!("{}", instruction.text),
-        };
-        let (address, data) = match (&instruction.operands[..], loads) {
-            ([data, address], true) => (address, [data.vector(), data.vector() + words]),
-            ([address, data], false) => (address, [data.vector(); 2]),
-            ([address, a, b], false) => (address, [a.vector(), b.vector()]),
-            _ => panic!("{}", instruction.text),
         };
         let offsets = match apart {
             Some(apart) => instruction.offsets.map(|offset| offset * apart as u32 * 4).to_vec(),
@@ -453,7 +442,7 @@ impl Wave {
         };
         for lane in self.lanes() {
             let own = self.read(address, lane);
-            for (&offset, &first) in offsets.iter().zip(&data) {
+            for (&offset, first) in offsets.iter().zip([data, data + words]) {
                 let at = own.wrapping_add(offset) as usize / 4;
                 for next in 0..words {
                     let register = &mut self.vector_registers[first + next][lane];

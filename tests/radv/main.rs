@@ -1,6 +1,6 @@
 //! What AMD's own compiler makes of every shader, for chips that are not there: no fused multiply-add, no scratch, no
 //! spills, registers and instructions under a ceiling. The kernels of the paper's layouts are run by an emulator, too: to
-//! the CPU's record, and at no less than a share of the chip's f32 rate.
+//! the CPU's bits, and at no less than a share of the chip's f32 rate.
 //!
 //! Mesa's RADV compiles for whatever chip `RADV_FORCE_FAMILY` names. It reads that as it starts, so each chip takes a
 //! process of its own: this program once more, as the test `compile`. Without RADV all is skipped in plain sight, or
@@ -296,7 +296,7 @@ fn what_the_compiler_writes_is_exact_small_and_fast() {
     note(read);
 }
 
-/// Runs what was compiled of a case: to the CPU's record, and as fast as is asked. How many agent-steps that was.
+/// Runs what was compiled of a case: to the CPU's bits, and as fast as is asked. How many agent-steps that was.
 fn run(case: &Case, chip: Chip, pass: Pass, compiled: &Compiled) -> u64 {
     let what = format!("{chip} under the {pass} pass, {}", case.name);
     let Run { differ, cost, share } = case.run(&chip, compiled);

@@ -178,6 +178,12 @@ impl Shape {
         Shape { workgroup: packing.workgroup, slots: packing.slots, records, sizes }
     }
 
+    /// The specialised one, if it is asked for and there can be one.
+    fn asked_for(world: &World, kernel: Kernel, room: Capacity, records: Kept) -> Option<Shape> {
+        let packing = Packing::specialised(world, room).filter(|_| kernel != Kernel::Generic);
+        packing.map(|packing| Shape::specialised(world, packing, records))
+    }
+
     fn specialised(world: &World, packing: Packing, records: Kept) -> Shape {
         let Constants { leaders, followers, pois, variant, policy: PolicyConstants { widths, .. }, .. } =
             world.constants;
@@ -351,6 +357,14 @@ struct Capacity {
     /// Threads of the largest workgroup, and bytes of its memory.
     workgroup: usize,
     workgroup_bytes: usize,
+}
+
+impl Capacity {
+    /// Of a device whose largest workgroup is told, and that no batch fills.
+    fn of_workgroups(threads: usize) -> Capacity {
+        let bytes = MAX_OFFSET;
+        Capacity { batch: bytes, buffer: bytes, kernels: 1, workgroup: threads, workgroup_bytes: 16 << 10 }
+    }
 }
 
 /// The shapes to play by kernels of their own: those compiled already, and of the others those with most to play, up to
@@ -1196,13 +1210,10 @@ pub fn shaders() -> Vec<(&'static str, String)> {
 /// what compilers make of it. `threads` is the size of the largest workgroup.
 #[doc(hidden)]
 pub fn shader_of(world: &World, kernel: Kernel, threads: usize) -> String {
-    let room = Capacity { batch: 0, buffer: 0, kernels: 1, workgroup: threads, workgroup_bytes: 16 << 10 };
+    let room = Capacity::of_workgroups(threads);
     let little = Kept { trace: false, sights: false };
-    let made = Packing::specialised(world, room).filter(|_| kernel != Kernel::Generic);
-    source(made.map_or_else(
-        || Shape::generic(world, Packing::generic(world, threads), little),
-        |packing| Shape::specialised(world, packing, little),
-    ))
+    let made = Shape::asked_for(world, kernel, room, little);
+    source(made.unwrap_or_else(|| Shape::generic(world, Packing::generic(world, threads), little)))
 }
 
 /// What one workgroup gets to play a group's first teams, and where it leaves what comes of that; for running what
@@ -1228,10 +1239,8 @@ pub struct Workgroup {
 /// A team is too large for any device.
 #[doc(hidden)]
 pub fn workgroup_of(group: &Group<'_>, kernel: Kernel, threads: usize) -> Result<Workgroup, BackendError> {
-    let bytes = MAX_OFFSET;
-    let room = Capacity { batch: bytes, buffer: bytes, kernels: 1, workgroup: threads, workgroup_bytes: 16 << 10 };
-    let made = Packing::specialised(group.world, room).filter(|_| kernel != Kernel::Generic);
-    let made = made.map(|packing| Shape::specialised(group.world, packing, Kept::of(group, false)));
+    let room = Capacity::of_workgroups(threads);
+    let made = Shape::asked_for(group.world, kernel, room, Kept::of(group, false));
     let batches = plan(&[*group], false, Records::Whole, room, &made.into_iter().collect())?;
     let work = &batches[0];
     let Share { task, first_team, shape, .. } = work.shares[0];
