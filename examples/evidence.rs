@@ -1,7 +1,7 @@
-//! Makes `docs/evidence.md` of the files in `docs/evidence/`, each of which a run wrote.
+//! Makes `docs/develop/evidence.md` of the files in `docs/develop/evidence/`, each of which a run wrote.
 //!
 //! ```text
-//! flotilla verify --report docs/evidence/my-machine.json
+//! flotilla verify --report docs/develop/evidence/my-machine.json
 //! cargo run --example evidence
 //! ```
 
@@ -14,7 +14,7 @@ use flotilla::record::evidence::{Compared, Sighting, Tier};
 
 #[allow(dead_code, reason = "a test that takes this file in calls `page`")]
 fn main() -> ExitCode {
-    let docs = env::args_os().nth(1).map_or("docs".into(), PathBuf::from);
+    let docs = env::args_os().nth(1).map_or("docs/develop".into(), PathBuf::from);
     let written = page(&docs.join("evidence")).and_then(|page| {
         let path = docs.join("evidence.md");
         fs::write(&path, page).map_err(|error| format!("{}: {error}", path.display()))
@@ -31,7 +31,7 @@ fn main() -> ExitCode {
 const HEAD: &str = "\
 # The same bits everywhere: what was seen
 
-<!-- made of the files in docs/evidence by: cargo run --example evidence -->
+<!-- made of the files in docs/develop/evidence by: cargo run --example evidence -->
 
 Config and seed are to decide every bit of a run, on every machine. That is a claim about compilers, drivers and processors that
 nobody can try all of, so here is what was tried, each row by a program that wrote down what it found. A row holds for the
@@ -53,7 +53,7 @@ flotilla verify --worlds 20 --report my-machine.json
 
 compares the instruction sets of the processor with each other and every GPU with the CPU, trains six short runs, and
 writes all that, with the names of processor, driver and compiler, into one small file. `--note` adds what else there is to
-know. Send the file in, or put it into `docs/evidence/` and say `cargo run --example evidence`. What differs belongs there as well.
+know. Send the file in, or put it into `docs/develop/evidence/` and say `cargo run --example evidence`. What differs belongs there as well.
 Built with `--features scalar` the instruction sets are compared with code that has none.
 ";
 

@@ -1,4 +1,4 @@
-"""Prints docs/python.md: what the package's docstrings and signatures say."""
+"""Prints docs/reference/python.md: what the package's docstrings and signatures say."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import flotilla
 OPENING = """\
 # flotilla in Python
 
-Everything that `import flotilla` gives. [The package's own page](../python/README.md) starts with what it is for. Arrays are
+Everything that `import flotilla` gives. [The package's own page](../../python/README.md) starts with what it is for. Arrays are
 NumPy's; shapes are written `[teams, leaders, 8]`. Every example here is run by the package's tests, with `np` for NumPy.
 
-This page is made from the docstrings by `python python/api.py > docs/python.md`, and a test fails where they differ.
+This page is made from the docstrings by `python python/api.py > docs/reference/python.md`, and a test fails where they differ.
 """
 ORDER = [
     ("Configs", ["Config", "Key", "ConfigError", "Problem"]),

@@ -16,7 +16,7 @@ use crate::declare::Choice;
 /// Most problems listed of one text.
 const MAX_LISTED: usize = 50;
 
-/// What is to be known of one key: a line of the table behind `docs/reference.md` and every commented config.
+/// What is to be known of one key: a line of the table behind `docs/reference/config.md` and every commented config.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Definition {
     /// Dotted: `world.dt`.

@@ -1,4 +1,4 @@
-//! `flotilla verify --report` writes what it found, and `docs/evidence.md` is what the files of `docs/evidence/` make.
+//! `flotilla verify --report` writes what it found, and `docs/develop/evidence.md` is what the files of `docs/develop/evidence/` make.
 
 #![cfg(feature = "cli")]
 
@@ -48,7 +48,7 @@ fn a_report_needs_no_gpu() {
         assert!(table.contains(adapter), "{table}");
     }
     // To the digests of all machines that sent one in.
-    let digests = evidence::digests(&evidence::read(&root().join("docs/evidence")).unwrap());
+    let digests = evidence::digests(&evidence::read(&root().join("docs/develop/evidence")).unwrap());
     assert_eq!(found.trained.len(), 6);
     for came in found.trained {
         assert_eq!(digests.get(&came.config), Some(&came.digest), "{}: not what the rows say", came.config);
@@ -118,10 +118,10 @@ fn a_report_is_written_over_no_input_and_nowhere() {
 
 #[test]
 fn the_page_is_what_the_files_make() {
-    let made = evidence::page(&root().join("docs/evidence")).unwrap();
-    let there = fs::read_to_string(root().join("docs/evidence.md")).unwrap();
+    let made = evidence::page(&root().join("docs/develop/evidence")).unwrap();
+    let there = fs::read_to_string(root().join("docs/develop/evidence.md")).unwrap();
     let first = made.lines().zip(there.lines()).find(|(made, there)| made != there);
-    assert!(made == there, "docs/evidence.md is another, say cargo run --example evidence: {first:#?}");
+    assert!(made == there, "docs/develop/evidence.md is another, say cargo run --example evidence: {first:#?}");
 }
 
 #[test]
@@ -159,7 +159,7 @@ fn a_row_that_differs_shows() {
 /// What the page says is tested is a test that there is.
 #[test]
 fn the_tests_that_the_page_names_are_there() {
-    let page = fs::read_to_string(root().join("docs/evidence.md")).unwrap();
+    let page = fs::read_to_string(root().join("docs/develop/evidence.md")).unwrap();
     let table = page.split("## What it relies on").nth(1).unwrap();
     let rows = table.lines().filter(|line| line.starts_with("| "));
     let names = rows.filter_map(|line| line.trim_end_matches(" |").rsplit(" | ").next());

@@ -1,4 +1,4 @@
-//! One step of an episode in float64, as docs/model.md states it, against the kernels on random worlds.
+//! One step of an episode in float64, as docs/explain/model.md states it, against the kernels on random worlds.
 //!
 //! The model starts every step from the kernels' own state, since radii and quadrants turn roundings into units within
 //! a few steps. A step on which a threshold is met within rounding may fall on either side and is counted instead of

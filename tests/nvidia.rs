@@ -5,7 +5,7 @@
 //! Without `nvcc` all is skipped in plain sight, or fails where `FLOTILLA_REQUIRE_NVCC=1` says that it is needed; the folder
 //! of CUDA's headers is `FLOTILLA_CUDA_INCLUDE` where the compiler does not find it by itself. `.ci/ports nvidia` brings both.
 //!
-//! With `FLOTILLA_EVIDENCE=FOLDER` what was read is noted there, as a row of `docs/evidence.md`.
+//! With `FLOTILLA_EVIDENCE=FOLDER` what was read is noted there, as a row of `docs/develop/evidence.md`.
 //!
 //! `cargo test --test nvidia -- table --ignored --nocapture` makes the table of `benches/README.md`.
 

@@ -1,4 +1,4 @@
-//! Every command of README.md and docs/*.md, as it stands there.
+//! Every command of README.md and of the pages below docs/, as it stands there.
 //!
 //! The blocks of a page are run in order, in a folder of its own that is empty but for the repository's `configs/`:
 //!
@@ -28,8 +28,17 @@ const PATIENCE: Duration = Duration::from_secs(300);
 
 fn pages() -> Vec<PathBuf> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let docs = fs::read_dir(root.join("docs")).unwrap().map(|entry| entry.unwrap().path());
-    let mut pages: Vec<_> = docs.filter(|path| path.extension().is_some_and(|extension| extension == "md")).collect();
+    let mut pages = Vec::new();
+    let mut folders = vec![root.join("docs")];
+    while let Some(folder) = folders.pop() {
+        for path in fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|extension| extension == "md") {
+                pages.push(path);
+            }
+        }
+    }
     pages.sort();
     pages.insert(0, root.join("README.md"));
     pages

@@ -1,4 +1,4 @@
-//! `flotilla paper --questions`: a short form of all of it, and that docs/questions.md tells what comes out.
+//! `flotilla paper --questions`: a short form of all of it, and that docs/results/questions.md tells what comes out.
 //!
 //! One question is trained in full; `FLOTILLA_LONG=1` trains all. Where results change on purpose, the page's tables and
 //! figures are written anew from what `flotilla paper --questions --out DIR` made by
@@ -94,7 +94,7 @@ fn few_trials_of_every_question_come_to_a_page() {
 }
 
 fn docs(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("docs").join(name)
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/results").join(name)
 }
 
 fn named(part: &Study, ending: &str) -> String {
@@ -121,7 +121,11 @@ fn the_page_tells_what_comes_out() {
     let list: Vec<String> = letters.iter().map(char::to_string).collect();
     let out = good(place.path(), &format!("--questions={} --quiet --out all", list.join(",")));
     for part in QUESTIONS.iter().filter(|asked| letters.contains(&asked.letter)).flat_map(|asked| asked.parts) {
-        assert_eq!(block(&page, part), block(&out, part), "docs/questions.md; see the head of tests/questions.rs");
+        assert_eq!(
+            block(&page, part),
+            block(&out, part),
+            "docs/results/questions.md; see the head of tests/questions.rs"
+        );
         for ending in ["svg", "csv"] {
             let [there, here] =
                 [docs(&named(part, ending)), place.path().join("all").join(part.name).with_extension(ending)];

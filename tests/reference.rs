@@ -1,10 +1,10 @@
-//! `docs/reference.md` says what the table of keys says. `FLOTILLA_WRITE=1` writes the page anew.
+//! `docs/reference/config.md` says what the table of keys says. `FLOTILLA_WRITE=1` writes the page anew.
 
 use std::fmt::Write;
 
 use flotilla::config::{self, Config, Coupling, Definition, Override};
 
-const PAGE: &str = "docs/reference.md";
+const PAGE: &str = "docs/reference/config.md";
 const OPENING: &str = "\
 # Every key of a config
 
@@ -12,7 +12,7 @@ A config is a TOML file of the sections below. `world.leaders` and `world.pois` 
 default shown here, and `flotilla check CONFIG` writes all of them out. Whatever is wrong with a file is told at once, by line,
 with what is allowed. Lengths are in map units, times in seconds, angles in radians.
 
-[model.md](model.md) has the equations. The last column is the section and equation of the paper, *Structural Credit Assignment
+[model.md](../explain/model.md) has the equations. The last column is the section and equation of the paper, *Structural Credit Assignment
 for Multiagent Leader-Based Learning*; where it is empty, the paper says nothing of the key. The paper gives numbers for
 hardly any of these: model.md says which, how the others were chosen, and how much hangs on them.
 
@@ -24,7 +24,7 @@ const CLOSING: &str = "
 ## `[[stages]]`
 
 Any number of these, in order of `from`, each of the file's own keys with some changed from a generation on
-([model.md](model.md#learning-section-43-algorithm-1)).
+([model.md](../explain/model.md#learning-section-43-algorithm-1)).
 
 | key | unit | type | range | default | meaning | paper |
 |---|---|---|---|---|---|---|

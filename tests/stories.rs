@@ -1,4 +1,4 @@
-//! The paper's claims (Sections 1, 5 and 6, Figures 4 to 6) over thirty trials: tables in README.md and docs/figures.md
+//! The paper's claims (Sections 1, 5 and 6, Figures 4 to 6) over thirty trials: tables in README.md and docs/results/claims.md
 //! are what comes out, verdict by verdict, whether the paper's claims hold or not.
 //!
 //! Where results change on purpose, `FLOTILLA_WRITE_CLAIMS=1 cargo test --test stories` writes the tables anew.
@@ -42,7 +42,7 @@ fn the_pages_tell_what_comes_out() {
     println!("{first_page}");
     let all = format!("{heading}\n\n{}", tables::full(&claims));
     holds("README.md", &first_page);
-    holds("docs/figures.md", &all);
+    holds("docs/results/claims.md", &all);
 }
 
 /// Fails unless a page has this between its marks, or puts it there if that is asked for.

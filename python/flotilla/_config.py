@@ -44,7 +44,7 @@ def _flat(sections: Mapping[str, Any]) -> list[tuple[str, Any]]:
 class Config:
     """One experiment: its world, its agents, its learning. A config cannot be changed; :meth:`replace` makes another.
 
-    Keys that are not given have the defaults of ``docs/reference.md``. A config can be compared, hashed, copied and
+    Keys that are not given have the defaults of ``docs/reference/config.md``. A config can be compared, hashed, copied and
     pickled.
 
     Args:

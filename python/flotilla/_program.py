@@ -61,7 +61,7 @@ def compare(runs: Sequence[Run | str | os.PathLike[str]], *, at: str | int = "la
         paired: compare pair by pair: trials with one seed and number are pairs.
 
     Returns:
-        what ``docs/json.md`` says of ``flotilla compare RUN RUN --json``.
+        what ``docs/reference/json.md`` says of ``flotilla compare RUN RUN --json``.
 
     Raises:
         ValueError: there is nothing to compare.
@@ -101,7 +101,7 @@ def paper(
         backend: as of :func:`train`.
 
     Returns:
-        what ``docs/json.md`` says of ``flotilla paper --json``.
+        what ``docs/reference/json.md`` says of ``flotilla paper --json``.
 
     Raises:
         ValueError: a number is not allowed.

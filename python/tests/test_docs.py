@@ -48,7 +48,7 @@ def test_examples_do_what_they_say(name, thing):
 
 
 def snippets():
-    for page in (ROOT / "README.md", ROOT / "python/README.md", ROOT / "docs/python.md"):
+    for page in (ROOT / "README.md", ROOT / "python/README.md", ROOT / "docs/reference/python.md"):
         for number, (why, code) in enumerate(re.findall(r"(<!-- not run: .*? -->\n\n?)?```python\n(.*?)```", page.read_text(), re.S)):
             if not why and ">>>" not in code:
                 yield pytest.param(code, id=f"{page.relative_to(ROOT)} {number}")
@@ -62,4 +62,4 @@ def test_snippets_run(code):
 
 def test_the_api_page_is_current():
     made = subprocess.run([sys.executable, ROOT / "python/api.py"], capture_output=True, text=True, check=True).stdout
-    assert made == (ROOT / "docs/python.md").read_text(), "make it anew: python python/api.py > docs/python.md"
+    assert made == (ROOT / "docs/reference/python.md").read_text(), "make it anew: python python/api.py > docs/reference/python.md"

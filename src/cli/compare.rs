@@ -33,7 +33,7 @@ pub struct Args {
     /// Compare pair by pair; trials with one seed and number are pairs
     #[arg(long)]
     paired: bool,
-    /// Print one JSON object (docs/json.md)
+    /// Print one JSON object (docs/reference/json.md)
     #[arg(long, conflicts_with_all = ["csv", "latex"])]
     json: bool,
     /// Print CSV, a row a mean or a difference

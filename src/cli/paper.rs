@@ -33,7 +33,7 @@ pub struct Args {
     #[arg(long, short, value_name = "DIR", default_value = "paper")]
     pub(super) out: PathBuf,
     /// Instead of the paper's experiments, train what answers the questions that it leaves open, or =a,c some of them
-    /// (docs/questions.md)
+    /// (docs/results/questions.md)
     #[arg(long, value_name = "LETTERS", num_args = 0..=1, require_equals = true, value_delimiter = ',',
         default_missing_value = "a,b,c,d,e,f,g", value_parser = letter)]
     pub(super) questions: Vec<char>,
@@ -55,7 +55,7 @@ pub struct Args {
     /// No progress on standard error
     #[arg(long, short)]
     pub(super) quiet: bool,
-    /// Print what came out as one JSON object (docs/json.md)
+    /// Print what came out as one JSON object (docs/reference/json.md)
     #[arg(long)]
     pub(super) json: bool,
     #[command(flatten)]

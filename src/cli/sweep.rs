@@ -24,7 +24,7 @@ use crate::sweep::shard::{self, MAX_SHARDS, Shard};
 use crate::sweep::slurm::Job;
 use crate::sweep::{Point, Sweep};
 
-const SCALE_OUT: &str = "Many processes (docs/sweeps.md)";
+const SCALE_OUT: &str = "Many processes (docs/how-to/sweeps.md)";
 const RESULTS: &str = "Results";
 
 #[derive(clap::Args)]
@@ -57,7 +57,7 @@ pub struct Args {
     /// No progress on standard error
     #[arg(long, short)]
     quiet: bool,
-    /// Print what came out as one JSON object (docs/json.md)
+    /// Print what came out as one JSON object (docs/reference/json.md)
     #[arg(long, conflicts_with_all = ["list", "slurm"])]
     json: bool,
     #[command(flatten)]

@@ -53,7 +53,7 @@ pub struct Args {
     /// No progress on standard error
     #[arg(long, short)]
     quiet: bool,
-    /// Print what came out as one JSON object (docs/json.md)
+    /// Print what came out as one JSON object (docs/reference/json.md)
     #[arg(long)]
     json: bool,
     /// Also write event files for TensorBoard, in OUT/tensorboard; with --resume also of what was trained before

@@ -43,7 +43,7 @@ pub struct Args {
     /// Only this kernel, instead of both
     #[arg(long, value_name = "KERNEL", value_parser = ["generic", "specialised"])]
     kernel: Option<String>,
-    /// Write what was compared, on what, and what short trainings come to, as a row of docs/evidence.md; compares the
+    /// Write what was compared, on what, and what short trainings come to, as a row of docs/develop/evidence.md; compares the
     /// processor's instruction sets, too, and needs no adapter
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,

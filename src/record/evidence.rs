@@ -1,4 +1,4 @@
-//! What was seen on a machine: the small file that `flotilla verify --report` writes. `docs/evidence.md` is made of
+//! What was seen on a machine: the small file that `flotilla verify --report` writes. `docs/develop/evidence.md` is made of
 //! such.
 
 use serde::{Deserialize, Serialize};

@@ -8,7 +8,7 @@
 //! | [`metrics`] | `metrics.csv` |
 //! | [`checkpoint`] | `checkpoints/`, written beside training |
 //! | [`folder`] | the run's folder, its lock and `run.json` |
-//! | [`evidence`] | what was seen on a machine, for `docs/evidence.md` |
+//! | [`evidence`] | what was seen on a machine, for `docs/develop/evidence.md` |
 //!
 //! Every file that is read is taken as hostile: its size is checked before memory is taken, what it says is checked
 //! before it is used, and nothing in it names another file.

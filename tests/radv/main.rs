@@ -6,7 +6,7 @@
 //! process of its own: this program once more, as the test `compile`. Without RADV all is skipped in plain sight, or
 //! fails where `FLOTILLA_REQUIRE_RADV=1` says that it is needed.
 //!
-//! With `FLOTILLA_EVIDENCE=FOLDER` what was read is noted there, as a row of `docs/evidence.md`.
+//! With `FLOTILLA_EVIDENCE=FOLDER` what was read is noted there, as a row of `docs/develop/evidence.md`.
 //!
 //! `cargo test --test radv -- table --ignored --nocapture` makes the tables of `benches/README.md`.
 
