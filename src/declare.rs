@@ -143,7 +143,7 @@ macro_rules! shared {
 }
 pub(crate) use shared;
 
-/// A key whose value is one of a few words: see `choice!`.
+/// A key whose value is one of a few words: see `config_enum!`.
 pub trait Choice: Copy + Serialize + 'static {
     /// Every word with what it stands for; its place is its number.
     const ALL: &'static [(&'static str, Self)];
@@ -165,7 +165,7 @@ pub trait Fixed {
 
 /// Defines an enum whose variants are written in configs as the words given, and in shaders as constants: `wgsl` has
 /// `const DENSITY_LINEAR: u32 = 0u;` for what is `Density::Linear` here.
-macro_rules! choice {
+macro_rules! config_enum {
     ($(#[$doc:meta])* $name:ident { $($(#[$variant_doc:meta])* $variant:ident = $word:literal,)* }) => {
         $(#[$doc])*
         #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize)]
@@ -204,7 +204,7 @@ macro_rules! choice {
         }
     };
 }
-pub(crate) use choice;
+pub(crate) use config_enum;
 
 #[cfg(test)]
 mod tests {
@@ -212,7 +212,7 @@ mod tests {
 
     use super::*;
 
-    choice! {
+    config_enum! {
         /// Of a test.
         Colour {
             Red = "red",

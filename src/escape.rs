@@ -1,22 +1,22 @@
-//! Names and values on their way into a line of text: nothing in them may end the line or steer a terminal.
+//! Escaping of names and values for one line of text: nothing in them may end the line or control a terminal.
 //!
 //! Pictures escape in [`crate::report::scene`], pages in [`crate::report::replay`], tables by the `csv` crate.
 
 use std::borrow::Cow;
 
-/// Whether a character would leave its line, move a terminal's cursor or turn its text around.
-pub fn steers(c: char) -> bool {
+/// Returns whether a character can end the line, control a terminal or reverse the text direction.
+pub fn is_control(c: char) -> bool {
     c.is_control() || matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }
 
-/// A text for one line: what steers is written as `\n`, `\u{1b}`.
+/// Escapes a text for one line: control characters are written as `\n`, `\u{1b}`.
 pub fn line(text: &str) -> Cow<'_, str> {
-    escaped(text, steers)
+    escaped(text, is_control)
 }
 
-/// [`line()`] of a text of several lines, which may have tabs.
+/// Escapes like [`line()`], but keeps line breaks and tabs.
 pub fn lines(text: &str) -> Cow<'_, str> {
-    escaped(text, |c| steers(c) && !matches!(c, '\n' | '\t'))
+    escaped(text, |c| is_control(c) && !matches!(c, '\n' | '\t'))
 }
 
 fn escaped(text: &str, bad: impl Fn(char) -> bool + Copy) -> Cow<'_, str> {
@@ -32,7 +32,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_what_steers_is_escaped() {
+    fn only_control_characters_are_escaped() {
         assert_eq!(line("Zürich — 4/4 'POIs' \\"), "Zürich — 4/4 'POIs' \\");
         assert_eq!(line("a\nb\t\u{1b}[31mred\u{9b}1m\r\u{202e}"), r"a\nb\t\u{1b}[31mred\u{9b}1m\r\u{202e}");
         assert_eq!(lines("a\nb\tc\u{7}"), "a\nb\tc\\u{7}");

@@ -346,10 +346,10 @@ fn mutate_lanes<S: Simd>(simd: S, key: Key, learning: &Learning, weights: &mut [
     chosen.mutate(simd, learning, weights);
 }
 
-/// A plan that is not one for the populations it was handed to.
+/// A breeding plan that does not match the populations it is applied to.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
-pub struct Misfit(String);
+pub struct InvalidInput(String);
 
 /// How the next generation of a trial's populations comes from this one.
 #[derive(Clone, Debug)]
@@ -370,14 +370,14 @@ impl Breeding<'_> {
     ///
     /// # Errors
     /// It has too few or too many places, or a parent that there is not.
-    pub fn check(&self, [leaders, slots, _]: [usize; 3]) -> Result<(), Misfit> {
-        let misfit = |text: String| Err(Misfit(text));
+    pub fn check(&self, [leaders, slots, _]: [usize; 3]) -> Result<(), InvalidInput> {
+        let invalid = |text: String| Err(InvalidInput(text));
         if self.parents.len() != leaders * slots {
-            return misfit(format!("{} parents for {leaders} populations of {slots}", self.parents.len()));
+            return invalid(format!("{} parents for {leaders} populations of {slots}", self.parents.len()));
         }
         match self.parents.iter().position(|&planned| (planned & !UNCHANGED) as usize >= slots) {
             None => Ok(()),
-            Some(place) => misfit(format!(
+            Some(place) => invalid(format!(
                 "slot {} of population {} has policy {} of {slots} as its parent (they count from 0)",
                 place % slots,
                 place / slots,
@@ -390,7 +390,7 @@ impl Breeding<'_> {
     ///
     /// # Errors
     /// The plan is not one for these sizes, see [`Breeding::check`].
-    pub fn on_host(&self, sizes: [usize; 3], weights: &[f32]) -> Result<Vec<f32>, Misfit> {
+    pub fn on_host(&self, sizes: [usize; 3], weights: &[f32]) -> Result<Vec<f32>, InvalidInput> {
         self.check(sizes)?;
         let [_, slots, parameters] = sizes;
         let (mut children, mut scratch) = (Vec::with_capacity(weights.len()), Vec::new());

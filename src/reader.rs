@@ -101,18 +101,18 @@ pub fn read<T>(
         let at = text.get(span.clone()).filter(|at| !at.trim().is_empty());
         let at = at.map_or(String::new(), |at| format!(" (at `{}`)", shorten(at)));
         let message = error.message().trim().replace('\n', ", ") + &at;
-        reader.blame(Place::Offset(span.start), "", message);
+        reader.report(Place::Offset(span.start), "", message);
     }
     if reader.problems.is_empty() {
         let mut refused = document.get_ref().keys().filter(|key| others.refused.contains(&key.get_ref().as_ref()));
         if let Some(section) = refused.next() {
-            reader.blame(Place::Offset(section.span().start), section.get_ref(), others.message.into());
+            reader.report(Place::Offset(section.span().start), section.get_ref(), others.message.into());
         }
     }
     if reader.problems.is_empty() {
         reader.fill(document.into_inner(), text, others.foreign, overrides);
         let read = ask(&mut reader);
-        reader.blame_unknown();
+        reader.report_unknown();
         if reader.problems.is_empty() {
             return Ok(read);
         }
@@ -354,7 +354,7 @@ macro_rules! section {
     };
     (@key $section:tt, $field:ident { $($words:tt)+ }) => {};
     (@key $section:tt, $field:ident { $($words:tt)+ } $unit:tt, $paper:tt) => {
-        fn $field<'r, 'a>(r: &'r mut $crate::reader::Reader<'a>) -> $crate::reader::Asked<'r, 'a> {
+        fn $field<'r, 'a>(r: &'r mut $crate::reader::Reader<'a>) -> $crate::reader::KeyRequest<'r, 'a> {
             let meaning = const { concat!($($words)+).trim_ascii() };
             r.key(concat!($section, ".", stringify!($field)), $unit, meaning, $paper)
         }
@@ -366,8 +366,8 @@ macro_rules! section {
 }
 pub(crate) use section;
 
-/// A key that is being asked for; what it allows and its default are yet to be said.
-pub struct Asked<'r, 'a> {
+/// A requested key, before its allowed values and its default are given.
+pub struct KeyRequest<'r, 'a> {
     reader: &'r mut Reader<'a>,
     name: &'static str,
     unit: &'static str,
@@ -401,7 +401,7 @@ impl<'a> Reader<'a> {
         for Override { key, text, name } in overrides {
             let (value, errors) = DeValue::parse_recoverable(text);
             for error in errors {
-                self.blame(Place::Outside, name, format!("found {}: {}", shorten(text), error.message().trim()));
+                self.report(Place::Outside, name, format!("found {}: {}", shorten(text), error.message().trim()));
             }
             self.entries.insert(key.clone(), Entry { value, text, outside: true, name: name.clone() });
         }
@@ -413,8 +413,8 @@ impl<'a> Reader<'a> {
         entry
     }
 
-    /// How many things were wrong so far.
-    pub fn faults(&self) -> usize {
+    /// Returns the number of problems found so far.
+    pub fn error_count(&self) -> usize {
         self.problems.len()
     }
 
@@ -425,8 +425,8 @@ impl<'a> Reader<'a> {
         unit: &'static str,
         meaning: &'static str,
         paper: &'static str,
-    ) -> Asked<'r, 'a> {
-        Asked { reader: self, name, unit, meaning, paper }
+    ) -> KeyRequest<'r, 'a> {
+        KeyRequest { reader: self, name, unit, meaning, paper }
     }
 
     /// A number, or its default where there is none.
@@ -440,7 +440,7 @@ impl<'a> Reader<'a> {
             Some(_) => String::new(),
             None => format!("{}, ", T::KIND),
         };
-        self.blame(entry.place(), &entry.name, format!("found {}, allowed {kind}{allowed}", entry.found()));
+        self.report(entry.place(), &entry.name, format!("found {}, allowed {kind}{allowed}", entry.found()));
         allowed.high
     }
 
@@ -455,7 +455,7 @@ impl<'a> Reader<'a> {
             }
             _ => {
                 let lengths = between(*lengths.start(), *lengths.end());
-                self.blame(place, &name, format!("found {found}, allowed a list of {lengths} {what}"));
+                self.report(place, &name, format!("found {found}, allowed a list of {lengths} {what}"));
                 None
             }
         }
@@ -476,20 +476,20 @@ impl<'a> Reader<'a> {
         items.iter().map(|item| self.check(item, allowed)).collect()
     }
 
-    fn blame(&mut self, place: Place, name: &str, message: String) {
+    fn report(&mut self, place: Place, name: &str, message: String) {
         self.problems.push((place, name.to_string(), message));
     }
 
-    /// Blames a key that was asked for; where it is missing, at its section's start.
-    pub fn blame_key(&mut self, key: &'static str, message: String) {
+    /// Reports a problem with a requested key; if the key is missing, at the start of its section.
+    pub fn report_key(&mut self, key: &'static str, message: String) {
         let section = || self.sections.get(section_of(key)).copied().unwrap_or(0);
         let known = self.known.get(key).cloned().flatten();
         let (place, name) = known.unwrap_or_else(|| (Place::Offset(section()), key.to_string()));
-        self.blame(place, &name, message);
+        self.report(place, &name, message);
     }
 
-    /// Blames all that was not asked for.
-    fn blame_unknown(&mut self) {
+    /// Reports every key and section that was never requested.
+    fn report_unknown(&mut self) {
         let known: Vec<&str> = self.known.keys().copied().collect();
         let mut sections: Vec<&str> = known.iter().map(|key| section_of(key)).collect();
         sections.dedup();
@@ -500,17 +500,17 @@ impl<'a> Reader<'a> {
             } else {
                 format!("unknown key{}", hint(name, &known))
             };
-            self.blame(entry.place(), &shorten(name), message);
+            self.report(entry.place(), &shorten(name), message);
         }
         for (name, start) in std::mem::take(&mut self.sections) {
             if !sections.contains(&name.as_str()) {
                 let message = format!("unknown section{}", hint(&name, &sections));
-                self.blame(Place::Offset(start), &shorten(&name), message);
+                self.report(Place::Offset(start), &shorten(&name), message);
                 self.entries.retain(|key, entry| entry.outside || section_of(key) != name);
             }
         }
         for (key, entry) in std::mem::take(&mut self.entries) {
-            self.blame(entry.place(), &shorten(&entry.name), format!("unknown key{}", hint(&key, &known)));
+            self.report(entry.place(), &shorten(&entry.name), format!("unknown key{}", hint(&key, &known)));
         }
     }
 
@@ -528,11 +528,11 @@ impl<'a> Reader<'a> {
     }
 }
 
-impl<'a> Asked<'_, 'a> {
+impl<'a> KeyRequest<'_, 'a> {
     /// What was written in the config. Where somebody wants to know of the key, its kind, range and default are noted.
     fn take(&mut self, about: impl FnOnce() -> (String, String, Option<String>)) -> Option<Entry<'a>> {
         if let Some(table) = &mut self.reader.table {
-            let Asked { name, unit, meaning, paper, .. } = *self;
+            let KeyRequest { name, unit, meaning, paper, .. } = *self;
             let (kind, range, default) = about();
             table.push(Definition { name, unit, kind, range, default, meaning, paper });
         }
@@ -553,7 +553,7 @@ impl<'a> Asked<'_, 'a> {
         T::ALL.iter().find(|choice| Some(choice.0) == word).map_or_else(
             || {
                 let message = format!("found {}, allowed {}", entry.found(), words());
-                self.reader.blame(entry.place(), &entry.name, message);
+                self.reader.report(entry.place(), &entry.name, message);
                 default
             },
             |choice| choice.1,
@@ -580,7 +580,7 @@ impl<'a> Asked<'_, 'a> {
         let Some(entry) = self.take(|| (format!("list of {WHAT}"), range(), default.as_ref().map(written))) else {
             if default.is_none() {
                 let message = format!("missing, allowed a list of {} {WHAT}", between(fewest, most));
-                self.reader.blame_key(self.name, message);
+                self.reader.report_key(self.name, message);
             }
             return default;
         };
@@ -599,15 +599,15 @@ impl<'a> Asked<'_, 'a> {
     }
 
     /// A list of as many lists of numbers as `of`, another key, has items (any number where that is not known), or of
-    /// none, which is the default. `blame` tells what is wrong with lists whose numbers are allowed, each fault with
-    /// its list.
+    /// none, which is the default. `check` returns the problems of lists whose numbers are allowed, each with the index
+    /// of its list.
     pub fn lists<T: Number>(
         mut self,
         what: &str,
         (of, count): (&str, Option<usize>),
         lengths: RangeInclusive<usize>,
         allowed: Allowed<T>,
-        blame: impl FnOnce(&[Vec<T>]) -> Vec<(usize, String)>,
+        check: impl FnOnce(&[Vec<T>]) -> Vec<(usize, String)>,
     ) -> Vec<Vec<T>> {
         let range = || format!("none, or as many as {of}, of numbers each {}", allowed.in_general());
         let Some(entry) = self.take(|| (format!("list of {what}"), range(), Some("[]".into()))) else { return vec![] };
@@ -615,18 +615,18 @@ impl<'a> Asked<'_, 'a> {
             return vec![];
         }
         let reader = self.reader;
-        let faults = reader.faults();
+        let errors = reader.error_count();
         let counts = count.map_or(1..=usize::MAX, |count| count..=count);
         let items = reader.items(entry, counts, &format!("{what}, or none")).unwrap_or_default();
         let places: Vec<_> = items.iter().map(|item| (item.place(), item.name.clone())).collect();
         let lists: Vec<_> = items.into_iter().map(|item| reader.numbers(item, lengths.clone(), allowed)).collect();
-        if reader.faults() == faults {
-            for (list, message) in blame(&lists) {
+        if reader.error_count() == errors {
+            for (list, message) in check(&lists) {
                 let (place, name) = &places[list];
-                reader.blame(*place, name, message);
+                reader.report(*place, name, message);
             }
         }
-        if reader.faults() == faults { lists } else { vec![] }
+        if reader.error_count() == errors { lists } else { vec![] }
     }
 
     /// One number, or a list of so many; the default is one.

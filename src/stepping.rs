@@ -160,8 +160,8 @@ impl Stepper {
         if !(1..=MAX_POPULATION).contains(&teams) {
             return Err(StepError::Teams(teams));
         }
-        if let Some(what) = world.misfit() {
-            return Err(StepError::World(what));
+        if let Err(field) = world.validate() {
+            return Err(StepError::World(field));
         }
         let (agents, leaders, pois) = (world.agents(), world.leaders(), world.pois.len());
         let words = world.constants.words as usize;

@@ -90,8 +90,11 @@ impl World {
         Vec2::new(self.constants.motion.map_x, self.constants.motion.map_y)
     }
 
-    /// What does not fit the rest, of a world that [`World::new`] did not make. Shaders rely on it.
-    pub fn misfit(&self) -> Option<&'static str> {
+    /// Checks that the fields agree with each other. Shaders run without bounds checks and rely on this.
+    ///
+    /// # Errors
+    /// The name of the first inconsistent field.
+    pub fn validate(&self) -> Result<(), &'static str> {
         let (constants, pois) = (&self.constants, self.pois.len());
         let PolicyConstants { layers, widths, parameters } = constants.policy;
         let used = widths.get(..=layers as usize).unwrap_or_default();
@@ -120,7 +123,7 @@ impl World {
                 ends && small && weights == Some(parameters) && widths[used.len()..].iter().all(|&left| left == 0),
             ),
         ];
-        fits.into_iter().find(|(_, fits)| !fits).map(|(what, _)| what)
+        fits.into_iter().find(|(_, fits)| !fits).map_or(Ok(()), |(field, _)| Err(field))
     }
 
     /// Agents that have a policy, the first of all.

@@ -467,7 +467,7 @@ fn questions_take_two_trials() {
 
 #[test]
 fn bench_refuses_what_it_cannot_lay_out() {
-    for (flags, blamed) in [
+    for (flags, named) in [
         (["--agents", "1024"], "341 leaders and 683 followers"),
         (["--agents", "0"], "from 1 to 1024"),
         (["--teams", "1"], "from 2 to "),
@@ -476,7 +476,7 @@ fn bench_refuses_what_it_cannot_lay_out() {
         let output = flotilla(&[&["bench", "--backend", "cpu"][..], &flags].concat());
         let error = String::from_utf8(output.stderr).unwrap();
         assert_eq!(output.status.code(), Some(2), "{error}");
-        assert!(error.contains(blamed), "{error}");
+        assert!(error.contains(named), "{error}");
         assert!(output.stdout.is_empty());
     }
 }

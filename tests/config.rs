@@ -123,7 +123,7 @@ fn minus_zero_is_zero() {
 }
 
 #[test]
-fn a_faulty_value_is_blamed_alone() {
+fn a_wrong_value_is_the_only_problem_reported() {
     for (text, key) in [
         ("[world]\nmap = [1e9, 50]\nleaders = [[900, 2]]\npois = [[3, 4]]", "world.map[0]"),
         ("[world]\nleaders = 3\npois = [[3, 4]]\ncoupling = 7", "world.leaders"),
@@ -443,7 +443,7 @@ fn rules_that_cannot_be_are_refused_where_they_stand() {
             "after = [[1], [2], [0]]",
             "5: world.after[0]: found POI 0 after POI 1 after POI 2 after POI 0, which can never begin",
         ),
-        // Who waits for a cycle is not blamed for it.
+        // Who waits for a cycle is not reported for it.
         ("after = [[1], [2], [1]]", "5: world.after[1]: found POI 1 after POI 2 after POI 1, which can never begin"),
         ("windows = [[1, 2]]", "5: world.windows: found a list of 1, allowed a list of 3 pairs [first, last], or none"),
         ("windows = [[1, 2], [0, 3], [1, 9]]", "5: world.windows[1][0]: found 0, allowed 1 to 25 (world.steps)"),
@@ -480,7 +480,7 @@ fn rules_that_cannot_be_are_refused_where_they_stand() {
         error,
         "rules.toml:4: world.observers: found \"followers\", but there are no followers, so nobody would observe"
     );
-    // By the flag, it is the flag that is blamed or the key that no longer fits.
+    // By the flag, the error names the flag or the key that no longer fits.
     let flag = Override::new("learning.paradigm", "all-leaders", "--paradigm");
     let text = world("observers = 'followers'");
     assert!(Config::read(&text, "rules.toml", &[], &[flag]).is_err());

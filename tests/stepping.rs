@@ -209,7 +209,7 @@ fn what_cannot_be_stepped_is_told_and_nothing_moves() {
             need: Need::Scores,
         };
         let refused = Cpu::default().rollout(&[group], &|_| unreachable!("nobody plays")).expect_err("nor here");
-        assert!(matches!(refused, BackendError::Misfit(_)), "{refused}");
+        assert!(matches!(refused, BackendError::InvalidInput(_)), "{refused}");
         error
     };
     for (what, change) in [

@@ -149,27 +149,27 @@ impl<'a> Group<'a> {
     /// Places, weights or choices are too few or too many, or a team plays a policy that there is not.
     pub fn check(&self) -> Result<(), BackendError> {
         let Group { world, starts, weights, policies, teams, .. } = *self;
-        let misfit = |text: String| Err(BackendError::Misfit(text));
-        if let Some(what) = world.misfit() {
-            return misfit(format!("a world whose {what} do not fit the rest of it"));
+        let invalid = |text: String| Err(BackendError::InvalidInput(text));
+        if let Err(field) = world.validate() {
+            return invalid(format!("the world is inconsistent: its {field} do not match the rest"));
         }
         let (agents, leaders) = (world.agents(), world.leaders());
         if starts.len() != agents && starts.len() != agents + world.pois.len() {
-            return misfit(format!("{} start positions for {agents} agents", starts.len()));
+            return invalid(format!("{} start positions for {agents} agents", starts.len()));
         }
         if !teams.len().is_multiple_of(leaders) {
-            return misfit(format!("{} choices of policies for teams of {leaders} leaders", teams.len()));
+            return invalid(format!("{} choices of policies for teams of {leaders} leaders", teams.len()));
         }
         let shared = policies * world.parameters();
         let numbers = leaders * shared;
         if let Weights::OnHost(weights) = weights
             && ![shared, numbers].contains(&weights.len())
         {
-            return misfit(format!("{} weights, but {policies} policies a leader have {numbers}", weights.len()));
+            return invalid(format!("{} weights, but {policies} policies a leader have {numbers}", weights.len()));
         }
         match teams.iter().position(|&policy| policy as usize >= policies) {
             None => Ok(()),
-            Some(place) => misfit(format!(
+            Some(place) => invalid(format!(
                 "leader {} of team {} plays policy {} of {policies} (they count from 0)",
                 place % leaders,
                 place / leaders,
@@ -379,9 +379,9 @@ pub trait Backend: Send {
     fn describe(&self) -> String;
 }
 
-impl From<evolve::Misfit> for BackendError {
-    fn from(misfit: evolve::Misfit) -> BackendError {
-        BackendError::Misfit(misfit.to_string())
+impl From<evolve::InvalidInput> for BackendError {
+    fn from(error: evolve::InvalidInput) -> BackendError {
+        BackendError::InvalidInput(error.to_string())
     }
 }
 
@@ -430,9 +430,9 @@ pub enum BackendError {
     /// What was asked does not fit the device.
     #[error("{0}")]
     TooLarge(String),
-    /// What was handed in does not fit together.
+    /// The input is inconsistent or out of range.
     #[error("{0}")]
-    Misfit(String),
+    InvalidInput(String),
     /// Populations of one backend were handed to another.
     #[error("the populations are held by another device; bring them to the host first")]
     HeldElsewhere,

@@ -124,7 +124,7 @@ fn program() -> PathBuf {
 /// The command failed.
 pub fn run() -> Result<(), Error> {
     let words = words();
-    refuse_steering(words.iter().skip(1).cloned())?;
+    reject_control_chars(words.iter().skip(1).cloned())?;
     let typed = Cli::from_arg_matches(&command().get_matches_from(words));
     match typed.unwrap_or_else(|error| error.format(&mut command()).exit()).command {
         Command::Paper(args) if !args.questions.is_empty() => questions::run(&args),
@@ -182,9 +182,9 @@ fn real(text: &str) -> Result<f64, String> {
 
 /// Refuses names and values that hold line breaks or escape sequences: none is needed, and any could end up in a
 /// script, a table or on a terminal as something else than a name.
-fn refuse_steering(words: impl Iterator<Item = OsString>) -> Result<(), Error> {
+fn reject_control_chars(words: impl Iterator<Item = OsString>) -> Result<(), Error> {
     for word in words {
-        if word.to_string_lossy().contains(escape::steers) {
+        if word.to_string_lossy().contains(escape::is_control) {
             return Err(Error::Usage(format!(
                 "'{}' holds a line break or another control character, which no name or value may have",
                 escape::line(&word.to_string_lossy())

@@ -38,7 +38,7 @@ pub fn backend(error: &BackendError) -> &'static str {
         BackendError::Gpu(error) => device(error),
         BackendError::TooLarge(_) => " (by --backend cpu and --breed host)",
         BackendError::Gone => "; run it again",
-        BackendError::Misfit(_) | BackendError::HeldElsewhere => "",
+        BackendError::InvalidInput(_) | BackendError::HeldElsewhere => "",
     }
 }
 

@@ -1,7 +1,7 @@
 //! `[learning]` and `[checkpoint]`: their data and their keys.
 
 use super::MAX_STEPS;
-use crate::declare::choice;
+use crate::declare::config_enum;
 use crate::model::{LEAST, LONGEST};
 use crate::reader::{Reader, between, section};
 
@@ -56,7 +56,7 @@ section! {
     }
 }
 
-choice! {
+config_enum! {
     /// Who learns.
     Paradigm {
         /// The leaders; followers keep their preset behaviour.
@@ -66,7 +66,7 @@ choice! {
     }
 }
 
-choice! {
+config_enum! {
     /// Which leaders have a policy in common.
     Sharing {
         /// None: each has a population of its own.
@@ -76,7 +76,7 @@ choice! {
     }
 }
 
-choice! {
+config_enum! {
     /// Which score a policy is selected by (see [`crate::credit`]).
     Fitness {
         /// The team's score.
@@ -92,7 +92,7 @@ choice! {
     }
 }
 
-choice! {
+config_enum! {
     /// By which of the leaders that it saw a follower is led.
     LedBy {
         /// The one that it saw at most steps.
@@ -102,7 +102,7 @@ choice! {
     }
 }
 
-choice! {
+config_enum! {
     /// How a mutated weight gains its noise.
     Mutation {
         /// Times itself.

@@ -149,7 +149,7 @@ impl Config {
     }
 
     /// Asks for every key. A faulty number reads as the most that is allowed, a faulty list as none, so that what
-    /// depends on it is not blamed as well.
+    /// depends on it is not reported as well.
     fn ask(r: &mut Reader<'_>) -> Config {
         let (motion, start_speed) = Motion::read(r);
         let paradigm = Paradigm::read(r);
@@ -163,12 +163,12 @@ impl Config {
             checkpoint: Saving::read(r),
             stages: vec![],
         };
-        if r.faults() == 0 && config.policy_bytes() > MAX_POLICY_BYTES {
+        if r.error_count() == 0 && config.policy_bytes() > MAX_POLICY_BYTES {
             let gib = |bytes: u64| bytes.div_ceil(1 << 30);
             let (bytes, most) = (gib(config.policy_bytes()), gib(MAX_POLICY_BYTES));
             let population = config.learning.population;
             let text = format!("found {population}, whose policies of all trials take {bytes} GiB, allowed {most} GiB");
-            r.blame_key("learning.population", text);
+            r.report_key("learning.population", text);
         }
         config
     }

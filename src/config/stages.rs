@@ -112,8 +112,8 @@ pub(super) fn read(text: &str, outside: bool, own: &Config) -> Result<Vec<Stage>
     let (document, _) = DeTable::parse_recoverable(text);
     let Some(list) = document.get_ref().get(STAGES) else { return Ok(vec![]) };
     let problems = RefCell::new(Vec::new());
-    let blame_line = |line, key, message| problems.borrow_mut().push(Problem { line, key, message });
-    let blame = |offset: usize, key: String, message: String| blame_line(line_of(offset), key, message);
+    let report_line = |line, key, message| problems.borrow_mut().push(Problem { line, key, message });
+    let report = |offset: usize, key: String, message: String| report_line(line_of(offset), key, message);
     let Some(tables) = list.get_ref().as_array().filter(|tables| tables.len() <= MAX_STAGES) else {
         let message = format!("allowed a list of up to {MAX_STAGES} tables [[{STAGES}]], each with `from` and `set`");
         return Err(vec![Problem { line: line_of(list.span().start), key: STAGES.into(), message }]);
@@ -122,7 +122,7 @@ pub(super) fn read(text: &str, outside: bool, own: &Config) -> Result<Vec<Stage>
     for (index, table) in tables.iter().enumerate() {
         let (name, start) = (format!("{STAGES}[{index}]"), table.span().start);
         let Some(keys) = table.get_ref().as_table() else {
-            blame(start, name, "allowed a table with `from` and `set`".into());
+            report(start, name, "allowed a table with `from` and `set`".into());
             continue;
         };
         let (mut from, mut written) = (None, BTreeMap::new());
@@ -140,7 +140,7 @@ pub(super) fn read(text: &str, outside: bool, own: &Config) -> Result<Vec<Stage>
                             let message = format!(
                                 "found {found}, allowed a whole number, {least} to {most} (learning.generations){after}"
                             );
-                            blame(offset, place, message);
+                            report(offset, place, message);
                             from = Some(least);
                         }
                     }
@@ -164,19 +164,19 @@ pub(super) fn read(text: &str, outside: bool, own: &Config) -> Result<Vec<Stage>
                         }
                     }
                 }
-                ("set", _) => blame(offset, place, "allowed a table of dotted keys in quotes".into()),
-                _ => blame(offset, place, "unknown key; a stage has from, set".into()),
+                ("set", _) => report(offset, place, "allowed a table of dotted keys in quotes".into()),
+                _ => report(offset, place, "unknown key; a stage has from, set".into()),
             }
         }
         if from.is_none() {
-            blame(start, name.clone(), "missing `from`, the first of its generations".into());
+            report(start, name.clone(), "missing `from`, the first of its generations".into());
         }
         let mut overrides = Vec::new();
         for (key, Written { line, text }) in &written {
             let name = format!("{name}.set.{key}");
             if FIXED.iter().any(|fixed| key == fixed || fixed.ends_with('.') && key.starts_with(fixed)) {
                 let message = "this is the same in all stages, for it makes the populations or the run".into();
-                blame_line(*line, name, message);
+                report_line(*line, name, message);
             } else {
                 overrides.push(Override { key: key.clone(), text: text.to_string(), name });
             }
@@ -193,17 +193,17 @@ pub(super) fn read(text: &str, outside: bool, own: &Config) -> Result<Vec<Stage>
                     let [found, expected] = [&config, own].map(Config::learners);
                     let key = format!("{name}.set.{key}");
                     let message = format!("{found} leaders learn in this stage, {expected} in all others");
-                    blame_line(line(&key), key, message);
+                    report_line(line(&key), key, message);
                 }
             }
             Err(super::ConfigError::Invalid { problems: found, .. }) => {
                 for Problem { key, message, .. } in found {
                     let line = line(&key);
                     let key = if key.starts_with(STAGES) { key } else { format!("{name}: {key}") };
-                    blame_line(line, key, message);
+                    report_line(line, key, message);
                 }
             }
-            Err(error) => blame(start, name, error.to_string()),
+            Err(error) => report(start, name, error.to_string()),
         }
         let value = |text: &str| {
             let table: Option<toml::Table> = format!("value = {text}").parse().ok();

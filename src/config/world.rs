@@ -64,7 +64,7 @@ impl Domain {
         let agents = leaders.as_ref().zip(followers.as_ref()).map_or(MAX_AGENTS, |(l, f)| l.len() + f.len());
         if agents > MAX_AGENTS {
             let message = format!("found {agents} agents with the leaders, allowed 1 to {MAX_AGENTS}");
-            r.blame_key("world.followers", message);
+            r.report_key("world.followers", message);
         }
         let observers = Observers::read(r);
         let counted = match (leaders.as_ref(), followers.as_ref(), paradigm) {
@@ -76,7 +76,7 @@ impl Domain {
         };
         if counted == 0 {
             let why = if paradigm == Paradigm::AllLeaders { "all agents lead" } else { "there are no followers" };
-            r.blame_key("world.observers", format!("found \"{observers}\", but {why}, so nobody would observe"));
+            r.report_key("world.observers", format!("found \"{observers}\", but {why}, so nobody would observe"));
         }
         let places = pois.as_ref().map(Vec::len);
         let steps = Domain::steps(r).number(between(1, MAX_STEPS), 25);

@@ -6,7 +6,7 @@ use fearless_simd::Simd;
 use serde::Serialize;
 
 use super::{LONGEST, Lanes};
-use crate::declare::{choice, shared};
+use crate::declare::{config_enum, shared};
 use crate::kernels::{math::within, operations::SQUARED_DISTANCE};
 use crate::reader::{OneOrList, Reader, between};
 
@@ -50,7 +50,7 @@ impl Coupling {
     }
 }
 
-choice! {
+config_enum! {
     /// Whose presence at a POI counts.
     Observers {
         /// Every agent's.
@@ -94,11 +94,11 @@ pub(crate) fn windows(r: &mut Reader<'_>, steps: usize, pois: Option<usize>) -> 
         r.key("world.windows", "steps", "the first and the last step of each POI at which it can be observed", "5");
     let reversed = |windows: &[Vec<usize>]| {
         let wrong = windows.iter().enumerate().filter(|(_, window)| window[0] > window[1]);
-        let blamed = wrong.map(|(poi, window)| {
+        let problems = wrong.map(|(poi, window)| {
             let message = format!("found the steps from {} to {}, allowed the earlier one first", window[0], window[1]);
             (poi, message)
         });
-        blamed.collect()
+        problems.collect()
     };
     let what = "pairs [first, last]";
     let windows = asked.lists(what, ("world.pois", pois), 2..=2, between(1, steps).because("world.steps"), reversed);
@@ -121,13 +121,13 @@ pub(crate) fn after(r: &mut Reader<'_>, pois: Option<usize>) -> Vec<Vec<usize>> 
             return vec![];
         }
         let own = after.iter().enumerate().filter(|(poi, after)| after.contains(poi));
-        let mut blamed: Vec<_> =
+        let mut problems: Vec<_> =
             own.map(|(poi, _)| (poi, "found the POI itself, allowed others".to_string())).collect();
-        if let (true, Some(cycle)) = (blamed.is_empty(), cycle(after)) {
+        if let (true, Some(cycle)) = (problems.is_empty(), cycle(after)) {
             let names: Vec<_> = cycle.iter().chain(&cycle[..1]).map(|poi| format!("POI {poi}")).collect();
-            blamed.push((cycle[0], format!("found {}, which can never begin", names.join(" after "))));
+            problems.push((cycle[0], format!("found {}, which can never begin", names.join(" after "))));
         }
-        blamed
+        problems
     };
     let lengths = 0..=pois.unwrap_or(usize::MAX);
     asked.lists("lists of POIs", ("world.pois", pois), lengths, between(0, most).because("the last POI"), wrong)

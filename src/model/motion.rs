@@ -36,9 +36,9 @@ impl Motion {
     pub(crate) fn read(r: &mut Reader<'_>) -> (Motion, Allowed<f64>) {
         let max_speed = Motion::max_speed(r).number(between(LEAST, 1e3).or_zero(), 3.0);
         let slowest = between(LEAST, max_speed).or_zero().because("motion.max_speed");
-        let before = r.faults();
+        let before = r.error_count();
         let min_speed = Motion::min_speed(r).number(slowest, 0.0);
-        let least = if r.faults() > before { 0.0 } else { min_speed };
+        let least = if r.error_count() > before { 0.0 } else { min_speed };
         let start_speed = between(least.max(LEAST), max_speed).because("motion.min_speed to motion.max_speed");
         let start_speed = if least == 0.0 { start_speed.or_zero() } else { start_speed };
         let motion = Motion {

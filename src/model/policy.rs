@@ -4,7 +4,7 @@
 use fearless_simd::{Simd, prelude::*};
 
 use super::{Lanes, sense::INPUTS};
-use crate::declare::{choice, shared};
+use crate::declare::{config_enum, shared};
 use crate::kernels::{
     math,
     operations::{FLUSH, TANH},
@@ -36,7 +36,7 @@ section! {
     }
 }
 
-choice! {
+config_enum! {
     /// What a policy's outputs are.
     Actions {
         /// What the leader does: its wanted change of heading and its wanted speed.

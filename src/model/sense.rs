@@ -3,7 +3,7 @@
 use fearless_simd::{Simd, prelude::*};
 
 use super::{LONGEST, Lanes};
-use crate::declare::{choice, shared};
+use crate::declare::{config_enum, shared};
 use crate::kernels::{
     except,
     math::{root, rsqrt},
@@ -56,7 +56,7 @@ impl Sense {
     }
 }
 
-choice! {
+config_enum! {
     /// How a sensed distance counts.
     Density {
         /// `1 - d/D` with D = √2·max(map).

@@ -73,7 +73,7 @@ pub fn positions(places: &[[i32; 2]], followers: &[usize]) -> Positions {
 }
 
 /// What is wrong with the values of one of [`AXES`].
-pub(super) fn blame<'a>(key: &str, values: &'a [Value]) -> impl Iterator<Item = String> + 'a {
+pub(super) fn problems<'a>(key: &str, values: &'a [Value]) -> impl Iterator<Item = String> + 'a {
     let allowed = if key == FOLLOWERS { 0..=MAX_FOLLOWERS } else { 1..=MAX_GROUPS };
     let fits = move |value: &Value| count(value).is_some_and(|count| allowed.contains(&count));
     let (low, high) = if key == FOLLOWERS { (0, MAX_FOLLOWERS) } else { (1, MAX_GROUPS) };

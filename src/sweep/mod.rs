@@ -160,7 +160,7 @@ impl Sweep {
                 Tried { index, values, config }
             })
             .collect();
-        let mut problems = grid.blame(&tried, skip);
+        let mut problems = grid.problems(&tried, skip);
         problems.extend(grid.take_own_values(&tried));
         if !problems.is_empty() {
             return Err(invalid(name, problems));
@@ -238,11 +238,11 @@ impl Grid {
             let mut keys: Vec<_> =
                 flat.into_iter().map(|(key, value)| (starts.get(&key).copied(), key, value)).collect();
             keys.sort_by_key(|(start, ..)| *start);
-            let (before, faults) = (grid.axes.len(), problems.len());
+            let (before, errors) = (grid.axes.len(), problems.len());
             for (start, key, value) in keys {
                 grid.read_key(name == VARY, start.map_or(line_of_section, line), key, value, &mut problems);
             }
-            if name == VARY && grid.axes.len() == before && problems.len() == faults {
+            if name == VARY && grid.axes.len() == before && problems.len() == errors {
                 let message = "it has no key; give a list of values for at least one: \"motion.max_speed\" = [2, 5]";
                 problems.push(problem(Some(line_of_section), VARY, message));
             }
@@ -262,33 +262,33 @@ impl Grid {
     fn read_key(&mut self, varied: bool, line: usize, key: String, value: Value, problems: &mut Vec<Problem>) {
         let mut axis = Axis { key, values: vec![], varied };
         let (key, name) = (&*axis.key, axis.name());
-        let mut blame = |message: String| problems.push(problem(Some(line), &name, message));
+        let mut report = |message: String| problems.push(problem(Some(line), &name, message));
         match value {
             Value::Boolean(skip) if key == SKIP && !varied => self.skip = skip,
-            other if key == SKIP && !varied => blame(format!("found {other}, allowed true or false")),
+            other if key == SKIP && !varied => report(format!("found {other}, allowed true or false")),
             _ if varied && layout::AXES.contains(&key) => {
-                blame("it lays out whole teams, of which the file has none of its own; allowed in [grid]".into());
+                report("it lays out whole teams, of which the file has none of its own; allowed in [grid]".into());
             }
             _ if varied && self.axes.iter().any(|(other, _)| other.key == key) => {
-                blame("it stands in [grid] too; leave one of them out".into());
+                report("it stands in [grid] too; leave one of them out".into());
             }
             Value::Array(values) if values.is_empty() => {
-                blame("found no values, allowed a list of at least one; or leave the key out".into());
+                report("found no values, allowed a list of at least one; or leave the key out".into());
             }
             Value::Array(values) => {
                 for (at, value) in values.iter().enumerate() {
                     if let Some(first) = values[..at].iter().position(|other| other == value) {
-                        blame(format!("found {value} twice, at [{first}] and at [{at}]"));
+                        report(format!("found {value} twice, at [{first}] and at [{at}]"));
                     }
                 }
                 if layout::AXES.contains(&key) {
-                    layout::blame(key, &values).for_each(blame);
+                    layout::problems(key, &values).for_each(report);
                 }
                 axis.values.extend(varied.then(|| Value::from("")));
                 axis.values.extend(values);
                 self.axes.push((axis, line));
             }
-            other => blame(format!("found {other}, allowed a list of values: [{other}]")),
+            other => report(format!("found {other}, allowed a list of values: [{other}]")),
         }
     }
 
@@ -360,7 +360,7 @@ impl Grid {
 
     /// All that keeps points from running, each problem once. With `skip`, points may fail, but not every point of
     /// any one value: what never works is a slip.
-    fn blame(&self, tried: &[Tried], skip: bool) -> Vec<Problem> {
+    fn problems(&self, tried: &[Tried], skip: bool) -> Vec<Problem> {
         let mut works: Vec<Vec<bool>> = self.axes.iter().map(|(axis, _)| vec![false; axis.values.len()]).collect();
         for tried in tried.iter().filter(|tried| tried.config.is_ok()) {
             works.iter_mut().zip(&tried.values).for_each(|(works, &value)| works[value] = true);

@@ -33,7 +33,9 @@ impl Job<'_> {
     pub fn script(&self) -> Result<String, String> {
         let words = self.command.iter().chain(self.options).map(String::as_str).chain([self.time]);
         // A path that is not UTF-8 was written with this in the place of what it is.
-        if let Some(word) = words.into_iter().find(|word| word.contains(escape::steers) || word.contains('\u{fffd}')) {
+        if let Some(word) =
+            words.into_iter().find(|word| word.contains(escape::is_control) || word.contains('\u{fffd}'))
+        {
             let word = escape::line(word);
             return Err(format!("a batch script cannot hold '{word}'; choose names in UTF-8, without line breaks"));
         }

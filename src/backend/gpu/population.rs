@@ -201,7 +201,7 @@ impl Population {
     pub fn check(&self, sizes: [usize; 3]) -> Result<(), BackendError> {
         let own = [if self.leaders == 1 { sizes[0] } else { self.leaders }, self.slots, self.parameters];
         let text = || format!("populations of {own:?} leaders, policies and weights stand for some of {sizes:?}");
-        if own == sizes { Ok(()) } else { Err(BackendError::Misfit(text())) }
+        if own == sizes { Ok(()) } else { Err(BackendError::InvalidInput(text())) }
     }
 
     /// Bytes of the pieces that one leader's policies come back in.
