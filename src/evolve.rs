@@ -8,7 +8,7 @@ use std::ops::Range;
 use fearless_simd::{Level, Simd, SimdMask, dispatch, prelude::*};
 use glam::Vec2;
 
-use crate::config::{Learning, Mutation, Sharing};
+use crate::config::{Learning, Mutation, Parents, Sharing};
 use crate::kernels::{bound, math, splat};
 use crate::parallel::*;
 use crate::world::{World, on_grid};
@@ -256,27 +256,48 @@ fn winner(first: u32, second: u32, scores: &[f32]) -> usize {
 /// Set in a slot's entry of the plan of [`draw_parents`] where the slot keeps its parent's weights as they are.
 pub const UNCHANGED: u32 = 1 << 31;
 
+/// Which policies of a population survive, and which may become parents.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Selection {
+    /// The number of policies that survive unchanged.
+    pub elites: usize,
+    /// Which policies may become parents.
+    pub parents: Parents,
+}
+
+impl Selection {
+    /// Returns the selection that a config asks for.
+    pub fn of(learning: &Learning) -> Selection {
+        Selection { elites: learning.elites.count(learning.population), parents: learning.parents }
+    }
+}
+
 /// Plans one population's next generation: the policy from which each slot comes, `[policies + 1]`, with [`UNCHANGED`]
 /// where it does not mutate.
 ///
-/// The first slots are the elites', best first, the others' parents win [`tournament`]s; the last slot gets the best of
-/// all, the champion. `key` is of purpose [`Purpose::Tournament`], `scores` are `[policies]`.
+/// The first slots are the elites', best first. The others' parents win [`tournament`]s, or with [`Parents::Elites`] are
+/// elites, each with the same probability. The last slot gets the best of all, the champion. `key` is of purpose
+/// [`Purpose::Tournament`], `scores` are `[policies]`.
 pub fn draw_parents(
     level: Level,
     key: Key,
     generation: usize,
     population: usize,
-    elites: usize,
+    selection: Selection,
     scores: &[f32],
     parents: &mut [u32],
 ) {
     let policies = scores.len();
+    let best = best(scores, selection.elites.max(1));
+    let choose = |first, second| match selection.parents {
+        Parents::All => winner(first, second, scores),
+        Parents::Elites => best[pick(first, best.len())],
+    };
     parents[..policies].par_chunks_mut(DRAWN_TOGETHER).enumerate().for_each(|(chunk, parents)| {
         let first = chunk * DRAWN_TOGETHER;
-        dispatch!(level, simd => draw_parents_lanes(simd, key, generation, population, first, scores, parents));
+        dispatch!(level, simd => draw_parents_lanes(simd, key, generation, population, first, choose, parents));
     });
-    let best = best(scores, elites.max(1));
-    for (parent, elite) in parents.iter_mut().zip(&best[..elites]) {
+    for (parent, elite) in parents.iter_mut().zip(&best[..selection.elites]) {
         *parent = *elite as u32 | UNCHANGED;
     }
     parents[policies] = best[0] as u32 | UNCHANGED;
@@ -300,7 +321,7 @@ fn draw_parents_lanes<S: Simd>(
     generation: usize,
     population: usize,
     first: usize,
-    scores: &[f32],
+    choose: impl Fn(u32, u32) -> usize,
     parents: &mut [u32],
 ) {
     for (slot, parents) in (first..).step_by(S::f32s::LEN).zip(parents.chunks_mut(S::f32s::LEN)) {
@@ -308,7 +329,7 @@ fn draw_parents_lanes<S: Simd>(
         let [x, y, z, w] = key.at_lanes::<S>(generation, population, slots);
         let [firsts, seconds, ..] = math::draw::<S>(x, y, z, w);
         for ((parent, &first), &second) in parents.iter_mut().zip(firsts.as_slice()).zip(seconds.as_slice()) {
-            *parent = winner(first, second, scores) as u32;
+            *parent = choose(first, second) as u32;
         }
     }
 }

@@ -545,6 +545,27 @@ impl<'a> KeyRequest<'_, 'a> {
         self.reader.number(entry, allowed, default)
     }
 
+    /// A number, or a percentage of the number that bounds it, written as a word such as `"10%"`.
+    pub fn number_or_percentage<T: Number>(mut self, allowed: Allowed<T>, default: T) -> NumberOrPercentage<T> {
+        const PERCENTAGES: &str = "above \"0%\", up to \"100%\"";
+        let kind = || format!("{}, or a percentage such as \"10%\"", kind::<T>());
+        let range = || format!("{}, or {PERCENTAGES}", allowed.in_general());
+        let entry = self.take(|| (kind(), range(), Some(written(&default))));
+        let Some((entry, word)) = entry.as_ref().and_then(|entry| Some((entry, entry.value.get_ref().as_str()?)))
+        else {
+            return NumberOrPercentage::Number(self.reader.number(entry, allowed, default));
+        };
+        let percentage = word.strip_suffix('%').and_then(|number| number.parse().ok());
+        match percentage.filter(|&percentage: &f64| 0.0 < percentage && percentage <= 100.0) {
+            Some(percentage) => NumberOrPercentage::Percentage(percentage),
+            None => {
+                let message = format!("found {}, allowed {allowed}, or {PERCENTAGES}", entry.found());
+                self.reader.report(entry.place(), &entry.name, message);
+                NumberOrPercentage::Number(allowed.nearest(default))
+            }
+        }
+    }
+
     /// What one of the words stands for, or its default where the key was left out.
     pub fn choice<T: Choice>(mut self, default: T) -> T {
         let words = || T::names().map(|word| format!("{word:?}")).collect::<Vec<_>>().join(" or ");
@@ -644,6 +665,14 @@ impl<'a> KeyRequest<'_, 'a> {
             entry => OneOrList::One(self.reader.number(entry, allowed, default)),
         }
     }
+}
+
+/// The value of a key that takes a number or a percentage.
+pub enum NumberOrPercentage<T> {
+    /// A number.
+    Number(T),
+    /// A percentage, above 0 and up to 100.
+    Percentage(f64),
 }
 
 /// What a key holds that takes both.

@@ -237,7 +237,7 @@ fn plain_world(seed: u64) -> Config {
             repulsion_gain: gain(rng, 5.0),
             wall_gain: gain(rng, 5.0),
         },
-        sense: Sense { poi_range, agent_range, density: word(rng) },
+        sense: Sense { poi_range, agent_range, density: word(rng), gain: 1.0 },
         policy: Policy {
             hidden: match rng.random_range(0..5) {
                 0 => vec![],
@@ -254,7 +254,8 @@ fn plain_world(seed: u64) -> Config {
             population: rng.random_range(2..=20),
             generations: 3,
             trials: 1,
-            elites: 1,
+            elites: Elites::Count(1),
+            parents: Parents::All,
             mutation: if rng.random_bool(0.5) { Mutation::Scaled } else { Mutation::Additive },
             mutation_probability: 0.15,
             mutation_sigma: 0.1,

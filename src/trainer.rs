@@ -12,7 +12,7 @@ use glam::Vec2;
 use crate::backend::{Backend, BackendError, Episode, Group, Held, Need, Weights};
 use crate::config::{Config, Learning, Sharing};
 use crate::credit::Credit;
-use crate::evolve::{self, Breeding, Key, Purpose};
+use crate::evolve::{self, Breeding, Key, Purpose, Selection};
 use crate::host::Instant;
 use crate::parallel::*;
 use crate::world::World;
@@ -752,10 +752,11 @@ impl Arm {
         let generation = self.age;
         let last = generation == self.last();
         let Arm { config, world, trials, held, .. } = self;
-        let Learning { seed, population, elites, .. } = config.learning;
+        let Learning { seed, population, .. } = config.learning;
+        let selection = Selection::of(&config.learning);
         let draw_parents = |key: Key, leader: usize, fitness: &[f32], parents: &mut [u32]| match last {
             true => evolve::keep_parents(fitness, parents),
-            false => evolve::draw_parents(level, key, generation, leader, elites, fitness, parents),
+            false => evolve::draw_parents(level, key, generation, leader, selection, fitness, parents),
         };
         self.age += 1;
         if !held.is_empty() {

@@ -186,6 +186,21 @@ fn every_wrong_value_is_named_with_line_and_range() {
         (23, "population = 1", "learning.population: found 1, allowed 2 to 1048576"),
         (23, "population = 1048577", "learning.population: found 1048577, allowed 2 to 1048576"),
         (23, "elites = 51", "learning.elites: found 51, allowed 0 to 50 (learning.population)"),
+        (
+            23,
+            "elites = \"0%\"",
+            "learning.elites: found \"0%\", allowed 0 to 50 (learning.population), or above \"0%\", up to \"100%\"",
+        ),
+        (
+            23,
+            "elites = \"ten\"",
+            "learning.elites: found \"ten\", allowed 0 to 50 (learning.population), or above \"0%\", up to \"100%\"",
+        ),
+        (
+            23,
+            "parents = \"elites\"\nelites = 0",
+            "learning.parents: found \"elites\" with learning.elites = 0, allowed with 1 or more",
+        ),
         (23, "generations = -1", "learning.generations: found -1, allowed 0 to 1000000"),
         (23, "trials = 0", "learning.trials: found 0, allowed 1 to 4096"),
         (23, "episodes_per_team = 0", "learning.episodes_per_team: found 0, allowed 1 to 1000"),
@@ -253,7 +268,7 @@ x.toml:13: motion.max_sped: unknown key, did you mean `motion.max_speed`?
 x.toml:21: policy.hidden[0]: found 65, allowed 1 to 64
 x.toml:24: learning.trials: found 0, allowed 1 to 4096
 x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, fitness, generations, led_by, \
-         led_within, mutation, mutation_probability, mutation_sigma, paradigm, poi_jitter, population, seed, sharing, start_jitter, trials
+         led_within, mutation, mutation_probability, mutation_sigma, paradigm, parents, poi_jitter, population, seed, sharing, start_jitter, trials
 --population: found 1, allowed 2 to 1048576"
     );
 }

@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use flotilla::config::{
-    Actions, Config, ConfigError, Coupling, Density, Domain, Fitness, Follow, Learning, LedBy, MAX_EPISODES,
+    Actions, Config, ConfigError, Coupling, Density, Domain, Elites, Fitness, Follow, Learning, LedBy, MAX_EPISODES,
     MAX_GENERATIONS, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion, Mutation,
-    Observers, Override, Paradigm, Policy, Problem, Saving, Sense, Sharing,
+    Observers, Override, Paradigm, Parents, Policy, Problem, Saving, Sense, Sharing,
 };
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -52,7 +52,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             repulsion_gain: 1.0,
             wall_gain: 1.0,
         },
-        sense: Sense { poi_range: f64::INFINITY, agent_range: 5.0, density: Density::Linear },
+        sense: Sense { poi_range: f64::INFINITY, agent_range: 5.0, density: Density::Linear, gain: 1.0 },
         policy: Policy { hidden: vec![10], actions: Actions::Direct },
         learning: Learning {
             paradigm: Paradigm::LeaderFollower,
@@ -61,7 +61,8 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             population: 50,
             generations: 100,
             trials: 5,
-            elites: 1,
+            elites: Elites::Count(1),
+            parents: Parents::All,
             mutation: Mutation::Scaled,
             mutation_probability: 0.15,
             mutation_sigma: 0.1,
@@ -272,14 +273,16 @@ fn configs() -> impl Strategy<Value = Config> {
         },
     );
     let range = || prop_oneof![Just(f64::INFINITY), size(0.01, 1e4)];
-    let sense = (range(), range(), word()).prop_map(|(poi_range, agent_range, density)| Sense {
+    let sense = (range(), range(), word(), size(1e-3, 1e3)).prop_map(|(poi_range, agent_range, density, gain)| Sense {
         poi_range,
         agent_range,
         density,
+        gain,
     });
     let policy = (vec(1..=MAX_HIDDEN_UNITS, 0..=MAX_HIDDEN_LAYERS), word())
         .prop_map(|(hidden, actions)| Policy { hidden, actions });
-    let sizes = (2..=5000usize, 0..=MAX_GENERATIONS, 1..=9usize, 0.0..=1.0f64, 1..=MAX_EPISODES);
+    let elites = prop_oneof![(0.0..=1.0f64).prop_map(Ok), size(1e-3, 100.0).prop_map(Err)];
+    let sizes = (2..=5000usize, 0..=MAX_GENERATIONS, 1..=9usize, (elites, word()), 1..=MAX_EPISODES);
     let mutation = (word(), size_or_zero(1e-6, 1.0), size_or_zero(1e-6, 100.0));
     let mutation = (mutation, 0..=MAX_STEPS, word());
     let jitters = (size_or_zero(1e-6, 1e4), size_or_zero(1e-6, 1e4));
@@ -287,7 +290,7 @@ fn configs() -> impl Strategy<Value = Config> {
         |(
             (paradigm, sharing),
             fitness,
-            (population, generations, trials, part, episodes_per_team),
+            (population, generations, trials, (part, parents), episodes_per_team),
             mutation,
             (start_jitter, poi_jitter),
             seed,
@@ -300,7 +303,11 @@ fn configs() -> impl Strategy<Value = Config> {
                 population,
                 generations,
                 trials,
-                elites: (population as f64 * part) as usize,
+                elites: match part {
+                    Ok(part) => Elites::Count((population as f64 * part) as usize),
+                    Err(percentage) => Elites::Percentage(percentage),
+                },
+                parents,
                 mutation,
                 mutation_probability,
                 mutation_sigma,
@@ -316,7 +323,10 @@ fn configs() -> impl Strategy<Value = Config> {
     let checkpoint = (0..=MAX_GENERATIONS, prop_oneof![Just(0.0), 0.01..=1e9])
         .prop_map(|(generations, seconds)| Saving { generations, seconds });
     (worlds(), follow, sense, policy, learning, checkpoint).prop_map(
-        |((mut world, motion), follow, sense, policy, learning, checkpoint)| {
+        |((mut world, motion), follow, sense, policy, mut learning, checkpoint)| {
+            if learning.elites == Elites::Count(0) {
+                learning.parents = Parents::All;
+            }
             if learning.paradigm == Paradigm::AllLeaders && world.observers == Observers::Followers {
                 world.observers = Observers::Leaders;
             }

@@ -9,9 +9,9 @@ use std::collections::HashSet;
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group, Need};
-use flotilla::config::{Actions, Config, Fitness, Learning, Mutation, Paradigm, Sharing};
+use flotilla::config::{Actions, Config, Elites, Fitness, Learning, Mutation, Paradigm, Parents, Sharing};
 use flotilla::credit::Credit;
-use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose};
+use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, UNCHANGED};
 use flotilla::trainer::{Row, Trainer};
 use flotilla::world::{GRID, World};
 use glam::Vec2;
@@ -192,6 +192,40 @@ fn a_tournament_is_between_any_two_policies() {
     chi_square("pairs", &counts, |_| 1.0 / 190.0);
     let mut duels = (0..100).map(|slot| evolve::tournament(tournaments.at(0, 0, slot), &[0.0, 1.0]));
     assert!(duels.all(|winner| winner == 1), "of two policies, both play");
+}
+
+#[test]
+fn truncation_draws_every_elite_as_parent_with_the_same_probability() {
+    let (policies, elites) = (200, 20);
+    // Policy 7i mod 200 has rank i.
+    let mut scores = vec![0.0; policies];
+    (0..policies).for_each(|rank| scores[7 * rank % policies] = -(rank as f32));
+    let mut counts = vec![0; elites];
+    let mut plan = vec![0; policies + 1];
+    for generation in 0..60 {
+        let selection = Selection { elites, parents: Parents::Elites };
+        let key = Key::new(3, 0, Purpose::Tournament);
+        evolve::draw_parents(Level::new(), key, generation, 1, selection, &scores, &mut plan);
+        for (rank, &parent) in plan[..elites].iter().enumerate() {
+            assert_eq!(parent, (7 * rank % policies) as u32 | UNCHANGED);
+        }
+        for &parent in &plan[elites..policies] {
+            let rank = (0..elites).find(|rank| 7 * rank % policies == parent as usize);
+            counts[rank.expect("every parent is an elite")] += 1;
+        }
+        assert_eq!(plan[policies], UNCHANGED, "the champion is the best policy, which is policy 0");
+    }
+    chi_square("elites as parents", &counts, |_| 1.0 / elites as f64);
+}
+
+#[test]
+fn a_share_of_elites_is_rounded_to_the_nearest_number_and_at_least_one() {
+    for (percentage, population, count) in
+        [(10.0, 50, 5), (10.0, 5000, 500), (1.0, 50, 1), (1.0, 149, 1), (1.0, 150, 2), (0.001, 50, 1), (100.0, 7, 7)]
+    {
+        assert_eq!(Elites::Percentage(percentage).count(population), count, "{percentage}% of {population}");
+    }
+    assert_eq!(Elites::Count(9).count(7), 7, "there are no more elites than policies");
 }
 
 /// Mean, standard deviation and shape of numbers that should be N(0, 1).
@@ -439,13 +473,13 @@ fn arms() -> Vec<Config> {
     vec![
         config(GENERALLY_FORWARD, |config| {
             small(config, 12, 5, 3);
-            config.learning.elites = 3;
+            config.learning.elites = 3.into();
         }),
         config(CHAOTIC, |config| {
             small(config, 9, 3, 2);
             (config.learning.start_jitter, config.learning.episodes_per_team) = (0.75, 3);
             (config.learning.mutation, config.learning.mutation_sigma) = (Mutation::Additive, 0.5);
-            (config.learning.fitness, config.learning.elites, config.learning.seed) = (Fitness::Dpp, 0, 1 << 40);
+            (config.learning.fitness, config.learning.elites, config.learning.seed) = (Fitness::Dpp, 0.into(), 1 << 40);
         }),
         config(STRICTLY_FORWARD, |config| {
             small(config, 17, 4, 1);
@@ -463,7 +497,12 @@ fn arms() -> Vec<Config> {
         }),
         config(GENERALLY_FORWARD, |config| {
             small(config, 6, 2, 1);
-            config.learning.elites = 6;
+            config.learning.elites = 6.into();
+        }),
+        config(CHAOTIC, |config| {
+            small(config, 18, 4, 2);
+            (config.learning.elites, config.learning.parents) = (Elites::Percentage(25.0), Parents::Elites);
+            config.sense.gain = 8.0;
         }),
         config(GENERALLY_FORWARD, |config| {
             small(config, 11, 4, 2);
@@ -596,7 +635,11 @@ impl Plain<'_> {
 
     /// Rows, then the policies best first.
     fn train(mut self) -> (Vec<Row>, Vec<f32>) {
-        let Learning { population, generations, elites, .. } = self.config.learning;
+        let Learning { population, generations, elites, parents, .. } = self.config.learning;
+        let elites = match elites {
+            Elites::Count(count) => count,
+            Elites::Percentage(percentage) => ((population as f64 * percentage / 100.0).round() as usize).max(1),
+        };
         let leaders = self.world.leaders();
         let mut rows = Vec::new();
         for generation in 0..=generations {
@@ -643,7 +686,12 @@ impl Plain<'_> {
                 self.policies[leader] = sorted.collect();
                 for slot in if generation < generations { elites..population } else { 0..0 } {
                     let key = self.key(Purpose::Tournament).at(generation, leader, slot);
-                    let mut child = policies[evolve::tournament(key, &fitness[leader])].clone();
+                    let parent = match parents {
+                        Parents::All => evolve::tournament(key, &fitness[leader]),
+                        // The upper bits of the slot's first random word.
+                        Parents::Elites => order[(uniform(key.draw(0)[0]) * elites as f64) as usize],
+                    };
+                    let mut child = policies[parent].clone();
                     let key = self.key(Purpose::Mutation).at(generation, leader, slot);
                     mutate(Level::baseline(), key, &stage.learning, &mut child);
                     self.policies[leader][slot] = child;

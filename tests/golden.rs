@@ -38,7 +38,7 @@ coupling = 4
 type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Which between them cover every choice that a config has, and sizes on both sides of every special case.
-const CASES: [Case; 25] = [
+const CASES: [Case; 27] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -179,6 +179,24 @@ const CASES: [Case; 25] = [
             ("world.coupling", "2"),
             ("world.after", "[[], [0], [1], []]"),
             ("world.windows", "[[1, 50], [20, 50], [25, 50], [10, 30]]"),
+        ],
+    ),
+    (
+        "truncation",
+        "a fifth of each population are elites, and only they become parents",
+        GENERALLY_FORWARD,
+        &[("learning.elites", "'20%'"), ("learning.parents", "'elites'"), ("world.coupling", "2")],
+    ),
+    (
+        "sense-gain",
+        "inputs of the inverse density times 8, three agents at a POI, all-leaders, D++",
+        CHAOTIC,
+        &[
+            ("sense.density", "'inverse'"),
+            ("sense.gain", "8.0"),
+            ("world.coupling", "3"),
+            ("learning.paradigm", "'all-leaders'"),
+            ("learning.fitness", "'D++'"),
         ],
     ),
 ];

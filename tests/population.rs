@@ -15,7 +15,7 @@ use flotilla::backend::gpu::device::{self, DeviceError, Kind};
 use flotilla::backend::gpu::episode::{GpuEpisodes, Holding};
 use flotilla::backend::{Backend, BackendError, Group, HELD_FROM, Held, Trace, Visit, Weights};
 use flotilla::backend::{Machine, Player};
-use flotilla::config::{Config, Coupling, Fitness, Learning, Mutation, Paradigm, Sharing};
+use flotilla::config::{Config, Coupling, Elites, Fitness, Learning, Mutation, Paradigm, Parents, Sharing};
 use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, Start};
@@ -95,7 +95,7 @@ fn arms() -> Vec<Config> {
     let mut second = support::layout("chaotic");
     (second.learning.trials, second.learning.generations, second.learning.population) = (1, 3, 40);
     (second.learning.start_jitter, second.learning.episodes_per_team) = (0.5, 2);
-    (second.learning.fitness, second.learning.elites) = (Fitness::D, 0);
+    (second.learning.fitness, second.learning.elites) = (Fitness::D, 0.into());
     second.learning.mutation = Mutation::Additive;
     let mut third = support::layout("strictly_forward");
     (third.learning.trials, third.learning.generations, third.learning.population) = (1, 6, 7);
@@ -105,7 +105,12 @@ fn arms() -> Vec<Config> {
     let mut fourth = support::layout("strictly_forward");
     (fourth.learning.trials, fourth.learning.generations, fourth.learning.population) = (2, 4, 35);
     (fourth.learning.paradigm, fourth.learning.sharing) = (Paradigm::AllLeaders, Sharing::All);
-    vec![first, second, third, fourth]
+    // Parents are drawn from the elites, a share of the population.
+    let mut fifth = support::layout("chaotic");
+    (fifth.learning.trials, fifth.learning.generations, fifth.learning.population) = (2, 4, 30);
+    (fifth.learning.elites, fifth.learning.parents) = (Elites::Percentage(20.0), Parents::Elites);
+    fifth.sense.gain = 3.0;
+    vec![first, second, third, fourth, fifth]
 }
 
 /// What a trainer of [`arms`] comes to, and what it would save before each generation.

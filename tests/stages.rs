@@ -80,6 +80,12 @@ fn what_is_wrong_with_a_stage_is_told_by_its_line() {
             3,
             "stages[0].set.learning.population: this is the same in all stages",
         ),
+        (stage("0", "'learning.elites' = '50%'"), 3, "stages[0].set.learning.elites: this is the same in all stages"),
+        (
+            stage("0", "'learning.parents' = 'elites'"),
+            3,
+            "stages[0].set.learning.parents: this is the same in all stages",
+        ),
         (stage("0", "'policy.hidden' = [3]"), 3, "stages[0].set.policy.hidden: this is the same in all stages"),
         (stage("0", "'checkpoint.seconds' = 3"), 3, "stages[0].set.checkpoint.seconds: this is the same"),
         (stage("0", "'world.leaders' = [[1, 1]]"), 3, "stages[0].set.world.leaders: 1 leaders learn in this stage, 2"),

@@ -109,7 +109,6 @@ fn combinations(config: &Config, args: &Args) -> Result<Vec<Config>, Error> {
                 let mut config = world.clone();
                 config.world.steps = steps as usize;
                 config.learning.population = teams as usize;
-                config.learning.elites = config.learning.elites.min(teams as usize);
                 config.learning.trials = 1;
                 config.learning.episodes_per_team = 1;
                 config.learning.generations = config::MAX_GENERATIONS;

@@ -1,9 +1,11 @@
 //! `[learning]` and `[checkpoint]`: their data and their keys.
 
+use serde::{Serialize, Serializer};
+
 use super::MAX_STEPS;
 use crate::declare::config_enum;
 use crate::model::{LEAST, LONGEST};
-use crate::reader::{Reader, between, section};
+use crate::reader::{NumberOrPercentage, Reader, between, section};
 
 /// Most teams (policies a population) in one generation.
 pub const MAX_POPULATION: usize = 1 << 20;
@@ -31,8 +33,12 @@ section! {
         generations: usize = "generations", "4.3, Alg. 1",
         /// independent repetitions
         trials: usize = "trials", "5",
-        /// n: the best of a population, which survive unchanged
-        elites: usize = "policies", "4.3, Alg. 1",
+        /// n: the best of a population, which survive unchanged; a share is rounded to the nearest whole number, and is at
+        /// least 1
+        elites: Elites = "policies", "4.3, Alg. 1",
+        /// which policies the parents of a generation are drawn from: by binary tournaments of the whole population, or
+        /// uniformly from its elites (truncation selection)
+        parents: Parents = "", "4.3, Alg. 1",
         /// what a mutated weight w gains: w·N(0, σ) if scaled, N(0, σ) if additive
         mutation: Mutation = "", "2.4, 4.3",
         /// of each weight of a new policy, to mutate
@@ -93,6 +99,52 @@ config_enum! {
 }
 
 config_enum! {
+    /// Which policies may become parents.
+    Parents {
+        /// All of them, by binary tournaments.
+        All = "all",
+        /// The elites, each with the same probability.
+        Elites = "elites",
+    }
+}
+
+/// How many of a population's policies survive unchanged.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Elites {
+    /// This many.
+    Count(usize),
+    /// This percentage of the population.
+    Percentage(f64),
+}
+
+impl Elites {
+    /// Returns the number of elites of a population: a share is rounded to the nearest whole number, and is at least 1.
+    /// It never exceeds the population.
+    pub fn count(self, population: usize) -> usize {
+        let count = match self {
+            Elites::Count(count) => count,
+            Elites::Percentage(percentage) => ((population as f64 * percentage / 100.0).round() as usize).max(1),
+        };
+        count.min(population)
+    }
+}
+
+impl From<usize> for Elites {
+    fn from(count: usize) -> Elites {
+        Elites::Count(count)
+    }
+}
+
+impl Serialize for Elites {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self {
+            Elites::Count(count) => count.serialize(serializer),
+            Elites::Percentage(percentage) => serializer.collect_str(&format_args!("{percentage}%")),
+        }
+    }
+}
+
+config_enum! {
     /// By which of the leaders that it saw a follower is led.
     LedBy {
         /// The one that it saw at most steps.
@@ -122,6 +174,18 @@ impl Paradigm {
 impl Learning {
     pub(super) fn read(r: &mut Reader<'_>, paradigm: Paradigm) -> Learning {
         let population = Learning::population(r).number(between(2, MAX_POPULATION), 50);
+        let elites = Learning::elites(r).number_or_percentage(between(0, population).because("learning.population"), 1);
+        let elites = match elites {
+            NumberOrPercentage::Number(count) => Elites::Count(count),
+            NumberOrPercentage::Percentage(percentage) => Elites::Percentage(percentage),
+        };
+        let parents = Learning::parents(r).choice(Parents::All);
+        if parents == Parents::Elites && elites == Elites::Count(0) {
+            r.report_key(
+                "learning.parents",
+                "found \"elites\" with learning.elites = 0, allowed with 1 or more".into(),
+            );
+        }
         Learning {
             paradigm,
             sharing: Learning::sharing(r).choice(Sharing::None),
@@ -129,7 +193,8 @@ impl Learning {
             population,
             generations: Learning::generations(r).number(between(0, MAX_GENERATIONS), 100),
             trials: Learning::trials(r).number(between(1, MAX_TRIALS), 5),
-            elites: Learning::elites(r).number(between(0, population).because("learning.population"), 1),
+            elites,
+            parents,
             mutation: Learning::mutation(r).choice(Mutation::Scaled),
             mutation_probability: Learning::mutation_probability(r).number(between(LEAST, 1.0).or_zero(), 0.15),
             mutation_sigma: Learning::mutation_sigma(r).number(between(LEAST, 100.0).or_zero(), 0.1),

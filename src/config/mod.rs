@@ -18,8 +18,8 @@ pub use crate::model::policy::{Actions, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Pol
 pub use crate::model::sense::{Density, Sense};
 pub use crate::reader::{Definition, Override, Problem};
 pub use learning::{
-    Fitness, Learning, LedBy, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm, Saving,
-    Sharing,
+    Elites, Fitness, Learning, LedBy, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm,
+    Parents, Saving, Sharing,
 };
 pub use load::{MAX_FILE_BYTES, is_standard_input, name, read_file};
 pub use stages::{MAX_STAGES, Stage};

@@ -17,13 +17,14 @@ pub const STAGES: &str = "stages";
 /// Most stages of a config.
 pub const MAX_STAGES: usize = 256;
 /// What is the same in all stages.
-const FIXED: [&str; 9] = [
+const FIXED: [&str; 10] = [
     "policy.",
     "checkpoint.",
     "learning.paradigm",
     "learning.sharing",
     "learning.population",
     "learning.elites",
+    "learning.parents",
     "learning.generations",
     "learning.trials",
     "learning.seed",

@@ -42,6 +42,8 @@ section! {
         /// what something at distance d adds to its quadrant's density: 1 − d/(√2·max(map)) if linear, 1/max(d, 1) if
         /// inverse
         density: Density = "", "3.1",
+        /// multiplies all inputs of the leaders' policies
+        gain: f64 = "", "",
     }
 }
 
@@ -52,6 +54,7 @@ impl Sense {
             poi_range: Sense::poi_range(r).number(between(0.01, LONGEST).or_unlimited(), f64::INFINITY),
             agent_range: Sense::agent_range(r).number(between(0.01, LONGEST).or_unlimited(), 5.0),
             density: Sense::density(r).choice(Density::Linear),
+            gain: Sense::gain(r).number(between(1e-3, 1e3), 1.0),
         }
     }
 }
@@ -73,9 +76,9 @@ shared! {
         pub poi_range2: f32,
         /// The range of agents, squared.
         pub agent_range2: f32,
-        /// 1/P, by which a sum over POIs is weighed.
+        /// gain/P: multiplies a sum over POIs.
         pub poi_share: f32,
-        /// 1/N, by which a sum over agents is weighed.
+        /// gain/N: multiplies a sum over agents.
         pub agent_share: f32,
         /// 1/D with D = √2·max(map).
         pub inverse_diagonal: f32,
@@ -89,8 +92,8 @@ impl SenseConstants {
         SenseConstants {
             poi_range2: range2(sense.poi_range),
             agent_range2: range2(sense.agent_range),
-            poi_share: (1.0 / pois as f64) as f32,
-            agent_share: (1.0 / agents as f64) as f32,
+            poi_share: (sense.gain / pois as f64) as f32,
+            agent_share: (sense.gain / agents as f64) as f32,
             inverse_diagonal: (1.0 / (2f64.sqrt() * map[0].max(map[1]))) as f32,
         }
     }
