@@ -51,7 +51,7 @@ def learn(config: flotilla.Config, iterations: int, seed: int) -> np.ndarray:
     torch.manual_seed(seed)
     steps, leaders = config["world.steps"], Leaders(config)
     optimizer = torch.optim.Adam(leaders.parameters(), RATE, eps=1e-5)
-    env = flotilla.VectorEnv(config, TEAMS, reward="G", autoreset="same_step", copy=True)
+    env = flotilla.VectorEnv(config, TEAMS, reward="G", autoreset="same_step")
     ages = (torch.arange(steps) / steps)[:, None].expand(steps, TEAMS)
     now, _ = env.reset(seed=seed)
     for iteration in range(iterations):

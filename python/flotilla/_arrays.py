@@ -1,7 +1,8 @@
-"""What arrays may be given."""
+"""Checks of arguments, and aligned arrays."""
 
 from __future__ import annotations
 
+import math
 import operator
 from typing import Any
 
@@ -11,8 +12,20 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float32]
 
 
+# Cache lines, vector instructions and zero-copy exchange with JAX ask for this.
+ALIGNMENT = 64
+
+
+def aligned(shape: tuple[int, ...]) -> Floats:
+    """A new float32 array whose first element lies at a multiple of 64 bytes. Its values are undefined."""
+    size = 4 * math.prod(shape)
+    memory = np.empty(size + ALIGNMENT, np.uint8)
+    start = -memory.__array_interface__["data"][0] % ALIGNMENT
+    return memory[start : start + size].view(np.float32).reshape(shape)
+
+
 def floats(what: str, values: ArrayLike, axes: int) -> Floats:
-    """An array of float32 with so many axes, without a copy where it is one already."""
+    """Converts values to a float32 array with the given number of axes, without a copy if they are one already."""
     try:
         array = np.asarray(values)
     except ValueError as error:

@@ -12,9 +12,8 @@ from pettingzoo import ParallelEnv
 from flotilla import _native
 from flotilla._arrays import Floats
 from flotilla._config import Config
-from flotilla._vector import PIXELS, RENDER_MODES, Teams
+from flotilla._vector import PIXELS, RENDER_MODES, TeamBatch
 
-# What a Box holds, as its types have it.
 Array = NDArray[Any]
 Space = spaces.Space[Array]
 
@@ -23,7 +22,7 @@ class TeamEnv(ParallelEnv[str, Array, Array]):  # type: ignore[misc, unused-igno
     """See :func:`flotilla.parallel_env`."""
 
     def __init__(self, config: Config, render_mode: str | None = None, reward: str = "G") -> None:
-        self._teams = Teams(config, 1, reward, render_mode)
+        self._teams = TeamBatch(config, 1, reward, render_mode)
         self.config, self.render_mode = config, render_mode
         self.metadata: dict[str, Any] = {
             "name": "flotilla_v0",
@@ -47,7 +46,7 @@ class TeamEnv(ParallelEnv[str, Array, Array]):  # type: ignore[misc, unused-igno
         return self.action_spaces[agent]
 
     def _observations(self) -> dict[str, Array]:
-        return dict(zip(self.agents, self._teams.inputs[0].copy()))
+        return dict(zip(self.agents, self._teams.inputs()[0]))
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None

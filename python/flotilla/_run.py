@@ -35,7 +35,8 @@ class Run:
             first: the share of POIs observed, 0 to 1, by each generation's best and mean team, and by the team of every
             population's best policy.
         policies: one float32 ``[leaders, policies, parameters]`` a trial, or ``[1, policies, parameters]`` where leaders
-            share a policy (``learning.sharing``); best policy first, so that team 0 of a rollout is the champion.
+            share a policy (``learning.sharing``); best policy first, so that team 0 of a rollout is the champion. These
+            arrays and those of ``metrics`` are read-only: copy them to change them.
         digest: of all of these: the same as the program's for this config and seed.
         backend: what it was trained on, in words.
 
@@ -49,12 +50,21 @@ class Run:
     def __init__(self, outcome: _native.Outcome, played: _native.Played, times: list[float] | None, folder: str | None):
         config, metrics, policies, digest = outcome
         self.config = Config._of(config)
-        self.metrics: dict[str, NDArray[np.float64]] = dict(zip(METRICS, metrics))
-        self.policies: list[Floats] = policies
+        self._metrics, self._policies = tuple(metrics), tuple(policies)
         self.digest: str = digest
+        self._show_arrays()
         self.backend = played[1]
         self._played, self._times, self._folder = played, times, folder
         self._kept: tempfile.TemporaryDirectory[str] | None = None
+
+    def _show_arrays(self) -> None:
+        """Makes the public attributes. They are read-only, and `save` does not use them: it writes what was trained."""
+        for metric in self._metrics:
+            metric.flags.writeable = False
+        for policies in self._policies:
+            policies.flags.writeable = False
+        self.metrics: dict[str, NDArray[np.float64]] = dict(zip(METRICS, self._metrics))
+        self.policies: list[Floats] = list(self._policies)
 
     @classmethod
     def open(cls, folder: str | os.PathLike[str]) -> Run:
@@ -106,8 +116,7 @@ class Run:
         self._write(os.fspath(folder), force)
 
     def _write(self, folder: str, force: bool) -> None:
-        metrics = [np.ascontiguousarray(self.metrics[name], dtype=np.float64) for name in METRICS]
-        policies = [np.ascontiguousarray(trial, dtype=np.float32) for trial in self.policies]
+        metrics, policies = list(self._metrics), list(self._policies)
         times = self._times or [0.0] * metrics[0].shape[-1]
         arguments = (self.config._native, metrics, policies, times, self._played, folder, force, _command())
         _native.save(*arguments)
@@ -171,6 +180,10 @@ class Run:
         # A temporary folder is this process's.
         folder = self._folder if self._kept is None else None
         return {**self.__dict__, "_kept": None, "_folder": folder, "config": self.config}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._show_arrays()
 
     def __repr__(self) -> str:
         best = self.metrics["best_g"][:, -1]

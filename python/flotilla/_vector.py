@@ -1,30 +1,44 @@
-"""Many teams at once, stepped by actions."""
+"""Environments of many teams, stepped by actions."""
 
 from __future__ import annotations
 
+import secrets
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
-from flotilla._arrays import Floats, floats, whole
+from flotilla._arrays import Floats, aligned, floats, whole
 from flotilla._config import Config
 from flotilla._play import _near
 
 if TYPE_CHECKING:
     from gymnasium import spaces
 
+    Base = object
+else:
+    try:
+        from gymnasium.vector import VectorEnv as Base
+    except ImportError:
+        Base = object
+
 Reward = str
 Autoreset = Literal["next_step", "same_step", "disabled"]
+Layout = Literal["leaders", "team", "flat"]
+Horizon = Literal["truncated", "terminated"]
 RENDER_MODES = ("rgb_array",)
 MAX_TEAMS = 1 << 20
 # Pixels of a picture's longer side.
 PIXELS = 480
 
 
-class Teams:
-    """Teams of one world, with starts that are drawn where the config says so: what both environments stand on."""
+class TeamBatch:
+    """Teams of one world that step together. Both kinds of environments are views of it.
+
+    Observations are copied out of Rust's memory while the interpreter's lock is held, so that no thread ever reads an
+    array that Rust is writing.
+    """
 
     def __init__(self, config: Config, teams: int, reward: str, render_mode: str | None) -> None:
         if not isinstance(config, Config):
@@ -35,76 +49,102 @@ class Teams:
             raise ValueError(f"render_mode {render_mode!r}, allowed are None and 'rgb_array'")
         self.config, self.reward, self.render_mode = config, reward, render_mode
         self.count = whole("the number of teams", teams, 1, MAX_TEAMS)
-        # What is recorded hangs on what is to be scored by.
+        # The fitness decides what the stepper records.
         scored = config.replace(learning={"fitness": reward})
         self.stepper = _native.Stepper(scored._native, self.count, reward != "G")
         self.leaders, self.length = config.leaders, int(config["world.steps"])
         self.agents = len(config["world.leaders"]) + len(config["world.followers"])
+        self.pois = len(config["world.pois"])
         self.jitter = float(config["learning.start_jitter"])
-        self.seed, self.drawn = int(config["learning.seed"]), 0
-        # Where these lie does not change.
-        self.inputs, self.steps, self.observed = self.stepper.inputs, self.stepper.steps, self.stepper.observed
+        self.seed: int | None = None
+        self.drawn = 0
         self.rewards = np.zeros((self.count, self.leaders), np.float32)
 
+    @property
+    def steps(self) -> NDArray[np.uint32]:
+        """Steps that each team has played in its episode, ``[teams]``."""
+        return self.stepper.steps
+
+    @property
+    def observed(self) -> NDArray[np.bool_]:
+        """POIs that each team has observed in its episode, ``[teams, pois]``."""
+        return self.stepper.observed
+
+    def inputs(self, out: Floats | None = None) -> Floats:
+        """What every leader senses, ``[teams, leaders, 8]``, in a new array or in `out`."""
+        if out is None:
+            out = aligned((self.count, self.leaders, _native.INPUTS))
+        self.stepper.read_inputs(out)
+        return out
+
     def reset(self, seed: int | None = None, chosen: NDArray[np.bool_] | None = None) -> None:
-        """Puts all teams, or the chosen ones, at a start: the config's, or each at one drawn for it."""
+        """Starts episodes of all teams, or of the chosen ones."""
         if seed is not None:
             self.seed, self.drawn = whole("seed", seed, 0, 2**63 - 1), 0
         starts = None
         if self.jitter > 0:
+            if self.seed is None:
+                self.seed = secrets.randbits(63)
             starts = _native.starts(self.config._native, self.seed, self.jitter, self.drawn, self.count)
             self.drawn += self.count
         self.stepper.reset(chosen, starts)
 
-    def step(self, actions: Floats, rested: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
-        """Plays a step, and rewards it; which teams but those that have rested have played their last one."""
-        had = None if self.reward == "G" else self.steps >= self.length
-        self.stepper.step(actions, self.rewards if had is None else None)
-        over: NDArray[np.bool_] = self.steps >= self.length
-        if rested is not None:
-            over &= ~rested
-        if had is not None and over.any():
+    def step(self, actions: Floats, idle: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+        """Plays a step and sets `rewards`. Returns which teams have just finished, except the `idle` ones."""
+        finished_before = None if self.reward == "G" else self.steps >= self.length
+        self.stepper.step(actions, self.rewards if finished_before is None else None)
+        finished: NDArray[np.bool_] = self.steps >= self.length
+        if idle is not None:
+            finished &= ~idle
+        if finished_before is not None and finished.any():
             self.stepper.fitness(self.reward, self.rewards)
-            # Who was over before has had its reward.
-            self.rewards[~over | had] = 0
-        elif had is not None:
+            # A team that was finished before this step has had its reward.
+            self.rewards[~finished | finished_before] = 0
+        elif finished_before is not None:
             self.rewards.fill(0)
-        return over
+        return finished
 
     def state(self) -> Floats:
-        """Everything that is to be known of each team, ``[teams, agents * 5 + pois]``."""
+        """The whole state of each team, ``[teams, agents * 5 + pois]``."""
         positions, headings, speeds = self.stepper.states()
         parts = (positions, headings, speeds[..., None])
         moving = np.concatenate(parts, axis=-1).reshape(self.count, -1)
         return np.concatenate((moving, self.observed.astype(np.float32)), axis=-1)
 
 
-class VectorEnv:
-    """Many teams of one world, stepped together: leaders along an axis, float32 arrays that are reused between steps.
+class VectorEnv(Base):
+    """Many teams of one world that step together: a ``gymnasium.vector.VectorEnv`` if gymnasium is installed.
 
-    Every episode takes ``world.steps`` steps; then it is *truncated*. Where the config's ``learning.start_jitter`` is above
-    0, every team of every episode starts from a place of its own, drawn from the seed of :meth:`reset`; else all start
-    where the config says. POIs stay where the config has them. ``close`` gives nothing back, for there is nothing to give.
+    An episode takes ``world.steps`` steps. If the config's ``learning.start_jitter`` is above 0, every team of every
+    episode starts from a place of its own, drawn from the seed of :meth:`reset`; otherwise all teams start where the
+    config says. POIs stay where the config has them.
 
-    Leaders sense the density of POIs, then of agents, in four quadrants around their heading: back right, front right, front
-    left, back left. They are told a turn, in parts of a half turn to the left, and a speed, from -1 for standing still to 1
-    for the highest. The spaces need gymnasium.
+    A leader's observation is the density of POIs, then of agents, in four quadrants around its heading: back right,
+    front right, front left, back left. Its action is a turn, from -1 (half a turn to the right) to 1 (half a turn to the
+    left), and a speed, from -1 (standing still) to 1 (the largest speed).
 
     Args:
-        config: the world. Of its learning only who leads and the jitter of starts counts here.
-        num_envs: how many teams.
+        config: the world. Of its learning section, only the paradigm and the jitter of starts matter here.
+        num_envs: number of teams.
         reward: ``"G"`` gives the newly observed share of POIs at each step, the same to all leaders, which adds up to G;
             ``"D"``, ``"Df"``, ``"D++"`` and ``"Dt"`` give each leader that fitness at the last step, and 0 before.
-        autoreset: what becomes of a team whose episode is over, as gymnasium has it (``metadata["autoreset_mode"]``):
-            ``"next_step"`` starts it at the step after the last, whose action counts for nothing; ``"same_step"`` starts it
-            at once, with what it saw last in ``infos["final_obs"]``; ``"disabled"`` leaves it until ``reset`` with
+        layout: shape of rewards and environments. ``"leaders"``: one environment per team and one reward per leader,
+            ``[num_envs, leaders]``. ``"team"``: one environment per team and one reward, ``[num_envs]``, the mean over its
+            leaders, as gymnasium's wrappers expect. ``"flat"``: one environment per leader, ``num_envs * leaders`` in all,
+            teams one after the other, as trainers with shared parameters expect.
+        autoreset: what happens to a finished team, in gymnasium's terms (``metadata["autoreset_mode"]``):
+            ``"next_step"`` resets it at the next step and ignores that step's action; ``"same_step"`` resets it at
+            once and returns its last observation in ``infos["final_obs"]``; ``"disabled"`` leaves it until ``reset`` with
             ``options={"reset_mask": mask}``.
-        copy: give every step's observations as arrays of their own.
+        copy: return new arrays at every step. If False, observations and rewards are the same arrays at every step,
+            with new values: faster, but wrong in a replay buffer that keeps references.
+        horizon: how the end of an episode is reported, ``"truncated"`` or ``"terminated"``.
+        time_input: append the played share of the episode to each leader's observation, which then has 9 numbers.
         render_mode: None or ``"rgb_array"``.
 
     Raises:
         ValueError: a number or word is not allowed.
-        MemoryError: there is not enough for so many teams.
+        MemoryError: there is not enough memory for so many teams.
 
     Example:
         >>> env = flotilla.VectorEnv(flotilla.Config.paper(), num_envs=64)
@@ -115,92 +155,125 @@ class VectorEnv:
         ((64, 4, 8), (64, 4), False)
     """
 
+    observation_space: spaces.Box
+    action_space: spaces.Box
+    single_observation_space: spaces.Box
+    single_action_space: spaces.Box
+
     def __init__(
         self,
         config: Config,
         num_envs: int,
         reward: Reward = "G",
         *,
+        layout: Layout = "leaders",
         autoreset: Autoreset = "next_step",
-        copy: bool = False,
+        copy: bool = True,
+        horizon: Horizon = "truncated",
+        time_input: bool = False,
         render_mode: str | None = None,
     ) -> None:
-        if autoreset not in ("next_step", "same_step", "disabled"):
-            raise ValueError(f"autoreset {autoreset!r}, allowed are 'next_step', 'same_step' and 'disabled'")
-        self._teams = Teams(config, num_envs, reward, render_mode)
-        self.config, self.num_envs, self.render_mode = config, self._teams.count, render_mode
-        self.leaders, self.autoreset, self.copy = self._teams.leaders, autoreset, bool(copy)
+        one_of("layout", layout, ("leaders", "team", "flat"))
+        one_of("autoreset", autoreset, ("next_step", "same_step", "disabled"))
+        one_of("horizon", horizon, ("truncated", "terminated"))
+        self._teams = TeamBatch(config, num_envs, reward, render_mode)
+        self.config, self.render_mode = config, render_mode
+        self.leaders, self.layout, self.autoreset = self._teams.leaders, layout, autoreset
+        self.copy, self.horizon, self.time_input = bool(copy), horizon, bool(time_input)
+        self.num_envs = self._teams.count * (self.leaders if layout == "flat" else 1)
         self.metadata: dict[str, Any] = {
             "render_modes": list(RENDER_MODES),
             "autoreset_mode": _autoreset_mode(autoreset),
             "render_fps": max(round(1 / config["world.dt"]), 1),
         }
         self.closed = False
-        self._over = np.zeros(self.num_envs, np.bool_)
-        self._any_over = False
+        self._finished = np.zeros(self._teams.count, np.bool_)
+        self._any_finished = False
+        inputs = _native.INPUTS + self.time_input
+        self._single = (inputs,) if layout == "flat" else (self.leaders, inputs)
+        self._inputs = aligned((self._teams.count, self.leaders, _native.INPUTS))
+        self._observations = aligned((self._teams.count, self.leaders, inputs)) if time_input else self._inputs
+        self._rewards = aligned((self.num_envs,) + ((self.leaders,) if layout == "leaders" else ()))
+        self._make_spaces()
 
-    @property
-    def single_observation_space(self) -> spaces.Box:
-        """What is seen of one team, ``Box [leaders, 8]``."""
-        from gymnasium import spaces
+    def _make_spaces(self) -> None:
+        """Makes the spaces once, so that a seed given to one of them stays."""
+        try:
+            from gymnasium import spaces
+        except ImportError:
+            return
+        action = (*self._single[:-1], _native.OUTPUTS)
+        self.single_observation_space = spaces.Box(0, np.inf, self._single, np.float32)
+        self.single_action_space = spaces.Box(-1, 1, action, np.float32)
+        self.observation_space = spaces.Box(0, np.inf, (self.num_envs, *self._single), np.float32)
+        self.action_space = spaces.Box(-1, 1, (self.num_envs, *action), np.float32)
 
-        return spaces.Box(0, np.inf, (self.leaders, _native.INPUTS), np.float32)
-
-    @property
-    def single_action_space(self) -> spaces.Box:
-        """What one team is told, ``Box [leaders, 2]``."""
-        from gymnasium import spaces
-
-        return spaces.Box(-1, 1, (self.leaders, _native.OUTPUTS), np.float32)
-
-    @property
-    def observation_space(self) -> spaces.Box:
-        """What is seen of all teams, ``Box [num_envs, leaders, 8]``."""
-        from gymnasium import spaces
-
-        return spaces.Box(0, np.inf, (self.num_envs, self.leaders, _native.INPUTS), np.float32)
-
-    @property
-    def action_space(self) -> spaces.Box:
-        """What all teams are told, ``Box [num_envs, leaders, 2]``."""
-        from gymnasium import spaces
-
-        return spaces.Box(-1, 1, (self.num_envs, self.leaders, _native.OUTPUTS), np.float32)
+    def __getattr__(self, name: str) -> Any:
+        if name.endswith("_space"):
+            raise ImportError(f"{name}: gymnasium is not installed; pip install flotilla-teams[gymnasium]")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @property
     def unwrapped(self) -> VectorEnv:
-        """Itself."""
+        """This environment."""
         return self
 
-    def _observations(self) -> Floats:
-        return self._teams.inputs.copy() if self.copy else self._teams.inputs
+    def _observe(self, copy: bool) -> Floats:
+        """Observations of all environments, ``[num_envs, ...]``."""
+        if not self.time_input:
+            found = self._teams.inputs(None if copy else self._inputs)
+        else:
+            found = aligned(self._observations.shape) if copy else self._observations
+            found[..., :-1] = self._teams.inputs(self._inputs)
+            found[..., -1] = (self._teams.steps / np.float32(self._teams.length))[:, None]
+        return found.reshape(self.num_envs, *self._single)
+
+    def _per_environment(self, teams: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """A value per team as a new array with a value per environment."""
+        return np.repeat(teams, self.leaders) if self.layout == "flat" else teams.copy()
+
+    def _reward(self) -> Floats:
+        """Rewards in the layout's shape, in a new array or in the one that is reused."""
+        out = aligned(self._rewards.shape) if self.copy else self._rewards
+        if self.layout == "team":
+            np.mean(self._teams.rewards, axis=1, out=out)
+        else:
+            out[...] = self._teams.rewards.reshape(out.shape)
+        return out
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Starts episodes anew.
+        """Starts new episodes.
 
         Args:
-            seed: of starts; None goes on drawing from the seed before, at first the config's.
-            options: ``{"reset_mask": mask}`` starts the teams anew that a bool ``[num_envs]`` marks, and leaves the others.
+            seed: seed of the drawn starts. None continues with the seed before; the first time it takes one from the
+                operating system, so that workers differ.
+            options: ``{"reset_mask": mask}`` resets only the teams that a bool array ``[teams]`` marks. In the layout
+                ``"flat"`` the mask is ``[num_envs]``, and a team is reset if all its leaders are marked.
 
         Returns:
-            observations, float32 ``[num_envs, leaders, 8]`` (not to be written to), and an empty dictionary.
+            observations, float32 ``[num_envs, leaders, 8]`` (``[num_envs, 8]`` in the layout ``"flat"``), and an empty
+            dictionary.
+
+        Raises:
+            ValueError: the seed or the mask is not allowed, or another thread is stepping this environment.
 
         Example:
             >>> env = flotilla.VectorEnv(flotilla.Config.paper(), 2)
             >>> env.reset(seed=0)[0].shape
             (2, 4, 8)
         """
-        chosen = None
+        chosen: NDArray[np.bool_] | None = None
         if options and options.get("reset_mask") is not None:
-            chosen = np.array(options["reset_mask"])
-            if chosen.dtype != np.bool_ or chosen.shape != (self.num_envs,):
-                raise ValueError(f"reset_mask is {chosen.dtype} {chosen.shape}, allowed is bool ({self.num_envs},)")
+            mask = np.array(options["reset_mask"])
+            if mask.dtype != np.bool_ or mask.shape != (self.num_envs,):
+                raise ValueError(f"reset_mask is {mask.dtype} {mask.shape}, allowed is bool ({self.num_envs},)")
+            chosen = np.all(mask.reshape(self._teams.count, -1), axis=1)
         self._teams.reset(seed, chosen)
-        self._over = np.zeros_like(self._over) if chosen is None else self._over & ~chosen
-        self._any_over = bool(self._over.any())
-        return self._observations(), {}
+        self._finished = np.zeros_like(self._finished) if chosen is None else self._finished & ~chosen
+        self._any_finished = bool(self._finished.any())
+        return self._observe(self.copy), {}
 
     def step(
         self, actions: ArrayLike
@@ -208,16 +281,17 @@ class VectorEnv:
         """Plays one step of every team.
 
         Args:
-            actions: ``[num_envs, leaders, 2]``; numbers beyond -1..1 are taken as -1 or 1. Not copied where they are
-                C-contiguous float32.
+            actions: ``[num_envs, leaders, 2]`` (``[num_envs, 2]`` in the layout ``"flat"``). Numbers beyond -1..1 are
+                clipped. C-contiguous float32 arrays are not copied.
 
         Returns:
-            observations float32 ``[num_envs, leaders, 8]``, rewards float32 ``[num_envs, leaders]``, terminated and truncated
-            bool ``[num_envs]``, and infos. Observations and rewards are the same arrays at every step, with other values,
-            unless ``copy`` was asked for.
+            observations, rewards, terminated, truncated and infos, see :class:`VectorEnv` for their shapes. With
+            ``autoreset="same_step"``, infos of a step that finished teams hold ``final_obs`` and ``final_info``: ``g``,
+            ``observed`` (``[num_envs, pois]``) and ``state``; names with an underscore in front mark the finished ones.
 
         Raises:
-            ValueError: the actions have another shape, or are not all finite; no team has moved then.
+            ValueError: the actions have another shape or are not all finite, or another thread is stepping this
+                environment. No team has moved then.
 
         Example:
             >>> env = flotilla.VectorEnv(flotilla.Config.paper(), 2, reward="Df", autoreset="same_step")
@@ -228,24 +302,41 @@ class VectorEnv:
             (array([ True,  True]), (2, 4), (2, 4, 8))
         """
         teams, infos = self._teams, dict[str, Any]()
-        array = floats("actions", actions, 3)
-        if self.autoreset == "next_step" and self._any_over:
-            # Teams that are over stay where they are at this step.
-            fresh = self._over
-            over = teams.step(array, fresh)
+        array = floats("actions", actions, 2 if self.layout == "flat" else 3)
+        if self.layout == "flat":
+            if array.shape != (self.num_envs, _native.OUTPUTS):
+                raise ValueError(f"actions are {list(array.shape)}, allowed is [num_envs, 2] = [{self.num_envs}, 2]")
+            array = array.reshape(teams.count, self.leaders, _native.OUTPUTS)
+        if self.autoreset == "next_step" and self._any_finished:
+            # These teams ignore this step's action.
+            fresh = self._finished
+            finished = teams.step(array, fresh)
             teams.reset(None, fresh)
         else:
-            over = teams.step(array)
-        self._any_over = bool(over.any())
-        if self.autoreset == "same_step" and self._any_over:
-            infos["final_obs"], infos["_final_obs"] = teams.inputs.copy(), over
-            teams.reset(None, over)
-        self._over = over.copy()
-        rewards = teams.rewards.copy() if self.copy else teams.rewards
-        return self._observations(), rewards, np.zeros(self.num_envs, np.bool_), over, infos
+            finished = teams.step(array)
+        self._any_finished = bool(finished.any())
+        rewards = self._reward()
+        ended = self._per_environment(finished)
+        if self.autoreset == "same_step" and self._any_finished:
+            infos["final_obs"], infos["_final_obs"] = self._observe(True), ended.copy()
+            infos["final_info"], infos["_final_info"] = self._final_info(ended), ended.copy()
+            teams.reset(None, finished)
+        self._finished = finished
+        never = np.zeros(self.num_envs, np.bool_)
+        terminated, truncated = (ended, never) if self.horizon == "terminated" else (never, ended)
+        return self._observe(self.copy), rewards, terminated, truncated, infos
+
+    def _final_info(self, ended: NDArray[np.bool_]) -> dict[str, Any]:
+        """What finished teams have reached, before they are reset."""
+        copies = self.leaders if self.layout == "flat" else 1
+        found: dict[str, Any] = {}
+        observed = self._teams.observed
+        for name, values in (("g", observed.mean(axis=1)), ("observed", observed), ("state", self._teams.state())):
+            found[name], found[f"_{name}"] = np.repeat(values, copies, axis=0), ended.copy()
+        return found
 
     def states(self) -> tuple[Floats, Floats, Floats]:
-        """Where everyone is: positions and headings ``[num_envs, agents, 2]``, speeds ``[num_envs, agents]``, leaders first.
+        """Positions and headings ``[teams, agents, 2]`` and speeds ``[teams, agents]``, leaders first.
 
         Example:
             >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).states()[0].shape
@@ -254,7 +345,7 @@ class VectorEnv:
         return self._teams.stepper.states()
 
     def near(self) -> NDArray[np.bool_]:
-        """Which agents were near which POI after the last step, ``[num_envs, pois, agents]``.
+        """Agents within the observation radius of each POI after the last step, ``[teams, pois, agents]``.
 
         Example:
             >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).near().shape
@@ -264,11 +355,11 @@ class VectorEnv:
 
     @property
     def observed(self) -> NDArray[np.bool_]:
-        """Which POIs have been observed since the start, ``[num_envs, pois]``."""
+        """POIs observed since the start of each team's episode, ``[teams, pois]``."""
         return self._teams.observed
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The first team as a picture, uint8 ``[height, width, 3]``, where the render mode is ``"rgb_array"``.
+        """The first team as a picture, uint8 ``[height, width, 3]``, if the render mode is ``"rgb_array"``.
 
         Example:
             >>> flotilla.VectorEnv(flotilla.Config.paper(), 2, render_mode="rgb_array").render().shape
@@ -277,15 +368,21 @@ class VectorEnv:
         return self._teams.stepper.render(0, PIXELS) if self.render_mode == "rgb_array" else None
 
     def close(self, **_: Any) -> None:
-        """Ends it."""
+        """Marks the environment as closed. It holds nothing that has to be freed."""
         self.closed = True
 
     def __repr__(self) -> str:
-        return f"<flotilla.VectorEnv: {self.num_envs} teams of {self.leaders} leaders, {self.autoreset} reset>"
+        return f"<flotilla.VectorEnv: {self._teams.count} teams of {self.leaders} leaders, {self.autoreset} reset>"
+
+
+def one_of(what: str, word: str, allowed: tuple[str, ...]) -> None:
+    """Raises a ValueError unless a word is one of those allowed."""
+    if word not in allowed:
+        raise ValueError(f"{what} {word!r}, allowed are {', '.join(map(repr, allowed))}")
 
 
 def _autoreset_mode(mode: str) -> Any:
-    """As gymnasium calls it, where that is installed; else its word."""
+    """Gymnasium's constant for the mode, or its value if gymnasium is not installed."""
     try:
         from gymnasium.vector import AutoresetMode
     except ImportError:

@@ -1,6 +1,6 @@
-//! Teams that are stepped by given actions.
+//! Teams that are stepped by given actions, with NumPy arrays in and out.
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, TryLockError};
 
 use flotilla::config::{Choice, Fitness};
 use flotilla::front;
@@ -9,10 +9,9 @@ use flotilla::report::scene::Scene;
 use flotilla::stepping;
 use flotilla::world::{INPUTS, OUTPUTS};
 use glam::{DVec2, Vec2};
-use numpy::ndarray::ArrayView;
 use numpy::{
     Element, PyArray1, PyArray2, PyArray3, PyArrayDyn, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray3,
-    PyReadwriteArray2, PyUntypedArrayMethods,
+    PyReadwriteArray2, PyReadwriteArray3, PyUntypedArrayMethods,
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -23,7 +22,7 @@ use crate::workers;
 
 type States<'py> = (Bound<'py, PyArray3<f32>>, Bound<'py, PyArray3<f32>>, Bound<'py, PyArray2<f32>>);
 
-/// So many teams of a world.
+/// Teams of one world that are stepped by given actions.
 #[pyclass(frozen)]
 pub struct Stepper {
     config: flotilla::Config,
@@ -31,24 +30,25 @@ pub struct Stepper {
 }
 
 impl Stepper {
-    fn inner(&self) -> MutexGuard<'_, stepping::Stepper> {
-        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    /// The stepper, if no other thread uses it. Waiting would hide that two threads step one environment.
+    fn stepper(&self) -> PyResult<MutexGuard<'_, stepping::Stepper>> {
+        match self.inner.try_lock() {
+            Ok(stepper) => Ok(stepper),
+            Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
+            Err(TryLockError::WouldBlock) => Err(PyValueError::new_err(
+                "another thread is stepping this environment: make one environment per thread",
+            )),
+        }
     }
 }
 
-/// What one of the stepper's arrays holds, to be looked at where it lies.
-fn shown<'py, T: Element>(
-    of: &Bound<'py, Stepper>,
+/// Copies one of the stepper's arrays to a new NumPy array.
+fn copied<'py, T: Element + Copy>(
+    py: Python<'py>,
     values: &[T],
     shape: &[usize],
 ) -> PyResult<Bound<'py, PyArrayDyn<T>>> {
-    let view = ArrayView::from_shape(shape, values).map_err(|error| PyValueError::new_err(error.to_string()))?;
-    // SAFETY: a stepper's arrays stay where they are from step to step (`stepping::Stepper` says so, and a test of this
-    // package looks), and the array keeps the stepper. Who reads while another thread steps reads some of both steps.
-    #[expect(unsafe_code, reason = "a copy a step would cost as much as a good part of the step")]
-    let array = unsafe { PyArrayDyn::borrow_from_array(&view, of.clone().into_any()) };
-    array.readwrite().make_nonwriteable();
-    Ok(array)
+    PyArray1::from_slice(py, values).reshape(shape)
 }
 
 #[pymethods]
@@ -60,11 +60,11 @@ impl Stepper {
     }
 
     #[getter]
-    fn teams(&self) -> usize {
-        self.inner().teams()
+    fn teams(&self) -> PyResult<usize> {
+        Ok(self.stepper()?.teams())
     }
 
-    /// Puts all teams, or the chosen ones, at the world's start or where they are told to.
+    /// Resets all teams, or the chosen ones, to the world's start or to the given starts `[teams, agents, 2]`.
     fn reset(
         &self,
         py: Python<'_>,
@@ -74,28 +74,27 @@ impl Stepper {
         let chosen = chosen.as_ref().map(|chosen| contiguous("reset_mask", chosen.as_slice())).transpose()?;
         let starts = starts.as_ref().map(|starts| contiguous("starts", starts.as_slice())).transpose()?;
         workers::aside(py, || {
-            let mut stepper = self.inner();
+            let mut stepper = self.stepper()?;
             match (chosen, starts) {
-                (Some(chosen), starts) => stepper.reset_some(chosen, starts),
-                (None, Some(starts)) => stepper.reset_to(starts),
+                (Some(chosen), starts) => stepper.reset_some(chosen, starts).raise(),
+                (None, Some(starts)) => stepper.reset_to(starts).raise(),
                 (None, None) => {
                     stepper.reset();
                     Ok(())
                 }
             }
         })
-        .raise()
     }
 
-    /// Plays a step by actions `[teams, leaders, 2]`, and writes to `rewards`, `[teams, leaders]`, which share of the POIs
-    /// each leader's team observed for the first time.
+    /// Plays a step by actions `[teams, leaders, 2]`. Writes the share of POIs that each leader's team has just observed for
+    /// the first time to `rewards`, `[teams, leaders]`.
     fn step(
         &self,
         py: Python<'_>,
         actions: PyReadonlyArray3<'_, f32>,
         rewards: Option<PyReadwriteArray2<'_, f32>>,
     ) -> PyResult<()> {
-        let shape = [self.teams(), self.config.learners(), OUTPUTS];
+        let shape = [self.teams()?, self.config.learners(), OUTPUTS];
         if actions.shape() != shape {
             let text = format!("actions are {:?}, allowed is [teams, leaders, 2] = {shape:?}", actions.shape());
             return Err(PyValueError::new_err(text));
@@ -104,8 +103,8 @@ impl Stepper {
         let rewards = rewards.as_mut().map(|rewards| contiguous("rewards", rewards.as_slice_mut())).transpose()?;
         let actions = contiguous("actions", actions.as_slice())?;
         workers::aside(py, || {
-            let mut stepper = self.inner();
-            stepper.step(actions)?;
+            let mut stepper = self.stepper()?;
+            stepper.step(actions).raise()?;
             let pois = self.config.world.pois.len();
             for (team, newly) in rewards
                 .into_iter()
@@ -113,77 +112,76 @@ impl Stepper {
             {
                 team.fill(newly.iter().filter(|&&newly| newly).count() as f32 / pois as f32);
             }
-            Ok::<_, stepping::StepError>(())
+            Ok(())
         })
-        .raise()
     }
 
-    /// Writes what every leader was worth so far by a fitness to `scores`, `[teams, leaders]`.
+    /// Writes each leader's fitness in the episode so far to `scores`, `[teams, leaders]`.
     fn fitness(&self, py: Python<'_>, fitness: &str, mut scores: PyReadwriteArray2<'_, f32>) -> PyResult<()> {
         let Some(&(_, fitness)) = Fitness::ALL.iter().find(|(name, _)| *name == fitness) else {
             let names: Vec<_> = Fitness::names().collect();
             return Err(PyValueError::new_err(format!("fitness {fitness:?}, allowed are {}", names.join(", "))));
         };
         let scores = contiguous("scores", scores.as_slice_mut())?;
-        workers::aside(py, || self.inner().fitness(fitness, scores)).raise()
+        workers::aside(py, || self.stepper()?.fitness(fitness, scores).raise())
     }
 
-    /// What every leader senses, `[teams, leaders, 8]`.
-    #[getter]
-    fn inputs<'py>(of: &Bound<'py, Self>) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
-        let stepper = of.get().inner();
-        shown(of, stepper.inputs(), &[stepper.teams(), stepper.world().leaders(), INPUTS])
+    /// Writes what every leader senses to `out`, `[teams, leaders, 8]`.
+    ///
+    /// The interpreter's lock is held meanwhile, so no Python thread reads a half-written array.
+    fn read_inputs(&self, mut out: PyReadwriteArray3<'_, f32>) -> PyResult<()> {
+        let stepper = self.stepper()?;
+        let shape = [stepper.teams(), stepper.world().leaders(), INPUTS];
+        if out.shape() != shape {
+            let text = format!("out is {:?}, allowed is [teams, leaders, 8] = {shape:?}", out.shape());
+            return Err(PyValueError::new_err(text));
+        }
+        contiguous("out", out.as_slice_mut())?.copy_from_slice(stepper.inputs());
+        Ok(())
     }
 
-    /// Agents near each POI, a bit an agent, `[teams, pois, words]`.
+    /// Agents within the observation radius of each POI, one bit per agent, `[teams, pois, words]`.
     #[getter]
-    fn near<'py>(of: &Bound<'py, Self>) -> PyResult<Bound<'py, PyArrayDyn<u32>>> {
-        let stepper = of.get().inner();
+    fn near<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<u32>>> {
+        let stepper = self.stepper()?;
         let words = stepper.world().constants.words as usize;
-        shown(of, stepper.near(), &[stepper.teams(), stepper.world().pois.len(), words])
+        copied(py, stepper.near(), &[stepper.teams(), stepper.world().pois.len(), words])
     }
 
     /// POIs observed since the start, `[teams, pois]`.
     #[getter]
-    fn observed<'py>(of: &Bound<'py, Self>) -> PyResult<Bound<'py, PyArrayDyn<bool>>> {
-        let stepper = of.get().inner();
-        shown(of, stepper.observed(), &[stepper.teams(), stepper.world().pois.len()])
-    }
-
-    /// POIs observed for the first time by the last step, `[teams, pois]`.
-    #[getter]
-    fn newly_observed<'py>(of: &Bound<'py, Self>) -> PyResult<Bound<'py, PyArrayDyn<bool>>> {
-        let stepper = of.get().inner();
-        shown(of, stepper.newly_observed(), &[stepper.teams(), stepper.world().pois.len()])
+    fn observed<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<bool>>> {
+        let stepper = self.stepper()?;
+        copied(py, stepper.observed(), &[stepper.teams(), stepper.world().pois.len()])
     }
 
     /// Steps played since the start, `[teams]`.
     #[getter]
-    fn steps<'py>(of: &Bound<'py, Self>) -> PyResult<Bound<'py, PyArrayDyn<u32>>> {
-        let stepper = of.get().inner();
-        shown(of, stepper.steps(), &[stepper.teams()])
+    fn steps<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<u32>>> {
+        let stepper = self.stepper()?;
+        copied(py, stepper.steps(), &[stepper.teams()])
     }
 
-    /// Where everyone is: positions and headings `[teams, agents, 2]`, speeds `[teams, agents]`.
+    /// Returns positions and headings `[teams, agents, 2]` and speeds `[teams, agents]`, leaders first.
     fn states<'py>(&self, py: Python<'py>) -> PyResult<States<'py>> {
-        let (teams, agents) = (self.teams(), self.config.world.leaders.len() + self.config.world.followers.len());
+        let (teams, agents) = (self.teams()?, self.config.world.leaders.len() + self.config.world.followers.len());
         let [positions, headings, speeds] = workers::aside(py, || {
-            let mut stepper = self.inner();
+            let mut stepper = self.stepper()?;
             let stepping::States { positions, headings, speeds } = stepper.states();
-            [positions, headings, speeds].map(<[f32]>::to_vec)
-        });
+            PyResult::Ok([positions, headings, speeds].map(<[f32]>::to_vec))
+        })?;
         let pairs = |values| PyArray1::from_vec(py, values).reshape([teams, agents, 2]);
         Ok((pairs(positions)?, pairs(headings)?, PyArray1::from_vec(py, speeds).reshape([teams, agents])?))
     }
 
-    /// A picture of a team, `[height, width, 3]`, its longer side of so many pixels.
+    /// Draws a team, `[height, width, 3]`; the longer side has the given number of pixels.
     fn render<'py>(&self, py: Python<'py>, team: usize, pixels: u32) -> PyResult<Bound<'py, PyArray3<u8>>> {
-        /// Millimetres of the longer side, which letters are sized for.
+        /// Millimetres of the longer side; letters are sized for it.
         const SIDE: f64 = 80.0;
         let drawn = workers::aside(py, || {
-            let mut stepper = self.inner();
+            let mut stepper = self.stepper()?;
             if team >= stepper.teams() {
-                return None;
+                return Ok(None);
             }
             let team = team_of(&mut stepper, team);
             let view = Viewport::new(&self.config, [DVec2::ZERO, self.config.world.map.into()], SIDE);
@@ -193,17 +191,17 @@ impl Stepper {
             let picture = scene.pixels(f64::from(pixels.clamp(16, 4096)) / SIDE);
             let rgb: Vec<u8> =
                 picture.data().chunks_exact(4).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
-            Some((picture.height() as usize, picture.width() as usize, rgb))
-        });
+            PyResult::Ok(Some((picture.height() as usize, picture.width() as usize, rgb)))
+        })?;
         let Some((height, width, rgb)) = drawn else {
-            let text = format!("team {team} of {} (they count from 0)", self.teams());
+            let text = format!("team {team} of {} (they count from 0)", self.teams()?);
             return Err(PyValueError::new_err(text));
         };
         PyArray1::from_vec(py, rgb).reshape([height, width, 3])
     }
 }
 
-/// A team as it stands, leaders in their colours.
+/// The present state of a team as the map draws it, leaders in their colours.
 fn team_of(stepper: &mut stepping::Stepper, team: usize) -> Team {
     let (agents, leaders) = (stepper.world().agents(), stepper.world().leaders());
     let at = |values: &[f32], agent: usize| {
@@ -237,7 +235,7 @@ fn team_of(stepper: &mut stepping::Stepper, team: usize) -> Team {
     }
 }
 
-/// An array as it lies in memory.
+/// Returns the elements of an array, or an error if they are not contiguous in C order.
 fn contiguous<T, E>(what: &str, slice: Result<T, E>) -> PyResult<T> {
     slice.map_err(|_| PyValueError::new_err(format!("{what} are not C-contiguous")))
 }

@@ -286,3 +286,14 @@ def test_a_bar_is_drawn(config, monkeypatch):
     assert [(bar.n, bar.total) for bar in bars] == [(7, 7)] and seen == list(range(7))
     train(config, progress=False)
     assert len(bars) == 1
+
+
+def test_results_cannot_be_changed_by_accident(config, tmp_path):
+    run = pickle.loads(pickle.dumps(flotilla.train(config)))
+    for array in (run.policies[0], run.metrics["best_g"]):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+    run.policies[0] = np.zeros_like(run.policies[0])
+    run.metrics["best_g"] = np.ones_like(run.metrics["best_g"])
+    run.save(tmp_path / "run")
+    assert flotilla.Run.open(tmp_path / "run").digest == run.digest
