@@ -1,6 +1,6 @@
 // Keeps of each team's record what its scores hang on, so that little has to come home. The record stays as it is.
 //
-// A set that another set of its POI contains changes no score (src/credit.rs says why). A POI's sets mostly grow as
+// A set that another set of its POI contains changes no score (src/credit/mod.rs says why). A POI's sets mostly grow as
 // agents come near, then shrink, so it is enough to go through them once and keep those that neither their predecessor
 // among the kept ones nor their successor contains. A team's kept sets become the record of an episode of fewer steps.
 //

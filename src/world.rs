@@ -4,10 +4,11 @@ use glam::{DVec2, Vec2};
 
 use crate::config::{Config, LedBy, MAX_AGENTS, MAX_HIDDEN_UNITS, MAX_POIS, MAX_STEPS};
 use crate::declare::Choice;
-use crate::model::couple::{CoupleConstants, Rule};
+use crate::model::couple::CoupleConstants;
 use crate::model::follow::FollowConstants;
 use crate::model::motion::MotionConstants;
 use crate::model::policy::PolicyConstants;
+use crate::model::rule::Rule;
 use crate::model::sense::{Density, SenseConstants};
 
 pub use crate::model::motion::GRID;

@@ -4,7 +4,7 @@
 use flotilla::backend::{Episode, Need, Seen, Strided, owner_bits};
 use flotilla::config::{Fitness, LedBy, Observers};
 use flotilla::credit::{Credit, Scores};
-use flotilla::model::couple;
+use flotilla::model::rule;
 use flotilla::world::{Constants, Led, World};
 use glam::Vec2;
 use rand::rngs::ChaCha8Rng;
@@ -64,7 +64,7 @@ impl Record {
             coupling: self.coupling.clone(),
             rule: {
                 let Rule { observers, windows, after } = &self.rule;
-                couple::Rule::new(observers.among(self.leaders, self.followers), agents, windows, after)
+                rule::Rule::new(observers.among(self.leaders, self.followers), agents, windows, after)
             },
             led: self.led,
         }

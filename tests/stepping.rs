@@ -8,7 +8,7 @@ use flotilla::backend::{Backend, BackendError, Episode, Group, Moment, Need, See
 use flotilla::config::{Fitness, MAX_AGENTS, MAX_POIS, MAX_POPULATION};
 use flotilla::credit::{self, Credit, Scores};
 use flotilla::evaluate::Starts;
-use flotilla::model::couple::Rule;
+use flotilla::model::rule::Rule;
 use flotilla::sample;
 use flotilla::stepping::{StepError, Stepper};
 use flotilla::world::World;

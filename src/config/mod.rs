@@ -11,10 +11,10 @@ use serde::Serialize;
 use crate::reader::{self, Reader};
 
 pub use crate::declare::Choice;
-pub use crate::model::couple::{Coupling, Observers};
 pub use crate::model::follow::Follow;
 pub use crate::model::motion::Motion;
 pub use crate::model::policy::{Actions, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
+pub use crate::model::rule::{Coupling, Observers};
 pub use crate::model::sense::{Density, Sense};
 pub use crate::reader::{Definition, Override, Problem};
 pub use learning::{

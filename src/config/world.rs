@@ -3,7 +3,8 @@
 use std::f64::consts::FRAC_PI_2;
 
 use super::{Coupling, Observers, Paradigm};
-use crate::model::couple::{after, observation_radius, windows};
+use crate::model::couple::observation_radius;
+use crate::model::rule::{after, windows};
 use crate::model::{LEAST, LONGEST};
 use crate::reader::{Allowed, Reader, between, section};
 

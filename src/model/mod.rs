@@ -11,6 +11,7 @@ pub mod couple;
 pub mod follow;
 pub mod motion;
 pub mod policy;
+pub mod rule;
 pub mod sense;
 
 use couple::{CoupleConstants, CoupleLanes};

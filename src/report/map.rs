@@ -5,7 +5,7 @@ use glam::DVec2;
 use super::curves::round_step;
 use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
 use crate::config::{Config, Observers};
-use crate::model::couple::Rule;
+use crate::model::rule::Rule;
 use crate::world::World;
 
 /// Colours of leaders and their followers on white. Green is the observed POIs', and grey nobody's.

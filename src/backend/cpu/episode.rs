@@ -1,0 +1,113 @@
+//! Whole episodes of one vector of teams.
+
+use std::ops::Range;
+
+use fearless_simd::{Simd, prelude::*};
+
+use super::batch::Chain;
+use super::block::{Block, Locus};
+use super::network::Network;
+use crate::backend::{Episode, Seen, Strided};
+use crate::kernels::splat;
+use crate::world::World;
+
+/// Whole episodes of one vector of teams: their policies, and their record.
+pub(super) struct Whole<S: Simd> {
+    pub(super) block: Block<S>,
+    network: Network<S>,
+    /// Group and team of each lane.
+    places: Vec<(usize, usize)>,
+    /// Where POIs are, a lane each; empty where they are the world's in all.
+    moved: Vec<[S::f32s; 2]>,
+    /// `[steps][pois][words][lanes]`, and the counts when they are complete, `[followers][leaders][lanes]`.
+    sets: Vec<u32>,
+    seen: Vec<u32>,
+    /// `[steps][followers][words of leaders][lanes]`, where they are recorded.
+    pub(super) sights: Vec<u32>,
+}
+
+/// Words of a team's sights, if they are recorded.
+pub(super) fn sight_words(world: &World, sighted: bool) -> usize {
+    if sighted { world.sight_words() } else { 0 }
+}
+
+impl<S: Simd> Whole<S> {
+    pub(super) fn new(simd: S, world: &World, sighted: bool) -> Whole<S> {
+        Whole {
+            block: Block::new(simd, world),
+            network: Network::new(simd, world),
+            places: Vec::with_capacity(S::f32s::LEN),
+            moved: Vec::new(),
+            sets: vec![0; world.set_words() * S::f32s::LEN],
+            seen: vec![0; world.followers() * world.leaders() * S::f32s::LEN],
+            sights: vec![0; sight_words(world, sighted) * S::f32s::LEN],
+        }
+    }
+
+    /// Puts `teams` teams of the run, from `first` on, at their start; lanes left over repeat the first.
+    #[inline(always)]
+    pub(super) fn load(&mut self, run: &Chain<'_>, first: usize, teams: usize) {
+        let Whole { block, network, places, moved, .. } = self;
+        moved.clear();
+        places.clear();
+        places.extend((0..S::f32s::LEN).map(|lane| run.locate(first + if lane < teams { lane } else { 0 })));
+        for (lane, &(group, _)) in places.iter().enumerate() {
+            block.place(lane, run.groups[group].starts);
+        }
+        if places.iter().any(|&(group, _)| run.groups[group].moved_pois().is_some()) {
+            moved.resize(run.world.pois.len(), [splat(block.simd, 0.0); 2]);
+            for (lane, &(group, _)) in places.iter().enumerate() {
+                let pois = run.groups[group].moved_pois().unwrap_or(&run.world.pois);
+                for ([x, y], poi) in moved.iter_mut().zip(pois) {
+                    (x[lane], y[lane]) = (poi.x, poi.y);
+                }
+            }
+        }
+        block.start();
+        network.load(run, places);
+    }
+
+    /// Plays some steps.
+    #[inline(always)]
+    pub(super) fn play(&mut self, world: &World, steps: Range<usize>) {
+        let Whole { block, network, moved, sets, seen, sights, .. } = self;
+        if moved.is_empty() {
+            play(block, network, &world.pois, sets, sights, steps);
+        } else {
+            play(block, network, moved, sets, sights, steps);
+        }
+        for (words, count) in seen.chunks_exact_mut(S::f32s::LEN).zip(&block.counts) {
+            count.store_slice(words);
+        }
+    }
+
+    /// One lane's record.
+    pub(super) fn episode(&self, lane: usize, group: usize, team: usize) -> Episode<'_> {
+        let strided = |words| Strided { words, stride: S::f32s::LEN, offset: lane };
+        let seen = Seen::Counts(strided(&self.seen));
+        Episode { group, team, sets: strided(&self.sets), seen, sights: strided(&self.sights) }
+    }
+}
+
+/// Plays some steps; the sets are of all steps, and so are the sights, if there are any.
+#[inline(always)]
+fn play<S: Simd>(
+    block: &mut Block<S>,
+    network: &mut Network<S>,
+    pois: &[impl Locus<S>],
+    sets: &mut [u32],
+    sights: &mut [u32],
+    steps: Range<usize>,
+) {
+    let size = pois.len() * block.world.constants.words as usize * S::f32s::LEN;
+    let of_step = sights.len() / block.world.constants.steps as usize;
+    for step in steps {
+        block.look(pois);
+        network.decide(&block.inputs, &mut block.outputs);
+        if of_step > 0 {
+            block.watch(&mut sights[step * of_step..]);
+        }
+        block.go();
+        block.couple(pois, &mut sets[step * size..]);
+    }
+}

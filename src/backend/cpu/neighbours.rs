@@ -1,0 +1,132 @@
+//! Which agents may be in reach of each other, in any lane.
+
+use fearless_simd::{Simd, SimdMask, prelude::*};
+
+use super::agent::Agent;
+use crate::kernels::math::within;
+use crate::kernels::splat;
+use crate::model::Lanes;
+
+/// Marks the pairs of agents of which one may sense or be drawn to the other, in any lane: `near` is
+/// `[words][agents]`, one bit per agent; `bounds` is scratch memory, one vector of agents each.
+#[inline(always)]
+pub(super) fn find_near<S: Simd>(world: &Lanes<S>, agents: &[Agent<S>], near: &mut [u64], bounds: &mut [Bounds<S>]) {
+    near.fill(0);
+    let (count, leaders) = (agents.len(), world.constants.leaders as usize);
+    let drawn = world.constants.follow.attraction_radius2;
+    let sensed = world.constants.sense.agent_range2.max(drawn);
+    let reach2 = |agent: usize| if agent < leaders { sensed } else { drawn };
+    if count > MANY {
+        let lanes = S::f32s::LEN;
+        for (bounds, agents) in bounds.iter_mut().zip(agents.chunks(lanes)) {
+            bounds.enclose(agents);
+        }
+        for (i, agent) in agents.iter().enumerate() {
+            let reach2 = reach2(i);
+            let own = bounds[i / lanes].around(i % lanes, reach2);
+            for (vector, bounds) in bounds.iter().enumerate().skip(i / lanes) {
+                let first = vector * lanes;
+                let mut bits = bounds.meet(own);
+                if first <= i {
+                    bits &= u64::MAX << (i - first) << 1;
+                }
+                let mut row = 0;
+                while bits != 0 {
+                    let j = first + bits.trailing_zeros() as usize;
+                    // Without a branch: of those whose boxes are near, the processor cannot guess who is.
+                    let within = u64::from(meet::<S>(agent, &agents[j], reach2));
+                    row |= within << (j % 64);
+                    near[i / 64 * count + j] |= within << (i % 64);
+                    bits &= bits - 1;
+                }
+                near[first / 64 * count + i] |= row;
+            }
+        }
+    } else {
+        let near = &mut near[..count];
+        for (i, agent) in agents.iter().enumerate() {
+            let reach2 = reach2(i);
+            let mut row = 0;
+            for j in i + 1..count {
+                if meet::<S>(agent, &agents[j], reach2) {
+                    row |= 1 << j;
+                    near[j] |= 1 << i;
+                }
+            }
+            near[i] |= row;
+        }
+    }
+}
+
+/// Whether the squared distance of two agents is `reach2` at most, in any lane.
+#[inline(always)]
+fn meet<S: Simd>(agent: &Agent<S>, other: &Agent<S>, reach2: f32) -> bool {
+    within::<S>(other.x - agent.x, other.y - agent.y, splat(agent.x.token(), reach2)).any_true()
+}
+
+/// The boxes around some agents' places in all lanes, an agent a lane.
+#[derive(Clone, Copy)]
+pub(super) struct Bounds<S: Simd> {
+    low_x: S::f32s,
+    high_x: S::f32s,
+    low_y: S::f32s,
+    high_y: S::f32s,
+}
+
+impl<S: Simd> Bounds<S> {
+    /// Boxes that nothing is near, as lanes left over hold.
+    pub(super) fn nowhere(simd: S) -> Bounds<S> {
+        let (low, high) = (splat(simd, f32::INFINITY), splat(simd, f32::NEG_INFINITY));
+        Bounds { low_x: low, high_x: high, low_y: low, high_y: high }
+    }
+
+    #[inline(always)]
+    fn enclose(&mut self, agents: &[Agent<S>]) {
+        for (lane, agent) in agents.iter().enumerate() {
+            self.low_x[lane] = agent.x.reduce_min();
+            self.high_x[lane] = agent.x.reduce_max();
+            self.low_y[lane] = agent.y.reduce_min();
+            self.high_y[lane] = agent.y.reduce_max();
+        }
+    }
+
+    /// One agent's box in every lane, widened by its reach.
+    #[inline(always)]
+    fn around(&self, lane: usize, reach2: f32) -> Bounds<S> {
+        let simd = self.low_x.token();
+        // No pair may be lost to a rounding.
+        let reach = reach2.sqrt() * 1.001;
+        Bounds {
+            low_x: splat(simd, self.low_x[lane] - reach),
+            high_x: splat(simd, self.high_x[lane] + reach),
+            low_y: splat(simd, self.low_y[lane] - reach),
+            high_y: splat(simd, self.high_y[lane] + reach),
+        }
+    }
+
+    /// A bit for each agent whose box meets this one.
+    #[inline(always)]
+    fn meet(&self, other: Bounds<S>) -> u64 {
+        let near_x = self.low_x.simd_le(other.high_x) & self.high_x.simd_ge(other.low_x);
+        let near_y = self.low_y.simd_le(other.high_y) & self.high_y.simd_ge(other.low_y);
+        (near_x & near_y).to_bitmask()
+    }
+}
+
+/// Pairs of more agents than this are first looked for by their bounds.
+const MANY: usize = 32;
+
+/// Calls `f` with each agent that may be in reach of this one, and its index, ascending.
+#[inline(always)]
+pub(super) fn each_near<T>(near: &[u64], agents: &[T], agent: usize, mut f: impl FnMut(usize, &T)) {
+    let (mut at, mut first) = (agent, 0);
+    while let Some(&near) = near.get(at) {
+        let mut bits = near;
+        while bits != 0 {
+            let index = first + bits.trailing_zeros() as usize;
+            f(index, &agents[index]);
+            bits &= bits - 1;
+        }
+        (at, first) = (at + agents.len(), first + 64);
+    }
+}

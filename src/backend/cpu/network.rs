@@ -1,0 +1,172 @@
+//! The leaders' policies of one vector of teams.
+
+use fearless_simd::{Simd, prelude::*};
+
+use super::batch::Chain;
+use super::transpose::turn;
+use crate::backend::Weights;
+use crate::kernels::{math, splat};
+use crate::model::policy::PolicyConstants;
+use crate::model::{Constants, policy};
+use crate::world::{INPUTS, OUTPUTS, World};
+
+/// The leaders' policies of one vector of teams.
+pub(super) struct Network<S: Simd> {
+    simd: S,
+    constants: Constants,
+    /// `[leaders]`, layer by layer, units that are weighed together (see [`together`]) a row an input, then the biases.
+    weights: Vec<S::f32s>,
+    /// Where in there each weight of a policy belongs.
+    slots: Vec<usize>,
+    /// A layer's units and the next one's, `[leaders][units]`.
+    hidden: [Vec<S::f32s>; 2],
+}
+
+impl<S: Simd> Network<S> {
+    pub(super) fn new(simd: S, world: &World) -> Network<S> {
+        let constants = world.constants;
+        let zero = splat(simd, 0.0);
+        let widest = constants.policy.widest();
+        let mut slots = vec![0; world.parameters()];
+        let (mut first, mut slot) = (0, 0);
+        for widths in constants.policy.widths[..=constants.policy.layers as usize].windows(2) {
+            let (rows, columns) = (widths[0] as usize + 1, widths[1] as usize);
+            let mut column = 0;
+            while column < columns {
+                let block = together(columns - column);
+                for (row, unit) in (0..rows).flat_map(|row| (0..block).map(move |unit| (row, unit))) {
+                    slots[first + row * columns + column + unit] = slot;
+                    slot += 1;
+                }
+                column += block;
+            }
+            first += rows * columns;
+        }
+        Network {
+            simd,
+            constants,
+            weights: vec![zero; world.leaders() * world.parameters()],
+            slots,
+            hidden: [vec![zero; world.leaders() * widest], vec![zero; world.leaders() * widest]],
+        }
+    }
+
+    /// Takes the policies of each lane's group and team.
+    #[inline(always)]
+    pub(super) fn load(&mut self, run: &Chain<'_>, places: &[(usize, usize)]) {
+        let Network { simd, weights, slots, .. } = self;
+        let (leaders, parameters) = (run.world.leaders(), run.world.parameters());
+        for (leader, weights) in weights.chunks_exact_mut(parameters).enumerate() {
+            // Four lanes at a time, the narrowest vector: four policies' weights are turned into four weights' lanes.
+            for (quad, places) in places.as_chunks::<4>().0.iter().enumerate() {
+                let policies = places.map(|(group, team)| {
+                    let group = &run.groups[group];
+                    let policy = group.teams[team * leaders + leader] as usize;
+                    let Weights::OnHost(weights) = group.weights else { unreachable!("seen before playing") };
+                    &weights[group.place(weights, leader, policy)..][..parameters]
+                });
+                turn(
+                    *simd,
+                    policies,
+                    #[inline(always)]
+                    |parameter, lanes| {
+                        weights[slots[parameter]].as_mut_slice()[quad * 4..quad * 4 + 4].copy_from_slice(lanes);
+                    },
+                );
+            }
+        }
+    }
+
+    /// Leaders decide where to turn and how fast to go.
+    #[inline(always)]
+    pub(super) fn decide(&mut self, inputs: &[[S::f32s; INPUTS]], outputs: &mut [[S::f32s; OUTPUTS]]) {
+        let Network { weights, hidden, constants, .. } = self;
+        let &mut Constants { leaders, policy: PolicyConstants { layers, widths, parameters }, .. } = constants;
+        let mut first = 0;
+        let [mut to, mut from] = hidden.each_mut().map(|units| &mut units[..]);
+        for (layer, widths) in widths[..=layers as usize].windows(2).enumerate() {
+            let [rows, columns] = [widths[0] as usize, widths[1] as usize];
+            let inputs = if layer == 0 { inputs.as_flattened() } else { &*from };
+            let units = &mut to[..leaders as usize * columns];
+            let weights = (0..leaders as usize).map(|leader| &weights[leader * parameters as usize + first..]);
+            match (rows, columns) {
+                // The paper's network, whose sizes the compiler makes use of.
+                (INPUTS, 10) => weigh_layer::<S, INPUTS, 10>(inputs, units, weights),
+                (10, OUTPUTS) => weigh_layer::<S, 10, OUTPUTS>(inputs, units, weights),
+                _ => {
+                    let leaders = inputs.chunks_exact(rows).zip(units.chunks_exact_mut(columns));
+                    for ((inputs, units), weights) in leaders.zip(weights) {
+                        weigh::<S>(inputs, units, weights);
+                    }
+                }
+            }
+            // All leaders' tanh at once, and in short loops: the processor sees far enough ahead to keep its units
+            // busy.
+            for unit in &mut *units {
+                *unit = policy::tame::<S>(*unit);
+            }
+            let (eights, rest) = units.as_chunks_mut::<8>();
+            for units in eights {
+                let mut halves = [(units[0], units[0]); 8];
+                for (half, &unit) in halves.iter_mut().zip(&*units) {
+                    *half = math::half_tanh::<S>(unit);
+                }
+                for (unit, &half) in units.iter_mut().zip(&halves) {
+                    *unit = math::whole_tanh::<S>(half);
+                }
+            }
+            for unit in rest {
+                *unit = math::whole_tanh::<S>(math::half_tanh::<S>(*unit));
+            }
+            first += (rows + 1) * columns;
+            std::mem::swap(&mut from, &mut to);
+        }
+        if widths[layers as usize] as usize == OUTPUTS {
+            return outputs.copy_from_slice(&from.as_chunks::<OUTPUTS>().0[..leaders as usize]);
+        }
+        for ((answer, inputs), wanted) in outputs.iter_mut().zip(inputs).zip(from.as_chunks().0) {
+            *answer = policy::choose::<S>(inputs, wanted);
+        }
+    }
+}
+
+/// Units that are weighed together, of those left in a layer: inputs are read once for all.
+#[inline(always)]
+fn together(left: usize) -> usize {
+    match left {
+        10 => 10,
+        4.. => 4,
+        2 | 3 => 2,
+        _ => 1,
+    }
+}
+
+/// Every leader's units of one layer, before their tanh.
+#[inline(always)]
+fn weigh_layer<'a, S: Simd, const INPUTS: usize, const UNITS: usize>(
+    inputs: &[S::f32s],
+    units: &mut [S::f32s],
+    weights: impl Iterator<Item = &'a [S::f32s]>,
+) {
+    let leaders = inputs.as_chunks::<INPUTS>().0.iter().zip(units.as_chunks_mut::<UNITS>().0);
+    for ((inputs, units), weights) in leaders.zip(weights) {
+        *units = policy::weigh::<S, UNITS>(inputs, &weights[..(INPUTS + 1) * UNITS]);
+    }
+}
+
+/// One leader's units of one layer, before their tanh.
+#[inline(always)]
+fn weigh<S: Simd>(inputs: &[S::f32s], mut units: &mut [S::f32s], mut weights: &[S::f32s]) {
+    while !units.is_empty() {
+        let count = together(units.len());
+        let (these, weights_of_these);
+        (these, units) = units.split_at_mut(count);
+        (weights_of_these, weights) = weights.split_at((inputs.len() + 1) * count);
+        match count {
+            10 => these.copy_from_slice(&policy::weigh::<S, 10>(inputs, weights_of_these)),
+            4 => these.copy_from_slice(&policy::weigh::<S, 4>(inputs, weights_of_these)),
+            2 => these.copy_from_slice(&policy::weigh::<S, 2>(inputs, weights_of_these)),
+            _ => these.copy_from_slice(&policy::weigh::<S, 1>(inputs, weights_of_these)),
+        }
+    }
+}

@@ -1,0 +1,34 @@
+//! Transposes between rows per team and columns of lanes.
+
+use fearless_simd::{Simd, f32x4, prelude::*};
+
+/// Turns rows of equal length into columns: `put` gets the number of each and its four numbers.
+#[inline(always)]
+pub(crate) fn turn<S: Simd>(simd: S, rows: [&[f32]; 4], mut put: impl FnMut(usize, &[f32])) {
+    let [a, b, c, d] = rows;
+    let columns = a.len();
+    let whole = columns / 4 * 4;
+    for at in (0..whole).step_by(4) {
+        // Written out: a call that is not inlined knows nothing of wide instructions.
+        let fours = [
+            f32x4::from_slice(simd, &a[at..at + 4]),
+            f32x4::from_slice(simd, &b[at..at + 4]),
+            f32x4::from_slice(simd, &c[at..at + 4]),
+            f32x4::from_slice(simd, &d[at..at + 4]),
+        ];
+        for (column, four) in (at..).zip(&transposed(fours)) {
+            put(column, four.as_slice());
+        }
+    }
+    for column in whole..columns {
+        put(column, &[a[column], b[column], c[column], d[column]]);
+    }
+}
+
+/// Rows turned into columns.
+#[inline(always)]
+pub(crate) fn transposed<S: Simd>([a, b, c, d]: [f32x4<S>; 4]) -> [f32x4<S>; 4] {
+    let (low, high) = (a.zip_low(c), a.zip_high(c));
+    let (other_low, other_high) = (b.zip_low(d), b.zip_high(d));
+    [low.zip_low(other_low), low.zip_high(other_low), high.zip_low(other_high), high.zip_high(other_high)]
+}

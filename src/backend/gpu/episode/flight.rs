@@ -1,0 +1,312 @@
+//! Work in flight: the device's buffers of one batch, and how a batch is submitted.
+
+use std::any::Any;
+
+use super::planner::{PACKED_HEAD, Share, State, Task, Work, gather};
+use super::shape::Shape;
+use super::{GpuEpisodes, Records};
+use crate::backend::gpu::device::{BINDING_ALIGNMENT, DeviceError, Gpu, Stopwatch, grid, timed};
+use crate::backend::gpu::population::{Population, Stretch, TOGETHER, parts};
+use crate::backend::{BackendError, FOUR, Group, Moment, Weights};
+use crate::host::Instant;
+use crate::parallel::*;
+
+/// Alignment of each kernel's first task, in tasks, so that a binding may start there. The size of a task is no power
+/// of two.
+const TASK_ALIGNMENT: usize = BINDING_ALIGNMENT / 4;
+/// Share of all sets that a packed record has room for at first.
+pub(super) const KEPT: f64 = 1.0 / 16.0;
+/// Additional words of a packed record.
+const KEPT_AT_LEAST: usize = 256;
+
+/// What is to be gathered from populations on the device, and the choices of those teams, `[teams][leaders]` each.
+type Gathering<'a> = (Vec<(Stretch, &'a Population)>, Vec<u32>);
+
+/// The device's side of one batch; buffers only grow.
+#[derive(Default)]
+pub(super) struct Buffers {
+    pub(super) worlds: Option<wgpu::Buffer>,
+    pub(super) tasks: Option<wgpu::Buffer>,
+    pub(super) places: Option<wgpu::Buffer>,
+    pub(super) stretches: Option<wgpu::Buffer>,
+    pub(super) choices: Option<wgpu::Buffer>,
+    pub(super) weights: Option<wgpu::Buffer>,
+    pub(super) record: Option<wgpu::Buffer>,
+    pub(super) moments: Option<wgpu::Buffer>,
+    pub(super) states: Option<wgpu::Buffer>,
+    pub(super) record_back: Option<wgpu::Buffer>,
+    pub(super) moments_back: Option<wgpu::Buffer>,
+    pub(super) least: Option<wgpu::Buffer>,
+    pub(super) packed: Option<wgpu::Buffer>,
+    pub(super) packed_back: Option<wgpu::Buffer>,
+    /// What comes home of the packed record, if it is packed, and whether the whole one comes in any case.
+    pub(super) sent: Option<Parcel>,
+    pub(super) whole: bool,
+    pub(super) watch: Option<Stopwatch>,
+    /// What to wait for.
+    pub(super) submitted: Option<wgpu::SubmissionIndex>,
+}
+
+/// A packed record on its way home.
+#[derive(Clone, Copy)]
+pub(super) struct Parcel {
+    /// Words that there is room for, tables and owners among them.
+    pub(super) room: usize,
+    /// Bytes that are copied: all, or only how many words were taken.
+    pub(super) bytes: u64,
+}
+
+impl Buffers {
+    /// Copies the whole record of a batch that was played, and waits for it.
+    pub(super) fn bring_record(&mut self, gpu: &Gpu, bytes: u64) -> Result<(), DeviceError> {
+        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ;
+        let back = grown(gpu, &mut self.record_back, "record, read back", bytes, usage)?;
+        let Some(record) = &self.record else { return Ok(()) };
+        let submitted = gpu.scoped("record, read back", || {
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            encoder.copy_buffer_to_buffer(record, 0, back, 0, bytes);
+            gpu.queue.submit([encoder.finish()])
+        })?;
+        gpu.wait_for(Some(submitted))
+    }
+}
+
+/// A buffer of at least so many bytes, made anew where the present one is too small.
+fn grown<'a>(
+    gpu: &Gpu,
+    buffer: &'a mut Option<wgpu::Buffer>,
+    what: &str,
+    bytes: u64,
+    usage: wgpu::BufferUsages,
+) -> Result<&'a wgpu::Buffer, DeviceError> {
+    let bytes = bytes.max(BINDING_ALIGNMENT as u64);
+    if buffer.as_ref().is_none_or(|buffer| buffer.size() < bytes) {
+        // Free the old one first: the two together may not fit.
+        if let Some(old) = buffer.take() {
+            old.destroy();
+        }
+        *buffer = Some(gpu.buffer(what, bytes, usage)?);
+    }
+    Ok(buffer.as_ref().expect("just made"))
+}
+
+impl GpuEpisodes {
+    /// Hands one batch to the device.
+    pub(super) fn submit(
+        &mut self,
+        flight: usize,
+        groups: &[Group<'_>],
+        work: &Work,
+        trace: bool,
+    ) -> Result<(), BackendError> {
+        use wgpu::BufferUsages as Usage;
+        let start = Instant::now();
+        let (stretches, choices) = self.stretches(groups, work)?;
+        self.fill_staging(groups, work);
+        let gathered = Instant::now();
+        self.stages.gather += gathered - start;
+        // Round by round, each shape's tasks stand together, from where a binding may start.
+        let mut tasks: Vec<Task> = Vec::new();
+        let mut dispatches: Vec<(Shape, usize, [u32; 3])> = Vec::new();
+        // Those that play every task once.
+        let mut first_round = 0;
+        let shapes = &work.shapes;
+        let new = shapes.iter().filter(|shape| !self.pipelines.contains_key(shape)).count();
+        if self.pipelines.len() + new > self.kept_kernels {
+            self.pipelines.retain(|shape, _| shapes.contains(shape));
+        }
+        let rounds = work.shares.iter().map(|share| (share.task.end as usize).div_ceil(share.steps_a_dispatch)).max();
+        for (round, &shape) in (0..rounds.unwrap_or(0)).flat_map(|round| shapes.iter().map(move |shape| (round, shape)))
+        {
+            tasks.resize(tasks.len().next_multiple_of(TASK_ALIGNMENT), Task::default());
+            let first = tasks.len();
+            tasks
+                .extend(work.shares.iter().filter(|share| share.shape == shape).filter_map(|share| share.round(round)));
+            if tasks.len() > first {
+                let grid = grid(tasks.len() - first, &self.gpu.limits);
+                // The grid's last row may be longer than the tasks: those workgroups play no team.
+                tasks.resize(first + (grid[0] * grid[1]) as usize, Task::default());
+                dispatches.push((shape, first, grid));
+                self.prepare_pipeline(shape)?;
+                first_round += usize::from(round == 0);
+            }
+        }
+        if work.head.is_some() {
+            self.prepare_packing()?;
+        }
+        let sent = work.head.map(|head| {
+            let most = work.record - PACKED_HEAD - 1;
+            let room = match self.records {
+                Records::Packed => most,
+                _ => head + (work.sets as f64 * self.kept) as usize + KEPT_AT_LEAST,
+            };
+            // Where nearly all sets are kept, they are packed only to see when that changes.
+            match room <= most {
+                true => Parcel { room, bytes: ((PACKED_HEAD + room) * size_of::<u32>()) as u64 },
+                false => Parcel { room: head, bytes: (PACKED_HEAD * size_of::<u32>()) as u64 },
+            }
+        });
+        let whole = work.head.is_none_or(|head| sent.is_some_and(|sent| sent.room == head));
+
+        let gpu = &self.gpu;
+        let buffers = &mut self.flights[flight];
+        let input = Usage::STORAGE | Usage::COPY_DST;
+        let output = Usage::STORAGE | Usage::COPY_SRC;
+        let back = Usage::COPY_DST | Usage::MAP_READ;
+        let record_bytes = (work.record * size_of::<u32>()) as u64;
+        let moment_bytes = (work.moments * size_of::<Moment>()) as u64;
+        let upload = |buffer, what, bytes: &[u8]| -> Result<wgpu::Buffer, DeviceError> {
+            let buffer = grown(gpu, buffer, what, bytes.len() as u64, input)?;
+            gpu.scoped(what, || gpu.write(buffer, 0, bytes))?;
+            Ok(buffer.clone())
+        };
+        let worlds = upload(&mut buffers.worlds, "worlds", bytemuck::cast_slice(&work.worlds))?;
+        let all_tasks = upload(&mut buffers.tasks, "tasks", bytemuck::cast_slice(&tasks))?;
+        let places = upload(&mut buffers.places, "places", bytemuck::cast_slice(&work.places))?;
+        let weight_bytes = (work.weights * size_of::<[f32; FOUR]>()) as u64;
+        let weights = grown(gpu, &mut buffers.weights, "weights", weight_bytes, input)?.clone();
+        for run in work.shares.chunk_by(|a, b| is_on_host(groups, a) == is_on_host(groups, b)) {
+            if is_on_host(groups, &run[0]) {
+                let (first, last) = (run[0].task.weights as usize, &run[run.len() - 1]);
+                let end = last.task.weights as usize + last.fours(groups);
+                let bytes = bytemuck::cast_slice(&self.staging[first..end]);
+                let offset = (first * size_of::<[f32; FOUR]>()) as u64;
+                gpu.scoped("weights", || gpu.write(&weights, offset, bytes))?;
+            }
+        }
+        let mut gathers = Vec::with_capacity(stretches.len());
+        if let Some(kernels) = self.kernels.as_ref().filter(|_| !stretches.is_empty()) {
+            let structs: Vec<Stretch> = stretches.iter().map(|(stretch, _)| *stretch).collect();
+            let structs = upload(&mut buffers.stretches, "stretches", &parts(&structs))?;
+            let choices = upload(&mut buffers.choices, "choices", bytemuck::cast_slice(&choices))?;
+            for (part, (stretch, population)) in stretches.iter().enumerate() {
+                gathers.push(kernels.gather((&structs, part), stretch, &choices, population, &weights)?);
+            }
+        }
+        let record = grown(gpu, &mut buffers.record, "record", record_bytes, output)?;
+        let moments = grown(gpu, &mut buffers.moments, "moments", moment_bytes, output)?;
+        let state_bytes = (work.states * size_of::<State>()) as u64;
+        let states = grown(gpu, &mut buffers.states, "states", state_bytes, output)?;
+        let record_back = match whole {
+            true => Some(grown(gpu, &mut buffers.record_back, "record, read back", record_bytes, back)?),
+            false => None,
+        };
+        let moments_back = match trace {
+            true => Some(grown(gpu, &mut buffers.moments_back, "moments, read back", moment_bytes, back)?),
+            false => None,
+        };
+
+        let packing = match (work.head, sent, &self.pack) {
+            (Some(head), Some(sent), Some(pack)) => {
+                let bytes = ((PACKED_HEAD + sent.room) * size_of::<u32>()) as u64;
+                let packed = grown(gpu, &mut buffers.packed, "packed record", bytes, output | Usage::COPY_DST)?;
+                let header = [head as u32, sent.room as u32];
+                gpu.scoped("packed record", || gpu.write(packed, 0, bytemuck::cast_slice(&header)))?;
+                let back = grown(gpu, &mut buffers.packed_back, "packed record, read back", sent.bytes, back)?;
+                let least = upload(&mut buffers.least, "sizes of sets", bytemuck::cast_slice(&work.least))?;
+                Some((pack, least, packed, back, sent.bytes))
+            }
+            _ => None,
+        };
+
+        let (mut bound, mut packs) = (Vec::with_capacity(dispatches.len()), Vec::new());
+        for (index, (shape, first, grid)) in dispatches.into_iter().enumerate() {
+            let tasks = wgpu::BufferBinding {
+                buffer: &all_tasks,
+                offset: (first * size_of::<Task>()) as u64,
+                size: wgpu::BufferSize::new(u64::from(grid[0] * grid[1]) * size_of::<Task>() as u64),
+            };
+            let [worlds, places, weights, record, moments, states] =
+                [&worlds, &places, &weights, record, moments, states].map(|buffer| buffer.as_entire_buffer_binding());
+            if let Some(((pipeline, layout), least, packed, ..)) = packing.as_ref().filter(|_| index < first_round) {
+                let [least, packed] = [least, *packed].map(|buffer| buffer.as_entire_buffer_binding());
+                let group =
+                    gpu.bind("pack", layout, &[worlds.clone(), tasks.clone(), least, packed, record.clone()])?;
+                packs.push((pipeline, group, grid));
+            }
+            let group =
+                gpu.bind("episode", &self.layout, &[worlds, tasks, places, weights, record, moments, states])?;
+            bound.push((&self.pipelines[&shape].pipeline, group, grid));
+        }
+        let watch = buffers.watch.as_ref();
+        let submitted = gpu.scoped("episodes", || {
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            let mut pass = encoder.begin_compute_pass(&timed(watch));
+            for (pipeline, group, [x, y, z]) in gathers.iter().chain(&bound).chain(&packs) {
+                pass.set_pipeline(pipeline);
+                pass.set_bind_group(0, group, &[]);
+                pass.dispatch_workgroups(*x, *y, *z);
+            }
+            drop(pass);
+            watch.inspect(|watch| watch.stop(&mut encoder));
+            if let Some(record_back) = record_back {
+                encoder.copy_buffer_to_buffer(record, 0, record_back, 0, record_bytes);
+            }
+            if let Some((.., packed, back, bytes)) = packing {
+                encoder.copy_buffer_to_buffer(packed, 0, back, 0, bytes);
+            }
+            if let Some(moments_back) = moments_back {
+                encoder.copy_buffer_to_buffer(moments, 0, moments_back, 0, moment_bytes);
+            }
+            gpu.queue.submit([encoder.finish()])
+        })?;
+        buffers.submitted = Some(submitted);
+        (buffers.sent, buffers.whole) = (sent, whole);
+        self.stages.upload += gathered.elapsed();
+        Ok(())
+    }
+
+    /// What a batch has to gather.
+    fn stretches<'a>(&self, groups: &[Group<'a>], work: &Work) -> Result<Gathering<'a>, BackendError> {
+        let (mut stretches, mut choices) = (Vec::new(), Vec::new());
+        for shares in work.shares.chunk_by(|a, b| a.group == b.group) {
+            let group = &groups[shares[0].group];
+            let Weights::Held(held) = group.weights else { continue };
+            let ours = |population: &&Population| self.kernels.as_ref().is_some_and(|k| population.is_of(k));
+            let population = (held as &dyn Any).downcast_ref().filter(ours).ok_or(BackendError::HeldElsewhere)?;
+            let leaders = group.world.leaders();
+            population.check([leaders, group.policies, group.world.parameters()])?;
+            let teams: u32 = shares.iter().map(|share| share.task.teams).sum();
+            for first in (0..leaders).step_by(TOGETHER) {
+                let stretch = Stretch {
+                    leaders: leaders as u32,
+                    first: first as u32,
+                    count: TOGETHER.min(leaders - first) as u32,
+                    parameters: group.world.constants.policy.parameters,
+                    teams,
+                    teams_a_task: shares[0].task.teams,
+                    choices: choices.len() as u32,
+                    weights: shares[0].task.weights,
+                };
+                stretches.push((stretch, population));
+            }
+            choices.extend(&group.teams[shares[0].first_team * leaders..][..teams as usize * leaders]);
+        }
+        Ok((stretches, choices))
+    }
+
+    /// Gathers the weights of every task whose policies are on the host; leaves room for the others'.
+    fn fill_staging(&mut self, groups: &[Group<'_>], work: &Work) {
+        if !work.shares.iter().any(|share| is_on_host(groups, share)) {
+            return;
+        }
+        self.staging.resize(work.weights, [0.0; FOUR]);
+        let mut rest = &mut self.staging[..];
+        let mut parts = Vec::with_capacity(work.shares.len());
+        for share in &work.shares {
+            let group = &groups[share.group];
+            let (part, tail) = rest.split_at_mut(share.fours(groups));
+            rest = tail;
+            if let Weights::OnHost(weights) = group.weights {
+                parts.push((share, group, weights, part));
+            }
+        }
+        parts.into_par_iter().for_each(|(share, group, weights, part)| {
+            gather(group, weights, share.first_team, share.task.teams as usize, part);
+        });
+    }
+}
+
+fn is_on_host(groups: &[Group<'_>], share: &Share) -> bool {
+    matches!(groups[share.group].weights, Weights::OnHost(_))
+}

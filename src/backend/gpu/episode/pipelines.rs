@@ -1,0 +1,90 @@
+//! Compiled kernels: which worlds get one of their own, and how long each is kept.
+
+use std::cmp::Reverse;
+use std::collections::hash_map::Entry;
+use std::collections::{BTreeMap, HashSet};
+
+use super::GpuEpisodes;
+use super::shape::{Capacity, Kept, Kernel, MAX_OFFSET, Packing, Shape};
+use super::source::{packing, source};
+use crate::backend::Group;
+use crate::backend::gpu::device::{Binding, DeviceError};
+
+/// Maximum number of specialised kernels under [`Kernel::Best`]: each takes a fraction of a second to compile.
+const MAX_SPECIALISED: usize = 16;
+/// Default maximum of kernels per batch, and of kernels kept from one batch to the next: a driver needs megabytes for
+/// each.
+pub(super) const KEPT_KERNELS: usize = 64;
+/// Default number of rollouts after which an unused pipeline is evicted. A process that trains one layout after another
+/// needs new kernels for each; a process that plays ever new worlds should rarely compile.
+pub(super) const IDLE_PLAYS: u64 = 1000;
+
+/// A kernel, and the last play that took it.
+pub(super) struct Compiled {
+    pub(super) pipeline: wgpu::ComputePipeline,
+    pub(super) played: u64,
+}
+
+/// The shapes to play by kernels of their own: those compiled already, and of the others those with most to play, up to
+/// [`MAX_SPECIALISED`] in all.
+fn worth_compiling(work: BTreeMap<Shape, u64>, compiled: &HashSet<Shape>) -> HashSet<Shape> {
+    let room = MAX_SPECIALISED.saturating_sub(compiled.iter().filter(|shape| shape.is_specialised()).count());
+    let (mut shapes, mut new): (Vec<_>, Vec<_>) = work.into_iter().partition(|(shape, _)| compiled.contains(shape));
+    new.sort_by_key(|(_, agent_steps)| Reverse(*agent_steps));
+    shapes.extend(new.into_iter().take(room));
+    shapes.into_iter().map(|(shape, _)| shape).collect()
+}
+
+impl GpuEpisodes {
+    pub(super) fn room(&self) -> Capacity {
+        let limits = &self.gpu.limits;
+        Capacity {
+            batch: self.batch_bytes,
+            kernels: self.kept_kernels,
+            buffer: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(MAX_OFFSET),
+            workgroup: limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x) as usize,
+            workgroup_bytes: limits.max_compute_workgroup_storage_size as usize,
+        }
+    }
+
+    /// The shapes that get kernels of their own.
+    pub(super) fn specialised(&self, groups: &[Group<'_>], trace: bool) -> HashSet<Shape> {
+        let mut work: BTreeMap<Shape, u64> = BTreeMap::new();
+        for group in groups {
+            if let Some(packing) = Packing::specialised(group.world, self.room()) {
+                let agent_steps = group.team_count() * group.world.agents() * group.world.steps();
+                let shape = Shape::specialised(group.world, packing, Kept::of(group, trace));
+                *work.entry(shape).or_default() += agent_steps as u64;
+            }
+        }
+        match self.kernel {
+            Kernel::Generic => HashSet::new(),
+            Kernel::Specialised => work.into_keys().collect(),
+            // Nobody traces for speed.
+            Kernel::Best if trace => HashSet::new(),
+            Kernel::Best => worth_compiling(work, &self.pipelines.keys().copied().collect()),
+        }
+    }
+
+    pub(super) fn prepare_packing(&mut self) -> Result<(), DeviceError> {
+        use Binding::{Read, Write};
+        if self.pack.is_none() {
+            let layout = self.gpu.layout("pack", &[Read, Read, Read, Write, Write])?;
+            let pipeline = self.gpu.own_pipeline("pack", &(self.edit)(packing()), "pack", &layout)?;
+            self.pack = Some((pipeline, layout));
+        }
+        Ok(())
+    }
+
+    pub(super) fn prepare_pipeline(&mut self, shape: Shape) -> Result<(), DeviceError> {
+        match self.pipelines.entry(shape) {
+            Entry::Occupied(mut entry) => entry.get_mut().played = self.plays,
+            Entry::Vacant(entry) => {
+                let pipeline =
+                    self.gpu.own_pipeline("episode", &(self.edit)(source(shape)), "episode", &self.layout)?;
+                entry.insert(Compiled { pipeline, played: self.plays });
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,87 @@
+//! Reading back: waits for a batch and hands its record to whoever scores it.
+
+use std::time::Duration;
+
+use super::GpuEpisodes;
+use super::flight::Parcel;
+use super::planner::{PACKED_HEAD, Share, Work};
+use crate::backend::Moment;
+use crate::backend::gpu::device::DeviceError;
+use crate::host::Instant;
+use crate::parallel::*;
+
+/// What came home of a batch's record.
+#[derive(Clone, Copy)]
+pub(super) enum Home<'a> {
+    /// All of it.
+    Whole(&'a [u32]),
+    /// What scores hang on, as `shaders/pack.wgsl` has it.
+    Packed(&'a [u32]),
+}
+
+/// Gets a task with the record and the moments of its batch.
+pub(super) type Done<'a> = dyn Fn(&Share, Home<'_>, &[Moment]) + Sync + 'a;
+
+impl GpuEpisodes {
+    /// Waits for one batch and hands its record on.
+    pub(super) fn collect(
+        &mut self,
+        flight: usize,
+        work: &Work,
+        trace: bool,
+        done: &Done<'_>,
+    ) -> Result<(), DeviceError> {
+        let start = Instant::now();
+        self.gpu.wait_for(self.flights[flight].submitted.clone())?;
+        let done_waiting = Instant::now();
+        let mut score = Duration::ZERO;
+        let mut share_out = |record: Home<'_>, moments: &[Moment]| {
+            let start = Instant::now();
+            work.shares.par_iter().for_each(|share| done(share, record, moments));
+            score += start.elapsed();
+        };
+        let record_bytes = (work.record * size_of::<u32>()) as u64;
+        let moment_bytes = (work.moments * size_of::<Moment>()) as u64;
+        let buffers = &mut self.flights[flight];
+        let mut fits = false;
+        if let (Some(head), Some(Parcel { room, bytes }), Some(back)) = (work.head, buffers.sent, &buffers.packed_back)
+        {
+            let used = self.gpu.mapped(back, 0..bytes, |bytes| {
+                let words: &[u32] = bytemuck::cast_slice(bytes);
+                let used = words[0] as usize;
+                fits = used <= room && words.len() > PACKED_HEAD;
+                if fits {
+                    share_out(Home::Packed(&words[PACKED_HEAD..]), &[]);
+                }
+                used
+            })?;
+            // Half as much again, since the next generation may keep more; and a batch that did stays in mind for a
+            // while.
+            let kept = 1.5 * used.saturating_sub(head) as f64 / work.sets as f64;
+            self.kept = kept.max(0.9 * self.kept);
+        }
+        if !fits {
+            if !buffers.whole {
+                buffers.bring_record(&self.gpu, record_bytes)?;
+            }
+            match (&buffers.record_back, &buffers.moments_back) {
+                (Some(record), Some(moments)) if trace => self.gpu.mapped(record, 0..record_bytes, |record| {
+                    self.gpu.mapped(moments, 0..moment_bytes, |moments| {
+                        share_out(Home::Whole(bytemuck::cast_slice(record)), bytemuck::cast_slice(moments));
+                    })
+                })??,
+                (Some(record), _) => self.gpu.mapped(record, 0..record_bytes, |record| {
+                    share_out(Home::Whole(bytemuck::cast_slice(record)), &[]);
+                })?,
+                _ => unreachable!("a batch was submitted"),
+            }
+        }
+        if let Some(watch) = &buffers.watch {
+            self.stages.gpu += watch.read(&self.gpu)?;
+        }
+        self.stages.wait += done_waiting - start;
+        self.stages.score += score;
+        self.stages.read_back += done_waiting.elapsed().saturating_sub(score);
+        Ok(())
+    }
+}

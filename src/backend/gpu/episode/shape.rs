@@ -1,0 +1,173 @@
+//! Kernels: what a pipeline is compiled for, and how teams are packed into its workgroups.
+
+use std::fmt;
+
+use glam::Vec2;
+
+use crate::backend::Group;
+use crate::config::MAX_HIDDEN_LAYERS;
+use crate::model::policy::{Actions, PolicyConstants};
+use crate::model::{Constants, Variant};
+use crate::world::World;
+
+/// Maximum bytes of a buffer, because offsets are u32 words.
+pub(super) const MAX_OFFSET: u64 = 1 << 33;
+/// Threads of a warp on most GPUs. Leaders and followers start at multiples of it (`ROLE` in the shader), so that they
+/// rarely share a warp.
+const ROLE: usize = 32;
+/// Workgroup sizes that the generic kernel may have. Every WebGPU device allows them.
+pub(super) const WORKGROUPS: [usize; 3] = [64, 128, 256];
+/// Teams per workgroup that a specialised kernel may have, best first: 32 teams fill a warp with one agent of each.
+pub(super) const TEAMS: [usize; 3] = [32, 16, 8];
+/// Maximum threads per workgroup of a specialised kernel: two or more workgroups then fit into a compute unit and hide
+/// each other's latency.
+const MAX_THREADS: usize = 512;
+/// Maximum weights of a policy that are written out as straight-line code.
+const MAX_STRAIGHT_WEIGHTS: usize = 512;
+
+/// Which kernel plays; no result depends on that.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kernel {
+    /// In rollouts a specialised one, for as many kinds of worlds as are worth compiling for, those with most to play
+    /// first; else the generic one.
+    Best,
+    /// The generic one.
+    Generic,
+    /// One made for its world's sizes, wherever there can be one.
+    Specialised,
+}
+
+impl fmt::Display for Kernel {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Kernel::Best => "best",
+            Kernel::Generic => "generic",
+            Kernel::Specialised => "specialised",
+        })
+    }
+}
+
+/// What a pipeline is compiled for: pipelines are kept by this.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub(super) struct Shape {
+    pub(super) workgroup: usize,
+    /// Agents a thread plays, one after another.
+    pub(super) slots: usize,
+    pub(super) records: Kept,
+    pub(super) sizes: Sizes,
+}
+
+/// What a kernel keeps beside sets and counts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub(super) struct Kept {
+    /// Every stage of every step.
+    pub(super) trace: bool,
+    /// Which leaders each follower sees at each step.
+    pub(super) sights: bool,
+}
+
+impl Kept {
+    pub(super) fn of(group: &Group<'_>, trace: bool) -> Kept {
+        Kept { trace, sights: group.need.sights() && group.world.followers() > 0 }
+    }
+}
+
+/// What a kernel knows of the worlds that it plays.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub(super) enum Sizes {
+    /// The widest layer, inputs included, rounded up to spare compilations, and whether the outputs choose a behaviour.
+    Any { widest: usize, chooses: bool },
+    /// All that makes a difference to the code.
+    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], variant: Variant },
+}
+
+pub(super) const WIDTHS: usize = MAX_HIDDEN_LAYERS + 2;
+
+impl Shape {
+    pub(super) fn is_specialised(&self) -> bool {
+        matches!(self.sizes, Sizes::Fixed { .. })
+    }
+
+    pub(super) fn generic(world: &World, packing: Packing, records: Kept) -> Shape {
+        let policy = &world.constants.policy;
+        let chooses = policy.actions() == Some(Actions::Behaviours);
+        let sizes = Sizes::Any { widest: policy.widest().next_power_of_two(), chooses };
+        Shape { workgroup: packing.workgroup, slots: packing.slots, records, sizes }
+    }
+
+    /// The specialised one, if it is asked for and there can be one.
+    pub(super) fn asked_for(world: &World, kernel: Kernel, room: Capacity, records: Kept) -> Option<Shape> {
+        let packing = Packing::specialised(world, room).filter(|_| kernel != Kernel::Generic);
+        packing.map(|packing| Shape::specialised(world, packing, records))
+    }
+
+    pub(super) fn specialised(world: &World, packing: Packing, records: Kept) -> Shape {
+        let Constants { leaders, followers, pois, variant, policy: PolicyConstants { widths, .. }, .. } =
+            world.constants;
+        let sizes = Sizes::Fixed { teams: packing.teams, leaders, agents: leaders + followers, pois, widths, variant };
+        Shape { workgroup: packing.workgroup, slots: packing.slots, records, sizes }
+    }
+}
+
+/// How the teams of one world are packed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Packing {
+    pub(super) workgroup: usize,
+    pub(super) slots: usize,
+    /// Teams of a workgroup.
+    pub(super) teams: usize,
+}
+
+/// Threads that `teams` teams take.
+fn seats(world: &World, teams: usize) -> usize {
+    (teams * world.leaders()).next_multiple_of(ROLE) + teams * world.followers()
+}
+
+impl Packing {
+    /// For a specialised kernel: as many teams as a warp has threads, or as many as fit. None where there had
+    /// better be none: too many agents, or too large a policy.
+    pub(super) fn specialised(world: &World, room: Capacity) -> Option<Packing> {
+        let threads = |teams: usize| seats(world, teams).next_multiple_of(ROLE);
+        let bytes = |teams: usize| 2 * teams * world.agents() * size_of::<Vec2>();
+        let fits =
+            |&teams: &usize| threads(teams) <= room.workgroup.min(MAX_THREADS) && bytes(teams) <= room.workgroup_bytes;
+        let teams = TEAMS.into_iter().find(fits).filter(|_| world.parameters() <= MAX_STRAIGHT_WEIGHTS)?;
+        Some(Packing { workgroup: threads(teams), slots: 1, teams })
+    }
+
+    /// For the generic kernel: the packing that leaves the fewest threads idle.
+    pub(super) fn generic(world: &World, largest: usize) -> Packing {
+        let sizes = WORKGROUPS.into_iter().filter(|&size| size <= largest);
+        let packed = sizes.clone().filter_map(|workgroup| {
+            let teams = (1..=workgroup).take_while(|&teams| seats(world, teams) <= workgroup).last()?;
+            Some(Packing { workgroup, slots: 1, teams })
+        });
+        // The share of threads that play, compared crosswise to stay in integers; the smaller workgroup wins ties.
+        packed.reduce(|a, b| if b.teams * a.workgroup > a.teams * b.workgroup { b } else { a }).unwrap_or_else(|| {
+            let workgroup = sizes.max().unwrap_or(WORKGROUPS[0]);
+            Packing { workgroup, slots: seats(world, 1).div_ceil(workgroup), teams: 1 }
+        })
+    }
+}
+
+/// Sizes of a device that bound a batch.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Capacity {
+    /// Bytes of one buffer that a batch aims for.
+    pub(super) batch: u64,
+    /// Bytes of the largest buffer.
+    pub(super) buffer: u64,
+    /// Kernels of a batch.
+    pub(super) kernels: usize,
+    /// Threads of the largest workgroup, and bytes of its memory.
+    pub(super) workgroup: usize,
+    pub(super) workgroup_bytes: usize,
+}
+
+impl Capacity {
+    /// Of a device whose largest workgroup is told, and that no batch fills.
+    pub(super) fn of_workgroups(threads: usize) -> Capacity {
+        let bytes = MAX_OFFSET;
+        Capacity { batch: bytes, buffer: bytes, kernels: 1, workgroup: threads, workgroup_bytes: 16 << 10 }
+    }
+}

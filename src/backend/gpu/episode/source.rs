@@ -1,0 +1,201 @@
+//! The text of the episode's shaders.
+
+use std::collections::HashSet;
+use std::fmt::Write;
+
+use crate::backend::gpu::exact;
+use crate::backend::{BackendError, FOUR, Group, Moment, Weights, fours, record_words};
+use crate::config::MAX_AGENTS;
+use crate::declare::Shared;
+use crate::model::policy::Actions;
+use crate::model::{self, Constants, Variant};
+use crate::world::{INPUTS, OUTPUTS, World};
+
+use super::Records;
+use super::planner::{NOWHERE, PACK_WORKGROUP, Share, State, Task, gather, plan};
+use super::shape::{Capacity, Kept, Kernel, Packing, Shape, Sizes, TEAMS, WIDTHS, WORKGROUPS};
+
+/// Maximum leaders whose sightings a follower counts in registers.
+const SIGHTS: usize = 8;
+
+/// The whole shader that packs records, with its constants in front.
+pub(super) fn packing() -> String {
+    let most = WORKGROUPS[WORKGROUPS.len() - 1].max(TEAMS[0]);
+    let structs = [model::declarations(), Task::wgsl(), State::wgsl(), Moment::wgsl()].concat();
+    exact::assemble(&[
+        &structs,
+        &format!(
+            "const WORKGROUP: u32 = {PACK_WORKGROUP}u;\nconst TEAMS: u32 = {most}u;\nconst NOWHERE: u32 = {NOWHERE}u;"
+        ),
+        include_str!("../../../../shaders/lib/layout.wgsl"),
+        include_str!("../../../../shaders/pack.wgsl"),
+    ])
+}
+
+/// The whole shader, with what it has in front.
+pub(super) fn source(shape: Shape) -> String {
+    let Shape { workgroup, slots, records: Kept { trace, sights: sighted }, sizes } = shape;
+    let (shared, tally, sights) = match sizes {
+        // As many agents as one team may have, or several teams on a thread each.
+        Sizes::Any { .. } => ((workgroup * slots).min(MAX_AGENTS), false, 1),
+        Sizes::Fixed { teams, leaders, agents, .. } => {
+            let tally = leaders < agents && leaders as usize <= SIGHTS;
+            (teams * agents as usize, tally, if tally { leaders } else { 1 })
+        }
+    };
+    let constants = format!(
+        "const WORKGROUP: u32 = {workgroup}u;\nconst SLOTS: u32 = {slots}u;\nconst SHARED: u32 = {shared}u;\n\
+         const TRACE: bool = {trace};\nconst SIGHTED: bool = {sighted};\nconst TALLY: bool = {tally};\nconst SIGHTS: u32 = {sights}u;"
+    );
+    let front = match sizes {
+        Sizes::Any { widest, chooses } => {
+            let variant = Variant::copied_from("world");
+            let generic = include_str!("../../../../shaders/generic.wgsl");
+            format!(
+                "const WIDEST: u32 = {widest}u;\nconst CHOOSES: bool = {chooses};\n\
+                 fn world_variant() -> Variant {{ return {variant}; }}\n{generic}"
+            )
+        }
+        Sizes::Fixed { teams, leaders, agents, pois, widths, variant } => format!(
+            "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u);\nconst variant = {variant};\n\
+             fn adopt(task: Task) {{}}\n{}",
+            straight_policy(&widths),
+            words = agents.div_ceil(32),
+            variant = variant.value()
+        ),
+    };
+    let structs = [Task::wgsl(), State::wgsl(), Moment::wgsl()].concat();
+    let (front, math) =
+        ([constants, front, model::declarations(), structs], include_str!("../../../../shaders/lib/math.wgsl"));
+    let front = front.iter().map(String::as_str).chain([include_str!("../../../../shaders/lib/layout.wgsl"), math]);
+    let parts = front.chain(model::WGSL).chain([include_str!("../../../../shaders/episode.wgsl")]);
+    exact::assemble(&parts.collect::<Vec<_>>())
+}
+
+/// A policy of these widths as straight-line code: `decide` of `shaders/generic.wgsl`, its loops written out. Each unit
+/// is a variable, and four weights at a time are read in the order in which they are needed, so that a compiler may
+/// read many before it waits for any.
+fn straight_policy(widths: &[u32; WIDTHS]) -> String {
+    let mut text = String::from("fn decide(start: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
+    let mut line = |line: std::fmt::Arguments<'_>| writeln!(text, "    {line}").expect("a string takes a line");
+    let mut read = HashSet::new();
+    let mut inputs: Vec<String> = (0..INPUTS).map(|input| format!("inputs[{input}]")).collect();
+    let mut first = 0;
+    let layers = widths.windows(2).take_while(|pair| pair[1] > 0);
+    for (layer, pair) in layers.enumerate() {
+        let (rows, columns) = (pair[0] as usize, pair[1] as usize);
+        // The biases first.
+        for row in std::iter::once(rows).chain(0..rows) {
+            for column in 0..columns {
+                let weight = first + row * columns + column;
+                let (four, axis) = (weight / FOUR, AXES[weight % FOUR]);
+                if read.insert(four) {
+                    line(format_args!("let w{four} = weights[start + {four}u * stride];"));
+                }
+                match row == rows {
+                    true => line(format_args!("var s{layer}_{column} = w{four}.{axis};")),
+                    false => line(format_args!("s{layer}_{column} += {} * w{four}.{axis};", inputs[row])),
+                }
+            }
+        }
+        inputs = (0..columns).map(|column| format!("u{layer}_{column}")).collect();
+        for (column, unit) in inputs.iter().enumerate() {
+            line(format_args!("let {unit} = activate(s{layer}_{column});"));
+        }
+        first += (rows + 1) * columns;
+    }
+    match inputs.len() {
+        OUTPUTS => line(format_args!("return vec2({});", inputs.join(", "))),
+        _ => line(format_args!("return choose(inputs, array({}));", inputs.join(", "))),
+    }
+    text + "}\n"
+}
+
+const AXES: [&str; FOUR] = ["x", "y", "z", "w"];
+
+/// The episode's shader in a few of its variants, generic and specialised for the paper's first layout.
+pub fn shaders() -> Vec<(&'static str, String)> {
+    let generic = |workgroup, slots, widest, records: Kept| {
+        source(Shape { workgroup, slots, records, sizes: Sizes::Any { widest, chooses: records.trace } })
+    };
+    let specialised = |records, actions: Actions| {
+        let widths = [INPUTS as u32, 10, actions.outputs() as u32, 0, 0];
+        let variant = Variant { density: 0, by_sine: 1 };
+        let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, variant };
+        source(Shape { workgroup: 384, slots: 1, records, sizes })
+    };
+    let [little, sights, trace] =
+        [(false, false), (false, true), (true, true)].map(|(trace, sights)| Kept { trace, sights });
+    vec![
+        ("episode", generic(64, 1, 16, little)),
+        ("episode, traced", generic(128, 1, 64, trace)),
+        ("episode, large teams", generic(256, 5, 64, little)),
+        ("episode, specialised", specialised(little, Actions::Direct)),
+        ("episode, specialised, behaviours", specialised(little, Actions::Behaviours)),
+        ("episode, specialised, with sights", specialised(sights, Actions::Direct)),
+        ("episode, specialised, traced", specialised(trace, Actions::Direct)),
+        ("pack", packing()),
+    ]
+}
+
+/// The shader that would play a world: the specialised one, where there can be one, or the generic one; for looking at
+/// what compilers make of it. `threads` is the size of the largest workgroup.
+#[doc(hidden)]
+pub fn shader_of(world: &World, kernel: Kernel, threads: usize) -> String {
+    let room = Capacity::of_workgroups(threads);
+    let little = Kept { trace: false, sights: false };
+    let made = Shape::asked_for(world, kernel, room, little);
+    source(made.unwrap_or_else(|| Shape::generic(world, Packing::generic(world, threads), little)))
+}
+
+/// What one workgroup gets to play a group's first teams, and where it leaves what comes of that; for running what
+/// compilers make of its shader.
+#[doc(hidden)]
+pub struct Workgroup {
+    /// Its shader.
+    pub shader: String,
+    /// How many threads it has, and how many teams they play.
+    pub threads: usize,
+    /// See `threads`.
+    pub teams: usize,
+    /// The words of each binding: nothing for the guard, worlds, tasks, places, weights, and yet to write the record,
+    /// moments and states.
+    pub buffers: [Vec<u32>; 8],
+}
+
+/// The workgroup that plays a group's first teams, policies on the host, in one dispatch: by a kernel made for their world
+/// if that is asked for and can be, or by the generic one. It takes another dispatch to follow, and leaves where the agents
+/// stand in the end. `threads` is the size of the largest workgroup.
+///
+/// # Errors
+/// A team is too large for any device.
+#[doc(hidden)]
+pub fn workgroup_of(group: &Group<'_>, kernel: Kernel, threads: usize) -> Result<Workgroup, BackendError> {
+    let room = Capacity::of_workgroups(threads);
+    let made = Shape::asked_for(group.world, kernel, room, Kept::of(group, false));
+    let batches = plan(&[*group], false, Records::Whole, room, &made.into_iter().collect())?;
+    let work = &batches[0];
+    let Share { task, first_team, shape, .. } = work.shares[0];
+    let mut weights = vec![[0.0; FOUR]; fours(group.world) * task.teams as usize];
+    if let Weights::OnHost(policies) = group.weights {
+        gather(group, policies, first_team, task.teams as usize, &mut weights);
+    }
+    let words = |bytes: &[u8]| bytemuck::pod_collect_to_vec(bytes);
+    let world = Constants { steps: task.end + 1, ..work.worlds[0] };
+    let agents = group.world.agents() * task.teams as usize;
+    Ok(Workgroup {
+        shader: source(shape),
+        threads: shape.workgroup,
+        teams: task.teams as usize,
+        buffers: [
+            vec![0; 4],
+            words(bytemuck::bytes_of(&world)),
+            words(bytemuck::bytes_of(&task)),
+            words(bytemuck::cast_slice(&work.places)),
+            words(bytemuck::cast_slice(&weights)),
+            vec![0; record_words(group.world, group.need) * task.teams as usize],
+            Vec::new(),
+            vec![0; agents * size_of::<State>() / 4],
+        ],
+    })
+}

@@ -1,0 +1,90 @@
+//! Which leader each follower belongs to: over the episode (Df), or at each step (Dt).
+
+use super::each_bit;
+use crate::backend::{Seen, Strided, owner_bits};
+use crate::config::LedBy;
+use crate::world::{Led, World};
+
+/// Owner of an agent that belongs to no group.
+pub const NOBODY: u32 = u32::MAX;
+
+/// Gives each follower to the leader it saw at most steps, ties to the lower index, or to [`NOBODY`] if it saw none:
+/// the owner of every agent, leaders their own, `[agents]`.
+pub fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
+    let leaders = world.constants.leaders;
+    owner.clear();
+    owner.extend(0..leaders);
+    let followers = 0..world.followers();
+    match seen {
+        Seen::Counts(seen) => owner.extend(followers.map(|follower| {
+            let (mut most, mut best) = (0, NOBODY);
+            for leader in 0..leaders {
+                let steps = seen.get(follower * leaders as usize + leader as usize);
+                if steps > most {
+                    (most, best) = (steps, leader);
+                }
+            }
+            best
+        })),
+        Seen::Most(owners) => {
+            let bits = owner_bits(leaders);
+            let (a_word, nobody) = ((32 / bits) as usize, (1 << bits) - 1);
+            owner.extend(followers.map(|follower| {
+                let owner = owners.get(follower / a_word) >> (follower % a_word * bits as usize) & nobody;
+                if owner == nobody { NOBODY } else { owner }
+            }));
+        }
+    }
+}
+
+/// The agents that belong to each leader, a bit an agent, `[leaders][words]`.
+pub(super) fn gather(owner: &[u32], world: &World, groups: &mut Vec<u32>) {
+    let words = world.constants.words as usize;
+    groups.resize(world.leaders() * words, 0);
+    for (agent, &leader) in owner.iter().enumerate().filter(|&(_, &leader)| leader != NOBODY) {
+        groups[leader as usize * words + agent / 32] |= 1 << (agent % 32);
+    }
+}
+
+/// Which leaders lead each follower at each step, laid out as the sights are, `[steps][followers][words of leaders]`:
+/// of those that the follower saw at the steps that [count](crate::world::Led), the one that it saw at most, ties to
+/// the lower index, or all.
+pub fn lead(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
+    let (followers, words) = (world.followers(), world.leader_words());
+    let (steps, Led { within, by }) = (sights.len() / (followers * words).max(1), world.led);
+    led.clear();
+    led.resize(sights.len(), 0);
+    let mut counts = vec![0u32; world.leaders()];
+    for follower in 0..followers {
+        counts.fill(0);
+        for step in 0..steps {
+            let place = |step: usize| (step * followers + follower) * words;
+            let seen = |step: usize| {
+                (0..words)
+                    .flat_map(move |word| each_bit(sights.get(place(step) + word)).map(move |bit| word * 32 + bit))
+            };
+            seen(step).for_each(|leader| counts[leader] += 1);
+            if within > 0 && step >= within {
+                seen(step - within).for_each(|leader| counts[leader] -= 1);
+            }
+            let leading = &mut led[place(step)..][..words];
+            let mut lead = |leader: usize| leading[leader / 32] |= 1 << (leader % 32);
+            let mut counted = counts.iter().enumerate().filter(|(_, count)| **count > 0);
+            match by {
+                LedBy::AnySeen => counted.for_each(|(leader, _)| lead(leader)),
+                LedBy::MostSeen => {
+                    let first = counted.next();
+                    let most =
+                        first.map(|first| counted.fold(first, |most, next| if next.1 > most.1 { next } else { most }));
+                    most.into_iter().for_each(|(leader, _)| lead(leader));
+                }
+            }
+        }
+    }
+}
+
+/// Whether a leader leads a follower at a step, from 0, as [`lead`] found.
+pub fn leads(led: &[u32], world: &World, step: usize, follower: usize, leader: usize) -> bool {
+    let place = (step * world.followers() + follower) * world.leader_words() + leader / 32;
+    led[place] >> (leader % 32) & 1 != 0
+}

@@ -1,0 +1,178 @@
+//! The fast path: every fitness but Dt, under the default rule, in one pass over the sets.
+
+use super::assignment::{assign, gather};
+use super::{Credit, each_bit, stepping_stone};
+use crate::backend::{Episode, Strided};
+use crate::world::World;
+
+impl Credit {
+    /// Which POIs were observed.
+    pub(super) fn observe(&mut self, episode: &Episode<'_>, world: &World) {
+        let Credit { observed, sets, .. } = self;
+        each_set(&episode.sets, world, sets, |poi| world.coupling[poi], |poi, _, _| observed[poi] = true);
+    }
+
+    /// A POI is lost without an agent who was in every set that was large enough, each without one to spare.
+    pub(super) fn lose_leaders(&mut self, episode: &Episode<'_>, world: &World) {
+        self.all_critical(world);
+        let Credit { observed, critical, sets, .. } = self;
+        let least = |poi: usize| world.coupling[poi];
+        each_set(&episode.sets, world, sets, least, |poi, size, set| {
+            observed[poi] = true;
+            narrow(&mut critical[poi * set.len()..][..set.len()], set, size == world.coupling[poi]);
+        });
+    }
+
+    /// A POI is lost without a group of whom every set that was large enough had more members than agents to spare.
+    pub(super) fn lose_groups(&mut self, episode: &Episode<'_>, world: &World) {
+        self.all_critical(world);
+        let Credit { observed, critical, owner, groups, sets, .. } = self;
+        let words = world.constants.words as usize;
+        groups.clear();
+        let least = |poi: usize| world.coupling[poi];
+        each_set(&episode.sets, world, sets, least, |poi, size, set| {
+            observed[poi] = true;
+            let spare = size - world.coupling[poi];
+            for (index, critical) in critical[poi * words..][..words].iter_mut().enumerate() {
+                let mut suspects = *critical;
+                if suspects != 0 && groups.is_empty() {
+                    assign(&episode.seen, world, owner);
+                    gather(owner, world, groups);
+                }
+                while suspects != 0 {
+                    let leader = index * 32 + suspects.trailing_zeros() as usize;
+                    let group = &groups[leader * words..][..words];
+                    let members: u32 = group.iter().zip(set).map(|(group, set)| (group & set).count_ones()).sum();
+                    if members <= spare {
+                        *critical &= !(1 << (leader % 32));
+                    }
+                    suspects &= suspects - 1;
+                }
+            }
+        });
+    }
+
+    /// What [`Credit::lose_leaders`] finds, and how close each leader came to every other POI.
+    pub(super) fn add_copies(&mut self, episode: &Episode<'_>, world: &World) {
+        self.all_critical(world);
+        let leaders = world.leaders();
+        self.company.clear();
+        self.company.resize(world.pois.len() * leaders, 0);
+        let Credit { observed, critical, company, sets, .. } = self;
+        each_set(
+            &episode.sets,
+            world,
+            sets,
+            |_| 1,
+            |poi, size, set| {
+                if size >= world.coupling[poi] {
+                    observed[poi] = true;
+                    narrow(&mut critical[poi * set.len()..][..set.len()], set, size == world.coupling[poi]);
+                } else if !observed[poi] {
+                    for leader in bits(set).take_while(|&agent| agent < leaders) {
+                        let most = &mut company[poi * leaders + leader];
+                        *most = size.max(*most);
+                    }
+                }
+            },
+        );
+    }
+
+    /// D++ of one leader.
+    pub(super) fn stepping_stone(&mut self, world: &World, leader: usize) -> f32 {
+        let most = world.coupling.iter().copied().max().unwrap_or(0);
+        self.completed.clear();
+        self.completed.resize(most as usize + 1, 0);
+        let mut at_most = 0u32;
+        for (poi, &coupling) in world.coupling.iter().enumerate() {
+            let company = self.company[poi * world.leaders() + leader];
+            if !self.observed[poi] && company > 0 {
+                self.completed[(coupling - company) as usize] += 1;
+                at_most += 1;
+            }
+        }
+        // Copies needed are under the largest coupling, so that many complete all that any number would.
+        let mut gain = 0;
+        stepping_stone(self.lost[leader], most, at_most, world.pois.len(), |copies| {
+            gain += self.completed[copies as usize];
+            gain
+        })
+    }
+
+    /// Before any large enough set, every leader may be critical.
+    fn all_critical(&mut self, world: &World) {
+        let (leaders, words) = (world.leaders(), world.constants.words as usize);
+        // Bits past the last leader stay out.
+        let of_word =
+            |word: usize| u32::MAX.checked_shl(leaders.saturating_sub(word * 32) as u32).map_or(u32::MAX, |v| !v);
+        self.critical.clear();
+        self.critical.extend((0..world.pois.len() * words).map(|index| of_word(index % words)));
+    }
+
+    pub(super) fn count_observed(&self) -> u32 {
+        self.observed.iter().filter(|&&observed| observed).count() as u32
+    }
+
+    /// Counts the observed POIs to which each leader was critical.
+    pub(super) fn count_lost(&mut self, world: &World) {
+        let (leaders, words) = (world.leaders(), world.constants.words as usize);
+        self.lost.clear();
+        self.lost.resize(leaders, 0);
+        for (critical, _) in self.critical.chunks_exact(words).zip(&self.observed).filter(|&(_, &observed)| observed) {
+            bits(critical).for_each(|leader| self.lost[leader] += 1);
+        }
+    }
+}
+
+/// Calls `visit(poi, size, set)`, POI by POI and in order of steps, for every set of at least `least(poi)` agents, and
+/// at least one, that is not that POI's set of the step before: repetition changes no fitness.
+#[inline(always)]
+fn each_set(
+    sets: &Strided<'_>,
+    world: &World,
+    scratch: &mut Vec<u32>,
+    least: impl Fn(usize) -> u32,
+    mut visit: impl FnMut(usize, u32, &[u32]),
+) {
+    let (pois, words) = (world.pois.len(), world.constants.words as usize);
+    if sets.is_empty() {
+        return;
+    }
+    scratch.clear();
+    scratch.resize(2 * words, 0);
+    for poi in 0..pois {
+        let least = least(poi);
+        let steps = sets.words[poi * words * sets.stride + sets.offset..].chunks(pois * words * sets.stride);
+        if words == 1 {
+            let mut before = 0;
+            for step in steps {
+                let set = step[0];
+                if set != before && set.count_ones() >= least {
+                    visit(poi, set.count_ones(), &[set]);
+                }
+                before = set;
+            }
+            continue;
+        }
+        let (mut set, mut before) = scratch.split_at_mut(words);
+        before.fill(0);
+        for step in steps {
+            set.iter_mut().zip(step.iter().step_by(sets.stride)).for_each(|(word, now)| *word = *now);
+            let size = set.iter().map(|word| word.count_ones()).sum();
+            if set != before && size >= least {
+                visit(poi, size, set);
+            }
+            std::mem::swap(&mut set, &mut before);
+        }
+    }
+}
+
+/// Leaves the agents of `critical` that are in `set`, if any of that set was needed, or none.
+fn narrow(critical: &mut [u32], set: &[u32], needed: bool) {
+    critical.iter_mut().zip(set).for_each(|(word, set)| *word &= if needed { *set } else { 0 });
+}
+
+/// The agents of a set, in ascending order.
+fn bits(set: &[u32]) -> impl Iterator<Item = usize> {
+    set.iter().enumerate().flat_map(|(index, &word)| each_bit(word).map(move |bit| index * 32 + bit))
+}

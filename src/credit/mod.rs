@@ -1,0 +1,151 @@
+//! Structural credit assignment: what each leader was worth to its team, from the record of one episode.
+//!
+//! Every fitness is a share of the world's P POIs, so it is counted in whole POIs and divided once. Nothing is
+//! simulated again. The record of who was at a POI at which step determines what would have been observed without a
+//! leader, without its whole group, without those that it led at each step, or with more copies of it.
+//!
+//! Under the default [rule](crate::model::rule::Rule) no fitness but Dt depends on when or how often a set of agents
+//! was at a POI. A set changes nothing if another set of the same POI contains it: the larger set still has at least
+//! as many agents after any removal or copy. So only the maximal sets of each POI matter and, except for D++, only
+//! those with at least as many agents as the POI needs. A backend may drop the others, see [`crate::backend::Need`].
+//! Dt, and rules with windows or orders, need the whole record ([`replay`](mod@replay)).
+
+mod assignment;
+mod fast;
+mod replay;
+
+pub use assignment::{NOBODY, assign, lead, leads};
+pub use replay::observed_at;
+
+use crate::backend::Episode;
+use crate::config::Fitness;
+use crate::world::World;
+
+/// Every fitness of one team; the differences are `[leaders]`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Scores {
+    /// POIs that were observed: by the default rule, that at some step had as many agents near as they need.
+    pub observed: u32,
+    /// Observed POIs over P, the same for every leader (paper, Equation 1).
+    pub g: f32,
+    /// G less G without the leader (paper, Equation 5; "leader trajectory removal").
+    pub d: Vec<f32>,
+    /// G less G without the leader and its followers (paper, section 4.2; "leader-follower trajectory assignment").
+    pub df: Vec<f32>,
+    /// D, or what copies of the leader would add, each its share (Rahmattalabi et al., the paper's reference 12).
+    pub dpp: Vec<f32>,
+    /// G less G without the leader and, at each step, the followers that it [leads](lead) then. Empty where the
+    /// [sights](Episode::sights) were not recorded, unless nobody follows: then it is D.
+    pub dt: Vec<f32>,
+}
+
+/// Scratch for scoring one episode after another without allocating; one a thread.
+#[derive(Clone, Debug, Default)]
+pub struct Credit {
+    /// Was the POI observed? `[pois]`
+    observed: Vec<bool>,
+    /// The leaders without any one of whom (D), or of whose groups (Df), an observed POI is lost: `[pois][words]`.
+    critical: Vec<u32>,
+    /// POIs lost without the leader, `[leaders]`.
+    lost: Vec<u32>,
+    /// The leader in whose group an agent is, itself for a leader, or [`NOBODY`]: `[agents]`.
+    owner: Vec<u32>,
+    /// The agents of each leader's group, or nothing before they are needed, `[leaders][words]`.
+    groups: Vec<u32>,
+    /// Most agents near the POI at a step with the leader among them, `[pois][leaders]`.
+    company: Vec<u32>,
+    /// Unobserved POIs that a number of copies of one leader would just complete, `[copies]`.
+    completed: Vec<u32>,
+    /// One set and the one before it, `[2][words]`.
+    sets: Vec<u32>,
+    /// By another rule than the default: the step at which each POI was observed, and would be otherwise, `[pois]`.
+    observed_at: Vec<u32>,
+    otherwise: Vec<u32>,
+    /// See [`lead`].
+    led: Vec<u32>,
+}
+
+impl Credit {
+    /// Scores every leader of the team by `fitness` into `scores`, `[leaders]`, and returns how many POIs the team
+    /// observed. The episode must be one of `world`, played with that fitness as a [need](crate::backend::Need).
+    pub fn score(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
+        if !world.rule.is_plain() || fitness == Fitness::Dt {
+            return self.replay(episode, world, fitness, scores);
+        }
+        self.observed.clear();
+        self.observed.resize(world.pois.len(), false);
+        let pois = world.pois.len();
+        match fitness {
+            Fitness::G => {
+                self.observe(episode, world);
+                scores.fill(share(self.count_observed(), pois));
+            }
+            Fitness::D | Fitness::Df => {
+                match fitness == Fitness::Df && world.followers() > 0 {
+                    true => self.lose_groups(episode, world),
+                    false => self.lose_leaders(episode, world),
+                }
+                self.count_lost(world);
+                scores.iter_mut().zip(&self.lost).for_each(|(score, &lost)| *score = share(lost, pois));
+            }
+            Fitness::Dt => unreachable!("it was replayed"),
+            Fitness::Dpp => {
+                self.add_copies(episode, world);
+                self.count_lost(world);
+                for (leader, score) in scores.iter_mut().enumerate().take(world.leaders()) {
+                    *score = self.stepping_stone(world, leader);
+                }
+            }
+        }
+        self.count_observed()
+    }
+
+    /// Every fitness of every leader. The episode must be one of `world`, played with all scores or the record as a
+    /// need.
+    pub fn all(&mut self, episode: &Episode<'_>, world: &World) -> Scores {
+        let leaders = world.leaders();
+        let mut by = |fitness| {
+            let mut scores = vec![0.0; leaders];
+            let observed = self.score(episode, world, fitness, &mut scores);
+            (observed, scores)
+        };
+        let ((observed, d), (_, df), (_, dpp)) = (by(Fitness::D), by(Fitness::Df), by(Fitness::Dpp));
+        let dt = match (world.followers(), episode.sights.is_empty()) {
+            (0, _) => d.clone(),
+            (_, true) => vec![],
+            (_, false) => by(Fitness::Dt).1,
+        };
+        Scores { observed, g: share(observed, world.pois.len()), d, df, dpp, dt }
+    }
+}
+
+/// D++: what is lost without the leader, if that is at least D++(most), else the first `D++(n) = gain(n) / n`,
+/// n = 1, 2, …, that D++(n + 1) does not better. All in POIs; `gain` is asked in this order, of `most` copies it is
+/// `at_most`.
+#[inline(always)]
+fn stepping_stone(lost: u32, most: u32, at_most: u32, pois: usize, mut gain: impl FnMut(u32) -> u32) -> f32 {
+    if u64::from(lost) * u64::from(most) >= u64::from(at_most) {
+        return share(lost, pois);
+    }
+    let mut now = gain(1);
+    for copies in 1..most {
+        let next = gain(copies + 1);
+        if u64::from(next) * u64::from(copies) <= u64::from(now) * (u64::from(copies) + 1) {
+            return share(now, pois * copies as usize);
+        }
+        now = next;
+    }
+    share(now, pois * most as usize)
+}
+
+/// A count over a count, both exact in f32.
+fn share(count: u32, of: usize) -> f32 {
+    count as f32 / of as f32
+}
+
+/// The places of a word's bits, in ascending order.
+fn each_bit(word: u32) -> impl Iterator<Item = usize> {
+    std::iter::successors(Some(word), |word| Some(word & word.wrapping_sub(1)))
+        .take_while(|&word| word != 0)
+        .map(|word| word.trailing_zeros() as usize)
+}

@@ -1,0 +1,141 @@
+//! The general path: replays the record under any rule, for every fitness including Dt.
+
+use std::ops::RangeInclusive;
+
+use super::assignment::{assign, gather, lead, leads};
+use super::{Credit, each_bit, share, stepping_stone};
+use crate::backend::{Episode, Strided};
+use crate::config::Fitness;
+use crate::model::rule::NEVER;
+use crate::world::World;
+
+/// By any other rule than the default, and Dt.
+impl Credit {
+    /// [`Credit::score`], each fitness by its definition.
+    pub(super) fn replay(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
+        let Credit { owner, groups, observed_at, otherwise, led, .. } = self;
+        let (pois, words, leaders) = (world.pois.len(), world.constants.words as usize, world.leaders());
+        let replay = Replay { sets: episode.sets, world };
+        replay.observe(observed_at);
+        let observed = count(observed_at);
+        // Whom else D takes out; nobody is missed where nothing was observed.
+        let taken = if world.followers() == 0 || observed == 0 { Fitness::D } else { fitness };
+        match taken {
+            Fitness::Df => {
+                assign(&episode.seen, world, owner);
+                groups.clear();
+                gather(owner, world, groups);
+            }
+            Fitness::Dt => lead(&episode.sights, world, led),
+            _ => {}
+        }
+        for (leader, score) in scores.iter_mut().enumerate().take(leaders) {
+            let mut lost = || {
+                let alone = |_, word, agents| agents & !alone(leader, word);
+                match taken {
+                    Fitness::Df => {
+                        let group = &groups[leader * words..][..words];
+                        replay.observe_without(observed_at, |_, word, agents| agents & !group[word], otherwise);
+                    }
+                    Fitness::Dt => {
+                        let stay = |step, word, agents| {
+                            let follow = each_bit(alone(step, word, agents)).filter(|bit| {
+                                let agent = word * 32 + bit;
+                                agent < leaders || !leads(led, world, step as usize - 1, agent - leaders, leader)
+                            });
+                            follow.map(|bit| 1 << bit).sum()
+                        };
+                        replay.observe_without(observed_at, stay, otherwise);
+                    }
+                    _ => replay.observe_without(observed_at, alone, otherwise),
+                }
+                observed - count(otherwise)
+            };
+            *score = match fitness {
+                Fitness::G => share(observed, pois),
+                Fitness::D | Fitness::Df | Fitness::Dt => share(lost(), pois),
+                Fitness::Dpp => {
+                    let (lost, most) = (lost(), world.coupling.iter().copied().max().unwrap_or(0));
+                    let mut gain = |copies| {
+                        replay.observe_with(observed_at, leader, copies, otherwise);
+                        count(otherwise) - observed
+                    };
+                    stepping_stone(lost, most, gain(most), pois, gain)
+                }
+            };
+        }
+        observed
+    }
+}
+
+/// Who was near which POI at which step, by a rule that is replayed.
+#[derive(Clone, Copy)]
+struct Replay<'a> {
+    sets: Strided<'a>,
+    world: &'a World,
+}
+
+impl Replay<'_> {
+    /// How many observers are near a POI after a step, of those of each word that `stay` lets stay.
+    fn near(&self, poi: usize, step: u32, stay: impl Fn(usize, u32) -> u32) -> u32 {
+        let Replay { sets, world } = self;
+        let words = world.constants.words as usize;
+        let first = ((step as usize - 1) * world.pois.len() + poi) * words;
+        world.rule.count((0..words).map(|word| stay(word, sets.get(first + word))))
+    }
+
+    /// At which step each POI is observed, where it has `enough` agents after one, which is asked for the steps that
+    /// are `worth` asking among those at which the rule lets it be.
+    fn play(
+        &self,
+        observed_at: &mut Vec<u32>,
+        worth: impl Fn(usize, RangeInclusive<u32>) -> RangeInclusive<u32>,
+        near: impl Fn(usize, u32) -> u32,
+    ) {
+        let Replay { sets, world } = self;
+        let pois = world.pois.len();
+        observed_at.clear();
+        observed_at.resize(pois, NEVER);
+        let steps = sets.len() / (pois * world.constants.words as usize);
+        world.rule.observe(steps as u32, observed_at, |poi, open| {
+            worth(poi, open).find(|&step| near(poi, step) >= world.coupling[poi])
+        });
+    }
+
+    /// As it was.
+    fn observe(&self, observed_at: &mut Vec<u32>) {
+        self.play(observed_at, |_, open| open, |poi, step| self.near(poi, step, |_, agents| agents));
+    }
+
+    /// With some agents left out, by step and word: no POI is observed sooner than it was.
+    fn observe_without(&self, was: &[u32], stay: impl Fn(u32, usize, u32) -> u32, observed_at: &mut Vec<u32>) {
+        let later = |poi: usize, open: RangeInclusive<u32>| was[poi].max(*open.start())..=*open.end();
+        self.play(observed_at, later, |poi, step| self.near(poi, step, |word, agents| stay(step, word, agents)));
+    }
+
+    /// With so many more copies of an agent: no POI is observed later than it was.
+    fn observe_with(&self, was: &[u32], agent: usize, copies: u32, observed_at: &mut Vec<u32>) {
+        let sooner = |poi: usize, open: RangeInclusive<u32>| *open.start()..=was[poi].min(*open.end());
+        self.play(observed_at, sooner, |poi, step| {
+            let copied = self.near(poi, step, |word, agents| agents & alone(agent, word));
+            self.near(poi, step, |_, agents| agents) + copies * copied
+        });
+    }
+}
+
+/// How many POIs are observed.
+fn count(observed_at: &[u32]) -> u32 {
+    observed_at.iter().filter(|&&step| step != NEVER).count() as u32
+}
+
+/// The step at which each POI is observed, from 1, or none: `[pois]`.
+pub fn observed_at(sets: Strided<'_>, world: &World) -> Vec<Option<usize>> {
+    let mut observed_at = Vec::new();
+    Replay { sets, world }.observe(&mut observed_at);
+    observed_at.into_iter().map(|step| (step != NEVER).then_some(step as usize)).collect()
+}
+
+/// A word of the set of one agent.
+fn alone(agent: usize, word: usize) -> u32 {
+    if agent / 32 == word { 1 << (agent % 32) } else { 0 }
+}

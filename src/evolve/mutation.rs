@@ -1,0 +1,331 @@
+//! Mutation: carries out the plan of the next generation.
+
+use std::ops::Range;
+
+use fearless_simd::{Level, Simd, SimdMask, dispatch, prelude::*};
+
+use super::random::Key;
+use super::selection::UNCHANGED;
+use super::weights::within_limits;
+use crate::config::{Learning, Mutation};
+use crate::kernels::math;
+
+/// Mutates a policy: every weight, with the configured probability, gains noise, `N(0, sigma)` times itself or plainly.
+///
+/// `key` is a slot's of purpose [`Purpose::Mutation`]; `scratch` may hold anything.
+pub fn mutate(level: Level, key: Key, learning: &Learning, weights: &mut [f32], scratch: &mut Vec<u32>) {
+    dispatch!(level, simd => mutate_lanes(simd, key, learning, weights, scratch));
+}
+
+#[inline(always)]
+fn mutate_lanes<S: Simd>(simd: S, key: Key, learning: &Learning, weights: &mut [f32], scratch: &mut Vec<u32>) {
+    let mut chosen = Chosen::new(scratch, 1, weights.len());
+    chosen.choose(simd, 0, key, learning.mutation_probability);
+    let listed = chosen.list(0);
+    chosen.address(simd, 0, listed, key.fork());
+    chosen.mutate(simd, learning, weights);
+}
+
+/// A breeding plan that does not match the populations it is applied to.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct InvalidInput(String);
+
+/// How the next generation of a trial's populations comes from this one.
+#[derive(Clone, Debug)]
+pub struct Breeding<'a> {
+    /// The plan, `[populations][slots]`, see [`draw_parents`].
+    pub parents: &'a [u32],
+    /// The trial's key of [`Purpose::Mutation`].
+    pub key: Key,
+    /// The generation that ends.
+    pub generation: usize,
+    /// By which a weight mutates.
+    pub learning: &'a Learning,
+}
+
+impl Breeding<'_> {
+    /// Whether the plan is one for populations of these sizes, `[leaders, slots, parameters]`. Every backend asks this
+    /// before it breeds.
+    ///
+    /// # Errors
+    /// It has too few or too many places, or a parent that there is not.
+    pub fn check(&self, [leaders, slots, _]: [usize; 3]) -> Result<(), InvalidInput> {
+        let invalid = |text: String| Err(InvalidInput(text));
+        if self.parents.len() != leaders * slots {
+            return invalid(format!("{} parents for {leaders} populations of {slots}", self.parents.len()));
+        }
+        match self.parents.iter().position(|&planned| (planned & !UNCHANGED) as usize >= slots) {
+            None => Ok(()),
+            Some(place) => invalid(format!(
+                "slot {} of population {} has policy {} of {slots} as its parent (they count from 0)",
+                place % slots,
+                place / slots,
+                self.parents[place] & !UNCHANGED
+            )),
+        }
+    }
+
+    /// The next generation of these weights, worked out on the host: what every backend must come to.
+    ///
+    /// # Errors
+    /// The plan is not one for these sizes, see [`Breeding::check`].
+    pub fn on_host(&self, sizes: [usize; 3], weights: &[f32]) -> Result<Vec<f32>, InvalidInput> {
+        self.check(sizes)?;
+        let [_, slots, parameters] = sizes;
+        let (mut children, mut scratch) = (Vec::with_capacity(weights.len()), Vec::new());
+        for (place, planned) in self.parents.iter().enumerate() {
+            let (leader, slot, first) = (place / slots, place % slots, children.len());
+            let parent = leader * slots + (planned & !UNCHANGED) as usize;
+            children.extend_from_slice(&weights[parent * parameters..(parent + 1) * parameters]);
+            if planned & UNCHANGED == 0 {
+                let key = self.key.at(self.generation, leader, slot);
+                mutate(Level::new(), key, self.learning, &mut children[first..], &mut scratch);
+            }
+        }
+        Ok(children)
+    }
+}
+
+/// The slots of one population to be filled by a plan.
+#[derive(Clone, Copy, Debug)]
+pub struct Offspring<'a> {
+    /// Of purpose [`Purpose::Mutation`].
+    pub key: Key,
+    /// The generation that ends.
+    pub generation: usize,
+    /// Its place among the trial's.
+    pub population: usize,
+    /// The first of the slots.
+    pub first: usize,
+    /// Each slot's entry of the plan of [`draw_parents`].
+    pub parents: &'a [u32],
+    /// `[policies + 1][parameters]`.
+    pub policies: &'a [f32],
+}
+
+/// Fills slots, `[slots][parameters]`: each gets its parent's weights and [`mutate`]s. `scratch` may hold anything.
+pub fn breed(level: Level, learning: &Learning, brood: Offspring<'_>, children: &mut [f32], scratch: &mut Vec<u32>) {
+    let parameters = children.len() / brood.parents.len();
+    // As many as stay in the innermost cache.
+    let together = (BRED_TOGETHER / parameters).clamp(1, WIDEST);
+    for (batch, (children, parents)) in
+        children.chunks_mut(together * parameters).zip(brood.parents.chunks(together)).enumerate()
+    {
+        let batch = Offspring { first: brood.first + batch * together, parents, ..brood };
+        dispatch!(level, simd => mutate_brood(simd, learning, batch, children, scratch));
+    }
+}
+
+/// Weights that are copied, then mutated.
+const BRED_TOGETHER: usize = 2048;
+
+#[inline(always)]
+fn mutate_brood<S: Simd>(
+    simd: S,
+    learning: &Learning,
+    brood: Offspring<'_>,
+    children: &mut [f32],
+    scratch: &mut Vec<u32>,
+) {
+    let parameters = children.len() / brood.parents.len();
+    let mut chosen = Chosen::new(scratch, brood.parents.len(), parameters);
+    for (batch, parents) in brood.parents.chunks(S::f32s::LEN).enumerate() {
+        let first = batch * S::f32s::LEN;
+        let slots = S::u32s::from_fn(simd, |lane| (brood.first + first + lane) as u32);
+        let keys = brood.key.at_lanes::<S>(brood.generation, brood.population, slots);
+        let [x, y, z, w] = keys;
+        let forks = math::draw::<S>(x, y, z, w ^ u32::MAX);
+        let key = |of: &[S::u32s; 4], lane: usize| Key([of[0][lane], of[1][lane], of[2][lane], of[3][lane]]);
+        let mutating = || (0..).zip(parents).filter(|(_, parent)| *parent & UNCHANGED == 0).map(|(lane, _)| lane);
+        // In loops of their own, so that the processor draws for several policies at once.
+        for (lane, &parent) in parents.iter().enumerate() {
+            // The processor waits for the next parents while it draws.
+            let (to, from) = ((first + lane) * parameters, (parent & !UNCHANGED) as usize * parameters);
+            copy(simd, &brood.policies[from..from + parameters], &mut children[to..to + parameters]);
+            if parent & UNCHANGED != 0 {
+                continue;
+            }
+            chosen.choose(simd, first + lane, key(&keys, lane), learning.mutation_probability);
+        }
+        let mut listed = [(0, 0); WIDEST];
+        for lane in mutating() {
+            listed[lane] = chosen.list(first + lane);
+        }
+        for lane in mutating() {
+            chosen.address(simd, first + lane, listed[lane], key(&forks, lane));
+        }
+    }
+    chosen.mutate(simd, learning, children);
+}
+
+/// Lanes of the widest vectors.
+const WIDEST: usize = 16;
+
+/// Copies a policy by vectors.
+#[inline(always)]
+fn copy<S: Simd>(simd: S, from: &[f32], to: &mut [f32]) {
+    let whole = from.len() / S::f32s::LEN * S::f32s::LEN;
+    for at in (0..whole).step_by(S::f32s::LEN) {
+        S::f32s::from_slice(simd, &from[at..at + S::f32s::LEN]).store_slice(&mut to[at..at + S::f32s::LEN]);
+    }
+    if whole < from.len() {
+        to[whole..].copy_from_slice(&from[whole..]);
+    }
+}
+
+/// The weights that mutate in one policy or several, so many that no lane idles.
+struct Chosen<'a> {
+    /// Weights of a policy.
+    parameters: usize,
+    /// A bit for each weight that mutates, [`Chosen::words`] a policy.
+    masks: &'a mut [u32],
+    /// How many are listed.
+    count: usize,
+    /// Each one's index in its policy and among all weights, its bits, and the key of its noise.
+    indices: &'a mut [u32],
+    places: &'a mut [u32],
+    bits: &'a mut [u32],
+    keys: [&'a mut [u32]; 4],
+}
+
+impl<'a> Chosen<'a> {
+    /// None of so many policies' weights.
+    #[inline(always)]
+    fn new(scratch: &'a mut Vec<u32>, policies: usize, parameters: usize) -> Chosen<'a> {
+        // Whole vectors are written from any place on.
+        let room = policies * parameters.next_multiple_of(64) + WIDEST;
+        if scratch.len() < 8 * room {
+            scratch.resize(8 * room, 0);
+        }
+        let mut fields = scratch.chunks_exact_mut(room);
+        let mut field = || fields.next().expect("there is room for eight");
+        let (masks, indices, places, bits) = (field(), field(), field(), field());
+        Chosen { parameters, masks, count: 0, indices, places, bits, keys: [field(), field(), field(), field()] }
+    }
+
+    /// Where a policy's masks are.
+    #[inline(always)]
+    fn words(&self, policy: usize) -> Range<usize> {
+        let words = 2 * self.parameters.div_ceil(64);
+        policy * words..(policy + 1) * words
+    }
+
+    /// Chooses which weights of a policy mutate: each by a random word of its own, of which a draw makes four.
+    ///
+    /// Weight 64·block + 16·word + place takes its word from counter 16·block + place: no lane width shows in that.
+    #[inline(always)]
+    fn choose<S: Simd>(&mut self, simd: S, policy: usize, key: Key, probability: f64) {
+        let threshold = mutation_threshold(probability);
+        let words = self.words(policy);
+        let lanes = S::u32s::from_fn(simd, |lane| lane as u32);
+        for (block, masks) in self.masks[words].as_chunks_mut::<2>().0.iter_mut().enumerate() {
+            let mut mutates = 0u64;
+            for place in (0..16).step_by(S::f32s::LEN) {
+                let counter = lanes + (16 * block + place) as u32;
+                for (index, word) in (0..).zip(key.draw_lanes::<S>(counter)) {
+                    mutates |= word.simd_lt(threshold.unwrap_or_default()).to_bitmask() << (16 * index + place);
+                }
+            }
+            if threshold.is_none() {
+                mutates = u64::MAX;
+            }
+            let left = self.parameters - 64 * block;
+            if left < 64 {
+                mutates &= (1 << left) - 1;
+            }
+            *masks = [mutates as u32, (mutates >> 32) as u32];
+        }
+    }
+
+    /// Lists the chosen weights of a policy; tells where.
+    #[inline(always)]
+    fn list(&mut self, policy: usize) -> (usize, usize) {
+        let before = self.count;
+        let mut count = before;
+        for (word, &mask) in (0..).step_by(32).zip(&self.masks[self.words(policy)]) {
+            for (index, byte) in (word..).step_by(8).zip(mask.to_le_bytes()) {
+                let to = &mut self.indices[count..count + 8];
+                for (to, &bit) in to.iter_mut().zip(&BITS[byte as usize]) {
+                    *to = index + u32::from(bit);
+                }
+                count += byte.count_ones() as usize;
+            }
+        }
+        self.count = count;
+        (before, count)
+    }
+
+    /// Says of the listed weights of a policy where they are, and that their noise has this key.
+    ///
+    /// Not at once as they are listed: what was written in pieces can be read as a whole only after a while.
+    #[inline(always)]
+    fn address<S: Simd>(&mut self, simd: S, policy: usize, (first, end): (usize, usize), noises: Key) {
+        let place = (policy * self.parameters) as u32;
+        for at in (first..end).step_by(S::f32s::LEN) {
+            let vector = at..at + S::f32s::LEN;
+            let index = S::u32s::from_slice(simd, &self.indices[vector.clone()]);
+            (index + place).store_slice(&mut self.places[vector.clone()]);
+            for (to, word) in self.keys.iter_mut().zip(noises.0) {
+                S::u32s::simd_from(simd, word).store_slice(&mut to[vector.clone()]);
+            }
+        }
+    }
+
+    /// Adds its noise to each.
+    #[inline(always)]
+    fn mutate<S: Simd>(self, simd: S, learning: &Learning, weights: &mut [f32]) {
+        let Chosen { count, indices, places, bits, keys: [x, y, z, w], .. } = self;
+        let sigma = learning.mutation_sigma as f32;
+        for (bits, &place) in bits[..count].iter_mut().zip(&*places) {
+            *bits = weights[place as usize].to_bits();
+        }
+        let vectors = || (0..count).step_by(S::f32s::LEN).map(|at| at..at + S::f32s::LEN);
+        let load = |from: &[u32]| S::u32s::from_slice(simd, from);
+        // In short loops: the processor sees far enough ahead to keep its units busy.
+        for at in vectors() {
+            let counter = load(&w[at.clone()]) ^ load(&indices[at.clone()]);
+            let [a, b, ..] = math::draw::<S>(load(&x[at.clone()]), load(&y[at.clone()]), load(&z[at.clone()]), counter);
+            a.store_slice(&mut x[at.clone()]);
+            b.store_slice(&mut y[at]);
+        }
+        for at in vectors() {
+            let radius: S::u32s = math::normal_radius::<S>(load(&x[at.clone()])).bitcast();
+            radius.store_slice(&mut x[at]);
+        }
+        for at in vectors() {
+            let weight: S::f32s = load(&bits[at.clone()]).bitcast();
+            let radius: S::f32s = load(&x[at.clone()]).bitcast();
+            let noise = math::normal_of::<S>(radius, math::normal_cosine::<S>(load(&y[at.clone()]))) * sigma;
+            let noise = if learning.mutation == Mutation::Scaled { noise * weight } else { noise };
+            let mutated: S::u32s = within_limits(simd, weight + noise).bitcast();
+            mutated.store_slice(&mut bits[at]);
+        }
+        for (&bits, &place) in bits[..count].iter().zip(&*places) {
+            weights[place as usize] = f32::from_bits(bits);
+        }
+    }
+}
+
+/// A weight mutates where its random word is below this; none where all do.
+pub fn mutation_threshold(probability: f64) -> Option<u32> {
+    (probability < 1.0).then_some((probability * (1u64 << 32) as f64) as u32)
+}
+
+/// The bits that are set in each byte, ascending, then zeros.
+const BITS: [[u8; 8]; 256] = {
+    let mut bits = [[0; 8]; 256];
+    let mut byte = 0;
+    while byte < 256 {
+        let (mut bit, mut count) = (0, 0);
+        while bit < 8 {
+            if byte >> bit & 1 == 1 {
+                bits[byte][count] = bit;
+                count += 1;
+            }
+            bit += 1;
+        }
+        byte += 1;
+    }
+    bits
+};

@@ -1,0 +1,132 @@
+//! Selection: elites, binary tournaments, and the plan of the next generation.
+
+use fearless_simd::{Level, Simd, dispatch, prelude::*};
+
+use super::random::{Key, pick};
+use crate::config::{Learning, Parents};
+use crate::kernels::math;
+use crate::parallel::*;
+
+/// The indices of the `count` best scores, best first; ties go to the lower index.
+pub fn best(scores: &[f32], count: usize) -> Vec<usize> {
+    let better = |a: &usize, b: &usize| scores[*b].total_cmp(&scores[*a]).then(a.cmp(b));
+    let mut order: Vec<usize>;
+    if count <= FEW {
+        // The best so far, in order; hardly any other score comes near them.
+        order = Vec::with_capacity(count + 1);
+        for (index, score) in scores.iter().enumerate() {
+            if order.len() < count || order.last().is_some_and(|&last| score.total_cmp(&scores[last]).is_gt()) {
+                order.insert(order.partition_point(|&other| scores[other].total_cmp(score).is_ge()), index);
+                order.truncate(count);
+            }
+        }
+        return order;
+    }
+    order = (0..scores.len()).collect();
+    if count < order.len() {
+        order.select_nth_unstable_by(count - 1, better);
+    }
+    order.truncate(count);
+    order.sort_unstable_by(better);
+    order
+}
+
+/// So few best scores are found without sorting.
+const FEW: usize = 16;
+
+/// The winner of the binary tournament of one slot: two distinct policies, the higher score, ties to the lower index.
+pub fn tournament(key: Key, scores: &[f32]) -> usize {
+    let [first, second, ..] = key.draw(0);
+    winner(first, second, scores)
+}
+
+/// The winner between the policies that two random words pick.
+#[inline(always)]
+fn winner(first: u32, second: u32, scores: &[f32]) -> usize {
+    let a = pick(first, scores.len());
+    let b = pick(second, scores.len() - 1);
+    let b = if b >= a { b + 1 } else { b };
+    let (low, high) = (a.min(b), a.max(b));
+    if scores[high] > scores[low] { high } else { low }
+}
+
+/// Set in a slot's entry of the plan of [`draw_parents`] where the slot keeps its parent's weights as they are.
+pub const UNCHANGED: u32 = 1 << 31;
+
+/// Which policies of a population survive, and which may become parents.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Selection {
+    /// The number of policies that survive unchanged.
+    pub elites: usize,
+    /// Which policies may become parents.
+    pub parents: Parents,
+}
+
+impl Selection {
+    /// Returns the selection that a config asks for.
+    pub fn of(learning: &Learning) -> Selection {
+        Selection { elites: learning.elites.count(learning.population), parents: learning.parents }
+    }
+}
+
+/// Plans one population's next generation: the policy from which each slot comes, `[policies + 1]`, with [`UNCHANGED`]
+/// where it does not mutate.
+///
+/// The first slots are the elites', best first. The others' parents win [`tournament`]s, or with [`Parents::Elites`] are
+/// elites, each with the same probability. The last slot gets the best of all, the champion. `key` is of purpose
+/// [`Purpose::Tournament`], `scores` are `[policies]`.
+pub fn draw_parents(
+    level: Level,
+    key: Key,
+    generation: usize,
+    population: usize,
+    selection: Selection,
+    scores: &[f32],
+    parents: &mut [u32],
+) {
+    let policies = scores.len();
+    let best = best(scores, selection.elites.max(1));
+    let choose = |first, second| match selection.parents {
+        Parents::All => winner(first, second, scores),
+        Parents::Elites => best[pick(first, best.len())],
+    };
+    parents[..policies].par_chunks_mut(DRAWN_TOGETHER).enumerate().for_each(|(chunk, parents)| {
+        let first = chunk * DRAWN_TOGETHER;
+        dispatch!(level, simd => draw_parents_lanes(simd, key, generation, population, first, choose, parents));
+    });
+    for (parent, elite) in parents.iter_mut().zip(&best[..selection.elites]) {
+        *parent = *elite as u32 | UNCHANGED;
+    }
+    parents[policies] = best[0] as u32 | UNCHANGED;
+}
+
+/// The plan that leaves all policies where they are, after the last generation; only the champion gets its slot.
+pub fn keep_parents(scores: &[f32], parents: &mut [u32]) {
+    for (slot, parent) in parents.iter_mut().enumerate() {
+        *parent = slot as u32 | UNCHANGED;
+    }
+    parents[scores.len()] = best(scores, 1)[0] as u32 | UNCHANGED;
+}
+
+/// Slots whose parents one thread draws at a time.
+const DRAWN_TOGETHER: usize = 4096;
+
+#[inline(always)]
+fn draw_parents_lanes<S: Simd>(
+    simd: S,
+    key: Key,
+    generation: usize,
+    population: usize,
+    first: usize,
+    choose: impl Fn(u32, u32) -> usize,
+    parents: &mut [u32],
+) {
+    for (slot, parents) in (first..).step_by(S::f32s::LEN).zip(parents.chunks_mut(S::f32s::LEN)) {
+        let slots = S::u32s::from_fn(simd, |lane| (slot + lane) as u32);
+        let [x, y, z, w] = key.at_lanes::<S>(generation, population, slots);
+        let [firsts, seconds, ..] = math::draw::<S>(x, y, z, w);
+        for ((parent, &first), &second) in parents.iter_mut().zip(firsts.as_slice()).zip(seconds.as_slice()) {
+            *parent = choose(first, second) as u32;
+        }
+    }
+}

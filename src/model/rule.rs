@@ -1,0 +1,267 @@
+//! Who observes a POI, when and in what order: the [`Rule`] and its keys in `[world]`.
+
+use std::ops::{Range, RangeInclusive};
+
+use serde::Serialize;
+
+use crate::declare::config_enum;
+use crate::reader::{OneOrList, Reader, between};
+
+/// Agents needed at a POI at the same step: one number for all POIs, or one per POI.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[serde(untagged)]
+pub enum Coupling {
+    /// As many at every POI.
+    Same(usize),
+    /// So many at each, `[pois]`.
+    Each(Vec<usize>),
+}
+
+impl Coupling {
+    /// Reads it, of so many agents, which `because` names, and POIs (none where their number is unknown).
+    pub(crate) fn read(r: &mut Reader<'_>, agents: usize, because: &'static str, pois: Option<usize>) -> Coupling {
+        let coupling = r
+            .key(
+                "world.coupling",
+                "agents",
+                "C: how many must be at a POI at the same step for it to be observed; one number for all POIs, or one \
+                 per POI",
+                "3.2, Eq. 2",
+            )
+            .one_or_list(between(1, agents).because(because), pois.map_or(0..=usize::MAX, |pois| pois..=pois), 3);
+        match coupling {
+            OneOrList::One(coupling) => Coupling::Same(coupling),
+            OneOrList::List(couplings) => Coupling::Each(couplings),
+        }
+    }
+
+    /// Of each of so many POIs.
+    pub fn of_each(&self, pois: usize) -> Vec<u32> {
+        match self {
+            Coupling::Same(count) => vec![*count as u32; pois],
+            Coupling::Each(counts) => counts.iter().map(|&count| count as u32).collect(),
+        }
+    }
+}
+
+config_enum! {
+    /// Whose presence at a POI counts.
+    Observers {
+        /// Every agent's.
+        All = "all",
+        /// Leaders' alone.
+        Leaders = "leaders",
+        /// Followers' alone.
+        Followers = "followers",
+    }
+}
+
+impl Observers {
+    /// Asks for it.
+    pub(crate) fn read(r: &mut Reader<'_>) -> Observers {
+        r.key("world.observers", "", "whose presence at a POI counts; the coupling is at most their number", "5")
+            .choice(Observers::All)
+    }
+
+    /// The agents that count, of so many leaders and then followers.
+    pub fn among(self, leaders: usize, followers: usize) -> Range<usize> {
+        match self {
+            Observers::All => 0..leaders + followers,
+            Observers::Leaders => 0..leaders,
+            Observers::Followers => leaders..leaders + followers,
+        }
+    }
+
+    /// How an error calls their number.
+    pub(crate) fn counted(self) -> &'static str {
+        match self {
+            Observers::All => "the number of agents",
+            Observers::Leaders => "the number of leaders, who alone are observers",
+            Observers::Followers => "the number of followers, who alone are observers",
+        }
+    }
+}
+
+/// Reads at which steps each POI can be observed, of so many steps and POIs (none where their number is unknown).
+pub(crate) fn windows(r: &mut Reader<'_>, steps: usize, pois: Option<usize>) -> Vec<[usize; 2]> {
+    let asked =
+        r.key("world.windows", "steps", "the first and the last step of each POI at which it can be observed", "5");
+    let reversed = |windows: &[Vec<usize>]| {
+        let wrong = windows.iter().enumerate().filter(|(_, window)| window[0] > window[1]);
+        let problems = wrong.map(|(poi, window)| {
+            let message = format!("found the steps from {} to {}, allowed the earlier one first", window[0], window[1]);
+            (poi, message)
+        });
+        problems.collect()
+    };
+    let what = "pairs [first, last]";
+    let windows = asked.lists(what, ("world.pois", pois), 2..=2, between(1, steps).because("world.steps"), reversed);
+    windows.into_iter().map(|window| [window[0], window[1]]).collect()
+}
+
+/// Reads which POIs each one comes after, of so many (none where their number is unknown).
+pub(crate) fn after(r: &mut Reader<'_>, pois: Option<usize>) -> Vec<Vec<usize>> {
+    let asked = r.key(
+        "world.after",
+        "POIs",
+        "the POIs, by their places in world.pois from 0 on, that must have been observed at an earlier step before this \
+         one can be",
+        "5",
+    );
+    let most = pois.map_or(usize::MAX, |pois| pois - 1);
+    let wrong = |after: &[Vec<usize>]| {
+        if pois.is_none() {
+            // There is something else to be mended first.
+            return vec![];
+        }
+        let own = after.iter().enumerate().filter(|(poi, after)| after.contains(poi));
+        let mut problems: Vec<_> =
+            own.map(|(poi, _)| (poi, "found the POI itself, allowed others".to_string())).collect();
+        if let (true, Some(cycle)) = (problems.is_empty(), cycle(after)) {
+            let names: Vec<_> = cycle.iter().chain(&cycle[..1]).map(|poi| format!("POI {poi}")).collect();
+            problems.push((cycle[0], format!("found {}, which can never begin", names.join(" after "))));
+        }
+        problems
+    };
+    let lengths = 0..=pois.unwrap_or(usize::MAX);
+    asked.lists("lists of POIs", ("world.pois", pois), lengths, between(0, most).because("the last POI"), wrong)
+}
+
+/// All POIs, each behind those it comes after; and those for which there is no such order.
+fn sorted(after: &[Vec<usize>]) -> (Vec<usize>, Vec<usize>) {
+    let (mut order, mut left): (Vec<usize>, Vec<usize>) = (vec![], (0..after.len()).collect());
+    let mut placed = vec![false; after.len()];
+    loop {
+        let free = |&poi: &usize| after[poi].iter().all(|&other| placed.get(other) == Some(&true));
+        let (next, others): (Vec<usize>, Vec<usize>) = left.into_iter().partition(free);
+        left = others;
+        if next.is_empty() {
+            return (order, left);
+        }
+        next.iter().for_each(|&poi| placed[poi] = true);
+        order.extend(next);
+    }
+}
+
+/// POIs each of which comes after the next, and the last after the first.
+fn cycle(after: &[Vec<usize>]) -> Option<Vec<usize>> {
+    let (_, left) = sorted(after);
+    let mut path = vec![*left.first()?];
+    loop {
+        // Whoever has no place in the order waits for one that has none either.
+        let next = *after[path[path.len() - 1]].iter().find(|poi| left.contains(poi))?;
+        if let Some(first) = path.iter().position(|&poi| poi == next) {
+            return Some(path.split_off(first));
+        }
+        path.push(next);
+    }
+}
+
+/// Who observes POIs, when, and in what order: by it everybody tells whether a POI was observed.
+///
+/// A POI is observed at the first step that is within its window, all POIs that it comes after having been observed at
+/// steps before, with at least as many agents that count near it as its coupling. Steps count from 1.
+///
+/// By the default all agents count, at any step, in any order.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Rule {
+    /// A bit for each agent that counts, `[words]`; empty where all do.
+    counted: Vec<u32>,
+    /// `[pois]`; empty where there are none.
+    windows: Vec<[u32; 2]>,
+    /// `[pois]`, and the POIs in an order in which each stands behind those it comes after; empty where none does.
+    after: Vec<Vec<usize>>,
+    order: Vec<usize>,
+}
+
+/// The step of what never happens.
+pub const NEVER: u32 = u32::MAX;
+
+impl Rule {
+    /// Of these agents of so many, windows `[pois]` and POIs that each comes after `[pois]`; no windows, or none that
+    /// any comes after, may be empty.
+    pub fn new(counted: Range<usize>, agents: usize, windows: &[[usize; 2]], after: &[Vec<usize>]) -> Rule {
+        let mut bits = vec![0; agents.div_ceil(32)];
+        counted.clone().for_each(|agent| bits[agent / 32] |= 1 << (agent % 32));
+        let after = if after.iter().all(Vec::is_empty) { vec![] } else { after.to_vec() };
+        Rule {
+            counted: if counted.len() == agents { vec![] } else { bits },
+            windows: windows.iter().map(|window| window.map(|step| step as u32)).collect(),
+            order: sorted(&after).0,
+            after,
+        }
+    }
+
+    /// Whether it fits so many words a set and POIs: it is of as many, no window starts before the first step, and no
+    /// POI waits for itself.
+    pub fn fits(&self, words: usize, pois: usize) -> bool {
+        let fits = |len: usize, wanted: usize| len == 0 || len == wanted;
+        fits(self.counted.len(), words)
+            && fits(self.windows.len(), pois)
+            && fits(self.after.len(), pois)
+            && self.windows.iter().all(|&[first, _]| first > 0)
+            && self.order.len() == self.after.len()
+    }
+
+    /// Whether it is the default.
+    pub fn is_plain(&self) -> bool {
+        self.counted.is_empty() && !self.is_timed()
+    }
+
+    /// Whether it matters at which steps agents were near a POI.
+    pub fn is_timed(&self) -> bool {
+        !self.windows.is_empty() || !self.after.is_empty()
+    }
+
+    /// Whether an agent counts.
+    pub fn counts(&self, agent: usize) -> bool {
+        self.counted(agent / 32, 1 << (agent % 32)) != 0
+    }
+
+    /// Those of a word of a set that count.
+    #[inline]
+    pub fn counted(&self, word: usize, agents: u32) -> u32 {
+        agents & self.counted.get(word).copied().unwrap_or(u32::MAX)
+    }
+
+    /// How many of a set, `[words]`, count.
+    #[inline]
+    pub fn count(&self, set: impl IntoIterator<Item = u32>) -> u32 {
+        set.into_iter().enumerate().map(|(word, agents)| self.counted(word, agents).count_ones()).sum()
+    }
+
+    /// The first and the last step of a POI's window; of one that has none, all.
+    pub fn window(&self, poi: usize) -> Option<[u32; 2]> {
+        self.windows.get(poi).copied()
+    }
+
+    /// The POIs that a POI comes after.
+    pub fn after(&self, poi: usize) -> &[usize] {
+        self.after.get(poi).map_or(&[], |after| after)
+    }
+
+    /// Whether a POI can be observed at a step by whoever is there, when these were observed before it.
+    pub fn is_open(&self, poi: usize, step: u32, observed: &[bool]) -> bool {
+        self.window(poi).is_none_or(|[first, last]| (first..=last).contains(&step))
+            && self.after(poi).iter().all(|&other| observed[other])
+    }
+
+    /// When each POI is observed in an episode of so many steps, `[pois]`, [`NEVER`] if it is not: at the first step,
+    /// among those at which the rule lets it be, that `first_enough` finds to have enough agents. That is asked for
+    /// each POI and its steps, and not where there are none.
+    pub fn observe(
+        &self,
+        steps: u32,
+        observed_at: &mut [u32],
+        mut first_enough: impl FnMut(usize, RangeInclusive<u32>) -> Option<u32>,
+    ) {
+        for place in 0..observed_at.len() {
+            let poi = self.order.get(place).copied().unwrap_or(place);
+            let [first, last] = self.window(poi).unwrap_or([1, steps]);
+            let latest = self.after(poi).iter().map(|&other| observed_at[other]).max();
+            // NEVER and one is NEVER.
+            let open = latest.map_or(first, |latest| first.max(latest.saturating_add(1)))..=last.min(steps);
+            observed_at[poi] = if open.is_empty() { None } else { first_enough(poi, open) }.unwrap_or(NEVER);
+        }
+    }
+}
