@@ -7,6 +7,11 @@
 //! - A `toml` block is a file where the paragraph before it names one (`` `sweep.toml` ``).
 //! - `<!-- not run: WHY -->` before a block leaves it out; `<!-- long: WHY -->` leaves it to `FLOTILLA_LONG=1`.
 //!
+//! - `<!-- output -->` before a `text` block holds the block to what the last command printed: its lines are printed in this
+//!   order, with others between them or not; `…` stands for any part of a line.
+//!
+//! `FLOTILLA_PAGE=first-run` runs the pages with this in their names.
+//!
 //! Commands that are not run, and those inside a text (`` `flotilla …` ``), have to be such that the program takes their
 //! flags; a word in capitals stands for a value there.
 
@@ -51,6 +56,8 @@ struct Block {
     /// Why it is left out, always or unless there is time.
     not_run: Option<String>,
     long: Option<String>,
+    /// Whether the last command printed this.
+    output: bool,
     /// The file that a `toml` block is.
     file: Option<String>,
     lines: Vec<(usize, String)>,
@@ -87,6 +94,7 @@ fn read(text: &str) -> (Vec<Block>, Vec<(usize, String)>) {
         if let Some(comment) = comment {
             let why = |kind: &str| comment.strip_prefix(kind).map(|why| why.trim().to_string());
             (next.not_run, next.long) = (why("not run:").or(next.not_run), why("long:").or(next.long));
+            next.output |= comment == "output";
         } else if let Some(fence) = line.trim_start().strip_prefix("```") {
             let mut block = Block { language: fence.trim().into(), ..std::mem::take(&mut next) };
             let named =
@@ -154,8 +162,8 @@ fn calls(line: &str) -> Vec<String> {
     parts.collect()
 }
 
-/// Runs a command as a shell does; its output where it failed.
-fn run(command: &str, folder: &Path) -> Result<(), String> {
+/// Runs a command as a shell does, and returns what it printed, as an error if it failed.
+fn run(command: &str, folder: &Path) -> Result<String, String> {
     let said = folder.join(".said");
     let output = fs::File::create(&said).unwrap();
     let mut bash = support::shell("bash", command);
@@ -173,10 +181,26 @@ fn run(command: &str, folder: &Path) -> Result<(), String> {
             None => std::thread::sleep(Duration::from_millis(5)),
         }
     };
-    if status == "exit status: 0" {
-        return Ok(());
-    }
-    Err(format!("{status}\n{}", fs::read_to_string(&said).unwrap_or_default()))
+    let printed = fs::read_to_string(&said).unwrap_or_default();
+    if status == "exit status: 0" { Ok(printed) } else { Err(format!("{status}\n{printed}")) }
+}
+
+/// The first line of a block that was not printed, after the lines before it.
+fn not_printed<'a>(block: &'a Block, printed: &str) -> Option<&'a (usize, String)> {
+    let mut printed = printed.lines();
+    let is = |line: &str, shown: &str| {
+        let mut rest = line.trim_end();
+        let parts: Vec<_> = shown.trim_end().split('…').collect();
+        let (first, others) = parts.split_first().unwrap();
+        let Some(left) = rest.strip_prefix(first) else { return false };
+        rest = left;
+        for part in others {
+            let Some(at) = rest.find(part) else { return false };
+            rest = &rest[at + part.len()..];
+        }
+        rest.is_empty() || parts.last().is_some_and(|last| last.is_empty())
+    };
+    block.lines.iter().find(|(_, shown)| !shown.trim().is_empty() && !printed.any(|line| is(line, shown)))
 }
 
 fn copy(from: &Path, to: &Path) {
@@ -211,8 +235,14 @@ fn try_page(name: &str, text: &str, long: bool) -> Tried {
         }
     };
     inline.iter().for_each(|(number, command)| parse(&mut tried, *number, command));
-    let mut broken = false;
+    let (mut broken, mut printed) = (false, String::new());
     for block in blocks {
+        if block.output && !broken {
+            if let Some((number, line)) = not_printed(&block, &printed) {
+                tried.failed.push(format!("{name}:{number}: {line}\nis not what the last command printed:\n{printed}"));
+            }
+            continue;
+        }
         let text = || block.lines.iter().map(|(_, line)| line.clone() + "\n").collect::<String>();
         match &*block.language {
             "toml" => {
@@ -235,10 +265,13 @@ fn try_page(name: &str, text: &str, long: bool) -> Tried {
                 tried.left_out.push(format!("{name}:{number}: {command}  ({why})"));
             } else if !broken {
                 tried.ran += 1;
-                if let Err(output) = run(&command, folder.path()) {
-                    tried.failed.push(format!("{name}:{number}: {command}\n{output}"));
-                    // What follows would fail for want of this.
-                    broken = true;
+                match run(&command, folder.path()) {
+                    Ok(output) => printed = output,
+                    Err(output) => {
+                        tried.failed.push(format!("{name}:{number}: {command}\n{output}"));
+                        // What follows would fail for want of this.
+                        broken = true;
+                    }
                 }
             }
         }
@@ -251,8 +284,12 @@ fn every_command_of_the_pages_does_what_it_says() {
     let long = std::env::var("FLOTILLA_LONG").is_ok_and(|long| long == "1");
     let (mut failed, mut told) = (Vec::new(), String::new());
     let mut all = 0;
+    let only = std::env::var("FLOTILLA_PAGE").unwrap_or_default();
     for page in pages() {
         let name = page.strip_prefix(env!("CARGO_MANIFEST_DIR")).unwrap().display().to_string();
+        if !name.contains(&only) {
+            continue;
+        }
         let mut tried = try_page(&name, &fs::read_to_string(&page).unwrap(), long);
         all += tried.ran;
         told += &format!(
@@ -267,7 +304,7 @@ fn every_command_of_the_pages_does_what_it_says() {
     // Straight to the stream: what a passing test prints by macro is not shown.
     write!(std::io::stderr(), "\n{told}").unwrap();
     assert!(failed.is_empty(), "{} commands of the pages fail:\n\n{}", failed.len(), failed.join("\n\n"));
-    assert!(all >= 10, "only {all} commands were found");
+    assert!(all >= 10 || !only.is_empty(), "only {all} commands were found");
 }
 
 #[test]
@@ -282,4 +319,57 @@ fn what_fails_in_a_page_is_told_with_its_place() {
     let expected = ["p.md:23: flotilla plot --ot x", "p.md:13: flotilla chekc x", "p.md:21: flotilla check --sed 1"];
     assert_eq!(places, expected, "{failed:?}");
     assert!(failed[1].contains("exit status: 2\n") && failed[1].contains("chekc"), "{failed:?}");
+}
+
+#[test]
+fn output_that_differs_is_reported() {
+    let page = "```\nprintf 'one 1\\ntwo 2\\nthree 3\\n'\n```\n\n<!-- output -->\n\n```text\none 1\nth…3\n```\n";
+    assert!(try_page("p.md", page, false).failed.is_empty());
+    for (from, to) in [("one 1\nth…3", "th…3\none 1"), ("th…3", "th…4"), ("one 1\n", "one\n")] {
+        let page =
+            page.replace(&format!("text\n{}", "one 1\nth…3"), &format!("text\n{}", "one 1\nth…3".replace(from, to)));
+        assert_eq!(try_page("p.md", &page, false).failed.len(), 1, "{page}");
+    }
+}
+
+/// The anchor that a heading gets.
+fn anchor(heading: &str) -> String {
+    let kept = heading.trim().to_lowercase();
+    kept.chars().filter(|c| c.is_alphanumeric() || " -_".contains(*c)).map(|c| if c == ' ' { '-' } else { c }).collect()
+}
+
+/// The relative links of a page that lead nowhere.
+fn broken_links(page: &Path) -> Vec<String> {
+    let anchors = |text: &str| -> Vec<String> {
+        text.lines().filter(|line| line.starts_with('#')).map(|line| anchor(line.trim_start_matches('#'))).collect()
+    };
+    let text = fs::read_to_string(page).unwrap();
+    let links = text.split("](").skip(1).filter_map(|rest| rest.split_once(')')).map(|(link, _)| link);
+    let broken = links.filter(|link| {
+        if link.contains("://") || link.starts_with("mailto:") || link.contains(char::is_whitespace) {
+            return false;
+        }
+        let (path, fragment) = link.split_once('#').map_or((*link, None), |(path, fragment)| (path, Some(fragment)));
+        let target = if path.is_empty() { page.to_path_buf() } else { page.with_file_name("").join(path) };
+        let is_page = target.extension().is_some_and(|extension| extension == "md");
+        let has = |fragment: &str| anchors(&fs::read_to_string(&target).unwrap()).iter().any(|there| there == fragment);
+        !target.exists() || is_page && fragment.is_some_and(|fragment| !has(fragment))
+    });
+    broken.map(|link| format!("{}: {link}", page.display())).collect()
+}
+
+#[test]
+fn every_link_of_the_pages_leads_somewhere() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let others =
+        ["CHANGELOG.md", "CONTRIBUTING.md", "python/README.md", "benches/README.md", "benches/peers/README.md"];
+    let pages = pages().into_iter().chain(others.map(|other| root.join(other)));
+    let broken: Vec<_> = pages.filter(|page| page.exists()).flat_map(|page| broken_links(&page)).collect();
+    assert!(broken.is_empty(), "{broken:#?}");
+
+    let folder = tempfile::tempdir().unwrap();
+    let page = folder.path().join("page.md");
+    fs::write(&page, "# One `two`: three\n[a](#one-two-three) [b](#four) [c](page.md#x) [d](none.md) [e](https://f.g)")
+        .unwrap();
+    assert_eq!(broken_links(&page).len(), 3, "{:?}", broken_links(&page));
 }

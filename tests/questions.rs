@@ -1,4 +1,4 @@
-//! `flotilla paper --questions`: a short form of all of it, and that docs/results/questions.md tells what comes out.
+//! `flotilla paper --questions`: a short form of all of it, and that docs/results/questions-tables.md tells what comes out.
 //!
 //! One question is trained in full; `FLOTILLA_LONG=1` trains all. Where results change on purpose, the page's tables and
 //! figures are written anew from what `flotilla paper --questions --out DIR` made by
@@ -103,7 +103,7 @@ fn named(part: &Study, ending: &str) -> String {
 
 #[test]
 fn the_page_tells_what_comes_out() {
-    let page = fs::read_to_string(docs("questions.md")).unwrap();
+    let page = fs::read_to_string(docs("questions-tables.md")).unwrap();
     if let Some(made) = std::env::var_os("FLOTILLA_WRITE_QUESTIONS").map(PathBuf::from) {
         let there = fs::read_to_string(made.join("questions.md")).unwrap();
         let mut page = page;
@@ -113,7 +113,7 @@ fn the_page_tells_what_comes_out() {
                 fs::copy(made.join(part.name).with_extension(ending), docs(&named(part, ending))).unwrap();
             }
         }
-        return fs::write(docs("questions.md"), page).unwrap();
+        return fs::write(docs("questions-tables.md"), page).unwrap();
     }
     let long = std::env::var("FLOTILLA_LONG").is_ok_and(|long| long == "1");
     let letters = if long { vec!['a', 'b', 'c', 'd', 'e', 'f', 'g'] } else { vec!['g'] };
@@ -124,7 +124,7 @@ fn the_page_tells_what_comes_out() {
         assert_eq!(
             block(&page, part),
             block(&out, part),
-            "docs/results/questions.md; see the head of tests/questions.rs"
+            "docs/results/questions-tables.md; see the head of tests/questions.rs"
         );
         for ending in ["svg", "csv"] {
             let [there, here] =
@@ -137,7 +137,7 @@ fn the_page_tells_what_comes_out() {
 /// Also of the questions that are not trained anew: tables, figures and files are of one run.
 #[test]
 fn the_pages_tables_are_those_of_its_files() {
-    let page = fs::read_to_string(docs("questions.md")).unwrap();
+    let page = fs::read_to_string(docs("questions-tables.md")).unwrap();
     for part in QUESTIONS.iter().flat_map(|question| question.parts) {
         let (block, mut told) = (block(&page, part), 0);
         let mut table = csv::Reader::from_path(docs(&named(part, "csv"))).unwrap();
