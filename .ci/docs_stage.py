@@ -1,0 +1,80 @@
+"""Copies docs/ to target/docs for the site, with what its pages link to elsewhere in the repository.
+
+    python3 .ci/docs_stage.py [FLOTILLA]
+
+A file outside docs/ that a page links to becomes repository/PATH in the site, and the links follow. With the program's path,
+the page of commands gets the full help of each command.
+"""
+
+import posixpath
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+STAGE = ROOT / "target/docs"
+LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
+
+
+def in_site(path):
+    """Returns where a file of the repository is in the site."""
+    return path.removeprefix("docs/") if path.startswith("docs/") else "repository/" + path
+
+
+def target(page, link):
+    """Returns the repository's file that a link of a page leads to, if it is one."""
+    if re.match(r"[a-z]+:", link):
+        return None
+    path = posixpath.normpath(posixpath.join(posixpath.dirname(page), link))
+    return path if (ROOT / path).is_file() else None
+
+
+def rewritten(text, page):
+    def link(match):
+        path = target(page, match[2])
+        if path is None:
+            return match[0]
+        there = posixpath.relpath(in_site(path), posixpath.dirname(in_site(page)) or ".")
+        return match[1] + there + (match[3] or "") + match[4]
+
+    return LINK.sub(link, text)
+
+
+def command_help(program):
+    def printed(*arguments):
+        return subprocess.run([program, *arguments], check=True, capture_output=True, text=True).stdout
+
+    names = [name for name in re.findall(r"^ +([a-z-]+) {2,}\S", printed("help"), re.M) if name != "help"]
+    texts = [f"\n### flotilla {name}\n\n```text\n{printed('help', name)}```\n" for name in names]
+    return "\n## Every flag\n" + "".join(texts)
+
+
+def main():
+    shutil.rmtree(STAGE, ignore_errors=True)
+    shutil.copytree(ROOT / "docs", STAGE, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
+    waiting = [path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rglob("*.md")]
+    seen = set(waiting)
+    while waiting:
+        page = waiting.pop()
+        text = (ROOT / page).read_text()
+        for match in LINK.finditer(text):
+            path = target(page, match[2])
+            if path is None or path.startswith("docs/") or path in seen:
+                continue
+            seen.add(path)
+            if path.endswith(".md"):
+                waiting.append(path)
+            else:
+                there = STAGE / in_site(path)
+                there.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(ROOT / path, there)
+        if page == "docs/reference/commands.md" and len(sys.argv) > 1:
+            text += command_help(sys.argv[1])
+        there = STAGE / in_site(page)
+        there.parent.mkdir(parents=True, exist_ok=True)
+        there.write_text(rewritten(text, page))
+
+
+main()
