@@ -229,8 +229,10 @@ fn begin(task: Task, me: ptr<function, Agent>) {
     let start = places[task.starts + (*me).agent];
     (*me).x = start.x;
     (*me).y = start.y;
-    (*me).hx = world.heading_x;
-    (*me).hy = world.heading_y;
+    // Headings come after the POIs.
+    let heading = places[task.pois + shape.pois + (*me).agent];
+    (*me).hx = heading.x;
+    (*me).hy = heading.y;
     (*me).speed = world.speed;
     for (var leader = 0u; !TALLY && leader < shape.leaders && (*me).agent >= shape.leaders; leader++) {
         record[sight(task, me, leader)] = 0u;

@@ -180,6 +180,11 @@ impl<T: Number> Allowed<T> {
             || self.unlimited && value.is_infinite()
     }
 
+    /// Whether it is above 0, but below the least number that is allowed besides 0.
+    fn is_too_small(&self, value: T) -> bool {
+        self.zero && T::ZERO < value && value < self.low
+    }
+
     /// The default, or the bound next to it where other keys leave no room for it.
     fn nearest(&self, default: T) -> T {
         match default {
@@ -194,18 +199,28 @@ impl<T: Number> Allowed<T> {
     /// What is allowed in any config: a bound that other keys set goes by their names.
     fn in_general(&self) -> String {
         match self.because {
-            "" => self.to_string(),
+            "" => self.in_detail(),
             both if both.contains(" to ") => both.into(),
             most => format!("{}{} to {most}", if self.zero { "0 or " } else { "" }, self.low),
         }
     }
+
+    /// The range with its gap between 0 and the least other number, if it has one.
+    fn in_detail(&self) -> String {
+        match (self.zero, self.low < self.high) {
+            (true, true) => format!("0 or {}", Allowed { zero: false, ..*self }),
+            _ => self.to_string(),
+        }
+    }
 }
+
+/// The plain range: the gap above 0 is only worth a word to who wrote a number within it.
 
 impl<T: Number> Display for Allowed<T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Allowed { low, high, .. } = self;
         match (self.zero, low.partial_cmp(high)) {
-            (true, Some(std::cmp::Ordering::Less)) => write!(f, "0 or {low} to {high}")?,
+            (true, Some(std::cmp::Ordering::Less)) => write!(f, "0 to {high}")?,
             (true, _) => write!(f, "0")?,
             (false, Some(std::cmp::Ordering::Less)) => write!(f, "{low} to {high}")?,
             (false, _) => write!(f, "{high}")?,
@@ -435,12 +450,13 @@ impl<'a> Reader<'a> {
     }
 
     fn check<T: Number>(&mut self, entry: &Entry<'_>, allowed: Allowed<T>) -> T {
-        let kind = match T::read(entry.value.get_ref()) {
+        let allows = match T::read(entry.value.get_ref()) {
             Some(Some(value)) if allowed.holds(value) => return value,
-            Some(_) => String::new(),
-            None => format!("{}, ", T::KIND),
+            Some(Some(value)) if allowed.is_too_small(value) => allowed.in_detail(),
+            Some(_) => allowed.to_string(),
+            None => format!("{}, {allowed}", T::KIND),
         };
-        self.report(entry.place(), &entry.name, format!("found {}, allowed {kind}{allowed}", entry.found()));
+        self.report(entry.place(), &entry.name, format!("found {}, allowed {allows}", entry.found()));
         allowed.high
     }
 

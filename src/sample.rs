@@ -212,11 +212,11 @@ fn plain_world(seed: u64) -> Config {
             after: vec![],
             steps: rng.random_range(20..=60),
             dt: [0.05, 0.2, 0.2, 0.5, 1.0][rng.random_range(0..5)],
-            heading: if exact || rng.random_bool(0.3) {
+            heading: Heading::Same(if exact || rng.random_bool(0.3) {
                 quarter * f64::from(rng.random_range(-2..=2))
             } else {
                 rng.random_range(-4.0..4.0)
-            },
+            }),
             speed: if rng.random_bool(0.5) { min_speed } else { max_speed },
         },
         motion: Motion {

@@ -24,6 +24,8 @@ pub struct World {
     pub constants: Constants,
     /// In units, on the kernels' grid: `[agents]`.
     pub starts: Vec<Vec2>,
+    /// Unit vectors, at the start: `[agents]`.
+    pub headings: Vec<Vec2>,
     /// In units, on the kernels' grid: `[pois]`.
     pub pois: Vec<Vec2>,
     /// Agents that each POI needs at once (C): `[pois]`.
@@ -55,7 +57,6 @@ impl World {
         let Config { world, motion, follow, sense, policy, .. } = config;
         let (agents, leaders) = (world.leaders.len() + world.followers.len(), config.learners());
         let pois = world.pois.len();
-        let (heading_x, heading_y) = unit(world.heading);
         let motion = MotionConstants::new(motion, world.dt, world.map);
         let constants = Constants {
             leaders: leaders as u32,
@@ -63,8 +64,6 @@ impl World {
             pois: pois as u32,
             steps: world.steps as u32,
             words: agents.div_ceil(32) as u32,
-            heading_x,
-            heading_y,
             speed: world.speed as f32,
             variant: Variant { density: sense.density as u32, by_sine: motion.by_sine().into() },
             policy: PolicyConstants::new(policy),
@@ -79,6 +78,7 @@ impl World {
         World {
             constants,
             starts: [points(&world.leaders), points(&world.followers)].concat(),
+            headings: world.headings().into_iter().map(unit).collect(),
             pois: points(&world.pois),
             coupling: world.coupling.of_each(pois),
             led: Led { within: config.learning.led_within, by: config.learning.led_by },
@@ -116,6 +116,7 @@ impl World {
                 "start positions",
                 self.starts.len() as u64 == u64::from(constants.leaders) + u64::from(constants.followers),
             ),
+            ("start headings", self.headings.len() == self.starts.len()),
             ("sets", constants.words as usize == self.starts.len().div_ceil(32)),
             ("observers, windows and order of POIs", self.rule.fits(constants.words as usize, pois)),
             ("density", (constants.variant.density as usize) < Density::ALL.len()),
@@ -176,7 +177,7 @@ pub fn on_grid(place: Vec2, map: Vec2) -> Vec2 {
 /// The unit vector of an angle; a component under 1e-6 in size is 0, so that layouts full of exact ties keep them.
 ///
 /// Sines and cosines here are [`libm`]'s: those of the platform may differ in the last bit from one system to another.
-fn unit(angle: f64) -> (f32, f32) {
+fn unit(angle: f64) -> Vec2 {
     let tidy = |component: f64| if component.abs() < 1e-6 { 0.0 } else { component as f32 };
-    (tidy(libm::cos(angle)), tidy(libm::sin(angle)))
+    Vec2::new(tidy(libm::cos(angle)), tidy(libm::sin(angle)))
 }

@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use flotilla::config::{
-    Actions, Config, ConfigError, Coupling, Density, Domain, Elites, Fitness, Follow, Learning, LedBy, MAX_EPISODES,
-    MAX_GENERATIONS, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion, Mutation,
-    Observers, Override, Paradigm, Parents, Policy, Problem, Saving, Sense, Sharing,
+    Actions, Config, ConfigError, Coupling, Density, Domain, Elites, Fitness, Follow, Heading, Learning, LedBy,
+    MAX_EPISODES, MAX_GENERATIONS, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion,
+    Mutation, Observers, Override, Paradigm, Parents, Policy, Problem, Saving, Sense, Sharing,
 };
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -36,7 +36,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             after: vec![],
             steps: 25,
             dt: 0.2,
-            heading: std::f64::consts::FRAC_PI_2,
+            heading: Heading::Same(std::f64::consts::FRAC_PI_2),
             speed: 0.0,
         },
         motion: Motion {
@@ -120,7 +120,7 @@ fn defaults_give_way_to_what_was_written() {
 #[test]
 fn minus_zero_is_zero() {
     let config = Config::parse(&format!("{SMALLEST}speed = -0.0\nheading = -0.0"), "test.toml").unwrap();
-    assert!(config.world.speed.is_sign_positive() && config.world.heading.is_sign_positive());
+    assert!(config.world.speed.is_sign_positive() && config.world.headings()[0].is_sign_positive());
 }
 
 #[test]
@@ -161,7 +161,7 @@ fn overrides_are_checked_with_the_file_and_named_as_the_user_knows_them() {
     assert_eq!(
         error.unwrap_err().to_string(),
         "3 problems in test.toml\n\
-         grid \"world.pois\"[0][1]: found 51.0, allowed 0 or 0.000001 to 50 (the map)\n\
+         grid \"world.pois\"[0][1]: found 51.0, allowed 0 to 50 (the map)\n\
          --population: found 1, allowed 2 to 1048576\n\
          grid \"world.dtt\": unknown key, did you mean `world.dt`?"
     );
@@ -222,13 +222,18 @@ fn worlds() -> impl Strategy<Value = (Domain, Motion)> {
                 let each = vec(1..=most, pois).prop_map(Coupling::Each);
                 (prop_oneof![(1..=most).prop_map(Coupling::Same), each], Just(observers))
             });
-            let rest = (size(0.01, 1e4), 1..=MAX_STEPS, size(1e-4, 10.0), -1e3..=1e3);
+            let rest = (size(0.01, 1e4), 1..=MAX_STEPS, size(1e-4, 10.0));
             let rules = (vec((0.0..=1.0f64, 0.0..=1.0f64), pois), vec(vec(any::<bool>(), pois), pois), 0..4usize);
-            let rest = (rest, rules);
+            let heading = prop_oneof![
+                (-1e3..=1e3).prop_map(Heading::Same),
+                vec(-1e3..=1e3, leaders).prop_map(Heading::Each),
+                vec(-1e3..=1e3, leaders + followers).prop_map(Heading::Each),
+            ];
+            let rest = (rest, rules, heading);
             let motion = (size_or_zero(1e-3, 1e3), size_or_zero(1e-3, 1e3));
             (places(leaders), places(followers), places(pois), coupling, rest, motion).prop_map(
-                move |(leaders, followers, pois, (coupling, observers), (rest, rules), motion)| {
-                    let ((observation_radius, steps, dt, heading), (parts, follows, kind)) = (rest, rules);
+                move |(leaders, followers, pois, (coupling, observers), (rest, rules, heading), motion)| {
+                    let ((observation_radius, steps, dt), (parts, follows, kind), heading) = (rest, rules, heading);
                     let map = [x, y];
                     let step = |part: f64| 1 + (part * (steps - 1) as f64) as usize;
                     let windows: Vec<_> =
@@ -272,7 +277,7 @@ fn configs() -> impl Strategy<Value = Config> {
             wall_gain,
         },
     );
-    let range = || prop_oneof![Just(f64::INFINITY), size(0.01, 1e4)];
+    let range = || prop_oneof![Just(0.0), Just(f64::INFINITY), size(0.01, 1e4)];
     let sense = (range(), range(), word(), size(1e-3, 1e3)).prop_map(|(poi_range, agent_range, density, gain)| Sense {
         poi_range,
         agent_range,
@@ -356,7 +361,9 @@ proptest! {
     /// Ranges and relations keep the exact arithmetic well inside f32: no constant is infinite, NaN or denormal.
     #[test]
     fn a_valid_config_makes_normal_constants(config in configs()) {
-        let constants = flotilla::world::World::new(&config).constants;
+        let world = flotilla::world::World::new(&config);
+        let headings = world.headings.iter().flat_map(|heading| heading.to_array());
+        let constants = world.constants;
         let c = &constants;
         let parts: [&[f32]; 4] = [
             bytemuck::cast_slice(std::slice::from_ref(&c.motion)),
@@ -364,7 +371,7 @@ proptest! {
             bytemuck::cast_slice(std::slice::from_ref(&c.follow)),
             bytemuck::cast_slice(std::slice::from_ref(&c.sense)),
         ];
-        for value in parts.concat().into_iter().chain([c.heading_x, c.heading_y, c.speed]) {
+        for value in parts.concat().into_iter().chain(headings).chain([c.speed]) {
             prop_assert!(value == 0.0 || (2f32.powi(-100)..=1e30).contains(&value.abs()), "{:?}", constants);
         }
         prop_assert_eq!(config.parameters(), c.policy.parameters as usize);
@@ -495,4 +502,23 @@ fn rules_that_cannot_be_are_refused_where_they_stand() {
     let text = world("observers = 'followers'");
     assert!(Config::read(&text, "rules.toml", &[], &[flag]).is_err());
     assert_eq!(Config::parse(&text, "rules.toml").unwrap().world.coupling, Coupling::Same(1));
+}
+
+/// One heading is everybody's. Of one per leader, each follower takes that of the nearest leader, the first if two are
+/// equally near. One per agent is taken as it is.
+#[test]
+fn followers_face_as_their_leader() {
+    let text = |heading: &str| {
+        format!(
+            "[world]\nleaders = [[10, 10], [20, 10]]\nfollowers = [[21, 10], [9, 10], [15, 10]]\npois = [[1, 1]]\n\
+             heading = {heading}"
+        )
+    };
+    let headings = |heading: &str| Config::parse(&text(heading), "headings").unwrap().world.headings();
+    assert_eq!(headings("1.5"), [1.5; 5]);
+    assert_eq!(headings("[1.0, 2.0]"), [1.0, 2.0, 2.0, 1.0, 1.0]);
+    assert_eq!(headings("[1, 2, 3, 4, 5]"), [1.0, 2.0, 3.0, 4.0, 5.0]);
+    let world = flotilla::world::World::new(&Config::parse(&text("[0, 3.141592653589793]"), "headings").unwrap());
+    let x: Vec<f32> = world.headings.iter().map(|heading| heading.x).collect();
+    assert_eq!(x, [1.0, -1.0, -1.0, 1.0, 1.0]);
 }

@@ -60,6 +60,7 @@ impl Record {
                 ..bytemuck::Zeroable::zeroed()
             },
             starts: vec![Vec2::ZERO; agents],
+            headings: vec![Vec2::X; agents],
             pois: vec![Vec2::ZERO; self.coupling.len()],
             coupling: self.coupling.clone(),
             rule: {

@@ -417,10 +417,11 @@ fn check_team<'a>(
     let Model { config, leaders, agents, .. } = model;
     let (leaders, agents, steps) = (*leaders, *agents, config.world.steps);
     let mut states: Vec<State> = (0..agents).map(|agent| State::of(trace.moment(0, team, agent))).collect();
-    let heading = DVec2::new(config.world.heading.cos(), config.world.heading.sin());
+    let headings = config.world.headings();
     for (agent, state) in states.iter().enumerate() {
         let tidy = |component: f64| if component.abs() < 1e-6 { 0.0 } else { f64::from(component as f32) };
         assert_eq!(state.position, starts[agent].as_dvec2());
+        let heading = DVec2::new(headings[agent].cos(), headings[agent].sin());
         assert_eq!(state.heading, DVec2::new(tidy(heading.x), tidy(heading.y)));
         assert_eq!(state.speed, f64::from(config.world.speed as f32));
     }

@@ -427,3 +427,54 @@ fn few_kernels_are_kept() {
         assert_eq!(backend.compiled(), [0, 5], "{info}");
     }
 }
+
+/// Agents that face elsewhere each, and leaders that sense nothing by a range of 0, have the same bits on the GPU. The
+/// agents share one place, where a distance of 0 is within a range of 0.
+#[test]
+fn own_headings_and_ranges_of_zero_agree() {
+    let config = |ranges: &str| {
+        let text = format!(
+            "[world]\nleaders = [[10, 5], [10, 5]]\nfollowers = [[10, 5], [12, 3], [10, 5]]\npois = [[10, 5], [12, 6]]\n\
+             coupling = 2\nsteps = 20\nheading = [0.5, -1.0, 2.0, 3.0, 0.0]\n[sense]\n{ranges}\n\
+             [learning]\npopulation = 4\ntrials = 1"
+        );
+        Config::parse(&text, "zero.toml").unwrap()
+    };
+    let ranges = ["poi_range = 0", "agent_range = 0", "poi_range = 0\nagent_range = 0\ndensity = 'inverse'", ""];
+    let worlds: Vec<_> = ranges.map(|ranges| (ranges.to_string(), config(ranges))).into();
+    for (ranges, config) in &worlds {
+        let world = World::new(config);
+        let weights = sample::weights(&world, 3, 5);
+        let teams: Vec<u32> = (0..6).map(|slot| slot / 2).collect();
+        let group = Group {
+            world: &world,
+            starts: &world.starts,
+            weights: weights[..].into(),
+            policies: 3,
+            teams: &teams,
+            need: Need::Record,
+        };
+        let trace = Cpu::default().trace(&group).unwrap();
+        for (agent, heading) in world.headings.iter().enumerate() {
+            assert_eq!(trace.moment(0, 0, agent).heading, heading.to_array(), "{ranges}, agent {agent}");
+        }
+        let sensed = |from: usize| {
+            let of = |team| (1..=20).flat_map(move |step| (0..2).map(move |leader| (step, team, leader)));
+            (0..3).flat_map(of).any(|(step, team, leader)| {
+                trace.moment(step, team, leader).inputs[from..from + 4].iter().any(|&input| input.to_bits() != 0)
+            })
+        };
+        assert_eq!(
+            (sensed(0), sensed(4)),
+            (!ranges.contains("poi_range = 0"), !ranges.contains("agent_range = 0")),
+            "{ranges}"
+        );
+    }
+    for (request, info) in support::adapters("own_headings_and_ranges_of_zero_agree") {
+        for kernel in KERNELS {
+            let plan = Plan { worlds: worlds.clone(), teams: 9, seed: 3, generations: 2 };
+            let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap().playing(kernel);
+            assert_eq!(check(&plan, backend.bringing(Records::Packed)).mismatch, None, "{info}, {kernel}");
+        }
+    }
+}

@@ -16,6 +16,7 @@ pub use crate::model::motion::Motion;
 pub use crate::model::policy::{Actions, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
 pub use crate::model::rule::{Coupling, Observers};
 pub use crate::model::sense::{Density, Sense};
+pub use crate::model::start::Heading;
 pub use crate::reader::{Definition, Override, Problem};
 pub use learning::{
     Elites, Fitness, Learning, LedBy, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm,

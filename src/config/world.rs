@@ -1,10 +1,9 @@
 //! `[world]`: its data and its keys.
 
-use std::f64::consts::FRAC_PI_2;
-
 use super::{Coupling, Observers, Paradigm};
 use crate::model::couple::observation_radius;
 use crate::model::rule::{after, windows};
+use crate::model::start::Heading;
 use crate::model::{LEAST, LONGEST};
 use crate::reader::{Allowed, Reader, between, section};
 
@@ -47,8 +46,8 @@ section! {
         steps: usize = "steps", "3.2, Eq. 2",
         /// time that a step takes
         dt: f64 = "s", "",
-        /// every agent's heading at the start, from the x axis towards the y axis: π/2 faces the POIs
-        heading: f64 = "rad", "3.1, Fig. 3",
+        /// Agents' headings at the start, in radians from the x axis towards the y axis.
+        heading: Heading,
         /// every agent's speed at the start
         speed: f64 = "units/s", "3.1",
     }
@@ -81,6 +80,9 @@ impl Domain {
         }
         let places = pois.as_ref().map(Vec::len);
         let steps = Domain::steps(r).number(between(1, MAX_STEPS), 25);
+        let counts =
+            leaders.as_ref().zip(followers.as_ref()).map(|(leaders, followers)| [leaders.len(), followers.len()]);
+        let heading = Heading::read(r, counts);
         Domain {
             map,
             coupling: Coupling::read(r, counted.clamp(1, MAX_AGENTS), observers.counted(), places),
@@ -93,8 +95,13 @@ impl Domain {
             observation_radius: observation_radius(r),
             steps,
             dt: Domain::dt(r).number(between(1e-4, 10.0), 0.2),
-            heading: Domain::heading(r).number(between(-1e3, 1e3), FRAC_PI_2),
+            heading,
             speed: Domain::speed(r).number(start_speed, 0.0),
         }
+    }
+
+    /// The heading of each agent at the start, leaders first, in radians.
+    pub fn headings(&self) -> Vec<f64> {
+        self.heading.of_each(&self.leaders, &self.followers)
     }
 }

@@ -13,6 +13,7 @@ pub mod motion;
 pub mod policy;
 pub mod rule;
 pub mod sense;
+pub mod start;
 
 use couple::{CoupleConstants, CoupleLanes};
 use follow::{FollowConstants, FollowLanes};
@@ -38,10 +39,6 @@ shared! {
         pub steps: u32,
         /// u32 words in the set of agents near one POI.
         pub words: u32,
-        /// The heading at the start: its cosine.
-        pub heading_x: f32,
-        /// Its sine.
-        pub heading_y: f32,
         /// At the start, units a second.
         pub speed: f32,
         /// What kernels have code of their own for.

@@ -33,11 +33,12 @@ pub const NAMES: [&str; INPUTS] = [
 const UNLIMITED: f32 = 1e30;
 
 section! {
-    /// `[sense]`: what a leader senses. An infinite range is unlimited; a config file says so with `inf`.
+    /// `[sense]`: what a leader senses. An infinite range is unlimited; a config file says so with `inf`. With a range
+    /// of 0 nothing is sensed, not even what is at the leader's own place.
     Sense = "sense" {
-        /// how far leaders sense POIs
+        /// how far leaders sense POIs; at 0 they sense none
         poi_range: f64 = "units", "3.1",
-        /// how far leaders sense other agents
+        /// how far leaders sense other agents; at 0 they sense none
         agent_range: f64 = "units", "3.1",
         /// what something at distance d adds to its quadrant's density: 1 − d/(√2·max(map)) if linear, 1/max(d, 1) if
         /// inverse
@@ -51,8 +52,8 @@ impl Sense {
     /// Reads the section.
     pub(crate) fn read(r: &mut Reader<'_>) -> Sense {
         Sense {
-            poi_range: Sense::poi_range(r).number(between(0.01, LONGEST).or_unlimited(), f64::INFINITY),
-            agent_range: Sense::agent_range(r).number(between(0.01, LONGEST).or_unlimited(), 5.0),
+            poi_range: Sense::poi_range(r).number(between(0.01, LONGEST).or_zero().or_unlimited(), f64::INFINITY),
+            agent_range: Sense::agent_range(r).number(between(0.01, LONGEST).or_zero().or_unlimited(), 5.0),
             density: Sense::density(r).choice(Density::Linear),
             gain: Sense::gain(r).number(between(1e-3, 1e3), 1.0),
         }
@@ -76,9 +77,9 @@ shared! {
         pub poi_range2: f32,
         /// The range of agents, squared.
         pub agent_range2: f32,
-        /// gain/P: multiplies a sum over POIs.
+        /// gain/P: multiplies a sum over POIs; 0 if no POI is sensed.
         pub poi_share: f32,
-        /// gain/N: multiplies a sum over agents.
+        /// gain/N: multiplies a sum over agents; 0 if no agent is sensed.
         pub agent_share: f32,
         /// 1/D with D = √2·max(map).
         pub inverse_diagonal: f32,
@@ -88,12 +89,14 @@ shared! {
 impl SenseConstants {
     /// Of so many agents and POIs on this map.
     pub fn new(sense: &Sense, agents: usize, pois: usize, map: [f64; 2]) -> SenseConstants {
+        // A range of 0 still reaches what is at the same place: that weighs nothing, on every backend alike.
+        let share = |range: f64, count: usize| if range == 0.0 { 0.0 } else { (sense.gain / count as f64) as f32 };
         let range2 = |range: f64| if range.is_infinite() { UNLIMITED } else { (range * range) as f32 };
         SenseConstants {
             poi_range2: range2(sense.poi_range),
             agent_range2: range2(sense.agent_range),
-            poi_share: (sense.gain / pois as f64) as f32,
-            agent_share: (sense.gain / agents as f64) as f32,
+            poi_share: share(sense.poi_range, pois),
+            agent_share: share(sense.agent_range, agents),
             inverse_diagonal: (1.0 / (2f64.sqrt() * map[0].max(map[1]))) as f32,
         }
     }

@@ -451,11 +451,10 @@ pub fn layout(name: &str, config: &Config) -> Scene {
     const EDGE: f64 = 3.0;
     const HEAD: f64 = 6.5;
     let world = World::new(config);
-    let heading = DVec2::new(libm::cos(config.world.heading), libm::sin(config.world.heading));
     let leaders = world.leaders();
     let agent = |(index, start): (usize, &glam::Vec2)| Marker {
         place: start.as_dvec2(),
-        heading,
+        heading: world.headings[index].as_dvec2(),
         group: (index < leaders).then_some(index),
         counts: world.rule.counts(index),
         trail: vec![],

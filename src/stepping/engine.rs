@@ -251,7 +251,8 @@ impl<S: Simd> Room<S> {
         }
         for (lane, team) in lanes::<S>(teams).filter(|&(_, team)| is_chosen(first + team)) {
             let at = (first + team) * agents;
-            self.block.place(lane, starts.map_or(&world.starts, |starts| &starts[at..at + agents]));
+            let starts = starts.map_or(&world.starts[..], |starts| &starts[at..at + agents]);
+            self.block.place(lane, starts, &world.headings);
             if !all {
                 self.block.start_lane(lane);
             }

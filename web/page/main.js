@@ -538,9 +538,20 @@ const page = (() => {
         leaders: world.leaders.length, agents: agents.length, coupling, shown: [0], g: 0, generation: 0, trial: 0,
         owner: agents.map((place, agent) => agent < world.leaders.length ? agent : nearest(place)),
         observed: world.pois.map(() => null), near: new Uint16Array(world.pois.length), led: new Uint32Array(0),
-        positions: Float32Array.from(agents.flat()), headings: Float32Array.from(agents.flatMap(() => [Math.cos(world.heading), Math.sin(world.heading)])),
+        positions: Float32Array.from(agents.flat()), headings: Float32Array.from(headings_of(world).flatMap((angle) => [Math.cos(angle), Math.sin(angle)])),
       }],
     };
+  }
+  // The heading of each agent at the start. Of one per leader, a follower takes that of the leader nearest to it.
+  function headings_of({ heading, leaders, followers }) {
+    const agents = [...leaders, ...followers];
+    if (!Array.isArray(heading)) return agents.map(() => heading);
+    if (heading.length === agents.length) return heading;
+    const nearest = ([x, y]) => {
+      const away = leaders.map(([u, v]) => (u - x) ** 2 + (v - y) ** 2);
+      return away.indexOf(Math.min(...away));
+    };
+    return [...heading, ...followers.map((place) => heading[nearest(place)])];
   }
   let palettes = null;
 

@@ -103,22 +103,22 @@ impl<S: Simd> Block<S> {
         std::mem::swap(&mut self.near, &mut standing.near);
     }
 
-    /// Puts one lane's agents where they start.
+    /// Puts one lane's agents where they start, with their first headings.
     #[inline(always)]
-    pub fn place(&mut self, lane: usize, starts: &[Vec2]) {
-        for (agent, start) in self.agents.iter_mut().zip(starts) {
+    pub fn place(&mut self, lane: usize, starts: &[Vec2], headings: &[Vec2]) {
+        for ((agent, start), heading) in self.agents.iter_mut().zip(starts).zip(headings) {
             agent.x[lane] = start.x;
             agent.y[lane] = start.y;
+            agent.hx[lane] = heading.x;
+            agent.hy[lane] = heading.y;
         }
     }
 
-    /// Sets all lanes' agents to their first heading and speed.
+    /// Sets all lanes' agents to their first speed.
     #[inline(always)]
     pub fn start(&mut self) {
         let Block { simd, world, agents, counts, .. } = self;
         for agent in agents {
-            agent.hx = splat(*simd, world.constants.heading_x);
-            agent.hy = splat(*simd, world.constants.heading_y);
             agent.speed = splat(*simd, world.constants.speed);
         }
         counts.fill(S::u32s::splat(*simd, 0));
@@ -127,9 +127,9 @@ impl<S: Simd> Block<S> {
     /// [`Block::start`] of one lane.
     #[inline(always)]
     pub fn start_lane(&mut self, lane: usize) {
-        let Constants { heading_x, heading_y, speed, .. } = self.world.constants;
+        let speed = self.world.constants.speed;
         for agent in &mut self.agents {
-            (agent.hx[lane], agent.hy[lane], agent.speed[lane]) = (heading_x, heading_y, speed);
+            agent.speed[lane] = speed;
         }
         self.counts.iter_mut().for_each(|count| count[lane] = 0);
     }

@@ -52,7 +52,7 @@ impl<S: Simd> Whole<S> {
         places.clear();
         places.extend((0..S::f32s::LEN).map(|lane| run.locate(first + if lane < teams { lane } else { 0 })));
         for (lane, &(group, _)) in places.iter().enumerate() {
-            block.place(lane, run.groups[group].starts);
+            block.place(lane, run.groups[group].starts, &run.world.headings);
         }
         if places.iter().any(|&(group, _)| run.groups[group].moved_pois().is_some()) {
             moved.resize(run.world.pois.len(), [splat(block.simd, 0.0); 2]);

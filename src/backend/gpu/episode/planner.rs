@@ -233,6 +233,8 @@ pub(super) fn plan(
                 if group.moved_pois().is_none() {
                     work.places.extend(&world.pois);
                 }
+                // The shader finds headings behind the POIs.
+                work.places.extend(&world.headings);
                 work.worlds.push(world.constants);
                 (work.worlds.len() - 1, Task { starts, pois, ..Task::default() })
             });

@@ -1,0 +1,72 @@
+//! Which way agents face at the start. The key stands in `[world]`.
+
+use std::f64::consts::FRAC_PI_2;
+
+use serde::Serialize;
+
+use crate::reader::{OneOrList, Reader, between};
+
+/// The agents' headings at the start, in radians from the x axis towards the y axis.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(untagged)]
+pub enum Heading {
+    /// One heading for all agents.
+    Same(f64),
+    /// One per leader, which its followers share; or one per agent, leaders first.
+    Each(Vec<f64>),
+}
+
+impl Heading {
+    /// Reads the key; `counts` are the numbers of leaders and followers, none if these are not known.
+    pub(crate) fn read(r: &mut Reader<'_>, counts: Option<[usize; 2]>) -> Heading {
+        let faults = r.error_count();
+        let heading = r
+            .key(
+                "world.heading",
+                "rad",
+                "headings at the start, from the x axis towards the y axis (π/2 faces the POIs of the paper's layouts): \
+                 one number for all agents, one per leader (a follower takes that of the leader nearest to it), or one \
+                 per agent",
+                "3.1, Fig. 3",
+            )
+            .one_or_list(between(-1e3, 1e3), 0..=usize::MAX, FRAC_PI_2);
+        match heading {
+            OneOrList::One(heading) => Heading::Same(heading),
+            OneOrList::List(headings) => {
+                if let (Some([leaders, followers]), true) = (counts, r.error_count() == faults)
+                    && headings.len() != leaders
+                    && headings.len() != leaders + followers
+                {
+                    let found = headings.len();
+                    let allowed = match followers {
+                        0 => format!("{leaders} (one per leader)"),
+                        _ => format!("{leaders} (one per leader) or {} (one per agent)", leaders + followers),
+                    };
+                    r.report_key(
+                        "world.heading",
+                        format!("found a list of {found}, allowed one number or a list of {allowed}"),
+                    );
+                }
+                Heading::Each(headings)
+            }
+        }
+    }
+
+    /// The heading of each agent, leaders first, given where all start.
+    pub fn of_each(&self, leaders: &[[f64; 2]], followers: &[[f64; 2]]) -> Vec<f64> {
+        match self {
+            Heading::Same(heading) => vec![*heading; leaders.len() + followers.len()],
+            Heading::Each(headings) if headings.len() == leaders.len() => {
+                let own = |follower: &[f64; 2]| headings[nearest(follower, leaders)];
+                headings.iter().copied().chain(followers.iter().map(own)).collect()
+            }
+            Heading::Each(headings) => headings.clone(),
+        }
+    }
+}
+
+/// The index of the nearest of some places; the first of those equally near.
+fn nearest(from: &[f64; 2], places: &[[f64; 2]]) -> usize {
+    let distance2 = |at: &[f64; 2]| (at[0] - from[0]).powi(2) + (at[1] - from[1]).powi(2);
+    (0..places.len()).min_by(|&a, &b| distance2(&places[a]).total_cmp(&distance2(&places[b]))).unwrap_or(0)
+}
