@@ -233,9 +233,8 @@ fn folders_of_many_runs_are_no_runs() {
         assert!(told.contains("sweep holds a sweep, not a run"), "{told}");
     }
     assert_eq!(fs::read(place.path("sweep/curves.svg")).unwrap(), picture);
-    for command in ["plot", "replay"] {
-        assert!(place.refused(1, &[command, "sweep"]).contains("name one of the runs in it, as sweep/points/0000"));
-    }
+    assert!(place.refused(1, "plot sweep").contains("name one of the runs in it, as sweep/points/0000"));
+    assert!(place.refused(1, "replay sweep").contains("name one of its points:\n  sweep/points/0000  "));
     place.good("replay sweep/points/0000");
 }
 
@@ -301,7 +300,7 @@ fn a_replay_counts_pois() {
     fs::write(place.path("nine.toml"), &config).unwrap();
     place.good("train nine.toml --out nine --quiet");
     let (told, _) = place.good("replay nine --out r.svg");
-    let count = told.split("it observed ").nth(1).and_then(|told| told.split(' ').next()).unwrap();
+    let count = told.split(": observed ").nth(1).and_then(|told| told.split(' ').next()).unwrap();
     assert!(count.parse::<u32>().is_ok_and(|count| (1..=9).contains(&count)), "{told}");
     fs::write(place.path("mean.toml"), config + "episodes_per_team = 3\nstart_jitter = 2.0\n").unwrap();
     place.good("train mean.toml --out mean --quiet");

@@ -172,7 +172,7 @@ fn replays_show_the_rule_and_who_leads() {
     assert!(leaders[1] > 0 && leaders[2] > 0, "{leaders:?}");
 
     let still = run.join("still.svg");
-    succeed(&["replay", text(&run), "--backend", "cpu", "--out", text(&still)]);
+    succeed(&["replay", text(&run), "--backend", "cpu", "--step", "1", "--out", text(&still)]);
     let layout = run.join("layout.svg");
     succeed(&["check", text(&run.join("config.toml")), "--out", text(&layout)]);
     let (still, layout) = (fs::read_to_string(still).unwrap(), fs::read_to_string(layout).unwrap());

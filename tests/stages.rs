@@ -15,7 +15,7 @@ use flotilla::config::{Config, Sharing};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{Folder, METRICS, POLICIES, RUN, Run, Start};
 use flotilla::record::policies::{self, Init, read_init};
-use flotilla::report::replay::replay;
+use flotilla::report::replay::{Which, replay};
 use flotilla::run::{Ended, Options, Results, RunError, Session};
 use flotilla::trainer::Trainer;
 use flotilla::verify;
@@ -323,7 +323,7 @@ fn a_run_that_ended_early_is_whole() {
         let expected = train(&shorter, &whole, init.clone(), Start::Fresh, 99).unwrap();
         assert_eq!(train(&shorter, &done, None, Start::Resume, 99).unwrap(), expected, "{number}");
         let mut backend = Cpu::default();
-        let replayed = replay(&done, 0, &[1, 3], &mut backend, &mut |_| true);
+        let replayed = replay(&done, 0, &[1, 3], Which::Best, &mut backend, &mut |_| true);
         assert_eq!(replayed.unwrap_or_else(|error| panic!("{number}: {error}")).len(), 2);
         // Killed before it could finish.
         train_shorter(&config, &killed, init.clone(), 3, false);
@@ -345,7 +345,7 @@ fn a_run_that_ended_early_is_whole() {
     // Without what it started from there is nothing to replay.
     let done = place.path().join("3-done");
     fs::remove_dir_all(done.join("checkpoints")).unwrap();
-    let error = replay(&done, 0, &[2], &mut Cpu::default(), &mut |_| true).err().unwrap().to_string();
+    let error = replay(&done, 0, &[2], Which::Best, &mut Cpu::default(), &mut |_| true).err().unwrap().to_string();
     assert!(error.contains("started from given policies"), "{error}");
 }
 

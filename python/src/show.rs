@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use flotilla::report::curves::PRINT;
-use flotilla::report::replay::{self as again, Film, ReplayError, Replayed};
+use flotilla::report::replay::{self as again, Film, ReplayError, Replayed, Which};
 use flotilla::report::runs;
 use flotilla::report::scene::{Format, Scene};
 use pyo3::exceptions::PyValueError;
@@ -40,7 +40,7 @@ pub fn replay(
             }
             interrupted.is_none()
         };
-        match again::replay(&folder, trial, &generations, &mut **backend, &mut watch) {
+        match again::replay(&folder, trial, &generations, Which::Best, &mut **backend, &mut watch) {
             Err(ReplayError::Stopped) if interrupted.is_some() => Ok(vec![]),
             played => played.raise(),
         }
@@ -58,8 +58,8 @@ impl Replay {
     #[getter]
     fn episodes(&self) -> Vec<(usize, usize, usize, f64, usize)> {
         let row = |played: &Replayed| {
-            let Replayed { trial, generation, team, best_g, ref observed, .. } = *played;
-            (trial, generation, team, best_g, observed.iter().flatten().count())
+            let Replayed { trial, generation, team, team_g, ref observed, .. } = *played;
+            (trial, generation, team, team_g, observed.iter().flatten().count())
         };
         self.played.iter().map(row).collect()
     }

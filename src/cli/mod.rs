@@ -33,6 +33,7 @@ mod man;
 mod output;
 mod paper;
 mod plot;
+mod points;
 mod questions;
 mod recovery;
 mod remedy;
@@ -74,7 +75,7 @@ commands! {
     Plot(plot),
     /// Compare runs, or the points of a sweep along an axis, with intervals and tests.
     Compare(compare),
-    /// Play the best team of a trial and generation again, as a page or a picture.
+    /// Play a team of a trial and generation again, as a page or a picture.
     Replay(replay),
     /// Measure how fast teams are played, alone and in whole generations.
     Bench(bench),
@@ -258,7 +259,9 @@ impl Error {
             | Error::Device(DeviceError::UnknownAdapter { .. })
             | Error::NoneToVerify(DeviceError::UnknownAdapter { .. })
             | Error::Record(RecordError::NoTrial { .. })
-            | Error::Replayed(ReplayError::NoTrial { .. } | ReplayError::NoGeneration { .. }) => 2,
+            | Error::Replayed(
+                ReplayError::NoTrial { .. } | ReplayError::NoGeneration { .. } | ReplayError::NoTeam { .. },
+            ) => 2,
             Error::Config(error) if error.is_usage() => 2,
             Error::Stopped(_) => 75,
             _ => 1,

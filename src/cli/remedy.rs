@@ -125,6 +125,7 @@ pub fn replayed(error: &ReplayError) -> String {
         ReplayError::NoGeneration { newest: Some(_), .. } => ", or finish the run with --resume".into(),
         ReplayError::NoGeneration { .. }
         | ReplayError::NoTrial { .. }
+        | ReplayError::NoTeam { .. }
         | ReplayError::NoStart { .. }
         | ReplayError::Differs { .. }
         | ReplayError::Stopped => String::new(),

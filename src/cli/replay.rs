@@ -1,4 +1,4 @@
-//! `flotilla replay`: the episode of the best team of any trial and generation, to look at.
+//! `flotilla replay`: the episode of a team of any trial and generation, to look at.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering::Relaxed;
@@ -6,35 +6,39 @@ use std::sync::atomic::Ordering::Relaxed;
 use serde_json::json;
 
 use super::recovery::Signals;
-use super::{Error, RunOptions, backend, between, output, print, whole};
-use crate::file;
+use super::{Error, RunOptions, backend, between, output, points, print, whole, words};
+use crate::config::Config;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::report::curves::PRINT;
 use crate::report::progress::Meter;
-use crate::report::replay::{self, FPS, Film, History, ReplayError, Replayed};
-use crate::report::runs;
+use crate::report::replay::{self, FPS, Film, History, ReplayError, Replayed, Which};
 use crate::report::scene::Format;
+use crate::{file, shell};
 
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `flotilla train` made
     #[arg(value_name = "RUN")]
     folder: PathBuf,
-    /// Trial to look at
-    #[arg(long, value_name = "N", default_value_t = 0, value_parser = whole)]
-    trial: usize,
-    /// Generation whose best team plays [default: the newest]
+    /// Trial to look at: a number from 0, or the one with the largest (best) or smallest (worst) G
+    #[arg(long, value_name = "best|worst|N", default_value = "0")]
+    trial: WhichTrial,
+    /// Generation whose team plays [default: the newest]
     #[arg(long, value_name = "N", value_parser = whole)]
     generation: Option<usize>,
+    /// Team to look at: the best of its generation, the champion (the team of every population's best policy), or a
+    /// number from 0
+    #[arg(long, value_name = "best|champion|N", default_value = "best")]
+    team: Which,
     /// Another generation of the trial, side by side
     #[arg(long, value_name = "N", value_parser = whole)]
     compare: Option<usize>,
     /// Step to stop at, in a still picture [default: the last]
     #[arg(long, value_name = "N", value_parser = whole)]
     step: Option<usize>,
-    /// File to write: .html to play, .gif moving, .svg, .pdf or .png still; %04d.png: a numbered .png a moment, for a
-    /// film [default: replay.html in RUN]
+    /// File to write: .html to play, .gif moving, .svg, .pdf or .png still. A name with %d or %04d before .png makes a
+    /// picture per moment, numbered there, for a film [default: replay.html in RUN]
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Pixels across, of a .gif or .png [default: a .gif fits into 960 x 720, a .png has 300 an inch]
@@ -46,19 +50,54 @@ pub struct Args {
     /// Print one JSON object
     #[arg(long)]
     json: bool,
-    /// No progress on standard error
+    /// No progress on standard error, and no summary on standard output but by --json
     #[arg(long, short)]
     quiet: bool,
     #[command(flatten)]
     run: RunOptions,
 }
 
+/// Which trial is looked at.
+#[derive(Clone, Copy, Debug)]
+enum WhichTrial {
+    Best,
+    Worst,
+    Number(usize),
+}
+
+impl std::str::FromStr for WhichTrial {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<WhichTrial, String> {
+        match text {
+            "best" => Ok(WhichTrial::Best),
+            "worst" => Ok(WhichTrial::Worst),
+            number => number
+                .parse()
+                .map(WhichTrial::Number)
+                .map_err(|_| "allowed best, worst or a whole number, from 0".into()),
+        }
+    }
+}
+
+impl WhichTrial {
+    /// Its number in a run.
+    fn find(self, folder: &Path, config: &Config, generation: Option<usize>, which: Which) -> Result<usize, Error> {
+        let [best, worst] = match self {
+            WhichTrial::Number(trial) => return Ok(trial),
+            WhichTrial::Best | WhichTrial::Worst => replay::extreme_trials(folder, config, generation, which)?,
+        };
+        Ok(if matches!(self, WhichTrial::Best) { best } else { worst })
+    }
+}
+
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { folder, trial, generation, compare, step, out, width, fps, json, quiet, run } = args;
+    let Args { folder, trial, generation, team, compare, step, out, width, fps, json, quiet, run } = args;
     let out = out.unwrap_or_else(|| folder.join("replay.html"));
-    let kind = Form::of(&out)?;
+    let kind = Form::of(&out, fps)?;
     kind.takes(&out, width, fps, step)?;
-    let config = runs::config(&folder)?;
+    let config = points::config(&folder)?;
+    let trial = trial.find(&folder, &config, generation, team)?;
     let generation = match generation {
         Some(generation) => generation,
         None if trial < config.learning.trials => History::read(&folder, &config, trial)?.newest().unwrap_or(0),
@@ -88,7 +127,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         meter.show(part, || format!("training trial {trial} again: generation {generation} of {last}"));
         !signals.stop.load(Relaxed)
     };
-    let played = replay::replay(&folder, trial, &generations, &mut *backend, &mut watch);
+    let played = replay::replay(&folder, trial, &generations, team, &mut *backend, &mut watch);
     meter.clear();
     let played = played.map_err(|error| match error {
         ReplayError::Stopped => Error::Stopped("before the episode was played; nothing was written".into()),
@@ -124,6 +163,7 @@ pub fn run(args: Args) -> Result<(), Error> {
             return report(
                 &played,
                 json,
+                quiet,
                 &text,
                 json!({ "first": first.display().to_string(), "last": last.display().to_string(), "frames": count }),
             );
@@ -131,18 +171,32 @@ pub fn run(args: Args) -> Result<(), Error> {
     };
     output::write(&out, |output| output.write_all(&content))?;
     let text = format!("{} ({} kB)\n", out.display(), content.len().div_ceil(1000));
-    report(&played, json, &text, json!({ "out": out.display().to_string(), "bytes": content.len() }))
+    report(&played, json, quiet, &text, json!({ "out": out.display().to_string(), "bytes": content.len() }))
 }
 
 /// Says what was played and where it was written, as text or as one JSON object.
-fn report(played: &[Replayed], json: bool, text: &str, mut object: serde_json::Value) -> Result<(), Error> {
+fn report(
+    played: &[Replayed],
+    json: bool,
+    quiet: bool,
+    text: &str,
+    mut object: serde_json::Value,
+) -> Result<(), Error> {
+    if quiet && !json {
+        return Ok(());
+    }
     if !json {
         played.iter().try_for_each(|played| print(&tell(played)))?;
         return print(text);
     }
     let episode = |played: &Replayed| {
-        let Replayed { trial, generation, team, best_g, .. } = played;
-        json!({ "trial": trial, "generation": generation, "team": team, "best_g": best_g })
+        let Replayed { trial, generation, which, team, team_g, .. } = played;
+        let (which, team, g) = match which {
+            Which::Best => ("best", Some(team), "best_g"),
+            Which::Champion => ("champion", None, "champion_g"),
+            Which::Number(_) => ("number", Some(team), "g"),
+        };
+        json!({ "trial": trial, "generation": generation, "which": which, "team": team, g: team_g })
     };
     object["episodes"] = played.iter().map(episode).collect();
     print(&format!("{object}\n"))
@@ -150,13 +204,15 @@ fn report(played: &[Replayed], json: bool, text: &str, mut object: serde_json::V
 
 /// What was played, in a line.
 fn tell(played: &Replayed) -> String {
-    let Replayed { trial, generation, team, best_g, episodes, world, .. } = played;
+    let Replayed { team_g, episodes, world, which, .. } = played;
     let (pois, digits) = (world.pois.len(), if *episodes > 1 { 2 } else { 0 });
     format!(
-        "trial {trial}, generation {generation}: team {team} is the best, it observed {:.digits$} of {pois} POIs{}, as \
-         metrics.csv says\n",
-        best_g * pois as f64,
-        if *episodes > 1 { format!(" (mean of {episodes} episodes)") } else { String::new() }
+        "{} of {}: observed {:.digits$} of {pois} POIs{}{}\n",
+        played.name(),
+        played.place(),
+        team_g * pois as f64,
+        if *episodes > 1 { format!(" (mean of {episodes} episodes)") } else { String::new() },
+        if matches!(which, Which::Number(_)) { "" } else { ", as metrics.csv says" },
     )
 }
 
@@ -169,11 +225,12 @@ enum Form {
 }
 
 impl Form {
-    fn of(path: &Path) -> Result<Form, Error> {
+    fn of(path: &Path, fps: Option<u32>) -> Result<Form, Error> {
         let extension = path.extension().map(|extension| extension.to_ascii_lowercase());
         match (extension.as_ref().and_then(|extension| extension.to_str()), Format::of(path)) {
             (Some("html"), _) => Ok(Form::Page),
             (Some("gif"), _) => Ok(Form::Gif),
+            (Some("mp4" | "m4v" | "mov" | "mkv" | "webm" | "avi"), _) => Err(Error::Usage(film(path, fps))),
             (_, Some(kind)) => {
                 let numbered = path.file_name().and_then(|name| Numbered::of(name.to_str()?));
                 Ok(numbered.filter(|_| kind == Format::Png).map_or(Form::Still(kind), Form::Film))
@@ -203,7 +260,30 @@ impl Form {
     }
 }
 
-/// A name with a place for a number, as `%04d`.
+/// How to make a film of a format that takes another program: one picture per moment, which `ffmpeg` joins.
+fn film(path: &Path, fps: Option<u32>) -> String {
+    let (out, fps) = (path.to_string_lossy(), fps.unwrap_or(FPS).to_string());
+    let frames = path.with_extension("");
+    let frames = format!("{}-%04d.png", frames.to_string_lossy().replace('%', "_"));
+    // The same command with another --out, however that was given.
+    let typed = words().into_iter().skip(1).map(|word| word.to_string_lossy().into_owned());
+    let replaced = typed.map(|word| match word.strip_suffix(&*out) {
+        Some(flag) if ["", "-o", "-o=", "--out="].contains(&flag) => format!("{flag}{frames}"),
+        _ => word,
+    });
+    let pictures = shell::command(["flotilla".to_string()].into_iter().chain(replaced));
+    // Video has even sizes.
+    let even = "pad=ceil(iw/2)*2:ceil(ih/2)*2";
+    let joined = ["ffmpeg", "-framerate", &fps, "-i", &frames, "-vf", even, "-pix_fmt", "yuv420p", &out];
+    format!(
+        "--out {out}: this format takes ffmpeg, which joins numbered pictures:\n  {pictures}\n  {}\nor write an animated \
+         picture: --out {}",
+        shell::command(joined),
+        path.with_extension("gif").display()
+    )
+}
+
+/// A file name with one place for a number: `%d`, or `%04d` for at least four digits.
 struct Numbered {
     before: String,
     digits: usize,
@@ -211,14 +291,18 @@ struct Numbered {
 }
 
 impl Numbered {
+    /// Finds the first such place. A letter or digit after it makes it an ordinary part of the name, as in `100%done`.
     fn of(name: &str) -> Option<Numbered> {
-        let (before, rest) = name.split_once('%')?;
-        let (digits, after) = rest.split_once('d')?;
-        let digits = match digits {
-            "" => 1,
-            digits => digits.strip_prefix('0')?.parse().ok().filter(|digits| (1..=9).contains(digits))?,
-        };
-        Some(Numbered { before: before.into(), digits, after: after.into() })
+        name.match_indices('%').find_map(|(at, _)| {
+            let rest = &name[at + 1..];
+            let (digits, after) = match rest.as_bytes() {
+                [b'd', ..] => (1, &rest[1..]),
+                [b'0', digit @ b'1'..=b'9', b'd', ..] => (usize::from(digit - b'0'), &rest[3..]),
+                _ => return None,
+            };
+            let ends = !after.starts_with(|next: char| next.is_alphanumeric());
+            ends.then(|| Numbered { before: name[..at].into(), digits, after: after.into() })
+        })
     }
 
     fn name(&self, number: usize) -> String {

@@ -50,7 +50,7 @@ pub struct Args {
     /// Write over the run in the folder (without --out in runs/NAME of the config)
     #[arg(long)]
     force: bool,
-    /// No progress on standard error
+    /// No progress on standard error, and no summary on standard output but by --json
     #[arg(long, short)]
     quiet: bool,
     /// Print what came out as one JSON object (docs/reference/json.md)
@@ -137,7 +137,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         if !folder.join(CURVES).exists() {
             draw(&folder);
         }
-        return told.print(&session, None, args.json);
+        return told.print(&session, None, args.quiet, args.json);
     }
     if !args.quiet {
         say(format_args!("training on {runs_on}, into {}", folder.display()));
@@ -171,7 +171,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         Ended::Done => {
             draw(&folder);
             let trained = Training { generations: next.min(last + 1) - from.min(last + 1), since };
-            told.print(&session, Some(trained), args.json)
+            told.print(&session, Some(trained), args.quiet, args.json)
         }
         Ended::Stopped => Err(Error::Stopped(format!(
             "before generation {next} of {last}, with everything saved; go on with\n  {}",
@@ -209,13 +209,16 @@ struct Told<'a> {
 
 impl Told<'_> {
     /// Prints what a run came to; `trained` is none where it was done already.
-    fn print(&self, session: &Session, trained: Option<Training>, json: bool) -> Result<(), Error> {
+    fn print(&self, session: &Session, trained: Option<Training>, quiet: bool, json: bool) -> Result<(), Error> {
         let results = session.results(0).expect("the run is done");
         let done_already = trained.is_none();
         let (generations, seconds) =
             trained.map_or((0, 0.0), |trained| (trained.generations, trained.since.elapsed().as_secs_f64()));
         if json {
             return print(&format!("{}\n", self.json(results, generations, seconds)));
+        }
+        if quiet {
+            return Ok(());
         }
         let learning = &self.config.learning;
         let trained = match done_already {

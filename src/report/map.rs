@@ -104,6 +104,11 @@ pub fn poi_label(rule: &Rule, poi: usize, needs: String) -> String {
     format!("{poi}: {needs}{}{after}", window.unwrap_or_default())
 }
 
+/// An observed POI's label: the step at which it was observed.
+pub fn observed_label(rule: &Rule, poi: usize, step: usize) -> String {
+    if rule.is_timed() { format!("{poi}: at step {step}") } else { format!("at step {step}") }
+}
+
 /// A team at one moment.
 pub struct Team {
     /// The first of the agents lead.
@@ -150,6 +155,12 @@ impl Viewport {
     fn area(&self) -> [f64; 4] {
         let [width, height] = self.size();
         [self.left, self.above, width, height]
+    }
+
+    /// The corners of its area: `[left, above, right, below]`.
+    fn whole(&self) -> [f64; 4] {
+        let [left, above, width, height] = self.area();
+        [left, above, left + width, above + height]
     }
 
     fn at(&self, place: DVec2) -> [f64; 2] {
@@ -237,8 +248,7 @@ impl Viewport {
         [LABEL, LEAST].into_iter().find_map(|size| {
             let crosses: Vec<_> = team.pois.iter().map(|poi| around(self.at(poi.place), 0.8)).collect();
             let mut taken: Vec<[f64; 4]> = Vec::new();
-            let [left, above, width, height] = self.area();
-            let whole = [left, above, left + width, above + height];
+            let whole = self.whole();
             let place = |poi: &Poi| {
                 let [x, y] = self.at(poi.place);
                 let half = text_width(&poi.label, size) / 2.0;
@@ -278,14 +288,17 @@ impl Viewport {
             let low = y + 0.36 * size;
             let places =
                 [[x + aside, low + 1.2], [x - aside, low + 1.2], [x + aside, low - 1.2], [x - aside, low - 1.2]];
+            let whole = self.whole();
+            let inside = |place: &&[f64; 2]| within(label_area(**place, &text, size), whole);
             let free = |place: &&[f64; 2]| {
                 let area = label_area(**place, &text, size);
-                !taken.iter().any(|other| overlap(area, *other))
+                within(area, whole)
+                    && !taken.iter().any(|other| overlap(area, *other))
                     && !arrows.iter().enumerate().any(|(at, other)| at != number && overlap(area, *other))
             };
             let place = match places.iter().find(free) {
                 Some(place) => *place,
-                None if team.leaders <= 12 => places[0],
+                None if team.leaders <= 12 => *places.iter().find(inside).unwrap_or(&places[0]),
                 None => continue,
             };
             plate(scene, &mut taken, place, &text, size);

@@ -1,8 +1,8 @@
-//! Replays: the very episode that a generation's best team was scored on.
+//! Replays: the very episode that a team of a generation was scored on.
 //!
 //! Training is a pure function of config and seed, and fast. So nothing of a generation needs to be kept: its trial is
-//! trained again up to it (from a checkpoint where one is on the way), its teams play again, and the best one's episode
-//! is traced. Its G is held against the run's `metrics.csv`.
+//! trained again up to it (from a checkpoint where one is on the way), its teams play again, and one team's episode is
+//! traced. The G of the best team, or the champion's, is compared with the run's `metrics.csv`.
 
 use std::path::Path;
 
@@ -38,7 +38,7 @@ pub enum ReplayError {
     #[error(transparent)]
     Backend(#[from] BackendError),
     /// The run has fewer trials.
-    #[error("{folder} has no trial {trial}: its config has {trials}, 0 to {}", trials - 1)]
+    #[error("{folder} has no trial {trial}: its config has {}", numbered(*trials, "trial"))]
     NoTrial {
         /// The run's.
         folder: String,
@@ -62,6 +62,14 @@ pub enum ReplayError {
         /// The newest that it has.
         newest: Option<usize>,
     },
+    /// A generation has fewer teams.
+    #[error("no team {team}: a generation has {teams} teams, {}; choose one of them, best or champion", places(*teams))]
+    NoTeam {
+        /// The one asked for, from 0.
+        team: usize,
+        /// How many there are.
+        teams: usize,
+    },
     /// What it started from is not there.
     #[error(
         "{folder} started from given policies, and no checkpoint that holds them or what came of them is left: it cannot be \
@@ -75,13 +83,15 @@ pub enum ReplayError {
     },
     /// Trained again, it comes to something else.
     #[error(
-        "{folder}: trained again, the best team of trial {trial}, generation {generation} has G = {found}, but metrics.csv \
+        "{folder}: trained again, the {who} of trial {trial}, generation {generation} has G = {found}, but metrics.csv \
          says {expected}: it was made with another config or another version of this program; repeat the run, then \
          replay it"
     )]
     Differs {
         /// The run's.
         folder: String,
+        /// Whose G differs: "best team" or "champion".
+        who: &'static str,
         /// The one asked for, from 0.
         trial: usize,
         /// The one asked for, from 0.
@@ -96,16 +106,54 @@ pub enum ReplayError {
     Stopped,
 }
 
+/// "3 trials, 0 to 2", "1 trial, 0".
+pub(crate) fn numbered(count: usize, what: &str) -> String {
+    format!("{}, {}", map::count(count, what), places(count))
+}
+
+/// "0 to 2", "0".
+fn places(count: usize) -> String {
+    if count > 1 { format!("0 to {}", count - 1) } else { "0".into() }
+}
+
+/// Which team of a generation plays again.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Which {
+    /// The team with the largest G, the first of those.
+    #[default]
+    Best,
+    /// The team of the best policy of every population, once the generation is scored.
+    Champion,
+    /// The team of this number among those of its generation.
+    Number(usize),
+}
+
+impl std::str::FromStr for Which {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Which, String> {
+        match text {
+            "best" => Ok(Which::Best),
+            "champion" => Ok(Which::Champion),
+            number => {
+                number.parse().map(Which::Number).map_err(|_| "allowed best, champion or a whole number, from 0".into())
+            }
+        }
+    }
+}
+
 /// One team's episode, with what it was worth.
 pub struct Replayed {
     /// Which trial it is of.
     pub trial: usize,
     /// Which generation it is of.
     pub generation: usize,
-    /// Index of the team among those of its generation.
+    /// What the team was asked for as.
+    pub which: Which,
+    /// Index of the team among those of its generation; of the champion, which is none of them, their number.
     pub team: usize,
-    /// The team's G over all its episodes, as in `metrics.csv`.
-    pub best_g: f64,
+    /// The team's G over all its episodes; of the best team and the champion as in `metrics.csv`.
+    pub team_g: f64,
     /// Episodes that the team's G is the mean of; this is the first.
     pub episodes: usize,
     /// The one that this generation played in.
@@ -124,49 +172,83 @@ pub struct Replayed {
 
 /// The metrics of one trial.
 pub struct History {
-    /// By generation; none where there is no row.
-    pub best_g: Vec<Option<f64>>,
+    /// G of the best team and of the champion by generation; none where there is no row.
+    rows: Vec<Option<[f64; 2]>>,
 }
 
 impl History {
-    /// Reads a trial's best G by generation.
+    /// Reads a trial's G by generation.
     ///
     /// # Errors
     /// The metrics cannot be read.
     pub fn read(folder: &Path, config: &Config, trial: usize) -> Result<History, ReadError> {
-        let mut best_g = Vec::new();
+        let all = History::all(folder, config)?;
+        Ok(all.into_iter().nth(trial).unwrap_or(History { rows: vec![] }))
+    }
+
+    /// Reads all trials' G by generation.
+    ///
+    /// # Errors
+    /// The metrics cannot be read.
+    pub fn all(folder: &Path, config: &Config) -> Result<Vec<History>, ReadError> {
+        let mut all: Vec<History> = (0..config.learning.trials).map(|_| History { rows: vec![] }).collect();
         runs::metrics(folder, config, |row| {
-            if row.trial == trial {
-                if best_g.len() <= row.generation {
-                    best_g.resize(row.generation + 1, None);
-                }
-                best_g[row.generation] = Some(row.best_g);
+            let rows = &mut all[row.trial].rows;
+            if rows.len() <= row.generation {
+                rows.resize(row.generation + 1, None);
             }
+            rows[row.generation] = Some([row.best_g, row.champion_g]);
         })?;
-        Ok(History { best_g })
+        Ok(all)
     }
 
     /// The newest generation that has a row.
     pub fn newest(&self) -> Option<usize> {
-        self.best_g.iter().rposition(Option::is_some)
+        self.rows.iter().rposition(Option::is_some)
     }
 
-    /// The value of a generation, if it is one of those.
-    pub fn get(&self, generation: usize) -> Option<f64> {
-        self.best_g.get(generation).copied().flatten()
+    /// G of a generation's champion, if that was asked for, or else of its best team; none if it has no row.
+    pub fn get(&self, generation: usize, which: Which) -> Option<f64> {
+        let [best, champion] = self.rows.get(generation).copied().flatten()?;
+        Some(if which == Which::Champion { champion } else { best })
     }
 }
 
-/// Plays the best teams of some generations of a trial of a run again, in their order.
+/// The trials with the largest and the smallest G of a generation (of the newest that all have), the first of those if
+/// several are equal: by the champions' G if these are asked for, or else by the best teams'.
+///
+/// # Errors
+/// The run cannot be read, or has no such generation.
+pub fn extreme_trials(
+    folder: &Path,
+    config: &Config,
+    generation: Option<usize>,
+    which: Which,
+) -> Result<[usize; 2], ReplayError> {
+    let all = History::all(folder, config)?;
+    let newest = all.iter().map(History::newest).min().flatten();
+    let generation = generation.or(newest).unwrap_or(0);
+    let g = all.iter().map(|history| history.get(generation, which)).collect::<Option<Vec<f64>>>();
+    let Some(g) = g else {
+        let trial = all.iter().position(|history| history.get(generation, which).is_none()).unwrap_or(0);
+        let folder = folder.display().to_string();
+        return Err(ReplayError::NoGeneration { folder, trial, generation, newest: all[trial].newest() });
+    };
+    let first = |better: fn(f64, f64) -> bool| (0..g.len()).reduce(|a, b| if better(g[b], g[a]) { b } else { a });
+    Ok([first(|b, a| b > a), first(|b, a| b < a)].map(|trial| trial.unwrap_or(0)))
+}
+
+/// Plays a team of each of some generations of a trial of a run again, in their order.
 ///
 /// `watch` is told the generation about to be trained; false from it stops.
 ///
 /// # Errors
-/// The run cannot be read, has no such generation, or did not come to what it comes to here.
+/// The run cannot be read, has no such generation or team, or did not come to what it comes to here.
 pub fn replay(
     folder: &Path,
     trial: usize,
     generations: &[usize],
+    which: Which,
     backend: &mut dyn Backend,
     watch: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Vec<Replayed>, ReplayError> {
@@ -176,10 +258,16 @@ pub fn replay(
     if trial >= trials {
         return Err(ReplayError::NoTrial { folder: name(), trial, trials });
     }
+    let teams = config.learning.population;
+    if let Which::Number(team) = which
+        && team >= teams
+    {
+        return Err(ReplayError::NoTeam { team, teams });
+    }
     let rows = History::read(folder, &config, trial)?;
     let newest = rows.newest();
     for &generation in generations {
-        if rows.get(generation).is_none() {
+        if rows.get(generation, which).is_none() {
             return Err(ReplayError::NoGeneration { folder: name(), trial, generation, newest });
         }
     }
@@ -189,25 +277,34 @@ pub fn replay(
     let mut trainer = Trainer::of_trial(config.clone(), trial);
     for index in order {
         let generation = generations[index];
+        // A champion has its slot once its generation is over.
+        let wanted = generation + usize::from(which == Which::Champion);
         // A run that started from given policies has those of generation 0.
         let next = trainer.generation(0);
-        if let Some(snapshot) = nearest(folder, &config, trial, next + usize::from(next > 0)..=generation) {
+        if let Some(snapshot) = nearest(folder, &config, trial, next + usize::from(next > 0)..=wanted) {
             // A checkpoint of other sizes is of another config: training on from the start does without.
             let _ = trainer.restore(0, snapshot);
         } else if next == 0 && Run::read(&folder.join(RUN)).is_ok_and(|run| run.init.is_some()) {
             return Err(ReplayError::NoStart { folder: name(), generation });
         }
-        while trainer.generation(0) < generation {
+        while trainer.generation(0) < wanted {
             if !watch(trainer.generation(0)) {
                 return Err(ReplayError::Stopped);
             }
             trainer.advance(backend)?;
         }
-        let found = best(&config.at(generation), &mut trainer, trial, backend)?;
-        let expected = rows.get(generation).unwrap_or(f64::NAN);
-        if found.best_g != expected {
-            let found = found.best_g;
-            return Err(ReplayError::Differs { folder: name(), trial, generation, found, expected });
+        let (found, g) = match which {
+            Which::Champion => {
+                let found = champion(&config.at(generation), &mut trainer, trial, backend)?;
+                let g = found.team_g;
+                (found, g)
+            }
+            _ => team(&config.at(generation), &mut trainer, trial, which, backend)?,
+        };
+        let expected = rows.get(generation, which).unwrap_or(f64::NAN);
+        if g != expected {
+            let who = if which == Which::Champion { "champion" } else { "best team" };
+            return Err(ReplayError::Differs { folder: name(), who, trial, generation, found: g, expected });
         }
         played[index] = Some(found);
     }
@@ -250,40 +347,102 @@ pub fn best(
     trial: usize,
     backend: &mut dyn Backend,
 ) -> Result<Replayed, BackendError> {
-    use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+    Ok(team(config, trainer, trial, Which::Best, backend)?.0)
+}
+
+/// Plays the teams of the generation before which a trial's trainer (of that trial alone) stands, and traces one of
+/// them. Also gives the largest G of all of them.
+fn team(
+    config: &Config,
+    trainer: &mut Trainer,
+    trial: usize,
+    which: Which,
+    backend: &mut dyn Backend,
+) -> Result<(Replayed, f64), BackendError> {
     let learning = &config.learning;
     let (generation, world) = (trainer.generation(0), trainer.world(0).clone());
-    let (leaders, population) = (world.leaders(), learning.population);
-    let weights = trainer.weights(0, 0)?.into();
+    let teams = evolve::teams_of(learning, trial, generation, world.leaders());
+    let cast = Episodes::new(config, &world, trial, generation, trainer.weights(0, 0)?, &teams);
+    let g = cast.play(backend)?;
+    let first_best = (0..g.len()).reduce(|a, b| if g[b] > g[a] { b } else { a }).unwrap_or(0);
+    let team = if let Which::Number(team) = which { team } else { first_best };
+    let played = cast.trace(team, backend)?;
+    Ok((Replayed { trial, generation, which, team, team_g: g[team], ..played }, g[first_best]))
+}
 
-    let teams = evolve::teams_of(learning, trial, generation, leaders);
-    let starts: Vec<Vec<Vec2>> = (0..learning.episodes_per_team)
-        .map(|episode| {
+/// Plays and traces the champion of the generation that a trial's trainer (of that trial alone) has just finished,
+/// whose config this is.
+fn champion(
+    config: &Config,
+    trainer: &mut Trainer,
+    trial: usize,
+    backend: &mut dyn Backend,
+) -> Result<Replayed, BackendError> {
+    // It plays beside the next generation, from its starts, but in the world of its own.
+    let (next, world) = (trainer.generation(0), World::new(config));
+    let population = config.learning.population;
+    let teams = vec![population as u32; world.leaders()];
+    let cast = Episodes::new(config, &world, trial, next, trainer.weights(0, 0)?, &teams);
+    let team_g = cast.play(backend)?[0];
+    let played = cast.trace(0, backend)?;
+    Ok(Replayed { trial, generation: next - 1, which: Which::Champion, team: population, team_g, ..played })
+}
+
+/// Teams of one generation, and what they play.
+struct Episodes<'a> {
+    config: &'a Config,
+    world: &'a World,
+    weights: &'a [f32],
+    teams: &'a [u32],
+    /// Of each episode.
+    starts: Vec<Vec<Vec2>>,
+}
+
+impl<'a> Episodes<'a> {
+    fn new(
+        config: &'a Config,
+        world: &'a World,
+        trial: usize,
+        generation: usize,
+        weights: &'a [f32],
+        teams: &'a [u32],
+    ) -> Episodes<'a> {
+        let starts = |episode| {
             let mut starts = Vec::new();
-            evolve::places(learning, trial, generation, episode, &world, &mut starts);
+            evolve::places(&config.learning, trial, generation, episode, world, &mut starts);
             starts
-        })
-        .collect();
-    let need = Need::Record;
-    let group = |starts, teams| Group { world: &world, starts, weights, policies: population + 1, teams, need };
-    let groups: Vec<Group<'_>> = starts.iter().map(|starts| group(starts, &teams)).collect();
-    let observed: Vec<AtomicU32> = std::iter::repeat_with(AtomicU32::default).take(population).collect();
-    backend.rollout(&groups, &|episode: Episode<'_>| {
-        let seen = credit::observed_at(episode.sets, &world).iter().flatten().count();
-        observed[episode.team].fetch_add(seen as u32, Relaxed);
-    })?;
-    let (mut team, mut most) = (0, 0);
-    for (index, observed) in observed.iter().enumerate() {
-        let observed = observed.load(Relaxed);
-        if observed > most {
-            (team, most) = (index, observed);
-        }
+        };
+        let starts = (0..config.learning.episodes_per_team).map(starts).collect();
+        Episodes { config, world, weights, teams, starts }
     }
-    let best_g = f64::from(most) / (world.pois.len() * starts.len()) as f64;
-    let need = if learning.fitness == Fitness::Dt { Need::Sights } else { need };
-    let shown = Group { need, ..group(&starts[0], &teams[team * leaders..(team + 1) * leaders]) };
-    let played = one(&shown, backend)?;
-    Ok(Replayed { trial, generation, team, best_g, episodes: starts.len(), ..played })
+
+    fn group<'b>(&'b self, episode: usize, teams: &'b [u32], need: Need) -> Group<'b> {
+        let (starts, policies) = (&self.starts[episode], self.config.learning.population + 1);
+        Group { world: self.world, starts, weights: self.weights.into(), policies, teams, need }
+    }
+
+    /// The G of every team over all its episodes.
+    fn play(&self, backend: &mut dyn Backend) -> Result<Vec<f64>, BackendError> {
+        use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+        let episodes = self.starts.len();
+        let groups: Vec<_> = (0..episodes).map(|episode| self.group(episode, self.teams, Need::Record)).collect();
+        let teams = self.teams.len() / self.world.leaders();
+        let observed: Vec<AtomicU32> = std::iter::repeat_with(AtomicU32::default).take(teams).collect();
+        backend.rollout(&groups, &|episode: Episode<'_>| {
+            let seen = credit::observed_at(episode.sets, self.world).iter().flatten().count();
+            observed[episode.team].fetch_add(seen as u32, Relaxed);
+        })?;
+        let whole = (self.world.pois.len() * episodes) as f64;
+        Ok(observed.into_iter().map(|observed| f64::from(observed.into_inner()) / whole).collect())
+    }
+
+    /// Plays the first episode of a team again, and traces it.
+    fn trace(&self, team: usize, backend: &mut dyn Backend) -> Result<Replayed, BackendError> {
+        let leaders = self.world.leaders();
+        let need = if self.config.learning.fitness == Fitness::Dt { Need::Sights } else { Need::Record };
+        let played = one(&self.group(0, &self.teams[team * leaders..(team + 1) * leaders], need), backend)?;
+        Ok(Replayed { episodes: self.starts.len(), ..played })
+    }
 }
 
 /// Plays one team, a group of its own, and traces it; who leads at each step is told where the group needs sights.
@@ -301,11 +460,12 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     let mut led = Vec::new();
     credit::lead(&episode.sights, world, &mut led);
     let observed = credit::observed_at(episode.sets, world);
-    let best_g = f64::from(scores.observed) / world.pois.len() as f64;
+    let team_g = f64::from(scores.observed) / world.pois.len() as f64;
     // POIs are drawn where they were.
     let pois = group.moved_pois().unwrap_or(&world.pois).to_vec();
     let world = World { pois, ..world.clone() };
-    Ok(Replayed { trial: 0, generation: 0, team: 0, best_g, episodes: 1, scores, owner, led, observed, trace, world })
+    let (trial, generation, which, team) = (0, 0, Which::Champion, 0);
+    Ok(Replayed { trial, generation, which, team, team_g, episodes: 1, scores, owner, led, observed, trace, world })
 }
 
 /// Observers in one set.
@@ -315,6 +475,20 @@ fn near(world: &World, sets: &Strided<'_>, set: usize) -> u32 {
 }
 
 impl Replayed {
+    /// Which team it is, to open a sentence: "Best team (number 3)".
+    pub fn name(&self) -> String {
+        match self.which {
+            Which::Best => format!("Best team (number {})", self.team),
+            Which::Champion => "Champion".into(),
+            Which::Number(team) => format!("Team number {team}"),
+        }
+    }
+
+    /// The trial and generation that it is of.
+    pub fn place(&self) -> String {
+        format!("trial {}, generation {}", self.trial, self.generation)
+    }
+
     /// Observers near a POI after a step, 0 at the start.
     pub fn near(&self, step: usize, poi: usize) -> u32 {
         let sets = Strided { words: &self.trace.sets, stride: 1, offset: 0 };
@@ -362,11 +536,16 @@ impl Replayed {
         let before: Vec<bool> = self.observed.iter().map(|at| at.is_some_and(|at| at < step.max(1))).collect();
         let poi = |(poi, place): (usize, &Vec2)| {
             let (near, needed) = (self.near(step, poi), world.coupling[poi]);
+            let observed = self.observed[poi].filter(|&observed| observed <= step);
             Poi {
                 place: place.as_dvec2(),
-                label: map::poi_label(&world.rule, poi, format!("{near}/{needed}")),
-                share: Some(f64::from(near) / f64::from(needed)),
-                observed: self.observed[poi].is_some_and(|observed| observed <= step),
+                // Once it is observed, nobody needs to be there any more.
+                label: match observed {
+                    Some(observed) => map::observed_label(&world.rule, poi, observed),
+                    None => map::poi_label(&world.rule, poi, format!("{near}/{needed}")),
+                },
+                share: Some(if observed.is_some() { 1.0 } else { f64::from(near) / f64::from(needed) }),
+                observed: observed.is_some(),
                 open: world.rule.is_open(poi, step.max(1) as u32, &before),
             }
         };
@@ -386,8 +565,9 @@ impl Replayed {
         let list: Vec<_> = times.iter().take(MOST).map(|(poi, step)| format!("POI {poi} at step {step}")).collect();
         let more = if times.len() > MOST { " and more" } else { "" };
         format!(
-            "Generation {}, step {step} of {}: {} of {pois} POIs observed{}{}{more}, by a team of {} and {}.",
-            self.generation,
+            "{} of {}, step {step} of {}: {} of {pois} POIs observed{}{}{more}, by a team of {} and {}.",
+            self.name(),
+            self.place(),
             world.steps(),
             times.len(),
             if list.is_empty() { "" } else { ": " },
@@ -497,8 +677,9 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
     json!({
         "trial": played.trial,
         "generation": played.generation,
+        "name": played.name(),
         "team": played.team,
-        "best_g": played.best_g,
+        "best_g": played.team_g,
         "means_of": played.episodes,
         "g": scores.g,
         "d": scores.d,
@@ -528,7 +709,10 @@ struct Screen<'a> {
 impl<'a> Screen<'a> {
     const SIDE: f64 = 80.0;
     const EDGE: f64 = 2.5;
-    const HEAD: f64 = 9.0;
+    const HEAD: f64 = 12.6;
+    /// Room for the axes left of each map and below it.
+    const LEFT: f64 = 8.0;
+    const BELOW: f64 = 7.4;
 
     /// `note` stands below the pictures, among what their signs mean.
     fn new(config: &Config, played: &'a [Replayed], note: Option<String>) -> Screen<'a> {
@@ -537,8 +721,11 @@ impl<'a> Screen<'a> {
         let teams: Vec<Team> = played.iter().map(|played| played.team(played.world.steps() as f64)).collect();
         let who = if config.world.observers == Observers::All { "agents" } else { "observers" };
         let timed = played.iter().any(|played| played.world.rule.is_timed());
-        let label = if timed { "0: 2/3: POI 0," } else { "2/3:" };
-        let mut legend = view.legend(&teams, &format!("{label} 2 {who} near of 3 needed"));
+        let needed = played.first().and_then(|played| played.world.coupling.first()).map_or(1, |&needed| needed);
+        let near = needed.saturating_sub(1).max(1);
+        let who = if near == 1 { &who[..who.len() - 1] } else { who };
+        let label = if timed { format!("0: {near}/{needed}: POI 0,") } else { format!("{near}/{needed}:") };
+        let mut legend = view.legend(&teams, &format!("{label} {near} {who} near of {needed} needed"));
         note.into_iter().for_each(|note| legend.note(note));
         Screen { played, view, width, legend }
     }
@@ -547,30 +734,29 @@ impl<'a> Screen<'a> {
     fn scene(&self, place: f64) -> Scene {
         let step = place as usize;
         let columns = self.played.len().max(1) as f64;
-        let whole = Self::EDGE + columns * (self.width + Self::EDGE);
+        let whole = Self::EDGE + columns * (Self::LEFT + self.width + Self::EDGE);
         let room = whole - 2.0 * Self::EDGE;
-        let below = Self::HEAD + self.view.size()[1];
+        let below = Self::HEAD + self.view.size()[1] + Self::BELOW;
         let mut scene = Scene::new(whole, below + 1.0 + self.legend.height(room));
         let mut said = Vec::new();
         for (column, played) in self.played.iter().enumerate() {
-            let left = Self::EDGE + column as f64 * (self.width + Self::EDGE);
+            let left = Self::EDGE + Self::LEFT + column as f64 * (Self::LEFT + self.width + Self::EDGE);
             let pois = played.world.pois.len();
             let by_now = played.observed.iter().flatten().filter(|&&observed| observed <= step).count();
             let steps = played.world.steps();
-            scene.bold([left, 4.0], format!("Generation {}", played.generation), 3.2, Anchor::Start, BLACK);
+            scene.bold([left, 4.0], played.name(), 3.2, Anchor::Start, BLACK);
+            scene.text([left, 7.6], played.place(), 2.6, Anchor::Start, FAINT);
             let state = format!("step {step} of {steps}   POIs observed: {by_now} of {pois}");
-            scene.text([left, 7.6], state, 2.6, Anchor::Start, FAINT);
-            self.view.moved_to([left, Self::HEAD]).draw(&mut scene, &played.team(place));
+            scene.text([left, 11.2], state, 2.6, Anchor::Start, FAINT);
+            let view = self.view.moved_to([left, Self::HEAD]);
+            view.draw(&mut scene, &played.team(place));
+            view.rule(&mut scene);
             said.push(played.say(step));
         }
         self.legend.draw(&mut scene, [Self::EDGE, below + 3.8], room);
-        scene.title = match self.played {
-            [one] => format!("The best team of generation {}", one.generation),
-            all => {
-                let generations: Vec<_> = all.iter().map(|played| played.generation.to_string()).collect();
-                format!("The best teams of generations {}, side by side", generations.join(" and "))
-            }
-        };
+        let names: Vec<_> =
+            self.played.iter().map(|played| format!("{} of {}", played.name(), played.place())).collect();
+        scene.title = names.join("; ");
         scene.description = said.join(" ");
         scene
     }

@@ -1,0 +1,38 @@
+//! Folders of sweeps named in the place of a run's.
+
+use std::fmt::Write;
+use std::path::Path;
+
+use super::Error;
+use crate::config::Config;
+use crate::record::folder::SWEEP;
+use crate::report::runs::{self, ReadError};
+use crate::sweep::{Sweep, results};
+
+/// Most points that are listed.
+const MOST: usize = 40;
+
+/// Reads a run's config. For the folder of a sweep the error lists its points with their values.
+///
+/// # Errors
+/// The folder is no run's, or its config is damaged.
+pub(super) fn config(folder: &Path) -> Result<Config, Error> {
+    runs::config(folder).map_err(|error| match error {
+        ReadError::Collection { what: "a sweep", .. } => match Sweep::load(&folder.join(SWEEP), &[], false) {
+            Ok(sweep) => Error::Refused(list(&sweep, folder)),
+            Err(error) => error.into(),
+        },
+        error => error.into(),
+    })
+}
+
+fn list(sweep: &Sweep, folder: &Path) -> String {
+    let mut text = format!("{} holds a sweep; name one of its points:", folder.display());
+    for point in sweep.points.iter().take(MOST) {
+        let _ = write!(text, "\n  {}  {}", results::point_folder(folder, point).display(), sweep.describe(point));
+    }
+    if let more @ 1.. = sweep.points.len().saturating_sub(MOST) {
+        let _ = write!(text, "\n  … and {more} more");
+    }
+    text
+}
