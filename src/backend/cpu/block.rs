@@ -9,7 +9,7 @@ use crate::backend::Moment;
 use crate::declare::Fixed;
 use crate::kernels::math::within;
 use crate::kernels::{only, splat};
-use crate::model::{Constants, Lanes, follow, motion, policy, sense};
+use crate::model::{Lanes, follow, motion, policy, sense};
 use crate::world::{INPUTS, OUTPUTS, World};
 
 /// Where a POI is.
