@@ -19,6 +19,8 @@ const MAX_BATCH: usize = 400;
 pub struct Manner<'a> {
     /// What is to be done about runs that are there.
     pub start: Start,
+    /// The disk within the sweep's folder, or within one above it.
+    pub disk: &'a Disk,
     /// Bytes that the points of a batch may take; more points than fit run in several batches, to the same results.
     pub memory: usize,
     /// As for any run, but for its watch.
@@ -95,13 +97,15 @@ pub fn run(points: &[&Point], out: &Path, player: &mut Player, options: &mut Man
     let mut progress = Headway { done: 0, points: points.len(), batch: 0, generation: 0, last: 0, played: 0, total };
     // Nothing of an earlier batch is lost, either, to a point that cannot be had.
     let folders: Vec<PathBuf> = points.iter().map(|point| point_folder(out, point)).collect();
-    folder::check(folders.iter().map(|path| &**path), options.start).map_err(RunError::from)?;
+    let disk = options.disk;
+    let configs = points.iter().map(|point| &point.config);
+    folder::check(disk, folders.iter().map(|path| &**path).zip(configs), options.start)?;
     for batch in batches(points, options.memory) {
         if options.runs.stop.load(Relaxed) {
             return Ok(Ended::Stopped);
         }
         let runs = batch.iter().map(|point| (point.config.clone(), point_folder(out, point))).collect();
-        let (mut session, notes) = Session::open(runs, options.start, &Disk::default())?;
+        let (mut session, notes) = Session::open(runs, options.start, disk)?;
         notes.iter().for_each(|(run, note)| (options.note)(batch[*run], note));
         // Steps that an earlier session played are none of this one's.
         let resumed: u128 = batch.iter().zip(session.generations()).map(|(point, &next)| played(point, next)).sum();
