@@ -1,15 +1,19 @@
 #!/bin/bash
-# A real Slurm on this machine runs a job array of a sweep; its results are compared with an unsharded run.
+# A real Slurm on this machine runs job arrays of sweeps. Their results are compared with those of undisturbed runs.
+# Jobs finish, are cancelled, are preempted, lose their node and reach their time limit.
 #
 #   apt-get install slurmctld slurmd slurm-client munge
-#   tests/slurm.sh [path/to/flotilla]
+#   tests/slurm.sh [path/to/flotilla [PART...]]
 #
-# Needs root (munged runs as its own user, slurmd starts jobs). All daemons have their own ports and files, in a
-# folder of their own, and are stopped whatever happens. Takes three to five minutes: the shortest time limit that
-# Slurm knows is a minute, and one of the jobs has to run into it.
+# The parts are array, cancelled, preempted, node and limit; without a name all run.
+# Needs root: munged runs as its own user, and slurmd starts jobs. All daemons have their own ports and files in a
+# temporary folder, and are always stopped. Takes five to ten minutes: the shortest time limit of Slurm is a minute, and
+# two jobs have to reach it.
 set -euo pipefail
 
 flotilla=$(realpath "${1:-target/debug/flotilla}")
+parts=("${@:2}")
+[ ${#parts[@]} != 0 ] || parts=(array cancelled preempted node limit)
 for program in slurmctld slurmd sbatch munged; do
     PATH=$PATH:/usr/sbin command -v "$program" > /dev/null || { echo "skipped: there is no $program here"; exit 0; }
 done
@@ -84,7 +88,11 @@ KillWait=10
 MinJobAge=600
 SchedulerParameters=sched_interval=2,sched_min_interval=0
 NodeName=$node NodeAddr=127.0.0.1 CPUs=$(nproc) State=UNKNOWN
-PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
+PreemptType=preempt/partition_prio
+PreemptMode=REQUEUE
+PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP PriorityTier=1
+PartitionName=graceful Nodes=ALL MaxTime=INFINITE State=UP PriorityTier=1 GraceTime=20
+PartitionName=urgent Nodes=ALL MaxTime=INFINITE State=UP PriorityTier=10 PreemptMode=OFF
 CONF
     setpriv --reuid munge --regid "$(id -g munge)" --clear-groups munged --foreground --key-file "$work/munge/key" \
         --socket "$work/munge/socket" --pid-file "$work/munge/pid" --log-file "$work/munge/log" \
@@ -93,10 +101,16 @@ CONF
     for _ in $(seq 50); do [ -S "$work/munge/socket" ] && break; sleep 0.1; done
     slurmctld -D -f "$SLURM_CONF" > "$work/slurmctld.log" 2>&1 &
     daemons+=($!)
-    slurmd -D -f "$SLURM_CONF" -N "$node" > "$work/slurmd.log" 2>&1 &
-    daemons+=($!)
+    start_node
+}
+
+# Starts the node of this machine and waits until it takes jobs.
+start_node() {
+    slurmd -D -f "$SLURM_CONF" -N "$(hostname -s)" >> "$work/slurmd.log" 2>&1 &
+    node_daemon=$!
+    daemons+=("$node_daemon")
     for _ in $(seq 60); do
-        [ "$(timeout 5 sinfo --noheader --format=%T 2> /dev/null)" = idle ] && return
+        [ "$(timeout 5 sinfo --noheader --partition=all --format=%T 2> /dev/null)" = idle ] && return
         sleep 0.5
     done
     say "the node did not come up"
@@ -149,40 +163,174 @@ sed -e 's/trials = 2/trials = 20/' -e 's/generations = 5$/generations = 200/' "$
 say "starting munge and Slurm $(slurmctld -V | cut -d' ' -f2) in $work"
 start_slurm
 
-say "an array of 4 tasks"
-"$flotilla" sweep "$work/small.toml" --out "$work/whole" --backend cpu --quiet > /dev/null
-"$flotilla" sweep "$work/small.toml" --out "$work/array" --backend cpu --threads 1 --shards 4 --slurm="$work/array.sh"
-job=$(sbatch --parsable --chdir="$work" "$work/array.sh")
-wait_for "$job" 300
-compare "$work/small.toml" "$work/array" "$work/whole"
-[ "$(ls "$work"/array/slurm-*.log | wc -l)" = 4 ]
-say "same bytes as unsharded"
+part_array() {
+    local job
+    say "an array of 4 tasks"
+    "$flotilla" sweep "$work/small.toml" --out "$work/whole" --backend cpu --quiet > /dev/null
+    "$flotilla" sweep "$work/small.toml" --out "$work/array" --backend cpu --threads 1 --shards 4 --slurm="$work/array.sh"
+    job=$(sbatch --parsable --chdir="$work" "$work/array.sh")
+    wait_for "$job" 300
+    compare "$work/small.toml" "$work/array" "$work/whole"
+    [ "$(ls "$work"/array/slurm-*.log | wc -l)" = 4 ]
+    say "same bytes as unsharded"
 
-say "a hand-written array, whose ids start at 7"
-printf '#!/bin/bash\nexec %q sweep %q --out %q --backend cpu --threads 1 --quiet\n' \
-    "$flotilla" "$work/small.toml" "$work/plain" > "$work/plain.sh"
-job=$(sbatch --parsable --chdir="$work" --array=7-9 --output="$work/plain-%a.log" "$work/plain.sh")
-wait_for "$job" 300
-compare "$work/small.toml" "$work/plain" "$work/whole"
-say "same bytes as unsharded"
+    say "a hand-written array, whose ids start at 7"
+    printf '#!/bin/bash\nexec %q sweep %q --out %q --backend cpu --threads 1 --quiet\n' \
+        "$flotilla" "$work/small.toml" "$work/plain" > "$work/plain.sh"
+    job=$(sbatch --parsable --chdir="$work" --array=7-9 --output="$work/plain-%a.log" "$work/plain.sh")
+    wait_for "$job" 300
+    compare "$work/small.toml" "$work/plain" "$work/whole"
+    say "same bytes as unsharded"
+}
 
-# As many generations as take one thread about 75 s of the processor here: longer than the limit, whatever the machine, and
-# whatever else it does meanwhile.
-TIMEFORMAT=%U
-seconds=$({ time "$flotilla" sweep "$work/long.toml" --out "$work/probe" --backend cpu --threads 1 --generations 60 --quiet \
-    > /dev/null 2>&1; } 2>&1)
-generations=$(awk -v seconds="$seconds" 'BEGIN { print int(75 * 61 / seconds) }')
-say "a task of $generations generations with a time limit of a minute"
-flags=(--generations "$generations")
-"$flotilla" sweep "$work/long.toml" --out "$work/limited" --backend cpu --threads 1 --time 00:01:00 \
-    "${flags[@]}" --slurm="$work/limited.sh"
-# The warning comes at most 30 s late, and the script asks for it a minute ahead; here that would leave no time at all.
-job=$(sbatch --parsable --chdir="$work" --signal=B:USR1@20 "$work/limited.sh")
-"$flotilla" sweep "$work/long.toml" --out "$work/unlimited" --backend cpu --threads 1 --quiet "${flags[@]}" > /dev/null &
-undisturbed=$!
-wait_for "$job" 900
-wait "$undisturbed"
-grep -q "back into the queue" "$work"/limited/slurm-*.log || { say "it was never requeued"; exit 1; }
-say "it was requeued $(cat "$work"/limited/slurm-*.log | grep -c "back into the queue") times"
-compare "$work/long.toml" "$work/limited" "$work/unlimited" "${flags[@]}"
-say "same bytes as undisturbed"
+# Trains the long sweep undisturbed, and writes its batch script for the folder $work/$1, with further flags.
+#
+# A calibration run determines how many generations take one thread about 75 s of processor time here: longer than the
+# shortest time limit, whatever the machine and its load.
+undisturbed=
+generations=
+prepare() {
+    local seconds TIMEFORMAT=%U
+    if [ -z "$generations" ]; then
+        seconds=$({ time "$flotilla" sweep "$work/long.toml" --out "$work/probe" --backend cpu --threads 1 \
+            --generations 60 --quiet > /dev/null 2>&1; } 2>&1)
+        generations=$(awk -v seconds="$seconds" 'BEGIN { print int(75 * 61 / seconds) }')
+        flags=(--generations "$generations")
+        "$flotilla" sweep "$work/long.toml" --out "$work/unlimited" --backend cpu --threads 1 --quiet "${flags[@]}" \
+            > /dev/null &
+        undisturbed=$!
+    fi
+    "$flotilla" sweep "$work/long.toml" --out "$work/$1" --backend cpu --threads 1 "${flags[@]}" --slurm="$work/$1.sh" \
+        "${@:2}"
+}
+
+# Compares the folder $work/$1 with the undisturbed sweep.
+same_as_undisturbed() {
+    [ -z "$undisturbed" ] || wait "$undisturbed"
+    undisturbed=
+    compare "$work/long.toml" "$work/$1" "$work/unlimited" "${flags[@]}"
+    say "same bytes as undisturbed"
+}
+
+fail() {
+    say "$1"
+    exit 1
+}
+
+# Waits until the command in the arguments after the first succeeds.
+until_true() {
+    local end=$((SECONDS + 120))
+    until "${@:2}"; do
+        [ $SECONDS -lt $end ] || fail "waited too long until $1"
+        sleep 0.5
+    done
+}
+
+# A property of the only task of a job, from Slurm.
+property() { scontrol show "job=$1" 2> /dev/null | tr ' ' '\n' | sed -n "s/^$2=//p" | head -n 1; }
+is_in_state() { [ "$(property "$1" JobState)" = "$2" ]; }
+has_sessions() { [ "$(grep -l "\"sessions\": $2" "$work/$1"/points/*/run.json 2> /dev/null | wc -l)" -gt 0 ]; }
+
+has_checkpoint() { ls "$work/$1"/points/0000/checkpoints/*.safetensors > /dev/null 2>&1; }
+
+# Submits $work/$1.sh and waits until its task trains in session $2.
+submit() {
+    job=$(sbatch --parsable --chdir="$work" "${@:3}" "$work/$1.sh")
+    until_true "session $2 of $1 starts" has_sessions "$1" "$2"
+}
+
+saves() { grep -q "everything is saved" "$work/$1"/slurm-*.log; }
+
+# Checks that the ended task in $work/$1 saved, and that no run was cut off.
+saved() {
+    saves "$1" || fail "it did not save"
+    ! grep -q '"state": "running"' "$work/$1"/points/*/run.json || fail "a run was cut off"
+}
+
+# Checks that a job has ended in state $2, and does not return.
+ended_for_good() {
+    until_true "job $1 ends" is_in_state "$1" "$2"
+    sleep 5
+    is_in_state "$1" "$2" || fail "it returned to the queue after $2: $(property "$1" JobState)"
+    [ "$(property "$1" Restarts)" = 0 ] || fail "it was restarted after $2"
+}
+
+part_cancelled() {
+    say "a task that is cancelled, and submitted again"
+    prepare cancelled
+    submit cancelled 1
+    scancel "$job"
+    ended_for_good "$job" CANCELLED
+    saved cancelled
+    say "it saved, and did not return"
+    submit cancelled 2
+    wait_for "$job" 900
+    same_as_undisturbed cancelled
+}
+
+part_preempted() {
+    local partition
+    for partition in all graceful; do
+        say "a task that is preempted in partition $partition"
+        prepare "preempted-$partition"
+        submit "preempted-$partition" 1 --partition="$partition"
+        sbatch --parsable --chdir="$work" --partition=urgent --exclusive --wrap="sleep 1" --output=/dev/null > /dev/null
+        wait_until_restarted "$job"
+        until_true "it saves" saves "preempted-$partition"
+        wait_for "$job" 900
+        same_as_undisturbed "preempted-$partition"
+    done
+}
+
+is_restarted() { [ "$(property "$1" Restarts)" -gt 0 ] 2> /dev/null; }
+wait_until_restarted() { until_true "job $1 returns to the queue" is_restarted "$1"; }
+
+# Kills the processes of this Slurm's jobs: the managers of steps ($1 is slurmstepd), or all in a job.
+kill_processes() {
+    local process
+    for process in /proc/[0-9]*; do
+        grep -qz "^SLURM_CONF=$SLURM_CONF\$" "$process/environ" 2> /dev/null || continue
+        if [ -n "$1" ]; then
+            [ "$(cat "$process/comm" 2> /dev/null)" = "$1" ] || continue
+        else
+            grep -qz "^SLURM_JOB_ID=" "$process/environ" 2> /dev/null || continue
+        fi
+        kill -KILL "${process#/proc/}" 2> /dev/null || true
+    done
+}
+
+part_node() {
+    say "a task whose node fails"
+    prepare node
+    submit node 1
+    until_true "there is a checkpoint" has_checkpoint node
+    # All of the node ends at once: its daemon, then the step's manager, which would report the end of the step.
+    kill -KILL "$node_daemon"
+    kill_processes slurmstepd
+    kill_processes ""
+    scontrol update "NodeName=$(hostname -s)" State=DOWN Reason=test
+    wait_until_restarted "$job"
+    scontrol update "NodeName=$(hostname -s)" State=RESUME
+    start_node
+    wait_for "$job" 900
+    same_as_undisturbed node
+}
+
+part_limit() {
+    say "a task with a time limit of a minute"
+    prepare limited --time 00:01:00
+    # The warning comes at most 30 s late, and the script asks for it a minute ahead; here that would leave no time.
+    job=$(sbatch --parsable --chdir="$work" --signal=B:USR1@20 "$work/limited.sh")
+    wait_for "$job" 900
+    grep -q "returns to the queue" "$work"/limited/slurm-*.log || fail "it was never requeued"
+    same_as_undisturbed limited
+
+    say "a task that reaches its time limit without a warning"
+    prepare late --time 00:01:00
+    submit late 1 --signal=B:CONT@20
+    ended_for_good "$job" TIMEOUT
+    saved late
+    say "it saved, and did not return"
+}
+
+for part in "${parts[@]}"; do "part_$part"; done

@@ -1,5 +1,6 @@
 //! What the commands that train recorded runs have in common: flags, signals, and what is told when a device fails.
 
+use std::ffi::OsString;
 use std::io;
 use std::path::Path;
 use std::sync::Arc;
@@ -69,12 +70,12 @@ impl Checkpoints {
 }
 
 /// Flags that set config keys, as typed.
-pub fn words_of(overrides: &[Override]) -> impl Iterator<Item = String> {
-    overrides.iter().flat_map(|set| [set.name.clone(), set.text.trim_matches(['"', '\'']).to_string()])
+pub fn words_of(overrides: &[Override]) -> impl Iterator<Item = OsString> {
+    overrides.iter().flat_map(|set| [set.name.clone().into(), set.text.trim_matches(['"', '\'']).into()])
 }
 
-/// The flags that say what to run on, as typed, those left out left out.
-pub fn words_of_machine(run: &RunOptions, loss: Loss) -> Vec<String> {
+/// The flags that say what to run on, as typed, without those at their defaults.
+pub fn words_of_machine(run: &RunOptions, loss: Loss) -> Vec<OsString> {
     fn word<T: ValueEnum + PartialEq>(value: T, default: T) -> Option<String> {
         (value != default).then(|| value.to_possible_value()).flatten().map(|value| value.get_name().to_string())
     }
@@ -86,12 +87,17 @@ pub fn words_of_machine(run: &RunOptions, loss: Loss) -> Vec<String> {
         ("--threads", threads.map(|threads| threads.to_string())),
         ("--on-device-loss", word(loss.on_device_loss, OnLoss::Stop)),
     ];
-    flags.into_iter().filter_map(|(flag, value)| Some([flag.to_string(), value?])).flatten().collect()
+    let words = |(flag, value): (&str, Option<String>)| match value? {
+        // It would be read as a flag.
+        value if value.starts_with('-') => Some(vec![format!("{flag}={value}").into()]),
+        value => Some(vec![flag.into(), value.into()]),
+    };
+    flags.into_iter().filter_map(words).flatten().collect()
 }
 
-/// A path as a shell reads it back.
+/// Quotes a path as an argument in a shell.
 pub fn quoted(path: &Path) -> String {
-    shell::quoted(&path.display().to_string())
+    shell::quoted(shell::argument(path))
 }
 
 /// Most characters of a command line that are kept.
@@ -99,32 +105,37 @@ const MOST: usize = 1 << 13;
 
 /// What was typed, as a shell reads it.
 pub fn typed() -> String {
-    let line = shell::command(super::words().iter().map(|word| word.to_string_lossy().into_owned()));
+    let line = shell::command(super::words());
     match line.char_indices().nth(MOST) {
         Some((end, _)) => format!("{} …", &line[..end]),
         None => line,
     }
 }
 
-/// Signals that ask for something.
+/// Flags that signals set.
 pub struct Signals {
+    /// The run saves and stops.
     pub stop: Arc<AtomicBool>,
+    /// The run saves and continues.
     pub save: Arc<AtomicBool>,
 }
 
 impl Signals {
-    /// From here on SIGINT and SIGTERM set `stop`, and end the process at once where it is set already; SIGUSR1 sets
-    /// `save`.
+    /// Installs the signal handlers. SIGINT and SIGTERM set `stop`, and SIGUSR1 sets `save`.
+    ///
+    /// A SIGINT after any of the first two ends the process at once, because a person who presses Ctrl-C again does not
+    /// want to wait. Another SIGTERM changes nothing: batch systems send it to a script and to its processes, and to
+    /// these twice at a time limit.
     ///
     /// # Errors
-    /// The system does not let them.
+    /// The system does not allow it.
     pub fn listen() -> Result<Signals, Error> {
         use signal_hook::consts::{SIGINT, SIGTERM};
         use signal_hook::flag;
         let signals = Signals { stop: Arc::default(), save: Arc::default() };
         let listen = || -> io::Result<()> {
+            flag::register_conditional_shutdown(SIGINT, 128 + SIGINT, signals.stop.clone())?;
             for signal in [SIGINT, SIGTERM] {
-                flag::register_conditional_shutdown(signal, 128 + signal, signals.stop.clone())?;
                 flag::register(signal, signals.stop.clone())?;
             }
             #[cfg(unix)]
