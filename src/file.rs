@@ -1,49 +1,49 @@
-//! Paths that a user or a folder names: what stands there is looked at before it is opened.
+//! Files that users name. Their kind and size are checked before they are read.
 
 use std::fs::{self, File};
 use std::io::{self, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
-/// Opens a plain file to read it. Anything else is refused, since opening a pipe that nobody writes to waits for ever;
-/// but what whoever started the process had opened for it (`/dev/stdin`, a shell's `<(…)`) is taken.
+/// Opens a regular file for reading. Opening a pipe without a writer would block, so other kinds are refused, except files
+/// that the parent process opened: `/dev/stdin`, or `<(…)` in a shell.
 ///
 /// # Errors
-/// There is no such file, it cannot be opened, or it is no file.
+/// The file is missing, cannot be opened, or is not a regular file.
 pub fn open(path: &Path) -> io::Result<File> {
     let kind = fs::metadata(path)?;
     if kind.is_dir() {
-        return Err(io::Error::new(ErrorKind::IsADirectory, "it is a folder, where a file is needed"));
+        return Err(io::Error::new(ErrorKind::IsADirectory, "it is a folder, not a file"));
     }
-    let handed_over = ["/dev/stdin", "/dev/fd", "/proc/self/fd"].iter().any(|open| path.starts_with(open));
-    if !kind.is_file() && !handed_over {
-        return Err(io::Error::new(ErrorKind::InvalidInput, "it is a pipe or a device, where a file is needed"));
+    let is_inherited = ["/dev/stdin", "/dev/fd", "/proc/self/fd"].iter().any(|prefix| path.starts_with(prefix));
+    if !kind.is_file() && !is_inherited {
+        return Err(io::Error::new(ErrorKind::InvalidInput, "it is a pipe or a device, not a file"));
     }
     File::open(path)
 }
 
-/// Why a text could not be read.
+/// The reason why a text could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum TextError {
-    /// It cannot be read.
+    /// Reading failed.
     #[error(transparent)]
     Read(#[from] io::Error),
-    /// It is larger than so many bytes.
-    #[error("it is larger than {0} bytes, the most that such a file may have")]
+    /// The text is larger than this many bytes.
+    #[error("it is larger than {0} bytes, the maximum for such a file")]
     TooLarge(u64),
-    /// This line, from 1, is not UTF-8.
+    /// The line with this number, from 1, is not UTF-8.
     #[error("line {0} is not UTF-8 text")]
     NotText(usize),
 }
 
-/// A text of `most` bytes at most.
+/// Reads a text of up to `max_bytes` bytes.
 ///
 /// # Errors
-/// It cannot be read, is larger, or is no UTF-8.
-pub fn text(file: impl Read, most: u64) -> Result<String, TextError> {
+/// Reading fails, or the text is larger or not UTF-8.
+pub fn text(file: impl Read, max_bytes: u64) -> Result<String, TextError> {
     let mut bytes = Vec::new();
-    file.take(most + 1).read_to_end(&mut bytes)?;
-    if bytes.len() as u64 > most {
-        return Err(TextError::TooLarge(most));
+    file.take(max_bytes + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > max_bytes {
+        return Err(TextError::TooLarge(max_bytes));
     }
     String::from_utf8(bytes).map_err(|error| {
         let before = &error.as_bytes()[..error.utf8_error().valid_up_to()];
@@ -51,27 +51,34 @@ pub fn text(file: impl Read, most: u64) -> Result<String, TextError> {
     })
 }
 
-/// Whether something stands at a path.
+/// Returns a file's name without its extension. A name made of dots alone would be the current folder or the one above,
+/// so `default` takes its place.
+pub fn stem(path: &Path, default: &str) -> String {
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    if stem.trim_matches('.').is_empty() { default.into() } else { stem.into_owned() }
+}
+
+/// Returns whether a path exists.
 ///
 /// # Errors
-/// That cannot be seen, for want of permission as a rule.
+/// The system does not tell, for example without permission.
 pub fn exists(path: &Path) -> io::Result<bool> {
     match path.try_exists() {
-        // Below something that is no folder there is nothing.
+        // A path below a file cannot exist.
         Err(error) if error.kind() == ErrorKind::NotADirectory => Ok(false),
-        seen => seen,
+        result => result,
     }
 }
 
-/// The folder that a path's last name is in: the present one of a bare name.
+/// Returns the folder that contains a path: the current one for a bare name.
 pub fn folder(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-/// Where a path leads, all links followed, whether or not anything is there yet.
+/// Returns a path with all links resolved, even if its last component does not exist yet.
 pub fn resolved(path: &Path) -> PathBuf {
-    let beside = || Some(fs::canonicalize(folder(path)).ok()?.join(path.file_name()?));
-    fs::canonicalize(path).ok().or_else(beside).unwrap_or_else(|| path.into())
+    let in_folder = || Some(fs::canonicalize(folder(path)).ok()?.join(path.file_name()?));
+    fs::canonicalize(path).ok().or_else(in_folder).unwrap_or_else(|| path.into())
 }
 
 #[cfg(test)]
@@ -79,7 +86,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_bare_name_is_in_the_present_folder() {
+    fn a_stem_is_never_a_folder() {
+        for (path, expected) in [("a/x.toml", "x"), ("...toml", "default"), ("..", "default"), ("....toml", "default")]
+        {
+            assert_eq!(stem(Path::new(path), "default"), expected, "{path}");
+        }
+        assert_eq!(stem(Path::new(".toml"), "default"), ".toml");
+        assert_eq!(stem(Path::new("..x.toml"), "default"), "..x");
+    }
+
+    #[test]
+    fn a_bare_name_is_in_the_current_folder() {
         for (path, expected) in [("x.svg", "."), ("./x.svg", "."), ("a/x.svg", "a"), ("/x.svg", "/"), ("..", ".")] {
             assert_eq!(folder(Path::new(path)), Path::new(expected), "{path}");
         }

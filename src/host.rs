@@ -1,7 +1,7 @@
-//! What flotilla takes from where it runs: the time, and a way to wait. Nothing else in the crate asks for either.
+//! The clock and blocking waits. No other module uses the system's directly.
 //!
-//! Native programs have both from the system. WebAssembly has neither: there, whoever embeds the crate `install`s
-//! them. Without a clock, time stands still there; without a way to park, waiting asks again and again.
+//! Native programs use the system's. WebAssembly has neither, so its embedder provides them with `install`. Without a
+//! clock, time stands still there. Without a way to park, waiting polls in a loop.
 
 #[cfg(not(target_family = "wasm"))]
 mod native {
@@ -9,12 +9,12 @@ mod native {
 
     pub use std::time::Instant;
 
-    /// Time since the start of 1970 by the system's clock.
+    /// Returns the time since the start of 1970.
     pub fn since_1970() -> Duration {
         SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
     }
 
-    /// Lets this thread wait until a future is there. What a GPU has promised comes while its device is polled.
+    /// Blocks this thread until a future is ready. Results of a GPU become ready while its device is polled.
     #[cfg(feature = "gpu")]
     pub fn wait<F: Future>(future: F) -> F::Output {
         pollster::block_on(future)
@@ -30,41 +30,41 @@ mod embedded {
     use std::sync::OnceLock;
     use std::time::Duration;
 
-    /// What an embedder offers.
+    /// The functions of an embedder.
     pub struct Host {
-        /// Time since some moment, never less than before.
+        /// Returns the time since a fixed moment, and never less than before.
         pub now: fn() -> Duration,
-        /// Time since the start of 1970.
+        /// Returns the time since the start of 1970.
         pub since_1970: fn() -> Duration,
-        /// Lets others run (a browser: its event loop) until `wake` was called since the last time this came back.
+        /// Yields, for example to the event loop of a browser, until `wake` is called after the previous return.
         pub park: fn(),
-        /// Ends the waiting of `park`; called from callbacks.
+        /// Lets `park` return. Callbacks call this.
         pub wake: fn(),
     }
 
     static HOST: OnceLock<Host> = OnceLock::new();
 
-    /// Takes what an embedder offers, once; false where there is a host already.
+    /// Installs the functions of the embedder. Returns false if some are installed already.
     pub fn install(host: Host) -> bool {
         HOST.set(host).is_ok()
     }
 
-    /// Time since the start of 1970.
+    /// Returns the time since the start of 1970.
     pub fn since_1970() -> Duration {
         HOST.get().map_or(Duration::ZERO, |host| (host.since_1970)())
     }
 
-    /// A moment, as [`std::time::Instant`], which is not to be had here.
+    /// A moment. [`std::time::Instant`] is not available on this platform.
     #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
     pub struct Instant(Duration);
 
     impl Instant {
-        /// This moment; the same one again and again where no host is installed.
+        /// Returns the current moment, or always the same one if no host is installed.
         pub fn now() -> Instant {
             Instant(HOST.get().map_or(Duration::ZERO, |host| (host.now)()))
         }
 
-        /// Time since this moment.
+        /// Returns the time since this moment.
         pub fn elapsed(self) -> Duration {
             Instant::now() - self
         }
@@ -78,7 +78,7 @@ mod embedded {
         }
     }
 
-    /// Waits until a future is there, parked wherever the host parks.
+    /// Waits until a future is ready, and parks meanwhile as the host does.
     #[cfg(feature = "gpu")]
     pub fn wait<F: Future>(future: F) -> F::Output {
         use std::sync::Arc;

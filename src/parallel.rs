@@ -1,6 +1,6 @@
-//! The one way to share work between threads: rayon's, or without the feature `parallel` the same calls on this thread.
+//! Parallel iteration: rayon's, or the same calls on one thread without the feature `parallel`.
 //!
-//! No result depends on it: whatever runs in parallel writes to places of its own.
+//! Results do not depend on the number of threads, because parallel tasks write to disjoint memory.
 
 #[cfg(feature = "parallel")]
 pub(crate) use rayon::{current_num_threads, join, prelude::*, scope};
@@ -12,22 +12,22 @@ pub(crate) use sequential::*;
 mod sequential {
     use std::slice::{ChunksExact, ChunksExactMut, ChunksMut, Iter, IterMut};
 
-    /// Threads that work is shared between.
+    /// Returns the number of threads, 1.
     pub(crate) fn current_num_threads() -> usize {
         1
     }
 
-    /// Runs both.
+    /// Runs both functions.
     pub(crate) fn join<A, B>(one: impl FnOnce() -> A, other: impl FnOnce() -> B) -> (A, B) {
         (one(), other())
     }
 
-    /// Runs this where all that it shares is shared.
+    /// Runs a function that could start tasks in a scope.
     pub(crate) fn scope<R>(run: impl FnOnce(&()) -> R) -> R {
         run(&())
     }
 
-    /// rayon's names for what slices have.
+    /// The methods of rayon's slices.
     pub(crate) trait ParallelSlices<T> {
         fn par_iter(&self) -> Iter<'_, T>;
         fn par_iter_mut(&mut self) -> IterMut<'_, T>;
@@ -63,7 +63,7 @@ mod sequential {
         }
     }
 
-    /// rayon's names for what iterators have.
+    /// The conversion of collections to rayon's iterators.
     pub(crate) trait ParallelItems: IntoIterator + Sized {
         fn into_par_iter(self) -> Self::IntoIter {
             self.into_iter()
@@ -72,7 +72,7 @@ mod sequential {
 
     impl<I: IntoIterator> ParallelItems for I {}
 
-    /// What rayon wants to know of how work is cut up.
+    /// The methods of rayon's iterators.
     pub(crate) trait ParallelCut: Iterator + Sized {
         fn with_min_len(self, _: usize) -> Self {
             self

@@ -1,102 +1,176 @@
-//! A TOML text read key by key: whoever asks for a key says what it allows, and everything that is wrong with the text
-//! is found in one pass and reported by line.
+//! A reader of TOML texts, key by key. Each request for a key states its allowed values, and one pass finds all problems
+//! of the text with their lines.
 //!
-//! What is asked for is also a table of keys, see [`keys`]. Which keys there are is no matter of this module.
+//! The requests also define the table of keys, see [`keys`]. The keys themselves are defined elsewhere.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::fmt::{self, Display};
 use std::ops::RangeInclusive;
 
 use serde::Serialize;
 use toml::Spanned;
-use toml::de::{DeTable, DeValue};
+use toml::de::{DeTable, DeValue, Error};
 
 use crate::declare::Choice;
 
-/// Most problems listed of one text.
-const MAX_LISTED: usize = 50;
+/// Maximum number of problems listed per text.
+pub const MAX_LISTED: usize = 50;
+/// Maximum number of unknown keys for which similar keys are searched. A text with more is not a config.
+const MAX_HINTS: usize = 256;
 
-/// What is to be known of one key: a line of the table behind `docs/reference/config.md` and every commented config.
+/// The description of one key: a row of `docs/reference/config.md` and a comment of every commented config.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Definition {
     /// Dotted: `world.dt`.
     pub name: &'static str,
-    /// Empty where it has none.
+    /// The unit, or an empty text.
     pub unit: &'static str,
-    /// What kind of value it takes: `number`, `word`, `list of positions [x, y]`.
+    /// The kind of its value: `number`, `word`, `list of positions [x, y]`.
     pub kind: String,
-    /// The values it takes; bounds that other keys set go by these keys' names.
+    /// The allowed values. A bound that depends on another key is that key's name.
     pub range: String,
-    /// As TOML; none where the key has to be given.
+    /// The default as TOML, or none if the key is required.
     pub default: Option<String>,
-    /// Without a full stop.
+    /// The meaning, without a full stop.
     pub meaning: &'static str,
-    /// Section and equation of the paper; empty where it says nothing of this.
+    /// The section and the equation of the paper, or an empty text.
     pub paper: &'static str,
 }
 
-/// A key set from outside the config file.
+/// A key that is set from outside the config file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Override {
     /// The dotted key: `learning.population`.
     pub key: String,
-    /// What it is set to, as TOML.
+    /// The value as TOML.
     pub text: String,
-    /// What errors call it: `--population`.
+    /// The name in errors: `--population`.
     pub name: String,
 }
 
 impl Override {
-    /// Sets `key` to `value`; errors call it `name`.
+    /// Sets `key` to `value`, with `name` as its name in errors.
     pub fn new(key: impl Into<String>, value: impl Into<toml::Value>, name: impl Into<String>) -> Override {
         Override { key: key.into(), text: value.into().to_string(), name: name.into() }
     }
 }
 
-/// One thing wrong with a config.
+/// One problem of a config.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Problem {
-    /// The line in the file, from 1; none for an [`Override`].
+    /// The line in the file, from 1, or none for an [`Override`].
     pub line: Option<usize>,
-    /// The dotted key with any place in its list, `world.leaders[3][1]`, or the override's name; empty for broken TOML.
+    /// The dotted key with its index in a list, `world.leaders[3][1]`, or the override's name. Empty for a syntax error.
     pub key: String,
-    /// What was found and what is allowed.
+    /// The value found and the values allowed.
     pub message: String,
 }
 
-/// All that is wrong with a text, by line; what came from outside it (see [`Override`]) last.
+/// The problems of a text by line, then those of [`Override`]s.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Problems {
-    /// As many as anyone reads.
+    /// The first [`MAX_LISTED`] problems.
     pub listed: Vec<Problem>,
-    /// How many more there are.
+    /// The number of further problems.
     pub unlisted: usize,
 }
 
-/// Sections of a text that are not for whoever reads it.
+/// Sections of a text that its reader does not read.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Others<'a> {
-    /// These are passed over.
+    /// Sections that are ignored.
     pub foreign: &'a [&'a str],
-    /// With any of these the text is something else, as the message says; of that nothing else is worth saying.
+    /// Sections that make the text something else. They are reported alone.
     pub refused: &'a [&'a str],
-    /// What is said of such a text.
+    /// The message about such a text.
     pub message: &'a str,
 }
 
-/// Reads a text, with some keys set from elsewhere: `ask` asks for every key that there is.
+/// A parsed text. A sweep reads all its points from one document, because parsing takes longer than reading.
+#[derive(Clone)]
+pub struct Document<'a> {
+    text: &'a str,
+    table: DeTable<'a>,
+    errors: Vec<Error>,
+    lines: LineNumbers,
+}
+
+impl<'a> Document<'a> {
+    /// Parses a text. [`read`] reports its syntax errors.
+    pub fn parse(text: &'a str) -> Document<'a> {
+        #[cfg(test)]
+        work::add(text.len());
+        let (table, errors) = DeTable::parse_recoverable(text);
+        Document { text, table: table.into_inner(), errors, lines: LineNumbers::of(text) }
+    }
+
+    /// Returns the same document without some of its sections.
+    pub fn without(mut self, sections: &[&str]) -> Document<'a> {
+        sections.iter().for_each(|section| drop(self.table.remove(*section)));
+        self
+    }
+
+    /// Returns the text that was parsed.
+    pub fn text(&self) -> &'a str {
+        self.text
+    }
+
+    /// Returns the top-level table.
+    pub fn table(&self) -> &DeTable<'a> {
+        &self.table
+    }
+
+    /// Returns the line numbers of the text.
+    pub fn lines(&self) -> &LineNumbers {
+        &self.lines
+    }
+}
+
+/// Line numbers by offset. Looking one up takes logarithmic time, so that a text with many problems takes linear time.
+#[derive(Clone, Debug)]
+pub struct LineNumbers {
+    /// The offset of every line break.
+    breaks: Vec<usize>,
+}
+
+impl LineNumbers {
+    /// Finds the lines of a text.
+    pub fn of(text: &str) -> LineNumbers {
+        LineNumbers { breaks: text.bytes().enumerate().filter(|(_, byte)| *byte == b'\n').map(|(at, _)| at).collect() }
+    }
+
+    /// Returns the line of an offset, from 1.
+    pub fn line(&self, offset: usize) -> usize {
+        self.breaks.partition_point(|&at| at < offset) + 1
+    }
+}
+
+/// Reads a text, with some keys set by overrides: `ask` requests every key.
 ///
 /// # Errors
-/// Everything that is wrong with the text and the overrides.
+/// All problems of the text and the overrides.
 pub fn read<T>(
     text: &str,
     others: Others<'_>,
     overrides: &[Override],
     ask: impl FnOnce(&mut Reader<'_>) -> T,
 ) -> Result<T, Problems> {
-    let (document, errors) = DeTable::parse_recoverable(text);
+    read_document(&Document::parse(text), others, overrides, ask)
+}
+
+/// Reads a parsed text, as [`read`] does.
+///
+/// # Errors
+/// All problems of the text and the overrides.
+pub fn read_document<T>(
+    document: &Document<'_>,
+    others: Others<'_>,
+    overrides: &[Override],
+    ask: impl FnOnce(&mut Reader<'_>) -> T,
+) -> Result<T, Problems> {
+    let Document { text, table, errors, lines } = document;
     let mut reader = Reader::default();
-    for error in first_slips(text, &errors) {
+    for error in first_errors(errors, lines) {
         let span = error.span().unwrap_or(0..0);
         let at = text.get(span.clone()).filter(|at| !at.trim().is_empty());
         let at = at.map_or(String::new(), |at| format!(" (at `{}`)", shorten(at)));
@@ -104,72 +178,72 @@ pub fn read<T>(
         reader.report(Place::Offset(span.start), "", message);
     }
     if reader.problems.is_empty() {
-        let mut refused = document.get_ref().keys().filter(|key| others.refused.contains(&key.get_ref().as_ref()));
+        let mut refused = table.keys().filter(|key| others.refused.contains(&key.get_ref().as_ref()));
         if let Some(section) = refused.next() {
             reader.report(Place::Offset(section.span().start), section.get_ref(), others.message.into());
         }
     }
     if reader.problems.is_empty() {
-        reader.fill(document.into_inner(), text, others.foreign, overrides);
+        reader.fill(table.clone(), text, others.foreign, overrides);
         let read = ask(&mut reader);
         reader.report_unknown();
         if reader.problems.is_empty() {
             return Ok(read);
         }
     }
-    Err(reader.into_problems(text))
+    Err(reader.into_problems(lines))
 }
 
-/// What an empty text comes to, and every key that `ask` asks for, in that order.
+/// Returns the result for an empty text, and the keys that `ask` requests, in order.
 pub fn keys<T>(ask: impl FnOnce(&mut Reader<'_>) -> T) -> (T, Vec<Definition>) {
     let mut reader = Reader { table: Some(vec![]), ..Reader::default() };
     let read = ask(&mut reader);
     (read, reader.table.unwrap_or_default())
 }
 
-/// The syntax errors that no earlier one explains: a slip can break the rest of its line, a list left open the rest of
-/// the file.
-fn first_slips<'e>(text: &str, errors: &'e [toml::de::Error]) -> impl Iterator<Item = &'e toml::de::Error> {
-    let left_open = errors.iter().any(|error| error.message().contains("unclosed array"));
-    let in_list = |error: &toml::de::Error| left_open && error.message().contains("array");
+/// Returns the syntax errors that are not consequences of an earlier one: an error can invalidate the rest of its line,
+/// and an unclosed list the rest of the file.
+fn first_errors<'e>(errors: &'e [Error], lines: &'e LineNumbers) -> impl Iterator<Item = &'e Error> {
+    let unclosed = errors.iter().any(|error| error.message().contains("unclosed array"));
+    let in_list = |error: &Error| unclosed && error.message().contains("array");
     let end = errors.iter().position(in_list).map_or(errors.len(), |first| first + 1);
-    let mut last = None;
+    let mut last = 0;
     errors[..end].iter().filter(move |error| {
-        let start = error.span().map_or(0, |span| span.start);
-        let new_line = last.is_none_or(|last| text.get(last..start).is_some_and(|since| since.contains('\n')));
-        last = if new_line { Some(start) } else { last };
-        new_line
+        let line = lines.line(error.span().map_or(0, |span| span.start));
+        let is_new = line > last;
+        last = last.max(line);
+        is_new
     })
 }
 
-/// The values a number may have.
+/// The allowed values of a number.
 #[derive(Clone, Copy, Debug)]
 pub struct Allowed<T> {
     low: T,
     high: T,
     zero: bool,
     unlimited: bool,
-    /// Where the bounds come from.
+    /// The keys that set the bounds.
     because: &'static str,
 }
 
-/// The numbers from `low` to `high`, both included.
+/// Returns the range from `low` to `high`, both included.
 pub fn between<T>(low: T, high: T) -> Allowed<T> {
     Allowed { low, high, zero: false, unlimited: false, because: "" }
 }
 
 impl<T: Number> Allowed<T> {
-    /// Also 0, where the least other value is greater.
+    /// Also allows 0, below the minimum.
     pub fn or_zero(self) -> Self {
         Allowed { zero: true, ..self }
     }
 
-    /// Also infinity.
+    /// Also allows infinity.
     pub fn or_unlimited(self) -> Self {
         Allowed { unlimited: true, ..self }
     }
 
-    /// The bounds are those of other keys, by these names.
+    /// Names the keys that set the bounds.
     pub fn because(self, because: &'static str) -> Self {
         Allowed { because, ..self }
     }
@@ -180,12 +254,12 @@ impl<T: Number> Allowed<T> {
             || self.unlimited && value.is_infinite()
     }
 
-    /// Whether it is above 0, but below the least number that is allowed besides 0.
+    /// Returns whether the value is above 0 and below the smallest allowed number other than 0.
     fn is_too_small(&self, value: T) -> bool {
         self.zero && T::ZERO < value && value < self.low
     }
 
-    /// The default, or the bound next to it where other keys leave no room for it.
+    /// Returns the default, or the bound next to it if other keys exclude it.
     fn nearest(&self, default: T) -> T {
         match default {
             _ if self.holds(default) => default,
@@ -196,7 +270,7 @@ impl<T: Number> Allowed<T> {
 }
 
 impl<T: Number> Allowed<T> {
-    /// What is allowed in any config: a bound that other keys set goes by their names.
+    /// Returns the range for any config: a bound that depends on other keys is their names.
     fn in_general(&self) -> String {
         match self.because {
             "" => self.in_detail(),
@@ -235,17 +309,17 @@ impl<T: Number> Display for Allowed<T> {
     }
 }
 
-/// A type that keys have numbers of.
+/// A type of numbers in a config.
 pub trait Number: Copy + PartialOrd + Display + Serialize {
-    /// 0.
+    /// The number 0.
     const ZERO: Self;
-    /// With its article: "a number".
+    /// The name of the type with its article: "a number".
     const KIND: &'static str;
 
-    /// The number that was written, `None` inside where the type cannot hold it, or `None` for another kind of value.
+    /// Returns the number of a value: `None` for another kind of value, `Some(None)` for a number outside the type.
     fn read(value: &DeValue<'_>) -> Option<Option<Self>>;
 
-    /// Whether it is infinity.
+    /// Returns whether the number is infinity.
     fn is_infinite(self) -> bool {
         false
     }
@@ -287,21 +361,22 @@ macro_rules! whole_number {
 }
 whole_number!(i64 u64 usize);
 
-/// Where a value was written, in the order in which problems are told.
+/// The place of a value. The order of the variants is the order of problems.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Place {
-    /// This many bytes into the file.
+    /// The offset in the file, in bytes.
     Offset(usize),
+    /// An override.
     Outside,
 }
 
-/// A value and what errors say of it.
+/// A value with its name and place for errors.
 struct Entry<'a> {
     value: Spanned<DeValue<'a>>,
-    /// The text that the value's span counts in.
+    /// The text that contains the value's span.
     text: &'a str,
     outside: bool,
-    /// What the user calls it: the key, with any place in its list, or the override's name.
+    /// The key with its index in a list, or the override's name.
     name: String,
 }
 
@@ -319,7 +394,7 @@ impl Entry<'_> {
     }
 }
 
-/// A text from the file, fit for one line of an error.
+/// Shortens a text from the file to a part of one line.
 fn shorten(text: &str) -> String {
     let line = text.lines().next().unwrap_or_default();
     let end = line.char_indices().nth(40).map_or(line.len(), |(end, _)| end);
@@ -327,28 +402,28 @@ fn shorten(text: &str) -> String {
     line[..end].chars().map(|c| if c.is_control() { ' ' } else { c }).chain(more.chars()).collect()
 }
 
-/// The values of a file that were not asked for yet, and what is wrong with those that were.
+/// The values of a file that were not requested yet, and the problems of those that were.
 #[derive(Default)]
 pub struct Reader<'a> {
-    /// By dotted key.
+    /// The values by dotted key.
     entries: BTreeMap<String, Entry<'a>>,
-    /// Values outside any section.
+    /// The values outside any section.
     strays: Vec<Entry<'a>>,
-    /// Where each section starts.
+    /// The start of each section.
     sections: BTreeMap<String, usize>,
-    /// The keys asked for, with the place and name of those that were there.
+    /// The requested keys, with the place and name of those in the text.
     known: BTreeMap<&'static str, Option<(Place, String)>>,
-    /// Place, name and message of each.
+    /// The place, name and message of each problem.
     problems: Vec<(Place, String, String)>,
-    /// All there is to know of the keys asked for, where somebody wants to.
+    /// The definitions of the requested keys, if [`keys`] collects them.
     table: Option<Vec<Definition>>,
 }
 
-/// Declares a section of a config, and of its keys all that is to be known but what they allow: each entry makes a
-/// field, its documentation, and a function by the field's name that asks a [`Reader`] for the key.
+/// Declares a section of a config with the description of its keys. Each entry defines a field, its documentation, and
+/// a function of the same name that requests the key from a [`Reader`].
 ///
-/// An entry is what the key means, without a full stop; the field; and the key's unit and its place in the paper, empty
-/// where it has none. A field whose key another part asks for has neither, and words of its own.
+/// An entry consists of the meaning without a full stop, the field, the unit, and the section of the paper. Unit and
+/// section may be empty. A field without either has no function, because another module requests its key.
 macro_rules! section {
     ($(#[$($about:tt)*])* $name:ident = $section:literal {
         $($(#[doc = $words:literal])+ $field:ident: $type:ty $(= $unit:tt, $paper:tt)?,)+
@@ -433,7 +508,7 @@ impl<'a> Reader<'a> {
         self.problems.len()
     }
 
-    /// Asks for a key.
+    /// Requests a key.
     pub fn key<'r>(
         &'r mut self,
         name: &'static str,
@@ -444,7 +519,7 @@ impl<'a> Reader<'a> {
         KeyRequest { reader: self, name, unit, meaning, paper }
     }
 
-    /// A number, or its default where there is none.
+    /// Returns a number, or its default without an entry.
     fn number<T: Number>(&mut self, entry: Option<Entry<'_>>, allowed: Allowed<T>, default: T) -> T {
         entry.map_or_else(|| allowed.nearest(default), |entry| self.check(&entry, allowed))
     }
@@ -460,7 +535,7 @@ impl<'a> Reader<'a> {
         allowed.high
     }
 
-    /// The items of a list, or none of a list of another length or of another thing.
+    /// Returns the items of a list. Reports another kind of value or another length.
     fn items(&mut self, entry: Entry<'a>, lengths: RangeInclusive<usize>, what: &str) -> Option<Vec<Entry<'a>>> {
         let found = entry.found();
         let (place, Entry { value, text, outside, name }) = (entry.place(), entry);
@@ -509,33 +584,40 @@ impl<'a> Reader<'a> {
         let known: Vec<&str> = self.known.keys().copied().collect();
         let mut sections: Vec<&str> = known.iter().map(|key| section_of(key)).collect();
         sections.dedup();
+        let (mut hints, mut unknown) = (0, HashSet::new());
+        let mut hint_for = |name: &str, known: &[&str]| {
+            hints += 1;
+            if hints > MAX_HINTS { String::new() } else { hint(name, known) }
+        };
         for entry in std::mem::take(&mut self.strays) {
             let name = &entry.name;
             let message = if sections.contains(&name.as_str()) {
                 format!("found {}, allowed a section [{name}]", entry.found())
             } else {
-                format!("unknown key{}", hint(name, &known))
+                format!("unknown key{}", hint_for(name, &known))
             };
             self.report(entry.place(), &shorten(name), message);
         }
         for (name, start) in std::mem::take(&mut self.sections) {
             if !sections.contains(&name.as_str()) {
-                let message = format!("unknown section{}", hint(&name, &sections));
+                let message = format!("unknown section{}", hint_for(&name, &sections));
                 self.report(Place::Offset(start), &shorten(&name), message);
-                self.entries.retain(|key, entry| entry.outside || section_of(key) != name);
+                unknown.insert(name);
             }
         }
         for (key, entry) in std::mem::take(&mut self.entries) {
-            self.report(entry.place(), &shorten(&entry.name), format!("unknown key{}", hint(&key, &known)));
+            if entry.outside || !unknown.contains(section_of(&key)) {
+                self.report(entry.place(), &shorten(&entry.name), format!("unknown key{}", hint_for(&key, &known)));
+            }
         }
     }
 
-    fn into_problems(mut self, text: &str) -> Problems {
+    fn into_problems(mut self, lines: &LineNumbers) -> Problems {
         self.problems.sort_by_key(|problem| problem.0);
         let unlisted = self.problems.len().saturating_sub(MAX_LISTED);
         let listed = self.problems.into_iter().take(MAX_LISTED).map(|(place, key, message)| {
             let line = match place {
-                Place::Offset(offset) => Some(text.bytes().take(offset).filter(|&byte| byte == b'\n').count() + 1),
+                Place::Offset(offset) => Some(lines.line(offset)),
                 Place::Outside => None,
             };
             Problem { line, key, message }
@@ -545,7 +627,7 @@ impl<'a> Reader<'a> {
 }
 
 impl<'a> KeyRequest<'_, 'a> {
-    /// What was written in the config. Where somebody wants to know of the key, its kind, range and default are noted.
+    /// Takes the value from the config. `about` returns kind, range and default for [`keys`].
     fn take(&mut self, about: impl FnOnce() -> (String, String, Option<String>)) -> Option<Entry<'a>> {
         if let Some(table) = &mut self.reader.table {
             let KeyRequest { name, unit, meaning, paper, .. } = *self;
@@ -555,13 +637,13 @@ impl<'a> KeyRequest<'_, 'a> {
         self.reader.take(self.name)
     }
 
-    /// A number, or its default where the key was left out.
+    /// Returns a number, or the default without the key.
     pub fn number<T: Number>(mut self, allowed: Allowed<T>, default: T) -> T {
         let entry = self.take(|| (kind::<T>().into(), allowed.in_general(), Some(written(&default))));
         self.reader.number(entry, allowed, default)
     }
 
-    /// A number, or a percentage of the number that bounds it, written as a word such as `"10%"`.
+    /// Returns a number, or a percentage of the number that bounds it, written as a word such as `"10%"`.
     pub fn number_or_percentage<T: Number>(mut self, allowed: Allowed<T>, default: T) -> NumberOrPercentage<T> {
         const PERCENTAGES: &str = "above \"0%\", up to \"100%\"";
         let kind = || format!("{}, or a percentage such as \"10%\"", kind::<T>());
@@ -582,7 +664,7 @@ impl<'a> KeyRequest<'_, 'a> {
         }
     }
 
-    /// What one of the words stands for, or its default where the key was left out.
+    /// Returns the value of a word, or the default without the key.
     pub fn choice<T: Choice>(mut self, default: T) -> T {
         let words = || T::names().map(|word| format!("{word:?}")).collect::<Vec<_>>().join(" or ");
         let Some(entry) = self.take(|| ("word".into(), words(), Some(written(&default)))) else { return default };
@@ -597,14 +679,14 @@ impl<'a> KeyRequest<'_, 'a> {
         )
     }
 
-    /// Two numbers, or their default where the key was left out.
+    /// Returns two numbers, or the default without the key.
     pub fn pair(mut self, allowed: Allowed<f64>, default: [f64; 2]) -> [f64; 2] {
         let about = || ("two numbers".into(), format!("each {}", allowed.in_general()), Some(written(&default)));
         let Some(entry) = self.take(about) else { return default };
         self.reader.two(entry, [allowed; 2])
     }
 
-    /// Positions within these sides; `None` where they have to be given and were not, or were no such list.
+    /// Returns positions within these sides, or `None` if the required key is missing or not such a list.
     pub fn positions(
         mut self,
         counts: RangeInclusive<usize>,
@@ -625,7 +707,7 @@ impl<'a> KeyRequest<'_, 'a> {
         Some(items.into_iter().map(|item| self.reader.two(item, sides)).collect())
     }
 
-    /// A list of numbers, or its default where the key was left out.
+    /// Returns a list of numbers, or the default without the key.
     pub fn numbers<T: Number>(mut self, counts: RangeInclusive<usize>, allowed: Allowed<T>, default: Vec<T>) -> Vec<T> {
         let range = || format!("{} of them, each {}", between(*counts.start(), *counts.end()), allowed.in_general());
         let about = || (format!("list of {}s", kind::<T>()), range(), Some(written(&default)));
@@ -635,9 +717,8 @@ impl<'a> KeyRequest<'_, 'a> {
         }
     }
 
-    /// A list of as many lists of numbers as `of`, another key, has items (any number where that is not known), or of
-    /// none, which is the default. `check` returns the problems of lists whose numbers are allowed, each with the index
-    /// of its list.
+    /// Returns a list of lists of numbers, by default an empty one. Otherwise it has as many lists as the key `of` has
+    /// items, or any number if that is unknown. `check` returns further problems, each with the index of its list.
     pub fn lists<T: Number>(
         mut self,
         what: &str,
@@ -666,7 +747,7 @@ impl<'a> KeyRequest<'_, 'a> {
         if reader.error_count() == errors { lists } else { vec![] }
     }
 
-    /// One number, or a list of so many; the default is one.
+    /// Returns one number or a list of numbers. The default is one number.
     pub fn one_or_list<T: Number>(
         mut self,
         allowed: Allowed<T>,
@@ -691,30 +772,30 @@ pub enum NumberOrPercentage<T> {
     Percentage(f64),
 }
 
-/// What a key holds that takes both.
+/// The value of a key that allows a number or a list.
 pub enum OneOrList<T> {
     /// One value for all.
     One(T),
-    /// A value for each.
+    /// One value for each.
     List(Vec<T>),
 }
 
-/// A kind of number without its article.
+/// Returns the name of a type without its article.
 fn kind<T: Number>() -> &'static str {
     T::KIND.trim_start_matches("a ")
 }
 
-/// A value as TOML has it.
+/// Writes a value as TOML.
 fn written<T: Serialize>(value: &T) -> String {
     toml::Value::try_from(value).expect("numbers, words and lists of them are TOML").to_string()
 }
 
-/// The section of a dotted key.
+/// Returns the section of a dotted key.
 fn section_of(key: &str) -> &str {
     key.split_once('.').map_or(key, |(section, _)| section)
 }
 
-/// `, did you mean …?` with the known name nearest to an unknown one, or else what its section knows.
+/// Returns `, did you mean …?` with the known name most similar to an unknown one, or the names of its section.
 fn hint(name: &str, known: &[&str]) -> String {
     const LONGEST_NAME: usize = 64;
     let last = |key: &'_ str| key.rsplit('.').next().unwrap_or_default().to_lowercase();
@@ -729,5 +810,24 @@ fn hint(name: &str, known: &[&str]) -> String {
     match siblings.is_empty() {
         true => String::new(),
         false => format!("; [{}] has {}", section_of(name), siblings.join(", ")),
+    }
+}
+
+/// Counts the bytes given to the TOML parser, so that tests can bound the work independently of time.
+#[cfg(test)]
+pub(crate) mod work {
+    use std::cell::Cell;
+
+    thread_local! {
+        static PARSED: Cell<usize> = const { Cell::new(0) };
+    }
+
+    pub(super) fn add(bytes: usize) {
+        PARSED.set(PARSED.get() + bytes);
+    }
+
+    /// Returns the bytes parsed by this thread since the last call.
+    pub(crate) fn take() -> usize {
+        PARSED.take()
     }
 }

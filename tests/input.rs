@@ -154,7 +154,7 @@ fn what_is_no_file_is_not_waited_for() {
         &["rollout", "small.toml", "--policies", "/dev/zero"],
     ] {
         let told = place.refused(1, command);
-        assert!(told.contains("it is a pipe or a device, where a file is needed"), "{told}");
+        assert!(told.contains("it is a pipe or a device, not a file"), "{told}");
     }
     for command in ["train small.toml", "sweep grid.toml", "paper --trials 1 --generations 1"] {
         let told = place.refused(1, &format!("{command} --backend cpu --out pipe"));

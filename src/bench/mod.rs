@@ -31,6 +31,8 @@ const LEAST: Duration = Duration::from_millis(200);
 /// Repeats of what takes longer than this at a time.
 const FEW_REPEATS: usize = 3;
 const LONG: Duration = Duration::from_secs(2);
+/// Reads of a clock after which it counts as standing still. They take longer than any clock needs to advance.
+const CLOCK_READS: usize = 1 << 22;
 /// Teams that are traced to see who is in reach of whom, and how many pairs are looked at, as far as one team allows.
 const TRACED_TEAMS: usize = 64;
 const TRACED_PAIRS: usize = 1 << 28;
@@ -265,6 +267,17 @@ fn rollout(
     Ok((times, mean_g, Reach::of(world, &trace)))
 }
 
+/// Returns whether the system's clock advances. No measurement would end without that.
+pub fn has_clock() -> bool {
+    advances(Instant::now)
+}
+
+/// Returns whether a clock advances while it is read many times.
+fn advances<T: PartialEq>(now: impl Fn() -> T) -> bool {
+    let start = now();
+    (0..CLOCK_READS).any(|_| now() != start)
+}
+
 /// Medians over a few repeats: seconds of one call, each repeat calling for [`LEAST`] at least, and what was measured
 /// between them, so that a slow spell of the machine meets both.
 fn time<E>(
@@ -302,6 +315,15 @@ mod tests {
     fn config() -> Config {
         let text = include_str!("../../configs/generally_forward.toml");
         Config::parse(text, "generally_forward.toml").expect("the project's own config")
+    }
+
+    #[test]
+    fn a_clock_that_stands_still_is_noticed() {
+        use std::cell::Cell;
+        assert!(!advances(|| 7));
+        let reads = Cell::new(0);
+        assert!(advances(|| reads.replace(reads.get() + 1) / 1000));
+        assert!(has_clock());
     }
 
     #[test]

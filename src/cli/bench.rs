@@ -57,6 +57,10 @@ pub struct Args {
 
 /// Prints a table, or JSON objects: a line for every combination of teams, steps and agents.
 pub fn run(args: Args) -> Result<(), Error> {
+    if !bench::has_clock() {
+        let message = "the system's monotonic clock stands still, so nothing can be timed; run bench where it advances";
+        return Err(Error::Refused(message.into()));
+    }
     let (name, text) = match &args.config {
         Some(path) => (config::name(path), config::read_file(path)?),
         None => {

@@ -8,6 +8,7 @@ use serde_json::json;
 use super::sweep::share;
 use super::{Error, print, say};
 use crate::config::{Config, Domain};
+use crate::escape::PathExt;
 use crate::file;
 use crate::record;
 use crate::record::folder::{self, RUN, Run, SWEEP};
@@ -107,11 +108,11 @@ fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<
     if let Some(by) = &args.by {
         return Err(Error::Usage(format!(
             "--by {by}: that takes the folder of one sweep, which {} is not",
-            folders[0].display()
+            folders[0].escaped()
         )));
     }
     if folders.len() < 2 {
-        let folder = folders[0].display();
+        let folder = folders[0].escaped();
         // What is wrong with the folder goes first.
         runs::config(&folders[0])?;
         return Err(Error::Usage(format!("{folder} is one run; name another to compare it with")));
@@ -119,7 +120,7 @@ fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<
     too_many(folders.len(), "runs")?;
     let mut seen = BTreeSet::new();
     if let Some(twice) = folders.iter().find(|folder| !seen.insert(file::resolved(folder))) {
-        return Err(Error::Usage(format!("{} is named twice; name other runs", twice.display())));
+        return Err(Error::Usage(format!("{} is named twice; name other runs", twice.escaped())));
     }
     let configs = folders.iter().map(|folder| runs::config(folder)).collect::<Result<Vec<_>, _>>()?;
     let first = &configs[0].world;
@@ -147,7 +148,7 @@ fn copies(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
     let original = |place: usize| {
         let first = (0..place).find(|&first| runs[first].1 == runs[place].1 && digests[first] == digests[place])?;
         digests[place].as_ref()?;
-        Some(format!("{} is a copy of {}: the same run", folders[place].display(), folders[first].display()))
+        Some(format!("{} is a copy of {}: the same run", folders[place].escaped(), folders[first].escaped()))
     };
     (0..folders.len()).filter_map(original).collect()
 }
@@ -175,11 +176,11 @@ fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Cont
                     Ok(config) if record::without_checkpoint(&config) == record::without_checkpoint(&point.config) => {
                         folders.push(folder);
                     }
-                    Ok(_) => return Err(Error::Refused(format!("{} is a run of another config", folder.display()))),
+                    Ok(_) => return Err(Error::Refused(format!("{} is a run of another config", folder.escaped()))),
                     Err(ReadError::Missing(_) | ReadError::Unfinished { .. }) => {
                         notes.push(format!(
                             "{} was not run, and is left out: {}",
-                            folder.display(),
+                            folder.escaped(),
                             sweep.describe(point)
                         ));
                     }
@@ -195,13 +196,13 @@ fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Cont
             groups.push((group.place, arms));
         }
     }
-    let [file, folder] = [out.join(SWEEP), out.into()].map(|path| path.display().to_string());
-    let command = shell::command(["flotilla", "sweep", &file, "--out", &folder, "--resume"]);
+    let [file, folder] = [out.join(SWEEP), out.into()].map(|path: PathBuf| shell::argument(&path));
+    let command = shell::command(["flotilla".into(), "sweep".into(), file, "--out".into(), folder, "--resume".into()]);
     match groups.is_empty() {
         false => Ok(groups),
         true => Err(Error::Missing(format!(
             "{}: no two values of {} have runs to compare; `{command}` trains them",
-            out.display(),
+            out.escaped(),
             sweep.axes[by].key,
         ))),
     }

@@ -9,6 +9,7 @@ use toml::{Table, Value};
 
 use super::{Error, output, print};
 use crate::config::{self, Config, Definition};
+use crate::escape::PathExt;
 use crate::record::RecordError;
 
 /// The paper's layouts, as they are asked for and as their config files are named, with the text of each.
@@ -48,7 +49,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         true => output::write(&path, |output| output.write_all(text.as_bytes()))?,
         false => write_new(&path, &text).map_err(|error| RecordError::Write { path: path.clone(), error })?,
     }
-    print(&format!("{}\n", path.display()))
+    print(&format!("{}\n", path.escaped()))
 }
 
 /// Writes a file that is not there yet.

@@ -17,6 +17,7 @@ use crate::backend::BackendError;
 use crate::backend::gpu::device::DeviceError;
 use crate::config::{self, Choice, Config, ConfigError, Fitness, Override, Paradigm};
 use crate::escape;
+use crate::file;
 use crate::record::RecordError;
 use crate::report::replay::ReplayError;
 use crate::run::RunError;
@@ -199,7 +200,7 @@ fn reject_control_chars(words: impl Iterator<Item = OsString>) -> Result<(), Err
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A config that cannot be read or is wrong.
-    #[error(transparent)]
+    #[error("{}{}", .0, remedy::config(.0))]
     Config(#[from] ConfigError),
     /// Episodes that could not be played.
     #[error("{}{}", .0, remedy::backend(.0))]
@@ -326,7 +327,7 @@ impl ConfigArgs {
     pub fn name(&self) -> String {
         match &self.file.path {
             path if config::is_standard_input(path) => "config".into(),
-            path => path.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
+            path => file::stem(path, "config"),
         }
     }
 

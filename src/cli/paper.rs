@@ -1,5 +1,6 @@
 //! `flotilla paper`: the paper's experiments, its figures and its claims, measured here.
 
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -9,11 +10,11 @@ use super::recovery::{self, Checkpoints, Loss, Signals};
 use super::{Error, Overrides, RunOptions, backend, number, print, say};
 use crate::baseline::Baselines;
 use crate::config::{self, Override};
+use crate::escape::PathExt;
 use crate::memory;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, ARMS, Folder, PAPER, POINTS, SWEEP, Start};
-use crate::record::ownership;
 use crate::report::curves::PRINT;
 use crate::report::paper::{self, Evidence, Experiment, Summary, Trajectory, claims, tables};
 use crate::report::progress::{Board, Meter};
@@ -28,13 +29,10 @@ use crate::trainer::Row;
 const CLAIMS: &str = "claims.md";
 const SUMMARY: &str = "summary.json";
 
-/// Where a paper goes by default.
-const OUT: &str = "paper";
-
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder for the figures, the claims and the curves
-    #[arg(long, short, value_name = "DIR", default_value = OUT)]
+    #[arg(long, short, value_name = "DIR", default_value = "paper")]
     pub(super) out: PathBuf,
     /// Instead of the paper's experiments, train what answers the questions that it leaves open, or =a,c some of them
     /// (docs/results/questions.md)
@@ -78,11 +76,6 @@ impl Args {
         [overrides.list(), self.checkpoints.list()].concat()
     }
 
-    /// Whether the user chose the folder.
-    pub(super) fn is_out_named(&self) -> bool {
-        self.out != Path::new(OUT)
-    }
-
     /// What to do with what is in the folder.
     pub(super) fn start(&self) -> Start {
         match (self.resume, self.force) {
@@ -94,10 +87,10 @@ impl Args {
 
     /// What to type to go on.
     pub(super) fn command_to_resume(&self) -> String {
-        let (overrides, out) = (self.overrides(), self.out.display().to_string());
+        let (overrides, out) = (self.overrides(), shell::argument(&self.out));
         let letters: Vec<String> = self.questions.iter().map(char::to_string).collect();
-        let questions = (!letters.is_empty()).then(|| format!("--questions={}", letters.join(",")));
-        let words = ["flotilla", "paper"].map(String::from).into_iter().chain(questions);
+        let questions = (!letters.is_empty()).then(|| format!("--questions={}", letters.join(",")).into());
+        let words = ["flotilla", "paper"].map(OsString::from).into_iter().chain(questions);
         let words = words.chain(["--out".into(), out]);
         let machine = recovery::words_of_machine(&self.run, self.loss);
         shell::command(words.chain(recovery::words_of(&overrides)).chain(["--resume".into()]).chain(machine))
@@ -117,14 +110,11 @@ pub fn run(args: Args) -> Result<(), Error> {
     plan.check(player.1.backend == "gpu").map_err(RunError::from)?;
     let disk = Disk::default();
     disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
-    let disk = ownership::enter(&disk, out, args.is_out_named())?;
-    let _lock = folder::lock(&disk, out)?;
+    let _lock = folder::lock(out)?;
     // Only now is nobody else writing here.
     marks.compare(out, start)?;
     let folders: Vec<PathBuf> = arms.iter().map(|arm| out.join(ARMS).join(arm_name(arm))).collect();
-    let configs_of_arms = arms.iter().map(|arm| &arm.config);
-    folder::check(&disk, folders.iter().map(|path| &**path).zip(configs_of_arms), start)?;
-    ownership::check(&disk, products().map(|name| out.join(name)))?;
+    folder::check(folders.iter().map(|path| &**path), start)?;
     marks.claim(out, start, &disk)?;
     // The first arm of each training is trained, the others are the same.
     let trained: Vec<usize> =
@@ -149,7 +139,7 @@ pub fn run(args: Args) -> Result<(), Error> {
             let on = player.0.describe();
             say(format_args!(
                 "training {count} experiments, {different} of them different, of {trials} trials each on {on}, into {}",
-                out.display()
+                out.escaped()
             ));
         }
         let names = arms.iter().map(|arm| (arm.name(), Some(arm.pois()))).collect();
@@ -223,7 +213,8 @@ pub fn run(args: Args) -> Result<(), Error> {
         |error| RecordError::Write { path, error }
     };
     let write = |name: String, content: &[u8]| -> Result<(), Error> {
-        Ok(ownership::publish(&disk, &out.join(name), |output| output.write_all(content))?)
+        let path = out.join(name);
+        Ok(disk.replace(&path, |output| output.write_all(content)).map_err(failed(&path))?)
     };
     for (index, layout) in paper::LAYOUTS.iter().enumerate() {
         let Some(number) = layout.figure else { continue };
@@ -256,7 +247,7 @@ pub fn run(args: Args) -> Result<(), Error> {
             let last = arm.best.iter().filter_map(|trial| trial.last()).sum::<f64>() / arm.best.len() as f64;
             json!({
                 "name": arm_name(arm),
-                "folder": folders[index].display().to_string(),
+                "folder": folders[index].escaped().to_string(),
                 "layout": arm.layout.name,
                 "paradigm": arm.paradigm,
                 "actions": arm.config.policy.actions,
@@ -266,9 +257,9 @@ pub fn run(args: Args) -> Result<(), Error> {
                 "best_g": last,
             })
         };
-        let path = |name: &str| out.join(name).display().to_string();
+        let path = |name: &str| out.join(name).escaped().to_string();
         let told = json!({
-            "folder": out.display().to_string(),
+            "folder": out.escaped().to_string(),
             "seed": learning.seed,
             "trials": learning.trials,
             "generations": learning.generations,
@@ -284,7 +275,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         "{baseline}\n{}\n{heading}\n\nTrained in {seconds:.1} s. Files in {}: figure4, figure5, figure6 (.svg, .png, .pdf), \
          claims.md (with every figure), summary.json, and a run each in {ARMS}/\n",
         tables::verdicts(&claims),
-        out.display()
+        out.escaped()
     ))
 }
 
@@ -300,11 +291,6 @@ const FIGURES: [&str; 9] = [
     "figure6.png",
     "figure6.pdf",
 ];
-
-/// All that is made of the runs.
-fn products() -> impl Iterator<Item = &'static str> {
-    [CLAIMS, SUMMARY].into_iter().chain(FIGURES)
-}
 
 /// An arm's folder: "chaotic-all-leaders-Df".
 fn arm_name(arm: &Experiment) -> String {
@@ -329,7 +315,7 @@ impl Marks {
         if out.is_file() {
             return Err(RecordError::NoFolder { path: out.into() }.into());
         }
-        let (name, holds) = (out.display(), |name: &str| out.join(name).exists());
+        let (name, holds) = (out.escaped(), |name: &str| out.join(name).exists());
         let like_ours = [ARMS, CLAIMS, SUMMARY].iter().chain(&FIGURES).find(|name| holds(name));
         let what = match () {
             () if holds(PAPER) => "a paper",
@@ -345,23 +331,12 @@ impl Marks {
             },
         };
         match start {
-            Start::Force if what == "a paper" => self.compare_mark(out),
+            Start::Force if what == "a paper" => Ok(()),
             Start::Fresh if what == "a paper" => Err(Error::Refused(format!(
                 "{name} holds a paper already; go on with it by --resume, write over it by --force, or choose another --out"
             ))),
             Start::Resume if what == "a paper" => self.compare_paper(out),
             _ => Err(Error::Refused(format!("{name} holds {what}, no paper; choose another --out"))),
-        }
-    }
-
-    /// Refuses a folder whose `paper.toml` was not made by flotilla.
-    fn compare_mark(&self, out: &Path) -> Result<(), Error> {
-        let path = out.join(PAPER);
-        let there: Option<toml::Table> = config::read_file(&path)?.parse().ok();
-        let like_ours = there.is_some_and(|there| self.0.iter().all(|(key, _)| there.contains_key(*key)));
-        match like_ours || out.join(ARMS).is_dir() {
-            true => Ok(()),
-            false => Err(RecordError::NotOurs { path }.into()),
         }
     }
 
@@ -388,7 +363,7 @@ impl Marks {
         Err(Error::Refused(format!(
             "{} holds another paper; what differs:{differences}\ngo on with its own flags (generations may be more), or choose \
              another --out",
-            out.display()
+            out.escaped()
         )))
     }
 
@@ -399,7 +374,9 @@ impl Marks {
             |error| RecordError::Write { path, error }
         };
         if start == Start::Force {
-            products().try_for_each(|name| ownership::withdraw(disk, &out.join(name)))?;
+            for path in [CLAIMS, SUMMARY].iter().chain(&FIGURES).map(|name| out.join(name)) {
+                disk.remove(&path).map_err(failed(&path))?;
+            }
         }
         let path = out.join(PAPER);
         Ok(disk.replace(&path, |output| output.write_all(self.text().as_bytes())).map_err(failed(&path))?)

@@ -2,10 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use super::output::{self, Destination};
-use super::{Error, print, say};
+use super::{Error, output, print, say};
+use crate::escape::PathExt;
 use crate::record::RecordError;
-use crate::record::ownership::CURVES;
 use crate::report::curves::PRINT;
 use crate::report::runs::{self, MAX_RUNS};
 use crate::report::scene::{Format, Scene};
@@ -30,24 +29,20 @@ pub fn run(args: Args) -> Result<(), Error> {
         let count = runs.len();
         return Err(Error::Usage(format!("{count} runs are too many to tell apart; name {MAX_RUNS} at most")));
     }
-    let place = match (out, &*runs) {
-        (Some(out), _) => Destination::Named(out),
-        (None, [run]) => Destination::OfRun(run.join(CURVES)),
-        (None, _) => Destination::Here("comparison.svg".into()),
-    };
-    let out = place.path();
-    let kind = kind_of(out)?;
+    let out = out.unwrap_or_else(|| match &*runs {
+        [run] => run.join("curves.svg"),
+        _ => "comparison.svg".into(),
+    });
+    let kind = kind_of(&out)?;
     let scene = runs::figure(&runs)?.scene();
-    place.check()?;
-    let content = scene.file(kind, PRINT).map_err(|error| RecordError::Write { path: out.into(), error })?;
-    place.write(|output| output.write_all(&content))?;
+    write(&scene, kind, &out)?;
     if runs::paired(&runs)? {
         say("note: these runs have one seed, so their trials are pairs: compare trial with trial, not only the means");
     }
-    let out = out.display().to_string();
+    let out = out.escaped().to_string();
     match json {
         true => {
-            let runs: Vec<_> = runs.iter().map(|run| run.display().to_string()).collect();
+            let runs: Vec<_> = runs.iter().map(|run| run.escaped().to_string()).collect();
             print(&format!("{}\n", serde_json::json!({ "out": out, "runs": runs })))
         }
         false => print(&format!("{out}\n")),
@@ -59,7 +54,7 @@ pub fn run(args: Args) -> Result<(), Error> {
 /// # Errors
 /// Nothing that a picture can be.
 pub(super) fn kind_of(path: &Path) -> Result<Format, Error> {
-    let wrong = || Error::Usage(format!("--out {}: its name must end in .svg, .pdf or .png", path.display()));
+    let wrong = || Error::Usage(format!("--out {}: its name must end in .svg, .pdf or .png", path.escaped()));
     Format::of(path).ok_or_else(wrong)
 }
 

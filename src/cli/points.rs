@@ -5,6 +5,7 @@ use std::path::Path;
 
 use super::Error;
 use crate::config::Config;
+use crate::escape::PathExt;
 use crate::record::folder::SWEEP;
 use crate::report::runs::{self, ReadError};
 use crate::sweep::{Sweep, results};
@@ -27,9 +28,9 @@ pub(super) fn config(folder: &Path) -> Result<Config, Error> {
 }
 
 fn list(sweep: &Sweep, folder: &Path) -> String {
-    let mut text = format!("{} holds a sweep; name one of its points:", folder.display());
+    let mut text = format!("{} holds a sweep; name one of its points:", folder.escaped());
     for point in sweep.points.iter().take(MOST) {
-        let _ = write!(text, "\n  {}  {}", results::point_folder(folder, point).display(), sweep.describe(point));
+        let _ = write!(text, "\n  {}  {}", results::point_folder(folder, point).escaped(), sweep.describe(point));
     }
     if let more @ 1.. = sweep.points.len().saturating_sub(MOST) {
         let _ = write!(text, "\n  … and {more} more");

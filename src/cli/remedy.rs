@@ -1,10 +1,16 @@
 //! What to type about an error of the library, which knows of no flags: each gives what is added to the error's own
 //! text.
 
-use std::io::ErrorKind::{FileTooLarge, PermissionDenied, QuotaExceeded, ReadOnlyFilesystem, StorageFull};
+use std::ffi::OsString;
+use std::io;
+use std::io::ErrorKind::{
+    FileTooLarge, NotADirectory, NotFound, PermissionDenied, QuotaExceeded, ReadOnlyFilesystem, StorageFull,
+};
 
 use crate::backend::BackendError;
 use crate::backend::gpu::device::DeviceError;
+use crate::config::ConfigError;
+use crate::escape::PathExt;
 use crate::record::RecordError;
 use crate::record::folder::CONFIG;
 use crate::report::replay::ReplayError;
@@ -42,6 +48,23 @@ pub fn backend(error: &BackendError) -> &'static str {
     }
 }
 
+/// About a file that cannot be read.
+fn unread(error: &io::Error) -> &'static str {
+    match error.kind() {
+        NotFound | NotADirectory => "; check the path",
+        PermissionDenied => "; ask its owner for permission to read it",
+        _ => "",
+    }
+}
+
+/// About a config or a sweep that cannot be used.
+pub fn config(error: &ConfigError) -> &'static str {
+    match error {
+        ConfigError::Unreadable { is_missing: true, .. } => "; check the path, or write a config with `flotilla init`",
+        ConfigError::Unreadable { .. } | ConfigError::Invalid { .. } => "",
+    }
+}
+
 /// About files, before `again`.
 pub fn record(error: &RecordError, again: &str) -> String {
     match error {
@@ -61,8 +84,7 @@ pub fn record(error: &RecordError, again: &str) -> String {
         RecordError::Exists { .. } => {
             "; go on with it by --resume, write over it by --force, or choose another --out".into()
         }
-        RecordError::NotOurs { .. } => "; move it away, or choose another --out".into(),
-        RecordError::OfAnotherUser { .. } => "; name what to write with --out".into(),
+        RecordError::NotOfARun { .. } => "; move it away, or choose another --out".into(),
         RecordError::NoFolder { .. } => "; choose a folder by --out".into(),
         RecordError::Shorter { there, .. } => {
             format!("; resume with --generations {there} or more, or choose another --out")
@@ -70,14 +92,15 @@ pub fn record(error: &RecordError, again: &str) -> String {
         RecordError::Locked { .. } => "; wait for it, stop it, or choose another --out".into(),
         RecordError::ConfigDiffers { path, .. } => format!(
             "\nresume with the config it was started with ({}/{CONFIG}), or choose another --out",
-            path.display()
+            path.escaped()
         ),
         RecordError::InitDiffers { there: Some(_), .. } => {
             "; resume without --init or with that file, or choose another --out".into()
         }
         RecordError::InitDiffers { there: None, .. } => "; resume without --init, or choose another --out".into(),
         RecordError::InitNeeded { .. } => "; give that file by --init".into(),
-        RecordError::Read { .. } | RecordError::Damaged { .. } | RecordError::NoTrial { .. } => String::new(),
+        RecordError::Read { error, .. } => unread(error).into(),
+        RecordError::Damaged { .. } | RecordError::NoTrial { .. } => String::new(),
     }
 }
 
@@ -100,7 +123,8 @@ pub fn run(error: &RunError) -> String {
 pub fn shown(error: &runs::ReadError) -> String {
     match error {
         runs::ReadError::Missing(folder) => {
-            let command = shell::command(["flotilla", "train", "CONFIG", "--out", &folder.to_string_lossy()]);
+            let words = ["flotilla", "train", "CONFIG", "--out"].map(OsString::from);
+            let command = shell::command(words.into_iter().chain([shell::argument(folder)]));
             format!("; `{command}` makes a run there")
         }
         runs::ReadError::NoFolder(_) => ", which `flotilla train` makes".into(),
@@ -109,8 +133,10 @@ pub fn shown(error: &runs::ReadError) -> String {
             "\nfind a config that is whole, and repeat the run with `flotilla train CONFIG --out DIR`".into()
         }
         runs::ReadError::Unfinished { folder, .. } => {
-            let [config, out] = [folder.join(CONFIG), folder.clone()].map(|path| path.to_string_lossy().into_owned());
-            let command = shell::command(["flotilla", "train", &config, "--out", &out, "--resume"]);
+            let [config, out] = [folder.join(CONFIG), folder.clone()].map(|path| shell::argument(&path));
+            let words: [OsString; 6] =
+                ["flotilla".into(), "train".into(), config, "--out".into(), out, "--resume".into()];
+            let command = shell::command(words);
             format!("; finish the run with `{command}`")
         }
         runs::ReadError::Record(error) => record(error, "try again"),

@@ -5,13 +5,12 @@ use std::sync::atomic::Ordering::Relaxed;
 
 use serde_json::json;
 
-use super::output::Destination;
 use super::recovery::Signals;
-use super::{Error, RunOptions, backend, between, points, print, whole, words};
+use super::{Error, RunOptions, backend, between, output, points, print, whole, words};
 use crate::config::Config;
+use crate::escape::PathExt;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
-use crate::record::ownership::{self, REPLAY};
 use crate::report::curves::PRINT;
 use crate::report::progress::Meter;
 use crate::report::replay::{self, FPS, Film, History, ReplayError, Replayed, Which};
@@ -95,8 +94,7 @@ impl WhichTrial {
 
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { folder, trial, generation, team, compare, step, out, width, fps, json, quiet, run } = args;
-    let place = out.map_or_else(|| Destination::OfRun(folder.join(REPLAY)), Destination::Named);
-    let out = place.path().to_path_buf();
+    let out = out.unwrap_or_else(|| folder.join("replay.html"));
     let kind = Form::of(&out, fps)?;
     kind.takes(&out, width, fps, step)?;
     let config = points::config(&folder)?;
@@ -118,7 +116,6 @@ pub fn run(args: Args) -> Result<(), Error> {
             "POIs are elsewhere in every generation (learning.poi_jitter): show one alone".into(),
         ));
     }
-    place.check()?;
     let steps = config.world.steps;
     if let Some(step) = step.filter(|&step| step > steps) {
         return Err(Error::Usage(format!("--step {step}: the episode has steps 0 to {steps}")));
@@ -140,7 +137,7 @@ pub fn run(args: Args) -> Result<(), Error> {
 
     let failed = |error| RecordError::Write { path: out.clone(), error };
     let name = folder.canonicalize().ok().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
-    let name = name.unwrap_or_else(|| folder.display().to_string());
+    let name = name.unwrap_or_else(|| folder.escaped().to_string());
     let motion = Film { width, fps: fps.unwrap_or(FPS) };
     let disk = Disk::default();
     let content = match kind {
@@ -154,11 +151,6 @@ pub fn run(args: Args) -> Result<(), Error> {
         Form::Film(numbered) => {
             disk.create_folder(file::folder(&out)).map_err(failed)?;
             let frames = replay::Frames::new(&config, &played, motion);
-            let mut names = (0..frames.places.len()).map(|number| out.with_file_name(numbered.name(number)));
-            if let Some(path) = names.find(|path| path.symlink_metadata().is_ok() && !ownership::is_drawing(path)) {
-                return Err(RecordError::NotOurs { path }.into());
-            }
-            let disk = ownership::enter(&disk, file::folder(&out), true)?;
             for (number, &place) in frames.places.iter().enumerate() {
                 let (scene, per_mm) = frames.scene(place);
                 let path = out.with_file_name(numbered.name(number));
@@ -168,19 +160,19 @@ pub fn run(args: Args) -> Result<(), Error> {
             }
             let count = frames.places.len();
             let [first, last] = [0, count - 1].map(|number| out.with_file_name(numbered.name(number)));
-            let text = format!("{} to {}\n", first.display(), last.display());
+            let text = format!("{} to {}\n", first.escaped(), last.escaped());
             return report(
                 &played,
                 json,
                 quiet,
                 &text,
-                json!({ "first": first.display().to_string(), "last": last.display().to_string(), "frames": count }),
+                json!({ "first": first.escaped().to_string(), "last": last.escaped().to_string(), "frames": count }),
             );
         }
     };
-    place.write(|output| output.write_all(&content))?;
-    let text = format!("{} ({} kB)\n", out.display(), content.len().div_ceil(1000));
-    report(&played, json, quiet, &text, json!({ "out": out.display().to_string(), "bytes": content.len() }))
+    output::write(&out, |output| output.write_all(&content))?;
+    let text = format!("{} ({} kB)\n", out.escaped(), content.len().div_ceil(1000));
+    report(&played, json, quiet, &text, json!({ "out": out.escaped().to_string(), "bytes": content.len() }))
 }
 
 /// Says what was played and where it was written, as text or as one JSON object.
@@ -245,7 +237,7 @@ impl Form {
                 Ok(numbered.filter(|_| kind == Format::Png).map_or(Form::Still(kind), Form::Film))
             }
             _ => {
-                let path = path.display();
+                let path = path.escaped();
                 Err(Error::Usage(format!("--out {path}: its name must end in .html, .gif, .svg, .pdf or .png")))
             }
         }
@@ -262,7 +254,7 @@ impl Form {
         ];
         match unused.into_iter().find(|(_, unused, _)| *unused) {
             Some((flag, _, of)) => {
-                Err(Error::Usage(format!("{flag} has no meaning for --out {}: it is of {of}", out.display())))
+                Err(Error::Usage(format!("{flag} has no meaning for --out {}: it is of {of}", out.escaped())))
             }
             None => Ok(()),
         }
@@ -288,7 +280,7 @@ fn film(path: &Path, fps: Option<u32>) -> String {
         "--out {out}: this format takes ffmpeg, which joins numbered pictures:\n  {pictures}\n  {}\nor write an animated \
          picture: --out {}",
         shell::command(joined),
-        path.with_extension("gif").display()
+        path.with_extension("gif").escaped()
     )
 }
 

@@ -1,7 +1,9 @@
 //! `flotilla sweep`: a grid of runs, on one machine or many.
 
+use std::collections::HashSet;
+use std::ffi::OsString;
 use std::fmt::Write as _;
-use std::io;
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use serde_json::json;
@@ -9,18 +11,18 @@ use serde_json::json;
 use super::recovery::{self, Loss, Signals};
 use super::{Error, Overrides, RunOptions, backend, between, output, print, say, whole};
 use crate::config::{self, ConfigError, Problem};
+use crate::escape::PathExt;
 use crate::file;
 use crate::memory;
 use crate::record::RecordError;
-use crate::record::disk::Disk;
+use crate::record::disk::{self, Disk};
 use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
-use crate::record::ownership;
 use crate::report::progress::Meter;
 use crate::run::{Ended, Options, RunError};
 use crate::shell;
 use crate::sweep::pictures;
 use crate::sweep::results::{self, Missing, Outcome};
-use crate::sweep::run::{self, Headway};
+use crate::sweep::run::{self, SweepProgress};
 use crate::sweep::shard::{self, MAX_SHARDS, Shard};
 use crate::sweep::slurm::Job;
 use crate::sweep::{Point, Sweep};
@@ -141,12 +143,11 @@ impl Args {
     }
 
     /// The command that does this sweep again, without what differs from process to process.
-    fn words(&self, sweep: &Path, out: &Path) -> Vec<String> {
-        let mut words =
-            ["sweep".into(), sweep.display().to_string(), "--out".into(), out.display().to_string()].to_vec();
+    fn words(&self, sweep: &Path, out: &Path) -> Vec<OsString> {
+        let mut words = vec!["sweep".into(), shell::argument(sweep), "--out".into(), shell::argument(out)];
         words.extend(recovery::words_of(&self.overrides.list()));
         words.extend(recovery::words_of_machine(&self.run, self.loss));
-        words.extend(self.memory.into_iter().flat_map(|gib| ["--memory".into(), gib.to_string()]));
+        words.extend(self.memory.into_iter().flat_map(|gib| ["--memory".into(), gib.to_string().into()]));
         if self.skip_impossible {
             words.push("--skip-impossible".into());
         }
@@ -156,7 +157,8 @@ impl Args {
     /// A command line of this sweep with more flags.
     fn command(&self, out: &Path, more: &[&str]) -> String {
         let words = self.words(&self.sweep, out);
-        shell::command(["flotilla"].into_iter().chain(words.iter().map(String::as_str)).chain(more.iter().copied()))
+        let more = more.iter().map(OsString::from);
+        shell::command([OsString::from("flotilla")].into_iter().chain(words).chain(more))
     }
 
     /// The grid's axes that pictures have across and down.
@@ -194,7 +196,7 @@ pub fn run(mut args: Args) -> Result<(), Error> {
     if args.collect {
         if !there(&out.join(SWEEP))? {
             let command = args.command(&out, &["--shard", "1/N"]);
-            return Err(Error::Usage(format!("{} holds no sweep; run its shards first: {command}", out.display())));
+            return Err(Error::Usage(format!("{} holds no sweep; run its shards first: {command}", out.escaped())));
         }
         same_sweep(&sweep, &out)?;
         return collect(&args, &sweep, &out, &axes);
@@ -210,7 +212,7 @@ pub fn run(mut args: Args) -> Result<(), Error> {
                 true => print(&format!(
                     "{}\n",
                     json!({
-                        "folder": out.display().to_string(),
+                        "folder": out.escaped().to_string(),
                         "sweep": sweep.name,
                         "shard": shard.to_string(),
                         "collect": command,
@@ -235,7 +237,7 @@ pub(super) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     }
     let refuse = |message: String| {
         let problems = vec![Problem { line: None, key: String::new(), message }];
-        Err(ConfigError::Invalid { name: path.display().to_string(), problems, unlisted: 0 }.into())
+        Err(ConfigError::Invalid { name: path.escaped().to_string(), problems, unlisted: 0 }.into())
     };
     if !there(&path)? {
         let holds = match there(&out.join(CONFIG))? {
@@ -243,7 +245,7 @@ pub(super) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
             false => folder::collection(out),
         };
         if let Some(what) = holds {
-            return refuse(format!("{} holds {what}, not a sweep; choose another --out", out.display()));
+            return refuse(format!("{} holds {what}, not a sweep; choose another --out", out.escaped()));
         }
         return match pictures::names()
             .chain([folder::RESULTS, folder::POINTS].map(String::from))
@@ -251,7 +253,7 @@ pub(super) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         {
             Some(theirs) => refuse(format!(
                 "{} holds {theirs}, but no {SWEEP}, which would say that it is a sweep's; choose another --out",
-                out.display()
+                out.escaped()
             )),
             None => Ok(()),
         };
@@ -263,41 +265,39 @@ pub(super) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         return Ok(());
     }
     let missing = |from: &str, other: &str, where_: &str| {
-        let lines: Vec<_> = from.lines().filter(|line| !other.lines().any(|other| other == *line)).collect();
+        let known: HashSet<&str> = other.lines().collect();
+        let lines: Vec<_> = from.lines().filter(|line| !known.contains(line)).collect();
         let more = if lines.len() > 8 { "\n  …" } else { "" };
         let lines: Vec<_> = lines.iter().take(8).map(|line| format!("\n  {where_}: {line}")).collect();
         lines.concat() + more
     };
     refuse(format!(
         "{} holds another sweep; what differs:{}{}\nchoose another --out",
-        out.display(),
+        out.escaped(),
         missing(&there, &sweep.text, "there"),
         missing(&sweep.text, &there, "here"),
     ))
 }
 
 /// Marks the folder as this sweep's. Shards that start at the same moment all write the same.
-pub(super) fn claim(disk: &Disk, sweep: &Sweep, out: &Path) -> Result<(), Error> {
-    let failed = |path: &Path| {
-        let path = path.to_path_buf();
-        move |error| RecordError::Write { path, error }
-    };
+pub(super) fn claim(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let path = out.join(SWEEP);
-    disk.create_folder(out).map_err(failed(out))?;
-    let disk = disk.within(out).map_err(failed(out))?;
-    if disk.kind(&path).map_err(failed(&path))?.is_none() {
-        let text = |output: &mut dyn io::Write| output.write_all(sweep.text.as_bytes());
-        disk.replace_shared(&path, text, || Ok(())).map_err(failed(&path))?;
-    }
+    Disk::default().create_folder(out).map_err(|error| RecordError::Write { path: out.into(), error })?;
+    let write = || -> io::Result<()> {
+        if !path.exists() {
+            let builder = &mut tempfile::Builder::new();
+            // As any other file: others may collect.
+            #[cfg(unix)]
+            builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+            let mut file = builder.tempfile_in(out)?;
+            file.write_all(sweep.text.as_bytes())?;
+            file.as_file().sync_all()?;
+            file.persist(&path).map_err(|error| error.error)?;
+        }
+        Ok(())
+    };
+    write().map_err(|error| RecordError::Write { path: path.clone(), error: disk::without_path(error) })?;
     same_sweep(sweep, out)
-}
-
-/// Enters a sweep's folder, in which nothing that is written in the end may be another's.
-fn enter(args: &Args, out: &Path) -> Result<Disk, Error> {
-    let disk = ownership::enter(&Disk::default(), out, args.out.is_some())?;
-    let products = pictures::names().chain([folder::RESULTS, folder::POINTS].map(String::from));
-    ownership::check(&disk, products.map(|name| out.join(name)))?;
-    Ok(disk)
 }
 
 fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Error> {
@@ -307,8 +307,7 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
         let plan = memory::Peaks::of([&point.config], rayon::current_num_threads());
         plan.check(player.1.backend == "gpu").map_err(RunError::from)?;
     }
-    claim(&Disk::default(), sweep, out)?;
-    let disk = enter(args, out)?;
+    claim(sweep, out)?;
     let memory = args.memory.map_or_else(free_memory, |gib| (gib * f64::from(1 << 30)) as usize);
     if !args.quiet {
         let skipped =
@@ -318,7 +317,7 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
         let (all, taken) = (sweep.points.len(), points.len());
         let part =
             if shard.count > 1 { format!("shard {shard}: {taken} of {all} points") } else { format!("{all} points") };
-        say(format_args!("{part}{skipped}{batches}, on {}, into {}", player.0.describe(), out.display()));
+        say(format_args!("{part}{skipped}{batches}, on {}, into {}", player.0.describe(), out.escaped()));
     }
     let signals = Signals::listen()?;
     let start = match (args.resume, args.force) {
@@ -327,9 +326,8 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
         _ => Start::Fresh,
     };
     let mut ticker = Ticker::new(args.quiet);
-    let mut options = run::Manner {
+    let mut options = run::SweepOptions {
         start,
-        disk: &disk,
         memory,
         runs: Options {
             command: &recovery::typed(),
@@ -378,7 +376,6 @@ pub(super) fn free_memory() -> usize {
 
 /// Puts together what is there, draws it, and fails where something is missing.
 fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(), Error> {
-    enter(args, out)?;
     let options = results::Detail { every: args.every as usize, reach: args.reach };
     let outcomes = results::write(sweep, out, &options)?;
     let (names, note) = pictures::draw(sweep, &outcomes, &options, axes, out)?;
@@ -389,7 +386,7 @@ fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(),
             let _ = write!(
                 text,
                 "\nFiles in {}:\n  points/      the runs themselves\n  results.csv  every point and trial, {}\n  points.csv   what each point came to\n",
-                out.display(),
+                out.escaped(),
                 if options.every == 1 {
                     "generation by generation".into()
                 } else {
@@ -438,14 +435,14 @@ fn as_json(
     out: &Path,
     pictures: &[String],
 ) -> serde_json::Value {
-    let path = |name: &str| out.join(name).display().to_string();
+    let path = |name: &str| out.join(name).escaped().to_string();
     let point = |(point, outcome): (&Point, &Result<Outcome, Missing>)| {
         let values =
             sweep.axes.iter().zip(&point.values).map(|(axis, &value)| (axis.key.clone(), json!(axis.values[value])));
         let folder = results::point_folder(out, point);
         let mut told = json!({
             "point": point.index,
-            "folder": folder.display().to_string(),
+            "folder": folder.escaped().to_string(),
             "values": serde_json::Map::from_iter(values),
         });
         match outcome {
@@ -462,7 +459,7 @@ fn as_json(
         told
     };
     json!({
-        "folder": out.display().to_string(),
+        "folder": out.escaped().to_string(),
         "sweep": sweep.name,
         "reach": options.reach,
         "points": sweep.points.iter().zip(outcomes).map(point).collect::<Vec<_>>(),
@@ -535,7 +532,7 @@ fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> 
     let out = absolute(out);
     let cpu = args.run.backend == super::BackendChoice::Cpu;
     let command =
-        [super::program().display().to_string()].into_iter().chain(args.words(&absolute(&args.sweep), &out)).collect();
+        [super::program().into_os_string()].into_iter().chain(args.words(&absolute(&args.sweep), &out)).collect();
     let job = Job {
         name: &sweep.name,
         command,
@@ -548,12 +545,12 @@ fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> 
     };
     let script = job.script().map_err(Error::Usage)?;
     // The tasks' logs go there, and Slurm creates no folder.
-    claim(&Disk::default(), sweep, &out)?;
+    claim(sweep, &out)?;
     match file {
         None => print(&script),
         Some(path) => {
             output::write(path, |output| output.write_all(script.as_bytes()))?;
-            say(format_args!("submit it with: sbatch {}", path.display()));
+            say(format_args!("submit it with: sbatch {}", path.escaped()));
             Ok(())
         }
     }
@@ -567,8 +564,8 @@ impl Ticker {
         Ticker(Meter::new(quiet))
     }
 
-    fn tick(&mut self, progress: &Headway) {
-        let Headway { done, points, batch, generation, last, played, total } = *progress;
+    fn tick(&mut self, progress: &SweepProgress) {
+        let SweepProgress { done, points, batch, generation, last, played, total } = *progress;
         self.0.show(played as f64 / total.max(1) as f64, || {
             format!("{done}/{points} points done, {batch} side by side at generation {}/{last}", generation.min(last))
         });

@@ -1,5 +1,6 @@
 //! `flotilla train`: a run from its config to its policies.
 
+use std::ffi::OsString;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -8,13 +9,13 @@ use serde_json::json;
 use super::recovery::{self, Checkpoints, Loss, Signals, quoted};
 use super::{ConfigArgs, Error, RunOptions, backend, print, say};
 use crate::config::Config;
+use crate::escape::PathExt;
 use crate::file;
 use crate::host::Instant;
 use crate::memory::Peaks;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, METRICS, POLICIES, Start};
-use crate::record::ownership::{self, CURVES};
 use crate::record::policies;
 use crate::report::progress::Board;
 use crate::report::runs;
@@ -25,6 +26,8 @@ use crate::trainer::Row;
 
 /// Where runs without `--out` go.
 const RUNS: &str = "runs";
+/// The run's learning curves, in its folder.
+const CURVES: &str = "curves.svg";
 /// Event files for TensorBoard, in a run's folder.
 const TENSORBOARD: &str = "tensorboard";
 
@@ -67,8 +70,8 @@ pub struct Args {
 impl Args {
     /// What to type to go on.
     fn command_to_resume(&self, folder: &Path) -> String {
-        let words = ["flotilla".into(), "train".into(), folder.join(folder::CONFIG).display().to_string()];
-        let out = ["--out".into(), folder.display().to_string(), "--resume".into()];
+        let words: [OsString; 3] = ["flotilla".into(), "train".into(), shell::argument(&folder.join(folder::CONFIG))];
+        let out = ["--out".into(), shell::argument(folder), "--resume".into()];
         let events = self.tensorboard.then(|| "--tensorboard".into());
         let machine = recovery::words_of_machine(&self.run, self.loss);
         shell::command(words.into_iter().chain(out).chain(events).chain(machine))
@@ -100,26 +103,18 @@ pub fn run(args: Args) -> Result<(), Error> {
     let init = args.init.as_deref().map(|path| policies::read_init(path, &config)).transpose()?;
     let (folder, start) = args.folder()?;
     if let Some(what) = folder::collection(&folder) {
-        return Err(Error::Refused(format!("{} holds {what}, not a run; choose another --out", folder.display())));
+        return Err(Error::Refused(format!("{} holds {what}, not a run; choose another --out", folder.escaped())));
     }
     if let Some(path) =
         args.init.as_deref().filter(|path| file::resolved(path) == file::resolved(&folder.join(POLICIES)))
     {
         return Err(Error::Usage(format!(
             "--init {}: this run would be written over it; choose another --out",
-            path.display()
+            path.escaped()
         )));
     }
-    let disk = Disk::default();
-    if folder.is_dir() {
-        let disk = ownership::enter(&disk, &folder, args.out.is_some())?;
-        // A run that is resumed is not held up by a picture.
-        if start != Start::Resume {
-            ownership::check(&disk, [folder.join(CURVES)])?;
-        }
-    }
     let signals = Signals::listen()?;
-    let opened = Session::open_from(vec![(config.clone(), folder.clone(), init)], start, &disk);
+    let opened = Session::open_from(vec![(config.clone(), folder.clone(), init)], start, &Disk::default());
     let (mut session, notes) = opened.map_err(|error| match error {
         RunError::Record(RecordError::Exists { .. }) if args.tensorboard => Error::Refused(format!(
             "{error}\nfor event files of the run that is there:\n  {}",
@@ -132,24 +127,22 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
     let path = folder.join(TENSORBOARD);
     let events_failed =
-        |error| say(format_args!("{}: cannot be written: {error}; there are no event files", path.display()));
-    let disk = session.disk(0).clone();
-    let events =
-        || Events::create(&disk, &path, config.learning.trials, &folder.join(METRICS)).map_err(events_failed).ok();
+        |error| say(format_args!("{}: cannot be written: {error}; there are no event files", path.escaped()));
+    let events = || Events::create(&path, config.learning.trials, &folder.join(METRICS)).map_err(events_failed).ok();
     let mut events = args.tensorboard.then(events).flatten();
     if start == Start::Force && !args.tensorboard {
         // They are of the run that was written over.
-        Events::clear(&disk, &path).unwrap_or_else(events_failed);
+        Events::clear(&path).unwrap_or_else(events_failed);
     }
     let told = Told { config: &config, name: args.config.name(), folder: &folder, runs_on: &runs_on };
     if session.is_done() {
         if !folder.join(CURVES).exists() {
-            draw(&disk, &folder);
+            draw(&folder);
         }
         return told.print(&session, None, args.quiet, args.json);
     }
     if !args.quiet {
-        say(format_args!("training on {runs_on}, into {}", folder.display()));
+        say(format_args!("training on {runs_on}, into {}", folder.escaped()));
     }
 
     let (since, from, last) = (Instant::now(), session.generations()[0], config.learning.generations);
@@ -178,7 +171,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let next = session.generations()[0];
     match ended? {
         Ended::Done => {
-            draw(&disk, &folder);
+            draw(&folder);
             let trained = Training { generations: next.min(last + 1) - from.min(last + 1), since };
             told.print(&session, Some(trained), args.quiet, args.json)
         }
@@ -190,15 +183,15 @@ pub fn run(args: Args) -> Result<(), Error> {
 }
 
 /// Draws the run's curves. All that was learned is saved by now, so a picture that fails is no failure of the run.
-fn draw(disk: &Disk, folder: &Path) {
+fn draw(folder: &Path) {
     let path = folder.join(CURVES);
     let drawn = runs::figure(&[folder.to_path_buf()]).map(|figure| figure.scene().svg());
     let written = drawn.map_err(|error| error.to_string()).and_then(|svg| {
-        let written = ownership::publish(disk, &path, |output| output.write_all(svg.as_bytes()));
+        let written = Disk::default().replace(&path, |output| output.write_all(svg.as_bytes()));
         written.map_err(|error| error.to_string())
     });
     if let Err(error) = written {
-        say(format_args!("{}: not drawn: {error}", path.display()));
+        say(format_args!("{}: not drawn: {error}", path.escaped()));
     }
 }
 
@@ -253,9 +246,9 @@ impl Told<'_> {
             });
             json!({ "best_g": best, "mean_g": mean, "champion_g": champion })
         };
-        let file = |name: &str| self.folder.join(name).display().to_string();
+        let file = |name: &str| self.folder.join(name).escaped().to_string();
         json!({
-            "folder": self.folder.display().to_string(),
+            "folder": self.folder.escaped().to_string(),
             "config": self.name,
             "digest": results.digest,
             "seed": learning.seed,
@@ -345,7 +338,7 @@ Next:
   flotilla replay {replayed}
   flotilla rollout {config} --policies {policies} --scores scores.csv
 ",
-        folder.display(),
+        folder.escaped(),
         folder::CONFIG,
         folder::RUN,
     );

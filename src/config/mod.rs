@@ -8,7 +8,7 @@
 
 use serde::Serialize;
 
-use crate::reader::{self, Reader};
+use crate::reader::{self, Document, Reader};
 
 pub use crate::declare::Choice;
 pub use crate::model::follow::Follow;
@@ -90,23 +90,61 @@ impl Config {
     /// Sections named in `foreign` belong to somebody else (a sweep's `grid`) and are passed over.
     ///
     /// # Errors
-    /// Everything that is wrong with the text and the overrides.
+    /// All problems of the text and the overrides.
     pub fn read(text: &str, name: &str, foreign: &[&str], overrides: &[Override]) -> Result<Config, ConfigError> {
-        let others = reader::Others {
-            foreign,
-            refused: if foreign.contains(&GRID) { &[] } else { &[GRID, VARY] },
-            message: "this makes the file a sweep, of many configs; use `flotilla sweep`",
-        };
-        // Stages are of the config that the other keys make.
-        let others = reader::Others { foreign: &[foreign, &[stages::STAGES]].concat(), ..others };
+        Config::read_document(&Document::parse(text), name, foreign, overrides)
+    }
+
+    /// Reads a config from a parsed text, as [`Config::read`] does.
+    ///
+    /// # Errors
+    /// All problems of the text and the overrides.
+    pub fn read_document(
+        document: &Document<'_>,
+        name: &str,
+        foreign: &[&str],
+        overrides: &[Override],
+    ) -> Result<Config, ConfigError> {
         let (staging, overrides): (Vec<_>, Vec<_>) =
             overrides.iter().cloned().partition(|set| set.key == stages::STAGES);
         let invalid = |problems, unlisted| ConfigError::Invalid { name: name.to_string(), problems, unlisted };
-        let own = reader::read(text, others, &overrides, Config::ask)
+        let own = Config::without_stages(document, foreign, &overrides)
             .map_err(|reader::Problems { listed, unlisted }| invalid(listed, unlisted))?;
-        let staging = staging.last().map(|set| format!("{} = {}", stages::STAGES, set.text));
-        let stages = stages::read(staging.as_deref().unwrap_or(text), staging.is_some(), &own);
-        Ok(Config { stages: stages.map_err(|problems| invalid(problems, 0))?, ..own })
+        let stages = match staging.last() {
+            Some(set) => {
+                let text = format!("{} = {}", stages::STAGES, set.text);
+                stages::read(&Document::parse(&text), true, &own)
+            }
+            None => stages::read(document, false, &own).map_err(|problems| {
+                let is_valid = |overrides: &[Override]| {
+                    Config::without_stages(document, foreign, overrides)
+                        .is_ok_and(|own| stages::read(document, false, &own).is_ok())
+                };
+                stages::attribute(problems, &overrides, is_valid)
+            }),
+        };
+        match stages {
+            Ok(stages) => Ok(Config { stages, ..own }),
+            Err(mut problems) => {
+                let unlisted = problems.len().saturating_sub(reader::MAX_LISTED);
+                problems.truncate(reader::MAX_LISTED);
+                Err(invalid(problems, unlisted))
+            }
+        }
+    }
+
+    /// Reads all keys except the stages. These are changes of the config that the other keys make.
+    fn without_stages(
+        document: &Document<'_>,
+        foreign: &[&str],
+        overrides: &[Override],
+    ) -> Result<Config, reader::Problems> {
+        let others = reader::Others {
+            foreign: &[foreign, &[stages::STAGES]].concat(),
+            refused: if foreign.contains(&GRID) { &[] } else { &[GRID, VARY] },
+            message: "this makes the file a sweep, of many configs; use `flotilla sweep`",
+        };
+        reader::read_document(document, others, overrides, Config::ask)
     }
 
     /// This config with some keys changed.
@@ -185,6 +223,8 @@ pub enum ConfigError {
         name: String,
         /// The system's words.
         reason: String,
+        /// Whether there is no such file.
+        is_missing: bool,
     },
     /// All that is wrong, by line; what came from outside the file (see [`Override`]) last.
     #[error("{}", list(name, problems, *unlisted))]

@@ -7,10 +7,10 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 
 use serde::Serialize;
-use toml::de::{DeTable, DeValue};
+use toml::de::DeValue;
 
 use super::{Config, MAX_GENERATIONS, Override, Problem};
-use crate::reader::Number;
+use crate::reader::{Document, Number};
 
 /// The list that a config has them in.
 pub const STAGES: &str = "stages";
@@ -106,12 +106,15 @@ struct Written<'a> {
     text: &'a str,
 }
 
-/// Reads the stages of a text whose other keys make a valid config; all that is wrong with them, by line.
-pub(super) fn read(text: &str, outside: bool, own: &Config) -> Result<Vec<Stage>, Vec<Problem>> {
-    let line_of =
-        |offset: usize| (!outside).then(|| text.bytes().take(offset).filter(|&byte| byte == b'\n').count() + 1);
-    let (document, _) = DeTable::parse_recoverable(text);
-    let Some(list) = document.get_ref().get(STAGES) else { return Ok(vec![]) };
+/// Reads the stages of a document whose other keys make a valid config. Their keys have lines unless the document comes
+/// from outside the file.
+///
+/// # Errors
+/// All problems of the stages, by line.
+pub(super) fn read(document: &Document<'_>, outside: bool, own: &Config) -> Result<Vec<Stage>, Vec<Problem>> {
+    let text = document.text();
+    let line_of = |offset: usize| (!outside).then(|| document.lines().line(offset));
+    let Some(list) = document.table().get(STAGES) else { return Ok(vec![]) };
     let problems = RefCell::new(Vec::new());
     let report_line = |line, key, message| problems.borrow_mut().push(Problem { line, key, message });
     let report = |offset: usize, key: String, message: String| report_line(line_of(offset), key, message);
@@ -215,4 +218,27 @@ pub(super) fn read(text: &str, outside: bool, own: &Config) -> Result<Vec<Stage>
     }
     let problems = problems.into_inner();
     if problems.is_empty() { Ok(stages) } else { Err(problems) }
+}
+
+/// Attributes the problems of stages to the flags that cause them, if the file is valid without flags: to each flag that
+/// alone makes it invalid, or else to all flags together.
+pub(super) fn attribute(
+    problems: Vec<Problem>,
+    flags: &[Override],
+    is_valid: impl Fn(&[Override]) -> bool,
+) -> Vec<Problem> {
+    if flags.is_empty() || !is_valid(&[]) {
+        return problems;
+    }
+    let mut causes: Vec<&Override> = flags.iter().filter(|&flag| !is_valid(std::slice::from_ref(flag))).collect();
+    if causes.is_empty() {
+        causes = flags.iter().collect();
+    }
+    let names: Vec<&str> = causes.iter().map(|flag| &*flag.name).collect();
+    let name = names.join(", ");
+    let of_flags = |Problem { line, key, message }: Problem| {
+        let line = line.map_or(String::new(), |line| format!(" (line {line})"));
+        Problem { line: None, key: name.clone(), message: format!("not possible with {key}{line}: {message}") }
+    };
+    problems.into_iter().map(of_flags).collect()
 }

@@ -28,6 +28,8 @@ use crate::host::Instant;
 use crate::trainer::{Row, Snapshot};
 
 const KIND: &str = "checkpoint 1";
+/// Maximum training time of a checkpoint, 30 000 years. A longer one counts as 0.
+const MAX_SECONDS: f64 = 1e12;
 /// Tensors, of all trials together.
 const WEIGHTS: &str = "weights.0";
 const FITNESS: &str = "fitness.0";
@@ -135,7 +137,9 @@ impl Checkpoint {
             text(key)?.parse::<u64>().map_err(|error| format!("its {key} is no number that can be: {error}"))
         };
         let config = text("config")?;
-        let seconds = text("seconds")?.parse().ok().filter(|seconds: &f64| seconds.is_finite() && *seconds >= 0.0);
+        // A longer time would make lines of metrics.csv too long for every reader. It has no influence on results.
+        let seconds: Option<f64> = text("seconds")?.parse().ok();
+        let seconds = seconds.filter(|seconds| (0.0..=MAX_SECONDS).contains(seconds)).unwrap_or(0.0);
         let metrics = Extent { bytes: number("metrics_bytes")?, sha256: text("metrics_sha256")? };
         let generation = number("generation")? as usize;
         let learning = &of.learning;
@@ -169,7 +173,6 @@ impl Checkpoint {
             Some(Row { arm: 0, trial, generation: generation - 1, best_g, mean_g, champion_g: 0.0 })
         };
         let pending = (0..learning.trials).map(row).collect();
-        let seconds = seconds.ok_or("its seconds are no number that can be")?;
         let snapshot = Snapshot { generation, last, weights, fitness, pending };
         let init = file.metadata(INIT).map(String::from);
         Ok(Checkpoint { config, init, seconds, metrics, snapshot })
@@ -231,22 +234,22 @@ impl Shapes {
 /// The folder cannot be read.
 pub fn list(folder: &Path) -> Result<Vec<usize>, RecordError> {
     let entries = match fs::read_dir(folder) {
-        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => return Ok(vec![]),
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(vec![]),
         entries => entries.map_err(RecordError::read(folder))?,
+    };
+    let generation = |name: &str| -> Option<usize> {
+        let digits = name.strip_suffix(EXTENSION)?;
+        (digits.len() == DIGITS && digits.bytes().all(|byte| byte.is_ascii_digit()))
+            .then(|| digits.parse().ok())
+            .flatten()
     };
     let mut generations = Vec::new();
     for entry in entries {
         let entry = entry.map_err(RecordError::read(folder))?;
-        generations.extend(entry.file_name().to_str().and_then(generation_of));
+        generations.extend(entry.file_name().to_str().and_then(generation));
     }
     generations.sort_unstable();
     Ok(generations)
-}
-
-/// The generation that a checkpoint's name says; none of any other name.
-fn generation_of(name: &str) -> Option<usize> {
-    let digits = name.strip_suffix(EXTENSION)?;
-    (digits.len() == DIGITS && digits.bytes().all(|byte| byte.is_ascii_digit())).then(|| digits.parse().ok()).flatten()
 }
 
 /// Where the checkpoint of a generation is.
@@ -424,11 +427,12 @@ impl Drop for Keeper {
 /// The folder cannot be read or written.
 pub fn tidy(disk: &Disk, folder: &Path) -> Result<Vec<usize>, RecordError> {
     let generations = list(folder)?;
-    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
-        let path = entry.path();
-        let whole = disk::of_temporary(&path);
-        if whole.is_some_and(|name| generation_of(name).is_some()) {
-            disk.remove(&path).map_err(RecordError::write(&path))?;
+    if let Ok(entries) = fs::read_dir(folder) {
+        for entry in entries.flatten() {
+            let path = entry.path();
+            if path.extension().is_some_and(|extension| extension == "tmp") {
+                disk.remove(&path).map_err(RecordError::write(&path))?;
+            }
         }
     }
     Ok(generations)
@@ -436,5 +440,7 @@ pub fn tidy(disk: &Disk, folder: &Path) -> Result<Vec<usize>, RecordError> {
 
 /// Where a checkpoint that cannot be used is put aside.
 pub fn aside(path: &Path) -> PathBuf {
-    path.with_extension("safetensors.damaged")
+    let mut name = disk::temporary(path);
+    name.set_extension("damaged");
+    name
 }

@@ -2,12 +2,10 @@
 //!
 //! | module | holds |
 //! |---|---|
-//! | [`beneath`] | a folder and what is below it, reached without following links |
 //! | [`disk`] | files replaced whole or not at all; the one place that writes, so that tests can make any write fail |
 //! | [`tensors`] | safetensors files under a checksum |
 //! | [`policies`] | `policies.safetensors` |
 //! | [`metrics`] | `metrics.csv` |
-//! | [`ownership`] | what may be written, replaced, renamed and deleted |
 //! | [`checkpoint`] | `checkpoints/`, written beside training |
 //! | [`folder`] | the run's folder, its lock and `run.json` |
 //! | [`evidence`] | what was seen on a machine, for `docs/develop/evidence.md` |
@@ -22,15 +20,14 @@ use std::path::{Path, PathBuf};
 use sha2::{Digest, Sha256};
 
 use crate::config::{self, Config};
+use crate::escape::PathExt;
 use crate::file::{self, TextError};
 
-pub mod beneath;
 pub mod checkpoint;
 pub mod disk;
 pub mod evidence;
 pub mod folder;
 pub mod metrics;
-pub mod ownership;
 pub mod policies;
 pub mod tensors;
 
@@ -38,7 +35,7 @@ pub mod tensors;
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
     /// What to do about it depends on the command.
-    #[error("{path}: cannot be written: {error}")]
+    #[error("{path}: cannot be written: {error}", path = path.escaped())]
     Write {
         /// The file or the folder.
         path: PathBuf,
@@ -46,7 +43,7 @@ pub enum RecordError {
         error: io::Error,
     },
     /// The system does not let it be read.
-    #[error("{path}: cannot be read: {error}")]
+    #[error("{path}: cannot be read: {error}", path = path.escaped())]
     Read {
         /// The file or the folder.
         path: PathBuf,
@@ -54,7 +51,7 @@ pub enum RecordError {
         error: io::Error,
     },
     /// The file is not what it should be; `reason` says in what.
-    #[error("{path}: {reason}")]
+    #[error("{path}: {reason}", path = path.escaped())]
     Damaged {
         /// The file or the folder.
         path: PathBuf,
@@ -62,7 +59,7 @@ pub enum RecordError {
         reason: String,
     },
     /// Policies of a trial that the file does not have.
-    #[error("{path}: {reason}")]
+    #[error("{path}: {reason}", path = path.escaped())]
     NoTrial {
         /// The file or the folder.
         path: PathBuf,
@@ -70,31 +67,25 @@ pub enum RecordError {
         reason: String,
     },
     /// A run that would be written over.
-    #[error("{path} holds a run already")]
+    #[error("{path} holds a run already", path = path.escaped())]
     Exists {
         /// The file or the folder.
         path: PathBuf,
     },
-    /// A file that flotilla did not make.
-    #[error("{path} was not made by flotilla and would be overwritten")]
-    NotOurs {
+    /// A file that a run would write over, where there is no run.
+    #[error("{path} is not a run's, and would be written over", path = path.escaped())]
+    NotOfARun {
         /// The file.
         path: PathBuf,
     },
-    /// A folder of another user, to which the user did not ask to write.
-    #[error("{path} belongs to another user, so nothing is written there unless --out names it")]
-    OfAnotherUser {
-        /// The folder.
-        path: PathBuf,
-    },
     /// A file where the folder should be.
-    #[error("{path} is a file")]
+    #[error("{path} is a file", path = path.escaped())]
     NoFolder {
         /// The file or the folder.
         path: PathBuf,
     },
     /// A run that has more generations than are asked for.
-    #[error("{path} is a run of {there} generations, which cannot become one of {here}")]
+    #[error("{path} is a run of {there} generations, which cannot become one of {here}", path = path.escaped())]
     Shorter {
         /// The file or the folder.
         path: PathBuf,
@@ -104,13 +95,13 @@ pub enum RecordError {
         here: usize,
     },
     /// Two processes would write the same files.
-    #[error("another process is training in {path}")]
+    #[error("another process is training in {path}", path = path.escaped())]
     Locked {
         /// The file or the folder.
         path: PathBuf,
     },
     /// A run that started from given policies, or that did not, cannot go on as if it had started from others.
-    #[error("{path} {}, so it cannot go on as a run {}", started(there), started_from(here))]
+    #[error("{path} {}, so it cannot go on as a run {}", started(there), started_from(here), path = path.escaped())]
     InitDiffers {
         /// The file or the folder.
         path: PathBuf,
@@ -120,7 +111,7 @@ pub enum RecordError {
         here: String,
     },
     /// A run that starts over needs the policies that it started from.
-    #[error("{path} {}, and has no checkpoint yet: it starts over from these alone", started(&Some(there.clone())))]
+    #[error("{path} {}, and has no checkpoint yet: it starts over from these alone", started(&Some(there.clone())), path = path.escaped())]
     InitNeeded {
         /// The file or the folder.
         path: PathBuf,
@@ -130,7 +121,8 @@ pub enum RecordError {
     /// A run that cannot go on under the config given.
     #[error(
         "{path} is a run of another config, so it cannot go on with this one; what differs:\n{}",
-        differences.join("\n")
+        differences.join("\n"),
+        path = path.escaped()
     )]
     ConfigDiffers {
         /// The file or the folder.

@@ -8,6 +8,7 @@ use serde::Serialize;
 
 use super::runs::{self, ReadError};
 use super::table;
+use crate::escape::{self, PathExt};
 use crate::statistics::{self, Estimate, Tested};
 
 /// Trials that are compared with those of others.
@@ -58,7 +59,7 @@ impl Cohort {
     /// Its name, and where its runs are.
     fn told(&self) -> String {
         const MOST: usize = 3;
-        let folders: Vec<String> = self.folders.iter().map(|folder| folder.display().to_string()).collect();
+        let folders: Vec<String> = self.folders.iter().map(|folder| folder.escaped().to_string()).collect();
         match folders.len().checked_sub(MOST) {
             _ if folders == [&*self.name] || self.name.ends_with(&format!("({})", folders.concat())) => {
                 self.name.clone()
@@ -319,7 +320,7 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
     }
     let named = |arm: &Cohort| Named {
         name: arm.name.clone(),
-        folders: arm.folders.iter().map(|folder| folder.display().to_string()).collect(),
+        folders: arm.folders.iter().map(|folder| folder.escaped().to_string()).collect(),
         trials: arm.trials.len(),
     };
     Ok(Comparison { place: place.into(), generation: last, arms: arms.iter().map(named).collect(), measures, notes })
@@ -490,17 +491,20 @@ pub fn csv(all: &[Comparison], output: impl io::Write) -> io::Result<()> {
                 Measure::GenerationsToReach { reach, generation } => (generation, reach.to_string()),
                 Measure::Played { .. } => (*last, String::new()),
             };
-            let place = || [place.clone(), measure.key().into(), generation.to_string(), reach.clone()];
+            let place =
+                || [escape::csv_cell(place).into_owned(), measure.key().into(), generation.to_string(), reach.clone()];
             let numbers = |Estimate { value, low, high }| [value, low, high].map(|number: f64| number.to_string());
             for (arm, Mean { mean, reached }) in named.iter().zip(arms) {
-                let whose = [arm.name.clone(), String::new(), arm.trials.to_string(), String::new()];
+                let name = escape::csv_cell(&arm.name).into_owned();
+                let whose = [name, String::new(), arm.trials.to_string(), String::new()];
                 let reached = reached.map_or(String::new(), |count| count.to_string());
                 let rest = [reached, String::new(), String::new(), String::new()];
                 table.write_record([&place()[..], &whose, &numbers(*mean), &rest].concat())?;
             }
             for Versus { arms, difference, test, p_holm } in pairs {
                 let [one, other] = arms.map(|arm| &named[arm]);
-                let whose = [one.name.clone(), other.name.clone(), one.trials.to_string(), other.trials.to_string()];
+                let names = [one, other].map(|arm| escape::csv_cell(&arm.name).into_owned());
+                let whose = [names, [one, other].map(|arm| arm.trials.to_string())].concat();
                 let rest = [String::new(), test.a.to_string(), test.p.to_string(), p_holm.to_string()];
                 table.write_record([&place()[..], &whose, &numbers(*difference), &rest].concat())?;
             }

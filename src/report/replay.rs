@@ -17,6 +17,7 @@ use super::scene::{Anchor, BLACK, Color, Scene};
 use crate::backend::{Backend, BackendError, Episode, Group, Need, Seen, Strided, Trace};
 use crate::config::{Config, Fitness, Observers};
 use crate::credit::{self, Credit, Scores};
+use crate::escape::PathExt;
 use crate::evolve;
 use crate::record::checkpoint;
 use crate::record::folder::{CHECKPOINTS, POLICIES, RUN, Run};
@@ -231,7 +232,7 @@ pub fn extreme_trials(
     let g = all.iter().map(|history| history.get(generation, which)).collect::<Option<Vec<f64>>>();
     let Some(g) = g else {
         let trial = all.iter().position(|history| history.get(generation, which).is_none()).unwrap_or(0);
-        let folder = folder.display().to_string();
+        let folder = folder.escaped().to_string();
         return Err(ReplayError::NoGeneration { folder, trial, generation, newest: all[trial].newest() });
     };
     let first = |better: fn(f64, f64) -> bool| (0..g.len()).reduce(|a, b| if better(g[b], g[a]) { b } else { a });
@@ -252,7 +253,7 @@ pub fn replay(
     backend: &mut dyn Backend,
     watch: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Vec<Replayed>, ReplayError> {
-    let name = || folder.display().to_string();
+    let name = || folder.escaped().to_string();
     let config = runs::config(folder)?;
     let trials = config.learning.trials;
     if trial >= trials {

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use super::curves::{Curve, Figure, Panel};
 use crate::config::{Config, ConfigError};
+use crate::escape::PathExt;
 use crate::file;
 use crate::record::RecordError;
 use crate::record::folder::{self, CONFIG, METRICS};
@@ -19,13 +20,13 @@ pub const MAX_RUNS: usize = 24;
 #[derive(Debug, thiserror::Error)]
 pub enum ReadError {
     /// There is nothing of this name.
-    #[error("{0}: no such folder")]
+    #[error("{}: no such folder", .0.escaped())]
     Missing(PathBuf),
     /// A run is a folder.
-    #[error("{0} is a file; name the folder of a run")]
+    #[error("{} is a file; name the folder of a run", .0.escaped())]
     NoFolder(PathBuf),
     /// A folder of something else.
-    #[error("{folder} is no run's folder: it has no {name}")]
+    #[error("{folder} is no run's folder: it has no {name}", folder = folder.escaped())]
     Foreign {
         /// The one named.
         folder: PathBuf,
@@ -33,7 +34,7 @@ pub enum ReadError {
         name: &'static str,
     },
     /// A run whose config is wrong.
-    #[error("{folder}: {error}")]
+    #[error("{folder}: {error}", folder = folder.escaped())]
     Config {
         /// The one named.
         folder: PathBuf,
@@ -41,7 +42,7 @@ pub enum ReadError {
         error: ConfigError,
     },
     /// A folder of several runs.
-    #[error("{folder} holds {what}; name one of the runs in it, as {folder}/{example}")]
+    #[error("{folder} holds {what}; name one of the runs in it, as {folder}/{example}", folder = folder.escaped())]
     Collection {
         /// The one named.
         folder: PathBuf,
@@ -51,7 +52,7 @@ pub enum ReadError {
         example: &'static str,
     },
     /// A run without what is to be shown.
-    #[error("{folder}: {reason}")]
+    #[error("{folder}: {reason}", folder = folder.escaped())]
     Unfinished {
         /// The one named.
         folder: PathBuf,
@@ -265,13 +266,13 @@ pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
             .filter(|part| !part.is_empty())
             .chain(Some(stages).filter(|_| staged))
             .collect();
-        if parts.is_empty() { folder.display().to_string() } else { parts.join(", ") }
+        if parts.is_empty() { folder.escaped().to_string() } else { parts.join(", ") }
     };
     let labels: Vec<String> = folders.iter().zip(&tables).zip(configs).map(label).collect();
     // Runs that are labelled alike differ in something long: say where they are, too.
     let twice = |label: &String| labels.iter().filter(|other| *other == label).count() > 1;
     let full = |(label, folder): (&String, &PathBuf)| {
-        let name = folder.display().to_string();
+        let name = folder.escaped().to_string();
         if twice(label) && *label != name { format!("{label} ({name})") } else { label.clone() }
     };
     labels.iter().zip(folders).map(full).collect()

@@ -2,8 +2,10 @@
 
 use std::fmt::Write;
 
-/// A Markdown table whose columns are of one width each; the first row is the head.
+/// Returns a Markdown table with aligned columns; the first row is the head. A `|` in a cell does not end the cell.
 pub fn markdown(rows: &[Vec<String>]) -> String {
+    let escaped = |row: &Vec<String>| row.iter().map(|cell| cell.replace('|', r"\|")).collect();
+    let rows: Vec<Vec<String>> = rows.iter().map(escaped).collect();
     let columns = rows[0].len();
     let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
     let widths: Vec<usize> = (0..columns).map(width).collect();
@@ -60,5 +62,6 @@ mod tests {
         );
         assert_eq!(tex("[a]"), "{}[a]");
         assert_eq!(markdown(&rows[..1]), "| arm | G |\n| --- | - |\n");
+        assert_eq!(markdown(&[vec!["a|b".into(), "G".into()]]), "| a\\|b | G |\n| ---- | - |\n");
     }
 }

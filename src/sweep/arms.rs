@@ -1,30 +1,29 @@
-//! The points of a sweep as arms that are compared along one axis.
+//! The points of a sweep, grouped for comparison along one axis.
 
 use std::collections::BTreeMap;
 
 use super::{Axis, Point, Sweep};
 use crate::escape;
 
-/// The key whose values only repeat: points that differ in nothing else are one arm.
+/// The key whose values are repetitions: points that differ only in it belong to one arm.
 const SEED: &str = "learning.seed";
 
-/// Points that differ in the values of one axis, and in seeds.
+/// Points that differ only in the values of one axis and in seeds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Series<'a> {
-    /// What they have in common: "coupling 3, fitness Df". Empty where there is no other axis.
+    /// The values of the other axes: "coupling 3, fitness Df". Empty without other axes.
     pub place: String,
-    /// By the axis's value: "repulsion_gain 2.0".
+    /// The points by value of the axis: "repulsion_gain 2.0".
     pub arms: Vec<(String, Vec<&'a Point>)>,
 }
 
 impl Sweep {
-    /// The axis of a name: its key, or that without its section.
+    /// Returns the axis with this key, with or without its section.
     pub fn axis(&self, name: &str) -> Option<usize> {
         self.axes.iter().position(|axis| axis.key == name || axis.leaf() == name)
     }
 
-    /// The points by the values of an axis, a group for each combination of the other axes that has two or more of
-    /// them.
+    /// Groups the points by the values of an axis, for each combination of the other axes with at least two values.
     pub fn arms(&self, by: usize) -> Vec<Series<'_>> {
         let told =
             |axis: &Axis, value: usize| escape::line(&format!("{} {}", axis.leaf(), axis.label(value))).to_string();

@@ -1,33 +1,33 @@
-//! The paper's geometry for any number of groups and of followers in each.
+//! The paper's geometry for any number of groups and followers.
 //!
-//! Group g = 1, 2, … has its leader at (10 g, 5) and a POI ten units ahead of it, at (10 g, 15), on a map 50 high and
-//! 10 (groups + 1) wide, 50 at least. Its followers stand around the leader on the first of 64 [`places`]: the paper's
-//! (±2, −3), then its chaotic layout's (±2, +2), then whichever place of the unit lattice within 5 of the leader is
-//! farthest from all that are taken. So a smaller ratio is a larger one with some followers left out; no two agents
-//! start at one point, or nearer than 1 to each other; and none starts within 5 of a POI.
+//! Group g = 1, 2, … has its leader at (10 g, 5) and a POI at (10 g, 15). The map is 50 high and 10 (groups + 1) wide, at
+//! least 50. Followers start on the first of 64 [`places`] around their leader: those of the paper at (±2, −3), those of
+//! its chaotic layout at (±2, +2), then always the point of the unit lattice within 5 of the leader that is farthest from
+//! all places so far. A layout with fewer followers is therefore a part of one with more. Agents start at least 1 apart,
+//! and more than 5 away from every POI.
 
 use toml::{Table, Value};
 
 use super::{Grid, problem};
 use crate::config::{Override, Problem};
 
-/// Followers of each leader (0 to 64; 2 where only the other axis is given).
+/// The key for followers per leader (0 to 64; 2 if only the other axis is given).
 pub const FOLLOWERS: &str = "followers_per_leader";
-/// Leaders, each with its followers and a POI (1 to 256; 4 where only the other axis is given).
+/// The key for leaders, each with followers and a POI (1 to 256; 4 if only the other axis is given).
 pub const GROUPS: &str = "groups";
-/// Both.
+/// Both keys.
 pub const AXES: [&str; 2] = [FOLLOWERS, GROUPS];
 const DEFAULT_FOLLOWERS: usize = 2;
 const DEFAULT_GROUPS: usize = 4;
-/// Most followers that a leader has places for.
+/// Maximum number of followers per leader.
 pub const MAX_FOLLOWERS: usize = 64;
-/// Most groups, one for each of the POIs a world may have.
+/// Maximum number of groups, one per POI.
 pub const MAX_GROUPS: usize = crate::config::MAX_POIS;
-/// Between neighbouring groups, and from each leader to its POI.
+/// The distance between neighbouring groups, and between a leader and its POI.
 const SPACING: i32 = 10;
 const LEADER_Y: i32 = 5;
 
-/// Where followers stand, as offsets from their leader, in the order in which they are taken.
+/// Returns the start positions of followers relative to their leader, in the order of their use.
 pub fn places() -> Vec<[i32; 2]> {
     let mut places = vec![[2, -3], [-2, -3], [2, 2], [-2, 2]];
     let squared = |[x, y]: [i32; 2], [u, v]: [i32; 2]| (x - u).pow(2) + (y - v).pow(2);
@@ -36,31 +36,31 @@ pub fn places() -> Vec<[i32; 2]> {
         (-4..=4).flat_map(|x| (-4..=4).map(move |y| [x, y])).filter(|&place| squared(place, [0, 0]) <= 25).collect();
     while places.len() < MAX_FOLLOWERS {
         let room = |place: [i32; 2]| {
-            // The neighbours' leader and followers stand a group's spacing to either side.
+            // The neighbouring groups have the same places.
             let taken = places.iter().copied().chain([[0, 0]]);
             let copies = taken.flat_map(|[x, y]| [[x, y], [x - SPACING, y], [x + SPACING, y]]);
             copies.map(|other| squared(place, other)).min()
         };
-        // Of equal room the nearer to the leader, then the one behind, then the right one.
+        // Ties: the place nearest to the leader, then the rear one, then the right one.
         let best = lattice.iter().max_by_key(|&&[x, y]| (room([x, y]), -squared([x, y], [0, 0]), -y, x));
         places.extend(best);
     }
     places
 }
 
-/// Where everything stands.
+/// The start positions of a world.
 pub struct Positions {
-    /// In units.
+    /// The positions of the leaders.
     pub leaders: Vec<[i32; 2]>,
-    /// Group by group.
+    /// The positions of the followers, group by group.
     pub followers: Vec<[i32; 2]>,
-    /// One a group.
+    /// The positions of the POIs, one per group.
     pub pois: Vec<[i32; 2]>,
-    /// Width and height.
+    /// The width and the height of the map.
     pub map: [i32; 2],
 }
 
-/// Lays out groups with so many followers each, on the first of the [`places`].
+/// Lays out groups with these numbers of followers, on the first of the [`places`].
 pub fn positions(places: &[[i32; 2]], followers: &[usize]) -> Positions {
     let leaders: Vec<_> = (1..).zip(followers).map(|(group, _)| [SPACING * group, LEADER_Y]).collect();
     let around = |(&[x, y], &count): (&[i32; 2], &usize)| places[..count].iter().map(move |[dx, dy]| [x + dx, y + dy]);
@@ -72,7 +72,7 @@ pub fn positions(places: &[[i32; 2]], followers: &[usize]) -> Positions {
     }
 }
 
-/// What is wrong with the values of one of [`AXES`].
+/// Returns the problems of the values of one of [`AXES`].
 pub(super) fn problems<'a>(key: &str, values: &'a [Value]) -> impl Iterator<Item = String> + 'a {
     let allowed = if key == FOLLOWERS { 0..=MAX_FOLLOWERS } else { 1..=MAX_GROUPS };
     let fits = move |value: &Value| count(value).is_some_and(|count| allowed.contains(&count));
@@ -87,17 +87,17 @@ fn count(value: &Value) -> Option<usize> {
     usize::try_from(value.as_integer()?).ok()
 }
 
-/// Whether the sweep itself says this key.
-fn says(grid: &Grid, base: &Table, key: &str) -> bool {
+/// Returns whether the sweep sets this key.
+fn sets(grid: &Grid, base: &Table, key: &str) -> bool {
     let (section, leaf) = key.split_once('.').unwrap_or((key, ""));
     base.get(section).and_then(|section| section.get(leaf)).is_some()
         || grid.axes.iter().any(|(axis, _)| axis.key == key)
 }
 
-/// Positions given beside the axes that would lay them out.
+/// Returns a problem for positions that are given although an axis lays them out.
 pub(super) fn conflicts(grid: &Grid, base: &Table) -> Vec<Problem> {
     let Some((axis, line)) = grid.axes.iter().find(|(axis, _)| AXES.contains(&&*axis.key)) else { return vec![] };
-    let given = ["world.leaders", "world.followers"].into_iter().filter(|key| says(grid, base, key));
+    let given = ["world.leaders", "world.followers"].into_iter().filter(|key| sets(grid, base, key));
     given
         .map(|key| {
             let message = format!("it lays out {key}, which is given too; leave one of them out");
@@ -106,7 +106,7 @@ pub(super) fn conflicts(grid: &Grid, base: &Table) -> Vec<Problem> {
         .collect()
 }
 
-/// How a sweep's points are laid out.
+/// The layout of a sweep's points.
 pub(super) struct Arrangement {
     axes: Option<[Option<usize>; 2]>,
     places: Vec<[i32; 2]>,
@@ -121,12 +121,12 @@ impl Arrangement {
         Arrangement {
             axes: used.then_some(axes),
             places: if used { places() } else { vec![] },
-            pois: !says(grid, base, "world.pois"),
-            map: !says(grid, base, "world.map"),
+            pois: !sets(grid, base, "world.pois"),
+            map: !sets(grid, base, "world.map"),
         }
     }
 
-    /// The positions of one combination; nothing where no axis lays them out.
+    /// Returns the positions of one combination, or nothing if no axis lays them out.
     pub(super) fn overrides(&self, grid: &Grid, values: &[usize]) -> Vec<Override> {
         let Some(axes) = self.axes else { return vec![] };
         let value = |axis: Option<usize>| axis.and_then(|axis| count(&grid.axes[axis].0.values[values[axis]]));

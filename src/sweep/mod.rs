@@ -1,30 +1,32 @@
-//! A grid of runs: what a sweep file says, and how its points are shared out, run and put together again.
+//! Sweeps: many runs from one file, shared between processes.
 //!
-//! A sweep file is a config with a section `[grid]`, whose keys are dotted config keys with lists of values, or the
-//! special axes of [`layout`]. Every combination of values is a [`Point`]: one config, trained as a run of its own in
-//! `points/NNNN`, whose results do not depend on which other points trained beside it. A section `[vary]` has keys that
-//! are changed one at a time: for every combination of `[grid]` there is a point with the file's own values, and one
-//! for each value of each key of `[vary]`.
+//! A sweep file is a config with a section `[grid]`. Its keys are dotted config keys with lists of values, or the special
+//! axes of [`layout`]. Every combination of values is a [`Point`]: one config, trained as a run in `points/NNNN`. Its
+//! results do not depend on the points that train beside it. The keys of a section `[vary]` change one at a time: every
+//! combination of `[grid]` has a point with the file's values, and one for each value of each key of `[vary]`.
 //!
 //! | module | holds |
 //! |---|---|
 //! | [`layout`] | the paper's geometry for any number of groups and followers |
-//! | [`shard`] | which points a process of many takes: by cost, the same on every machine |
-//! | [`run`] | trains a shard's points side by side |
-//! | [`results`] | `results.csv` and `points.csv`, put together from the points' folders |
-//! | [`pictures`] | heat maps and curves of them |
-//! | [`arms`] | points by the values of one axis, to be compared |
+//! | [`shard`] | the assignment of points to processes by cost |
+//! | [`run`] | training of points side by side |
+//! | [`results`] | the tables `results.csv` and `points.csv` |
+//! | [`pictures`] | heat maps and curves |
+//! | [`arms`] | points grouped by the values of one axis, for comparison |
 //! | [`slurm`] | the batch script of a job array |
-//! | [`questions`] | the questions that the paper leaves open, as sweeps |
+//! | [`questions`] | the open questions of the paper, as sweeps |
 
-use std::collections::BTreeMap;
+use std::collections::hash_map::Entry;
+use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use toml::de::{DeTable, DeValue};
-use toml::{Spanned, Table, Value};
+use toml::{Table, Value};
 
 use crate::config::{self, Config, ConfigError, GRID, Override, Problem, VARY, read_file};
 use crate::escape;
+use crate::file;
+use crate::reader::Document;
 
 pub mod arms;
 pub mod layout;
@@ -35,52 +37,52 @@ pub mod run;
 pub mod shard;
 pub mod slurm;
 
-/// The key of `[grid]` that is no axis.
+/// The key of `[grid]` that is not an axis.
 const SKIP: &str = "skip_impossible";
-/// Most points in a sweep.
+/// Maximum number of points of a sweep.
 pub const MAX_POINTS: usize = 1 << 16;
-/// Most problems listed of one sweep.
+/// Maximum number of problems listed per sweep.
 const MAX_LISTED: usize = 50;
 
-/// A sweep, every point of which can run.
+/// A sweep whose points are all valid.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sweep {
-    /// What its file is called, without folder and extension.
+    /// The name of the file, without folder and extension.
     pub name: String,
-    /// Those of the grid, then those varied, each in the order of the file; the first changes slowest from point to
+    /// The axes of the grid, then the varied ones, in the order of the file. The first changes slowest from point to
     /// point.
     pub axes: Vec<Axis>,
-    /// Every combination that is not left out, in order.
+    /// The combinations that are not skipped, in order.
     pub points: Vec<Point>,
-    /// Combinations left out because they cannot run.
+    /// The number of combinations that are skipped because they are invalid.
     pub skipped: usize,
-    /// The sweep file that says this, flags included: the same for the same sweep.
+    /// The sweep file in normal form, flags included. Equal sweeps have equal texts.
     pub text: String,
 }
 
-/// A key of `[grid]` or `[vary]` and the values it takes.
+/// A key of `[grid]` or `[vary]` with its values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Axis {
     /// A dotted config key, or one of [`layout::AXES`].
     pub key: String,
-    /// Of a varied key the first is the file's own.
+    /// The values. The first of a varied key is the file's.
     pub values: Vec<Value>,
-    /// Changed one at a time: of a point's varied keys, at most one has another than its first value.
+    /// Whether the key is varied: a point has at most one varied key with another than its first value.
     pub varied: bool,
 }
 
 impl Axis {
-    /// What errors call it.
+    /// Returns the name in errors.
     fn name(&self) -> String {
         format!("{}.{}", if self.varied { VARY } else { GRID }, quoted(&self.key))
     }
 
-    /// What errors call a value, by its place in the file's list.
+    /// Returns the name of a value in errors, with its index in the file's list.
     fn name_of(&self, value: usize) -> String {
         format!("{}[{}]", self.name(), value - usize::from(self.varied))
     }
 
-    /// A value for people and tables: words without quotes, all else as TOML.
+    /// Returns a value for people and tables: words without quotes, other values as TOML.
     pub fn label(&self, value: usize) -> String {
         match &self.values[value] {
             Value::String(word) => word.clone(),
@@ -88,7 +90,7 @@ impl Axis {
         }
     }
 
-    /// The key without its section.
+    /// Returns the key without its section.
     pub fn leaf(&self) -> &str {
         self.key.rsplit('.').next().unwrap_or_default()
     }
@@ -97,19 +99,19 @@ impl Axis {
 /// One combination of values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Point {
-    /// Its place among all combinations, those left out included.
+    /// The index among all combinations, including skipped ones.
     pub index: usize,
     /// The index of its value on each axis.
     pub values: Vec<usize>,
-    /// What it runs.
+    /// The config.
     pub config: Config,
 }
 
 impl Sweep {
-    /// Reads a sweep file; `flags` set config keys of all points, `skip` leaves impossible points out.
+    /// Reads a sweep file. `flags` set config keys of all points, and `skip` skips invalid points.
     ///
     /// # Errors
-    /// A file that cannot be read, or everything that is wrong with it and with any of its points.
+    /// The file cannot be read, or all problems of it and of its points.
     pub fn load(path: &Path, flags: &[Override], skip: bool) -> Result<Sweep, ConfigError> {
         let mut sweep = Sweep::read(&read_file(path)?, &config::name(path), flags, skip)?;
         if config::is_standard_input(path) {
@@ -118,17 +120,20 @@ impl Sweep {
         Ok(sweep)
     }
 
-    /// Reads a sweep from its text; `name` stands for the file in errors.
+    /// Reads a sweep from its text. `name` is the file in errors.
     ///
     /// # Errors
-    /// Everything that is wrong with the text and with any of its points.
+    /// All problems of the text and of its points.
     pub fn read(text: &str, name: &str, flags: &[Override], skip: bool) -> Result<Sweep, ConfigError> {
-        let (Ok(document), Ok(mut base)) = (DeTable::parse(text), text.parse::<Table>()) else {
-            Config::read(text, name, &[GRID, VARY], &[])?;
+        let document = Document::parse(text);
+        let Ok(mut base) = text.parse::<Table>() else {
+            Config::read_document(&document, name, &[GRID, VARY], &[])?;
             return Err(invalid(name, vec![problem(None, "", "it is not TOML")]));
         };
         let sections = [GRID, VARY].map(|section| base.remove(section));
-        let mut grid = Grid::read(text, document.into_inner(), sections).map_err(|list| invalid(name, list))?;
+        let mut grid = Grid::read(&document, sections).map_err(|list| invalid(name, list))?;
+        // Every point reads the rest of the document, so its cost must not depend on the length of the lists.
+        let document = document.without(&[GRID, VARY]);
         let skip = skip || grid.skip;
         let mut problems: Vec<Problem> = flags
             .iter()
@@ -156,7 +161,7 @@ impl Sweep {
             .map(|index| {
                 let values = grid.values(index);
                 let overrides = [flags, &grid.overrides(&values), &layout.overrides(&grid, &values)].concat();
-                let config = Config::read(text, name, &[GRID, VARY], &overrides);
+                let config = Config::read_document(&document, name, &[GRID, VARY], &overrides);
                 Tried { index, values, config }
             })
             .collect();
@@ -169,17 +174,17 @@ impl Sweep {
         let axes = grid.axes.into_iter().map(|(axis, _)| axis).collect();
         let point = |Tried { index, values, config }| config.ok().map(|config| Point { index, values, config });
         let points: Vec<_> = tried.into_iter().filter_map(point).collect();
-        let name = Path::new(name).file_stem().map_or("sweep".into(), |stem| stem.to_string_lossy().into_owned());
+        let name = file::stem(Path::new(name), "sweep");
         Ok(Sweep { name, axes, skipped: total - points.len(), points, text })
     }
 
-    /// A point for people: `world.coupling = 3, learning.fitness = Df`.
+    /// Describes a point: `world.coupling = 3, learning.fitness = Df`.
     pub fn describe(&self, point: &Point) -> String {
         describe(self.axes.iter(), &point.values)
     }
 }
 
-/// A combination of values and what became of it.
+/// A combination of values with its config, or the problems of that.
 struct Tried {
     index: usize,
     values: Vec<usize>,
@@ -203,22 +208,23 @@ fn invalid(name: &str, mut problems: Vec<Problem>) -> ConfigError {
     ConfigError::Invalid { name: name.into(), problems, unlisted }
 }
 
-/// `[grid]` and `[vary]` as written: every axis with its line.
+/// The sections `[grid]` and `[vary]`: every axis with its line.
 struct Grid {
     line: usize,
-    /// Those of the grid first.
+    /// The axes of the grid, then the varied ones.
     axes: Vec<(Axis, usize)>,
     skip: bool,
 }
 
 impl Grid {
-    /// Of a varied axis the first value is yet to be found (see [`Grid::take_own_values`]).
-    fn read(text: &str, document: DeTable<'_>, values: [Option<Value>; 2]) -> Result<Grid, Vec<Problem>> {
-        let line = |at: usize| text.bytes().take(at).filter(|&byte| byte == b'\n').count() + 1;
+    /// Reads the axes. The first value of a varied axis is not known yet, see [`Grid::take_own_values`].
+    fn read(document: &Document<'_>, values: [Option<Value>; 2]) -> Result<Grid, Vec<Problem>> {
+        let line = |at: usize| document.lines().line(at);
         let mut grid = Grid { line: 0, axes: vec![], skip: false };
         let mut problems = Vec::new();
         let mut spans: BTreeMap<_, _> = document
-            .into_iter()
+            .table()
+            .iter()
             .filter(|(key, _)| [GRID, VARY].contains(&key.get_ref().as_ref()))
             .map(|(key, value)| (key.get_ref().to_string(), (key.span().start, value)))
             .collect();
@@ -226,11 +232,11 @@ impl Grid {
             let Some((start, section)) = spans.remove(name) else { continue };
             let line_of_section = line(start);
             grid.line = if grid.line == 0 { line_of_section } else { grid.line };
-            let (DeValue::Table(section), Some(Value::Table(values))) = (section.into_inner(), values) else {
+            let (DeValue::Table(section), Some(Value::Table(values))) = (section.get_ref(), values) else {
                 problems.push(problem(Some(line_of_section), name, format!("allowed a section [{name}]")));
                 continue;
             };
-            // The spans know the order in the file, the plain values are easier to pass on.
+            // Spans give the order in the file. Plain values are simpler to use.
             let mut starts = BTreeMap::new();
             flatten_spans(section, "", &mut starts);
             let mut flat = BTreeMap::new();
@@ -276,9 +282,13 @@ impl Grid {
                 report("found no values, allowed a list of at least one; or leave the key out".into());
             }
             Value::Array(values) => {
+                let mut first_at = HashMap::with_capacity(values.len());
                 for (at, value) in values.iter().enumerate() {
-                    if let Some(first) = values[..at].iter().position(|other| other == value) {
-                        report(format!("found {value} twice, at [{first}] and at [{at}]"));
+                    match first_at.entry(canonical(value)) {
+                        Entry::Vacant(new) => drop(new.insert(at)),
+                        Entry::Occupied(first) => {
+                            report(format!("found {value} twice, at [{}] and at [{at}]", first.get()));
+                        }
                     }
                 }
                 if layout::AXES.contains(&key) {
@@ -296,14 +306,14 @@ impl Grid {
         self.axes.iter().map(|(axis, _)| axis).filter(|axis| !axis.varied)
     }
 
-    /// Points of each combination of the grid: the file's own values, and each varied one.
+    /// Returns the number of points per combination of the grid: one with the file's values, and one per varied value.
     fn variations(&self) -> usize {
         let varied = self.axes.iter().filter(|(axis, _)| axis.varied);
         1 + varied.map(|(axis, _)| axis.values.len() - 1).sum::<usize>()
     }
 
-    /// Finds the first value of every varied axis: what the points that do not change it have. A value that is no other
-    /// than that is a problem.
+    /// Sets the first value of every varied axis: the value of the points that do not change it. A listed value that is
+    /// the same is a problem.
     fn take_own_values(&mut self, tried: &[Tried]) -> Vec<Problem> {
         let mut problems = Vec::new();
         for combination in tried.chunks(self.variations()) {
@@ -323,7 +333,7 @@ impl Grid {
             let configs = tried.chunks(variations).filter_map(|of| of[0].config.as_ref().ok());
             let mut values = configs.filter_map(|config| value_of(config, key));
             let first = values.next().unwrap_or_else(|| Value::from(""));
-            // A default may depend on what the grid changes.
+            // A default may depend on the keys of the grid.
             if values.all(|value| value == first) { first } else { Value::from("the file's") }
         };
         for (axis, _) in self.axes.iter_mut().filter(|(axis, _)| axis.varied) {
@@ -332,8 +342,8 @@ impl Grid {
         problems
     }
 
-    /// The value on each axis of a point: a combination of the grid's, the last changing fastest, and of each the
-    /// variations.
+    /// Returns the index of a point's value on each axis. The last axis of the grid changes fastest, and each combination
+    /// has its variations.
     fn values(&self, index: usize) -> Vec<usize> {
         let (mut combination, mut variation) = (index / self.variations(), index % self.variations());
         let mut values = vec![0; self.axes.len()];
@@ -358,8 +368,8 @@ impl Grid {
         set.map(|(axis, value)| Override::new(&axis.key, axis.values[value].clone(), axis.name_of(value))).collect()
     }
 
-    /// All that keeps points from running, each problem once. With `skip`, points may fail, but not every point of
-    /// any one value: what never works is a slip.
+    /// Returns the problems of the points, each once. With `skip`, points may be invalid, but not all points of one value,
+    /// because such a value is a mistake.
     fn problems(&self, tried: &[Tried], skip: bool) -> Vec<Problem> {
         let mut works: Vec<Vec<bool>> = self.axes.iter().map(|(axis, _)| vec![false; axis.values.len()]).collect();
         for tried in tried.iter().filter(|tried| tried.config.is_ok()) {
@@ -394,7 +404,7 @@ impl Grid {
         problems
     }
 
-    /// The sweep file in its normal form.
+    /// Writes the sweep file in normal form.
     fn normal(&self, mut base: Table, flags: &[Override], skip: bool) -> String {
         for Override { key, text, .. } in flags {
             let (section, leaf) = key.split_once('.').unwrap_or((key, ""));
@@ -425,17 +435,27 @@ impl Grid {
     }
 }
 
-/// What a config says of a dotted key.
+/// Returns the value of a dotted key in a config.
 fn value_of(config: &Config, key: &str) -> Option<Value> {
     let (section, leaf) = key.split_once('.')?;
     config.to_toml().parse::<Table>().ok()?.get(section)?.get(leaf).cloned()
+}
+
+/// Returns a text that is the same for equal values only.
+fn canonical(value: &Value) -> String {
+    match value {
+        // 0.0 and -0.0 are equal, and adding 0 to either gives 0.0.
+        Value::Float(number) => Value::Float(number + 0.0).to_string(),
+        Value::Array(values) => format!("[{}]", values.iter().map(canonical).collect::<Vec<_>>().join(",")),
+        other => other.to_string(),
+    }
 }
 
 fn quoted(key: &str) -> String {
     if key.contains('.') { format!("{key:?}") } else { key.into() }
 }
 
-/// `world.coupling = […]` without quotes is a table in a table; both ways mean the same key.
+/// Joins nested keys with dots: `world.coupling = […]` without quotes is a table in a table.
 fn flatten(table: Table, prefix: &str, flat: &mut BTreeMap<String, Value>) {
     for (key, value) in table {
         let key = format!("{prefix}{key}");
@@ -446,13 +466,48 @@ fn flatten(table: Table, prefix: &str, flat: &mut BTreeMap<String, Value>) {
     }
 }
 
-fn flatten_spans(table: DeTable<'_>, prefix: &str, starts: &mut BTreeMap<String, usize>) {
+fn flatten_spans(table: &DeTable<'_>, prefix: &str, starts: &mut BTreeMap<String, usize>) {
     for (key, value) in table {
         let start = key.span().start;
         let key = format!("{prefix}{}", key.get_ref());
-        match Spanned::into_inner(value) {
+        match value.get_ref() {
             DeValue::Table(table) => flatten_spans(table, &format!("{key}."), starts),
             _ => drop(starts.insert(key, start)),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::reader::work;
+
+    #[test]
+    fn the_text_of_a_sweep_is_parsed_once_however_many_points_it_has() {
+        let parsed = |points: usize| {
+            let seeds: Vec<_> = (0..points).map(|seed| seed.to_string()).collect();
+            let world = "[world]\nleaders = [[10, 5]]\npois = [[10, 15]]\n";
+            let text = format!("{world}[grid]\n\"learning.seed\" = [{}]\n", seeds.join(", "));
+            work::take();
+            let sweep = Sweep::read(&text, "seeds.toml", &[], false).unwrap();
+            assert_eq!(sweep.points.len(), points);
+            assert_eq!(sweep.points[points - 1].config.learning.seed, points as u64 - 1);
+            (work::take(), text.len())
+        };
+        for points in [10, 1000] {
+            let (bytes, length) = parsed(points);
+            assert!(bytes <= 2 * length, "{points} points of {length} bytes: {bytes} bytes parsed");
+        }
+    }
+
+    #[test]
+    fn equal_values_are_found_whatever_their_notation() {
+        let twice = |values: &str| {
+            let text =
+                format!("[world]\nleaders = [[10, 5]]\npois = [[10, 15]]\n[grid]\n\"motion.min_speed\" = {values}");
+            Sweep::read(&text, "x.toml", &[], false).unwrap_err().to_string()
+        };
+        assert!(twice("[0.5, 1.0, 0.50]").contains("found 0.5 twice, at [0] and at [2]"));
+        assert!(twice("[0.0, -0.0]").contains("twice, at [0] and at [1]"));
     }
 }

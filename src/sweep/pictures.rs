@@ -1,5 +1,5 @@
-//! What a sweep came to, as figures: `final`, `reach` and `curves`, or where keys are varied `final` alone, each as
-//! SVG, PNG and PDF.
+//! The figures of a sweep: `final`, `reach` and `curves`, or only `final` for varied keys. Each is written as SVG, PNG and
+//! PDF.
 
 use std::path::Path;
 
@@ -7,39 +7,38 @@ use super::results::{Detail, Missing, Outcome};
 use super::{Axis, Point, Sweep};
 use crate::record::RecordError;
 use crate::record::disk::Disk;
-use crate::record::ownership;
 use crate::report::curves::{Curve, PRINT, SMALL, distinct};
 use crate::report::grid::{Cell, Curves, Dots, HeatMap, Interval, Scale};
 use crate::report::scene::Format;
 
-/// Most values of an axis, and most panels, that a figure has room for.
+/// Maximum number of values of an axis, and of panels, in a figure.
 const MAX_VALUES: usize = 40;
 const MAX_PANELS: usize = 48;
-/// Most values of all varied keys together.
+/// Maximum number of values of all varied keys together.
 const MAX_ROWS: usize = 100;
-/// Longest label of a value, in millimetres.
+/// Maximum length of a label, in millimetres.
 const LONGEST: f64 = 36.0;
 
-/// A point that is done and what it came to, none where there is none.
+/// A finished point with its results, or none.
 type Spot<'a> = Option<(&'a Point, &'a Outcome)>;
 
-/// The points by the values of two axes, with a panel for each combination of the others.
+/// The points by the values of two axes, with one panel for each combination of the other axes.
 struct Facets<'a> {
     x: &'a Axis,
     y: Option<&'a Axis>,
-    /// Title, and the points `[y][x]`, with what they came to.
+    /// The title, and the points `[y][x]` with their results.
     panels: Vec<(String, Vec<Spot<'a>>)>,
 }
 
-/// What came out at the end; of grids also when it was reached, and the way there.
+/// The names of the figures: final G and, for grids, generations to reach one and learning curves.
 const FIGURES: [&str; 3] = ["final", "reach", "curves"];
 
-/// What the files of all figures are called.
+/// Returns the names of all files.
 pub fn names() -> impl Iterator<Item = String> {
     FIGURES.into_iter().flat_map(|name| Format::ALL.map(|kind| format!("{name}.{}", kind.extension())))
 }
 
-/// Draws the figures of the points that are done, over one or two axes; gives the files' names, and what was left out.
+/// Draws the figures of the finished points over one or two axes. Returns the names of the files, and why one is missing.
 ///
 /// # Errors
 /// A file cannot be written.
@@ -63,22 +62,23 @@ pub fn draw(
         Ok(scenes) => scenes,
         Err(reason) => return Ok((vec![], Some(reason))),
     };
-    let disk = ownership::enter(&Disk::default(), out, true)?;
+    let disk = Disk::default();
     let mut names = Vec::new();
     for (name, scene) in scenes {
         for kind in Format::ALL {
             let name = format!("{name}.{}", kind.extension());
             let path = out.join(&name);
-            let bytes = scene.file(kind, PRINT).map_err(|error| RecordError::Write { path: path.clone(), error })?;
-            ownership::publish(&disk, &path, |output| output.write_all(&bytes))?;
+            let bytes = scene.file(kind, PRINT);
+            let write = bytes.and_then(|bytes| disk.deliver(&path, |output| output.write_all(&bytes)));
+            write.map_err(|error| RecordError::Write { path, error })?;
             names.push(name);
         }
     }
     Ok((names, None))
 }
 
-/// The best team's G in the last generation for every value of every varied key, with a panel for each combination of
-/// the grid.
+/// Draws the best team's G in the last generation for every value of every varied key, with one panel for each
+/// combination of the grid.
 fn dots(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>]) -> Result<Dots, String> {
     let (varied, grid): (Vec<usize>, Vec<usize>) = (0..sweep.axes.len()).partition(|&axis| sweep.axes[axis].varied);
     let rows: usize = varied.iter().map(|&axis| sweep.axes[axis].values.len() - 1).sum();
@@ -117,14 +117,14 @@ fn dots(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>]) -> Result<Dots, St
     Ok(dots)
 }
 
-/// A varied key with its own value, and the others.
+/// Returns a varied key with its value in the file, and its other values.
 fn group(axis: &Axis) -> (String, Vec<String>) {
     let Scale { label, values } = scale(axis);
     (format!("{label} ({})", values[0]), values[1..].to_vec())
 }
 
 impl<'a> Facets<'a> {
-    /// The points by the axes asked for, or by the first two that have more than one value.
+    /// Arranges the points by the requested axes, or by the first two with more than one value.
     fn new(sweep: &'a Sweep, outcomes: &'a [Result<Outcome, Missing>], asked: &[usize]) -> Result<Facets<'a>, String> {
         let varied = (0..sweep.axes.len()).filter(|&axis| sweep.axes[axis].values.len() > 1 && !asked.contains(&axis));
         let wanted = if asked.is_empty() { 2 } else { asked.len() };
@@ -150,7 +150,7 @@ impl<'a> Facets<'a> {
             for &axis in others.iter().rev() {
                 let (value, axis) = (panel % counts(axis), &sweep.axes[axis]);
                 panel /= axis.values.len();
-                // What is the same in every panel tells none from another.
+                // A value that all panels share does not distinguish them.
                 if axis.values.len() > 1 {
                     parts.push(format!("{} = {}", axis.leaf(), axis.label(value)));
                 }
@@ -181,7 +181,7 @@ impl<'a> Facets<'a> {
         }
     }
 
-    /// The best team's G in the last generation.
+    /// Draws the best team's G in the last generation.
     fn last(&self) -> HeatMap {
         let key = [0.0, 0.25, 0.5, 0.75, 1.0].map(|g| (g, g.to_string())).to_vec();
         self.heat_map("G of the best team, last generation, mean over trials".into(), key, |_, outcome| {
@@ -190,7 +190,7 @@ impl<'a> Facets<'a> {
         })
     }
 
-    /// Generations to reach a G, shaded by their logarithm.
+    /// Draws the generations to reach a G, shaded by their logarithm.
     fn reach(&self, options: &Detail) -> HeatMap {
         let all = self.panels.iter().flat_map(|(_, points)| points).flatten();
         let last = all.map(|(point, _)| point.config.learning.generations).max().unwrap_or(0).max(1) as f64;
@@ -206,7 +206,7 @@ impl<'a> Facets<'a> {
         })
     }
 
-    /// Learning curves, one a value of the x axis.
+    /// Draws learning curves, one for each value of the x axis.
     fn curves(&self, sweep: &Sweep) -> Curves {
         let width = self.x.values.len();
         let mut panels = Vec::new();

@@ -10,6 +10,7 @@ use super::results::point_folder;
 use super::{Axis, Point, Sweep};
 use crate::backend::{Backend, BackendError, Group, Need};
 use crate::config::{Config, ConfigError, Override};
+use crate::escape::PathExt;
 use crate::evaluate::{self, Starts};
 use crate::record::RecordError;
 use crate::record::folder::POLICIES;
@@ -392,7 +393,7 @@ impl Study {
         let mut named = Vec::new();
         let mut weights = Vec::new();
         for (name, folder) in arms {
-            named.push(Named { name: name.clone(), folders: vec![folder.display().to_string()], trials });
+            named.push(Named { name: name.clone(), folders: vec![folder.escaped().to_string()], trials });
             weights.push(champions(&folder.join(POLICIES), config)?);
         }
         named.push(Named { name: "straight ahead".into(), folders: vec![], trials });

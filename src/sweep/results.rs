@@ -1,28 +1,29 @@
-//! What a sweep came to, put together from its points' folders: the same bytes whoever ran them, and in which order.
+//! The tables of a sweep, from its points' folders. Their bytes do not depend on who trained the points, or in what order.
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use super::{Point, Sweep};
+use super::{Axis, Point, Sweep};
 use crate::config::Config;
+use crate::escape::{self, PathExt};
 use crate::file;
 use crate::record::disk::Disk;
 use crate::record::folder::{CONFIG, METRICS, POINTS, RESULTS};
+use crate::record::metrics;
 use crate::record::{RecordError, without_checkpoint};
-use crate::record::{metrics, ownership};
 use crate::statistics::Average;
 use crate::trainer::Row;
 
-/// What [`write()`] makes of the points that are complete.
+/// The options of [`write()`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Detail {
-    /// Every how many generations `results.csv` has a row; the last always has one.
+    /// The number of generations per row of `results.csv`. The last generation always has a row.
     pub every: usize,
-    /// The G (in 0..1) whose first generation is told.
+    /// The G in 0..1 whose first generation is reported.
     pub reach: f64,
 }
 
-/// What a point's trials came to, by the best team.
+/// The results of a point's trials.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Outcome {
     /// The best team's G in the last generation of every trial.
@@ -31,23 +32,23 @@ pub struct Outcome {
     pub champion: Vec<f64>,
     /// The first generation of every trial whose best G is at least [`Detail::reach`].
     pub reached: Vec<Option<usize>>,
-    /// Generation, mean and standard error over the trials of the best G, as often as `results.csv` has rows.
+    /// Generation, mean and standard error of the best G over the trials, for each row of `results.csv`.
     pub curve: Vec<(usize, f64, f64)>,
 }
 
 impl Outcome {
-    /// The best team's G in the last generation, over the trials.
+    /// Returns the average over trials of the best team's G in the last generation.
     pub fn best(&self) -> Average {
         self.best.iter().collect()
     }
 
-    /// The champion's.
+    /// Returns the average over trials of the champion's G in the last generation.
     pub fn champion(&self) -> Average {
         self.champion.iter().collect()
     }
 
-    /// The median over the trials of the generations to reach G, where trials that never do count as later than all;
-    /// none where it is one of these.
+    /// Returns the median over trials of the first generation that reaches G. Trials that never do count as infinite, and
+    /// an infinite median is none.
     pub fn median_reached(&self) -> Option<f64> {
         let mut reached: Vec<usize> = self.reached.iter().map(|reached| reached.unwrap_or(usize::MAX)).collect();
         reached.sort_unstable();
@@ -56,31 +57,31 @@ impl Outcome {
     }
 }
 
-/// Where a point's run is in a sweep's folder.
+/// Returns the folder of a point's run.
 pub fn point_folder(out: &Path, point: &Point) -> PathBuf {
     out.join("points").join(format!("{:04}", point.index))
 }
 
-/// A point that cannot be put together, and why.
+/// The reason why a point has no results.
 #[derive(Debug, thiserror::Error)]
 pub enum Missing {
     /// Its folder has no run.
     #[error("it was not run")]
     NotRun,
-    /// Its run has come to the first generation, not yet to the second.
+    /// Its run is at the first generation of the second.
     #[error("it has come to generation {0} of {1}")]
     Unfinished(usize, usize),
-    /// Its files cannot be used, for this reason.
+    /// Its files cannot be used.
     #[error("{0}")]
     Damaged(String),
 }
 
-/// Writes `results.csv` and `points.csv` of the points that are complete; gives what every point came to.
+/// Writes `results.csv` and `points.csv` of the finished points. Returns the results of every point.
 ///
 /// # Errors
 /// The files cannot be written.
 pub fn write(sweep: &Sweep, out: &Path, options: &Detail) -> Result<Vec<Result<Outcome, Missing>>, RecordError> {
-    let disk = ownership::enter(&Disk::default(), out, true)?;
+    let disk = Disk::default();
     let mut outcomes = Vec::new();
     let path = out.join(RESULTS);
     let rows = |output: &mut dyn Write| {
@@ -103,19 +104,20 @@ pub fn write(sweep: &Sweep, out: &Path, options: &Detail) -> Result<Vec<Result<O
         }
         table.flush()
     };
-    ownership::publish(&disk, &path, rows)?;
+    disk.deliver(&path, rows).map_err(|error| RecordError::Write { path, error })?;
 
     let path = out.join(POINTS);
     let summary = |output: &mut dyn Write| summary(sweep, &outcomes, options, output);
-    ownership::publish(&disk, &path, summary)?;
+    disk.deliver(&path, summary).map_err(|error| RecordError::Write { path, error })?;
     Ok(outcomes)
 }
 
 fn labels(sweep: &Sweep, point: &Point) -> Vec<String> {
-    sweep.axes.iter().zip(&point.values).map(|(axis, &value)| axis.label(value)).collect()
+    let label = |(axis, &value): (&Axis, &usize)| escape::csv_cell(&axis.label(value)).into_owned();
+    sweep.axes.iter().zip(&point.values).map(label).collect()
 }
 
-/// `points.csv`: one row a point.
+/// Writes `points.csv`, one row per point.
 fn summary(
     sweep: &Sweep,
     outcomes: &[Result<Outcome, Missing>],
@@ -145,33 +147,33 @@ fn summary(
     table.flush()
 }
 
-/// A complete point's rows for `results.csv`, by trial and generation, and what it came to.
+/// Reads the rows of a finished point for `results.csv`, by trial and generation, and its results.
 fn read(point: &Point, out: &Path, options: &Detail) -> Result<(Vec<Row>, Outcome), Missing> {
     let folder = point_folder(out, point);
     let damaged = |error: &dyn std::fmt::Display| Missing::Damaged(error.to_string());
     let path = folder.join(METRICS);
-    if !file::exists(&path).map_err(|error| damaged(&format!("{}: cannot be read: {error}", path.display())))? {
+    if !file::exists(&path).map_err(|error| damaged(&format!("{}: cannot be read: {error}", path.escaped())))? {
         return Err(Missing::NotRun);
     }
     let config = Config::load(&folder.join(CONFIG)).map_err(|error| damaged(&error))?;
     if without_checkpoint(&config) != without_checkpoint(&point.config) {
-        return Err(Missing::Damaged(format!("{}: it is of another config", folder.display())));
+        return Err(Missing::Damaged(format!("{}: it is of another config", folder.escaped())));
     }
     let (trials, last) = (config.learning.trials, config.learning.generations);
     let mut rows: Vec<Vec<Row>> = vec![Vec::new(); trials];
     let mut reached = vec![None; trials];
     let mut next = 0;
     for row in metrics::open(&path).map_err(|error| damaged(&error))? {
-        let (row, _) = row.map_err(|error| damaged(&format!("{}: {error}", path.display())))?;
+        let (row, _) = row.map_err(|error| damaged(&format!("{}: {error}", path.escaped())))?;
         let Row { trial, generation, best_g, .. } = row;
         if (generation, trial) != (next / trials, next % trials) || generation > last {
             return Err(Missing::Damaged(format!(
                 "{}: trial {trial} of generation {generation} is out of turn",
-                path.display()
+                path.escaped()
             )));
         }
         next += 1;
-        // In an easier stage it is another G.
+        // G of an easier stage is not comparable.
         if best_g >= options.reach && reached[trial].is_none() && generation >= config.last_from() {
             reached[trial] = Some(generation);
         }

@@ -1,4 +1,4 @@
-//! Trains points side by side, each recorded as a run of its own, in batches that fit in memory.
+//! Training of points side by side, in batches that fit in memory. Each point is recorded as a run.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering::Relaxed;
@@ -11,47 +11,44 @@ use crate::record::disk::Disk;
 use crate::record::folder::{self, Note, Start};
 use crate::run::{self, Ended, RunError, Session};
 
-/// Most points in one batch: each keeps two files open, and most systems allow a process 1024 or, where it asks as the
-/// program does, more.
+/// Maximum number of points per batch. Each keeps two files open, and most systems allow a process at least 1024.
 const MAX_BATCH: usize = 400;
 
-/// How points are run.
-pub struct Manner<'a> {
-    /// What is to be done about runs that are there.
+/// How points are trained.
+pub struct SweepOptions<'a> {
+    /// How to treat existing runs.
     pub start: Start,
-    /// The disk within the sweep's folder, or within one above it.
-    pub disk: &'a Disk,
-    /// Bytes that the points of a batch may take; more points than fit run in several batches, to the same results.
+    /// Bytes for the points of a batch. The number of batches does not change the results.
     pub memory: usize,
-    /// As for any run, but for its watch.
+    /// The options of the runs, except `watch`.
     pub runs: run::Options<'a>,
-    /// Told of every generation played.
-    pub watch: &'a mut dyn FnMut(&Headway),
-    /// Told what was found in a point's folder.
+    /// Called after every generation.
+    pub watch: &'a mut dyn FnMut(&SweepProgress),
+    /// Called with every note about a point's folder.
     pub note: &'a mut dyn FnMut(&Point, &Note),
 }
 
-/// How far the points have come.
+/// The progress of the points.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Headway {
-    /// Points done, those found done included.
+pub struct SweepProgress {
+    /// Number of finished points, including those finished earlier.
     pub done: usize,
-    /// Points in all.
+    /// Number of points.
     pub points: usize,
-    /// Points in the batch.
+    /// Number of unfinished points in the batch.
     pub batch: usize,
-    /// The generation that the first of the batch plays next.
+    /// The lowest next generation in the batch.
     pub generation: usize,
-    /// The last generation of any of the batch.
+    /// The highest last generation in the batch.
     pub last: usize,
-    /// Steps of a team played so far, by all points that are being or have been run now.
+    /// Team-steps played so far in this process.
     pub played: u128,
-    /// Steps of a team, those to be played included.
+    /// Team-steps to be played in this process.
     pub total: u128,
 }
 
-/// Bytes that a point's run takes: three times its policies (this generation, the next, a checkpoint) and what its
-/// teams score.
+/// Returns the bytes for training a point: its policies three times (this generation, the next, a checkpoint) and its
+/// scores.
 pub fn bytes(config: &Config) -> usize {
     let learning = &config.learning;
     let episodes = config.staged().iter().map(|(_, config)| config.learning.episodes_per_team).max().unwrap_or(1);
@@ -61,7 +58,7 @@ pub fn bytes(config: &Config) -> usize {
     bytes.try_into().unwrap_or(usize::MAX)
 }
 
-/// Steps of a team that a point takes until it is done.
+/// Returns the team-steps of a point.
 fn team_steps(config: &Config) -> u128 {
     let of_stage = |config: Config| {
         let learning = &config.learning;
@@ -71,7 +68,7 @@ fn team_steps(config: &Config) -> u128 {
     config.shares().into_iter().map(of_stage).sum()
 }
 
-/// Cuts points into batches that fit in memory, in order; a point that does not fit is a batch of its own.
+/// Splits points into batches that fit in memory, in order. A point that does not fit is a batch of its own.
 pub fn batches<'a>(points: &'a [&'a Point], memory: usize) -> Vec<&'a [&'a Point]> {
     let mut rest = points;
     let mut batches = Vec::new();
@@ -88,26 +85,30 @@ pub fn batches<'a>(points: &'a [&'a Point], memory: usize) -> Vec<&'a [&'a Point
     batches
 }
 
-/// Runs points, each in its folder under `out`, or goes on with them.
+/// Trains points, each in its folder in `out`, or resumes them.
 ///
 /// # Errors
-/// A folder cannot be used or written, there is too little memory, or the backend fails; what came before is saved.
-pub fn run(points: &[&Point], out: &Path, player: &mut Player, options: &mut Manner<'_>) -> Result<Ended, RunError> {
+/// A folder cannot be used or written, memory is insufficient, or the backend fails. Earlier progress is saved.
+pub fn run(
+    points: &[&Point],
+    out: &Path,
+    player: &mut Player,
+    options: &mut SweepOptions<'_>,
+) -> Result<Ended, RunError> {
     let total = points.iter().map(|point| team_steps(&point.config)).sum();
-    let mut progress = Headway { done: 0, points: points.len(), batch: 0, generation: 0, last: 0, played: 0, total };
-    // Nothing of an earlier batch is lost, either, to a point that cannot be had.
+    let mut progress =
+        SweepProgress { done: 0, points: points.len(), batch: 0, generation: 0, last: 0, played: 0, total };
+    // All folders are checked first, so that no batch trains before a later one is refused.
     let folders: Vec<PathBuf> = points.iter().map(|point| point_folder(out, point)).collect();
-    let disk = options.disk;
-    let configs = points.iter().map(|point| &point.config);
-    folder::check(disk, folders.iter().map(|path| &**path).zip(configs), options.start)?;
+    folder::check(folders.iter().map(|path| &**path), options.start).map_err(RunError::from)?;
     for batch in batches(points, options.memory) {
         if options.runs.stop.load(Relaxed) {
             return Ok(Ended::Stopped);
         }
         let runs = batch.iter().map(|point| (point.config.clone(), point_folder(out, point))).collect();
-        let (mut session, notes) = Session::open(runs, options.start, disk)?;
+        let (mut session, notes) = Session::open(runs, options.start, &Disk::default())?;
         notes.iter().for_each(|(run, note)| (options.note)(batch[*run], note));
-        // Steps that an earlier session played are none of this one's.
+        // Steps of earlier sessions do not count.
         let resumed: u128 = batch.iter().zip(session.generations()).map(|(point, &next)| played(point, next)).sum();
         progress.total -= resumed;
         let (done, before, watch) = (progress.done, progress.played, &mut *options.watch);
@@ -132,12 +133,12 @@ pub fn run(points: &[&Point], out: &Path, player: &mut Player, options: &mut Man
     Ok(Ended::Done)
 }
 
-/// A point's last generation.
+/// Returns the last generation of a point.
 fn last(point: &Point) -> usize {
     point.config.learning.generations
 }
 
-/// Steps of a team that a point has played that plays a generation next.
+/// Returns the team-steps that a point has played before a generation.
 fn played(point: &Point, next: usize) -> u128 {
     let generations = last(point) + 1;
     team_steps(&point.config) / generations as u128 * next.min(generations) as u128

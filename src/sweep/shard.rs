@@ -1,4 +1,4 @@
-//! Which points each of many processes takes: a pure function of the sweep, so that they need not talk to each other.
+//! The assignment of points to processes: a pure function of the sweep, so that processes need not communicate.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -9,24 +9,26 @@ use super::Point;
 use crate::config::Config;
 use crate::world::World;
 
-/// Most shards of a sweep.
+/// Maximum number of shards of a sweep.
 pub const MAX_SHARDS: usize = 1 << 16;
 
 /// Shard `index` (from 1) of `count`; written `1/4` to `4/4`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shard {
-    /// Which part, from 1.
+    /// The number of this shard, from 1.
     pub index: usize,
-    /// Parts in all.
+    /// The number of shards.
     pub count: usize,
 }
 
 impl Shard {
-    /// All of it.
+    /// The only shard.
     pub const WHOLE: Shard = Shard { index: 1, count: 1 };
 
+    /// Returns a shard.
+    ///
     /// # Errors
-    /// No such shard, in words.
+    /// A message if there is no such shard.
     pub fn new(index: usize, count: usize) -> Result<Shard, String> {
         match count {
             1..=MAX_SHARDS if (1..=count).contains(&index) => Ok(Shard { index, count }),
@@ -37,13 +39,14 @@ impl Shard {
         }
     }
 
-    /// The shard that a job array gives this process, none outside of one; `get` looks up an environment variable.
+    /// Returns the shard of this process in a job array, or none outside of an array. `get` reads an environment
+    /// variable.
     ///
-    /// Slurm's array tells all that is needed (its ids may start anywhere); a Kubernetes indexed job tells its index
-    /// in `JOB_COMPLETION_INDEX`, and `FLOTILLA_SHARDS` has to tell its `completions`.
+    /// Slurm sets all required variables, and its ids may start anywhere. A Kubernetes indexed job sets
+    /// `JOB_COMPLETION_INDEX`, and `FLOTILLA_SHARDS` must be its `completions`.
     ///
     /// # Errors
-    /// Variables that do not fit together, in words.
+    /// A message about variables that contradict each other.
     pub fn from_env(get: impl Fn(&str) -> Option<String>) -> Result<Option<Shard>, String> {
         let number = |name: &str| match get(name) {
             None => Ok(None),
@@ -75,14 +78,14 @@ impl Shard {
         shard.map(Some).map_err(|error| format!("{names}: {error}; say --shard I/N where the array has gaps"))
     }
 
-    /// This shard's points, in order (see [`deal`]).
+    /// Returns the points of this shard in order, see [`deal`].
     pub fn take<'a>(&self, points: &'a [Point]) -> Vec<&'a Point> {
         let of = deal(points, self.count);
         points.iter().zip(of).filter(|(_, of)| *of == self.index).map(|(point, _)| point).collect()
     }
 }
 
-/// The shard (from 1) of every point, of so many: dealt out dearest first, each to the shard with the least to do.
+/// Assigns each point to one of `count` shards, from 1: in order of decreasing cost, each to the least loaded shard.
 pub fn deal(points: &[Point], count: usize) -> Vec<usize> {
     let mut order: Vec<(u128, usize)> = points.iter().map(cost).zip(0..).collect();
     order.sort_by_key(|&(cost, at)| (Reverse(cost), points[at].index));
@@ -114,8 +117,8 @@ impl Display for Shard {
     }
 }
 
-/// About how many operations a point takes: teams played, times steps, times what an agent does in one, with the
-/// counts of a step's arithmetic (networks, pairs of agents, sensing, coupling).
+/// Estimates the number of operations of a point: teams × steps × operations per step (networks, pairs of agents,
+/// sensing, coupling).
 pub fn cost(point: &Point) -> u128 {
     point.config.shares().iter().map(cost_of_stage).sum()
 }
