@@ -1,4 +1,4 @@
-//! Makes `docs/develop/evidence.md` of the files in `docs/develop/evidence/`, each of which a run wrote.
+//! Makes `docs/develop/evidence.md` from the files in `docs/develop/evidence/`, each of which a run wrote.
 //!
 //! ```text
 //! flotilla verify --report docs/develop/evidence/my-machine.json
@@ -29,21 +29,20 @@ fn main() -> ExitCode {
 }
 
 const HEAD: &str = "\
-# The same bits everywhere: what was seen
+# Evidence of equal bits
+
+For readers who ask on which machines the same bits were seen, and for anyone who wants to add a machine.
 
 <!-- made of the files in docs/develop/evidence by: cargo run --example evidence -->
 
-Config and seed are to decide every bit of a run, on every machine. That is a claim about compilers, drivers and processors that
-nobody can try all of, so here is what was tried, each row by a program that wrote down what it found. A row holds for the
-machine, the driver *and* the toolchain that it names.
+Config and seed decide every bit of a run, on every machine. Nobody can try all compilers, drivers and processors. This page lists what was
+tried. Each row was written by a program that compared results, and holds for the machine, driver and toolchain that it names.
 
-- *executed*: it ran there, or under the emulator that the row names, and its bits were compared;
-- *machine code read*: a compiler for a device that was not there, its driver's own or its maker's, made code, and a test read it
-  and ran it in an emulator, where the row says so;
-- *compiled*: it compiles for there; nothing ran.
+- *executed*: it ran there, or in the emulator that the row names, and its bits were compared;
+- *machine code read*: a compiler for an absent device made code, and a test inspected it and ran it in an emulator if the row says so;
+- *compiled*: it compiles for that target; nothing ran.
 
-What no row shows is argued [below](#what-it-relies-on). Every GPU, in a row or not, has to pass `flotilla`'s own probes each time
-that it is opened, or it is refused.
+Every GPU, listed or not, has to pass flotilla's own tests each time that it is opened. Otherwise it is refused.
 
 ## Add your machine
 
@@ -51,40 +50,39 @@ that it is opened, or it is refused.
 flotilla verify --worlds 20 --report my-machine.json
 ```
 
-compares the instruction sets of the processor with each other and every GPU with the CPU, trains six short runs, and
-writes all that, with the names of processor, driver and compiler, into one small file. `--note` adds what else there is to
-know. Send the file in, or put it into `docs/develop/evidence/` and say `cargo run --example evidence`. What differs belongs there as well.
-Built with `--features scalar` the instruction sets are compared with code that has none.
+This compares the processor's instruction sets with each other and every GPU with the CPU, and trains six short runs. It writes the results,
+with the names of processor, driver and compiler, into one small file. `--note` adds a remark. Send the file in, or put it into
+`docs/develop/evidence/` and run `cargo run --example evidence`. Differences belong here, too. A build with `--features scalar` also compares
+with code that uses no vector instructions.
 ";
 
 const TAIL: &str = "\
-## What it relies on
+## What exactness relies on
 
-and does not control, with the test that would notice. Names are those of functions in `tests/`.
+flotilla does not control the following. Each line names the functions in `tests/` that would notice a change.
 
-| relied on | why it might not be so | noticed by |
+| assumption | why it might fail | noticed by |
 |---|---|---|
-| a float sum or product is rounded to nearest, ties to even | WGSL leaves the rounding of `+ - *` open | probes whenever a GPU is opened; `devices_are_exact_under_both_passes` |
+| float sums and products are rounded to nearest, ties to even | WGSL leaves the rounding of `+ - *` open | probes whenever a GPU is opened; `devices_are_exact_under_both_passes` |
 | no product is fused with a sum, no sum reordered | WGSL allows both, and drivers do both | the same probes; `the_probes_catch_a_device_without_a_pass`, `what_the_compiler_writes_is_exact_small_and_fast` |
-| a guard `x \\| 0` with a zero that only the run time knows stays | a compiler that knew the zero could drop it | `guards_are_not_cancelled`; `every_product_is_guarded_in_metals_and_directx_text` |
-| a sum has a guard, or nothing reads it but a comparison of whole numbers, by its bits | a compiler might take that for one of floats, and move the sum across it; none is known to | the probes; `only_what_is_compared_by_its_bits_needs_no_guard` |
-| naga writes no options and no function that fuses into Metal's and DirectX's text | a later version might | `every_product_is_guarded_in_metals_and_directx_text` |
-| a driver keeps `NoContraction` | Vulkan asks it of drivers | the probes; `every_float_result_is_decorated` |
-| numbers of normal size are not flushed to zero | they never are; those below 2^-126 may be, so none comes up | `flush_makes_small_values_positive_zero`, `no_value_comes_near_the_denormals`, `twins_have_the_same_numbers` |
-| `bitcast` of a NaN is never needed, nor is one ever made | WGSL may change a NaN's bits, and may assume that there is none | `a_valid_config_makes_normal_constants`, `kernels_follow_the_model` |
-| constants in shaders are what they look like | naga folds expressions of literals in f64, and built-ins by the host's library | `no_shader_leaves_the_core` |
-| sines, cosines and logarithms of the host | each platform's library rounds them as it likes | none is asked: `nothing_asks_the_platform_for_a_function` |
-| the compiler of Rust neither fuses nor reorders | it never does unless told to | golden digests by every instruction set: `every_instruction_set` |
-| instruction sets round alike | lanes, masks and conversions differ in their corners | `levels_give_the_same_bits`, `every_instruction_set` |
+| a guard `x \\| 0` remains, because the zero is known only at run time | a compiler that knew the zero could remove it | `guards_are_not_cancelled`; `every_product_is_guarded_in_metals_and_directx_text` |
+| a sum has a guard, or only a comparison of its bits as an integer reads it | a compiler might treat that as a float comparison; none is known to | the probes; `only_what_is_compared_by_its_bits_needs_no_guard` |
+| naga writes no option or function that fuses operations for Metal and DirectX | a later version might | `every_product_is_guarded_in_metals_and_directx_text` |
+| a driver keeps `NoContraction` | Vulkan requires it of drivers | the probes; `every_float_result_is_decorated` |
+| numbers of normal size are not flushed to zero | they never are; numbers below 2^-126 may be, so none occurs | `flush_makes_small_values_positive_zero`, `no_value_comes_near_the_denormals`, `twins_have_the_same_numbers` |
+| `bitcast` of a NaN is never needed, nor is one ever made | WGSL may change a NaN's bits and may assume that none exists | `a_valid_config_makes_normal_constants`, `kernels_follow_the_model` |
+| constants in shaders have the value that they show | naga folds literals in f64 and built-ins with the host's library | `no_shader_leaves_the_core` |
+| sines, cosines and logarithms of the host | each platform's library rounds them differently | none is called: `nothing_asks_the_platform_for_a_function` |
+| Rust's compiler neither fuses nor reorders | it does so only on request | golden digests with every instruction set: `every_instruction_set` |
+| instruction sets round alike | masks and conversions differ in corner cases | `levels_give_the_same_bits`, `every_instruction_set` |
 | text becomes the nearest float, and floats become text and back | Rust's own library does both | `the_program_tells_the_same_digest` |
 
-Three things are outside the promise: how long anything takes; the last digits of p-values and intervals in comparisons, where
-the `statrs` crate asks the platform for logarithms; and a process whose host has changed the rounding of its threads.
+Three things are not promised: times; the last digits of p-values and intervals, for which the `statrs` crate uses the platform's
+logarithms; and processes that change the rounding mode of their threads.
 
-On Metal the guarded pass alone is used. It hangs on no compile option: what stands between a product and the sum after it
-is an integer operation with a word that is read from a buffer, and no option lets a compiler guess that word. The other way
-would be `#pragma METAL fp contract(off)` at the head of the text, which on Apple's compilers has kept a product and a sum
-apart where no option did; naga has no place for it. Nobody has run flotilla on a GPU of hardware, on Metal or on DirectX yet.
+On Metal only the guarded pass is used. It does not depend on compiler options. Between a product and the sum after it stands an integer
+operation with a word read from a buffer, whose value no compiler can know. Nobody has run flotilla on a hardware GPU, on Metal or on DirectX
+yet.
 ";
 
 /// The page, of all files of a folder.
@@ -156,7 +154,7 @@ fn overview(rows: &BTreeMap<String, Sighting>) -> String {
     if !digests.is_empty() {
         let of = rows.values().filter(|evidence| !evidence.trained.is_empty()).count();
         text += &format!(
-            "\nThe short trainings (two trials of ten generations) and the digests that most of {of} rows came to:\n\n| training | SHA-256 |\n|---|---|\n"
+            "\nThe short trainings (two trials of ten generations) and the digests of most of {of} rows:\n\n| training | SHA-256 |\n|---|---|\n"
         );
         digests.iter().for_each(|(config, digest)| text += &format!("| {config} | `{digest}` |\n"));
     }

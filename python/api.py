@@ -12,12 +12,14 @@ sys.path = sys.path[1:]
 import flotilla
 
 OPENING = """\
-# flotilla in Python
+# Python reference
 
-Everything that `import flotilla` gives. [The package's own page](../../python/README.md) starts with what it is for. Arrays are
-NumPy's; shapes are written `[teams, leaders, 8]`. Every example here is run by the package's tests, with `np` for NumPy.
+For Python users: every function and class of `import flotilla`.
 
-This page is made from the docstrings by `python python/api.py > docs/reference/python.md`, and a test fails where they differ.
+[The same in Python](../tutorial/python.md) is a gentler start. Arrays are NumPy's; shapes are written `[teams, leaders, 8]`. Every
+example is run by the package's tests, with `np` for NumPy.
+
+This page is made from the docstrings by `python python/api.py > docs/reference/python.md`.
 """
 ORDER = [
     ("Configs", ["Config", "Key", "ConfigError", "Problem"]),

@@ -160,7 +160,7 @@ fn a_row_that_differs_shows() {
 #[test]
 fn the_tests_that_the_page_names_are_there() {
     let page = fs::read_to_string(root().join("docs/develop/evidence.md")).unwrap();
-    let table = page.split("## What it relies on").nth(1).unwrap();
+    let table = page.split("## What exactness relies on").nth(1).unwrap();
     let rows = table.lines().filter(|line| line.starts_with("| "));
     let names = rows.filter_map(|line| line.trim_end_matches(" |").rsplit(" | ").next());
     let names: Vec<&str> = names.flat_map(|cell| cell.split('`').skip(1).step_by(2)).collect();

@@ -6,25 +6,26 @@ use flotilla::config::{self, Config, Coupling, Definition, Override};
 
 const PAGE: &str = "docs/reference/config.md";
 const OPENING: &str = "\
-# Every key of a config
+# Config keys
 
-A config is a TOML file of the sections below. `world.leaders` and `world.pois` have to be given; every other key has the
-default shown here, and `flotilla check CONFIG` writes all of them out. Whatever is wrong with a file is told at once, by line,
-with what is allowed. Lengths are in map units, times in seconds, angles in radians.
+For users who write configs: every key, its unit, range, default and meaning.
 
-[model.md](../explain/model.md) has the equations. The last column is the section and equation of the paper, *Structural Credit Assignment
-for Multiagent Leader-Based Learning*; where it is empty, the paper says nothing of the key. The paper gives numbers for
-hardly any of these: model.md says which, how the others were chosen, and how much hangs on them.
+A config is a TOML file with the sections below. `world.leaders` and `world.pois` are required; every other key has the default shown
+here. `flotilla check CONFIG` prints all values and reports every error at once, with its line. Lengths are in map units, times in seconds,
+angles in radians.
 
-This page is made from the program's own table of keys by `FLOTILLA_WRITE=1 cargo test --test reference`, and that test fails
-where they differ.
+[The model](../explain/model.md) has the equations. The last column is the section and equation of the paper, *Structural Credit
+Assignment for Multiagent Leader-Based Learning*. It is empty if the paper does not mention the key. The paper gives numbers for hardly any
+key; [choices](../explain/choices.md) explains how the others were chosen.
+
+This page is made from the program's table of keys by `FLOTILLA_WRITE=1 cargo test --test reference`.
 ";
 
 const CLOSING: &str = "
 ## `[[stages]]`
 
-Any number of these, in order of `from`, each of the file's own keys with some changed from a generation on
-([model.md](../explain/model.md#learning-section-43-algorithm-1)).
+Any number of stages, in order of `from`. Each starts from the file's own keys and changes some of them
+([curricula](../explain/model.md#learning-section-43-algorithm-1)).
 
 | key | unit | type | range | default | meaning | paper |
 |---|---|---|---|---|---|---|

@@ -48,7 +48,8 @@ def test_examples_do_what_they_say(name, thing):
 
 
 def snippets():
-    for page in (ROOT / "README.md", ROOT / "python/README.md", ROOT / "docs/reference/python.md"):
+    pages = ("README.md", "python/README.md", "docs/reference/python.md", "docs/tutorial/python.md", "docs/how-to/another-optimiser.md")
+    for page in map(ROOT.joinpath, pages):
         for number, (why, code) in enumerate(re.findall(r"(<!-- not run: .*? -->\n\n?)?```python\n(.*?)```", page.read_text(), re.S)):
             if not why and ">>>" not in code:
                 yield pytest.param(code, id=f"{page.relative_to(ROOT)} {number}")
