@@ -289,7 +289,6 @@ impl<T: Number> Allowed<T> {
 }
 
 /// The plain range: the gap above 0 is only worth a word to who wrote a number within it.
-
 impl<T: Number> Display for Allowed<T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Allowed { low, high, .. } = self;
