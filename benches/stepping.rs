@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, Group, Need};
+use flotilla::backend::{Backend, Group, RecordRequest};
 use flotilla::config::Config;
 use flotilla::evolve::{Key, Purpose, random_policy};
 use flotilla::stepping::Stepper;
@@ -48,7 +48,7 @@ fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result
         weights,
         policies: teams,
         teams: &order,
-        need: Need::Scores,
+        need: RecordRequest::Scores,
     };
     let groups = [group(&world, weights[0][..].into()), group(&small, weights[1][..].into())];
     let mut cpu = Cpu::at_level(level);

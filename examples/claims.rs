@@ -8,7 +8,7 @@ use std::process::ExitCode;
 
 use flotilla::backend::cpu::Cpu;
 use flotilla::baseline::Baselines;
-use flotilla::config::Override;
+use flotilla::config::{Override, ValidConfig};
 use flotilla::report::paper::{self, Evidence, claims, tables};
 use flotilla::trainer::Row;
 use flotilla::trainer::Trainer;
@@ -50,7 +50,7 @@ fn measure(keys: &[Override]) -> Result<String, String> {
     let mut arms = paper::arms(keys).map_err(|error| error.to_string())?;
     let (configs, places) = paper::trained(&arms);
     let mut backend = Cpu::default();
-    let mut trainer = Trainer::new(configs);
+    let mut trainer = Trainer::new(ValidConfig::all(&configs).unwrap());
     for row in trainer.finish(&mut backend).map_err(|error| error.to_string())? {
         for (arm, _) in places.iter().enumerate().filter(|&(_, &place)| place == row.arm) {
             arms[arm].add(&Row { arm, ..row });

@@ -1,9 +1,9 @@
-// How fast sums and products go at most: independent chains in registers, 6 of products and 6 of sums a thread.
-// Each turn of the loop is TURN lane operations (src/backend/gpu/probe.rs).
+// The arithmetic ceiling: independent chains in registers, 6 of products and 6 of sums per thread. One iteration is
+// OPERATIONS_PER_ITERATION lane operations (src/bench/gpu_ceiling.rs).
 
-// factor, term, a sum that never comes out.
+// Factor, term, and a sum that never results.
 @group(0) @binding(1) var<storage, read> numbers: array<f32>;
-// How many turns.
+// The number of iterations.
 @group(0) @binding(2) var<storage, read> turns: array<u32>;
 @group(0) @binding(3) var<storage, read_write> result: array<f32>;
 
@@ -52,7 +52,7 @@ fn ceiling(@builtin(local_invocation_index) thread: u32) {
         t = t + term;
     }
     let all = p + q + s + t;
-    // Only this keeps the chains from being left out.
+    // Without a use of the results the compiler would remove the chains.
     if (all.x + all.y + all.z == numbers[2]) {
         result[thread] = all.x;
     }

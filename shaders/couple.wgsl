@@ -1,6 +1,6 @@
-// Who is close enough to a POI to observe it (Equations 3 and 4).
+// Who is close enough to a POI to observe it (paper, Equations 3 and 4).
 
-// Whether the POI at offset (`dx`, `dy`) is within its observation radius.
+// Returns whether the POI at offset (`dx`, `dy`) is within its observation radius.
 fn observes(dx: f32, dy: f32) -> bool {
     return within(dx, dy, world.observation_radius2);
 }

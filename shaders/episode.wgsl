@@ -1,48 +1,48 @@
-// Whole episodes: a workgroup plays some teams from start to end, state in registers and workgroup memory. Long ones
-// take several dispatches, with the state kept in between.
+// Whole episodes: a workgroup plays some teams from start to end, with state in registers and workgroup memory. Long
+// episodes take several dispatches, with the state stored in between.
 //
-// One text for two kernels. In one made for its world all sizes are constants; in the generic one they are read with
-// the task (`generic.wgsl`). The host puts in front:
-//   WORKGROUP  threads of a workgroup
-//   SLOTS      agents a thread plays, one after another
+// One text makes two kernels. In the specialised one all sizes are constants. In the generic one they are read with the
+// task (`generic.wgsl`). The host prepends:
+//   WORKGROUP  threads per workgroup
+//   SLOTS      agents per thread, played one after another
 //   SHARED     agents of a workgroup's teams
-//   TRACE      whether every stage of every step is kept
-//   SIGHTED    whether it is recorded which leaders each follower sees at each step
-//   TALLY      whether a follower counts the leaders that it sees in registers (SIGHTS of them), not in the record
+//   TRACE      whether every stage of every step is recorded
+//   SIGHTED    whether the leaders that each follower sees at each step are recorded
+//   TALLY      whether a follower counts the leaders it sees in registers (SIGHTS of them), not in the record
 //   shape      the sizes
-//   variant    what the step has code of its own for
-//   adopt      readies them
+//   variant    the choices between formulas
+//   adopt      sets both for a task
 //   decide     a leader's policy
 //
-// Neighbouring threads play the same agent of neighbouring teams: they do the same, read neighbouring weights, and are
-// often all out of reach of the same agent. Leaders come first, followers start at the next multiple of ROLE threads,
-// so that the two rarely share a warp.
+// Neighbouring threads play the same agent of neighbouring teams. They execute the same code, load neighbouring
+// weights, and are often all out of reach of the same agent. Leaders come first. Followers start at the next multiple
+// of ROLE threads, so that the two rarely share a warp.
 
 const ROLE: u32 = 32u;
 
-// What is fixed for a whole kernel, or for a task.
+// Sizes that are constant in a kernel, or for a task.
 struct Shape {
     leaders: u32,
     agents: u32,
     pois: u32,
     words: u32,
-    // Teams of a workgroup; a task may have fewer.
+    // Teams per workgroup. A task may have fewer.
     teams: u32,
 }
 
-// This task's world.
+// The task's world.
 var<private> world: Constants;
 
-// Positions of all agents, `[agents][teams]`, as of the last step, and as of this step: the two take turns, so that one
-// barrier a step is enough.
+// Positions of all agents, `[agents][teams]`, after the last step and after this step. The two halves alternate, so
+// that one barrier per step is enough.
 var<workgroup> positions: array<vec2<f32>, 2u * SHARED>;
 
-// What one thread plays: an agent of a team, with its state and what it wants next.
+// What one thread plays: an agent of a team, its state, and its wanted course.
 struct Agent {
     plays: bool,
     team: u32,
     agent: u32,
-    // Its place in `positions`.
+    // Its index in `positions`.
     seat: u32,
     x: f32,
     y: f32,
@@ -50,15 +50,15 @@ struct Agent {
     hy: f32,
     speed: f32,
     next: Course,
-    // How often it saw each leader.
+    // The number of steps at which it saw each leader.
     seen: array<u32, SIGHTS>,
-    // For the trace: what was sensed and answered, or the force.
+    // For the trace: a leader's inputs and outputs, or a follower's force.
     inputs: array<f32, INPUTS>,
     outputs: vec2<f32>,
     force: vec2<f32>,
 }
 
-// The agent that place `index` of the workgroup plays.
+// Returns the agent that place `index` of the workgroup plays.
 fn find_seat(index: u32, teams: u32) -> Agent {
     var agent: Agent;
     let leaders = shape.teams * shape.leaders;
@@ -71,7 +71,8 @@ fn find_seat(index: u32, teams: u32) -> Agent {
     return agent;
 }
 
-// Which of 32 agents from `base` on a leader at this place could sense, a bit each. Its team's positions start at `first`.
+// Returns which of 32 agents from `base` on are within a leader's range, one bit each. Its team's positions start at
+// `first`.
 fn reached(first: u32, base: u32, x: f32, y: f32) -> u32 {
     var near = 0u;
     for (var other = base; other < min(base + 32u, shape.agents); other++) {
@@ -98,8 +99,8 @@ fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
     }
     var of_agents = vec4(0.0);
     for (var word = 0u; word < shape.words; word++) {
-        // First who is in reach, then each thread goes through its own: a warp takes as many turns as one of its threads
-        // has others in reach at most, not as many as are in reach of any.
+        // The first loop finds the agents in reach, and the second iterates over these only. A warp then takes as many
+        // iterations as its busiest thread, not as many as there are agents in reach of any thread.
         let base = word * 32u;
         var near = reached(first, base, x, y);
         near &= ~select(0u, 1u << (leader % 32u), leader / 32u == word);
@@ -122,12 +123,12 @@ fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
     (*me).next = Course(heading.x, heading.y, wanted_speed(outputs.y));
 }
 
-// Where a follower's count of a leader stands in the record.
+// Returns the index in the record of a follower's count of a leader.
 fn sight(task: Task, me: ptr<function, Agent>, leader: u32) -> u32 {
     return task.seen + (((*me).agent - shape.leaders) * shape.leaders + leader) * task.teams + (*me).team;
 }
 
-// A follower counts the leaders that it sees and follows whoever is near. Its team's positions start at `first`.
+// A follower counts the leaders it sees, and follows the agents near it. Its team's positions start at `first`.
 fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
     let x = (*me).x;
     let y = (*me).y;
@@ -154,7 +155,7 @@ fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
     (*me).next = steer(pull, sizes(pull), (*me).hx, (*me).hy, (*me).speed);
 }
 
-// Everyone moves.
+// Moves the agent.
 fn go(me: ptr<function, Agent>) {
     let next = (*me).next;
     let heading = renormalize(next.hx, next.hy);
@@ -167,8 +168,8 @@ fn go(me: ptr<function, Agent>) {
     (*me).speed = speed;
 }
 
-// Records who is near each POI after a step, of positions from `now` on: one thread a POI, word and team, from the last
-// thread on, since followers are done before leaders.
+// Records the agents at each POI after a step, from positions that start at `now`. One thread per POI, word and team,
+// from the last thread on, because followers finish before leaders.
 fn couple(task: Task, step: u32, now: u32, thread: u32) {
     let rows = shape.pois * shape.words;
     for (var item = WORKGROUP - 1u - thread; item < rows * shape.teams; item += WORKGROUP) {
@@ -188,13 +189,13 @@ fn couple(task: Task, step: u32, now: u32, thread: u32) {
     }
 }
 
-// Records which leaders each follower sees before a step, of positions from `now` on: one thread a follower, word and
-// team.
+// Records which leaders each follower sees before a step, from positions that start at `now`. One thread per follower,
+// word and team.
 fn watch(task: Task, step: u32, now: u32, thread: u32) {
     let followers = shape.agents - shape.leaders;
     let words = (shape.leaders + 31u) / 32u;
     let rows = followers * words;
-    // Behind the counts.
+    // Sightings come after the counts.
     let sights = task.seen + followers * shape.leaders * task.teams;
     for (var item = thread; item < rows * shape.teams; item += WORKGROUP) {
         let team = item % shape.teams;
@@ -224,7 +225,7 @@ fn trace(task: Task, step: u32, me: ptr<function, Agent>) {
     moments[task.moments + (step * task.teams + (*me).team) * shape.agents + (*me).agent] = moment;
 }
 
-// The start of an episode.
+// Starts an episode.
 fn begin(task: Task, me: ptr<function, Agent>) {
     let start = places[task.starts + (*me).agent];
     (*me).x = start.x;
@@ -242,7 +243,7 @@ fn begin(task: Task, me: ptr<function, Agent>) {
     }
 }
 
-// Where the dispatch before this one left off.
+// Continues from the previous dispatch.
 fn resume(task: Task, me: ptr<function, Agent>) {
     let state = states[task.states + (*me).team * shape.agents + (*me).agent];
     (*me).x = state.x;
@@ -255,7 +256,7 @@ fn resume(task: Task, me: ptr<function, Agent>) {
     }
 }
 
-// What is left at the end of a dispatch.
+// Stores the state at the end of a dispatch.
 fn leave(task: Task, me: ptr<function, Agent>) {
     for (var leader = 0u; TALLY && leader < shape.leaders && (*me).agent >= shape.leaders; leader++) {
         record[sight(task, me, leader)] = (*me).seen[leader];
@@ -272,7 +273,7 @@ fn episode(
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    // A dispatch may hold a few workgroups more than there are tasks; their tasks are empty.
+    // A dispatch may have a few more workgroups than tasks. Their tasks are empty.
     let index = workgroup.y * workgroups.x + workgroup.x;
     let task = tasks[index];
     world = worlds[task.world];

@@ -1,6 +1,7 @@
-// A follower's preset behaviour: drawn to agents in sight, pushed off close ones and walls (Section 4.1, Figure 2b).
+// The followers' preset behaviour: attraction to agents in sight, repulsion from close ones and walls (paper, Section
+// 4.1, Figure 2b).
 
-// Offsets to the agents within a follower's radii, summed and counted.
+// Sums and counts of the offsets to agents within a follower's radii.
 struct Sums {
     repel_x: f32,
     repel_y: f32,
@@ -17,17 +18,17 @@ struct Course {
     speed: f32,
 }
 
-// Whether a follower sees the agent at offset (`dx`, `dy`): whether it is within the attraction radius.
+// Returns whether a follower sees the agent at offset (`dx`, `dy`): it is within the attraction radius.
 fn sees(dx: f32, dy: f32) -> bool {
     return within(dx, dy, world.attraction_radius2);
 }
 
-// Adds the agent at offset (`dx`, `dy`); tells whether it is within the attraction radius.
+// Adds the agent at offset (`dx`, `dy`), and returns whether the follower sees it.
 fn influence(dx: f32, dy: f32, sums: ptr<function, Sums>) -> bool {
     let seen = within(dx, dy, world.attraction_radius2);
     if seen {
         let near = within(dx, dy, world.repulsion_radius2);
-        // One sum grows; the other would by 0, which changes no bit of it.
+        // One sum grows. Adding 0 to the other would not change its bits.
         let old = *sums;
         let x = select(old.attract_x, old.repel_x, near) + dx;
         let y = select(old.attract_y, old.repel_y, near) + dy;
@@ -41,15 +42,15 @@ fn influence(dx: f32, dy: f32, sums: ptr<function, Sums>) -> bool {
     return seen;
 }
 
-// What acts on a follower: the force, and whether any agent or wall is near.
-struct Pull {
+// The force on a follower, and whether any agent or wall is near.
+struct SteeringForce {
     x: f32,
     y: f32,
     influenced: bool,
 }
 
-// The push of the two walls of one axis, at 0 and at `size`, and a number that is not negative if either is within the
-// repulsion radius.
+// Returns the push of the two walls of one axis, at 0 and at `size`, and a number that is not negative if either is
+// within the repulsion radius.
 fn walls(at: f32, size: f32) -> vec2<f32> {
     let low = world.repulsion_radius - at;
     let high = world.repulsion_radius - (size - at);
@@ -57,8 +58,8 @@ fn walls(at: f32, size: f32) -> vec2<f32> {
     return vec2(push * world.wall_gain, select(high, low, low > high));
 }
 
-// The sum of repulsion, attraction and wall push at a place: mean offsets, scaled by gain over radius.
-fn force(sums: Sums, x: f32, y: f32) -> Pull {
+// Returns the sum of repulsion, attraction and wall push at a position. Each mean offset is scaled by gain over radius.
+fn force(sums: Sums, x: f32, y: f32) -> SteeringForce {
     let repel = recip(f32(max(sums.repel_count, 1u))) * world.repulsion_scale;
     let attract = recip(f32(max(sums.attract_count, 1u))) * world.attraction_scale;
     let walls_x = walls(x, world.map_x);
@@ -66,20 +67,20 @@ fn force(sums: Sums, x: f32, y: f32) -> Pull {
     let force_x = sums.attract_x * attract - sums.repel_x * repel + walls_x.x;
     let force_y = sums.attract_y * attract - sums.repel_y * repel + walls_y.x;
     let influenced = sums.repel_count + sums.attract_count > 0u || walls_x.y >= 0.0 || walls_y.y >= 0.0;
-    return Pull(flush(force_x, TINY), flush(force_y, TINY), influenced);
+    return SteeringForce(flush(force_x, TINY), flush(force_y, TINY), influenced);
 }
 
-// The squared size of a force, and 1 over its size.
-fn sizes(pull: Pull) -> vec2<f32> {
+// Returns the squared size of a force, and the inverse of its size.
+fn sizes(pull: SteeringForce) -> vec2<f32> {
     let force2 = pull.x * pull.x + pull.y * pull.y;
     return vec2(force2, rsqrt(force2));
 }
 
-// The heading turned towards the force, of these sizes, by at most the largest turn, and the wanted speed.
+// Turns the heading towards the force by at most the maximum turn. Returns the heading and the wanted speed.
 //
-// No angle is needed: the force's direction is taken where it lies within the largest turn (by its sine or cosine),
-// else the heading turns by that much, to the side of the force.
-fn steer(pull: Pull, sizes: vec2<f32>, hx: f32, hy: f32, speed: f32) -> Course {
+// No angle is computed. If the force's direction is within the maximum turn, it becomes the heading; its sine or cosine
+// tells. Otherwise the heading turns by the maximum, to the side of the force.
+fn steer(pull: SteeringForce, sizes: vec2<f32>, hx: f32, hy: f32, speed: f32) -> Course {
     let force2 = sizes.x;
     let inverse = sizes.y;
     let ux = pull.x * inverse;
@@ -89,8 +90,8 @@ fn steer(pull: Pull, sizes: vec2<f32>, hx: f32, hy: f32, speed: f32) -> Course {
     let sine = select(0.0 - world.max_turn_sin, world.max_turn_sin, across >= 0.0);
     let turned = rotate(hx, hy, world.max_turn_cos, sine);
     let pulled = force2 > 0.0;
-    // A cosine near 1 cannot tell small angles apart, a sine near 1 cannot tell large ones. Without a force, `along` is
-    // 0.
+    // A cosine near 1 cannot resolve small angles, and a sine near 1 cannot resolve large ones. Without a force,
+    // `along` is 0.
     var reached = along >= world.max_turn_cos && pulled;
     if variant.by_sine != 0u {
         reached = along > 0.0 && abs(across) <= world.max_turn_sin;

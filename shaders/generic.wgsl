@@ -1,7 +1,7 @@
-// What the generic kernel has in front instead of constants: the sizes of whatever world a task plays.
+// What the generic kernel has instead of constants: the sizes of a task's world.
 //
-// The host puts in front:
-//   WIDEST         widest layer of any policy, inputs included
+// The host prepends:
+//   WIDEST         the widest layer of any policy, inputs included
 //   CHOOSES        whether outputs choose a behaviour
 //   world_variant  the variant of this task's world
 
@@ -10,14 +10,13 @@ var<private> variant: Variant;
 
 fn adopt(task: Task) {
     let agents = world.leaders + world.followers;
-    // An empty task has no team, but something to divide by.
+    // An empty task has no team, but the number is a divisor.
     let teams = max(task.teams, 1u);
     shape = Shape(world.leaders, agents, world.pois, world.words, teams);
     variant = world_variant();
 }
 
-// A leader's answer to its inputs: layer by layer, each unit's bias (the last of its weights) and weighted inputs added
-// in order.
+// Computes a leader's outputs: layer by layer, each unit's bias plus its weighted inputs in order.
 fn decide(start: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
     var inputs: array<f32, WIDEST>;
     for (var input = 0u; input < INPUTS; input++) {
@@ -46,7 +45,7 @@ fn decide(start: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
     return vec2(inputs[0], inputs[1]);
 }
 
-// One of a policy's weights.
+// Returns one of a policy's weights.
 fn weight(start: u32, stride: u32, index: u32) -> f32 {
     return weights[start + index / 4u * stride][index % 4u];
 }

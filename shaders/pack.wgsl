@@ -1,39 +1,40 @@
-// Keeps of each team's record what its scores hang on, so that little has to come home. The record stays as it is.
+// Packs what scores depend on of each team's record, so that little has to be copied to the host. The record stays
+// unchanged.
 //
-// A set that another set of its POI contains changes no score (src/credit/mod.rs says why). A POI's sets mostly grow as
-// agents come near, then shrink, so it is enough to go through them once and keep those that neither their predecessor
-// among the kept ones nor their successor contains. A team's kept sets become the record of an episode of fewer steps.
+// A set that another set of its POI contains changes no score (see src/credit/mod.rs). A POI's sets mostly grow as
+// agents come near, then shrink. So one pass is enough that keeps the sets that neither the previous kept set nor the
+// next set contains. A team's kept sets become the record of an episode with fewer steps.
 //
-// The host puts these constants in front:
-//   WORKGROUP  threads of a workgroup
-//   TEAMS      teams of a task at most
-//   NOWHERE    an offset that there is not
+// The host prepends:
+//   WORKGROUP  threads per workgroup
+//   TEAMS      maximum teams per task
+//   NOWHERE    sentinel: no offset
 
 struct Packed {
-    // Words taken, more than `room` if they did not fit.
+    // Words used; more than `room` if they did not fit.
     used: atomic<u32>,
     room: u32,
-    // Of each task a table `[teams + 1]` of where its teams' sets start and end, and where that is asked for the
-    // leaders that followers saw most, `[words][teams]`. After all that the sets, `[rows][pois][words]` of each team.
+    // Per task a table `[teams + 1]` of the offsets of its teams' sets and, if requested, the leaders that followers
+    // saw most, `[words][teams]`. Then the sets, `[rows][pois][words]` per team.
     words: array<u32>,
 }
 
-// In place of what an episode reads. How many agents a set must have to be kept, of each POI.
+// Replaces a binding of the episode. The minimum size of a kept set, per POI.
 @group(0) @binding(3) var<storage, read> least: array<u32>;
 @group(0) @binding(4) var<storage, read_write> packed: Packed;
 
-// Rows that each team takes, and where they start, or NOWHERE if they do not fit.
+// Rows per team, and their offsets, or NOWHERE if they do not fit.
 var<workgroup> rows: array<atomic<u32>, TEAMS>;
 var<workgroup> homes: array<u32, TEAMS>;
 
-// Goes through the sets of one POI of one team and returns how many are kept. Unless `home` is NOWHERE, they go there,
-// and rows up to `all` are filled with empty sets.
+// Returns how many sets of one POI of one team are kept. Unless `home` is NOWHERE, writes them there, and empty sets up
+// to `all` rows.
 fn keep(task: Task, sizes: Sizes, team: u32, poi: u32, home: u32, all: u32) -> u32 {
     let row = sizes.pois * sizes.words * task.teams;
     let first = task.sets + poi * sizes.words * task.teams + team;
     let enough = least[task.least + poi];
     var kept = 0u;
-    // The set that is kept unless the next ones contain it.
+    // The offset of the set that is kept unless the next one contains it.
     var held = NOWHERE;
     for (var step = 0u; step < sizes.steps; step++) {
         var size = 0u;
@@ -79,7 +80,7 @@ fn copy(task: Task, sizes: Sizes, place: u32, home: u32) {
     }
 }
 
-// What of a world is needed here.
+// The sizes of a world that packing needs.
 struct Sizes {
     leaders: u32,
     followers: u32,
@@ -88,7 +89,7 @@ struct Sizes {
     steps: u32,
 }
 
-// The leader that a follower saw most, ties to the lower index, or `nobody`.
+// Returns the leader that a follower saw most, or `nobody`. Ties go to the lower index.
 fn owner(task: Task, sizes: Sizes, team: u32, follower: u32, nobody: u32) -> u32 {
     var most = 0u;
     var best = nobody;
@@ -102,7 +103,7 @@ fn owner(task: Task, sizes: Sizes, team: u32, follower: u32, nobody: u32) -> u32
     return best;
 }
 
-// One workgroup packs one task.
+// Packs one task per workgroup.
 @compute @workgroup_size(WORKGROUP)
 fn pack(
     @builtin(workgroup_id) workgroup: vec3<u32>,

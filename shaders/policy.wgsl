@@ -1,18 +1,18 @@
-// A leader's policy: a fully connected network with a bias and tanh in every layer (Sections 2.4 and 3.1).
+// A leader's policy: a fully connected network with biases and tanh in every layer (paper, Sections 2.4 and 3.1).
 
-// Sums under this size count as 0.
+// Sums smaller than this are flushed to 0.
 const TINY: f32 = 0x1p-30f;
 
-// A unit's sum after its tanh; sums too small to matter become 0, which keeps the next layer away from denormals.
+// Returns the tanh of a unit's sum. Small sums are flushed to 0, so that the next layer has no denormals.
 fn activate(sum: f32) -> f32 {
     return whole_tanh(half_tanh(limit_tanh(flush(sum, TINY))));
 }
 
-// Behaviours to choose among: hold, towards POIs, away from POIs, towards agents, away from agents.
+// Behaviours to choose among: hold, towards or away from POIs, towards or away from agents.
 const BEHAVIOURS: u32 = 5u;
 
-// The turn to the middle of the quadrant of most, in half turns to the left, or to the one opposite; straight ahead
-// where there is nothing.
+// Returns the turn to the middle of the quadrant of highest density, or to the opposite one, in half turns to the left.
+// 0 if nothing is sensed.
 fn quadrant(densities: vec4<f32>, away: bool) -> f32 {
     var most = densities.x;
     var turn = -0.75;
@@ -32,7 +32,7 @@ fn quadrant(densities: vec4<f32>, away: bool) -> f32 {
     return select(0.0, select(turn, back, away), most > 0.0);
 }
 
-// What the most wanted behaviour is as a direct answer: the first of the largest `wanted`, each in -1..1.
+// Returns the actions of the most wanted behaviour: the first of the largest `wanted`, each in -1..1.
 fn choose(inputs: array<f32, INPUTS>, wanted: array<f32, BEHAVIOURS>) -> vec2<f32> {
     var most = wanted[0];
     var behaviour = 0u;
@@ -59,12 +59,12 @@ fn choose(inputs: array<f32, INPUTS>, wanted: array<f32, BEHAVIOURS>) -> vec2<f3
     return vec2(quadrant(select(agents, pois, behaviour < 3u), behaviour == 2u || behaviour == 4u), 1.0);
 }
 
-// The wanted turn, in radians to the left, of the policy's first output in -1..1.
+// Converts the first output, in -1..1, to a wanted turn in radians to the left.
 fn wanted_turn(output: f32) -> f32 {
     return output * 3.14159274;
 }
 
-// The wanted speed of the policy's second output in -1..1.
+// Converts the second output, in -1..1, to a wanted speed.
 fn wanted_speed(output: f32) -> f32 {
     return (output + 1.0) * 0.5 * world.max_speed;
 }

@@ -1,44 +1,43 @@
-// Populations that stay on the device: `breed` makes a leader's next generation by the plan that the CPU drew, `gather`
-// lays out the weights of a batch's teams as an episode reads them. One buffer holds one leader's policies,
-// `[slots][parameters]`.
+// Populations that stay on the device. `breed` makes a leader's next generation from the CPU's plan; `gather` lays out
+// the weights of a batch's teams for the episode. One buffer holds one leader's policies, `[slots][parameters]`.
 //
-// The host puts in front:
-//   WORKGROUP       threads of a workgroup, a multiple of TILE
-//   Brood, Stretch  as src/backend/gpu/population.rs declares them
+// The host prepends:
+//   WORKGROUP         threads per workgroup, a multiple of TILE
+//   Brood, GatherJob  declared in src/backend/gpu/population.rs
 
-// Weights are 0 or of this size at least, and stay at the largest.
+// The range of sizes of a weight other than 0.
 const MIN_WEIGHT: f32 = 0x1p-30f;
 const MAX_WEIGHT: f32 = 1048576.0;
 
 const UNCHANGED: u32 = 0x80000000u;
 
 @group(0) @binding(1) var<storage, read> brood: Brood;
-// The slot that each slot's policy is copied from, with UNCHANGED set where it does not mutate.
+// The slot that each slot is copied from, with UNCHANGED set if it does not mutate.
 @group(0) @binding(2) var<storage, read> plan: array<u32>;
 @group(0) @binding(3) var<storage, read> policies: array<f32>;
 @group(0) @binding(4) var<storage, read_write> children: array<f32>;
 
-@group(0) @binding(1) var<storage, read> stretch: Stretch;
-// The policy that each leader plays in each team, `[teams][leaders]`.
+@group(0) @binding(1) var<storage, read> job: GatherJob;
+// The policy of each leader in each team, `[teams][leaders]`.
 @group(0) @binding(2) var<storage, read> choices: array<u32>;
-// Of each task `[fours of a policy's weights][leaders][teams]`.
+// Per task `[fours of a policy's weights][leaders][teams]`.
 @group(0) @binding(4) var<storage, read_write> weights: array<vec4<f32>>;
 // The policies of the leaders after the first.
 @group(0) @binding(5) var<storage, read> policies_1: array<f32>;
 @group(0) @binding(6) var<storage, read> policies_2: array<f32>;
 @group(0) @binding(7) var<storage, read> policies_3: array<f32>;
 
-// Four random words of a slot for a counter: `Key::draw`.
+// Returns four random words for a counter, see `Key::draw`.
 fn words(key: vec4<u32>, counter: u32) -> vec4<u32> {
-    return draw(vec4(key.xyz, key.w ^ counter));
+    return pcg4d(vec4(key.xyz, key.w ^ counter));
 }
 
-// A weight brought within the sizes that policies may have.
+// Clamps a weight to MAX_WEIGHT, and flushes it to 0 below MIN_WEIGHT.
 fn within_limits(weight: f32) -> f32 {
-    return flush(bound(weight, -MAX_WEIGHT, MAX_WEIGHT), MIN_WEIGHT);
+    return flush(clamp_to(weight, -MAX_WEIGHT, MAX_WEIGHT), MIN_WEIGHT);
 }
 
-// A weight with noise of its own: `index` is its place in the policy, `noises` the policy's key of noise.
+// Returns a mutated weight. `index` is its index in the policy, `noises` the policy's noise key.
 fn mutated(noises: vec4<u32>, index: u32, weight: f32) -> f32 {
     let words = words(noises, index);
     let plain = normal(words.x, words.y) * brood.sigma;
@@ -46,8 +45,8 @@ fn mutated(noises: vec4<u32>, index: u32, weight: f32) -> f32 {
     return within_limits(weight + noise);
 }
 
-// One thread a slot and draw, which decides on four weights: 64·block + 16·word + place is the weight that the word of
-// counter 16·block + place decides on. Neighbouring threads have neighbouring weights.
+// One thread per slot and draw, which decides on four weights. The word of counter 16·block + place decides on weight
+// 64·block + 16·word + place. Neighbouring threads have neighbouring weights.
 @compute @workgroup_size(WORKGROUP)
 fn breed(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -72,10 +71,10 @@ fn breed(
     if (planned & UNCHANGED) != 0u {
         return;
     }
-    let key = draw(vec4(brood.key[0], brood.key[1], brood.key[2] ^ slot, brood.key[3]));
+    let key = pcg4d(vec4(brood.key[0], brood.key[1], brood.key[2] ^ slot, brood.key[3]));
     let below = words(key, counter) < vec4(brood.threshold);
     let bits = select(vec4(0u), vec4(1u, 2u, 4u, 8u), below);
-    // Threads side by side go through as many mutations as the one with the most, so each goes from one to the next.
+    // Each thread iterates over its own mutations only: a warp takes as many iterations as its busiest thread.
     var left = select(bits.x | bits.y | bits.z | bits.w, 15u, brood.all != 0u);
     let noises = words(key, 0xffffffffu);
     while left != 0u {
@@ -89,11 +88,11 @@ fn breed(
 
 const TILE: u32 = 32u;
 
-// Weights of some teams' leaders, `[leaders][teams][parameters]`, rows apart by one more word so that columns spread
-// over all banks.
+// Weights of some teams' leaders, `[leaders][teams][parameters]`. Rows have one word of padding, so that a column uses
+// all banks.
 var<workgroup> tile: array<f32, TILE * (TILE + 1u)>;
 
-// A weight of one of the leaders gathered.
+// Returns a weight of one of the gathered leaders.
 fn weight_of(leader: u32, index: u32) -> f32 {
     switch leader {
         case 0u: { return policies[index]; }
@@ -103,17 +102,17 @@ fn weight_of(leader: u32, index: u32) -> f32 {
     }
 }
 
-// One workgroup turns a tile of weights: it reads along policies, and writes along teams, four weights at a time.
+// Transposes one tile of weights per workgroup: reads along policies, writes along teams, four weights at a time.
 @compute @workgroup_size(WORKGROUP)
 fn gather(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    let across = (stretch.parameters + TILE - 1u) / TILE;
+    let across = (job.parameters + TILE - 1u) / TILE;
     let index = workgroup.y * workgroups.x + workgroup.x;
     let first_policy = index / across * TILE;
-    let played = stretch.count * stretch.teams;
+    let played = job.count * job.teams;
     let first_parameter = index % across * TILE;
     let column = thread % TILE;
     for (var row = thread / TILE; row < TILE; row += WORKGROUP / TILE) {
@@ -121,27 +120,27 @@ fn gather(
         let parameter = first_parameter + column;
         // The last four weights of a policy may be fewer.
         var weight = 0.0;
-        if policy < played && parameter < stretch.parameters {
-            let leader = policy / stretch.teams;
-            let choice = policy % stretch.teams * stretch.leaders + stretch.first + leader;
-            weight = weight_of(leader, choices[stretch.choices + choice] * stretch.parameters + parameter);
+        if policy < played && parameter < job.parameters {
+            let leader = policy / job.teams;
+            let choice = policy % job.teams * job.leaders + job.first + leader;
+            weight = weight_of(leader, choices[job.choices + choice] * job.parameters + parameter);
         }
         tile[row * (TILE + 1u) + column] = weight;
     }
     workgroupBarrier();
     let policy = first_policy + column;
-    let team = policy % stretch.teams;
-    let leader = stretch.first + policy / stretch.teams;
-    let before = team / stretch.teams_a_task * stretch.teams_a_task;
-    let teams = min(stretch.teams_a_task, stretch.teams - before);
-    let fours = (stretch.parameters + 3u) / 4u;
-    let task = stretch.weights + before * stretch.leaders * fours;
+    let team = policy % job.teams;
+    let leader = job.first + policy / job.teams;
+    let before = team / job.teams_a_task * job.teams_a_task;
+    let teams = min(job.teams_a_task, job.teams - before);
+    let fours = (job.parameters + 3u) / 4u;
+    let task = job.weights + before * job.leaders * fours;
     for (var row = thread / TILE; row < TILE / 4u && policy < played; row += WORKGROUP / TILE) {
         let four = first_parameter / 4u + row;
         if four < fours {
             let start = column * (TILE + 1u) + 4u * row;
             let some = vec4(tile[start], tile[start + 1u], tile[start + 2u], tile[start + 3u]);
-            weights[task + (four * stretch.leaders + leader) * teams + team - before] = some;
+            weights[task + (four * job.leaders + leader) * teams + team - before] = some;
         }
     }
 }

@@ -1,12 +1,12 @@
-// Asks a device whether its arithmetic is the CPU's. One invocation takes four values and writes a word a probe.
-// The twin is `expected` in src/backend/gpu/probe.rs: same names, same order.
+// Tests whether a device's arithmetic equals the CPU's. One invocation reads four values and writes one word per probe.
+// Twin of `expected` in src/backend/gpu/self_test.rs: same names, same order.
 
 const PROBES: u32 = 37u;
 
 @group(0) @binding(1) var<storage, read> values: array<f32>;
 @group(0) @binding(2) var<storage, read_write> words: array<u32>;
 
-// The bits of a float, with one zero: the sign of a zero differs from device to device.
+// Returns the bits of a float, with -0 as 0, because the sign of a zero differs between devices.
 fn bits(x: f32) -> u32 {
     let word = bitcast<u32>(x);
     return select(word, 0u, word == 0x80000000u);
@@ -20,7 +20,7 @@ fn product(a: f32, b: f32) -> f32 {
     return a * b;
 }
 
-// 1/d for d > 0, from a guess in the bits.
+// Returns 1/d for d > 0, from a guess in the bits.
 fn reciprocal(d: f32) -> f32 {
     var r = bitcast<f32>(0x7ef311c3u - bitcast<u32>(d));
     for (var step = 0u; step < 3u; step++) {
@@ -29,7 +29,7 @@ fn reciprocal(d: f32) -> f32 {
     return r;
 }
 
-// 1/sqrt(d) for d > 0.
+// Returns 1/sqrt(d) for d > 0.
 fn reciprocal_root(d: f32) -> f32 {
     var r = bitcast<f32>(0x5f3759dfu - (bitcast<u32>(d) >> 1u));
     for (var step = 0u; step < 3u; step++) {

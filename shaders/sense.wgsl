@@ -1,25 +1,25 @@
-// What a leader senses: the density of POIs and of agents in four quadrants around its heading (Section 3.1).
+// What a leader senses: the density of POIs and of agents in four quadrants around its heading (paper, Section 3.1).
 
-// What an entity at offset (`dx`, `dy`) adds to the density of its quadrant, if it is in range.
+// Returns the density of an entity at offset (`dx`, `dy`), if it is in range.
 fn density(dx: f32, dy: f32) -> f32 {
     let d2 = dx * dx + dy * dy;
     if variant.density == DENSITY_LINEAR {
-        return 1.0 - root(d2) * world.inverse_diagonal;
+        return 1.0 - exact_sqrt(d2) * world.inverse_diagonal;
     }
     return rsqrt(select(1.0, d2, d2 > 1.0));
 }
 
-// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant, in the order of the policy's
-// inputs: back-right, front-right, front-left, back-left.
+// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant. Quadrants are in the order of the
+// policy's inputs: back right, front right, front left, back left.
 //
-// The quadrant is read off the signs of the offset along the heading and to its left; a tie goes to the quadrant
-// counterclockwise of it, so that each boundary belongs to exactly one quadrant.
+// The signs of the offset along the heading and to its left determine the quadrant. A tie goes to the counterclockwise
+// quadrant, so that each boundary belongs to exactly one.
 fn sense(density: f32, dx: f32, dy: f32, hx: f32, hy: f32, sums: ptr<function, vec4<f32>>) {
     let fx = dx * hx + dy * hy;
     let fy = dy * hx - dx * hy;
     let left = fy > 0.0 || (fy >= 0.0 && fx >= 0.0);
     let front = fx > 0.0 || (fx >= 0.0 && !(fy > 0.0));
-    // One sum grows; the others would by 0, which changes no bit of them.
+    // One sum grows. Adding 0 to the others would not change their bits.
     let old = *sums;
     let grown = select(select(old.x, old.y, front), select(old.w, old.z, front), left) + density;
     (*sums).x = select(old.x, grown, !left && !front);
@@ -28,7 +28,7 @@ fn sense(density: f32, dx: f32, dy: f32, hx: f32, hy: f32, sums: ptr<function, v
     (*sums).w = select(old.w, grown, left && !front);
 }
 
-// The policy's inputs, of the sums over a leader's quadrants.
+// Returns the policy's inputs: the sums of both kinds, each multiplied by its constant.
 fn weigh_in(of_pois: vec4<f32>, of_agents: vec4<f32>) -> array<f32, INPUTS> {
     let p = of_pois * world.poi_share;
     let a = of_agents * world.agent_share;

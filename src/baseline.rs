@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use fearless_simd::Level;
 use glam::Vec2;
 
-use crate::backend::{Backend, BackendError, Episode, Group, Need};
+use crate::backend::{Backend, BackendError, Episode, Group, RecordRequest};
 use crate::config::{Config, Fitness, Learning};
 use crate::credit::Credit;
 use crate::evolve::{self, Key, Purpose};
@@ -80,7 +80,14 @@ impl Baselines {
             for (trial, (weights, starts)) in place.weights.iter().zip(&place.starts).enumerate() {
                 for starts in starts {
                     let (world, weights, teams) = (&place.world, weights[..].into(), &*place.teams);
-                    groups.push(Group { world, starts, weights, policies, teams, need: Need::Score(Fitness::G) });
+                    groups.push(Group {
+                        world,
+                        starts,
+                        weights,
+                        policies,
+                        teams,
+                        need: RecordRequest::Score(Fitness::G),
+                    });
                     homes.push((&**place, trial * policies));
                 }
             }

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use glam::Vec2;
 
-use crate::backend::{Backend, BackendError, Group, Moment, Need};
+use crate::backend::{Backend, BackendError, Group, Moment, RecordRequest};
 use crate::credit::Credit;
 use crate::evolve::{self, Key, Purpose};
 use crate::statistics::{self, Estimate};
@@ -164,7 +164,7 @@ impl Evaluation {
         [g, d, df, dpp].map(|score| score as f32)
     }
 
-    /// The mean over episodes of Dt of a leader of a team, if the group [needed](Need::sights) sights.
+    /// The mean over episodes of Dt of a leader of a team, if the group [needed](RecordRequest::sights) sights.
     pub fn dt(&self, team: usize, leader: usize) -> Option<f32> {
         self.timed.then(|| (self.credits[team * self.leaders + leader][3] / self.episodes as f64) as f32)
     }
@@ -195,7 +195,7 @@ pub fn evaluate(
         credits: vec![[0.0; 4]; teams * leaders],
         timed: group.need.sights(),
     };
-    let need = if group.need.sights() { Need::Sights } else { Need::Scores };
+    let need = if group.need.sights() { RecordRequest::Sights } else { RecordRequest::Scores };
     let done = AtomicUsize::new(0);
     for first in (0..episodes).step_by(at_once) {
         let batch: Vec<Vec<Vec2>> =

@@ -16,9 +16,9 @@ use crate::backend::cpu::Cpu;
 use crate::backend::gpu::{
     self,
     device::{DeviceError, Wanted},
-    episode::{GpuEpisodes, Holding},
+    episode::{GpuBackend, ResidencyPolicy},
 };
-use crate::backend::{Backend, BackendError, Group, Machine, Need, Player};
+use crate::backend::{Backend, BackendError, Group, Machine, OpenBackend, RecordRequest};
 use crate::config::{Config, ConfigError, Fitness, MAX_POPULATION};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
 use crate::evolve::{self, MAX_WEIGHT};
@@ -40,9 +40,6 @@ pub enum Failure {
     /// Everything that is wrong with a config.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// A number that no config file could hold.
-    #[error("the config cannot be written down: {0}")]
-    Unwritten(String),
     /// The machine has less memory than a training takes.
     #[error(transparent)]
     TooLittle(#[from] TooLittle),
@@ -147,7 +144,7 @@ pub enum Processor {
 #[cfg(feature = "gpu")]
 pub struct Found {
     /// The GPU, opened.
-    pub gpu: Option<GpuEpisodes>,
+    pub gpu: Option<GpuBackend>,
     /// Why a GPU that is there was passed over.
     pub passed_over: Option<DeviceError>,
 }
@@ -158,14 +155,14 @@ pub struct Found {
 /// # Errors
 /// There is none that can be used.
 #[cfg(feature = "gpu")]
-pub fn find_gpu(processor: &Processor, holding: Option<Holding>) -> Result<Found, DeviceError> {
+pub fn find_gpu(processor: &Processor, holding: Option<ResidencyPolicy>) -> Result<Found, DeviceError> {
     let choice = match processor {
         Processor::Cpu => return Ok(Found { gpu: None, passed_over: None }),
         Processor::Auto | Processor::Gpu => Wanted::Real,
         Processor::Adapter(name) => Wanted::Named(name.clone()),
     };
-    let optional = *processor == Processor::Auto && holding != Some(Holding::Always);
-    match gpu::open(choice).and_then(GpuEpisodes::new) {
+    let optional = *processor == Processor::Auto && holding != Some(ResidencyPolicy::Always);
+    match gpu::open(choice).and_then(GpuBackend::new) {
         Ok(gpu) => {
             let gpu = match holding {
                 Some(holding) => gpu.holding(holding),
@@ -186,19 +183,19 @@ pub fn find_gpu(processor: &Processor, holding: Option<Holding>) -> Result<Found
 /// # Errors
 /// There is no such GPU, or none that can be used.
 #[cfg(feature = "gpu")]
-pub fn open(processor: &Processor) -> Result<(Player, Option<DeviceError>), DeviceError> {
+pub fn open(processor: &Processor) -> Result<(OpenBackend, Option<DeviceError>), DeviceError> {
     let Found { gpu, passed_over } = find_gpu(processor, None)?;
     Ok((gpu.map_or_else(cpu, on_gpu), passed_over))
 }
 
 /// The backend that is always there.
-pub fn cpu() -> Player {
+pub fn cpu() -> OpenBackend {
     (Box::new(Cpu::default()), Machine::of_cpu())
 }
 
 /// A GPU, and what it is.
 #[cfg(feature = "gpu")]
-pub fn on_gpu(backend: GpuEpisodes) -> Player {
+pub fn on_gpu(backend: GpuBackend) -> OpenBackend {
     let machine = Machine::of_gpu(&backend);
     (Box::new(backend), machine)
 }
@@ -316,14 +313,15 @@ pub fn train_from(
     first: &[Vec<f32>],
     mut watch: impl FnMut(Generation<'_>) -> ControlFlow<()>,
 ) -> Result<Trained, Failure> {
-    let mut config = checked(config)?;
+    let valid = config.validate()?;
+    let mut config = Config::clone(&valid);
     let plan = Peaks::of([&config], current_num_threads());
     // Nothing is saved on the way, but what comes out is kept: the rows twice, and the policies.
     let rows = config.learning.trials as u64 * (config.learning.generations as u64 + 1);
     let kept = rows * (size_of::<Row>() + 3 * size_of::<f64>()) as u64 + config.policy_bytes();
     let needed = (plan.host.min(plan.gpu_host) - plan.checkpoint).saturating_add(kept);
     memory::check(needed, 0)?;
-    let (mut trainer, mut rows, mut stopped) = (Trainer::new(vec![config.clone()]), Vec::new(), false);
+    let (mut trainer, mut rows, mut stopped) = (Trainer::new([valid]), Vec::new(), false);
     let (leaders, parameters, trials) = (config.populations(), config.parameters(), config.learning.trials);
     if first.len() > 1 && first.len() != trials {
         return Err(Failure::Trials { found: first.len(), trials });
@@ -388,7 +386,7 @@ pub fn play(
     starts: &Starts,
 ) -> Result<Played, Failure> {
     let cast = Cast::new(config, teams, weights, starts)?;
-    let need = if config.learning.fitness == Fitness::Dt { Need::Sights } else { Need::Scores };
+    let need = if config.learning.fitness == Fitness::Dt { RecordRequest::Sights } else { RecordRequest::Scores };
     let group = Group { need, ..cast.group(&cast.world.starts) };
     let evaluation = evaluate::evaluate(backend, &group, starts, &|_| ())?;
     let Evaluation { leaders, .. } = evaluation;
@@ -480,18 +478,12 @@ pub fn trace(
 /// # Errors
 /// The config is wrong, or there may not be so many teams.
 pub fn stepper(config: &Config, teams: usize, recording: bool) -> Result<Stepper, Failure> {
-    let world = World::new(&checked(config)?);
+    let world = World::new(&*config.validate()?);
     Ok(match (recording, config.learning.fitness) {
         (false, _) => Stepper::new(world, teams)?,
         (true, Fitness::Dt) => Stepper::recording(world, teams)?.with_sights()?,
         (true, _) => Stepper::recording(world, teams)?,
     })
-}
-
-/// A config that may have been built by hand, as if it had been read from a file.
-fn checked(config: &Config) -> Result<Config, Failure> {
-    let text = toml::to_string(config).map_err(|error| Failure::Unwritten(error.to_string()))?;
-    Ok(Config::parse(&text, "the config")?)
 }
 
 /// Teams of given policies, fit to be played.
@@ -504,7 +496,7 @@ struct Cast<'a> {
 
 impl<'a> Cast<'a> {
     fn new(config: &Config, teams: usize, weights: &'a [f32], starts: &Starts) -> Result<Cast<'a>, Failure> {
-        let world = World::new(&checked(config)?);
+        let world = World::new(&*config.validate()?);
         if !(1..=MAX_POPULATION).contains(&teams) {
             return Err(Failure::Teams(teams));
         }
@@ -537,6 +529,6 @@ impl<'a> Cast<'a> {
 
     fn group<'b>(&'b self, starts: &'b [glam::Vec2]) -> Group<'b> {
         let Cast { world, weights, policies, teams } = self;
-        Group { world, starts, weights: weights[..].into(), policies: *policies, teams, need: Need::Scores }
+        Group { world, starts, weights: weights[..].into(), policies: *policies, teams, need: RecordRequest::Scores }
     }
 }

@@ -41,51 +41,60 @@
 //!                       └──────────────┴────────────── next generation ◀───────┘
 //! ```
 //!
-//! 1. [`config`] reads a TOML file and names everything that is wrong with it. The sections of a step's parts, and all
-//!    else that is to be said of a part, stand in [`model`].
-//! 2. [`world`] turns it into one experiment's constants and start state.
-//! 3. [`trainer`] asks [`evolve`] for teams and hands all of them, of all trials, to a [`backend`] as one batch.
-//! 4. The backend plays each team's whole episode: by [`model`] on the CPU, by its twins under `shaders/` on a GPU.
-//!    It reports who was near which POI at which step, and which leader each follower saw, or as much of that as is
-//!    needed.
-//! 5. [`credit`] turns that record into G, D, Df, D++ and Dt.
-//! 6. [`evolve`] selects and mutates, or has a GPU that holds the populations do the latter; [`run`] keeps what came out
-//!    by [`record`]; [`report`] draws it.
+//! 1. [`config`] reads a TOML file and reports everything that is wrong with it. [`model`] has the sections, constants
+//!    and formulas of a step's parts.
+//! 2. [`world`] turns a config into one experiment's constants and start state.
+//! 3. [`trainer`] draws team schedules with [`evolve`], and gives the teams of all trials to a [`backend`] as one batch.
+//! 4. The backend plays each team's whole episode: with [`model`] on the CPU, with its twins under `shaders/` on a GPU.
+//!    It records who was at which POI at which step and which leader each follower saw, or as much of that as the
+//!    fitness needs.
+//! 5. [`credit`] computes G, D, Df, D++ and Dt from that record.
+//! 6. [`evolve`] selects and mutates on the host, or plans the same for a GPU that holds the populations. [`run`] saves
+//!    the results with [`record`]; [`report`] draws them.
+//!
+//! # Where to change what
+//!
+//! | to | change |
+//! |---|---|
+//! | add a density | `model/sense.rs` and its twin `shaders/sense.wgsl`, `bench/operations.rs` |
+//! | add a fitness | `config/learning.rs`, `credit/` (`mod.rs`, `fast.rs` or `replay.rs`), `backend/batch.rs` (what to record) |
+//! | hold populations in a third place | `trainer/residency.rs`, `trainer/populations.rs`, `backend/batch.rs` |
 //!
 //! # Modules
 //!
-//! Each imports only those above it; a module without a feature is always there.
+//! Each imports only those above it. A module without a feature is always compiled.
 //!
 //! | module | feature | holds |
 //! |---|---|---|
-//! | [`escape`], [`mod@file`], [`shell`] | | names, paths and command lines on their way in and out |
-//! | [`host`], [`parallel`] | | time, waiting and threads, as whoever runs flotilla has them |
-//! | [`declare`] | | what is declared once and has several forms: shared structs, choices of words |
-//! | [`reader`] | | a TOML text, read key by key |
+//! | [`escape`], [`mod@file`], [`shell`] | | names, paths and command lines as input and output |
+//! | [`host`], [`parallel`] | | time, waiting and threads |
+//! | [`config_enum`], [`gpu_struct`] | | enums that are words in configs, structs that shaders share |
+//! | [`reader`] | | reading a TOML text key by key |
 //! | [`kernels`] | | arithmetic on lanes of teams |
-//! | [`model`] | | each part of a step: keys, constants, formulas, shader, costs |
+//! | [`model`] | | the parts of a step: keys, constants, formulas, shaders |
 //! | [`config`] | | the config: what an experiment is |
 //! | [`world`] | | one experiment's constants and start state |
-//! | [`evolve`] | | teams, selection and mutation, by counters |
+//! | [`evolve`] | | random numbers, team schedules, selection and mutation |
 //! | [`sample`] | | random worlds for tests |
-//! | [`backend`] | | whole episodes of many teams: on the CPU, and with `gpu` on a GPU |
+//! | [`backend`] | | whole episodes of many teams on the CPU, and with `gpu` on a GPU |
 //! | [`credit`] | | G, D, Df, D++ and Dt |
 //! | [`trainer`] | | the generation loop |
-//! | [`verify`] | | whether two backends agree to the bit |
-//! | [`statistics`] | | what chance leaves open |
-//! | [`baseline`] | | what needs no learning |
-//! | [`evaluate`] | | trained teams, from starts that no training saw |
-//! | [`stepping`] | | teams stepped by given actions |
-//! | [`memory`] | | what a run will take |
+//! | [`verify`] | | whether two backends agree bit for bit |
+//! | [`statistics`] | | intervals and tests |
+//! | [`baseline`] | | baselines without learning |
+//! | [`evaluate`] | | trained teams from held-out starts |
+//! | [`stepping`] | | teams stepped with given actions |
+//! | [`memory`] | | a run's peak memory |
 //! | [`record`] | `record` | files: policies, metrics, checkpoints, folders |
-//! | [`run`] | `record` | a trainer and its runs' folders, kept together |
+//! | [`run`] | `record` | a trainer together with its runs' folders |
 //! | [`report`] | `report` | pictures, films, pages; the paper's claims |
 //! | [`sweep`] | `report` | many runs of a grid |
 //! | [`front`] | | what programs need, in a few lines |
-//! | [`mod@bench`] | `cli` | a backend's speed, and what the machine can do at most |
-//! | [`cli`] | `cli` | what was typed, turned into all this |
+//! | [`mod@bench`] | `cli` | a backend's speed, and the machine's arithmetic ceiling |
+//! | [`cli`] | `cli` | the command line |
 //!
-//! Only `backend::gpu` knows wgpu; the model knows neither threads nor GPUs; only [`host`] asks for the time.
+//! Only `backend::gpu` and the GPU's ceiling in [`mod@bench`] use wgpu. The model knows neither threads nor GPUs. Only
+//! [`host`] reads the clock.
 //!
 //! # Features
 //!
@@ -117,13 +126,14 @@ pub mod bench;
 #[cfg(feature = "cli")]
 pub mod cli;
 pub mod config;
+pub mod config_enum;
 pub mod credit;
-pub mod declare;
 pub mod escape;
 pub mod evaluate;
 pub mod evolve;
 pub mod file;
 pub mod front;
+pub mod gpu_struct;
 pub mod host;
 pub mod kernels;
 pub mod memory;

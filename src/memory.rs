@@ -8,7 +8,7 @@
 use std::fs;
 use std::path::Path;
 
-use crate::backend::{self, BATCH_BYTES, Need, PACKED_FROM, cpu};
+use crate::backend::{self, BATCH_BYTES, PACKED_FROM, RecordRequest, cpu};
 use crate::config::Config;
 use crate::trainer;
 use crate::world::World;
@@ -61,7 +61,7 @@ impl Peaks {
                     (config, world)
                 })
                 .collect();
-            let need = |config: &Config| Need::Score(config.learning.fitness);
+            let need = |config: &Config| RecordRequest::Score(config.learning.fitness);
             // Of what a stage decides, the largest counts.
             let most = |size: &dyn Fn(&Config, &World) -> u64| {
                 staged.iter().map(|(config, world)| size(config, world)).max().unwrap_or(0)

@@ -11,7 +11,7 @@ use serde::Serialize;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue, Error};
 
-use crate::declare::Choice;
+use crate::config_enum::Choice;
 
 /// Maximum number of problems listed per text.
 pub const MAX_LISTED: usize = 50;

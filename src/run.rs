@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
 
-use crate::backend::{BackendError, Machine, Player};
-use crate::config::{self, Config};
+use crate::backend::{BackendError, Machine, OpenBackend};
+use crate::config::{self, Config, ConfigError, ValidConfig};
 use crate::host::Instant;
 use crate::memory::{self, TooLittle};
 use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule};
@@ -50,6 +50,9 @@ pub enum RunError {
         /// How much was asked for.
         bytes: u64,
     },
+    /// The config of a run is invalid.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
     /// Populations cannot be brought to the host to be saved.
     #[error("no checkpoint could be made: {0}")]
     Held(BackendError),
@@ -81,7 +84,7 @@ pub struct Options<'a> {
     /// Set by whoever wants a checkpoint of each now.
     pub save: &'a AtomicBool,
     /// Asked for another backend when one fails.
-    pub instead: &'a mut dyn FnMut(&BackendError) -> Option<Player>,
+    pub instead: &'a mut dyn FnMut(&BackendError) -> Option<OpenBackend>,
     /// Told once of an error of a backend that held populations, where it was made up for: they are the host's then.
     pub setback: &'a mut dyn FnMut(&BackendError),
     /// Told of every generation played.
@@ -174,6 +177,7 @@ impl Session {
             .try_reserve_exact(bytes.try_into().unwrap_or(usize::MAX))
             .map_err(|_| RunError::Memory { what: "twice the policies of all trials", bytes })?;
         // Before any of them is touched.
+        let configs = runs.iter().map(|(config, ..)| config.validate()).collect::<Result<Vec<ValidConfig>, _>>()?;
         folder::check(runs.iter().map(|(_, path, _)| &**path), start)?;
         let opened = side_by_side(runs, |(config, path, init)| Member::open(config, path, init, start, disk))?;
         let (mut members, mut snapshots, mut notes) = (Vec::new(), Vec::new(), Vec::new());
@@ -185,8 +189,8 @@ impl Session {
             members.push(member);
             snapshots.push(snapshot);
         }
-        let going = members.iter().filter(|member| member.going.is_some());
-        let mut trainer = Trainer::new(going.map(|member| member.config.clone()).collect());
+        let going = members.iter().zip(configs).filter(|(member, _)| member.going.is_some());
+        let mut trainer = Trainer::new(going.map(|(_, config)| config));
         let mut generations = Vec::with_capacity(members.len());
         let mut arms = Vec::new();
         for (run, (member, snapshot)) in members.iter_mut().zip(snapshots).enumerate() {
@@ -237,7 +241,7 @@ impl Session {
     ///
     /// # Errors
     /// The backend fails (what came before is saved then), or something cannot be written.
-    pub fn train(&mut self, player: &mut Player, options: &mut Options<'_>) -> Result<Ended, RunError> {
+    pub fn train(&mut self, player: &mut OpenBackend, options: &mut Options<'_>) -> Result<Ended, RunError> {
         self.since = Instant::now();
         for member in self.members.iter_mut().filter(|member| member.going.is_some()) {
             member.run.sessions = member.run.sessions.saturating_add(1);
@@ -333,7 +337,7 @@ impl Session {
     }
 
     /// What they run on from now on.
-    fn settle_on(&mut self, (backend, machine): &Player) {
+    fn settle_on(&mut self, (backend, machine): &OpenBackend) {
         for run in self.members.iter_mut().filter(|member| member.going.is_some()).map(|member| &mut member.run) {
             let Machine { backend: kind, adapter, driver, threads } = machine.clone();
             let (version, commit) = (crate::VERSION.into(), crate::COMMIT.map(String::from));

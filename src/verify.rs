@@ -1,5 +1,7 @@
-//! Whether a backend agrees with the CPU, bit for bit: random worlds stage by stage, all of them as one batch, once by
-//! the record and once by the scores, breeding where the backend holds populations, and short training runs.
+//! Verification that a backend agrees with the CPU bit for bit.
+//!
+//! Compares random worlds stage by stage; all of them as one batch, by record and by scores; breeding on the device;
+//! and short training runs.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -8,32 +10,32 @@ use std::sync::Mutex;
 use glam::Vec2;
 
 use crate::backend::compare::{Mismatch, first_mismatch};
-use crate::backend::{Backend, BackendError, Group, Need};
-use crate::config::{Config, Paradigm};
+use crate::backend::{Backend, BackendError, Group, RecordRequest};
+use crate::config::{Config, Paradigm, ValidConfig};
 use crate::credit::{Credit, Scores};
 use crate::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use crate::sample;
 use crate::trainer::{Row, Trainer};
 use crate::world::World;
 
-/// What is compared.
+/// The input of a comparison.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// The worlds and what each is called in a report.
+    /// The worlds, each with its name in reports.
     pub worlds: Vec<(String, Config)>,
-    /// Random teams of each.
+    /// Random teams per world.
     pub teams: usize,
-    /// Start of the teams' randomness.
+    /// The seed of the teams.
     pub seed: u64,
     /// Generations of the short training run of the first few worlds.
     pub generations: usize,
 }
 
-/// Worlds that train for a few generations, all side by side.
+/// Worlds that train for a few generations, side by side.
 const TRAINED: usize = 8;
 
 impl Plan {
-    /// A spread of random worlds of every kind, degenerate ones among them.
+    /// Returns random worlds of every kind, including degenerate ones.
     pub fn random(seeds: Range<u64>, teams: usize) -> Plan {
         let seed = seeds.start;
         let worlds = seeds.map(|seed| (format!("random world {seed}"), sample::world(seed))).collect();
@@ -41,8 +43,8 @@ impl Plan {
     }
 }
 
-/// Short trainings of the paper's six experiments, each with its name: what they come to is the same on every machine,
-/// so that their digests compare machines that never meet.
+/// Returns short trainings of the paper's six experiments, each with its name. Their results are the same on every
+/// machine, so machines can be compared by digests.
 pub fn short_trainings() -> Vec<(String, Config)> {
     const LAYOUTS: [(&str, &str); 3] = [
         ("generally forward", include_str!("../configs/generally_forward.toml")),
@@ -64,15 +66,15 @@ pub fn short_trainings() -> Vec<(String, Config)> {
 /// How much was compared, and the first difference, if any.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Agreement {
-    /// Worlds played on both.
+    /// Worlds played on both backends.
     pub worlds: usize,
-    /// Steps of agents in these.
+    /// Steps of agents in these worlds.
     pub agent_steps: u64,
-    /// Where, in words.
+    /// A description of the first difference.
     pub mismatch: Option<String>,
 }
 
-/// The teams of one world: leader l of team t plays policy t + l, so that every team mixes policies of its own.
+/// The teams of one world. Leader l of team t plays policy t + l, so that every team mixes policies.
 struct Teams {
     world: World,
     policies: usize,
@@ -80,8 +82,8 @@ struct Teams {
     choice: Vec<u32>,
     /// See [`Group::starts`].
     places: Vec<Vec2>,
-    /// Of every other world also who was seen at which step, which kernels of their own record.
-    need: Need,
+    /// Every other world also records sightings, which needs kernels of its own.
+    need: RecordRequest,
 }
 
 impl Teams {
@@ -92,12 +94,12 @@ impl Teams {
         let policy = |place: usize| ((place / leaders + place % leaders) % policies) as u32;
         let choice = (0..teams * leaders).map(policy).collect();
         let mut weights = sample::weights(&world, policies, seed);
-        // Of a shared population, teams mix policies all the same: that asks for more.
+        // With a shared population teams still mix policies, which tests more.
         weights.truncate(config.populations() * policies * world.parameters());
         let mut places = world.starts.clone();
         let learning = &config.learning;
         evolve::jitter_pois(Key::new(seed, 0, Purpose::Pois), 0, 0, &world, learning.poi_jitter, &mut places);
-        let need = if sights { Need::Sights } else { Need::Record };
+        let need = if sights { RecordRequest::Sights } else { RecordRequest::Record };
         Teams { policies, weights, choice, places, need, world }
     }
 
@@ -107,10 +109,10 @@ impl Teams {
     }
 }
 
-/// Compares a backend with the reference; stops at the first difference.
+/// Compares a backend with the reference. Stops at the first difference.
 ///
 /// # Errors
-/// When a backend fails.
+/// A backend failed.
 pub fn compare(
     plan: &Plan,
     reference: &mut dyn Backend,
@@ -120,7 +122,7 @@ pub fn compare(
     let mut outcome = Agreement::default();
     let mut all = Vec::with_capacity(plan.worlds.len());
     for (name, config) in &plan.worlds {
-        // Stages train below; here plays the world of the first.
+        // Only the first stage plays here. Training below plays all of them.
         let teams = Teams::new(&config.at(0), plan.teams, plan.seed, outcome.worlds % 2 == 0);
         if let Some(mismatch) = compare_stages(&teams, reference, backend)? {
             outcome.mismatch = Some(format!("{name}: {mismatch}"));
@@ -137,8 +139,8 @@ pub fn compare(
         outcome.mismatch = Some(format!("{name}: the record of team {team} differs when all worlds are one batch"));
         return Ok(outcome);
     }
-    // Few worlds are played as often as it takes to ask for scores of every kind.
-    let turns = Need::OF_SCORES.len().div_ceil(groups.len().max(1));
+    // With few worlds, each is played several times, so that every kind of scores is requested.
+    let turns = RecordRequest::OF_SCORES.len().div_ceil(groups.len().max(1));
     for turn in 0..turns {
         if let Some((group, team, difference)) = compare_scores(&groups, turn, reference, backend)? {
             let (name, _) = &plan.worlds[group];
@@ -167,7 +169,7 @@ fn compare_stages(
     Ok(first_mismatch(&teams.world, &expected, &found))
 }
 
-/// Plays all groups as one batch, without a trace; the first group and team whose record differs.
+/// Plays all groups as one batch, without a trace. Returns the first group and team whose records differ.
 fn compare_batch(
     groups: &[Group<'_>],
     reference: &mut dyn Backend,
@@ -177,7 +179,7 @@ fn compare_batch(
         let records: Vec<Vec<Mutex<Vec<u32>>>> =
             groups.iter().map(|group| (0..group.team_count()).map(|_| Mutex::default()).collect()).collect();
         backend.rollout(groups, &|episode| {
-            // A team that is visited twice has a record twice as long.
+            // A team that is visited twice gets a record of twice the length.
             let mut record = records[episode.group][episode.team].lock().expect("no visit panics");
             record.extend(episode.sets.iter().chain(episode.seen.words().iter()).chain(episode.sights.iter()));
         })?;
@@ -193,23 +195,24 @@ fn compare_batch(
     Ok(teams.into_iter().find(differs))
 }
 
-/// Plays all groups as three batches of which only scores are wanted, of every kind by turns, and holds them against
-/// those of the reference's whole record; the first group and team that differs, and how. From turn to turn a group is
-/// asked for another kind.
+/// Plays all groups in three batches that request scores only, and compares them with the scores of the reference's
+/// whole record. Returns the first group and team that differ, and how. The kind of scores that a group requests
+/// changes with each turn.
 fn compare_scores(
     groups: &[Group<'_>],
     turn: usize,
     reference: &mut dyn Backend,
     backend: &mut dyn Backend,
 ) -> Result<Option<(usize, usize, String)>, BackendError> {
-    let need_of = |group: usize| Need::OF_SCORES[(turn * groups.len() + group) % Need::OF_SCORES.len()];
-    // Records come home packed where all of a batch can: those that must not for the sake of time are by themselves.
+    let need_of =
+        |group: usize| RecordRequest::OF_SCORES[(turn * groups.len() + group) % RecordRequest::OF_SCORES.len()];
+    // A batch is packed only if all its groups can be, so those that cannot are separate.
     let mut batches = [vec![], vec![], vec![]];
     for (index, group) in groups.iter().enumerate() {
         let (whole, timed) = (need_of(index).least(1).is_none(), group.world.rule.is_timed());
         batches[if whole { 0 } else { 1 + usize::from(timed) }].push(index);
     }
-    let played = |backend: &mut dyn Backend, needs: &dyn Fn(usize) -> Need| {
+    let played = |backend: &mut dyn Backend, needs: &dyn Fn(usize) -> RecordRequest| {
         let scores: Vec<Mutex<BTreeMap<usize, Scores>>> = groups.iter().map(|_| Mutex::default()).collect();
         for batch in &batches {
             let asked: Vec<Group<'_>> =
@@ -218,9 +221,11 @@ fn compare_scores(
                 let index = batch[episode.group];
                 let (world, mut credit) = (groups[index].world, Credit::default());
                 let found = match need_of(index) {
-                    // Dt is not asked for, whatever the record tells.
-                    Need::Record | Need::Sights | Need::Scores => Scores { dt: vec![], ..credit.all(&episode, world) },
-                    Need::Score(fitness) => {
+                    // Dt was not requested.
+                    RecordRequest::Record | RecordRequest::Sights | RecordRequest::Scores => {
+                        Scores { dt: vec![], ..credit.all(&episode, world) }
+                    }
+                    RecordRequest::Score(fitness) => {
                         let mut one = vec![0.0; world.leaders()];
                         let observed = credit.score(&episode, world, fitness, &mut one);
                         Scores { observed, d: one, ..Scores::default() }
@@ -231,7 +236,7 @@ fn compare_scores(
         }
         Ok::<_, BackendError>(scores.into_iter().map(|scores| scores.into_inner().expect("no visit panics")))
     };
-    let expected = played(reference, &|_| Need::Sights)?;
+    let expected = played(reference, &|_| RecordRequest::Sights)?;
     let found = played(backend, &need_of)?;
     Ok(expected.zip(found).enumerate().find_map(|(group, (expected, found))| {
         let differs = |(team, expected): (&usize, &Scores)| {
@@ -243,13 +248,13 @@ fn compare_scores(
     }))
 }
 
-/// Breeds a world's policies where the backend holds them; the first weight that differs.
+/// Breeds a world's policies on the device. Returns the first weight that differs.
 fn compare_breeding(config: &Config, teams: &Teams, backend: &mut dyn Backend) -> Result<Option<String>, BackendError> {
     let Teams { world, policies, weights, .. } = teams;
     let (slots, parameters) = (*policies, world.parameters());
     let sizes = [weights.len() / slots / parameters, slots, parameters];
     let Some(mut held) = backend.hold(weights, sizes)? else { return Ok(None) };
-    // Each slot's parent is the slot after it, every fourth is kept as it is.
+    // Each slot's parent is the next slot. Every fourth slot does not mutate.
     let planned = |place: usize| ((place + 1) % slots) as u32 | if place % 4 == 3 { UNCHANGED } else { 0 };
     let parents: Vec<u32> = (0..sizes[0]).flat_map(|_| (0..slots).map(planned)).collect();
     let (key, learning) = (Key::new(config.learning.seed, 0, Purpose::Mutation), &config.learning);
@@ -277,14 +282,15 @@ fn compare_training(
     reference: &mut dyn Backend,
     backend: &mut dyn Backend,
 ) -> Result<Option<String>, BackendError> {
-    let configs: Vec<Config> = (plan.worlds.iter().take(TRAINED))
+    let configs = (plan.worlds.iter().take(TRAINED))
         .map(|(_, config)| {
             let mut config = config.clone();
-            config.learning.generations = plan.generations;
+            // Stages may begin later than the short run ends.
+            config.learning.generations = plan.generations.max(config.last_from());
             config.learning.trials = config.learning.trials.min(2);
-            config
+            Ok(config.validate()?.ending_at(plan.generations))
         })
-        .collect();
+        .collect::<Result<Vec<ValidConfig>, BackendError>>()?;
     let train = |backend: &mut dyn Backend| {
         let mut trainer = Trainer::new(configs.clone());
         let mut rows: Vec<Row> = Vec::new();

@@ -1,9 +1,9 @@
-//! One experiment's constants and start state, in the form that kernels and shaders read.
+//! One experiment's constants and start state, as kernels and shaders read them.
 
 use glam::{DVec2, Vec2};
 
 use crate::config::{Config, LedBy, MAX_AGENTS, MAX_HIDDEN_UNITS, MAX_POIS, MAX_STEPS};
-use crate::declare::Choice;
+use crate::config_enum::Choice;
 use crate::model::couple::CoupleConstants;
 use crate::model::follow::FollowConstants;
 use crate::model::motion::MotionConstants;
@@ -16,32 +16,31 @@ pub use crate::model::policy::{BEHAVIOURS, OUTPUTS};
 pub use crate::model::sense::INPUTS;
 pub use crate::model::{Constants, Variant};
 
-/// One world: constants, start positions of all agents (leaders first), POIs, how many agents each needs, and by what
-/// rule these observe.
+/// One world: constants, start positions (leaders first), POIs, their coupling, and the rule of observation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct World {
-    /// What kernels read.
+    /// The constants of kernels.
     pub constants: Constants,
-    /// In units, on the kernels' grid: `[agents]`.
+    /// Start positions in units, on the kernels' grid, `[agents]`.
     pub starts: Vec<Vec2>,
-    /// Unit vectors, at the start: `[agents]`.
+    /// Initial headings, unit vectors, `[agents]`.
     pub headings: Vec<Vec2>,
-    /// In units, on the kernels' grid: `[pois]`.
+    /// POI positions in units, on the kernels' grid, `[pois]`.
     pub pois: Vec<Vec2>,
-    /// Agents that each POI needs at once (C): `[pois]`.
+    /// C: observers that each POI needs at the same step, `[pois]`.
     pub coupling: Vec<u32>,
-    /// Who observes, when and in what order.
+    /// Who observes, when, and in what order.
     pub rule: Rule,
-    /// Whom Dt counts as led.
+    /// The rule by which leaders lead followers, for Dt.
     pub led: Led,
 }
 
-/// Whom a follower is led by at a step, which [`Dt`](crate::config::Fitness::Dt) asks.
+/// The rule by which leaders lead a follower at a step, for [`Dt`](crate::config::Fitness::Dt).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Led {
-    /// Steps that tell it, the last ones up to this; 0 is all since the start.
+    /// The number of recent steps that count, including the present one. 0 counts all since the start.
     pub within: usize,
-    /// By which of the leaders that it saw at these.
+    /// The leaders that lead, of those seen at these steps.
     pub by: LedBy,
 }
 
@@ -52,7 +51,7 @@ impl Default for Led {
 }
 
 impl World {
-    /// Builds the world of a valid config; in the all-leaders paradigm the followers' places hold leaders.
+    /// Builds the world of a valid config. In the all-leaders paradigm the followers are leaders too.
     pub fn new(config: &Config) -> World {
         let Config { world, motion, follow, sense, policy, .. } = config;
         let (agents, leaders) = (world.leaders.len() + world.followers.len(), config.learners());
@@ -86,7 +85,7 @@ impl World {
         }
     }
 
-    /// Its width and height.
+    /// Returns the width and height of the map.
     pub fn map(&self) -> Vec2 {
         Vec2::new(self.constants.motion.map_x, self.constants.motion.map_y)
     }
@@ -128,55 +127,55 @@ impl World {
         fits.into_iter().find(|(_, fits)| !fits).map_or(Ok(()), |(field, _)| Err(field))
     }
 
-    /// Agents that have a policy, the first of all.
+    /// Returns the number of leaders, the agents with a policy.
     pub fn leaders(&self) -> usize {
         self.constants.leaders as usize
     }
 
-    /// Agents that follow.
+    /// Returns the number of followers.
     pub fn followers(&self) -> usize {
         self.constants.followers as usize
     }
 
-    /// Leaders and followers.
+    /// Returns the number of leaders and followers.
     pub fn agents(&self) -> usize {
         self.leaders() + self.followers()
     }
 
-    /// Steps of an episode.
+    /// Returns the steps of an episode.
     pub fn steps(&self) -> usize {
         self.constants.steps as usize
     }
 
-    /// Weights of one policy.
+    /// Returns the weights of one policy.
     pub fn parameters(&self) -> usize {
         self.constants.policy.parameters as usize
     }
 
-    /// Words of a bit a leader.
+    /// Returns the words of a set of leaders, one bit per leader.
     pub fn leader_words(&self) -> usize {
         self.leaders().div_ceil(32)
     }
 
-    /// Words in one team's record of sights: steps × followers × words of leaders.
+    /// Returns the words of one team's record of sightings: steps × followers × words of leaders.
     pub fn sight_words(&self) -> usize {
         self.steps() * self.followers() * self.leader_words()
     }
 
-    /// Words in one team's record of sets: steps × POIs × words a set.
+    /// Returns the words of one team's record of sets: steps × POIs × words per set.
     pub fn set_words(&self) -> usize {
         self.steps() * self.pois.len() * self.constants.words as usize
     }
 }
 
-/// The nearest place of the kernels' grid that is on the map.
+/// Rounds a position to the kernels' grid, and clamps it to the map.
 pub fn on_grid(place: Vec2, map: Vec2) -> Vec2 {
     ((place * GRID + 0.5).floor() / GRID).clamp(Vec2::ZERO, map)
 }
 
-/// The unit vector of an angle; a component under 1e-6 in size is 0, so that layouts full of exact ties keep them.
+/// Returns the unit vector of an angle. Components smaller than 1e-6 become 0, so that layouts keep exact ties.
 ///
-/// Sines and cosines here are [`libm`]'s: those of the platform may differ in the last bit from one system to another.
+/// Sine and cosine are from [`libm`], because the platform's may differ in the last bit.
 fn unit(angle: f64) -> Vec2 {
     let tidy = |component: f64| if component.abs() < 1e-6 { 0.0 } else { component as f32 };
     Vec2::new(tidy(libm::cos(angle)), tidy(libm::sin(angle)))

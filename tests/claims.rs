@@ -6,7 +6,7 @@ use std::sync::Mutex;
 
 use fearless_simd::Level;
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::{Backend, Group, Need};
+use flotilla::backend::{Backend, Group, RecordRequest};
 use flotilla::baseline::{Baseline, Baselines};
 use flotilla::config::{Fitness, Override, Paradigm};
 use flotilla::credit::Credit;
@@ -177,7 +177,7 @@ fn straight_ahead_solves_what_the_tables_say_and_random_teams_are_played() {
                 weights: weights[..].into(),
                 policies: population,
                 teams: &teams,
-                need: Need::Scores,
+                need: RecordRequest::Scores,
             };
             let visit = |episode: flotilla::backend::Episode<'_>| {
                 let observed = Credit::default().all(&episode, &world).observed;

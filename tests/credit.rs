@@ -1,7 +1,7 @@
 //! Credit against its definition: the record is edited (agents taken out, copies added) and G counted anew, step by step
 //! as the rule has it.
 
-use flotilla::backend::{Episode, Need, Seen, Strided, owner_bits};
+use flotilla::backend::{Episode, RecordRequest, Seen, Strided, owner_bits};
 use flotilla::config::{Fitness, LedBy, Observers};
 use flotilla::credit::{Credit, Scores};
 use flotilla::model::rule;
@@ -96,7 +96,7 @@ impl Record {
 
     /// What a need leaves of the record: of each POI the sets that are large enough and that no other contains, and the
     /// leader that each follower saw most.
-    fn packed(&self, need: Need) -> (Vec<u32>, Vec<u32>) {
+    fn packed(&self, need: RecordRequest) -> (Vec<u32>, Vec<u32>) {
         let (pois, words) = (self.coupling.len(), (self.leaders + self.followers).div_ceil(32));
         let contains = |a: &[usize], b: &[usize]| b.iter().all(|agent| a.contains(agent));
         let kept = |poi: usize| {
@@ -319,13 +319,13 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
     if world.rule.is_timed() {
         return expected;
     }
-    let needs = [Fitness::G, Fitness::D, Fitness::Df, Fitness::Dpp].map(Need::Score);
-    for need in [Need::Scores].into_iter().chain(needs) {
+    let needs = [Fitness::G, Fitness::D, Fitness::Df, Fitness::Dpp].map(RecordRequest::Score);
+    for need in [RecordRequest::Scores].into_iter().chain(needs) {
         let (sets, owners) = record.packed(need);
         let whole = |words| Strided { words, stride: 1, offset: 0 };
-        let seen = Seen::Most(whole(&owners));
+        let seen = Seen::Owners(whole(&owners));
         let episode = Episode { group: 0, team: 0, sets: whole(&sets), seen, sights: Strided::NONE };
-        let Need::Score(fitness) = need else {
+        let RecordRequest::Score(fitness) = need else {
             let found = Scores { dt: expected.dt.clone(), ..credit.all(&episode, &world) };
             assert_eq!(found, expected, "packed");
             continue;

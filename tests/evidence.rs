@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::{Backend, BackendError, Group, Need, Trace, Visit};
+use flotilla::backend::{Backend, BackendError, Group, RecordRequest, Trace, Visit};
 use flotilla::record::evidence::{Compared, SCHEMA, Sighting, Tier};
 use flotilla::verify::{self, Plan};
 
@@ -58,7 +58,7 @@ fn a_report_needs_no_gpu() {
 /// Right but where scores of one kind are asked for: there teams play each other's policies.
 struct Liar {
     cpu: Cpu,
-    about: Need,
+    about: RecordRequest,
 }
 
 impl Backend for Liar {
@@ -84,7 +84,7 @@ impl Backend for Liar {
 fn one_world_is_asked_for_scores_of_every_kind() {
     let worlds = verify::short_trainings().into_iter().take(1).collect();
     let plan = Plan { worlds, teams: 64, seed: 0, generations: 0 };
-    for about in Need::OF_SCORES {
+    for about in RecordRequest::OF_SCORES {
         let mut liar = Liar { cpu: Cpu::default(), about };
         let found = verify::compare(&plan, &mut Cpu::default(), &mut liar, |_| {}).unwrap();
         assert!(found.mismatch.as_ref().is_some_and(|told| told.contains("stage credit")), "{about:?}: {found:?}");

@@ -8,8 +8,8 @@ use std::collections::HashSet;
 
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, Group, Need};
-use flotilla::config::{Actions, Config, Elites, Fitness, Learning, Mutation, Paradigm, Parents, Sharing};
+use flotilla::backend::{Backend, Group, RecordRequest};
+use flotilla::config::{Actions, Config, Elites, Fitness, Learning, Mutation, Paradigm, Parents, Sharing, ValidConfig};
 use flotilla::credit::Credit;
 use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, UNCHANGED};
 use flotilla::trainer::{Row, Trainer};
@@ -554,7 +554,7 @@ set = { world.coupling = [1, 2], motion.max_speed = 5.0 }
 
 /// Rows and policies of every arm.
 fn train(configs: &[Config]) -> Vec<(Vec<Row>, Vec<Vec<f32>>)> {
-    let (mut trainer, mut backend) = (Trainer::new(configs.to_vec()), Cpu::default());
+    let (mut trainer, mut backend) = (Trainer::new(ValidConfig::all(configs).unwrap()), Cpu::default());
     let mut rows = vec![Vec::new(); configs.len()];
     for row in trainer.finish(&mut backend).unwrap() {
         rows[row.arm].push(row);
@@ -608,7 +608,7 @@ impl Plain<'_> {
             evolve::jitter_starts(key, generation, episode, &of_stage, start_jitter, &mut starts);
             evolve::jitter_pois(self.key(Purpose::Pois), generation, episode, &of_stage, poi_jitter, &mut starts);
             let teams = vec![0; team.len()];
-            let (world, weights, need) = (&of_stage, weights[..].into(), Need::Sights);
+            let (world, weights, need) = (&of_stage, weights[..].into(), RecordRequest::Sights);
             let group = Group { world, starts: &starts, weights, policies: 1, teams: &teams, need };
             let found = std::sync::Mutex::new(None);
             let visit = |episode: flotilla::backend::Episode<'_>| {
@@ -719,7 +719,7 @@ fn a_shared_policy_scores_the_mean_of_its_leaders() {
         config.world.observation_radius = 8.0;
     });
     let (world, leaders) = (World::new(&config), config.learners());
-    let mut trainer = Trainer::new(vec![config.clone()]);
+    let mut trainer = Trainer::new([config.validate().unwrap()]);
     let weights = trainer.weights(0, 0).unwrap().chunks(world.parameters()).map(<[f32]>::to_vec).collect();
     let plain = Plain { config: &config, world, trial: 0, policies: vec![weights] };
     trainer.advance(&mut Cpu::default()).unwrap();

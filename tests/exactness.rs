@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use flotilla::backend::gpu::device::{self, AdapterInfo, Binding, DeviceError, Kind, Request, Wanted};
 use flotilla::backend::gpu::episode::{self, Kernel};
 use flotilla::backend::gpu::exact::{self, Pass, ShaderError};
-use flotilla::backend::gpu::{self, probe, shaders};
+use flotilla::backend::gpu::{self, self_test, shaders};
 use flotilla::verify::short_trainings;
 use flotilla::world::World;
 use naga::back::{hlsl, msl};
@@ -599,7 +599,7 @@ fn running_out_of_memory_is_an_error() {
 #[test]
 fn a_refusal_names_the_device_and_the_probe() {
     let mismatch =
-        probe::Deviation { probe: "x*y + z".into(), values: vec![1.5f32.to_bits()], cpu: 1, gpu: 2 }.to_string();
+        self_test::Deviation { probe: "x*y + z".into(), values: vec![1.5f32.to_bits()], cpu: 1, gpu: 2 }.to_string();
     let failures = vec![(Pass::NoContraction, mismatch.clone()), (Pass::Guarded, mismatch)];
     let message = flotilla::cli::Error::from(DeviceError::Inexact { adapter: "Some GPU".into(), failures }).to_string();
     for part in ["Some GPU", "x*y + z", "no-contraction", "guarded", "0x00000002", "1.5e0", "--backend cpu"] {

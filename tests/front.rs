@@ -10,7 +10,7 @@ use std::path::Path;
 
 use flotilla::Config;
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::{Backend, Group, Need};
+use flotilla::backend::{Backend, Group, RecordRequest};
 use flotilla::config::{Fitness, MAX_AGENTS, MAX_POPULATION, MAX_STEPS, Stage};
 use flotilla::evaluate::Starts;
 use flotilla::front::{self, Failure, Processor, Trained};
@@ -220,7 +220,7 @@ fn given_policies_are_played_and_traced_team_by_team() {
             weights: weights[..].into(),
             policies: teams,
             teams: &order,
-            need: Need::Record,
+            need: RecordRequest::Record,
         };
         let trace = backend.trace(&group).expect("it fits");
         let (agents, steps) = (world.agents(), world.steps());
@@ -309,7 +309,7 @@ fn what_is_wrong_is_told() {
     for (index, break_it) in broken.into_iter().enumerate() {
         let mut config = config.clone();
         break_it(&mut config);
-        let refused = |error| matches!(error, Failure::Config(_) | Failure::Unwritten(_));
+        let refused = |error| matches!(error, Failure::Config(_));
         assert!(refused(play(&config, 2, &good, Starts::Own).expect_err("it is broken")), "{index}");
         let trained = flotilla::train(&config, &mut Cpu::default(), |_| Continue(()));
         assert!(refused(trained.expect_err("it is broken")), "{index}");

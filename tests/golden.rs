@@ -11,9 +11,9 @@ use std::sync::LazyLock;
 
 use flotilla::backend::cpu::{Cpu, level_name};
 #[cfg(feature = "gpu")]
-use flotilla::backend::gpu::{self, episode::GpuEpisodes};
-use flotilla::backend::{Backend, BackendError, Episode, Group, Need, Trace, Visit};
-use flotilla::config::{Config, Override};
+use flotilla::backend::gpu::{self, episode::GpuBackend};
+use flotilla::backend::{Backend, BackendError, Episode, Group, RecordRequest, Trace, Visit};
+use flotilla::config::{Config, Override, ValidConfig};
 use flotilla::trainer::{Row, Trainer};
 use flotilla::world::World;
 use sha2::{Digest, Sha256};
@@ -229,7 +229,7 @@ pub struct Golden {
 
 /// Trains all configs side by side: what each came to, and the most that a team of it observed.
 pub fn train(configs: &[Config], backend: &mut dyn Backend) -> Vec<(Golden, f64)> {
-    let mut trainer = Trainer::new(configs.to_vec());
+    let mut trainer = Trainer::new(ValidConfig::all(configs).unwrap());
     let mut texts = vec![String::from("trial,generation,best_g,mean_g,champion_g\n"); configs.len()];
     let mut most = vec![0f64; configs.len()];
     for row in trainer.finish(backend).unwrap() {
@@ -255,8 +255,14 @@ pub fn train(configs: &[Config], backend: &mut dyn Backend) -> Vec<(Golden, f64)
 fn trace(backend: &mut dyn Backend, config: &Config, world: &World, weights: &[f32]) -> String {
     let policies = config.learning.population;
     let teams: Vec<u32> = (0..policies * world.leaders()).map(|place| (place / world.leaders()) as u32).collect();
-    let group =
-        Group { world, starts: &world.starts, weights: weights.into(), policies, teams: &teams, need: Need::Record };
+    let group = Group {
+        world,
+        starts: &world.starts,
+        weights: weights.into(),
+        policies,
+        teams: &teams,
+        need: RecordRequest::Record,
+    };
     let trace = backend.trace(&group).unwrap();
     let floats: Vec<f32> = bytemuck::cast_slice(&trace.moments).iter().map(|float: &f32| float + 0.0).collect();
     hex(&Sha256::digest(bytemuck::cast_slice::<f32, u8>(&floats)))
@@ -329,7 +335,7 @@ fn every_instruction_set() {
 #[test]
 fn every_adapter() {
     for (request, info) in support::adapters("every_adapter") {
-        check(&info.to_string(), &mut GpuEpisodes::new(gpu::open(request).unwrap()).unwrap());
+        check(&info.to_string(), &mut GpuBackend::new(gpu::open(request).unwrap()).unwrap());
     }
 }
 

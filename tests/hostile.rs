@@ -285,7 +285,7 @@ fn checkpoints() {
     let [before, end] = &files.checkpoints;
     fuzz("checkpoint", &[before, end], |bytes| {
         let Ok(read) = Checkpoint::read(Cursor::new(bytes), &longer) else { return false };
-        let mut trainer = Trainer::new(vec![longer.clone()]);
+        let mut trainer = Trainer::new([longer.validate().unwrap()]);
         if read.snapshot.weights.is_empty() {
             // They are the policies', and those are read with as much care.
             assert_eq!(read.snapshot.generation, read.snapshot.last + 1);

@@ -28,7 +28,7 @@ fn apply<S: Simd>(simd: S, function: Function, input: &[f32], output: &mut [f32]
                 let x = S::f32s::from_slice(simd, input);
                 match function {
                     Rsqrt => math::rsqrt::<S>(x),
-                    Root => math::root::<S>(x),
+                    Root => math::exact_sqrt::<S>(x),
                     Recip => math::recip::<S>(x),
                     Tanh => math::whole_tanh::<S>(math::half_tanh::<S>(math::limit_tanh::<S>(x))),
                     Sin => math::sin_cos::<S>(x).0,
@@ -196,7 +196,7 @@ fn samples(function: Function, count: u32) -> Vec<f32> {
     let span = (high.to_bits() - low.to_bits()) as u64;
     (0..count)
         .map(|i| {
-            let [word, sign, ..] = math::draw_scalar([i, 0, 0, function as u32]);
+            let [word, sign, ..] = math::pcg4d_scalar([i, 0, 0, function as u32]);
             let x = f32::from_bits(low.to_bits() + ((word as u64 * span) >> 32) as u32);
             if matches!(function, Tanh | Sin | Cos) && sign >> 31 == 1 { -x } else { x }
         })
@@ -232,7 +232,7 @@ fn draws(level: Level, place: usize, count: usize) -> Vec<[u32; 4]> {
                     counters[place] = S::u32s::from_fn(simd, |lane| counter + lane as u32);
                     counter += S::u32s::LEN as u32;
                     let [x, y, z, w] = counters;
-                    let words = math::draw::<S>(x, y, z, w);
+                    let words = math::pcg4d::<S>(x, y, z, w);
                     for (lane, draw) in chunk.iter_mut().enumerate() {
                         *draw = [words[0][lane], words[1][lane], words[2][lane], words[3][lane]];
                     }
@@ -252,7 +252,7 @@ fn draw_scalar_is_a_lane_of_draw() {
             for (i, lane) in draws(level, place, 1 << 16).into_iter().enumerate() {
                 let mut counter = [7; 4];
                 counter[place] = i as u32;
-                assert_eq!(lane, math::draw_scalar(counter), "{level:?}, counter {counter:?}");
+                assert_eq!(lane, math::pcg4d_scalar(counter), "{level:?}, counter {counter:?}");
             }
         }
     }
@@ -305,10 +305,10 @@ fn every_counter_bit_moves_every_drawn_bit() {
     (0..128usize).into_par_iter().for_each(|flipped| {
         let mut ones = [[0usize; 32]; 4];
         for i in 0..COUNT as u32 {
-            let counter = math::draw_scalar([i, 1, 2, 3]);
+            let counter = math::pcg4d_scalar([i, 1, 2, 3]);
             let mut neighbour = counter;
             neighbour[flipped / 32] ^= 1 << (flipped % 32);
-            let (a, b) = (math::draw_scalar(counter), math::draw_scalar(neighbour));
+            let (a, b) = (math::pcg4d_scalar(counter), math::pcg4d_scalar(neighbour));
             for (word, ones) in ones.iter_mut().enumerate() {
                 ones.iter_mut().enumerate().for_each(|(bit, ones)| *ones += ((a[word] ^ b[word]) >> bit & 1) as usize);
             }
@@ -430,7 +430,7 @@ fn numbers(source: &str, function: &str) -> Vec<f64> {
 fn twins_have_the_same_numbers() {
     for function in [
         "rsqrt",
-        "root",
+        "exact_sqrt",
         "rough_rsqrt",
         "recip",
         "rough_twice_recip",

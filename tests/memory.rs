@@ -156,7 +156,7 @@ fn packed_records_are_counted() {
 #[test]
 fn checkpoints_need_no_copy() {
     let config = Config::parse(&text(60, 2, 9, "generations = 1"), "config").unwrap();
-    let mut trainer = Trainer::new(vec![config.clone()]);
+    let mut trainer = Trainer::new([config.validate().unwrap()]);
     for _ in 0..3 {
         trainer.advance(&mut Cpu::default()).unwrap();
     }
@@ -189,7 +189,7 @@ fn checkpoints_need_no_copy() {
     let read = checkpoint::read(&checkpoint::path(&folder.path().join("view"), 3), Path::new("none"), &config);
     let read = read.unwrap().expect("it has its weights");
     assert_eq!(read.snapshot, trainer.snapshot(0).unwrap());
-    let mut other = Trainer::new(vec![config]);
+    let mut other = Trainer::new([config.validate().unwrap()]);
     assert!(other.restore(0, read.snapshot));
     let rows = |trainer: &mut Trainer| trainer.advance(&mut Cpu::default()).unwrap();
     assert_eq!(rows(&mut other), rows(&mut trainer));

@@ -12,7 +12,7 @@ mod support;
 use std::f64::consts::PI;
 
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, Group, Moment, Need, Trace};
+use flotilla::backend::{Backend, Group, Moment, RecordRequest, Trace};
 use flotilla::bench::with_agents;
 use flotilla::config::{Actions, Config, Coupling, Density, Paradigm};
 use flotilla::sample;
@@ -387,7 +387,7 @@ fn check(cpu: &mut Cpu, world: &Config, model: &Model, seed: u64) -> Tally {
         .map(|start| start + Vec2::new(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0)) * jitter)
         .map(|start| on_grid(start, model.map.as_vec2()))
         .collect();
-    let (world, need) = (&compiled, Need::Sights);
+    let (world, need) = (&compiled, RecordRequest::Sights);
     // POIs of an episode may be elsewhere than the world's.
     let moved: Vec<Vec2> = model.moved.iter().flatten().map(|poi| poi.as_vec2()).collect();
     let places = [&starts[..], &moved].concat();
@@ -591,7 +591,7 @@ actions = 'behaviours'";
             weights: weights[..].into(),
             policies: 1,
             teams: &teams,
-            need: Need::Record,
+            need: RecordRequest::Record,
         };
         for level in Cpu::levels() {
             let trace = Cpu::at_level(level).trace(&group).unwrap();
@@ -610,7 +610,7 @@ actions = 'behaviours'";
         weights: weights[..].into(),
         policies: 1,
         teams: &[0, 0],
-        need: Need::Record,
+        need: RecordRequest::Record,
     };
     let trace = Cpu::default().trace(&group).unwrap();
     assert_eq!(trace.moment(1, 0, 0).outputs, front_right);

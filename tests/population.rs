@@ -12,10 +12,12 @@ use fearless_simd::Level;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu;
 use flotilla::backend::gpu::device::{self, DeviceError, Kind};
-use flotilla::backend::gpu::episode::{GpuEpisodes, Holding};
-use flotilla::backend::{Backend, BackendError, Group, HELD_FROM, Held, Trace, Visit, Weights};
-use flotilla::backend::{Machine, Player};
-use flotilla::config::{Config, Coupling, Elites, Fitness, Learning, Mutation, Paradigm, Parents, Sharing};
+use flotilla::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
+use flotilla::backend::{Backend, BackendError, DevicePopulation, Group, HELD_FROM, Trace, Visit, Weights};
+use flotilla::backend::{Machine, OpenBackend};
+use flotilla::config::{
+    Config, Coupling, Elites, Fitness, Learning, Mutation, Paradigm, Parents, Sharing, ValidConfig,
+};
 use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, Start};
@@ -57,7 +59,7 @@ fn parents([leaders, slots, _]: [usize; 3], generation: usize) -> Vec<u32> {
 #[test]
 fn breeding_gives_the_same_bits() {
     for (request, info) in support::adapters("breeding_gives_the_same_bits") {
-        let mut backend = GpuEpisodes::new(gpu::open(request).unwrap()).unwrap().holding(Holding::Always);
+        let mut backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().holding(ResidencyPolicy::Always);
         let mut mutated = 0;
         for sizes in [[1, 2, 1], [3, 5, 97], [4, 51, 112], [2, 301, 64], [2, 17, 1000], [1, 300, 65], [257, 2, 18]] {
             for (case, probability) in [0.0, 0.1, 0.999, 1.0].into_iter().enumerate() {
@@ -130,7 +132,7 @@ fn snapshots_of(trainer: &mut Trainer) -> Result<Vec<Snapshot>, SnapshotError> {
 }
 
 fn restored(snapshots: &[Snapshot]) -> Trainer {
-    let mut trainer = Trainer::new(arms());
+    let mut trainer = Trainer::new(ValidConfig::all(&arms()).unwrap());
     for (arm, snapshot) in snapshots.iter().enumerate() {
         assert!(trainer.restore(arm, snapshot.clone()));
     }
@@ -143,7 +145,8 @@ fn train(trainer: &mut Trainer, backend: &mut dyn Backend) -> Story {
 
 /// What the CPU comes to, and its snapshots before each generation.
 fn reference() -> (Story, Vec<Vec<Snapshot>>) {
-    let (mut trainer, mut rows, mut snapshots) = (Trainer::new(arms()), Vec::new(), Vec::new());
+    let (mut trainer, mut rows, mut snapshots) =
+        (Trainer::new(ValidConfig::all(&arms()).unwrap()), Vec::new(), Vec::new());
     while !trainer.is_done() {
         snapshots.push(snapshots_of(&mut trainer).unwrap());
         rows.extend(trainer.advance(&mut Cpu::default()).unwrap());
@@ -157,18 +160,26 @@ fn training_comes_to_the_same_wherever_populations_are() {
     assert!(expected.rows.iter().any(|row| row.best_g > 0.0), "nothing was observed");
     for (request, info) in support::adapters("training_comes_to_the_same_wherever_populations_are") {
         let gpu = gpu::open(request).unwrap();
-        let open = |holding| GpuEpisodes::new(gpu.clone()).unwrap().holding(holding);
+        let open = |holding| GpuBackend::new(gpu.clone()).unwrap().holding(holding);
         // The populations of some arms take more than this, of others less.
-        let some = Holding::From(4 * 30 * 112 * 4);
-        for holding in [Holding::Always, Holding::Never, some] {
-            assert_eq!(train(&mut Trainer::new(arms()), &mut open(holding)), expected, "{info}, {holding:?}");
+        let some = ResidencyPolicy::From(4 * 30 * 112 * 4);
+        for holding in [ResidencyPolicy::Always, ResidencyPolicy::Never, some] {
+            assert_eq!(
+                train(&mut Trainer::new(ValidConfig::all(&arms()).unwrap()), &mut open(holding)),
+                expected,
+                "{info}, {holding:?}"
+            );
         }
         // Batches of some teams each.
-        let mut small = open(Holding::Always).batched(1 << 14);
-        assert_eq!(train(&mut Trainer::new(arms()), &mut small), expected, "{info}, small batches");
+        let mut small = open(ResidencyPolicy::Always).batched(1 << 14);
+        assert_eq!(
+            train(&mut Trainer::new(ValidConfig::all(&arms()).unwrap()), &mut small),
+            expected,
+            "{info}, small batches"
+        );
         // What is saved is the same, and goes on anywhere.
-        let (mut device, mut again) = (open(Holding::Always), open(Holding::Always));
-        let (mut trainer, mut rows) = (Trainer::new(arms()), Vec::new());
+        let (mut device, mut again) = (open(ResidencyPolicy::Always), open(ResidencyPolicy::Always));
+        let (mut trainer, mut rows) = (Trainer::new(ValidConfig::all(&arms()).unwrap()), Vec::new());
         for (generation, snapshot) in snapshots.iter().enumerate() {
             assert_eq!(&snapshots_of(&mut trainer).unwrap(), snapshot, "{info}, before generation {generation}");
             for other in [&mut Cpu::default() as &mut dyn Backend, &mut again] {
@@ -180,9 +191,12 @@ fn training_comes_to_the_same_wherever_populations_are() {
         }
         assert_eq!((&rows, policies(&trainer)), (&expected.rows, expected.policies.clone()), "{info}");
         // A trainer that moves from one device to another takes its populations along.
-        let (mut trainer, mut rows) = (Trainer::new(arms()), Vec::new());
-        let mut backends: [Box<dyn Backend>; 3] =
-            [Box::new(open(Holding::Always)), Box::new(open(Holding::Always)), Box::new(Cpu::default())];
+        let (mut trainer, mut rows) = (Trainer::new(ValidConfig::all(&arms()).unwrap()), Vec::new());
+        let mut backends: [Box<dyn Backend>; 3] = [
+            Box::new(open(ResidencyPolicy::Always)),
+            Box::new(open(ResidencyPolicy::Always)),
+            Box::new(Cpu::default()),
+        ];
         while !trainer.is_done() {
             let backend = &mut backends[trainer.generation(2) % 3];
             rows.extend(trainer.advance(&mut **backend).unwrap());
@@ -235,7 +249,7 @@ fn stages_and_ends_count_wherever_populations_are() {
          [[stages]]\nfrom = 5\nset = { world.coupling = 2, learning.poi_jitter = 2.0 }\n",
     );
     let story = |backend: &mut dyn Backend, end: usize| {
-        let (mut trainer, mut rows) = (Trainer::new(vec![config.clone()]), Vec::new());
+        let (mut trainer, mut rows) = (Trainer::new([config.validate().unwrap()]), Vec::new());
         while !trainer.is_done() {
             rows.extend(trainer.advance(backend).unwrap());
             if trainer.generation(0) == end {
@@ -249,7 +263,8 @@ fn stages_and_ends_count_wherever_populations_are() {
         let expected = story(&mut Cpu::default(), end);
         assert_eq!(story(&mut Device::failing_at(0, false), end), expected, "ended at {end}");
         for (request, info) in &adapters {
-            let mut gpu = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap().holding(Holding::Always);
+            let mut gpu =
+                GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().holding(ResidencyPolicy::Always);
             assert_eq!(story(&mut gpu, end), expected, "{info}, ended at {end}");
         }
         assert!(expected.0.iter().all(|row| row.champion_g > 0.0), "what champions start from does not show");
@@ -261,7 +276,7 @@ fn stages_and_ends_count_wherever_populations_are() {
 fn what_was_drawn_for_a_stage_that_no_longer_comes_is_forgotten() {
     let config = staged("[[stages]]\nfrom = 3\nset = { learning.start_jitter = 3.0 }\n");
     let story = |backend: &mut dyn Backend| {
-        let mut trainer = Trainer::new(vec![config.clone()]);
+        let mut trainer = Trainer::new([config.validate().unwrap()]);
         while trainer.generation(0) < 2 {
             trainer.advance(backend).unwrap();
         }
@@ -280,7 +295,8 @@ fn what_was_drawn_for_a_stage_that_no_longer_comes_is_forgotten() {
 #[test]
 fn a_setback_is_told() {
     for nth in 1.. {
-        let (mut trainer, mut device, mut told) = (Trainer::new(arms()), Device::failing_at(nth, false), 0);
+        let (mut trainer, mut device, mut told) =
+            (Trainer::new(ValidConfig::all(&arms()).unwrap()), Device::failing_at(nth, false), 0);
         while !trainer.is_done() {
             trainer.advance(&mut device).unwrap();
             told += usize::from(trainer.take_setback().is_some_and(|error| error.to_string().contains("pulled out")));
@@ -300,14 +316,14 @@ fn what_does_not_fit_the_device_is_declined() {
         let gpu = gpu::open(device::Request { default_limits: true, ..request }).unwrap();
         // The least over WebGPU's 128 MiB; a backend that declines does not look at the weights.
         let sizes = [1, (128 << 20) / 4 / 112 + 1, 112];
-        let open = |holding| GpuEpisodes::new(gpu.clone()).unwrap().holding(holding);
-        assert!(open(Holding::From(1)).hold(&[], sizes).unwrap().is_none(), "{info}");
-        let error = open(Holding::Always).hold(&[], sizes).unwrap_err().to_string();
+        let open = |holding| GpuBackend::new(gpu.clone()).unwrap().holding(holding);
+        assert!(open(ResidencyPolicy::From(1)).hold(&[], sizes).unwrap().is_none(), "{info}");
+        let error = open(ResidencyPolicy::Always).hold(&[], sizes).unwrap_err().to_string();
         assert!(error.contains("134217") && error.contains("breed on the host"), "{info}: {error}");
-        assert!(open(Holding::Never).hold(&[], [1, 2, 1]).unwrap().is_none(), "{info}");
+        assert!(open(ResidencyPolicy::Never).hold(&[], [1, 2, 1]).unwrap().is_none(), "{info}");
         // Nothing is asked for.
         let weights = vec![0.0; HELD_FROM as usize / 4];
-        let mut backend = GpuEpisodes::new(gpu.clone()).unwrap();
+        let mut backend = GpuBackend::new(gpu.clone()).unwrap();
         let held = backend.hold(&weights, [2, weights.len() / 2, 1]).unwrap();
         assert_eq!(held.is_some(), info.kind != Kind::Software, "{info}");
         assert!(backend.hold(&weights[1..], [1, weights.len() - 1, 1]).unwrap().is_none(), "{info}");
@@ -364,7 +380,7 @@ impl std::fmt::Debug for OnDevice {
     }
 }
 
-impl Held for OnDevice {
+impl DevicePopulation for OnDevice {
     fn breed(&mut self, breeding: &Breeding<'_>) -> Result<(), BackendError> {
         self.state.call()?;
         self.weights = breeding.on_host(self.sizes, &self.weights)?;
@@ -387,7 +403,9 @@ impl Backend for Device {
         // Groups from the host come once populations were brought home.
         let weights = |group: &Group<'_>| match group.weights {
             Weights::OnHost(weights) => weights.to_vec(),
-            Weights::Held(held) => (held as &dyn Any).downcast_ref::<OnDevice>().expect("held here").weights.clone(),
+            Weights::OnDevice(held) => {
+                (held as &dyn Any).downcast_ref::<OnDevice>().expect("held here").weights.clone()
+            }
         };
         let weights: Vec<Vec<f32>> = groups.iter().map(weights).collect();
         let groups: Vec<Group<'_>> = groups
@@ -402,7 +420,7 @@ impl Backend for Device {
         self.cpu.trace(group)
     }
 
-    fn hold(&mut self, weights: &[f32], sizes: [usize; 3]) -> Result<Option<Box<dyn Held>>, BackendError> {
+    fn hold(&mut self, weights: &[f32], sizes: [usize; 3]) -> Result<Option<Box<dyn DevicePopulation>>, BackendError> {
         Ok(Some(Box::new(OnDevice { state: self.state.clone(), weights: weights.to_vec(), sizes })))
     }
 
@@ -419,7 +437,7 @@ fn populations_lost_with_their_device_are_made_again() {
     for (for_good, saves_every) in [(true, 1), (true, 3), (true, 100), (false, 3), (false, 100)] {
         for nth in 1.. {
             let case = format!("fails at call {nth}, for good: {for_good}, saved every {saves_every} generations");
-            let (mut trainer, mut rows) = (Trainer::new(arms()), Vec::new());
+            let (mut trainer, mut rows) = (Trainer::new(ValidConfig::all(&arms()).unwrap()), Vec::new());
             let mut device = Device::failing_at(nth, for_good);
             while !trainer.is_done() {
                 if trainer.generation(2) % saves_every == 0 {
@@ -457,7 +475,7 @@ fn a_run_survives_the_loss_of_the_device_that_holds_its_populations() {
         let path = folder.path().join(name);
         let (mut session, _) = Session::open(vec![(config.clone(), path.clone())], start, &Disk::default()).unwrap();
         let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
-        let cpu = || -> Player { (Box::new(Cpu::default()), Machine::default()) };
+        let cpu = || -> OpenBackend { (Box::new(Cpu::default()), Machine::default()) };
         let mut options = Options {
             command: "",
             stop: &stop,

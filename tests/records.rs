@@ -9,10 +9,10 @@ use std::collections::BTreeMap;
 use std::sync::Mutex;
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records};
+use flotilla::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy};
 use flotilla::backend::gpu::{self, device::Request};
-use flotilla::backend::{Backend, Group, Need};
-use flotilla::config::{Config, Coupling, Fitness, Observers, Paradigm};
+use flotilla::backend::{Backend, Group, RecordRequest};
+use flotilla::config::{Config, Coupling, Fitness, Observers, Paradigm, ValidConfig};
 use flotilla::credit::Credit;
 use flotilla::sample;
 use flotilla::sweep::Sweep;
@@ -36,7 +36,7 @@ impl Teams {
         Teams { choice: (0..teams * world.leaders()).map(|place| (place * 7 % 5) as u32).collect(), weights, world }
     }
 
-    fn group(&self, need: Need) -> Group<'_> {
+    fn group(&self, need: RecordRequest) -> Group<'_> {
         let Teams { world, weights, choice } = self;
         Group { world, starts: &world.starts, weights: weights[..].into(), policies: 5, teams: choice, need }
     }
@@ -52,22 +52,27 @@ impl Teams {
 type Scores = BTreeMap<(usize, usize), (u32, Vec<Vec<f32>>)>;
 
 /// The need of a group where those that a packed record answers come by turns, from `first` on; or Dt, which none does.
-fn need_of(group: usize, first: usize) -> Need {
-    let (packed, _) = Need::OF_SCORES.split_at(5);
-    if first == DT { Need::Score(Fitness::Dt) } else { packed[(group + first) % packed.len()] }
+fn need_of(group: usize, first: usize) -> RecordRequest {
+    let (packed, _) = RecordRequest::OF_SCORES.split_at(5);
+    if first == DT { RecordRequest::Score(Fitness::Dt) } else { packed[(group + first) % packed.len()] }
 }
 
 const DT: usize = usize::MAX;
 
 /// Plays all teams as one batch, the needs of the groups by turns from `first` on; `asked` is what the backend is told.
-fn scores(backend: &mut dyn Backend, all: &[Teams], first: usize, asked: impl Fn(Need) -> Need) -> Scores {
+fn scores(
+    backend: &mut dyn Backend,
+    all: &[Teams],
+    first: usize,
+    asked: impl Fn(RecordRequest) -> RecordRequest,
+) -> Scores {
     let need = |group: usize| need_of(group, first);
     let groups: Vec<_> = all.iter().enumerate().map(|(index, teams)| teams.group(asked(need(index)))).collect();
     let scores = Mutex::new(Scores::new());
     let visit = |episode: flotilla::backend::Episode<'_>| {
         let (world, mut credit) = (groups[episode.group].world, Credit::default());
         let found = match need(episode.group) {
-            Need::Score(fitness) => {
+            RecordRequest::Score(fitness) => {
                 let mut one = vec![0.0; world.leaders()];
                 (credit.score(&episode, world, fitness, &mut one), vec![one])
             }
@@ -85,15 +90,15 @@ fn scores(backend: &mut dyn Backend, all: &[Teams], first: usize, asked: impl Fn
 }
 
 fn expected(all: &[Teams], first: usize) -> Scores {
-    scores(&mut Cpu::default(), all, first, |_| Need::Sights)
+    scores(&mut Cpu::default(), all, first, |_| RecordRequest::Sights)
 }
 
-fn open(request: &Request, records: Records) -> GpuEpisodes {
-    GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap().bringing(records)
+fn open(request: &Request, records: Records) -> GpuBackend {
+    GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().bringing(records)
 }
 
 /// What came from the device since this was last asked.
-fn down(backend: &mut GpuEpisodes) -> u64 {
+fn down(backend: &mut GpuBackend) -> u64 {
     backend.take_stages().traffic.down
 }
 
@@ -168,7 +173,9 @@ fn a_changed_rule_is_noticed() {
     let expected = expected(&all, 0);
     for (request, info) in support::adapters("a_changed_rule_is_noticed") {
         for (index, edit) in edits.into_iter().enumerate() {
-            let mut backend = open(&request, Records::Packed).edited(edit);
+            // SAFETY: the edits change comparisons and shorten a loop; every index stays in bounds.
+            #[expect(unsafe_code, reason = "an edited shader is compiled without bounds checks")]
+            let mut backend = unsafe { open(&request, Records::Packed).edited(edit) };
             assert!(scores(&mut backend, &all, 0, |need| need) != expected, "{info}: edit {index} was not noticed");
         }
     }
@@ -221,7 +228,7 @@ fn whole_records_come_where_they_must() {
     let [for_short, for_long, for_longest] = [&short, &long, &longest].map(|teams| expected(teams, 0));
     for (request, info) in support::adapters("whole_records_come_where_they_must") {
         let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
-        assert!(scores(&mut backend, &short, 0, |_| Need::Record) == for_short, "{info}");
+        assert!(scores(&mut backend, &short, 0, |_| RecordRequest::Record) == for_short, "{info}");
         assert_eq!(down(&mut backend), short[0].whole(), "{info}: the record was asked for");
         // Several dispatches.
         assert!(scores(&mut backend, &long, 0, |need| need) == for_long, "{info}");
@@ -243,8 +250,8 @@ fn a_generation_moves_less_than_95_bytes_a_team() {
     (config.learning.trials, config.learning.population, config.learning.generations) = (1, teams, 60);
     config.learning.fitness = Fitness::Df;
     for (request, info) in support::adapters("a_generation_moves_less_than_95_bytes_a_team") {
-        let mut backend = open(&request, Records::PackedFrom(0)).holding(Holding::Always);
-        let mut trainer = Trainer::new(vec![config.clone()]);
+        let mut backend = open(&request, Records::PackedFrom(0)).holding(ResidencyPolicy::Always);
+        let mut trainer = Trainer::new([config.validate().unwrap()]);
         let mut before = backend.gpu().traffic();
         for generation in 0..=50 {
             let rows = trainer.advance(&mut backend).unwrap();
@@ -296,7 +303,7 @@ fn records_are_packed_only_where_time_does_not_matter() {
             let moved = down(&mut backend);
             assert_eq!(moved < all[0].whole() / 2, packed, "{info}, {what}: {moved} bytes");
             // Dt asks when its followers were led: nothing is packed, and sights come with the rest.
-            let expected = scores(&mut Cpu::default(), &all, DT, |_| Need::Sights);
+            let expected = scores(&mut Cpu::default(), &all, DT, |_| RecordRequest::Sights);
             assert!(scores(&mut backend, &all, DT, |need| need) == expected, "{info}, {what}, Dt");
             let sights = (200 * 4 * all[0].world.sight_words()) as u64;
             assert_eq!(down(&mut backend), all[0].whole() + sights, "{info}, {what}, Dt");
@@ -338,10 +345,10 @@ fn compiling() {
     cases.push(("large.toml".into(), sweep.points.into_iter().map(|point| small(point.config)).collect()));
     for (request, info) in support::adapters("compiling") {
         for (name, configs) in &cases {
-            let backend = || GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
-            let gpu = backend().playing(Kernel::Best).holding(Holding::Always).bringing(Records::PackedFrom(0));
+            let backend = || GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
+            let gpu = backend().playing(Kernel::Best).holding(ResidencyPolicy::Always).bringing(Records::PackedFrom(0));
             for (what, mut backend) in [("by default", backend()), ("as on a GPU", gpu)] {
-                let mut trainer = Trainer::new(configs.clone());
+                let mut trainer = Trainer::new(ValidConfig::all(&configs).unwrap());
                 let mut seconds = || {
                     let start = processor_seconds();
                     trainer.advance(&mut backend).unwrap();

@@ -17,9 +17,9 @@ use std::time::{Duration, Instant};
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu;
 use flotilla::backend::gpu::device::DeviceError;
-use flotilla::backend::gpu::episode::GpuEpisodes;
+use flotilla::backend::gpu::episode::GpuBackend;
 use flotilla::backend::{Backend, BackendError, Group, Trace, Visit};
-use flotilla::backend::{Machine, Player};
+use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::Config;
 use flotilla::record::checkpoint::{self, Checkpoint};
 use flotilla::record::disk::{Disk, Operation};
@@ -52,7 +52,7 @@ fn small() -> Config {
     Config::parse(SMALL, "small.toml").unwrap()
 }
 
-fn cpu() -> Player {
+fn cpu() -> OpenBackend {
     (Box::new(Cpu::default()), Machine::default())
 }
 
@@ -66,7 +66,14 @@ struct Told {
     reached: usize,
 }
 
-fn session(config: &Config, path: &Path, start: Start, disk: Disk, player: Player, stop_at: Option<usize>) -> Told {
+fn session(
+    config: &Config,
+    path: &Path,
+    start: Start,
+    disk: Disk,
+    player: OpenBackend,
+    stop_at: Option<usize>,
+) -> Told {
     let (mut session, notes) = match Session::open(vec![(config.clone(), path.into())], start, &disk) {
         Ok(opened) => opened,
         Err(error) => return Told { end: Err(error), results: None, notes: vec![], start: 0, reached: 0 },
@@ -84,8 +91,8 @@ fn session(config: &Config, path: &Path, start: Start, disk: Disk, player: Playe
 /// Trains until told to stop.
 fn train(
     session: &mut Session,
-    mut player: Player,
-    instead: &mut dyn FnMut(&BackendError) -> Option<Player>,
+    mut player: OpenBackend,
+    instead: &mut dyn FnMut(&BackendError) -> Option<OpenBackend>,
     stops: &mut dyn FnMut(&[usize]) -> bool,
 ) -> Result<Ended, RunError> {
     let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
@@ -602,7 +609,7 @@ fn a_lost_device_costs_nothing() {
     let config = Config::parse(&SMALL.replace("[checkpoint]\ngenerations = 1", "[checkpoint]"), "small.toml").unwrap();
     let expected = reference(&config);
     for left in 0..=config.learning.generations + 1 {
-        let failing = || -> Player { (Box::new(Failing { cpu: Cpu::default(), left }), Machine::default()) };
+        let failing = || -> OpenBackend { (Box::new(Failing { cpu: Cpu::default(), left }), Machine::default()) };
         let folder = tempfile::tempdir().unwrap();
         // It saves, and is resumed.
         let path = folder.path().join("stop");
@@ -634,8 +641,8 @@ fn a_run_may_change_to_another_processor_and_back() {
     let config = small();
     let expected = reference(&config);
     for (request, info) in support::adapters("a_run_may_change_to_another_processor_and_back") {
-        let gpu = || -> Player {
-            let backend = GpuEpisodes::new(gpu::open(request.clone()).unwrap()).unwrap();
+        let gpu = || -> OpenBackend {
+            let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
             (Box::new(backend), Machine { backend: "gpu".into(), ..Machine::default() })
         };
         let folder = tempfile::tempdir().unwrap();

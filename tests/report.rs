@@ -757,7 +757,7 @@ fn what_is_trained_once_for_two_arms_is_the_same_for_both() {
     let (configs, places) = paper::trained(&arms);
     assert_eq!((configs.len(), places.len()), (26, 33));
     let course = |config: &Config| {
-        let mut trainer = Trainer::new(vec![config.clone()]);
+        let mut trainer = Trainer::new([config.validate().unwrap()]);
         trainer.finish(&mut Cpu::default()).unwrap();
         trainer.policies(0)
     };

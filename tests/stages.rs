@@ -234,7 +234,7 @@ fn a_run_goes_on_from_the_policies_that_it_started_from() {
     let learned = policies::read_all(&file, &config).unwrap();
     let whole = place.path().join("whole");
     let expected = train(&config, &whole, init(), Start::Fresh, 99).unwrap().unwrap();
-    let mut trainer = Trainer::new(vec![config.clone()]);
+    let mut trainer = Trainer::new([config.validate().unwrap()]);
     let (policies, parameters) = (8, config.parameters());
     for (trial, weights) in learned.iter().enumerate() {
         assert!(trainer.start_from(0, trial, policies, weights));
@@ -252,9 +252,9 @@ fn a_run_goes_on_from_the_policies_that_it_started_from() {
     let given: Vec<Vec<f32>> = init().unwrap().trials.into_iter().map(|trial| trial.weights).collect();
     assert!(given == learned && learned[0] != learned[1]);
     // Of more policies the first, of fewer all, before those that are drawn as ever.
-    let drawn = Trainer::new(vec![config.clone()]).weights(0, 0).unwrap().to_vec();
+    let drawn = Trainer::new([config.validate().unwrap()]).weights(0, 0).unwrap().to_vec();
     for given in [3, 20] {
-        let mut trainer = Trainer::new(vec![config.clone()]);
+        let mut trainer = Trainer::new([config.validate().unwrap()]);
         let weights: Vec<f32> = (0..2 * given * parameters).map(|number| number as f32).collect();
         assert!(trainer.start_from(0, 0, given, &weights));
         let taken = given.min(policies) * parameters;

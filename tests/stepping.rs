@@ -4,7 +4,7 @@
 mod support;
 
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, BackendError, Episode, Group, Moment, Need, Seen, Strided, Trace};
+use flotilla::backend::{Backend, BackendError, Episode, Group, Moment, RecordRequest, Seen, Strided, Trace};
 use flotilla::config::{Fitness, MAX_AGENTS, MAX_POIS, MAX_POPULATION};
 use flotilla::credit::{self, Credit, Scores};
 use flotilla::evaluate::Starts;
@@ -31,8 +31,14 @@ impl Played {
         let weights = sample::weights(&world, teams, seed);
         let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; world.leaders()]).collect();
         let weights = weights[..].into();
-        let group =
-            Group { world: &world, starts: &starts, weights, policies: teams, teams: &order, need: Need::Sights };
+        let group = Group {
+            world: &world,
+            starts: &starts,
+            weights,
+            policies: teams,
+            teams: &order,
+            need: RecordRequest::Sights,
+        };
         let trace = Cpu::default().trace(&group).expect("the group fits the world");
         Played { world, starts, trace }
     }
@@ -206,7 +212,7 @@ fn what_cannot_be_stepped_is_told_and_nothing_moves() {
             weights: none[..].into(),
             policies: 1,
             teams: &teams,
-            need: Need::Scores,
+            need: RecordRequest::Scores,
         };
         let refused = Cpu::default().rollout(&[group], &|_| unreachable!("nobody plays")).expect_err("nor here");
         assert!(matches!(refused, BackendError::InvalidInput(_)), "{refused}");

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use flotilla::backend::cpu::Cpu;
 use flotilla::baseline::Baselines;
-use flotilla::config::Override;
+use flotilla::config::{Override, ValidConfig};
 use flotilla::report::paper::{self, Evidence, claims, tables};
 use flotilla::trainer::Row;
 use flotilla::trainer::Trainer;
@@ -25,7 +25,7 @@ fn the_pages_tell_what_comes_out() {
     let learning = arms[0].config.learning.clone();
     assert_eq!((learning.population, learning.generations), (50, 100));
     let (configs, places) = paper::trained(&arms);
-    let (mut trainer, mut backend) = (Trainer::new(configs), Cpu::default());
+    let (mut trainer, mut backend) = (Trainer::new(ValidConfig::all(&configs).unwrap()), Cpu::default());
     for row in trainer.finish(&mut backend).unwrap() {
         let of = (0..arms.len()).filter(|&arm| places[arm] == row.arm);
         of.for_each(|arm| arms[arm].add(&Row { arm, ..row }));

@@ -12,7 +12,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::config::{Config, Coupling, Override};
+use flotilla::config::{Config, Coupling, Override, ValidConfig};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{Folder, Start};
 use flotilla::sweep::shard::{Shard, cost};
@@ -431,7 +431,7 @@ fn points_come_out_of_one_batch_as_they_do_alone() {
     let sweep = sweep_of(SMALL);
     let train = |configs: Vec<Config>| {
         let arms = configs.len();
-        let mut trainer = Trainer::new(configs);
+        let mut trainer = Trainer::new(ValidConfig::all(&configs).unwrap());
         let rows = trainer.finish(&mut Cpu::default()).unwrap();
         (0..arms)
             .map(|arm| {
@@ -900,7 +900,7 @@ fn a_batch_of_unequal_points_costs_what_its_parts_do() {
                 \"world.coupling\" = [1, 4]\n\"world.steps\" = [10, 25, 100]\n";
     let sweep = sweep_of(text);
     let seconds = |configs: Vec<Config>| {
-        let mut trainer = Trainer::new(configs);
+        let mut trainer = Trainer::new(ValidConfig::all(&configs).unwrap());
         let mut backend = Cpu::default();
         let start = Instant::now();
         trainer.finish(&mut backend).unwrap();

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
-use flotilla::backend::Player;
+use flotilla::backend::OpenBackend;
 use flotilla::front::{self, Trained};
 use flotilla::memory::Peaks;
 use flotilla::record::disk::Disk;
@@ -142,7 +142,7 @@ fn outcomes(py: Python<'_>, trained: Trained, digest: String) -> PyResult<Outcom
 /// random.
 type Played = (String, String, Option<String>);
 
-fn named((backend, machine): &Player) -> Played {
+fn named((backend, machine): &OpenBackend) -> Played {
     (machine.backend.clone(), backend.describe(), None)
 }
 

@@ -4,7 +4,7 @@ use std::cell::Cell;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
-use flotilla::backend::Player;
+use flotilla::backend::OpenBackend;
 use flotilla::front::{self, Processor};
 use pyo3::exceptions::PyRuntimeWarning;
 use pyo3::prelude::*;
@@ -12,7 +12,7 @@ use pyo3::prelude::*;
 use crate::errors::Raise;
 
 /// Backends that nobody plays on, each with what it was asked for by: opening a GPU takes longer than many a rollout.
-static IDLE: Mutex<Vec<(String, Player)>> = Mutex::new(Vec::new());
+static IDLE: Mutex<Vec<(String, OpenBackend)>> = Mutex::new(Vec::new());
 /// Most of them.
 const MOST: usize = 4;
 /// Whether this process is the copy of one that may have had threads, which are not copied.
@@ -51,7 +51,7 @@ pub fn aside<R: Send>(py: Python<'_>, work: impl FnOnce() -> R + Send) -> R {
 pub fn play<R: Send>(
     py: Python<'_>,
     backend: &str,
-    work: impl FnOnce(&mut Player) -> PyResult<R> + Send,
+    work: impl FnOnce(&mut OpenBackend) -> PyResult<R> + Send,
 ) -> PyResult<R> {
     aside(py, || {
         let mut player = match take(backend) {
@@ -69,13 +69,13 @@ pub fn play<R: Send>(
     })
 }
 
-fn take(backend: &str) -> Option<Player> {
+fn take(backend: &str) -> Option<OpenBackend> {
     let mut idle = IDLE.try_lock().ok()?;
     let place = idle.iter().position(|(name, _)| name == backend)?;
     Some(idle.swap_remove(place).1)
 }
 
-fn open(backend: &str) -> PyResult<Player> {
+fn open(backend: &str) -> PyResult<OpenBackend> {
     let processor = match backend {
         "auto" => Processor::Auto,
         "cpu" => Processor::Cpu,

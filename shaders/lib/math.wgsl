@@ -7,7 +7,7 @@ fn rsqrt(x: f32) -> f32 {
 }
 
 // √x.
-fn root(x: f32) -> f32 {
+fn exact_sqrt(x: f32) -> f32 {
     let y = rough_rsqrt(x);
     let g = x * y;
     return g * (1.8898816 - g * y);
@@ -34,14 +34,14 @@ fn rough_twice_recip(x: f32) -> f32 {
     return y * (2.8286855 - x * y);
 }
 
-// x, brought to where tanh comes to 1 if it is beyond.
+// Clamps x to the range outside of which tanh is ±1.
 fn limit_tanh(x: f32) -> f32 {
     let limit = 7.5501223;
     let low = select(limit, x, x < limit);
     return select(-limit, low, low > -limit);
 }
 
-// n and d with tanh(x/2) = n/d, for an x from limit_tanh.
+// n and d with tanh(x/2) = n/d, for x from limit_tanh.
 fn half_tanh(x: f32) -> vec2<f32> {
     let z = x * x;
     let n = x * ((z * 0.02999907 + 14.7163315) * z + 544.93274);
@@ -49,7 +49,7 @@ fn half_tanh(x: f32) -> vec2<f32> {
     return vec2<f32>(n, d);
 }
 
-// tanh x of its half_tanh.
+// tanh x, from its half_tanh.
 fn whole_tanh(half: vec2<f32>) -> f32 {
     let n = half.x;
     let d = half.y;
@@ -88,19 +88,19 @@ fn ln(x: f32) -> f32 {
 fn normal(a: u32, b: u32) -> f32 {
     let u = f32((a >> 8u) + 1u) * 5.9604645e-8;
     let angle = (f32(b >> 8u) - 8388608.0) * 3.7450704e-7;
-    let radius = root(ln(u) * -2.0);
+    let radius = exact_sqrt(ln(u) * -2.0);
     let cosine = sin_cos(angle).y;
     return flush(radius * cosine, 9.094947e-13);
 }
 
-// `x` moved into `low..=high`.
-fn bound(x: f32, low: f32, high: f32) -> f32 {
+// `x` clamped to `low..=high`.
+fn clamp_to(x: f32, low: f32, high: f32) -> f32 {
     let raised = select(x, low, x < low);
     return select(raised, high, raised > high);
 }
 
-// Whether an offset is at most as long as a radius, given squared: told by the bits, which are in the order of the
-// numbers where none is negative, so that no guard need stand between.
+// Whether the length of an offset is at most a radius, given squared. Compares bits, which are in the order of the
+// numbers because none is negative; so no guard is needed in between.
 fn within(dx: f32, dy: f32, radius2: f32) -> bool {
     let d2 = dx * dx + dy * dy;
     return bitcast<i32>(d2) <= bitcast<i32>(radius2);
@@ -111,13 +111,13 @@ fn flush(x: f32, limit: f32) -> f32 {
     return select(x, 0.0, abs(x) < limit);
 }
 
-// Four random words for a counter: pcg4d and one more fold.
-fn draw(counter: vec4<u32>) -> vec4<u32> {
-    return stir(stir(counter * 1664525u + 1013904223u));
+// Four random words for a counter: pcg4d with one more round.
+fn pcg4d(counter: vec4<u32>) -> vec4<u32> {
+    return pcg4d_round(pcg4d_round(counter * 1664525u + 1013904223u));
 }
 
-// One round of draw.
-fn stir(counter: vec4<u32>) -> vec4<u32> {
+// One round of pcg4d.
+fn pcg4d_round(counter: vec4<u32>) -> vec4<u32> {
     var v = counter;
     v.x += v.y * v.w;
     v.y += v.z * v.x;

@@ -1,41 +1,41 @@
-//! What a backend is asked to play.
+//! The input of a backend: groups of teams to play.
 
 use glam::Vec2;
 
-use super::{BackendError, Held};
+use super::{BackendError, DevicePopulation};
 use crate::config::Fitness;
 use crate::world::World;
 
-/// Teams of one world that start alike and are made of one set of policies.
+/// Teams of one world that start at the same positions and choose from the same policies.
 #[derive(Clone, Copy, Debug)]
 pub struct Group<'a> {
-    /// The world that they play in.
+    /// The world.
     pub world: &'a World,
-    /// Start positions `[agents]`, leaders first; after them places of the POIs, `[pois]`, unless these are the
+    /// Start positions, `[agents]`, leaders first, optionally followed by POI positions, `[pois]`, that replace the
     /// world's.
     pub starts: &'a [Vec2],
     /// The policies.
     pub weights: Weights<'a>,
-    /// Policies a leader has to choose from.
+    /// Policies per leader.
     pub policies: usize,
-    /// The policy each leader plays in each team, `[teams][leaders]`.
+    /// The policy of each leader in each team, `[teams][leaders]`.
     pub teams: &'a [u32],
-    /// What its episodes must tell.
-    pub need: Need,
+    /// The requested record.
+    pub need: RecordRequest,
 }
 
 impl<'a> Group<'a> {
-    /// How many teams play.
+    /// Returns the number of teams.
     pub fn team_count(&self) -> usize {
         self.teams.len() / self.world.leaders()
     }
 
-    /// Where its POIs are, if not where the world has them.
+    /// Returns the POI positions, if they are not the world's.
     pub fn moved_pois(&self) -> Option<&'a [Vec2]> {
         Some(&self.starts[self.world.agents()..]).filter(|pois| !pois.is_empty())
     }
 
-    /// Where the weights of a leader's policy start among those on the host.
+    /// Returns the index of a policy's first weight.
     #[inline]
     pub(crate) fn place(&self, weights: &[f32], leader: usize, policy: usize) -> usize {
         let parameters = self.world.parameters();
@@ -43,10 +43,10 @@ impl<'a> Group<'a> {
         (if shared { policy } else { leader * self.policies + policy }) * parameters
     }
 
-    /// Whether its parts fit each other. Every backend asks this before it plays.
+    /// Checks the group. Every backend calls this before it plays.
     ///
     /// # Errors
-    /// Places, weights or choices are too few or too many, or a team plays a policy that there is not.
+    /// An array has the wrong length, the world is inconsistent, or a team plays a policy that does not exist.
     pub fn check(&self) -> Result<(), BackendError> {
         let Group { world, starts, weights, policies, teams, .. } = *self;
         let invalid = |text: String| Err(BackendError::InvalidInput(text));
@@ -79,61 +79,64 @@ impl<'a> Group<'a> {
     }
 }
 
-/// What is wanted of an episode. A backend may tell more, and does where that costs nothing.
+/// A request for what to record of an episode. A backend may record more if that costs nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Need {
-    /// The whole record, but for who was seen at which step.
+pub enum RecordRequest {
+    /// The whole record, except which leaders were seen at which step.
     Record,
-    /// The whole record: what every fitness is worked out from.
+    /// The whole record. Every fitness can be computed from it.
     Sights,
-    /// What every fitness but Dt is worked out from.
+    /// The part that every fitness but Dt is computed from.
     Scores,
-    /// What this fitness is worked out from.
+    /// The part that one fitness is computed from.
     Score(Fitness),
 }
 
-impl Need {
-    /// Every need of scores alone.
-    pub const OF_SCORES: [Need; 6] = [
-        Need::Scores,
-        Need::Score(Fitness::G),
-        Need::Score(Fitness::D),
-        Need::Score(Fitness::Df),
-        Need::Score(Fitness::Dpp),
-        Need::Score(Fitness::Dt),
+impl RecordRequest {
+    /// Every request that asks for scores only.
+    pub const OF_SCORES: [RecordRequest; 6] = [
+        RecordRequest::Scores,
+        RecordRequest::Score(Fitness::G),
+        RecordRequest::Score(Fitness::D),
+        RecordRequest::Score(Fitness::Df),
+        RecordRequest::Score(Fitness::Dpp),
+        RecordRequest::Score(Fitness::Dt),
     ];
 
-    /// How many agents a set must have to make a difference, where so many must be near; none where the whole record
-    /// is wanted.
+    /// Returns the minimum number of agents in a set that can affect a score, at a POI of this coupling. `None` if the
+    /// whole record is requested.
     pub fn least(self, coupling: u32) -> Option<u32> {
         match self {
-            // Dt asks when.
-            Need::Record | Need::Sights | Need::Score(Fitness::Dt) => None,
-            // D++ asks how many are missing.
-            Need::Scores | Need::Score(Fitness::Dpp) => Some(1),
-            Need::Score(Fitness::G | Fitness::D | Fitness::Df) => Some(coupling),
+            // Dt depends on when sets occur.
+            RecordRequest::Record | RecordRequest::Sights | RecordRequest::Score(Fitness::Dt) => None,
+            // D++ depends on how many agents are missing.
+            RecordRequest::Scores | RecordRequest::Score(Fitness::Dpp) => Some(1),
+            RecordRequest::Score(Fitness::G | Fitness::D | Fitness::Df) => Some(coupling),
         }
     }
 
-    /// Whether it matters which leader a follower saw most.
+    /// Reports whether the leader that each follower saw most is needed.
     pub fn owners(self) -> bool {
-        matches!(self, Need::Record | Need::Sights | Need::Scores | Need::Score(Fitness::Df))
+        matches!(
+            self,
+            RecordRequest::Record | RecordRequest::Sights | RecordRequest::Scores | RecordRequest::Score(Fitness::Df)
+        )
     }
 
-    /// Whether it matters which leaders a follower saw at which step.
+    /// Reports whether the leaders that each follower saw at each step are needed.
     pub fn sights(self) -> bool {
-        matches!(self, Need::Sights | Need::Score(Fitness::Dt))
+        matches!(self, RecordRequest::Sights | RecordRequest::Score(Fitness::Dt))
     }
 }
 
-/// What the policies of a group are, `[leaders][policies][parameters]`, or `[1][policies][parameters]` where all
-/// leaders choose from the same: each number 0 or of size 2^-30 to 2^20.
+/// The policies of a group: `[leaders][policies][parameters]`, or `[1][policies][parameters]` if all leaders choose
+/// from the same. Each number is 0, or of size 2^-30 to 2^20.
 #[derive(Clone, Copy, Debug)]
 pub enum Weights<'a> {
     /// In the host's memory.
     OnHost(&'a [f32]),
     /// In the memory of the backend that plays.
-    Held(&'a (dyn Held + 'static)),
+    OnDevice(&'a (dyn DevicePopulation + 'static)),
 }
 
 impl<'a> From<&'a [f32]> for Weights<'a> {
@@ -143,14 +146,14 @@ impl<'a> From<&'a [f32]> for Weights<'a> {
 }
 
 impl<'a> Weights<'a> {
-    /// The numbers, where they are at hand.
+    /// Returns the weights, if they are in the host's memory.
     ///
     /// # Errors
-    /// Another backend holds them.
+    /// A device holds them.
     pub fn on_host(self) -> Result<&'a [f32], BackendError> {
         match self {
             Weights::OnHost(weights) => Ok(weights),
-            Weights::Held(_) => Err(BackendError::HeldElsewhere),
+            Weights::OnDevice(_) => Err(BackendError::HeldElsewhere),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Where two traces of the same teams first differ.
+//! Comparison of two traces of the same teams.
 
 use std::fmt;
 
@@ -6,22 +6,22 @@ use super::{Moment, Trace};
 use crate::model::sense;
 use crate::world::{INPUTS, World};
 
-/// What is compared of a step, in the order in which a step works it out.
+/// The quantities of a step, in the order in which a step computes them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Quantity {
     /// The inputs of a leader's policy.
     Sense,
-    /// What the policy answered.
+    /// The outputs of a leader's policy.
     Policy,
-    /// Which leaders a follower saw at the step.
+    /// The leaders that a follower saw at the step.
     Sight,
     /// The force on a follower.
     Follow,
     /// Position, heading and speed after the step.
     Move,
-    /// The agents near a POI.
+    /// The agents at a POI.
     Couple,
-    /// How often a follower saw a leader.
+    /// At how many steps a follower saw a leader.
     Influence,
 }
 
@@ -39,16 +39,16 @@ impl fmt::Display for Quantity {
     }
 }
 
-/// The first place where a trace differs from the reference.
+/// The first difference of a trace from the reference.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Mismatch {
-    /// The step, from 1; of counts over an episode, the last.
+    /// The step, from 1. For counts over an episode, the last step.
     pub step: usize,
-    /// Its place in the group.
+    /// The index of the team in its group.
     pub team: usize,
-    /// What differs.
+    /// The quantity that differs.
     pub stage: Quantity,
-    /// Which number of the stage: "agent 3, input 2".
+    /// The number that differs: "agent 3, input 2".
     pub place: String,
     /// The bits of the reference.
     pub expected: u32,
@@ -68,7 +68,7 @@ impl fmt::Display for Mismatch {
     }
 }
 
-/// The first difference of two traces of the same group: the earliest step, there the earliest stage, then team.
+/// Returns the first difference of two traces of the same group: by step, then stage, then team.
 pub fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mismatch> {
     if expected == found && bits(expected) == bits(found) {
         return None;
@@ -119,7 +119,7 @@ pub fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<
     first
 }
 
-/// The stage and name of each word of a [`Moment`].
+/// Returns the quantity and the name of each word of a [`Moment`].
 fn field(word: usize) -> (Quantity, &'static str) {
     const OTHERS: [(Quantity, &str); WORDS - INPUTS] = [
         (Quantity::Policy, "turn"),

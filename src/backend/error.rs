@@ -2,6 +2,7 @@
 
 #[cfg(feature = "gpu")]
 use super::gpu::device::DeviceError;
+use crate::config::ConfigError;
 use crate::evolve;
 
 /// Why episodes could not be played.
@@ -11,18 +12,24 @@ pub enum BackendError {
     #[cfg(feature = "gpu")]
     #[error(transparent)]
     Gpu(#[from] DeviceError),
-    /// What was asked does not fit the device.
+    /// The request exceeds a limit of the device.
     #[error("{0}")]
     TooLarge(String),
     /// The input is inconsistent or out of range.
     #[error("{0}")]
     InvalidInput(String),
-    /// Populations of one backend were handed to another.
+    /// A backend got populations that another one holds.
     #[error("the populations are held by another device; bring them to the host first")]
     HeldElsewhere,
-    /// Nobody has the populations of the present generation any more.
+    /// The populations of the present generation are lost.
     #[error("the populations were lost with the device that held them")]
     Gone,
+}
+
+impl From<ConfigError> for BackendError {
+    fn from(error: ConfigError) -> BackendError {
+        BackendError::InvalidInput(error.to_string())
+    }
 }
 
 impl From<evolve::InvalidInput> for BackendError {

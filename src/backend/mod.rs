@@ -2,8 +2,8 @@
 //!
 //! | file | holds |
 //! |---|---|
-//! | `batch` | what is to be played: groups of teams, where their policies are, what is needed of them |
-//! | `record` | what one team did, as far as credit needs it |
+//! | `batch` | what is to be played: groups of teams, where their policies are, what to record |
+//! | `record` | the record of one team's episode, which credit is computed from |
 //! | `trace` | every stage of every step, for comparison and replays |
 //! | `error` | why episodes could not be played |
 
@@ -23,49 +23,53 @@ pub mod gpu;
 mod record;
 mod trace;
 
-pub use batch::{Group, Need, Weights};
+pub use batch::{Group, RecordRequest, Weights};
 pub use error::BackendError;
 pub use record::{Episode, Seen, Strided, owner_bits};
 pub use trace::{Moment, Trace};
 
-/// Plays episodes. Every implementation gives the same bits.
+/// Plays episodes. Every implementation returns the same bits.
 pub trait Backend: Send {
     /// Plays every team of every group once.
     ///
     /// # Errors
-    /// A group does not fit together or does not fit the device, or the device failed.
+    /// A group is inconsistent or exceeds a limit of the device, or the device failed.
     fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError>;
 
-    /// Plays one group and keeps every stage of every step.
+    /// Plays one group and returns every stage of every step.
     ///
     /// # Errors
-    /// As for [`Backend::rollout`].
+    /// See [`Backend::rollout`].
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError>;
 
-    /// Takes the populations of one trial, `[populations][slots][parameters]`, a leader's each or one for all, into
-    /// memory of its own, to breed them there; none where they had better stay on the host.
+    /// Copies the populations of one trial, `[populations][slots][parameters]`, to the device, to be bred there.
+    /// Returns `None` if they had better stay on the host.
     ///
     /// # Errors
-    /// They were asked to be held here and do not fit, or the device failed.
-    fn hold(&mut self, _weights: &[f32], _sizes: [usize; 3]) -> Result<Option<Box<dyn Held>>, BackendError> {
+    /// The device was asked to hold all populations and these do not fit, or it failed.
+    fn hold(
+        &mut self,
+        _weights: &[f32],
+        _sizes: [usize; 3],
+    ) -> Result<Option<Box<dyn DevicePopulation>>, BackendError> {
         Ok(None)
     }
 
-    /// What it runs on, for people: "cpu (AVX2, 2 threads)".
+    /// Describes the hardware for people: "cpu (AVX2, 2 threads)".
     fn describe(&self) -> String;
 }
 
 /// Called once for each team, from any thread, in any order.
 pub type Visit<'a> = dyn Fn(Episode<'_>) + Sync + 'a;
 
-/// The populations of one trial in a backend's own memory; dropped, they leave it.
+/// The populations of one trial in a device's memory, which dropping them frees.
 ///
-/// After an error they may be of any generation.
-pub trait Held: Any + Debug + Send + Sync {
-    /// Makes the next generation, to the bits of [`crate::evolve::mutate`].
+/// After an error their generation is undefined.
+pub trait DevicePopulation: Any + Debug + Send + Sync {
+    /// Replaces the populations by the next generation, with the bits of [`crate::evolve::mutate`].
     ///
     /// # Errors
-    /// The plan does not fit the populations, or the device failed.
+    /// The plan does not match the populations, or the device failed.
     fn breed(&mut self, breeding: &Breeding<'_>) -> Result<(), BackendError>;
 
     /// Copies all weights to the host, `[populations][slots][parameters]`.
@@ -75,28 +79,28 @@ pub trait Held: Any + Debug + Send + Sync {
     fn fetch(&self, weights: &mut [f32]) -> Result<(), BackendError>;
 }
 
-/// What a run runs on, for `run.json`.
+/// The hardware of a run, for `run.json`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Machine {
     /// "cpu" or "gpu".
     pub backend: String,
-    /// What the GPU calls itself.
+    /// The GPU's name.
     pub adapter: Option<String>,
     /// The GPU's driver and its version.
     pub driver: Option<String>,
-    /// Threads of the CPU that work.
+    /// CPU threads.
     pub threads: usize,
 }
 
 impl Machine {
-    /// The CPU, on the threads that there are.
+    /// Describes the CPU, with the threads of the current pool.
     pub fn of_cpu() -> Machine {
         Machine { backend: "cpu".into(), threads: current_num_threads(), ..Machine::default() }
     }
 
-    /// What a GPU backend runs on.
+    /// Describes the GPU of a backend.
     #[cfg(feature = "gpu")]
-    pub fn of_gpu(backend: &gpu::episode::GpuEpisodes) -> Machine {
+    pub fn of_gpu(backend: &gpu::episode::GpuBackend) -> Machine {
         let adapter = &backend.gpu().adapter;
         Machine {
             backend: "gpu".into(),
@@ -107,46 +111,45 @@ impl Machine {
     }
 }
 
-/// A backend and what it is.
-pub type Player = (Box<dyn Backend>, Machine);
+/// An open backend and its hardware.
+pub type OpenBackend = (Box<dyn Backend>, Machine);
 
-/// Populations of a trial that take so many bytes are held where nothing else is asked for, but never by a software
-/// renderer: about what goes over the bus in the time of the few dispatches that holding costs. An estimate, not a
-/// measurement.
+/// Default minimum bytes of a trial's populations to be held on a GPU: about what the bus transfers in the time of the
+/// few dispatches that holding costs. An estimate, not a measurement. Software renderers hold none.
 pub const HELD_FROM: u64 = 1 << 20;
 
-/// Records of a batch that take so many bytes are packed where nothing else is asked for, but never by a software
-/// renderer: about what goes over the bus in the time that one more dispatch costs. An estimate, not a measurement.
+/// Default minimum bytes of a batch's records to be packed on a GPU: about what the bus transfers in the time of one
+/// more dispatch. An estimate, not a measurement. Software renderers pack none.
 pub const PACKED_FROM: u64 = 1 << 20;
 
-/// Bytes of one buffer that a batch on a GPU aims for: enough to fill it, small enough to overlap batches.
+/// Target bytes of one buffer of a batch on a GPU: enough to fill the device, small enough to overlap batches.
 pub const BATCH_BYTES: u64 = 256 << 20;
-/// Weights that a GPU's thread reads at once.
+/// Weights that a GPU thread loads at once.
 const FOUR: usize = 4;
 
-/// Words of a team's record: sets, counts and, where they are needed, sights.
-fn record_words(world: &World, need: Need) -> usize {
+/// Returns the words of a team's record: sets, counts and, if requested, sightings.
+fn record_words(world: &World, need: RecordRequest) -> usize {
     let sights = if need.sights() { world.sight_words() } else { 0 };
     world.set_words() + world.leaders() * world.followers() + sights
 }
 
-/// Bytes of a team's record.
-pub fn record_bytes(world: &World, need: Need) -> u64 {
+/// Returns the bytes of a team's record.
+pub fn record_bytes(world: &World, need: RecordRequest) -> u64 {
     (record_words(world, need) * size_of::<u32>()) as u64
 }
 
-/// Weights of a team as an episode on a GPU reads them, four at a time.
+/// Returns the weights of a team as an episode on a GPU loads them, in fours.
 fn fours(world: &World) -> usize {
     world.leaders() * world.parameters().div_ceil(FOUR)
 }
 
-/// Bytes of a team's weights as an episode on a GPU reads them.
+/// Returns the bytes of a team's weights as an episode on a GPU loads them.
 pub fn weight_bytes(world: &World) -> u64 {
     (fours(world) * size_of::<[f32; FOUR]>()) as u64
 }
 
-/// Bytes that a GPU holds of a trial's populations, `[populations, slots, parameters]`, where it does: a buffer a
-/// population and one more, and every slot's parent.
+/// Returns the bytes of a trial's populations, `[populations, slots, parameters]`, on a GPU that holds them: one buffer
+/// per population, one more, and every slot's parent. 0 if they are too small to be held by default.
 pub fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {
     let [populations, population, parents] =
         [populations, 4 * slots * parameters, 4 * populations * slots].map(|count| count as u64);

@@ -1,78 +1,80 @@
 //! The record of one team's episode: who was at which POI, and which leaders followers saw.
 
-/// What one team did, as far as credit needs it.
+/// The record of one team's episode. Credit is computed from it.
 #[derive(Clone, Copy, Debug)]
 pub struct Episode<'a> {
-    /// Index of its group in the batch.
+    /// The index of its group in the batch.
     pub group: usize,
-    /// Index of the team in the group.
+    /// The index of the team in the group.
     pub team: usize,
-    /// The agents near each POI after each step, a bit an agent: `[steps][pois][words]`. Where only scores are
-    /// [needed](Need), there may be fewer steps, down to none, whose sets give the same scores, see [`crate::credit`].
+    /// The agents at each POI after each step, one bit per agent, `[steps][pois][words]`. If only scores were
+    /// [requested](super::RecordRequest), there may be fewer steps, down to none, whose sets give the same scores; see
+    /// [`crate::credit`].
     pub sets: Strided<'a>,
-    /// Which leaders its followers saw, as counts or as what [is needed](Need) of them.
+    /// The leaders that the followers saw.
     pub seen: Seen<'a>,
-    /// The leaders that each follower saw before the move of each step, a bit a leader:
-    /// `[steps][followers][words of leaders]`. Empty where nobody [needs](Need::sights) it.
+    /// The leaders that each follower saw before the move of each step, one bit per leader, `[steps][followers][words
+    /// of leaders]`. Empty unless [requested](super::RecordRequest::sights).
     pub sights: Strided<'a>,
 }
 
-/// Which leaders the followers of one team saw.
+/// The leaders that the followers of one team saw.
 #[derive(Clone, Copy, Debug)]
 pub enum Seen<'a> {
-    /// At how many steps each follower saw each leader: `[followers][leaders]`.
+    /// The number of steps at which each follower saw each leader, `[followers][leaders]`.
     Counts(Strided<'a>),
-    /// The leader that each follower saw at most steps, as [`crate::credit::assign`] has it: [`owner_bits`] bits a
-    /// follower, all ones for nobody, from the lowest of a word on. Empty where nobody [needs](Need) it.
-    Most(Strided<'a>),
+    /// The leader that each follower saw at most steps, see [`crate::credit::assign`]: [`owner_bits`] bits per
+    /// follower, from the lowest of a word, all ones for nobody. Empty unless
+    /// [requested](super::RecordRequest::owners).
+    Owners(Strided<'a>),
 }
 
 impl<'a> Seen<'a> {
-    /// The words, whichever they are.
+    /// Returns the words of either form.
     pub fn words(self) -> Strided<'a> {
         match self {
-            Seen::Counts(words) | Seen::Most(words) => words,
+            Seen::Counts(words) | Seen::Owners(words) => words,
         }
     }
 }
 
-/// Bits that a leader's index takes in [`Seen::Most`].
+/// Returns the bits per follower in [`Seen::Owners`].
 pub fn owner_bits(leaders: u32) -> u32 {
     if leaders < 255 { 8 } else { 16 }
 }
 
-/// Words of one team among those of its neighbours: word i of this team is `words[i * stride + offset]`.
+/// The words of one team in an array that interleaves several: word i is `words[i * stride + offset]`.
 #[derive(Clone, Copy, Debug)]
 pub struct Strided<'a> {
-    /// The words of all these teams.
+    /// The words of all teams.
     pub words: &'a [u32],
-    /// How many words on a team's next word is.
+    /// The number of teams, and so the distance between a team's words.
     pub stride: usize,
-    /// Where this team's first word is, under the stride.
+    /// The index of this team, less than the stride.
     pub offset: usize,
 }
 
 impl<'a> Strided<'a> {
-    /// No words.
+    /// An empty view.
     pub const NONE: Strided<'static> = Strided { words: &[], stride: 1, offset: 0 };
 
-    /// All words of this team.
+    /// Returns all words of this team.
     pub fn iter(self) -> impl Iterator<Item = u32> + 'a {
         (0..self.len()).map(move |index| self.get(index))
     }
 
-    /// Word `index` of this team.
+    /// Returns word `index` of this team.
     #[inline]
     pub fn get(&self, index: usize) -> u32 {
         self.words[index * self.stride + self.offset]
     }
 
-    /// Words of each team.
+    /// Returns the number of words of each team.
     pub fn len(&self) -> usize {
         self.words.len() / self.stride
     }
 
-    /// Whether there is no word.
+    /// Reports whether there are no words.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

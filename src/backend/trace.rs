@@ -1,25 +1,24 @@
 //! The trace of a group: every stage of every step.
 
-use crate::declare::shared;
+use crate::gpu_struct::gpu_struct;
 use crate::world::{INPUTS, OUTPUTS};
 
-shared! {
-    /// Floats that a [`Trace`] holds of one agent at one step, in this order.
+gpu_struct! {
+    /// The floats of one agent at one step of a [`Trace`], in this order.
     ///
-    /// The inputs and the outputs are a leader's, the force a follower's; who has none has zeros. So does step 0, the
-    /// start.
+    /// Only leaders have inputs and outputs, only followers a force. Other agents, and step 0 (the start), have zeros.
     pub struct Moment {
         /// Sensed densities.
         pub inputs: [f32; INPUTS],
-        /// What the policy answered, each in -1..1.
+        /// The outputs of the policy, each in -1..1.
         pub outputs: [f32; OUTPUTS],
-        /// Attraction, repulsion and wall push together.
+        /// The sum of attraction, repulsion and wall push.
         pub force: [f32; 2],
-        /// Where the agent is after the step, x and y in units.
+        /// The position after the step, x and y in units.
         pub position: [f32; 2],
-        /// Where it heads then, a unit vector.
+        /// The heading after the step, a unit vector.
         pub heading: [f32; 2],
-        /// How fast it is then, in units a second.
+        /// The speed after the step, in units per second.
         pub speed: f32,
     }
 }
@@ -33,17 +32,17 @@ pub struct Trace {
     pub agents: usize,
     /// `[steps + 1][teams][agents]`.
     pub moments: Vec<Moment>,
-    /// The agents near each POI after each step, a bit an agent: `[teams][steps][pois][words]`.
+    /// The agents at each POI after each step, one bit per agent, `[teams][steps][pois][words]`.
     pub sets: Vec<u32>,
-    /// At how many steps each follower saw each leader, `[teams][followers][leaders]`.
+    /// The number of steps at which each follower saw each leader, `[teams][followers][leaders]`.
     pub seen: Vec<u32>,
-    /// Where [needed](Need::sights), which leaders each follower saw before each step's move, a bit a leader:
-    /// `[teams][steps][followers][words of leaders]`.
+    /// The leaders that each follower saw before the move of each step, one bit per leader,
+    /// `[teams][steps][followers][words of leaders]`. Empty unless [requested](super::RecordRequest::sights).
     pub sights: Vec<u32>,
 }
 
 impl Trace {
-    /// What one agent of one team did at one step.
+    /// Returns what one agent of one team did at one step.
     pub fn moment(&self, step: usize, team: usize, agent: usize) -> &Moment {
         &self.moments[(step * self.teams + team) * self.agents + agent]
     }

@@ -1,4 +1,4 @@
-//! How fast episodes are played, alone and within whole generations, and how much of what a machine can do that takes.
+//! The speed of episodes and of whole generations, and the share of the machine's arithmetic ceiling that they reach.
 
 use std::cell::RefCell;
 use std::hint::black_box;
@@ -9,9 +9,8 @@ use fearless_simd::Level;
 
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu::device::Traffic;
-use crate::backend::gpu::episode::{GpuEpisodes, Stages};
-use crate::backend::gpu::probe;
-use crate::backend::{Backend, BackendError, Group, Need, Weights};
+use crate::backend::gpu::episode::{GpuBackend, Stages};
+use crate::backend::{Backend, BackendError, Group, RecordRequest, Weights};
 use crate::config::{Config, Coupling};
 use crate::credit::Credit;
 use crate::evolve::{Key, Purpose, random_policy, teams_of};
@@ -21,32 +20,33 @@ use crate::trainer::{Times, Trainer};
 use crate::world::World;
 
 pub mod ceiling;
+mod gpu_ceiling;
 pub mod operations;
 
 use operations::Reach;
 
-/// Timed repeats, of which the median counts, and the least time that each takes.
+/// Timed repeats, of which the median counts, and the minimum time of each.
 const REPEATS: usize = 5;
 const LEAST: Duration = Duration::from_millis(200);
-/// Repeats of what takes longer than this at a time.
+/// Repeats of anything that takes longer than this.
 const FEW_REPEATS: usize = 3;
 const LONG: Duration = Duration::from_secs(2);
 /// Reads of a clock after which it counts as standing still. They take longer than any clock needs to advance.
 const CLOCK_READS: usize = 1 << 22;
-/// Teams that are traced to see who is in reach of whom, and how many pairs are looked at, as far as one team allows.
+/// Teams that are traced to count neighbours, and the maximum number of pairs in that trace, beyond the first team.
 const TRACED_TEAMS: usize = 64;
 const TRACED_PAIRS: usize = 1 << 28;
 
-/// What is measured.
+/// The hardware that is measured.
 pub enum Subject {
-    /// The CPU, by this instruction set.
+    /// The CPU, with an instruction set.
     Cpu(Cpu, Level),
     /// A GPU.
-    Gpu(Box<GpuEpisodes>),
+    Gpu(Box<GpuBackend>),
 }
 
 impl Subject {
-    /// What plays.
+    /// Returns the backend.
     pub fn backend(&mut self) -> &mut dyn Backend {
         match self {
             Subject::Cpu(cpu, _) => cpu,
@@ -54,15 +54,15 @@ impl Subject {
         }
     }
 
-    /// Readies what measures how many f32 sums and products a second, none fused, it can do at most.
+    /// Prepares the measurement of its arithmetic ceiling.
     ///
     /// # Errors
-    /// When the GPU fails.
+    /// The GPU failed.
     fn ceiling(&self) -> Result<Box<Peak>, BackendError> {
         Ok(match self {
             &Subject::Cpu(_, level) => Box::new(move || Ok(ceiling::measure(level))),
             Subject::Gpu(gpu) => {
-                let ceiling = probe::Ceiling::new(gpu.gpu())?;
+                let ceiling = gpu_ceiling::Ceiling::new(gpu.gpu())?;
                 Box::new(move || Ok(ceiling.measure()?))
             }
         })
@@ -71,79 +71,79 @@ impl Subject {
 
 type Peak = dyn FnMut() -> Result<f64, BackendError>;
 
-/// What was measured of one config.
+/// The measurements of one config.
 pub struct Timing {
     /// Teams that play at once.
     pub teams: usize,
-    /// Of a team.
+    /// Leaders per team.
     pub leaders: usize,
-    /// Of a team.
+    /// Followers per team.
     pub followers: usize,
-    /// Of the world.
+    /// POIs.
     pub pois: usize,
-    /// Of an episode.
+    /// Steps per episode.
     pub steps: usize,
-    /// Seconds of one rollout (episodes, record and scores).
+    /// Seconds per rollout: episodes, record and scores.
     pub rollout: f64,
-    /// Seconds of one generation (that, selection and mutation), where it was asked for.
+    /// Seconds per generation: a rollout, selection and mutation. `None` unless requested.
     pub generation: Option<f64>,
-    /// Where the time of generations went, where it was asked for.
+    /// The time of generations by phase. `None` unless requested.
     pub profile: Option<Profile>,
     /// Mean G of the random teams of the rollout.
     pub mean_g: f64,
-    /// Who was in reach of whom, on which the work depends.
+    /// Who was in reach of whom, on which the operations depend.
     pub reach: Reach,
-    /// Lane operations of a team-step.
+    /// Lane operations per team-step.
     pub operations: f64,
-    /// Lane operations a second that the machine can do at most.
+    /// Lane operations per second at the arithmetic ceiling.
     pub ceiling: f64,
 }
 
-/// Where the time of some generations went.
+/// The time of some generations by phase.
 pub struct Profile {
-    /// How many these times are of, together.
+    /// The number of these generations.
     pub generations: usize,
-    /// By what was done.
+    /// The trainer's phases.
     pub times: Times,
-    /// What a GPU's rollouts are made of.
+    /// The phases of a GPU's rollouts.
     pub stages: Option<Stages>,
-    /// What went over its bus, in rollouts and between them.
+    /// Bytes over the bus, in rollouts and between them.
     pub traffic: Traffic,
 }
 
-/// What to measure of whole generations.
+/// The measurements of whole generations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Generations {
-    /// Only rollouts.
+    /// Nothing: only rollouts.
     LeftOut,
-    /// How long one takes.
+    /// The time of a generation.
     Timed,
-    /// How long one takes, and where that time goes.
+    /// The time of a generation, by phase.
     Profiled,
 }
 
 impl Timing {
-    /// Agents of all teams together.
+    /// Returns the agents per team.
     pub fn agents(&self) -> usize {
         self.leaders + self.followers
     }
 
-    /// Steps of all teams together.
+    /// Returns the steps of all teams together.
     pub fn team_steps(&self) -> f64 {
         (self.teams * self.steps) as f64
     }
 
-    /// The part of the arithmetic ceiling that rollouts reach.
+    /// Returns the share of the arithmetic ceiling that rollouts reach.
     pub fn ceiling_share(&self) -> f64 {
         self.operations * self.team_steps() / self.rollout / self.ceiling
     }
 }
 
-/// The config with other numbers of agents, leaders and followers in its own ratio as nearly as whole numbers allow,
-/// laid out in the groups of [`layout`]; POIs stay as many, ahead of the first groups.
+/// Returns the config with another number of agents, laid out in the groups of [`layout`]. The ratio of leaders to
+/// followers stays as close as integers allow. The number of POIs stays; they are ahead of the first groups.
 ///
 /// # Errors
-/// More leaders than groups, or more followers of one leader than there are places for.
+/// There are more leaders than groups, or more followers per leader than positions.
 pub fn with_agents(config: &Config, agents: usize) -> Result<Config, String> {
     let (leaders, followers) = (config.world.leaders.len(), config.world.followers.len());
     let groups = ((agents * leaders) as f64 / (leaders + followers) as f64).round().max(1.0) as usize;
@@ -174,7 +174,7 @@ pub fn with_agents(config: &Config, agents: usize) -> Result<Config, String> {
 /// Times rollouts of one trial's random teams, and its generations.
 ///
 /// # Errors
-/// When the backend fails.
+/// The backend failed.
 pub fn measure(config: &Config, player: &mut Subject, generations: Generations) -> Result<Timing, BackendError> {
     let world = World::new(config);
     let ceiling = &mut player.ceiling()?;
@@ -206,9 +206,10 @@ pub fn measure(config: &Config, player: &mut Subject, generations: Generations) 
     })
 }
 
-/// Seconds of one generation, and where they went; the first, which readies what the others use, does not count.
+/// Returns seconds per generation, and its phases. The first generation is not counted, because it compiles and
+/// allocates.
 fn generations(config: &Config, player: &mut Subject) -> Result<(f64, Profile), BackendError> {
-    let mut trainer = Trainer::new(vec![config.clone()]);
+    let mut trainer = Trainer::new([config.validate()?]);
     trainer.advance(player.backend())?;
     let take = |trainer: &mut Trainer, player: &mut Subject| {
         let (stages, traffic) = match player {
@@ -224,8 +225,8 @@ fn generations(config: &Config, player: &mut Subject) -> Result<(f64, Profile), 
     Ok((seconds, Profile { generations, traffic: profile.traffic - before.traffic, ..profile }))
 }
 
-/// Seconds of one rollout of random policies, scored as in training, with the ceiling meanwhile; the mean G; and who
-/// was in reach of whom.
+/// Returns seconds per rollout of random policies, scored as in training, and the arithmetic ceiling measured in
+/// between; the mean G; and who was in reach of whom.
 fn rollout(
     config: &Config,
     world: &World,
@@ -240,10 +241,10 @@ fn rollout(
         random_policy(Level::new(), key.at(0, policy / population, policy % population), weights);
     }
     let teams = teams_of(&config.learning, 0, 0, leaders);
-    // Where generations play from the device's memory, so do rollouts.
+    // If generations play from the device's memory, so do these rollouts.
     let held = backend.hold(&weights, [config.populations(), population, world.parameters()])?;
-    let played = held.as_deref().map_or(weights[..].into(), Weights::Held);
-    let need = Need::Score(config.learning.fitness);
+    let played = held.as_deref().map_or(weights[..].into(), Weights::OnDevice);
+    let need = RecordRequest::Score(config.learning.fitness);
     let group = Group { world, starts: &world.starts, weights: played, policies: population, teams: &teams, need };
     let observed = AtomicU64::new(0);
     let play = || {
@@ -261,7 +262,7 @@ fn rollout(
     let mean_g = observed.into_inner() as f64 / (population * world.pois.len()) as f64;
     let pairs = world.steps() * world.agents() * world.agents();
     let traced = (TRACED_PAIRS / pairs).clamp(1, TRACED_TEAMS).min(population);
-    // The CPU's, since every backend's is the same.
+    // The CPU traces, because every backend's trace is the same.
     let traced = Group { weights: weights[..].into(), teams: &teams[..traced * leaders], ..group };
     let trace = Cpu::default().trace(&traced)?;
     Ok((times, mean_g, Reach::of(world, &trace)))
@@ -278,8 +279,8 @@ fn advances<T: PartialEq>(now: impl Fn() -> T) -> bool {
     (0..CLOCK_READS).any(|_| now() != start)
 }
 
-/// Medians over a few repeats: seconds of one call, each repeat calling for [`LEAST`] at least, and what was measured
-/// between them, so that a slow spell of the machine meets both.
+/// Returns medians over a few repeats: seconds per call, and the measurement between repeats, so that a slow phase of
+/// the machine affects both. Each repeat takes at least [`LEAST`].
 fn time<E>(
     mut call: impl FnMut() -> Result<(), E>,
     mut between: impl FnMut() -> Result<f64, E>,
@@ -300,7 +301,7 @@ fn time<E>(
     Ok([median(seconds), median(others)])
 }
 
-/// The middle of some (finite) values, of an even number the upper of two.
+/// Returns the median of finite values; of an even number, the upper one.
 fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values[values.len() / 2]
@@ -340,7 +341,7 @@ mod tests {
             assert!((world.leaders() as f64 - agents as f64 / 3.0).abs() <= 1.0, "{} of {agents}", world.leaders());
             let starts: HashSet<_> = world.starts.iter().map(|start| start.to_array().map(f32::to_bits)).collect();
             assert_eq!(starts.len(), agents);
-            // As if it had been read from a file.
+            // The config is valid.
             Config::parse(&config.to_toml(), "laid out").unwrap();
         }
         let refusal = with_agents(&config(), 1024).unwrap_err();

@@ -1,15 +1,15 @@
 //! Opens what episodes are played on.
 
 use super::{BackendChoice, Breed, Error, RunOptions, remedy, say};
-use crate::backend::Player;
-use crate::backend::gpu::episode::{GpuEpisodes, Holding};
+use crate::backend::OpenBackend;
+use crate::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
 use crate::front::{self, Found, Processor};
 
 /// Opens the backend that was asked for; `--threads` holds for the whole process.
 ///
 /// # Errors
 /// There is no such backend here, or no threads.
-pub fn open(options: &RunOptions) -> Result<Player, Error> {
+pub fn open(options: &RunOptions) -> Result<OpenBackend, Error> {
     Ok(open_gpu(options)?.map_or_else(front::cpu, front::on_gpu))
 }
 
@@ -17,12 +17,12 @@ pub fn open(options: &RunOptions) -> Result<Player, Error> {
 ///
 /// # Errors
 /// There is no such GPU here, or no threads.
-pub fn open_gpu(options: &RunOptions) -> Result<Option<GpuEpisodes>, Error> {
+pub fn open_gpu(options: &RunOptions) -> Result<Option<GpuBackend>, Error> {
     start_threads(options)?;
     let holding = match options.breed {
         Breed::Auto => None,
-        Breed::Host => Some(Holding::Never),
-        Breed::Device => Some(Holding::Always),
+        Breed::Host => Some(ResidencyPolicy::Never),
+        Breed::Device => Some(ResidencyPolicy::Always),
     };
     if (options.backend, options.breed) == (BackendChoice::Cpu, Breed::Device) {
         return Err(Error::Usage(

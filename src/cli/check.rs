@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::{ConfigArgs, Error, output, plot, print};
-use crate::backend::{self, Need};
+use crate::backend::{self, RecordRequest};
 use crate::config::Config;
 use crate::memory::Peaks;
 use crate::report::map;
@@ -63,7 +63,7 @@ impl Cost {
             team_steps += played * wide(world.steps());
             agent_steps += played * wide(world.steps()) * wide(world.agents());
             agents = agents.max(world.agents());
-            record_bytes = record_bytes.max(backend::record_bytes(&world, Need::Score(learning.fitness)));
+            record_bytes = record_bytes.max(backend::record_bytes(&world, RecordRequest::Score(learning.fitness)));
         }
         let plan = Peaks::of([config], rayon::current_num_threads());
         Cost {

@@ -10,7 +10,7 @@ use clap::ValueEnum;
 
 use super::{Error, RunOptions, number, say};
 use crate::backend::BackendError;
-use crate::backend::Player;
+use crate::backend::OpenBackend;
 use crate::config::Override;
 use crate::front;
 use crate::shell;
@@ -33,7 +33,7 @@ pub enum OnLoss {
 
 impl Loss {
     /// The backend to go on with after another failed, if that was asked for.
-    pub fn instead(self, error: &BackendError) -> Option<Player> {
+    pub fn instead(self, error: &BackendError) -> Option<OpenBackend> {
         (self.on_device_loss == OnLoss::Cpu).then(|| {
             let (backend, machine) = front::cpu();
             say(format_args!("{error}\ngoing on with {}, to the same results", backend.describe()));

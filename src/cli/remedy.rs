@@ -115,7 +115,7 @@ pub fn run(error: &RunError) -> String {
         RunError::Backend { saved: Err(error), .. } => run(error),
         RunError::Held(BackendError::Gone) => "; --resume goes on from the last checkpoint or the start".into(),
         RunError::Held(error) => backend(error).into(),
-        RunError::Memory { .. } => String::new(),
+        RunError::Memory { .. } | RunError::Config(_) => String::new(),
     }
 }
 

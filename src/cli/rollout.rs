@@ -8,7 +8,7 @@ use clap::builder::PossibleValuesParser as Words;
 use serde_json::json;
 
 use super::{ConfigFile, Error, RunOptions, backend, between, output, print, real, say, whole};
-use crate::backend::{Backend, Group, Machine, Moment, Need};
+use crate::backend::{Backend, Group, Machine, Moment, RecordRequest};
 use crate::config::{Choice, Override, Paradigm};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Spread, Starts};
 use crate::record::policies;
@@ -120,7 +120,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         weights: policies.weights[..].into(),
         policies: policies.policies,
         teams: &teams,
-        need: if args.scores.is_some() { Need::Sights } else { Need::Scores },
+        need: if args.scores.is_some() { RecordRequest::Sights } else { RecordRequest::Scores },
     };
 
     let meter = Mutex::new(Meter::new(args.quiet));
@@ -247,7 +247,7 @@ fn write_trace(
         for episode in 0..episodes {
             let starts = starts.of(episode, group.world);
             let last = if episodes > 1 { format!(",{episode}") } else { String::new() };
-            for (first, part) in evaluate::parts(&Group { starts: &starts, need: Need::Record, ..*group }) {
+            for (first, part) in evaluate::parts(&Group { starts: &starts, need: RecordRequest::Record, ..*group }) {
                 let trace = match backend.trace(&part) {
                     Ok(trace) => trace,
                     Err(error) => {

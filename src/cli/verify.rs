@@ -12,7 +12,7 @@ use crate::backend::Backend;
 use crate::backend::cpu::{Cpu, level_name};
 use crate::backend::gpu;
 use crate::backend::gpu::device::{self, AdapterInfo, DeviceError, Request, Wanted};
-use crate::backend::gpu::episode::{GpuEpisodes, Holding, Kernel, Records};
+use crate::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy};
 use crate::backend::gpu::exact::Pass;
 use crate::config::{self, Config};
 use crate::escape;
@@ -245,7 +245,7 @@ fn verify(plan: &Plan, request: Request, kernel: Kernel, info: &AdapterInfo, qui
     if let Some(mismatch) = gpu::self_test(&gpu)? {
         return Ok(Agreement { mismatch: Some(mismatch.to_string()), ..Agreement::default() });
     }
-    let mut gpu = GpuEpisodes::new(gpu)?.playing(kernel).holding(Holding::Always).bringing(Records::Packed);
+    let mut gpu = GpuBackend::new(gpu)?.playing(kernel).holding(ResidencyPolicy::Always).bringing(Records::Packed);
     let shown = meter_of(&mut meter, plan, format!("{}{pass}", info.name));
     let compared = compare(plan, &mut Cpu::default(), &mut gpu, shown);
     meter.clear();

@@ -3,7 +3,7 @@
 use serde::{Serialize, Serializer};
 
 use super::MAX_STEPS;
-use crate::declare::config_enum;
+use crate::config_enum::config_enum;
 use crate::model::{LEAST, LONGEST};
 use crate::reader::{NumberOrPercentage, Reader, between, section};
 

@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use crate::reader::{self, Document, Reader};
 
-pub use crate::declare::Choice;
+pub use crate::config_enum::Choice;
 pub use crate::model::follow::Follow;
 pub use crate::model::motion::Motion;
 pub use crate::model::policy::{Actions, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
@@ -24,11 +24,13 @@ pub use learning::{
 };
 pub use load::{MAX_FILE_BYTES, is_standard_input, name, read_file};
 pub use stages::{MAX_STAGES, Stage};
+pub use valid::ValidConfig;
 pub use world::{Domain, MAX_AGENTS, MAX_POIS, MAX_STEPS};
 
 mod learning;
 mod load;
 mod stages;
+mod valid;
 mod world;
 
 /// Most bytes that the policies of all trials of a run may take.

@@ -1,15 +1,17 @@
-//! Which leader each follower belongs to: over the episode (Df), or at each step (Dt).
+//! Assignment of followers to leaders: over the episode (Df), or at each step (Dt).
 
 use super::each_bit;
 use crate::backend::{Seen, Strided, owner_bits};
 use crate::config::LedBy;
 use crate::world::{Led, World};
 
-/// Owner of an agent that belongs to no group.
+/// The owner of an agent that belongs to no group.
 pub const NOBODY: u32 = u32::MAX;
 
-/// Gives each follower to the leader it saw at most steps, ties to the lower index, or to [`NOBODY`] if it saw none:
-/// the owner of every agent, leaders their own, `[agents]`.
+/// Assigns each follower to the leader that it saw at most steps. Ties go to the lower index. Followers that saw no
+/// leader get [`NOBODY`].
+///
+/// Writes the owner of every agent, `[agents]`. A leader owns itself.
 pub fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
     let leaders = world.constants.leaders;
     owner.clear();
@@ -26,7 +28,7 @@ pub fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
             }
             best
         })),
-        Seen::Most(owners) => {
+        Seen::Owners(owners) => {
             let bits = owner_bits(leaders);
             let (a_word, nobody) = ((32 / bits) as usize, (1 << bits) - 1);
             owner.extend(followers.map(|follower| {
@@ -37,7 +39,7 @@ pub fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
     }
 }
 
-/// The agents that belong to each leader, a bit an agent, `[leaders][words]`.
+/// Writes the agents that belong to each leader, one bit per agent, `[leaders][words]`.
 pub(super) fn gather(owner: &[u32], world: &World, groups: &mut Vec<u32>) {
     let words = world.constants.words as usize;
     groups.resize(world.leaders() * words, 0);
@@ -46,9 +48,10 @@ pub(super) fn gather(owner: &[u32], world: &World, groups: &mut Vec<u32>) {
     }
 }
 
-/// Which leaders lead each follower at each step, laid out as the sights are, `[steps][followers][words of leaders]`:
-/// of those that the follower saw at the steps that [count](crate::world::Led), the one that it saw at most, ties to
-/// the lower index, or all.
+/// Writes which leaders lead each follower at each step, one bit per leader, `[steps][followers][words of leaders]`.
+///
+/// Only the steps that [count](crate::world::Led) matter. The leader that the follower saw at most of them leads it,
+/// ties to the lower index; or with [`LedBy::AnySeen`] every leader that it saw.
 pub fn lead(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
     let (followers, words) = (world.followers(), world.leader_words());
     let (steps, Led { within, by }) = (sights.len() / (followers * words).max(1), world.led);
@@ -83,7 +86,7 @@ pub fn lead(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
     }
 }
 
-/// Whether a leader leads a follower at a step, from 0, as [`lead`] found.
+/// Reports whether a leader leads a follower at a step, from 0, according to the output of [`lead`].
 pub fn leads(led: &[u32], world: &World, step: usize, follower: usize, leader: usize) -> bool {
     let place = (step * world.followers() + follower) * world.leader_words() + leader / 32;
     led[place] >> (leader % 32) & 1 != 0

@@ -6,13 +6,14 @@ use crate::backend::{Episode, Strided};
 use crate::world::World;
 
 impl Credit {
-    /// Which POIs were observed.
+    /// Finds which POIs were observed.
     pub(super) fn observe(&mut self, episode: &Episode<'_>, world: &World) {
         let Credit { observed, sets, .. } = self;
         each_set(&episode.sets, world, sets, |poi| world.coupling[poi], |poi, _, _| observed[poi] = true);
     }
 
-    /// A POI is lost without an agent who was in every set that was large enough, each without one to spare.
+    /// Finds the leaders without whom a POI is lost: those in every large enough set, if none of these sets had an
+    /// agent to spare.
     pub(super) fn lose_leaders(&mut self, episode: &Episode<'_>, world: &World) {
         self.all_critical(world);
         let Credit { observed, critical, sets, .. } = self;
@@ -23,7 +24,8 @@ impl Credit {
         });
     }
 
-    /// A POI is lost without a group of whom every set that was large enough had more members than agents to spare.
+    /// Finds the leaders without whose group a POI is lost: every large enough set had more members of the group than
+    /// agents to spare.
     pub(super) fn lose_groups(&mut self, episode: &Episode<'_>, world: &World) {
         self.all_critical(world);
         let Credit { observed, critical, owner, groups, sets, .. } = self;
@@ -52,7 +54,8 @@ impl Credit {
         });
     }
 
-    /// What [`Credit::lose_leaders`] finds, and how close each leader came to every other POI.
+    /// Finds what [`Credit::lose_leaders`] finds, and how many agents accompanied each leader at every POI that was not
+    /// observed.
     pub(super) fn add_copies(&mut self, episode: &Episode<'_>, world: &World) {
         self.all_critical(world);
         let leaders = world.leaders();
@@ -78,7 +81,7 @@ impl Credit {
         );
     }
 
-    /// D++ of one leader.
+    /// Returns D++ of one leader.
     pub(super) fn stepping_stone(&mut self, world: &World, leader: usize) -> f32 {
         let most = world.coupling.iter().copied().max().unwrap_or(0);
         self.completed.clear();
@@ -91,7 +94,7 @@ impl Credit {
                 at_most += 1;
             }
         }
-        // Copies needed are under the largest coupling, so that many complete all that any number would.
+        // Fewer copies than the largest coupling are ever needed.
         let mut gain = 0;
         stepping_stone(self.lost[leader], most, at_most, world.pois.len(), |copies| {
             gain += self.completed[copies as usize];
@@ -99,10 +102,10 @@ impl Credit {
         })
     }
 
-    /// Before any large enough set, every leader may be critical.
+    /// Marks every leader as critical, as before the first large enough set.
     fn all_critical(&mut self, world: &World) {
         let (leaders, words) = (world.leaders(), world.constants.words as usize);
-        // Bits past the last leader stay out.
+        // Bits past the last leader stay 0.
         let of_word =
             |word: usize| u32::MAX.checked_shl(leaders.saturating_sub(word * 32) as u32).map_or(u32::MAX, |v| !v);
         self.critical.clear();
@@ -113,7 +116,7 @@ impl Credit {
         self.observed.iter().filter(|&&observed| observed).count() as u32
     }
 
-    /// Counts the observed POIs to which each leader was critical.
+    /// Counts the observed POIs that each leader is critical to.
     pub(super) fn count_lost(&mut self, world: &World) {
         let (leaders, words) = (world.leaders(), world.constants.words as usize);
         self.lost.clear();
@@ -124,8 +127,8 @@ impl Credit {
     }
 }
 
-/// Calls `visit(poi, size, set)`, POI by POI and in order of steps, for every set of at least `least(poi)` agents, and
-/// at least one, that is not that POI's set of the step before: repetition changes no fitness.
+/// Calls `visit(poi, size, set)` for every set of at least `least(poi)` agents that differs from the POI's set of the
+/// step before, because repetition changes no fitness. Goes POI by POI, in order of steps.
 #[inline(always)]
 fn each_set(
     sets: &Strided<'_>,
@@ -167,12 +170,12 @@ fn each_set(
     }
 }
 
-/// Leaves the agents of `critical` that are in `set`, if any of that set was needed, or none.
+/// Intersects `critical` with `set` if all of that set was needed; otherwise clears it.
 fn narrow(critical: &mut [u32], set: &[u32], needed: bool) {
     critical.iter_mut().zip(set).for_each(|(word, set)| *word &= if needed { *set } else { 0 });
 }
 
-/// The agents of a set, in ascending order.
+/// Returns the agents of a set, in ascending order.
 fn bits(set: &[u32]) -> impl Iterator<Item = usize> {
     set.iter().enumerate().flat_map(|(index, &word)| each_bit(word).map(move |bit| index * 32 + bit))
 }

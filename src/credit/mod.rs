@@ -7,7 +7,7 @@
 //! Under the default [rule](crate::model::rule::Rule) no fitness but Dt depends on when or how often a set of agents
 //! was at a POI. A set changes nothing if another set of the same POI contains it: the larger set still has at least
 //! as many agents after any removal or copy. So only the maximal sets of each POI matter and, except for D++, only
-//! those with at least as many agents as the POI needs. A backend may drop the others, see [`crate::backend::Need`].
+//! those with at least as many agents as the POI needs. A backend may drop the others, see [`crate::backend::RecordRequest`].
 //! Dt, and rules with windows or orders, need the whole record ([`replay`](mod@replay)).
 
 mod assignment;
@@ -21,53 +21,56 @@ use crate::backend::Episode;
 use crate::config::Fitness;
 use crate::world::World;
 
-/// Every fitness of one team; the differences are `[leaders]`.
+/// Every fitness of one team. Each difference is `[leaders]`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Scores {
-    /// POIs that were observed: by the default rule, that at some step had as many agents near as they need.
+    /// POIs observed. Under the default rule: those with enough agents within the observation radius at some step.
     pub observed: u32,
-    /// Observed POIs over P, the same for every leader (paper, Equation 1).
+    /// G: observed POIs over P, the same for every leader (paper, Equation 1).
     pub g: f32,
-    /// G less G without the leader (paper, Equation 5; "leader trajectory removal").
+    /// D: G minus G without the leader (paper, Equation 5; "leader trajectory removal").
     pub d: Vec<f32>,
-    /// G less G without the leader and its followers (paper, section 4.2; "leader-follower trajectory assignment").
+    /// Df: G minus G without the leader and its followers (paper, Section 4.2; "leader-follower trajectory
+    /// assignment").
     pub df: Vec<f32>,
-    /// D, or what copies of the leader would add, each its share (Rahmattalabi et al., the paper's reference 12).
+    /// D++: D, or the gain per added copy of this leader if that is larger (Rahmattalabi et al., the paper's reference
+    /// 12).
     pub dpp: Vec<f32>,
-    /// G less G without the leader and, at each step, the followers that it [leads](lead) then. Empty where the
-    /// [sights](Episode::sights) were not recorded, unless nobody follows: then it is D.
+    /// Dt: G minus G without the leader and, at each step, the followers that it [leads](lead) at that step. Empty if
+    /// the [sightings](Episode::sights) were not recorded. Without followers it is D.
     pub dt: Vec<f32>,
 }
 
-/// Scratch for scoring one episode after another without allocating; one a thread.
+/// Scratch memory for scoring episodes without allocating; one per thread.
 #[derive(Clone, Debug, Default)]
 pub struct Credit {
-    /// Was the POI observed? `[pois]`
+    /// Whether each POI was observed, `[pois]`.
     observed: Vec<bool>,
-    /// The leaders without any one of whom (D), or of whose groups (Df), an observed POI is lost: `[pois][words]`.
+    /// The leaders without whom (D), or without whose groups (Df), an observed POI is lost, `[pois][words]`.
     critical: Vec<u32>,
     /// POIs lost without the leader, `[leaders]`.
     lost: Vec<u32>,
-    /// The leader in whose group an agent is, itself for a leader, or [`NOBODY`]: `[agents]`.
+    /// The leader that each agent belongs to, or [`NOBODY`], `[agents]`.
     owner: Vec<u32>,
-    /// The agents of each leader's group, or nothing before they are needed, `[leaders][words]`.
+    /// The agents of each leader's group, `[leaders][words]`; empty until needed.
     groups: Vec<u32>,
-    /// Most agents near the POI at a step with the leader among them, `[pois][leaders]`.
+    /// The largest set at the POI that has the leader in it, `[pois][leaders]`.
     company: Vec<u32>,
-    /// Unobserved POIs that a number of copies of one leader would just complete, `[copies]`.
+    /// Unobserved POIs that this number of copies of one leader would complete, `[copies]`.
     completed: Vec<u32>,
-    /// One set and the one before it, `[2][words]`.
+    /// One set, and the set of the step before, `[2][words]`.
     sets: Vec<u32>,
-    /// By another rule than the default: the step at which each POI was observed, and would be otherwise, `[pois]`.
+    /// The step at which each POI was observed, and would be without some agents, `[pois]`. Used by [`Credit::replay`].
     observed_at: Vec<u32>,
     otherwise: Vec<u32>,
-    /// See [`lead`].
+    /// The output of [`lead`].
     led: Vec<u32>,
 }
 
 impl Credit {
     /// Scores every leader of the team by `fitness` into `scores`, `[leaders]`, and returns how many POIs the team
-    /// observed. The episode must be one of `world`, played with that fitness as a [need](crate::backend::Need).
+    /// observed. The episode must be of `world`, and played with a [request](crate::backend::RecordRequest) for that
+    /// fitness.
     pub fn score(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
         if !world.rule.is_plain() || fitness == Fitness::Dt {
             return self.replay(episode, world, fitness, scores);
@@ -100,8 +103,8 @@ impl Credit {
         self.count_observed()
     }
 
-    /// Every fitness of every leader. The episode must be one of `world`, played with all scores or the record as a
-    /// need.
+    /// Returns every fitness of every leader. The episode must be of `world`, and played with a request for all scores
+    /// or the record.
     pub fn all(&mut self, episode: &Episode<'_>, world: &World) -> Scores {
         let leaders = world.leaders();
         let mut by = |fitness| {
@@ -119,9 +122,11 @@ impl Credit {
     }
 }
 
-/// D++: what is lost without the leader, if that is at least D++(most), else the first `D++(n) = gain(n) / n`,
-/// n = 1, 2, …, that D++(n + 1) does not better. All in POIs; `gain` is asked in this order, of `most` copies it is
-/// `at_most`.
+/// Returns D++ of a leader whose removal loses `lost` POIs. `gain(n)` is how many POIs n copies add; `at_most` is
+/// `gain(most)`.
+///
+/// That is D if it is at least D++(most). Otherwise it is the first `D++(n) = gain(n) / n`, n = 1, 2, …, that D++(n +
+/// 1) does not exceed.
 #[inline(always)]
 fn stepping_stone(lost: u32, most: u32, at_most: u32, pois: usize, mut gain: impl FnMut(u32) -> u32) -> f32 {
     if u64::from(lost) * u64::from(most) >= u64::from(at_most) {
@@ -138,12 +143,12 @@ fn stepping_stone(lost: u32, most: u32, at_most: u32, pois: usize, mut gain: imp
     share(now, pois * most as usize)
 }
 
-/// A count over a count, both exact in f32.
+/// Returns a ratio of two counts, each exact in f32.
 fn share(count: u32, of: usize) -> f32 {
     count as f32 / of as f32
 }
 
-/// The places of a word's bits, in ascending order.
+/// Returns the positions of a word's set bits, in ascending order.
 fn each_bit(word: u32) -> impl Iterator<Item = usize> {
     std::iter::successors(Some(word), |word| Some(word & word.wrapping_sub(1)))
         .take_while(|&word| word != 0)

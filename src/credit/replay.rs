@@ -9,16 +9,16 @@ use crate::config::Fitness;
 use crate::model::rule::NEVER;
 use crate::world::World;
 
-/// By any other rule than the default, and Dt.
+/// The general path.
 impl Credit {
-    /// [`Credit::score`], each fitness by its definition.
+    /// Computes [`Credit::score`] by each fitness's definition.
     pub(super) fn replay(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
         let Credit { owner, groups, observed_at, otherwise, led, .. } = self;
         let (pois, words, leaders) = (world.pois.len(), world.constants.words as usize, world.leaders());
         let replay = Replay { sets: episode.sets, world };
         replay.observe(observed_at);
         let observed = count(observed_at);
-        // Whom else D takes out; nobody is missed where nothing was observed.
+        // Without followers, Df and Dt are D. If nothing was observed, nothing can be lost.
         let taken = if world.followers() == 0 || observed == 0 { Fitness::D } else { fitness };
         match taken {
             Fitness::Df => {
@@ -68,7 +68,7 @@ impl Credit {
     }
 }
 
-/// Who was near which POI at which step, by a rule that is replayed.
+/// The sets of an episode, to be replayed under the world's rule.
 #[derive(Clone, Copy)]
 struct Replay<'a> {
     sets: Strided<'a>,
@@ -76,7 +76,7 @@ struct Replay<'a> {
 }
 
 impl Replay<'_> {
-    /// How many observers are near a POI after a step, of those of each word that `stay` lets stay.
+    /// Counts the observers at a POI after a step. `stay` masks each word of the set.
     fn near(&self, poi: usize, step: u32, stay: impl Fn(usize, u32) -> u32) -> u32 {
         let Replay { sets, world } = self;
         let words = world.constants.words as usize;
@@ -84,8 +84,8 @@ impl Replay<'_> {
         world.rule.count((0..words).map(|word| stay(word, sets.get(first + word))))
     }
 
-    /// At which step each POI is observed, where it has `enough` agents after one, which is asked for the steps that
-    /// are `worth` asking among those at which the rule lets it be.
+    /// Writes the step at which each POI is observed: the first step with enough agents, `near(poi, step)`, among the
+    /// steps that are `worth` testing of those at which the rule allows it.
     fn play(
         &self,
         observed_at: &mut Vec<u32>,
@@ -102,18 +102,18 @@ impl Replay<'_> {
         });
     }
 
-    /// As it was.
+    /// Replays the episode as it was.
     fn observe(&self, observed_at: &mut Vec<u32>) {
         self.play(observed_at, |_, open| open, |poi, step| self.near(poi, step, |_, agents| agents));
     }
 
-    /// With some agents left out, by step and word: no POI is observed sooner than it was.
+    /// Replays the episode without some agents, by step and word. No POI is observed sooner than it was.
     fn observe_without(&self, was: &[u32], stay: impl Fn(u32, usize, u32) -> u32, observed_at: &mut Vec<u32>) {
         let later = |poi: usize, open: RangeInclusive<u32>| was[poi].max(*open.start())..=*open.end();
         self.play(observed_at, later, |poi, step| self.near(poi, step, |word, agents| stay(step, word, agents)));
     }
 
-    /// With so many more copies of an agent: no POI is observed later than it was.
+    /// Replays the episode with more copies of an agent. No POI is observed later than it was.
     fn observe_with(&self, was: &[u32], agent: usize, copies: u32, observed_at: &mut Vec<u32>) {
         let sooner = |poi: usize, open: RangeInclusive<u32>| *open.start()..=was[poi].min(*open.end());
         self.play(observed_at, sooner, |poi, step| {
@@ -123,19 +123,19 @@ impl Replay<'_> {
     }
 }
 
-/// How many POIs are observed.
+/// Counts the observed POIs.
 fn count(observed_at: &[u32]) -> u32 {
     observed_at.iter().filter(|&&step| step != NEVER).count() as u32
 }
 
-/// The step at which each POI is observed, from 1, or none: `[pois]`.
+/// Returns the step, from 1, at which each POI is observed, if any, `[pois]`.
 pub fn observed_at(sets: Strided<'_>, world: &World) -> Vec<Option<usize>> {
     let mut observed_at = Vec::new();
     Replay { sets, world }.observe(&mut observed_at);
     observed_at.into_iter().map(|step| (step != NEVER).then_some(step as usize)).collect()
 }
 
-/// A word of the set of one agent.
+/// Returns a word of the set with only this agent.
 fn alone(agent: usize, word: usize) -> u32 {
     if agent / 32 == word { 1 << (agent % 32) } else { 0 }
 }

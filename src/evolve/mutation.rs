@@ -10,9 +10,9 @@ use super::weights::within_limits;
 use crate::config::{Learning, Mutation};
 use crate::kernels::math;
 
-/// Mutates a policy: every weight, with the configured probability, gains noise, `N(0, sigma)` times itself or plainly.
+/// Mutates a policy: every weight, with the configured probability, gains noise, `N(0, sigma)` or that times itself.
 ///
-/// `key` is a slot's of purpose [`Purpose::Mutation`]; `scratch` may hold anything.
+/// `key` is a slot's key of [`Purpose::Mutation`](super::Purpose::Mutation). `scratch` may hold anything.
 pub fn mutate(level: Level, key: Key, learning: &Learning, weights: &mut [f32], scratch: &mut Vec<u32>) {
     dispatch!(level, simd => mutate_lanes(simd, key, learning, weights, scratch));
 }
@@ -31,25 +31,25 @@ fn mutate_lanes<S: Simd>(simd: S, key: Key, learning: &Learning, weights: &mut [
 #[error("{0}")]
 pub struct InvalidInput(String);
 
-/// How the next generation of a trial's populations comes from this one.
+/// How to make the next generation of a trial's populations.
 #[derive(Clone, Debug)]
 pub struct Breeding<'a> {
-    /// The plan, `[populations][slots]`, see [`draw_parents`].
+    /// The plan, `[populations][slots]`, see [`draw_parents`](super::draw_parents).
     pub parents: &'a [u32],
-    /// The trial's key of [`Purpose::Mutation`].
+    /// The trial's key of [`Purpose::Mutation`](super::Purpose::Mutation).
     pub key: Key,
     /// The generation that ends.
     pub generation: usize,
-    /// By which a weight mutates.
+    /// The mutation's kind, probability and standard deviation.
     pub learning: &'a Learning,
 }
 
 impl Breeding<'_> {
-    /// Whether the plan is one for populations of these sizes, `[leaders, slots, parameters]`. Every backend asks this
-    /// before it breeds.
+    /// Checks the plan against the sizes of the populations, `[populations, slots, parameters]`. Every backend calls
+    /// this before it breeds.
     ///
     /// # Errors
-    /// It has too few or too many places, or a parent that there is not.
+    /// The plan has too few or too many entries, or a parent that does not exist.
     pub fn check(&self, [leaders, slots, _]: [usize; 3]) -> Result<(), InvalidInput> {
         let invalid = |text: String| Err(InvalidInput(text));
         if self.parents.len() != leaders * slots {
@@ -66,10 +66,10 @@ impl Breeding<'_> {
         }
     }
 
-    /// The next generation of these weights, worked out on the host: what every backend must come to.
+    /// Returns the next generation of `weights`, computed on the host. Every backend must return the same bits.
     ///
     /// # Errors
-    /// The plan is not one for these sizes, see [`Breeding::check`].
+    /// The plan does not match the sizes, see [`Breeding::check`].
     pub fn on_host(&self, sizes: [usize; 3], weights: &[f32]) -> Result<Vec<f32>, InvalidInput> {
         self.check(sizes)?;
         let [_, slots, parameters] = sizes;
@@ -87,27 +87,27 @@ impl Breeding<'_> {
     }
 }
 
-/// The slots of one population to be filled by a plan.
+/// Some slots of one population, to be filled according to a plan.
 #[derive(Clone, Copy, Debug)]
 pub struct Offspring<'a> {
-    /// Of purpose [`Purpose::Mutation`].
+    /// The trial's key of [`Purpose::Mutation`](super::Purpose::Mutation).
     pub key: Key,
     /// The generation that ends.
     pub generation: usize,
-    /// Its place among the trial's.
+    /// The index of the population in its trial.
     pub population: usize,
-    /// The first of the slots.
+    /// The index of the first slot.
     pub first: usize,
-    /// Each slot's entry of the plan of [`draw_parents`].
+    /// Each slot's entry of the plan, see [`draw_parents`](super::draw_parents).
     pub parents: &'a [u32],
-    /// `[policies + 1][parameters]`.
+    /// The population that ends, `[policies + 1][parameters]`.
     pub policies: &'a [f32],
 }
 
-/// Fills slots, `[slots][parameters]`: each gets its parent's weights and [`mutate`]s. `scratch` may hold anything.
+/// Fills slots, `[slots][parameters]`: copies each one's parent and [`mutate`]s it. `scratch` may hold anything.
 pub fn breed(level: Level, learning: &Learning, brood: Offspring<'_>, children: &mut [f32], scratch: &mut Vec<u32>) {
     let parameters = children.len() / brood.parents.len();
-    // As many as stay in the innermost cache.
+    // As many policies as fit into the first-level cache.
     let together = (BRED_TOGETHER / parameters).clamp(1, WIDEST);
     for (batch, (children, parents)) in
         children.chunks_mut(together * parameters).zip(brood.parents.chunks(together)).enumerate()
@@ -117,7 +117,7 @@ pub fn breed(level: Level, learning: &Learning, brood: Offspring<'_>, children: 
     }
 }
 
-/// Weights that are copied, then mutated.
+/// Weights that are copied before they are mutated.
 const BRED_TOGETHER: usize = 2048;
 
 #[inline(always)]
@@ -135,12 +135,12 @@ fn mutate_brood<S: Simd>(
         let slots = S::u32s::from_fn(simd, |lane| (brood.first + first + lane) as u32);
         let keys = brood.key.at_lanes::<S>(brood.generation, brood.population, slots);
         let [x, y, z, w] = keys;
-        let forks = math::draw::<S>(x, y, z, w ^ u32::MAX);
+        let forks = math::pcg4d::<S>(x, y, z, w ^ u32::MAX);
         let key = |of: &[S::u32s; 4], lane: usize| Key([of[0][lane], of[1][lane], of[2][lane], of[3][lane]]);
         let mutating = || (0..).zip(parents).filter(|(_, parent)| *parent & UNCHANGED == 0).map(|(lane, _)| lane);
-        // In loops of their own, so that the processor draws for several policies at once.
+        // These loops are separate so that the processor draws for several policies at once.
         for (lane, &parent) in parents.iter().enumerate() {
-            // The processor waits for the next parents while it draws.
+            // The copies' loads overlap with the arithmetic of the draws.
             let (to, from) = ((first + lane) * parameters, (parent & !UNCHANGED) as usize * parameters);
             copy(simd, &brood.policies[from..from + parameters], &mut children[to..to + parameters]);
             if parent & UNCHANGED != 0 {
@@ -162,7 +162,7 @@ fn mutate_brood<S: Simd>(
 /// Lanes of the widest vectors.
 const WIDEST: usize = 16;
 
-/// Copies a policy by vectors.
+/// Copies a policy with vector loads and stores.
 #[inline(always)]
 fn copy<S: Simd>(simd: S, from: &[f32], to: &mut [f32]) {
     let whole = from.len() / S::f32s::LEN * S::f32s::LEN;
@@ -174,15 +174,15 @@ fn copy<S: Simd>(simd: S, from: &[f32], to: &mut [f32]) {
     }
 }
 
-/// The weights that mutate in one policy or several, so many that no lane idles.
+/// The weights that mutate, of one policy or several, collected so that no lane is idle.
 struct Chosen<'a> {
-    /// Weights of a policy.
+    /// Weights per policy.
     parameters: usize,
-    /// A bit for each weight that mutates, [`Chosen::words`] a policy.
+    /// One bit per weight, set if it mutates; see [`Chosen::words`].
     masks: &'a mut [u32],
-    /// How many are listed.
+    /// The number of weights listed.
     count: usize,
-    /// Each one's index in its policy and among all weights, its bits, and the key of its noise.
+    /// Per listed weight: its index in its policy, its index among all weights, its bits, and the key of its noise.
     indices: &'a mut [u32],
     places: &'a mut [u32],
     bits: &'a mut [u32],
@@ -190,10 +190,10 @@ struct Chosen<'a> {
 }
 
 impl<'a> Chosen<'a> {
-    /// None of so many policies' weights.
+    /// Returns an empty list for a number of policies.
     #[inline(always)]
     fn new(scratch: &'a mut Vec<u32>, policies: usize, parameters: usize) -> Chosen<'a> {
-        // Whole vectors are written from any place on.
+        // Whole vectors are stored at unaligned positions.
         let room = policies * parameters.next_multiple_of(64) + WIDEST;
         if scratch.len() < 8 * room {
             scratch.resize(8 * room, 0);
@@ -204,16 +204,16 @@ impl<'a> Chosen<'a> {
         Chosen { parameters, masks, count: 0, indices, places, bits, keys: [field(), field(), field(), field()] }
     }
 
-    /// Where a policy's masks are.
+    /// Returns the range of a policy's masks.
     #[inline(always)]
     fn words(&self, policy: usize) -> Range<usize> {
         let words = 2 * self.parameters.div_ceil(64);
         policy * words..(policy + 1) * words
     }
 
-    /// Chooses which weights of a policy mutate: each by a random word of its own, of which a draw makes four.
+    /// Chooses which weights of a policy mutate. Each has a random word of its own; a draw makes four words.
     ///
-    /// Weight 64·block + 16·word + place takes its word from counter 16·block + place: no lane width shows in that.
+    /// Weight `64·block + 16·word + place` uses the word of counter `16·block + place`, whatever the number of lanes.
     #[inline(always)]
     fn choose<S: Simd>(&mut self, simd: S, policy: usize, key: Key, probability: f64) {
         let threshold = mutation_threshold(probability);
@@ -238,7 +238,7 @@ impl<'a> Chosen<'a> {
         }
     }
 
-    /// Lists the chosen weights of a policy; tells where.
+    /// Lists the chosen weights of a policy, and returns the range of their entries.
     #[inline(always)]
     fn list(&mut self, policy: usize) -> (usize, usize) {
         let before = self.count;
@@ -256,9 +256,10 @@ impl<'a> Chosen<'a> {
         (before, count)
     }
 
-    /// Says of the listed weights of a policy where they are, and that their noise has this key.
+    /// Fills in the positions and noise keys of a policy's listed weights.
     ///
-    /// Not at once as they are listed: what was written in pieces can be read as a whole only after a while.
+    /// This is separate from [`Chosen::list`], because a vector load right after narrow stores to the same bytes would
+    /// stall.
     #[inline(always)]
     fn address<S: Simd>(&mut self, simd: S, policy: usize, (first, end): (usize, usize), noises: Key) {
         let place = (policy * self.parameters) as u32;
@@ -272,7 +273,7 @@ impl<'a> Chosen<'a> {
         }
     }
 
-    /// Adds its noise to each.
+    /// Adds its noise to each listed weight.
     #[inline(always)]
     fn mutate<S: Simd>(self, simd: S, learning: &Learning, weights: &mut [f32]) {
         let Chosen { count, indices, places, bits, keys: [x, y, z, w], .. } = self;
@@ -282,10 +283,11 @@ impl<'a> Chosen<'a> {
         }
         let vectors = || (0..count).step_by(S::f32s::LEN).map(|at| at..at + S::f32s::LEN);
         let load = |from: &[u32]| S::u32s::from_slice(simd, from);
-        // In short loops: the processor sees far enough ahead to keep its units busy.
+        // Several short loops: out-of-order execution overlaps iterations only if they are short.
         for at in vectors() {
             let counter = load(&w[at.clone()]) ^ load(&indices[at.clone()]);
-            let [a, b, ..] = math::draw::<S>(load(&x[at.clone()]), load(&y[at.clone()]), load(&z[at.clone()]), counter);
+            let [a, b, ..] =
+                math::pcg4d::<S>(load(&x[at.clone()]), load(&y[at.clone()]), load(&z[at.clone()]), counter);
             a.store_slice(&mut x[at.clone()]);
             b.store_slice(&mut y[at]);
         }
@@ -307,12 +309,12 @@ impl<'a> Chosen<'a> {
     }
 }
 
-/// A weight mutates where its random word is below this; none where all do.
+/// Returns the threshold below which a weight's random word makes it mutate, or `None` if every weight mutates.
 pub fn mutation_threshold(probability: f64) -> Option<u32> {
     (probability < 1.0).then_some((probability * (1u64 << 32) as f64) as u32)
 }
 
-/// The bits that are set in each byte, ascending, then zeros.
+/// Per byte: the indices of its set bits, ascending, padded with zeros.
 const BITS: [[u8; 8]; 256] = {
     let mut bits = [[0; 8]; 256];
     let mut byte = 0;

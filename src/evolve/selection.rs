@@ -7,12 +7,12 @@ use crate::config::{Learning, Parents};
 use crate::kernels::math;
 use crate::parallel::*;
 
-/// The indices of the `count` best scores, best first; ties go to the lower index.
+/// Returns the indices of the `count` best scores, best first. Ties go to the lower index.
 pub fn best(scores: &[f32], count: usize) -> Vec<usize> {
     let better = |a: &usize, b: &usize| scores[*b].total_cmp(&scores[*a]).then(a.cmp(b));
     let mut order: Vec<usize>;
     if count <= FEW {
-        // The best so far, in order; hardly any other score comes near them.
+        // The best so far, in order. Few scores are inserted, so that this is faster than sorting.
         order = Vec::with_capacity(count + 1);
         for (index, score) in scores.iter().enumerate() {
             if order.len() < count || order.last().is_some_and(|&last| score.total_cmp(&scores[last]).is_gt()) {
@@ -31,16 +31,17 @@ pub fn best(scores: &[f32], count: usize) -> Vec<usize> {
     order
 }
 
-/// So few best scores are found without sorting.
+/// Up to this count, [`best`] searches without sorting.
 const FEW: usize = 16;
 
-/// The winner of the binary tournament of one slot: two distinct policies, the higher score, ties to the lower index.
+/// Returns the winner of one slot's binary tournament: of two distinct random policies, the one with the higher score.
+/// Ties go to the lower index.
 pub fn tournament(key: Key, scores: &[f32]) -> usize {
     let [first, second, ..] = key.draw(0);
     winner(first, second, scores)
 }
 
-/// The winner between the policies that two random words pick.
+/// Returns the winner between the two policies that two random words pick.
 #[inline(always)]
 fn winner(first: u32, second: u32, scores: &[f32]) -> usize {
     let a = pick(first, scores.len());
@@ -50,15 +51,15 @@ fn winner(first: u32, second: u32, scores: &[f32]) -> usize {
     if scores[high] > scores[low] { high } else { low }
 }
 
-/// Set in a slot's entry of the plan of [`draw_parents`] where the slot keeps its parent's weights as they are.
+/// Flag of a plan's entry, see [`draw_parents`]: the slot keeps its parent's weights.
 pub const UNCHANGED: u32 = 1 << 31;
 
-/// Which policies of a population survive, and which may become parents.
+/// The rule by which policies survive and become parents.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Selection {
     /// The number of policies that survive unchanged.
     pub elites: usize,
-    /// Which policies may become parents.
+    /// The policies that may become parents.
     pub parents: Parents,
 }
 
@@ -69,12 +70,12 @@ impl Selection {
     }
 }
 
-/// Plans one population's next generation: the policy from which each slot comes, `[policies + 1]`, with [`UNCHANGED`]
-/// where it does not mutate.
+/// Plans one population's next generation: the policy that each slot is copied from, `[policies + 1]`, with
+/// [`UNCHANGED`] if it does not mutate.
 ///
-/// The first slots are the elites', best first. The others' parents win [`tournament`]s, or with [`Parents::Elites`] are
-/// elites, each with the same probability. The last slot gets the best of all, the champion. `key` is of purpose
-/// [`Purpose::Tournament`], `scores` are `[policies]`.
+/// The first slots are the elites', best first. The others' parents win [`tournament`]s, or with [`Parents::Elites`]
+/// are elites, each with the same probability. The last slot gets the best of all, the champion. `key` is of
+/// [`Purpose::Tournament`](super::Purpose::Tournament), `scores` are `[policies]`.
 pub fn draw_parents(
     level: Level,
     key: Key,
@@ -100,7 +101,7 @@ pub fn draw_parents(
     parents[policies] = best[0] as u32 | UNCHANGED;
 }
 
-/// The plan that leaves all policies where they are, after the last generation; only the champion gets its slot.
+/// Plans that every policy stays, after the last generation. The champion gets its slot.
 pub fn keep_parents(scores: &[f32], parents: &mut [u32]) {
     for (slot, parent) in parents.iter_mut().enumerate() {
         *parent = slot as u32 | UNCHANGED;
@@ -108,7 +109,7 @@ pub fn keep_parents(scores: &[f32], parents: &mut [u32]) {
     parents[scores.len()] = best(scores, 1)[0] as u32 | UNCHANGED;
 }
 
-/// Slots whose parents one thread draws at a time.
+/// Slots per rayon task.
 const DRAWN_TOGETHER: usize = 4096;
 
 #[inline(always)]
@@ -124,7 +125,7 @@ fn draw_parents_lanes<S: Simd>(
     for (slot, parents) in (first..).step_by(S::f32s::LEN).zip(parents.chunks_mut(S::f32s::LEN)) {
         let slots = S::u32s::from_fn(simd, |lane| (slot + lane) as u32);
         let [x, y, z, w] = key.at_lanes::<S>(generation, population, slots);
-        let [firsts, seconds, ..] = math::draw::<S>(x, y, z, w);
+        let [firsts, seconds, ..] = math::pcg4d::<S>(x, y, z, w);
         for ((parent, &first), &second) in parents.iter_mut().zip(firsts.as_slice()).zip(seconds.as_slice()) {
             *parent = choose(first, second) as u32;
         }

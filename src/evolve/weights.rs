@@ -3,20 +3,19 @@
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
 use super::random::Key;
-use crate::kernels::{bound, math, splat};
+use crate::kernels::{clamp_to, math, splat};
 
-/// Weights are 0 or of this size (2^-30) at least, so that no product in a policy is denormal.
+/// The smallest size of a weight other than 0 (2^-30): no product in a policy is denormal.
 pub const MIN_WEIGHT: f32 = 1.0 / 1_073_741_824.0;
-/// Weights of larger size (2^20) stay at it.
+/// The largest size of a weight (2^20). Mutation clamps to it.
 pub const MAX_WEIGHT: f32 = 1_048_576.0;
 
-/// Whether a number may be a weight.
+/// Reports whether a number may be a weight.
 pub fn is_weight(number: f32) -> bool {
     number == 0.0 || (MIN_WEIGHT..=MAX_WEIGHT).contains(&number.abs())
 }
 
-/// Makes weights fit for the kernels: those too small for them become 0. Gives the place of one that is too large or
-/// no number.
+/// Rounds weights that are too small to 0. Returns the index of the first that is too large or not a number.
 pub fn admit(weights: &mut [f32]) -> Option<usize> {
     weights.iter_mut().position(|weight| {
         if weight.abs() < MIN_WEIGHT {
@@ -26,7 +25,8 @@ pub fn admit(weights: &mut [f32]) -> Option<usize> {
     })
 }
 
-/// Weights N(0, 1) for a new policy; `key` is a slot's of purpose [`Purpose::Weights`].
+/// Fills a new policy with weights from N(0, 1). `key` is a slot's key of
+/// [`Purpose::Weights`](super::Purpose::Weights).
 pub fn random_policy(level: Level, key: Key, weights: &mut [f32]) {
     dispatch!(level, simd => random_lanes(simd, key, weights));
 }
@@ -43,9 +43,9 @@ fn random_lanes<S: Simd>(simd: S, key: Key, weights: &mut [f32]) {
     }
 }
 
-/// A weight brought within the sizes that policies may have.
+/// Clamps a weight to [`MAX_WEIGHT`], and flushes it to 0 below [`MIN_WEIGHT`].
 #[inline(always)]
 pub(super) fn within_limits<S: Simd>(simd: S, weight: S::f32s) -> S::f32s {
-    let bounded = bound::<S>(weight, splat(simd, -MAX_WEIGHT), splat(simd, MAX_WEIGHT));
+    let bounded = clamp_to::<S>(weight, splat(simd, -MAX_WEIGHT), splat(simd, MAX_WEIGHT));
     math::flush::<S>(bounded, MIN_WEIGHT)
 }

@@ -1,23 +1,24 @@
-//! The exact core: the few functions beyond `+ - *` that an episode and a mutation need, built from operations that
-//! every processor rounds alike.
+//! The exact core: the functions beyond `+ - *` that an episode and a mutation need, built from operations that every
+//! processor rounds alike.
 //!
-//! Twin of `shaders/lib/math.wgsl`: same names, same statements, same order. Only f32 `+ - *`, comparison, select,
-//! abs, 32-bit integer operations, bit casts and conversions of integers up to 2^24 occur. Within the stated ranges
-//! every intermediate value is 0 or of size 2^-120 to 2^120, so flushed denormals change nothing, and the sign of an
-//! intermediate zero shows in no result. Stated errors are the largest over every float of the range, as
-//! `tests/math.rs` finds them; one ULP is the spacing of floats at the exact value. `tests/fit.rs` fits the polynomials
-//! anew. Counts are of lane operations, constants free.
+//! Twin of `shaders/lib/math.wgsl`: same names, same statements, same order. Only f32 `+ - *`, comparison, select, abs,
+//! 32-bit integer operations, bit casts and conversions of integers up to 2^24 occur. Within the stated ranges every
+//! intermediate value is 0 or of size 2^-120 to 2^120. So flushed denormals change nothing, and no result depends on
+//! the sign of an intermediate zero.
+//!
+//! Stated errors are maxima over every float of the range (`tests/math.rs`). One ULP is the spacing of floats at the
+//! exact value. `tests/fit.rs` fits the polynomials. Operations are lane operations, constants not counted.
 
 #![allow(clippy::approx_constant, reason = "the twin has the same literals")]
 
 use fearless_simd::prelude::*;
 
-use super::{except, larger, smaller};
+use super::{larger, smaller, zero_if};
 
 /// 1/√x for x in 2^-80..2^40 within 2 ULP; some finite value for 0. 12 operations.
 ///
-/// The seed, an exponent halved and negated, follows 2^(-1/3)/√x within 4 %. A quadratic in x·y² brings that to 3e-5,
-/// and a Newton step, whose factor of x·y² is 1 at this scale, to rounding.
+/// The seed, with its exponent halved and negated, approximates 2^(-1/3)/√x within 4 %. A quadratic in x·y² reduces the
+/// error to 3e-5. A Newton step, whose factor of x·y² is 1 at this scale, reduces it to rounding.
 #[inline(always)]
 pub fn rsqrt<S: Simd>(x: S::f32s) -> S::f32s {
     let y = rough_rsqrt::<S>(x);
@@ -26,7 +27,7 @@ pub fn rsqrt<S: Simd>(x: S::f32s) -> S::f32s {
 
 /// √x for 0 and x in 2^-80..2^40 within 2.1 ULP. 12 operations: one fewer than `x * rsqrt(x)`.
 #[inline(always)]
-pub fn root<S: Simd>(x: S::f32s) -> S::f32s {
+pub fn exact_sqrt<S: Simd>(x: S::f32s) -> S::f32s {
     let y = rough_rsqrt::<S>(x);
     let g = x * y;
     g * (S::f32s::splat(x.token(), 1.8898816) - g * y)
@@ -50,8 +51,8 @@ pub fn recip<S: Simd>(x: S::f32s) -> S::f32s {
 
 /// 2/x within 2e-4. 4 operations.
 ///
-/// A negated exponent follows √2/x within 1.4 %, where it would follow 1/x only within 5 %, and the Newton step that
-/// squares the error turns √2/x into 2/x.
+/// A negated exponent approximates √2/x within 1.4 %, but 1/x only within 5 %. The Newton step that squares the error
+/// turns √2/x into 2/x.
 #[inline(always)]
 fn rough_twice_recip<S: Simd>(x: S::f32s) -> S::f32s {
     let bits: S::u32s = x.bitcast();
@@ -59,17 +60,17 @@ fn rough_twice_recip<S: Simd>(x: S::f32s) -> S::f32s {
     y * (S::f32s::splat(x.token(), 2.8286855) - x * y)
 }
 
-/// x, brought to where tanh comes to 1 if it is beyond. 2 operations.
+/// Clamps x to the range outside of which tanh is ±1 in f32. 2 operations.
 #[inline(always)]
 pub fn limit_tanh<S: Simd>(x: S::f32s) -> S::f32s {
     let limit = S::f32s::splat(x.token(), 7.5501223);
-    // For numbers this is the shader's pair of selects, in half the operations.
+    // Equal to the shader's pair of selects for numbers, in half the operations.
     larger::<S>(smaller::<S>(x, limit), -limit)
 }
 
-/// n and d with tanh(x/2) = n/d, for an x from [`limit_tanh`]; [`whole_tanh`] goes on with them. 9 operations.
+/// n and d with tanh(x/2) = n/d, for x from [`limit_tanh`]. 9 operations. See [`whole_tanh`].
 ///
-/// A rational approximation whose two parts meet where tanh comes to 1.
+/// A rational approximation whose two parts are equal at the limits.
 #[inline(always)]
 pub fn half_tanh<S: Simd>(x: S::f32s) -> (S::f32s, S::f32s) {
     let z = x * x;
@@ -78,10 +79,10 @@ pub fn half_tanh<S: Simd>(x: S::f32s) -> (S::f32s, S::f32s) {
     (n, d)
 }
 
-/// tanh x of its [`limit_tanh`]'s [`half_tanh`], for 0 and any finite |x| from 2^-40, in [-1, 1], within 4.5e-7,
-/// and 1.1e-6 of its size; odd. 13 operations.
+/// tanh x, from the [`half_tanh`] of its [`limit_tanh`], for 0 and any finite |x| from 2^-40. In [-1, 1], within 4.5e-7
+/// and a relative error of 1.1e-6; odd. 13 operations.
 ///
-/// tanh x = 2nd/(n² + d²), which cannot pass 1.
+/// tanh x = 2nd/(n² + d²), which cannot exceed 1.
 #[inline(always)]
 pub fn whole_tanh<S: Simd>((n, d): (S::f32s, S::f32s)) -> S::f32s {
     let s = n * n + d * d;
@@ -91,7 +92,7 @@ pub fn whole_tanh<S: Simd>((n, d): (S::f32s, S::f32s)) -> S::f32s {
 
 /// (sin x, cos x) for 0 and |x| from 2^-40 to π, within 1.9e-7; exact for 0. 26 operations.
 ///
-/// Each is a polynomial in x², with the factor that vanishes where the function does.
+/// Each is a polynomial in x², times the factor that has the function's zeros.
 #[inline(always)]
 pub fn sin_cos<S: Simd>(x: S::f32s) -> (S::f32s, S::f32s) {
     let simd = x.token();
@@ -105,7 +106,7 @@ pub fn sin_cos<S: Simd>(x: S::f32s) -> (S::f32s, S::f32s) {
     (x * u * p, v * q)
 }
 
-/// ln x for x in 2^-24..1 within 3.2e-7 of its size; 0 for 1. 24 operations.
+/// ln x for x in 2^-24..1 within a relative error of 3.2e-7; 0 for 1. 24 operations.
 #[inline(always)]
 pub fn ln<S: Simd>(x: S::f32s) -> S::f32s {
     let bits: S::u32s = x.bitcast();
@@ -127,20 +128,20 @@ pub fn normal<S: Simd>(a: S::u32s, b: S::u32s) -> S::f32s {
     normal_of::<S>(normal_radius::<S>(a), normal_cosine::<S>(b))
 }
 
-/// [`normal`] of its two parts.
+/// [`normal`], from its radius and cosine.
 #[inline(always)]
 pub fn normal_of<S: Simd>(radius: S::f32s, cosine: S::f32s) -> S::f32s {
     flush::<S>(radius * cosine, 9.094947e-13)
 }
 
-/// The radius of [`normal`]: the top 24 bits of `a` make a uniform number in (0, 1].
+/// The radius of [`normal`]: the top 24 bits of `a` are a uniform number in (0, 1].
 #[inline(always)]
 pub fn normal_radius<S: Simd>(a: S::u32s) -> S::f32s {
     let u = ((a >> 8) + 1).to_float::<S::f32s>() * 5.9604645e-8;
-    root::<S>(ln::<S>(u) * -2.0)
+    exact_sqrt::<S>(ln::<S>(u) * -2.0)
 }
 
-/// The cosine of [`normal`]: the top 24 bits of `b` make an angle in [-π, π).
+/// The cosine of [`normal`]: the top 24 bits of `b` are an angle in [-π, π).
 #[inline(always)]
 pub fn normal_cosine<S: Simd>(b: S::u32s) -> S::f32s {
     let angle = ((b >> 8).to_float::<S::f32s>() - 8388608.0) * 3.7450704e-7;
@@ -148,34 +149,35 @@ pub fn normal_cosine<S: Simd>(b: S::u32s) -> S::f32s {
     cosine
 }
 
-/// Whether an offset is at most as long as a radius, given squared. 4 operations.
+/// Whether the length of an offset is at most a radius, given squared. 4 operations.
 #[inline(always)]
 pub fn within<S: Simd>(dx: S::f32s, dy: S::f32s, radius2: S::f32s) -> S::mask32s {
     let d2 = dx * dx + dy * dy;
-    // For numbers that are not negative this is the shader's comparison of bits.
+    // Equal to the shader's comparison of bits, because no number is negative.
     d2.simd_le(radius2)
 }
 
 /// +0 where |x| < `limit`, else x. 3 operations.
 #[inline(always)]
 pub fn flush<S: Simd>(x: S::f32s, limit: f32) -> S::f32s {
-    except::<S>(x, x.abs().simd_lt(limit))
+    zero_if::<S>(x, x.abs().simd_lt(limit))
 }
 
-/// Four random words for each counter (x, y, z, w): pcg4d (Jarzynski and Olano 2020) and one more fold. 40 operations.
+/// Four random words for each counter (x, y, z, w): pcg4d (Jarzynski and Olano 2020) with one more round. 40
+/// operations.
 ///
-/// Without that fold the low half of a word would not depend on the high bits of the counter.
+/// Without that round the low half of a word would not depend on the high bits of the counter.
 #[inline(always)]
-pub fn draw<S: Simd>(x: S::u32s, y: S::u32s, z: S::u32s, w: S::u32s) -> [S::u32s; 4] {
+pub fn pcg4d<S: Simd>(x: S::u32s, y: S::u32s, z: S::u32s, w: S::u32s) -> [S::u32s; 4] {
     let (x, y, z, w) =
         (x * 1664525 + 1013904223, y * 1664525 + 1013904223, z * 1664525 + 1013904223, w * 1664525 + 1013904223);
-    let [x, y, z, w] = stir::<S>(x, y, z, w);
-    stir::<S>(x, y, z, w)
+    let [x, y, z, w] = pcg4d_round::<S>(x, y, z, w);
+    pcg4d_round::<S>(x, y, z, w)
 }
 
-/// One round of [`draw`].
+/// One round of [`pcg4d`].
 #[inline(always)]
-fn stir<S: Simd>(x: S::u32s, y: S::u32s, z: S::u32s, w: S::u32s) -> [S::u32s; 4] {
+fn pcg4d_round<S: Simd>(x: S::u32s, y: S::u32s, z: S::u32s, w: S::u32s) -> [S::u32s; 4] {
     let x = x + y * w;
     let y = y + z * x;
     let z = z + x * y;
@@ -183,8 +185,8 @@ fn stir<S: Simd>(x: S::u32s, y: S::u32s, z: S::u32s, w: S::u32s) -> [S::u32s; 4]
     [x ^ (x >> 16), y ^ (y >> 16), z ^ (z >> 16), w ^ (w >> 16)]
 }
 
-/// One lane of [`draw`].
-pub fn draw_scalar(counter: [u32; 4]) -> [u32; 4] {
+/// One lane of [`pcg4d`].
+pub fn pcg4d_scalar(counter: [u32; 4]) -> [u32; 4] {
     let [mut x, mut y, mut z, mut w] = counter.map(|word| word.wrapping_mul(1664525).wrapping_add(1013904223));
     for _ in 0..2 {
         x = x.wrapping_add(y.wrapping_mul(w));

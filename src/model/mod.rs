@@ -1,11 +1,11 @@
-//! The parts of a step, each in one place: its keys, its constants, its formulas, its shader and what they cost.
+//! The parts of a step. Each file has one part's config keys, constants, formulas and shader.
 //!
-//! Formulas are pure functions over lanes of teams, the twins of `shaders/*.wgsl`: same names, same order. A part's
-//! keys make its section of the config, and its constants are computed once from that, in f64, and rounded once.
+//! Formulas are pure functions over lanes of teams. Each has a twin in `shaders/*.wgsl` with the same names and the
+//! same order of operations. Constants are computed once from the config, in f64, and rounded once.
 
 use fearless_simd::Simd;
 
-use crate::declare::{Field, Shared, shared};
+use crate::gpu_struct::{Field, GpuStruct, gpu_struct};
 
 pub mod couple;
 pub mod follow;
@@ -21,44 +21,44 @@ use motion::{MotionConstants, MotionLanes};
 use policy::PolicyConstants;
 use sense::{Density, SenseConstants, SenseLanes};
 
-/// Longest map side, radius or range: squares of distances stay far from the ends of f32.
+/// The maximum length of a map side, radius or range. Its square is far from f32's overflow.
 pub(crate) const LONGEST: f64 = 1e4;
-/// Least size of a length or speed that is not 0: its square stays far from the denormals of f32.
+/// The minimum size of a length or speed other than 0. Its square is far from f32's denormals.
 pub(crate) const LEAST: f64 = 1e-6;
 
-shared! {
-    /// What every kernel reads; in the shaders the fields of all parts stand side by side.
+gpu_struct! {
+    /// The constants of a world. In the shaders the fields of all parts are fields of this struct.
     pub struct Constants {
-        /// Learners of a team, agents 0 on.
+        /// Leaders of a team, agents 0 on.
         pub leaders: u32,
-        /// Agents after them.
+        /// Followers of a team, the agents after the leaders.
         pub followers: u32,
         /// Points of interest.
         pub pois: u32,
-        /// T, of an episode.
+        /// T: steps of an episode.
         pub steps: u32,
-        /// u32 words in the set of agents near one POI.
+        /// u32 words in a set of agents.
         pub words: u32,
-        /// At the start, units a second.
+        /// The initial speed, in units per second.
         pub speed: f32,
-        /// What kernels have code of their own for.
+        /// Choices that kernels are specialised for.
         pub variant: Variant,
-        /// Sizes of a policy.
+        /// The sizes of a policy.
         pub policy: PolicyConstants,
-        /// How agents move.
+        /// Constants of motion.
         pub motion: MotionConstants,
-        /// Who is at a POI.
+        /// Constants of coupling.
         pub couple: CoupleConstants,
-        /// What followers do.
+        /// Constants of following.
         pub follow: FollowConstants,
-        /// What leaders sense.
+        /// Constants of sensing.
         pub sense: SenseConstants,
     }
 
-    /// What a step has code of its own for: a kernel made for its world has it as a constant.
+    /// Choices between formulas. In a specialised kernel they are constants.
     #[derive(Eq, Hash, Ord, PartialOrd)]
     pub struct Variant as VariantLanes {
-        /// A [`Density`].
+        /// A [`Density`], by its number.
         pub density: u32,
         /// See [`MotionConstants::by_sine`].
         pub by_sine: u32,
@@ -66,29 +66,29 @@ shared! {
 }
 
 impl Variant {
-    /// How a leader senses.
+    /// Returns the density.
     pub fn density(&self) -> Density {
         Density::of(self.density)
     }
 }
 
-/// The constants, and those of the parts with every float in all lanes.
+/// A world's constants, and every float of the parts in all lanes.
 #[derive(Clone, Copy)]
 pub struct Lanes<S: Simd> {
-    /// As they are.
+    /// The constants.
     pub constants: Constants,
-    /// In all lanes.
+    /// Motion.
     pub motion: MotionLanes<S>,
-    /// In all lanes.
+    /// Coupling.
     pub couple: CoupleLanes<S>,
-    /// In all lanes.
+    /// Following.
     pub follow: FollowLanes<S>,
-    /// In all lanes.
+    /// Sensing.
     pub sense: SenseLanes<S>,
 }
 
 impl<S: Simd> Lanes<S> {
-    /// Puts every float into all lanes.
+    /// Copies every float to all lanes.
     pub fn new(simd: S, constants: Constants) -> Lanes<S> {
         let Constants { motion, couple, follow, sense, .. } = constants;
         Lanes {
@@ -101,11 +101,11 @@ impl<S: Simd> Lanes<S> {
     }
 }
 
-/// The structs and constants that the parts' shaders read.
+/// Returns the WGSL of the structs and constants that the parts' shaders use.
 pub fn declarations() -> String {
     let inputs = format!("const INPUTS: u32 = {}u;\n", sense::INPUTS);
     [Constants::wgsl(), Variant::wgsl(), Density::wgsl(), inputs].concat()
 }
 
-/// The parts' shaders.
+/// The parts' shaders, in the order of a step.
 pub const WGSL: [&str; 5] = [sense::WGSL, policy::WGSL, follow::WGSL, motion::WGSL, couple::WGSL];

@@ -1,27 +1,24 @@
-//! A leader's policy: a fully connected network with a bias and tanh in every layer (Sections 2.4 and 3.1), whose
-//! outputs are what it does, or choose among known behaviours.
+//! A leader's policy: a fully connected network with biases and tanh in every layer (paper, Sections 2.4 and 3.1). Its
+//! outputs are actions, or choose among behaviours.
 
 use fearless_simd::{Simd, prelude::*};
 
 use super::{Lanes, sense::INPUTS};
-use crate::declare::{config_enum, shared};
-use crate::kernels::{
-    math,
-    operations::{FLUSH, TANH},
-    select, splat,
-};
+use crate::config_enum::config_enum;
+use crate::gpu_struct::gpu_struct;
+use crate::kernels::{math, select, splat};
 use crate::reader::{Reader, between, section};
 
-/// The shader's part.
+/// The shader of this part.
 pub const WGSL: &str = include_str!("../../shaders/policy.wgsl");
 
-/// What a leader answers to its inputs: wanted change of heading and wanted speed.
+/// Actions of a leader: a wanted turn and a wanted speed.
 pub const OUTPUTS: usize = 2;
-/// Behaviours to choose among: hold, towards POIs, away from POIs, towards agents, away from agents.
+/// Behaviours to choose among: hold, towards or away from POIs, towards or away from agents.
 pub const BEHAVIOURS: usize = 5;
-/// Most hidden layers of a policy.
+/// Maximum number of hidden layers.
 pub const MAX_HIDDEN_LAYERS: usize = 3;
-/// Most units in one hidden layer.
+/// Maximum units per hidden layer.
 pub const MAX_HIDDEN_UNITS: usize = 64;
 
 section! {
@@ -47,7 +44,7 @@ config_enum! {
 }
 
 impl Actions {
-    /// Outputs of the network.
+    /// Returns the number of outputs of the network.
     pub const fn outputs(self) -> usize {
         match self {
             Actions::Direct => OUTPUTS,
@@ -65,23 +62,23 @@ impl Policy {
         }
     }
 
-    /// The widths of all layers, inputs and outputs included.
+    /// Returns the widths of all layers, from inputs to outputs.
     pub fn widths(&self) -> Vec<usize> {
         [&[INPUTS], &self.hidden[..], &[self.actions.outputs()]].concat()
     }
 
-    /// Weights of one policy, biases included.
+    /// Returns the weights of one policy, biases included.
     pub fn parameters(&self) -> usize {
         self.widths().windows(2).map(|w| (w[0] + 1) * w[1]).sum()
     }
 }
 
-shared! {
+gpu_struct! {
     /// The sizes of a policy.
     pub struct PolicyConstants as PolicyLanes {
         /// Layers of weights.
         pub layers: u32,
-        /// `inputs, hidden…, outputs`; unused entries are 0.
+        /// `inputs, hidden…, outputs`, padded with 0.
         pub widths: [u32; MAX_HIDDEN_LAYERS + 2],
         /// Weights, biases included.
         pub parameters: u32,
@@ -89,7 +86,7 @@ shared! {
 }
 
 impl PolicyConstants {
-    /// Of a valid section.
+    /// Computes the sizes for a valid section.
     pub fn new(policy: &Policy) -> PolicyConstants {
         let mut widths = [0; MAX_HIDDEN_LAYERS + 2];
         for (width, units) in widths.iter_mut().zip(policy.widths()) {
@@ -98,36 +95,28 @@ impl PolicyConstants {
         PolicyConstants { layers: policy.hidden.len() as u32 + 1, widths, parameters: policy.parameters() as u32 }
     }
 
-    /// What the last layer is; none where it is neither.
+    /// Returns what the outputs are, or `None` if their number is neither.
     pub fn actions(&self) -> Option<Actions> {
         let outputs = *self.widths.get(self.layers as usize)? as usize;
         [Actions::Direct, Actions::Behaviours].into_iter().find(|actions| actions.outputs() == outputs)
     }
 
-    /// Units of the widest layer, inputs included.
+    /// Returns the widest layer, inputs included.
     pub fn widest(&self) -> usize {
         self.widths.into_iter().max().unwrap_or(0) as usize
     }
 
-    /// Words that a vector of teams takes of one leader: its weights, inputs, two layers and outputs.
+    /// Returns the words per leader in a vector of teams: weights, inputs, two layers and outputs.
     pub fn words(&self) -> usize {
         self.parameters as usize + INPUTS + 2 * self.widest() + OUTPUTS
     }
-
-    /// Lane operations of one leader: a product and a sum a weight (the bias is where a sum starts), every unit's
-    /// activation, and what is wanted of the outputs.
-    pub fn operations(&self) -> u32 {
-        let layers = self.widths[..=self.layers as usize].windows(2);
-        let chosen = if self.actions() == Some(Actions::Behaviours) { CHOICE } else { 0 };
-        layers.map(|widths| widths[1] * (2 * widths[0] + FLUSH + TANH)).sum::<u32>() + chosen + 1 + 3
-    }
 }
 
-/// Some units before their tanh: the bias (the last of a unit's weights) and the weighted inputs, added in order.
+/// Computes some units before tanh: the bias, plus the weighted inputs in order.
 ///
-/// `weights` holds a row an input, and the biases, of `UNITS` weights each.
+/// `weights` has one row of `UNITS` per input, then the biases.
 #[inline(always)]
-pub fn weigh<S: Simd, const UNITS: usize>(inputs: &[S::f32s], weights: &[S::f32s]) -> [S::f32s; UNITS] {
+pub fn affine<S: Simd, const UNITS: usize>(inputs: &[S::f32s], weights: &[S::f32s]) -> [S::f32s; UNITS] {
     let (rows, _) = weights.as_chunks::<UNITS>();
     let mut sums = rows[inputs.len()];
     for (&input, row) in inputs.iter().zip(rows) {
@@ -138,23 +127,19 @@ pub fn weigh<S: Simd, const UNITS: usize>(inputs: &[S::f32s], weights: &[S::f32s
     sums
 }
 
-/// The sum, ready for its tanh; sums too small to matter become 0, which keeps the next layer away from denormals.
+/// Clamps a sum to the range of tanh. Small sums are flushed to 0, so that the next layer has no denormals.
 #[inline(always)]
-pub fn tame<S: Simd>(sum: S::f32s) -> S::f32s {
+pub fn clamp_preactivation<S: Simd>(sum: S::f32s) -> S::f32s {
     math::limit_tanh::<S>(math::flush::<S>(sum, TINY))
 }
 
-/// Sums under this size (2^-30) count as 0.
+/// Sums smaller than this (2^-30) are flushed to 0.
 pub const TINY: f32 = 1.0 / 1_073_741_824.0;
 
-/// Lane operations of a choice: 4 comparisons with 2 selections each; of both classes 3 such, the opposite quadrant (a
-/// comparison, a selection, a sum) and whether there is any (2); and the class, the direction and the two answers.
-const CHOICE: u32 = 4 * 3 + 2 * (3 * 3 + 3 + 2) + 8;
-
-/// What the most wanted behaviour is as a direct answer: the first of the largest `wanted`, each in -1..1.
+/// Returns the actions of the most wanted behaviour: the first of the largest `wanted`, each in -1..1.
 ///
-/// Behaviours: hold; towards and away from the quadrant of most POIs; towards and away from that of most agents, the
-/// first where several are alike. Where nothing is sensed, straight ahead.
+/// Behaviours: hold; towards or away from the quadrant with the highest density of POIs; towards or away from the one
+/// of agents. Ties go to the first quadrant. If nothing is sensed, the leader goes straight ahead.
 #[inline(always)]
 pub fn choose<S: Simd>(inputs: &[S::f32s; INPUTS], wanted: &[S::f32s; BEHAVIOURS]) -> [S::f32s; OUTPUTS] {
     let simd = wanted[0].token();
@@ -184,13 +169,13 @@ pub fn choose<S: Simd>(inputs: &[S::f32s; INPUTS], wanted: &[S::f32s; BEHAVIOURS
     [select::<S>(number(0.0), turn, moves), select::<S>(number(-1.0), number(1.0), moves)]
 }
 
-/// The wanted turn, in radians to the left, of the policy's first output in -1..1.
+/// Converts the first output, in -1..1, to a wanted turn in radians to the left.
 #[inline(always)]
 pub fn wanted_turn<S: Simd>(output: S::f32s) -> S::f32s {
     output * std::f32::consts::PI
 }
 
-/// The wanted speed of the policy's second output in -1..1.
+/// Converts the second output, in -1..1, to a wanted speed.
 #[inline(always)]
 pub fn wanted_speed<S: Simd>(world: &Lanes<S>, output: S::f32s) -> S::f32s {
     (output + 1.0) * 0.5 * world.motion.max_speed

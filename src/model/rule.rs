@@ -4,21 +4,21 @@ use std::ops::{Range, RangeInclusive};
 
 use serde::Serialize;
 
-use crate::declare::config_enum;
+use crate::config_enum::config_enum;
 use crate::reader::{OneOrList, Reader, between};
 
 /// Agents needed at a POI at the same step: one number for all POIs, or one per POI.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(untagged)]
 pub enum Coupling {
-    /// As many at every POI.
+    /// The same number for every POI.
     Same(usize),
-    /// So many at each, `[pois]`.
+    /// One number per POI, `[pois]`.
     Each(Vec<usize>),
 }
 
 impl Coupling {
-    /// Reads it, of so many agents, which `because` names, and POIs (none where their number is unknown).
+    /// Reads the coupling. Errors name the number of agents by `because`. `pois` is `None` if their list is invalid.
     pub(crate) fn read(r: &mut Reader<'_>, agents: usize, because: &'static str, pois: Option<usize>) -> Coupling {
         let coupling = r
             .key(
@@ -35,7 +35,7 @@ impl Coupling {
         }
     }
 
-    /// Of each of so many POIs.
+    /// Returns the coupling of each POI, `[pois]`.
     pub fn of_each(&self, pois: usize) -> Vec<u32> {
         match self {
             Coupling::Same(count) => vec![*count as u32; pois],
@@ -57,13 +57,13 @@ config_enum! {
 }
 
 impl Observers {
-    /// Asks for it.
+    /// Reads the key.
     pub(crate) fn read(r: &mut Reader<'_>) -> Observers {
         r.key("world.observers", "", "whose presence at a POI counts; the coupling is at most their number", "5")
             .choice(Observers::All)
     }
 
-    /// The agents that count, of so many leaders and then followers.
+    /// Returns the agents that are observers.
     pub fn among(self, leaders: usize, followers: usize) -> Range<usize> {
         match self {
             Observers::All => 0..leaders + followers,
@@ -72,7 +72,7 @@ impl Observers {
         }
     }
 
-    /// How an error calls their number.
+    /// Returns how errors name the number of observers.
     pub(crate) fn counted(self) -> &'static str {
         match self {
             Observers::All => "the number of agents",
@@ -82,7 +82,7 @@ impl Observers {
     }
 }
 
-/// Reads at which steps each POI can be observed, of so many steps and POIs (none where their number is unknown).
+/// Reads the steps at which each POI can be observed. `pois` is `None` if their list is invalid.
 pub(crate) fn windows(r: &mut Reader<'_>, steps: usize, pois: Option<usize>) -> Vec<[usize; 2]> {
     let asked =
         r.key("world.windows", "steps", "the first and the last step of each POI at which it can be observed", "5");
@@ -99,7 +99,7 @@ pub(crate) fn windows(r: &mut Reader<'_>, steps: usize, pois: Option<usize>) -> 
     windows.into_iter().map(|window| [window[0], window[1]]).collect()
 }
 
-/// Reads which POIs each one comes after, of so many (none where their number is unknown).
+/// Reads which POIs each one comes after. `pois` is `None` if their list is invalid.
 pub(crate) fn after(r: &mut Reader<'_>, pois: Option<usize>) -> Vec<Vec<usize>> {
     let asked = r.key(
         "world.after",
@@ -111,7 +111,7 @@ pub(crate) fn after(r: &mut Reader<'_>, pois: Option<usize>) -> Vec<Vec<usize>> 
     let most = pois.map_or(usize::MAX, |pois| pois - 1);
     let wrong = |after: &[Vec<usize>]| {
         if pois.is_none() {
-            // There is something else to be mended first.
+            // The list of POIs has to be fixed first.
             return vec![];
         }
         let own = after.iter().enumerate().filter(|(poi, after)| after.contains(poi));
@@ -127,7 +127,7 @@ pub(crate) fn after(r: &mut Reader<'_>, pois: Option<usize>) -> Vec<Vec<usize>> 
     asked.lists("lists of POIs", ("world.pois", pois), lengths, between(0, most).because("the last POI"), wrong)
 }
 
-/// All POIs, each behind those it comes after; and those for which there is no such order.
+/// Sorts POIs topologically: each after those it comes after. Also returns the POIs that have no such order.
 fn sorted(after: &[Vec<usize>]) -> (Vec<usize>, Vec<usize>) {
     let (mut order, mut left): (Vec<usize>, Vec<usize>) = (vec![], (0..after.len()).collect());
     let mut placed = vec![false; after.len()];
@@ -143,12 +143,12 @@ fn sorted(after: &[Vec<usize>]) -> (Vec<usize>, Vec<usize>) {
     }
 }
 
-/// POIs each of which comes after the next, and the last after the first.
+/// Returns POIs of which each comes after the next, and the last after the first.
 fn cycle(after: &[Vec<usize>]) -> Option<Vec<usize>> {
     let (_, left) = sorted(after);
     let mut path = vec![*left.first()?];
     loop {
-        // Whoever has no place in the order waits for one that has none either.
+        // A POI without an order waits for another one without.
         let next = *after[path[path.len() - 1]].iter().find(|poi| left.contains(poi))?;
         if let Some(first) = path.iter().position(|&poi| poi == next) {
             return Some(path.split_off(first));
@@ -157,29 +157,29 @@ fn cycle(after: &[Vec<usize>]) -> Option<Vec<usize>> {
     }
 }
 
-/// Who observes POIs, when, and in what order: by it everybody tells whether a POI was observed.
+/// Who observes POIs, when, and in what order.
 ///
-/// A POI is observed at the first step that is within its window, all POIs that it comes after having been observed at
-/// steps before, with at least as many agents that count near it as its coupling. Steps count from 1.
+/// A POI is observed at the first step that is within its window, at which all POIs that it comes after were observed
+/// at earlier steps, and at which at least as many observers as its coupling are within its radius. Steps count from 1.
 ///
-/// By the default all agents count, at any step, in any order.
+/// By default all agents are observers, at any step and in any order.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Rule {
-    /// A bit for each agent that counts, `[words]`; empty where all do.
+    /// One bit per agent, set if it is an observer, `[words]`. Empty if all are.
     counted: Vec<u32>,
-    /// `[pois]`; empty where there are none.
+    /// The first and last step of each POI, `[pois]`. Empty without windows.
     windows: Vec<[u32; 2]>,
-    /// `[pois]`, and the POIs in an order in which each stands behind those it comes after; empty where none does.
+    /// The POIs that each one comes after, `[pois]`, and a topological order of all. Empty without orders.
     after: Vec<Vec<usize>>,
     order: Vec<usize>,
 }
 
-/// The step of what never happens.
+/// The step of an event that never happens.
 pub const NEVER: u32 = u32::MAX;
 
 impl Rule {
-    /// Of these agents of so many, windows `[pois]` and POIs that each comes after `[pois]`; no windows, or none that
-    /// any comes after, may be empty.
+    /// Creates a rule from the observers, of `agents`, the windows, `[pois]`, and the POIs that each comes after,
+    /// `[pois]`. Either list may be empty.
     pub fn new(counted: Range<usize>, agents: usize, windows: &[[usize; 2]], after: &[Vec<usize>]) -> Rule {
         let mut bits = vec![0; agents.div_ceil(32)];
         counted.clone().for_each(|agent| bits[agent / 32] |= 1 << (agent % 32));
@@ -192,8 +192,8 @@ impl Rule {
         }
     }
 
-    /// Whether it fits so many words a set and POIs: it is of as many, no window starts before the first step, and no
-    /// POI waits for itself.
+    /// Reports whether the rule is consistent with the words of a set and the number of POIs: sizes match, windows
+    /// start at step 1 or later, and no POI waits for itself.
     pub fn fits(&self, words: usize, pois: usize) -> bool {
         let fits = |len: usize, wanted: usize| len == 0 || len == wanted;
         fits(self.counted.len(), words)
@@ -203,52 +203,53 @@ impl Rule {
             && self.order.len() == self.after.len()
     }
 
-    /// Whether it is the default.
+    /// Reports whether this is the default rule.
     pub fn is_plain(&self) -> bool {
         self.counted.is_empty() && !self.is_timed()
     }
 
-    /// Whether it matters at which steps agents were near a POI.
+    /// Reports whether it matters when agents are at a POI.
     pub fn is_timed(&self) -> bool {
         !self.windows.is_empty() || !self.after.is_empty()
     }
 
-    /// Whether an agent counts.
+    /// Reports whether an agent is an observer.
     pub fn counts(&self, agent: usize) -> bool {
         self.counted(agent / 32, 1 << (agent % 32)) != 0
     }
 
-    /// Those of a word of a set that count.
+    /// Masks a word of a set to the observers.
     #[inline]
     pub fn counted(&self, word: usize, agents: u32) -> u32 {
         agents & self.counted.get(word).copied().unwrap_or(u32::MAX)
     }
 
-    /// How many of a set, `[words]`, count.
+    /// Counts the observers in a set, `[words]`.
     #[inline]
     pub fn count(&self, set: impl IntoIterator<Item = u32>) -> u32 {
         set.into_iter().enumerate().map(|(word, agents)| self.counted(word, agents).count_ones()).sum()
     }
 
-    /// The first and the last step of a POI's window; of one that has none, all.
+    /// Returns the first and last step of a POI's window, if it has one.
     pub fn window(&self, poi: usize) -> Option<[u32; 2]> {
         self.windows.get(poi).copied()
     }
 
-    /// The POIs that a POI comes after.
+    /// Returns the POIs that a POI comes after.
     pub fn after(&self, poi: usize) -> &[usize] {
         self.after.get(poi).map_or(&[], |after| after)
     }
 
-    /// Whether a POI can be observed at a step by whoever is there, when these were observed before it.
+    /// Reports whether a POI can be observed at a step, if these POIs were observed before.
     pub fn is_open(&self, poi: usize, step: u32, observed: &[bool]) -> bool {
         self.window(poi).is_none_or(|[first, last]| (first..=last).contains(&step))
             && self.after(poi).iter().all(|&other| observed[other])
     }
 
-    /// When each POI is observed in an episode of so many steps, `[pois]`, [`NEVER`] if it is not: at the first step,
-    /// among those at which the rule lets it be, that `first_enough` finds to have enough agents. That is asked for
-    /// each POI and its steps, and not where there are none.
+    /// Writes the step at which each POI is observed in an episode of so many steps, `[pois]`, or [`NEVER`].
+    ///
+    /// `first_enough` returns the first of the given steps at which a POI has enough observers. It is called with the
+    /// steps that the rule allows, if there are any.
     pub fn observe(
         &self,
         steps: u32,
@@ -259,7 +260,7 @@ impl Rule {
             let poi = self.order.get(place).copied().unwrap_or(place);
             let [first, last] = self.window(poi).unwrap_or([1, steps]);
             let latest = self.after(poi).iter().map(|&other| observed_at[other]).max();
-            // NEVER and one is NEVER.
+            // Saturates at NEVER.
             let open = latest.map_or(first, |latest| first.max(latest.saturating_add(1)))..=last.min(steps);
             observed_at[poi] = if open.is_empty() { None } else { first_enough(poi, open) }.unwrap_or(NEVER);
         }

@@ -1,24 +1,22 @@
-//! What a leader senses: the density of POIs and of agents in four quadrants around its heading (Section 3.1).
+//! Sensing: the density of POIs and of agents in four quadrants around its heading (paper, Section 3.1).
 
 use fearless_simd::{Simd, prelude::*};
 
 use super::{LONGEST, Lanes};
-use crate::declare::{config_enum, shared};
+use crate::config_enum::config_enum;
+use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
-    except,
-    math::{root, rsqrt},
-    only,
-    operations::{ROOT, ROTATE, RSQRT, SQUARED_DISTANCE},
-    select, splat,
+    math::{exact_sqrt, rsqrt},
+    select, splat, zero_if, zero_unless,
 };
 use crate::reader::{Reader, between, section};
 
-/// The shader's part.
+/// The shader of this part.
 pub const WGSL: &str = include_str!("../../shaders/sense.wgsl");
 
 /// Inputs of a policy: POI and agent density in four quadrants each.
 pub const INPUTS: usize = 8;
-/// What they are, in order.
+/// The inputs' names, in order.
 pub const NAMES: [&str; INPUTS] = [
     "POIs back right",
     "POIs front right",
@@ -29,7 +27,7 @@ pub const NAMES: [&str; INPUTS] = [
     "agents front left",
     "agents back left",
 ];
-/// A squared range no distance on a map reaches.
+/// A squared range that exceeds every distance on a map.
 const UNLIMITED: f32 = 1e30;
 
 section! {
@@ -70,12 +68,12 @@ config_enum! {
     }
 }
 
-shared! {
-    /// What sensing reads.
+gpu_struct! {
+    /// Constants of sensing.
     pub struct SenseConstants as SenseLanes {
-        /// The range of POIs, squared.
+        /// The squared range of POIs.
         pub poi_range2: f32,
-        /// The range of agents, squared.
+        /// The squared range of agents.
         pub agent_range2: f32,
         /// gain/P: multiplies a sum over POIs; 0 if no POI is sensed.
         pub poi_share: f32,
@@ -87,7 +85,7 @@ shared! {
 }
 
 impl SenseConstants {
-    /// Of so many agents and POIs on this map.
+    /// Computes the constants for so many agents and POIs on a map.
     pub fn new(sense: &Sense, agents: usize, pois: usize, map: [f64; 2]) -> SenseConstants {
         // A range of 0 still reaches what is at the same place: that weighs nothing, on every backend alike.
         let share = |range: f64, count: usize| if range == 0.0 { 0.0 } else { (sense.gain / count as f64) as f32 };
@@ -102,36 +100,22 @@ impl SenseConstants {
     }
 }
 
-/// Lane operations of a leader that senses an entity: the range's test and selection, the quadrant's 4 tests and what
-/// joins them (4), 2 selections by the side and 4 by the front, 4 sums; and the density: a root, scaled and taken from
-/// 1, or an inverse root of at least 1.
-pub fn operations(density: Density) -> u32 {
-    let density = match density {
-        Density::Linear => ROOT + 2,
-        Density::Inverse => RSQRT + 2,
-    };
-    SQUARED_DISTANCE + ROTATE + 2 + 4 + 4 + 2 + 4 + 4 + density
-}
-
-/// Lane operations of a leader, whatever it senses: a density is weighed by the share of its kind.
-pub const WEIGHED: u32 = INPUTS as u32;
-
-/// What an entity at offset (`dx`, `dy`) adds to the density of its quadrant, if it is in range.
+/// Returns the density of an entity at offset (`dx`, `dy`), if it is in range.
 #[inline(always)]
 pub fn density<S: Simd, const DENSITY: u32>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::f32s {
     let one = splat(dx.token(), 1.0);
     let d2 = dx * dx + dy * dy;
     match const { Density::of(DENSITY) } {
-        Density::Linear => one - root::<S>(d2) * world.sense.inverse_diagonal,
+        Density::Linear => one - exact_sqrt::<S>(d2) * world.sense.inverse_diagonal,
         Density::Inverse => rsqrt::<S>(select::<S>(one, d2, d2.simd_gt(one))),
     }
 }
 
-/// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant, in the order of the policy's
-/// inputs: back-right, front-right, front-left, back-left.
+/// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant. Quadrants are in the order of the
+/// policy's inputs: back right, front right, front left, back left.
 ///
-/// The quadrant is read off the signs of the offset along the heading and to its left; a tie goes to the quadrant
-/// counterclockwise of it, so that each boundary belongs to exactly one quadrant.
+/// The signs of the offset along the heading and to its left determine the quadrant. A tie goes to the counterclockwise
+/// quadrant, so that each boundary belongs to exactly one.
 #[inline(always)]
 pub fn sense<S: Simd>(density: S::f32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, hy: S::f32s, sums: &mut [S::f32s; 4]) {
     let zero = splat(dx.token(), 0.0);
@@ -139,15 +123,15 @@ pub fn sense<S: Simd>(density: S::f32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, h
     let fy = dy * hx - dx * hy;
     let left = fy.simd_gt(zero) | (fy.simd_ge(zero) & fx.simd_ge(zero));
     let front = fx.simd_gt(zero) | (fx.simd_ge(zero) & !fy.simd_gt(zero));
-    let density_left = only::<S>(density, left);
-    let density_right = except::<S>(density, left);
-    sums[0] += except::<S>(density_right, front);
-    sums[1] += only::<S>(density_right, front);
-    sums[2] += only::<S>(density_left, front);
-    sums[3] += except::<S>(density_left, front);
+    let density_left = zero_unless::<S>(density, left);
+    let density_right = zero_if::<S>(density, left);
+    sums[0] += zero_if::<S>(density_right, front);
+    sums[1] += zero_unless::<S>(density_right, front);
+    sums[2] += zero_unless::<S>(density_left, front);
+    sums[3] += zero_if::<S>(density_left, front);
 }
 
-/// The policy's inputs, of the sums over a leader's quadrants.
+/// Returns the policy's inputs: the sums of both kinds, each multiplied by its constant.
 #[inline(always)]
 pub fn weigh_in<S: Simd>(world: &Lanes<S>, of_pois: [S::f32s; 4], of_agents: [S::f32s; 4]) -> [S::f32s; INPUTS] {
     let [p, a] = [world.sense.poi_share, world.sense.agent_share];

@@ -14,7 +14,7 @@ use serde_json::json;
 use super::map::{self, FAINT, Legend, Marker, Poi, Team, Viewport};
 use super::runs::{self, ReadError};
 use super::scene::{Anchor, BLACK, Color, Scene};
-use crate::backend::{Backend, BackendError, Episode, Group, Need, Seen, Strided, Trace};
+use crate::backend::{Backend, BackendError, Episode, Group, RecordRequest, Seen, Strided, Trace};
 use crate::config::{Config, Fitness, Observers};
 use crate::credit::{self, Credit, Scores};
 use crate::escape::PathExt;
@@ -275,7 +275,7 @@ pub fn replay(
     let mut order: Vec<usize> = (0..generations.len()).collect();
     order.sort_by_key(|&index| generations[index]);
     let mut played: Vec<Option<Replayed>> = generations.iter().map(|_| None).collect();
-    let mut trainer = Trainer::of_trial(config.clone(), trial);
+    let mut trainer = Trainer::of_trial(&config.validate().map_err(BackendError::from)?, trial);
     for index in order {
         let generation = generations[index];
         // A champion has its slot once its generation is over.
@@ -417,7 +417,7 @@ impl<'a> Episodes<'a> {
         Episodes { config, world, weights, teams, starts }
     }
 
-    fn group<'b>(&'b self, episode: usize, teams: &'b [u32], need: Need) -> Group<'b> {
+    fn group<'b>(&'b self, episode: usize, teams: &'b [u32], need: RecordRequest) -> Group<'b> {
         let (starts, policies) = (&self.starts[episode], self.config.learning.population + 1);
         Group { world: self.world, starts, weights: self.weights.into(), policies, teams, need }
     }
@@ -426,7 +426,8 @@ impl<'a> Episodes<'a> {
     fn play(&self, backend: &mut dyn Backend) -> Result<Vec<f64>, BackendError> {
         use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
         let episodes = self.starts.len();
-        let groups: Vec<_> = (0..episodes).map(|episode| self.group(episode, self.teams, Need::Record)).collect();
+        let groups: Vec<_> =
+            (0..episodes).map(|episode| self.group(episode, self.teams, RecordRequest::Record)).collect();
         let teams = self.teams.len() / self.world.leaders();
         let observed: Vec<AtomicU32> = std::iter::repeat_with(AtomicU32::default).take(teams).collect();
         backend.rollout(&groups, &|episode: Episode<'_>| {
@@ -440,7 +441,8 @@ impl<'a> Episodes<'a> {
     /// Plays the first episode of a team again, and traces it.
     fn trace(&self, team: usize, backend: &mut dyn Backend) -> Result<Replayed, BackendError> {
         let leaders = self.world.leaders();
-        let need = if self.config.learning.fitness == Fitness::Dt { Need::Sights } else { Need::Record };
+        let need =
+            if self.config.learning.fitness == Fitness::Dt { RecordRequest::Sights } else { RecordRequest::Record };
         let played = one(&self.group(0, &self.teams[team * leaders..(team + 1) * leaders], need), backend)?;
         Ok(Replayed { episodes: self.starts.len(), ..played })
     }

@@ -5,14 +5,14 @@ use std::sync::{Mutex, PoisonError};
 use fearless_simd::{Simd, f32x4, prelude::*};
 use glam::Vec2;
 
-use crate::backend::cpu::{Agent, Block, Standing, transposed, turn};
+use crate::backend::cpu::{Agent, Block, BlockState, transpose_rows, transpose4};
 use crate::backend::{Episode, Seen, Strided};
-use crate::kernels::{bound, splat};
+use crate::kernels::{clamp_to, splat};
 use crate::parallel::*;
 use crate::world::{INPUTS, OUTPUTS, World};
 
-/// What is told of all teams.
-pub(super) struct Shown {
+/// The arrays that a stepper shows, of all teams.
+pub(super) struct Observations {
     pub(super) inputs: Vec<f32>,
     pub(super) near: Vec<u32>,
     pub(super) newly: Vec<bool>,
@@ -23,138 +23,152 @@ pub(super) struct Shown {
     pub(super) speeds: Vec<f32>,
 }
 
-/// Vectors of teams of some instruction set.
+/// Vectors of teams of any instruction set.
 pub(super) trait Vectors: Send + Sync {
-    fn reset(&mut self, world: &World, chosen: Option<&[bool]>, starts: Option<&[Vec2]>, shown: &mut Shown);
-    fn step(&mut self, world: &World, actions: &[f32], shown: &mut Shown);
-    fn states(&mut self, world: &World, shown: &mut Shown);
-    /// Makes room for the sights of all steps.
+    fn reset(
+        &mut self,
+        world: &World,
+        chosen: Option<&[bool]>,
+        starts: Option<&[Vec2]>,
+        observations: &mut Observations,
+    );
+    fn step(&mut self, world: &World, actions: &[f32], observations: &mut Observations);
+    fn states(&mut self, world: &World, observations: &mut Observations);
+    /// Allocates a record of sightings for all steps.
     fn keep_sights(&mut self, world: &World);
-    /// The record of a team, if one is kept; `seen` takes a part of it.
+    /// Returns the record of a team, if one is kept. `seen` is scratch memory that holds a part of it.
     fn episode<'a>(&'a self, team: usize, world: &World, seen: &'a mut Vec<u32>) -> Option<Episode<'a>>;
 }
 
-/// One vector of teams. Between steps it keeps no more than it needs, for many go through the caches.
-struct Part<S: Simd> {
-    /// The first of the teams, and how many there are.
+/// The state of one vector of teams between steps. It is small, because all of them pass through the caches in each
+/// step.
+struct TeamBlock<S: Simd> {
+    /// The index of the first team, and the number of teams.
     first: usize,
     teams: usize,
-    standing: Standing<S>,
-    /// Who was near each POI at each step, `[teams][steps][pois][words]`, if that is kept.
+    state: BlockState<S>,
+    /// The agents at each POI at each step, `[teams][steps][pois][words]`; empty unless recorded.
     record: Vec<u32>,
-    /// Which leaders each follower saw at each step, `[teams][steps][followers][words of leaders]`, if that is kept.
+    /// The leaders that each follower saw at each step, `[teams][steps][followers][words of leaders]`; empty unless
+    /// recorded.
     sights: Vec<u32>,
 }
 
-/// What a thread plays a step with: the block takes on what stands of one vector of teams after the other.
-struct Room<S: Simd> {
+/// Scratch memory of a thread. Its block takes on the state of one vector of teams after the other.
+struct Workspace<S: Simd> {
     block: Block<S>,
-    /// Who is near each POI, `[pois][words][lanes]`.
+    /// The agents at each POI, `[pois][words][lanes]`.
     sets: Vec<u32>,
-    /// Which leaders each follower sees, `[followers][words of leaders][lanes]`.
+    /// The leaders that each follower sees, `[followers][words of leaders][lanes]`.
     sights: Vec<u32>,
-    /// Agents and counts before a step, where some teams are over.
+    /// Agents and counts before a step, if some teams' episodes are over.
     kept: (Vec<Agent<S>>, Vec<S::u32s>),
 }
 
-/// Vectors of teams, and the rooms of as many threads as have been at work at once.
-struct Batch<S: Simd> {
+/// All vectors of teams, and the workspaces that no thread is using.
+struct TeamBlocks<S: Simd> {
     simd: S,
-    parts: Vec<Part<S>>,
-    idle: Mutex<Vec<Box<Room<S>>>>,
+    blocks: Vec<TeamBlock<S>>,
+    idle: Mutex<Vec<Box<Workspace<S>>>>,
 }
 
 pub(super) fn vectors<S: Simd>(simd: S, world: &World, teams: usize, record: usize) -> Box<dyn Vectors> {
-    let part = |first: usize| {
+    let block = |first: usize| {
         let teams = S::f32s::LEN.min(teams - first);
-        let standing = Block::new(simd, world).into_standing(record > 0);
-        Part { first, teams, standing, record: vec![0; teams * record], sights: vec![] }
+        let state = Block::new(simd, world).into_state(record > 0);
+        TeamBlock { first, teams, state, record: vec![0; teams * record], sights: vec![] }
     };
-    let parts = (0..teams).step_by(S::f32s::LEN).map(part).collect();
-    Box::new(Batch { simd, parts, idle: Mutex::default() })
+    let blocks = (0..teams).step_by(S::f32s::LEN).map(block).collect();
+    Box::new(TeamBlocks { simd, blocks, idle: Mutex::default() })
 }
 
-/// So many vectors are done by one thread, which takes less time than to wake another.
+/// Vectors per task, so that waking a thread is worth its time.
 pub(super) const FEW: usize = 8;
 
-impl<S: Simd> Vectors for Batch<S> {
-    fn reset(&mut self, world: &World, chosen: Option<&[bool]>, starts: Option<&[Vec2]>, shown: &mut Shown) {
+impl<S: Simd> Vectors for TeamBlocks<S> {
+    fn reset(
+        &mut self,
+        world: &World,
+        chosen: Option<&[bool]>,
+        starts: Option<&[Vec2]>,
+        observations: &mut Observations,
+    ) {
         let simd = self.simd;
-        self.each(world, shown, &|room, part, shown| {
+        self.each(world, observations, &|workspace, block, observations| {
             simd.vectorize(
                 #[inline(always)]
-                || room.reset(simd, world, part, chosen, starts, shown),
+                || workspace.reset(simd, world, block, chosen, starts, observations),
             );
         });
     }
 
-    fn step(&mut self, world: &World, actions: &[f32], shown: &mut Shown) {
+    fn step(&mut self, world: &World, actions: &[f32], observations: &mut Observations) {
         let simd = self.simd;
-        self.each(world, shown, &|room, part, shown| {
+        self.each(world, observations, &|workspace, block, observations| {
             simd.vectorize(
                 #[inline(always)]
-                || room.step(simd, world, part, actions, shown),
+                || workspace.step(simd, world, block, actions, observations),
             );
         });
     }
 
-    fn states(&mut self, world: &World, shown: &mut Shown) {
+    fn states(&mut self, world: &World, observations: &mut Observations) {
         let simd = self.simd;
-        self.each(world, shown, &|_, part, shown| {
+        self.each(world, observations, &|_, block, observations| {
             simd.vectorize(
                 #[inline(always)]
-                || show(simd, &part.standing.agents, shown),
+                || show(simd, &block.state.agents, observations),
             );
         });
     }
 
     fn keep_sights(&mut self, world: &World) {
-        for part in &mut self.parts {
-            part.sights = vec![0; part.teams * world.sight_words()];
+        for block in &mut self.blocks {
+            block.sights = vec![0; block.teams * world.sight_words()];
         }
     }
 
     fn episode<'a>(&'a self, team: usize, world: &World, seen: &'a mut Vec<u32>) -> Option<Episode<'a>> {
-        let (part, lane) = (&self.parts[team / S::f32s::LEN], team % S::f32s::LEN);
+        let (block, lane) = (&self.blocks[team / S::f32s::LEN], team % S::f32s::LEN);
         let words = world.set_words();
-        let sets = part.record.get(lane * words..(lane + 1) * words)?;
+        let sets = block.record.get(lane * words..(lane + 1) * words)?;
         seen.clear();
-        seen.extend(part.standing.counts.iter().map(|count| count[lane]));
+        seen.extend(block.state.counts.iter().map(|count| count[lane]));
         let plain = |words| Strided { words, stride: 1, offset: 0 };
         let (first, words) = (lane * world.sight_words(), world.sight_words());
-        let sights = plain(part.sights.get(first..first + words).unwrap_or_default());
+        let sights = plain(block.sights.get(first..first + words).unwrap_or_default());
         Some(Episode { group: 0, team, sets: plain(sets), seen: Seen::Counts(plain(seen)), sights })
     }
 }
 
-impl<S: Simd> Batch<S> {
-    /// Does something with every vector, shared out over threads.
+impl<S: Simd> TeamBlocks<S> {
+    /// Calls `act` with every vector, on all threads.
     fn each(
         &mut self,
         world: &World,
-        shown: &mut Shown,
-        act: &(impl Fn(&mut Room<S>, &mut Part<S>, Slices<'_>) + Sync),
+        observations: &mut Observations,
+        act: &(impl Fn(&mut Workspace<S>, &mut TeamBlock<S>, Slices<'_>) + Sync),
     ) {
-        let (simd, parts, idle) = (self.simd, &mut self.parts, &self.idle);
-        View::new(parts, shown).each(world, &|parts, mut shown| {
-            let room = idle.lock().unwrap_or_else(PoisonError::into_inner).pop();
-            let mut room = room.unwrap_or_else(|| Box::new(Room::new(simd, world)));
-            for part in parts {
-                let own = shown.split(part.teams, world);
-                act(&mut room, part, own);
+        let (simd, blocks, idle) = (self.simd, &mut self.blocks, &self.idle);
+        View::new(blocks, observations).each(world, &|blocks, mut observations| {
+            let workspace = idle.lock().unwrap_or_else(PoisonError::into_inner).pop();
+            let mut workspace = workspace.unwrap_or_else(|| Box::new(Workspace::new(simd, world)));
+            for block in blocks {
+                let own = observations.split(block.teams, world);
+                act(&mut workspace, block, own);
             }
-            idle.lock().unwrap_or_else(PoisonError::into_inner).push(room);
+            idle.lock().unwrap_or_else(PoisonError::into_inner).push(workspace);
         });
     }
 }
 
-/// Some vectors of teams, and what is told of them.
+/// Some vectors of teams, and what is shown of them.
 struct View<'a, S: Simd> {
-    parts: &'a mut [Part<S>],
-    shown: Slices<'a>,
+    blocks: &'a mut [TeamBlock<S>],
+    observations: Slices<'a>,
 }
 
-/// [`Shown`] of some teams.
+/// The [`Observations`] of some teams.
 struct Slices<'a> {
     inputs: &'a mut [f32],
     near: &'a mut [u32],
@@ -167,27 +181,27 @@ struct Slices<'a> {
 }
 
 impl<'a, S: Simd> View<'a, S> {
-    fn new(parts: &'a mut [Part<S>], shown: &'a mut Shown) -> View<'a, S> {
-        let Shown { inputs, near, newly, observed, steps, positions, headings, speeds } = shown;
-        View { parts, shown: Slices { inputs, near, newly, observed, steps, positions, headings, speeds } }
+    fn new(blocks: &'a mut [TeamBlock<S>], observations: &'a mut Observations) -> View<'a, S> {
+        let Observations { inputs, near, newly, observed, steps, positions, headings, speeds } = observations;
+        View { blocks, observations: Slices { inputs, near, newly, observed, steps, positions, headings, speeds } }
     }
 
-    /// Does something with a few at a time, shared out over threads.
-    fn each(self, world: &World, act: &(impl Fn(&'a mut [Part<S>], Slices<'a>) + Sync)) {
-        let View { parts, mut shown } = self;
-        if parts.len() > FEW {
-            let (low, high) = parts.split_at_mut(parts.len() / 2);
-            let first = shown.split(low.len() * S::f32s::LEN, world);
-            let (low, high) = (View { parts: low, shown: first }, View { parts: high, shown });
+    /// Calls `act` with a few vectors at a time, on all threads.
+    fn each(self, world: &World, act: &(impl Fn(&'a mut [TeamBlock<S>], Slices<'a>) + Sync)) {
+        let View { blocks, mut observations } = self;
+        if blocks.len() > FEW {
+            let (low, high) = blocks.split_at_mut(blocks.len() / 2);
+            let first = observations.split(low.len() * S::f32s::LEN, world);
+            let (low, high) = (View { blocks: low, observations: first }, View { blocks: high, observations });
             join(|| low.each(world, act), || high.each(world, act));
         } else {
-            act(parts, shown);
+            act(blocks, observations);
         }
     }
 }
 
 impl<'a> Slices<'a> {
-    /// Takes the first teams off.
+    /// Splits off the first teams.
     fn split(&mut self, teams: usize, world: &World) -> Slices<'a> {
         fn take<'a, T>(slice: &mut &'a mut [T], count: usize) -> &'a mut [T] {
             let (taken, rest) = std::mem::take(slice).split_at_mut(count);
@@ -208,23 +222,23 @@ impl<'a> Slices<'a> {
     }
 }
 
-/// The team in a lane of a vector of so many; lanes left over repeat the first.
+/// Returns the team in a lane. Unused lanes repeat the first team.
 #[inline(always)]
 fn team_of(lane: usize, teams: usize) -> usize {
     if lane < teams { lane } else { 0 }
 }
 
-/// Every lane and its team, in a vector of so many.
+/// Returns every lane and its team.
 #[inline(always)]
 fn lanes<S: Simd>(teams: usize) -> impl Iterator<Item = (usize, usize)> {
     (0..S::f32s::LEN).map(move |lane| (lane, team_of(lane, teams)))
 }
 
-impl<S: Simd> Room<S> {
-    fn new(simd: S, world: &World) -> Room<S> {
+impl<S: Simd> Workspace<S> {
+    fn new(simd: S, world: &World) -> Workspace<S> {
         let sets = vec![0; world.pois.len() * world.constants.words as usize * S::f32s::LEN];
         let sights = vec![0; world.followers() * world.leader_words() * S::f32s::LEN];
-        Room { block: Block::new(simd, world), sets, sights, kept: Default::default() }
+        Workspace { block: Block::new(simd, world), sets, sights, kept: Default::default() }
     }
 
     #[inline(always)]
@@ -232,19 +246,19 @@ impl<S: Simd> Room<S> {
         &mut self,
         simd: S,
         world: &World,
-        part: &mut Part<S>,
+        block: &mut TeamBlock<S>,
         chosen: Option<&[bool]>,
         starts: Option<&[Vec2]>,
-        shown: Slices<'_>,
+        observations: Slices<'_>,
     ) {
-        let Slices { inputs, near, newly, observed, steps, .. } = shown;
+        let Slices { inputs, near, newly, observed, steps, .. } = observations;
         let (agents, pois, words) = (world.agents(), world.pois.len(), world.constants.words as usize);
-        let Part { first, teams, ref mut standing, ref mut record, ref mut sights } = *part;
+        let TeamBlock { first, teams, ref mut state, ref mut record, ref mut sights } = *block;
         let is_chosen = |team: usize| chosen.is_none_or(|chosen| chosen[team]);
         if !(first..first + teams).any(is_chosen) {
             return;
         }
-        self.block.swap(standing);
+        self.block.swap(state);
         let all = (first..first + teams).all(is_chosen);
         if all {
             self.block.start();
@@ -267,20 +281,20 @@ impl<S: Simd> Room<S> {
             sights[team * seen..][..seen].fill(0);
         }
         self.sense(simd, world, inputs);
-        self.block.swap(standing);
+        self.block.swap(state);
     }
 
     #[inline(always)]
-    fn step(&mut self, simd: S, world: &World, part: &mut Part<S>, actions: &[f32], shown: Slices<'_>) {
-        let Slices { inputs, near, newly, observed, steps, .. } = shown;
+    fn step(&mut self, simd: S, world: &World, block: &mut TeamBlock<S>, actions: &[f32], observations: Slices<'_>) {
+        let Slices { inputs, near, newly, observed, steps, .. } = observations;
         let last = world.constants.steps;
         let playing = (0..).zip(&*steps).map(|(team, &step)| u64::from(step < last) << team).sum::<u64>();
         newly.fill(false);
-        let Part { first, teams, ref mut standing, ref mut record, ref mut sights } = *part;
+        let TeamBlock { first, teams, ref mut state, ref mut record, ref mut sights } = *block;
         if playing == 0 {
             return;
         }
-        self.block.swap(standing);
+        self.block.swap(state);
         self.take(simd, world, &actions[first * world.leaders() * OUTPUTS..], teams);
         if !sights.is_empty() {
             self.watch(world, steps, sights);
@@ -305,7 +319,7 @@ impl<S: Simd> Room<S> {
             |column| &sets[column * width..][..width],
             bytemuck::cast_slice_mut(near),
         );
-        // What is observed by a step opens no other POI before the next.
+        // A POI that this step observes opens another one from the next step on.
         let rule = &world.rule;
         for (poi, (sets, &coupling)) in self.sets.chunks_exact(words * width).zip(&world.coupling).enumerate() {
             let count = sets.chunks_exact(width).enumerate().fold(S::u32s::splat(simd, 0), |count, (word, sets)| {
@@ -329,10 +343,10 @@ impl<S: Simd> Room<S> {
         }
         steps.iter_mut().for_each(|step| *step = last.min(*step + 1));
         self.sense(simd, world, inputs);
-        self.block.swap(standing);
+        self.block.swap(state);
     }
 
-    /// Records who sees whom before this step of each team that has not played its last.
+    /// Records which leaders each follower sees before this step, for teams whose episode is not over.
     #[inline(always)]
     fn watch(&mut self, world: &World, steps: &[u32], sights: &mut [u32]) {
         self.block.watch(&mut self.sights);
@@ -343,7 +357,7 @@ impl<S: Simd> Room<S> {
         }
     }
 
-    /// Takes the actions of so many teams as the policies' answers.
+    /// Uses the actions of so many teams as the policies' outputs.
     #[inline(always)]
     fn take(&mut self, simd: S, world: &World, actions: &[f32], teams: usize) {
         let columns = world.leaders() * OUTPUTS;
@@ -351,7 +365,7 @@ impl<S: Simd> Room<S> {
             let row = |lane: usize| &actions[team_of(quad * 4 + lane, teams) * columns..][..columns];
             let rows = [row(0), row(1), row(2), row(3)];
             let outputs = self.block.outputs.as_flattened_mut();
-            turn(
+            transpose_rows(
                 simd,
                 rows,
                 #[inline(always)]
@@ -359,11 +373,11 @@ impl<S: Simd> Room<S> {
             );
         }
         for output in self.block.outputs.as_flattened_mut() {
-            *output = bound::<S>(*output, splat(simd, -1.0), splat(simd, 1.0));
+            *output = clamp_to::<S>(*output, splat(simd, -1.0), splat(simd, 1.0));
         }
     }
 
-    /// Puts a lane back to what was kept of it.
+    /// Restores a lane's state from before the step.
     #[inline(always)]
     fn keep(&mut self, lane: usize) {
         let (agents, counts) = &self.kept;
@@ -393,33 +407,33 @@ impl<S: Simd> Room<S> {
     }
 }
 
-/// Shows everyone's places, headings and speeds.
+/// Writes all positions, headings and speeds.
 #[inline(always)]
-fn show<S: Simd>(simd: S, agents: &[Agent<S>], shown: Slices<'_>) {
+fn show<S: Simd>(simd: S, agents: &[Agent<S>], observations: Slices<'_>) {
     to_rows(
         simd,
         2 * agents.len(),
         #[inline(always)]
         |column| if column % 2 == 0 { agents[column / 2].x.as_slice() } else { agents[column / 2].y.as_slice() },
-        shown.positions,
+        observations.positions,
     );
     to_rows(
         simd,
         2 * agents.len(),
         #[inline(always)]
         |column| if column % 2 == 0 { agents[column / 2].hx.as_slice() } else { agents[column / 2].hy.as_slice() },
-        shown.headings,
+        observations.headings,
     );
     to_rows(
         simd,
         agents.len(),
         #[inline(always)]
         |column| agents[column].speed.as_slice(),
-        shown.speeds,
+        observations.speeds,
     );
 }
 
-/// How many bits of each lane are set.
+/// Counts the set bits of each lane.
 #[inline(always)]
 fn ones<S: Simd>(bits: S::u32s) -> S::u32s {
     let pairs = bits - ((bits >> 1) & 0x5555_5555);
@@ -429,7 +443,7 @@ fn ones<S: Simd>(bits: S::u32s) -> S::u32s {
     (halves + (halves >> 16)) & 0x3f
 }
 
-/// Turns columns, a lane a team, into a row of numbers a team; lanes that have no row are left out.
+/// Transposes columns, one team per lane, to one row per team. Unused lanes have no row.
 #[inline(always)]
 fn to_rows<'a, S: Simd>(simd: S, count: usize, column: impl Fn(usize) -> &'a [f32], rows: &mut [f32]) {
     let whole = count / 4 * 4;
@@ -440,7 +454,7 @@ fn to_rows<'a, S: Simd>(simd: S, count: usize, column: impl Fn(usize) -> &'a [f3
             let ((a, b), (c, d)) = (ab.split_at_mut(count), cd.split_at_mut(count));
             for at in (0..whole).step_by(4) {
                 let four = |at: usize| f32x4::from_slice(simd, &column(at)[first..first + 4]);
-                let turned = transposed([four(at), four(at + 1), four(at + 2), four(at + 3)]);
+                let turned = transpose4([four(at), four(at + 1), four(at + 2), four(at + 3)]);
                 turned[0].store_slice(&mut a[at..at + 4]);
                 turned[1].store_slice(&mut b[at..at + 4]);
                 turned[2].store_slice(&mut c[at..at + 4]);

@@ -1,13 +1,12 @@
-//! Step by step: teams whose leaders do what the caller says, on the CPU.
+//! Stepping: the caller decides the leaders' actions, step by step, on the CPU.
 //!
-//! A [`Stepper`] plays the episodes of [`crate::backend`], by the same kernels on the same vectors of teams, but in
-//! place of policies' answers it takes actions. Given a policy's own answers, it comes to the bits of
-//! [`Backend::trace`](crate::backend::Backend::trace).
+//! A [`Stepper`] plays the episodes of [`crate::backend`] with the same kernels, but takes actions from the caller. Given a
+//! policy's own outputs, it returns the bits of [`Backend::trace`](crate::backend::Backend::trace).
 //!
 //! ```
 //! use flotilla::{config::Config, stepping::Stepper, world::World};
 //!
-//! let config = Config::parse(include_str!("../configs/generally_forward.toml"), "generally_forward.toml")?;
+//! let config = Config::parse(include_str!("../../configs/generally_forward.toml"), "generally_forward.toml")?;
 //! let mut stepper = Stepper::new(World::new(&config), 64)?;
 //! // Every leader of every team straight ahead at full speed: [teams][leaders][2].
 //! let ahead = [0.0, 1.0].repeat(64 * stepper.world().leaders());
@@ -31,119 +30,118 @@ use crate::world::{GRID, INPUTS, OUTPUTS, World, on_grid};
 
 mod engine;
 
-use engine::{FEW, Shown, Vectors, vectors};
+use engine::{FEW, Observations, Vectors, vectors};
 
-/// Teams of one world, each at a step of its own.
+/// Teams of one world, each at its own step.
 ///
-/// Arrays are flat and stay where they are from step to step; their shapes are written `[teams][leaders][8]`, the last
-/// index moving fastest. Agents are counted leaders first.
+/// Arrays are flat and keep their addresses from step to step. Shapes are row-major: the last index of
+/// `[teams][leaders][8]` varies fastest. Leaders come before followers.
 pub struct Stepper {
     world: World,
     vectors: Box<dyn Vectors>,
-    shown: Shown,
+    observations: Observations,
 }
 
-/// Where all agents are.
+/// The state of all agents.
 #[derive(Clone, Copy, Debug)]
 pub struct States<'a> {
-    /// `[teams][agents][2]`: x and y on the map.
+    /// Positions on the map, `[teams][agents][2]`, in units.
     pub positions: &'a [f32],
-    /// `[teams][agents][2]`: unit vectors.
+    /// Headings, unit vectors, `[teams][agents][2]`.
     pub headings: &'a [f32],
-    /// `[teams][agents]`.
+    /// Speeds, `[teams][agents]`, in units per second.
     pub speeds: &'a [f32],
 }
 
-/// Why teams could not be made, started, stepped or scored. They are then as they were.
+/// Why teams could not be created, reset, stepped or scored. Their state is unchanged.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum StepError {
-    /// No team, or more than there may be.
+    /// The number of teams is 0 or too large.
     #[error("{0} teams; there may be 1 to {MAX_POPULATION}")]
     Teams(usize),
-    /// A world that [`World::new`] did not make of a valid config.
+    /// The world is inconsistent.
     #[error("the world's {0} do not fit its numbers of agents and POIs")]
     World(&'static str),
-    /// The system gives no memory for them.
+    /// The system has too little memory.
     #[error("there is no memory for {teams} teams, {bytes} bytes")]
     Memory {
-        /// How many were asked for.
+        /// The number of teams.
         teams: usize,
-        /// What these take.
+        /// Bytes needed.
         bytes: u128,
     },
-    /// An array of another length.
+    /// An array has the wrong length.
     #[error("{found} {what}, but {shape} are {expected}")]
     Length {
-        /// What it holds.
+        /// The name of its elements.
         what: &'static str,
-        /// Its indices.
+        /// The array's shape.
         shape: &'static str,
-        /// How many numbers that makes.
+        /// The length that the shape needs.
         expected: usize,
-        /// How many were given.
+        /// The array's length.
         found: usize,
     },
-    /// An action that is infinite or no number.
+    /// An action is infinite or not a number.
     #[error("the {} of leader {leader} in team {team} is {value}, which is no finite number", ["turn", "speed"][*.output])]
     Action {
-        /// Which team, from 0.
+        /// The team, from 0.
         team: usize,
-        /// Which leader of it, from 0.
+        /// The leader in its team, from 0.
         leader: usize,
         /// 0 for the turn, 1 for the speed.
         output: usize,
-        /// What was given.
+        /// The action.
         value: f32,
     },
-    /// A start that is not on the map.
+    /// A start position is off the map.
     #[error("agent {agent} of team {team} would start at ({}, {}), which is not on the map", at[0], at[1])]
     Start {
-        /// Which team, from 0.
+        /// The team, from 0.
         team: usize,
-        /// Which agent of it, leaders first.
+        /// The agent in its team, leaders first.
         agent: usize,
-        /// Where, in units.
+        /// The position, in units.
         at: [f32; 2],
     },
-    /// A team that there is not.
+    /// The team does not exist.
     #[error("team {team} of {teams} (they count from 0)")]
     NoTeam {
-        /// Which team, from 0.
+        /// The team, from 0.
         team: usize,
-        /// How many there are.
+        /// The number of teams.
         teams: usize,
     },
-    /// Scores need a record, which [`Stepper::recording`] keeps.
+    /// Scores need a record, see [`Stepper::recording`].
     #[error("no record was kept to score teams by")]
     NotRecorded,
-    /// Dt needs a record of sights, which [`Stepper::with_sights`] keeps.
+    /// Dt needs a record of sightings, see [`Stepper::with_sights`].
     #[error("no record was kept of who saw whom at which step, which Dt asks; make the stepper `with_sights`")]
     NotSeen,
 }
 
 impl Stepper {
-    /// So many teams, all at the world's start. No record is kept.
+    /// Creates teams at the world's start, without a record.
     ///
     /// # Errors
-    /// No team or more than [`MAX_POPULATION`], or there is no memory for them.
+    /// The number of teams is 0 or above [`MAX_POPULATION`], or there is too little memory.
     pub fn new(world: World, teams: usize) -> Result<Stepper, StepError> {
         Stepper::at_level(Level::new(), world, teams, false)
     }
 
-    /// So many teams, all at the world's start, with a record of who was near which POI at which step, by which
-    /// [`Stepper::scores`] and [`Stepper::fitness`] tell what each leader was worth.
+    /// Creates teams at the world's start that record who is at which POI at which step. [`Stepper::scores`] and
+    /// [`Stepper::fitness`] need that.
     ///
     /// # Errors
-    /// No team or more than [`MAX_POPULATION`], or there is no memory for them.
+    /// The number of teams is 0 or above [`MAX_POPULATION`], or there is too little memory.
     pub fn recording(world: World, teams: usize) -> Result<Stepper, StepError> {
         Stepper::at_level(Level::new(), world, teams, true)
     }
 
-    /// [`Stepper::new`] or [`Stepper::recording`], by a chosen instruction set (tests compare them; benches choose
-    /// one).
+    /// [`Stepper::new`] or [`Stepper::recording`] with a given instruction set, for tests and benchmarks.
     ///
     /// # Errors
-    /// No team or more than [`MAX_POPULATION`], or there is no memory for them.
+    /// The number of teams is 0 or above [`MAX_POPULATION`], or there is too little memory.
     pub fn at_level(level: Level, world: World, teams: usize, recording: bool) -> Result<Stepper, StepError> {
         if !(1..=MAX_POPULATION).contains(&teams) {
             return Err(StepError::Teams(teams));
@@ -153,7 +151,8 @@ impl Stepper {
         }
         let (agents, leaders, pois) = (world.agents(), world.leaders(), world.pois.len());
         let words = world.constants.words as usize;
-        // Asked for first, since later a refusal would be an abort: a team's numbers, in the vectors and as shown.
+        // Reserved first, because a failing allocation below would abort. Counts a team's numbers, both in the vectors
+        // and as shown.
         let record = if recording { world.set_words() } else { 0 };
         let in_vectors = agents * 6 + leaders * (INPUTS + OUTPUTS) + world.followers() * (11 + leaders) + pois * words;
         let numbers = in_vectors + record + leaders * INPUTS + agents * 5 + pois * (words + 1) + 1;
@@ -163,7 +162,7 @@ impl Stepper {
             .and_then(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).ok())
             .ok_or(StepError::Memory { teams, bytes })?;
         let vectors = dispatch!(level, simd => vectors(simd, &world, teams, record));
-        let shown = Shown {
+        let observations = Observations {
             inputs: vec![0.0; teams * leaders * INPUTS],
             near: vec![0; teams * pois * words],
             newly: vec![false; teams * pois],
@@ -173,15 +172,15 @@ impl Stepper {
             headings: vec![0.0; teams * agents * 2],
             speeds: vec![0.0; teams * agents],
         };
-        let mut stepper = Stepper { world, vectors, shown };
+        let mut stepper = Stepper { world, vectors, observations };
         stepper.reset();
         Ok(stepper)
     }
 
-    /// The same, all at the world's start, with a record of which leaders each follower saw at which step, too, for Dt.
+    /// Resets all teams, and records which leaders each follower sees at each step, which Dt needs.
     ///
     /// # Errors
-    /// There is no memory for it.
+    /// There is too little memory.
     pub fn with_sights(mut self) -> Result<Stepper, StepError> {
         let teams = self.teams();
         let bytes = self.world.sight_words() as u128 * 4 * teams as u128;
@@ -194,58 +193,59 @@ impl Stepper {
         Ok(self)
     }
 
-    /// The world that all teams are in.
+    /// Returns the world.
     pub fn world(&self) -> &World {
         &self.world
     }
 
-    /// How many teams there are.
+    /// Returns the number of teams.
     pub fn teams(&self) -> usize {
-        self.shown.steps.len()
+        self.observations.steps.len()
     }
 
-    /// Puts all teams at the world's start.
+    /// Resets all teams to the world's start.
     pub fn reset(&mut self) {
-        self.vectors.reset(&self.world, None, None, &mut self.shown);
+        self.vectors.reset(&self.world, None, None, &mut self.observations);
     }
 
-    /// Puts all teams where they are told to start, `[teams][agents][2]`, each place moved to the nearest one of the
-    /// kernels' grid (within 2^-19). [`crate::evaluate::Starts`] draws such places.
+    /// Resets all teams to given start positions, `[teams][agents][2]`, each rounded to the kernels' grid (within
+    /// 2^-19). [`crate::evaluate::Starts`] draws such positions.
     ///
     /// # Errors
-    /// Too few or too many numbers, or a place that is not on the map.
+    /// The length is wrong, or a position is off the map.
     pub fn reset_to(&mut self, starts: &[f32]) -> Result<(), StepError> {
         let starts = self.checked(starts, None)?;
-        self.vectors.reset(&self.world, None, Some(&starts), &mut self.shown);
+        self.vectors.reset(&self.world, None, Some(&starts), &mut self.observations);
         Ok(())
     }
 
-    /// Puts the chosen teams, `[teams]`, at the world's start or where they are told to, as [`Stepper::reset_to`] does;
-    /// the others' places are not looked at, and they stay as they are.
+    /// Resets the chosen teams, `[teams]`, to the world's start, or to given start positions like
+    /// [`Stepper::reset_to`]. The other teams, and their positions in `starts`, are ignored.
     ///
     /// # Errors
-    /// Too few or too many choices or numbers, or a place that is not on the map.
+    /// A length is wrong, or a position is off the map.
     pub fn reset_some(&mut self, chosen: &[bool], starts: Option<&[f32]>) -> Result<(), StepError> {
         self.check_length("choices", "[teams]", self.teams(), chosen.len())?;
         let starts = starts.map(|starts| self.checked(starts, Some(chosen))).transpose()?;
-        self.vectors.reset(&self.world, Some(chosen), starts.as_deref(), &mut self.shown);
+        self.vectors.reset(&self.world, Some(chosen), starts.as_deref(), &mut self.observations);
         Ok(())
     }
 
-    /// Plays one step by what every leader is to do, `[teams][leaders][2]`: a turn, in parts of a half turn to the
-    /// left, and a speed, from -1 for standing still to 1 for the highest. Numbers beyond -1..1 are taken as -1 or 1.
-    /// Where policies of the world choose behaviours, these are still the actions: each behaviour comes to a turn of 0,
+    /// Plays one step with given actions, `[teams][leaders][2]`: a turn to the left, as a fraction of a half turn, and
+    /// a speed, from -1 (stop) to 1 (the maximum). Actions are clamped to -1..1.
+    ///
+    /// If policies of this world choose behaviours, actions are still turns and speeds. Each behaviour is a turn of 0,
     /// ±0.25 or ±0.75 and a speed of -1 or 1, see [`crate::model::policy::choose`].
     ///
-    /// A team that has played its last step stays as it is, whatever is asked of it, until it is reset.
+    /// A team whose episode is over does not move until it is reset.
     ///
     /// # Errors
-    /// Too few or too many numbers, or one that is not finite; no team has moved then.
+    /// The length is wrong, or a number is not finite. No team has moved then.
     pub fn step(&mut self, actions: &[f32]) -> Result<(), StepError> {
         let leaders = self.world.leaders();
         let expected = self.teams() * leaders * OUTPUTS;
         self.check_length("actions", "[teams][leaders][2]", expected, actions.len())?;
-        // All at once, which is quick; where the bad one is, is looked for only if there is one.
+        // The fast test covers all actions. Only if it fails is the index searched.
         if !actions.iter().fold(true, |finite, action| finite & action.is_finite()) {
             let index = actions.iter().position(|action| !action.is_finite()).unwrap_or(0);
             let (leader, output) = (index / OUTPUTS, index % OUTPUTS);
@@ -256,55 +256,55 @@ impl Stepper {
                 value: actions[index],
             });
         }
-        self.vectors.step(&self.world, actions, &mut self.shown);
+        self.vectors.step(&self.world, actions, &mut self.observations);
         Ok(())
     }
 
-    /// What every leader senses where it is, `[teams][leaders][8]`: the density of POIs, then of agents, in four
-    /// quadrants around its heading, back right, front right, front left, back left.
+    /// Returns what every leader senses, `[teams][leaders][8]`: the density of POIs, then of agents, in four quadrants
+    /// around its heading: back right, front right, front left, back left.
     pub fn inputs(&self) -> &[f32] {
-        &self.shown.inputs
+        &self.observations.inputs
     }
 
-    /// The agents near each POI after the last step, `[teams][pois][words]`, a bit an agent, 32 a word. A start counts
-    /// for nothing: before its first step a team is near none.
+    /// Returns the agents at each POI after the last step, `[teams][pois][words]`, one bit per agent. Before the first
+    /// step there are none.
     pub fn near(&self) -> &[u32] {
-        &self.shown.near
+        &self.observations.near
     }
 
-    /// The POIs that were observed for the first time by the last step, `[teams][pois]`.
+    /// Returns which POIs the last step observed first, `[teams][pois]`.
     pub fn newly_observed(&self) -> &[bool] {
-        &self.shown.newly
+        &self.observations.newly
     }
 
-    /// The POIs that have been observed since the start, `[teams][pois]`.
+    /// Returns which POIs have been observed since the start, `[teams][pois]`.
     pub fn observed(&self) -> &[bool] {
-        &self.shown.observed
+        &self.observations.observed
     }
 
-    /// How many steps each team has played since its start, `[teams]`: after as many as the world's, its episode is
-    /// over.
+    /// Returns how many steps each team has played since its start, `[teams]`. The episode is over after the world's
+    /// number of steps.
     pub fn steps(&self) -> &[u32] {
-        &self.shown.steps
+        &self.observations.steps
     }
 
-    /// Whether a team has played its last step; a team that there is not never does.
+    /// Reports whether a team's episode is over. False for a team that does not exist.
     pub fn is_over(&self, team: usize) -> bool {
-        self.shown.steps.get(team).is_some_and(|&step| step as usize >= self.world.steps())
+        self.observations.steps.get(team).is_some_and(|&step| step as usize >= self.world.steps())
     }
 
-    /// Where everyone is, worked out now.
+    /// Computes the state of all agents.
     pub fn states(&mut self) -> States<'_> {
-        self.vectors.states(&self.world, &mut self.shown);
-        let Shown { positions, headings, speeds, .. } = &self.shown;
+        self.vectors.states(&self.world, &mut self.observations);
+        let Observations { positions, headings, speeds, .. } = &self.observations;
         States { positions, headings, speeds }
     }
 
-    /// Every fitness of a team's episode as far as it has been played; Dt only with a record [of
-    /// sights](Stepper::with_sights), or where nobody follows.
+    /// Returns every fitness of a team's episode so far. Dt needs a [record of sightings](Stepper::with_sights), unless
+    /// there are no followers.
     ///
     /// # Errors
-    /// There is no such team, or no record was kept.
+    /// The team does not exist, or no record was kept.
     pub fn scores(&self, team: usize) -> Result<Scores, StepError> {
         if team >= self.teams() {
             return Err(StepError::NoTeam { team, teams: self.teams() });
@@ -314,10 +314,10 @@ impl Stepper {
         Ok(Credit::default().all(&episode, &self.world))
     }
 
-    /// What every leader was worth, by one fitness, as far as its team's episode has been played: `[teams][leaders]`.
+    /// Writes one fitness of every leader for the episodes so far, `[teams][leaders]`.
     ///
     /// # Errors
-    /// There is room for fewer or more numbers, no record was kept, or none of sights for Dt.
+    /// The length is wrong, no record was kept, or Dt has no record of sightings.
     pub fn fitness(&self, fitness: Fitness, scores: &mut [f32]) -> Result<(), StepError> {
         thread_local! { static CREDIT: RefCell<(Credit, Vec<u32>)> = RefCell::default(); }
         let leaders = self.world.leaders();
@@ -344,7 +344,7 @@ impl Stepper {
         if found == expected { Ok(()) } else { Err(StepError::Length { what, shape, expected, found }) }
     }
 
-    /// The start positions of the chosen teams, on the grid.
+    /// Returns the start positions of the chosen teams, rounded to the grid.
     fn checked(&self, starts: &[f32], chosen: Option<&[bool]>) -> Result<Vec<Vec2>, StepError> {
         let (agents, constants) = (self.world.agents(), &self.world.constants);
         self.check_length("coordinates", "[teams][agents][2]", self.teams() * agents * 2, starts.len())?;
@@ -365,7 +365,7 @@ impl Stepper {
     }
 }
 
-/// The place itself where it is on the grid or a wall, coordinate by coordinate, else the nearest on the grid.
+/// Rounds a position to the grid. A coordinate on a wall stays.
 fn settled(place: Vec2, map: Vec2) -> Vec2 {
     let near = on_grid(place, map);
     let settle = |at: f32, wall: f32, near: f32| if (at * GRID).fract() == 0.0 || at == wall { at } else { near };

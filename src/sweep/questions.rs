@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use super::results::point_folder;
 use super::{Axis, Point, Sweep};
-use crate::backend::{Backend, BackendError, Group, Need};
+use crate::backend::{Backend, BackendError, Group, RecordRequest};
 use crate::config::{Config, ConfigError, Override};
 use crate::escape::PathExt;
 use crate::evaluate::{self, Starts};
@@ -412,7 +412,7 @@ impl Study {
             let mut of_arms = Vec::new();
             for weights in &weights {
                 let (weights, starts_here) = (weights[..].into(), &world.starts);
-                let need = Need::Scores;
+                let need = RecordRequest::Scores;
                 let group =
                     Group { world: &world, starts: starts_here, weights, policies: trials, teams: &teams, need };
                 let played = evaluate::evaluate(backend, &group, &starts, &|_| {})?;

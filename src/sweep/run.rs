@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering::Relaxed;
 
 use super::Point;
 use super::results::point_folder;
-use crate::backend::Player;
+use crate::backend::OpenBackend;
 use crate::config::Config;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, Note, Start};
@@ -92,7 +92,7 @@ pub fn batches<'a>(points: &'a [&'a Point], memory: usize) -> Vec<&'a [&'a Point
 pub fn run(
     points: &[&Point],
     out: &Path,
-    player: &mut Player,
+    player: &mut OpenBackend,
     options: &mut SweepOptions<'_>,
 ) -> Result<Ended, RunError> {
     let total = points.iter().map(|point| team_steps(&point.config)).sum();

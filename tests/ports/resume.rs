@@ -8,7 +8,7 @@ use std::time::Duration;
 use std::{env, fs};
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::{Machine, Player};
+use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::Config;
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, POLICIES, Start};
@@ -44,7 +44,7 @@ seconds = 0
 fn train(folder: &Path) {
     let (mut session, notes) = Session::open(vec![(config(), folder.into())], Start::Resume, &Disk::default()).unwrap();
     assert!(!notes.iter().any(|(_, note)| note.is_damage()), "{notes:?}");
-    let mut player: Player = (Box::new(Cpu::default()), Machine::default());
+    let mut player: OpenBackend = (Box::new(Cpu::default()), Machine::default());
     let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
     let mut options = Options {
         command: "",

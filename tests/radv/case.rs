@@ -5,7 +5,7 @@ use std::sync::Mutex;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::episode::{Kernel, Workgroup, workgroup_of};
 use flotilla::backend::gpu::exact::Pass;
-use flotilla::backend::{Backend, Group, Need};
+use flotilla::backend::{Backend, Group, RecordRequest};
 use flotilla::bench::operations::{self, Reach};
 use flotilla::sample;
 use flotilla::world::World;
@@ -64,7 +64,7 @@ impl Case {
             weights: weights[..].into(),
             policies: MOST,
             teams: &choice[..teams * world.leaders()],
-            need: Need::Record,
+            need: RecordRequest::Record,
         };
         let name = format!("{name}, {kernel}, {threads}");
         let workgroup = workgroup_of(&group(MOST), kernel, threads).unwrap_or_else(|error| panic!("{name}: {error}"));

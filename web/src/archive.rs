@@ -3,7 +3,7 @@
 use std::io::{Cursor, Read, Write};
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::{Group, Need};
+use flotilla::backend::{Group, RecordRequest};
 use flotilla::config::{Config, Fitness};
 use flotilla::evolve;
 use flotilla::record::checkpoint::{self, Checkpoint};
@@ -201,7 +201,7 @@ pub fn play(config: &Config, policies: usize, mut weights: Vec<f32>) -> Result<V
     if !fits || evolve::admit(&mut weights).is_some() {
         return Err(refuse("these policies are not for this config"));
     }
-    let need = if config.learning.fitness == Fitness::Dt { Need::Sights } else { Need::Record };
+    let need = if config.learning.fitness == Fitness::Dt { RecordRequest::Sights } else { RecordRequest::Record };
     let weights = weights[..].into();
     let group = Group { world: &world, starts: &world.starts, weights, policies, teams: &vec![0; leaders], need };
     let played = replay::one(&group, &mut Cpu::default()).map_err(refuse)?;

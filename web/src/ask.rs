@@ -4,9 +4,9 @@ use std::fmt::Display;
 
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::device::{Gpu, Request, Wanted};
-use flotilla::backend::gpu::episode::{GpuEpisodes, Holding, Records};
+use flotilla::backend::gpu::episode::{GpuBackend, Records, ResidencyPolicy};
 use flotilla::backend::gpu::{self, exact::Pass};
-use flotilla::backend::{Machine, Player};
+use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::{Config, ConfigError, Override};
 use flotilla::front;
 use flotilla::report::replay;
@@ -85,7 +85,7 @@ const BATCH_BYTES: u64 = 16 << 20;
 
 /// What a worker keeps between questions.
 pub struct Session {
-    player: Player,
+    player: OpenBackend,
     training: Training,
     drive: Option<Drive>,
 }
@@ -158,7 +158,7 @@ pub fn described(config: &Config) -> Value {
     words
 }
 
-fn machine((backend, machine): &Player) -> Value {
+fn machine((backend, machine): &OpenBackend) -> Value {
     let Machine { backend: kind, adapter, driver, threads } = machine;
     json!({ "description": backend.describe(), "backend": kind, "adapter": adapter, "driver": driver, "threads": threads })
 }
@@ -173,8 +173,8 @@ fn open_gpu(pass: Option<&str>) -> Result<Gpu, Refusal> {
     gpu::open(request).map_err(refuse)
 }
 
-fn episodes(gpu: Gpu) -> Result<GpuEpisodes, Refusal> {
-    Ok(GpuEpisodes::new(gpu).map_err(refuse)?.batched(BATCH_BYTES))
+fn episodes(gpu: Gpu) -> Result<GpuBackend, Refusal> {
+    Ok(GpuBackend::new(gpu).map_err(refuse)?.batched(BATCH_BYTES))
 }
 
 fn verify(worlds: u64, teams: usize, seed: u64, pass: Option<&str>) -> Result<Value, Refusal> {
@@ -183,7 +183,7 @@ fn verify(worlds: u64, teams: usize, seed: u64, pass: Option<&str>) -> Result<Va
     if let Some(mismatch) = gpu::self_test(&gpu).map_err(refuse)? {
         return Ok(json!({ "worlds": 0, "agent_steps": 0, "mismatch": mismatch.to_string() }));
     }
-    let mut gpu = episodes(gpu)?.holding(Holding::Always).bringing(Records::Packed);
+    let mut gpu = episodes(gpu)?.holding(ResidencyPolicy::Always).bringing(Records::Packed);
     let plan = Plan::random(seed..seed + worlds, teams);
     let told = |outcome: &verify::Agreement| {
         crate::progress(json!({ "verified": outcome.worlds, "worlds": worlds }));

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use flotilla::backend::Backend;
 use flotilla::backend::cpu::Cpu;
-use flotilla::config::Config;
+use flotilla::config::{Config, ValidConfig};
 use flotilla::host::Instant;
 use flotilla::report::replay;
 use flotilla::trainer::{Row, Snapshot, Trainer};
@@ -55,10 +55,11 @@ impl Training {
     pub fn new(runs: Vec<Chosen>) -> Result<Training, Refusal> {
         let parse = |chosen: &Chosen| Ok(Config::parse(&chosen.text, "the config")?);
         let configs = runs.iter().map(parse).collect::<Result<Vec<_>, Refusal>>()?;
+        let valid = ValidConfig::all(&configs)?;
         let mut batches = Vec::new();
         let whole: Vec<usize> = (0..runs.len()).filter(|&run| runs[run].trials.is_none()).collect();
         if !whole.is_empty() {
-            let trainer = Trainer::new(whole.iter().map(|&run| configs[run].clone()).collect());
+            let trainer = Trainer::new(whole.iter().map(|&run| valid[run].clone()));
             batches.push(Batch { trainer, arms: whole.into_iter().map(|run| (run, None)).collect() });
         }
         for (run, chosen) in runs.iter().enumerate() {
@@ -66,7 +67,7 @@ impl Training {
                 if trial >= configs[run].learning.trials {
                     return Err(refuse(format!("no trial {trial}")));
                 }
-                let trainer = Trainer::of_trial(configs[run].clone(), trial);
+                let trainer = Trainer::of_trial(&valid[run], trial);
                 batches.push(Batch { trainer, arms: vec![(run, Some(trial))] });
             }
         }
@@ -135,7 +136,7 @@ impl Training {
         if let Some((arm, batch)) = batch.filter(|_| at_hand == generation) {
             batch.keep(arm, &mut self.kept)?;
         }
-        let mut trainer = Trainer::of_trial(config.clone(), trial);
+        let mut trainer = Trainer::of_trial(&config.validate()?, trial);
         let before = self.kept.snapshots.range((run, trial, 0)..=(run, trial, generation)).next_back();
         if let Some((_, snapshot)) = before {
             // One of other sizes cannot be; from the start it comes to the same.

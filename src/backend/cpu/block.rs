@@ -6,57 +6,57 @@ use glam::Vec2;
 use super::agent::Agent;
 use super::neighbours::{self, Bounds};
 use crate::backend::Moment;
-use crate::declare::Fixed;
+use crate::config_enum::ConstDispatch;
 use crate::kernels::math::within;
-use crate::kernels::{only, splat};
+use crate::kernels::{splat, zero_unless};
 use crate::model::{Lanes, follow, motion, policy, sense};
 use crate::world::{INPUTS, OUTPUTS, World};
 
-/// Where a POI is.
-pub(crate) trait Locus<S: Simd>: Copy {
-    /// One team a lane.
+/// The position of a POI.
+pub(crate) trait PoiPosition<S: Simd>: Copy {
+    /// Returns x and y, one team per lane.
     fn lanes(self, simd: S) -> [S::f32s; 2];
 }
 
-/// The same in all teams.
-impl<S: Simd> Locus<S> for Vec2 {
+/// The same position in all teams.
+impl<S: Simd> PoiPosition<S> for Vec2 {
     #[inline(always)]
     fn lanes(self, simd: S) -> [S::f32s; 2] {
         [splat(simd, self.x), splat(simd, self.y)]
     }
 }
 
-/// In each team its own.
-impl<S: Simd> Locus<S> for [S::f32s; 2] {
+/// One position per team.
+impl<S: Simd> PoiPosition<S> for [S::f32s; 2] {
     #[inline(always)]
     fn lanes(self, _: S) -> [S::f32s; 2] {
         self
     }
 }
 
-/// The state of one vector of teams, everything a lane a team, and a step of it. Every read in a step is of the state
-/// before it.
+/// The state of one vector of teams, one team per lane, with scratch memory for a step. A step reads the state before
+/// it only.
 pub(crate) struct Block<S: Simd> {
     pub(super) simd: S,
     pub(super) world: Lanes<S>,
-    /// Leaders first.
+    /// `[agents]`, leaders first.
     pub agents: Vec<Agent<S>>,
     pub inputs: Vec<[S::f32s; INPUTS]>,
     pub outputs: Vec<[S::f32s; OUTPUTS]>,
-    /// The speed that each agent wants next.
+    /// The wanted speed of each agent.
     pub(super) wanted: Vec<S::f32s>,
     pub(super) followers: Vec<Follower<S>>,
-    /// At how many steps each follower saw each leader, `[followers][leaders]`.
+    /// The number of steps at which each follower saw each leader, `[followers][leaders]`.
     pub counts: Vec<S::u32s>,
-    /// A bit for each pair of agents that may be in reach in some lane: `[words][agents]`.
+    /// The pairs of agents that may be in reach in some lane, one bit each, `[words][agents]`.
     pub(super) near: Vec<u64>,
     pub(super) bounds: Vec<Bounds<S>>,
 }
 
-/// What of a [`Block`] must be kept from one step to the next, once it has looked.
-pub(crate) struct Standing<S: Simd> {
+/// The part of a [`Block`] that has to be kept between steps, after [`Block::look`].
+pub(crate) struct BlockState<S: Simd> {
     pub agents: Vec<Agent<S>>,
-    /// None where nobody asks for them.
+    /// Empty if nobody needs them.
     pub counts: Vec<S::u32s>,
     pub(super) near: Vec<u64>,
 }
@@ -64,7 +64,7 @@ pub(crate) struct Standing<S: Simd> {
 #[derive(Clone, Copy)]
 pub(super) struct Follower<S: Simd> {
     sums: follow::Sums<S>,
-    pull: follow::Pull<S>,
+    pull: follow::SteeringForce<S>,
     sizes: (S::f32s, S::f32s),
 }
 
@@ -72,7 +72,7 @@ impl<S: Simd> Block<S> {
     pub fn new(simd: S, world: &World) -> Block<S> {
         let zero = splat(simd, 0.0);
         let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
-        let pull = follow::Pull { x: zero, y: zero, influenced: S::mask32s::splat(simd, false) };
+        let pull = follow::SteeringForce { x: zero, y: zero, influenced: S::mask32s::splat(simd, false) };
         Block {
             simd,
             world: Lanes::new(simd, world.constants),
@@ -87,23 +87,23 @@ impl<S: Simd> Block<S> {
         }
     }
 
-    /// Only what is kept, with the counts or without.
-    pub fn into_standing(self, counted: bool) -> Standing<S> {
+    /// Returns the state to keep, with the counts or without.
+    pub fn into_state(self, counted: bool) -> BlockState<S> {
         let Block { agents, counts, near, .. } = self;
-        Standing { agents, counts: if counted { counts } else { vec![] }, near }
+        BlockState { agents, counts: if counted { counts } else { vec![] }, near }
     }
 
-    /// Takes on what stands of other teams, for what stands of these.
+    /// Exchanges this block's state for another.
     #[inline(always)]
-    pub fn swap(&mut self, standing: &mut Standing<S>) {
-        std::mem::swap(&mut self.agents, &mut standing.agents);
-        if !standing.counts.is_empty() {
-            std::mem::swap(&mut self.counts, &mut standing.counts);
+    pub fn swap(&mut self, state: &mut BlockState<S>) {
+        std::mem::swap(&mut self.agents, &mut state.agents);
+        if !state.counts.is_empty() {
+            std::mem::swap(&mut self.counts, &mut state.counts);
         }
-        std::mem::swap(&mut self.near, &mut standing.near);
+        std::mem::swap(&mut self.near, &mut state.near);
     }
 
-    /// Puts one lane's agents where they start, with their first headings.
+    /// Puts one lane's agents at their start positions, with their initial headings.
     #[inline(always)]
     pub fn place(&mut self, lane: usize, starts: &[Vec2], headings: &[Vec2]) {
         for ((agent, start), heading) in self.agents.iter_mut().zip(starts).zip(headings) {
@@ -114,7 +114,7 @@ impl<S: Simd> Block<S> {
         }
     }
 
-    /// Sets all lanes' agents to their first speed.
+    /// Sets all lanes' agents to their initial speed.
     #[inline(always)]
     pub fn start(&mut self) {
         let Block { simd, world, agents, counts, .. } = self;
@@ -134,14 +134,14 @@ impl<S: Simd> Block<S> {
         self.counts.iter_mut().for_each(|count| count[lane] = 0);
     }
 
-    /// What leaders sense, for the policies to answer.
+    /// Computes the inputs of the leaders' policies.
     #[inline(always)]
-    pub fn look(&mut self, pois: &[impl Locus<S>]) {
+    pub fn look(&mut self, pois: &[impl PoiPosition<S>]) {
         neighbours::find_near(&self.world, &self.agents, &mut self.near, &mut self.bounds);
         self.sense(pois);
     }
 
-    /// Everyone moves: leaders as their policies answered, followers after whoever was near.
+    /// Moves all agents: leaders by their policies' outputs, followers by the agents near them.
     #[inline(always)]
     pub fn go(&mut self) {
         self.act();
@@ -149,14 +149,14 @@ impl<S: Simd> Block<S> {
         self.advance();
     }
 
-    /// Leaders sense: all POIs, then the other agents, each in ascending order.
+    /// Leaders sense all POIs, then the other agents, each in ascending order.
     #[inline(always)]
-    fn sense(&mut self, pois: &[impl Locus<S>]) {
-        self.world.constants.variant.density().fix(Sensing { block: self, pois });
+    fn sense(&mut self, pois: &[impl PoiPosition<S>]) {
+        self.world.constants.variant.density().dispatch(Sensing { block: self, pois });
     }
 
     #[inline(always)]
-    fn sense_by<P: Locus<S>, const DENSITY: u32>(&mut self, pois: &[P]) {
+    fn sense_by<P: PoiPosition<S>, const DENSITY: u32>(&mut self, pois: &[P]) {
         let Block { simd, world, agents, near, inputs, .. } = self;
         for (leader, (agent, inputs)) in agents.iter().zip(inputs).enumerate() {
             let &Agent { x, y, hx, hy, .. } = agent;
@@ -197,7 +197,7 @@ impl<S: Simd> Block<S> {
         }
     }
 
-    /// Leaders turn and wish for a speed as their policies say.
+    /// Leaders turn, and set their wanted speed, by their policies' outputs.
     #[inline(always)]
     fn act(&mut self) {
         let Block { world, agents, outputs, wanted, .. } = self;
@@ -207,7 +207,7 @@ impl<S: Simd> Block<S> {
         }
     }
 
-    /// Followers count the leaders they see and follow whoever is near.
+    /// Followers count the leaders they see, and follow the agents near them.
     #[inline(always)]
     fn follow(&mut self) {
         let Block { simd, world, agents, wanted, near, followers, counts, .. } = self;
@@ -237,7 +237,7 @@ impl<S: Simd> Block<S> {
         }
     }
 
-    /// Everyone moves.
+    /// Moves all agents along their headings.
     #[inline(always)]
     fn advance(&mut self) {
         let world = &self.world;
@@ -252,7 +252,7 @@ impl<S: Simd> Block<S> {
         }
     }
 
-    /// One lane's agents as they stand; before the first step nothing has been sensed yet.
+    /// Writes the moments of one lane's agents. Before the first step nothing has been sensed.
     pub(super) fn moments(&self, lane: usize, sensed: bool, moments: &mut [Moment]) {
         let leaders = self.outputs.len();
         for (index, (agent, moment)) in self.agents.iter().zip(moments).enumerate() {
@@ -270,13 +270,13 @@ impl<S: Simd> Block<S> {
     }
 }
 
-/// Leaders sense by one of the densities.
+/// [`Block::sense_by`] with the density as a constant.
 struct Sensing<'a, S: Simd, P> {
     block: &'a mut Block<S>,
     pois: &'a [P],
 }
 
-impl<S: Simd, P: Locus<S>> Fixed for Sensing<'_, S, P> {
+impl<S: Simd, P: PoiPosition<S>> ConstDispatch for Sensing<'_, S, P> {
     type Output = ();
 
     #[inline(always)]
@@ -285,8 +285,8 @@ impl<S: Simd, P: Locus<S>> Fixed for Sensing<'_, S, P> {
     }
 }
 
-/// Turns followers to where they are pulled. In short loops: the processor sees far enough ahead to keep its units
-/// busy.
+/// Turns followers towards the force on them. Several short loops: out-of-order execution overlaps iterations only if
+/// they are short.
 #[inline(always)]
 fn steer<S: Simd, const BY_SINE: bool>(
     world: &Lanes<S>,
@@ -307,8 +307,8 @@ fn steer<S: Simd, const BY_SINE: bool>(
     }
 }
 
-/// What an entity at offset (`dx`, `dy`) adds to the density of its quadrant: nothing beyond the range.
+/// Returns the density that an entity at offset (`dx`, `dy`) adds to its quadrant: 0 out of range.
 #[inline(always)]
 fn sensed<S: Simd, const DENSITY: u32>(world: &Lanes<S>, range2: S::f32s, dx: S::f32s, dy: S::f32s) -> S::f32s {
-    only::<S>(sense::density::<S, DENSITY>(world, dx, dy), within::<S>(dx, dy, range2))
+    zero_unless::<S>(sense::density::<S, DENSITY>(world, dx, dy), within::<S>(dx, dy, range2))
 }

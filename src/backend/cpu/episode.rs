@@ -4,36 +4,36 @@ use std::ops::Range;
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::batch::Chain;
-use super::block::{Block, Locus};
+use super::batch::WorldBatch;
+use super::block::{Block, PoiPosition};
 use super::network::Network;
 use crate::backend::{Episode, Seen, Strided};
 use crate::kernels::splat;
 use crate::world::World;
 
-/// Whole episodes of one vector of teams: their policies, and their record.
-pub(super) struct Whole<S: Simd> {
+/// Whole episodes of one vector of teams: their state, policies and record.
+pub(super) struct EpisodeBlock<S: Simd> {
     pub(super) block: Block<S>,
     network: Network<S>,
-    /// Group and team of each lane.
+    /// The group and team of each lane.
     places: Vec<(usize, usize)>,
-    /// Where POIs are, a lane each; empty where they are the world's in all.
+    /// The POI positions, `[pois]`; empty if every lane has the world's.
     moved: Vec<[S::f32s; 2]>,
-    /// `[steps][pois][words][lanes]`, and the counts when they are complete, `[followers][leaders][lanes]`.
+    /// The sets, `[steps][pois][words][lanes]`, and the final counts, `[followers][leaders][lanes]`.
     sets: Vec<u32>,
     seen: Vec<u32>,
-    /// `[steps][followers][words of leaders][lanes]`, where they are recorded.
+    /// The sightings, `[steps][followers][words of leaders][lanes]`; empty unless recorded.
     pub(super) sights: Vec<u32>,
 }
 
-/// Words of a team's sights, if they are recorded.
+/// Returns the words of a team's sightings: 0 unless recorded.
 pub(super) fn sight_words(world: &World, sighted: bool) -> usize {
     if sighted { world.sight_words() } else { 0 }
 }
 
-impl<S: Simd> Whole<S> {
-    pub(super) fn new(simd: S, world: &World, sighted: bool) -> Whole<S> {
-        Whole {
+impl<S: Simd> EpisodeBlock<S> {
+    pub(super) fn new(simd: S, world: &World, sighted: bool) -> EpisodeBlock<S> {
+        EpisodeBlock {
             block: Block::new(simd, world),
             network: Network::new(simd, world),
             places: Vec::with_capacity(S::f32s::LEN),
@@ -44,10 +44,10 @@ impl<S: Simd> Whole<S> {
         }
     }
 
-    /// Puts `teams` teams of the run, from `first` on, at their start; lanes left over repeat the first.
+    /// Puts `teams` teams of the batch, from `first` on, at their start. Unused lanes repeat the first team.
     #[inline(always)]
-    pub(super) fn load(&mut self, run: &Chain<'_>, first: usize, teams: usize) {
-        let Whole { block, network, places, moved, .. } = self;
+    pub(super) fn load(&mut self, run: &WorldBatch<'_>, first: usize, teams: usize) {
+        let EpisodeBlock { block, network, places, moved, .. } = self;
         moved.clear();
         places.clear();
         places.extend((0..S::f32s::LEN).map(|lane| run.locate(first + if lane < teams { lane } else { 0 })));
@@ -70,7 +70,7 @@ impl<S: Simd> Whole<S> {
     /// Plays some steps.
     #[inline(always)]
     pub(super) fn play(&mut self, world: &World, steps: Range<usize>) {
-        let Whole { block, network, moved, sets, seen, sights, .. } = self;
+        let EpisodeBlock { block, network, moved, sets, seen, sights, .. } = self;
         if moved.is_empty() {
             play(block, network, &world.pois, sets, sights, steps);
         } else {
@@ -81,7 +81,7 @@ impl<S: Simd> Whole<S> {
         }
     }
 
-    /// One lane's record.
+    /// Returns one lane's record.
     pub(super) fn episode(&self, lane: usize, group: usize, team: usize) -> Episode<'_> {
         let strided = |words| Strided { words, stride: S::f32s::LEN, offset: lane };
         let seen = Seen::Counts(strided(&self.seen));
@@ -89,12 +89,12 @@ impl<S: Simd> Whole<S> {
     }
 }
 
-/// Plays some steps; the sets are of all steps, and so are the sights, if there are any.
+/// Plays some steps. `sets` and `sights` are of all steps; `sights` may be empty.
 #[inline(always)]
 fn play<S: Simd>(
     block: &mut Block<S>,
     network: &mut Network<S>,
-    pois: &[impl Locus<S>],
+    pois: &[impl PoiPosition<S>],
     sets: &mut [u32],
     sights: &mut [u32],
     steps: Range<usize>,

@@ -7,7 +7,7 @@ use std::sync::{Mutex, PoisonError};
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
-use super::{Backend, BackendError, Group, Need, Trace, Visit};
+use super::{Backend, BackendError, Group, RecordRequest, Trace, Visit};
 use crate::parallel::*;
 use crate::world::World;
 
@@ -21,13 +21,13 @@ mod record;
 mod transpose;
 
 pub(crate) use agent::Agent;
-pub(crate) use block::{Block, Standing};
-pub(crate) use transpose::{transposed, turn};
+pub(crate) use block::{Block, BlockState};
+pub(crate) use transpose::{transpose_rows, transpose4};
 
-use batch::{Chain, runs};
-use episode::{Whole, sight_words};
+use batch::{WorldBatch, world_batches};
+use episode::{EpisodeBlock, sight_words};
 
-/// Plays episodes on the processor, at the widest instruction set it has, on the threads of the current rayon pool.
+/// Plays episodes on the CPU, with the widest instruction set that it has, on the threads of the current rayon pool.
 pub struct Cpu {
     level: Level,
 }
@@ -39,13 +39,12 @@ impl Default for Cpu {
 }
 
 impl Cpu {
-    /// A backend that uses a chosen instruction set (tests compare them; benches choose one).
+    /// Returns a backend that uses a given instruction set, for tests and benchmarks.
     pub fn at_level(level: Level) -> Cpu {
         Cpu { level }
     }
 
-    /// Every instruction set that this processor has, narrowest first; with the feature `scalar` also doing without
-    /// one.
+    /// Returns every instruction set of this CPU, narrowest first. With the feature `scalar` the first uses no vectors.
     pub fn levels() -> Vec<Level> {
         let best = Level::new();
         let mut levels = vec![Level::baseline()];
@@ -66,7 +65,7 @@ impl Cpu {
     }
 }
 
-/// What people call an instruction set.
+/// Returns the common name of an instruction set.
 pub fn level_name(level: Level) -> &'static str {
     #[cfg(target_arch = "x86_64")]
     match level {
@@ -111,25 +110,25 @@ impl Backend for Cpu {
 
 fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
     let width = S::f32s::LEN;
-    let runs = runs(groups);
-    let blocks: Vec<(&Chain<'_>, usize)> =
+    let runs = world_batches(groups);
+    let blocks: Vec<(&WorldBatch<'_>, usize)> =
         runs.iter().flat_map(|run| (0..run.teams).step_by(width).map(move |team| (run, team))).collect();
-    // A thread takes whatever lies idle: as many are made as threads play at once.
-    let idle: Mutex<Vec<Whole<S>>> = Mutex::default();
-    let take = |&Chain { world, sighted, .. }: &Chain<'_>| {
+    // Blocks that no thread is using. As many are allocated as threads play at once.
+    let idle: Mutex<Vec<EpisodeBlock<S>>> = Mutex::default();
+    let take = |&WorldBatch { world, sighted, .. }: &WorldBatch<'_>| {
         let mut idle = idle.lock().unwrap_or_else(PoisonError::into_inner);
         let fits = idle.iter().position(|whole| {
             whole.block.world.constants == world.constants
                 && whole.sights.len() == sight_words(world, sighted) * S::f32s::LEN
         });
         if fits.is_none() {
-            // Left over from a world that is done.
+            // They are of an earlier world.
             idle.clear();
         }
         fits.map(|index| idle.swap_remove(index))
     };
     blocks.par_iter().with_max_len(1).for_each(|&(run, first)| {
-        let mut whole = take(run).unwrap_or_else(|| Whole::new(simd, run.world, run.sighted));
+        let mut whole = take(run).unwrap_or_else(|| EpisodeBlock::new(simd, run.world, run.sighted));
         let teams = width.min(run.teams - first);
         simd.vectorize(
             #[inline(always)]
@@ -150,10 +149,10 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
     let world = group.world;
     let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
     let sighted = group.need.sights();
-    let run = Chain { world, first: 0, groups: std::slice::from_ref(group), teams, sighted };
+    let run = WorldBatch { world, first: 0, groups: std::slice::from_ref(group), teams, sighted };
     let mut moments = vec![bytemuck::Zeroable::zeroed(); (steps + 1) * teams * agents];
     let (mut sets, mut seen, mut sights) = (Vec::new(), Vec::new(), Vec::new());
-    let mut whole = Whole::new(simd, world, sighted);
+    let mut whole = EpisodeBlock::new(simd, world, sighted);
     for first in (0..teams).step_by(S::f32s::LEN) {
         let lanes = S::f32s::LEN.min(teams - first);
         whole.load(&run, first, lanes);
@@ -179,7 +178,7 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
     Trace { teams, agents, moments, sets, seen, sights }
 }
 
-/// Lanes of the vectors that this processor plays on.
+/// Returns the number of lanes of this CPU's vectors.
 pub fn lanes() -> u64 {
     fn count<S: Simd>(_: S) -> u64 {
         S::f32s::LEN as u64
@@ -187,8 +186,8 @@ pub fn lanes() -> u64 {
     dispatch!(Level::new(), simd => count(simd))
 }
 
-/// Bytes that one vector of teams takes, of whom this is needed.
-pub fn block_bytes(world: &World, need: Need) -> u64 {
+/// Returns the bytes of one vector of teams, with the record that is requested.
+pub fn block_bytes(world: &World, need: RecordRequest) -> u64 {
     let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
     let record = world.set_words() + followers * leaders + sight_words(world, need.sights());
     let words = 8 * agents + leaders * world.constants.policy.words() + 3 * followers + record;

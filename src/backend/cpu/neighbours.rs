@@ -1,4 +1,4 @@
-//! Which agents may be in reach of each other, in any lane.
+//! Finding agents that may be in reach of each other, in any lane.
 
 use fearless_simd::{Simd, SimdMask, prelude::*};
 
@@ -33,7 +33,8 @@ pub(super) fn find_near<S: Simd>(world: &Lanes<S>, agents: &[Agent<S>], near: &m
                 let mut row = 0;
                 while bits != 0 {
                     let j = first + bits.trailing_zeros() as usize;
-                    // Without a branch: of those whose boxes are near, the processor cannot guess who is.
+                    // Branch-free, because the branch predictor cannot guess which of the agents in overlapping boxes
+                    // are in reach.
                     let within = u64::from(meet::<S>(agent, &agents[j], reach2));
                     row |= within << (j % 64);
                     near[i / 64 * count + j] |= within << (i % 64);
@@ -58,13 +59,13 @@ pub(super) fn find_near<S: Simd>(world: &Lanes<S>, agents: &[Agent<S>], near: &m
     }
 }
 
-/// Whether the squared distance of two agents is `reach2` at most, in any lane.
+/// Reports whether the squared distance of two agents is at most `reach2` in any lane.
 #[inline(always)]
 fn meet<S: Simd>(agent: &Agent<S>, other: &Agent<S>, reach2: f32) -> bool {
     within::<S>(other.x - agent.x, other.y - agent.y, splat(agent.x.token(), reach2)).any_true()
 }
 
-/// The boxes around some agents' places in all lanes, an agent a lane.
+/// Bounding boxes of some agents' positions over all lanes, one agent per lane.
 #[derive(Clone, Copy)]
 pub(super) struct Bounds<S: Simd> {
     low_x: S::f32s,
@@ -74,7 +75,7 @@ pub(super) struct Bounds<S: Simd> {
 }
 
 impl<S: Simd> Bounds<S> {
-    /// Boxes that nothing is near, as lanes left over hold.
+    /// Returns boxes that overlap nothing, for unused lanes.
     pub(super) fn nowhere(simd: S) -> Bounds<S> {
         let (low, high) = (splat(simd, f32::INFINITY), splat(simd, f32::NEG_INFINITY));
         Bounds { low_x: low, high_x: high, low_y: low, high_y: high }
@@ -90,11 +91,11 @@ impl<S: Simd> Bounds<S> {
         }
     }
 
-    /// One agent's box in every lane, widened by its reach.
+    /// Returns one agent's box in every lane, widened by its reach.
     #[inline(always)]
     fn around(&self, lane: usize, reach2: f32) -> Bounds<S> {
         let simd = self.low_x.token();
-        // No pair may be lost to a rounding.
+        // The margin covers rounding, so that no pair is missed.
         let reach = reach2.sqrt() * 1.001;
         Bounds {
             low_x: splat(simd, self.low_x[lane] - reach),
@@ -104,7 +105,7 @@ impl<S: Simd> Bounds<S> {
         }
     }
 
-    /// A bit for each agent whose box meets this one.
+    /// Returns one bit per agent, set if its box overlaps this one.
     #[inline(always)]
     fn meet(&self, other: Bounds<S>) -> u64 {
         let near_x = self.low_x.simd_le(other.high_x) & self.high_x.simd_ge(other.low_x);
@@ -113,10 +114,10 @@ impl<S: Simd> Bounds<S> {
     }
 }
 
-/// Pairs of more agents than this are first looked for by their bounds.
+/// With more agents than this, pairs are first tested by their bounding boxes.
 const MANY: usize = 32;
 
-/// Calls `f` with each agent that may be in reach of this one, and its index, ascending.
+/// Calls `f` with the index and the state of each agent that may be in reach of this one, ascending.
 #[inline(always)]
 pub(super) fn each_near<T>(near: &[u64], agents: &[T], agent: usize, mut f: impl FnMut(usize, &T)) {
     let (mut at, mut first) = (agent, 0);

@@ -2,8 +2,8 @@
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::batch::Chain;
-use super::transpose::turn;
+use super::batch::WorldBatch;
+use super::transpose::transpose_rows;
 use crate::backend::Weights;
 use crate::kernels::{math, splat};
 use crate::model::policy::PolicyConstants;
@@ -14,11 +14,12 @@ use crate::world::{INPUTS, OUTPUTS, World};
 pub(super) struct Network<S: Simd> {
     simd: S,
     constants: Constants,
-    /// `[leaders]`, layer by layer, units that are weighed together (see [`together`]) a row an input, then the biases.
+    /// `[leaders][parameters]`, layer by layer. Units that are computed together (see [`together`]) form a block: one
+    /// row per input, then the biases.
     weights: Vec<S::f32s>,
-    /// Where in there each weight of a policy belongs.
+    /// The index in `weights` of each weight of a policy.
     slots: Vec<usize>,
-    /// A layer's units and the next one's, `[leaders][units]`.
+    /// The units of a layer and of the next, `[leaders][units]`.
     hidden: [Vec<S::f32s>; 2],
 }
 
@@ -51,13 +52,13 @@ impl<S: Simd> Network<S> {
         }
     }
 
-    /// Takes the policies of each lane's group and team.
+    /// Loads the policies of each lane's group and team.
     #[inline(always)]
-    pub(super) fn load(&mut self, run: &Chain<'_>, places: &[(usize, usize)]) {
+    pub(super) fn load(&mut self, run: &WorldBatch<'_>, places: &[(usize, usize)]) {
         let Network { simd, weights, slots, .. } = self;
         let (leaders, parameters) = (run.world.leaders(), run.world.parameters());
         for (leader, weights) in weights.chunks_exact_mut(parameters).enumerate() {
-            // Four lanes at a time, the narrowest vector: four policies' weights are turned into four weights' lanes.
+            // Four lanes at a time, the width of the narrowest vector.
             for (quad, places) in places.as_chunks::<4>().0.iter().enumerate() {
                 let policies = places.map(|(group, team)| {
                     let group = &run.groups[group];
@@ -65,7 +66,7 @@ impl<S: Simd> Network<S> {
                     let Weights::OnHost(weights) = group.weights else { unreachable!("seen before playing") };
                     &weights[group.place(weights, leader, policy)..][..parameters]
                 });
-                turn(
+                transpose_rows(
                     *simd,
                     policies,
                     #[inline(always)]
@@ -77,7 +78,7 @@ impl<S: Simd> Network<S> {
         }
     }
 
-    /// Leaders decide where to turn and how fast to go.
+    /// Computes the leaders' outputs.
     #[inline(always)]
     pub(super) fn decide(&mut self, inputs: &[[S::f32s; INPUTS]], outputs: &mut [[S::f32s; OUTPUTS]]) {
         let Network { weights, hidden, constants, .. } = self;
@@ -90,20 +91,20 @@ impl<S: Simd> Network<S> {
             let units = &mut to[..leaders as usize * columns];
             let weights = (0..leaders as usize).map(|leader| &weights[leader * parameters as usize + first..]);
             match (rows, columns) {
-                // The paper's network, whose sizes the compiler makes use of.
-                (INPUTS, 10) => weigh_layer::<S, INPUTS, 10>(inputs, units, weights),
-                (10, OUTPUTS) => weigh_layer::<S, 10, OUTPUTS>(inputs, units, weights),
+                // The paper's network, with constant sizes.
+                (INPUTS, 10) => affine_layer::<S, INPUTS, 10>(inputs, units, weights),
+                (10, OUTPUTS) => affine_layer::<S, 10, OUTPUTS>(inputs, units, weights),
                 _ => {
                     let leaders = inputs.chunks_exact(rows).zip(units.chunks_exact_mut(columns));
                     for ((inputs, units), weights) in leaders.zip(weights) {
-                        weigh::<S>(inputs, units, weights);
+                        affine::<S>(inputs, units, weights);
                     }
                 }
             }
-            // All leaders' tanh at once, and in short loops: the processor sees far enough ahead to keep its units
-            // busy.
+            // All leaders' tanh together, in short loops: out-of-order execution overlaps iterations only if they are
+            // short.
             for unit in &mut *units {
-                *unit = policy::tame::<S>(*unit);
+                *unit = policy::clamp_preactivation::<S>(*unit);
             }
             let (eights, rest) = units.as_chunks_mut::<8>();
             for units in eights {
@@ -130,7 +131,7 @@ impl<S: Simd> Network<S> {
     }
 }
 
-/// Units that are weighed together, of those left in a layer: inputs are read once for all.
+/// Returns how many of the `left` units of a layer are computed together, so that their inputs are loaded once.
 #[inline(always)]
 fn together(left: usize) -> usize {
     match left {
@@ -141,32 +142,32 @@ fn together(left: usize) -> usize {
     }
 }
 
-/// Every leader's units of one layer, before their tanh.
+/// Computes every leader's units of one layer, before tanh.
 #[inline(always)]
-fn weigh_layer<'a, S: Simd, const INPUTS: usize, const UNITS: usize>(
+fn affine_layer<'a, S: Simd, const INPUTS: usize, const UNITS: usize>(
     inputs: &[S::f32s],
     units: &mut [S::f32s],
     weights: impl Iterator<Item = &'a [S::f32s]>,
 ) {
     let leaders = inputs.as_chunks::<INPUTS>().0.iter().zip(units.as_chunks_mut::<UNITS>().0);
     for ((inputs, units), weights) in leaders.zip(weights) {
-        *units = policy::weigh::<S, UNITS>(inputs, &weights[..(INPUTS + 1) * UNITS]);
+        *units = policy::affine::<S, UNITS>(inputs, &weights[..(INPUTS + 1) * UNITS]);
     }
 }
 
-/// One leader's units of one layer, before their tanh.
+/// Computes one leader's units of one layer, before tanh.
 #[inline(always)]
-fn weigh<S: Simd>(inputs: &[S::f32s], mut units: &mut [S::f32s], mut weights: &[S::f32s]) {
+fn affine<S: Simd>(inputs: &[S::f32s], mut units: &mut [S::f32s], mut weights: &[S::f32s]) {
     while !units.is_empty() {
         let count = together(units.len());
         let (these, weights_of_these);
         (these, units) = units.split_at_mut(count);
         (weights_of_these, weights) = weights.split_at((inputs.len() + 1) * count);
         match count {
-            10 => these.copy_from_slice(&policy::weigh::<S, 10>(inputs, weights_of_these)),
-            4 => these.copy_from_slice(&policy::weigh::<S, 4>(inputs, weights_of_these)),
-            2 => these.copy_from_slice(&policy::weigh::<S, 2>(inputs, weights_of_these)),
-            _ => these.copy_from_slice(&policy::weigh::<S, 1>(inputs, weights_of_these)),
+            10 => these.copy_from_slice(&policy::affine::<S, 10>(inputs, weights_of_these)),
+            4 => these.copy_from_slice(&policy::affine::<S, 4>(inputs, weights_of_these)),
+            2 => these.copy_from_slice(&policy::affine::<S, 2>(inputs, weights_of_these)),
+            _ => these.copy_from_slice(&policy::affine::<S, 1>(inputs, weights_of_these)),
         }
     }
 }

@@ -1,14 +1,14 @@
-//! What a step leaves in the record: who is at each POI, and which leaders each follower sees.
+//! The record of a step: who is at each POI, and which leaders each follower sees.
 
 use fearless_simd::{Simd, prelude::*};
 
 use super::agent::Agent;
-use super::block::{Block, Locus};
+use super::block::{Block, PoiPosition};
 use crate::kernels::splat;
 use crate::model::{Lanes, couple, follow};
 
 impl<S: Simd> Block<S> {
-    /// Records which leaders each follower sees, `[followers][words of leaders][lanes]`.
+    /// Writes which leaders each follower sees, one bit per leader, `[followers][words of leaders][lanes]`.
     #[inline(always)]
     pub fn watch(&self, sights: &mut [u32]) {
         let Block { simd, world, agents, .. } = self;
@@ -25,9 +25,9 @@ impl<S: Simd> Block<S> {
         }
     }
 
-    /// Records who is near each POI, `[pois][words][lanes]`.
+    /// Writes the agents at each POI, one bit per agent, `[pois][words][lanes]`.
     #[inline(always)]
-    pub fn couple(&mut self, pois: &[impl Locus<S>], mut sets: &mut [u32]) {
+    pub fn couple(&mut self, pois: &[impl PoiPosition<S>], mut sets: &mut [u32]) {
         let (fours, rest) = pois.as_chunks::<4>();
         for pois in fours {
             sets = observe(self.simd, &self.world, &self.agents, pois, sets);
@@ -38,13 +38,13 @@ impl<S: Simd> Block<S> {
     }
 }
 
-/// Puts the agents near some POIs into their sets, `[N][words][lanes]`; gives back the sets after these.
+/// Writes the sets of some POIs, `[N][words][lanes]`, and returns the rest of `sets`.
 #[inline(always)]
 fn observe<'a, S: Simd, const N: usize>(
     simd: S,
     world: &Lanes<S>,
     agents: &[Agent<S>],
-    pois: &[impl Locus<S>; N],
+    pois: &[impl PoiPosition<S>; N],
     sets: &'a mut [u32],
 ) -> &'a mut [u32] {
     let mut places = [[splat(simd, 0.0); 2]; N];

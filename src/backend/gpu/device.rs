@@ -1,6 +1,6 @@
-//! Finding, opening and talking to a GPU.
+//! Finding, opening and using a GPU.
 //!
-//! [`super::open`] tests a device before handing it out.
+//! [`super::open`] also tests a device.
 
 use std::fmt;
 use std::ops::Range;
@@ -16,23 +16,23 @@ use super::exact::{self, Pass, ShaderError};
 use crate::escape;
 use crate::host::{self, Instant};
 
-/// Names of renderers that run on the CPU, for drivers that do not admit it in their device type.
+/// Names of renderers that run on the CPU, for drivers whose device type hides that.
 const SOFTWARE: [&str; 5] = ["llvmpipe", "lavapipe", "swiftshader", "microsoft basic render", "software"];
 
-/// An adapter, as a person would tell it from others.
+/// An adapter: a GPU, or a renderer on the CPU.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct AdapterInfo {
-    /// What the driver calls the device.
+    /// The driver's name for the device.
     pub name: String,
-    /// Driver and version; empty where the backend does not say.
+    /// The driver and its version. Empty if the backend does not report them.
     pub driver: String,
     /// "vulkan", "metal", "dx12".
     pub backend: String,
-    /// What it runs on.
+    /// The kind of device.
     pub kind: Kind,
 }
 
-/// What an adapter runs on, the most wanted first.
+/// The kind of device, the preferred kinds first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
     /// A GPU with memory of its own.
@@ -41,14 +41,14 @@ pub enum Kind {
     Integrated,
     /// A GPU passed to a virtual machine.
     Virtual,
-    /// The driver does not say.
+    /// The driver does not report the kind.
     Unknown,
     /// A renderer that runs on the CPU.
     Software,
 }
 
 impl Kind {
-    /// Whether this is a GPU for sure.
+    /// Reports whether this is certainly a GPU.
     pub fn is_real(self) -> bool {
         self <= Kind::Virtual
     }
@@ -98,86 +98,86 @@ impl From<&wgpu::AdapterInfo> for AdapterInfo {
     }
 }
 
-/// Why a GPU could not be had, or failed at work.
+/// Why a GPU could not be opened, or failed.
 #[derive(Debug, thiserror::Error)]
 pub enum DeviceError {
-    /// There is no adapter at all.
+    /// There is no adapter.
     #[error("no GPU adapter found (is a Vulkan, Metal or DirectX 12 driver installed?)")]
     NoAdapter,
-    /// There are only software renderers, which are opened only if asked for.
+    /// There are only software renderers, which are opened only by name or number.
     #[error("no GPU among the adapters, only {}", list(.found))]
     NoRealAdapter {
-        /// The adapters that there are.
+        /// The adapters.
         found: Vec<AdapterInfo>,
     },
-    /// No adapter has the name or number asked for.
+    /// No adapter has this name or number.
     #[error("no adapter {} \"{name}\"; there {}", if is_index(name) { "has the number" } else { "matches" }, there_are(.found))]
     UnknownAdapter {
-        /// The name or number asked for.
+        /// The name or number.
         name: String,
-        /// The adapters that there are.
+        /// The adapters.
         found: Vec<AdapterInfo>,
     },
-    /// The driver does not open it.
+    /// The driver refuses to open it.
     #[error("{adapter}: cannot be opened: {reason}")]
     Refused {
         /// The adapter, with its driver.
         adapter: String,
-        /// The driver's words.
+        /// The driver's message.
         reason: String,
     },
-    /// Its arithmetic differs from the CPU's under every pass.
+    /// The device's arithmetic differs from the CPU's under every pass.
     #[error("{adapter}: not bit-exact, so it cannot be used: {}", inexact(.failures))]
     Inexact {
         /// The adapter, with its driver.
         adapter: String,
-        /// By each pass, where it first differed.
+        /// Per pass, the first difference.
         failures: Vec<(Pass, String)>,
     },
-    /// The driver gave the device up; whatever it held is gone.
+    /// The driver lost the device, and everything on it.
     #[error("{adapter}: the device was lost ({reason})")]
     Lost {
         /// The adapter, with its driver.
         adapter: String,
-        /// The driver's words.
+        /// The driver's message.
         reason: String,
     },
-    /// The device has no room for a buffer.
+    /// The device has too little memory for a buffer.
     #[error("{adapter}: out of memory for {what}; use a smaller batch")]
     OutOfMemory {
         /// The adapter, with its driver.
         adapter: String,
-        /// What it was needed for.
+        /// The use of the buffer.
         what: String,
     },
-    /// A buffer or binding is larger than the device can have at all.
+    /// A buffer or binding exceeds the device's limit.
     #[error("{adapter}: {what} needs {bytes} bytes, the device allows {allowed}; use a smaller batch")]
     TooLarge {
         /// The adapter, with its driver.
         adapter: String,
-        /// What it was needed for.
+        /// The use of the buffer.
         what: String,
-        /// How many were needed.
+        /// Bytes needed.
         bytes: u64,
-        /// How many the device allows.
+        /// Bytes allowed.
         allowed: u64,
     },
-    /// A shader of the program does not compile for it.
+    /// A shader does not compile for the device.
     #[error("shader {label} {source}")]
     Shader {
         /// The shader's name.
         label: String,
-        /// What is wrong with it.
+        /// The error.
         source: ShaderError,
     },
-    /// Whatever else wgpu reports.
+    /// Any other error of wgpu.
     #[error("{adapter}: {what} failed: {reason}")]
     Failed {
         /// The adapter, with its driver.
         adapter: String,
-        /// What was being done.
+        /// The operation.
         what: String,
-        /// The driver's words.
+        /// The driver's message.
         reason: String,
     },
 }
@@ -186,7 +186,7 @@ fn list(found: &[AdapterInfo]) -> String {
     found.iter().enumerate().map(|(index, info)| format!("{index}: {info}")).collect::<Vec<_>>().join(", ")
 }
 
-/// Whether this can only be an adapter's index: a number, or what would have been one.
+/// Reports whether this can only be an adapter's index: a number, even one out of range.
 fn is_index(name: &str) -> bool {
     let digits = name.trim().trim_start_matches(['+', '-']);
     !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit())
@@ -200,15 +200,15 @@ fn inexact(failures: &[(Pass, String)]) -> String {
     failures.iter().map(|(pass, failure)| format!("under the {pass} pass, {failure}")).collect::<Vec<_>>().join("; ")
 }
 
-/// All adapters that can compute, the most wanted first. None is no error.
+/// Returns all adapters that can compute, the preferred ones first.
 ///
-/// `WGPU_BACKEND` narrows the backends (`vulkan`, `metal`, `dx12`); the Vulkan loader has its own `VK_DRIVER_FILES`.
+/// `WGPU_BACKEND` limits the backends (`vulkan`, `metal`, `dx12`). The Vulkan loader has its own `VK_DRIVER_FILES`.
 pub fn adapters() -> Vec<AdapterInfo> {
     found().into_iter().map(|(_, info)| info).collect()
 }
 
 fn found() -> Vec<(wgpu::Adapter, AdapterInfo)> {
-    // Not the default instance, which ignores the environment and asks for validation layers in debug builds.
+    // The default instance ignores the environment, and enables validation layers in debug builds.
     let backends = wgpu::Backends::all().with_env();
     let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
         backends,
@@ -220,7 +220,7 @@ fn found() -> Vec<(wgpu::Adapter, AdapterInfo)> {
         .filter(|a| a.get_downlevel_capabilities().flags.contains(wgpu::DownlevelFlags::COMPUTE_SHADERS))
         .map(|adapter| (adapter.get_info(), adapter))
         .collect();
-    // One device through two backends is one adapter, by the backend that needs no guards.
+    // A device that two backends offer is one adapter. The backend that needs no guards wins.
     adapters.sort_by_key(|(info, _)| (AdapterInfo::from(info).kind, info.backend != wgpu::Backend::Vulkan));
     let same = |a: &wgpu::AdapterInfo, b: &wgpu::AdapterInfo| {
         a.backend != b.backend && (a.vendor, a.device, &a.name) == (b.vendor, b.device, &b.name)
@@ -231,26 +231,25 @@ fn found() -> Vec<(wgpu::Adapter, AdapterInfo)> {
     kept.map(|(_, (info, adapter))| (adapter, AdapterInfo::from(&info))).collect()
 }
 
-/// Which adapter to open.
+/// Selects the adapter to open.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Wanted {
     /// A GPU, never a software renderer.
     Real,
-    /// By its index in [`adapters`], which is what a number is, or else by a part of its name in any case (the first
-    /// that matches).
+    /// By its index in [`adapters`] if this is a number, else by a part of its name, in any case. The first match wins.
     Named(String),
 }
 
-/// What to open, and how. Only tests and `verify` need more than a [`Wanted`].
+/// A request to open a device. Only tests and `verify` need more than a [`Wanted`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Request {
-    /// Which adapter.
+    /// The adapter.
     pub choice: Wanted,
-    /// This pass alone instead of the first that is exact. [`Pass::Plain`] is opened untested.
+    /// Only this pass, instead of the first exact one. [`Pass::Plain`] is not tested.
     pub pass: Option<Pass>,
-    /// WebGPU's default limits instead of the adapter's own.
+    /// Use WebGPU's default limits instead of the adapter's own.
     pub default_limits: bool,
-    /// Shaders keep bounds checks, loop bounds and zeroed workgroup memory.
+    /// Keep bounds checks, loop bounds and zeroed workgroup memory in shaders.
     pub checked: bool,
 }
 
@@ -260,32 +259,32 @@ impl From<Wanted> for Request {
     }
 }
 
-/// What has gone wrong since the device was opened, as told by wgpu's callbacks.
+/// Errors since the device was opened, from wgpu's callbacks.
 #[derive(Default)]
-struct Trouble {
+struct DeviceErrors {
     lost: Option<String>,
     error: Option<String>,
 }
 
-/// An opened device whose arithmetic was seen to be exact under `pass`; a clone is the same device.
+/// An opened device whose arithmetic was tested under `pass`. Clones share the device.
 #[derive(Clone)]
 pub struct Gpu {
-    /// Which one it is.
+    /// The adapter.
     pub adapter: AdapterInfo,
-    /// What may be asked of the device.
+    /// The device's limits.
     pub limits: wgpu::Limits,
-    /// How shaders are compiled.
+    /// The compile pass of its shaders.
     pub pass: Pass,
     /// Whether shaders keep their checks, see [`Request::checked`].
     pub checked: bool,
     /// The wgpu device.
     pub device: wgpu::Device,
-    /// Its only queue.
+    /// The only queue.
     pub queue: wgpu::Queue,
-    /// The zero that guarded arithmetic is masked with: binding 0 of every bind group.
+    /// A buffer of zeros that guarded arithmetic uses: binding 0 of every bind group.
     guard: wgpu::Buffer,
-    trouble: Arc<Mutex<Trouble>>,
-    /// Bytes that went up and came down.
+    errors: Arc<Mutex<DeviceErrors>>,
+    /// Bytes to and from the device.
     traffic: Arc<[AtomicU64; 2]>,
 }
 
@@ -318,30 +317,30 @@ impl fmt::Debug for Gpu {
     }
 }
 
-/// The adapter of a choice.
+/// Returns the adapter of a choice.
 pub(super) fn choose(choice: &Wanted) -> Result<(wgpu::Adapter, AdapterInfo), DeviceError> {
     let mut found = found();
     let infos: Vec<_> = found.iter().map(|(_, info)| info.clone()).collect();
     Ok(found.swap_remove(position(choice, &infos)?))
 }
 
-/// Which of the [`adapters`] is chosen.
+/// Returns the index in [`adapters`] of a choice.
 ///
 /// # Errors
-/// There is no adapter, none that is a GPU, or none of that name or number.
+/// There is no adapter, none that is a GPU, or none with that name or number.
 pub fn position(choice: &Wanted, infos: &[AdapterInfo]) -> Result<usize, DeviceError> {
     match choice {
         Wanted::Named(name) => {
             let part = name.trim().to_lowercase();
             let found = match is_index(&part) {
                 true => part.parse().ok().filter(|&index: &usize| index < infos.len()),
-                // Nothing is a part of every name.
+                // Every name contains the empty string.
                 false if part.is_empty() => None,
                 false => infos.iter().position(|info| info.name.to_lowercase().contains(&part)),
             };
             found.ok_or_else(|| DeviceError::UnknownAdapter { name: name.clone(), found: infos.to_vec() })
         }
-        // The most wanted adapter is the first.
+        // The first adapter is the preferred one.
         Wanted::Real if infos.first().is_some_and(|info| !info.kind.is_real()) => {
             Err(DeviceError::NoRealAdapter { found: infos.to_vec() })
         }
@@ -364,7 +363,7 @@ pub enum Binding {
     Write,
 }
 
-/// The buffers of a pipeline: group 0, the guard at 0, then the given ones from 1 on.
+/// The layout of a pipeline's buffers: group 0, the guard at binding 0, the others from binding 1 on.
 #[derive(Clone, Debug)]
 pub struct Bindings {
     bindings: wgpu::BindGroupLayout,
@@ -372,7 +371,7 @@ pub struct Bindings {
 }
 
 impl Gpu {
-    /// Opens an adapter, not yet tested.
+    /// Opens an adapter, without testing it.
     pub(super) fn new(
         adapter: &wgpu::Adapter,
         info: AdapterInfo,
@@ -392,13 +391,13 @@ impl Gpu {
             reason: error.to_string(),
         };
         let (device, queue) = host::wait(adapter.request_device(&descriptor)).map_err(refused)?;
-        let trouble = Arc::new(Mutex::new(Trouble::default()));
-        let noted = trouble.clone();
+        let errors = Arc::new(Mutex::new(DeviceErrors::default()));
+        let noted = errors.clone();
         device.set_device_lost_callback(move |reason, message| {
             let reason = if message.is_empty() { format!("{reason:?}") } else { message };
             noted.lock().unwrap_or_else(PoisonError::into_inner).lost.get_or_insert(reason);
         });
-        let noted = trouble.clone();
+        let noted = errors.clone();
         device.on_uncaptured_error(Arc::new(move |error| {
             noted.lock().unwrap_or_else(PoisonError::into_inner).error.get_or_insert(chain(&error));
         }));
@@ -407,19 +406,20 @@ impl Gpu {
             contents: &[0; 16],
             usage: wgpu::BufferUsages::UNIFORM,
         });
-        Ok(Gpu { adapter: info, limits, pass, checked, device, queue, guard, trouble, traffic: Arc::default() })
+        Ok(Gpu { adapter: info, limits, pass, checked, device, queue, guard, errors, traffic: Arc::default() })
     }
 
-    /// An error if the device was lost or anything failed outside the calls below; to be asked after every wait.
+    /// Returns an error if the device was lost, or if anything failed outside the calls below. To be called after every
+    /// wait.
     ///
     /// # Errors
     /// The device was lost, or a command failed.
     pub fn check(&self) -> Result<(), DeviceError> {
-        let mut trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(reason) = &trouble.lost {
+        let mut errors = self.errors.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(reason) = &errors.lost {
             return Err(DeviceError::Lost { adapter: self.adapter.to_string(), reason: reason.clone() });
         }
-        match trouble.error.take() {
+        match errors.error.take() {
             Some(reason) => Err(self.failed("a command", reason)),
             None => Ok(()),
         }
@@ -429,16 +429,16 @@ impl Gpu {
         DeviceError::Failed { adapter: self.adapter.to_string(), what: what.into(), reason: reason.to_string() }
     }
 
-    /// Runs `make` and reports what wgpu found wrong with it, as an error about `what`.
+    /// Runs `make`, and returns any error of wgpu as an error about `what`.
     ///
     /// # Errors
-    /// What wgpu found, or the device was lost.
+    /// wgpu reported an error, or the device was lost.
     pub fn scoped<T>(&self, what: &str, make: impl FnOnce() -> T) -> Result<T, DeviceError> {
         use wgpu::ErrorFilter::{Internal, OutOfMemory, Validation};
         let [memory, validation, internal] =
             [OutOfMemory, Validation, Internal].map(|f| self.device.push_error_scope(f));
         let made = make();
-        // Innermost first; array elements would be dropped in the wrong order.
+        // Scopes have to be popped innermost first.
         let errors = [host::wait(internal.pop()), host::wait(validation.pop()), host::wait(memory.pop())];
         self.check()?;
         match errors.into_iter().flatten().next() {
@@ -450,10 +450,10 @@ impl Gpu {
         }
     }
 
-    /// A new buffer of `bytes` bytes, all zero.
+    /// Creates a buffer of `bytes` bytes, all zero.
     ///
     /// # Errors
-    /// It is larger than the device allows, or there is no memory for it.
+    /// It exceeds the device's limits, or there is too little memory.
     pub fn buffer(&self, what: &str, bytes: u64, usage: wgpu::BufferUsages) -> Result<wgpu::Buffer, DeviceError> {
         let mut allowed = self.limits.max_buffer_size;
         if usage.contains(wgpu::BufferUsages::STORAGE) {
@@ -469,10 +469,10 @@ impl Gpu {
         self.scoped(what, || self.device.create_buffer(&descriptor))
     }
 
-    /// A new buffer that holds `contents`.
+    /// Creates a buffer that holds `contents`.
     ///
     /// # Errors
-    /// It is larger than the device allows, or there is no memory for it.
+    /// It exceeds the device's limits, or there is too little memory.
     pub fn upload<T: Pod>(
         &self,
         what: &str,
@@ -485,22 +485,22 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// Has bytes written to a buffer (usage `COPY_DST`), before all that is submitted from now on.
+    /// Writes to a buffer (usage `COPY_DST`) before everything that is submitted from now on.
     pub fn write(&self, buffer: &wgpu::Buffer, offset: u64, bytes: &[u8]) {
         self.traffic[0].fetch_add(bytes.len() as u64, Relaxed);
         self.queue.write_buffer(buffer, offset, bytes);
     }
 
-    /// What was written to the device and read from it since it was opened.
+    /// Returns the bytes written to and read from the device since it was opened.
     pub fn traffic(&self) -> Traffic {
         let [up, down] = [0, 1].map(|way| self.traffic[way].load(Relaxed));
         Traffic { up, down }
     }
 
-    /// Waits for all work and reads a range of a buffer (in bytes, multiples of 4; usage `COPY_SRC`).
+    /// Waits for all work, and reads a range of a buffer (in bytes, multiples of 4; usage `COPY_SRC`).
     ///
     /// # Errors
-    /// The device was lost or has no memory for the copy.
+    /// The device was lost, or has too little memory for the copy.
     pub fn read<T: Pod>(&self, buffer: &wgpu::Buffer, bytes: Range<u64>) -> Result<Vec<T>, DeviceError> {
         let size = bytes.end - bytes.start;
         self.traffic[1].fetch_add(size, Relaxed);
@@ -511,7 +511,7 @@ impl Gpu {
             let mut encoder = self.device.create_command_encoder(&Default::default());
             encoder.copy_buffer_to_buffer(buffer, bytes.start, &landing, 0, size);
             self.queue.submit([encoder.finish()]);
-            // Nobody listens any more only if waiting failed.
+            // The receiver is dropped only after an error.
             landing.map_async(wgpu::MapMode::Read, .., move |result| drop(send.send(result)));
         })?;
         self.wait()?;
@@ -521,8 +521,8 @@ impl Gpu {
         Ok(bytemuck::pod_collect_to_vec(&view[..]))
     }
 
-    /// Shows a range of a buffer to which all was copied, by work that was waited for (in bytes, multiples of 4; usage
-    /// `MAP_READ`).
+    /// Calls `show` with a range of a buffer (in bytes, multiples of 4; usage `MAP_READ`). All work that writes it must
+    /// have been waited for.
     ///
     /// # Errors
     /// The device was lost, or the buffer cannot be read.
@@ -534,11 +534,11 @@ impl Gpu {
     ) -> Result<T, DeviceError> {
         self.traffic[1].fetch_add(bytes.end - bytes.start, Relaxed);
         let (send, receive) = oneshot::channel();
-        // Nobody listens any more only if waiting failed.
+        // The receiver is dropped only after an error.
         self.scoped("reading back", || {
             buffer.map_async(wgpu::MapMode::Read, bytes.clone(), move |result| drop(send.send(result)));
         })?;
-        // The work was waited for: polling once lets the map through.
+        // The work is done, so one poll completes the mapping.
         let polled = self.device.poll(wgpu::PollType::Poll);
         self.check()?;
         polled.map_err(|error| self.failed("reading back", error))?;
@@ -564,11 +564,11 @@ impl Gpu {
     /// # Errors
     /// The device was lost, or a command failed.
     pub fn wait_for(&self, submission_index: Option<wgpu::SubmissionIndex>) -> Result<(), DeviceError> {
-        // A browser has no polling: there, whatever was submitted until now is waited for.
+        // A browser cannot poll. There, this waits for everything submitted so far.
         if cfg!(target_family = "wasm") {
             let (send, done) = oneshot::channel();
             self.queue.on_submitted_work_done(move || _ = send.send(()));
-            // What nobody answers is a lost device, as the check tells.
+            // If nobody answers, the device was lost; `check` reports that.
             let _ = host::wait(done);
             return self.check();
         }
@@ -577,10 +577,10 @@ impl Gpu {
         waited.map(drop).map_err(|error| self.failed("waiting", error))
     }
 
-    /// The layout of a pipeline that uses these buffers as bindings 1, 2, … of group 0.
+    /// Returns the layout of a pipeline that uses these buffers as bindings 1, 2, … of group 0.
     ///
     /// # Errors
-    /// The device does not allow so many buffers.
+    /// The device does not support so many buffers.
     pub fn layout(&self, label: &str, buffers: &[Binding]) -> Result<Bindings, DeviceError> {
         let entry = |(binding, &kind): (u32, &Binding)| wgpu::BindGroupLayoutEntry {
             binding,
@@ -609,7 +609,7 @@ impl Gpu {
         })
     }
 
-    /// Buffers for a pipeline, in the order of its layout.
+    /// Binds buffers for a pipeline, in the order of its layout.
     ///
     /// # Errors
     /// A buffer does not fit its binding.
@@ -629,7 +629,7 @@ impl Gpu {
     }
 
     /// Compiles one of the crate's own shaders, see [`Gpu::pipeline`].
-    pub(super) fn own_pipeline(
+    pub(crate) fn own_pipeline(
         &self,
         label: &str,
         wgsl: &str,
@@ -647,12 +647,12 @@ impl Gpu {
     /// Compiles an entry point under the device's pass. Workgroup memory starts undefined unless `checked`.
     ///
     /// # Safety
-    /// Unless `checked`, nothing keeps the shader within its buffers: its indices must be in bounds, its loops must
-    /// end, it must divide no integer by zero, and read no workgroup memory that it did not write. Its bindings must be
-    /// those of the layout, `checked` or not.
+    /// Unless `checked`, the shader is compiled without bounds checks. Its indices must be in bounds, and its loops
+    /// must end. It must not divide an integer by zero, or read workgroup memory that it did not write. Its bindings
+    /// must match the layout, `checked` or not.
     ///
     /// # Errors
-    /// The shader leaves the exact core, or asks for more than the device allows; or the driver refuses it.
+    /// The shader leaves the exact core, exceeds the device's limits, or the driver refuses it.
     #[expect(unsafe_code, reason = "shaders of the crate's own are compiled without bounds checks")]
     pub unsafe fn pipeline(
         &self,
@@ -662,7 +662,7 @@ impl Gpu {
         layout: &Bindings,
     ) -> Result<wgpu::ComputePipeline, DeviceError> {
         let compiled = self.scoped(label, || {
-            // SAFETY: the caller's.
+            // SAFETY: see the function's own contract.
             unsafe { exact::compile(&self.device, label, wgsl, self.pass, self.checked) }
         })?;
         let module = compiled.map_err(|source| DeviceError::Shader { label: label.into(), source })?;
@@ -714,8 +714,7 @@ impl Gpu {
         })
     }
 
-    /// How long one dispatch takes: by the device's clock where it has one that can be asked, else from submitting it
-    /// to seeing it done.
+    /// Returns how long one dispatch takes: by the device's clock if it has one, else from submission to completion.
     ///
     /// # Errors
     /// The device was lost, or refuses the dispatch.
@@ -733,16 +732,16 @@ impl Gpu {
         self.wait()?;
         let elapsed = start.elapsed();
         match watch {
-            // A clock that stands still (some software drivers) tells nothing.
+            // Some software drivers have a clock that stands still.
             Some(watch) => Ok(Some(watch.read(self)?).filter(|time| !time.is_zero()).unwrap_or(elapsed)),
             None => Ok(elapsed),
         }
     }
 
-    /// A stopwatch, if the device's clock can be asked.
+    /// Returns a stopwatch, if the device has a clock.
     ///
     /// # Errors
-    /// There is no memory for its few numbers.
+    /// There is too little memory.
     pub fn stopwatch(&self) -> Result<Option<Stopwatch>, DeviceError> {
         if !self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY) {
             return Ok(None);
@@ -767,13 +766,13 @@ pub struct Stopwatch {
 }
 
 impl Stopwatch {
-    /// Hands the times of the pass over, after it.
+    /// Copies the times of the pass to the host, after it.
     pub fn stop(&self, encoder: &mut wgpu::CommandEncoder) {
         encoder.resolve_query_set(&self.queries, 0..2, &self.ticks, 0);
         encoder.copy_buffer_to_buffer(&self.ticks, 0, &self.landing, 0, self.ticks.size());
     }
 
-    /// How long the pass took that was submitted, and waited for, last.
+    /// Returns how long the last submitted pass took, which must have been waited for.
     ///
     /// # Errors
     /// The device was lost.
@@ -785,7 +784,7 @@ impl Stopwatch {
     }
 }
 
-/// A compute pass, timed if there is a stopwatch.
+/// Describes a compute pass, timed if there is a stopwatch.
 pub fn timed(watch: Option<&Stopwatch>) -> wgpu::ComputePassDescriptor<'_> {
     let timestamp_writes = watch.map(|watch| wgpu::ComputePassTimestampWrites {
         query_set: &watch.queries,
@@ -795,13 +794,13 @@ pub fn timed(watch: Option<&Stopwatch>) -> wgpu::ComputePassDescriptor<'_> {
     wgpu::ComputePassDescriptor { label: None, timestamp_writes }
 }
 
-/// A dispatch of at least `tasks` workgroups, within the device's limit on each side.
+/// Returns a grid of at least `tasks` workgroups, within the device's limit on each dimension.
 pub(super) fn grid(tasks: usize, limits: &wgpu::Limits) -> [u32; 3] {
     let rows = tasks.div_ceil(limits.max_compute_workgroups_per_dimension as usize).max(1);
     [tasks.div_ceil(rows) as u32, rows as u32, 1]
 }
 
-/// An error with all its causes.
+/// Formats an error with all its causes.
 fn chain(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();

@@ -23,14 +23,14 @@ use naga::{
     Module, Range, RelationalFunction, ResourceBinding, Scalar, ScalarKind, Span, Statement, Type, TypeInner,
 };
 
-/// How a shader's float arithmetic is kept from being contracted and reassociated.
+/// The compile pass that keeps a shader's float arithmetic from being contracted and reassociated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Pass {
-    /// SPIR-V whose float results are all decorated `NoContraction`. Vulkan only; costs no instruction.
+    /// SPIR-V with every float result decorated `NoContraction`. Vulkan only. Costs no instruction.
     NoContraction,
-    /// naga IR whose float sums and products pass through integer bits. Everywhere; costs an `or` each.
+    /// naga IR whose float sums and products pass through integer bits. Works everywhere. Costs one `or` each.
     Guarded,
-    /// Nothing is done. Only for showing that the tests notice; never chosen.
+    /// No protection. Never chosen; for tests that show that differences are detected.
     Plain,
 }
 
@@ -47,26 +47,26 @@ impl std::fmt::Display for Pass {
 /// Why a shader could not be compiled.
 #[derive(Debug, thiserror::Error)]
 pub enum ShaderError {
-    /// The text is no WGSL; naga's words.
+    /// The text is not WGSL; naga's message.
     #[error("does not parse:\n{0}")]
     Parse(String),
-    /// naga's validation refuses it; its words.
+    /// naga's validation fails; its message.
     #[error("is not valid: {0}")]
     Invalid(String),
-    /// These operations are not known to be exact on every device.
+    /// Some operations are not known to be exact on every device.
     #[error("leaves the exact core: {}", .0.join("; "))]
     Foreign(Vec<String>),
-    /// It uses the binding of the guard itself.
+    /// It uses the guard's binding.
     #[error("binds group 0 binding 0, which is the guard's")]
     GuardTaken,
-    /// It is beyond a limit of the device.
+    /// It exceeds a limit of the device.
     #[error("needs {what} {needed}, the device allows {allowed}")]
     Limit {
-        /// Which limit.
+        /// The name of the limit.
         what: &'static str,
-        /// How much the shader takes.
+        /// The shader's need.
         needed: u64,
-        /// How much there may be.
+        /// The limit.
         allowed: u64,
     },
     /// naga cannot write it as SPIR-V.
@@ -74,15 +74,15 @@ pub enum ShaderError {
     Spirv(#[from] spv::Error),
 }
 
-/// One shader text of several files, in order.
+/// Joins the parts of a shader's text, in order.
 pub fn assemble(parts: &[&str]) -> String {
     parts.join("\n")
 }
 
-/// Parses and validates; the capabilities are those of plain WebGPU (no f16, f64, subgroups).
+/// Parses and validates a shader. The capabilities are those of plain WebGPU (no f16, f64, subgroups).
 ///
 /// # Errors
-/// It does not parse or is not valid.
+/// It does not parse, or is not valid.
 pub fn parse(wgsl: &str) -> Result<(Module, ModuleInfo), ShaderError> {
     let module = naga::front::wgsl::parse_str(wgsl).map_err(|error| ShaderError::Parse(error.emit_to_string(wgsl)))?;
     let info = validate(&module).map_err(|error| ShaderError::Invalid(error.emit_to_string(wgsl)))?;
@@ -95,7 +95,7 @@ fn validate(module: &Module) -> Result<ModuleInfo, Box<Invalid>> {
     Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(module).map_err(Box::new)
 }
 
-/// The SPIR-V of all entry points, every float result decorated `NoContraction`.
+/// Returns the SPIR-V of all entry points, with every float result decorated `NoContraction`.
 ///
 /// `checked` keeps naga's bounds checks, loop bounds, division checks and zeroed workgroup memory.
 ///
@@ -106,14 +106,14 @@ pub fn spirv(wgsl: &str, checked: bool) -> Result<Vec<u32>, ShaderError> {
     Ok(decorate(&emit(&module, &info, checked)?))
 }
 
-/// naga's own SPIR-V of a module, not yet exact.
+/// Returns naga's own SPIR-V of a module, which is not yet exact.
 ///
 /// # Errors
 /// It has no SPIR-V.
 pub fn emit(module: &Module, info: &ModuleInfo, checked: bool) -> Result<Vec<u32>, ShaderError> {
     let policy = if checked { BoundsCheckPolicy::Restrict } else { BoundsCheckPolicy::Unchecked };
     let options = spv::Options {
-        // Any Vulkan takes 1.0, and wgpu does not tell what else the driver would take.
+        // Every Vulkan driver accepts 1.0. wgpu does not report the maximum.
         lang_version: (1, 0),
         flags: spv::WriterFlags::empty(),
         fake_missing_bindings: true,
@@ -135,7 +135,7 @@ pub fn emit(module: &Module, info: &ModuleInfo, checked: bool) -> Result<Vec<u32
     Ok(spv::write_vec(module, info, &options, None)?)
 }
 
-/// The few SPIR-V numbers that the decorating pass needs (SPIR-V 1.6, sections 3.20 and 3.49).
+/// The SPIR-V opcodes that the decorating pass needs (SPIR-V 1.6, Sections 3.20 and 3.49).
 mod op {
     /// Words before the first instruction.
     pub const HEADER: usize = 5;
@@ -143,7 +143,7 @@ mod op {
     pub const TYPES: std::ops::RangeInclusive<u32> = 19..=39;
     pub const DECORATE: u32 = 71;
     pub const NO_CONTRACTION: u32 = 42;
-    /// Of the set `GLSL.std.450`, the only one that naga uses.
+    /// An instruction of `GLSL.std.450`, the only set that naga uses.
     pub const FMA: u32 = 50;
 
     /// OpFNegate, OpFAdd, OpFSub, OpFMul, OpFDiv, OpFRem, OpFMod, then OpVectorTimesScalar to OpDot.
@@ -152,7 +152,7 @@ mod op {
     }
 }
 
-/// Each instruction: its opcode, its place and its words.
+/// Returns the opcode, the offset and the words of each instruction.
 fn instructions(words: &[u32]) -> impl Iterator<Item = (u32, usize, &[u32])> {
     let mut at = op::HEADER;
     std::iter::from_fn(move || {
@@ -164,7 +164,7 @@ fn instructions(words: &[u32]) -> impl Iterator<Item = (u32, usize, &[u32])> {
     })
 }
 
-/// Ids of all float arithmetic results.
+/// Returns the ids of all float arithmetic results.
 fn float_results(words: &[u32]) -> impl Iterator<Item = u32> {
     instructions(words).filter_map(|(opcode, _, instruction)| {
         let fused = opcode == op::EXT_INST && instruction.get(4) == Some(&op::FMA);
@@ -174,13 +174,13 @@ fn float_results(words: &[u32]) -> impl Iterator<Item = u32> {
 
 /// Adds `OpDecorate %id NoContraction` for every float arithmetic result.
 pub fn decorate(words: &[u32]) -> Vec<u32> {
-    // Annotations end where the types begin; every module has a type.
+    // Annotations end where the types begin. Every module has a type.
     let end = instructions(words).find(|(opcode, ..)| op::TYPES.contains(opcode)).map_or(words.len(), |(_, at, _)| at);
     let decorations = float_results(words).flat_map(|id| [3 << 16 | op::DECORATE, id, op::NO_CONTRACTION]);
     words[..end].iter().copied().chain(decorations).chain(words[end..].iter().copied()).collect()
 }
 
-/// How many float arithmetic results of a SPIR-V module are not decorated `NoContraction`.
+/// Counts the float arithmetic results of a SPIR-V module that are not decorated `NoContraction`.
 pub fn undecorated(words: &[u32]) -> usize {
     let decorated: std::collections::HashSet<u32> = instructions(words)
         .filter(|(opcode, _, i)| *opcode == op::DECORATE && i.get(2) == Some(&op::NO_CONTRACTION))
@@ -255,7 +255,7 @@ fn guard_function(function: &mut Function, info: &FunctionInfo, module: &Module,
     let mut append = |expression, span| expressions.append(expression, span);
     let pointer = append(Expression::GlobalVariable(guard), Span::UNDEFINED);
     let zero = append(Expression::Load { pointer }, Span::UNDEFINED);
-    // The first and the last expression that each old one became: the last holds its value.
+    // The first and the last expression that replace each old one. The last has its value.
     let mut moved: Vec<(Handle<Expression>, Handle<Expression>)> = Vec::new();
     let exposed = exposed(function, info, module, None);
     for (old, expression) in function.expressions.iter() {
@@ -292,7 +292,7 @@ fn guard_function(function: &mut Function, info: &FunctionInfo, module: &Module,
     function.body.splice(0..0, Block::from_vec(vec![load]));
 }
 
-/// Of each expression whether anything may read it but guards, and comparisons of whole numbers by its bits.
+/// Returns, per expression, whether anything may read it except guards and integer comparisons of its bits.
 fn exposed(
     function: &Function,
     info: &FunctionInfo,
@@ -316,7 +316,7 @@ fn exposed(
         let Expression::Load { pointer } = expressions[zero] else { return false };
         matches!(expressions[pointer], Expression::GlobalVariable(variable) if Some(variable) == guard)
     };
-    // Whatever reads an expression stands behind it.
+    // Readers come after what they read.
     for (reader, expression) in expressions.iter().collect::<Vec<_>>().into_iter().rev() {
         let exposes = match *expression {
             Expression::Binary { op, left, .. } if compares(op) => is_float(info[left].ty.inner_with(&module.types)),
@@ -338,16 +338,16 @@ fn compares(op: BinaryOperator) -> bool {
     matches!(op, Equal | NotEqual | Less | LessEqual | Greater | GreaterEqual)
 }
 
-/// Where the pass keeps its zero.
+/// The binding of the guard.
 const GUARD: ResourceBinding = ResourceBinding { group: 0, binding: 0 };
 
-/// Whether an expression is a float sum or product, a scalar or of vectors.
+/// Reports whether an expression is a float sum or product, scalar or vector.
 fn rounds(expression: &Expression, inner: &TypeInner) -> bool {
     use BinaryOperator::{Add, Multiply, Subtract};
     matches!(expression, Expression::Binary { op: Add | Subtract | Multiply, .. }) && is_float(inner)
 }
 
-/// How many float sums and products of a module have neither a guard nor are compared by their bits alone; 0 after
+/// Counts the float sums and products of a module that are neither guarded nor compared only by their bits. 0 after
 /// [`guarded`].
 ///
 /// # Errors
@@ -366,7 +366,7 @@ pub fn unguarded(module: &Module) -> Result<usize, ShaderError> {
     Ok(functions(module, &info).map(count).sum())
 }
 
-/// Every function of a module, entry points last, with its name and what the validator found.
+/// Returns every function of a module, entry points last, with its name and the validator's information.
 fn functions<'a>(
     module: &'a Module,
     info: &'a ModuleInfo,
@@ -396,7 +396,7 @@ fn move_block(block: &mut Block, moved: &[(Handle<Expression>, Handle<Expression
     }
 }
 
-/// The expressions that one of the core reads; None for an expression outside the core.
+/// Returns the operands of an expression of the core, or `None` for one outside it.
 fn operands(expression: &mut Expression) -> Option<Vec<&mut Handle<Expression>>> {
     use Expression as E;
     Some(match expression {
@@ -422,7 +422,8 @@ fn operands(expression: &mut Expression) -> Option<Vec<&mut Handle<Expression>>>
 
 type Parts<'a> = (Vec<&'a mut Handle<Expression>>, Vec<&'a mut Block>);
 
-/// The expressions and blocks in a statement of the core (an `Emit`'s range apart); None for one outside it.
+/// Returns the expressions and blocks in a statement of the core, without an `Emit`'s range, or `None` for one outside
+/// it.
 fn parts(statement: &mut Statement) -> Option<Parts<'_>> {
     use Statement as S;
     Some(match statement {
@@ -447,10 +448,10 @@ fn parts(statement: &mut Statement) -> Option<Parts<'_>> {
     })
 }
 
-/// Every operation of a module outside the exact core, as `function: operation`; empty if it is sound.
+/// Returns every operation of a module outside the exact core, as `function: operation`. Empty if the module is exact.
 ///
 /// The core: f32 `+ - *`, negation, comparison, `select`, `abs`, `floor`, bit casts; all integer arithmetic;
-/// conversions between u32, i32 and f32; vectors of these, loads, stores, integer atomics, calls, control flow,
+/// conversions between u32, i32 and f32; vectors of these; loads, stores, integer atomics, calls, control flow,
 /// workgroup barriers.
 pub fn foreign_operations(module: &Module) -> Vec<String> {
     match validate(module) {
@@ -546,7 +547,7 @@ fn foreign_statements(block: &Block, report: &mut impl FnMut(String)) {
     }
 }
 
-/// What passthrough shaders are not checked for by wgpu: workgroup sizes and memory within the device's limits.
+/// Checks what wgpu does not check for passthrough shaders: workgroup sizes and memory.
 fn check_limits(module: &Module, limits: &wgpu::Limits) -> Result<(), ShaderError> {
     let within = |what, needed: u64, allowed: u32| match needed <= allowed.into() {
         true => Ok(()),
@@ -565,13 +566,13 @@ fn check_limits(module: &Module, limits: &wgpu::Limits) -> Result<(), ShaderErro
     within("workgroup memory, in bytes, of", bytes.sum(), limits.max_compute_workgroup_storage_size)
 }
 
-/// Compiles a shader for a device under a pass. Pipelines of it need an explicit layout with dense bindings from 0 (the
-/// guard) on; errors of the driver go to the device's error scopes.
+/// Compiles a shader for a device under a pass. Its pipelines need an explicit layout with dense bindings from 0 (the
+/// guard) on. The driver's errors go to the device's error scopes.
 ///
 /// Unless `checked`, shaders run without bounds checks, loop bounds, division checks and zeroed workgroup memory.
 ///
 /// # Safety
-/// As of [`super::device::Gpu::pipeline`].
+/// See [`super::device::Gpu::pipeline`].
 #[expect(unsafe_code, reason = "shaders are compiled without bounds checks")]
 pub(super) unsafe fn compile(
     device: &wgpu::Device,
@@ -599,8 +600,8 @@ pub(super) unsafe fn compile(
                 spirv: Some(words.into()),
                 ..Default::default()
             };
-            // SAFETY: naga validated the module and wrote the SPIR-V, to which only decorations were added; limits were
-            // checked above; the rest is the caller's.
+            // SAFETY: naga validated the module and wrote the SPIR-V, to which only decorations were added. The limits
+            // were checked above. The rest is the caller's obligation.
             return Ok(unsafe { device.create_shader_module_passthrough(descriptor) });
         }
         Pass::Guarded => guarded(&module)?,
@@ -611,6 +612,6 @@ pub(super) unsafe fn compile(
     if checked {
         return Ok(device.create_shader_module(descriptor));
     }
-    // SAFETY: wgpu validates the module; the rest is the caller's.
+    // SAFETY: wgpu validates the module. The rest is the caller's obligation.
     Ok(unsafe { device.create_shader_module_trusted(descriptor, wgpu::ShaderRuntimeChecks::unchecked()) })
 }

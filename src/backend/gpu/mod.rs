@@ -8,22 +8,21 @@
 //! | [`device`] | adapters, and what is asked of an opened one |
 //! | [`population`] | policies that stay on the device |
 //! | [`episode`] | whole episodes |
-//! | [`probe`] | opening a device, and the tests that it must pass |
+//! | [`self_test`] | opening a device, and the tests that it must pass |
 
 pub mod device;
 pub mod episode;
 pub mod exact;
 pub mod population;
-pub mod probe;
+pub mod self_test;
 
-pub use probe::{open, self_test};
+pub use self_test::{open, self_test};
+
+/// The shader that measures a device's arithmetic ceiling.
+pub const CEILING: &str = include_str!("../../../shaders/ceiling.wgsl");
 
 /// The whole text of every shader, with a name for each: what the lints and the exactness tests walk over.
 pub fn shaders() -> Vec<(&'static str, String)> {
-    [
-        vec![("probe", probe::SHADER.into()), ("ceiling", probe::CEILING.into())],
-        episode::shaders(),
-        population::shaders(),
-    ]
-    .concat()
+    [vec![("probe", self_test::SHADER.into()), ("ceiling", CEILING.into())], episode::shaders(), population::shaders()]
+        .concat()
 }

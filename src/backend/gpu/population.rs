@@ -1,4 +1,4 @@
-//! Populations that stay on the device: the CPU decides who is copied from whom, the device copies and mutates.
+//! Populations that stay on the device. The CPU plans who is copied from whom; the device copies and mutates.
 
 use std::fmt;
 use std::ops::Range;
@@ -8,78 +8,78 @@ use bytemuck::Pod;
 
 use super::device::{BINDING_ALIGNMENT, Binding, Bindings, DeviceError, Gpu, grid};
 use super::exact;
-use crate::backend::{BackendError, Held};
+use crate::backend::{BackendError, DevicePopulation};
 use crate::config::Mutation;
-use crate::declare::{Shared, shared};
 use crate::evolve::{self, Breeding};
+use crate::gpu_struct::{GpuStruct, gpu_struct};
 
-/// Threads of a workgroup.
+/// Threads per workgroup.
 const WORKGROUP: usize = 256;
-/// Weights that a workgroup of `gather` turns at a time, along policies and across them (`TILE` in the shader).
+/// Rows and columns of the tile that a workgroup of `gather` transposes (`TILE` in the shader).
 const TILE: usize = 32;
-/// Leaders whose policies are gathered together: as many buffers as every WebGPU device binds beside the others.
-pub const TOGETHER: usize = 4;
-/// Bytes that go to or come from the device at a time, so that as much memory beside the populations is enough.
+/// Leaders per gather dispatch: as many buffers as every WebGPU device can bind besides the others.
+pub(super) const TOGETHER: usize = 4;
+/// Bytes per transfer, so that little memory is needed besides the populations.
 const PIECE: usize = 64 << 20;
 
-shared! {
-    /// How one leader's next generation is made.
+gpu_struct! {
+    /// How to breed one leader's next generation.
     pub struct Brood {
-        /// The slots' key, which has the generation and the population in it but not the slot.
+        /// The slots' key before the slot is xored in, see [`Key::of_population`](crate::evolve::Key::of_population).
         pub key: [u32; 4],
-        /// Policies of the leader, the champion's place included.
+        /// Policies, including the champion's slot.
         pub slots: u32,
-        /// Weights of a policy.
+        /// Weights per policy.
         pub parameters: u32,
-        /// Where the leader's parents start in the plan.
+        /// The offset of the leader's parents in the plan.
         pub parents: u32,
-        /// Weights whose random word is below it mutate.
+        /// A weight mutates if its random word is below this threshold.
         pub threshold: u32,
-        /// Not 0 where all weights do.
+        /// Not 0 if every weight mutates.
         pub all: u32,
-        /// Whether noise is of a weight's own size.
+        /// Not 0 if noise scales with the weight.
         pub scaled: u32,
-        /// The noise's standard deviation.
+        /// The standard deviation of the noise.
         pub sigma: f32,
     }
 
-    /// Some leaders' policies in some teams of one group, which tasks share.
-    pub struct Stretch {
-        /// Leaders of a team.
+    /// A request to gather policies for consecutive tasks of one group.
+    pub struct GatherJob {
+        /// Leaders per team.
         pub leaders: u32,
-        /// The first of those gathered.
+        /// The first leader to gather.
         pub first: u32,
-        /// How many are gathered, up to [`TOGETHER`].
+        /// Leaders to gather, up to [`TOGETHER`].
         pub count: u32,
-        /// Weights of a policy.
+        /// Weights per policy.
         pub parameters: u32,
-        /// Teams of the group that these tasks play.
+        /// Teams of these tasks.
         pub teams: u32,
-        /// Every task has so many, the last what is left.
+        /// Teams per task. The last task has the remainder.
         pub teams_a_task: u32,
-        /// Where the teams' choices of policies start in their buffer.
+        /// The offset of the teams' policies in their buffer.
         pub choices: u32,
-        /// Where the weights go in theirs.
+        /// The offset of the output.
         pub weights: u32,
     }
 }
 
-impl Stretch {
-    /// Workgroups that it takes.
-    pub fn tiles(&self) -> usize {
+impl GatherJob {
+    /// Returns the number of workgroups.
+    pub(super) fn tiles(&self) -> usize {
         (self.teams as usize * self.count as usize).div_ceil(TILE) * (self.parameters as usize).div_ceil(TILE)
     }
 }
 
-/// What works on the populations of one device.
-pub struct Kernels {
+/// The kernels that work on the populations of one device.
+pub(super) struct Kernels {
     gpu: Gpu,
     breed: (wgpu::ComputePipeline, Bindings),
     gather: (wgpu::ComputePipeline, Bindings),
 }
 
-/// One dispatch, with all that it uses.
-pub type Dispatch<'a> = (&'a wgpu::ComputePipeline, wgpu::BindGroup, [u32; 3]);
+/// A pipeline, its bindings and its workgroups.
+pub(super) type Dispatch<'a> = (&'a wgpu::ComputePipeline, wgpu::BindGroup, [u32; 3]);
 
 impl fmt::Debug for Kernels {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -88,11 +88,11 @@ impl fmt::Debug for Kernels {
 }
 
 impl Kernels {
-    /// Compiles them; `edit` changes the shader's text.
+    /// Compiles the kernels. `edit` may change the shader's text.
     ///
     /// # Errors
-    /// The device does not take them.
-    pub fn new(gpu: Gpu, edit: fn(String) -> String) -> Result<Kernels, DeviceError> {
+    /// The device does not support them.
+    pub(super) fn new(gpu: Gpu, edit: fn(String) -> String) -> Result<Kernels, DeviceError> {
         use Binding::{Read, Write};
         let text = edit(source());
         let pipeline = |entry, buffers: &[Binding]| -> Result<_, DeviceError> {
@@ -104,11 +104,12 @@ impl Kernels {
         Ok(Kernels { breed, gather, gpu })
     }
 
-    /// Takes the populations of a trial, `[leaders][slots][parameters]`, of a size that fits a buffer a leader.
+    /// Copies the populations of a trial, `[leaders][slots][parameters]`, to the device. Each leader's must fit into
+    /// one buffer.
     ///
     /// # Errors
     /// They do not fit the device.
-    pub fn hold(
+    pub(super) fn hold(
         self: &Arc<Kernels>,
         weights: &[f32],
         [leaders, slots, parameters]: [usize; 3],
@@ -134,35 +135,36 @@ impl Kernels {
         Ok(Population { kernels: self.clone(), buffers, broods, plan, leaders, slots, parameters })
     }
 
-    /// The dispatch that lays out a stretch of teams: the stretch stands alone in its part of a buffer.
+    /// Returns the dispatch that gathers the policies of a job. The job is an aligned element of a buffer, `(buffer,
+    /// index)`.
     ///
     /// # Errors
-    /// The device does not take the buffers.
-    pub fn gather(
+    /// The device does not support the buffers.
+    pub(super) fn gather(
         &self,
-        (stretches, part): (&wgpu::Buffer, usize),
-        stretch: &Stretch,
+        (jobs, part): (&wgpu::Buffer, usize),
+        job: &GatherJob,
         choices: &wgpu::Buffer,
         population: &Population,
         weights: &wgpu::Buffer,
     ) -> Result<Dispatch<'_>, DeviceError> {
-        // Where there are fewer leaders, nobody reads the buffers that are left.
+        // With fewer leaders, the remaining bindings are not read.
         let last = population.leaders - 1;
         let leader = |index: u32| {
-            let leader = (stretch.first + index.min(stretch.count - 1)) as usize;
-            // All leaders may choose from the same.
+            let leader = (job.first + index.min(job.count - 1)) as usize;
+            // All leaders may share one population.
             &population.buffers[leader.min(last)]
         };
         let [first, second, third, fourth] = [0, 1, 2, 3].map(|index| leader(index).as_entire_buffer_binding());
         let (choices, weights) = (choices.as_entire_buffer_binding(), weights.as_entire_buffer_binding());
-        let buffers = [part_of::<Stretch>(stretches, part), choices, first, weights, second, third, fourth];
+        let buffers = [part_of::<GatherJob>(jobs, part), choices, first, weights, second, third, fourth];
         let group = self.gpu.bind("gather", &self.gather.1, &buffers)?;
-        Ok((&self.gather.0, group, grid(stretch.tiles(), &self.gpu.limits)))
+        Ok((&self.gather.0, group, grid(job.tiles(), &self.gpu.limits)))
     }
 }
 
-/// Structs one after another, each from where a binding may start.
-pub fn parts<T: Pod>(structs: &[T]) -> Vec<u8> {
+/// Returns the bytes of structs, each aligned so that a binding may start there.
+pub(super) fn parts<T: Pod>(structs: &[T]) -> Vec<u8> {
     let mut bytes = vec![0; structs.len() * BINDING_ALIGNMENT];
     for (part, one) in bytes.chunks_exact_mut(BINDING_ALIGNMENT).zip(structs) {
         part[..size_of::<T>()].copy_from_slice(bytemuck::bytes_of(one));
@@ -177,9 +179,9 @@ fn part_of<T>(buffer: &wgpu::Buffer, part: usize) -> wgpu::BufferBinding<'_> {
 
 /// The populations of one trial in a device's memory.
 #[derive(Debug)]
-pub struct Population {
+pub(super) struct Population {
     kernels: Arc<Kernels>,
-    /// A leader's policies each, `[slots][parameters]`, and room for one leader's more.
+    /// One buffer per leader, `[slots][parameters]`, and one more for the children of the first.
     buffers: Vec<wgpu::Buffer>,
     broods: wgpu::Buffer,
     plan: wgpu::Buffer,
@@ -189,29 +191,29 @@ pub struct Population {
 }
 
 impl Population {
-    /// Whether these kernels may work on it.
-    pub fn is_of(&self, kernels: &Arc<Kernels>) -> bool {
+    /// Reports whether these kernels may work on it.
+    pub(super) fn is_of(&self, kernels: &Arc<Kernels>) -> bool {
         Arc::ptr_eq(&self.kernels, kernels)
     }
 
-    /// Whether teams of these sizes, `[leaders, slots, parameters]`, may choose from it.
+    /// Checks that teams of these sizes, `[leaders, slots, parameters]`, can choose from it.
     ///
     /// # Errors
-    /// It has others.
-    pub fn check(&self, sizes: [usize; 3]) -> Result<(), BackendError> {
+    /// The sizes differ.
+    pub(super) fn check(&self, sizes: [usize; 3]) -> Result<(), BackendError> {
         let own = [if self.leaders == 1 { sizes[0] } else { self.leaders }, self.slots, self.parameters];
         let text = || format!("populations of {own:?} leaders, policies and weights stand for some of {sizes:?}");
         if own == sizes { Ok(()) } else { Err(BackendError::InvalidInput(text())) }
     }
 
-    /// Bytes of the pieces that one leader's policies come back in.
+    /// Returns the byte ranges in which one leader's policies are transferred.
     fn pieces(&self) -> impl Iterator<Item = Range<usize>> + use<> {
         let size = self.slots * self.parameters * size_of::<f32>();
         (0..size).step_by(PIECE).map(move |start| start..size.min(start + PIECE))
     }
 }
 
-impl Held for Population {
+impl DevicePopulation for Population {
     fn breed(&mut self, breeding: &Breeding<'_>) -> Result<(), BackendError> {
         breeding.check([self.leaders, self.slots, self.parameters])?;
         let Kernels { gpu, breed: (pipeline, layout), .. } = &*self.kernels;
@@ -231,7 +233,7 @@ impl Held for Population {
             .collect();
         let threads = self.slots * self.parameters.div_ceil(64) * 16;
         let [x, y, z] = grid(threads.div_ceil(WORKGROUP), &gpu.limits);
-        // A leader's children go where the leader before had its parents, the first one's into the free room.
+        // A leader's children replace the parents of the leader before it. The first one's go to the additional buffer.
         let homes = std::iter::once(&self.buffers[self.leaders]).chain(&self.buffers);
         let mut groups = Vec::with_capacity(self.leaders);
         for (leader, (policies, children)) in self.buffers[..self.leaders].iter().zip(homes).enumerate() {
@@ -272,17 +274,17 @@ impl Held for Population {
     }
 }
 
-/// The whole shader, with what it has in front.
+/// Returns the whole shader.
 fn source() -> String {
     exact::assemble(&[
         &format!("const WORKGROUP: u32 = {WORKGROUP}u;"),
-        &[Brood::wgsl(), Stretch::wgsl()].concat(),
+        &[Brood::wgsl(), GatherJob::wgsl()].concat(),
         include_str!("../../../shaders/lib/math.wgsl"),
         include_str!("../../../shaders/population.wgsl"),
     ])
 }
 
-/// The shader, for the lints.
-pub fn shaders() -> Vec<(&'static str, String)> {
+/// Returns the shader and its name.
+pub(super) fn shaders() -> Vec<(&'static str, String)> {
     vec![("population", source())]
 }

@@ -2,11 +2,11 @@
 
 use std::any::Any;
 
-use super::planner::{PACKED_HEAD, Share, State, Task, Work, gather};
+use super::planner::{BatchPlan, PACKED_HEAD, PlannedTask, State, Task, gather};
 use super::shape::Shape;
-use super::{GpuEpisodes, Records};
+use super::{GpuBackend, Records};
 use crate::backend::gpu::device::{BINDING_ALIGNMENT, DeviceError, Gpu, Stopwatch, grid, timed};
-use crate::backend::gpu::population::{Population, Stretch, TOGETHER, parts};
+use crate::backend::gpu::population::{GatherJob, Population, TOGETHER, parts};
 use crate::backend::{BackendError, FOUR, Group, Moment, Weights};
 use crate::host::Instant;
 use crate::parallel::*;
@@ -14,21 +14,21 @@ use crate::parallel::*;
 /// Alignment of each kernel's first task, in tasks, so that a binding may start there. The size of a task is no power
 /// of two.
 const TASK_ALIGNMENT: usize = BINDING_ALIGNMENT / 4;
-/// Share of all sets that a packed record has room for at first.
+/// Initial share of all sets that a packed record has room for.
 pub(super) const KEPT: f64 = 1.0 / 16.0;
-/// Additional words of a packed record.
+/// Words of a packed record beyond that share.
 const KEPT_AT_LEAST: usize = 256;
 
-/// What is to be gathered from populations on the device, and the choices of those teams, `[teams][leaders]` each.
-type Gathering<'a> = (Vec<(Stretch, &'a Population)>, Vec<u32>);
+/// Jobs to gather from populations on the device, and the policies of these teams, `[teams][leaders]` each.
+type Gathering<'a> = (Vec<(GatherJob, &'a Population)>, Vec<u32>);
 
-/// The device's side of one batch; buffers only grow.
+/// The device's buffers of one batch. They only grow.
 #[derive(Default)]
 pub(super) struct Buffers {
     pub(super) worlds: Option<wgpu::Buffer>,
     pub(super) tasks: Option<wgpu::Buffer>,
     pub(super) places: Option<wgpu::Buffer>,
-    pub(super) stretches: Option<wgpu::Buffer>,
+    pub(super) jobs: Option<wgpu::Buffer>,
     pub(super) choices: Option<wgpu::Buffer>,
     pub(super) weights: Option<wgpu::Buffer>,
     pub(super) record: Option<wgpu::Buffer>,
@@ -39,20 +39,20 @@ pub(super) struct Buffers {
     pub(super) least: Option<wgpu::Buffer>,
     pub(super) packed: Option<wgpu::Buffer>,
     pub(super) packed_back: Option<wgpu::Buffer>,
-    /// What comes home of the packed record, if it is packed, and whether the whole one comes in any case.
-    pub(super) sent: Option<Parcel>,
+    /// The packed record, if any, and whether the whole record is copied to the host too.
+    pub(super) sent: Option<PackedReadback>,
     pub(super) whole: bool,
     pub(super) watch: Option<Stopwatch>,
-    /// What to wait for.
+    /// The submission to wait for.
     pub(super) submitted: Option<wgpu::SubmissionIndex>,
 }
 
-/// A packed record on its way home.
+/// A packed record that is copied to the host.
 #[derive(Clone, Copy)]
-pub(super) struct Parcel {
-    /// Words that there is room for, tables and owners among them.
+pub(super) struct PackedReadback {
+    /// Words that there is room for, including tables and owners.
     pub(super) room: usize,
-    /// Bytes that are copied: all, or only how many words were taken.
+    /// Bytes that are copied: everything, or only how many words were used.
     pub(super) bytes: u64,
 }
 
@@ -71,7 +71,7 @@ impl Buffers {
     }
 }
 
-/// A buffer of at least so many bytes, made anew where the present one is too small.
+/// Returns a buffer of at least so many bytes. Replaces the present one if it is too small.
 fn grown<'a>(
     gpu: &Gpu,
     buffer: &'a mut Option<wgpu::Buffer>,
@@ -81,7 +81,7 @@ fn grown<'a>(
 ) -> Result<&'a wgpu::Buffer, DeviceError> {
     let bytes = bytes.max(BINDING_ALIGNMENT as u64);
     if buffer.as_ref().is_none_or(|buffer| buffer.size() < bytes) {
-        // Free the old one first: the two together may not fit.
+        // The old buffer is freed first, because both together may not fit.
         if let Some(old) = buffer.take() {
             old.destroy();
         }
@@ -90,25 +90,25 @@ fn grown<'a>(
     Ok(buffer.as_ref().expect("just made"))
 }
 
-impl GpuEpisodes {
-    /// Hands one batch to the device.
+impl GpuBackend {
+    /// Submits one batch.
     pub(super) fn submit(
         &mut self,
         flight: usize,
         groups: &[Group<'_>],
-        work: &Work,
+        work: &BatchPlan,
         trace: bool,
     ) -> Result<(), BackendError> {
         use wgpu::BufferUsages as Usage;
         let start = Instant::now();
-        let (stretches, choices) = self.stretches(groups, work)?;
+        let (jobs, choices) = self.jobs(groups, work)?;
         self.fill_staging(groups, work);
         let gathered = Instant::now();
         self.stages.gather += gathered - start;
-        // Round by round, each shape's tasks stand together, from where a binding may start.
+        // In each round the tasks of a shape are consecutive. The first is at an offset where a binding may start.
         let mut tasks: Vec<Task> = Vec::new();
         let mut dispatches: Vec<(Shape, usize, [u32; 3])> = Vec::new();
-        // Those that play every task once.
+        // The dispatches of the first round, which cover every task once.
         let mut first_round = 0;
         let shapes = &work.shapes;
         let new = shapes.iter().filter(|shape| !self.pipelines.contains_key(shape)).count();
@@ -124,7 +124,7 @@ impl GpuEpisodes {
                 .extend(work.shares.iter().filter(|share| share.shape == shape).filter_map(|share| share.round(round)));
             if tasks.len() > first {
                 let grid = grid(tasks.len() - first, &self.gpu.limits);
-                // The grid's last row may be longer than the tasks: those workgroups play no team.
+                // The last row of the grid may be longer than the tasks. Its additional workgroups play no team.
                 tasks.resize(first + (grid[0] * grid[1]) as usize, Task::default());
                 dispatches.push((shape, first, grid));
                 self.prepare_pipeline(shape)?;
@@ -140,10 +140,10 @@ impl GpuEpisodes {
                 Records::Packed => most,
                 _ => head + (work.sets as f64 * self.kept) as usize + KEPT_AT_LEAST,
             };
-            // Where nearly all sets are kept, they are packed only to see when that changes.
+            // If nearly all sets are kept, packing only measures when that changes.
             match room <= most {
-                true => Parcel { room, bytes: ((PACKED_HEAD + room) * size_of::<u32>()) as u64 },
-                false => Parcel { room: head, bytes: (PACKED_HEAD * size_of::<u32>()) as u64 },
+                true => PackedReadback { room, bytes: ((PACKED_HEAD + room) * size_of::<u32>()) as u64 },
+                false => PackedReadback { room: head, bytes: (PACKED_HEAD * size_of::<u32>()) as u64 },
             }
         });
         let whole = work.head.is_none_or(|head| sent.is_some_and(|sent| sent.room == head));
@@ -174,13 +174,13 @@ impl GpuEpisodes {
                 gpu.scoped("weights", || gpu.write(&weights, offset, bytes))?;
             }
         }
-        let mut gathers = Vec::with_capacity(stretches.len());
-        if let Some(kernels) = self.kernels.as_ref().filter(|_| !stretches.is_empty()) {
-            let structs: Vec<Stretch> = stretches.iter().map(|(stretch, _)| *stretch).collect();
-            let structs = upload(&mut buffers.stretches, "stretches", &parts(&structs))?;
+        let mut gathers = Vec::with_capacity(jobs.len());
+        if let Some(kernels) = self.kernels.as_ref().filter(|_| !jobs.is_empty()) {
+            let structs: Vec<GatherJob> = jobs.iter().map(|(job, _)| *job).collect();
+            let structs = upload(&mut buffers.jobs, "jobs", &parts(&structs))?;
             let choices = upload(&mut buffers.choices, "choices", bytemuck::cast_slice(&choices))?;
-            for (part, (stretch, population)) in stretches.iter().enumerate() {
-                gathers.push(kernels.gather((&structs, part), stretch, &choices, population, &weights)?);
+            for (part, (job, population)) in jobs.iter().enumerate() {
+                gathers.push(kernels.gather((&structs, part), job, &choices, population, &weights)?);
             }
         }
         let record = grown(gpu, &mut buffers.record, "record", record_bytes, output)?;
@@ -256,19 +256,19 @@ impl GpuEpisodes {
         Ok(())
     }
 
-    /// What a batch has to gather.
-    fn stretches<'a>(&self, groups: &[Group<'a>], work: &Work) -> Result<Gathering<'a>, BackendError> {
-        let (mut stretches, mut choices) = (Vec::new(), Vec::new());
+    /// Returns what a batch has to gather on the device.
+    fn jobs<'a>(&self, groups: &[Group<'a>], work: &BatchPlan) -> Result<Gathering<'a>, BackendError> {
+        let (mut jobs, mut choices) = (Vec::new(), Vec::new());
         for shares in work.shares.chunk_by(|a, b| a.group == b.group) {
             let group = &groups[shares[0].group];
-            let Weights::Held(held) = group.weights else { continue };
+            let Weights::OnDevice(held) = group.weights else { continue };
             let ours = |population: &&Population| self.kernels.as_ref().is_some_and(|k| population.is_of(k));
             let population = (held as &dyn Any).downcast_ref().filter(ours).ok_or(BackendError::HeldElsewhere)?;
             let leaders = group.world.leaders();
             population.check([leaders, group.policies, group.world.parameters()])?;
             let teams: u32 = shares.iter().map(|share| share.task.teams).sum();
             for first in (0..leaders).step_by(TOGETHER) {
-                let stretch = Stretch {
+                let job = GatherJob {
                     leaders: leaders as u32,
                     first: first as u32,
                     count: TOGETHER.min(leaders - first) as u32,
@@ -278,15 +278,15 @@ impl GpuEpisodes {
                     choices: choices.len() as u32,
                     weights: shares[0].task.weights,
                 };
-                stretches.push((stretch, population));
+                jobs.push((job, population));
             }
             choices.extend(&group.teams[shares[0].first_team * leaders..][..teams as usize * leaders]);
         }
-        Ok((stretches, choices))
+        Ok((jobs, choices))
     }
 
-    /// Gathers the weights of every task whose policies are on the host; leaves room for the others'.
-    fn fill_staging(&mut self, groups: &[Group<'_>], work: &Work) {
+    /// Gathers the weights of every task whose policies are on the host, and leaves room for the others.
+    fn fill_staging(&mut self, groups: &[Group<'_>], work: &BatchPlan) {
         if !work.shares.iter().any(|share| is_on_host(groups, share)) {
             return;
         }
@@ -307,6 +307,6 @@ impl GpuEpisodes {
     }
 }
 
-fn is_on_host(groups: &[Group<'_>], share: &Share) -> bool {
+fn is_on_host(groups: &[Group<'_>], share: &PlannedTask) -> bool {
     matches!(groups[share.group].weights, Weights::OnHost(_))
 }

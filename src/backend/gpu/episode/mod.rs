@@ -1,9 +1,18 @@
 //! Whole episodes on a GPU: teams are packed into workgroups, workgroups into batches that fit the device.
 //!
-//! One shader text makes two kernels: the generic one, which plays any world, and the specialised one, made for a
-//! world's sizes, in which all loops have constant bounds and the policy is straight-line code. See [`Kernel`].
+//! | file | holds |
+//! |---|---|
+//! | `shape` | kernels: what they are compiled for, and how teams fill their workgroups |
+//! | `planner` | teams cut into tasks, and tasks into batches |
+//! | `source` | the text of the shaders |
+//! | `pipelines` | compiled kernels |
+//! | `flight` | buffers, and submitting a batch |
+//! | `readback` | waiting for a batch, and reading its record |
 //!
-//! While the GPU plays one batch, the CPU reads the record of the batch before it. Where only scores are wanted, the
+//! One shader text makes two kernels. The generic one plays any world. The specialised one is compiled for a world's
+//! sizes: all loops have constant bounds and the policy is straight-line code. See [`Kernel`].
+//!
+//! While the GPU plays one batch, the CPU reads the record of the batch before it. If only scores are requested, the
 //! GPU keeps the record and returns only what the scores depend on, see [`Records`].
 
 use std::collections::HashMap;
@@ -15,8 +24,8 @@ use bytemuck::Zeroable;
 use super::device::{Binding, Bindings, DeviceError, Gpu, Kind, Traffic};
 use super::population::Kernels;
 use crate::backend::{
-    BATCH_BYTES, Backend, BackendError, Episode, FOUR, Group, HELD_FROM, Held, Moment, PACKED_FROM, Seen, Strided,
-    Trace, Visit,
+    BATCH_BYTES, Backend, BackendError, DevicePopulation, Episode, FOUR, Group, HELD_FROM, Moment, PACKED_FROM, Seen,
+    Strided, Trace, Visit,
 };
 use crate::host::Instant;
 
@@ -34,34 +43,34 @@ pub use source::{Workgroup, shader_of, shaders, workgroup_of};
 use flight::{Buffers, KEPT};
 use pipelines::{Compiled, IDLE_PLAYS, KEPT_KERNELS};
 use planner::{NOWHERE, owner_words, plan};
-use readback::{Done, Home};
+use readback::{Done, Readback};
 use shape::Shape;
 
-/// Which populations a device holds in its own memory between generations; no result depends on that.
+/// Selects the populations that a device holds between generations. Results do not depend on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Holding {
+pub enum ResidencyPolicy {
     /// None.
     Never,
-    /// Those that take at least so many bytes a trial and fit.
+    /// Those of at least so many bytes per trial, if they fit.
     From(u64),
-    /// All; what does not fit is an error.
+    /// All. Populations that do not fit are an error.
     Always,
 }
 
-/// How records come home where only scores are wanted; no result depends on that.
+/// How records are copied to the host if only scores are requested. Results do not depend on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Records {
-    /// Whole.
+    /// Unpacked.
     Whole,
-    /// Those of batches that take at least so many bytes are packed on the device first: of each POI the sets that
-    /// another one contains are left out, and of what followers saw only whom they saw most.
+    /// Batches with records of at least so many bytes are packed on the device first. Packing drops the sets that
+    /// another set of the same POI contains, and of the counts it keeps only the leader that each follower saw most.
     PackedFrom(u64),
-    /// All are packed, and room is made for as much as a whole record takes, so that little is ever brought whole.
+    /// All are packed, with room for as much as a whole record, so that the whole is rarely copied.
     Packed,
 }
 
 impl Records {
-    /// Whether a record of so many bytes is packed.
+    /// Reports whether a record of so many bytes is packed.
     fn packs(self, bytes: u64) -> bool {
         match self {
             Records::Whole => false,
@@ -72,69 +81,69 @@ impl Records {
 }
 
 /// Plays episodes on a GPU.
-pub struct GpuEpisodes {
+pub struct GpuBackend {
     gpu: Gpu,
     layout: Bindings,
     kernel: Kernel,
     pipelines: HashMap<Shape, Compiled>,
-    /// Calls of `play` so far.
+    /// The number of calls of `play`.
     plays: u64,
-    holding: Holding,
+    holding: ResidencyPolicy,
     records: Records,
-    /// Compiled once something is to be packed.
+    /// Compiled when first needed.
     pack: Option<(wgpu::ComputePipeline, Bindings)>,
-    /// The part of all sets for which room is made.
+    /// The share of all sets that packed records have room for.
     kept: f64,
-    /// Compiled once something is to be held.
+    /// Compiled when populations are first held.
     kernels: Option<Arc<Kernels>>,
-    /// Two sets, so that one batch plays while the other is read.
+    /// Two sets of buffers, so that one batch plays while the other is read.
     flights: [Buffers; 2],
-    /// Weights on their way to the device.
+    /// Weights to be copied to the device.
     staging: Vec<[f32; FOUR]>,
-    /// Bytes of one buffer that a batch aims for.
+    /// Target bytes of one buffer of a batch.
     batch_bytes: u64,
     kept_kernels: usize,
     idle_plays: u64,
-    /// Changes the shader's text, so that tests can show that a change is noticed.
+    /// Changes the text of shaders, so that tests can show that a change is detected.
     edit: fn(String) -> String,
     stages: Stages,
 }
 
-/// Where the time of rollouts went. The CPU's stages follow each other; the GPU works beside all of them.
+/// The time that rollouts took, by phase. The CPU's phases follow each other; the GPU works at the same time.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Stages {
-    /// Cutting the batch up and gathering its weights.
+    /// Planning batches and gathering weights.
     pub gather: Duration,
-    /// Handing everything to the driver.
+    /// Copying inputs to the driver and submitting.
     pub upload: Duration,
     /// Waiting for the GPU.
     pub wait: Duration,
-    /// Mapping the record.
+    /// Mapping the record into the host's memory.
     pub read_back: Duration,
-    /// Reading and scoring the record.
+    /// Computing scores from the record.
     pub score: Duration,
-    /// Playing, by the GPU's own clock; 0 where that was not asked for or there is none.
+    /// Playing, by the GPU's clock. 0 if that was not requested or there is none.
     pub gpu: Duration,
-    /// Bytes that went to the device, and came from it.
+    /// Bytes copied to and from the device.
     pub traffic: Traffic,
 }
 
-impl GpuEpisodes {
-    /// Readies an opened device for episodes.
+impl GpuBackend {
+    /// Prepares an opened device for episodes.
     ///
     /// # Errors
-    /// When the device does not take the episode's bindings.
-    pub fn new(gpu: Gpu) -> Result<GpuEpisodes, DeviceError> {
+    /// The device does not support the episode's bindings.
+    pub fn new(gpu: Gpu) -> Result<GpuBackend, DeviceError> {
         use Binding::{Read, Write};
         let software = gpu.adapter.kind == Kind::Software;
         let layout = gpu.layout("episode", &[Read, Read, Read, Read, Write, Write, Write])?;
-        Ok(GpuEpisodes {
+        Ok(GpuBackend {
             gpu,
             layout,
             kernel: if software { Kernel::Generic } else { Kernel::Best },
             pipelines: HashMap::new(),
             plays: 0,
-            holding: if software { Holding::Never } else { Holding::From(HELD_FROM) },
+            holding: if software { ResidencyPolicy::Never } else { ResidencyPolicy::From(HELD_FROM) },
             records: if software { Records::Whole } else { Records::PackedFrom(PACKED_FROM) },
             pack: None,
             kept: KEPT,
@@ -149,49 +158,54 @@ impl GpuEpisodes {
         })
     }
 
-    /// The same with batches of other sizes; no result depends on them.
-    pub fn batched(self, bytes: u64) -> GpuEpisodes {
-        GpuEpisodes { batch_bytes: bytes, ..self }
+    /// Sets the target bytes of a batch's buffers. Results do not depend on it.
+    pub fn batched(self, bytes: u64) -> GpuBackend {
+        GpuBackend { batch_bytes: bytes, ..self }
     }
 
-    /// The same with another choice of kernels than by default: [`Kernel::Best`], but [`Kernel::Generic`] on a software
-    /// renderer, whose compiler takes a second for each of the others.
-    pub fn playing(self, kernel: Kernel) -> GpuEpisodes {
-        GpuEpisodes { kernel, ..self }
+    /// Chooses kernels. The default is [`Kernel::Best`], and [`Kernel::Generic`] on software renderers, whose compilers
+    /// take about a second for each specialised kernel.
+    pub fn playing(self, kernel: Kernel) -> GpuBackend {
+        GpuBackend { kernel, ..self }
     }
 
-    /// The same with other numbers of kernels, at least one, of a batch and from one batch to the next, and of plays after
-    /// which one that none of them took is let go of; no result depends on them.
-    pub fn keeping(self, kernels: usize, plays: u64) -> GpuEpisodes {
-        GpuEpisodes { kept_kernels: kernels.max(1), idle_plays: plays, ..self }
+    /// Sets the maximum number of kernels per batch and kept between batches, at least one, and the number of rollouts
+    /// after which an unused kernel is evicted. Results do not depend on it.
+    pub fn keeping(self, kernels: usize, plays: u64) -> GpuBackend {
+        GpuBackend { kept_kernels: kernels.max(1), idle_plays: plays, ..self }
     }
 
-    /// How many generic and specialised kernels are compiled and kept.
+    /// Returns how many generic and how many specialised kernels are compiled.
     pub fn compiled(&self) -> [usize; 2] {
         let specialised = self.pipelines.keys().filter(|shape| shape.is_specialised()).count();
         [self.pipelines.len() - specialised, specialised]
     }
 
-    /// The same with other populations held than by default.
-    pub fn holding(self, holding: Holding) -> GpuEpisodes {
-        GpuEpisodes { holding, ..self }
+    /// Chooses which populations the device holds.
+    pub fn holding(self, holding: ResidencyPolicy) -> GpuBackend {
+        GpuBackend { holding, ..self }
     }
 
-    /// The same with records brought home in another way than by default.
-    pub fn bringing(self, records: Records) -> GpuEpisodes {
-        GpuEpisodes { records, ..self }
+    /// Chooses how records are copied to the host.
+    pub fn bringing(self, records: Records) -> GpuBackend {
+        GpuBackend { records, ..self }
     }
 
-    /// The same with changed shaders, for tests that show that a change is noticed.
+    /// Changes the text of shaders, so that tests can show that a change is detected.
+    ///
+    /// # Safety
+    /// Shaders are compiled without bounds checks. An edited shader must keep its indices in bounds and its loops finite,
+    /// see [`Gpu::pipeline`].
     #[doc(hidden)]
-    pub fn edited(self, edit: fn(String) -> String) -> GpuEpisodes {
-        GpuEpisodes { edit, ..self }
+    #[expect(unsafe_code, reason = "edited shaders are compiled without bounds checks")]
+    pub unsafe fn edited(self, edit: fn(String) -> String) -> GpuBackend {
+        GpuBackend { edit, ..self }
     }
 
-    /// Asks the GPU's clock too from now on, if it has one.
+    /// Starts to time rollouts by the GPU's clock, if it has one.
     ///
     /// # Errors
-    /// When the device fails.
+    /// The device failed.
     pub fn use_clock(&mut self) -> Result<(), DeviceError> {
         for flight in &mut self.flights {
             flight.watch = self.gpu.stopwatch()?;
@@ -199,17 +213,17 @@ impl GpuEpisodes {
         Ok(())
     }
 
-    /// Where the time went since this was last asked.
+    /// Returns and resets the times of rollouts.
     pub fn take_stages(&mut self) -> Stages {
         std::mem::take(&mut self.stages)
     }
 
-    /// The device it plays on.
+    /// Returns the device.
     pub fn gpu(&self) -> &Gpu {
         &self.gpu
     }
 
-    /// Plays all tasks; `done` gets each with the batch's record and moments.
+    /// Plays all tasks, and calls `done` for each with the record and the moments of its batch.
     fn play(&mut self, groups: &[Group<'_>], trace: bool, done: &Done<'_>) -> Result<(), BackendError> {
         let (start, before) = (Instant::now(), self.gpu.traffic());
         self.plays += 1;
@@ -230,16 +244,16 @@ impl GpuEpisodes {
     }
 }
 
-impl Backend for GpuEpisodes {
+impl Backend for GpuBackend {
     fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
         groups.iter().try_for_each(Group::check)?;
-        self.play(groups, false, &|share, home, _| {
+        self.play(groups, false, &|share, readback, _| {
             let Group { world, need, .. } = groups[share.group];
             let Task { sets, seen, table, owners, .. } = share.task;
             let stride = share.task.teams as usize;
             let (group, first) = (share.group, share.first_team);
-            match home {
-                Home::Whole(record) => {
+            match readback {
+                Readback::Whole(record) => {
                     let sets = &record[sets as usize..][..world.set_words() * stride];
                     let sight_words = if need.sights() { world.sight_words() } else { 0 };
                     let (seen, sights) = record[seen as usize..].split_at(world.leaders() * world.followers() * stride);
@@ -250,7 +264,7 @@ impl Backend for GpuEpisodes {
                         visit(Episode { group, team: first + offset, sets, seen, sights });
                     }
                 }
-                Home::Packed(words) => {
+                Readback::Packed(words) => {
                     let table = &words[table as usize..][..=stride];
                     let owners = match owners {
                         NOWHERE => &[],
@@ -259,7 +273,7 @@ impl Backend for GpuEpisodes {
                     for (offset, ends) in table.windows(2).enumerate() {
                         let words = &words[ends[0] as usize..ends[1] as usize];
                         let sets = Strided { words, stride: 1, offset: 0 };
-                        let seen = Seen::Most(Strided { words: owners, stride, offset });
+                        let seen = Seen::Owners(Strided { words: owners, stride, offset });
                         visit(Episode { group, team: first + offset, sets, seen, sights: Strided::NONE });
                     }
                 }
@@ -281,8 +295,8 @@ impl Backend for GpuEpisodes {
             seen: vec![0; teams * seen_words],
             sights: vec![0; teams * sight_words],
         });
-        self.play(std::slice::from_ref(group), true, &|share, home, moments| {
-            let Home::Whole(record) = home else { unreachable!("no trace is packed") };
+        self.play(std::slice::from_ref(group), true, &|share, readback, moments| {
+            let Readback::Whole(record) = readback else { unreachable!("no trace is packed") };
             let mut trace = trace.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
             let task = share.task;
             let stride = task.teams as usize;
@@ -308,21 +322,21 @@ impl Backend for GpuEpisodes {
         Ok(trace.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
     }
 
-    fn hold(&mut self, weights: &[f32], sizes: [usize; 3]) -> Result<Option<Box<dyn Held>>, BackendError> {
+    fn hold(&mut self, weights: &[f32], sizes: [usize; 3]) -> Result<Option<Box<dyn DevicePopulation>>, BackendError> {
         let [leaders, slots, parameters] = sizes;
         let allowed = self.room().buffer;
         let bytes = (slots * parameters * size_of::<f32>()) as u64;
         let least = match self.holding {
-            Holding::Never => return Ok(None),
-            Holding::From(least) => least,
-            Holding::Always => 0,
+            ResidencyPolicy::Never => return Ok(None),
+            ResidencyPolicy::From(least) => least,
+            ResidencyPolicy::Always => 0,
         };
         if leaders as u64 * bytes < least {
             return Ok(None);
         }
         if bytes > allowed {
             return match self.holding {
-                Holding::Always => Err(BackendError::TooLarge(format!(
+                ResidencyPolicy::Always => Err(BackendError::TooLarge(format!(
                     "the policies of one leader take {bytes} bytes, this adapter holds {allowed} in one buffer; \
                      breed on the host, or use a smaller population"
                 ))),
@@ -335,7 +349,9 @@ impl Backend for GpuEpisodes {
         };
         match kernels.hold(weights, sizes) {
             Ok(population) => Ok(Some(Box::new(population))),
-            Err(DeviceError::OutOfMemory { .. } | DeviceError::TooLarge { .. }) if self.holding != Holding::Always => {
+            Err(DeviceError::OutOfMemory { .. } | DeviceError::TooLarge { .. })
+                if self.holding != ResidencyPolicy::Always =>
+            {
                 Ok(None)
             }
             Err(error) => Err(error.into()),
@@ -344,9 +360,9 @@ impl Backend for GpuEpisodes {
 
     fn describe(&self) -> String {
         let held = match self.holding {
-            Holding::Never => String::new(),
-            Holding::From(bytes) => format!(", holds populations of {} MiB or more", bytes >> 20),
-            Holding::Always => ", holds all populations".into(),
+            ResidencyPolicy::Never => String::new(),
+            ResidencyPolicy::From(bytes) => format!(", holds populations of {} MiB or more", bytes >> 20),
+            ResidencyPolicy::Always => ", holds all populations".into(),
         };
         format!("gpu ({}, {} pass{held})", self.gpu.adapter, self.gpu.pass)
     }

@@ -4,7 +4,7 @@ use std::cmp::Reverse;
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, HashSet};
 
-use super::GpuEpisodes;
+use super::GpuBackend;
 use super::shape::{Capacity, Kept, Kernel, MAX_OFFSET, Packing, Shape};
 use super::source::{packing, source};
 use crate::backend::Group;
@@ -19,14 +19,14 @@ pub(super) const KEPT_KERNELS: usize = 64;
 /// needs new kernels for each; a process that plays ever new worlds should rarely compile.
 pub(super) const IDLE_PLAYS: u64 = 1000;
 
-/// A kernel, and the last play that took it.
+/// A compiled kernel, and the last call of `play` that used it.
 pub(super) struct Compiled {
     pub(super) pipeline: wgpu::ComputePipeline,
     pub(super) played: u64,
 }
 
-/// The shapes to play by kernels of their own: those compiled already, and of the others those with most to play, up to
-/// [`MAX_SPECIALISED`] in all.
+/// Returns the shapes that get a specialised kernel: those that have one, and of the others those with most
+/// agent-steps, up to [`MAX_SPECIALISED`] in all.
 fn worth_compiling(work: BTreeMap<Shape, u64>, compiled: &HashSet<Shape>) -> HashSet<Shape> {
     let room = MAX_SPECIALISED.saturating_sub(compiled.iter().filter(|shape| shape.is_specialised()).count());
     let (mut shapes, mut new): (Vec<_>, Vec<_>) = work.into_iter().partition(|(shape, _)| compiled.contains(shape));
@@ -35,7 +35,7 @@ fn worth_compiling(work: BTreeMap<Shape, u64>, compiled: &HashSet<Shape>) -> Has
     shapes.into_iter().map(|(shape, _)| shape).collect()
 }
 
-impl GpuEpisodes {
+impl GpuBackend {
     pub(super) fn room(&self) -> Capacity {
         let limits = &self.gpu.limits;
         Capacity {
@@ -47,7 +47,7 @@ impl GpuEpisodes {
         }
     }
 
-    /// The shapes that get kernels of their own.
+    /// Returns the shapes that get a specialised kernel.
     pub(super) fn specialised(&self, groups: &[Group<'_>], trace: bool) -> HashSet<Shape> {
         let mut work: BTreeMap<Shape, u64> = BTreeMap::new();
         for group in groups {
@@ -60,7 +60,7 @@ impl GpuEpisodes {
         match self.kernel {
             Kernel::Generic => HashSet::new(),
             Kernel::Specialised => work.into_keys().collect(),
-            // Nobody traces for speed.
+            // Traces are not worth a compilation.
             Kernel::Best if trace => HashSet::new(),
             Kernel::Best => worth_compiling(work, &self.pipelines.keys().copied().collect()),
         }

@@ -7,7 +7,7 @@ use glam::Vec2;
 use super::Records;
 use super::shape::{Capacity, Kept, Packing, Shape};
 use crate::backend::{BackendError, FOUR, Group, Moment, fours, owner_bits, record_words};
-use crate::declare::shared;
+use crate::gpu_struct::gpu_struct;
 use crate::model::Constants;
 use crate::model::policy::PolicyConstants;
 use crate::world::World;
@@ -22,60 +22,60 @@ pub(super) const PACKED_HEAD: usize = 2;
 /// Sentinel: no offset.
 pub(super) const NOWHERE: u32 = u32::MAX;
 
-shared! {
-    /// One workgroup's share of the work: some teams of one group.
+gpu_struct! {
+    /// The work of one workgroup: some teams of one group. All offsets are in elements.
     #[derive(Default)]
     pub struct Task {
-        /// Which of the batch's worlds they play in.
+        /// The index of the world in the batch.
         pub world: u32,
-        /// Where the agents' start positions begin in their buffer; all such places are in elements.
+        /// The offset of the agents' start positions.
         pub starts: u32,
-        /// Where the POIs begin.
+        /// The offset of the POI positions.
         pub pois: u32,
-        /// Where the weights begin.
+        /// The offset of the weights.
         pub weights: u32,
-        /// Where the agents near each POI are recorded.
+        /// The offset of the sets of agents at each POI.
         pub sets: u32,
-        /// Where it is recorded whom followers saw.
+        /// The offset of the counts of leaders that followers saw.
         pub seen: u32,
-        /// Where a trace's moments go.
+        /// The offset of a trace's moments.
         pub moments: u32,
-        /// Where agents stand between two dispatches.
+        /// The offset of the agents' states between two dispatches.
         pub states: u32,
-        /// How many teams it has.
+        /// The number of teams.
         pub teams: u32,
-        /// The first step that a dispatch plays.
+        /// The first step of a dispatch.
         pub first: u32,
-        /// The one before which it ends.
+        /// The step before which a dispatch ends.
         pub end: u32,
-        /// Where packing finds how many agents each POI needs, see `shaders/pack.wgsl`.
+        /// The offset of the minimum size of each POI's sets, for packing (`shaders/pack.wgsl`).
         pub least: u32,
-        /// Where packing leaves the table of where each team's kept sets are.
+        /// The offset of the table of packed sets, which packing writes.
         pub table: u32,
-        /// Where packing leaves the leaders that followers saw most, or all ones for nowhere.
+        /// The offset of the leaders that followers saw most, which packing writes, or [`NOWHERE`].
         pub owners: u32,
     }
 
-    /// An agent between two dispatches.
+    /// The state of an agent between two dispatches.
     pub struct State {
-        /// Where it is, in units.
+        /// x, in units.
         pub x: f32,
-        /// Likewise.
+        /// y, in units.
         pub y: f32,
-        /// Where it heads, a unit vector.
+        /// The heading's cosine.
         pub hx: f32,
-        /// Likewise.
+        /// The heading's sine.
         pub hy: f32,
-        /// How fast it is, in units a second.
+        /// The speed, in units per second.
         pub speed: f32,
     }
 }
 
-/// Steps that one dispatch may play, see [`TURNS`].
+/// Returns the maximum steps per dispatch, see [`TURNS`].
 fn steps_a_dispatch(world: &World, packing: Packing, records: Kept) -> usize {
     let Constants { words, policy: PolicyConstants { widths, .. }, .. } = world.constants;
     let network: u32 = widths.windows(2).map(|w| (w[0] + 2) * w[1]).sum();
-    // A leader goes through the agents, and through those in reach.
+    // A leader iterates over all agents, and again over those in reach.
     let agent = world.pois.len() + 2 * world.agents() + words as usize + network as usize + 20;
     let sights = if records.sights { world.followers() * world.leader_words() } else { 0 };
     let items = |rows: usize| (rows * packing.teams).div_ceil(packing.workgroup);
@@ -84,22 +84,22 @@ fn steps_a_dispatch(world: &World, packing: Packing, records: Kept) -> usize {
 }
 
 /// A task and where its teams come from.
-pub(super) struct Share {
+pub(super) struct PlannedTask {
     pub(super) group: usize,
     pub(super) first_team: usize,
     pub(super) shape: Shape,
-    /// All steps of the episode.
+    /// The task, with all steps of the episode.
     pub(super) task: Task,
     pub(super) steps_a_dispatch: usize,
 }
 
-impl Share {
-    /// How many weights its teams have, in fours.
+impl PlannedTask {
+    /// Returns the number of weights of its teams, in fours.
     pub(super) fn fours(&self, groups: &[Group<'_>]) -> usize {
         self.task.teams as usize * fours(groups[self.group].world)
     }
 
-    /// The task's part in one round of dispatches; none when it is done.
+    /// Returns the task with the steps of one round of dispatches, or `None` after its last round.
     pub(super) fn round(&self, round: usize) -> Option<Task> {
         let first = (round * self.steps_a_dispatch) as u32;
         let end = self.task.end.min(first + self.steps_a_dispatch as u32);
@@ -107,31 +107,31 @@ impl Share {
     }
 }
 
-/// Tasks that fit the device's buffers together.
+/// Tasks that fit the device's buffers together: one batch.
 #[derive(Default)]
-pub(super) struct Work {
-    pub(super) shares: Vec<Share>,
-    /// What its kernels are made for.
+pub(super) struct BatchPlan {
+    pub(super) shares: Vec<PlannedTask>,
+    /// The shapes of its kernels.
     pub(super) shapes: BTreeSet<Shape>,
     pub(super) worlds: Vec<Constants>,
     pub(super) places: Vec<Vec2>,
-    /// In fours.
+    /// Weights, in fours.
     pub(super) weights: usize,
     pub(super) record: usize,
     pub(super) moments: usize,
     pub(super) states: usize,
     /// Words of all sets in the record.
     pub(super) sets: usize,
-    /// If the record is packed: the words of tables and owners, and how many agents a set must have, `[pois]` a group.
+    /// If the record is packed: the words of tables and owners, and the minimum size of a set, `[pois]` per group.
     pub(super) head: Option<usize>,
     pub(super) least: Vec<u32>,
 }
 
-impl Work {
-    /// Finds a place for what is packed of the record; none where the whole record is wanted, where it matters when
-    /// sets stood, where packing takes too long for one dispatch, or where there is nothing to gain.
+impl BatchPlan {
+    /// Lays out the packed record, unless the whole record is requested, the rule depends on when sets occur, packing
+    /// would take too long for one dispatch, or it would save nothing.
     fn pack(&mut self, groups: &[Group<'_>], records: Records) {
-        let packs = |share: &Share| {
+        let packs = |share: &PlannedTask| {
             let Group { world, need, .. } = groups[share.group];
             need.least(1).is_some() && !world.rule.is_timed() && pack_turns(groups, share) <= TURNS
         };
@@ -143,7 +143,7 @@ impl Work {
             let Group { world, need, .. } = groups[shares[0].group];
             let least = self.least.len() as u32;
             self.least.extend(world.coupling.iter().filter_map(|&coupling| need.least(coupling)));
-            for Share { task, .. } in shares {
+            for PlannedTask { task, .. } in shares {
                 let teams = task.teams as usize;
                 (task.least, task.table, task.owners) = (least, head as u32, NOWHERE);
                 head += teams + 1;
@@ -157,33 +157,34 @@ impl Work {
     }
 }
 
-/// Words of a team that say which leader each follower saw most.
+/// Returns the words per team for the leader that each follower saw most.
 pub(super) fn owner_words(world: &World) -> usize {
     world.followers().div_ceil((32 / owner_bits(world.constants.leaders)) as usize)
 }
 
-/// Turns of loops that a thread takes at most to pack a task.
-fn pack_turns(groups: &[Group<'_>], share: &Share) -> usize {
+/// Returns the maximum loop iterations per thread to pack a task.
+fn pack_turns(groups: &[Group<'_>], share: &PlannedTask) -> usize {
     let (world, teams) = (groups[share.group].world, share.task.teams as usize);
     let sets = (world.pois.len() * teams).div_ceil(PACK_WORKGROUP);
     let owners = (owner_words(world) * teams).div_ceil(PACK_WORKGROUP) * 4 * (world.leaders() + 2);
-    // Each set is read twice; as many at most are written or left empty.
+    // Each set is read twice, and at most as many are written or skipped.
     sets * 4 * world.steps() * (world.constants.words as usize + 1) + owners + 3 * teams
 }
 
-/// Cuts the groups' teams into tasks and the tasks into batches; worlds of the given shapes have kernels of their own.
+/// Cuts the groups' teams into tasks, and the tasks into batches. Worlds with one of the `specialised` shapes get that
+/// kernel.
 ///
 /// # Errors
-/// When one team's record is larger than the device's largest buffer.
+/// One team's record exceeds the device's largest buffer.
 pub(super) fn plan(
     groups: &[Group<'_>],
     trace: bool,
     records: Records,
     room: Capacity,
     specialised: &HashSet<Shape>,
-) -> Result<Vec<Work>, BackendError> {
+) -> Result<Vec<BatchPlan>, BackendError> {
     let target = room.buffer.min(room.batch);
-    let mut batches = vec![Work::default()];
+    let mut batches = vec![BatchPlan::default()];
     for (index, group) in groups.iter().enumerate() {
         let world = group.world;
         let kept = Kept::of(group, trace);
@@ -211,7 +212,7 @@ pub(super) fn plan(
         });
         let teams_a_task = packing.teams.min((target / bytes_a_team.max(1)).max(1) as usize);
         let steps_a_dispatch = steps_a_dispatch(world, packing, kept);
-        // A group's world, starts and POIs are stored once a batch.
+        // A group's world, starts and POIs are stored once per batch.
         let mut stored: Option<(usize, Task)> = None;
         for first_team in (0..group.team_count()).step_by(teams_a_task) {
             let teams = teams_a_task.min(group.team_count() - first_team);
@@ -222,7 +223,7 @@ pub(super) fn plan(
                 || full(work.moments, size_of::<Moment>())
                 || work.shapes.len() >= room.kernels && !work.shapes.contains(&shape)
             {
-                batches.push(Work::default());
+                batches.push(BatchPlan::default());
                 work = batches.last_mut().expect("just pushed");
                 stored = None;
             }
@@ -257,7 +258,7 @@ pub(super) fn plan(
                 work.states += world.agents() * teams;
             }
             work.shapes.insert(shape);
-            work.shares.push(Share { group: index, first_team, shape, task, steps_a_dispatch });
+            work.shares.push(PlannedTask { group: index, first_team, shape, task, steps_a_dispatch });
         }
     }
     batches.retain(|work| !work.shares.is_empty());
@@ -267,7 +268,8 @@ pub(super) fn plan(
     Ok(batches)
 }
 
-/// A task's weights, `[fours of a policy's weights][leaders][teams]`: neighbouring threads read neighbouring weights.
+/// Writes a task's weights, `[fours of a policy's weights][leaders][teams]`, so that neighbouring threads load
+/// neighbouring weights.
 pub(super) fn gather(group: &Group<'_>, weights: &[f32], first_team: usize, teams: usize, to: &mut [[f32; FOUR]]) {
     let (leaders, parameters) = (group.world.leaders(), group.world.parameters());
     let policies = &group.teams[first_team * leaders..(first_team + teams) * leaders];

@@ -1,33 +1,33 @@
-//! Reading back: waits for a batch and hands its record to whoever scores it.
+//! Reading back: waits for a batch and passes its record on for scoring.
 
 use std::time::Duration;
 
-use super::GpuEpisodes;
-use super::flight::Parcel;
-use super::planner::{PACKED_HEAD, Share, Work};
+use super::GpuBackend;
+use super::flight::PackedReadback;
+use super::planner::{BatchPlan, PACKED_HEAD, PlannedTask};
 use crate::backend::Moment;
 use crate::backend::gpu::device::DeviceError;
 use crate::host::Instant;
 use crate::parallel::*;
 
-/// What came home of a batch's record.
+/// The record of a batch, in the host's memory.
 #[derive(Clone, Copy)]
-pub(super) enum Home<'a> {
-    /// All of it.
+pub(super) enum Readback<'a> {
+    /// The whole record.
     Whole(&'a [u32]),
-    /// What scores hang on, as `shaders/pack.wgsl` has it.
+    /// The part that the scores depend on, as `shaders/pack.wgsl` writes it.
     Packed(&'a [u32]),
 }
 
-/// Gets a task with the record and the moments of its batch.
-pub(super) type Done<'a> = dyn Fn(&Share, Home<'_>, &[Moment]) + Sync + 'a;
+/// Called for each task with the record and the moments of its batch.
+pub(super) type Done<'a> = dyn Fn(&PlannedTask, Readback<'_>, &[Moment]) + Sync + 'a;
 
-impl GpuEpisodes {
-    /// Waits for one batch and hands its record on.
+impl GpuBackend {
+    /// Waits for one batch, and passes its record on.
     pub(super) fn collect(
         &mut self,
         flight: usize,
-        work: &Work,
+        work: &BatchPlan,
         trace: bool,
         done: &Done<'_>,
     ) -> Result<(), DeviceError> {
@@ -35,7 +35,7 @@ impl GpuEpisodes {
         self.gpu.wait_for(self.flights[flight].submitted.clone())?;
         let done_waiting = Instant::now();
         let mut score = Duration::ZERO;
-        let mut share_out = |record: Home<'_>, moments: &[Moment]| {
+        let mut share_out = |record: Readback<'_>, moments: &[Moment]| {
             let start = Instant::now();
             work.shares.par_iter().for_each(|share| done(share, record, moments));
             score += start.elapsed();
@@ -44,19 +44,19 @@ impl GpuEpisodes {
         let moment_bytes = (work.moments * size_of::<Moment>()) as u64;
         let buffers = &mut self.flights[flight];
         let mut fits = false;
-        if let (Some(head), Some(Parcel { room, bytes }), Some(back)) = (work.head, buffers.sent, &buffers.packed_back)
+        if let (Some(head), Some(PackedReadback { room, bytes }), Some(back)) =
+            (work.head, buffers.sent, &buffers.packed_back)
         {
             let used = self.gpu.mapped(back, 0..bytes, |bytes| {
                 let words: &[u32] = bytemuck::cast_slice(bytes);
                 let used = words[0] as usize;
                 fits = used <= room && words.len() > PACKED_HEAD;
                 if fits {
-                    share_out(Home::Packed(&words[PACKED_HEAD..]), &[]);
+                    share_out(Readback::Packed(&words[PACKED_HEAD..]), &[]);
                 }
                 used
             })?;
-            // Half as much again, since the next generation may keep more; and a batch that did stays in mind for a
-            // while.
+            // The next generation may keep more, so there is room for half as much again. The room shrinks slowly.
             let kept = 1.5 * used.saturating_sub(head) as f64 / work.sets as f64;
             self.kept = kept.max(0.9 * self.kept);
         }
@@ -67,11 +67,11 @@ impl GpuEpisodes {
             match (&buffers.record_back, &buffers.moments_back) {
                 (Some(record), Some(moments)) if trace => self.gpu.mapped(record, 0..record_bytes, |record| {
                     self.gpu.mapped(moments, 0..moment_bytes, |moments| {
-                        share_out(Home::Whole(bytemuck::cast_slice(record)), bytemuck::cast_slice(moments));
+                        share_out(Readback::Whole(bytemuck::cast_slice(record)), bytemuck::cast_slice(moments));
                     })
                 })??,
                 (Some(record), _) => self.gpu.mapped(record, 0..record_bytes, |record| {
-                    share_out(Home::Whole(bytemuck::cast_slice(record)), &[]);
+                    share_out(Readback::Whole(bytemuck::cast_slice(record)), &[]);
                 })?,
                 _ => unreachable!("a batch was submitted"),
             }

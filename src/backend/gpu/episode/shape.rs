@@ -25,15 +25,15 @@ const MAX_THREADS: usize = 512;
 /// Maximum weights of a policy that are written out as straight-line code.
 const MAX_STRAIGHT_WEIGHTS: usize = 512;
 
-/// Which kernel plays; no result depends on that.
+/// Selects the kernel that plays. Results do not depend on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kernel {
-    /// In rollouts a specialised one, for as many kinds of worlds as are worth compiling for, those with most to play
-    /// first; else the generic one.
+    /// In rollouts a specialised kernel for the kinds of worlds with most to play, up to a limit. Otherwise the generic
+    /// one.
     Best,
-    /// The generic one.
+    /// The generic kernel.
     Generic,
-    /// One made for its world's sizes, wherever there can be one.
+    /// A specialised kernel wherever one is possible.
     Specialised,
 }
 
@@ -47,22 +47,22 @@ impl fmt::Display for Kernel {
     }
 }
 
-/// What a pipeline is compiled for: pipelines are kept by this.
+/// Everything that a pipeline is compiled for. Pipelines are cached by it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) struct Shape {
     pub(super) workgroup: usize,
-    /// Agents a thread plays, one after another.
+    /// Agents that a thread plays, one after another.
     pub(super) slots: usize,
     pub(super) records: Kept,
     pub(super) sizes: Sizes,
 }
 
-/// What a kernel keeps beside sets and counts.
+/// Additional records of a kernel, besides sets and counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) struct Kept {
-    /// Every stage of every step.
+    /// Whether it records every stage of every step.
     pub(super) trace: bool,
-    /// Which leaders each follower sees at each step.
+    /// Whether it records which leaders each follower sees at each step.
     pub(super) sights: bool,
 }
 
@@ -72,12 +72,13 @@ impl Kept {
     }
 }
 
-/// What a kernel knows of the worlds that it plays.
+/// Knowledge of a kernel about its worlds at compile time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) enum Sizes {
-    /// The widest layer, inputs included, rounded up to spare compilations, and whether the outputs choose a behaviour.
+    /// The widest layer, inputs included and rounded up to save compilations, and whether the outputs choose a
+    /// behaviour.
     Any { widest: usize, chooses: bool },
-    /// All that makes a difference to the code.
+    /// Everything that the code depends on.
     Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], variant: Variant },
 }
 
@@ -95,7 +96,7 @@ impl Shape {
         Shape { workgroup: packing.workgroup, slots: packing.slots, records, sizes }
     }
 
-    /// The specialised one, if it is asked for and there can be one.
+    /// Returns the specialised shape, if it is asked for and possible.
     pub(super) fn asked_for(world: &World, kernel: Kernel, room: Capacity, records: Kept) -> Option<Shape> {
         let packing = Packing::specialised(world, room).filter(|_| kernel != Kernel::Generic);
         packing.map(|packing| Shape::specialised(world, packing, records))
@@ -109,23 +110,23 @@ impl Shape {
     }
 }
 
-/// How the teams of one world are packed.
+/// How teams fill the workgroups of one world's kernel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Packing {
     pub(super) workgroup: usize,
     pub(super) slots: usize,
-    /// Teams of a workgroup.
+    /// Teams per workgroup.
     pub(super) teams: usize,
 }
 
-/// Threads that `teams` teams take.
+/// Returns the threads that `teams` teams need.
 fn seats(world: &World, teams: usize) -> usize {
     (teams * world.leaders()).next_multiple_of(ROLE) + teams * world.followers()
 }
 
 impl Packing {
-    /// For a specialised kernel: as many teams as a warp has threads, or as many as fit. None where there had
-    /// better be none: too many agents, or too large a policy.
+    /// Returns the packing for a specialised kernel: as many teams as a warp has threads, or as many as fit. `None` if
+    /// there are too many agents or the policy is too large.
     pub(super) fn specialised(world: &World, room: Capacity) -> Option<Packing> {
         let threads = |teams: usize| seats(world, teams).next_multiple_of(ROLE);
         let bytes = |teams: usize| 2 * teams * world.agents() * size_of::<Vec2>();
@@ -135,14 +136,14 @@ impl Packing {
         Some(Packing { workgroup: threads(teams), slots: 1, teams })
     }
 
-    /// For the generic kernel: the packing that leaves the fewest threads idle.
+    /// Returns the packing for the generic kernel that leaves the fewest threads idle.
     pub(super) fn generic(world: &World, largest: usize) -> Packing {
         let sizes = WORKGROUPS.into_iter().filter(|&size| size <= largest);
         let packed = sizes.clone().filter_map(|workgroup| {
             let teams = (1..=workgroup).take_while(|&teams| seats(world, teams) <= workgroup).last()?;
             Some(Packing { workgroup, slots: 1, teams })
         });
-        // The share of threads that play, compared crosswise to stay in integers; the smaller workgroup wins ties.
+        // Compares the shares of busy threads by cross-multiplication. The smaller workgroup wins ties.
         packed.reduce(|a, b| if b.teams * a.workgroup > a.teams * b.workgroup { b } else { a }).unwrap_or_else(|| {
             let workgroup = sizes.max().unwrap_or(WORKGROUPS[0]);
             Packing { workgroup, slots: seats(world, 1).div_ceil(workgroup), teams: 1 }
@@ -150,22 +151,22 @@ impl Packing {
     }
 }
 
-/// Sizes of a device that bound a batch.
+/// The limits of a device that bound a batch.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Capacity {
-    /// Bytes of one buffer that a batch aims for.
+    /// Target bytes of one buffer.
     pub(super) batch: u64,
-    /// Bytes of the largest buffer.
+    /// Maximum bytes of a buffer.
     pub(super) buffer: u64,
-    /// Kernels of a batch.
+    /// Maximum kernels per batch.
     pub(super) kernels: usize,
-    /// Threads of the largest workgroup, and bytes of its memory.
+    /// Maximum threads per workgroup, and bytes of workgroup memory.
     pub(super) workgroup: usize,
     pub(super) workgroup_bytes: usize,
 }
 
 impl Capacity {
-    /// Of a device whose largest workgroup is told, and that no batch fills.
+    /// Returns the limits of a device with this maximum of threads per workgroup, and no limit on batches.
     pub(super) fn of_workgroups(threads: usize) -> Capacity {
         let bytes = MAX_OFFSET;
         Capacity { batch: bytes, buffer: bytes, kernels: 1, workgroup: threads, workgroup_bytes: 16 << 10 }

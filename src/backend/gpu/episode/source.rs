@@ -6,19 +6,19 @@ use std::fmt::Write;
 use crate::backend::gpu::exact;
 use crate::backend::{BackendError, FOUR, Group, Moment, Weights, fours, record_words};
 use crate::config::MAX_AGENTS;
-use crate::declare::Shared;
+use crate::gpu_struct::GpuStruct;
 use crate::model::policy::Actions;
 use crate::model::{self, Constants, Variant};
 use crate::world::{INPUTS, OUTPUTS, World};
 
 use super::Records;
-use super::planner::{NOWHERE, PACK_WORKGROUP, Share, State, Task, gather, plan};
+use super::planner::{NOWHERE, PACK_WORKGROUP, PlannedTask, State, Task, gather, plan};
 use super::shape::{Capacity, Kept, Kernel, Packing, Shape, Sizes, TEAMS, WIDTHS, WORKGROUPS};
 
 /// Maximum leaders whose sightings a follower counts in registers.
 const SIGHTS: usize = 8;
 
-/// The whole shader that packs records, with its constants in front.
+/// Returns the shader that packs records.
 pub(super) fn packing() -> String {
     let most = WORKGROUPS[WORKGROUPS.len() - 1].max(TEAMS[0]);
     let structs = [model::declarations(), Task::wgsl(), State::wgsl(), Moment::wgsl()].concat();
@@ -32,11 +32,11 @@ pub(super) fn packing() -> String {
     ])
 }
 
-/// The whole shader, with what it has in front.
+/// Returns the episode's shader for a shape.
 pub(super) fn source(shape: Shape) -> String {
     let Shape { workgroup, slots, records: Kept { trace, sights: sighted }, sizes } = shape;
     let (shared, tally, sights) = match sizes {
-        // As many agents as one team may have, or several teams on a thread each.
+        // The agents of one large team, or of several small ones.
         Sizes::Any { .. } => ((workgroup * slots).min(MAX_AGENTS), false, 1),
         Sizes::Fixed { teams, leaders, agents, .. } => {
             let tally = leaders < agents && leaders as usize <= SIGHTS;
@@ -72,9 +72,9 @@ pub(super) fn source(shape: Shape) -> String {
     exact::assemble(&parts.collect::<Vec<_>>())
 }
 
-/// A policy of these widths as straight-line code: `decide` of `shaders/generic.wgsl`, its loops written out. Each unit
-/// is a variable, and four weights at a time are read in the order in which they are needed, so that a compiler may
-/// read many before it waits for any.
+/// Returns a policy of these widths as straight-line code: `decide` of `shaders/generic.wgsl` with its loops unrolled.
+/// Each unit is a variable. Weights are loaded four at a time, in order of use, so that a compiler may start many loads
+/// before it waits for the first.
 fn straight_policy(widths: &[u32; WIDTHS]) -> String {
     let mut text = String::from("fn decide(start: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
     let mut line = |line: std::fmt::Arguments<'_>| writeln!(text, "    {line}").expect("a string takes a line");
@@ -84,7 +84,7 @@ fn straight_policy(widths: &[u32; WIDTHS]) -> String {
     let layers = widths.windows(2).take_while(|pair| pair[1] > 0);
     for (layer, pair) in layers.enumerate() {
         let (rows, columns) = (pair[0] as usize, pair[1] as usize);
-        // The biases first.
+        // Biases first.
         for row in std::iter::once(rows).chain(0..rows) {
             for column in 0..columns {
                 let weight = first + row * columns + column;
@@ -113,7 +113,8 @@ fn straight_policy(widths: &[u32; WIDTHS]) -> String {
 
 const AXES: [&str; FOUR] = ["x", "y", "z", "w"];
 
-/// The episode's shader in a few of its variants, generic and specialised for the paper's first layout.
+/// Returns some variants of the episode's shader, generic and specialised for the paper's first layout, each with a
+/// name.
 pub fn shaders() -> Vec<(&'static str, String)> {
     let generic = |workgroup, slots, widest, records: Kept| {
         source(Shape { workgroup, slots, records, sizes: Sizes::Any { widest, chooses: records.trace } })
@@ -138,8 +139,8 @@ pub fn shaders() -> Vec<(&'static str, String)> {
     ]
 }
 
-/// The shader that would play a world: the specialised one, where there can be one, or the generic one; for looking at
-/// what compilers make of it. `threads` is the size of the largest workgroup.
+/// Returns the shader that would play a world, to inspect what compilers make of it: the specialised one if there is
+/// one, else the generic one. `threads` is the maximum per workgroup.
 #[doc(hidden)]
 pub fn shader_of(world: &World, kernel: Kernel, threads: usize) -> String {
     let room = Capacity::of_workgroups(threads);
@@ -148,34 +149,32 @@ pub fn shader_of(world: &World, kernel: Kernel, threads: usize) -> String {
     source(made.unwrap_or_else(|| Shape::generic(world, Packing::generic(world, threads), little)))
 }
 
-/// What one workgroup gets to play a group's first teams, and where it leaves what comes of that; for running what
-/// compilers make of its shader.
+/// The inputs and outputs of one workgroup that plays a group's first teams, to run what compilers make of its shader.
 #[doc(hidden)]
 pub struct Workgroup {
-    /// Its shader.
+    /// The text of the shader.
     pub shader: String,
-    /// How many threads it has, and how many teams they play.
+    /// Threads of the workgroup.
     pub threads: usize,
-    /// See `threads`.
+    /// Teams that it plays.
     pub teams: usize,
-    /// The words of each binding: nothing for the guard, worlds, tasks, places, weights, and yet to write the record,
-    /// moments and states.
+    /// The words of each binding: the guard (empty), worlds, tasks, positions, weights; and the outputs record, moments
+    /// (empty) and states.
     pub buffers: [Vec<u32>; 8],
 }
 
-/// The workgroup that plays a group's first teams, policies on the host, in one dispatch: by a kernel made for their world
-/// if that is asked for and can be, or by the generic one. It takes another dispatch to follow, and leaves where the agents
-/// stand in the end. `threads` is the size of the largest workgroup.
+/// Returns the workgroup that plays a group's first teams in one dispatch, with policies on the host. It writes the
+/// agents' final states, as if another dispatch followed. `threads` is the maximum per workgroup.
 ///
 /// # Errors
-/// A team is too large for any device.
+/// A team exceeds the limits of any device.
 #[doc(hidden)]
 pub fn workgroup_of(group: &Group<'_>, kernel: Kernel, threads: usize) -> Result<Workgroup, BackendError> {
     let room = Capacity::of_workgroups(threads);
     let made = Shape::asked_for(group.world, kernel, room, Kept::of(group, false));
     let batches = plan(&[*group], false, Records::Whole, room, &made.into_iter().collect())?;
     let work = &batches[0];
-    let Share { task, first_team, shape, .. } = work.shares[0];
+    let PlannedTask { task, first_team, shape, .. } = work.shares[0];
     let mut weights = vec![[0.0; FOUR]; fours(group.world) * task.teams as usize];
     if let Weights::OnHost(policies) = group.weights {
         gather(group, policies, first_team, task.teams as usize, &mut weights);

@@ -1,34 +1,33 @@
-//! The self-test of a device: small computations whose bits must be the CPU's. And its measure: how fast it computes.
+//! The self-test of a device: small computations whose bits must equal the CPU's.
 
 use std::borrow::Cow;
 use std::fmt;
 use std::sync::Arc;
-use std::time::Duration;
 
 use wgpu::BufferUsages;
 
 use super::device::{self, Binding, DeviceError, Gpu, Kind, Request};
-use super::episode::{GpuEpisodes, Kernel};
+use super::episode::{GpuBackend, Kernel};
 use super::exact::Pass;
 use super::population::Kernels;
 use crate::backend::compare::first_mismatch;
 use crate::backend::cpu::Cpu;
-use crate::backend::{Backend, BackendError, Group, Held, Need};
+use crate::backend::{Backend, BackendError, DevicePopulation, Group, RecordRequest};
 use crate::config::{Config, Learning};
 use crate::evolve::{Breeding, Key, Purpose};
 use crate::sample;
 use crate::world::World;
 
-/// Where a device first differed from the CPU.
+/// The first difference of a device from the CPU.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Deviation {
-    /// What was computed.
+    /// The name of the computation.
     pub probe: Cow<'static, str>,
-    /// From which values, in the order `x, y, z, w`.
+    /// The inputs, in the order `x, y, z, w`.
     pub values: Vec<u32>,
-    /// The bits that the CPU came to.
+    /// The CPU's bits.
     pub cpu: u32,
-    /// The bits that the device came to.
+    /// The device's bits.
     pub gpu: u32,
 }
 
@@ -47,15 +46,15 @@ impl fmt::Display for Deviation {
 /// The shader of the arithmetic probe.
 pub const SHADER: &str = include_str!("../../../shaders/probe.wgsl");
 
-/// One probe: the first mismatch under the device's current pass, or none.
+/// One probe. Returns the first mismatch under the device's current pass, if any.
 pub type Probe = fn(&Gpu) -> Result<Option<Deviation>, DeviceError>;
 
 /// All probes that a pass must survive, the quickest first.
 ///
-/// A new one is a function here: it compiles through `gpu.own_pipeline`, so that the pass under test applies to it.
+/// A new probe is a function here. It compiles its shader with `gpu.own_pipeline`, which applies the pass under test.
 pub const ALL: &[Probe] = &[arithmetic, episode, breeding];
 
-/// Opens an adapter and finds the first pass under which every probe gives the CPU's bits: no contraction on Vulkan,
+/// Opens an adapter, and finds the first pass under which every probe gives the CPU's bits: no contraction on Vulkan,
 /// else guarded.
 ///
 /// # Errors
@@ -93,10 +92,10 @@ pub fn open(request: impl Into<Request>) -> Result<Gpu, DeviceError> {
     Err(DeviceError::Inexact { adapter: gpu.adapter.to_string(), failures })
 }
 
-/// Runs every probe under the device's current pass; the first that differs from the CPU, if any.
+/// Runs every probe under the device's current pass, and returns the first difference from the CPU, if any.
 ///
 /// # Errors
-/// The device fails.
+/// The device failed.
 pub fn self_test(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     for probe in ALL {
         if let Some(mismatch) = probe(gpu)? {
@@ -106,7 +105,7 @@ pub fn self_test(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     Ok(None)
 }
 
-/// Computations of `arithmetic`, in the order of `shaders/probe.wgsl`.
+/// The computations of [`arithmetic`], in the order of `shaders/probe.wgsl`.
 const NAMES: [&str; 37] = [
     "x*y + z",
     "x*y - z",
@@ -150,11 +149,11 @@ const NAMES: [&str; 37] = [
 /// The paper's first layout.
 const CONFIG: &str = include_str!("../../../configs/generally_forward.toml");
 
-/// Groups of four values that [`arithmetic`] tries.
+/// Groups of four values, the inputs of [`arithmetic`].
 const ITEMS: usize = 4096;
 const WORKGROUP: usize = 64;
 
-/// Contraction, reassociation, conversion and comparison, on [`ITEMS`] groups of values.
+/// Tests contraction, reassociation, conversion and comparison on [`ITEMS`] groups of values.
 fn arithmetic(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     let values = values();
     let bytes = (ITEMS * NAMES.len() * size_of::<u32>()) as u64;
@@ -173,7 +172,7 @@ fn arithmetic(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     }))
 }
 
-/// A whole episode of the paper's first layout, stage by stage.
+/// Tests an episode of the paper's first layout, stage by stage.
 fn episode(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     const TEAMS: usize = 8;
     let config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
@@ -186,11 +185,11 @@ fn episode(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
         weights: weights[..].into(),
         policies: TEAMS,
         teams: &teams,
-        need: Need::Record,
+        need: RecordRequest::Record,
     };
     let traced = |error| refused(gpu, error);
     let expected = Cpu::default().trace(&group).map_err(traced)?;
-    let mut episodes = GpuEpisodes::new(gpu.clone())?;
+    let mut episodes = GpuBackend::new(gpu.clone())?;
     if gpu.adapter.kind != Kind::Software {
         episodes = episodes.playing(Kernel::Specialised);
     }
@@ -203,7 +202,7 @@ fn episode(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     }))
 }
 
-/// The next generation of two populations.
+/// Tests the next generation of two populations.
 fn breeding(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     const SLOTS: usize = 64;
     let config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
@@ -234,78 +233,8 @@ fn refused(gpu: &Gpu, error: BackendError) -> DeviceError {
     }
 }
 
-/// The shader of [`Ceiling`].
-pub const CEILING: &str = include_str!("../../../shaders/ceiling.wgsl");
-/// Lane operations of a turn of its loop: 8 times 6 products and 6 sums.
-const TURN: f64 = 8.0 * 12.0;
-/// Turns of its loop at most: see the episode's `TURNS`.
-const MOST_TURNS: u32 = 4096;
-/// A dispatch that takes so long is long enough to be timed, and short enough for any driver's patience.
-const LEAST: Duration = Duration::from_millis(20);
-
-/// Measures how many f32 sums and products a second, not fused, a device does at most under its pass.
-pub struct Ceiling {
-    gpu: Gpu,
-    pipeline: wgpu::ComputePipeline,
-    buffers: wgpu::BindGroup,
-    turns: wgpu::Buffer,
-    workgroups: u32,
-    operations: f64,
-}
-
-impl Ceiling {
-    /// Readies the measurement: finds out how much keeps the device busy for a while.
-    ///
-    /// # Errors
-    /// When the device fails.
-    pub fn new(gpu: &Gpu) -> Result<Ceiling, DeviceError> {
-        let layout = gpu.layout("ceiling", &[Binding::Read, Binding::Read, Binding::Write])?;
-        let pipeline = gpu.own_pipeline("ceiling", CEILING, "ceiling", &layout)?;
-        let numbers = gpu.upload("ceiling's numbers", &[1.000_000_1f32, 0.25, -1.0, 0.0], BufferUsages::STORAGE)?;
-        let turns = gpu.upload("ceiling's turns", &[0u32; 4], BufferUsages::STORAGE)?;
-        let result = gpu.buffer("ceiling's result", (WORKGROUP * size_of::<f32>()) as u64, BufferUsages::STORAGE)?;
-        let bound = [&numbers, &turns, &result].map(|buffer| buffer.as_entire_buffer_binding());
-        let buffers = gpu.bind("ceiling", &layout, &bound)?;
-        let mut ceiling = Ceiling { gpu: gpu.clone(), pipeline, buffers, turns, workgroups: 0, operations: 0.0 };
-        // As many threads as fill any GPU a few times over; longer, and then more of them, until it takes a while.
-        let (mut turns, mut workgroups) = (64, 4096);
-        loop {
-            ceiling.set(turns, workgroups)?;
-            let seconds = ceiling.operations / ceiling.measure()?;
-            if seconds >= LEAST.as_secs_f64() {
-                return Ok(ceiling);
-            } else if turns < MOST_TURNS {
-                turns *= 2;
-            } else if workgroups * 2 <= gpu.limits.max_compute_workgroups_per_dimension {
-                workgroups *= 2;
-            } else {
-                return Ok(ceiling);
-            }
-        }
-    }
-
-    fn set(&mut self, turns: u32, workgroups: u32) -> Result<(), DeviceError> {
-        let words = [turns; 4];
-        self.gpu.scoped("ceiling's turns", || {
-            self.gpu.write(&self.turns, 0, bytemuck::cast_slice(&words));
-        })?;
-        self.workgroups = workgroups;
-        self.operations = f64::from(turns) * TURN * f64::from(workgroups) * WORKGROUP as f64;
-        Ok(())
-    }
-
-    /// Lane operations a second, now.
-    ///
-    /// # Errors
-    /// When the device fails.
-    pub fn measure(&self) -> Result<f64, DeviceError> {
-        let time = self.gpu.time("ceiling", &self.pipeline, &self.buffers, [self.workgroups, 1, 1])?;
-        Ok(self.operations / time.as_secs_f64())
-    }
-}
-
-/// Reproducible values that make rounding show: zeros, equal pairs, small integers, sums that nearly cancel, and full
-/// mantissas over 2^-12 to 2^12, so that nothing under 2^-100 but 0 comes up on the way.
+/// Returns reproducible values on which rounding shows: zeros, equal pairs, small integers, sums that nearly cancel,
+/// and full mantissas over 2^-12 to 2^12. No intermediate value is below 2^-100 other than 0.
 fn values() -> Vec<f32> {
     let mut state = 0u64;
     let mut next = || {
@@ -332,7 +261,7 @@ fn values() -> Vec<f32> {
             4 => group[2] = -(group[0] * group[1]),
             _ => {}
         }
-        // + 0.0: rounding may have made a -0.
+        // `+ 0.0` turns a -0 from rounding into 0.
         values.extend(group.map(|value| value + 0.0));
     }
     values
@@ -368,7 +297,7 @@ fn reciprocal_root(d: f32) -> f32 {
     r
 }
 
-/// The twin of `probe` in `shaders/probe.wgsl`.
+/// Twin of `probe` in `shaders/probe.wgsl`.
 #[allow(clippy::eq_op, reason = "x*y - y*x is 0 but where it is contracted")]
 fn expected(values: &[f32], item: usize) -> [u32; NAMES.len()] {
     let v: [f32; 4] = std::array::from_fn(|i| values[item * 4 + i]);
@@ -430,7 +359,7 @@ mod tests {
 
     type Formula = fn([f32; 4]) -> f32;
 
-    /// How many of the groups give another word for `probe` by this formula.
+    /// Returns how many groups give another word for `probe` by this formula.
     fn shown(probe: &str, formula: Formula) -> usize {
         let values = values();
         let index = NAMES.iter().position(|name| *name == probe).expect("it is one of the probes");

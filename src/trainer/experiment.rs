@@ -1,0 +1,184 @@
+//! One experiment of a trainer: its trials, and how far they are.
+
+use std::ops::Range;
+use std::sync::atomic::AtomicU32;
+
+use fearless_simd::Level;
+
+use super::residency::Residency;
+use super::schedule::TeamSchedule;
+use super::stages::{Stage, Stages};
+use super::{Row, Snapshot};
+use crate::config::{Learning, ValidConfig};
+use crate::evolve::{self, Key, Purpose};
+use crate::parallel::*;
+
+/// One experiment and its trials.
+pub(super) struct Experiment {
+    pub stages: Stages,
+    pub trials: Vec<TrialState>,
+    /// The schedules of the generation that plays, one per trial.
+    pub schedules: Vec<TeamSchedule>,
+    /// The schedules of the generation after it, drawn meanwhile if a backend holds the populations; else empty.
+    pub next_schedules: Vec<TeamSchedule>,
+    /// The generation that plays next, two past the last when all is done. The populations are of an earlier generation
+    /// after a device lost them.
+    pub generation: usize,
+    pub residency: Residency,
+}
+
+/// One trial's populations, and scratch memory for its generations.
+///
+/// A population has one slot more than policies. The last slot holds the champion of the previous generation, which
+/// plays along as one more team.
+pub(super) struct TrialState {
+    /// The trial's number within its config.
+    pub index: usize,
+    /// This generation, `[populations][policies + 1][parameters]`, and memory for the next.
+    pub weights: Vec<f32>,
+    pub children: Vec<f32>,
+    /// POIs observed, `[episodes][policies + 1]`.
+    pub observed: Vec<AtomicU32>,
+    /// Scores, f32 as bits, `[episodes][policies + 1][leaders]`.
+    pub scores: Vec<AtomicU32>,
+    /// The mean score of every policy, `[populations][policies]`.
+    pub fitness: Vec<f32>,
+    /// The plan of the next generation, see [`evolve::draw_parents`], `[populations][policies + 1]`.
+    pub parents: Vec<u32>,
+    /// The row of the previous generation, whose champion has yet to play.
+    pub pending: Option<Row>,
+}
+
+impl Experiment {
+    pub fn new(config: &ValidConfig, trials: Range<usize>, level: Level) -> Experiment {
+        let stages = Stages::new(config);
+        let leaders = stages.of(0).world.leaders();
+        let schedule = || TeamSchedule::new(config.learning.population, config.populations(), leaders);
+        let schedules = std::iter::repeat_with(schedule).take(trials.len()).collect();
+        let trials = trials.into_par_iter().map(|index| TrialState::new(&stages, index, level)).collect();
+        let residency = Residency::on_host(0);
+        Experiment { stages, trials, schedules, next_schedules: vec![], generation: 0, residency }
+    }
+
+    /// The stage that the populations are about to play in.
+    pub fn stage(&self) -> &Stage {
+        self.stages.of(self.residency.generation())
+    }
+
+    /// The last generation of the run.
+    pub fn last(&self) -> usize {
+        self.stages.last_generation
+    }
+
+    /// Reports whether the champions of the last generation have played.
+    pub fn is_done(&self) -> bool {
+        self.generation > self.last() + 1
+    }
+
+    /// Reports whether the populations are of a generation that was played already, so that it has to be replayed.
+    pub fn is_behind(&self) -> bool {
+        self.residency.generation() < self.generation && !self.is_done()
+    }
+
+    /// Reports whether the populations are past the last generation, and only champions play.
+    pub fn is_over(&self) -> bool {
+        self.residency.generation() > self.last()
+    }
+
+    /// Numbers in the policies of one trial, without the champions' slots.
+    pub fn policy_len(&self) -> usize {
+        let Stage { config, world, .. } = self.stage();
+        config.populations() * config.learning.population * world.parameters()
+    }
+
+    /// Makes the schedules those of the populations' generation.
+    pub fn prepare(&mut self, level: Level) {
+        let generation = self.residency.generation();
+        if self.next_schedules.first().is_some_and(|next| next.is_of(generation, &self.stages)) {
+            std::mem::swap(&mut self.schedules, &mut self.next_schedules);
+        }
+        let Experiment { stages, schedules, trials, .. } = self;
+        let pairs = schedules.par_iter_mut().zip(trials);
+        pairs.for_each(|(schedule, trial)| schedule.draw(level, stages, trial.index, generation));
+    }
+
+    /// Draws the next generation's schedules, beside those of the one that plays.
+    pub fn prepare_next(&self, level: Level, next: &mut Vec<TeamSchedule>) {
+        if self.is_over() {
+            return;
+        }
+        let Stage { config, world, .. } = self.stage();
+        let (population, populations) = (config.learning.population, config.populations());
+        next.resize_with(self.trials.len(), || TeamSchedule::new(population, populations, world.leaders()));
+        let generation = self.residency.generation() + 1;
+        let pairs = next.par_iter_mut().zip(&self.trials);
+        pairs.for_each(|(schedule, trial)| schedule.draw(level, &self.stages, trial.index, generation));
+    }
+
+    /// Returns the experiment's state as far as the host has it.
+    pub fn snapshot(&self) -> Snapshot<&[f32]> {
+        Snapshot {
+            generation: self.generation,
+            last: self.last(),
+            weights: self.trials.iter().map(|trial| &trial.weights[..]).collect(),
+            fitness: self.trials.iter().map(|trial| &trial.fitness[..]).collect(),
+            pending: self.trials.iter().map(|trial| trial.pending).collect(),
+        }
+    }
+
+    /// Takes on a snapshot; returns false, and changes nothing, if its sizes do not match. `index` is the experiment's
+    /// in its trainer.
+    pub fn restore(&mut self, index: usize, snapshot: Snapshot, level: Level) -> bool {
+        let Snapshot { generation, last, weights, fitness, pending } = snapshot;
+        let counts = [weights.len(), fitness.len(), pending.len()];
+        let fits = |((trial, weights), fitness): ((&TrialState, &Vec<f32>), &Vec<f32>)| {
+            trial.weights.len() == weights.len() && trial.fitness.len() == fitness.len()
+        };
+        if counts != [self.trials.len(); 3] || !self.trials.iter().zip(&weights).zip(&fitness).all(fits) {
+            return false;
+        }
+        for (trial, ((weights, fitness), pending)) in
+            self.trials.iter_mut().zip(weights.into_iter().zip(fitness).zip(pending))
+        {
+            (trial.weights, trial.fitness) = (weights, fitness);
+            trial.pending = pending.map(|row| Row { arm: index, ..row });
+        }
+        self.generation = generation.min(self.last() + 2);
+        self.residency = Residency::on_host(self.generation);
+        if generation == last + 1 && last < self.last() {
+            // The shorter run kept its last policies. This run breeds a next generation from them.
+            self.residency = Residency::on_host(last);
+            self.breed_on_host(level);
+        }
+        true
+    }
+}
+
+impl TrialState {
+    /// Returns a trial with random policies. Scratch memory is enough for every stage's episodes.
+    fn new(stages: &Stages, index: usize, level: Level) -> TrialState {
+        let Stage { config, world, .. } = stages.of(0);
+        let Learning { seed, population, .. } = config.learning;
+        let (leaders, populations, parameters) = (world.leaders(), config.populations(), world.parameters());
+        let key = Key::new(seed, index, Purpose::Weights);
+        let mut weights = vec![0.0; populations * (population + 1) * parameters];
+        weights.par_chunks_exact_mut((population + 1) * parameters).enumerate().for_each(|(leader, policies)| {
+            policies[..population * parameters]
+                .par_chunks_exact_mut(parameters)
+                .with_min_len(64)
+                .enumerate()
+                .for_each(|(slot, policy)| evolve::random_policy(level, key.at(0, leader, slot), policy));
+        });
+        let slots = stages.max_episodes() * (population + 1);
+        TrialState {
+            index,
+            children: vec![0.0; weights.len()],
+            weights,
+            observed: std::iter::repeat_with(AtomicU32::default).take(slots).collect(),
+            scores: std::iter::repeat_with(AtomicU32::default).take(slots * leaders).collect(),
+            fitness: vec![0.0; populations * population],
+            parents: vec![0; populations * (population + 1)],
+            pending: None,
+        }
+    }
+}

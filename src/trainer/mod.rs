@@ -1,0 +1,373 @@
+//! The generation loop: all trials of all experiments advance together, in one batch per generation.
+//!
+//! A generation is: draw the team schedules, play them, collect the results, plan the next generation, breed it.
+//!
+//! | file | holds |
+//! |---|---|
+//! | `experiment` | one experiment's trials, and how far they are |
+//! | `stages` | the stages of a curriculum |
+//! | `schedule` | who plays with whom in a generation, and from where |
+//! | `residency` | where populations are: on the host or on a device |
+//! | `populations` | moving populations between the two, and breeding them |
+//! | `results` | playing a generation, and its rows and fitness |
+//! | `size` | bytes that all this takes |
+
+use std::collections::TryReserveError;
+use std::time::Duration;
+
+use fearless_simd::Level;
+
+use crate::backend::{Backend, BackendError};
+use crate::config::ValidConfig;
+use crate::host::Instant;
+use crate::parallel::*;
+use crate::world::World;
+
+mod experiment;
+mod populations;
+mod residency;
+mod results;
+mod schedule;
+mod size;
+mod stages;
+
+pub use size::{bytes, next_bytes, snapshot_bytes};
+
+use experiment::Experiment;
+use schedule::TeamSchedule;
+
+/// Trains any number of experiments side by side. Each is at a generation of its own.
+pub struct Trainer {
+    experiments: Vec<Experiment>,
+    level: Level,
+    times: Times,
+    setback: Option<BackendError>,
+}
+
+/// The results of one generation of one trial. Every G is in 0..1.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Row {
+    /// The experiment's index in its trainer; 0 in a run by itself.
+    pub arm: usize,
+    /// The trial, from 0.
+    pub trial: usize,
+    /// The generation, from 0, the random start.
+    pub generation: usize,
+    /// G of the best team.
+    pub best_g: f64,
+    /// G in the mean over teams.
+    pub mean_g: f64,
+    /// G of the team of every population's best policy.
+    pub champion_g: f64,
+}
+
+/// The state that an experiment resumes from: the populations about to play, and each trial's unfinished row.
+///
+/// `N` is `Vec<f32>`, or a slice of a trainer's memory.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Snapshot<N = Vec<f32>> {
+    /// The generation that plays next.
+    pub generation: usize,
+    /// The run's last generation, after which policies stay as they are.
+    pub last: usize,
+    /// A trial's weights, `[populations][policies + 1][parameters]`, see
+    /// [`Config::populations`](crate::config::Config::populations).
+    pub weights: Vec<N>,
+    /// A trial's scores of the previous generation, `[populations][policies]`.
+    pub fitness: Vec<N>,
+    /// A trial's row of the previous generation.
+    pub pending: Vec<Option<Row>>,
+}
+
+/// The time that generations took, by phase.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Times {
+    /// Drawing team schedules, unless that was done while others played.
+    pub prepare: Duration,
+    /// Rollouts and scores.
+    pub play: Duration,
+    /// Rows and fitness.
+    pub conclude: Duration,
+    /// Selection and mutation.
+    pub breed: Duration,
+}
+
+/// The outcome of an experiment: the sorted policies of each trial, and a snapshot without weights.
+pub type End<'a> = (Vec<&'a [f32]>, Snapshot<&'a [f32]>);
+
+/// Why there is no snapshot.
+#[derive(Debug, thiserror::Error)]
+pub enum SnapshotError {
+    /// The system has too little memory for it.
+    #[error(transparent)]
+    Memory(#[from] TryReserveError),
+    /// The populations cannot be copied to the host.
+    #[error(transparent)]
+    Backend(#[from] BackendError),
+}
+
+impl Trainer {
+    /// Creates random populations for every trial of every config.
+    pub fn new(configs: impl IntoIterator<Item = ValidConfig>) -> Trainer {
+        let level = Level::new();
+        let experiment = |config: ValidConfig| Experiment::new(&config, 0..config.learning.trials, level);
+        let experiments = configs.into_iter().map(experiment).collect();
+        Trainer { experiments, level, times: Times::default(), setback: None }
+    }
+
+    /// Creates random populations for one trial of a config. Its rows are the same as among the other trials.
+    pub fn of_trial(config: &ValidConfig, trial: usize) -> Trainer {
+        let level = Level::new();
+        let experiments = vec![Experiment::new(config, trial..trial + 1, level)];
+        Trainer { experiments, level, times: Times::default(), setback: None }
+    }
+
+    /// Returns the generation that an experiment plays next: two past its last when it is done.
+    pub fn generation(&self, experiment: usize) -> usize {
+        self.experiments[experiment].generation
+    }
+
+    /// Makes the generation that an experiment plays next its last, unless an earlier one is. Returns the last.
+    ///
+    /// The results are those of a config with so many generations.
+    pub fn end(&mut self, experiment: usize) -> usize {
+        let Experiment { stages, generation, .. } = &mut self.experiments[experiment];
+        stages.last_generation = stages.last_generation.min(*generation);
+        stages.last_generation
+    }
+
+    /// Takes the error of a backend that held populations and failed, if the trainer recovered from it. The host holds
+    /// the populations from then on.
+    pub fn take_setback(&mut self) -> Option<BackendError> {
+        self.setback.take()
+    }
+
+    /// Returns and resets the times of generations.
+    pub fn take_times(&mut self) -> Times {
+        std::mem::take(&mut self.times)
+    }
+
+    /// Reports whether every experiment has played its last generation, and the champions of that.
+    pub fn is_done(&self) -> bool {
+        self.experiments.iter().all(Experiment::is_done)
+    }
+
+    /// Plays, scores and breeds one generation of every experiment that has one left.
+    ///
+    /// Returns the rows that became complete, by experiment, trial and generation. A generation's champion plays with
+    /// the next generation, and by itself after the last.
+    ///
+    /// A backend may hold the populations. If it loses them, the trainer replays generations from its last copy.
+    ///
+    /// # Errors
+    /// The backend failed. The trainer is then still before this generation.
+    pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
+        // Enters the thread pool once: a small generation is over sooner than a thread wakes up.
+        scope(|_| match self.replay_and_play(backend) {
+            // A device may have room for the populations or for the episodes, but not for both.
+            Err(error) if self.release_all() => {
+                let rows = self.replay_and_play(backend)?;
+                self.setback = Some(error);
+                Ok(rows)
+            }
+            played => played,
+        })
+    }
+
+    /// Plays every generation that is left, and returns all rows.
+    ///
+    /// # Errors
+    /// The backend failed. The trainer is then before that generation, and the rows before it are lost.
+    pub fn finish(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
+        let mut rows = Vec::new();
+        while !self.is_done() {
+            rows.extend(self.advance(backend)?);
+        }
+        Ok(rows)
+    }
+
+    /// Replays the generations that were lost, then plays the next one. Returns only the rows of that, because the rows
+    /// of replayed generations were returned before.
+    fn replay_and_play(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
+        while self.experiments.iter().any(Experiment::is_behind) {
+            self.play_generation(Experiment::is_behind, backend)?;
+        }
+        let rows = self.play_generation(|experiment| !experiment.is_done(), backend)?;
+        let unfinished = self.experiments.iter_mut().filter(|experiment| !experiment.is_done());
+        unfinished.for_each(|experiment| experiment.generation += 1);
+        Ok(rows)
+    }
+
+    /// Takes all populations back from the backend that failed. Returns false if there were none, or if they are lost.
+    fn release_all(&mut self) -> bool {
+        let on_device = self.experiments.iter_mut().filter(|experiment| experiment.residency.is_on_device());
+        let released: Vec<bool> = on_device.map(|experiment| experiment.release().is_ok()).collect();
+        !released.is_empty() && released.iter().all(|&released| released)
+    }
+
+    /// Plays the generation that the populations of some experiments are at.
+    fn play_generation(
+        &mut self,
+        plays: impl Fn(&Experiment) -> bool,
+        backend: &mut dyn Backend,
+    ) -> Result<Vec<Row>, BackendError> {
+        let level = self.level;
+        let playing = self.experiments.iter_mut().enumerate().filter(|(_, experiment)| plays(experiment));
+        let mut playing: Vec<(usize, &mut Experiment)> = playing.collect();
+
+        let start = Instant::now();
+        playing.iter_mut().try_for_each(|(_, experiment)| experiment.offer(backend))?;
+        playing.par_iter_mut().for_each(|(_, experiment)| experiment.prepare(level));
+        let prepared = Instant::now();
+        play_and_draw_next(&mut playing, level, backend)?;
+        let mut over = playing.iter_mut().filter(|(_, experiment)| experiment.is_over());
+        over.try_for_each(|(_, experiment)| experiment.fetch())?;
+        let played = Instant::now();
+        let collect = |(index, experiment): &mut (usize, &mut Experiment)| match experiment.is_over() {
+            true => experiment.collect_last_rows(),
+            false => experiment.collect_results(*index),
+        };
+        let mut rows = playing.par_iter_mut().flat_map_iter(collect).collect::<Vec<_>>();
+        let concluded = Instant::now();
+        playing.retain(|(_, experiment)| !experiment.is_over());
+        let setbacks: Vec<_> =
+            playing.par_iter_mut().filter_map(|(_, experiment)| experiment.breed(level).err()).collect();
+        self.setback = setbacks.into_iter().next().or(self.setback.take());
+        rows.sort_by_key(|row| (row.arm, row.trial, row.generation));
+        self.times.prepare += prepared - start;
+        self.times.play += played - prepared;
+        self.times.conclude += concluded - played;
+        self.times.breed += concluded.elapsed();
+        Ok(rows)
+    }
+
+    /// Returns the policies of an experiment's last generation, which it has played: best first in each population, one
+    /// `[populations][policies][parameters]` per trial.
+    pub fn policies(&self, experiment: usize) -> Vec<Vec<f32>> {
+        let experiment = &self.experiments[experiment];
+        let sort = |trial: &experiment::TrialState| {
+            let mut policies = vec![0.0; experiment.policy_len()];
+            experiment.sort(&trial.weights, &trial.fitness, &mut policies);
+            policies
+        };
+        experiment.trials.iter().map(sort).collect()
+    }
+
+    /// Returns the outcomes of experiments that are done: [`Trainer::policies`], in the next generation's memory, and
+    /// the snapshot after the last generation. Its weights are empty, because they are the policies in another order.
+    pub fn ends(&mut self, experiments: &[usize]) -> Vec<End<'_>> {
+        for &experiment in experiments {
+            let experiment = &mut self.experiments[experiment];
+            let len = experiment.policy_len();
+            for index in 0..experiment.trials.len() {
+                let mut policies = std::mem::take(&mut experiment.trials[index].children);
+                let trial = &experiment.trials[index];
+                experiment.sort(&trial.weights, &trial.fitness, &mut policies[..len]);
+                experiment.trials[index].children = policies;
+            }
+        }
+        let end = |&experiment: &usize| {
+            let experiment = &self.experiments[experiment];
+            let len = experiment.policy_len();
+            let sorted = experiment.trials.iter().map(|trial| &trial.children[..len]).collect();
+            (sorted, Snapshot { generation: experiment.last() + 1, weights: vec![], ..experiment.snapshot() })
+        };
+        experiments.iter().map(end).collect()
+    }
+
+    /// Returns the populations of a trial that are about to play, `[populations][policies + 1][parameters]`. A
+    /// population's last slot holds the champion of the previous generation.
+    ///
+    /// # Errors
+    /// The backend that holds them failed to return them.
+    pub fn weights(&mut self, experiment: usize, trial: usize) -> Result<&[f32], BackendError> {
+        let experiment = &mut self.experiments[experiment];
+        experiment.bring_up_to_date()?;
+        Ok(&experiment.trials[trial].weights)
+    }
+
+    /// Returns the world that an experiment's next generation plays in.
+    pub fn world(&self, experiment: usize) -> &World {
+        let experiment = &self.experiments[experiment];
+        &experiment.stages.of(experiment.generation).world
+    }
+
+    /// Returns what [`Trainer::restore`] needs of an experiment, without copying it.
+    ///
+    /// # Errors
+    /// The backend that holds the populations failed to return them.
+    pub fn view(&mut self, experiment: usize) -> Result<Snapshot<&[f32]>, BackendError> {
+        let experiment = &mut self.experiments[experiment];
+        experiment.bring_up_to_date()?;
+        Ok(experiment.snapshot())
+    }
+
+    /// Returns a copy of what [`Trainer::restore`] needs of an experiment.
+    ///
+    /// # Errors
+    /// There is too little memory, or the backend that holds the populations failed to return them.
+    pub fn snapshot(&mut self, experiment: usize) -> Result<Snapshot, SnapshotError> {
+        let copy = |numbers: &[f32]| {
+            let mut copy = Vec::new();
+            copy.try_reserve_exact(numbers.len())?;
+            copy.extend_from_slice(numbers);
+            Ok(copy)
+        };
+        let each = |trials: Vec<&[f32]>| -> Result<Vec<_>, TryReserveError> { trials.into_iter().map(copy).collect() };
+        let Snapshot { generation, last, weights, fitness, pending } = self.view(experiment)?;
+        Ok(Snapshot { generation, last, weights: each(weights)?, fitness: each(fitness)?, pending })
+    }
+
+    /// Puts given policies, `[populations][policies][parameters]`, into the first slots of a trial's populations, in
+    /// their order and as many as fit. The other slots keep their random policies.
+    ///
+    /// Returns false, and changes nothing, if the experiment has played or the sizes do not match.
+    #[must_use]
+    pub fn start_from(&mut self, experiment: usize, trial: usize, policies: usize, weights: &[f32]) -> bool {
+        let experiment = &mut self.experiments[experiment];
+        let stage = experiment.stage();
+        let (populations, parameters) = (stage.config.populations(), stage.world.parameters());
+        let population = stage.config.learning.population;
+        let fresh = experiment.generation == 0 && experiment.residency.is_undecided();
+        let Some(trial) = experiment.trials.get_mut(trial) else { return false };
+        if !fresh || policies == 0 || weights.len() != populations * policies * parameters {
+            return false;
+        }
+        let taken = policies.min(population) * parameters;
+        let slots = trial.weights.chunks_exact_mut((population + 1) * parameters);
+        for (slots, policies) in slots.zip(weights.chunks_exact(policies * parameters)) {
+            slots[..taken].copy_from_slice(&policies[..taken]);
+        }
+        true
+    }
+
+    /// Resumes an experiment from a snapshot of the same config. The snapshot's config may have had fewer generations.
+    ///
+    /// Returns false, and changes nothing, if the sizes do not match.
+    #[must_use]
+    pub fn restore(&mut self, experiment: usize, snapshot: Snapshot) -> bool {
+        self.experiments[experiment].restore(experiment, snapshot, self.level)
+    }
+}
+
+/// Plays the teams of some experiments. Meanwhile, draws the next schedules of those whose populations are on a device.
+fn play_and_draw_next(
+    playing: &mut [(usize, &mut Experiment)],
+    level: Level,
+    backend: &mut dyn Backend,
+) -> Result<(), BackendError> {
+    let take = |(_, experiment): &mut (usize, &mut Experiment)| std::mem::take(&mut experiment.next_schedules);
+    let mut next: Vec<Vec<TeamSchedule>> = playing.iter_mut().map(take).collect();
+    let (played, ()) = join(
+        || results::play(backend, playing),
+        || {
+            for (next, (_, experiment)) in next.iter_mut().zip(&*playing) {
+                if experiment.residency.is_on_device() {
+                    experiment.prepare_next(level, next);
+                }
+            }
+        },
+    );
+    playing.iter_mut().zip(next).for_each(|((_, experiment), next)| experiment.next_schedules = next);
+    played
+}

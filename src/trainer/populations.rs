@@ -1,0 +1,167 @@
+//! The populations of an experiment: moving them between host and device, and breeding them.
+
+use std::cell::RefCell;
+
+use fearless_simd::Level;
+
+use super::experiment::{Experiment, TrialState};
+use super::residency::Residency;
+use super::stages::Stage;
+use crate::backend::{Backend, BackendError};
+use crate::config::Learning;
+use crate::evolve::{self, Breeding, Key, Purpose, Selection};
+use crate::parallel::*;
+
+/// Slots that one thread fills at a time.
+const BROOD: usize = 64;
+
+impl Experiment {
+    /// Asks a backend once to hold the populations. It takes those of all trials or none.
+    pub fn offer(&mut self, backend: &mut dyn Backend) -> Result<(), BackendError> {
+        if !self.residency.is_undecided() {
+            return Ok(());
+        }
+        self.residency.decline();
+        let Stage { config, world, .. } = self.stage();
+        let sizes = [config.populations(), config.learning.population + 1, world.parameters()];
+        let held: Option<Vec<_>> =
+            self.trials.iter().map(|trial| backend.hold(&trial.weights, sizes).transpose()).collect();
+        if let Some(held) = held {
+            self.residency.accept(held.into_iter().collect::<Result<_, _>>()?);
+        }
+        Ok(())
+    }
+
+    /// Copies the populations to the host, those of all trials or none, unless the host's are current.
+    pub fn fetch(&mut self) -> Result<(), BackendError> {
+        if self.residency.host_is_current() {
+            return Ok(());
+        }
+        for (held, trial) in self.residency.on_device().iter().zip(&mut self.trials) {
+            held.fetch(&mut trial.children)?;
+        }
+        for TrialState { weights, children, .. } in &mut self.trials {
+            std::mem::swap(weights, children);
+        }
+        self.residency.fetched();
+        Ok(())
+    }
+
+    /// Takes the populations back from the backend. After an error the host's last copy is all there is.
+    pub fn release(&mut self) -> Result<(), BackendError> {
+        let fetched = self.fetch();
+        self.residency.lose();
+        fetched
+    }
+
+    /// Makes the host's weights those of the generation that plays next, for a snapshot.
+    pub fn bring_up_to_date(&mut self) -> Result<(), BackendError> {
+        if self.is_behind() {
+            return Err(BackendError::Gone);
+        }
+        let fetched = self.fetch();
+        if fetched.is_err() {
+            self.residency.lose();
+        }
+        fetched
+    }
+
+    /// Makes the next generation: plans each slot's parent and whether it mutates, and carries that out where the
+    /// populations are. After the last generation the policies stay, and the champion gets its slot.
+    ///
+    /// # Errors
+    /// The backend that holds the populations failed. The results of this generation are known by then. The next
+    /// generation replays what was lost, or fails.
+    pub fn breed(&mut self, level: Level) -> Result<(), BackendError> {
+        if !self.residency.is_on_device() {
+            self.breed_on_host(level);
+            return Ok(());
+        }
+        let bred = self.breed_on_device(level);
+        match bred {
+            Ok(()) => self.residency.bred(),
+            Err(_) => self.residency.lose(),
+        }
+        bred
+    }
+
+    fn breed_on_device(&mut self, level: Level) -> Result<(), BackendError> {
+        let generation = self.residency.generation();
+        let Experiment { stages, trials, residency, .. } = self;
+        let Residency::Device { populations, .. } = residency else { return Ok(()) };
+        let (learning, last) = (&stages.of(generation).config.learning, stages.last_generation);
+        let (seed, population) = (learning.seed, learning.population);
+        trials.par_iter_mut().for_each(|trial| {
+            let key = Key::new(seed, trial.index, Purpose::Tournament);
+            let plans = trial.parents.par_chunks_exact_mut(population + 1);
+            plans.zip(trial.fitness.par_chunks_exact(population)).enumerate().for_each(
+                |(leader, (parents, fitness))| plan(level, learning, key, (generation, last), leader, fitness, parents),
+            );
+        });
+        populations.iter_mut().zip(trials).try_for_each(|(held, trial)| {
+            let key = Key::new(seed, trial.index, Purpose::Mutation);
+            held.breed(&Breeding { parents: &trial.parents, key, generation, learning })
+        })
+    }
+
+    /// Breeds populations that the host has, which cannot fail.
+    pub fn breed_on_host(&mut self, level: Level) {
+        thread_local! { static SCRATCH: RefCell<Vec<u32>> = const { RefCell::new(Vec::new()) }; }
+        let generation = self.residency.generation();
+        let Experiment { stages, trials, .. } = self;
+        let Stage { config, world, .. } = stages.of(generation);
+        let (learning, last) = (&config.learning, stages.last_generation);
+        let Learning { seed, population, .. } = *learning;
+        let parameters = world.parameters();
+        let stride = (population + 1) * parameters;
+        trials.par_iter_mut().for_each(|trial| {
+            let tournaments = Key::new(seed, trial.index, Purpose::Tournament);
+            let key = Key::new(seed, trial.index, Purpose::Mutation);
+            let TrialState { weights, children, parents, fitness, .. } = trial;
+            let plans = fitness.par_chunks_exact(population).zip(parents.par_chunks_exact_mut(population + 1));
+            let populations = weights.par_chunks_exact(stride).zip(children.par_chunks_exact_mut(stride));
+            plans.zip(populations).enumerate().for_each(|(leader, ((fitness, parents), (policies, children)))| {
+                plan(level, learning, tournaments, (generation, last), leader, fitness, parents);
+                let broods = parents.par_chunks(BROOD).zip(children.par_chunks_mut(BROOD * parameters));
+                // Small tasks, so that no thread is left with a long one at the end.
+                broods.with_max_len(4).enumerate().for_each(|(index, (parents, children))| {
+                    let first = index * BROOD;
+                    let brood = evolve::Offspring { key, generation, population: leader, first, parents, policies };
+                    SCRATCH.with_borrow_mut(|scratch| evolve::breed(level, learning, brood, children, scratch));
+                });
+            });
+            std::mem::swap(weights, &mut trial.children);
+        });
+        self.residency.bred();
+    }
+
+    /// Copies policies, without the champions' slots, best first in each population.
+    pub fn sort(&self, weights: &[f32], fitness: &[f32], policies: &mut [f32]) {
+        let Stage { config, world, .. } = self.stage();
+        let (population, parameters) = (config.learning.population, world.parameters());
+        let populations = weights.par_chunks_exact((population + 1) * parameters);
+        let sorted = policies.par_chunks_exact_mut(population * parameters);
+        populations.zip(fitness.par_chunks_exact(population)).zip(sorted).for_each(|((weights, fitness), sorted)| {
+            let best = evolve::best(fitness, population);
+            for (policy, index) in sorted.chunks_exact_mut(parameters).zip(best) {
+                policy.copy_from_slice(&weights[index * parameters..(index + 1) * parameters]);
+            }
+        });
+    }
+}
+
+/// Plans one population's next generation; after the last generation, keeps every policy.
+fn plan(
+    level: Level,
+    learning: &Learning,
+    key: Key,
+    (generation, last): (usize, usize),
+    leader: usize,
+    fitness: &[f32],
+    parents: &mut [u32],
+) {
+    match generation == last {
+        true => evolve::keep_parents(fitness, parents),
+        false => evolve::draw_parents(level, key, generation, leader, Selection::of(learning), fitness, parents),
+    }
+}

@@ -1,0 +1,99 @@
+//! Team schedules: who plays with whom in one generation, and from where.
+//!
+//! A schedule depends on counters only, never on results, so the next one can be drawn while the present one plays.
+
+use fearless_simd::Level;
+use glam::Vec2;
+
+use super::stages::{Stage, Stages};
+use crate::config::{Config, Learning, Sharing};
+use crate::evolve::{self, Key, Purpose};
+use crate::parallel::*;
+
+/// Policies per rayon task for cheap work, at least: fewer are done before another thread wakes up.
+pub(super) const MIN_POLICIES_PER_TASK: usize = 2048;
+
+/// Returns the number of populations that have [`MIN_POLICIES_PER_TASK`] policies together.
+pub(super) fn min_populations_per_task(population: usize) -> usize {
+    MIN_POLICIES_PER_TASK.div_ceil(population)
+}
+
+/// Who plays with whom in one generation of one trial, and from where.
+pub(super) struct TeamSchedule {
+    /// The generation and the index of its stage. `None` before the first draw. Ending a run early can change the stage.
+    drawn_for: Option<(usize, usize)>,
+    /// The policy of each team, `[populations][policies]`: for fitness.
+    pub orders: Vec<u32>,
+    /// The policy of each leader, `[policies + 1][leaders]`: for the backend. The last team is the champion's.
+    pub teams: Vec<u32>,
+    /// Start positions, followed by POI positions if POIs move, `[episodes][agents + pois]`.
+    pub starts: Vec<Vec<Vec2>>,
+    /// The same for the champions of the previous stage. Empty unless a stage ends just before this generation.
+    pub previous_stage_starts: Vec<Vec<Vec2>>,
+}
+
+impl TeamSchedule {
+    /// Returns a schedule that is yet to be drawn.
+    pub fn new(population: usize, populations: usize, leaders: usize) -> TeamSchedule {
+        TeamSchedule {
+            drawn_for: None,
+            orders: vec![0; populations * population],
+            // The champion's team, the last, is every population's last slot.
+            teams: evolve::one_policy_a_team(population + 1, leaders),
+            starts: vec![],
+            previous_stage_starts: vec![],
+        }
+    }
+
+    /// Reports whether this is the schedule of a generation.
+    pub fn is_of(&self, generation: usize, stages: &Stages) -> bool {
+        self.drawn_for == Some((generation, stages.index_of(generation)))
+    }
+
+    /// Draws the schedule of a trial's generation, unless it is that already.
+    pub fn draw(&mut self, level: Level, stages: &Stages, trial: usize, generation: usize) {
+        if self.is_of(generation, stages) {
+            return;
+        }
+        self.drawn_for = Some((generation, stages.index_of(generation)));
+        let stage = stages.of(generation);
+        self.form_teams(level, &stage.config.learning, trial, generation);
+        draw_starts(stage, trial, generation, &mut self.starts);
+        match stages.ending_before(generation) {
+            Some(stage) => draw_starts(stage, trial, generation, &mut self.previous_stage_starts),
+            None => self.previous_stage_starts.clear(),
+        }
+    }
+
+    /// Writes `orders` and `teams`.
+    fn form_teams(&mut self, level: Level, learning: &Learning, trial: usize, generation: usize) {
+        // With a shared population, team t always plays policy t.
+        if learning.sharing == Sharing::All {
+            return;
+        }
+        let population = learning.population;
+        let key = Key::new(learning.seed, trial, Purpose::Teams);
+        let orders = self.orders.par_chunks_exact_mut(population);
+        orders
+            .with_min_len(min_populations_per_task(population))
+            .enumerate()
+            .for_each(|(leader, order)| evolve::shuffle(level, key, generation, leader, order));
+        let (orders, leaders) = (&self.orders, self.orders.len() / population);
+        let teams =
+            self.teams[..population * leaders].par_chunks_exact_mut(leaders).with_min_len(MIN_POLICIES_PER_TASK);
+        teams.enumerate().for_each(|(team, policies)| {
+            for (policy, order) in policies.iter_mut().zip(orders.chunks_exact(population)) {
+                *policy = order[team];
+            }
+        });
+    }
+}
+
+/// Draws the start positions of all episodes of a stage's generation.
+fn draw_starts(stage: &Stage, trial: usize, generation: usize, episodes: &mut Vec<Vec<Vec2>>) {
+    let Stage { config: Config { learning, .. }, world, .. } = stage;
+    episodes.resize(learning.episodes_per_team, vec![]);
+    for (episode, starts) in episodes.iter_mut().enumerate() {
+        evolve::places(learning, trial, generation, episode, world, starts);
+    }
+}

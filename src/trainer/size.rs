@@ -1,0 +1,57 @@
+//! Bytes that a trainer allocates, for estimates before a run.
+
+use crate::config::Config;
+
+/// Bytes per episode of a batch, on any backend.
+const EPISODE: u64 = 40;
+
+/// Returns the bytes that the trials of a valid config take on any backend, in the stage that takes most.
+pub fn bytes(config: &Config) -> u64 {
+    max_over_stages(config, bytes_of_stage) + previous_stage_bytes(config)
+}
+
+/// Returns the bytes of the next generation's schedules, drawn while a backend that holds the populations plays.
+pub fn next_bytes(config: &Config) -> u64 {
+    max_over_stages(config, schedule_bytes) + previous_stage_bytes(config)
+}
+
+/// Returns the bytes of the numbers in a [`Snapshot`](super::Snapshot) of a valid config's experiment.
+pub fn snapshot_bytes(config: &Config) -> u64 {
+    let [trials, populations, policies, parameters] = sizes(config);
+    4 * trials * populations * ((policies + 1) * parameters + policies)
+}
+
+fn max_over_stages(config: &Config, bytes: fn(&Config) -> u64) -> u64 {
+    config.staged().iter().map(|(_, config)| bytes(config)).max().unwrap_or(0)
+}
+
+fn bytes_of_stage(config: &Config) -> u64 {
+    let ([trials, populations, policies, parameters], leaders) = (sizes(config), config.learners() as u64);
+    let (slots, episodes) = (policies + 1, config.learning.episodes_per_team as u64);
+    let weights = 2 * populations * slots * parameters;
+    let fitness_and_parents = populations * (policies + slots);
+    let observed_and_scores = episodes * slots * (1 + leaders);
+    4 * trials * (weights + fitness_and_parents + observed_and_scores + episodes * EPISODE) + schedule_bytes(config)
+}
+
+/// Start positions of the previous stage's champions, kept beside those of the stage that begins.
+fn previous_stage_bytes(config: &Config) -> u64 {
+    if config.stages.is_empty() { 0 } else { max_over_stages(config, start_bytes) }
+}
+
+fn schedule_bytes(config: &Config) -> u64 {
+    let ([trials, populations, policies, _], leaders) = (sizes(config), config.learners() as u64);
+    4 * trials * (populations * policies + leaders * (policies + 1)) + start_bytes(config)
+}
+
+fn start_bytes(config: &Config) -> u64 {
+    let agents = (config.world.leaders.len() + config.world.followers.len()) as u64;
+    let moved = if config.learning.poi_jitter > 0.0 { config.world.pois.len() as u64 } else { 0 };
+    4 * config.learning.trials as u64 * config.learning.episodes_per_team as u64 * 2 * (agents + moved)
+}
+
+/// Returns `[trials, populations, policies, parameters]`.
+fn sizes(config: &Config) -> [u64; 4] {
+    let learning = &config.learning;
+    [learning.trials, config.populations(), learning.population, config.parameters()].map(|count| count as u64)
+}
