@@ -74,6 +74,7 @@
 //! | [`model`] | | the parts of a step: keys, constants, formulas, shaders |
 //! | [`config`] | | the config: what an experiment is |
 //! | [`world`] | | one experiment's constants and start state |
+//! | [`reach`] | | how far agents travel at most, and which POIs no team can observe |
 //! | [`evolve`] | | random numbers, team schedules, selection and mutation |
 //! | [`sample`] | | random worlds for tests |
 //! | [`backend`] | | whole episodes of many teams on the CPU, and with `gpu` on a GPU |
@@ -139,6 +140,7 @@ pub mod kernels;
 pub mod memory;
 pub mod model;
 pub mod parallel;
+pub mod reach;
 pub mod reader;
 #[cfg(feature = "record")]
 pub mod record;

@@ -355,7 +355,7 @@ fn overrides_out_of_range_name_the_flag() {
     assert!(told(wrong).starts_with("invalid value 'five' for '--trials <N>': allowed a number\n"));
     // A number below 0 is a value of any flag, and no flag itself.
     for (line, flag) in [
-        ("replay x --trial -1", "--trial <N>"),
+        ("replay x --trial -1", "--trial <best|worst|N>"),
         ("replay x --step -2", "--step <N>"),
         ("sweep x --shards -1", "--shards <N>"),
     ] {

@@ -172,3 +172,188 @@ fn the_folder_of_a_sweep_lists_its_points() {
         "{told}"
     );
 }
+
+/// A POI far from everybody: 25 steps are too few, as the bound says; nothing is ever observed.
+const FAR: &str = "\
+[world]
+map = [60, 60]
+leaders = [[30, 30], [33, 30]]
+followers = [[31, 28]]
+pois = [[3, 30], [57, 30]]
+coupling = 3
+[learning]
+population = 4
+generations = 2
+trials = 2
+";
+
+#[test]
+fn pois_out_of_reach_are_told_before_and_after_training() {
+    let place = Place::new(&[("far.toml", FAR), ("near.toml", SMALL)]);
+    let warned = "warning: POI 0 cannot be reached by the 3 agents that it needs: at best the last of them is 30.0 units \
+                  away, and an agent travels at most 14.4 units in 25 steps";
+    let (text, told) = place.good("check far.toml");
+    assert!(told.contains(warned) && told.contains("set world.steps to at least 4"), "{told}");
+    assert!(text.contains("#   an agent travels      at most 14.4 units in an episode\n"), "{text}");
+    let cost = json(&place, "check near.toml --json")["cost"].clone();
+    assert!((17.4..17.5).contains(&cost["travel"].as_f64().unwrap()), "{cost}");
+    assert_eq!(place.good("check near.toml").1, "");
+    for line in ["train far.toml --out far --backend cpu --quiet", "train far.toml --out again --backend cpu --seed 3"]
+    {
+        let (_, told) = place.good(line);
+        assert!(told.contains(warned), "{told}");
+        assert!(told.contains("warning: no team observed any POI in any generation"), "{told}");
+        assert!(told.contains("world.steps") && told.contains("world.coupling"), "{told}");
+    }
+    let (_, told) = place.good("compare far again");
+    assert!(told.contains("no team of these runs observed any POI in any generation"), "{told}");
+    let (_, told) = place.good("train near.toml --out near --backend cpu");
+    assert!(!told.contains("warning"), "{told}");
+    assert!(!place.good("compare near far").1.contains("no team of these runs"));
+    let text = FAR.to_string() + "[grid]\n'world.steps' = [20, 60]\n";
+    place.write("grid.toml", text);
+    let (_, told) = place.good("sweep grid.toml --out grid --backend cpu --quiet");
+    assert!(
+        told.contains("units in 20 steps") && told.contains("; at 1 of 2 points, the first world.steps = 20"),
+        "{told}"
+    );
+}
+
+/// Whatever random teams observe, the bound never says that it is out of reach.
+#[test]
+fn nothing_that_is_observed_is_said_to_be_out_of_reach() {
+    use flotilla::{backend::cpu::Cpu, evaluate::Starts, reach, sample, world::World};
+    let (mut far, mut seen) = (0, 0);
+    for seed in 0..150 {
+        let mut config = sample::world(seed);
+        config.stages.clear();
+        // Slow and short episodes, so that some POIs are out of reach.
+        config.world.steps = 4 + (seed as usize % 5) * 4;
+        config.world.windows.clear();
+        let (world, teams) = (World::new(&config), 12);
+        let weights = sample::weights(&world, teams, seed);
+        let unreachable: Vec<usize> = reach::unreachable(&config).iter().map(|found| found.poi).collect();
+        let traced = flotilla::trace(&config, &mut Cpu::default(), teams, &weights, &Starts::Own, 0).unwrap();
+        let pois = world.pois.len();
+        for team in 0..teams {
+            let mut observed = vec![u32::MAX; pois];
+            world.rule.observe(config.world.steps as u32, &mut observed, |poi, mut open| {
+                open.find(|&step| {
+                    let place = world.pois[poi].as_dvec2();
+                    let near = (0..world.agents()).filter(|&agent| {
+                        let at = ((team * (config.world.steps + 1) + step as usize) * world.agents() + agent) * 2;
+                        let [x, y] = [traced.positions[at], traced.positions[at + 1]].map(f64::from);
+                        world.rule.counts(agent) && (place.x - x).hypot(place.y - y) <= config.world.observation_radius
+                    });
+                    near.count() >= world.coupling[poi] as usize
+                })
+            });
+            for poi in (0..pois).filter(|&poi| observed[poi] != u32::MAX) {
+                assert!(!unreachable.contains(&poi), "seed {seed}: team {team} observes POI {poi}");
+                seen += 1;
+            }
+        }
+        far += unreachable.len();
+    }
+    assert!(far > 50 && seen > 500, "{far} out of reach, {seen} observed");
+}
+
+#[test]
+fn the_summary_says_how_to_film_the_best_champion() {
+    let place = Place::new(&[("small.toml", SMALL)]);
+    let (text, _) = place.good("train small.toml --out run --backend cpu");
+    let champions = metric(&place, 4, 4);
+    let most = champions.iter().copied().fold(0.0, f64::max);
+    let best = champions.iter().position(|&g| g == most).unwrap();
+    assert!(
+        text.contains(&format!("The best champion is that of trial {best}: {:.2} of 2 POIs.\n", 2.0 * most)),
+        "{text}"
+    );
+    let film = text.lines().find(|line| line.contains("--team champion")).unwrap().trim();
+    assert!(place.shell(film).status.success(), "{film}");
+    assert!(place.path("run/champion.gif").exists(), "{film}");
+    let scores = text.lines().find(|line| line.contains("flotilla rollout")).unwrap().trim();
+    assert!(place.shell(scores).status.success(), "{scores}");
+}
+
+#[test]
+fn a_rollout_takes_the_folder_of_a_run() {
+    let place = small();
+    let of_folder = place.good("rollout run --json --quiet").0;
+    let named = place.good("rollout run/config.toml --policies run/policies.safetensors --json --quiet").0;
+    assert_eq!(of_folder, named);
+    assert!(place.refused(2, "rollout small.toml").contains("--policies: a config file needs a file of policies"));
+    assert!(place.refused(2, "rollout run --stage 1").contains("--stage 1: the config has 1 stage, 0\n"));
+}
+
+#[test]
+fn layouts_to_start_from_train_and_look_right() {
+    let place = Place::new(&[]);
+    for (shape, groups, followers, pois) in [
+        ("ring", 6, 3, 6),
+        ("row", 1, 0, 3),
+        ("row", 5, 2, 4),
+        ("grid", 4, 3, 9),
+        ("ring", 40, 8, 3),
+        ("grid", 2, 20, 7),
+    ] {
+        let line = format!("init {shape} --groups {groups} --followers {followers} --pois {pois} --force --out x.toml");
+        place.good(&line);
+        let text = place.read("x.toml");
+        assert!(text.to_lowercase().starts_with(&format!("# {shape}: {groups} group")), "{text}");
+        let config = flotilla::Config::parse(&text, "x").unwrap();
+        let world = &config.world;
+        assert_eq!((world.leaders.len(), world.followers.len(), world.pois.len()), (groups, groups * followers, pois));
+        assert_eq!(place.good("check x.toml").1, "", "{line}: a POI cannot be reached");
+        if shape == "ring" {
+            // Each follower belongs to the leader that it stands behind.
+            let headings = world.headings();
+            for (follower, heading) in headings[groups..].iter().enumerate() {
+                assert_eq!(heading, &headings[follower / followers], "{line}: follower {follower}");
+            }
+        }
+    }
+    let told = place.refused(2, "init chaotic --groups 3");
+    assert!(told.contains("--groups: the layout chaotic is the paper's; use it with ring, row or grid"), "{told}");
+    let told = place.refused(2, "init ring --groups 600 --followers 1 --pois 5");
+    assert!(told.contains("these are 1200 agents, allowed 1 to 1024"), "{told}");
+    assert!(place.refused(2, "init row --pois 0").contains("--pois 0: allowed 1 to 256"));
+}
+
+/// The ring shows what learning does: at the end teams observe more than random ones.
+#[test]
+fn the_ring_shows_learning() {
+    let place = Place::new(&[]);
+    place.good("init ring --groups 6 --out ring.toml");
+    place.good("train ring.toml --out run --trials 3 --generations 40 --backend cpu --quiet");
+    let sum = |generation| metric(&place, generation, 2).iter().sum::<f64>() * 6.0 / 3.0;
+    assert!(sum(40) >= sum(0) + 1.0 && sum(40) >= 2.0, "{} of 6 POIs at the start, {} at the end", sum(0), sum(40));
+}
+
+#[test]
+fn keys_are_set_from_the_command_line() {
+    let place = Place::new(&[("small.toml", SMALL)]);
+    let world = |flags: &str| json(&place, &format!("check small.toml --json {flags}"))["config"].clone();
+    let config = world("--set world.steps=44 --set learning.fitness=G --set policy.hidden=[4,5]");
+    assert_eq!((&config["world"]["steps"], &config["learning"]["fitness"]), (&44.into(), &"G".into()));
+    assert_eq!(config["policy"]["hidden"], serde_json::json!([4, 5]));
+    assert_eq!(world("--fitness df")["learning"]["fitness"], "Df");
+    let told = place.refused(2, "check small.toml --set world.stps=3");
+    assert!(told.contains("--set world.stps: unknown key, did you mean `world.steps`?"), "{told}");
+    let told = place.refused(2, "check small.toml --set world.steps=0");
+    assert!(told.contains("--set world.steps: found 0, allowed 1 to 10000"), "{told}");
+    assert!(place.refused(2, "check small.toml --set steps").contains("allowed KEY=VALUE, as world.steps=60"));
+}
+
+#[test]
+fn messages_name_what_was_meant() {
+    let place = small();
+    let told = place.refused(2, "replay run --champion");
+    assert!(told.contains("--team champion") && !told.contains("as a value"), "{told}");
+    let told = place.refused(2, "compare run --set world.steps=3");
+    assert!(!told.contains("as a value"), "{told}");
+    assert!(place.refused(1, "sweep small.toml").contains("small.toml: grid: missing"));
+    place.write("bad.safetensors", "These are words, no tensors.");
+    let told = place.refused(1, "rollout small.toml --policies bad.safetensors");
+    assert!(told.contains("it is not a safetensors file") && !told.contains("1048576"), "{told}");
+}

@@ -447,7 +447,7 @@ fn stages_are_seen_by_every_command() {
     good("rollout staged.toml --policies run/policies.safetensors");
     assert!(good("rollout staged.toml --policies run/policies.safetensors --stage 2").contains("of 3"));
     let (code, _, told) = run(&folder, "rollout staged.toml --policies run/policies.safetensors --stage 3");
-    assert!(code == Some(2) && told.contains("the config has 3, 0 to 2"), "{told}");
+    assert!(code == Some(2) && told.contains("the config has 3 stages, 0 to 2"), "{told}");
     // 2 generations of 9 steps, 2 of twice 14, 3 of 9, each of 27 teams.
     let output = cargo_bin_cmd!("flotilla").args(["check", "staged.toml"]).current_dir(&folder).output().unwrap();
     let text = String::from_utf8(output.stdout).unwrap();

@@ -91,7 +91,7 @@ fn training_writes_a_folder_that_says_everything() {
     assert!(summary.contains(run["digest"].as_str().unwrap()));
 
     // The resolved config alone repeats the run, with other threads.
-    let (again, _) = place.good("train runs/small/config.toml --out again --threads 1 --quiet");
+    let (again, _) = place.good("train runs/small/config.toml --out again --threads 1");
     assert!(again.contains(run["digest"].as_str().unwrap()), "{again}");
     assert_eq!(fs::read(place.path("again/policies.safetensors")).unwrap(), bytes);
     assert_eq!(place.read("again/config.toml"), place.read("runs/small/config.toml"));
@@ -141,7 +141,7 @@ fn a_run_is_written_over_only_when_that_is_asked_for() {
     assert!(place.read("runs/small/config.toml").contains("seed = 9"));
     // Resuming what is done tells what it came to, and changes nothing.
     let before = place.read("runs/small-3/run.json");
-    let (summary, _) = place.good(&format!("train small.toml --resume {short}"));
+    let (summary, _) = place.good(&format!("train small.toml --resume {short}").replace("--quiet", ""));
     assert!(summary.contains("runs/small-3") && summary.starts_with("This run was done already."), "{summary}");
     assert_eq!(place.read("runs/small-3/run.json"), before);
     assert_eq!(place.run("train small.toml --resume --force").status.code(), Some(2));
@@ -267,7 +267,7 @@ fn rollout_takes_other_programs_files_and_refuses_what_it_cannot_play() {
         assert!(error.contains("bad.safetensors: it is cut short"), "{error}");
     }
     fs::write(place.path("bad.safetensors"), "not tensors at all").unwrap();
-    assert!(place.refused(1, &line("bad")).contains("it is no safetensors file"));
+    assert!(place.refused(1, &line("bad")).contains("it is not a safetensors file"));
     assert!(place.refused(1, &line("missing")).contains("missing.safetensors: cannot be read"));
     place.refused(1, "rollout small.toml --policies good.safetensors --scores no/such/folder.csv");
     assert_eq!(place.run("rollout small.toml").status.code(), Some(2));
@@ -301,12 +301,12 @@ fn a_finished_run_is_extended() {
 #[test]
 fn commands_that_are_told_run_as_they_are_told() {
     let place = place();
-    let typed = r#"flotilla train small.toml --backend cpu --quiet --out "it's my \$HOME; run""#;
+    let typed = r#"flotilla train small.toml --backend cpu --out "it's my \$HOME; run""#;
     let output = place.shell(typed);
     let said = String::from_utf8(output.stdout).unwrap();
     let (_, next) = said.split_once("Next:\n").expect(&said);
     let commands: Vec<&str> = next.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
-    assert_eq!(commands.len(), 2, "{said}");
+    assert_eq!(commands.len(), 3, "{said}");
     for command in commands {
         let output = place.shell(&format!("{command} --backend cpu"));
         assert!(output.status.success(), "{command}: {}", String::from_utf8_lossy(&output.stderr));

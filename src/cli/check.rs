@@ -4,10 +4,11 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::{ConfigArgs, Error, output, plot, print};
+use super::{ConfigArgs, Error, output, plot, print, warnings};
 use crate::backend::{self, RecordRequest};
 use crate::config::Config;
 use crate::memory::Peaks;
+use crate::reach;
 use crate::report::map;
 use crate::world::World;
 
@@ -28,6 +29,8 @@ pub struct Args {
 struct Cost {
     agents: usize,
     learners: usize,
+    /// How far an agent travels at most in an episode, in units.
+    travel: f64,
     /// Episodes played.
     teams: u128,
     team_steps: u128,
@@ -51,7 +54,7 @@ impl Cost {
     fn of(config: &Config) -> Cost {
         let wide = |count: usize| count as u128;
         let [mut teams, mut team_steps, mut agent_steps] = [0; 3];
-        let (mut agents, mut record_bytes) = (0, 0);
+        let (mut agents, mut record_bytes, mut travel) = (0, 0, 0.0_f64);
         // Of stages all that they play, and the size of the largest.
         for share in config.shares() {
             let (world, learning) = (World::new(&share), &share.learning);
@@ -63,12 +66,14 @@ impl Cost {
             team_steps += played * wide(world.steps());
             agent_steps += played * wide(world.steps()) * wide(world.agents());
             agents = agents.max(world.agents());
+            travel = reach::travel(&world, world.steps()).into_iter().fold(travel, f64::max);
             record_bytes = record_bytes.max(backend::record_bytes(&world, RecordRequest::Score(learning.fitness)));
         }
         let plan = Peaks::of([config], rayon::current_num_threads());
         Cost {
             agents,
             learners: config.learners(),
+            travel,
             teams,
             team_steps,
             agent_steps,
@@ -99,16 +104,20 @@ pub fn run(args: Args) -> Result<(), Error> {
         plot::write(&map::layout(&name, &config), kind, out)?;
     }
     let cost = Cost::of(&config);
+    warnings::unreachable(&config);
     if args.json {
         let report = Report { config: &config, cost: &cost };
         return print(&(serde_json::to_string(&report).expect("plain fields are JSON") + "\n"));
     }
-    let Cost { agents, learners, teams, team_steps, agent_steps, parameters, policy_bytes, record_bytes, .. } = cost;
+    let Cost {
+        agents, learners, travel, teams, team_steps, agent_steps, parameters, policy_bytes, record_bytes, ..
+    } = cost;
     let Cost { host_bytes, checkpoint_bytes, gpu_host_bytes, adapter_bytes, .. } = cost;
     print(&format!(
         "{}
 # A run of this plays {teams} teams, champions included:
 #   agents a team         {agents}, of which {learners} learn
+#   an agent travels      at most {travel:.1} units in an episode
 #   team-steps            {team_steps}
 #   agent-steps           {agent_steps}
 #   parameters a policy   {parameters}

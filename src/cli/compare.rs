@@ -79,6 +79,14 @@ pub fn run(args: Args) -> Result<(), Error> {
         let place = if comparison.place.is_empty() { String::new() } else { format!("{}: ", comparison.place) };
         notes.extend(comparison.notes.iter().map(|note| format!("{place}{note}")));
     }
+    let nothing = |arm: &Cohort| arm.trials.iter().all(|trial| trial.course.iter().flatten().all(|&g| g == 0.0));
+    if groups.iter().all(|(_, arms)| arms.iter().all(nothing)) {
+        notes.push(
+            "no team of these runs observed any POI in any generation: there is nothing to compare; `flotilla check CONFIG` \
+             names POIs that cannot be reached"
+                .into(),
+        );
+    }
     // Of runs, all that there was to tell yet is that their layouts differ or that one is another.
     let alike = args.folders.len() == 1 || told == 0;
     if !args.paired && alike && groups.iter().all(|(_, arms)| comparison::paired(arms)) {

@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use clap::builder::{PossibleValue, PossibleValuesParser};
 use toml::{Table, Value};
 
-use super::{Error, output, print};
+use super::layout::{SHAPES, StartLayout};
+use super::{Error, output, print, whole};
 use crate::config::{self, Config, Definition};
 use crate::escape::PathExt;
 use crate::record::RecordError;
@@ -23,9 +24,18 @@ const WIDTH: usize = 110;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The paper's layout to start from
+    /// Layout to start from: one of the paper's, or groups and POIs on a ring, in a row or in a grid
     #[arg(default_value = LAYOUTS[0].0[0], value_parser = layouts())]
     layout: String,
+    /// Groups, each of a leader and its followers, of a ring, row or grid [default: 4]
+    #[arg(long, value_name = "N", value_parser = whole)]
+    groups: Option<usize>,
+    /// Followers per group, of a ring, row or grid [default: 3]
+    #[arg(long, value_name = "N", value_parser = whole)]
+    followers: Option<usize>,
+    /// POIs of a ring, row or grid [default: as many as groups]
+    #[arg(long, value_name = "N", value_parser = whole)]
+    pois: Option<usize>,
     /// File to write, which must not be there yet [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
@@ -36,13 +46,13 @@ pub struct Args {
 
 /// Their names, by either of which they are found.
 fn layouts() -> PossibleValuesParser {
-    PossibleValuesParser::new(LAYOUTS.map(|([name, file], _)| PossibleValue::new(name).alias(file)))
+    let papers = LAYOUTS.map(|([name, file], _)| PossibleValue::new(name).alias(file));
+    PossibleValuesParser::new(papers.into_iter().chain(SHAPES.map(|(name, _)| PossibleValue::new(name))))
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let (names, from) =
-        LAYOUTS.into_iter().find(|(names, _)| names.contains(&&*args.layout)).expect("no other is taken");
-    let text = commented(from, &Config::parse(from, names[0])?);
+    let from = template(&args)?;
+    let text = commented(&from, &Config::parse(&from, &args.layout)?);
     let Some(path) = args.out else { return print(&text) };
     output::check(&[("--out", Some(&path))], &[])?;
     match args.force {
@@ -50,6 +60,28 @@ pub fn run(args: Args) -> Result<(), Error> {
         false => write_new(&path, &text).map_err(|error| RecordError::Write { path: path.clone(), error })?,
     }
     print(&format!("{}\n", path.escaped()))
+}
+
+/// The config to start from: one of the paper's, or one with as many groups and POIs as were asked for.
+fn template(args: &Args) -> Result<String, Error> {
+    let Some((_, shape)) = SHAPES.into_iter().find(|(name, _)| *name == args.layout) else {
+        let given = [("--groups", args.groups), ("--followers", args.followers), ("--pois", args.pois)];
+        if let Some((flag, _)) = given.into_iter().find(|(_, number)| number.is_some()) {
+            let layout = &args.layout;
+            return Err(Error::Usage(format!(
+                "{flag}: the layout {layout} is the paper's; use it with ring, row or grid"
+            )));
+        }
+        let paper = LAYOUTS.into_iter().find(|(names, _)| names.contains(&&*args.layout));
+        return Ok(paper.expect("no other is taken").1.into());
+    };
+    let groups = args.groups.unwrap_or(4);
+    let layout =
+        StartLayout { shape, groups, followers: args.followers.unwrap_or(3), pois: args.pois.unwrap_or(groups) };
+    match layout.problem() {
+        Some(problem) => Err(Error::Usage(problem)),
+        None => Ok(layout.text()?),
+    }
 }
 
 /// Writes a file that is not there yet.

@@ -11,6 +11,7 @@ use std::str::FromStr;
 use std::sync::{LazyLock, OnceLock};
 
 use clap::builder::PossibleValuesParser as Words;
+use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 
 use crate::backend::BackendError;
@@ -30,6 +31,7 @@ mod compare;
 mod completions;
 mod devices;
 mod init;
+mod layout;
 mod man;
 mod output;
 mod paper;
@@ -43,6 +45,7 @@ mod rollout;
 mod sweep;
 mod train;
 mod verify;
+mod warnings;
 
 /// Lists the commands, each with its file, and calls the one that was typed.
 macro_rules! commands {
@@ -127,11 +130,25 @@ fn program() -> PathBuf {
 pub fn run() -> Result<(), Error> {
     let words = words();
     reject_control_chars(words.iter().skip(1).cloned())?;
-    let typed = Cli::from_arg_matches(&command().get_matches_from(words));
+    let matches = command().try_get_matches_from(words).unwrap_or_else(|error| hinted(error).exit());
+    let typed = Cli::from_arg_matches(&matches);
     match typed.unwrap_or_else(|error| error.format(&mut command()).exit()).command {
         Command::Paper(args) if !args.questions.is_empty() => questions::run(&args),
         command => command.run(),
     }
+}
+
+/// Replaces clap's advice about an unknown flag, to pass it as a value, which helps nobody here.
+fn hinted(mut error: clap::Error) -> clap::Error {
+    if error.kind() == ErrorKind::UnknownArgument {
+        error.remove(ContextKind::Suggested);
+        let unknown = error.get(ContextKind::InvalidArg).map(ToString::to_string);
+        if let Some(flag @ ("--champion" | "--best")) = unknown.as_deref() {
+            let meant = format!("--team {}", flag.trim_start_matches('-'));
+            error.insert(ContextKind::SuggestedArg, ContextValue::String(meant));
+        }
+    }
+    error
 }
 
 /// [`run`] within a process that was started by other words: the first is the program that they would be typed to. Only
@@ -364,25 +381,46 @@ pub struct Overrides {
     #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
     pub population: Option<toml::Value>,
     /// Score that policies are selected by
-    #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = Words::new(Fitness::names()))]
+    #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = Words::new(Fitness::names()), ignore_case = true)]
     pub fitness: Option<String>,
     /// Who learns
-    #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = Words::new(Paradigm::names()))]
+    #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = Words::new(Paradigm::names()), ignore_case = true)]
     pub paradigm: Option<String>,
+    /// Any key of the config, as world.steps=60; may be given more than once
+    #[arg(long, help_heading = IN_CONFIG, value_name = "KEY=VALUE", value_parser = assignment)]
+    pub set: Vec<Override>,
+}
+
+/// A key and its value, which is TOML or a word.
+fn assignment(text: &str) -> Result<Override, String> {
+    let (key, value) = text.split_once('=').ok_or("allowed KEY=VALUE, as world.steps=60")?;
+    let (key, value) = (key.trim(), value.trim());
+    let is_toml = format!("value = {value}").parse::<toml::Table>().is_ok();
+    let text = if is_toml { value.to_string() } else { toml::Value::from(value).to_string() };
+    Ok(Override { key: key.into(), text, name: format!("--set {key}") })
+}
+
+/// The word as a list of words has it, in whatever case it was typed.
+fn canonical(mut names: impl Iterator<Item = &'static str>, typed: &str) -> toml::Value {
+    match names.find(|name| name.eq_ignore_ascii_case(typed)) {
+        Some(name) => name.into(),
+        None => typed.into(),
+    }
 }
 
 impl Overrides {
     /// The keys that were set, each named as its flag.
     pub fn list(&self) -> Vec<Override> {
-        let Overrides { seed, trials, generations, population, fitness, paradigm } = self;
+        let Overrides { seed, trials, generations, population, fitness, paradigm, set: given } = self;
         let numbers = [("seed", seed), ("trials", trials), ("generations", generations), ("population", population)]
             .map(|(name, value)| (name, value.clone()));
-        let words = [("fitness", fitness), ("paradigm", paradigm)]
-            .map(|(name, value)| (name, value.clone().map(toml::Value::from)));
+        let fitness = fitness.as_ref().map(|typed| canonical(Fitness::names(), typed));
+        let paradigm = paradigm.as_ref().map(|typed| canonical(Paradigm::names(), typed));
+        let words = [("fitness", fitness), ("paradigm", paradigm)];
         let set = |(name, value): (&str, Option<toml::Value>)| {
             Some(Override::new(format!("learning.{name}"), value?, format!("--{name}")))
         };
-        numbers.into_iter().chain(words).filter_map(set).collect()
+        numbers.into_iter().chain(words).filter_map(set).chain(given.iter().cloned()).collect()
     }
 }
 

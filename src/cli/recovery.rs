@@ -71,7 +71,10 @@ impl Checkpoints {
 
 /// Flags that set config keys, as typed.
 pub fn words_of(overrides: &[Override]) -> impl Iterator<Item = OsString> {
-    overrides.iter().flat_map(|set| [set.name.clone().into(), set.text.trim_matches(['"', '\'']).into()])
+    overrides.iter().flat_map(|set| match set.name.split_once(' ') {
+        Some((flag, key)) => [flag.into(), format!("{key}={}", set.text).into()],
+        None => [set.name.clone().into(), set.text.trim_matches(['"', '\'']).into()],
+    })
 }
 
 /// The flags that say what to run on, as typed, without those at their defaults.

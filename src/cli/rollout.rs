@@ -7,12 +7,15 @@ use std::sync::Mutex;
 use clap::builder::PossibleValuesParser as Words;
 use serde_json::json;
 
-use super::{ConfigFile, Error, RunOptions, backend, between, output, print, real, say, whole};
+use super::{
+    ConfigFile, Error, RunOptions, assignment, backend, between, canonical, output, points, print, real, say, whole,
+};
 use crate::backend::{Backend, Group, Machine, Moment, RecordRequest};
 use crate::config::{Choice, Override, Paradigm};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Spread, Starts};
-use crate::record::policies;
+use crate::record::{folder, policies};
 use crate::report::progress::Meter;
+use crate::report::replay::numbered;
 use crate::world::World;
 
 const HELD_OUT: &str = "Starts that no training saw";
@@ -23,16 +26,21 @@ const SENSED: &str = "pois_back_right,pois_front_right,pois_front_left,pois_back
 
 #[derive(clap::Args)]
 pub struct Args {
-    #[command(flatten)]
-    config: ConfigFile,
+    /// Folder that `flotilla train` made; or a config file (TOML), - for standard input, with --policies
+    #[arg(value_name = "RUN|CONFIG")]
+    path: PathBuf,
+    /// Any key of the config, as world.steps=60; may be given more than once
+    #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
+    set: Vec<Override>,
     /// Who learned, instead of the config's
-    #[arg(long, value_name = "NAME", value_parser = Words::new(Paradigm::names()))]
+    #[arg(long, value_name = "NAME", value_parser = Words::new(Paradigm::names()), ignore_case = true)]
     paradigm: Option<String>,
     #[command(flatten)]
     run: RunOptions,
-    /// Safetensors file with a tensor `weights` or `weights.N`, f32 [leaders, policies, parameters]
+    /// Safetensors file with a tensor `weights` or `weights.N`, f32 [leaders, policies, parameters] [default: the
+    /// run's policies.safetensors]
     #[arg(long, value_name = "FILE")]
-    policies: PathBuf,
+    policies: Option<PathBuf>,
     /// Take the tensor `weights.N` [default: `weights`, or else `weights.0`]
     #[arg(long, value_name = "N", value_parser = whole)]
     trial: Option<usize>,
@@ -85,29 +93,43 @@ impl Args {
 /// Team j is made of the policies with index j of every leader.
 pub fn run(args: Args) -> Result<(), Error> {
     let outputs = [("--scores", args.scores.as_deref()), ("--trace", args.trace.as_deref())];
-    output::check(&outputs, &[&args.config.path, &args.policies])?;
+    let (config, trained) = match args.path.is_dir() {
+        true => {
+            points::config(&args.path)?;
+            (args.path.join(folder::CONFIG), Some(args.path.join(folder::POLICIES)))
+        }
+        false => (args.path.clone(), None),
+    };
+    let Some(policies) = args.policies.clone().or(trained) else {
+        return Err(Error::Usage(format!(
+            "--policies: a config file needs a file of policies; or name a run's folder in place of {}",
+            args.path.display()
+        )));
+    };
+    let config = ConfigFile { path: config };
+    output::check(&outputs, &[&config.path, &policies])?;
     let set = |key: &str, value: Option<toml::Value>| {
         Some(Override::new(format!("learning.{key}"), value?, format!("--{}", key.replace('_', "-"))))
     };
     let overrides = [
-        set("paradigm", args.paradigm.clone().map(toml::Value::from)),
+        set("paradigm", args.paradigm.as_ref().map(|typed| canonical(Paradigm::names(), typed))),
         set("start_jitter", args.start_jitter.map(toml::Value::from)),
         set("poi_jitter", args.poi_jitter.map(toml::Value::from)),
     ];
-    let config = args.config.load(&overrides.into_iter().flatten().collect::<Vec<_>>())?;
+    let config = config.load(&overrides.into_iter().flatten().chain(args.set.iter().cloned()).collect::<Vec<_>>())?;
     let config = match args.stage {
         None => config,
         Some(stage) => {
             let mut staged = config.staged();
             if stage >= staged.len() {
                 let stages = staged.len();
-                return Err(Error::Usage(format!("--stage {stage}: the config has {stages}, 0 to {}", stages - 1)));
+                return Err(Error::Usage(format!("--stage {stage}: the config has {}", numbered(stages, "stage"))));
             }
             staged.swap_remove(stage).1
         }
     };
     let starts = args.starts(config.learning.start_jitter, config.learning.poi_jitter)?;
-    let policies = policies::read(&args.policies, &config, args.trial)?;
+    let policies = policies::read(&policies, &config, args.trial)?;
     let world = World::new(&config);
     let (mut backend, machine) = backend::open(&args.run)?;
     if !args.quiet {

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 
 use super::recovery::{self, Loss, Signals};
-use super::{Error, Overrides, RunOptions, backend, between, output, print, say, whole};
+use super::{Error, Overrides, RunOptions, backend, between, output, print, say, warnings, whole};
 use crate::config::{self, ConfigError, Problem};
 use crate::escape::PathExt;
 use crate::file;
@@ -307,6 +307,7 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
         let plan = memory::Peaks::of([&point.config], rayon::current_num_threads());
         plan.check(player.1.backend == "gpu").map_err(RunError::from)?;
     }
+    warnings::unreachable_in(sweep, &points);
     claim(sweep, out)?;
     let memory = args.memory.map_or_else(free_memory, |gib| (gib * f64::from(1 << 30)) as usize);
     if !args.quiet {

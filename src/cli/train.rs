@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 
 use super::recovery::{self, Checkpoints, Loss, Signals, quoted};
-use super::{ConfigArgs, Error, RunOptions, backend, print, say};
+use super::{ConfigArgs, Error, RunOptions, backend, print, say, warnings};
 use crate::config::Config;
 use crate::escape::PathExt;
 use crate::file;
@@ -18,6 +18,7 @@ use crate::record::disk::Disk;
 use crate::record::folder::{self, METRICS, POLICIES, Start};
 use crate::record::policies;
 use crate::report::progress::Board;
+use crate::report::replay::History;
 use crate::report::runs;
 use crate::report::tensorboard::Events;
 use crate::run::{Ended, Options, Results, RunError, Session};
@@ -99,6 +100,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let config = args.config.load_with(args.checkpoints.list())?;
     let mut player = backend::open(&args.run)?;
     Peaks::of([&config], rayon::current_num_threads()).check(player.1.backend == "gpu").map_err(RunError::from)?;
+    warnings::unreachable(&config);
     let runs_on = player.0.describe();
     let init = args.init.as_deref().map(|path| policies::read_init(path, &config)).transpose()?;
     let (folder, start) = args.folder()?;
@@ -214,6 +216,15 @@ impl Told<'_> {
     fn print(&self, session: &Session, trained: Option<Training>, quiet: bool, json: bool) -> Result<(), Error> {
         let results = session.results(0).expect("the run is done");
         let done_already = trained.is_none();
+        let ever = |all: Vec<History>| all.iter().any(|history| history.most() > 0.0);
+        if !History::all(self.folder, self.config).is_ok_and(ever) {
+            say(format_args!(
+                "warning: no team observed any POI in any generation, so there was nothing to learn from; try more \
+                 world.steps, a smaller world.coupling, POIs nearer to the starts, or a larger learning.population; \
+                 `flotilla replay {}` shows what teams do",
+                quoted(self.folder)
+            ));
+        }
         let (generations, seconds) =
             trained.map_or((0, 0.0), |trained| (trained.generations, trained.since.elapsed().as_secs_f64()));
         if json {
@@ -322,8 +333,12 @@ fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> S
             format!("  {name:<a$}  {best:<b$}   {mean:<c$}   {champion}", a = width(0), b = width(1), c = width(2));
         let _ = writeln!(text, "{}", line.trim_end());
     }
-    let [replayed, config, policies] =
-        [folder.into(), folder.join(folder::CONFIG), folder.join(POLICIES)].map(|path: PathBuf| quoted(&path));
+    let replayed = quoted(folder);
+    let film = quoted(&folder.join("champion.gif"));
+    let best = story.last.iter().reduce(|a, b| if b.champion_g > a.champion_g { b } else { a });
+    let (best, observed) = best.map_or((0, 0.0), |row| (row.trial, row.champion_g * pois as f64));
+    let what = counted.map_or("share of POIs".into(), |pois| format!("of {pois} POIs"));
+    let _ = write!(text, "\nThe best champion is that of trial {best}: {observed:.2} {what}.\n");
     let _ = write!(
         text,
         "
@@ -336,7 +351,8 @@ Files in {}:
 
 Next:
   flotilla replay {replayed}
-  flotilla rollout {config} --policies {policies} --scores scores.csv
+  flotilla replay {replayed} --trial {best} --team champion --out {film}
+  flotilla rollout {replayed} --scores scores.csv
 ",
         folder.escaped(),
         folder::CONFIG,

@@ -257,6 +257,12 @@ fn list(name: &str, problems: &[Problem], unlisted: usize) -> String {
         format!("{place}{key}{message}")
     });
     let mut lines: Vec<String> = lines.collect();
+    if let ([line], [Problem { line: None, key, .. }]) = (&mut lines[..], problems)
+        && !key.is_empty()
+        && !key.starts_with("--")
+    {
+        *line = format!("{name}: {line}");
+    }
     if unlisted > 0 {
         lines.push(format!("… and {unlisted} more"));
     }

@@ -120,7 +120,10 @@ impl<R: Read + Seek> TensorFile<R> {
         let header_bytes = u64::from_le_bytes(length);
         if header_bytes > MAX_HEADER_BYTES {
             let most = MAX_HEADER_BYTES;
-            return Err(format!("it is no safetensors file, or its header is over {most} bytes ({header_bytes})"));
+            return Err(match header_bytes < size {
+                true => format!("its header is over {most} bytes ({header_bytes})"),
+                false => "it is not a safetensors file".into(),
+            });
         }
         let start = 8 + header_bytes;
         if size < start {

@@ -208,6 +208,11 @@ impl History {
         self.rows.iter().rposition(Option::is_some)
     }
 
+    /// The largest G of a best team or champion in any generation.
+    pub fn most(&self) -> f64 {
+        self.rows.iter().flatten().flatten().copied().fold(0.0, f64::max)
+    }
+
     /// G of a generation's champion, if that was asked for, or else of its best team; none if it has no row.
     pub fn get(&self, generation: usize, which: Which) -> Option<f64> {
         let [best, champion] = self.rows.get(generation).copied().flatten()?;

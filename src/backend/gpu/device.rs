@@ -111,7 +111,7 @@ pub enum DeviceError {
         found: Vec<AdapterInfo>,
     },
     /// No adapter has this name or number.
-    #[error("no adapter {} \"{name}\"; there {}", if is_index(name) { "has the number" } else { "matches" }, there_are(.found))]
+    #[error("no adapter {} \"{name}\"; {}", if is_index(name) { "has the number" } else { "matches" }, there_are(.found))]
     UnknownAdapter {
         /// The name or number.
         name: String,
@@ -193,7 +193,13 @@ fn is_index(name: &str) -> bool {
 }
 
 fn there_are(found: &[AdapterInfo]) -> String {
-    if found.is_empty() { "is none at all".into() } else { format!("is {}", list(found)) }
+    let one = |(index, info): (usize, &AdapterInfo)| format!("{index} ({info})");
+    let all: Vec<_> = found.iter().enumerate().map(one).collect();
+    match all.len() {
+        0 => "there is none at all".into(),
+        1 => format!("the only adapter is {}", all[0]),
+        _ => format!("the adapters are {}", all.join(", ")),
+    }
 }
 
 fn inexact(failures: &[(Pass, String)]) -> String {

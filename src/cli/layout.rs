@@ -1,0 +1,200 @@
+//! Layouts to start an experiment of one's own from: groups of a leader and its followers, and POIs ahead of them.
+
+use std::f64::consts::{FRAC_PI_2, TAU};
+use std::fmt::Write;
+
+use glam::DVec2;
+
+use crate::config::{Config, ConfigError, MAX_AGENTS, MAX_POIS};
+use crate::reach;
+use crate::world::World;
+
+/// How groups and POIs are arranged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Pattern {
+    /// Groups around the centre look outwards; POIs are around them.
+    Ring,
+    /// Groups side by side; POIs in a row ahead of them.
+    Row,
+    /// Groups side by side; POIs in several rows ahead of them.
+    Grid,
+}
+
+/// The shapes by name.
+pub(super) const SHAPES: [(&str, Pattern); 3] =
+    [("ring", Pattern::Ring), ("row", Pattern::Row), ("grid", Pattern::Grid)];
+
+/// From a leader to the POI ahead of it, and between groups side by side, in units.
+const APART: f64 = 10.0;
+/// From a leader back to its first followers, which see it within the attraction radius of 5.
+const BEHIND: f64 = 3.0;
+/// Around everything, to the edge of the map: a POI's observation radius and some room.
+const EDGE: f64 = 8.0;
+
+/// A layout that was asked for.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct StartLayout {
+    pub shape: Pattern,
+    pub groups: usize,
+    pub followers: usize,
+    pub pois: usize,
+}
+
+/// One group: its leader's place, and which way it looks.
+struct LeaderStart {
+    place: DVec2,
+    heading: f64,
+}
+
+impl StartLayout {
+    /// What is wrong with the numbers.
+    pub fn problem(&self) -> Option<String> {
+        let agents = self.groups.saturating_mul(self.followers.saturating_add(1));
+        match agents {
+            _ if self.groups == 0 => Some("--groups 0: allowed at least 1".into()),
+            _ if self.pois == 0 || self.pois > MAX_POIS => {
+                Some(format!("--pois {}: allowed 1 to {MAX_POIS}", self.pois))
+            }
+            _ if agents > MAX_AGENTS => Some(format!(
+                "--groups {} --followers {}: these are {agents} agents, allowed 1 to {MAX_AGENTS}",
+                self.groups, self.followers
+            )),
+            _ => None,
+        }
+    }
+
+    /// The config file: a comment that says what the layout is, and the keys that make it.
+    ///
+    /// # Errors
+    /// The layout does not make a valid config.
+    pub fn text(&self) -> Result<String, ConfigError> {
+        let short = Config::parse(&self.with_steps(1), "layout")?;
+        // The farthest POI is reached with time to spare.
+        let nearest = |poi: &[f64; 2]| {
+            let away = |leader: &[f64; 2]| DVec2::from(*poi).distance((*leader).into());
+            short.world.leaders.iter().map(away).fold(f64::INFINITY, f64::min)
+        };
+        let farthest = short.world.pois.iter().map(nearest).fold(0.0, f64::max);
+        let most = crate::config::MAX_STEPS;
+        let travel = reach::travel(&World::new(&short), most);
+        let enough = travel.iter().position(|&travel| travel >= 1.5 * farthest + BEHIND).unwrap_or(most);
+        let text = self.with_steps(enough.next_multiple_of(5).clamp(25, most));
+        Config::parse(&text, "layout").map(|_| text)
+    }
+
+    fn groups(&self) -> Vec<LeaderStart> {
+        let group = |index: usize| match self.shape {
+            Pattern::Ring => {
+                let heading = TAU * index as f64 / self.groups as f64;
+                LeaderStart { place: DVec2::from_angle(heading) * self.radius(), heading }
+            }
+            Pattern::Row | Pattern::Grid => {
+                LeaderStart { place: DVec2::new(APART * index as f64, 0.0), heading: FRAC_PI_2 }
+            }
+        };
+        (0..self.groups).map(group).collect()
+    }
+
+    /// The radius of the leaders' ring, so wide that neighbouring groups do not attract each other.
+    fn radius(&self) -> f64 {
+        let around = 8.0 * self.groups as f64 / TAU + BEHIND;
+        if self.groups == 1 { 0.0 } else { around.max(6.0) }
+    }
+
+    fn pois(&self) -> Vec<DVec2> {
+        let pois = self.pois;
+        let width = APART * (self.groups - 1) as f64;
+        // In the middle of equal shares of a width.
+        let spread = |index: usize, count: usize, width: f64| (index as f64 + 0.5) / count as f64 * width;
+        let at = |index: usize| match self.shape {
+            Pattern::Ring => DVec2::from_angle(TAU * index as f64 / pois as f64) * (self.radius() + APART),
+            Pattern::Row => DVec2::new(spread(index, pois, width + APART) - APART / 2.0, APART),
+            Pattern::Grid => {
+                let columns = (pois as f64).sqrt().ceil() as usize;
+                let row = index / columns;
+                let in_row = columns.min(pois - row * columns);
+                let wide = (width + APART).max(APART * columns as f64);
+                let x = spread(index % columns, in_row, wide) - (wide - width) / 2.0;
+                DVec2::new(x, APART * (row + 1) as f64)
+            }
+        };
+        (0..pois).map(at).collect()
+    }
+
+    /// Where followers start relative to a leader that looks along the x axis: in rows behind it.
+    fn behind(&self) -> Vec<DVec2> {
+        let columns = self.followers.min(3).max(self.followers.div_ceil(3)).max(1);
+        let across = |column: usize, of: usize| match of {
+            1 => 0.0,
+            _ => 4.0 * column as f64 / (of - 1) as f64 - 2.0,
+        };
+        let one = |index: usize| {
+            let row = index / columns;
+            DVec2::new(-BEHIND - 0.6 * row as f64, across(index % columns, columns.min(self.followers - row * columns)))
+        };
+        (0..self.followers).map(one).collect()
+    }
+
+    fn with_steps(&self, steps: usize) -> String {
+        let groups = self.groups();
+        let followers = groups.iter().flat_map(|group| {
+            let turn = DVec2::from_angle(group.heading);
+            self.behind().into_iter().map(move |behind| group.place + turn.rotate(behind))
+        });
+        let (leaders, followers): (Vec<DVec2>, Vec<DVec2>) =
+            (groups.iter().map(|group| group.place).collect(), followers.collect());
+        let pois = self.pois();
+        let all = || leaders.iter().chain(&followers).chain(&pois);
+        let corner = all().copied().reduce(DVec2::min).unwrap_or_default() - EDGE;
+        let map = (all().copied().reduce(DVec2::max).unwrap_or_default() + EDGE - corner).ceil();
+        let places = |places: &[DVec2]| {
+            let one = |place: &DVec2| {
+                let [x, y] = (*place - corner).to_array().map(|at| (at * 100.0).round() / 100.0);
+                format!("[{x:?}, {y:?}]")
+            };
+            format!("[{}]", places.iter().map(one).collect::<Vec<_>>().join(", "))
+        };
+        let headings: Vec<_> =
+            groups.iter().map(|group| format!("{:?}", (group.heading * 1e6).round() / 1e6)).collect();
+        let needed = self.followers + 1;
+        let mut text = self.header(needed);
+        let _ = write!(
+            text,
+            "\n[world]\nmap = [{:?}, {:?}]\nleaders = {}\nfollowers = {}\npois = {}\ncoupling = {needed}\nsteps = {steps}\n",
+            map.x,
+            map.y,
+            places(&leaders),
+            places(&followers),
+            places(&pois),
+        );
+        if self.shape == Pattern::Ring {
+            let _ = writeln!(text, "heading = [{}]", headings.join(", "));
+        }
+        text
+    }
+
+    fn header(&self, needed: usize) -> String {
+        let StartLayout { groups, followers, pois, .. } = *self;
+        let count = |number: usize, what: &str| format!("{number} {what}{}", if number == 1 { "" } else { "s" });
+        let (name, looks) = match self.shape {
+            Pattern::Ring => ("Ring", "stand around the centre of the map and look outwards"),
+            Pattern::Row => ("Row", "stand side by side and look up"),
+            Pattern::Grid => ("Grid", "stand side by side and look up"),
+        };
+        let place = match self.shape {
+            Pattern::Ring => "on a ring around them",
+            Pattern::Row => "in a row ahead of them",
+            Pattern::Grid => "in rows ahead of them",
+        };
+        format!(
+            "# {name}: {}, each a leader with {}.\n#\n# The groups {looks}. The {} {} {place}. A POI counts once {} {} \
+             near it at the\n# same step.\n",
+            count(groups, "group"),
+            count(followers, "follower"),
+            count(pois, "POI"),
+            if pois == 1 { "is" } else { "are" },
+            count(needed, "agent"),
+            if needed == 1 { "is" } else { "are" },
+        )
+    }
+}

@@ -1,0 +1,240 @@
+//! How far agents can travel at most, and which POIs no team can observe.
+//!
+//! These are bounds: a POI that is reported here cannot be observed by any policy. One that is not reported may still be
+//! out of reach, since bounds ignore turns and the formation of a team.
+
+use std::fmt::{self, Display};
+
+use crate::config::{Config, MAX_STEPS, Observers};
+use crate::model::rule::NEVER;
+use crate::world::{GRID, World};
+
+/// Rounding of headings, speeds and squared distances, relative to their size.
+const ROUNDING: f64 = 1e-5;
+
+/// A POI that no team can observe.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Unreachable {
+    /// Its index.
+    pub poi: usize,
+    /// Why nobody can observe it.
+    pub why: Why,
+}
+
+/// Why no team can observe a POI.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Why {
+    /// Too few agents get there in time.
+    Far {
+        /// How many must be there at once.
+        needed: usize,
+        /// What the agents that count are called: "agent", "leader" or "follower".
+        who: &'static str,
+        /// How far from the POI the last one that is needed starts, at best.
+        distance: f64,
+        /// Within this distance it would be at the POI.
+        radius: f64,
+        /// How far an agent travels at most until the POI's last step.
+        travel: f64,
+        /// The last step at which the POI can be observed.
+        steps: usize,
+    },
+    /// Its last step comes before it can be observed, because it comes after another POI.
+    After {
+        /// The other POI.
+        other: usize,
+        /// The first step at which the other can be observed, if there is one.
+        observed: Option<usize>,
+    },
+}
+
+impl Display for Unreachable {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let poi = self.poi;
+        match &self.why {
+            Why::Far { needed, who, distance, radius, travel, steps } => {
+                match needed {
+                    1 => write!(f, "POI {poi} cannot be reached: the nearest {who} is {distance:.1} units away")?,
+                    _ => write!(
+                        f,
+                        "POI {poi} cannot be reached by the {needed} {who}s that it needs: at best the last of them is \
+                         {distance:.1} units away"
+                    )?,
+                }
+                write!(
+                    f,
+                    ", and an agent travels at most {travel:.1} units in {steps} steps (the observation radius is {radius})"
+                )
+            }
+            Why::After { other, observed: None } => {
+                write!(f, "POI {poi} cannot be observed: it comes after POI {other}, which cannot be observed")
+            }
+            Why::After { other, observed: Some(step) } => write!(
+                f,
+                "POI {poi} cannot be observed in time: it comes after POI {other}, which takes until step {step} at least"
+            ),
+        }
+    }
+}
+
+/// How far an agent travels at most, in units, after each of so many steps, 0 at the start.
+///
+/// It accelerates as fast as it can and never turns. Walls only shorten its way.
+pub fn travel(world: &World, steps: usize) -> Vec<f64> {
+    let motion = &world.constants.motion;
+    let [change, least, most, dt] =
+        [motion.max_speed_change, motion.min_speed, motion.max_speed, motion.dt].map(f64::from);
+    // A position is rounded in f32 and then to the grid, on both axes.
+    let largest = f64::from(motion.map_x.max(motion.map_y));
+    let rounding = 2f64.sqrt() * (1.0 / f64::from(GRID) + largest * f64::from(f32::EPSILON));
+    let (mut speed, mut far) = (f64::from(world.constants.speed), 0.0);
+    let step = |_| {
+        speed = (speed + change).max(least).min(most);
+        far += speed * dt * (1.0 + ROUNDING) + rounding;
+        far
+    };
+    std::iter::once(0.0).chain((0..steps).map(step)).collect()
+}
+
+/// The POIs that no team can observe in any episode of a config (of its own keys, without its stages).
+pub fn unreachable(config: &Config) -> Vec<Unreachable> {
+    let world = World::new(config);
+    let steps = world.steps();
+    let travel = travel(&world, steps);
+    let radius = config.world.observation_radius;
+    // Jitter moves both ends by up to so much on each axis.
+    let jitter = 2f64.sqrt() * (config.learning.start_jitter + config.learning.poi_jitter);
+    let who = match config.world.observers {
+        Observers::All => "agent",
+        Observers::Leaders => "leader",
+        Observers::Followers => "follower",
+    };
+    // How far the last agent that a POI needs is away, and the first step at which it can be there.
+    let distance = |poi: usize| {
+        let from = |agent: usize| world.starts[agent].as_dvec2().distance(world.pois[poi].as_dvec2());
+        let mut distances: Vec<f64> = (0..world.agents()).filter(|&agent| world.rule.counts(agent)).map(from).collect();
+        distances.sort_by(f64::total_cmp);
+        let last = (world.coupling[poi] as usize).saturating_sub(1);
+        (distances.get(last).copied().unwrap_or(f64::INFINITY) - jitter).max(0.0)
+    };
+    let distances: Vec<f64> = (0..world.pois.len()).map(distance).collect();
+    let there = |poi: usize, step: u32| distances[poi] <= travel[step as usize] + radius * (1.0 + ROUNDING);
+    let mut observed = vec![NEVER; world.pois.len()];
+    world.rule.observe(steps as u32, &mut observed, |poi, mut open| open.find(|&step| there(poi, step)));
+    let why = |poi: usize| {
+        let last = world.rule.window(poi).map_or(steps as u32, |[_, last]| last.min(steps as u32));
+        let latest = world.rule.after(poi).iter().copied().max_by_key(|&other| observed[other]);
+        match latest {
+            Some(other) if there(poi, last) => {
+                Why::After { other, observed: (observed[other] != NEVER).then_some(observed[other] as usize) }
+            }
+            _ => Why::Far {
+                needed: world.coupling[poi] as usize,
+                who,
+                distance: distances[poi],
+                radius,
+                travel: travel[last as usize],
+                steps: last as usize,
+            },
+        }
+    };
+    let never = (0..world.pois.len()).filter(|&poi| observed[poi] == NEVER);
+    never.map(|poi| Unreachable { poi, why: why(poi) }).collect()
+}
+
+/// The fewest steps in which every POI could be reached, if the length of an episode is what keeps some from it.
+pub fn fewest_steps(config: &Config, unreachable: &[Unreachable]) -> Option<usize> {
+    let far = unreachable.iter().filter_map(|unreachable| match unreachable.why {
+        Why::Far { distance, radius, .. } => Some(distance - radius),
+        Why::After { .. } => None,
+    });
+    let farthest = far.reduce(f64::max)?;
+    let steps = travel(&World::new(config), MAX_STEPS).iter().position(|&travel| travel >= farthest)?;
+    (steps > config.world.steps).then_some(steps)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn config(keys: &str) -> Config {
+        let text = format!(
+            "[world]\nmap = [60, 60]\nleaders = [[10, 10], [10, 20]]\nfollowers = [[12, 10]]\npois = [[10, 40], [12, 12]]\n{keys}"
+        );
+        Config::parse(&text, "test").unwrap()
+    }
+
+    fn found(keys: &str) -> Vec<(usize, String)> {
+        unreachable(&config(keys)).into_iter().map(|found| (found.poi, found.to_string())).collect()
+    }
+
+    #[test]
+    fn an_agent_accelerates_to_its_largest_speed() {
+        let far = travel(&World::new(&config("coupling = 1\n")), 25);
+        // 1, 2 and then 3 units a second, for 0.2 s each.
+        for (steps, expected) in [(0, 0.0), (1, 0.2), (2, 0.6), (3, 1.2), (25, 14.4)] {
+            assert!(far[steps] >= expected && far[steps] < expected + 1e-3, "{steps}: {}", far[steps]);
+        }
+        let still = travel(&World::new(&config("coupling = 1\nspeed = 3\n[motion]\nmax_acceleration = 0\n")), 10);
+        assert!(still[10] >= 6.0 && still[10] < 6.001, "{still:?}");
+    }
+
+    #[test]
+    fn the_last_agent_that_is_needed_decides() {
+        // From (10, 20) it is 20 units to the first POI, of which the radius covers 5; the others are 30 away.
+        assert!(found("coupling = 1\nsteps = 26\n").is_empty());
+        assert_eq!(
+            found("coupling = 1\nsteps = 25\n"),
+            [(
+                0,
+                "POI 0 cannot be reached: the nearest agent is 20.0 units away, and an agent travels at most 14.4 units in \
+                 25 steps (the observation radius is 5)"
+                    .to_string()
+            )]
+        );
+        let three = found("coupling = 3\nsteps = 40\n");
+        assert!(
+            three.len() == 1 && three[0].1.contains("by the 3 agents that it needs: at best the last"),
+            "{three:?}"
+        );
+        assert!(found("coupling = 3\nsteps = 45\n").is_empty());
+    }
+
+    #[test]
+    fn only_observers_count() {
+        assert!(found("coupling = 1\nsteps = 26\nobservers = 'leaders'\n").is_empty());
+        let followers = found("coupling = 1\nsteps = 26\nobservers = 'followers'\n");
+        assert!(
+            followers.len() == 1 && followers[0].1.contains("the nearest follower is 30.1 units away"),
+            "{followers:?}"
+        );
+    }
+
+    #[test]
+    fn windows_end_early_and_pois_wait_for_others() {
+        let closed = found("coupling = 1\nsteps = 40\nwindows = [[1, 25], [1, 40]]\n");
+        assert!(closed.len() == 1 && closed[0].1.contains("14.4 units in 25 steps"), "{closed:?}");
+        let waits = found("coupling = 1\nsteps = 25\nafter = [[], [0]]\n");
+        assert_eq!(waits[1].1, "POI 1 cannot be observed: it comes after POI 0, which cannot be observed");
+        let late = found("coupling = 1\nsteps = 40\nwindows = [[1, 40], [1, 26]]\nafter = [[], [0]]\n");
+        assert_eq!(
+            late[0].1,
+            "POI 1 cannot be observed in time: it comes after POI 0, which takes until step 26 at least"
+        );
+        assert!(found("coupling = 1\nsteps = 40\nwindows = [[1, 40], [1, 27]]\nafter = [[], [0]]\n").is_empty());
+    }
+
+    #[test]
+    fn jitter_brings_starts_and_pois_nearer() {
+        assert!(found("coupling = 1\nsteps = 25\n[learning]\nstart_jitter = 0.5\n").is_empty());
+        assert!(found("coupling = 1\nsteps = 25\n[learning]\npoi_jitter = 0.5\n").is_empty());
+    }
+
+    #[test]
+    fn as_many_steps_as_are_named_are_enough() {
+        let near = config("coupling = 1\nsteps = 25\n");
+        assert_eq!(fewest_steps(&near, &unreachable(&near)), Some(26));
+        let still = config("coupling = 1\n[motion]\nmax_speed = 0\n");
+        assert_eq!(fewest_steps(&still, &unreachable(&still)), None);
+    }
+}
