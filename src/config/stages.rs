@@ -238,7 +238,7 @@ pub(super) fn attribute(
     let name = names.join(", ");
     let of_flags = |Problem { line, key, message }: Problem| {
         let line = line.map_or(String::new(), |line| format!(" (line {line})"));
-        Problem { line: None, key: name.clone(), message: format!("not possible with {key}{line}: {message}") }
+        Problem { line: None, key: name.clone(), message: format!("{key}: {message}{line}") }
     };
     problems.into_iter().map(of_flags).collect()
 }
