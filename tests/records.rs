@@ -348,7 +348,7 @@ fn compiling() {
             let backend = || GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
             let gpu = backend().playing(Kernel::Best).holding(ResidencyPolicy::Always).bringing(Records::PackedFrom(0));
             for (what, mut backend) in [("by default", backend()), ("as on a GPU", gpu)] {
-                let mut trainer = Trainer::new(ValidConfig::all(&configs).unwrap());
+                let mut trainer = Trainer::new(ValidConfig::all(configs).unwrap());
                 let mut seconds = || {
                     let start = processor_seconds();
                     trainer.advance(&mut backend).unwrap();

@@ -8,7 +8,7 @@
 //! was at a POI. A set changes nothing if another set of the same POI contains it: the larger set still has at least
 //! as many agents after any removal or copy. So only the maximal sets of each POI matter and, except for D++, only
 //! those with at least as many agents as the POI needs. A backend may drop the others, see [`crate::backend::RecordRequest`].
-//! Dt, and rules with windows or orders, need the whole record ([`replay`](mod@replay)).
+//! Dt, and rules with windows or orders, need the whole record.
 
 mod assignment;
 mod fast;

@@ -49,7 +49,7 @@ gpu_struct! {
         pub leaders: u32,
         /// The first leader to gather.
         pub first: u32,
-        /// Leaders to gather, up to [`TOGETHER`].
+        /// Leaders to gather, up to 4 (`TOGETHER`).
         pub count: u32,
         /// Weights per policy.
         pub parameters: u32,

@@ -52,7 +52,7 @@ gpu_struct! {
         pub least: u32,
         /// The offset of the table of packed sets, which packing writes.
         pub table: u32,
-        /// The offset of the leaders that followers saw most, which packing writes, or [`NOWHERE`].
+        /// The offset of the leaders that followers saw most, which packing writes, or all ones for nowhere.
         pub owners: u32,
     }
 
