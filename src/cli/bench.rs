@@ -28,20 +28,20 @@ pub struct Args {
     overrides: Overrides,
     #[command(flatten)]
     run: RunOptions,
-    /// Teams of a generation, one or several [default: 50,4096,131072; with --json, 4096]
+    /// Teams per generation, one or several [default: 50,4096,131072; with --json, 4096]
     #[arg(long, value_name = "N,…", value_delimiter = ',',
         value_parser = between(2..=config::MAX_POPULATION as u32))]
     teams: Vec<u32>,
-    /// Steps of an episode, one or several [default: the config's]
+    /// Steps per episode, one or several [default: the config's]
     #[arg(long, value_name = "N,…", value_delimiter = ',',
         value_parser = between(1..=config::MAX_STEPS as u32))]
     steps: Vec<u32>,
-    /// Agents of a team, one or several: leaders and followers in the config's ratio, laid out in groups as by
+    /// Agents per team, one or several: leaders and followers in the config's ratio, laid out in groups as by
     /// `flotilla sweep` [default: the config's]
     #[arg(long, value_name = "N,…", value_delimiter = ',',
         value_parser = between(1..=config::MAX_AGENTS as u32))]
     agents: Vec<u32>,
-    /// Leave whole generations out
+    /// Measure rollouts only, not whole generations
     #[arg(long)]
     rollout_only: bool,
     /// Also tell where a generation's time goes, and on a GPU what goes over its bus
@@ -50,7 +50,7 @@ pub struct Args {
     /// Instruction set of the CPU backend, of those that this processor has [default: the widest]
     #[arg(long, value_name = "NAME")]
     instructions: Option<String>,
-    /// Print JSON objects, one a line
+    /// Print JSON objects, one per line
     #[arg(long)]
     json: bool,
 }

@@ -25,19 +25,19 @@ pub struct Args {
     /// Of a sweep: the axis whose values are compared, for each combination of the others [default: its only one]
     #[arg(long, value_name = "AXIS")]
     by: Option<String>,
-    /// Generations to compare G at, as 0,50,last; last is the last one that all have come to
+    /// Generations at which to compare G, as 0,50,last; last is the last one that all arms have reached
     #[arg(long, value_name = "N,…", value_delimiter = ',', default_value = "last", value_parser = at)]
     at: Vec<At>,
     /// G whose first generation is compared, in 0..1
     #[arg(long, value_name = "G", default_value_t = 0.75, value_parser = share)]
     reach: f64,
-    /// Compare pair by pair; trials with one seed and number are pairs
+    /// Compare pair by pair; trials with the same seed and number are pairs
     #[arg(long)]
     paired: bool,
     /// Print one JSON object (docs/reference/json.md)
     #[arg(long, conflicts_with_all = ["csv", "latex"])]
     json: bool,
-    /// Print CSV, a row a mean or a difference
+    /// Print CSV, one row per mean or difference
     #[arg(long, conflicts_with = "latex")]
     csv: bool,
     /// Print LaTeX tables, which need no package

@@ -36,7 +36,7 @@ pub struct Args {
     /// POIs of a ring, row or grid [default: as many as groups]
     #[arg(long, value_name = "N", value_parser = whole)]
     pois: Option<usize>,
-    /// File to write, which must not be there yet [default: standard output]
+    /// File to write; it must not exist yet [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Write over the file

@@ -67,11 +67,11 @@ macro_rules! commands {
 commands! {
     /// Write a commented config to start from.
     Init(init),
-    /// Check a config; print it with every default written out, and what a run of it costs.
+    /// Check a config; print it with every value written out, and the cost of a run.
     Check(check),
     /// Train the teams of a config, and save what they learned.
     Train(train),
-    /// Play teams of policies from a file, and score every leader.
+    /// Play teams of given policies without training, and score every leader.
     Rollout(rollout),
     /// Train all of the paper's experiments, draw its figures and check its claims.
     Paper(paper),
@@ -85,11 +85,11 @@ commands! {
     Bench(bench),
     /// Compare every GPU with the CPU, bit for bit.
     Verify(verify),
-    /// List what can be trained on.
+    /// List the processors and GPUs to train on.
     Devices(devices),
-    /// Train every point of a grid side by side; share the grid out over many machines.
+    /// Train every point of a grid side by side, on one machine or many.
     Sweep(sweep),
-    /// Print the script by which a shell completes commands and flags.
+    /// Print a shell completion script.
     Completions(completions),
     /// Write manual pages.
     Man(man),
@@ -306,7 +306,7 @@ pub fn print(text: &str) -> Result<(), Error> {
     }
 }
 
-const IN_CONFIG: &str = "Instead of the config's";
+const IN_CONFIG: &str = "Config overrides";
 const WHERE: &str = "Where to run (the results are the same)";
 
 /// A config file.
@@ -368,16 +368,16 @@ impl ConfigArgs {
 /// Flags that stand for config keys; their ranges are checked with the config.
 #[derive(clap::Args, Default)]
 pub struct Overrides {
-    /// Start of all randomness
+    /// Random seed
     #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
     pub seed: Option<toml::Value>,
     /// Independent repetitions
     #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
     pub trials: Option<toml::Value>,
-    /// Generations after the random start
+    /// Generations after generation 0, which is random
     #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
     pub generations: Option<toml::Value>,
-    /// Policies a population, and teams a generation
+    /// Policies per population, and teams per generation
     #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
     pub population: Option<toml::Value>,
     /// Score that policies are selected by

@@ -42,13 +42,13 @@ pub struct Args {
     /// Independent repetitions [default: 5, or 30 of questions]
     #[arg(long, value_name = "N", value_parser = number)]
     trials: Option<toml::Value>,
-    /// Generations after the random start [default: 100, or what a question's config says]
+    /// Generations after generation 0, which is random [default: 100, or what a question's config says]
     #[arg(long, value_name = "N", value_parser = number)]
     generations: Option<toml::Value>,
-    /// Start of all randomness [default: 0]
+    /// Random seed [default: 0]
     #[arg(long, value_name = "N", value_parser = number)]
     seed: Option<toml::Value>,
-    /// Go on with the paper in the folder, or start it; of one that is done, draw figures and claims again
+    /// Resume the paper in the directory, or start it; for a finished one, draw figures and claims again
     #[arg(long, conflicts_with = "force")]
     pub(super) resume: bool,
     /// Write over the paper in the folder
@@ -57,7 +57,7 @@ pub struct Args {
     /// No progress on standard error
     #[arg(long, short)]
     pub(super) quiet: bool,
-    /// Print what came out as one JSON object (docs/reference/json.md)
+    /// Print the results as one JSON object (docs/reference/json.md)
     #[arg(long)]
     pub(super) json: bool,
     #[command(flatten)]

@@ -18,7 +18,7 @@ use crate::shell;
 /// What to do about a failing device.
 #[derive(clap::Args, Clone, Copy)]
 pub struct Loss {
-    /// What to do when the device fails in mid-run
+    /// What to do if the device fails during a run
     #[arg(long, value_enum, value_name = "WHAT", default_value_t = OnLoss::Stop)]
     on_device_loss: OnLoss,
 }
@@ -27,7 +27,7 @@ pub struct Loss {
 pub enum OnLoss {
     /// Save and fail, to be resumed
     Stop,
-    /// Go on with the CPU, to the same results
+    /// Continue on the CPU, to the same results
     Cpu,
 }
 
@@ -50,10 +50,10 @@ pub fn setback(error: &BackendError) {
 /// How often runs are saved, instead of what their config says.
 #[derive(clap::Args)]
 pub struct Checkpoints {
-    /// Save what --resume needs after so many generations; 0 is never
+    /// Write a checkpoint every N generations; 0 means never
     #[arg(long, value_name = "N", value_parser = number)]
     checkpoint_generations: Option<toml::Value>,
-    /// Save what --resume needs after so many seconds; 0 is never
+    /// Write a checkpoint every S seconds; 0 means never
     #[arg(long, value_name = "S", value_parser = number)]
     checkpoint_seconds: Option<toml::Value>,
 }

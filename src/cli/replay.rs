@@ -45,7 +45,7 @@ pub struct Args {
     /// Pixels across, of a .gif or .png [default: a .gif fits into 960 x 720, a .png has 300 an inch]
     #[arg(long, value_name = "PIXELS", value_parser = between(100..=8192u32))]
     width: Option<u32>,
-    /// Pictures a second, of a .gif or a film [default: 20]
+    /// Pictures per second, for a .gif or a film [default: 20]
     #[arg(long, value_name = "N", value_parser = between(1..=50u32))]
     fps: Option<u32>,
     /// Print one JSON object

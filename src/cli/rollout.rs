@@ -18,7 +18,7 @@ use crate::report::progress::Meter;
 use crate::report::replay::numbered;
 use crate::world::World;
 
-const HELD_OUT: &str = "Starts that no training saw";
+const HELD_OUT: &str = "Held-out starts";
 /// Columns of a trace, and what leaders add to them: the eight inputs and two outputs of their policies.
 const STATES: &str = "team,step,agent,role,x,y,heading_x,heading_y,speed";
 const SENSED: &str = "pois_back_right,pois_front_right,pois_front_left,pois_back_left,\
@@ -60,7 +60,7 @@ pub struct Args {
     #[arg(long, short)]
     quiet: bool,
 
-    /// Play every team from so many jittered starts [default: once, from the config's own]
+    /// Play every team from this many held-out starts [default: once, from the config's own start]
     #[arg(long, value_name = "N", value_parser = between(1..=MAX_EPISODES),
         help_heading = HELD_OUT)]
     episodes: Option<u32>,
@@ -68,10 +68,10 @@ pub struct Args {
     #[arg(long, value_name = "S", requires = "episodes", value_parser = between(0..=i64::MAX as u64),
         help_heading = HELD_OUT)]
     seed: Option<u64>,
-    /// How far a start is moved at most, on each axis [default: the config's learning.start_jitter]
+    /// Largest offset of a start on each axis [default: the config's learning.start_jitter]
     #[arg(long, value_name = "J", requires = "episodes", value_parser = real, help_heading = HELD_OUT)]
     start_jitter: Option<f64>,
-    /// How far a POI is moved at most, on each axis [default: the config's learning.poi_jitter]
+    /// Largest offset of a POI on each axis [default: the config's learning.poi_jitter]
     #[arg(long, value_name = "J", requires = "episodes", value_parser = real, help_heading = HELD_OUT)]
     poi_jitter: Option<f64>,
 }

@@ -27,7 +27,7 @@ use crate::sweep::shard::{self, MAX_SHARDS, Shard};
 use crate::sweep::slurm::Job;
 use crate::sweep::{Point, Sweep};
 
-const SCALE_OUT: &str = "Many processes (docs/how-to/sweeps.md)";
+const SCALE_OUT: &str = "Many processes (docs/how-to/clusters.md)";
 const RESULTS: &str = "Results";
 
 #[derive(clap::Args)]
@@ -39,10 +39,10 @@ pub struct Args {
     overrides: Overrides,
     #[command(flatten)]
     run: RunOptions,
-    /// Folder for what comes out, the same for all shards [default: runs/NAME of the sweep]
+    /// Output directory, the same for all shards [default: runs/NAME of the sweep]
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Go on with the points in the folder, and start those that are not there
+    /// Resume the points in the directory, and start the missing ones
     #[arg(long, conflicts_with = "force")]
     resume: bool,
     /// Write over this sweep's points in the folder
@@ -60,7 +60,7 @@ pub struct Args {
     /// No progress on standard error
     #[arg(long, short)]
     quiet: bool,
-    /// Print what came out as one JSON object (docs/reference/json.md)
+    /// Print the results as one JSON object (docs/reference/json.md)
     #[arg(long, conflicts_with_all = ["list", "slurm"])]
     json: bool,
     #[command(flatten)]
@@ -91,7 +91,7 @@ pub struct Args {
     /// A row of results.csv every N generations, and one for the last
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = between(1..=u32::MAX), help_heading = RESULTS)]
     every: u32,
-    /// G whose first generation is told, in 0..1
+    /// G for which the first generation is reported, 0 to 1
     #[arg(long, value_name = "G", default_value_t = 0.75, value_parser = share, help_heading = RESULTS)]
     reach: f64,
     /// The two axes of the pictures, across and down [default: the first two of the grid]

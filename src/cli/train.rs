@@ -38,16 +38,15 @@ pub struct Args {
     config: ConfigArgs,
     #[command(flatten)]
     run: RunOptions,
-    /// Folder for what comes out [default: runs/NAME of the config (runs/config of standard input), or the next free
+    /// Output directory [default: runs/NAME of the config (runs/config for standard input), or the next free
     /// runs/NAME-2, …]
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Go on with the run in the folder (without --out the latest of this config's name), or start it if there is none
+    /// Resume the run in the directory (without --out the latest of this config's name), or start it if there is none
     #[arg(long, conflicts_with = "force")]
     resume: bool,
     /// Start from the policies of a safetensors file, in place of random ones: trial i from its tensor `weights.i`, or
-    /// all from `weights`, f32 [leaders, policies, parameters]; fewer policies than a population takes are joined by
-    /// random ones
+    /// all from `weights`, f32 [leaders, policies, parameters]; missing policies are filled with random ones
     #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
     /// Write over the run in the folder (without --out in runs/NAME of the config)
@@ -56,7 +55,7 @@ pub struct Args {
     /// No progress on standard error, and no summary on standard output but by --json
     #[arg(long, short)]
     quiet: bool,
-    /// Print what came out as one JSON object (docs/reference/json.md)
+    /// Print the results as one JSON object (docs/reference/json.md)
     #[arg(long)]
     json: bool,
     /// Also write event files for TensorBoard, in OUT/tensorboard; with --resume also of what was trained before

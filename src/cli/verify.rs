@@ -31,7 +31,7 @@ pub struct Args {
     /// Random worlds
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = between(1..=100_000u32))]
     worlds: u32,
-    /// Start of all randomness
+    /// Random seed
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = between(0..=u32::MAX))]
     seed: u32,
     /// Only the adapter whose name contains this, or of this number
@@ -43,11 +43,11 @@ pub struct Args {
     /// Only this kernel, instead of both
     #[arg(long, value_name = "KERNEL", value_parser = ["generic", "specialised"])]
     kernel: Option<String>,
-    /// Write what was compared, on what, and what short trainings come to, as a row of docs/develop/evidence.md; compares the
+    /// Write comparisons, hardware and the digests of short trainings as a row of docs/develop/evidence.md; compares the
     /// processor's instruction sets, too, and needs no adapter
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
-    /// What else there is to know of the machine, for the report
+    /// A remark about the machine, for the report
     #[arg(long, value_name = "TEXT", requires = "report")]
     note: Option<String>,
     /// Print one JSON object
