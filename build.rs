@@ -15,11 +15,42 @@ fn main() {
     let compiler = compiler.map_or(String::new(), |output| String::from_utf8_lossy(&output.stdout).trim().into());
     println!("cargo::rustc-env=FLOTILLA_RUSTC={compiler}");
     let (commit, files) = match variable("PROFILE").as_str() {
-        "release" => commit(Path::new(&variable("CARGO_MANIFEST_DIR"))),
+        "release" => state(Path::new(&variable("CARGO_MANIFEST_DIR"))),
         _ => Default::default(),
     };
     files.iter().for_each(|file| println!("cargo::rerun-if-changed={}", file.display()));
     println!("cargo::rustc-env=FLOTILLA_COMMIT={}", commit.unwrap_or_default());
+}
+
+/// Returns the commit of a source tree with `-dirty` after it if files differ from that commit, and the files that this
+/// depends on. If nobody can say whether files differ, `-unchecked` follows.
+pub fn state(root: &Path) -> (Option<String>, Vec<PathBuf>) {
+    let (commit, mut files) = commit(root);
+    let Some(commit) = commit else { return (None, files) };
+    let dirty = match fs::read_to_string(root.join(".cargo_vcs_info.json")) {
+        Ok(text) => Some(text.replace(char::is_whitespace, "").contains("\"dirty\":true")),
+        Err(_) => {
+            let sources = SOURCES.iter().map(|name| root.join(name)).filter(|path| path.exists());
+            files.extend(sources);
+            differs(root)
+        }
+    };
+    let mark = match dirty {
+        Some(false) => "",
+        Some(true) => "-dirty",
+        None => "-unchecked",
+    };
+    (Some(commit + mark), files)
+}
+
+/// What a build reads.
+const SOURCES: [&str; 7] = ["Cargo.toml", "Cargo.lock", "build.rs", "configs", "shaders", "src", "python/src"];
+
+/// Whether tracked files differ from the commit; none without git.
+fn differs(root: &Path) -> Option<bool> {
+    let line = ["status", "--porcelain", "--untracked-files=no"];
+    let output = Command::new("git").args(line).current_dir(root).output().ok()?;
+    output.status.success().then_some(!output.stdout.is_empty())
 }
 
 /// The commit of a source tree, and the files that say so: of a checkout (whole, shallow or a worktree) what HEAD names,

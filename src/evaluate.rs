@@ -98,9 +98,9 @@ impl Tally {
         self.squares += u128::from(value) * u128::from(value);
     }
 
-    /// 0 of none.
+    /// The mean; 0 without values.
     pub fn mean(&self) -> f64 {
-        self.sum as f64 / self.count as f64
+        self.sum as f64 / self.count.max(1) as f64
     }
 
     /// Of values that are counted in parts of which `unit` make one, and none is above `most`.
@@ -227,4 +227,18 @@ pub fn evaluate(
         }
     }
     Ok(evaluation)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_mean_of_nothing_is_0() {
+        let mut tally = Tally::default();
+        assert_eq!(tally.mean(), 0.0);
+        assert_eq!(tally.spread(2, 4), Spread { mean: 0.0, deviation: None, interval: None });
+        tally.add(3);
+        assert_eq!(tally.mean(), 3.0);
+    }
 }

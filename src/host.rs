@@ -1,4 +1,4 @@
-//! The clock and blocking waits. No other module uses the system's directly.
+//! The clock, blocking waits and threads. No other module uses the system's directly.
 //!
 //! Native programs use the system's. WebAssembly has neither, so its embedder provides them with `install`. Without a
 //! clock, time stands still there. Without a way to park, waiting polls in a loop.
@@ -103,3 +103,120 @@ mod embedded {
 
 #[cfg(target_family = "wasm")]
 pub use embedded::*;
+
+#[cfg(all(feature = "parallel", not(target_family = "wasm")))]
+pub use threads::{Threads, start};
+
+/// Starts the threads that rayon shares work between, as many as the system allows.
+#[cfg(all(feature = "parallel", not(target_family = "wasm")))]
+mod threads {
+    use std::fmt::{self, Display};
+    use std::sync::{OnceLock, mpsc};
+    use std::{io, thread};
+
+    /// How many threads a process asked for, and how many it has.
+    #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+    pub struct Threads {
+        /// How many it asked for.
+        pub wanted: usize,
+        /// How many the system let it start; with 0, all work is done by the thread that asked.
+        pub started: usize,
+    }
+
+    impl Threads {
+        /// Whether there are fewer threads than were asked for.
+        pub fn is_short(&self) -> bool {
+            self.started < self.wanted
+        }
+    }
+
+    impl Display for Threads {
+        fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            let Threads { wanted, started } = self;
+            write!(
+                f,
+                "only {started} of {wanted} threads could be started, so this takes longer: the system allows no more \
+                 threads or memory here; see `ulimit -u` and `ulimit -v`"
+            )
+        }
+    }
+
+    /// Starts the threads of this process: so many, or one per core (or what `RAYON_NUM_THREADS` says). Only the first call
+    /// does anything; later calls return what it returned.
+    ///
+    /// rayon cannot be asked again after a thread could not be started. So the threads are started first, and rayon gets
+    /// those that there are.
+    pub fn start(threads: Option<usize>) -> Threads {
+        static STARTED: OnceLock<Threads> = OnceLock::new();
+        *STARTED.get_or_init(|| start_now(threads.unwrap_or_else(usual)))
+    }
+
+    /// Returns how many threads rayon would start.
+    fn usual() -> usize {
+        let set = std::env::var("RAYON_NUM_THREADS").ok().and_then(|text| text.parse().ok());
+        set.filter(|&threads| threads > 0).unwrap_or_else(|| thread::available_parallelism().map_or(1, usize::from))
+    }
+
+    type Worker = mpsc::Sender<rayon::ThreadBuilder>;
+
+    /// Starts a thread that waits to become one of rayon's.
+    fn spawn() -> io::Result<Worker> {
+        let (sender, receiver) = mpsc::channel::<rayon::ThreadBuilder>();
+        thread::Builder::new().spawn(move || receiver.recv().map(rayon::ThreadBuilder::run))?;
+        Ok(sender)
+    }
+
+    /// Starts threads until there are enough or one cannot be started.
+    fn workers(wanted: usize, mut spawn: impl FnMut() -> io::Result<Worker>) -> Vec<Worker> {
+        (0..wanted).map_while(|_| spawn().ok()).collect()
+    }
+
+    /// Returns what makes threads that wait into threads of a pool.
+    fn hand_over(workers: Vec<Worker>) -> impl FnMut(rayon::ThreadBuilder) -> io::Result<()> {
+        let mut workers = workers.into_iter();
+        move |thread| {
+            let gone = || io::Error::other("no thread is left");
+            let worker = workers.next().ok_or_else(gone)?;
+            worker.send(thread).map_err(|_| gone())
+        }
+    }
+
+    fn start_now(wanted: usize) -> Threads {
+        let workers = workers(wanted, spawn);
+        let started = workers.len();
+        let built = match started {
+            0 => rayon::ThreadPoolBuilder::new().num_threads(1).use_current_thread().build_global(),
+            _ => rayon::ThreadPoolBuilder::new().num_threads(started).spawn_handler(hand_over(workers)).build_global(),
+        };
+        match built {
+            Ok(()) => Threads { wanted, started },
+            // The process has started its own threads before.
+            Err(_) => Threads { wanted: rayon::current_num_threads(), started: rayon::current_num_threads() },
+        }
+    }
+
+    #[cfg(test)]
+    mod tests {
+        use super::*;
+
+        #[test]
+        fn as_many_threads_are_started_as_the_system_allows() {
+            let mut left = 2;
+            let limited = || match left {
+                0 => Err(io::ErrorKind::WouldBlock.into()),
+                _ => {
+                    left -= 1;
+                    spawn()
+                }
+            };
+            let workers = workers(5, limited);
+            assert_eq!(workers.len(), 2);
+            let pool =
+                rayon::ThreadPoolBuilder::new().num_threads(2).spawn_handler(hand_over(workers)).build().unwrap();
+            assert_eq!(pool.current_num_threads(), 2);
+            assert_eq!(pool.join(|| 1, || 2), (1, 2));
+            let threads = Threads { wanted: 5, started: 2 };
+            assert!(threads.is_short() && threads.to_string().contains("only 2 of 5 threads"));
+        }
+    }
+}

@@ -52,7 +52,8 @@ impl Peaks {
     /// What it takes to train these (valid) configs side by side, on so many threads.
     pub fn of<'a>(configs: impl IntoIterator<Item = &'a Config>, threads: usize) -> Peaks {
         let lanes = cpu::lanes();
-        let [mut training, mut next, mut checkpoint, mut queue, mut weights, mut record] = [0_u64; 6];
+        let [mut training, mut next, mut checkpoint, mut queue] = [0_u64; 4];
+        let [mut weights, mut record, mut states] = [0_u64; 3];
         let [mut block, mut order, mut populations, mut held] = [0_u64; 4];
         for config in configs {
             let staged: Vec<(Config, World)> = (config.staged().into_iter())
@@ -80,14 +81,18 @@ impl Peaks {
             record = record.saturating_add(most(&|config, world| {
                 teams(config).saturating_mul(backend::record_bytes(world, need(config)))
             }));
+            states = states.saturating_add(most(&|config, world| {
+                teams(config).saturating_mul(backend::state_bytes(world, need(config)))
+            }));
         }
         // Episodes and the final sorting of each population take turns.
         let playing = threads as u64 * block + queue;
         let sorting = populations.min(threads as u64) * order;
         let always = PROGRAM + training + checkpoint;
-        // A batch ends where the larger of its two large buffers is full; two are under way.
+        // A batch ends when the largest of its three large buffers is full; two are under way.
         let share = |bytes: u64, batches: u64| {
-            let batch = u128::from(bytes) * u128::from(BATCH_BYTES) / u128::from(weights.max(record).max(1));
+            let batch =
+                u128::from(bytes) * u128::from(BATCH_BYTES) / u128::from(weights.max(record).max(states).max(1));
             bytes.min(batch as u64 * batches)
         };
         // What is packed of a record takes at most as much again, and where it does not fit the record comes whole.
@@ -97,7 +102,7 @@ impl Peaks {
             checkpoint,
             // A batch is gathered, and two are on their way to the adapter or back.
             gpu_host: always + next + (share(weights, 1) + share(weights, 2) + records).max(sorting),
-            adapter: share(weights, 2) + records + held,
+            adapter: share(weights, 2) + records + share(states, 2) + held,
         }
     }
 
@@ -134,23 +139,62 @@ fn checkpoint_bytes(config: &Config) -> u64 {
     if due && copies_checkpoint([config]) { trainer::snapshot_bytes(config) } else { 0 }
 }
 
-/// Bytes that this process may still take: what the system has free or can free, within the limit of its control
-/// group. None where the system does not tell.
+/// Returns the bytes that this process may still take: what the system has free or can free, within the limits of its
+/// control groups and of its address space. None if the system does not say.
+///
+/// On macOS and Windows only the program (the feature `cli`) asks.
 pub fn available() -> Option<u64> {
-    let free =
-        field(&fs::read_to_string("/proc/meminfo").ok()?, "MemAvailable:").map(|kib| kib.saturating_mul(1024))?;
-    let group = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
-    let group = group.lines().find_map(|line| line.strip_prefix("0::")).unwrap_or("/");
-    // Any group above may be the one with a limit.
-    let limits = Path::new(group).ancestors().filter_map(|group| {
-        let group = Path::new("/sys/fs/cgroup").join(group.strip_prefix("/").unwrap_or(group));
+    match () {
+        #[cfg(all(feature = "cli", any(target_os = "macos", windows)))]
+        () => free_of_system(),
+        #[cfg(not(all(feature = "cli", any(target_os = "macos", windows))))]
+        () => available_under(Path::new("/")),
+    }
+}
+
+/// Returns the bytes that macOS or Windows has free.
+#[cfg(all(feature = "cli", any(target_os = "macos", windows)))]
+fn free_of_system() -> Option<u64> {
+    let mut system = sysinfo::System::new();
+    system.refresh_memory_specifics(sysinfo::MemoryRefreshKind::nothing().with_ram());
+    Some(system.available_memory()).filter(|&bytes| bytes > 0)
+}
+
+/// [`available`] on Linux, whose files are under this folder.
+fn available_under(root: &Path) -> Option<u64> {
+    let read = |path: &str| fs::read_to_string(root.join(path)).ok();
+    let kib = |text: String, name: &str| field(&text, name).map(|kib| kib.saturating_mul(1024));
+    let free = kib(read("proc/meminfo")?, "MemAvailable:")?;
+    let address_space = || {
+        let most = field(&read("proc/self/limits")?, "Max address space")?;
+        Some(most.saturating_sub(kib(read("proc/self/status")?, "VmSize:")?))
+    };
+    let groups = read("proc/self/cgroup").unwrap_or_default();
+    let limits = groups.lines().flat_map(|line| limits_of_group(root, line));
+    limits.chain(address_space()).chain([free]).min()
+}
+
+/// Returns what the memory limits of a control group and of the groups above it leave. `line` is the group's in
+/// `/proc/self/cgroup`: `0::/path` in version 2, `number:controllers:/path` in version 1.
+fn limits_of_group(root: &Path, line: &str) -> Vec<u64> {
+    let mut parts = line.splitn(3, ':').skip(1);
+    let (Some(controllers), Some(path)) = (parts.next(), parts.next()) else { return vec![] };
+    // Each version's folder, its file with the limit, and what its processes hold besides files, which can be dropped.
+    let (mount, limit, held) = match controllers {
+        "" => ("sys/fs/cgroup", "memory.max", "anon "),
+        _ if controllers.split(',').any(|name| name == "memory") => {
+            ("sys/fs/cgroup/memory", "memory.limit_in_bytes", "total_rss ")
+        }
+        _ => return vec![],
+    };
+    let left = |group: &Path| -> Option<u64> {
+        let group = root.join(mount).join(group.strip_prefix("/").unwrap_or(group));
         let read = |file: &str| fs::read_to_string(group.join(file)).ok();
-        let most: u64 = read("memory.max")?.trim().parse().ok()?;
-        // Files that are kept in memory give way.
-        let used = field(&read("memory.stat")?, "anon ").unwrap_or(0);
-        Some(most.saturating_sub(used))
-    });
-    limits.chain([free]).min()
+        let most: u64 = read(limit)?.trim().parse().ok()?;
+        Some(most.saturating_sub(field(&read("memory.stat")?, held).unwrap_or(0)))
+    };
+    // In a container the path may be the host's: then only the group at the top is there.
+    Path::new(path).ancestors().filter_map(left).collect()
 }
 
 /// The number after a name at the start of a line.
@@ -174,6 +218,63 @@ mod tests {
         assert_eq!(field(text, "MemAvailable:"), Some(12));
         assert_eq!(field(text, "anon "), Some(7));
         assert_eq!(field(text, "none"), None);
+    }
+
+    /// A folder with files as Linux has them.
+    fn system(files: &[(&str, &str)]) -> tempfile::TempDir {
+        let root = tempfile::tempdir().unwrap();
+        for (name, text) in files {
+            let path = root.path().join(name);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        }
+        root
+    }
+
+    #[test]
+    fn every_limit_of_the_system_counts() {
+        const FREE: (&str, &str) = ("proc/meminfo", "MemTotal: 9000 kB\nMemAvailable:    8000 kB\n");
+        const NONE: &str = "9223372036854771712\n";
+        let available = |files: &[(&str, &str)]| available_under(system(files).path());
+        assert_eq!(available(&[]), None);
+        assert_eq!(available(&[FREE]), Some(8_192_000));
+        // Version 2: a limit of the group above, and "max" below.
+        let second = [
+            FREE,
+            ("proc/self/cgroup", "0::/jobs/one\n"),
+            ("sys/fs/cgroup/jobs/one/memory.max", "max\n"),
+            ("sys/fs/cgroup/jobs/one/memory.stat", "anon 100000\nfile 7\n"),
+            ("sys/fs/cgroup/jobs/memory.max", "5000000\n"),
+            ("sys/fs/cgroup/jobs/memory.stat", "anon 1000000\nanon_thp 9\n"),
+        ];
+        assert_eq!(available(&second), Some(4_000_000));
+        // Version 1, as Slurm makes groups: a job's limit above its steps, whose own is none.
+        let first = [
+            FREE,
+            ("proc/self/cgroup", "5:cpuset:/\n4:hugetlb,memory:/slurm/job_7/step_0\n0::/\n"),
+            ("sys/fs/cgroup/memory/memory.limit_in_bytes", NONE),
+            ("sys/fs/cgroup/memory/memory.stat", "total_rss 6000000\n"),
+            ("sys/fs/cgroup/memory/slurm/job_7/memory.limit_in_bytes", "3000000\n"),
+            ("sys/fs/cgroup/memory/slurm/job_7/memory.stat", "cache 5\nrss 7\ntotal_cache 9\ntotal_rss 500000\n"),
+            ("sys/fs/cgroup/memory/slurm/job_7/step_0/memory.limit_in_bytes", NONE),
+            ("sys/fs/cgroup/memory/slurm/job_7/step_0/memory.stat", "total_rss 500000\n"),
+        ];
+        assert_eq!(available(&first), Some(2_500_000));
+        // Version 1 in a container: the path is the host's.
+        let contained = [
+            FREE,
+            ("proc/self/cgroup", "4:memory:/docker/0123\n"),
+            ("sys/fs/cgroup/memory/memory.limit_in_bytes", "2000000\n"),
+            ("sys/fs/cgroup/memory/memory.stat", "total_rss 0\n"),
+        ];
+        assert_eq!(available(&contained), Some(2_000_000));
+        // `ulimit -v`.
+        let limited = "Limit                     Soft Limit           Hard Limit           Units     \n\
+                       Max address space         3000000              unlimited            bytes     \n";
+        let status = ("proc/self/status", "Name:\tx\nVmSize:\t    1000 kB\n");
+        assert_eq!(available(&[FREE, ("proc/self/limits", limited), status]), Some(1_976_000));
+        let unlimited = limited.replace("3000000  ", "unlimited");
+        assert_eq!(available(&[FREE, ("proc/self/limits", &unlimited), status]), Some(8_192_000));
     }
 
     #[test]

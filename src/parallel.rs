@@ -5,8 +5,57 @@
 #[cfg(feature = "parallel")]
 pub(crate) use rayon::{current_num_threads, join, prelude::*, scope};
 
+#[cfg(all(feature = "parallel", not(target_family = "wasm")))]
+pub use crate::host::{Threads, start};
+
 #[cfg(not(feature = "parallel"))]
 pub(crate) use sequential::*;
+
+/// Work that a thread of its own does, or where none can be started this one.
+#[cfg(feature = "record")]
+pub(crate) enum Aside<T> {
+    Running(std::thread::JoinHandle<T>),
+    Done(T),
+}
+
+#[cfg(feature = "record")]
+impl<T: Send + 'static> Aside<T> {
+    /// Starts the work; without another thread, comes back when it is done.
+    pub(crate) fn start<W: FnOnce() -> T + Send + 'static>(work: W) -> Aside<T> {
+        use std::sync::{Arc, Mutex, PoisonError};
+        // A thread that cannot be started takes along what it was given, so it only gets a share.
+        let place = Arc::new(Mutex::new(Some(work)));
+        let take = |place: &Mutex<Option<W>>| place.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let shared = place.clone();
+        match std::thread::Builder::new().spawn(move || take(&shared).expect("nobody else takes it")()) {
+            Ok(thread) => Aside::Running(thread),
+            Err(_) => Aside::Done(take(&place).expect("no thread took it")()),
+        }
+    }
+
+    /// Whether [`Aside::finish`] comes back at once.
+    pub(crate) fn is_finished(&self) -> bool {
+        match self {
+            Aside::Running(thread) => thread.is_finished(),
+            Aside::Done(_) => true,
+        }
+    }
+
+    /// Waits for the work, whatever comes of it.
+    pub(crate) fn end(self) {
+        if let Aside::Running(thread) = self {
+            let _ = thread.join();
+        }
+    }
+
+    /// Waits for the work, and returns its result.
+    pub(crate) fn finish(self) -> T {
+        match self {
+            Aside::Running(thread) => thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)),
+            Aside::Done(result) => result,
+        }
+    }
+}
 
 #[cfg(not(feature = "parallel"))]
 mod sequential {

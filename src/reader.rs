@@ -53,6 +53,11 @@ impl Override {
     pub fn new(key: impl Into<String>, value: impl Into<toml::Value>, name: impl Into<String>) -> Override {
         Override { key: key.into(), text: value.into().to_string(), name: name.into() }
     }
+
+    /// Sets `key` to what a text says in TOML; errors call it `name`.
+    pub fn of_text(key: impl Into<String>, text: impl Into<String>, name: impl Into<String>) -> Override {
+        Override { key: key.into(), text: text.into(), name: name.into() }
+    }
 }
 
 /// One problem of a config.
@@ -145,7 +150,8 @@ impl LineNumbers {
     }
 }
 
-/// Reads a text, with some keys set by overrides: `ask` requests every key.
+/// Reads a text, with some keys set by overrides: `ask` requests every key. Also returns a note
+/// about each key that was left out and whose default other keys leave no room for.
 ///
 /// # Errors
 /// All problems of the text and the overrides.
@@ -154,7 +160,7 @@ pub fn read<T>(
     others: Others<'_>,
     overrides: &[Override],
     ask: impl FnOnce(&mut Reader<'_>) -> T,
-) -> Result<T, Problems> {
+) -> Result<(T, Vec<String>), Problems> {
     read_document(&Document::parse(text), others, overrides, ask)
 }
 
@@ -167,7 +173,7 @@ pub fn read_document<T>(
     others: Others<'_>,
     overrides: &[Override],
     ask: impl FnOnce(&mut Reader<'_>) -> T,
-) -> Result<T, Problems> {
+) -> Result<(T, Vec<String>), Problems> {
     let Document { text, table, errors, lines } = document;
     let mut reader = Reader::default();
     for error in first_errors(errors, lines) {
@@ -188,7 +194,7 @@ pub fn read_document<T>(
         let read = ask(&mut reader);
         reader.report_unknown();
         if reader.problems.is_empty() {
-            return Ok(read);
+            return Ok((read, reader.notes));
         }
     }
     Err(reader.into_problems(lines))
@@ -414,6 +420,8 @@ pub struct Reader<'a> {
     known: BTreeMap<&'static str, Option<(Place, String)>>,
     /// The place, name and message of each problem.
     problems: Vec<(Place, String, String)>,
+    /// Notes about keys that were left out.
+    notes: Vec<String>,
     /// The definitions of the requested keys, if [`keys`] collects them.
     table: Option<Vec<Definition>>,
 }
@@ -519,8 +527,18 @@ impl<'a> Reader<'a> {
     }
 
     /// Returns a number, or its default without an entry.
-    fn number<T: Number>(&mut self, entry: Option<Entry<'_>>, allowed: Allowed<T>, default: T) -> T {
-        entry.map_or_else(|| allowed.nearest(default), |entry| self.check(&entry, allowed))
+    fn number<T: Number>(&mut self, key: &str, entry: Option<Entry<'_>>, allowed: Allowed<T>, default: T) -> T {
+        if let Some(entry) = entry {
+            return self.check(&entry, allowed);
+        }
+        let nearest = allowed.nearest(default);
+        if nearest != default {
+            self.notes.push(format!(
+                "{key} is not set: {nearest} is used, because the default, {default}, is not in the range allowed here, \
+                 {allowed}"
+            ));
+        }
+        nearest
     }
 
     fn check<T: Number>(&mut self, entry: &Entry<'_>, allowed: Allowed<T>) -> T {
@@ -639,7 +657,7 @@ impl<'a> KeyRequest<'_, 'a> {
     /// Returns a number, or the default without the key.
     pub fn number<T: Number>(mut self, allowed: Allowed<T>, default: T) -> T {
         let entry = self.take(|| (kind::<T>().into(), allowed.in_general(), Some(written(&default))));
-        self.reader.number(entry, allowed, default)
+        self.reader.number(self.name, entry, allowed, default)
     }
 
     /// Returns a number, or a percentage of the number that bounds it, written as a word such as `"10%"`.
@@ -650,7 +668,7 @@ impl<'a> KeyRequest<'_, 'a> {
         let entry = self.take(|| (kind(), range(), Some(written(&default))));
         let Some((entry, word)) = entry.as_ref().and_then(|entry| Some((entry, entry.value.get_ref().as_str()?)))
         else {
-            return NumberOrPercentage::Number(self.reader.number(entry, allowed, default));
+            return NumberOrPercentage::Number(self.reader.number(self.name, entry, allowed, default));
         };
         let percentage = word.strip_suffix('%').and_then(|number| number.parse().ok());
         match percentage.filter(|&percentage: &f64| 0.0 < percentage && percentage <= 100.0) {
@@ -758,7 +776,7 @@ impl<'a> KeyRequest<'_, 'a> {
             Some(entry) if entry.value.get_ref().is_array() => {
                 OneOrList::List(self.reader.numbers(entry, counts, allowed))
             }
-            entry => OneOrList::One(self.reader.number(entry, allowed, default)),
+            entry => OneOrList::One(self.reader.number(self.name, entry, allowed, default)),
         }
     }
 }

@@ -3,6 +3,7 @@
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::backend::{BackendError, Machine, OpenBackend};
@@ -602,25 +603,24 @@ impl Twin {
     }
 }
 
-/// Does something slow (files are flushed to the disk) with each, side by side.
+/// Does something slow (files are flushed to the disk) with each, side by side on as many threads as the system allows.
 fn side_by_side<T: Send, R: Send>(
     all: Vec<T>,
     each: impl Fn(T) -> Result<R, RunError> + Sync,
 ) -> Result<Vec<R>, RunError> {
-    if all.len() == 1 {
-        return all.into_iter().map(each).collect();
-    }
-    let (share, mut all, each) = (all.len().div_ceil(MAX_WRITERS), all.into_iter(), &each);
-    std::thread::scope(|scope| {
-        let some = || Some(all.by_ref().take(share).collect::<Vec<T>>()).filter(|some| !some.is_empty());
-        let shares = std::iter::from_fn(some);
-        let threads: Vec<_> = shares
-            .map(|some| scope.spawn(move || some.into_iter().map(each).collect::<Result<Vec<R>, RunError>>()))
-            .collect();
-        let shares = threads
-            .into_iter()
-            .map(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
-            .collect::<Result<Vec<_>, _>>();
-        Ok(shares?.into_iter().flatten().collect())
-    })
+    let helpers = all.len().min(MAX_WRITERS).saturating_sub(1);
+    let queue = Mutex::new(all.into_iter().enumerate());
+    let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).next();
+    let work = || std::iter::from_fn(next).map(|(place, item)| (place, each(item))).collect::<Vec<_>>();
+    let mut done = std::thread::scope(|scope| {
+        let start = |_| std::thread::Builder::new().spawn_scoped(scope, work).ok();
+        let threads: Vec<_> = (0..helpers).map_while(start).collect();
+        let mut done = work();
+        for thread in threads {
+            done.extend(thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
+        }
+        done
+    });
+    done.sort_by_key(|(place, _)| *place);
+    done.into_iter().map(|(_, result)| result).collect()
 }

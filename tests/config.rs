@@ -7,6 +7,7 @@ use flotilla::config::{
     MAX_EPISODES, MAX_GENERATIONS, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion,
     Mutation, Observers, Override, Paradigm, Parents, Policy, Problem, Saving, Sense, Sharing,
 };
+use flotilla::reader::Document;
 use proptest::collection::vec;
 use proptest::prelude::*;
 
@@ -521,4 +522,66 @@ fn followers_face_as_their_leader() {
     let world = flotilla::world::World::new(&Config::parse(&text("[0, 3.141592653589793]"), "headings").unwrap());
     let x: Vec<f32> = world.headings.iter().map(|heading| heading.x).collect();
     assert_eq!(x, [1.0, -1.0, -1.0, 1.0, 1.0]);
+}
+
+/// Returns what is noted of a config's `[world]`, by default of one leader, one follower and one POI.
+fn notes(world: &str) -> Vec<String> {
+    let text = format!("[world]\nleaders = [[9, 9]]\nfollowers = [[8, 8]]\npois = [[5, 5]]\n{world}");
+    Config::read_noted(&Document::parse(&text), "x.toml", &[], &[]).unwrap_or_else(|error| panic!("{error}")).1
+}
+
+#[test]
+fn a_default_that_does_not_fit_is_noted() {
+    assert_eq!(
+        notes(""),
+        ["world.coupling is not set: 2 is used, because the default, 3, is not in the range allowed here, 1 to 2 \
+          (the number of agents)"]
+    );
+    assert_eq!(notes("coupling = 2"), Vec::<String>::new());
+    let found = notes("observers = \"leaders\"");
+    assert!(found[0].contains("1 is used") && found[0].contains("the number of leaders"), "{found:?}");
+    let found = notes("coupling = 1\n[motion]\nmin_speed = 1.5");
+    assert!(found.len() == 1 && found[0].starts_with("world.speed is not set: 1.5 is used"), "{found:?}");
+    // What is written out says itself.
+    let config = Config::parse("[world]\nleaders = [[9, 9]]\npois = [[5, 5]]", "x.toml").unwrap();
+    assert_eq!(
+        Config::read_noted(&Document::parse(&config.to_toml()), "x.toml", &[], &[]).unwrap().1,
+        Vec::<String>::new()
+    );
+}
+
+/// Where an agent gets that heads along the x axis at 1 unit a second.
+fn travelled(map: f64, dt: f64, from: f64, steps: usize) -> f64 {
+    let text = format!(
+        "[world]\nmap = [{map}, {map}]\nleaders = [[{from}, 5]]\npois = [[5, 5]]\ncoupling = 1\nsteps = {steps}\ndt = {dt}\n\
+         heading = 0\nspeed = 1\n[motion]\nmax_speed = 1"
+    );
+    let mut stepper = flotilla::stepper(&Config::parse(&text, "x.toml").unwrap(), 1, false).unwrap();
+    (0..steps).for_each(|_| stepper.step(&[0.0, 1.0]).unwrap());
+    f64::from(stepper.states().positions[0]) - from
+}
+
+/// Positions are f32 on a grid. Steps that are long enough for that are walked in full, shorter ones are noted.
+#[test]
+fn steps_too_short_for_the_map_are_noted() {
+    let noted = |map: f64, dt: f64, speed: f64| {
+        let found = notes(&format!("coupling = 1\nmap = [{map}, 9]\ndt = {dt}\n[motion]\nmax_speed = {speed}"));
+        assert!(found.iter().all(|note| note.starts_with("motion.max_speed times world.dt is ")), "{found:?}");
+        !found.is_empty()
+    };
+    // The paper's, and one step for which there are just as many positions as asked for, in f32 and on the grid.
+    assert!(!noted(50.0, 0.2, 3.0));
+    assert!(!noted(1000.0, 256.0 / 16384.0, 1.0) && noted(1000.0, 255.9 / 16384.0, 1.0));
+    assert!(!noted(20.0, 1.0 / 1024.0, 1.0) && noted(20.0, 0.99 / 1024.0, 1.0));
+    assert!(noted(10_000.0, 1e-4, 3.0) && noted(1000.0, 1e-3, 1.0) && !noted(1000.0, 1e-3, 0.0));
+    let error =
+        |map: f64, dt: f64, from: f64, steps: usize| travelled(map, dt, from, steps) / (dt * steps as f64) - 1.0;
+    assert!(error(1000.0, 0.001, 600.0, 10_000) < -0.02, "what the note is for");
+    assert_eq!(travelled(10_000.0, 1e-4, 9000.0, 1000), 0.0);
+    for (map, dt, from) in
+        [(1000.0, 0.0157, 600.0), (1000.0, 0.01567, 900.0), (20.0, 0.000_98, 3.0), (60.0, 0.000_98, 40.0)]
+    {
+        let error = error(map, dt, from, 1000);
+        assert!(error.abs() < 0.006, "{map}, {dt}: {error}");
+    }
 }

@@ -497,3 +497,67 @@ fn names_that_are_no_text_work_but_for_scripts() {
     assert!(place.refused(2, &words).contains("UTF-8"));
     assert!(!place.path("job.sh").exists());
 }
+
+/// Where no or few more threads can be started, there are fewer, to the same results. Root is bound by no number of
+/// processes, so it hands over to somebody else.
+#[cfg(target_os = "linux")]
+#[test]
+fn few_threads_are_enough() {
+    let place = Place::new(&[("small.toml", SMALL)]);
+    let all = std::os::unix::fs::PermissionsExt::from_mode(0o777);
+    std::fs::set_permissions(place.root(), all).unwrap();
+    if place.shell("prlimit --version && setpriv --version").status.code() != Some(0) {
+        eprintln!("skipped: prlimit or setpriv is missing");
+        return;
+    }
+    let root = place.shell("test $(id -u) = 0").status.success();
+    let user = if root { "setpriv --reuid=65534 --clear-groups" } else { "" };
+    let digests: Vec<String> = [(1, "0 of"), (3, "2 of")]
+        .into_iter()
+        .map(|(limit, started)| {
+            // The limit counts what else a user runs; nobody runs anything else.
+            let started = if root { started } else { "of" };
+            let run = |command: &str| {
+                let output =
+                    place.shell(&format!("exec {user} prlimit --nproc={limit} $(command -v flotilla) {command}"));
+                let told = String::from_utf8(output.stderr).unwrap();
+                assert_eq!(output.status.code(), Some(0), "{limit}, {command}: {told}");
+                told
+            };
+            let told = run(&format!(
+                "train small.toml --backend cpu --threads 5 --quiet --out run{limit} --checkpoint-generations 1"
+            ));
+            assert!(told.contains(&format!("only {started}")) && told.contains("ulimit -u"), "{told}");
+            run("check small.toml");
+            run("devices");
+            run(&format!("paper --backend cpu --trials 1 --generations 1 --quiet --out paper{limit}"));
+            let run: serde_json::Value = serde_json::from_str(&place.read(format!("run{limit}/run.json"))).unwrap();
+            run["digest"].as_str().unwrap().to_string()
+        })
+        .collect();
+    assert_eq!(digests[0], digests[1]);
+}
+
+/// With little address space, a command works or says what it lacks.
+#[cfg(target_os = "linux")]
+#[test]
+fn little_address_space_is_an_error() {
+    let place = Place::new(&[("small.toml", SMALL)]);
+    let mut refused = 0;
+    for mib in (20..=120).step_by(10) {
+        let line = "flotilla train small.toml --backend cpu --threads 4 --quiet --out run";
+        let output = place.shell(&format!("ulimit -v {}; exec {line}{mib}", mib << 10));
+        let told = String::from_utf8(output.stderr).unwrap();
+        match output.status.code() {
+            Some(0) => {}
+            Some(1) => {
+                assert!(told.contains("error: ") && told.contains("memory") && told.contains("ulimit -v"), "{told}");
+                refused += 1;
+            }
+            // The system could not even load the program.
+            Some(127) if told.contains("shared libraries") => {}
+            other => panic!("{mib} MiB: {other:?}: {told}"),
+        }
+    }
+    assert!(refused > 0, "no limit was too small");
+}

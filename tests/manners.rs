@@ -33,7 +33,7 @@ fn the_version_is_told_in_a_line_or_with_commit_and_target() {
     let target = lines[2].strip_prefix("target  ").expect(&long);
     assert!(target.starts_with(std::env::consts::ARCH) && target.contains('-'), "{long}");
     // A debug build is not told, so as not to be compiled anew at every commit.
-    let commit = build::commit(Path::new(env!("CARGO_MANIFEST_DIR"))).0.filter(|_| !cfg!(debug_assertions));
+    let commit = build::state(Path::new(env!("CARGO_MANIFEST_DIR"))).0.filter(|_| !cfg!(debug_assertions));
     assert_eq!(flotilla::COMMIT, commit.as_deref());
     assert!(lines[1].ends_with(&commit.unwrap_or("not recorded".into())), "{long}");
 }
@@ -91,6 +91,35 @@ fn the_commit_is_read_as_git_reads_it() {
     same(&folder.path().join("shallow"));
 }
 
+/// A build of changed files is not a build of the commit.
+#[test]
+fn a_changed_tree_is_recorded_as_such() {
+    let folder = tempfile::tempdir().unwrap();
+    let tree = folder.path();
+    let git = |line: &str| {
+        let mut command = Command::new("git");
+        command.args(["-c", "user.name=x", "-c", "user.email=x@example.org"]).args(line.split(' ')).current_dir(tree);
+        command.output().is_ok_and(|output| output.status.success())
+    };
+    if !git("init -q") {
+        eprintln!("skipped: there is no git");
+        return;
+    }
+    fs::create_dir(tree.join("src")).unwrap();
+    fs::write(tree.join("src/lib.rs"), "// one\n").unwrap();
+    assert!(git("add src/lib.rs") && git("commit -q -m one"));
+    let hash = build::commit(tree).0.unwrap();
+    let (state, files) = build::state(tree);
+    assert_eq!(state.as_ref(), Some(&hash));
+    assert!(files.contains(&tree.join("src")), "cargo looks again when a source changes: {files:?}");
+    fs::write(tree.join("notes"), "not tracked").unwrap();
+    assert_eq!(build::state(tree).0.as_ref(), Some(&hash));
+    fs::write(tree.join("src/lib.rs"), "// two\n").unwrap();
+    assert_eq!(build::state(tree).0, Some(hash.clone() + "-dirty"));
+    assert!(git("add src/lib.rs"));
+    assert_eq!(build::state(tree).0, Some(hash + "-dirty"));
+}
+
 #[test]
 fn without_git_the_commit_is_what_the_archive_says_or_nothing() {
     let folder = tempfile::tempdir().unwrap();
@@ -100,10 +129,18 @@ fn without_git_the_commit_is_what_the_archive_says_or_nothing() {
     let text = format!("{{\n  \"git\": {{\n    \"sha1\": \"{hash}\"\n  }},\n  \"path_in_vcs\": \"\"\n}}");
     fs::write(folder.path().join(".cargo_vcs_info.json"), text).unwrap();
     assert_eq!(build::commit(folder.path()).0.as_deref(), Some(hash));
+    assert_eq!(build::state(folder.path()).0.as_deref(), Some(hash));
+    let text = fs::read_to_string(folder.path().join(".cargo_vcs_info.json")).unwrap();
+    let dirty = text.replace("67\"\n", "67\",\n    \"dirty\": true\n");
+    fs::write(folder.path().join(".cargo_vcs_info.json"), dirty).unwrap();
+    assert_eq!(build::state(folder.path()).0, Some(format!("{hash}-dirty")));
     fs::remove_file(folder.path().join(".cargo_vcs_info.json")).unwrap();
     fs::create_dir(folder.path().join(".git")).unwrap();
     fs::write(folder.path().join(".git/HEAD"), "no hash\n").unwrap();
     assert_eq!(build::commit(folder.path()).0, None);
+    assert_eq!(build::state(folder.path()).0, None);
+    fs::write(folder.path().join(".git/HEAD"), hash).unwrap();
+    assert_eq!(build::state(folder.path()).0, Some(format!("{hash}-unchecked")), "git cannot read this");
 }
 
 /// Standard output and standard error of a command that must succeed, with something on standard input.

@@ -152,6 +152,19 @@ fn packed_records_are_counted() {
     assert_eq!(adapter(2000), 2 * 2001 * (weights + 2 * record + held));
 }
 
+/// Episodes of large teams take several dispatches on a GPU. The agents' states between them are counted, too.
+#[test]
+fn states_between_dispatches_are_counted() {
+    let text = |agents: usize| {
+        let followers = vec!["[2, 2]"; agents - 1].join(", ");
+        format!("[world]\nleaders = [[1, 1]]\nfollowers = [{followers}]\npois = [[9, 9]]\n[learning]\ntrials = 1\n")
+    };
+    let config = Config::parse(&text(1024), "config").unwrap();
+    // Weights, record and states of a team: 112 weights; 25 steps of 32 words, and 1023 followers who see one leader.
+    let (weights, record, states) = (112 * 4, (25 * 32 + 1023) * 4, 1024 * 20);
+    assert_eq!(Peaks::of([&config], 1).adapter, 2 * 51 * (weights + record + states) / 2);
+}
+
 /// What is written from the populations is what would be written from a copy of them.
 #[test]
 fn checkpoints_need_no_copy() {

@@ -1021,3 +1021,26 @@ fn event_files_of_a_run_that_is_there_are_written_by_resuming_it() {
         assert_eq!(records(trial), [0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10]);
     }
 }
+
+/// Pictures in the documentation say in words what they show, as those of the program do.
+#[test]
+fn pictures_of_the_documentation_are_described() {
+    let mut folders = vec![Path::new(env!("CARGO_MANIFEST_DIR")).join("docs")];
+    let mut pictures = 0;
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|ending| ending == "svg") {
+                let svg = fs::read_to_string(&path).unwrap();
+                for element in ["<title id=\"title\">", "<desc id=\"description\">"] {
+                    let text = svg.split(element).nth(1).and_then(|rest| rest.split('<').next()).unwrap_or_default();
+                    assert!(text.len() > 20, "{}: {element}", path.display());
+                }
+                pictures += 1;
+            }
+        }
+    }
+    assert!(pictures > 10);
+}

@@ -200,6 +200,8 @@ fn keys_at_their_defaults_leave_a_configs_digest_as_it_was() {
         ("world.after", "[[], [], [], [0]]"),
         ("learning.led_within", "1"),
         ("learning.led_by", "'any-seen'"),
+        ("sense.gain", "2.0"),
+        ("learning.parents", "'elites'"),
     ] {
         let coupling = Override { key: "world.coupling".into(), text: "1".into(), name: "coupling".into() };
         let change = Override { key: key.into(), text: value.into(), name: key.into() };
@@ -207,5 +209,5 @@ fn keys_at_their_defaults_leave_a_configs_digest_as_it_was() {
     }
     digests.sort();
     digests.dedup();
-    assert_eq!(digests.len(), 6, "each key has a say");
+    assert_eq!(digests.len(), 8, "each key has a say");
 }

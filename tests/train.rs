@@ -638,3 +638,84 @@ fn no_training_starts_where_teams_are_evaluated() {
         }
     }
 }
+
+/// The summary has a row for each of two generations, not one generation twice, and counts and times as people write them.
+#[test]
+fn summaries_of_the_shortest_runs_read_well() {
+    let place = place();
+    let (summary, _) = place.good("train small.toml --trials 1 --generations 0");
+    assert!(summary.starts_with("Trained 1 trial of 8 teams, 0 generations, in "), "{summary}");
+    assert!(summary.contains("\n  start ") && !summary.contains("generation 0"), "{summary}");
+    let (summary, _) = place.good("train small.toml --generations 1");
+    assert!(summary.starts_with("Trained 3 trials of 8 teams, 1 generation, in "), "{summary}");
+    assert!(summary.contains("\n  start ") && summary.contains("\n  generation 1 "), "{summary}");
+}
+
+/// What the config leaves to a default that does not fit, and what its author had better know, is told and in the JSON.
+#[test]
+fn notes_on_a_config_are_told() {
+    let place = place();
+    let text = "[world]\nleaders = [[9, 9]]\nfollowers = [[8, 8]]\npois = [[5, 5]]\nmap = [1000, 1000]\ndt = 0.001\n\
+                [learning]\ntrials = 1\ngenerations = 0\n";
+    place.write("noted.toml", text);
+    for command in ["check noted.toml --json", "train noted.toml --json --quiet"] {
+        let output = place.command().args(command.split(' ')).output().unwrap();
+        let told = String::from_utf8(output.stderr).unwrap();
+        assert!(told.contains("note: world.coupling is not set: 2 is used"), "{command}: {told}");
+        assert!(told.contains("note: motion.max_speed times world.dt is 3.00e-3 units"), "{command}: {told}");
+        let json: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!(json["notes"].as_array().unwrap().len(), 2, "{json}");
+    }
+    let (_, told) = place.good("train small.toml --out plain --quiet");
+    assert!(!told.contains("note: world."), "{told}");
+}
+
+/// A number that no config can hold is named as it was typed.
+#[test]
+fn large_numbers_are_told_as_they_were_typed() {
+    let place = place();
+    for number in ["9223372036854775808", "18446744073709551616", "-9223372036854775809"] {
+        let told = place.refused(2, &["train", "small.toml", "--seed", number]);
+        assert!(told.contains(&format!("--seed: found {number}, allowed")), "{told}");
+    }
+    place.good("train small.toml --seed 9223372036854775807 --generations 0 --quiet");
+    assert!(place.read("runs/small/config.toml").contains("seed = 9223372036854775807"));
+}
+
+/// Whatever stands in names and files, `--json` is JSON, and what it says is what is meant; on a terminal nothing of it
+/// steers.
+#[test]
+fn json_is_json_whatever_stands_in_it() {
+    let place = place();
+    place.write("a \"b\".toml", SMALL);
+    place.write("sweep.toml", SMALL.to_string() + "[grid]\n\"learning.seed\" = [1, 2]\n");
+    let json = |words: &[&str], code: i32| {
+        let output = place.command().args(words).output().unwrap();
+        let text = String::from_utf8(output.stdout).unwrap();
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(code), "{words:?}: {told}");
+        assert!(!text.contains(['\u{202e}', '\u{9b}', '\u{1b}']), "{words:?}: {text}");
+        serde_json::from_str::<serde_json::Value>(&text).unwrap_or_else(|error| panic!("{words:?}: {error}: {text}"))
+    };
+    let cpu = ["--backend", "cpu", "--json"];
+    let config = "a \"b\".toml";
+    json(&["check", config, "--json"], 0);
+    assert_eq!(
+        json(&[&["train", config, "--out", "run \"1\"", "--quiet"][..], &cpu].concat(), 0)["folder"],
+        "run \"1\""
+    );
+    json(&[&["train", config, "--out", "two", "--seed", "3", "--quiet"][..], &cpu].concat(), 0);
+    json(&["plot", "run \"1\"", "two", "--out", "curves \"\".svg", "--json"], 0);
+    json(&["compare", "run \"1\"", "two", "--json"], 0);
+    json(&[&["replay", "run \"1\""][..], &cpu].concat(), 0);
+    let policies = "run \"1\"/policies.safetensors";
+    json(&[&["rollout", config, "--policies", policies, "--quiet"][..], &cpu].concat(), 0);
+    json(&[&["bench", "--rollout-only", "--teams", "2"][..], &cpu].concat(), 0);
+    json(&[&["sweep", "sweep.toml", "--out", "a \"sweep\"", "--quiet"][..], &cpu].concat(), 0);
+    // An error in a point's file becomes a reason in the JSON, with what stands in the file.
+    let point = "a \"sweep\"/points/0001/config.toml";
+    place.write(point, "[world]\n\"x\u{202e}\u{9b}y\" = 1\n");
+    let told = json(&["sweep", "sweep.toml", "--out", "a \"sweep\"", "--collect", "--json"], 1);
+    let missing = told["points"][1]["missing"].as_str().unwrap();
+    assert!(missing.contains("x\u{202e}"), "{missing:?}");
+}

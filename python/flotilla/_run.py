@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import tempfile
 import warnings
@@ -196,8 +197,8 @@ class Run:
 
 
 def _command() -> str:
-    """What this process was started by, for a run's record."""
-    return " ".join([os.path.basename(sys.executable or "python"), *sys.argv])[:8000]
+    """Returns the command that started this process as a shell reads it, for a run's record."""
+    return shlex.join([os.path.basename(sys.executable or "python"), *sys.argv])[:8000]
 
 
 def _shown_by_default() -> bool:

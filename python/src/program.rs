@@ -3,7 +3,7 @@
 use std::ffi::OsString;
 
 use flotilla::backend::gpu::device;
-use flotilla::cli::{self, Error};
+use flotilla::cli;
 use pyo3::prelude::*;
 
 use crate::workers;
@@ -11,14 +11,8 @@ use crate::workers;
 /// Does what was typed, the program's name first; gives the exit code.
 #[pyfunction]
 pub fn main(py: Python<'_>, words: Vec<OsString>) -> u8 {
-    workers::aside(py, || match cli::run_as(words) {
-        Ok(()) => 0,
-        Err(error) => {
-            let word = if matches!(error, Error::Stopped(_)) { "stopped" } else { "error" };
-            cli::say(format_args!("{word}: {error}"));
-            error.exit_code()
-        }
-    })
+    // It starts its own threads, as many as the command says.
+    py.detach(|| cli::main(Some(words)))
 }
 
 /// Adapters that a driver offers: name, driver, interface, kind.

@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
 use flotilla::backend::OpenBackend;
 use flotilla::front::{self, Processor};
+use flotilla::parallel;
 use pyo3::exceptions::PyRuntimeWarning;
 use pyo3::prelude::*;
 
@@ -30,9 +31,12 @@ pub fn forked() {
     }
 }
 
-/// Gives this thread of a forked process workers of its own: those of the parent would never answer.
+/// Starts as many threads as the system allows. A thread of a forked process gets workers of its own: those of the parent
+/// would never answer.
 fn gain_threads() {
-    if FORKED.load(Relaxed) && !HAS_THREADS.replace(true) {
+    if !FORKED.load(Relaxed) {
+        parallel::start(None);
+    } else if !HAS_THREADS.replace(true) {
         // Where that fails, the thread has some.
         std::mem::forget(rayon::ThreadPoolBuilder::new().use_current_thread().build());
     }

@@ -2,6 +2,7 @@ import filecmp
 import json
 import os
 import pickle
+import shlex
 import signal
 import subprocess
 import sys
@@ -297,3 +298,16 @@ def test_results_cannot_be_changed_by_accident(config, tmp_path):
     run.metrics["best_g"] = np.ones_like(run.metrics["best_g"])
     run.save(tmp_path / "run")
     assert flotilla.Run.open(tmp_path / "run").digest == run.digest
+
+
+def test_the_recorded_command_is_one_that_a_shell_reads(tmp_path):
+    script = tmp_path / "my script.py"
+    script.write_text(
+        "import flotilla\n"
+        "config = flotilla.Config.paper().replace(learning={'generations': 0, 'trials': 1})\n"
+        "flotilla.train(config, out='kept', backend='cpu')\n"
+    )
+    words = [str(script), "it's", "$HOME; ls"]
+    subprocess.run([sys.executable, *words], check=True, cwd=tmp_path)
+    command = json.loads((tmp_path / "kept/run.json").read_text())["command"]
+    assert shlex.split(command)[1:] == words

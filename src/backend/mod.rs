@@ -148,6 +148,18 @@ pub fn weight_bytes(world: &World) -> u64 {
     (fours(world) * size_of::<[f32; FOUR]>()) as u64
 }
 
+/// Returns the bytes of a team's states that a GPU keeps between dispatches, 0 if one dispatch plays the whole episode.
+pub fn state_bytes(world: &World, request: RecordRequest) -> u64 {
+    #[cfg(feature = "gpu")]
+    let bytes = gpu::episode::state_bytes(world, request);
+    #[cfg(not(feature = "gpu"))]
+    let bytes = {
+        let _ = (world, request);
+        0
+    };
+    bytes
+}
+
 /// Returns the bytes of a trial's populations, `[populations, slots, parameters]`, on a GPU that holds them: one buffer
 /// per population, one more, and every slot's parent. 0 if they are too small to be held by default.
 pub fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {

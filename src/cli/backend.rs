@@ -4,11 +4,12 @@ use super::{BackendChoice, Breed, Error, RunOptions, remedy, say};
 use crate::backend::OpenBackend;
 use crate::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
 use crate::front::{self, Found, Processor};
+use crate::parallel;
 
 /// Opens the backend that was asked for; `--threads` holds for the whole process.
 ///
 /// # Errors
-/// There is no such backend here, or no threads.
+/// There is no such backend here.
 pub fn open(options: &RunOptions) -> Result<OpenBackend, Error> {
     Ok(open_gpu(options)?.map_or_else(front::cpu, front::on_gpu))
 }
@@ -16,9 +17,9 @@ pub fn open(options: &RunOptions) -> Result<OpenBackend, Error> {
 /// The GPU that was asked for, if any; `--threads` holds for the whole process.
 ///
 /// # Errors
-/// There is no such GPU here, or no threads.
+/// There is no such GPU here.
 pub fn open_gpu(options: &RunOptions) -> Result<Option<GpuBackend>, Error> {
-    start_threads(options)?;
+    start_threads(options.threads);
     let holding = match options.breed {
         Breed::Auto => None,
         Breed::Host => Some(ResidencyPolicy::Never),
@@ -46,12 +47,10 @@ pub fn open_gpu(options: &RunOptions) -> Result<Option<GpuBackend>, Error> {
     Ok(gpu)
 }
 
-/// Makes `--threads` hold for the whole process.
-///
-/// # Errors
-/// So many cannot be started.
-pub fn start_threads(options: &RunOptions) -> Result<(), Error> {
-    let Some(threads) = options.threads else { return Ok(()) };
-    let started = rayon::ThreadPoolBuilder::new().num_threads(threads.into()).build_global();
-    started.map_err(|error| Error::Usage(format!("--threads {threads} cannot be started: {error}")))
+/// Starts the threads of the whole process, as many as `--threads` says; fewer where the system allows no more.
+pub fn start_threads(threads: Option<u16>) {
+    let threads = parallel::start(threads.map(usize::from));
+    if threads.is_short() {
+        say(format_args!("note: {threads}"));
+    }
 }

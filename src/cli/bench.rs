@@ -7,7 +7,7 @@ use std::time::Duration;
 use fearless_simd::Level;
 use serde_json::json;
 
-use super::{BackendChoice, Breed, Error, Overrides, RunOptions, backend, between, print};
+use super::{BackendChoice, Breed, Error, Overrides, RunOptions, backend, between, print, print_json};
 use crate::backend::Machine;
 use crate::backend::cpu::{Cpu, level_name};
 use crate::bench::{self, Generations, Profile, Subject, Timing};
@@ -86,7 +86,10 @@ pub fn run(args: Args) -> Result<(), Error> {
     };
     for config in configs {
         let measure = bench::measure(&config, &mut player, generations)?;
-        print(&if args.json { json(&measure, &machine) } else { line(&measure) })?;
+        match args.json {
+            true => print_json(&json(&measure, &machine))?,
+            false => print(&line(&measure))?,
+        }
     }
     if args.json { Ok(()) } else { print(LEGEND) }
 }
@@ -141,7 +144,7 @@ fn open(args: &Args) -> Result<(Subject, Machine), Error> {
                     "--instructions is for the CPU backend; leave out --adapter and --breed device".into(),
                 ));
             }
-            backend::start_threads(&args.run)?;
+            backend::start_threads(args.run.threads);
             return Ok((Subject::Cpu(Cpu::at_level(level), level), front::cpu().1));
         }
     };
@@ -222,7 +225,7 @@ fn traffic(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
     rows.map(|(name, part, bytes)| (name, part, bytes as f64 / *generations as f64)).collect()
 }
 
-fn json(measure: &Timing, machine: &Machine) -> String {
+fn json(measure: &Timing, machine: &Machine) -> serde_json::Value {
     let Timing { teams, leaders, followers, pois, steps, rollout, mean_g, reach, operations, ceiling, .. } = measure;
     let agents = measure.agents();
     let mut object = json!({
@@ -257,5 +260,5 @@ fn json(measure: &Timing, machine: &Machine) -> String {
         let traffic = traffic(profile).into_iter().map(|(name, _, bytes)| (format!("{name}_bytes"), json!(bytes)));
         object["profile"] = serde_json::Value::Object(stages.chain(traffic).collect());
     }
-    format!("{object}\n")
+    object
 }

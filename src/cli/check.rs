@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::{ConfigArgs, Error, output, plot, print, warnings};
+use super::{ConfigArgs, Error, output, plot, print, print_json, warnings};
 use crate::backend::{self, RecordRequest};
 use crate::config::Config;
 use crate::memory::Peaks;
@@ -16,7 +16,7 @@ use crate::world::World;
 pub struct Args {
     #[command(flatten)]
     config: ConfigArgs,
-    /// Print one JSON object with `config` and `cost` (an unlimited range is null)
+    /// Print one JSON object with `config`, `cost` and `notes` (an unlimited range is null)
     #[arg(long)]
     json: bool,
     /// Draw the layout before any training: .svg, .pdf or .png
@@ -92,13 +92,15 @@ impl Cost {
 struct Report<'a> {
     config: &'a Config,
     cost: &'a Cost,
+    notes: &'a [String],
 }
 
 /// Prints the config, so that standard output is a config file again, with the cost as comments below it.
 pub fn run(args: Args) -> Result<(), Error> {
+    super::backend::start_threads(None);
     let kind = args.out.as_deref().map(plot::kind_of).transpose()?;
     output::check(&[("--out", args.out.as_deref())], &[&args.config.file.path])?;
-    let config = args.config.load()?;
+    let (config, notes) = args.config.load(vec![])?;
     if let (Some(out), Some(kind)) = (&args.out, kind) {
         let name = args.config.name();
         plot::write(&map::layout(&name, &config), kind, out)?;
@@ -106,8 +108,8 @@ pub fn run(args: Args) -> Result<(), Error> {
     let cost = Cost::of(&config);
     warnings::unreachable(&config);
     if args.json {
-        let report = Report { config: &config, cost: &cost };
-        return print(&(serde_json::to_string(&report).expect("plain fields are JSON") + "\n"));
+        let report = Report { config: &config, cost: &cost, notes: &notes };
+        return print_json(&report);
     }
     let Cost {
         agents, learners, travel, teams, team_steps, agent_steps, parameters, policy_bytes, record_bytes, ..

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 
 use super::sweep::share;
-use super::{Error, print, say};
+use super::{Error, print, print_json, say};
 use crate::config::{Config, Domain};
 use crate::escape::PathExt;
 use crate::file;
@@ -106,7 +106,7 @@ pub fn run(args: Args) -> Result<(), Error> {
             "comparisons": all,
             "notes": notes,
         });
-        return print(&format!("{told}\n"));
+        return print_json(&told);
     }
     print(&if args.latex { comparison::latex(&all, &options) } else { comparison::text(&all, &options) })
 }

@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use super::{Error, print, remedy};
+use super::{Error, backend, print, print_json, remedy};
 use crate::backend::Backend;
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu;
@@ -17,6 +17,7 @@ pub struct Args {
 
 /// Opens every adapter in turn, since only an open device can be tested.
 pub fn run(args: Args) -> Result<(), Error> {
+    backend::start_threads(None);
     let adapters: Vec<_> = device::adapters()
         .into_iter()
         .enumerate()
@@ -43,7 +44,7 @@ pub fn run(args: Args) -> Result<(), Error> {
                 })
             })
             .collect();
-        return print(&format!("{:#}\n", json!({ "cpu": Cpu::default().describe(), "adapters": adapters })));
+        return print_json(&json!({ "cpu": Cpu::default().describe(), "adapters": adapters }));
     }
     let mut text = format!("{}\n", Cpu::default().describe());
     for (index, info, opened) in &adapters {

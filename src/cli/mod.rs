@@ -13,12 +13,14 @@ use std::sync::{LazyLock, OnceLock};
 use clap::builder::PossibleValuesParser as Words;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
+use serde::Serialize;
 
 use crate::backend::BackendError;
 use crate::backend::gpu::device::DeviceError;
 use crate::config::{self, Choice, Config, ConfigError, Fitness, Override, Paradigm};
 use crate::escape;
 use crate::file;
+use crate::reader::Document;
 use crate::record::RecordError;
 use crate::report::replay::ReplayError;
 use crate::run::RunError;
@@ -37,6 +39,7 @@ mod output;
 mod paper;
 mod plot;
 mod points;
+mod process;
 mod questions;
 mod recovery;
 mod remedy;
@@ -97,7 +100,7 @@ commands! {
 
 /// Trains cooperative teams by coevolution on any GPU, with the same bits on a CPU.
 #[derive(Parser)]
-#[command(version, long_version = VERSION.as_str(), arg_required_else_help = true)]
+#[command(name = "flotilla", version, long_version = VERSION.as_str(), arg_required_else_help = true)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -123,11 +126,26 @@ fn program() -> PathBuf {
     named.or_else(|| std::env::current_exe().ok()).unwrap_or_else(|| "flotilla".into())
 }
 
-/// Does what was typed; wrong usage ends the program here, with exit code 2.
+/// Sets the process up, runs the command, reports its error, and returns the exit code. Wrong usage ends the process here,
+/// with exit code 2.
 ///
-/// # Errors
-/// The command failed.
-pub fn run() -> Result<(), Error> {
+/// `words` are the command, the program that it would be typed to first, if this process was started by other words. Only
+/// the first call's words count.
+pub fn main(words: Option<Vec<OsString>>) -> u8 {
+    if let Some(words) = words {
+        WORDS.get_or_init(|| words);
+    }
+    match process::set_up().and_then(|()| run()) {
+        Ok(()) => 0,
+        Err(error) => {
+            let word = if matches!(error, Error::Stopped(_)) { "stopped" } else { "error" };
+            say(format_args!("{word}: {error}"));
+            error.exit_code()
+        }
+    }
+}
+
+fn run() -> Result<(), Error> {
     let words = words();
     reject_control_chars(words.iter().skip(1).cloned())?;
     let matches = command().try_get_matches_from(words).unwrap_or_else(|error| hinted(error).exit());
@@ -151,16 +169,6 @@ fn hinted(mut error: clap::Error) -> clap::Error {
     error
 }
 
-/// [`run`] within a process that was started by other words: the first is the program that they would be typed to. Only
-/// the first call's words count.
-///
-/// # Errors
-/// The command failed.
-pub fn run_as(words: Vec<OsString>) -> Result<(), Error> {
-    WORDS.get_or_init(|| words);
-    run()
-}
-
 /// The command line, to be parsed or described without being run.
 pub fn command() -> clap::Command {
     // A number below 0 is a value, if a wrong one, and no flag.
@@ -172,10 +180,14 @@ pub fn command() -> clap::Command {
     })
 }
 
-/// A number for a config key, whose range is told with the config.
-fn number(text: &str) -> Result<toml::Value, String> {
-    let whole = text.parse::<i64>().map(toml::Value::from);
-    whole.or_else(|_| text.parse::<f64>().map(toml::Value::from)).map_err(|_| "allowed a number".into())
+/// A number for a config key, whose range is told with the config; gives it as TOML has it.
+fn number(text: &str) -> Result<String, String> {
+    let digits = text.strip_prefix(['-', '+']).unwrap_or(text);
+    // Whole numbers stay as they were typed: some are too large for TOML, and no float says which.
+    match !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit()) {
+        true => Ok(text.parse::<i64>().map_or(text.into(), |number| number.to_string())),
+        false => real(text).map(|number| toml::Value::from(number).to_string()),
+    }
 }
 
 /// A count, or a place from 0.
@@ -306,6 +318,16 @@ pub fn print(text: &str) -> Result<(), Error> {
     }
 }
 
+/// Writes a result as one line of JSON to standard output. What could steer a terminal is written as JSON's own escapes,
+/// so every reader gets the same text back.
+///
+/// # Errors
+/// Standard output is closed or full.
+pub fn print_json(value: &impl Serialize) -> Result<(), Error> {
+    let text = serde_json::to_string(value).expect("numbers, texts and lists of them are JSON");
+    print(&(escape::json(&text).into_owned() + "\n"))
+}
+
 const IN_CONFIG: &str = "Config overrides";
 const WHERE: &str = "Where to run (the results are the same)";
 
@@ -323,8 +345,13 @@ impl ConfigFile {
     /// # Errors
     /// Everything that is wrong with the file and the flags.
     pub fn load(&self, overrides: &[Override]) -> Result<Config, Error> {
+        Ok(self.load_noted(overrides)?.0)
+    }
+
+    /// [`ConfigFile::load`], and what the config's author should know.
+    fn load_noted(&self, overrides: &[Override]) -> Result<(Config, Vec<String>), Error> {
         let text = config::read_file(&self.path)?;
-        Ok(Config::read(&text, &config::name(&self.path), &[], overrides)?)
+        Ok(Config::read_noted(&Document::parse(&text), &config::name(&self.path), &[], overrides)?)
     }
 }
 
@@ -348,20 +375,15 @@ impl ConfigArgs {
         }
     }
 
-    /// The config that was meant.
+    /// The config that was meant, with more keys set by a command's own flags; reports what its author should know, and
+    /// returns that as well.
     ///
     /// # Errors
     /// Everything that is wrong with the file and the flags.
-    pub fn load(&self) -> Result<Config, Error> {
-        self.load_with(vec![])
-    }
-
-    /// The config that was meant, with more keys set by a command's own flags.
-    ///
-    /// # Errors
-    /// Everything that is wrong with the file and the flags.
-    pub fn load_with(&self, more: Vec<Override>) -> Result<Config, Error> {
-        self.file.load(&[self.overrides.list(), more].concat())
+    pub fn load(&self, more: Vec<Override>) -> Result<(Config, Vec<String>), Error> {
+        let (config, notes) = self.file.load_noted(&[self.overrides.list(), more].concat())?;
+        notes.iter().for_each(|note| say(format_args!("note: {note}")));
+        Ok((config, notes))
     }
 }
 
@@ -370,16 +392,16 @@ impl ConfigArgs {
 pub struct Overrides {
     /// Random seed
     #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
-    pub seed: Option<toml::Value>,
+    pub seed: Option<String>,
     /// Independent repetitions
     #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
-    pub trials: Option<toml::Value>,
+    pub trials: Option<String>,
     /// Generations after generation 0, which is random
     #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
-    pub generations: Option<toml::Value>,
+    pub generations: Option<String>,
     /// Policies per population, and teams per generation
     #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
-    pub population: Option<toml::Value>,
+    pub population: Option<String>,
     /// Score that policies are selected by
     #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = Words::new(Fitness::names()), ignore_case = true)]
     pub fitness: Option<String>,
@@ -416,9 +438,10 @@ impl Overrides {
             .map(|(name, value)| (name, value.clone()));
         let fitness = fitness.as_ref().map(|typed| canonical(Fitness::names(), typed));
         let paradigm = paradigm.as_ref().map(|typed| canonical(Paradigm::names(), typed));
-        let words = [("fitness", fitness), ("paradigm", paradigm)];
-        let set = |(name, value): (&str, Option<toml::Value>)| {
-            Some(Override::new(format!("learning.{name}"), value?, format!("--{name}")))
+        let words = [("fitness", fitness), ("paradigm", paradigm)]
+            .map(|(name, value)| (name, value.map(|value| value.to_string())));
+        let set = |(name, value): (&str, Option<String>)| {
+            Some(Override::of_text(format!("learning.{name}"), value?, format!("--{name}")))
         };
         numbers.into_iter().chain(words).filter_map(set).chain(given.iter().cloned()).collect()
     }

@@ -65,7 +65,8 @@ fn tell_of_waiting(path: &Path) -> mpsc::Sender<()> {
     let (opened, waiting) = mpsc::channel();
     if fs::metadata(path).is_ok_and(|there| !there.is_file() && !there.is_dir()) {
         let path = path.to_path_buf();
-        thread::spawn(move || {
+        // Without a thread nobody is told, which changes nothing else.
+        let _ = thread::Builder::new().spawn(move || {
             if waiting.recv_timeout(PATIENCE) == Err(mpsc::RecvTimeoutError::Timeout) {
                 say(format_args!("waiting for somebody to read from {}", path.escaped()));
             }

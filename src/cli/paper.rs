@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use serde_json::json;
 
 use super::recovery::{self, Checkpoints, Loss, Signals};
-use super::{Error, Overrides, RunOptions, backend, number, print, say};
+use super::{Error, Overrides, RunOptions, backend, number, print, print_json, say};
 use crate::baseline::Baselines;
 use crate::config::{self, Override};
 use crate::escape::PathExt;
@@ -41,13 +41,13 @@ pub struct Args {
     pub(super) questions: Vec<char>,
     /// Independent repetitions [default: 5, or 30 of questions]
     #[arg(long, value_name = "N", value_parser = number)]
-    trials: Option<toml::Value>,
+    trials: Option<String>,
     /// Generations after generation 0, which is random [default: 100, or what a question's config says]
     #[arg(long, value_name = "N", value_parser = number)]
-    generations: Option<toml::Value>,
+    generations: Option<String>,
     /// Random seed [default: 0]
     #[arg(long, value_name = "N", value_parser = number)]
-    seed: Option<toml::Value>,
+    seed: Option<String>,
     /// Resume the paper in the directory, or start it; for a finished one, draw figures and claims again
     #[arg(long, conflicts_with = "force")]
     pub(super) resume: bool,
@@ -269,7 +269,7 @@ pub fn run(args: Args) -> Result<(), Error> {
             "claims": &claims,
             "files": { "claims": path(CLAIMS), "summary": path(SUMMARY), "figures": FIGURES.map(path) },
         });
-        return print(&format!("{told}\n"));
+        return print_json(&told);
     }
     print(&format!(
         "{baseline}\n{}\n{heading}\n\nTrained in {seconds:.1} s. Files in {}: figure4, figure5, figure6 (.svg, .png, .pdf), \

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{Error, output, print, say};
+use super::{Error, output, print, print_json, say};
 use crate::escape::PathExt;
 use crate::record::RecordError;
 use crate::report::curves::PRINT;
@@ -43,7 +43,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     match json {
         true => {
             let runs: Vec<_> = runs.iter().map(|run| run.escaped().to_string()).collect();
-            print(&format!("{}\n", serde_json::json!({ "out": out, "runs": runs })))
+            print_json(&serde_json::json!({ "out": out, "runs": runs }))
         }
         false => print(&format!("{out}\n")),
     }

@@ -8,7 +8,7 @@ use serde_json::json;
 use super::paper::Args;
 use super::recovery::{self, Signals};
 use super::sweep::{claim, free_memory, same_sweep};
-use super::{Error, backend, print, say};
+use super::{Error, backend, print, print_json, say};
 use crate::escape::PathExt;
 use crate::memory::Peaks;
 use crate::record::disk::Disk;
@@ -184,7 +184,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
             "questions": all.collect::<Vec<_>>(),
             "page": out.join(PAGE).escaped().to_string(),
         });
-        return print(&format!("{told}\n"));
+        return print_json(&told);
     }
     print(&format!(
         "{page}\nFiles in {}: {PAGE}, for each table its figure (.svg, .png, .pdf) and every comparison (.csv), and the sweep \

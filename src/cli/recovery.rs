@@ -52,18 +52,18 @@ pub fn setback(error: &BackendError) {
 pub struct Checkpoints {
     /// Write a checkpoint every N generations; 0 means never
     #[arg(long, value_name = "N", value_parser = number)]
-    checkpoint_generations: Option<toml::Value>,
+    checkpoint_generations: Option<String>,
     /// Write a checkpoint every S seconds; 0 means never
     #[arg(long, value_name = "S", value_parser = number)]
-    checkpoint_seconds: Option<toml::Value>,
+    checkpoint_seconds: Option<String>,
 }
 
 impl Checkpoints {
     /// The keys that were set, each named as its flag.
     pub fn list(&self) -> Vec<Override> {
         let Checkpoints { checkpoint_generations, checkpoint_seconds } = self;
-        let set = |(name, value): (&str, &Option<toml::Value>)| {
-            Some(Override::new(format!("checkpoint.{name}"), value.clone()?, format!("--checkpoint-{name}")))
+        let set = |(name, value): (&str, &Option<String>)| {
+            Some(Override::of_text(format!("checkpoint.{name}"), value.clone()?, format!("--checkpoint-{name}")))
         };
         [("generations", checkpoint_generations), ("seconds", checkpoint_seconds)].into_iter().filter_map(set).collect()
     }

@@ -108,7 +108,9 @@ pub fn record(error: &RecordError, again: &str) -> String {
 pub fn run(error: &RunError) -> String {
     match error {
         RunError::Record(error) => record(error, "go on with --resume"),
-        RunError::TooLittle(_) => " (flotilla check tells what a config needs)".into(),
+        RunError::TooLittle(_) => {
+            " (flotilla check shows what a config needs; `ulimit -v` and limits of a job or container count)".into()
+        }
         RunError::Backend { saved: Ok(()), .. } => {
             ": go on with --resume, with --on-device-loss cpu to change to the CPU".into()
         }

@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use serde_json::json;
 
 use super::recovery::Signals;
-use super::{Error, RunOptions, backend, between, output, points, print, whole, words};
+use super::{Error, RunOptions, backend, between, output, points, print, print_json, whole, words};
 use crate::config::Config;
 use crate::escape::PathExt;
 use crate::record::RecordError;
@@ -200,7 +200,7 @@ fn report(
         json!({ "trial": trial, "generation": generation, "which": which, "team": team, g: team_g })
     };
     object["episodes"] = played.iter().map(episode).collect();
-    print(&format!("{object}\n"))
+    print_json(&object)
 }
 
 /// What was played, in a line.

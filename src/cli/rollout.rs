@@ -8,7 +8,8 @@ use clap::builder::PossibleValuesParser as Words;
 use serde_json::json;
 
 use super::{
-    ConfigFile, Error, RunOptions, assignment, backend, between, canonical, output, points, print, real, say, whole,
+    ConfigFile, Error, RunOptions, assignment, backend, between, canonical, output, points, print, print_json, real,
+    say, whole,
 };
 use crate::backend::{Backend, Group, Machine, Moment, RecordRequest};
 use crate::config::{Choice, Override, Paradigm};
@@ -162,7 +163,10 @@ pub fn run(args: Args) -> Result<(), Error> {
     if let Some(path) = &args.trace {
         write_trace(path, &mut *backend, &group, &starts, &mut meter)?;
     }
-    print(&if args.json { in_json(&evaluation, &starts, &machine) } else { in_words(&evaluation, &starts) })
+    match args.json {
+        true => print_json(&in_json(&evaluation, &starts, &machine)),
+        false => print(&in_words(&evaluation, &starts)),
+    }
 }
 
 fn counted(teams: usize, episodes: usize) -> String {
@@ -204,7 +208,7 @@ fn in_words(evaluation: &Evaluation, starts: &Starts) -> String {
     text
 }
 
-fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> String {
+fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> serde_json::Value {
     let spread = |spread: Spread| {
         let Spread { mean, deviation, interval } = spread;
         json!({ "mean": mean, "standard_deviation": deviation, "interval_95": interval })
@@ -229,7 +233,7 @@ fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> Strin
         (object["seed"], object["start_jitter"], object["poi_jitter"]) =
             (json!(seed), json!(jitter), json!(poi_jitter));
     }
-    format!("{object}\n")
+    object
 }
 
 /// Floats are printed in the fewest digits that read back to the same bits.

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 
 use super::recovery::{self, Loss, Signals};
-use super::{Error, Overrides, RunOptions, backend, between, output, print, say, warnings, whole};
+use super::{Error, Overrides, RunOptions, backend, between, output, print, print_json, say, warnings, whole};
 use crate::config::{self, ConfigError, Problem};
 use crate::escape::PathExt;
 use crate::file;
@@ -209,15 +209,12 @@ pub fn run(mut args: Args) -> Result<(), Error> {
         Some(shard) => {
             let command = args.command(&out, &["--collect"]);
             match args.json {
-                true => print(&format!(
-                    "{}\n",
-                    json!({
-                        "folder": out.escaped().to_string(),
-                        "sweep": sweep.name,
-                        "shard": shard.to_string(),
-                        "collect": command,
-                    })
-                )),
+                true => print_json(&json!({
+                    "folder": out.escaped().to_string(),
+                    "sweep": sweep.name,
+                    "shard": shard.to_string(),
+                    "collect": command,
+                })),
                 false => print(&format!("When all shards are done: {command}\n")),
             }
         }
@@ -381,7 +378,7 @@ fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(),
     let outcomes = results::write(sweep, out, &options)?;
     let (names, note) = pictures::draw(sweep, &outcomes, &options, axes, out)?;
     match args.json {
-        true => print(&format!("{}\n", as_json(sweep, &outcomes, &options, out, &names)))?,
+        true => print_json(&as_json(sweep, &outcomes, &options, out, &names))?,
         false => {
             let mut text = summary(sweep, &outcomes, &options);
             let _ = write!(

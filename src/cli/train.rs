@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 
 use super::recovery::{self, Checkpoints, Loss, Signals, quoted};
-use super::{ConfigArgs, Error, RunOptions, backend, print, say, warnings};
+use super::{ConfigArgs, Error, RunOptions, backend, print, print_json, say, warnings};
 use crate::config::Config;
 use crate::escape::PathExt;
 use crate::file;
@@ -96,7 +96,7 @@ impl Args {
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let config = args.config.load_with(args.checkpoints.list())?;
+    let (config, notes_on_config) = args.config.load(args.checkpoints.list())?;
     let mut player = backend::open(&args.run)?;
     Peaks::of([&config], rayon::current_num_threads()).check(player.1.backend == "gpu").map_err(RunError::from)?;
     warnings::unreachable(&config);
@@ -135,7 +135,8 @@ pub fn run(args: Args) -> Result<(), Error> {
         // They are of the run that was written over.
         Events::clear(&path).unwrap_or_else(events_failed);
     }
-    let told = Told { config: &config, name: args.config.name(), folder: &folder, runs_on: &runs_on };
+    let told =
+        Told { config: &config, notes: &notes_on_config, name: args.config.name(), folder: &folder, runs_on: &runs_on };
     if session.is_done() {
         if !folder.join(CURVES).exists() {
             draw(&folder);
@@ -205,6 +206,7 @@ struct Training {
 /// What a run is told by.
 struct Told<'a> {
     config: &'a Config,
+    notes: &'a [String],
     name: String,
     folder: &'a Path,
     runs_on: &'a str,
@@ -227,7 +229,7 @@ impl Told<'_> {
         let (generations, seconds) =
             trained.map_or((0, 0.0), |trained| (trained.generations, trained.since.elapsed().as_secs_f64()));
         if json {
-            return print(&format!("{}\n", self.json(results, generations, seconds)));
+            return print_json(&self.json(results, generations, seconds));
         }
         if quiet {
             return Ok(());
@@ -236,10 +238,11 @@ impl Told<'_> {
         let trained = match done_already {
             true => "This run was done already".into(),
             false => format!(
-                "Trained {} trials of {} teams, {} generations, in {seconds:.1} s ({:.1} generations/s) on {}",
-                learning.trials,
+                "Trained {} of {} teams, {}, in {} ({:.1} generations/s) on {}",
+                counted(learning.trials, "trial"),
                 learning.population,
-                learning.generations,
+                counted(learning.generations, "generation"),
+                time(seconds),
                 generations as f64 / seconds.max(1e-9),
                 self.runs_on
             ),
@@ -269,6 +272,7 @@ impl Told<'_> {
             "trained_generations": trained,
             "seconds": seconds,
             "backend": self.runs_on,
+            "notes": self.notes,
             "first": course(&results.story.first),
             "last": course(&results.story.last),
             "files": {
@@ -308,6 +312,20 @@ impl Extremes {
     }
 }
 
+/// "1 trial", "2 trials".
+fn counted(count: usize, what: &str) -> String {
+    format!("{count} {what}{}", if count == 1 { "" } else { "s" })
+}
+
+/// A time in seconds, or if it is short in milliseconds.
+fn time(seconds: f64) -> String {
+    match seconds * 1000.0 {
+        short if short < 9.95 => format!("{short:.1} ms"),
+        short if short < 99.5 => format!("{short:.0} ms"),
+        _ => format!("{seconds:.1} s"),
+    }
+}
+
 /// What a person wants to know at the end.
 fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> String {
     let Results { story, digest } = results;
@@ -318,7 +336,10 @@ fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> S
     let mut text = format!("{trained}.\n\n{what}: mean over trials (lowest to highest trial)\n");
     let last = format!("generation {}", config.learning.generations);
     let mut table = vec![["", SCORES[0].0, SCORES[1].0, SCORES[2].0].map(String::from)];
-    for (name, rows) in [("start", &story.first), (&*last, &story.last)] {
+    let rows = [("start", &story.first), (&*last, &story.last)];
+    // A run of no generations after the start has one row.
+    let shown = if config.learning.generations == 0 { 1 } else { rows.len() };
+    for (name, rows) in rows.into_iter().take(shown) {
         let [best, mean, champion] = SCORES.map(|(_, share)| {
             let Extremes { mean, lowest, highest } = Extremes::of(rows.iter().map(|row| share(row) * pois as f64));
             format!("{mean:.2} ({lowest:.2} to {highest:.2})")
@@ -358,4 +379,16 @@ Next:
         folder::RUN,
     );
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_and_times_are_as_people_write_them() {
+        assert_eq!([0, 1, 2].map(|count| counted(count, "trial")), ["0 trials", "1 trial", "2 trials"]);
+        let times = [0.0004, 0.0123, 0.0994, 0.0996, 12.34].map(time);
+        assert_eq!(times, ["0.4 ms", "12 ms", "99 ms", "0.1 s", "12.3 s"]);
+    }
 }

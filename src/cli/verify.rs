@@ -3,11 +3,12 @@
 use std::ops::ControlFlow::Continue;
 use std::path::PathBuf;
 use std::process::Command;
+use std::time::Duration;
 
 use fearless_simd::Level;
 use serde_json::json;
 
-use super::{Error, between, output, print};
+use super::{Error, backend, between, output, print, print_json, say};
 use crate::backend::Backend;
 use crate::backend::cpu::{Cpu, level_name};
 use crate::backend::gpu;
@@ -17,6 +18,7 @@ use crate::backend::gpu::exact::Pass;
 use crate::config::{self, Config};
 use crate::escape;
 use crate::front::{self, Failure};
+use crate::host::Instant;
 use crate::record::evidence::{Compared, ShortTraining, Sighting, Tier};
 use crate::report::progress::Meter;
 use crate::verify::{Agreement, Plan, compare, short_trainings};
@@ -28,9 +30,10 @@ pub struct Args {
     /// Random teams of each world
     #[arg(long, value_name = "N", default_value_t = 48, value_parser = between(1..=65_536u32))]
     teams: u32,
-    /// Random worlds
-    #[arg(long, value_name = "N", default_value_t = 200, value_parser = between(1..=100_000u32))]
-    worlds: u32,
+    /// Random worlds that each adapter, pass and kernel is compared over [default: as many of the first 200 as take about a
+    /// minute in all; with --report all 200]
+    #[arg(long, value_name = "N", value_parser = between(1..=100_000u32))]
+    worlds: Option<u32>,
     /// Random seed
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = between(0..=u32::MAX))]
     seed: u32,
@@ -60,9 +63,10 @@ pub struct Args {
 
 /// Prints a table of adapters, passes and kernels, and after it what differs.
 pub fn run(args: Args) -> Result<(), Error> {
+    backend::start_threads(None);
     let config = args.config.as_deref().filter(|path| !config::is_standard_input(path));
     output::check(&[("--report", args.report.as_deref())], config.as_slice())?;
-    let plan = plan(&args)?;
+    let (plan, budget) = plan(&args)?;
     let mut lines = Vec::new();
     if args.report.is_some() {
         lines.extend(instruction_sets(&plan, args.quiet));
@@ -72,24 +76,42 @@ pub fn run(args: Args) -> Result<(), Error> {
         Err(Error::NoneToVerify(DeviceError::NoAdapter)) if args.report.is_some() => vec![],
         adapters => adapters?,
     };
-    for (choice, info) in adapters {
-        for pass in passes(args.pass.as_deref(), &info) {
+    let mut combinations = Vec::new();
+    for (choice, info) in &adapters {
+        for pass in passes(args.pass.as_deref(), info) {
             for kernel in kernels(args.kernel.as_deref()) {
-                let request = Request { pass: Some(pass), ..choice.clone().into() };
-                let result = verify(&plan, request, kernel, &info, args.quiet);
-                lines.push(Compared {
-                    pass: Some(pass.to_string()),
-                    kernel: Some(kernel.to_string()),
-                    ..line(info.to_string(), &Cpu::default(), result)
-                });
+                combinations.push(Combination { choice, info, pass, kernel });
             }
         }
     }
+    if !args.quiet && !combinations.is_empty() {
+        say(expected(&plan, budget, combinations.len()));
+    }
+    let mut meter = Meter::new(args.quiet);
+    for (place, combination) in combinations.iter().enumerate() {
+        let mut shown = |done: f64, outcome: &Agreement| {
+            meter.show((place as f64 + done) / combinations.len() as f64, || {
+                let Combination { info, pass, kernel, .. } = combination;
+                let of = if budget.is_some() { String::new() } else { format!(" of {}", plan.worlds.len()) };
+                format!("{}, {pass} pass, {kernel} kernel: {}{of} worlds", info.name, outcome.worlds)
+            });
+        };
+        let result = verify(&plan, budget.map(|all| all / combinations.len() as u32), combination, &mut shown);
+        lines.push(Compared {
+            pass: Some(combination.pass.to_string()),
+            kernel: Some(combination.kernel.to_string()),
+            ..line(combination.info.to_string(), &Cpu::default(), result)
+        });
+    }
+    meter.clear();
     if let Some(path) = &args.report {
         let evidence = evidence(&lines, args.note.clone(), args.quiet)?;
         output::write(path, |file| file.write_all(evidence.to_json().as_bytes()))?;
     }
-    print(&if args.json { in_json(&lines) } else { in_words(&lines) })?;
+    match args.json {
+        true => print_json(&json!({ "equal": lines.iter().all(|line| line.equal), "comparisons": lines }))?,
+        false => print(&in_words(&lines))?,
+    }
     match lines.iter().filter(|line| !line.equal).count() {
         0 => Ok(()),
         failed => Err(Error::Different(format!(
@@ -97,6 +119,63 @@ pub fn run(args: Args) -> Result<(), Error> {
             lines.len()
         ))),
     }
+}
+
+/// Random worlds to compare, of which a budget may leave out the last.
+const WORLDS: u32 = 200;
+/// Worlds compared between two looks at the clock: one of each layout.
+const PART: usize = 10;
+/// The time that comparing takes if nobody says how many worlds.
+const BUDGET: Duration = Duration::from_secs(60);
+
+/// What is compared with the CPU.
+struct Combination<'a> {
+    choice: &'a Wanted,
+    info: &'a AdapterInfo,
+    pass: Pass,
+    kernel: Kernel,
+}
+
+/// Says what is compared and how long that takes.
+fn expected(plan: &Plan, budget: Option<Duration>, combinations: usize) -> String {
+    let by = format!(
+        "{combinations} {} of adapter, pass and kernel",
+        if combinations == 1 { "combination" } else { "combinations" }
+    );
+    match budget {
+        Some(budget) => format!(
+            "comparing random worlds by {by}, at least {PART} by each, for about {} s; --worlds N sets how many",
+            budget.as_secs()
+        ),
+        None => format!(
+            "comparing {} worlds by each of {by}, which can take minutes; the time left is shown every now and then",
+            plan.worlds.len()
+        ),
+    }
+}
+
+/// Compares a plan part by part until the budget is spent, at least one part; without a budget the whole plan at once.
+fn compare_within<E>(
+    plan: &Plan,
+    budget: Option<Duration>,
+    mut compare: impl FnMut(&Plan, &Agreement) -> Result<Agreement, E>,
+) -> Result<Agreement, E> {
+    let since = Instant::now();
+    let mut all = Agreement::default();
+    let part = if budget.is_some() { PART } else { plan.worlds.len() };
+    for (index, worlds) in plan.worlds.chunks(part.max(1)).enumerate() {
+        let begun = Instant::now();
+        let part = Plan { worlds: worlds.to_vec(), seed: plan.seed + (index * PART) as u64, ..plan.clone() };
+        let found = compare(&part, &all)?;
+        all.worlds += found.worlds;
+        all.agent_steps += found.agent_steps;
+        all.mismatch = found.mismatch;
+        let is_spent = budget.is_some_and(|budget| since.elapsed() + begun.elapsed() > budget);
+        if all.mismatch.is_some() || is_spent {
+            break;
+        }
+    }
+    Ok(all)
 }
 
 /// One line of the table; an error of the device counts as a failure.
@@ -187,14 +266,12 @@ fn in_words(lines: &[Compared]) -> String {
     text + &failures
 }
 
-fn in_json(lines: &[Compared]) -> String {
-    format!("{}\n", json!({ "equal": lines.iter().all(|line| line.equal), "comparisons": lines }))
-}
-
-fn plan(args: &Args) -> Result<Plan, Error> {
+/// What is compared, and for how long if nobody says how much.
+fn plan(args: &Args) -> Result<(Plan, Option<Duration>), Error> {
     let (seed, teams) = (u64::from(args.seed), args.teams as usize);
-    Ok(match &args.config {
-        None => Plan::random(seed..seed + u64::from(args.worlds), teams),
+    let is_open = args.config.is_none() && args.worlds.is_none() && args.report.is_none();
+    let plan = match &args.config {
+        None => Plan::random(seed..seed + u64::from(args.worlds.unwrap_or(WORLDS)), teams),
         Some(path) => {
             let config = Config::load(path)?;
             let stages = config.staged().into_iter().enumerate().skip(1);
@@ -203,7 +280,8 @@ fn plan(args: &Args) -> Result<Plan, Error> {
             let worlds = [vec![(config::name(path), config)], stages].concat();
             Plan { worlds, teams, seed, generations: 5 }
         }
-    })
+    };
+    Ok((plan, is_open.then_some(BUDGET)))
 }
 
 /// The adapters to verify, each with what opens it.
@@ -238,16 +316,58 @@ fn kernels(name: Option<&str>) -> impl Iterator<Item = Kernel> {
     all.into_iter().filter(move |kernel| name.is_none_or(|name| kernel.to_string() == name))
 }
 
-fn verify(plan: &Plan, request: Request, kernel: Kernel, info: &AdapterInfo, quiet: bool) -> Result<Agreement, Error> {
-    let pass = request.pass.map_or_else(String::new, |pass| format!(", {pass} pass, {kernel} kernel"));
-    let mut meter = Meter::new(quiet);
-    let gpu = gpu::open(request)?;
+/// Compares a combination with the CPU; `shown` gets the part that is done, and what was found by then.
+fn verify(
+    plan: &Plan,
+    budget: Option<Duration>,
+    combination: &Combination<'_>,
+    shown: &mut dyn FnMut(f64, &Agreement),
+) -> Result<Agreement, Error> {
+    let since = Instant::now();
+    let gpu = gpu::open(Request { pass: Some(combination.pass), ..combination.choice.clone().into() })?;
     if let Some(mismatch) = gpu::self_test(&gpu)? {
         return Ok(Agreement { mismatch: Some(mismatch.to_string()), ..Agreement::default() });
     }
-    let mut gpu = GpuBackend::new(gpu)?.playing(kernel).holding(ResidencyPolicy::Always).bringing(Records::Packed);
-    let shown = meter_of(&mut meter, plan, format!("{}{pass}", info.name));
-    let compared = compare(plan, &mut Cpu::default(), &mut gpu, shown);
-    meter.clear();
-    Ok(compared?)
+    let gpu = GpuBackend::new(gpu)?.playing(combination.kernel);
+    let mut gpu = gpu.holding(ResidencyPolicy::Always).bringing(Records::Packed);
+    Ok(compare_within(plan, budget, |part, before| {
+        compare(part, &mut Cpu::default(), &mut gpu, |now| {
+            let now = Agreement { worlds: before.worlds + now.worlds, ..now.clone() };
+            let done = match budget {
+                Some(budget) => (since.elapsed().as_secs_f64() / budget.as_secs_f64()).min(1.0),
+                None => now.worlds as f64 / plan.worlds.len() as f64,
+            };
+            shown(done, &now);
+        })
+    })?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_budget_is_kept_by_whole_parts() {
+        let plan = Plan::random(0..35, 1);
+        let found = |budget: Option<Duration>, wrong: usize| {
+            let mut sizes = vec![];
+            let compare = |part: &Plan, before: &Agreement| {
+                assert_eq!(before.worlds, sizes.iter().sum::<usize>());
+                assert_eq!(part.worlds[0].0, format!("random world {}", part.seed));
+                sizes.push(part.worlds.len());
+                let mismatch = (sizes.len() == wrong).then(|| "differs".to_string());
+                Ok::<_, ()>(Agreement { worlds: part.worlds.len(), agent_steps: 7, mismatch })
+            };
+            let all = compare_within(&plan, budget, compare).unwrap();
+            assert_eq!(all.agent_steps, 7 * sizes.len() as u64);
+            assert_eq!((all.worlds, all.mismatch.is_some()), (sizes.iter().sum(), sizes.len() == wrong));
+            sizes
+        };
+        assert_eq!(found(None, 0), [35]);
+        assert_eq!(found(Some(Duration::ZERO), 0), [10]);
+        assert_eq!(found(Some(BUDGET), 0), [10, 10, 10, 5]);
+        assert_eq!(found(Some(BUDGET), 2), [10, 10]);
+        assert!(expected(&plan, Some(BUDGET), 4).contains("about 60 s"));
+        assert!(expected(&plan, None, 1).contains("35 worlds by each of 1 combination "));
+    }
 }

@@ -23,7 +23,7 @@ pub use learning::{
     Parents, Saving, Sharing,
 };
 pub use load::{MAX_FILE_BYTES, is_standard_input, name, read_file};
-pub use stages::{MAX_STAGES, Stage};
+pub use stages::{GENERATIONS, MAX_STAGES, STAGES, Stage};
 pub use valid::ValidConfig;
 pub use world::{Domain, MAX_AGENTS, MAX_POIS, MAX_STEPS};
 
@@ -107,32 +107,60 @@ impl Config {
         foreign: &[&str],
         overrides: &[Override],
     ) -> Result<Config, ConfigError> {
+        Ok(Config::read_noted(document, name, foreign, overrides)?.0)
+    }
+
+    /// [`Config::read_document`], and what the author of the config should know: which defaults other keys leave no room for,
+    /// and what [`Config::notes`] says.
+    ///
+    /// # Errors
+    /// All problems of the text and the overrides.
+    pub fn read_noted(
+        document: &Document<'_>,
+        name: &str,
+        foreign: &[&str],
+        overrides: &[Override],
+    ) -> Result<(Config, Vec<String>), ConfigError> {
         let (staging, overrides): (Vec<_>, Vec<_>) =
             overrides.iter().cloned().partition(|set| set.key == stages::STAGES);
         let invalid = |problems, unlisted| ConfigError::Invalid { name: name.to_string(), problems, unlisted };
-        let own = Config::without_stages(document, foreign, &overrides)
+        let (own, mut notes) = Config::without_stages(document, foreign, &overrides)
             .map_err(|reader::Problems { listed, unlisted }| invalid(listed, unlisted))?;
+        let shortened = overrides.iter().any(|set| set.key == stages::GENERATIONS);
         let stages = match staging.last() {
             Some(set) => {
                 let text = format!("{} = {}", stages::STAGES, set.text);
-                stages::read(&Document::parse(&text), true, &own)
+                stages::read(&Document::parse(&text), true, &own, shortened)
             }
-            None => stages::read(document, false, &own).map_err(|problems| {
+            None => stages::read(document, false, &own, shortened).map_err(|problems| {
                 let is_valid = |overrides: &[Override]| {
                     Config::without_stages(document, foreign, overrides)
-                        .is_ok_and(|own| stages::read(document, false, &own).is_ok())
+                        .is_ok_and(|(own, _)| stages::read(document, false, &own, shortened).is_ok())
                 };
                 stages::attribute(problems, &overrides, is_valid)
             }),
         };
-        match stages {
-            Ok(stages) => Ok(Config { stages, ..own }),
-            Err(mut problems) => {
-                let unlisted = problems.len().saturating_sub(reader::MAX_LISTED);
-                problems.truncate(reader::MAX_LISTED);
-                Err(invalid(problems, unlisted))
-            }
-        }
+        let stages = stages.map_err(|mut problems| {
+            let unlisted = problems.len().saturating_sub(reader::MAX_LISTED);
+            problems.truncate(reader::MAX_LISTED);
+            invalid(problems, unlisted)
+        })?;
+        let last = own.learning.generations;
+        let (stages, later): (Vec<Stage>, Vec<Stage>) = stages.into_iter().partition(|stage| stage.from <= last);
+        notes.extend(later.iter().map(|Stage { from, .. }| {
+            format!("the stage from generation {from} on is left out, because this run ends with generation {last}")
+        }));
+        let config = Config { stages, ..own };
+        notes.extend(config.notes());
+        Ok((config, notes))
+    }
+
+    /// Returns what is allowed and yet likely a mistake, once per line.
+    pub fn notes(&self) -> Vec<String> {
+        let too_short = |config: &Config| config.motion.too_short(config.world.dt, config.world.map);
+        let mut notes: Vec<String> = self.staged().iter().filter_map(|(_, config)| too_short(config)).collect();
+        notes.dedup();
+        notes
     }
 
     /// Reads all keys except the stages. These are changes of the config that the other keys make.
@@ -140,7 +168,7 @@ impl Config {
         document: &Document<'_>,
         foreign: &[&str],
         overrides: &[Override],
-    ) -> Result<Config, reader::Problems> {
+    ) -> Result<(Config, Vec<String>), reader::Problems> {
         let others = reader::Others {
             foreign: &[foreign, &[stages::STAGES]].concat(),
             refused: if foreign.contains(&GRID) { &[] } else { &[GRID, VARY] },

@@ -16,6 +16,8 @@ use crate::reader::{Document, Number};
 pub const STAGES: &str = "stages";
 /// Most stages of a config.
 pub const MAX_STAGES: usize = 256;
+/// The key that says how long a run is.
+pub const GENERATIONS: &str = "learning.generations";
 /// What is the same in all stages.
 const FIXED: [&str; 10] = [
     "policy.",
@@ -25,7 +27,7 @@ const FIXED: [&str; 10] = [
     "learning.population",
     "learning.elites",
     "learning.parents",
-    "learning.generations",
+    GENERATIONS,
     "learning.trials",
     "learning.seed",
 ];
@@ -108,10 +110,16 @@ struct Written<'a> {
 
 /// Reads the stages of a document whose other keys make a valid config. Their keys have lines unless the document comes
 /// from outside the file.
+/// `shortened`: the run's length was set from outside, so that stages may begin after its end.
 ///
 /// # Errors
 /// All problems of the stages, by line.
-pub(super) fn read(document: &Document<'_>, outside: bool, own: &Config) -> Result<Vec<Stage>, Vec<Problem>> {
+pub(super) fn read(
+    document: &Document<'_>,
+    outside: bool,
+    own: &Config,
+    shortened: bool,
+) -> Result<Vec<Stage>, Vec<Problem>> {
     let text = document.text();
     let line_of = |offset: usize| (!outside).then(|| document.lines().line(offset));
     let Some(list) = document.table().get(STAGES) else { return Ok(vec![]) };
@@ -135,14 +143,14 @@ pub(super) fn read(document: &Document<'_>, outside: bool, own: &Config) -> Resu
             match (key.get_ref().as_ref(), value.get_ref()) {
                 ("from", number) => {
                     let least = stages.last().map_or(0, |before| before.from + 1);
-                    let most = own.learning.generations.min(MAX_GENERATIONS);
+                    let most = if shortened { MAX_GENERATIONS } else { own.learning.generations };
                     match <usize as Number>::read(number).flatten() {
                         Some(number) if (least..=most).contains(&number) => from = Some(number),
                         found => {
                             let found = found.map_or("something else".into(), |found| found.to_string());
                             let after = if least > 0 { ", after the stage before" } else { "" };
                             let message = format!(
-                                "found {found}, allowed a whole number, {least} to {most} (learning.generations){after}"
+                                "found {found}, allowed a whole number, {least} to {most} ({GENERATIONS}){after}"
                             );
                             report(offset, place, message);
                             from = Some(least);

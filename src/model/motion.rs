@@ -50,6 +50,31 @@ impl Motion {
     }
 }
 
+impl Motion {
+    /// Returns what is wrong with steps of this time on this map, if they are so short that rounding of positions shows.
+    pub(crate) fn too_short(&self, dt: f64, map: [f64; 2]) -> Option<String> {
+        let (step, resolution) = (self.max_speed * dt, resolution(map));
+        (step > 0.0 && step < SHORTEST * resolution).then(|| {
+            format!(
+                "motion.max_speed times world.dt is {step:.2e} units, and positions on this map are {resolution:.2e} units \
+                 apart: agents stand still or get too far or not far enough; set a larger world.dt or a smaller world.map, \
+                 so that a step is at least {:.2e} units",
+                SHORTEST * resolution
+            )
+        })
+    }
+}
+
+/// The shortest step that rounding does not change noticeably, in distances between neighbouring positions. A step is off
+/// by at most one and a half of these distances on each axis, 0.6 % of so long a step.
+const SHORTEST: f64 = 256.0;
+
+/// Returns the largest distance between neighbouring positions on a map: the grid's, or where f32 is coarser, f32's.
+pub fn resolution(map: [f64; 2]) -> f64 {
+    let side = map[0].max(map[1]) as f32;
+    f64::from((side - side.next_down()).max(1.0 / GRID))
+}
+
 gpu_struct! {
     /// Constants of motion.
     pub struct MotionConstants as MotionLanes {

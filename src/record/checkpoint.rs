@@ -11,7 +11,6 @@ use std::fs;
 use std::io::{ErrorKind, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::thread::JoinHandle;
 use std::time::Duration;
 
 use safetensors::tensor::Dtype;
@@ -25,6 +24,7 @@ use crate::config::Config;
 use crate::evolve;
 use crate::file;
 use crate::host::Instant;
+use crate::parallel::Aside;
 use crate::trainer::{Row, Snapshot};
 
 const KIND: &str = "checkpoint 1";
@@ -293,7 +293,7 @@ pub struct Keeper {
     config: Arc<Config>,
     /// Generations of the checkpoints that are whole, oldest first.
     kept: Vec<usize>,
-    writing: Option<JoinHandle<Result<(usize, Duration), RecordError>>>,
+    writing: Option<Aside<Result<(usize, Duration), RecordError>>>,
     /// The generation, the moment and the cost of the last.
     last: (usize, Instant, Duration),
 }
@@ -327,7 +327,7 @@ impl Keeper {
         self.last = (generation, Instant::now(), since.elapsed());
         let (disk, config) = (self.disk.clone(), self.config.clone());
         let path = path(&self.folder, generation);
-        self.writing = Some(std::thread::spawn(move || {
+        self.writing = Some(Aside::start(move || {
             metrics.sync().map_err(RecordError::write(metrics.path()))?;
             checkpoint.write(&disk, &path, &config).map_err(RecordError::write(&path))?;
             Ok((generation, since.elapsed()))
@@ -360,7 +360,7 @@ impl Keeper {
     /// The last checkpoint could not be written.
     pub fn wait(&mut self) -> Result<(), RecordError> {
         let Some(writing) = self.writing.take() else { return Ok(()) };
-        let (generation, cost) = writing.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
+        let (generation, cost) = writing.finish()?;
         self.last.2 = cost;
         self.keep(generation)
     }
@@ -403,7 +403,7 @@ impl Keeper {
     /// # Errors
     /// The last checkpoint could not be written.
     pub fn poll(&mut self) -> Result<(), RecordError> {
-        if self.writing.as_ref().is_some_and(JoinHandle::is_finished) { self.wait() } else { Ok(()) }
+        if self.writing.as_ref().is_some_and(Aside::is_finished) { self.wait() } else { Ok(()) }
     }
 
     /// The generation of the newest whole checkpoint.
@@ -416,7 +416,7 @@ impl Drop for Keeper {
     fn drop(&mut self) {
         // Whoever leaves early still lets the writer finish: the folder's lock goes next.
         if let Some(writing) = self.writing.take() {
-            let _ = writing.join();
+            writing.end();
         }
     }
 }

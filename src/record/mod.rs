@@ -173,7 +173,7 @@ fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
 
 /// Keys that came later, at their defaults: they are left out of a config's digest, so that a run of an earlier version
 /// can go on.
-const LATER: [&str; 8] = [
+const LATER: [&str; 10] = [
     "observers = \"all\"\n",
     "windows = []\n",
     "after = []\n",
@@ -182,6 +182,8 @@ const LATER: [&str; 8] = [
     "led_within = 0\n",
     "led_by = \"most-seen\"\n",
     "poi_jitter = 0.0\n",
+    "gain = 1.0\n",
+    "parents = \"all\"\n",
 ];
 
 /// SHA-256 of all of a config that has a say in the results.

@@ -23,7 +23,7 @@ use std::path::Path;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-use crate::config::{self, Config, ConfigError, GRID, Override, Problem, VARY, read_file};
+use crate::config::{self, Config, ConfigError, GENERATIONS, GRID, Override, Problem, STAGES, VARY, read_file};
 use crate::escape;
 use crate::file;
 use crate::reader::Document;
@@ -413,6 +413,12 @@ impl Grid {
             if let (Some(section), Some(value)) = (section.as_table_mut(), value) {
                 section.insert(leaf.into(), value);
             }
+        }
+        // A shorter run has no stages that begin after its end, see `Config::read_noted`.
+        let last = flags.iter().find(|set| set.key == GENERATIONS).and_then(|set| set.text.parse().ok());
+        if let (Some(last), Some(Value::Array(stages))) = (last, base.get_mut(STAGES)) {
+            let from = |stage: &Value| stage.get("from").and_then(Value::as_integer);
+            stages.retain(|stage| from(stage).is_none_or(|from: i64| from <= last));
         }
         let mut text = toml::to_string(&base).unwrap_or_default();
         for (section, varied) in [(GRID, false), (VARY, true)] {

@@ -36,6 +36,7 @@ mod readback;
 mod shape;
 mod source;
 
+pub(crate) use planner::state_bytes;
 pub use planner::{State, Task};
 pub use shape::Kernel;
 pub use source::{Workgroup, shader_of, shaders, workgroup_of};

@@ -5,8 +5,8 @@ use std::collections::{BTreeSet, HashSet};
 use glam::Vec2;
 
 use super::Records;
-use super::shape::{Capacity, Kept, Packing, Shape};
-use crate::backend::{BackendError, FOUR, Group, Moment, fours, owner_bits, record_words};
+use super::shape::{Capacity, Kept, MAX_THREADS, Packing, Shape, WORKGROUPS};
+use crate::backend::{BackendError, FOUR, Group, Moment, RecordRequest, fours, owner_bits, record_words};
 use crate::gpu_struct::gpu_struct;
 use crate::model::Constants;
 use crate::model::policy::PolicyConstants;
@@ -81,6 +81,17 @@ fn steps_a_dispatch(world: &World, packing: Packing, records: Kept) -> usize {
     let items = |rows: usize| (rows * packing.teams).div_ceil(packing.workgroup);
     let items = items(world.pois.len() * words as usize) + items(sights);
     (TURNS / (packing.slots * agent + items * 33)).max(1)
+}
+
+/// Returns the bytes of a team's states between two dispatches, 0 if one dispatch plays the whole episode. An adapter that
+/// allows larger workgroups than every WebGPU device does may need none where this counts some.
+pub(crate) fn state_bytes(world: &World, request: RecordRequest) -> u64 {
+    let kept = Kept { trace: false, sights: request.sights() && world.followers() > 0 };
+    let generic = Packing::generic(world, WORKGROUPS[2]);
+    let specialised = Packing::specialised(world, Capacity::of_workgroups(MAX_THREADS));
+    let packings = [generic].into_iter().chain(specialised);
+    let parted = packings.into_iter().any(|packing| world.steps() > steps_a_dispatch(world, packing, kept));
+    if parted { (world.agents() * size_of::<State>()) as u64 } else { 0 }
 }
 
 /// A task and where its teams come from.
@@ -189,10 +200,20 @@ pub(super) fn plan(
         let world = group.world;
         let kept = Kept::of(group, trace);
         let moments_a_team = if trace { (world.steps() + 1) * world.agents() } else { 0 };
+        let for_it =
+            Packing::specialised(world, room).map(|packing| (packing, Shape::specialised(world, packing, kept)));
+        let (packing, shape) = for_it.filter(|(_, shape)| specialised.contains(shape)).unwrap_or_else(|| {
+            let packing = Packing::generic(world, room.workgroup);
+            (packing, Shape::generic(world, packing, kept))
+        });
+        let steps_a_dispatch = steps_a_dispatch(world, packing, kept);
+        let states_a_team = if world.steps() > steps_a_dispatch { world.agents() } else { 0 };
+        // Every buffer that grows with the teams is one of these, or smaller than one of them.
         let bytes_a_team = [
             record_words(world, group.need) * size_of::<u32>(),
             fours(world) * size_of::<[f32; FOUR]>(),
             moments_a_team * size_of::<Moment>(),
+            states_a_team * size_of::<State>(),
         ]
         .into_iter()
         .max()
@@ -204,14 +225,7 @@ pub(super) fn plan(
                 room.buffer
             )));
         }
-        let for_it =
-            Packing::specialised(world, room).map(|packing| (packing, Shape::specialised(world, packing, kept)));
-        let (packing, shape) = for_it.filter(|(_, shape)| specialised.contains(shape)).unwrap_or_else(|| {
-            let packing = Packing::generic(world, room.workgroup);
-            (packing, Shape::generic(world, packing, kept))
-        });
         let teams_a_task = packing.teams.min((target / bytes_a_team.max(1)).max(1) as usize);
-        let steps_a_dispatch = steps_a_dispatch(world, packing, kept);
         // A group's world, starts and POIs are stored once per batch.
         let mut stored: Option<(usize, Task)> = None;
         for first_team in (0..group.team_count()).step_by(teams_a_task) {
@@ -221,6 +235,7 @@ pub(super) fn plan(
             if full(work.record, size_of::<u32>())
                 || full(work.weights, size_of::<[f32; FOUR]>())
                 || full(work.moments, size_of::<Moment>())
+                || full(work.states, size_of::<State>())
                 || work.shapes.len() >= room.kernels && !work.shapes.contains(&shape)
             {
                 batches.push(BatchPlan::default());
@@ -254,9 +269,7 @@ pub(super) fn plan(
             work.record += record_words(world, group.need) * teams;
             work.sets += world.set_words() * teams;
             work.moments += moments_a_team * teams;
-            if world.steps() > steps_a_dispatch {
-                work.states += world.agents() * teams;
-            }
+            work.states += states_a_team * teams;
             work.shapes.insert(shape);
             work.shares.push(PlannedTask { group: index, first_team, shape, task, steps_a_dispatch });
         }
@@ -280,5 +293,41 @@ pub(super) fn gather(group: &Group<'_>, weights: &[f32], first_team: usize, team
         for (four, weights) in column.zip(weights[from..from + parameters].chunks(FOUR)) {
             four[..weights.len()].copy_from_slice(weights);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::backend::{BATCH_BYTES, Weights};
+    use crate::config::Config;
+
+    /// Agents that wait between two dispatches count towards a batch, too.
+    #[test]
+    fn no_batch_outgrows_a_buffer() {
+        let text = "[world]\nleaders = [[1, 1]]\nfollowers = [FOLLOWERS]\npois = [[9, 9]]\nsteps = 45\n";
+        let text = text.replace("FOLLOWERS", &vec!["[2, 2]"; 255].join(", "));
+        let world = World::new(&Config::parse(&text, "large").unwrap());
+        let (policies, population) = (vec![0.0; world.parameters()], 27_000);
+        let group = Group {
+            world: &world,
+            starts: &world.starts,
+            weights: Weights::OnHost(&policies),
+            policies: 1,
+            teams: &vec![0; population],
+            need: RecordRequest::Score(crate::config::Fitness::Df),
+        };
+        for buffer in [128 << 20, 1 << 20, 1 << 14] {
+            let room = Capacity { batch: BATCH_BYTES, buffer, ..Capacity::of_workgroups(256) };
+            let batches = plan(&[group], false, Records::Whole, room, &HashSet::new()).unwrap();
+            for work in &batches {
+                let states = (work.states * size_of::<State>()) as u64;
+                assert!(states > 0 && states <= buffer, "{states} bytes of states, {buffer} allowed");
+                assert!((work.record * size_of::<u32>()) as u64 <= buffer);
+            }
+            let teams: u32 = batches.iter().flat_map(|work| &work.shares).map(|share| share.task.teams).sum();
+            assert_eq!(teams as usize, population);
+        }
+        assert_eq!(state_bytes(&world, group.need), 256 * 20);
     }
 }

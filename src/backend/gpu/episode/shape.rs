@@ -21,7 +21,7 @@ pub(super) const WORKGROUPS: [usize; 3] = [64, 128, 256];
 pub(super) const TEAMS: [usize; 3] = [32, 16, 8];
 /// Maximum threads per workgroup of a specialised kernel: two or more workgroups then fit into a compute unit and hide
 /// each other's latency.
-const MAX_THREADS: usize = 512;
+pub(super) const MAX_THREADS: usize = 512;
 /// Maximum weights of a policy that are written out as straight-line code.
 const MAX_STRAIGHT_WEIGHTS: usize = 512;
 
