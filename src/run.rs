@@ -179,7 +179,7 @@ impl Session {
             .map_err(|_| RunError::Memory { what: "twice the policies of all trials", bytes })?;
         // Before any of them is touched.
         let configs = runs.iter().map(|(config, ..)| config.validate()).collect::<Result<Vec<ValidConfig>, _>>()?;
-        folder::check(runs.iter().map(|(_, path, _)| &**path), start)?;
+        folder::check(disk, runs.iter().map(|(config, path, _)| (&**path, config)), start)?;
         let opened = side_by_side(runs, |(config, path, init)| Member::open(config, path, init, start, disk))?;
         let (mut members, mut snapshots, mut notes) = (Vec::new(), Vec::new(), Vec::new());
         for (member, snapshot, told) in opened {
@@ -231,6 +231,11 @@ impl Session {
     /// What a run came to, once it is done.
     pub fn results(&self, run: usize) -> Option<&Results> {
         self.members[run].results.as_ref()
+    }
+
+    /// The disk within a run's folder.
+    pub fn disk(&self, run: usize) -> &Disk {
+        &self.members[run].folder.disk
     }
 
     /// What `run.json` says of a run.
@@ -459,13 +464,15 @@ impl Member {
         let (metrics, before, from) = match found.checkpoint {
             Some((Checkpoint { snapshot, seconds, .. }, metrics)) => (metrics, seconds, Origin::Checkpoint(snapshot)),
             None => {
-                let metrics = metrics::Writer::create(disk, &member.folder.file(METRICS), &member.config);
+                let metrics =
+                    metrics::Writer::create(&member.folder.disk, &member.folder.file(METRICS), &member.config);
                 (metrics.map_err(member.metrics_failed())?, 0.0, init.map_or(Origin::Chance, Origin::Policies))
             }
         };
         let generation = if let Origin::Checkpoint(snapshot) = &from { snapshot.generation } else { 0 };
         let checkpoints = member.folder.file(folder::CHECKPOINTS);
-        let keeper = Keeper::new(disk.clone(), checkpoints, member.config.clone(), found.kept, generation);
+        let keeper =
+            Keeper::new(member.folder.disk.clone(), checkpoints, member.config.clone(), found.kept, generation);
         let going = Some(Going { arm: 0, metrics, keeper, ending: None });
         Ok((Member { going, before, ..member }, from, found.notes))
     }
@@ -593,11 +600,12 @@ impl Twin {
             return Ok(());
         }
         let (from, path) = (of.join(METRICS), folder.file(METRICS));
-        let copy = disk.replace(&path, |output| std::io::copy(&mut std::fs::File::open(&from)?, output).map(drop));
+        let copy =
+            folder.disk.replace(&path, |output| std::io::copy(&mut std::fs::File::open(&from)?, output).map(drop));
         copy.map_err(|error| RecordError::Write { path, error })?;
         let policies = of.join(POLICIES);
         let policies = policies::read_all(&policies, &of_config)?;
-        policies::write(disk, &folder.file(POLICIES), &config, &policies)?;
+        policies::write(&folder.disk, &folder.file(POLICIES), &config, &policies)?;
         let (_, digest) = folder.digest(&config, &policies)?;
         Ok(folder.write_run(&Run { digest: Some(digest), ..run })?)
     }

@@ -24,7 +24,7 @@ use flotilla::config::Config;
 use flotilla::record::checkpoint::{self, Checkpoint};
 use flotilla::record::disk::{Disk, Operation};
 use flotilla::record::folder::{CONFIG, Folder, METRICS, Note, POLICIES, RUN, Run, Start, Status};
-use flotilla::record::{RecordError, policies};
+use flotilla::record::{RecordError, metrics, policies};
 use flotilla::run::{Ended, Options, Results, RunError, Session};
 use rand::{RngExt, SeedableRng, rngs::ChaCha8Rng};
 use tempfile::TempDir;
@@ -896,9 +896,9 @@ fn where_one_of_several_runs_cannot_start_none_is_touched() {
     let held = Folder::open(&taken, Start::Fresh, &small(), None, Disk::default()).unwrap();
     assert!(open(Start::Fresh).contains("holds a run already") && !free.exists());
     fs::create_dir(&free).unwrap();
-    fs::write(free.join(METRICS), "of a run").unwrap();
+    fs::write(free.join(METRICS), metrics::HEADER).unwrap();
     assert!(open(Start::Force).starts_with("another process is training in"));
-    assert_eq!(fs::read_to_string(free.join(METRICS)).unwrap(), "of a run");
+    assert_eq!(fs::read_to_string(free.join(METRICS)).unwrap(), metrics::HEADER);
     drop(held);
 }
 
@@ -922,7 +922,7 @@ fn other_files_are_left_alone() {
             let refused = flotilla_train(&file, &out, &[flag]).output().unwrap();
             let told = stderr(&refused);
             assert!(
-                refused.status.code() == Some(1) && told.contains("is not a run's, and would be written"),
+                refused.status.code() == Some(1) && told.contains("was not made by flotilla and would be overwritten"),
                 "{told}"
             );
             assert!(told.contains(name) && told.contains("move it away"), "{told}");

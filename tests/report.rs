@@ -13,6 +13,7 @@ use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::{Config, Fitness, Override};
+use flotilla::record::ownership::LIST;
 use flotilla::report::curves::{distinct, poi_ticks};
 use flotilla::report::scene::{Color, text_width};
 use flotilla::report::{map, paper};
@@ -869,7 +870,9 @@ fn paper(out: &Path, flags: &[&str]) -> Output {
 fn outcome(out: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let entries = |folder: &Path| fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect::<Vec<_>>();
     let arms = entries(&out.join("arms")).into_iter().map(|arm| arm.join("policies.safetensors"));
-    let files: Vec<PathBuf> = entries(out).into_iter().filter(|path| path.is_file()).chain(arms).collect();
+    // The list of what was made has lines of earlier versions, too.
+    let files = entries(out).into_iter().filter(|path| path.is_file() && !path.ends_with(LIST));
+    let files: Vec<PathBuf> = files.chain(arms).collect();
     let bytes = |path: PathBuf| {
         let bytes = fs::read(&path).unwrap();
         let name = path.strip_prefix(out).unwrap().to_path_buf();

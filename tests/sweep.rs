@@ -15,6 +15,7 @@ use flotilla::backend::cpu::Cpu;
 use flotilla::config::{Config, Coupling, Override, ValidConfig};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{Folder, Start};
+use flotilla::record::ownership::LIST;
 use flotilla::sweep::shard::{Shard, cost};
 use flotilla::sweep::{Sweep, layout, run};
 use flotilla::trainer::Trainer;
@@ -83,7 +84,8 @@ fn results(out: &Path) -> Vec<(String, Vec<u8>)> {
     let mut files: Vec<_> = fs::read_dir(out)
         .unwrap()
         .map(|entry| entry.unwrap().path())
-        .filter(|path| path.is_file())
+        // The list of what was made has lines of earlier versions, too.
+        .filter(|path| path.is_file() && !path.ends_with(LIST))
         .map(|path| (path.file_name().unwrap().to_str().unwrap().to_string(), fs::read(&path).unwrap()))
         .collect();
     files.sort();

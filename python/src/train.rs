@@ -10,6 +10,7 @@ use flotilla::front::{self, Trained};
 use flotilla::memory::Peaks;
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{self, Folder, METRICS, POLICIES, Start, Status};
+use flotilla::record::ownership::{self, CURVES};
 use flotilla::record::{RecordError, metrics, policies};
 use flotilla::report::runs;
 use flotilla::run::{Ended, Options, RunError, Session};
@@ -246,8 +247,8 @@ pub fn train_into(
 /// Draws a run's curves beside it, as the program does.
 fn draw(folder: &PathBuf) -> PyResult<()> {
     let svg = runs::figure(std::slice::from_ref(folder)).raise()?.scene().svg();
-    let path = folder.join("curves.svg");
-    Disk::default().replace(&path, |output| output.write_all(svg.as_bytes())).raise()
+    let disk = ownership::enter(&Disk::default(), folder, true).raise()?;
+    ownership::publish(&disk, &folder.join(CURVES), |output| output.write_all(svg.as_bytes())).raise()
 }
 
 /// Reads a run that is done.
@@ -299,10 +300,11 @@ pub fn save(
     workers::aside(py, || {
         let disk = Disk::default();
         let start = if force { Start::Force } else { Start::Fresh };
-        let (kept, _) = Folder::open(&folder, start, config, None, disk.clone()).raise()?;
+        let (kept, _) = Folder::open(&folder, start, config, None, disk).raise()?;
+        let disk = &kept.disk;
         let path = kept.file(METRICS);
         let write = || {
-            let mut writer = metrics::Writer::create(&disk, &path, config)?;
+            let mut writer = metrics::Writer::create(disk, &path, config)?;
             for (generation, &seconds) in times.iter().enumerate() {
                 let row = |trial: usize| {
                     let of = |score: &[f64]| score[trial * columns + generation];
@@ -314,7 +316,7 @@ pub fn save(
             writer.flush()
         };
         write().map_err(|error| RecordError::Write { path: path.clone(), error }).raise()?;
-        policies::write(&disk, &kept.file(POLICIES), config, &weights).raise()?;
+        policies::write(disk, &kept.file(POLICIES), config, &weights).raise()?;
         let (_, digest) = kept.digest(config, &weights).raise()?;
         let (backend, description, init) = played;
         let run = folder::Run {

@@ -1,5 +1,6 @@
 //! `flotilla man`: manual pages, one a command.
 
+use std::fs;
 use std::path::PathBuf;
 
 use clap::CommandFactory;
@@ -9,6 +10,7 @@ use super::{Cli, Error, print};
 use crate::escape::PathExt;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
+use crate::record::ownership;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -17,11 +19,15 @@ pub struct Args {
     out: PathBuf,
 }
 
-/// Writes the pages in place of any others of their names.
+/// How a manual page says that it is about this program.
+const TITLE: &str = ".TH flotilla";
+
+/// Writes the pages in the place of earlier versions of them.
 pub fn run(args: Args) -> Result<(), Error> {
     let disk = Disk::default();
     let failed = |path: PathBuf| move |error| RecordError::Write { path, error };
     disk.create_folder(&args.out).map_err(failed(args.out.clone()))?;
+    let disk = ownership::enter(&disk, &args.out, true)?;
     let mut all = Cli::command().disable_help_subcommand(true);
     all.build();
     let commands: Vec<_> = std::iter::once(&all).chain(all.get_subcommands()).cloned().collect();
@@ -29,6 +35,9 @@ pub fn run(args: Args) -> Result<(), Error> {
         commands.into_iter().map(|command| Man::new(command).source(concat!("flotilla ", env!("CARGO_PKG_VERSION"))))
     {
         let path = args.out.join(page.get_filename());
+        if path.symlink_metadata().is_ok() && !fs::read_to_string(&path).is_ok_and(|text| text.contains(TITLE)) {
+            return Err(RecordError::NotOurs { path }.into());
+        }
         disk.replace(&path, |output| page.render(output)).map_err(failed(path))?;
     }
     print(&format!("{}\n", args.out.escaped()))

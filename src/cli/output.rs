@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::mpsc;
 use std::thread;
 use std::time::Duration;
@@ -11,7 +11,60 @@ use super::{Error, say};
 use crate::escape::PathExt;
 use crate::file;
 use crate::record::disk::Disk;
-use crate::record::{RecordError, folder};
+use crate::record::{RecordError, folder, ownership};
+
+/// Where a picture or a page goes.
+pub enum Destination {
+    /// The user named the file, whatever it is.
+    Named(PathBuf),
+    /// A file of a run's folder.
+    OfRun(PathBuf),
+    /// A file of the present folder, by a name that the user did not choose.
+    Here(PathBuf),
+}
+
+impl Destination {
+    /// The file.
+    pub fn path(&self) -> &Path {
+        match self {
+            Destination::Named(path) | Destination::OfRun(path) | Destination::Here(path) => path,
+        }
+    }
+
+    /// Refuses a file that flotilla did not make, unless the user named it.
+    ///
+    /// # Errors
+    /// It is such, or the folder belongs to another user.
+    pub fn check(&self) -> Result<(), RecordError> {
+        match self {
+            Destination::Named(_) => Ok(()),
+            Destination::OfRun(path) => ownership::check(&self.disk()?, [path]),
+            Destination::Here(path) if path.symlink_metadata().is_err() || ownership::is_drawing(path) => Ok(()),
+            Destination::Here(path) => Err(RecordError::NotOurs { path: path.clone() }),
+        }
+    }
+
+    /// Writes the file, whole or not at all.
+    ///
+    /// # Errors
+    /// It cannot be written, or [`Destination::check`].
+    pub fn write(&self, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Error> {
+        self.check()?;
+        match self {
+            Destination::Named(path) => write(path, content),
+            Destination::OfRun(path) => Ok(ownership::publish(&self.disk()?, path, content)?),
+            Destination::Here(path) => {
+                let written = self.disk()?.replace_shared(path, content, || Ok(()));
+                Ok(written.map_err(|error| RecordError::Write { path: path.clone(), error })?)
+            }
+        }
+    }
+
+    /// The disk within the file's folder, which no flag names.
+    fn disk(&self) -> Result<Disk, RecordError> {
+        ownership::enter(&Disk::default(), file::folder(self.path()), matches!(self, Destination::Named(_)))
+    }
+}
 
 /// Refuses to write over what is read, over another output, or over what a run needs. Each file comes with its flag.
 ///

@@ -15,6 +15,7 @@ use crate::memory;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, ARMS, Folder, PAPER, POINTS, SWEEP, Start};
+use crate::record::ownership;
 use crate::report::curves::PRINT;
 use crate::report::paper::{self, Evidence, Experiment, Summary, Trajectory, claims, tables};
 use crate::report::progress::{Board, Meter};
@@ -29,10 +30,13 @@ use crate::trainer::Row;
 const CLAIMS: &str = "claims.md";
 const SUMMARY: &str = "summary.json";
 
+/// Where a paper goes by default.
+const OUT: &str = "paper";
+
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder for the figures, the claims and the curves
-    #[arg(long, short, value_name = "DIR", default_value = "paper")]
+    #[arg(long, short, value_name = "DIR", default_value = OUT)]
     pub(super) out: PathBuf,
     /// Instead of the paper's experiments, train what answers the questions that it leaves open, or =a,c some of them
     /// (docs/results/questions.md)
@@ -76,6 +80,11 @@ impl Args {
         [overrides.list(), self.checkpoints.list()].concat()
     }
 
+    /// Whether the user chose the folder.
+    pub(super) fn is_out_named(&self) -> bool {
+        self.out != Path::new(OUT)
+    }
+
     /// What to do with what is in the folder.
     pub(super) fn start(&self) -> Start {
         match (self.resume, self.force) {
@@ -110,11 +119,14 @@ pub fn run(args: Args) -> Result<(), Error> {
     plan.check(player.1.backend == "gpu").map_err(RunError::from)?;
     let disk = Disk::default();
     disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
-    let _lock = folder::lock(out)?;
+    let disk = ownership::enter(&disk, out, args.is_out_named())?;
+    let _lock = folder::lock(&disk, out)?;
     // Only now is nobody else writing here.
     marks.compare(out, start)?;
     let folders: Vec<PathBuf> = arms.iter().map(|arm| out.join(ARMS).join(arm_name(arm))).collect();
-    folder::check(folders.iter().map(|path| &**path), start)?;
+    let configs_of_arms = arms.iter().map(|arm| &arm.config);
+    folder::check(&disk, folders.iter().map(|path| &**path).zip(configs_of_arms), start)?;
+    ownership::check(&disk, products().map(|name| out.join(name)))?;
     marks.claim(out, start, &disk)?;
     // The first arm of each training is trained, the others are the same.
     let trained: Vec<usize> =
@@ -213,8 +225,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         |error| RecordError::Write { path, error }
     };
     let write = |name: String, content: &[u8]| -> Result<(), Error> {
-        let path = out.join(name);
-        Ok(disk.replace(&path, |output| output.write_all(content)).map_err(failed(&path))?)
+        Ok(ownership::publish(&disk, &out.join(name), |output| output.write_all(content))?)
     };
     for (index, layout) in paper::LAYOUTS.iter().enumerate() {
         let Some(number) = layout.figure else { continue };
@@ -292,6 +303,11 @@ const FIGURES: [&str; 9] = [
     "figure6.pdf",
 ];
 
+/// All that is made of the runs.
+fn products() -> impl Iterator<Item = &'static str> {
+    [CLAIMS, SUMMARY].into_iter().chain(FIGURES)
+}
+
 /// An arm's folder: "chaotic-all-leaders-Df".
 fn arm_name(arm: &Experiment) -> String {
     arm.name().replace(", ", "-").replace(' ', "-")
@@ -331,12 +347,23 @@ impl Marks {
             },
         };
         match start {
-            Start::Force if what == "a paper" => Ok(()),
+            Start::Force if what == "a paper" => self.compare_mark(out),
             Start::Fresh if what == "a paper" => Err(Error::Refused(format!(
                 "{name} holds a paper already; go on with it by --resume, write over it by --force, or choose another --out"
             ))),
             Start::Resume if what == "a paper" => self.compare_paper(out),
             _ => Err(Error::Refused(format!("{name} holds {what}, no paper; choose another --out"))),
+        }
+    }
+
+    /// Refuses a folder whose `paper.toml` was not made by flotilla.
+    fn compare_mark(&self, out: &Path) -> Result<(), Error> {
+        let path = out.join(PAPER);
+        let there: Option<toml::Table> = config::read_file(&path)?.parse().ok();
+        let like_ours = there.is_some_and(|there| self.0.iter().all(|(key, _)| there.contains_key(*key)));
+        match like_ours || out.join(ARMS).is_dir() {
+            true => Ok(()),
+            false => Err(RecordError::NotOurs { path }.into()),
         }
     }
 
@@ -374,9 +401,7 @@ impl Marks {
             |error| RecordError::Write { path, error }
         };
         if start == Start::Force {
-            for path in [CLAIMS, SUMMARY].iter().chain(&FIGURES).map(|name| out.join(name)) {
-                disk.remove(&path).map_err(failed(&path))?;
-            }
+            products().try_for_each(|name| ownership::withdraw(disk, &out.join(name)))?;
         }
         let path = out.join(PAPER);
         Ok(disk.replace(&path, |output| output.write_all(self.text().as_bytes())).map_err(failed(&path))?)

@@ -2,9 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{Error, output, print, print_json, say};
+use super::output::{self, Destination};
+use super::{Error, print, print_json, say};
 use crate::escape::PathExt;
 use crate::record::RecordError;
+use crate::record::ownership::CURVES;
 use crate::report::curves::PRINT;
 use crate::report::runs::{self, MAX_RUNS};
 use crate::report::scene::{Format, Scene};
@@ -29,13 +31,17 @@ pub fn run(args: Args) -> Result<(), Error> {
         let count = runs.len();
         return Err(Error::Usage(format!("{count} runs are too many to tell apart; name {MAX_RUNS} at most")));
     }
-    let out = out.unwrap_or_else(|| match &*runs {
-        [run] => run.join("curves.svg"),
-        _ => "comparison.svg".into(),
-    });
-    let kind = kind_of(&out)?;
+    let place = match (out, &*runs) {
+        (Some(out), _) => Destination::Named(out),
+        (None, [run]) => Destination::OfRun(run.join(CURVES)),
+        (None, _) => Destination::Here("comparison.svg".into()),
+    };
+    let out = place.path();
+    let kind = kind_of(out)?;
     let scene = runs::figure(&runs)?.scene();
-    write(&scene, kind, &out)?;
+    place.check()?;
+    let content = scene.file(kind, PRINT).map_err(|error| RecordError::Write { path: out.into(), error })?;
+    place.write(|output| output.write_all(&content))?;
     if runs::paired(&runs)? {
         say("note: these runs have one seed, so their trials are pairs: compare trial with trial, not only the means");
     }

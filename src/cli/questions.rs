@@ -9,11 +9,12 @@ use super::paper::Args;
 use super::recovery::{self, Signals};
 use super::sweep::{claim, free_memory, same_sweep};
 use super::{Error, backend, print, print_json, say};
+use crate::config::Config;
 use crate::escape::PathExt;
 use crate::memory::Peaks;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, SWEEP};
-use crate::record::{RecordError, policies};
+use crate::record::{RecordError, ownership, policies};
 use crate::report::comparison;
 use crate::report::curves::PRINT;
 use crate::report::progress::Meter;
@@ -26,6 +27,17 @@ use crate::sweep::{Sweep, shard};
 
 /// What came out, as a page.
 const PAGE: &str = "questions.md";
+
+/// All parts of all questions.
+fn all_parts() -> impl Iterator<Item = &'static Study> {
+    QUESTIONS.iter().flat_map(|question| question.parts)
+}
+
+/// The files that are made of each part.
+fn files() -> impl Iterator<Item = String> {
+    let endings = || Format::ALL.map(Format::extension).into_iter().chain(["csv"]);
+    all_parts().flat_map(move |part| endings().map(|ending| format!("{}.{ending}", part.name)))
+}
 
 /// Trains every part of the questions, each as a sweep in a folder of its own, and writes what came out.
 pub fn run(args: &Args) -> Result<(), Error> {
@@ -45,16 +57,13 @@ pub fn run(args: &Args) -> Result<(), Error> {
         return Err(Error::Refused(format!("{} holds a run; choose another --out", out.escaped())));
     }
     parts.iter().try_for_each(|(part, sweep)| same_sweep(sweep, &out.join(part.name)))?;
-    let all = || QUESTIONS.iter().flat_map(|question| question.parts);
-    if !all().any(|part| out.join(part.name).join(SWEEP).exists()) {
-        let endings = || Format::ALL.map(Format::extension).into_iter().chain(["csv"]);
-        let files = all().flat_map(|part| endings().map(|ending| format!("{}.{ending}", part.name)));
-        if let Some(theirs) = files.chain([PAGE.into()]).find(|name| out.join(name).exists()) {
-            return Err(Error::Refused(format!(
-                "{} holds {theirs}, but none of the questions' sweeps; choose another --out",
-                out.escaped()
-            )));
-        }
+    if !all_parts().any(|part| out.join(part.name).join(SWEEP).exists())
+        && let Some(theirs) = files().chain([PAGE.into()]).find(|name| out.join(name).exists())
+    {
+        return Err(Error::Refused(format!(
+            "{} holds {theirs}, but none of the questions' sweeps; choose another --out",
+            out.escaped()
+        )));
     }
     let mut player = backend::open(&args.run)?;
     for config in parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config) {
@@ -62,7 +71,9 @@ pub fn run(args: &Args) -> Result<(), Error> {
     }
     let disk = Disk::default();
     disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
-    let _lock = folder::lock(out)?;
+    let disk = ownership::enter(&disk, out, args.is_out_named())?;
+    let _lock = folder::lock(&disk, out)?;
+    ownership::check(&disk, files().chain([PAGE.into()]).map(|name| out.join(name)))?;
     if !args.quiet {
         let points: usize = parts.iter().map(|(_, sweep)| sweep.points.len()).sum();
         say(format_args!("training {points} experiments on {}, into {}", player.0.describe(), out.escaped()));
@@ -70,11 +81,12 @@ pub fn run(args: &Args) -> Result<(), Error> {
 
     let warm: Vec<_> = parts.iter().map(|(part, sweep)| part.warm(sweep, out)).collect();
     // Nothing of one part is lost, and no time, to a folder of another that cannot be had.
-    let points = parts
-        .iter()
-        .flat_map(|(part, sweep)| sweep.points.iter().map(|point| point_folder(&out.join(part.name), point)));
-    let folders: Vec<PathBuf> = points.chain(warm.iter().flatten().map(|run| run.folder.clone())).collect();
-    folder::check(folders.iter().map(|path| &**path), start)?;
+    let points = parts.iter().flat_map(|(part, sweep)| {
+        sweep.points.iter().map(|point| (point_folder(&out.join(part.name), point), &point.config))
+    });
+    let warm_runs = warm.iter().flatten().map(|run| (run.folder.clone(), &run.config));
+    let folders: Vec<(PathBuf, &Config)> = points.chain(warm_runs).collect();
+    folder::check(&disk, folders.iter().map(|(path, config)| (&**path, *config)), start)?;
 
     let signals = Signals::listen()?;
     let mut meter = Meter::new(args.quiet);
@@ -86,10 +98,11 @@ pub fn run(args: &Args) -> Result<(), Error> {
     let mut before = 0.0;
     for (at, (part, sweep)) in parts.iter().enumerate() {
         let folder = out.join(part.name);
-        claim(sweep, &folder)?;
+        claim(&disk, sweep, &folder)?;
         let points: Vec<_> = sweep.points.iter().collect();
         let mut manner = SweepOptions {
             start,
+            disk: &disk,
             memory: free_memory(),
             runs: Options {
                 command: &recovery::typed(),
@@ -153,12 +166,12 @@ pub fn run(args: &Args) -> Result<(), Error> {
             for kind in Format::ALL {
                 let path = out.join(format!("{}.{}", part.name, kind.extension()));
                 let bytes = answer.scene().file(kind, PRINT);
-                write(&path, bytes)?;
+                write(&disk, &path, bytes)?;
             }
             let mut csv = Vec::new();
             let all: Vec<_> = answer.comparisons().cloned().collect();
             let path = out.join(format!("{}.csv", part.name));
-            write(&path, comparison::csv(&all, &mut csv).map(|()| csv))?;
+            write(&disk, &path, comparison::csv(&all, &mut csv).map(|()| csv))?;
             of_parts.push(answer);
         }
         answers.push((*question, of_parts));
@@ -171,7 +184,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
         first.trials, first.seed
     );
     let page = questions::page(&answers, &heading);
-    write(&out.join(PAGE), Ok(page.clone().into_bytes()))?;
+    write(&disk, &out.join(PAGE), Ok(page.clone().into_bytes()))?;
     if args.json {
         let all = answers.iter().map(|(question, answers)| {
             let comparisons: Vec<_> = answers.iter().flat_map(Answer::comparisons).collect();
@@ -193,7 +206,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
     ))
 }
 
-fn write(path: &Path, bytes: std::io::Result<Vec<u8>>) -> Result<(), Error> {
-    let written = bytes.and_then(|bytes| Disk::default().replace(path, |output| output.write_all(&bytes)));
-    Ok(written.map_err(|error| RecordError::Write { path: path.into(), error })?)
+fn write(disk: &Disk, path: &Path, bytes: std::io::Result<Vec<u8>>) -> Result<(), Error> {
+    let bytes = bytes.map_err(|error| RecordError::Write { path: path.into(), error })?;
+    Ok(ownership::publish(disk, path, |output| output.write_all(&bytes))?)
 }

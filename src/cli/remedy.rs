@@ -84,7 +84,8 @@ pub fn record(error: &RecordError, again: &str) -> String {
         RecordError::Exists { .. } => {
             "; go on with it by --resume, write over it by --force, or choose another --out".into()
         }
-        RecordError::NotOfARun { .. } => "; move it away, or choose another --out".into(),
+        RecordError::NotOurs { .. } => "; move it away, or choose another --out".into(),
+        RecordError::OfAnotherUser { .. } => "; name what to write with --out".into(),
         RecordError::NoFolder { .. } => "; choose a folder by --out".into(),
         RecordError::Shorter { there, .. } => {
             format!("; resume with --generations {there} or more, or choose another --out")

@@ -5,12 +5,14 @@ use std::sync::atomic::Ordering::Relaxed;
 
 use serde_json::json;
 
+use super::output::Destination;
 use super::recovery::Signals;
-use super::{Error, RunOptions, backend, between, output, points, print, print_json, whole, words};
+use super::{Error, RunOptions, backend, between, points, print, print_json, whole, words};
 use crate::config::Config;
 use crate::escape::PathExt;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
+use crate::record::ownership::{self, REPLAY};
 use crate::report::curves::PRINT;
 use crate::report::progress::Meter;
 use crate::report::replay::{self, FPS, Film, History, ReplayError, Replayed, Which};
@@ -94,7 +96,8 @@ impl WhichTrial {
 
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { folder, trial, generation, team, compare, step, out, width, fps, json, quiet, run } = args;
-    let out = out.unwrap_or_else(|| folder.join("replay.html"));
+    let place = out.map_or_else(|| Destination::OfRun(folder.join(REPLAY)), Destination::Named);
+    let out = place.path().to_path_buf();
     let kind = Form::of(&out, fps)?;
     kind.takes(&out, width, fps, step)?;
     let config = points::config(&folder)?;
@@ -116,6 +119,7 @@ pub fn run(args: Args) -> Result<(), Error> {
             "POIs are elsewhere in every generation (learning.poi_jitter): show one alone".into(),
         ));
     }
+    place.check()?;
     let steps = config.world.steps;
     if let Some(step) = step.filter(|&step| step > steps) {
         return Err(Error::Usage(format!("--step {step}: the episode has steps 0 to {steps}")));
@@ -151,6 +155,11 @@ pub fn run(args: Args) -> Result<(), Error> {
         Form::Film(numbered) => {
             disk.create_folder(file::folder(&out)).map_err(failed)?;
             let frames = replay::Frames::new(&config, &played, motion);
+            let mut names = (0..frames.places.len()).map(|number| out.with_file_name(numbered.name(number)));
+            if let Some(path) = names.find(|path| path.symlink_metadata().is_ok() && !ownership::is_drawing(path)) {
+                return Err(RecordError::NotOurs { path }.into());
+            }
+            let disk = ownership::enter(&disk, file::folder(&out), true)?;
             for (number, &place) in frames.places.iter().enumerate() {
                 let (scene, per_mm) = frames.scene(place);
                 let path = out.with_file_name(numbered.name(number));
@@ -170,7 +179,7 @@ pub fn run(args: Args) -> Result<(), Error> {
             );
         }
     };
-    output::write(&out, |output| output.write_all(&content))?;
+    place.write(|output| output.write_all(&content))?;
     let text = format!("{} ({} kB)\n", out.escaped(), content.len().div_ceil(1000));
     report(&played, json, quiet, &text, json!({ "out": out.escaped().to_string(), "bytes": content.len() }))
 }

@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 use std::ffi::OsString;
 use std::fmt::Write as _;
-use std::io::{self, Write as _};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use serde_json::json;
@@ -15,8 +15,9 @@ use crate::escape::PathExt;
 use crate::file;
 use crate::memory;
 use crate::record::RecordError;
-use crate::record::disk::{self, Disk};
+use crate::record::disk::Disk;
 use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
+use crate::record::ownership;
 use crate::report::progress::Meter;
 use crate::run::{Ended, Options, RunError};
 use crate::shell;
@@ -277,24 +278,27 @@ pub(super) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
 }
 
 /// Marks the folder as this sweep's. Shards that start at the same moment all write the same.
-pub(super) fn claim(sweep: &Sweep, out: &Path) -> Result<(), Error> {
-    let path = out.join(SWEEP);
-    Disk::default().create_folder(out).map_err(|error| RecordError::Write { path: out.into(), error })?;
-    let write = || -> io::Result<()> {
-        if !path.exists() {
-            let builder = &mut tempfile::Builder::new();
-            // As any other file: others may collect.
-            #[cfg(unix)]
-            builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-            let mut file = builder.tempfile_in(out)?;
-            file.write_all(sweep.text.as_bytes())?;
-            file.as_file().sync_all()?;
-            file.persist(&path).map_err(|error| error.error)?;
-        }
-        Ok(())
+pub(super) fn claim(disk: &Disk, sweep: &Sweep, out: &Path) -> Result<(), Error> {
+    let failed = |path: &Path| {
+        let path = path.to_path_buf();
+        move |error| RecordError::Write { path, error }
     };
-    write().map_err(|error| RecordError::Write { path: path.clone(), error: disk::without_path(error) })?;
+    let path = out.join(SWEEP);
+    disk.create_folder(out).map_err(failed(out))?;
+    let disk = disk.within(out).map_err(failed(out))?;
+    if disk.kind(&path).map_err(failed(&path))?.is_none() {
+        let text = |output: &mut dyn io::Write| output.write_all(sweep.text.as_bytes());
+        disk.replace_shared(&path, text, || Ok(())).map_err(failed(&path))?;
+    }
     same_sweep(sweep, out)
+}
+
+/// Enters a sweep's folder, in which nothing that is written in the end may be another's.
+fn enter(args: &Args, out: &Path) -> Result<Disk, Error> {
+    let disk = ownership::enter(&Disk::default(), out, args.out.is_some())?;
+    let products = pictures::names().chain([folder::RESULTS, folder::POINTS].map(String::from));
+    ownership::check(&disk, products.map(|name| out.join(name)))?;
+    Ok(disk)
 }
 
 fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Error> {
@@ -305,7 +309,8 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
         plan.check(player.1.backend == "gpu").map_err(RunError::from)?;
     }
     warnings::unreachable_in(sweep, &points);
-    claim(sweep, out)?;
+    claim(&Disk::default(), sweep, out)?;
+    let disk = enter(args, out)?;
     let memory = args.memory.map_or_else(free_memory, |gib| (gib * f64::from(1 << 30)) as usize);
     if !args.quiet {
         let skipped =
@@ -326,6 +331,7 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
     let mut ticker = Ticker::new(args.quiet);
     let mut options = run::SweepOptions {
         start,
+        disk: &disk,
         memory,
         runs: Options {
             command: &recovery::typed(),
@@ -374,6 +380,7 @@ pub(super) fn free_memory() -> usize {
 
 /// Puts together what is there, draws it, and fails where something is missing.
 fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(), Error> {
+    enter(args, out)?;
     let options = results::Detail { every: args.every as usize, reach: args.reach };
     let outcomes = results::write(sweep, out, &options)?;
     let (names, note) = pictures::draw(sweep, &outcomes, &options, axes, out)?;
@@ -543,7 +550,7 @@ fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> 
     };
     let script = job.script().map_err(Error::Usage)?;
     // The tasks' logs go there, and Slurm creates no folder.
-    claim(sweep, &out)?;
+    claim(&Disk::default(), sweep, &out)?;
     match file {
         None => print(&script),
         Some(path) => {

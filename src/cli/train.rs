@@ -16,6 +16,7 @@ use crate::memory::Peaks;
 use crate::record::RecordError;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, METRICS, POLICIES, Start};
+use crate::record::ownership::{self, CURVES};
 use crate::record::policies;
 use crate::report::progress::Board;
 use crate::report::replay::History;
@@ -27,8 +28,6 @@ use crate::trainer::Row;
 
 /// Where runs without `--out` go.
 const RUNS: &str = "runs";
-/// The run's learning curves, in its folder.
-const CURVES: &str = "curves.svg";
 /// Event files for TensorBoard, in a run's folder.
 const TENSORBOARD: &str = "tensorboard";
 
@@ -114,8 +113,16 @@ pub fn run(args: Args) -> Result<(), Error> {
             path.escaped()
         )));
     }
+    let disk = Disk::default();
+    if folder.is_dir() {
+        let disk = ownership::enter(&disk, &folder, args.out.is_some())?;
+        // A run that is resumed is not held up by a picture.
+        if start != Start::Resume {
+            ownership::check(&disk, [folder.join(CURVES)])?;
+        }
+    }
     let signals = Signals::listen()?;
-    let opened = Session::open_from(vec![(config.clone(), folder.clone(), init)], start, &Disk::default());
+    let opened = Session::open_from(vec![(config.clone(), folder.clone(), init)], start, &disk);
     let (mut session, notes) = opened.map_err(|error| match error {
         RunError::Record(RecordError::Exists { .. }) if args.tensorboard => Error::Refused(format!(
             "{error}\nfor event files of the run that is there:\n  {}",
@@ -129,17 +136,19 @@ pub fn run(args: Args) -> Result<(), Error> {
     let path = folder.join(TENSORBOARD);
     let events_failed =
         |error| say(format_args!("{}: cannot be written: {error}; there are no event files", path.escaped()));
-    let events = || Events::create(&path, config.learning.trials, &folder.join(METRICS)).map_err(events_failed).ok();
+    let disk = session.disk(0).clone();
+    let events =
+        || Events::create(&disk, &path, config.learning.trials, &folder.join(METRICS)).map_err(events_failed).ok();
     let mut events = args.tensorboard.then(events).flatten();
     if start == Start::Force && !args.tensorboard {
         // They are of the run that was written over.
-        Events::clear(&path).unwrap_or_else(events_failed);
+        Events::clear(&disk, &path).unwrap_or_else(events_failed);
     }
     let told =
         Told { config: &config, notes: &notes_on_config, name: args.config.name(), folder: &folder, runs_on: &runs_on };
     if session.is_done() {
         if !folder.join(CURVES).exists() {
-            draw(&folder);
+            draw(&disk, &folder);
         }
         return told.print(&session, None, args.quiet, args.json);
     }
@@ -173,7 +182,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let next = session.generations()[0];
     match ended? {
         Ended::Done => {
-            draw(&folder);
+            draw(&disk, &folder);
             let trained = Training { generations: next.min(last + 1) - from.min(last + 1), since };
             told.print(&session, Some(trained), args.quiet, args.json)
         }
@@ -185,11 +194,11 @@ pub fn run(args: Args) -> Result<(), Error> {
 }
 
 /// Draws the run's curves. All that was learned is saved by now, so a picture that fails is no failure of the run.
-fn draw(folder: &Path) {
+fn draw(disk: &Disk, folder: &Path) {
     let path = folder.join(CURVES);
     let drawn = runs::figure(&[folder.to_path_buf()]).map(|figure| figure.scene().svg());
     let written = drawn.map_err(|error| error.to_string()).and_then(|svg| {
-        let written = Disk::default().replace(&path, |output| output.write_all(svg.as_bytes()));
+        let written = ownership::publish(disk, &path, |output| output.write_all(svg.as_bytes()));
         written.map_err(|error| error.to_string())
     });
     if let Err(error) = written {

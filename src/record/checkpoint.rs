@@ -234,22 +234,22 @@ impl Shapes {
 /// The folder cannot be read.
 pub fn list(folder: &Path) -> Result<Vec<usize>, RecordError> {
     let entries = match fs::read_dir(folder) {
-        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(vec![]),
+        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => return Ok(vec![]),
         entries => entries.map_err(RecordError::read(folder))?,
-    };
-    let generation = |name: &str| -> Option<usize> {
-        let digits = name.strip_suffix(EXTENSION)?;
-        (digits.len() == DIGITS && digits.bytes().all(|byte| byte.is_ascii_digit()))
-            .then(|| digits.parse().ok())
-            .flatten()
     };
     let mut generations = Vec::new();
     for entry in entries {
         let entry = entry.map_err(RecordError::read(folder))?;
-        generations.extend(entry.file_name().to_str().and_then(generation));
+        generations.extend(entry.file_name().to_str().and_then(generation_of));
     }
     generations.sort_unstable();
     Ok(generations)
+}
+
+/// The generation that a checkpoint's name says; none of any other name.
+fn generation_of(name: &str) -> Option<usize> {
+    let digits = name.strip_suffix(EXTENSION)?;
+    (digits.len() == DIGITS && digits.bytes().all(|byte| byte.is_ascii_digit())).then(|| digits.parse().ok()).flatten()
 }
 
 /// Where the checkpoint of a generation is.
@@ -427,12 +427,11 @@ impl Drop for Keeper {
 /// The folder cannot be read or written.
 pub fn tidy(disk: &Disk, folder: &Path) -> Result<Vec<usize>, RecordError> {
     let generations = list(folder)?;
-    if let Ok(entries) = fs::read_dir(folder) {
-        for entry in entries.flatten() {
-            let path = entry.path();
-            if path.extension().is_some_and(|extension| extension == "tmp") {
-                disk.remove(&path).map_err(RecordError::write(&path))?;
-            }
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        let path = entry.path();
+        let whole = disk::of_temporary(&path);
+        if whole.is_some_and(|name| generation_of(name).is_some()) {
+            disk.remove(&path).map_err(RecordError::write(&path))?;
         }
     }
     Ok(generations)
@@ -440,7 +439,5 @@ pub fn tidy(disk: &Disk, folder: &Path) -> Result<Vec<usize>, RecordError> {
 
 /// Where a checkpoint that cannot be used is put aside.
 pub fn aside(path: &Path) -> PathBuf {
-    let mut name = disk::temporary(path);
-    name.set_extension("damaged");
-    name
+    path.with_extension("safetensors.damaged")
 }

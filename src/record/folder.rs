@@ -1,7 +1,7 @@
 //! A run's folder: who may write in it, what is in it, and where a run in it goes on.
 
 use std::fmt;
-use std::fs::{self, File, OpenOptions, TryLockError};
+use std::fs::{self, File, TryLockError};
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, UNIX_EPOCH};
@@ -12,6 +12,8 @@ use sha2::{Digest, Sha256};
 use super::checkpoint::{self, Checkpoint};
 use super::disk::Disk;
 use super::metrics::{self, RowsError};
+use super::ownership::{self, CURVES, MAX_RUN_BYTES, REPLAY};
+pub use super::ownership::{ARMS, CHECKPOINTS, CONFIG, METRICS, PAPER, POINTS, POLICIES, RESULTS, RUN, SWEEP};
 use super::{RecordError, hex, policies, read_text};
 use crate::config::{Config, MAX_STAGES};
 use crate::escape::PathExt;
@@ -19,32 +21,10 @@ use crate::file;
 use crate::host;
 use crate::trainer::Row;
 
-/// The config, every key written out.
-pub const CONFIG: &str = "config.toml";
-/// What the run is and what became of it, see [`Run`].
-pub const RUN: &str = "run.json";
-/// See [`super::metrics`].
-pub const METRICS: &str = "metrics.csv";
-/// See [`super::policies`].
-pub const POLICIES: &str = "policies.safetensors";
-/// The folder of [`super::checkpoint`]s.
-pub const CHECKPOINTS: &str = "checkpoints";
-/// What marks a folder as a paper's, and the folder of its runs.
-pub const PAPER: &str = "paper.toml";
-/// The folder of a paper's runs.
-pub const ARMS: &str = "arms";
-/// In a sweep's folder: the sweep as it was run, and its tables.
-pub const SWEEP: &str = "sweep.toml";
-/// A sweep's rows, one a trial.
-pub const RESULTS: &str = "results.csv";
-/// A sweep's points, one a line.
-pub const POINTS: &str = "points.csv";
 /// Locked by whoever trains in the folder. The lock is the system's: it goes with the process, however that ends.
 const LOCK: &str = ".lock";
-/// Pictures made of a run, gone with it.
-const PICTURES: [&str; 2] = ["curves.svg", "replay.html"];
-/// Most bytes in `run.json`.
-const MAX_RUN_BYTES: u64 = 1 << 16;
+/// Most bytes in a `config.toml` that is kept where another takes its place.
+const MAX_KEPT_BYTES: u64 = 1 << 20;
 
 /// What to do with a folder that holds a run already.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -109,6 +89,8 @@ pub enum Status {
     Stopped,
     /// It has played its last generation.
     Done,
+    /// It takes the place of another run, whose files are not all gone yet: what is there counts for nothing.
+    Replacing,
 }
 
 impl Run {
@@ -187,6 +169,13 @@ pub enum Note {
     SetAside(String),
     /// A small file that cannot be read, for this reason.
     WrittenAnew(String),
+    /// The folder's config was written by hand, and another takes its place.
+    ConfigKept {
+        /// Where what was there is from now on.
+        path: PathBuf,
+    },
+    /// A replacement of the run was interrupted.
+    Replacing,
     /// There is a whole checkpoint.
     GoingOn {
         /// The one that plays next.
@@ -212,6 +201,10 @@ impl fmt::Display for Note {
         match self {
             Note::SetAside(reason) => write!(f, "{reason}; set aside, going back to the one before"),
             Note::WrittenAnew(reason) => write!(f, "{reason}; it is written anew"),
+            Note::ConfigKept { path } => {
+                write!(f, "{CONFIG} has changed; the text that was there is kept as {}", path.display())
+            }
+            Note::Replacing => f.write_str("the run that was here was being replaced: what is left of it is removed"),
             Note::GoingOn { generation } => write!(f, "going on before generation {generation}"),
             Note::StartingOver => f.write_str("no checkpoint can be used: starting over, to the same results"),
             Note::NotLocked => f.write_str(
@@ -245,66 +238,105 @@ impl Folder {
         init: Option<&str>,
         disk: Disk,
     ) -> Result<(Folder, Resumed), RecordError> {
-        let checkpoints = path.join(CHECKPOINTS);
         if path.is_file() {
             return Err(RecordError::NoFolder { path: path.into() });
         }
-        if start == Start::Fresh && holds_run(path)? {
-            return Err(RecordError::Exists { path: path.into() });
-        }
+        let holds_run = || match ownership::holds_run(path, config)? {
+            true if start == Start::Fresh => Err(RecordError::Exists { path: path.into() }),
+            holds => Ok(holds),
+        };
+        holds_run()?;
         disk.create_folder(path).map_err(RecordError::write(path))?;
-        let lock = lock(path)?;
+        let disk = ownership::enter(&disk, path, true)?;
+        ownership::refuse_links(&disk, path)?;
+        let lock = lock(&disk, path)?;
         // Only now is nobody else writing here.
-        if start == Start::Fresh && holds_run(path)? {
-            return Err(RecordError::Exists { path: path.into() });
-        }
-        disk.create_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
+        let there = holds_run()?;
         let folder = Folder { path: path.into(), disk, lock };
-        let run = folder.file(RUN);
-        let there = file::exists(&run).map_err(RecordError::read(&run))? || !checkpoint::list(&checkpoints)?.is_empty();
-        if start != Start::Fresh && !there {
-            folder.refuse_others(config)?;
-        }
-        if start == Start::Force {
-            folder.clear()?;
-        }
         let mut found = Resumed { checkpoint: None, kept: vec![], run: None, finished: None, notes: vec![] };
         found.notes.extend(folder.lock.is_none().then_some(Note::NotLocked));
+        let interrupted = Run::read(&folder.file(RUN)).ok().filter(|run| run.state == Status::Replacing);
+        match (start, interrupted) {
+            (Start::Force, _) if there => {
+                folder.clear(&Run { init: init.map(String::from), ..Run::new(config) }, config, &mut found)?;
+            }
+            (Start::Resume, Some(run)) => {
+                found.notes.push(Note::Replacing);
+                folder.clear(&run, config, &mut found)?;
+            }
+            _ => {}
+        }
         if start == Start::Resume {
             folder.find(config, init, &mut found)?;
         }
-        // So that whoever goes on knows that it takes these policies.
-        if let Some(init) = init.filter(|_| found.checkpoint.is_none() && found.finished.is_none()) {
-            folder
-                .write_run(&Run { init: Some(init.into()), ..found.run.clone().unwrap_or_else(|| Run::new(config)) })?;
+        // Before anything else of the run: whoever finds the folder knows whose it is, and whether the run takes policies.
+        if found.checkpoint.is_none() && found.finished.is_none() {
+            let run = found.run.clone().unwrap_or_else(|| Run::new(config));
+            let init = init.map(String::from).or(run.init.clone());
+            folder.write_run(&Run { init, ..run })?;
+        }
+        if found.finished.is_none() {
+            let checkpoints = folder.file(CHECKPOINTS);
+            folder.disk.create_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
         }
         let there = Config::load(&folder.file(CONFIG)).ok();
         // One that says the same may be somebody's own, with comments.
         if there.as_ref() != Some(config) && (found.finished.is_none() || there.is_none()) {
-            folder.write_config(config)?;
+            found.notes.extend(folder.write_config(config)?);
         }
         Ok((folder, found))
     }
 
-    /// Writes `config.toml`.
+    /// Writes `config.toml`; a text that was written by hand is kept beside it, which the note says.
     ///
     /// # Errors
     /// It cannot be written.
-    pub fn write_config(&self, config: &Config) -> Result<(), RecordError> {
-        self.write_text(CONFIG, &config.to_toml())
+    pub fn write_config(&self, config: &Config) -> Result<Option<Note>, RecordError> {
+        let kept = self.keep_config()?;
+        self.write_text(CONFIG, &config.to_toml())?;
+        Ok(kept.map(|path| Note::ConfigKept { path }))
     }
 
-    /// Removes a run; whatever else is in the folder stays.
-    fn clear(&self) -> Result<(), RecordError> {
+    /// Copies `config.toml` if it is another text than flotilla writes; gives where the copy is.
+    fn keep_config(&self) -> Result<Option<PathBuf>, RecordError> {
+        let Ok(text) = read_text(&self.file(CONFIG), MAX_KEPT_BYTES) else { return Ok(None) };
+        if Config::parse(&text, CONFIG).is_ok_and(|config| config.to_toml() == text) {
+            return Ok(None);
+        }
+        for number in 1.. {
+            let path = self.file(&numbered_config(number));
+            if self.disk.kind(&path).map_err(RecordError::write(&path))?.is_none() {
+                self.disk
+                    .replace(&path, |output| output.write_all(text.as_bytes()))
+                    .map_err(RecordError::write(&path))?;
+                return Ok(Some(path));
+            }
+            // Kept already, where what came after was interrupted.
+            if read_text(&path, MAX_KEPT_BYTES).is_ok_and(|there| there == text) {
+                return Ok(Some(path));
+            }
+        }
+        unreachable!("there are more numbers than files")
+    }
+
+    /// Removes a run; whatever else is in the folder stays. From its first step on `run.json` says that the run is being
+    /// replaced, and by what.
+    fn clear(&self, by: &Run, config: &Config, found: &mut Resumed) -> Result<(), RecordError> {
+        self.write_run(&Run { state: Status::Replacing, ..by.clone() })?;
         let checkpoints = self.file(CHECKPOINTS);
         let generations = checkpoint::tidy(&self.disk, &checkpoints)?;
         let old = generations.into_iter().map(|generation| checkpoint::path(&checkpoints, generation));
-        // The config is replaced whole, and may be what this run was read from.
-        let files = [RUN, METRICS, POLICIES].into_iter().chain(PICTURES).map(|name| self.file(name));
-        for path in old.chain(files) {
+        for path in old.chain([METRICS, POLICIES].map(|name| self.file(name))) {
             self.disk.remove(&path).map_err(RecordError::write(&path))?;
         }
-        Ok(())
+        for name in [CURVES, REPLAY] {
+            ownership::withdraw(&self.disk, &self.file(name))?;
+        }
+        // Replaced whole, since the new run may be read from it.
+        if Config::load(&self.file(CONFIG)).ok().as_ref() != Some(config) {
+            found.notes.extend(self.write_config(config)?);
+        }
+        self.write_run(&Run { state: Status::Running, ..by.clone() })
     }
 
     /// Finds where the run goes on; what cannot go on is left as it is.
@@ -371,23 +403,6 @@ impl Folder {
             None => Note::Starting,
         });
         found.kept = kept;
-        Ok(())
-    }
-
-    /// Refuses a folder without a run whose files are somebody else's, for a run would write over them.
-    fn refuse_others(&self, config: &Config) -> Result<(), RecordError> {
-        let is_there = |path: &Path| file::exists(path).map_err(RecordError::read(path));
-        let refuse = |path: PathBuf| Err(RecordError::NotOfARun { path });
-        let [toml, csv, tensors] = [CONFIG, METRICS, POLICIES].map(|name| self.file(name));
-        if is_there(&toml)? && Config::load(&toml).is_err() {
-            return refuse(toml);
-        }
-        if is_there(&csv)? && !metrics::begins(&csv).map_err(RecordError::read(&csv))? {
-            return refuse(csv);
-        }
-        if is_there(&tensors)? && !policies::are_of(&tensors, config) {
-            return refuse(tensors);
-        }
         Ok(())
     }
 
@@ -521,23 +536,31 @@ pub fn holds_run(path: &Path) -> Result<bool, RecordError> {
     Ok(false)
 }
 
+/// Where the text of a config is kept whose place another took.
+fn numbered_config(number: usize) -> String {
+    if number == 1 { "config.old.toml".into() } else { format!("config.old-{number}.toml") }
+}
+
 /// Whether runs may be started in folders, of which none is touched: none holds a run where it is not to be written
 /// over or gone on with, and where it is, nobody trains in it.
 ///
 /// # Errors
 /// The first folder that may not be used, or that cannot be looked into.
-pub(crate) fn check<'a>(folders: impl IntoIterator<Item = &'a Path>, start: Start) -> Result<(), RecordError> {
-    for path in folders {
-        match start {
-            Start::Fresh if holds_run(path)? => return Err(RecordError::Exists { path: path.into() }),
-            // Where there is no lock, nobody has one.
-            Start::Force | Start::Resume if path.join(LOCK).exists() => {
-                // Closing the file is not enough where a process being started has a copy of it for a moment.
-                if let Some(lock) = lock(path)? {
-                    let _ = lock.unlock();
-                }
+pub(crate) fn check<'a>(
+    disk: &Disk,
+    folders: impl IntoIterator<Item = (&'a Path, &'a Config)>,
+    start: Start,
+) -> Result<(), RecordError> {
+    for (path, config) in folders {
+        if ownership::holds_run(path, config)? && start == Start::Fresh {
+            return Err(RecordError::Exists { path: path.into() });
+        }
+        // Where there is no lock, nobody has one.
+        if start != Start::Fresh && path.join(LOCK).exists() {
+            // Closing the file is not enough where a process being started has a copy of it for a moment.
+            if let Some(lock) = lock(&disk.within(path).map_err(RecordError::write(path))?, path)? {
+                let _ = lock.unlock();
             }
-            _ => {}
         }
     }
     Ok(())
@@ -556,13 +579,9 @@ impl Drop for Folder {
 ///
 /// # Errors
 /// Another process has it, or it cannot be written.
-pub(crate) fn lock(path: &Path) -> Result<Option<File>, RecordError> {
+pub(crate) fn lock(disk: &Disk, path: &Path) -> Result<Option<File>, RecordError> {
     let name = path.join(LOCK);
-    if fs::metadata(&name).is_ok_and(|there| !there.is_file()) {
-        return Err(RecordError::damaged(&name, "it is no file, as a lock has to be; remove it"));
-    }
-    let file =
-        OpenOptions::new().create(true).truncate(false).write(true).open(&name).map_err(RecordError::write(&name))?;
+    let file = disk.open_lock(&name).map_err(RecordError::write(&name))?;
     match file.try_lock() {
         Ok(()) => Ok(Some(file)),
         Err(TryLockError::WouldBlock) => Err(RecordError::Locked { path: path.into() }),

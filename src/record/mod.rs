@@ -2,10 +2,12 @@
 //!
 //! | module | holds |
 //! |---|---|
+//! | [`beneath`] | a folder and what is below it, reached without following links |
 //! | [`disk`] | files replaced whole or not at all; the one place that writes, so that tests can make any write fail |
 //! | [`tensors`] | safetensors files under a checksum |
 //! | [`policies`] | `policies.safetensors` |
 //! | [`metrics`] | `metrics.csv` |
+//! | [`ownership`] | what may be written, replaced, renamed and deleted |
 //! | [`checkpoint`] | `checkpoints/`, written beside training |
 //! | [`folder`] | the run's folder, its lock and `run.json` |
 //! | [`evidence`] | what was seen on a machine, for `docs/develop/evidence.md` |
@@ -23,11 +25,13 @@ use crate::config::{self, Config};
 use crate::escape::PathExt;
 use crate::file::{self, TextError};
 
+pub mod beneath;
 pub mod checkpoint;
 pub mod disk;
 pub mod evidence;
 pub mod folder;
 pub mod metrics;
+pub mod ownership;
 pub mod policies;
 pub mod tensors;
 
@@ -72,10 +76,16 @@ pub enum RecordError {
         /// The file or the folder.
         path: PathBuf,
     },
-    /// A file that a run would write over, where there is no run.
-    #[error("{path} is not a run's, and would be written over", path = path.escaped())]
-    NotOfARun {
+    /// A file that flotilla did not make.
+    #[error("{path} was not made by flotilla and would be overwritten", path = path.escaped())]
+    NotOurs {
         /// The file.
+        path: PathBuf,
+    },
+    /// A folder of another user, to which the user did not ask to write.
+    #[error("{path} belongs to another user, so nothing is written there unless --out names it", path = path.escaped())]
+    OfAnotherUser {
+        /// The folder.
         path: PathBuf,
     },
     /// A file where the folder should be.

@@ -370,6 +370,7 @@ impl Scene {
         let per_meter = (f64::from(pixmap.width()) / self.width * 1000.0).round() as u32;
         let unit = png::Unit::Meter;
         encoder.set_pixel_dims(Some(png::PixelDimensions { xppu: per_meter, yppu: per_meter, unit }));
+        encoder.add_text_chunk("Software".into(), "flotilla".into()).map_err(std::io::Error::other)?;
         for (key, text) in [("Title", &self.title), ("Description", &self.description)] {
             encoder.add_itxt_chunk(key.into(), text.clone()).map_err(std::io::Error::other)?;
         }

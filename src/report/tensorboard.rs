@@ -4,12 +4,14 @@
 //! buffer `Event`. Of the latter only the few fields are written that scalars need, by hand. The numbers are f64, the
 //! same as in `metrics.csv`.
 
-use std::fs::{self, OpenOptions};
-use std::io::{self, Write};
+use std::fs;
+use std::io::{self, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use crate::host::{self, Instant};
+use crate::record::beneath::FileKind;
+use crate::record::disk::Disk;
 use crate::record::metrics;
 use crate::trainer::Row;
 
@@ -24,6 +26,7 @@ const OURS: &str = ".flotilla";
 
 /// The event files of one run.
 pub struct Events {
+    disk: Disk,
     /// One file a trial.
     files: Vec<PathBuf>,
     /// What is not in the files yet.
@@ -32,23 +35,22 @@ pub struct Events {
 }
 
 impl Events {
-    /// Starts event files in `folder/trial-N`, a folder a trial, with all that is in `metrics` so far; they take the
-    /// place of any others.
+    /// Starts event files in `folder/trial-N`, a folder per trial, with all that is in `metrics` so far; they take the
+    /// place of those that an earlier session wrote. `disk` is within the run's folder.
     ///
     /// # Errors
     /// They cannot be written.
-    pub fn create(folder: &Path, trials: usize, metrics: &Path) -> io::Result<Events> {
-        let seconds = now() as u64;
+    pub fn create(disk: &Disk, folder: &Path, trials: usize, metrics: &Path) -> io::Result<Events> {
         let digits = trials.saturating_sub(1).to_string().len();
         let mut files = Vec::with_capacity(trials);
-        Events::clear(folder)?;
+        Events::clear(disk, folder)?;
         for trial in 0..trials {
             let folder = folder.join(format!("trial-{trial:0digits$}"));
-            fs::create_dir_all(&folder)?;
-            files.push(folder.join(format!("events.out.{MARK}.{seconds:010}{OURS}")));
+            disk.create_folder(&folder)?;
+            files.push(new_file(disk, &folder, now() as u64)?);
         }
         let first = record(&event(now(), 0, &Content::Version));
-        let mut events = Events { files, new: vec![first; trials], flushed: Instant::now() };
+        let mut events = Events { disk: disk.clone(), files, new: vec![first; trials], flushed: Instant::now() };
         let rows = || metrics::open(metrics).map_err(io::Error::other).map(|rows| rows.map_while(Result::ok));
         // As if they had been written when they became complete, all sessions in one.
         let start = now() - rows()?.last().map_or(0.0, |(_, seconds)| seconds);
@@ -62,22 +64,19 @@ impl Events {
         Ok(events)
     }
 
-    /// Removes a run's event files, and nothing else.
+    /// Removes a run's event files, and nothing else: by their names and by how they begin.
     ///
     /// # Errors
     /// One cannot be removed.
-    pub fn clear(folder: &Path) -> io::Result<()> {
-        if !folder.is_dir() {
-            return Ok(());
-        }
-        for trial in fs::read_dir(folder)? {
-            let trial = trial?.path();
-            let is_ours = trial.file_name().is_some_and(|name| name.to_string_lossy().starts_with("trial-"));
-            for entry in if is_ours && trial.is_dir() { Some(fs::read_dir(trial)?) } else { None }.into_iter().flatten()
-            {
-                let path = entry?.path();
-                if path.file_name().is_some_and(|name| name.to_string_lossy().ends_with(OURS)) {
-                    fs::remove_file(path)?;
+    pub fn clear(disk: &Disk, folder: &Path) -> io::Result<()> {
+        for trial in names(folder)?.into_iter().filter(|trial| named(trial, "trial-", "")) {
+            // A link is not listed either.
+            if !fs::symlink_metadata(&trial)?.is_dir() {
+                continue;
+            }
+            for path in names(&trial)?.into_iter().filter(|path| named(path, &format!("events.out.{MARK}."), OURS)) {
+                if disk.kind(&path)? == Some(FileKind::File) && begins(disk, &path)? {
+                    disk.remove(&path)?;
                 }
             }
         }
@@ -106,12 +105,48 @@ impl Events {
     pub fn flush(&mut self) -> io::Result<()> {
         for (file, new) in self.files.iter().zip(&mut self.new).filter(|(_, new)| !new.is_empty()) {
             // Opened each time: there may be more trials than a process may have files.
-            OpenOptions::new().create(true).append(true).open(file)?.write_all(new)?;
+            self.disk.extend(file, new)?;
             new.clear();
         }
         self.flushed = Instant::now();
         Ok(())
     }
+}
+
+/// Creates a trial's event file, whose name says when; a later second where the name is taken.
+fn new_file(disk: &Disk, folder: &Path, mut seconds: u64) -> io::Result<PathBuf> {
+    loop {
+        let path = folder.join(format!("events.out.{MARK}.{seconds:010}{OURS}"));
+        match disk.create_new(&path) {
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => seconds += 1,
+            created => return created.map(|_| path),
+        }
+    }
+}
+
+/// What is in a folder, if it is there.
+fn names(folder: &Path) -> io::Result<Vec<PathBuf>> {
+    match fs::read_dir(folder) {
+        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => Ok(vec![]),
+        entries => entries?.map(|entry| Ok(entry?.path())).collect(),
+    }
+}
+
+/// Whether a path's name is a number between these.
+fn named(path: &Path, before: &str, after: &str) -> bool {
+    let name = path.file_name().and_then(|name| name.to_str());
+    let number = name.and_then(|name| name.strip_prefix(before)?.strip_suffix(after));
+    number.is_some_and(|number| !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit()))
+}
+
+/// Whether a file begins as an event file does, as far as it goes.
+fn begins(disk: &Disk, path: &Path) -> io::Result<bool> {
+    let first = record(&event(0.0, 0, &Content::Version));
+    let mut start = Vec::new();
+    disk.read(path)?.take(first.len() as u64).read_to_end(&mut start)?;
+    // The length of the record, and after the time the step and the version.
+    let same = |range: std::ops::Range<usize>| start.get(range.clone()).is_none_or(|bytes| *bytes == first[range]);
+    Ok(start.is_empty() || start.len() == first.len() && same(0..13) && same(21..first.len() - 4))
 }
 
 /// Seconds since 1970.

@@ -7,6 +7,7 @@ use super::results::{Detail, Missing, Outcome};
 use super::{Axis, Point, Sweep};
 use crate::record::RecordError;
 use crate::record::disk::Disk;
+use crate::record::ownership;
 use crate::report::curves::{Curve, PRINT, SMALL, distinct};
 use crate::report::grid::{Cell, Curves, Dots, HeatMap, Interval, Scale};
 use crate::report::scene::Format;
@@ -62,15 +63,14 @@ pub fn draw(
         Ok(scenes) => scenes,
         Err(reason) => return Ok((vec![], Some(reason))),
     };
-    let disk = Disk::default();
+    let disk = ownership::enter(&Disk::default(), out, true)?;
     let mut names = Vec::new();
     for (name, scene) in scenes {
         for kind in Format::ALL {
             let name = format!("{name}.{}", kind.extension());
             let path = out.join(&name);
-            let bytes = scene.file(kind, PRINT);
-            let write = bytes.and_then(|bytes| disk.deliver(&path, |output| output.write_all(&bytes)));
-            write.map_err(|error| RecordError::Write { path, error })?;
+            let bytes = scene.file(kind, PRINT).map_err(|error| RecordError::Write { path: path.clone(), error })?;
+            ownership::publish(&disk, &path, |output| output.write_all(&bytes))?;
             names.push(name);
         }
     }

@@ -9,8 +9,8 @@ use crate::escape::{self, PathExt};
 use crate::file;
 use crate::record::disk::Disk;
 use crate::record::folder::{CONFIG, METRICS, POINTS, RESULTS};
-use crate::record::metrics;
 use crate::record::{RecordError, without_checkpoint};
+use crate::record::{metrics, ownership};
 use crate::statistics::Average;
 use crate::trainer::Row;
 
@@ -81,7 +81,7 @@ pub enum Missing {
 /// # Errors
 /// The files cannot be written.
 pub fn write(sweep: &Sweep, out: &Path, options: &Detail) -> Result<Vec<Result<Outcome, Missing>>, RecordError> {
-    let disk = Disk::default();
+    let disk = ownership::enter(&Disk::default(), out, true)?;
     let mut outcomes = Vec::new();
     let path = out.join(RESULTS);
     let rows = |output: &mut dyn Write| {
@@ -104,11 +104,11 @@ pub fn write(sweep: &Sweep, out: &Path, options: &Detail) -> Result<Vec<Result<O
         }
         table.flush()
     };
-    disk.deliver(&path, rows).map_err(|error| RecordError::Write { path, error })?;
+    ownership::publish(&disk, &path, rows)?;
 
     let path = out.join(POINTS);
     let summary = |output: &mut dyn Write| summary(sweep, &outcomes, options, output);
-    disk.deliver(&path, summary).map_err(|error| RecordError::Write { path, error })?;
+    ownership::publish(&disk, &path, summary)?;
     Ok(outcomes)
 }
 

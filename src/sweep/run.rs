@@ -18,6 +18,8 @@ const MAX_BATCH: usize = 400;
 pub struct SweepOptions<'a> {
     /// How to treat existing runs.
     pub start: Start,
+    /// The disk within the sweep's folder, or within one above it.
+    pub disk: &'a Disk,
     /// Bytes for the points of a batch. The number of batches does not change the results.
     pub memory: usize,
     /// The options of the runs, except `watch`.
@@ -100,13 +102,15 @@ pub fn run(
         SweepProgress { done: 0, points: points.len(), batch: 0, generation: 0, last: 0, played: 0, total };
     // All folders are checked first, so that no batch trains before a later one is refused.
     let folders: Vec<PathBuf> = points.iter().map(|point| point_folder(out, point)).collect();
-    folder::check(folders.iter().map(|path| &**path), options.start).map_err(RunError::from)?;
+    let disk = options.disk;
+    let configs = points.iter().map(|point| &point.config);
+    folder::check(disk, folders.iter().map(|path| &**path).zip(configs), options.start)?;
     for batch in batches(points, options.memory) {
         if options.runs.stop.load(Relaxed) {
             return Ok(Ended::Stopped);
         }
         let runs = batch.iter().map(|point| (point.config.clone(), point_folder(out, point))).collect();
-        let (mut session, notes) = Session::open(runs, options.start, &Disk::default())?;
+        let (mut session, notes) = Session::open(runs, options.start, disk)?;
         notes.iter().for_each(|(run, note)| (options.note)(batch[*run], note));
         // Steps of earlier sessions do not count.
         let resumed: u128 = batch.iter().zip(session.generations()).map(|(point, &next)| played(point, next)).sum();

@@ -129,7 +129,7 @@ mod commands {
             place
         }
 
-        /// Commands run on the CPU unless they say otherwise; all must have `--backend`.
+        /// Commands run on the CPU unless they say otherwise; all but `plot` must have `--backend`.
         pub fn on_cpu(self) -> Place {
             Place { on_cpu: true, ..self }
         }
@@ -165,7 +165,8 @@ mod commands {
 
         pub fn run(&self, words: impl Words) -> Output {
             let mut words = words.words();
-            if self.on_cpu && !words.iter().any(|word| word == "--backend") {
+            let plays = words.first().is_some_and(|command| command != "plot");
+            if self.on_cpu && plays && !words.iter().any(|word| word == "--backend") {
                 words.extend(["--backend".into(), "cpu".into()]);
             }
             self.command().args(words).output().unwrap()

@@ -1,0 +1,380 @@
+//! A folder and what is below it, reached name by name from an open handle, so that no symbolic link is followed.
+//!
+//! Only the way to the folder itself may lead through links: that is the name that the user gave. On systems other than
+//! Unix every name is looked at before it is used.
+
+use std::ffi::{OsStr, OsString};
+use std::fs::File;
+use std::io::{self, ErrorKind};
+use std::path::{Component, Path, PathBuf};
+
+/// A folder that is held open.
+pub struct Root {
+    path: PathBuf,
+    handle: Handle,
+}
+
+/// What is at a path, links not followed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FileKind {
+    /// A plain file.
+    File,
+    /// A folder.
+    Folder,
+    /// A symbolic link, wherever it leads.
+    Link,
+    /// A pipe, a socket or a device.
+    Other,
+}
+
+/// A name in a folder that is held open; whether anything has that name is another matter.
+pub struct FolderEntry {
+    parent: Handle,
+    name: OsString,
+    path: PathBuf,
+}
+
+impl Root {
+    /// Opens a folder; links on the way to it are followed.
+    ///
+    /// # Errors
+    /// What the system says.
+    pub fn open(path: &Path) -> io::Result<Root> {
+        Ok(Root { path: path.into(), handle: system::open(path)? })
+    }
+
+    /// The folder's path, as it was given.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The numbers of the folder's owner and of the present user, where the system has such.
+    ///
+    /// # Errors
+    /// What the system says.
+    pub fn owners(&self) -> io::Result<Option<[u32; 2]>> {
+        system::owners(&self.handle)
+    }
+
+    /// The entry of a path, which begins with the folder's own.
+    ///
+    /// # Errors
+    /// A folder on the way is a link or is missing, or the path leads elsewhere.
+    pub fn entry(&self, path: &Path) -> io::Result<FolderEntry> {
+        let (folders, name) = self.names(path)?;
+        let mut parent = system::copy(&self.handle)?;
+        let mut at = self.path.clone();
+        for folder in folders {
+            at.push(folder);
+            parent = system::step(&parent, folder, &at)?;
+        }
+        Ok(FolderEntry { parent, name: name.into(), path: path.into() })
+    }
+
+    /// Creates a folder and those above it, down from this one.
+    ///
+    /// # Errors
+    /// Something else has the name, a link as well, or what the system says.
+    pub fn create_folder(&self, path: &Path) -> io::Result<()> {
+        if path == self.path {
+            return Ok(());
+        }
+        let (folders, name) = self.names(path)?;
+        let (mut parent, mut at) = (system::copy(&self.handle)?, self.path.clone());
+        for folder in folders.into_iter().chain([name]) {
+            at.push(folder);
+            match system::create_folder(&parent, folder, &at) {
+                Err(error) if error.kind() != ErrorKind::AlreadyExists => return Err(error),
+                _ => parent = system::step(&parent, folder, &at)?,
+            }
+        }
+        Ok(())
+    }
+
+    /// The names that lead from the folder to a path: the folders on the way, and the last.
+    fn names<'a>(&self, path: &'a Path) -> io::Result<(Vec<&'a OsStr>, &'a OsStr)> {
+        let elsewhere = || {
+            let text = format!("it is not in {}, where alone this is written", self.path.display());
+            io::Error::new(ErrorKind::InvalidInput, text)
+        };
+        let here = self.path == Path::new(".") && path.is_relative();
+        let below = path.strip_prefix(&self.path).or(if here { Ok(path) } else { Err(()) });
+        let below = below.map_err(|()| elsewhere())?;
+        let name = |part| if let Component::Normal(name) = part { Some(name) } else { None };
+        let mut names: Vec<&OsStr> = below.components().map(name).collect::<Option<_>>().ok_or_else(elsewhere)?;
+        let last = names.pop().ok_or_else(elsewhere)?;
+        Ok((names, last))
+    }
+}
+
+impl FolderEntry {
+    /// What has the name, if anything.
+    ///
+    /// # Errors
+    /// What the system says.
+    pub fn kind(&self) -> io::Result<Option<FileKind>> {
+        system::kind(&self.parent, &self.name, &self.path)
+    }
+
+    /// Refuses a name that something else than a plain file has.
+    ///
+    /// # Errors
+    /// It has, or what the system says.
+    pub fn only_file(&self) -> io::Result<Option<()>> {
+        match self.kind()? {
+            None => Ok(None),
+            Some(FileKind::File) => Ok(Some(())),
+            Some(FileKind::Link) => Err(is_link(&self.path)),
+            Some(FileKind::Folder) => {
+                Err(io::Error::new(ErrorKind::IsADirectory, "it is a folder, where a file is needed"))
+            }
+            Some(FileKind::Other) => {
+                Err(io::Error::new(ErrorKind::InvalidInput, "it is a pipe or a device, where a file is needed"))
+            }
+        }
+    }
+
+    /// Creates a file; nothing may have its name yet.
+    ///
+    /// # Errors
+    /// What the system says.
+    pub fn create_new(&self) -> io::Result<File> {
+        system::create_new(&self.parent, &self.name, &self.path)
+    }
+
+    /// Opens a plain file to read it.
+    ///
+    /// # Errors
+    /// It is none, or what the system says.
+    pub fn read(&self) -> io::Result<File> {
+        self.only_file()?.ok_or(ErrorKind::NotFound)?;
+        system::read(&self.parent, &self.name, &self.path)
+    }
+
+    /// Opens a plain file to write to it; what it holds stays.
+    ///
+    /// # Errors
+    /// It is none, or what the system says.
+    pub fn write(&self) -> io::Result<File> {
+        self.only_file()?;
+        system::write(&self.parent, &self.name, &self.path)
+    }
+
+    /// Opens a plain file to write to its end, and creates it if it is not there.
+    ///
+    /// # Errors
+    /// It is none, or what the system says.
+    pub fn extend(&self) -> io::Result<File> {
+        self.only_file()?;
+        system::extend(&self.parent, &self.name, &self.path)
+    }
+
+    /// Removes a file.
+    ///
+    /// # Errors
+    /// It is a link or a folder, or what the system says.
+    pub fn remove(&self) -> io::Result<()> {
+        self.only_file()?;
+        system::remove(&self.parent, &self.name, &self.path)
+    }
+
+    /// Gives a file another name, in the place of any file that has it.
+    ///
+    /// # Errors
+    /// A link or a folder has it, or what the system says.
+    pub fn rename(&self, to: &FolderEntry) -> io::Result<()> {
+        to.only_file()?;
+        system::rename((&self.parent, &self.name, &self.path), (&to.parent, &to.name, &to.path))
+    }
+
+    /// Makes the names of the entry's folder last, where the system can.
+    ///
+    /// # Errors
+    /// What the system says.
+    pub fn sync_folder(&self) -> io::Result<()> {
+        match system::sync(&self.parent) {
+            // Some network file systems cannot.
+            Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
+            synced => synced,
+        }
+    }
+}
+
+/// The error of a link that something would be written through.
+pub fn is_link(path: &Path) -> io::Error {
+    let text =
+        format!("{} is a symbolic link, and nothing is written through one here; remove the link", path.display());
+    io::Error::new(ErrorKind::InvalidInput, text)
+}
+
+/// What a path needs to be a folder that can be stepped into.
+fn not_a_folder(kind: Option<FileKind>, path: &Path, error: io::Error) -> io::Error {
+    match kind {
+        Some(FileKind::Link) => is_link(path),
+        Some(FileKind::File | FileKind::Other) => {
+            io::Error::new(ErrorKind::NotADirectory, "a file stands where a folder is needed; choose another name")
+        }
+        Some(FileKind::Folder) | None => error,
+    }
+}
+
+/// A folder held open; nothing where the system has no such thing.
+struct Handle(#[cfg(unix)] std::os::fd::OwnedFd);
+
+#[cfg(unix)]
+mod system {
+    use std::ffi::OsStr;
+    use std::fs::File;
+    use std::io::{self, ErrorKind};
+    use std::path::Path;
+
+    use rustix::fs::{self, AtFlags, FileType, Mode, OFlags};
+
+    use super::{FileKind, Handle, not_a_folder};
+
+    const FOLDER: OFlags = OFlags::RDONLY.union(OFlags::DIRECTORY).union(OFlags::CLOEXEC);
+    /// A pipe that is put in the place of a file is not waited for.
+    const FILE: OFlags = OFlags::NOFOLLOW.union(OFlags::CLOEXEC).union(OFlags::NONBLOCK);
+    /// As files and folders are commonly created; the user's mask takes from it.
+    const FILE_MODE: Mode = Mode::from_bits_truncate(0o666);
+    const FOLDER_MODE: Mode = Mode::from_bits_truncate(0o777);
+
+    pub fn open(path: &Path) -> io::Result<Handle> {
+        Ok(Handle(fs::open(path, FOLDER, Mode::empty())?))
+    }
+
+    pub fn copy(handle: &Handle) -> io::Result<Handle> {
+        Ok(Handle(handle.0.try_clone()?))
+    }
+
+    pub fn owners(handle: &Handle) -> io::Result<Option<[u32; 2]>> {
+        Ok(Some([fs::fstat(&handle.0)?.st_uid, rustix::process::geteuid().as_raw()]))
+    }
+
+    pub fn step(parent: &Handle, name: &OsStr, path: &Path) -> io::Result<Handle> {
+        let opened = fs::openat(&parent.0, name, FOLDER | OFlags::NOFOLLOW, Mode::empty());
+        opened.map(Handle).map_err(|error| not_a_folder(kind(parent, name, path).ok().flatten(), path, error.into()))
+    }
+
+    pub fn create_folder(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<()> {
+        Ok(fs::mkdirat(&parent.0, name, FOLDER_MODE)?)
+    }
+
+    pub fn kind(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<Option<FileKind>> {
+        match fs::statat(&parent.0, name, AtFlags::SYMLINK_NOFOLLOW).map_err(io::Error::from) {
+            Ok(there) => Ok(Some(match FileType::from_raw_mode(there.st_mode) {
+                FileType::RegularFile => FileKind::File,
+                FileType::Directory => FileKind::Folder,
+                FileType::Symlink => FileKind::Link,
+                _ => FileKind::Other,
+            })),
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    pub fn create_new(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<File> {
+        let flags = FILE | OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL;
+        Ok(fs::openat(&parent.0, name, flags, FILE_MODE)?.into())
+    }
+
+    pub fn read(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<File> {
+        Ok(fs::openat(&parent.0, name, FILE | OFlags::RDONLY, Mode::empty())?.into())
+    }
+
+    pub fn write(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<File> {
+        Ok(fs::openat(&parent.0, name, FILE | OFlags::WRONLY, Mode::empty())?.into())
+    }
+
+    pub fn extend(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<File> {
+        let flags = FILE | OFlags::WRONLY | OFlags::CREATE | OFlags::APPEND;
+        Ok(fs::openat(&parent.0, name, flags, FILE_MODE)?.into())
+    }
+
+    pub fn remove(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<()> {
+        Ok(fs::unlinkat(&parent.0, name, AtFlags::empty())?)
+    }
+
+    pub fn rename(from: (&Handle, &OsStr, &Path), to: (&Handle, &OsStr, &Path)) -> io::Result<()> {
+        Ok(fs::renameat(&from.0.0, from.1, &to.0.0, to.1)?)
+    }
+
+    pub fn sync(handle: &Handle) -> io::Result<()> {
+        Ok(fs::fsync(&handle.0)?)
+    }
+}
+
+#[cfg(not(unix))]
+mod system {
+    use std::ffi::OsStr;
+    use std::fs::{self, File, OpenOptions};
+    use std::io::{self, ErrorKind};
+    use std::path::Path;
+
+    use super::{FileKind, Handle, not_a_folder};
+
+    pub fn open(path: &Path) -> io::Result<Handle> {
+        match fs::metadata(path)?.is_dir() {
+            true => Ok(Handle()),
+            false => Err(ErrorKind::NotADirectory.into()),
+        }
+    }
+
+    pub fn copy(_: &Handle) -> io::Result<Handle> {
+        Ok(Handle())
+    }
+
+    pub fn owners(_: &Handle) -> io::Result<Option<[u32; 2]>> {
+        Ok(None)
+    }
+
+    pub fn step(parent: &Handle, name: &OsStr, path: &Path) -> io::Result<Handle> {
+        match kind(parent, name, path)? {
+            Some(FileKind::Folder) => Ok(Handle()),
+            there => Err(not_a_folder(there, path, ErrorKind::NotFound.into())),
+        }
+    }
+
+    pub fn create_folder(_: &Handle, _: &OsStr, path: &Path) -> io::Result<()> {
+        fs::create_dir(path)
+    }
+
+    pub fn kind(_: &Handle, _: &OsStr, path: &Path) -> io::Result<Option<FileKind>> {
+        match fs::symlink_metadata(path) {
+            Ok(there) if there.is_symlink() => Ok(Some(FileKind::Link)),
+            Ok(there) if there.is_dir() => Ok(Some(FileKind::Folder)),
+            Ok(there) if there.is_file() => Ok(Some(FileKind::File)),
+            Ok(_) => Ok(Some(FileKind::Other)),
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    pub fn create_new(_: &Handle, _: &OsStr, path: &Path) -> io::Result<File> {
+        OpenOptions::new().write(true).create_new(true).open(path)
+    }
+
+    pub fn read(_: &Handle, _: &OsStr, path: &Path) -> io::Result<File> {
+        File::open(path)
+    }
+
+    pub fn write(_: &Handle, _: &OsStr, path: &Path) -> io::Result<File> {
+        OpenOptions::new().write(true).open(path)
+    }
+
+    pub fn extend(_: &Handle, _: &OsStr, path: &Path) -> io::Result<File> {
+        OpenOptions::new().append(true).create(true).open(path)
+    }
+
+    pub fn remove(_: &Handle, _: &OsStr, path: &Path) -> io::Result<()> {
+        fs::remove_file(path)
+    }
+
+    pub fn rename(from: (&Handle, &OsStr, &Path), to: (&Handle, &OsStr, &Path)) -> io::Result<()> {
+        fs::rename(from.2, to.2)
+    }
+
+    pub fn sync(_: &Handle) -> io::Result<()> {
+        Ok(())
+    }
+}

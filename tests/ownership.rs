@@ -1,0 +1,512 @@
+//! What flotilla did not make, it neither replaces nor deletes, and in its folders it writes through no link.
+
+#![cfg(feature = "cli")]
+
+mod support;
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::SeqCst};
+
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::{Machine, Player};
+use flotilla::config::Config;
+use flotilla::record::disk::Disk;
+use flotilla::record::folder::{METRICS, POLICIES, RUN, Run, Start, Status};
+use flotilla::record::ownership::{self, LIST};
+use flotilla::run::{Ended, Options, Session};
+use support::{Place, SMALL};
+
+const SWEEP: &str = "
+[world]
+leaders = [[10, 5], [20, 5]]
+pois = [[10, 9], [20, 9]]
+steps = 5
+[learning]
+population = 4
+generations = 2
+trials = 1
+[grid]
+\"world.coupling\" = [1, 2]
+";
+
+fn place() -> Place {
+    Place::new(&[("small.toml", SMALL), ("grid.toml", SWEEP)]).on_cpu()
+}
+
+/// A place with a run in `run`.
+fn with_run() -> Place {
+    let place = place();
+    place.good("train small.toml --out run --quiet");
+    place
+}
+
+/// Everything below a folder: names, and what is in the files.
+fn all(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
+        match entry.symlink_metadata().unwrap().is_dir() {
+            true => found.extend(all(&entry)),
+            false => found.push((entry.clone(), fs::read(&entry).unwrap_or_default())),
+        }
+    }
+    found.sort();
+    found
+}
+
+#[test]
+fn a_picture_that_flotilla_did_not_draw_is_not_drawn_over() {
+    let place = place();
+    fs::create_dir(place.path("v")).unwrap();
+    place.write("v/curves.svg", "precious");
+    for flag in ["", "--force"] {
+        let told = place.refused(1, &format!("train small.toml --out v --quiet {flag}"));
+        assert!(told.contains("v/curves.svg was not made by flotilla") && told.contains("move it away"), "{told}");
+        assert_eq!((place.read("v/curves.svg"), place.path("v/run.json").exists()), ("precious".into(), false));
+    }
+    // A run that is resumed is trained all the same, and told of.
+    let (_, told) = place.good("train small.toml --out v --quiet --resume");
+    assert!(told.contains("v/curves.svg: not drawn") && place.path("v/run.json").exists(), "{told}");
+    assert_eq!(place.read("v/curves.svg"), "precious");
+    assert!(place.refused(1, "plot v").contains("v/curves.svg was not made by flotilla"));
+    assert_eq!(place.read("v/curves.svg"), "precious");
+    place.good("plot v --out v/curves.svg");
+    assert!(place.read("v/curves.svg").starts_with("<svg"), "it was named");
+}
+
+#[test]
+fn a_picture_that_was_edited_is_kept() {
+    let place = with_run();
+    place.good("plot run");
+    place.good("replay run --quiet");
+    place.good("replay run --quiet --trial 1");
+    let edited = place.read("run/curves.svg").replace("</svg>", "<!-- for the thesis --></svg>");
+    place.write("run/curves.svg", &edited);
+    assert!(place.refused(1, "plot run").contains("not made by flotilla"));
+    place.refused(1, "train small.toml --out run --quiet --force");
+    let (_, told) = place.good("train small.toml --out run --quiet --resume --generations 8");
+    assert!(told.contains("curves.svg: not drawn"), "{told}");
+    assert_eq!(place.read("run/curves.svg"), edited);
+    // A line of the list that a crash cut short takes none with it.
+    let list = place.read(Path::new("run").join(LIST));
+    place.write(Path::new("run").join(LIST), format!("{list}0123"));
+    fs::remove_file(place.path("run/curves.svg")).unwrap();
+    place.good("plot run");
+    place.good("plot run");
+}
+
+#[test]
+fn force_removes_what_the_run_made_and_nothing_else() {
+    let place = place();
+    fs::create_dir(place.path("v")).unwrap();
+    place.write("v/replay.html", "precious");
+    place.good("train small.toml --out v --quiet --force");
+    assert_eq!(place.read("v/replay.html"), "precious", "there was no run to write over");
+    place.good("train small.toml --out v --quiet --force");
+    assert_eq!(place.read("v/replay.html"), "precious");
+    assert!(place.refused(1, "replay v --quiet").contains("v/replay.html was not made by flotilla"));
+    fs::remove_file(place.path("v/replay.html")).unwrap();
+    place.good("replay v --quiet");
+    place.good("train small.toml --out v --quiet --force");
+    assert!(!place.path("v/replay.html").exists(), "it showed the run that is gone");
+}
+
+#[test]
+fn event_files_of_others_stay() {
+    let place = with_run();
+    let trial = place.path("run/tensorboard/trial-0");
+    fs::create_dir_all(&trial).unwrap();
+    let theirs = ["notes.flotilla", "events.out.tfevents.1.flotilla", "events.out.tfevents.x.flotilla"];
+    theirs.iter().for_each(|name| fs::write(trial.join(name), "precious, and longer than a first record is").unwrap());
+    let stays = |count: usize| {
+        theirs.iter().for_each(|name| assert!(fs::read(trial.join(name)).unwrap().starts_with(b"precious"), "{name}"));
+        assert_eq!(fs::read_dir(&trial).unwrap().count(), count);
+    };
+    place.good("train small.toml --out run --quiet --force --tensorboard");
+    stays(4);
+    place.good("train small.toml --out run --quiet --resume --generations 8 --tensorboard");
+    stays(4);
+    place.good("train small.toml --out run --quiet --force");
+    stays(3);
+}
+
+/// The first message does not advise what the next one refuses.
+#[test]
+fn a_folder_of_someone_elses_is_refused_in_the_same_words_by_every_flag() {
+    let place = place();
+    for (name, text) in [
+        ("metrics.csv", "loss,step\n1,2\n"),
+        ("policies.safetensors", "theirs"),
+        ("config.toml", "theirs = true\n"),
+        ("run.json", "{\"job\": 7}\n"),
+        ("checkpoints/000000004.safetensors", "theirs"),
+    ] {
+        let out = place.path(name.replace('/', "-"));
+        let file = out.join(name);
+        fs::create_dir_all(file.parent().unwrap()).unwrap();
+        fs::write(&file, text).unwrap();
+        let before = all(&out);
+        for flags in [&[][..], &["--force"], &["--resume"]] {
+            let words = [&["train", "small.toml", "--quiet", "--out", out.to_str().unwrap()], flags].concat();
+            let told = place.refused(1, &words);
+            assert!(told.contains(&format!("{name} was not made by flotilla")), "{name} {flags:?}: {told}");
+            assert!(told.contains("move it away, or choose another --out") && !told.contains("--force"), "{told}");
+            assert_eq!(all(&out), before, "{name} {flags:?}");
+        }
+    }
+    // A config of one's own beside nothing else is one to start from, and another's is not replaced.
+    fs::create_dir(place.path("own")).unwrap();
+    let own = format!("# Mine.\n{SMALL}");
+    place.write("own/config.toml", &own);
+    let told = place.refused(1, "train small.toml --out own --quiet --force --seed 3");
+    assert!(told.contains("own/config.toml was not made by flotilla"), "{told}");
+    place.good("train own/config.toml --out own --quiet");
+    assert_eq!(place.read("own/config.toml"), own);
+}
+
+#[test]
+fn other_files_of_a_run_are_no_leftovers() {
+    let place = with_run();
+    for name in ["checkpoints/notes.tmp", "checkpoints/a.safetensors.tmp", "run.json.tmp", "metrics.csv.tmp"] {
+        fs::write(place.path("run").join(name), "precious").unwrap();
+    }
+    place.write("run/checkpoints/.flotilla-000000003.safetensors.tmp", "left by a writer that was killed");
+    place.good("train small.toml --out run --quiet --resume --generations 9");
+    for name in ["checkpoints/notes.tmp", "checkpoints/a.safetensors.tmp", "run.json.tmp", "metrics.csv.tmp"] {
+        assert_eq!(place.read(Path::new("run").join(name)), "precious");
+    }
+    assert!(!place.path("run/checkpoints/.flotilla-000000003.safetensors.tmp").exists());
+}
+
+#[test]
+fn a_film_is_not_put_over_other_pictures() {
+    let place = with_run();
+    place.write("p0003.png", "precious");
+    let told = place.refused(1, "replay run --quiet --width 100 --out p%04d.png");
+    assert!(told.contains("p0003.png was not made by flotilla"), "{told}");
+    assert_eq!(place.read("p0003.png"), "precious");
+    assert!(!place.path("p0000.png").exists(), "nothing of it was written");
+    place.good("replay run --quiet --width 100 --out q%04d.png");
+    // Over its own pictures, a film may be made again.
+    place.good("replay run --quiet --width 100 --out q%04d.png --trial 1");
+    // So may a comparison, whose name nobody chose.
+    place.good("train small.toml --out other --quiet --seed 3");
+    place.good("plot run other");
+    place.good("plot run other");
+    place.write("comparison.svg", "<svg xmlns=\"http://www.w3.org/2000/svg\"><title>precious</title></svg>");
+    assert!(place.refused(1, "plot run other").contains("comparison.svg was not made by flotilla"));
+    assert!(place.read("comparison.svg").contains("precious"));
+}
+
+#[test]
+fn a_config_with_comments_is_kept_where_another_takes_its_place() {
+    let place = place();
+    fs::create_dir(place.path("own")).unwrap();
+    let own = format!("# Mine.\n{SMALL}");
+    place.write("own/config.toml", &own);
+    place.good("train own/config.toml --out own --quiet");
+    let (_, told) = place.good("train own/config.toml --out own --quiet --resume --generations 15");
+    assert!(told.contains("kept as own/config.old.toml"), "{told}");
+    assert_eq!(place.read("own/config.old.toml"), own);
+    assert!(place.read("own/config.toml").contains("generations = 15"));
+    // What flotilla wrote itself needs no copy.
+    place.good("train own/config.toml --out own --quiet --resume --generations 16");
+    assert!(!place.path("own/config.old-2.toml").exists());
+    place.write("own/config.toml", format!("# Mine, too.\n{}", place.read("own/config.toml")));
+    place.good("train small.toml --out own --quiet --force");
+    assert!(place.read("own/config.old-2.toml").starts_with("# Mine, too.\n"));
+}
+
+#[test]
+fn tables_and_pictures_of_others_in_a_sweep_are_left_alone() {
+    let place = place();
+    place.good("sweep grid.toml --out sweep --quiet");
+    place.good("sweep grid.toml --out sweep --quiet --collect");
+    for name in ["results.csv", "points.csv", "final.svg", "final.png", "final.pdf"] {
+        let before = fs::read(place.path("sweep").join(name)).unwrap();
+        place.write(Path::new("sweep").join(name), "precious");
+        for flag in ["--collect", "--force", "--resume"] {
+            let told = place.refused(1, &format!("sweep grid.toml --out sweep --quiet {flag}"));
+            assert!(told.contains(&format!("sweep/{name} was not made by flotilla")), "{told}");
+            assert_eq!(place.read(Path::new("sweep").join(name)), "precious");
+        }
+        place.write(Path::new("sweep").join(name), before);
+    }
+    place.good("sweep grid.toml --out sweep --quiet --force");
+    place.command().arg("man").assert().success();
+    place.command().arg("man").assert().success();
+    let page = fs::read_dir(place.path("man")).unwrap().next().unwrap().unwrap().path();
+    fs::write(&page, "precious").unwrap();
+    place.command().arg("man").assert().code(1);
+    assert_eq!(fs::read_to_string(page).unwrap(), "precious");
+    // What another program calls a paper is none.
+    fs::create_dir(place.path("thesis")).unwrap();
+    place.write("thesis/paper.toml", "title = 'mine'\n");
+    let told = place.refused(1, "paper --out thesis --force --trials 1 --generations 1 --quiet");
+    assert!(told.contains("thesis/paper.toml was not made by flotilla"), "{told}");
+    assert_eq!(place.read("thesis/paper.toml"), "title = 'mine'\n");
+}
+
+#[test]
+fn only_the_owners_folders_are_written_in_unless_they_are_named() {
+    assert!(ownership::may_enter(1000, 1000, false));
+    assert!(!ownership::may_enter(1001, 1000, false));
+    assert!(!ownership::may_enter(0, 1000, false) && !ownership::may_enter(1000, 0, false));
+    assert!(ownership::may_enter(1001, 1000, true));
+}
+
+#[cfg(unix)]
+mod links {
+    use std::io::Write;
+    use std::os::unix::fs::{chown, symlink};
+
+    use super::*;
+
+    /// A folder of somebody else's, which must not change.
+    fn victim(place: &Place) -> PathBuf {
+        let victim = place.path("victim");
+        fs::create_dir_all(victim.join("docs")).unwrap();
+        for name in ["file", "docs/notes.tmp", "docs/000000006.safetensors", "docs/000000003.safetensors"] {
+            fs::write(victim.join(name), "precious").unwrap();
+        }
+        victim
+    }
+
+    /// Runs commands, whatever they come to, that must leave a folder as it was; gives what they said.
+    fn unchanged(place: &Place, folder: &Path, lines: &[&str]) -> String {
+        let before = all(folder);
+        let mut told = String::new();
+        for line in lines {
+            let output = place.run(*line);
+            let text = String::from_utf8(output.stderr).unwrap();
+            assert!(!text.contains("panicked"), "{line}: {text}");
+            assert!(text.contains("is a symbolic link"), "{line}: {text}");
+            assert_eq!(all(folder), before, "{line}");
+            told += &text;
+        }
+        told
+    }
+
+    #[test]
+    fn pictures_and_pages_are_not_written_through_links() {
+        let place = with_run();
+        let victim = victim(&place);
+        for (name, line) in [("replay.html", "replay run --quiet"), ("curves.svg", "plot run")] {
+            let path = place.path("run").join(name);
+            let _ = fs::remove_file(&path);
+            symlink(victim.join("file"), &path).unwrap();
+            let told = unchanged(&place, &victim, &[line]);
+            assert!(
+                told.contains(&format!("run/{name} is a symbolic link")) && told.contains("remove the link"),
+                "{told}"
+            );
+            assert!(path.is_symlink());
+            fs::remove_file(&path).unwrap();
+        }
+        // Nor is a new file made, nor the list of what was made written elsewhere.
+        symlink(victim.join("new"), place.path("run/replay.html")).unwrap();
+        unchanged(&place, &victim, &["replay run --quiet"]);
+        fs::remove_file(place.path("run/replay.html")).unwrap();
+        fs::remove_file(place.path("run").join(LIST)).unwrap();
+        symlink(victim.join("file"), place.path("run").join(LIST)).unwrap();
+        unchanged(&place, &victim, &["replay run --quiet"]);
+    }
+
+    #[test]
+    fn a_runs_own_files_are_not_written_through_links() {
+        let place = with_run();
+        let victim = victim(&place);
+        let [force, resume] =
+            ["--force", "--resume --generations 9"].map(|flags| format!("train small.toml --out run --quiet {flags}"));
+        let both = [&*force, &*resume];
+        // Folders: one of files that look like a run's, and an empty one.
+        fs::rename(place.path("run/checkpoints"), place.path("kept")).unwrap();
+        symlink(victim.join("docs"), place.path("run/checkpoints")).unwrap();
+        unchanged(&place, &victim, &both);
+        fs::remove_file(place.path("run/checkpoints")).unwrap();
+        fs::rename(place.path("kept"), place.path("run/checkpoints")).unwrap();
+        for name in [".lock", METRICS, POLICIES, RUN] {
+            let path = place.path("run").join(name);
+            let kept = fs::read(&path).unwrap();
+            fs::remove_file(&path).unwrap();
+            symlink(victim.join("new"), &path).unwrap();
+            unchanged(&place, &victim, &both[..usize::from(name != RUN) + 1]);
+            fs::remove_file(&path).unwrap();
+            fs::write(&path, kept).unwrap();
+        }
+        // Even where it leads to what is a run's.
+        fs::rename(place.path("run").join(METRICS), victim.join(METRICS)).unwrap();
+        symlink(victim.join(METRICS), place.path("run").join(METRICS)).unwrap();
+        unchanged(&place, &victim, &both);
+    }
+
+    #[test]
+    fn a_new_run_is_not_locked_elsewhere() {
+        let place = place();
+        let victim = victim(&place);
+        fs::create_dir(place.path("v")).unwrap();
+        symlink(victim.join("new"), place.path("v/.lock")).unwrap();
+        unchanged(&place, &victim, &["train small.toml --out v --quiet", "train small.toml --out v --quiet --resume"]);
+    }
+
+    #[test]
+    fn event_files_are_not_written_through_links() {
+        let place = with_run();
+        let victim = victim(&place);
+        symlink(&victim, place.path("run/tensorboard")).unwrap();
+        unchanged(&place, &victim, &["train small.toml --out run --quiet --force --tensorboard"]);
+        fs::remove_file(place.path("run/tensorboard")).unwrap();
+        fs::create_dir(place.path("run/tensorboard")).unwrap();
+        symlink(&victim, place.path("run/tensorboard/trial-0")).unwrap();
+        unchanged(&place, &victim, &["train small.toml --out run --quiet --force --tensorboard"]);
+        assert!(place.path("run/run.json").exists(), "the run is none the worse for it");
+    }
+
+    #[test]
+    fn sweeps_and_papers_are_not_written_through_links() {
+        let place = with_run();
+        let victim = victim(&place);
+        place.good("sweep grid.toml --out sweep --quiet");
+        for name in ["results.csv", "final.png"] {
+            let path = place.path("sweep").join(name);
+            fs::rename(&path, place.path("kept")).unwrap();
+            symlink(victim.join("file"), &path).unwrap();
+            unchanged(&place, &victim, &["sweep grid.toml --out sweep --quiet --collect"]);
+            fs::remove_file(&path).unwrap();
+            fs::rename(place.path("kept"), &path).unwrap();
+        }
+        // Another run in the place of a point, or of all of them.
+        let runs = place.path("run");
+        fs::rename(place.path("sweep/points/0000"), place.path("kept")).unwrap();
+        symlink(&runs, place.path("sweep/points/0000")).unwrap();
+        unchanged(&place, &runs, &["sweep grid.toml --out sweep --quiet --force"]);
+        fs::remove_file(place.path("sweep/points/0000")).unwrap();
+        fs::rename(place.path("kept"), place.path("sweep/points/0000")).unwrap();
+        fs::rename(place.path("sweep/points"), place.path("points")).unwrap();
+        symlink(place.path("points"), place.path("sweep/points")).unwrap();
+        unchanged(&place, &place.path("points"), &["sweep grid.toml --out sweep --quiet --force"]);
+
+        let paper = "paper --out paper --trials 1 --generations 1 --quiet";
+        fs::create_dir(place.path("paper")).unwrap();
+        symlink(&victim, place.path("paper/arms")).unwrap();
+        place.write("paper/paper.toml", "seed = 0\ntrials = 1\ngenerations = 1\n");
+        unchanged(&place, &victim, &[&format!("{paper} --force"), &format!("{paper} --resume")]);
+        fs::remove_file(place.path("paper/arms")).unwrap();
+        symlink(victim.join("file"), place.path("paper/claims.md")).unwrap();
+        unchanged(&place, &victim, &[&format!("{paper} --force"), &format!("{paper} --resume")]);
+    }
+
+    /// The folder that the user names may be reached through links.
+    #[test]
+    fn a_link_may_be_named() {
+        let place = place();
+        fs::create_dir(place.path("disk")).unwrap();
+        symlink(place.path("disk"), place.path("runs")).unwrap();
+        place.good("train small.toml --quiet");
+        place.good("train small.toml --quiet --resume --generations 8");
+        symlink(place.path("disk/small"), place.path("mine")).unwrap();
+        place.good("train small.toml --out mine --quiet --force");
+        place.good("replay mine --quiet");
+        place.good("plot mine");
+        assert!(place.path("disk/small/replay.html").exists());
+    }
+
+    #[test]
+    fn a_folder_of_another_user_is_written_in_only_if_it_is_named() {
+        let place = with_run();
+        if chown(place.path("run"), Some(12345), None).is_err() {
+            writeln!(io::stderr(), "\nskipped: only root may give files away").unwrap();
+            return;
+        }
+        let _ = fs::remove_file(place.path("run/curves.svg"));
+        for line in ["replay run --quiet", "plot run"] {
+            let told = place.refused(1, line);
+            assert!(told.contains("run belongs to another user") && told.contains("--out"), "{told}");
+        }
+        assert!(!place.path("run/replay.html").exists() && !place.path("run/curves.svg").exists());
+        place.good("replay run --quiet --out run/replay.html");
+        place.good("train small.toml --out run --quiet --resume --generations 8");
+        // The latest run of this name is another's, and nobody named it.
+        fs::create_dir(place.path("runs")).unwrap();
+        fs::rename(place.path("run"), place.path("runs/small")).unwrap();
+        let told = place.refused(1, "train small.toml --quiet --resume --generations 9");
+        assert!(told.contains("runs/small belongs to another user"), "{told}");
+        place.good("train small.toml --quiet --resume --generations 9 --out runs/small");
+    }
+}
+
+/// Trains to the end, unless the disk fails.
+fn train(config: &Config, path: &Path, start: Start, disk: Disk) -> Result<(), String> {
+    let opened = Session::open(vec![(config.clone(), path.into())], start, &disk);
+    let (mut session, _) = opened.map_err(|error| error.to_string())?;
+    if session.is_done() {
+        return Ok(());
+    }
+    let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
+    let mut options = Options {
+        command: "",
+        stop: &stop,
+        save: &save,
+        instead: &mut |_| None,
+        setback: &mut |_| {},
+        watch: &mut |_| {},
+    };
+    let mut player: Player = (Box::new(Cpu::default()), Machine::default());
+    let ended = session.train(&mut player, &mut options).map_err(|error| error.to_string())?;
+    assert_eq!(ended, Ended::Done);
+    Ok(())
+}
+
+fn digest(path: &Path) -> Option<String> {
+    Run::read(&path.join(RUN)).unwrap().digest
+}
+
+/// Every operation of a replacement fails once, with all after it, as when the process is killed there: the next session
+/// takes the folder, by either flag, and comes to what a run from the start comes to.
+#[test]
+fn an_interrupted_replacement_is_taken_up_by_force_and_by_resume() {
+    let old = Config::parse(SMALL, "small.toml").unwrap();
+    let mut new = old.clone();
+    (new.learning.seed, new.learning.population, new.checkpoint.generations) = (5, 6, 2);
+    let memory = || tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap();
+    let fresh = memory();
+    train(&new, fresh.path(), Start::Fresh, Disk::default()).unwrap();
+    let expected = digest(fresh.path());
+    let attempt = |fails: Option<usize>| {
+        let folder = memory();
+        train(&old, folder.path(), Start::Fresh, Disk::default()).unwrap();
+        fs::write(folder.path().join("notes.txt"), "mine").unwrap();
+        let count = Arc::new(AtomicUsize::new(0));
+        let counted = count.clone();
+        let disk = Disk::failing(move |_, _| match counted.fetch_add(1, SeqCst) {
+            at if fails.is_some_and(|fails| at >= fails) => Err(io::ErrorKind::StorageFull.into()),
+            _ => Ok(()),
+        });
+        let result = train(&new, folder.path(), Start::Force, disk);
+        (folder, result, count.load(SeqCst))
+    };
+    let (folder, result, operations) = attempt(None);
+    assert_eq!((result, digest(folder.path())), (Ok(()), expected.clone()));
+    let mut replacing = 0;
+    for at in 0..operations {
+        for start in [Start::Force, Start::Resume] {
+            let (folder, failed, _) = attempt(Some(at));
+            assert!(failed.is_err(), "operation {at}");
+            let state = Run::read(&folder.path().join(RUN)).map(|run| run.state);
+            replacing += usize::from(state.as_ref().is_ok_and(|state| *state == Status::Replacing));
+            let whole = state.is_ok_and(|state| state == Status::Done);
+            // Before the first step the old run is whole, and is not resumed as another.
+            let start = if whole && Config::load(&folder.path().join("config.toml")).unwrap() == old {
+                Start::Force
+            } else {
+                start
+            };
+            let again = train(&new, folder.path(), start, Disk::default());
+            assert_eq!((again, digest(folder.path())), (Ok(()), expected.clone()), "operation {at}, {start:?}");
+            assert_eq!(fs::read(folder.path().join("notes.txt")).unwrap(), b"mine");
+        }
+    }
+    assert!(replacing > 20, "only {replacing} failures were inside the replacement");
+}
