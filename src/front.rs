@@ -27,7 +27,11 @@ use crate::parallel::current_num_threads;
 #[cfg(feature = "record")]
 use crate::record::{RecordError, hex, metrics};
 #[cfg(feature = "report")]
-use crate::record::{folder::POLICIES, policies};
+use crate::record::{
+    digests::{Digests, Verification},
+    folder::POLICIES,
+    policies,
+};
 #[cfg(feature = "report")]
 use crate::report::runs;
 use crate::stepping::{StepError, Stepper};
@@ -246,13 +250,13 @@ impl Trained {
     /// Reads what a run came to from its folder.
     ///
     /// # Errors
-    /// The folder holds no run, or one that is not finished, or its files are damaged.
+    /// The folder holds no run, or one that is not finished, or its files are damaged or not as the run left them.
     #[cfg(feature = "report")]
-    pub fn read(folder: &Path) -> Result<Trained, Failure> {
-        let config = runs::config(folder)?;
+    pub fn read(folder: &Path, verification: Verification) -> Result<Trained, Failure> {
+        let config = runs::config(folder, verification)?;
         let (mut rows, mut turns) = (Vec::new(), vec![0; config.learning.trials]);
         let mut in_turn = true;
-        runs::metrics(folder, &config, |row| {
+        runs::metrics(folder, &config, verification, |row| {
             in_turn &= turns[row.trial] == row.generation;
             turns[row.trial] += 1;
             rows.push(*row);
@@ -267,8 +271,15 @@ impl Trained {
             let reason = format!("its {} has {found} rows of {expected}", crate::record::folder::METRICS);
             return Err(runs::ReadError::Unfinished { folder: folder.into(), reason }.into());
         }
-        let policies = policies::read_all(&folder.join(POLICIES), &config)?;
-        Ok(Trained::new(config, &rows, policies))
+        let path = folder.join(POLICIES);
+        let policies = policies::read_all(&path, &config)?;
+        let digests = Digests::read(folder, verification)?;
+        let trained = Trained::new(config, &rows, policies);
+        // Config and metrics are as the run left them, so policies are what differs.
+        match digests.run {
+            Some(digest) if digest != trained.digest() => Err(RecordError::Differs { path }.into()),
+            _ => Ok(trained),
+        }
     }
 
     /// The digest that `run.json` has of a run that came to the same: of the metrics and all policies.

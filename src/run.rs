@@ -12,7 +12,9 @@ use crate::host::Instant;
 use crate::memory::{self, TooLittle};
 use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule};
 use crate::record::disk::Disk;
-use crate::record::folder::{self, Folder, METRICS, Note, POLICIES, Run, Start, Status, Story};
+use crate::record::folder::{
+    self, FileSums, Folder, METRICS, Note, Origin, POLICIES, Run, RunSums, Start, StartFrom, Status, Story,
+};
 use crate::record::metrics::{self, Extent};
 use crate::record::policies::{self, Init, Policies};
 use crate::record::{RecordError, config_digest};
@@ -160,15 +162,25 @@ impl Session {
         disk: &Disk,
     ) -> Result<(Session, Vec<(usize, Note)>), RunError> {
         let runs = runs.into_iter().map(|(config, path)| (config, path, None)).collect();
-        Session::open_from(runs, start, disk)
+        Session::open_all(runs, StartFrom::Random, start, disk)
     }
 
-    /// [`Session::open`], each run from given policies if there are any, read for its config.
+    /// [`Session::open`], each run from given policies if there are any, read for its config. Where there are none, a run
+    /// that is resumed may have been started from some.
     ///
     /// # Errors
     /// See [`Session::open`]; or a run to go on with started from others, or has no checkpoint and needs them.
     pub fn open_from(
         runs: Vec<(Config, PathBuf, Option<Init>)>,
+        start: Start,
+        disk: &Disk,
+    ) -> Result<(Session, Vec<(usize, Note)>), RunError> {
+        Session::open_all(runs, StartFrom::Unsaid, start, disk)
+    }
+
+    fn open_all(
+        runs: Vec<(Config, PathBuf, Option<Init>)>,
+        otherwise: StartFrom<'_>,
         start: Start,
         disk: &Disk,
     ) -> Result<(Session, Vec<(usize, Note)>), RunError> {
@@ -180,7 +192,8 @@ impl Session {
         // Before any of them is touched.
         let configs = runs.iter().map(|(config, ..)| config.validate()).collect::<Result<Vec<ValidConfig>, _>>()?;
         folder::check(disk, runs.iter().map(|(config, path, _)| (&**path, config)), start)?;
-        let opened = side_by_side(runs, |(config, path, init)| Member::open(config, path, init, start, disk))?;
+        let opened =
+            side_by_side(runs, |(config, path, init)| Member::open(config, path, init, otherwise, start, disk))?;
         let (mut members, mut snapshots, mut notes) = (Vec::new(), Vec::new(), Vec::new());
         for (member, snapshot, told) in opened {
             // One warning is enough for all runs.
@@ -202,13 +215,13 @@ impl Session {
             going.arm = arms.len();
             arms.push(run);
             let fits = match snapshot {
-                Origin::Checkpoint(snapshot) => trainer.restore(going.arm, snapshot),
-                Origin::Policies(Init { trials, .. }) => {
+                Beginning::Checkpoint(snapshot) => trainer.restore(going.arm, snapshot),
+                Beginning::Policies(Init { trials, .. }) => {
                     (trials.into_iter().enumerate()).all(|(trial, Policies { policies, weights })| {
                         trainer.start_from(going.arm, trial, policies, &weights)
                     })
                 }
-                Origin::Chance => true,
+                Beginning::Chance => true,
             };
             if !fits {
                 unreachable!("checkpoints and policies are read in the sizes of their config");
@@ -252,6 +265,7 @@ impl Session {
         for member in self.members.iter_mut().filter(|member| member.going.is_some()) {
             member.run.sessions = member.run.sessions.saturating_add(1);
             member.run.command = options.command.into();
+            member.run.origin = Some(Origin::of(&member.config));
         }
         self.settle_on(player);
         self.write_runs(Status::Running)?;
@@ -329,6 +343,7 @@ impl Session {
                 if shorter != member.config {
                     keeper.shorten(&shorter)?;
                     member.folder.write_config(&shorter)?;
+                    member.run.origin = Some(Origin::of(&shorter));
                     member.config = shorter;
                 }
             }
@@ -437,7 +452,7 @@ impl Session {
 }
 
 /// What a run goes on from, or starts from.
-enum Origin {
+enum Beginning {
     Checkpoint(Snapshot),
     Policies(Init),
     Chance,
@@ -449,27 +464,28 @@ impl Member {
         config: Config,
         path: PathBuf,
         init: Option<Init>,
+        otherwise: StartFrom<'_>,
         start: Start,
         disk: &Disk,
-    ) -> Result<(Member, Origin, Vec<Note>), RunError> {
-        let given = init.as_ref().map(|init| init.digest.clone());
-        let (folder, found) = Folder::open(&path, start, &config, given.as_deref(), disk.clone())?;
-        let mut run = found.run.unwrap_or_else(|| Run::new(&config));
-        let there = found.checkpoint.as_ref().map_or(&run.init, |(checkpoint, _)| &checkpoint.init).clone();
-        run.init = given.or(there);
+    ) -> Result<(Member, Beginning, Vec<Note>), RunError> {
+        let from = init.as_ref().map_or(otherwise, |init| StartFrom::Policies(&init.digest));
+        let (folder, found) = Folder::open(&path, start, &config, from, disk.clone())?;
+        let run = found.run.unwrap_or_else(|| Run::new(&config));
         let member = Member { config, going: None, folder, run, results: None, before: 0.0 };
         if let Some((story, digest)) = found.finished.zip(member.run.digest.clone()) {
-            return Ok((Member { results: Some(Results { story, digest }), ..member }, Origin::Chance, found.notes));
+            return Ok((Member { results: Some(Results { story, digest }), ..member }, Beginning::Chance, found.notes));
         }
         let (metrics, before, from) = match found.checkpoint {
-            Some((Checkpoint { snapshot, seconds, .. }, metrics)) => (metrics, seconds, Origin::Checkpoint(snapshot)),
+            Some((Checkpoint { snapshot, seconds, .. }, metrics)) => {
+                (metrics, seconds, Beginning::Checkpoint(snapshot))
+            }
             None => {
                 let metrics =
                     metrics::Writer::create(&member.folder.disk, &member.folder.file(METRICS), &member.config);
-                (metrics.map_err(member.metrics_failed())?, 0.0, init.map_or(Origin::Chance, Origin::Policies))
+                (metrics.map_err(member.metrics_failed())?, 0.0, init.map_or(Beginning::Chance, Beginning::Policies))
             }
         };
-        let generation = if let Origin::Checkpoint(snapshot) = &from { snapshot.generation } else { 0 };
+        let generation = if let Beginning::Checkpoint(snapshot) = &from { snapshot.generation } else { 0 };
         let checkpoints = member.folder.file(folder::CHECKPOINTS);
         let keeper =
             Keeper::new(member.folder.disk.clone(), checkpoints, member.config.clone(), found.kept, generation);
@@ -547,9 +563,10 @@ impl Member {
             // What this run was extended from goes with them: only now is there something else.
             keeper.wait()?;
         }
-        policies::write(&self.folder.disk, &path, &self.config, policies)?;
-        let (story, digest) = self.folder.digest(&self.config, policies)?;
+        let checksum = policies::write(&self.folder.disk, &path, &self.config, policies)?;
+        let (story, RunSums { run: digest, metrics }) = self.folder.digest(&self.config, policies)?;
         keeper.wait()?;
+        self.run.files = Some(FileSums { metrics, policies: checksum });
         self.write_run(Status::Done, generation, seconds, Some(digest.clone()))?;
         self.results = Some(Results { story, digest });
         self.going = None;
@@ -559,7 +576,8 @@ impl Member {
     fn write_run(&mut self, state: Status, next: usize, seconds: f64, digest: Option<String>) -> Result<(), RunError> {
         let generations = next.min(self.config.learning.generations + 1);
         let (updated, seconds) = (folder::now(), self.before + seconds);
-        self.run = Run { state, updated, seconds, generations, digest, ..self.run.clone() };
+        let files = self.run.files.take().filter(|_| state == Status::Done);
+        self.run = Run { state, updated, seconds, generations, digest, files, ..self.run.clone() };
         Ok(self.folder.write_run(&self.run)?)
     }
 
@@ -594,7 +612,7 @@ impl Twin {
     fn record(self, start: Start, disk: &Disk) -> Result<(), RunError> {
         let Twin { of, of_config, folder, config } = self;
         let run = Run::read(&of.join(folder::RUN))?;
-        let (folder, found) = Folder::open(&folder, start, &config, None, disk.clone())?;
+        let (folder, found) = Folder::open(&folder, start, &config, StartFrom::Random, disk.clone())?;
         let there = found.run.filter(|_| found.finished.is_some());
         if there.is_some_and(|there| there.digest == run.digest) {
             return Ok(());
@@ -605,9 +623,10 @@ impl Twin {
         copy.map_err(|error| RecordError::Write { path, error })?;
         let policies = of.join(POLICIES);
         let policies = policies::read_all(&policies, &of_config)?;
-        policies::write(&folder.disk, &folder.file(POLICIES), &config, &policies)?;
-        let (_, digest) = folder.digest(&config, &policies)?;
-        Ok(folder.write_run(&Run { digest: Some(digest), ..run })?)
+        let checksum = policies::write(&folder.disk, &folder.file(POLICIES), &config, &policies)?;
+        let (_, RunSums { run: digest, metrics }) = folder.digest(&config, &policies)?;
+        let files = Some(FileSums { metrics, policies: checksum });
+        Ok(folder.write_run(&Run { digest: Some(digest), origin: Some(Origin::of(&config)), files, ..run })?)
     }
 }
 

@@ -14,6 +14,7 @@ use flotilla::backend::{Backend, Group, RecordRequest};
 use flotilla::config::{Fitness, MAX_AGENTS, MAX_POPULATION, MAX_STEPS, Stage};
 use flotilla::evaluate::Starts;
 use flotilla::front::{self, Failure, Processor, Trained};
+use flotilla::record::digests::Verification;
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::Start;
 use flotilla::record::policies::{self, Init, Policies};
@@ -84,9 +85,9 @@ fn training_comes_to_what_a_run_comes_to() {
             expected.map(|(generation, trial)| (generation, trial, trained.champion_g[trial * 7 + generation]));
         assert_eq!(told, expected.collect::<Vec<_>>(), "seed {seed}");
         assert_eq!(trained.digest(), recorded(&config, &path), "seed {seed}");
-        assert_eq!(Trained::read(&path).expect("the run is whole"), trained, "seed {seed}");
+        assert_eq!(Trained::read(&path, Verification::Required).expect("the run is whole"), trained, "seed {seed}");
     }
-    assert!(matches!(Trained::read(folder.path()), Err(Failure::Run(_))));
+    assert!(matches!(Trained::read(folder.path(), Verification::Required), Err(Failure::Run(_))));
 
     // A row that is missing, and two that changed places.
     let (run, path) = (folder.path().join("0"), folder.path().join("0/metrics.csv"));
@@ -94,7 +95,7 @@ fn training_comes_to_what_a_run_comes_to() {
     let mut lines: Vec<&str> = rows.lines().collect();
     let read = |lines: &[&str]| {
         fs::write(&path, lines.join("\n") + "\n").expect("the folder can be written");
-        Trained::read(&run).expect_err("rows are not as they were").to_string()
+        Trained::read(&run, Verification::Skipped).expect_err("rows are not as they were").to_string()
     };
     let short = read(&lines[..lines.len() - 1]);
     assert!(short.contains("metrics.csv has 20 rows of 21"), "{short}");
@@ -109,7 +110,7 @@ fn training_comes_to_what_a_run_comes_to() {
     // Policies of another run: fewer of each leader, and of another network.
     lines.swap(1, 4);
     fs::write(&path, lines.join("\n") + "\n").expect("the folder can be written");
-    assert!(Trained::read(&run).is_ok());
+    assert!(Trained::read(&run, Verification::Required).is_ok());
     let config = config(0);
     for (change, told) in [
         ((|config| config.learning.population += 1) as fn(&mut Config), "policies of each leader, not"),
@@ -119,7 +120,7 @@ fn training_comes_to_what_a_run_comes_to() {
         change(&mut other);
         let trained = flotilla::train(&other, &mut Cpu::default(), |_| Continue(())).expect("it trains");
         policies::write(&Disk::default(), &run.join("policies.safetensors"), &other, &trained.policies).unwrap();
-        let error = Trained::read(&run).expect_err("they are of another run").to_string();
+        let error = Trained::read(&run, Verification::Required).expect_err("they are of another run").to_string();
         assert!(error.contains("policies.safetensors: ") && error.contains(told), "{error}");
     }
 }

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::SeqCst};
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::{Machine, Player};
+use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::Config;
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, POLICIES, RUN, Run, Start, Status};
@@ -453,7 +453,7 @@ fn train(config: &Config, path: &Path, start: Start, disk: Disk) -> Result<(), S
         setback: &mut |_| {},
         watch: &mut |_| {},
     };
-    let mut player: Player = (Box::new(Cpu::default()), Machine::default());
+    let mut player: OpenBackend = (Box::new(Cpu::default()), Machine::default());
     let ended = session.train(&mut player, &mut options).map_err(|error| error.to_string())?;
     assert_eq!(ended, Ended::Done);
     Ok(())

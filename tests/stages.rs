@@ -12,8 +12,9 @@ use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::backend::Machine;
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::{Config, Sharing};
+use flotilla::record::digests::Verification;
 use flotilla::record::disk::Disk;
-use flotilla::record::folder::{Folder, METRICS, POLICIES, RUN, Run, Start};
+use flotilla::record::folder::{Folder, METRICS, POLICIES, RUN, Run, Start, StartFrom};
 use flotilla::record::policies::{self, Init, read_init};
 use flotilla::report::replay::{Which, replay};
 use flotilla::run::{Ended, Options, Results, RunError, Session};
@@ -283,7 +284,7 @@ fn a_run_goes_on_from_the_policies_that_it_started_from() {
         assert!(before == [&whole, &first].map(|path| everything(path)), "what was refused was changed");
     }
     let bare = place.path().join("bare");
-    let (folder, _) = Folder::open(&bare, Start::Fresh, &config, None, Disk::default()).unwrap();
+    let (folder, _) = Folder::open(&bare, Start::Fresh, &config, StartFrom::Unsaid, Disk::default()).unwrap();
     folder.write_run(&Run { init: Some(digest), ..Run::new(&config) }).unwrap();
     drop(folder);
     let error = train(&config, &bare, None, Start::Resume, 99).unwrap_err().to_string();
@@ -323,7 +324,7 @@ fn a_run_that_ended_early_is_whole() {
         let expected = train(&shorter, &whole, init.clone(), Start::Fresh, 99).unwrap();
         assert_eq!(train(&shorter, &done, None, Start::Resume, 99).unwrap(), expected, "{number}");
         let mut backend = Cpu::default();
-        let replayed = replay(&done, 0, &[1, 3], Which::Best, &mut backend, &mut |_| true);
+        let replayed = replay(&done, 0, &[1, 3], Which::Best, Verification::Required, &mut backend, &mut |_| true);
         assert_eq!(replayed.unwrap_or_else(|error| panic!("{number}: {error}")).len(), 2);
         // Killed before it could finish.
         train_shorter(&config, &killed, init.clone(), 3, false);
@@ -345,7 +346,8 @@ fn a_run_that_ended_early_is_whole() {
     // Without what it started from there is nothing to replay.
     let done = place.path().join("3-done");
     fs::remove_dir_all(done.join("checkpoints")).unwrap();
-    let error = replay(&done, 0, &[2], Which::Best, &mut Cpu::default(), &mut |_| true).err().unwrap().to_string();
+    let error = replay(&done, 0, &[2], Which::Best, Verification::Required, &mut Cpu::default(), &mut |_| true);
+    let error = error.err().unwrap().to_string();
     assert!(error.contains("started from given policies"), "{error}");
 }
 
@@ -440,7 +442,7 @@ fn stages_are_seen_by_every_command() {
     good("plot run plain --out both.svg");
     assert!(!fs::read_to_string(folder.join("both.svg")).unwrap().contains("begins at"));
     fs::write(folder.join("run/metrics.csv"), short).unwrap();
-    good("plot run --out short.svg");
+    good("plot run --unverified --out short.svg");
     let curves = fs::read_to_string(folder.join("short.svg")).unwrap();
     assert!(curves.contains("Stage 1 begins") && !curves.contains("Stage 2 begins"), "{curves}");
     fs::write(folder.join("run/metrics.csv"), rows).unwrap();

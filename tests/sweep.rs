@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::{Config, Coupling, Override, ValidConfig};
 use flotilla::record::disk::Disk;
-use flotilla::record::folder::{Folder, Start};
+use flotilla::record::folder::{Folder, Start, StartFrom};
 use flotilla::record::ownership::LIST;
 use flotilla::sweep::shard::{Shard, cost};
 use flotilla::sweep::{Sweep, layout, run};
@@ -762,7 +762,7 @@ fn what_another_process_trains_is_left_alone_with_all_else() {
     let before = all();
     let point = out.join("points/0005");
     let config = Config::load(&point.join("config.toml")).unwrap();
-    let held = Folder::open(&point, Start::Resume, &config, None, Disk::default()).unwrap();
+    let held = Folder::open(&point, Start::Resume, &config, StartFrom::Unsaid, Disk::default()).unwrap();
     for memory in ["1", "0.000001"] {
         let error = failed(flotilla(&sweep, &out, &["--quiet", "--force", "--memory", memory]), 1);
         let expected = format!("error: another process is training in {}; ", point.display());
@@ -787,6 +787,8 @@ fn damaged_points_are_missing_not_wrong() {
     let text = fs::read_to_string(metrics(1)).unwrap();
     let lines: Vec<&str> = text.lines().collect();
     fs::write(metrics(1), lines[..5].join("\n") + "\n").unwrap();
+    let record = out.join("points/0001/run.json");
+    fs::write(&record, fs::read_to_string(&record).unwrap().replace("\"done\"", "\"running\"")).unwrap();
     let text = fs::read_to_string(metrics(2)).unwrap();
     fs::write(metrics(2), text.replacen("\n0,0,", "\n0,0,7", 1)).unwrap();
     fs::remove_file(metrics(3)).unwrap();

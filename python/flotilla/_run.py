@@ -40,6 +40,7 @@ class Run:
             arrays and those of ``metrics`` are read-only: copy them to change them.
         digest: of all of these: the same as the program's for this config and seed.
         backend: what it was trained on, in words.
+        unverified: True if its files were not compared with their digests.
 
     Example:
         >>> config = flotilla.Config.paper("chaotic").replace(learning={"generations": 3, "trials": 2})
@@ -57,6 +58,7 @@ class Run:
         self.backend = played[1]
         self._played, self._times, self._folder = played, times, folder
         self._kept: tempfile.TemporaryDirectory[str] | None = None
+        self.unverified = False
 
     def _show_arrays(self) -> None:
         """Makes the public attributes. They are read-only, and `save` does not use them: it writes what was trained."""
@@ -68,14 +70,16 @@ class Run:
         self.policies: list[Floats] = list(self._policies)
 
     @classmethod
-    def open(cls, folder: str | os.PathLike[str]) -> Run:
+    def open(cls, folder: str | os.PathLike[str], unverified: bool = False) -> Run:
         """Reads a run that is done, whoever trained it.
 
         Args:
             folder: what ``flotilla train``, a sweep or :func:`train` wrote.
+            unverified: read files that differ from their digests in ``run.json``, too.
 
         Raises:
-            Error: the folder holds no run, or one that is not finished, or its files are damaged.
+            Error: the folder holds no run, or one that is not finished, or its files are damaged or not as the run left
+                them.
 
         Example:
             >>> config = flotilla.Config.paper().replace(learning={"generations": 2})
@@ -84,8 +88,10 @@ class Run:
             True
         """
         path = os.fspath(folder)
-        outcome, played, times = _native.open(path)
-        return cls(outcome, played, times, path)
+        outcome, played, times = _native.open(path, unverified)
+        run = cls(outcome, played, times, path)
+        run.unverified = unverified
+        return run
 
     @property
     def folder(self) -> str:
@@ -165,7 +171,7 @@ class Run:
             shown.insert(0, compare)
         generations = [whole("generation", shown_one, 0, 2**63 - 1) for shown_one in shown]
         number = whole("trial", trial, 0, 2**63 - 1)
-        return Replay(_native.replay(self.folder, number, generations, backend_name(backend)))
+        return Replay(_native.replay(self.folder, number, generations, self.unverified, backend_name(backend)))
 
     def plot(self) -> Figure:
         """The learning curves: best team, champion and mean team, mean and standard error over trials.
@@ -189,6 +195,7 @@ class Run:
     def __repr__(self) -> str:
         best = self.metrics["best_g"][:, -1]
         where = f", in {self._folder}" if self._folder is not None and self._kept is None else ""
+        where += ", unverified" if self.unverified else ""
         last = self.metrics["best_g"].shape[1] - 1
         return (
             f"<flotilla.Run: {len(best)} trials, {last} generations, best G {best.mean():.3f} "

@@ -154,4 +154,4 @@ def plot(runs: Sequence[Run]) -> Figure:
     folders = [run.folder for run in runs]
     if not 1 <= len(folders) <= 24:
         raise ValueError(f"{len(folders)} runs, allowed are 1 to 24")
-    return Figure(_native.figure(folders))
+    return Figure(_native.figure(folders, any(run.unverified for run in runs)))

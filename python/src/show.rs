@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+use flotilla::record::digests::Verification;
 use flotilla::report::curves::PRINT;
 use flotilla::report::replay::{self as again, Film, ReplayError, Replayed, Which};
 use flotilla::report::runs;
@@ -29,8 +30,10 @@ pub fn replay(
     folder: PathBuf,
     trial: usize,
     generations: Vec<usize>,
+    unverified: bool,
     backend: &str,
 ) -> PyResult<Replay> {
+    let verification = Verification::unless(unverified);
     let (mut interrupted, mut asked) = (None, Instant::now());
     let played = workers::play(py, backend, |(backend, _)| {
         let mut watch = |_| {
@@ -40,7 +43,7 @@ pub fn replay(
             }
             interrupted.is_none()
         };
-        match again::replay(&folder, trial, &generations, Which::Best, &mut **backend, &mut watch) {
+        match again::replay(&folder, trial, &generations, Which::Best, verification, &mut **backend, &mut watch) {
             Err(ReplayError::Stopped) if interrupted.is_some() => Ok(vec![]),
             played => played.raise(),
         }
@@ -49,7 +52,7 @@ pub fn replay(
         return Err(error);
     }
     let name = folder.file_name().map_or("run".into(), |name| name.to_string_lossy().into_owned());
-    Ok(Replay { name, config: runs::config(&folder).raise()?, played })
+    Ok(Replay { name, config: runs::config(&folder, verification).raise()?, played })
 }
 
 #[pymethods]
@@ -89,8 +92,9 @@ pub struct Figure(Scene);
 
 /// The learning curves of one run, or of several side by side.
 #[pyfunction]
-pub fn figure(py: Python<'_>, folders: Vec<PathBuf>) -> PyResult<Figure> {
-    workers::aside(py, || runs::figure(&folders).map(|figure| Figure(figure.scene()))).raise()
+pub fn figure(py: Python<'_>, folders: Vec<PathBuf>, unverified: bool) -> PyResult<Figure> {
+    let verification = Verification::unless(unverified);
+    workers::aside(py, || runs::figure(&folders, verification).map(|figure| Figure(figure.scene()))).raise()
 }
 
 #[pymethods]

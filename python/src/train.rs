@@ -8,8 +8,9 @@ use std::time::{Duration, Instant};
 use flotilla::backend::OpenBackend;
 use flotilla::front::{self, Trained};
 use flotilla::memory::Peaks;
+use flotilla::record::digests::Verification;
 use flotilla::record::disk::Disk;
-use flotilla::record::folder::{self, Folder, METRICS, POLICIES, Start, Status};
+use flotilla::record::folder::{self, FileSums, Folder, METRICS, POLICIES, RunSums, Start, StartFrom, Status};
 use flotilla::record::ownership::{self, CURVES};
 use flotilla::record::{RecordError, metrics, policies};
 use flotilla::report::runs;
@@ -246,16 +247,16 @@ pub fn train_into(
 
 /// Draws a run's curves beside it, as the program does.
 fn draw(folder: &PathBuf) -> PyResult<()> {
-    let svg = runs::figure(std::slice::from_ref(folder)).raise()?.scene().svg();
+    let svg = runs::figure(std::slice::from_ref(folder), Verification::Required).raise()?.scene().svg();
     let disk = ownership::enter(&Disk::default(), folder, true).raise()?;
     ownership::publish(&disk, &folder.join(CURVES), |output| output.write_all(svg.as_bytes())).raise()
 }
 
 /// Reads a run that is done.
 #[pyfunction]
-pub fn open(py: Python<'_>, folder: PathBuf) -> PyResult<(Outcomes<'_>, Played, Vec<f64>)> {
+pub fn open(py: Python<'_>, folder: PathBuf, unverified: bool) -> PyResult<(Outcomes<'_>, Played, Vec<f64>)> {
     let (trained, digest, run, times) = workers::aside(py, || {
-        let trained = Trained::read(&folder).raise()?;
+        let trained = Trained::read(&folder, Verification::unless(unverified)).raise()?;
         let run = folder::Run::read(&folder.join(folder::RUN)).raise()?;
         let digest = trained.digest();
         let path = folder.join(METRICS);
@@ -300,7 +301,7 @@ pub fn save(
     workers::aside(py, || {
         let disk = Disk::default();
         let start = if force { Start::Force } else { Start::Fresh };
-        let (kept, _) = Folder::open(&folder, start, config, None, disk).raise()?;
+        let (kept, _) = Folder::open(&folder, start, config, StartFrom::Random, disk).raise()?;
         let disk = &kept.disk;
         let path = kept.file(METRICS);
         let write = || {
@@ -316,8 +317,8 @@ pub fn save(
             writer.flush()
         };
         write().map_err(|error| RecordError::Write { path: path.clone(), error }).raise()?;
-        policies::write(disk, &kept.file(POLICIES), config, &weights).raise()?;
-        let (_, digest) = kept.digest(config, &weights).raise()?;
+        let checksum = policies::write(disk, &kept.file(POLICIES), config, &weights).raise()?;
+        let (_, RunSums { run: digest, metrics }) = kept.digest(config, &weights).raise()?;
         let (backend, description, init) = played;
         let run = folder::Run {
             version: env!("CARGO_PKG_VERSION").into(),
@@ -330,6 +331,7 @@ pub fn save(
             sessions: 1,
             generations: columns,
             digest: Some(digest.clone()),
+            files: Some(FileSums { metrics, policies: checksum }),
             command: command.into(),
             commit: flotilla::COMMIT.map(String::from),
             init,

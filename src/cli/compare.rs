@@ -11,6 +11,7 @@ use crate::config::{Config, Domain};
 use crate::escape::PathExt;
 use crate::file;
 use crate::record;
+use crate::record::digests::{self, UNVERIFIED, Verification};
 use crate::record::folder::{self, RUN, Run, SWEEP};
 use crate::report::comparison::{self, At, Cohort, Comparison, ComparisonError, Question};
 use crate::report::runs::{self, MAX_RUNS, ReadError};
@@ -34,6 +35,9 @@ pub struct Args {
     /// Compare pair by pair; trials with the same seed and number are pairs
     #[arg(long)]
     paired: bool,
+    /// Read files that differ from their digests in run.json, too, and mark what comes out
+    #[arg(long)]
+    unverified: bool,
     /// Print one JSON object (docs/reference/json.md)
     #[arg(long, conflicts_with_all = ["csv", "latex"])]
     json: bool,
@@ -61,6 +65,9 @@ pub fn run(args: Args) -> Result<(), Error> {
         [folder] if folder::collection(folder) == Some("a sweep") => of_sweep(folder, &args, &mut notes)?,
         folders => vec![(String::new(), of_runs(folders, &args, &mut notes)?)],
     };
+    let verification = Verification::unless(args.unverified);
+    let folders = groups.iter().flat_map(|(_, arms)| arms).flat_map(|arm| &arm.folders);
+    digests::without(folders.map(|folder| &**folder)).into_iter().for_each(say);
     // Told even if nothing can be compared: they may say why.
     let tell = |notes: &[String]| notes.iter().for_each(|note| say(format_args!("note: {note}")));
     tell(&notes);
@@ -105,14 +112,22 @@ pub fn run(args: Args) -> Result<(), Error> {
             "test": if args.paired { "wilcoxon" } else { "mann-whitney" },
             "comparisons": all,
             "notes": notes,
+            "unverified": args.unverified,
         });
         return print_json(&told);
     }
-    print(&if args.latex { comparison::latex(&all, &options) } else { comparison::text(&all, &options) })
+    let text = if args.latex { comparison::latex(&all, &options) } else { comparison::text(&all, &options) };
+    let mark = match (verification, args.latex) {
+        (Verification::Required, _) => String::new(),
+        (Verification::Skipped, false) => format!("{UNVERIFIED}\n"),
+        (Verification::Skipped, true) => format!("% {UNVERIFIED}\n"),
+    };
+    print(&(mark + &text))
 }
 
 /// Every run an arm, named by what sets it apart.
 fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<Vec<Cohort>, Error> {
+    let verification = Verification::unless(args.unverified);
     if let Some(by) = &args.by {
         return Err(Error::Usage(format!(
             "--by {by}: that takes the folder of one sweep, which {} is not",
@@ -122,7 +137,7 @@ fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<
     if folders.len() < 2 {
         let folder = folders[0].escaped();
         // What is wrong with the folder goes first.
-        runs::config(&folders[0])?;
+        runs::config(&folders[0], verification)?;
         return Err(Error::Usage(format!("{folder} is one run; name another to compare it with")));
     }
     too_many(folders.len(), "runs")?;
@@ -130,7 +145,7 @@ fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<
     if let Some(twice) = folders.iter().find(|folder| !seen.insert(file::resolved(folder))) {
         return Err(Error::Usage(format!("{} is named twice; name other runs", twice.escaped())));
     }
-    let configs = folders.iter().map(|folder| runs::config(folder)).collect::<Result<Vec<_>, _>>()?;
+    let configs = folders.iter().map(|folder| runs::config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
     let first = &configs[0].world;
     let differs = |differs: fn(&Domain, &Domain) -> bool| configs.iter().any(|config| differs(&config.world, first));
     let layouts = [
@@ -145,7 +160,8 @@ fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<
     }
     notes.extend(copies(folders, &configs));
     let arms = runs::labels(folders, &configs).into_iter().zip(folders);
-    Ok(arms.map(|(name, folder)| Cohort::read(name, vec![folder.clone()])).collect::<Result<_, _>>()?)
+    let read = |(name, folder): (String, &PathBuf)| Cohort::read(name, vec![folder.clone()], verification);
+    Ok(arms.map(read).collect::<Result<_, _>>()?)
 }
 
 /// What is to be told of runs that are one and the same: between them there is nothing to compare.
@@ -172,6 +188,7 @@ fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Cont
         (None, 1) => 0,
         (None, _) => return Err(Error::Usage(format!("the sweep has several axes; name one by --by: {}", keys()))),
     };
+    let verification = Verification::unless(args.unverified);
     let mut groups = Vec::new();
     for group in sweep.arms(by) {
         let mut arms = Vec::new();
@@ -179,8 +196,9 @@ fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Cont
             let mut folders = Vec::new();
             for point in points {
                 let folder = results::point_folder(out, point);
-                match runs::config(&folder).and_then(|config| runs::metrics(&folder, &config, |_| {}).map(|()| config))
-                {
+                let read = runs::config(&folder, verification)
+                    .and_then(|config| runs::metrics(&folder, &config, verification, |_| {}).map(|()| config));
+                match read {
                     Ok(config) if record::without_checkpoint(&config) == record::without_checkpoint(&point.config) => {
                         folders.push(folder);
                     }
@@ -196,7 +214,7 @@ fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Cont
                 }
             }
             if !folders.is_empty() {
-                arms.push(Cohort::read(name, folders)?);
+                arms.push(Cohort::read(name, folders, verification)?);
             }
         }
         too_many(arms.len(), "values")?;

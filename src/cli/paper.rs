@@ -13,8 +13,9 @@ use crate::config::{self, Override};
 use crate::escape::PathExt;
 use crate::memory;
 use crate::record::RecordError;
+use crate::record::digests::Verification;
 use crate::record::disk::Disk;
-use crate::record::folder::{self, ARMS, Folder, PAPER, POINTS, SWEEP, Start};
+use crate::record::folder::{self, ARMS, Folder, PAPER, POINTS, SWEEP, Start, StartFrom};
 use crate::record::ownership;
 use crate::report::curves::PRINT;
 use crate::report::paper::{self, Evidence, Experiment, Summary, Trajectory, claims, tables};
@@ -141,7 +142,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     if start == Start::Force {
         // What is written over is gone before anything can stop this.
         for &arm in &twins {
-            Folder::open(&folders[arm], start, &arms[arm].config, None, disk.clone())?;
+            Folder::open(&folders[arm], start, &arms[arm].config, StartFrom::Random, disk.clone())?;
         }
     }
     let learning = arms[0].config.learning.clone();
@@ -194,7 +195,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     run::record_twins(twins.collect(), Start::Resume, &disk)?;
     for (arm, folder) in arms.iter_mut().zip(&folders) {
         let config = arm.config.clone();
-        runs::metrics(folder, &config, |row| arm.add(row))?;
+        runs::metrics(folder, &config, Verification::Required, |row| arm.add(row))?;
     }
     let mut baselines = Baselines::new(paper::grounds(&arms));
     let mut meter = Meter::new(quiet);

@@ -6,6 +6,7 @@ use super::output::{self, Destination};
 use super::{Error, print, print_json, say};
 use crate::escape::PathExt;
 use crate::record::RecordError;
+use crate::record::digests::{self, UNVERIFIED, Verification};
 use crate::record::ownership::CURVES;
 use crate::report::curves::PRINT;
 use crate::report::runs::{self, MAX_RUNS};
@@ -20,13 +21,17 @@ pub struct Args {
     /// several]
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Read files that differ from their digests in run.json, too, and mark what comes out
+    #[arg(long)]
+    unverified: bool,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { runs, out, json } = args;
+    let Args { runs, out, unverified, json } = args;
+    let verification = Verification::unless(unverified);
     if runs.len() > MAX_RUNS {
         let count = runs.len();
         return Err(Error::Usage(format!("{count} runs are too many to tell apart; name {MAX_RUNS} at most")));
@@ -38,19 +43,21 @@ pub fn run(args: Args) -> Result<(), Error> {
     };
     let out = place.path();
     let kind = kind_of(out)?;
-    let scene = runs::figure(&runs)?.scene();
+    let scene = runs::figure(&runs, verification)?.scene();
+    digests::without(runs.iter().map(|run| &**run)).into_iter().for_each(say);
     place.check()?;
     let content = scene.file(kind, PRINT).map_err(|error| RecordError::Write { path: out.into(), error })?;
     place.write(|output| output.write_all(&content))?;
-    if runs::paired(&runs)? {
+    if runs::paired(&runs, verification)? {
         say("note: these runs have one seed, so their trials are pairs: compare trial with trial, not only the means");
     }
     let out = out.escaped().to_string();
     match json {
         true => {
             let runs: Vec<_> = runs.iter().map(|run| run.escaped().to_string()).collect();
-            print_json(&serde_json::json!({ "out": out, "runs": runs }))
+            print_json(&serde_json::json!({ "out": out, "runs": runs, "unverified": unverified }))
         }
+        false if unverified => print(&format!("{out}\n{UNVERIFIED}\n")),
         false => print(&format!("{out}\n")),
     }
 }

@@ -6,6 +6,7 @@ use std::path::Path;
 use super::Error;
 use crate::config::Config;
 use crate::escape::PathExt;
+use crate::record::digests::Verification;
 use crate::record::folder::SWEEP;
 use crate::report::runs::{self, ReadError};
 use crate::sweep::{Sweep, results};
@@ -17,8 +18,8 @@ const MOST: usize = 40;
 ///
 /// # Errors
 /// The folder is no run's, or its config is damaged.
-pub(super) fn config(folder: &Path) -> Result<Config, Error> {
-    runs::config(folder).map_err(|error| match error {
+pub(super) fn config(folder: &Path, verification: Verification) -> Result<Config, Error> {
+    runs::config(folder, verification).map_err(|error| match error {
         ReadError::Collection { what: "a sweep", .. } => match Sweep::load(&folder.join(SWEEP), &[], false) {
             Ok(sweep) => Error::Refused(list(&sweep, folder)),
             Err(error) => error.into(),

@@ -11,6 +11,7 @@ use crate::backend::BackendError;
 use crate::backend::gpu::device::DeviceError;
 use crate::config::ConfigError;
 use crate::escape::PathExt;
+use crate::file;
 use crate::record::RecordError;
 use crate::record::folder::CONFIG;
 use crate::report::replay::ReplayError;
@@ -99,6 +100,26 @@ pub fn record(error: &RecordError, again: &str) -> String {
             "; resume without --init or with that file, or choose another --out".into()
         }
         RecordError::InitDiffers { there: None, .. } => "; resume without --init, or choose another --out".into(),
+        RecordError::OriginUnknown { .. } => {
+            "; give the policies that it started from by --init, or start it over by --force".into()
+        }
+        RecordError::Edited { path } => format!(
+            "; restore what it was, or move {} away and name the run's own config, or choose another --out",
+            path.display()
+        ),
+        RecordError::Differs { path } => {
+            let folder = file::folder(path).display().to_string();
+            let config = file::folder(path).join(CONFIG).display().to_string();
+            let again = match path.ends_with(CONFIG) {
+                true => String::new(),
+                false => {
+                    let command = shell::command(["flotilla", "train", &config, "--out", &folder, "--resume"]);
+                    format!(", make it again with `{command}`")
+                }
+            };
+            format!("; restore it{again}, or read it all the same with --unverified")
+        }
+        RecordError::Newer { .. } => "; use that version, or choose another --out".into(),
         RecordError::InitNeeded { .. } => "; give that file by --init".into(),
         RecordError::Read { error, .. } => unread(error).into(),
         RecordError::Damaged { .. } | RecordError::NoTrial { .. } => String::new(),

@@ -7,10 +7,11 @@ use serde_json::json;
 
 use super::output::Destination;
 use super::recovery::Signals;
-use super::{Error, RunOptions, backend, between, points, print, print_json, whole, words};
+use super::{Error, RunOptions, backend, between, points, print, print_json, say, whole, words};
 use crate::config::Config;
 use crate::escape::PathExt;
 use crate::record::RecordError;
+use crate::record::digests::{self, UNVERIFIED, Verification};
 use crate::record::disk::Disk;
 use crate::record::ownership::{self, REPLAY};
 use crate::report::curves::PRINT;
@@ -50,6 +51,9 @@ pub struct Args {
     /// Pictures per second, for a .gif or a film [default: 20]
     #[arg(long, value_name = "N", value_parser = between(1..=50u32))]
     fps: Option<u32>,
+    /// Read files that differ from their digests in run.json, too, and mark what comes out
+    #[arg(long)]
+    unverified: bool,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -85,26 +89,39 @@ impl std::str::FromStr for WhichTrial {
 
 impl WhichTrial {
     /// Its number in a run.
-    fn find(self, folder: &Path, config: &Config, generation: Option<usize>, which: Which) -> Result<usize, Error> {
+    fn find(
+        self,
+        folder: &Path,
+        config: &Config,
+        generation: Option<usize>,
+        which: Which,
+        verification: Verification,
+    ) -> Result<usize, Error> {
         let [best, worst] = match self {
             WhichTrial::Number(trial) => return Ok(trial),
-            WhichTrial::Best | WhichTrial::Worst => replay::extreme_trials(folder, config, generation, which)?,
+            WhichTrial::Best | WhichTrial::Worst => {
+                replay::extreme_trials(folder, config, generation, which, verification)?
+            }
         };
         Ok(if matches!(self, WhichTrial::Best) { best } else { worst })
     }
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { folder, trial, generation, team, compare, step, out, width, fps, json, quiet, run } = args;
+    let Args { folder, trial, generation, team, compare, step, out, width, fps, unverified, json, quiet, run } = args;
+    let verification = Verification::unless(unverified);
     let place = out.map_or_else(|| Destination::OfRun(folder.join(REPLAY)), Destination::Named);
     let out = place.path().to_path_buf();
     let kind = Form::of(&out, fps)?;
     kind.takes(&out, width, fps, step)?;
-    let config = points::config(&folder)?;
-    let trial = trial.find(&folder, &config, generation, team)?;
+    let config = points::config(&folder, verification)?;
+    digests::without([&*folder]).into_iter().for_each(say);
+    let trial = trial.find(&folder, &config, generation, team, verification)?;
     let generation = match generation {
         Some(generation) => generation,
-        None if trial < config.learning.trials => History::read(&folder, &config, trial)?.newest().unwrap_or(0),
+        None if trial < config.learning.trials => {
+            History::read(&folder, &config, trial, verification)?.newest().unwrap_or(0)
+        }
         None => 0,
     };
     let generations: Vec<usize> = compare.into_iter().chain([generation]).collect();
@@ -132,7 +149,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         meter.show(part, || format!("training trial {trial} again: generation {generation} of {last}"));
         !signals.stop.load(Relaxed)
     };
-    let played = replay::replay(&folder, trial, &generations, team, &mut *backend, &mut watch);
+    let played = replay::replay(&folder, trial, &generations, team, verification, &mut *backend, &mut watch);
     meter.clear();
     let played = played.map_err(|error| match error {
         ReplayError::Stopped => Error::Stopped("before the episode was played; nothing was written".into()),
@@ -197,6 +214,9 @@ fn report(
     }
     if !json {
         played.iter().try_for_each(|played| print(&tell(played)))?;
+        if played.iter().any(|played| played.unverified) {
+            print(&format!("{UNVERIFIED}\n"))?;
+        }
         return print(text);
     }
     let episode = |played: &Replayed| {
@@ -208,6 +228,7 @@ fn report(
         };
         json!({ "trial": trial, "generation": generation, "which": which, "team": team, g: team_g })
     };
+    object["unverified"] = played.iter().any(|played| played.unverified).into();
     object["episodes"] = played.iter().map(episode).collect();
     print_json(&object)
 }

@@ -12,9 +12,11 @@ use super::{
     say, whole,
 };
 use crate::backend::{Backend, Group, Machine, Moment, RecordRequest};
-use crate::config::{Choice, Override, Paradigm};
+use crate::config::{Choice, Config, Override, Paradigm};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Spread, Starts};
-use crate::record::{folder, policies};
+use crate::file;
+use crate::record::digests::{self, Digests, UNVERIFIED, Verification};
+use crate::record::{folder, policies, tensors};
 use crate::report::progress::Meter;
 use crate::report::replay::numbered;
 use crate::world::World;
@@ -54,6 +56,9 @@ pub struct Args {
     /// Write every leader's scores: team,leader,g,d,df,dpp,dt; of several episodes their means, and the spread of POIs
     #[arg(long, value_name = "FILE")]
     scores: Option<PathBuf>,
+    /// Read files that differ from their digests in run.json, too, and mark what comes out
+    #[arg(long)]
+    unverified: bool,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -96,7 +101,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let outputs = [("--scores", args.scores.as_deref()), ("--trace", args.trace.as_deref())];
     let (config, trained) = match args.path.is_dir() {
         true => {
-            points::config(&args.path)?;
+            points::config(&args.path, Verification::unless(args.unverified))?;
             (args.path.join(folder::CONFIG), Some(args.path.join(folder::POLICIES)))
         }
         false => (args.path.clone(), None),
@@ -107,6 +112,7 @@ pub fn run(args: Args) -> Result<(), Error> {
             args.path.display()
         )));
     };
+    let config_path = config.clone();
     let config = ConfigFile { path: config };
     output::check(&outputs, &[&config.path, &policies])?;
     let set = |key: &str, value: Option<toml::Value>| {
@@ -130,6 +136,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         }
     };
     let starts = args.starts(config.learning.start_jitter, config.learning.poi_jitter)?;
+    verify(&config_path, &policies, args.unverified)?;
     let policies = policies::read(&policies, &config, args.trial)?;
     let world = World::new(&config);
     let (mut backend, machine) = backend::open(&args.run)?;
@@ -163,10 +170,31 @@ pub fn run(args: Args) -> Result<(), Error> {
     if let Some(path) = &args.trace {
         write_trace(path, &mut *backend, &group, &starts, &mut meter)?;
     }
-    match args.json {
-        true => print_json(&in_json(&evaluation, &starts, &machine)),
-        false => print(&in_words(&evaluation, &starts)),
+    if args.json {
+        let mut object = in_json(&evaluation, &starts, &machine);
+        object["unverified"] = args.unverified.into();
+        return print_json(&object);
     }
+    let mark = if args.unverified { format!("{UNVERIFIED}\n") } else { String::new() };
+    print(&(in_words(&evaluation, &starts) + &mark))
+}
+
+/// Compares a config and policies that are a run's with the digests in its `run.json`.
+fn verify(config: &Path, policies: &Path, unverified: bool) -> Result<(), Error> {
+    let verification = Verification::unless(unverified);
+    let mut folders = Vec::new();
+    if config.ends_with(folder::CONFIG) {
+        Digests::read(file::folder(config), verification)?.compare_config(config, &Config::load(config)?)?;
+        folders.push(file::folder(config));
+    }
+    if policies.ends_with(folder::POLICIES) {
+        let checksum = tensors::open(policies)?.checksum().map(String::from);
+        Digests::read(file::folder(policies), verification)?.compare_policies(policies, checksum.as_deref())?;
+        folders.push(file::folder(policies));
+    }
+    folders.dedup();
+    digests::without(folders).into_iter().for_each(say);
+    Ok(())
 }
 
 fn counted(teams: usize, episodes: usize) -> String {

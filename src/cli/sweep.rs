@@ -15,6 +15,7 @@ use crate::escape::PathExt;
 use crate::file;
 use crate::memory;
 use crate::record::RecordError;
+use crate::record::digests::{self, UNVERIFIED, Verification};
 use crate::record::disk::Disk;
 use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
 use crate::record::ownership;
@@ -95,6 +96,9 @@ pub struct Args {
     /// G for which the first generation is reported, 0 to 1
     #[arg(long, value_name = "G", default_value_t = 0.75, value_parser = share, help_heading = RESULTS)]
     reach: f64,
+    /// Read points' files that differ from their digests in run.json, too, and mark what comes out
+    #[arg(long, requires = "collect", help_heading = RESULTS)]
+    unverified: bool,
     /// The two axes of the pictures, across and down [default: the first two of the grid]
     #[arg(long, value_name = "AXIS,AXIS", value_delimiter = ',', num_args = 1..=2, help_heading = RESULTS)]
     axes: Vec<String>,
@@ -381,7 +385,10 @@ pub(super) fn free_memory() -> usize {
 /// Puts together what is there, draws it, and fails where something is missing.
 fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(), Error> {
     enter(args, out)?;
-    let options = results::Detail { every: args.every as usize, reach: args.reach };
+    let verification = Verification::unless(args.unverified);
+    let options = results::Detail { every: args.every as usize, reach: args.reach, verification };
+    let folders: Vec<PathBuf> = sweep.points.iter().map(|point| results::point_folder(out, point)).collect();
+    digests::without(folders.iter().map(|folder| &**folder)).into_iter().for_each(say);
     let outcomes = results::write(sweep, out, &options)?;
     let (names, note) = pictures::draw(sweep, &outcomes, &options, axes, out)?;
     match args.json {
@@ -405,6 +412,7 @@ fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(),
                 text += "  final, reach, curves (.svg, .png, .pdf)   G at the end, generations to reach one, and learning curves\n";
             }
             text.extend(note.map(|note| note + "\n"));
+            text += &if args.unverified { format!("{UNVERIFIED}\n") } else { String::new() };
             print(&text)?;
         }
     }
@@ -467,6 +475,7 @@ fn as_json(
         "folder": out.escaped().to_string(),
         "sweep": sweep.name,
         "reach": options.reach,
+        "unverified": options.verification.is_skipped(),
         "points": sweep.points.iter().zip(outcomes).map(point).collect::<Vec<_>>(),
         "files": {
             "sweep": path(SWEEP),

@@ -2,6 +2,7 @@
 
 use std::ffi::OsString;
 use std::fmt::Write;
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde_json::json;
@@ -14,6 +15,7 @@ use crate::file;
 use crate::host::Instant;
 use crate::memory::Peaks;
 use crate::record::RecordError;
+use crate::record::digests::Verification;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, METRICS, POLICIES, Start};
 use crate::record::ownership::{self, CURVES};
@@ -21,6 +23,7 @@ use crate::record::policies;
 use crate::report::progress::Board;
 use crate::report::replay::History;
 use crate::report::runs;
+use crate::report::scene::Scene;
 use crate::report::tensorboard::Events;
 use crate::run::{Ended, Options, Results, RunError, Session};
 use crate::shell;
@@ -128,6 +131,8 @@ pub fn run(args: Args) -> Result<(), Error> {
             "{error}\nfor event files of the run that is there:\n  {}",
             args.command_to_resume(&folder)
         )),
+        // Before its origin is recorded, a run that is resumed would start from random policies.
+        RunError::Record(error) if args.init.is_some() => error.into(),
         error => error.into(),
     })?;
     for (_, note) in notes {
@@ -147,7 +152,9 @@ pub fn run(args: Args) -> Result<(), Error> {
     let told =
         Told { config: &config, notes: &notes_on_config, name: args.config.name(), folder: &folder, runs_on: &runs_on };
     if session.is_done() {
-        if !folder.join(CURVES).exists() {
+        // A session that ended between the run and its picture left an older one, or none.
+        let digest = session.results(0).map_or("", |results| &results.digest);
+        if !fs::read_to_string(folder.join(CURVES)).is_ok_and(|svg| Scene::shows(&svg, digest)) {
             draw(&disk, &folder);
         }
         return told.print(&session, None, args.quiet, args.json);
@@ -196,7 +203,7 @@ pub fn run(args: Args) -> Result<(), Error> {
 /// Draws the run's curves. All that was learned is saved by now, so a picture that fails is no failure of the run.
 fn draw(disk: &Disk, folder: &Path) {
     let path = folder.join(CURVES);
-    let drawn = runs::figure(&[folder.to_path_buf()]).map(|figure| figure.scene().svg());
+    let drawn = runs::figure(&[folder.to_path_buf()], Verification::Required).map(|figure| figure.scene().svg());
     let written = drawn.map_err(|error| error.to_string()).and_then(|svg| {
         let written = ownership::publish(disk, &path, |output| output.write_all(svg.as_bytes()));
         written.map_err(|error| error.to_string())
@@ -227,7 +234,7 @@ impl Told<'_> {
         let results = session.results(0).expect("the run is done");
         let done_already = trained.is_none();
         let ever = |all: Vec<History>| all.iter().any(|history| history.most() > 0.0);
-        if !History::all(self.folder, self.config).is_ok_and(ever) {
+        if !History::all(self.folder, self.config, Verification::Required).is_ok_and(ever) {
             say(format_args!(
                 "warning: no team observed any POI in any generation, so there was nothing to learn from; try more \
                  world.steps, a smaller world.coupling, POIs nearer to the starts, or a larger learning.population; \

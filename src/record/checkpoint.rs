@@ -100,6 +100,7 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
                 ("seconds", seconds.to_string()),
                 ("metrics_bytes", metrics.bytes.to_string()),
                 ("metrics_sha256", metrics.sha256.clone()),
+                (tensors::VERSION, crate::VERSION.into()),
             ]
             .map(|(key, value)| (key.to_string(), value)),
         );
@@ -118,7 +119,7 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
         }
         let trials = snapshot.fitness.iter().map(AsRef::as_ref);
         list.push(Tensor::floats(FITNESS.into(), fitness.into(), trials));
-        tensors::put(output, KIND, &metadata, &list)
+        tensors::put(output, KIND, &metadata, &list).map(drop)
     }
 }
 

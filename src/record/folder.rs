@@ -14,13 +14,15 @@ use super::disk::Disk;
 use super::metrics::{self, RowsError};
 use super::ownership::{self, CURVES, MAX_RUN_BYTES, REPLAY};
 pub use super::ownership::{ARMS, CHECKPOINTS, CONFIG, METRICS, PAPER, POINTS, POLICIES, RESULTS, RUN, SWEEP};
-use super::{RecordError, hex, policies, read_text};
+use super::{RecordError, config_digest, hex, policies, read_text, tensors};
 use crate::config::{Config, MAX_STAGES};
 use crate::escape::PathExt;
 use crate::file;
 use crate::host;
 use crate::trainer::Row;
 
+/// Stands in a folder while a run from given policies begins in it, until `run.json` says so.
+const INIT_MARK: &str = ".init";
 /// Locked by whoever trains in the folder. The lock is the system's: it goes with the process, however that ends.
 const LOCK: &str = ".lock";
 /// Most bytes in a `config.toml` that is kept where another takes its place.
@@ -66,8 +68,14 @@ pub struct Run {
     pub sessions: u64,
     /// Generations played, the random start included.
     pub generations: usize,
-    /// See [`Folder::digest`]; once the run is done.
+    /// See [`RunSums::run`]; once the run is done.
     pub digest: Option<String>,
+    /// What it was started with. Runs of earlier versions do not have it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub origin: Option<Origin>,
+    /// Digests of its files, once the run is done. Runs of earlier versions do not have them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub files: Option<FileSums>,
     /// [`policies::Init::digest`] of what it started from, if not at random.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub init: Option<String>,
@@ -77,6 +85,48 @@ pub struct Run {
     /// The commit that the program was built from, where it was built from one.
     #[serde(default)]
     pub commit: Option<String>,
+}
+
+/// The config that a run was started with, which it keeps when it is resumed.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Origin {
+    /// [`config_digest`] of it.
+    pub config: String,
+    /// Its generations, which alone may grow.
+    pub generations: usize,
+}
+
+impl Origin {
+    /// The origin of a run of a config.
+    pub fn of(config: &Config) -> Origin {
+        Origin { config: config_digest(config), generations: config.learning.generations }
+    }
+
+    /// Whether a run that was started so may be resumed with a config.
+    fn allows(&self, config: &Config) -> bool {
+        self.generations <= config.learning.generations
+            && self.config == config_digest(&checkpoint::of_length(config, self.generations))
+    }
+}
+
+/// Digests of a finished run's files.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FileSums {
+    /// See [`RunSums::metrics`].
+    #[serde(rename = "metrics.csv")]
+    pub metrics: String,
+    /// The checksum that the file carries, see [`super::tensors`].
+    #[serde(rename = "policies.safetensors")]
+    pub policies: String,
+}
+
+/// Digests of what a run came to.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RunSums {
+    /// SHA-256 of the metrics and then of every trial's policies, see [`Folder::digest`].
+    pub run: String,
+    /// SHA-256 of `metrics.csv` without `seconds` and `stage`.
+    pub metrics: String,
 }
 
 /// How far a run came.
@@ -111,6 +161,8 @@ impl Run {
             sessions: 0,
             generations: 0,
             digest: None,
+            origin: Some(Origin::of(config)),
+            files: None,
             init: None,
             command: String::new(),
             commit: None,
@@ -122,7 +174,11 @@ impl Run {
     /// # Errors
     /// It cannot be read, or is not what it should be.
     pub fn read(path: &Path) -> Result<Run, RecordError> {
-        Run::parse(&read_text(path, MAX_RUN_BYTES)?).map_err(|reason| RecordError::damaged(path, reason))
+        let text = read_text(path, MAX_RUN_BYTES)?;
+        Run::parse(&text).map_err(|reason| match newer_version(&text) {
+            Some(version) => RecordError::Newer { path: path.into(), version: Some(version) },
+            None => RecordError::damaged(path, reason),
+        })
     }
 
     /// Reads the text of a `run.json`.
@@ -136,6 +192,33 @@ impl Run {
     /// The text of `run.json`.
     pub fn to_json(&self) -> String {
         serde_json::to_string_pretty(self).expect("plain fields are JSON") + "\n"
+    }
+}
+
+/// The version in the text of a `run.json`, if it is newer than this program's.
+fn newer_version(text: &str) -> Option<String> {
+    let numbers = |version: &str| -> Option<Vec<u64>> {
+        version.split(['-', '+']).next()?.split('.').map(|number| number.parse().ok()).collect()
+    };
+    let version = serde_json::from_str::<serde_json::Value>(text).ok()?.get("version")?.as_str()?.to_string();
+    (numbers(&version)? > numbers(crate::VERSION)?).then_some(version)
+}
+
+/// What a run is told to start from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StartFrom<'a> {
+    /// Nothing was said: a run that is resumed keeps what it was started from.
+    Unsaid,
+    /// Random policies, which is all that the run can have been started from.
+    Random,
+    /// Policies with this [`policies::Init::digest`].
+    Policies(&'a str),
+}
+
+impl StartFrom<'_> {
+    /// The digest of the given policies.
+    fn digest(self) -> Option<String> {
+        if let StartFrom::Policies(digest) = self { Some(digest.into()) } else { None }
     }
 }
 
@@ -225,17 +308,17 @@ pub struct Story {
 }
 
 impl Folder {
-    /// Takes a folder for a run of a config, creating it where needed; `init` is [`policies::Init::digest`] of what the
-    /// run is to start from, if that is given.
+    /// Takes a folder for a run of a config, creating it where needed. What the run starts from is recorded before
+    /// anything else is written.
     ///
     /// # Errors
-    /// It holds a run that must not be written over, is in use, belongs to another config, started from other policies
-    /// or needs those that it started from; or it cannot be written.
+    /// It holds a run that must not be written over, is in use, belongs to another config or a newer version, started
+    /// from other or unknown policies, or needs those that it started from; or it cannot be written.
     pub fn open(
         path: &Path,
         start: Start,
         config: &Config,
-        init: Option<&str>,
+        from: StartFrom<'_>,
         disk: Disk,
     ) -> Result<(Folder, Resumed), RecordError> {
         if path.is_file() {
@@ -249,6 +332,11 @@ impl Folder {
         disk.create_folder(path).map_err(RecordError::write(path))?;
         let disk = ownership::enter(&disk, path, true)?;
         ownership::refuse_links(&disk, path)?;
+        let mark = path.join(INIT_MARK);
+        if from.digest().is_some() && !file::exists(&path.join(RUN)).map_err(RecordError::read(path))? {
+            // Whoever resumes a run that was killed before `run.json` was whole must not take random policies.
+            disk.create(&mark).map_err(RecordError::write(&mark))?;
+        }
         let lock = lock(&disk, path)?;
         // Only now is nobody else writing here.
         let there = holds_run()?;
@@ -258,7 +346,7 @@ impl Folder {
         let interrupted = Run::read(&folder.file(RUN)).ok().filter(|run| run.state == Status::Replacing);
         match (start, interrupted) {
             (Start::Force, _) if there => {
-                folder.clear(&Run { init: init.map(String::from), ..Run::new(config) }, config, &mut found)?;
+                folder.clear(&Run { init: from.digest(), ..Run::new(config) }, config, &mut found)?;
             }
             (Start::Resume, Some(run)) => {
                 found.notes.push(Note::Replacing);
@@ -267,24 +355,42 @@ impl Folder {
             _ => {}
         }
         if start == Start::Resume {
-            folder.find(config, init, &mut found)?;
+            folder.find(config, from, &mut found)?;
         }
-        // Before anything else of the run: whoever finds the folder knows whose it is, and whether the run takes policies.
-        if found.checkpoint.is_none() && found.finished.is_none() {
-            let run = found.run.clone().unwrap_or_else(|| Run::new(config));
-            let init = init.map(String::from).or(run.init.clone());
-            folder.write_run(&Run { init, ..run })?;
+        if found.finished.is_some() {
+            if Config::load(&folder.file(CONFIG)).is_err() {
+                found.notes.extend(folder.write_config(config)?);
+            }
+            return Ok((folder, found));
         }
-        if found.finished.is_none() {
-            let checkpoints = folder.file(CHECKPOINTS);
-            folder.disk.create_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
-        }
-        let there = Config::load(&folder.file(CONFIG)).ok();
-        // One that says the same may be somebody's own, with comments.
-        if there.as_ref() != Some(config) && (found.finished.is_none() || there.is_none()) {
+        folder.record_origin(config, from, &mut found)?;
+        folder.disk.remove(&mark).map_err(RecordError::write(&mark))?;
+        let checkpoints = folder.file(CHECKPOINTS);
+        folder.disk.create_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
+        // A file that says the same may be somebody's own, with comments.
+        if Config::load(&folder.file(CONFIG)).ok().as_ref() != Some(config) {
             found.notes.extend(folder.write_config(config)?);
         }
         Ok((folder, found))
+    }
+
+    /// Writes into `run.json` what a run starts from, unless it is there. A finished run that goes on is no longer
+    /// finished, so that nobody compares its files with digests that are about to be wrong.
+    fn record_origin(&self, config: &Config, from: StartFrom<'_>, found: &mut Resumed) -> Result<(), RecordError> {
+        let there = found.checkpoint.as_ref().and_then(|(checkpoint, _)| checkpoint.init.clone());
+        let before = found.run.clone();
+        let mut run = before.clone().unwrap_or_else(|| Run::new(config));
+        run.init = from.digest().or(there).or(run.init);
+        if run.state == Status::Done {
+            run = Run { state: Status::Running, digest: None, files: None, ..run };
+        }
+        // What an earlier version left out.
+        run.origin = run.origin.or_else(|| Some(Origin::of(config)));
+        if before.as_ref() != Some(&run) {
+            self.write_run(&run)?;
+        }
+        found.run = Some(run);
+        Ok(())
     }
 
     /// Writes `config.toml`; a text that was written by hand is kept beside it, which the note says.
@@ -340,8 +446,10 @@ impl Folder {
     }
 
     /// Finds where the run goes on; what cannot go on is left as it is.
-    fn find(&self, config: &Config, init: Option<&str>, found: &mut Resumed) -> Result<(), RecordError> {
-        let checkpoints = self.file(CHECKPOINTS);
+    fn find(&self, config: &Config, from: StartFrom<'_>, found: &mut Resumed) -> Result<(), RecordError> {
+        let (checkpoints, init) = (self.file(CHECKPOINTS), from.digest());
+        let init = init.as_deref();
+        self.refuse_newer(&checkpoints)?;
         let mut kept = checkpoint::tidy(&self.disk, &checkpoints)?;
         let before = self.compare(config, found, !kept.is_empty())?;
         match Run::read(&self.file(RUN)) {
@@ -355,6 +463,20 @@ impl Folder {
         if found.finished.is_some() {
             return began.map_or(Ok(()), |there| self.started_alike(there, init));
         }
+        // Where nothing says otherwise, the file there was edited: it says the same as the config given.
+        let edited = || {
+            let origin = found.run.as_ref()?.origin.as_ref().filter(|origin| !origin.allows(config))?;
+            let (path, there, here) = (self.path.clone(), origin.generations, config.learning.generations);
+            Some(match there > here {
+                true => RecordError::Shorter { path, there, here },
+                false if before.is_some() => RecordError::Edited { path: self.file(CONFIG) },
+                false => {
+                    let differences = vec![format!("  {} says so, without saying what", self.file(RUN).display())];
+                    RecordError::ConfigDiffers { path, differences }
+                }
+            })
+        };
+        let edited = edited();
         let any = !kept.is_empty();
         while let Some(&generation) = kept.last() {
             let path = checkpoint::path(&checkpoints, generation);
@@ -372,6 +494,7 @@ impl Folder {
                         None => format!("{}: {} is not as this left it", path.escaped(), metrics.escaped()),
                     }
                 }
+                Ok(Some(_)) if edited.is_some() => break,
                 Ok(Some(_)) if before.is_some() => format!("{}: it is of another run", path.escaped()),
                 Ok(Some(_)) => {
                     let differences = vec![format!("  {} says so, without saying what", path.escaped())];
@@ -391,6 +514,15 @@ impl Folder {
             self.disk.rename(&path, &aside).map_err(RecordError::write(&aside))?;
             kept.pop();
         }
+        if let Some(edited) = edited.filter(|_| found.checkpoint.is_none()) {
+            return Err(edited);
+        }
+        if began.is_none() && found.checkpoint.is_none() && from == StartFrom::Unsaid {
+            let is_there = |name: &str| file::exists(&self.file(name)).map_err(RecordError::read(&self.file(name)));
+            if any || is_there(INIT_MARK)? || is_there(RUN)? || is_there(METRICS)? || is_there(POLICIES)? {
+                return Err(RecordError::OriginUnknown { path: self.path.clone() });
+            }
+        }
         if let Some(there) = began.filter(|_| found.checkpoint.is_none()) {
             self.started_alike(there.clone(), init)?;
             if let Some(there) = there.filter(|_| init.is_none()) {
@@ -403,6 +535,20 @@ impl Folder {
             None => Note::Starting,
         });
         found.kept = kept;
+        Ok(())
+    }
+
+    /// Refuses files that a newer version of the program wrote, before any of them is touched.
+    fn refuse_newer(&self, checkpoints: &Path) -> Result<(), RecordError> {
+        let generations = checkpoint::list(checkpoints)?.into_iter();
+        let files = generations.map(|generation| checkpoint::path(checkpoints, generation));
+        for path in files.chain([self.file(POLICIES)]) {
+            if let Some(version) = tensors::newer(&path) {
+                // Only checkpoints say which version wrote them.
+                let recorded = || Some(Run::read(&self.file(RUN)).ok()?.version);
+                return Err(RecordError::Newer { path, version: version.or_else(recorded) });
+            }
+        }
         Ok(())
     }
 
@@ -461,14 +607,14 @@ impl Folder {
         self.path.join(name)
     }
 
-    /// Reads the whole of the metrics of a finished run: where it came from and to, and the run's digest.
+    /// Reads the whole of the metrics of a finished run: where it came from and to, and its digests.
     ///
     /// The digest is SHA-256 over `metrics.csv` without `seconds` (and `stage`), then over every trial's policies as in
     /// their file (f32, little-endian). It is the same for all runs of a config, on any backend, however often resumed.
     ///
     /// # Errors
     /// The metrics cannot be read, or have not one row for every trial and generation.
-    pub fn digest(&self, config: &Config, policies: &[impl AsRef<[f32]>]) -> Result<(Story, String), RecordError> {
+    pub fn digest(&self, config: &Config, policies: &[impl AsRef<[f32]>]) -> Result<(Story, RunSums), RecordError> {
         let path = self.file(METRICS);
         let damaged = |reason: String| RecordError::damaged(&path, reason);
         let mut rows = metrics::open(&path)?;
@@ -496,8 +642,9 @@ impl Folder {
             return Err(damaged(format!("it has {count} rows, not {}", trials * (last + 1))));
         }
         let mut hash: Sha256 = rows.digest();
+        let metrics = hex(&hash.clone().finalize());
         policies.iter().for_each(|weights| hash.update(bytemuck::cast_slice::<f32, u8>(weights.as_ref())));
-        Ok((story, hex(&hash.finalize())))
+        Ok((story, RunSums { run: hex(&hash.finalize()), metrics }))
     }
 
     /// What a run that is done came to; none where its files are not all as it left them.
@@ -506,13 +653,22 @@ impl Folder {
         if run.generations != config.learning.generations + 1 {
             return Ok(None);
         }
-        let path = self.file(POLICIES);
-        let policies = policies::read_all(&path, config);
-        if policies.is_ok() && !policies::are_of(&path, config) {
+        if run.origin.as_ref().is_some_and(|origin| *origin != Origin::of(config)) {
             return Ok(None);
         }
+        let path = self.file(POLICIES);
+        let policies = policies::read_all(&path, config);
+        let (of_config, checksum) = policies::mark(&path);
+        if policies.is_ok() && of_config != Some(config_digest(config)) {
+            return Ok(None);
+        }
+        let same = |found: &RunSums| {
+            let files = run.files.as_ref();
+            let same = files.is_none_or(|it| it.metrics == found.metrics && Some(&it.policies) == checksum.as_ref());
+            found.run == *digest && same
+        };
         match policies.and_then(|policies| self.digest(config, &policies)) {
-            Ok((story, found)) => Ok((found == *digest).then_some(story)),
+            Ok((story, found)) => Ok(same(&found).then_some(story)),
             // What is gone or damaged is made again; what cannot be read now may be whole.
             Err(RecordError::Read { path, error }) if error.kind() != ErrorKind::NotFound => {
                 Err(RecordError::Read { path, error })

@@ -10,6 +10,7 @@
 //! | [`ownership`] | what may be written, replaced, renamed and deleted |
 //! | [`checkpoint`] | `checkpoints/`, written beside training |
 //! | [`folder`] | the run's folder, its lock and `run.json` |
+//! | [`digests`] | whether files are as `run.json` says |
 //! | [`evidence`] | what was seen on a machine, for `docs/develop/evidence.md` |
 //!
 //! Every file that is read is taken as hostile: its size is checked before memory is taken, what it says is checked
@@ -22,11 +23,12 @@ use std::path::{Path, PathBuf};
 use sha2::{Digest, Sha256};
 
 use crate::config::{self, Config};
-use crate::escape::PathExt;
+use crate::escape::{self, PathExt};
 use crate::file::{self, TextError};
 
 pub mod beneath;
 pub mod checkpoint;
+pub mod digests;
 pub mod disk;
 pub mod evidence;
 pub mod folder;
@@ -128,6 +130,36 @@ pub enum RecordError {
         /// [`policies::Init::digest`] of these.
         there: String,
     },
+    /// A run that was started from nobody knows what.
+    #[error("{path}: its run.json is missing or damaged, so it is not known what policies this run started from")]
+    OriginUnknown {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// A config that was changed after its run was started.
+    #[error("{path}: it is not the config that this run was started with (run.json has another digest)")]
+    Edited {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A file that is not as the run left it.
+    #[error("{path}: it is not as the run left it (run.json has another digest)")]
+    Differs {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A file of a newer version of the program.
+    #[error(
+        "{path}: it was written by {}, in a format that is newer than this version ({}) reads",
+        by(version),
+        crate::VERSION
+    )]
+    Newer {
+        /// The file.
+        path: PathBuf,
+        /// The version that wrote it, if that is known.
+        version: Option<String>,
+    },
     /// A run that cannot go on under the config given.
     #[error(
         "{path} is a run of another config, so it cannot go on with this one; what differs:\n{}",
@@ -140,6 +172,10 @@ pub enum RecordError {
         /// A line for each key.
         differences: Vec<String>,
     },
+}
+
+fn by(version: &Option<String>) -> String {
+    version.as_ref().map_or("a newer flotilla".into(), |version| format!("flotilla {}", escape::line(version)))
 }
 
 fn started(digest: &Option<String>) -> String {

@@ -44,24 +44,34 @@ pub fn layers(config: &Config) -> String {
     config.policy.widths().iter().map(ToString::to_string).collect::<Vec<_>>().join(",")
 }
 
-/// Writes the policies of all trials of a config, each `[populations][population][parameters]`.
+/// Writes the policies of all trials of a config, each `[populations][population][parameters]`. Returns the file's
+/// checksum.
 ///
 /// # Errors
 /// The file cannot be written; the one before it is then still there.
-pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f32]>]) -> Result<(), RecordError> {
-    disk.replace(path, |output| put(output, config, trials)).map_err(RecordError::write(path))
+pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f32]>]) -> Result<String, RecordError> {
+    let mut checksum = String::new();
+    let content = |output: &mut dyn Write| put(output, config, trials).map(|sum| checksum = sum);
+    disk.replace(path, content).map_err(RecordError::write(path))?;
+    Ok(checksum)
 }
 
 /// Whether a file can be read and says that it is of a run of this config.
 pub fn are_of(path: &Path, config: &Config) -> bool {
-    tensors::open(path).is_ok_and(|file| file.metadata(CONFIG) == Some(&super::config_digest(config)))
+    mark(path).0 == Some(super::config_digest(config))
 }
 
-/// Writes what such a file holds into a stream.
+/// The digest of the config that a file says it is of, and its checksum; none where it does not say so or cannot be read.
+pub fn mark(path: &Path) -> (Option<String>, Option<String>) {
+    let Ok(file) = tensors::open(path) else { return (None, None) };
+    (file.metadata(CONFIG).map(String::from), file.checksum().map(String::from))
+}
+
+/// Writes what such a file holds into a stream. Returns its checksum.
 ///
 /// # Errors
 /// The stream refuses it.
-pub fn put(output: &mut dyn Write, config: &Config, trials: &[impl AsRef<[f32]>]) -> io::Result<()> {
+pub fn put(output: &mut dyn Write, config: &Config, trials: &[impl AsRef<[f32]>]) -> io::Result<String> {
     let shape = vec![config.populations(), config.learning.population, config.parameters()];
     let of_trial = |(trial, weights)| Tensor::floats(tensor(trial), shape.clone(), [weights]);
     let tensors: Vec<_> = trials.iter().map(AsRef::as_ref).enumerate().map(of_trial).collect();

@@ -20,6 +20,8 @@ use crate::file;
 pub const MAX_HEADER_BYTES: u64 = 1 << 20;
 const KIND: &str = "flotilla";
 const CHECKSUM: &str = "sha256";
+/// Metadata: the version of the program that wrote the file, where it says so.
+pub(super) const VERSION: &str = "version";
 const NO_CHECKSUM: &str = "0000000000000000000000000000000000000000000000000000000000000000";
 
 #[cfg(target_endian = "big")]
@@ -55,10 +57,10 @@ pub fn write(
     metadata: &BTreeMap<String, String>,
     tensors: &[Tensor<'_>],
 ) -> io::Result<()> {
-    disk.replace(path, |output| put(output, kind, metadata, tensors))
+    disk.replace(path, |output| put(output, kind, metadata, tensors).map(drop))
 }
 
-/// Writes what such a file holds into a stream.
+/// Writes what such a file holds into a stream. Returns its checksum.
 ///
 /// # Errors
 /// The stream refuses it.
@@ -67,7 +69,7 @@ pub fn put(
     kind: &str,
     metadata: &BTreeMap<String, String>,
     tensors: &[Tensor<'_>],
-) -> io::Result<()> {
+) -> io::Result<String> {
     let mut metadata: Map<_, _> = metadata.iter().map(|(key, value)| (key.clone(), json!(value))).collect();
     metadata.insert(KIND.into(), kind.into());
     metadata.insert(CHECKSUM.into(), NO_CHECKSUM.into());
@@ -89,10 +91,12 @@ pub fn put(
     let mut hash = Sha256::new_with_prefix(length).chain_update(&header);
     let parts = || tensors.iter().flat_map(|tensor| &tensor.parts);
     parts().for_each(|part| hash.update(part));
-    let header = header.replacen(NO_CHECKSUM, &hex(&hash.finalize()), 1);
+    let checksum = hex(&hash.finalize());
+    let header = header.replacen(NO_CHECKSUM, &checksum, 1);
     output.write_all(&length)?;
     output.write_all(header.as_bytes())?;
-    parts().try_for_each(|part| output.write_all(part))
+    parts().try_for_each(|part| output.write_all(part))?;
+    Ok(checksum)
 }
 
 /// A file whose header was read and, where it has a checksum, found whole.
@@ -167,6 +171,11 @@ impl<R: Read + Seek> TensorFile<R> {
         if hex(&hash.finalize()) == checksum { Ok(()) } else { Err(DAMAGED.into()) }
     }
 
+    /// The checksum that it carries, which was compared; none in a file of another program.
+    pub fn checksum(&self) -> Option<&str> {
+        self.metadata(CHECKSUM)
+    }
+
     /// What kind of file it says it is, none for another program's.
     pub fn kind(&self) -> Option<&str> {
         self.metadata(KIND)
@@ -216,6 +225,22 @@ impl<R: Read + Seek> TensorFile<R> {
         };
         (0..parts).map(part).collect()
     }
+}
+
+/// Whether the file at a path says that it is of a later format than this program writes: then the version that wrote
+/// it, where the file says that. A file that cannot be read is none.
+pub fn newer(path: &Path) -> Option<Option<String>> {
+    let mut file = file::open(path).ok()?;
+    let mut length = [0; 8];
+    file.read_exact(&mut length).ok()?;
+    let mut header = vec![0; usize::try_from(u64::from_le_bytes(length).min(MAX_HEADER_BYTES)).ok()?];
+    file.read_exact(&mut header).ok()?;
+    let header: Metadata = serde_json::from_slice(&header).ok()?;
+    let metadata = header.metadata().as_ref()?;
+    // All formats so far are the first of their kind. A damaged byte can make one look later, but then no checksum fits.
+    let (_, format) = metadata.get(KIND)?.rsplit_once(' ')?;
+    let later = format.parse::<u64>().ok()? > 1 && open(path).is_ok();
+    later.then(|| metadata.get(VERSION).cloned())
 }
 
 /// Opens the file at a path.

@@ -9,6 +9,7 @@ use serde::Serialize;
 use super::runs::{self, ReadError};
 use super::table;
 use crate::escape::{self, PathExt};
+use crate::record::digests::Verification;
 use crate::statistics::{self, Estimate, Tested};
 
 /// Trials that are compared with those of others.
@@ -40,11 +41,11 @@ impl Cohort {
     ///
     /// # Errors
     /// A run cannot be read.
-    pub fn read(name: String, folders: Vec<PathBuf>) -> Result<Cohort, ReadError> {
+    pub fn read(name: String, folders: Vec<PathBuf>, verification: Verification) -> Result<Cohort, ReadError> {
         let mut arm = Cohort { name, folders, planned: 0, trials: vec![] };
         for folder in &arm.folders {
-            let config = runs::config(folder)?;
-            let courses = runs::trials(folder, &config)?.into_iter().enumerate();
+            let config = runs::config(folder, verification)?;
+            let courses = runs::trials(folder, &config, verification)?.into_iter().enumerate();
             let from = config.last_from();
             arm.trials.extend(courses.map(|(trial, course)| Trial {
                 key: (config.learning.seed, trial),

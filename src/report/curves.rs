@@ -87,6 +87,10 @@ pub struct Figure {
     pub y_max: f64,
     /// Shares of the POIs, not their number.
     pub shares: bool,
+    /// The digest of the one run that it shows, once that is done.
+    pub source: Option<String>,
+    /// What a reader should know before trusting it.
+    pub warning: Option<String>,
 }
 
 impl Figure {
@@ -108,6 +112,7 @@ impl Figure {
         let caption = if banded.is_some() { 4.0 } else { 0.0 };
         let mut scene = Scene::new(COLUMN, above + height + BELOW + caption);
         (scene.title, scene.description) = (self.title(), self.description());
+        scene.source.clone_from(&self.source);
 
         for (row, entries) in rows.iter().enumerate() {
             let y = 1.0 + 3.8 * row as f64 + 2.0;
@@ -161,6 +166,7 @@ impl Figure {
                 }
             });
         }
+        self.warning.iter().for_each(|warning| scene.warn(warning));
         scene
     }
 

@@ -20,6 +20,7 @@ use crate::credit::{self, Credit, Scores};
 use crate::escape::PathExt;
 use crate::evolve;
 use crate::record::checkpoint;
+use crate::record::digests::{UNVERIFIED, Verification};
 use crate::record::folder::{CHECKPOINTS, POLICIES, RUN, Run};
 use crate::trainer::{Snapshot, Trainer};
 use crate::world::World;
@@ -169,6 +170,8 @@ pub struct Replayed {
     pub led: Vec<u32>,
     /// The step at which each POI was observed first.
     pub observed: Vec<Option<usize>>,
+    /// Whether the run's files were not compared with their digests.
+    pub unverified: bool,
 }
 
 /// The metrics of one trial.
@@ -182,8 +185,13 @@ impl History {
     ///
     /// # Errors
     /// The metrics cannot be read.
-    pub fn read(folder: &Path, config: &Config, trial: usize) -> Result<History, ReadError> {
-        let all = History::all(folder, config)?;
+    pub fn read(
+        folder: &Path,
+        config: &Config,
+        trial: usize,
+        verification: Verification,
+    ) -> Result<History, ReadError> {
+        let all = History::all(folder, config, verification)?;
         Ok(all.into_iter().nth(trial).unwrap_or(History { rows: vec![] }))
     }
 
@@ -191,9 +199,9 @@ impl History {
     ///
     /// # Errors
     /// The metrics cannot be read.
-    pub fn all(folder: &Path, config: &Config) -> Result<Vec<History>, ReadError> {
+    pub fn all(folder: &Path, config: &Config, verification: Verification) -> Result<Vec<History>, ReadError> {
         let mut all: Vec<History> = (0..config.learning.trials).map(|_| History { rows: vec![] }).collect();
-        runs::metrics(folder, config, |row| {
+        runs::metrics(folder, config, verification, |row| {
             let rows = &mut all[row.trial].rows;
             if rows.len() <= row.generation {
                 rows.resize(row.generation + 1, None);
@@ -230,8 +238,9 @@ pub fn extreme_trials(
     config: &Config,
     generation: Option<usize>,
     which: Which,
+    verification: Verification,
 ) -> Result<[usize; 2], ReplayError> {
-    let all = History::all(folder, config)?;
+    let all = History::all(folder, config, verification)?;
     let newest = all.iter().map(History::newest).min().flatten();
     let generation = generation.or(newest).unwrap_or(0);
     let g = all.iter().map(|history| history.get(generation, which)).collect::<Option<Vec<f64>>>();
@@ -255,11 +264,12 @@ pub fn replay(
     trial: usize,
     generations: &[usize],
     which: Which,
+    verification: Verification,
     backend: &mut dyn Backend,
     watch: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Vec<Replayed>, ReplayError> {
     let name = || folder.escaped().to_string();
-    let config = runs::config(folder)?;
+    let config = runs::config(folder, verification)?;
     let trials = config.learning.trials;
     if trial >= trials {
         return Err(ReplayError::NoTrial { folder: name(), trial, trials });
@@ -270,7 +280,7 @@ pub fn replay(
     {
         return Err(ReplayError::NoTeam { team, teams });
     }
-    let rows = History::read(folder, &config, trial)?;
+    let rows = History::read(folder, &config, trial, verification)?;
     let newest = rows.newest();
     for &generation in generations {
         if rows.get(generation, which).is_none() {
@@ -312,7 +322,7 @@ pub fn replay(
             let who = if which == Which::Champion { "champion" } else { "best team" };
             return Err(ReplayError::Differs { folder: name(), who, trial, generation, found: g, expected });
         }
-        played[index] = Some(found);
+        played[index] = Some(Replayed { unverified: verification.is_skipped(), ..found });
     }
     Ok(played.into_iter().flatten().collect())
 }
@@ -472,8 +482,22 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     // POIs are drawn where they were.
     let pois = group.moved_pois().unwrap_or(&world.pois).to_vec();
     let world = World { pois, ..world.clone() };
-    let (trial, generation, which, team) = (0, 0, Which::Champion, 0);
-    Ok(Replayed { trial, generation, which, team, team_g, episodes: 1, scores, owner, led, observed, trace, world })
+    let (trial, generation, which, team, episodes, unverified) = (0, 0, Which::Champion, 0, 1, false);
+    Ok(Replayed {
+        trial,
+        generation,
+        which,
+        team,
+        team_g,
+        episodes,
+        scores,
+        owner,
+        led,
+        observed,
+        trace,
+        world,
+        unverified,
+    })
 }
 
 /// Observers in one set.
@@ -628,8 +652,9 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         Some(first) => first.world.pois.iter().map(|poi| poi.as_dvec2().to_array()).collect(),
         None => world.pois.clone(),
     };
+    let unverified = if played.iter().any(|played| played.unverified) { " (unverified)" } else { "" };
     json!({
-        "run": name,
+        "run": format!("{name}{unverified}"),
         "paradigm": config.learning.paradigm,
         "fitness": config.learning.fitness,
         "map": world.map,
@@ -734,7 +759,8 @@ impl<'a> Screen<'a> {
         let who = if near == 1 { &who[..who.len() - 1] } else { who };
         let label = if timed { format!("0: {near}/{needed}: POI 0,") } else { format!("{near}/{needed}:") };
         let mut legend = view.legend(&teams, &format!("{label} {near} {who} near of {needed} needed"));
-        note.into_iter().for_each(|note| legend.note(note));
+        let unverified = played.iter().any(|played| played.unverified).then(|| UNVERIFIED.to_string());
+        note.into_iter().chain(unverified).for_each(|note| legend.note(note));
         Screen { played, view, width, legend }
     }
 

@@ -8,6 +8,7 @@ use crate::config::{Config, ConfigError};
 use crate::escape::PathExt;
 use crate::file;
 use crate::record::RecordError;
+use crate::record::digests::{Digests, UNVERIFIED, Verification};
 use crate::record::folder::{self, CONFIG, METRICS};
 use crate::record::metrics::{self, RowsError};
 use crate::statistics::Average;
@@ -67,8 +68,8 @@ pub enum ReadError {
 /// A run's config.
 ///
 /// # Errors
-/// The folder is not there, is no run's, or its config is damaged.
-pub fn config(folder: &Path) -> Result<Config, ReadError> {
+/// The folder is not there, is no run's, or its config is damaged or not as the run left it.
+pub fn config(folder: &Path, verification: Verification) -> Result<Config, ReadError> {
     let kind = std::fs::metadata(folder).map_err(|error| match error.kind() {
         ErrorKind::NotFound => ReadError::Missing(folder.into()),
         _ => ReadError::Record(RecordError::Read { path: folder.into(), error }),
@@ -84,7 +85,9 @@ pub fn config(folder: &Path) -> Result<Config, ReadError> {
         }
         return Err(ReadError::Foreign { folder: folder.into(), name: CONFIG });
     }
-    Config::load(&path).map_err(|error| ReadError::Config { folder: folder.into(), error })
+    let config = Config::load(&path).map_err(|error| ReadError::Config { folder: folder.into(), error })?;
+    Digests::read(folder, verification)?.compare_config(&path, &config)?;
+    Ok(config)
 }
 
 /// Whether a file is there; an error where that cannot be seen.
@@ -95,16 +98,24 @@ fn seen(path: &Path) -> Result<bool, RecordError> {
 /// A run's metrics, row by row as far as they are whole; what is cut off at the end is still being written.
 ///
 /// # Errors
-/// There are none yet, or they are not this run's.
-pub fn metrics(folder: &Path, config: &Config, mut each: impl FnMut(&Row)) -> Result<(), ReadError> {
+/// There are none yet, or they are not this run's or not as the run left them, which may show only after all rows.
+pub fn metrics(
+    folder: &Path,
+    config: &Config,
+    verification: Verification,
+    mut each: impl FnMut(&Row),
+) -> Result<(), ReadError> {
     let path = folder.join(METRICS);
+    // Before the metrics, since the run may come to its end now.
+    let digests = Digests::read(folder, verification)?;
     let unfinished = |reason: String| ReadError::Unfinished { folder: folder.into(), reason };
     if !seen(&path)? {
         return Err(unfinished(format!("it has no {METRICS} yet")));
     }
     let damaged = |reason: String| ReadError::Record(RecordError::Damaged { path: path.clone(), reason });
     let mut count = 0;
-    for row in metrics::open(&path)? {
+    let mut rows = metrics::open(&path)?;
+    for row in &mut rows {
         let row = match row {
             Ok((row, _)) => row,
             // A line that is cut short is the last one, of a run that goes on or was killed.
@@ -122,6 +133,7 @@ pub fn metrics(folder: &Path, config: &Config, mut each: impl FnMut(&Row)) -> Re
         each(&row);
         count += 1;
     }
+    digests.compare_metrics(&path, rows.digest())?;
     if count == 0 { Err(unfinished(format!("its {METRICS} has no rows yet"))) } else { Ok(()) }
 }
 
@@ -141,9 +153,9 @@ impl Courses {
     ///
     /// # Errors
     /// See [`metrics()`].
-    pub fn read(folder: &Path, config: &Config) -> Result<Courses, ReadError> {
+    pub fn read(folder: &Path, config: &Config, verification: Verification) -> Result<Courses, ReadError> {
         let mut courses = Courses { best: vec![], mean: vec![], champion: vec![] };
-        metrics(folder, config, |row| {
+        metrics(folder, config, verification, |row| {
             for (course, g) in [
                 (&mut courses.best, row.best_g),
                 (&mut courses.mean, row.mean_g),
@@ -163,10 +175,10 @@ impl Courses {
 ///
 /// # Errors
 /// See [`metrics()`]; or a trial's rows are not in order.
-pub fn trials(folder: &Path, config: &Config) -> Result<Vec<Vec<[f64; 2]>>, ReadError> {
+pub fn trials(folder: &Path, config: &Config, verification: Verification) -> Result<Vec<Vec<[f64; 2]>>, ReadError> {
     let mut trials = vec![vec![]; config.learning.trials];
     let mut skipped = None;
-    metrics(folder, config, |row| match &mut trials[row.trial] {
+    metrics(folder, config, verification, |row| match &mut trials[row.trial] {
         trial if trial.len() == row.generation => trial.push([row.best_g, row.champion_g]),
         _ => skipped = skipped.or(Some((row.trial, row.generation))),
     })?;
@@ -183,9 +195,9 @@ pub fn trials(folder: &Path, config: &Config) -> Result<Vec<Vec<[f64; 2]>>, Read
 ///
 /// # Errors
 /// A run cannot be read.
-pub fn figure(folders: &[PathBuf]) -> Result<Figure, ReadError> {
-    let configs = folders.iter().map(|folder| config(folder)).collect::<Result<Vec<_>, _>>()?;
-    let all = folders.iter().zip(&configs).map(|(folder, config)| Courses::read(folder, config));
+pub fn figure(folders: &[PathBuf], verification: Verification) -> Result<Figure, ReadError> {
+    let configs = folders.iter().map(|folder| config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
+    let all = folders.iter().zip(&configs).map(|(folder, config)| Courses::read(folder, config, verification));
     let all = all.collect::<Result<Vec<_>, _>>()?;
     // Stages may have POIs of their own.
     let counts: Vec<Option<usize>> = configs.iter().map(Config::pois).collect();
@@ -217,6 +229,11 @@ pub fn figure(folders: &[PathBuf]) -> Result<Figure, ReadError> {
         y_label: if same { format!("POIs observed{what}") } else { format!("Share of POIs observed{what}") },
         y_max: scale,
         shares: !same,
+        source: match folders {
+            [folder] => Digests::read(folder, verification)?.run,
+            _ => None,
+        },
+        warning: verification.is_skipped().then(|| UNVERIFIED.into()),
     })
 }
 
@@ -225,9 +242,9 @@ pub fn figure(folders: &[PathBuf]) -> Result<Figure, ReadError> {
 ///
 /// # Errors
 /// A run cannot be read.
-pub fn paired(folders: &[PathBuf]) -> Result<bool, ReadError> {
-    let seeds =
-        folders.iter().map(|folder| Ok(config(folder)?.learning.seed)).collect::<Result<Vec<_>, ReadError>>()?;
+pub fn paired(folders: &[PathBuf], verification: Verification) -> Result<bool, ReadError> {
+    let seed = |folder: &PathBuf| Ok(config(folder, verification)?.learning.seed);
+    let seeds = folders.iter().map(seed).collect::<Result<Vec<_>, ReadError>>()?;
     Ok(seeds.len() > 1 && seeds.iter().all(|seed| *seed == seeds[0]))
 }
 

@@ -121,6 +121,8 @@ pub struct Scene {
     pub title: String,
     /// What is to be seen in it, in sentences with figures, for those who cannot see it.
     pub description: String,
+    /// The digest of the run that it shows, which an SVG carries.
+    pub source: Option<String>,
     pub(super) marks: Vec<Mark>,
 }
 
@@ -158,7 +160,26 @@ impl Format {
 impl Scene {
     /// An empty picture of this size, in points.
     pub fn new(width: f64, height: f64) -> Scene {
-        Scene { width, height, title: String::new(), description: String::new(), marks: Vec::new() }
+        let (title, description, marks) = (String::new(), String::new(), Vec::new());
+        Scene { width, height, title, description, source: None, marks }
+    }
+
+    /// Adds a line below all of it.
+    pub fn warn(&mut self, text: &str) {
+        const SIZE: f64 = 2.47;
+        self.height += 4.0;
+        self.text([1.0, self.height - 1.4], text, SIZE, Anchor::Start, BLACK);
+        self.description += &format!(" {text}.");
+    }
+
+    /// The element by which an SVG says which run it shows.
+    fn metadata(source: &str) -> String {
+        format!("<metadata>run {source}</metadata>\n")
+    }
+
+    /// Whether the text of an SVG shows the run with this digest.
+    pub fn shows(svg: &str, source: &str) -> bool {
+        svg.contains(&Scene::metadata(source))
     }
 
     /// A line through places.
@@ -230,6 +251,7 @@ impl Scene {
             Escaped(&self.title),
             Escaped(&self.description),
         )?;
+        self.source.iter().for_each(|source| svg.push_str(&Scene::metadata(source)));
         // Each letter that occurs is drawn once, and used from there.
         let texts =
             self.marks.iter().filter_map(|mark| if let Mark::Text { text, .. } = mark { Some(text) } else { None });

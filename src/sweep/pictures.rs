@@ -6,6 +6,7 @@ use std::path::Path;
 use super::results::{Detail, Missing, Outcome};
 use super::{Axis, Point, Sweep};
 use crate::record::RecordError;
+use crate::record::digests::UNVERIFIED;
 use crate::record::disk::Disk;
 use crate::record::ownership;
 use crate::report::curves::{Curve, PRINT, SMALL, distinct};
@@ -65,7 +66,10 @@ pub fn draw(
     };
     let disk = ownership::enter(&Disk::default(), out, true)?;
     let mut names = Vec::new();
-    for (name, scene) in scenes {
+    for (name, mut scene) in scenes {
+        if options.verification.is_skipped() {
+            scene.warn(UNVERIFIED);
+        }
         for kind in Format::ALL {
             let name = format!("{name}.{}", kind.extension());
             let path = out.join(&name);

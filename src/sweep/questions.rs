@@ -13,6 +13,7 @@ use crate::config::{Config, ConfigError, Override};
 use crate::escape::PathExt;
 use crate::evaluate::{self, Starts};
 use crate::record::RecordError;
+use crate::record::digests::Verification;
 use crate::record::folder::POLICIES;
 use crate::record::policies::{self, Policies};
 use crate::report::comparison::{self, At, Cohort, Comparison, ComparisonError, Mean, Measure, Measured, Named};
@@ -365,7 +366,7 @@ impl Study {
             let comparison = match self.moved {
                 Some(jitter) => self.played(&place, &points[0].config, &arms, jitter, backend)?,
                 None => {
-                    let read = |(name, folder)| Cohort::read(name, vec![folder]);
+                    let read = |(name, folder)| Cohort::read(name, vec![folder], Verification::Required);
                     let arms = arms.into_iter().map(read).collect::<Result<Vec<_>, _>>()?;
                     let at = match self.at {
                         [] => vec![At::Last],

@@ -7,6 +7,7 @@ use super::{Axis, Point, Sweep};
 use crate::config::Config;
 use crate::escape::{self, PathExt};
 use crate::file;
+use crate::record::digests::{Digests, Verification};
 use crate::record::disk::Disk;
 use crate::record::folder::{CONFIG, METRICS, POINTS, RESULTS};
 use crate::record::{RecordError, without_checkpoint};
@@ -21,6 +22,8 @@ pub struct Detail {
     pub every: usize,
     /// The G in 0..1 whose first generation is reported.
     pub reach: f64,
+    /// Whether points' files are compared with their digests.
+    pub verification: Verification,
 }
 
 /// The results of a point's trials.
@@ -155,15 +158,18 @@ fn read(point: &Point, out: &Path, options: &Detail) -> Result<(Vec<Row>, Outcom
     if !file::exists(&path).map_err(|error| damaged(&format!("{}: cannot be read: {error}", path.escaped())))? {
         return Err(Missing::NotRun);
     }
+    let digests = Digests::read(&folder, options.verification).map_err(|error| damaged(&error))?;
     let config = Config::load(&folder.join(CONFIG)).map_err(|error| damaged(&error))?;
     if without_checkpoint(&config) != without_checkpoint(&point.config) {
         return Err(Missing::Damaged(format!("{}: it is of another config", folder.escaped())));
     }
+    digests.compare_config(&folder.join(CONFIG), &config).map_err(|error| damaged(&error))?;
     let (trials, last) = (config.learning.trials, config.learning.generations);
     let mut rows: Vec<Vec<Row>> = vec![Vec::new(); trials];
     let mut reached = vec![None; trials];
     let mut next = 0;
-    for row in metrics::open(&path).map_err(|error| damaged(&error))? {
+    let mut source = metrics::open(&path).map_err(|error| damaged(&error))?;
+    for row in &mut source {
         let (row, _) = row.map_err(|error| damaged(&format!("{}: {error}", path.escaped())))?;
         let Row { trial, generation, best_g, .. } = row;
         if (generation, trial) != (next / trials, next % trials) || generation > last {
@@ -181,6 +187,7 @@ fn read(point: &Point, out: &Path, options: &Detail) -> Result<(Vec<Row>, Outcom
             rows[trial].push(row);
         }
     }
+    digests.compare_metrics(&path, source.digest()).map_err(|error| damaged(&error))?;
     if next < trials * (last + 1) {
         return Err(Missing::Unfinished(next / trials, last));
     }

@@ -7,7 +7,7 @@ use flotilla::backend::{Group, RecordRequest};
 use flotilla::config::{Config, Fitness};
 use flotilla::evolve;
 use flotilla::record::checkpoint::{self, Checkpoint};
-use flotilla::record::folder::{self, Run, Status};
+use flotilla::record::folder::{self, FileSums, Origin, Run, Status};
 use flotilla::record::metrics::{self, Extent, Lines};
 use flotilla::record::{config_digest, hex, policies};
 use flotilla::report::replay;
@@ -70,6 +70,7 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
     let (policies, fitness): (Vec<_>, Vec<_>) =
         rest.chunks_exact((policies + fitness) * size_of::<f32>()).map(trial).unzip();
     let digest = hex(&metrics::digest(rows.iter().map(|&(row, _)| row), &policies));
+    let metrics = hex(&metrics::digest(rows.iter().map(|&(row, _)| row), &[] as &[&[f32]]));
 
     let lines = Lines::of(&config);
     let mut text = lines.header();
@@ -93,6 +94,8 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
         metrics: ending.unwrap_or_else(|| Extent::after(&text)),
         snapshot: Snapshot { generation: last + 1, last, weights: vec![], fitness, pending: pending.collect() },
     };
+    let (mut weights, mut checkpoint) = (Vec::new(), Vec::new());
+    let checksum = policies::put(&mut weights, &config, &policies).map_err(refuse)?;
     let run = Run {
         version: flotilla::VERSION.into(),
         commit: flotilla::COMMIT.map(String::from),
@@ -109,10 +112,9 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
         sessions: 1,
         generations: last + 1,
         digest: Some(digest.clone()),
+        files: Some(FileSums { metrics, policies: checksum }),
         ..Run::new(&config)
     };
-    let (mut weights, mut checkpoint) = (Vec::new(), Vec::new());
-    policies::put(&mut weights, &config, &policies).map_err(refuse)?;
     end.put(&mut checkpoint, &config).map_err(refuse)?;
     let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
     let path = checkpoint::path(folder::CHECKPOINTS.as_ref(), last + 1);
@@ -157,6 +159,9 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
     let (metrics, weights) = (file(folder::METRICS)?, file(folder::POLICIES)?);
     let run = Run::parse(&String::from_utf8_lossy(&file(folder::RUN)?))
         .map_err(|error| refuse(format!("run.json: {error}")))?;
+    if run.origin.is_some_and(|origin| origin != Origin::of(&config)) {
+        return Err(refuse("config.toml is not the config that this run was trained by"));
+    }
     let expected = run.digest.ok_or_else(|| refuse("run.json tells no digest: the run is not done"))?;
     let mut numbers: Vec<f64> = Vec::new();
     let mut rows = metrics::Rows::new(&metrics[..]).map_err(|error| refuse(format!("metrics.csv: {error}")))?;

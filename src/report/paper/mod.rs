@@ -260,6 +260,8 @@ pub fn figure(results: Evidence<'_>, layout: usize) -> Figure {
         y_label: "POIs observed".into(),
         y_max: PARADIGMS.into_iter().map(pois).fold(1.0, f64::max),
         shares: false,
+        source: None,
+        warning: None,
     }
 }
 

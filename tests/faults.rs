@@ -1,0 +1,425 @@
+//! Every file-system call of the program may fail, or be its last: nothing is lost, and the same bytes come out.
+//!
+//! A library that `cc` makes of `faults/shim.c` fails a call of the program or kills it there. `--resume` must then end in
+//! the files of an undisturbed run, or be refused with a message that names a command that does. A few hundred faults
+//! are injected; with `FLOTILLA_LONG=1` every call of every scenario fails in each way.
+
+#![cfg(all(feature = "cli", target_os = "linux", any(target_arch = "x86_64", target_arch = "aarch64")))]
+
+mod support;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+
+use tempfile::TempDir;
+
+const SMALL: &str = "
+[world]
+leaders = [[10, 5], [20, 5]]
+followers = [[12, 2], [22, 2]]
+pois = [[10, 9], [20, 9]]
+coupling = 2
+steps = 6
+[policy]
+hidden = [3]
+[learning]
+population = 4
+generations = 3
+trials = 2
+[checkpoint]
+generations = 1
+seconds = 0
+";
+const STAGES: &str = "[[stages]]\nfrom = 2\nset = { 'world.coupling' = 1 }\n";
+const GRID: &str = "[grid]\n\"learning.fitness\" = ['D', 'Df']\n";
+/// A command that takes longer than this hangs.
+const LIMIT: Duration = Duration::from_secs(120);
+
+/// What is started, disturbed and gone on with.
+struct Scenario {
+    name: &'static str,
+    /// Makes what is there before, undisturbed.
+    before: &'static [&'static str],
+    /// Is disturbed.
+    command: &'static str,
+    /// Goes on after that; none of these gives up what was done. The second is for where the first is refused.
+    resume: [&'static str; 2],
+    /// How many faults are injected in the short form.
+    short: usize,
+    /// In the long form, at most so many calls fail.
+    long: usize,
+}
+
+const SCENARIOS: [Scenario; 9] = [
+    Scenario {
+        name: "train",
+        before: &[],
+        command: "train small.toml --out out",
+        resume: ["train small.toml --out out --resume", ""],
+        short: 60,
+        long: 1000,
+    },
+    Scenario {
+        name: "extension",
+        before: &["train small.toml --out out --generations 2"],
+        command: "train small.toml --out out --resume",
+        resume: ["train small.toml --out out --resume", ""],
+        short: 50,
+        long: 1000,
+    },
+    Scenario {
+        name: "force",
+        before: &["train small.toml --out out --seed 5"],
+        command: "train small.toml --out out --force",
+        // Where nothing was written over, the run that is there is another one.
+        resume: ["train small.toml --out out --resume", "train small.toml --out out --force"],
+        short: 50,
+        long: 1000,
+    },
+    Scenario {
+        name: "init",
+        before: &["train small.toml --out first --seed 5"],
+        command: "train small.toml --out out --init first/policies.safetensors",
+        resume: [
+            "train small.toml --out out --resume",
+            "train small.toml --out out --resume --init first/policies.safetensors",
+        ],
+        short: 50,
+        long: 1000,
+    },
+    Scenario {
+        name: "stages",
+        before: &[],
+        command: "train stages.toml --out out",
+        resume: ["train stages.toml --out out --resume", ""],
+        short: 24,
+        long: 1000,
+    },
+    Scenario {
+        name: "tensorboard",
+        before: &[],
+        command: "train small.toml --out out --tensorboard",
+        resume: ["train small.toml --out out --resume --tensorboard", ""],
+        short: 30,
+        long: 1000,
+    },
+    Scenario {
+        name: "sweep",
+        before: &[],
+        command: "sweep grid.toml --out out",
+        resume: ["sweep grid.toml --out out --resume", ""],
+        short: 40,
+        long: 1000,
+    },
+    Scenario {
+        name: "paper",
+        before: &[],
+        command: "paper --trials 1 --generations 1 --out out",
+        resume: ["paper --trials 1 --generations 1 --out out --resume", ""],
+        short: 8,
+        long: 200,
+    },
+    Scenario {
+        name: "questions",
+        before: &[],
+        command: "paper --questions=g --trials 2 --generations 1 --out out",
+        resume: ["paper --questions=g --trials 2 --generations 1 --out out --resume", ""],
+        short: 6,
+        long: 200,
+    },
+];
+
+/// What happens to a call.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Fault {
+    /// The disk is full, for this call only.
+    Full,
+    /// The disk is full from this call on.
+    FullFromHere,
+    /// The disk fails once.
+    Broken,
+    /// The process ends.
+    Killed,
+}
+
+const FAULTS: [Fault; 4] = [Fault::Killed, Fault::Full, Fault::FullFromHere, Fault::Broken];
+
+/// A call of a scenario that fails.
+struct Case<'a> {
+    scenario: &'a Scenario,
+    /// From 1.
+    call: usize,
+    fault: Fault,
+}
+
+/// What scenarios start from and come to.
+struct Prepared {
+    before: TempDir,
+    expected: BTreeMap<String, Vec<u8>>,
+    calls: usize,
+}
+
+/// The library that disturbs a process.
+struct Shim(TempDir);
+
+impl Shim {
+    /// Compiles it; why not, if it cannot be had here.
+    fn compile() -> Result<Shim, String> {
+        let folder = TempDir::new().unwrap();
+        let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/faults/shim.c");
+        let compiled = Command::new("cc")
+            .args(["-O1", "-Wall", "-Werror", "-shared", "-fPIC", "-o"])
+            .arg(folder.path().join("shim.so"))
+            .arg(source)
+            .output()
+            .map_err(|error| format!("cc cannot be run: {error}"))?;
+        assert!(compiled.status.success(), "{}", String::from_utf8_lossy(&compiled.stderr));
+        let shim = Shim(folder);
+        let tried = shim.disturb(Command::new("true"), 0, Fault::Full, None).output();
+        match tried.map_err(|error| error.to_string())? {
+            tried if tried.status.success() => Ok(shim),
+            tried => Err(String::from_utf8_lossy(&tried.stderr).trim().into()),
+        }
+    }
+
+    fn disturb(&self, mut command: Command, call: usize, fault: Fault, count: Option<&Path>) -> Command {
+        let kind = match fault {
+            Fault::Killed => "KILL",
+            Fault::Broken => "EIO",
+            Fault::Full | Fault::FullFromHere => "ENOSPC",
+        };
+        command.env("LD_PRELOAD", self.0.path().join("shim.so"));
+        command.env("FAULT_AT", call.to_string()).env("FAULT_KIND", kind);
+        if fault == Fault::FullFromHere {
+            command.env("FAULT_ALL", "1");
+        }
+        if let Some(count) = count {
+            command.env("FAULT_COUNT", count);
+        }
+        command
+    }
+}
+
+/// A folder in memory, where that can be had: a disk takes its time.
+fn folder() -> TempDir {
+    tempfile::tempdir_in("/dev/shm").unwrap_or_else(|_| TempDir::new().unwrap())
+}
+
+fn program(folder: &Path, words: &str) -> Command {
+    let mut command = support::flotilla();
+    command.current_dir(folder).args(words.split_whitespace());
+    // One thread makes the same calls in the same order, nearly.
+    command.args(["--backend", "cpu", "--threads", "1", "--quiet"]);
+    command
+}
+
+/// What a command comes to; one that hangs is a failure.
+fn output(mut command: Command, context: &str) -> Output {
+    let mut child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let since = Instant::now();
+    while child.try_wait().unwrap().is_none() {
+        if since.elapsed() > LIMIT {
+            child.kill().unwrap();
+            panic!("{context}: {command:?} hangs");
+        }
+        std::thread::sleep(Duration::from_millis(3));
+    }
+    let output = child.wait_with_output().unwrap();
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert!(!told.contains("panicked"), "{context}: {command:?}: {told}");
+    output
+}
+
+fn good(folder: &Path, words: &str, context: &str) {
+    let output = output(program(folder, words), context);
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(0), "{context}: {words}: {told}");
+}
+
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).unwrap();
+    for entry in fs::read_dir(from).unwrap() {
+        let entry = entry.unwrap();
+        let to = to.join(entry.file_name());
+        match entry.file_type().unwrap().is_dir() {
+            true => copy(&entry.path(), &to),
+            false => drop(fs::copy(entry.path(), to).unwrap()),
+        }
+    }
+}
+
+/// What came out: every file but those that say when and where, metrics without their seconds, and of event files, which
+/// say when, the size.
+fn outcome(folder: &Path) -> BTreeMap<String, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    let mut folders = vec![folder.to_path_buf()];
+    while let Some(next) = folders.pop() {
+        for entry in fs::read_dir(&next).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+                continue;
+            }
+            let name = path.strip_prefix(folder).unwrap().display().to_string();
+            let file = path.file_name().unwrap().to_string_lossy().into_owned();
+            // How often it is saved has no say in what comes out, nor what a killed writer left.
+            let passing = file.starts_with('.') || file.ends_with(".tmp") || name.contains("checkpoints/");
+            if passing || ["run.json", "summary.json"].contains(&&*file) {
+                continue;
+            }
+            let bytes = fs::read(&path).unwrap();
+            if file == "metrics.csv" {
+                let text = String::from_utf8(bytes).unwrap();
+                let kept = |line: &str| {
+                    let fields = line.split(',').enumerate().filter(|&(column, _)| column != 5).map(|(_, field)| field);
+                    fields.collect::<Vec<_>>().join(",") + "\n"
+                };
+                found.insert(name, text.lines().map(kept).collect::<String>().into_bytes());
+            } else if file.contains("tfevents") {
+                let name = name.split("events.out").next().unwrap().to_string();
+                found.insert(name, bytes.len().to_string().into_bytes());
+            } else {
+                found.insert(name, bytes);
+            }
+        }
+    }
+    found
+}
+
+fn prepare(shim: &Shim, scenario: &Scenario) -> Prepared {
+    let before = folder();
+    let files = [("small", String::new()), ("stages", STAGES.into()), ("grid", GRID.into())];
+    for (name, more) in files {
+        fs::write(before.path().join(format!("{name}.toml")), format!("{SMALL}{more}")).unwrap();
+    }
+    scenario.before.iter().for_each(|words| good(before.path(), words, scenario.name));
+    let undisturbed = folder();
+    copy(before.path(), undisturbed.path());
+    let count = undisturbed.path().join("calls");
+    let counted = shim.disturb(program(undisturbed.path(), scenario.command), 0, Fault::Full, Some(&count));
+    let told = output(counted, scenario.name);
+    assert!(told.status.success(), "{}: {}", scenario.name, String::from_utf8_lossy(&told.stderr));
+    let calls = fs::read_to_string(&count).unwrap().trim().parse().unwrap();
+    assert!(calls > 20, "{}: {calls}", scenario.name);
+    Prepared { before, expected: outcome(&undisturbed.path().join("out")), calls }
+}
+
+/// Disturbs one call; what then is wrong, if anything is. A command that was refused gives its message.
+fn inject(shim: &Shim, case: &Case<'_>, prepared: &Prepared) -> Option<String> {
+    let Case { scenario, call, fault } = *case;
+    let context = format!("{}, call {call} of {}, {fault:?}", scenario.name, prepared.calls);
+    let place = folder();
+    copy(prepared.before.path(), place.path());
+    let disturbed = output(shim.disturb(program(place.path(), scenario.command), call, fault, None), &context);
+    let told = String::from_utf8_lossy(&disturbed.stderr).into_owned();
+    if disturbed.status.code() == Some(1) {
+        assert!(told.contains("error: "), "{context}: {told}");
+    } else {
+        let ends = disturbed.status.success() || fault == Fault::Killed && disturbed.status.code().is_none();
+        assert!(ends, "{context}: {:?}: {told}", disturbed.status);
+    }
+    let [mut resume, otherwise] = scenario.resume;
+    let begun = fs::read_dir(place.path().join("out")).is_ok_and(|mut entries| entries.next().is_some());
+    if !begun {
+        // Nothing was begun, so there is nothing to resume.
+        if scenario.name == "init" && disturbed.status.code().is_some() && !told.contains("run it again") {
+            return Some(format!("{context}: {told}"));
+        }
+        resume = scenario.command;
+    }
+    let resumed = output(program(place.path(), resume), &context);
+    let refused = String::from_utf8_lossy(&resumed.stderr).into_owned();
+    let mut refusal = None;
+    if !resumed.status.success() {
+        // What to do is a flag or a command.
+        if resumed.status.code() != Some(1)
+            || otherwise.is_empty()
+            || !refused.contains("--") && !refused.contains("resume with")
+        {
+            return Some(format!("{context}: {told}\nthen {resume}: {:?}: {refused}", resumed.status));
+        }
+        let again = output(program(place.path(), otherwise), &context);
+        refusal = Some(refused.clone());
+        if !again.status.success() {
+            return Some(format!("{context}: {told}\nthen {refused}\nthen {}", String::from_utf8_lossy(&again.stderr)));
+        }
+    }
+    let found = outcome(&place.path().join("out"));
+    let differ = |name: &&String| found.get(*name) != prepared.expected.get(*name);
+    let mut names: Vec<_> = found.keys().chain(prepared.expected.keys()).filter(differ).cloned().collect();
+    names.sort();
+    names.dedup();
+    (!names.is_empty()).then(|| format!("{context}: {told}\n{refusal:?}\ndiffers in {names:?}"))
+}
+
+#[test]
+fn no_failing_call_costs_anything() {
+    let long = std::env::var("FLOTILLA_LONG").is_ok_and(|long| long == "1");
+    let only = std::env::var("FLOTILLA_FAULTS").ok();
+    let shim = match Shim::compile() {
+        Ok(shim) => shim,
+        Err(reason) => {
+            // Straight to the stream: what a passing test prints by macro is not shown.
+            writeln!(std::io::stderr(), "\nno_failing_call_costs_anything: skipped: {reason}").unwrap();
+            return;
+        }
+    };
+    let chosen: Vec<&Scenario> =
+        SCENARIOS.iter().filter(|scenario| only.as_ref().is_none_or(|only| only.contains(scenario.name))).collect();
+    let prepared: Vec<Prepared> = chosen.iter().map(|scenario| prepare(&shim, scenario)).collect();
+    let mut cases = Vec::new();
+    for (scenario, prepared) in chosen.iter().zip(&prepared) {
+        let calls = prepared.calls;
+        if long {
+            let every = calls.div_ceil(scenario.long);
+            let all = (1..=calls).step_by(every).flat_map(|call| FAULTS.map(|fault| (call, fault)));
+            cases.extend(all.map(|(call, fault)| (Case { scenario, call, fault }, prepared)));
+        } else {
+            // The first calls decide what a run is known by.
+            let spread = (0..scenario.short).map(|at| 1 + at * calls / scenario.short);
+            let all = spread.enumerate().map(|(at, call)| (call, FAULTS[at % FAULTS.len()]));
+            cases.extend(all.map(|(call, fault)| (Case { scenario, call, fault }, prepared)));
+        }
+    }
+    let (next, wrong) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
+    std::thread::scope(|scope| {
+        for _ in 0..std::thread::available_parallelism().map_or(2, usize::from) {
+            scope.spawn(|| {
+                while let Some((case, prepared)) = cases.get(next.fetch_add(1, Relaxed)) {
+                    wrong.lock().unwrap().extend(inject(&shim, case, prepared));
+                }
+            });
+        }
+    });
+    let wrong = wrong.into_inner().unwrap();
+    let told = format!("{} of {} faults:\n{}", wrong.len(), cases.len(), wrong.join("\n\n"));
+    assert!(wrong.is_empty(), "{told}");
+    assert!(only.is_some() || cases.len() >= if long { 5000 } else { 300 }, "{}", cases.len());
+    println!("{} faults", cases.len());
+}
+
+/// The shim does what it says: without this, a test of faults that never happen would pass.
+#[test]
+fn the_shim_fails_the_call_that_it_was_told() {
+    let Ok(shim) = Shim::compile() else { return };
+    let place = folder();
+    let written = |call: usize, fault: Fault| -> (Option<i32>, bool) {
+        let target: PathBuf = place.path().join("x");
+        let _ = fs::remove_file(&target);
+        let mut command = Command::new("sh");
+        command.args(["-c", "echo one > x"]).current_dir(place.path()).stderr(Stdio::null());
+        let ended = shim.disturb(command, call, fault, None).status().unwrap();
+        (ended.code(), fs::read(&target).is_ok_and(|bytes| bytes == b"one\n"))
+    };
+    assert_eq!(written(0, Fault::Full), (Some(0), true));
+    let (code, whole) = written(1, Fault::Full);
+    assert!(code != Some(0) && !whole, "{code:?}");
+    assert_eq!(written(1, Fault::Killed), (None, false));
+    assert_eq!(written(1000, Fault::Broken), (Some(0), true));
+}
