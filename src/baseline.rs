@@ -1,8 +1,9 @@
-//! What a layout gives without any learning: a team that goes straight ahead, and the best of as many random teams as
-//! evolution evaluates.
+//! What a task gives without learning: the best constant speed, the best of many random constant actions, and the best
+//! of as many random networks as evolution evaluates.
 //!
-//! Both are played by a backend like any team, from the starts of the trial that they are held against. Random teams
-//! are drawn as generation 0 draws policies, by a purpose of their own, so that no result of a training changes.
+//! A backend plays them like any team: a constant action is a policy whose only weights are biases of its last layer.
+//! Random teams are drawn by purposes of their own, so that no result of a training changes. Generation `g` of trial
+//! `t` plays from the same starts as that generation of that trial in training.
 
 use std::cell::RefCell;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
@@ -11,50 +12,144 @@ use fearless_simd::Level;
 use glam::Vec2;
 
 use crate::backend::{Backend, BackendError, Episode, Group, RecordRequest};
-use crate::config::{Config, Fitness, Learning};
+use crate::config::{Actions, Config, Fitness, Learning};
 use crate::credit::Credit;
-use crate::evolve::{self, Key, Purpose};
+use crate::evaluate::Starts;
+use crate::evolve::{self, Key, MIN_WEIGHT, Purpose};
+use crate::model::policy::BEHAVIOURS;
 use crate::parallel::*;
 use crate::world::World;
 
-/// What came out for one config: G in 0..1, `[trials][generations + 1]`.
+/// The number of constant speeds that are tried: 1/20 of the largest, 2/20, …, all of it.
+pub const SPEEDS: usize = 20;
+/// Random teams of each kind that play the selection episodes, where starts or POIs move.
+const FINALISTS: usize = 20;
+/// Teams drawn at a time, which bounds the memory for their weights.
+const DRAWN_TOGETHER: usize = 4096;
+/// A bias of this size makes tanh 1 or -1 exactly.
+const SATURATING: f32 = 20.0;
+
+/// G of the baselines of one config, in 0..1, `[trials][generations + 1]`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Baseline {
-    /// A team whose weights are all zero: every leader goes straight ahead at half its highest speed.
+    /// A team whose weights are all zero: every leader drives straight ahead at half its largest speed.
     pub straight: Vec<Vec<f64>>,
-    /// The best of all random teams so far, as many in each generation as the population has.
+    /// The best constant (see [`constants`]) in each generation.
+    pub constant: Vec<Vec<f64>>,
+    /// The best random constant action so far, with as many drawn in each generation as the population has policies.
+    pub actions: Vec<Vec<f64>>,
+    /// The best random network so far, with as many drawn in each generation as the population has policies.
     pub random: Vec<Vec<f64>>,
 }
 
-/// Plays the baselines of any number of configs side by side, generation by generation: each in the world of the file's own
-/// keys, whatever its stages change.
+/// G of one trial's baselines, each chosen by the episodes that training plays. Where starts or POIs move, G is from
+/// held-out starts.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Outcome {
+    /// G of each constant.
+    pub constants: Vec<f64>,
+    /// The index of the constant that was chosen.
+    pub best_constant: usize,
+    /// G of the random constant action that was chosen.
+    pub action: f64,
+    /// G of the random network that was chosen.
+    pub network: f64,
+}
+
+/// Returns the outputs of the constants that a config's leaders are tried with, all leaders the same: straight ahead at
+/// each of [`SPEEDS`] speeds, or each behaviour.
+pub fn constants(actions: Actions) -> Vec<Vec<f64>> {
+    match actions {
+        Actions::Direct => (1..=SPEEDS).map(|speed| vec![0.0, 2.0 * speed as f64 / SPEEDS as f64 - 1.0]).collect(),
+        Actions::Behaviours => {
+            let chosen = |behaviour| (0..BEHAVIOURS).map(|other| if other == behaviour { 1.0 } else { -1.0 }).collect();
+            (0..BEHAVIOURS).map(chosen).collect()
+        }
+    }
+}
+
+/// Returns the index among [`constants`] of the policy whose weights are all zero: half speed, or the first behaviour.
+const fn zero_policy(actions: Actions) -> usize {
+    match actions {
+        Actions::Direct => SPEEDS / 2 - 1,
+        Actions::Behaviours => 0,
+    }
+}
+
+/// Writes a policy that gives these outputs, each in -1..1, whatever it senses.
+pub fn constant_policy(outputs: &[f64], policy: &mut [f32]) {
+    let biases = policy.len() - outputs.len();
+    policy.fill(0.0);
+    for (bias, &output) in policy[biases..].iter_mut().zip(outputs) {
+        let exact = libm::atanh(output.clamp(-1.0, 1.0)) as f32;
+        *bias = if exact.abs() < MIN_WEIGHT { 0.0 } else { exact.clamp(-SATURATING, SATURATING) };
+    }
+}
+
+/// Writes a random constant action: every output is uniform in -1..1.
+fn random_action(key: Key, outputs: usize, policy: &mut [f32]) {
+    let uniform = |output| f64::from(key.draw(output)[0]) / (1u64 << 31) as f64 - 1.0;
+    constant_policy(&(0..outputs as u32).map(uniform).collect::<Vec<_>>(), policy);
+}
+
+/// Plays the baselines of any number of configs side by side, generation by generation. Each plays in the world of the
+/// file's own keys, whatever its stages change.
 pub struct Baselines {
     places: Vec<Setting>,
     generation: usize,
+}
+
+/// A team of every leader's policy with the same index.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Team {
+    /// A constant, by its index.
+    Constant(usize),
+    /// A random constant action, by its generation and slot.
+    Action(usize, usize),
+    /// A random network, by its generation and slot.
+    Network(usize, usize),
 }
 
 /// One config and its trials.
 struct Setting {
     config: Config,
     world: World,
-    /// `[trials][populations][population + 1][parameters]`; the last policy is zero.
-    weights: Vec<Vec<f32>>,
-    /// `[trials][episodes][agents]`, with POIs if they move.
-    starts: Vec<Vec<Vec<Vec2>>>,
-    /// Team j is every leader's policy j, `[population + 1][leaders]`.
-    teams: Vec<u32>,
-    /// POIs observed in all episodes of the present generation, `[trials][population + 1]`.
-    observed: Vec<AtomicU32>,
+    constants: Vec<Vec<f64>>,
+    trials: Vec<Trial>,
     found: Baseline,
 }
 
+/// One trial's teams of the present generation, and what its earlier ones observed.
+struct Trial {
+    index: usize,
+    /// `[populations][teams][parameters]`
+    weights: Vec<f32>,
+    /// `[episodes][agents]`, with POIs if they move.
+    starts: Vec<Vec<Vec2>>,
+    /// POIs observed in all episodes of the present generation: by constants, by random actions, by random networks.
+    observed: Vec<AtomicU32>,
+    /// POIs that each constant observed in all generations.
+    constants: Vec<u64>,
+    /// The random actions and networks that observed most, best first.
+    finalists: [Vec<(u32, Team)>; 2],
+}
+
 impl Baselines {
-    /// Of valid configs; fitness, selection and mutation have no say.
+    /// Prepares the baselines of all trials of valid configs. Fitness, selection and mutation play no part.
     pub fn new(configs: Vec<Config>) -> Baselines {
-        Baselines { places: configs.into_iter().map(Setting::new).collect(), generation: 0 }
+        let all = |config: Config| {
+            let trials = 0..config.learning.trials;
+            Setting::new(config, trials)
+        };
+        Baselines { places: configs.into_iter().map(all).collect(), generation: 0 }
     }
 
-    /// The generation that plays next.
+    /// Prepares the baselines of one trial of a valid config; the trial may be beyond the config's number of them.
+    pub fn of_trial(config: Config, trial: usize) -> Baselines {
+        Baselines { places: vec![Setting::new(config, trial..trial + 1)], generation: 0 }
+    }
+
+    /// Returns the generation that plays next.
     pub fn generation(&self) -> usize {
         self.generation
     }
@@ -69,93 +164,259 @@ impl Baselines {
     /// # Errors
     /// When the backend fails; this generation can then be played again.
     pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<(), BackendError> {
-        thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
         let generation = self.generation;
         let mut playing: Vec<_> =
             self.places.iter_mut().filter(|place| generation <= place.config.learning.generations).collect();
-        playing.iter_mut().for_each(|place| place.prepare(generation));
-        let (mut groups, mut homes) = (Vec::new(), Vec::new());
-        for place in &playing {
-            let policies = place.config.learning.population + 1;
-            for (trial, (weights, starts)) in place.weights.iter().zip(&place.starts).enumerate() {
-                for starts in starts {
-                    let (world, weights, teams) = (&place.world, weights[..].into(), &*place.teams);
-                    groups.push(Group {
-                        world,
-                        starts,
-                        weights,
-                        policies,
-                        teams,
-                        need: RecordRequest::Score(Fitness::G),
+        playing.iter_mut().for_each(|place| place.start(generation));
+        let most = playing.iter().map(|place| place.teams()).max().unwrap_or(0);
+        for first in (0..most).step_by(DRAWN_TOGETHER) {
+            playing.iter_mut().for_each(|place| place.draw(generation, first));
+            let mut rounds = Vec::new();
+            for place in &playing {
+                let teams = place.teams().min(first + DRAWN_TOGETHER).saturating_sub(first);
+                for trial in place.trials.iter().filter(|_| teams > 0) {
+                    let observed = &trial.observed[first..first + teams];
+                    rounds.push(Round {
+                        world: &place.world,
+                        weights: &trial.weights,
+                        starts: &trial.starts,
+                        observed,
                     });
-                    homes.push((&**place, trial * policies));
                 }
             }
+            play(backend, &rounds)?;
         }
-        backend.rollout(&groups, &|episode: Episode<'_>| {
-            let (place, first) = homes[episode.group];
-            CREDIT.with_borrow_mut(|(credit, scores)| {
-                scores.resize(place.world.leaders(), 0.0);
-                let observed = credit.score(&episode, &place.world, Fitness::G, scores);
-                place.observed[first + episode.team].fetch_add(observed, Relaxed);
-            });
-        })?;
-        playing.iter_mut().for_each(|place| place.conclude());
+        playing.iter_mut().for_each(|place| place.conclude(generation));
         self.generation += 1;
         Ok(())
     }
 
-    /// What came out, by config.
+    /// Returns G by generation, for each config.
     pub fn found(self) -> Vec<Baseline> {
         self.places.into_iter().map(|place| place.found).collect()
     }
+
+    /// Chooses each baseline's team of every config and trial, `[configs][trials]`, after the last generation.
+    ///
+    /// Where starts or POIs move, the constants and the best random teams play so many more episodes whose starts are
+    /// drawn as in training. The best of each kind is chosen by these, and played from as many held-out starts, those
+    /// of `flotilla rollout`.
+    ///
+    /// # Errors
+    /// When the backend fails.
+    pub fn outcomes(&self, backend: &mut dyn Backend, episodes: u32) -> Result<Vec<Vec<Outcome>>, BackendError> {
+        let mut outcomes = Vec::new();
+        for place in &self.places {
+            let trials = place.trials.iter().map(|trial| place.outcome(trial, backend, episodes));
+            outcomes.push(trials.collect::<Result<_, _>>()?);
+        }
+        Ok(outcomes)
+    }
+}
+
+/// Teams to play from some starts, and where the POIs that they observe are added up.
+struct Round<'a> {
+    world: &'a World,
+    /// `[populations][teams][parameters]`
+    weights: &'a [f32],
+    starts: &'a [Vec<Vec2>],
+    /// `[teams]`
+    observed: &'a [AtomicU32],
+}
+
+/// Plays all teams from all of their starts, as one batch.
+fn play(backend: &mut dyn Backend, rounds: &[Round<'_>]) -> Result<(), BackendError> {
+    thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
+    let teams = |round: &Round<'_>| evolve::one_policy_a_team(round.observed.len(), round.world.leaders());
+    let teams: Vec<Vec<u32>> = rounds.iter().map(teams).collect();
+    let (mut groups, mut homes) = (Vec::new(), Vec::new());
+    for (round, teams) in rounds.iter().zip(&teams) {
+        for starts in round.starts {
+            let (weights, policies) = (round.weights.into(), round.observed.len());
+            groups.push(Group {
+                world: round.world,
+                starts,
+                weights,
+                policies,
+                teams,
+                need: RecordRequest::Score(Fitness::G),
+            });
+            homes.push(round);
+        }
+    }
+    backend.rollout(&groups, &|episode: Episode<'_>| {
+        let round = homes[episode.group];
+        CREDIT.with_borrow_mut(|(credit, scores)| {
+            scores.resize(round.world.leaders(), 0.0);
+            let observed = credit.score(&episode, round.world, Fitness::G, scores);
+            round.observed[episode.team].fetch_add(observed, Relaxed);
+        });
+    })
+}
+
+/// Returns POIs that each team observes from all of these starts.
+fn observed(
+    backend: &mut dyn Backend,
+    world: &World,
+    weights: &[f32],
+    teams: usize,
+    starts: &[Vec<Vec2>],
+) -> Result<Vec<u32>, BackendError> {
+    let observed: Vec<AtomicU32> = std::iter::repeat_with(AtomicU32::default).take(teams).collect();
+    play(backend, &[Round { world, weights, starts, observed: &observed }])?;
+    Ok(observed.into_iter().map(AtomicU32::into_inner).collect())
 }
 
 impl Setting {
-    fn new(config: Config) -> Setting {
+    fn new(config: Config, trials: std::ops::Range<usize>) -> Setting {
         let world = World::new(&config);
-        let Learning { trials, population, episodes_per_team, generations, .. } = config.learning;
-        let none = || vec![Vec::with_capacity(generations + 1); trials];
-        Setting {
-            weights: vec![vec![0.0; config.populations() * (population + 1) * world.parameters()]; trials],
-            starts: vec![vec![vec![]; episodes_per_team]; trials],
-            teams: (0..=population as u32).flat_map(|team| vec![team; world.leaders()]).collect(),
-            observed: std::iter::repeat_with(AtomicU32::default).take(trials * (population + 1)).collect(),
-            found: Baseline { straight: none(), random: none() },
-            config,
-            world,
+        let constants = constants(config.policy.actions);
+        let Learning { population, episodes_per_team, generations, .. } = config.learning;
+        let none = || vec![Vec::with_capacity(generations + 1); trials.len()];
+        let found = Baseline { straight: none(), constant: none(), actions: none(), random: none() };
+        let trial = |index| Trial {
+            index,
+            weights: vec![],
+            starts: vec![vec![]; episodes_per_team],
+            observed: std::iter::repeat_with(AtomicU32::default).take(constants.len() + 2 * population).collect(),
+            constants: vec![0; constants.len()],
+            finalists: [vec![], vec![]],
+        };
+        Setting { trials: trials.map(trial).collect(), found, constants, config, world }
+    }
+
+    /// The number of teams that play in one generation of a trial.
+    fn teams(&self) -> usize {
+        self.constants.len() + 2 * self.config.learning.population
+    }
+
+    /// The team of a place among those of a generation.
+    fn team(&self, generation: usize, place: usize) -> Team {
+        let (constants, population) = (self.constants.len(), self.config.learning.population);
+        match place.checked_sub(constants) {
+            None => Team::Constant(place),
+            Some(slot) if slot < population => Team::Action(generation, slot),
+            Some(slot) => Team::Network(generation, slot - population),
         }
     }
 
-    /// Draws a generation's policies and starts.
-    fn prepare(&mut self, generation: usize) {
-        let Setting { config, world, weights, starts, observed, .. } = self;
-        let Learning { seed, population, .. } = config.learning;
-        let (level, parameters) = (Level::new(), world.parameters());
-        weights.par_iter_mut().zip(starts).enumerate().for_each(|(trial, (weights, starts))| {
-            let key = Key::new(seed, trial, Purpose::Baseline);
-            let populations = weights.par_chunks_exact_mut((population + 1) * parameters).enumerate();
-            populations.for_each(|(leader, policies)| {
-                let drawn = policies.chunks_exact_mut(parameters).take(population).enumerate();
-                drawn.for_each(|(slot, policy)| evolve::random_policy(level, key.at(generation, leader, slot), policy));
-            });
-            for (episode, starts) in starts.iter_mut().enumerate() {
-                evolve::places(&config.learning, trial, generation, episode, world, starts);
+    /// Writes the policy of one population in a team.
+    fn write_policy(&self, level: Level, trial: usize, team: Team, population: usize, policy: &mut [f32]) {
+        let key = |purpose| Key::new(self.config.learning.seed, trial, purpose);
+        match team {
+            Team::Constant(index) => constant_policy(&self.constants[index], policy),
+            Team::Action(generation, slot) => {
+                let key = key(Purpose::ConstantActions).at(generation, population, slot);
+                random_action(key, self.config.policy.actions.outputs(), policy);
             }
+            Team::Network(generation, slot) => {
+                evolve::random_policy(level, key(Purpose::Baseline).at(generation, population, slot), policy);
+            }
+        }
+    }
+
+    /// Writes teams' policies, `[populations][teams][parameters]`.
+    fn write_policies(&self, trial: usize, teams: &[Team], weights: &mut Vec<f32>) {
+        let (level, parameters) = (Level::new(), self.world.parameters());
+        weights.clear();
+        weights.resize(self.config.populations() * teams.len() * parameters, 0.0);
+        weights.par_chunks_exact_mut(parameters).enumerate().for_each(|(place, policy)| {
+            self.write_policy(level, trial, teams[place % teams.len()], place / teams.len(), policy);
         });
-        observed.iter().for_each(|observed| observed.store(0, Relaxed));
+    }
+
+    /// Draws a generation's starts.
+    fn start(&mut self, generation: usize) {
+        for Trial { index, starts, observed, .. } in &mut self.trials {
+            for (episode, starts) in starts.iter_mut().enumerate() {
+                evolve::places(&self.config.learning, *index, generation, episode, &self.world, starts);
+            }
+            observed.iter().for_each(|observed| observed.store(0, Relaxed));
+        }
+    }
+
+    /// Draws some of a generation's teams.
+    fn draw(&mut self, generation: usize, first: usize) {
+        let last = self.teams().min(first + DRAWN_TOGETHER);
+        let teams: Vec<Team> = (first..last).map(|place| self.team(generation, place)).collect();
+        if teams.is_empty() {
+            return;
+        }
+        let mut trials = std::mem::take(&mut self.trials);
+        trials.iter_mut().for_each(|trial| self.write_policies(trial.index, &teams, &mut trial.weights));
+        self.trials = trials;
     }
 
     /// Takes in what the generation's teams observed.
-    fn conclude(&mut self) {
+    fn conclude(&mut self, generation: usize) {
         let Learning { population, episodes_per_team, .. } = self.config.learning;
         let whole = (self.world.pois.len() * episodes_per_team) as f64;
-        let Baseline { straight, random } = &mut self.found;
-        let trials = self.observed.chunks_exact(population + 1);
-        for ((straight, random), observed) in straight.iter_mut().zip(random).zip(trials) {
-            let g = |team: &AtomicU32| f64::from(team.load(Relaxed)) / whole;
-            straight.push(g(&observed[population]));
-            random.push(observed[..population].iter().map(g).chain(random.last().copied()).fold(0.0, f64::max));
+        let zero = zero_policy(self.config.policy.actions);
+        for (place, trial) in self.trials.iter_mut().enumerate() {
+            let observed: Vec<u32> = trial.observed.iter().map(|observed| observed.load(Relaxed)).collect();
+            let (constants, random) = observed.split_at(self.constants.len());
+            trial.constants.iter_mut().zip(constants).for_each(|(sum, &observed)| *sum += u64::from(observed));
+            let most = constants.iter().copied().max().unwrap_or(0);
+            self.found.constant[place].push(f64::from(most) / whole);
+            self.found.straight[place].push(f64::from(constants[zero]) / whole);
+            let (actions, networks) = random.split_at(population);
+            let kinds: [(_, _, fn(usize, usize) -> Team); 2] = [
+                (actions, &mut self.found.actions[place], Team::Action),
+                (networks, &mut self.found.random[place], Team::Network),
+            ];
+            for ((observed, best, team), finalists) in kinds.into_iter().zip(&mut trial.finalists) {
+                for (slot, &observed) in observed.iter().enumerate() {
+                    // Ties go to the team that was drawn first.
+                    let rank = finalists.partition_point(|(other, _)| *other >= observed);
+                    if rank < FINALISTS {
+                        finalists.insert(rank, (observed, team(generation, slot)));
+                        finalists.truncate(FINALISTS);
+                    }
+                }
+                best.push(f64::from(finalists[0].0) / whole);
+            }
         }
     }
+
+    fn outcome(&self, trial: &Trial, backend: &mut dyn Backend, episodes: u32) -> Result<Outcome, BackendError> {
+        let Learning { generations, episodes_per_team, start_jitter, poi_jitter, .. } = self.config.learning;
+        let all: Vec<Team> = (0..self.constants.len()).map(Team::Constant).collect();
+        if start_jitter == 0.0 && poi_jitter == 0.0 {
+            let whole = (self.world.pois.len() * episodes_per_team) as f64;
+            let [action, network] = [0, 1].map(|kind| f64::from(trial.finalists[kind][0].0) / whole);
+            let generations = (generations + 1) as f64;
+            let constants = trial.constants.iter().map(|&sum| sum as f64 / (whole * generations)).collect();
+            return Ok(Outcome { best_constant: first_largest(&trial.constants), constants, action, network });
+        }
+        let kinds = [&trial.finalists[0], &trial.finalists[1]].map(|of| of.iter().map(|&(_, team)| team));
+        let [actions, networks] = kinds.map(|teams| teams.collect::<Vec<_>>());
+        let mut starts = vec![vec![]; episodes as usize];
+        for (episode, starts) in starts.iter_mut().enumerate() {
+            // No training plays this generation's starts.
+            evolve::places(&self.config.learning, trial.index, generations + 2, episode, &self.world, starts);
+        }
+        let candidates = [&all[..], &actions, &networks].concat();
+        let mut weights = Vec::new();
+        self.write_policies(trial.index, &candidates, &mut weights);
+        let chosen = observed(backend, &self.world, &weights, candidates.len(), &starts)?;
+        let (of_constants, rest) = chosen.split_at(all.len());
+        let (of_actions, of_networks) = rest.split_at(actions.len());
+        let [action, network] =
+            [(&actions, of_actions), (&networks, of_networks)].map(|(teams, observed)| teams[first_largest(observed)]);
+
+        let held_out = Starts::Drawn { episodes, seed: 0, jitter: start_jitter, poi_jitter };
+        let starts: Vec<Vec<Vec2>> = (0..episodes as usize).map(|episode| held_out.of(episode, &self.world)).collect();
+        let teams = [&all[..], &[action, network]].concat();
+        self.write_policies(trial.index, &teams, &mut weights);
+        let found = observed(backend, &self.world, &weights, teams.len(), &starts)?;
+        let whole = (self.world.pois.len() * starts.len()) as f64;
+        let mut g: Vec<f64> = found.into_iter().map(|observed| f64::from(observed) / whole).collect();
+        let random = g.split_off(all.len());
+        Ok(Outcome { best_constant: first_largest(of_constants), constants: g, action: random[0], network: random[1] })
+    }
+}
+
+/// Returns the index of the largest value, of equal ones the first.
+fn first_largest<T: Ord>(values: &[T]) -> usize {
+    (1..values.len()).fold(0, |best, index| if values[index] > values[best] { index } else { best })
 }

@@ -82,8 +82,8 @@
 //! | [`trainer`] | | the generation loop |
 //! | [`verify`] | | whether two backends agree bit for bit |
 //! | [`statistics`] | | intervals and tests |
-//! | [`baseline`] | | baselines without learning |
 //! | [`evaluate`] | | trained teams from held-out starts |
+//! | [`baseline`] | | baselines without learning |
 //! | [`stepping`] | | teams stepped with given actions |
 //! | [`memory`] | | a run's peak memory |
 //! | [`record`] | `record` | files: policies, metrics, checkpoints, folders |

@@ -7,9 +7,10 @@ use std::sync::Mutex;
 use fearless_simd::Level;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Backend, Group, RecordRequest};
-use flotilla::baseline::{Baseline, Baselines};
+use flotilla::baseline::{self, Baseline, Baselines};
 use flotilla::config::{Fitness, Override, Paradigm};
 use flotilla::credit::Credit;
+use flotilla::evaluate::{self, Starts};
 use flotilla::evolve::{self, Key, Purpose};
 use flotilla::report::paper::claims::{Claim, Verdict, claims};
 use flotilla::report::paper::{self, Evidence, Experiment, LAYOUTS, SOURCES, Source, tables};
@@ -142,53 +143,118 @@ fn values_that_are_all_alike_leave_room_for_what_was_not_seen() {
     assert_eq!((statistics::share(0, 0), statistics::share(2, 1)), (None, None));
 }
 
-#[test]
-fn straight_ahead_solves_what_the_tables_say_and_random_teams_are_played() {
-    let arms = arms(2, 2);
-    let configs = paper::grounds(&arms);
-    let mut baselines = Baselines::new(configs.clone());
+/// Plays the baselines of some configs to the end.
+fn played(mut baselines: Baselines) -> Baselines {
     while !baselines.is_done() {
         baselines.advance(&mut Cpu::default()).unwrap();
     }
-    let found = baselines.found();
-    // All-leaders, then leader-follower, of each layout.
+    baselines
+}
+
+#[test]
+fn random_baselines_are_the_best_of_the_teams_that_a_backend_plays() {
+    let arms = arms(2, 2);
+    let configs = paper::grounds(&arms);
+    let found = played(Baselines::new(configs.clone())).found();
+    // At half speed, in all-leaders, then leader-follower, of each layout.
     let straight: Vec<f64> = found.iter().map(|found| found.straight[1][2]).collect();
     assert_eq!(straight, [0.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0]);
     assert!(found.iter().any(|found| found.random[0] != found.random[1]), "trials draw the same");
     for (config, found) in configs.iter().zip(&found) {
         let world = World::new(config);
         let (population, parameters) = (config.learning.population, world.parameters());
-        let mut best = 0.0f64;
-        for generation in 0..=2 {
-            let mut weights = Vec::new();
-            for leader in 0..world.leaders() {
-                for slot in 0..population {
-                    let mut policy = vec![0.0; parameters];
-                    let key = Key::new(3, 1, Purpose::Baseline).at(generation, leader, slot);
-                    evolve::random_policy(Level::new(), key, &mut policy);
-                    weights.extend(policy);
+        for purpose in [Purpose::Baseline, Purpose::ConstantActions] {
+            let mut best = 0.0f64;
+            for generation in 0..=2 {
+                let mut weights = Vec::new();
+                for leader in 0..world.leaders() {
+                    for slot in 0..population {
+                        let mut policy = vec![0.0; parameters];
+                        let key = Key::new(3, 1, purpose).at(generation, leader, slot);
+                        match purpose {
+                            Purpose::Baseline => evolve::random_policy(Level::new(), key, &mut policy),
+                            _ => {
+                                let uniform = |of: u32| f64::from(key.draw(of)[0]) / (1u64 << 31) as f64 - 1.0;
+                                baseline::constant_policy(&[uniform(0), uniform(1)], &mut policy);
+                            }
+                        }
+                        weights.extend(policy);
+                    }
                 }
+                let observed = observed(&world, &weights, population);
+                best = best.max(f64::from(observed.into_iter().max().unwrap()) / world.pois.len() as f64);
+                let found = if purpose == Purpose::Baseline { &found.random } else { &found.actions };
+                assert_eq!(found[1][generation], best, "{purpose:?}, generation {generation}");
             }
-            let teams: Vec<u32> = (0..population as u32).flat_map(|team| vec![team; world.leaders()]).collect();
-            let most = Mutex::new(0);
-            let group = Group {
-                world: &world,
-                starts: &world.starts,
-                weights: weights[..].into(),
-                policies: population,
-                teams: &teams,
-                need: RecordRequest::Scores,
-            };
-            let visit = |episode: flotilla::backend::Episode<'_>| {
-                let observed = Credit::default().all(&episode, &world).observed;
-                let mut most = most.lock().unwrap();
-                *most = observed.max(*most);
-            };
-            Cpu::default().rollout(&[group], &visit).unwrap();
-            best = best.max(f64::from(*most.lock().unwrap()) / world.pois.len() as f64);
-            assert_eq!(found.random[1][generation], best, "generation {generation}");
         }
     }
+}
+
+/// POIs that each team observes from the world's own starts; team j is every leader's policy j.
+fn observed(world: &World, weights: &[f32], policies: usize) -> Vec<u32> {
+    let teams = evolve::one_policy_a_team(policies, world.leaders());
+    let found = Mutex::new(vec![0; policies]);
+    let (weights, starts) = (weights.into(), &world.starts);
+    let group = Group { world, starts, weights, policies, teams: &teams, need: RecordRequest::Scores };
+    let visit = |episode: flotilla::backend::Episode<'_>| {
+        found.lock().unwrap()[episode.team] = Credit::default().all(&episode, world).observed;
+    };
+    Cpu::default().rollout(&[group], &visit).unwrap();
+    found.into_inner().unwrap()
+}
+
+/// The same actions, given step by step, reach the same POIs.
+#[test]
+fn constant_speeds_are_those_of_a_stepped_team_and_solve_every_layout() {
+    for (place, config) in paper::grounds(&arms(1, 0)).into_iter().enumerate() {
+        let found = played(Baselines::of_trial(config.clone(), 0));
+        let outcome = found.outcomes(&mut Cpu::default(), 1).unwrap().concat().remove(0);
+        let teams = baseline::SPEEDS;
+        let mut stepper = flotilla::stepper(&config, teams, false).unwrap();
+        let speed = |team: usize| (2 * (team + 1)) as f32 / teams as f32 - 1.0;
+        let actions: Vec<f32> =
+            (0..teams).flat_map(|team| (0..config.learners()).flat_map(move |_| [0.0, speed(team)])).collect();
+        (0..config.world.steps).for_each(|_| stepper.step(&actions).unwrap());
+        let pois = config.world.pois.len();
+        let g = |pois: &[bool]| pois.iter().filter(|&&observed| observed).count() as f64 / pois.len() as f64;
+        let stepped: Vec<f64> = stepper.observed().chunks(pois).map(g).collect();
+        let name = format!("{}, {pois} POIs, {} steps", config.learning.paradigm, config.world.steps);
+        assert_eq!(outcome.constants, stepped, "{name}");
+        // From 60 to 95 % of the largest speed, in every layout of the paper and both paradigms.
+        let solves = outcome.constants[11..19].iter().all(|&g| g == 1.0);
+        assert!(solves || place >= 6, "{name}: {:?}", outcome.constants);
+        assert_eq!(outcome.constants[outcome.best_constant], 1.0, "{name}");
+    }
+}
+
+#[test]
+fn where_pois_move_baselines_are_measured_from_held_out_starts() {
+    let mut config = paper::grounds(&arms(2, 3))[1].clone();
+    (config.learning.poi_jitter, config.learning.population, config.learning.episodes_per_team) = (5.0, 6, 2);
+    let baselines = played(Baselines::of_trial(config.clone(), 5));
+    let outcome = baselines.outcomes(&mut Cpu::default(), 30).unwrap().concat().remove(0);
+    let world = World::new(&config);
+    let constants = baseline::constants(config.policy.actions);
+    let policies = constants.len();
+    let mut weights = vec![0.0; world.leaders() * policies * world.parameters()];
+    for (place, policy) in weights.chunks_mut(world.parameters()).enumerate() {
+        baseline::constant_policy(&constants[place % policies], policy);
+    }
+    let teams = evolve::one_policy_a_team(policies, world.leaders());
+    let (weights, starts) = (weights[..].into(), &world.starts);
+    let group = Group { world: &world, starts, weights, policies, teams: &teams, need: RecordRequest::Scores };
+    let held_out = Starts::Drawn { episodes: 30, seed: 0, jitter: 0.0, poi_jitter: 5.0 };
+    let played = evaluate::evaluate(&mut Cpu::default(), &group, &held_out, &|_| ()).unwrap();
+    let g: Vec<f64> = played.observed.iter().map(|tally| tally.mean() / world.pois.len() as f64).collect();
+    for (found, g) in outcome.constants.iter().zip(&g) {
+        assert!((found - g).abs() < 1e-12, "{:?} is not {g:?}", outcome.constants);
+    }
+    assert!(g.iter().any(|&other| other != g[0]) && outcome.network > 0.0 && outcome.action > 0.0, "{outcome:?}");
+    // Another trial draws other teams.
+    let other =
+        self::played(Baselines::of_trial(config, 6)).outcomes(&mut Cpu::default(), 30).unwrap().concat().remove(0);
+    assert_eq!(other.constants, outcome.constants);
+    assert_ne!((other.network, other.action), (outcome.network, outcome.action));
 }
 
 /// Claims of arms whose best teams come to a share of the POIs, by layout, paradigm, fitness, trial and generation.
@@ -199,7 +265,8 @@ fn judged(trials: u32, generations: u32, g: impl Fn(&Experiment, usize, usize) -
         arm.best = (0..trials as usize).map(course).collect();
     }
     let none = vec![vec![0.0; generations as usize + 1]; trials as usize];
-    let baselines = vec![Baseline { straight: none.clone(), random: none }; 8];
+    let baselines =
+        vec![Baseline { straight: none.clone(), constant: none.clone(), actions: none.clone(), random: none }; 8];
     claims(Evidence { arms: &arms, baselines: &baselines })
 }
 

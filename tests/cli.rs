@@ -395,6 +395,7 @@ fn wrong_usage_is_exit_code_2() {
         ("rollout x.toml --policies p --episodes 0", "a whole number from 1 to 1000000"),
         ("rollout x.toml --policies p --episodes 2 --start-jitter far", "a number"),
         ("rollout x.toml --policies p --episodes 2 --poi-jitter far", "a number"),
+        ("baseline x.toml --seeds 0", "a whole number from 1 to 4096"),
         ("train x.toml --trials far", "a number"),
     ] {
         let output = flotilla(&line.split(' ').collect::<Vec<_>>());

@@ -17,7 +17,7 @@ use flotilla::world::{GRID, World};
 use glam::Vec2;
 use proptest::prelude::*;
 
-const PURPOSES: [Purpose; 9] = [
+const PURPOSES: [Purpose; 10] = [
     Purpose::Weights,
     Purpose::Teams,
     Purpose::Starts,
@@ -27,6 +27,7 @@ const PURPOSES: [Purpose; 9] = [
     Purpose::HeldOut,
     Purpose::Pois,
     Purpose::HeldOutPois,
+    Purpose::ConstantActions,
 ];
 const GENERALLY_FORWARD: &str = "generally_forward";
 const STRICTLY_FORWARD: &str = "strictly_forward";

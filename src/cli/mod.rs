@@ -27,6 +27,7 @@ use crate::run::RunError;
 use crate::sweep::questions::Unanswered;
 
 mod backend;
+mod baseline;
 mod bench;
 mod check;
 mod compare;
@@ -74,6 +75,8 @@ commands! {
     Check(check),
     /// Train the teams of a config, and save what they learned.
     Train(train),
+    /// Play what needs no learning: constant actions and random teams.
+    Baseline(baseline),
     /// Play teams of given policies without training, and score every leader.
     Rollout(rollout),
     /// Train all of the paper's experiments, draw its figures and check its claims.

@@ -26,6 +26,8 @@ pub enum Purpose {
     Pois = 8,
     /// Held-out POI positions, for evaluation.
     HeldOutPois = 9,
+    /// Random constant actions that evolution is compared with.
+    ConstantActions = 10,
 }
 
 /// A key of the counter-based random number generator. [`Key::draw`] returns the words of a counter.

@@ -1,0 +1,215 @@
+//! `flotilla baseline`: what a task gives without learning.
+
+use serde_json::json;
+
+use super::{ConfigFile, Error, Overrides, RunOptions, backend, between, number, print, say};
+use crate::backend::Machine;
+use crate::baseline::{self, Baselines, Outcome, SPEEDS};
+use crate::config::{Actions, Choice, Config, Paradigm};
+use crate::evaluate::MAX_EPISODES;
+use crate::report::progress::Meter;
+use crate::report::table::markdown;
+use crate::statistics;
+use clap::builder::PossibleValuesParser as Words;
+
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(flatten)]
+    config: ConfigFile,
+    /// Independent repetitions of the random baselines
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = between(1..=4096u32))]
+    seeds: u32,
+    /// Held-out episodes per team, and as many to choose the team by, where starts or POIs move
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = between(1..=MAX_EPISODES))]
+    episodes: u32,
+    /// Generations after the random start; they set how many random teams are drawn [default: the config's]
+    #[arg(long, value_name = "N", value_parser = number)]
+    generations: Option<toml::Value>,
+    /// Policies per population; they set how many random teams are drawn [default: the config's]
+    #[arg(long, value_name = "N", value_parser = number)]
+    population: Option<toml::Value>,
+    /// Who learns [default: the config's]
+    #[arg(long, value_name = "NAME", value_parser = Words::new(Paradigm::names()))]
+    paradigm: Option<String>,
+    /// Print one JSON object (docs/reference/json.md)
+    #[arg(long)]
+    json: bool,
+    /// No progress on standard error
+    #[arg(long, short)]
+    quiet: bool,
+    #[command(flatten)]
+    run: RunOptions,
+}
+
+/// Plays the baselines of a config, one repetition after the other.
+pub fn run(args: Args) -> Result<(), Error> {
+    let Args { generations, population, paradigm, .. } = &args;
+    let [generations, population] = [generations, population].map(Clone::clone);
+    let overrides = Overrides { generations, population, paradigm: paradigm.clone(), ..Overrides::default() };
+    let config = args.config.load(&overrides.list())?;
+    let (mut backend, machine) = backend::open(&args.run)?;
+    if !args.quiet {
+        say(format_args!("playing on {}", backend.describe()));
+    }
+    let generations = config.learning.generations + 1;
+    let mut meter = Meter::new(args.quiet);
+    let mut outcomes = Vec::new();
+    for seed in 0..args.seeds as usize {
+        let mut baselines = Baselines::of_trial(config.clone(), seed);
+        while !baselines.is_done() {
+            baselines.advance(&mut *backend)?;
+            let done = seed * generations + baselines.generation();
+            let part = done as f64 / (args.seeds as usize * generations) as f64;
+            meter.show(part, || format!("playing random teams of seed {seed}"));
+        }
+        outcomes.extend(baselines.outcomes(&mut *backend, args.episodes)?.concat());
+    }
+    meter.clear();
+    let found = Found { config: &config, episodes: args.episodes, outcomes };
+    print(&if args.json { found.in_json(&machine) } else { found.in_words() })
+}
+
+/// The outcomes of all seeds.
+struct Found<'a> {
+    config: &'a Config,
+    episodes: u32,
+    outcomes: Vec<Outcome>,
+}
+
+impl Found<'_> {
+    /// The number of random teams of each kind per seed.
+    fn teams(&self) -> usize {
+        self.config.learning.population * (self.config.learning.generations + 1)
+    }
+
+    fn pois(&self) -> usize {
+        self.config.world.pois.len()
+    }
+
+    /// Whether starts or POIs move, so that teams are chosen by some episodes and measured by others.
+    fn moves(&self) -> bool {
+        self.config.learning.start_jitter > 0.0 || self.config.learning.poi_jitter > 0.0
+    }
+
+    /// POIs observed, by seed.
+    fn observed(&self, g: impl Fn(&Outcome) -> f64) -> Vec<f64> {
+        self.outcomes.iter().map(|outcome| g(outcome) * self.pois() as f64).collect()
+    }
+
+    /// Each baseline's name and the POIs that it observes, by seed.
+    fn baselines(&self) -> [(&'static str, String, Vec<f64>); 3] {
+        let constant = match self.config.policy.actions {
+            Actions::Direct => format!("best of {SPEEDS} constant speeds, straight ahead"),
+            Actions::Behaviours => "best constant behaviour".into(),
+        };
+        let teams = self.teams();
+        [
+            ("constant", constant, self.observed(|outcome| outcome.constants[outcome.best_constant])),
+            ("action", format!("best of {teams} random constant actions"), self.observed(|outcome| outcome.action)),
+            ("network", format!("best of {teams} random networks"), self.observed(|outcome| outcome.network)),
+        ]
+    }
+
+    /// The 95 % interval of a mean over seeds. A constant has none where nothing moves, because all seeds are the same.
+    fn interval(&self, key: &str, observed: &[f64]) -> Option<[f64; 2]> {
+        let mean = statistics::mean(observed, 1.0).filter(|_| key != "constant" || self.moves())?;
+        let mean = mean.within(0.0, self.pois() as f64);
+        Some([mean.low, mean.high])
+    }
+
+    /// The POIs that each constant observes: the mean over seeds.
+    fn constants(&self) -> Vec<f64> {
+        let seeds = self.outcomes.len() as f64;
+        let mean = |index| self.observed(|outcome| outcome.constants[index]).iter().sum::<f64>() / seeds;
+        (0..baseline::constants(self.config.policy.actions).len()).map(mean).collect()
+    }
+
+    fn in_words(&self) -> String {
+        let (pois, seeds, teams) = (self.pois(), self.outcomes.len(), self.teams());
+        let head = [&format!("POIs observed, of {pois}"), "mean [95 % interval]", "lowest", "highest"];
+        let mut rows = vec![head.map(|head| head.to_string()).to_vec()];
+        for (key, name, observed) in self.baselines() {
+            let mean = observed.iter().sum::<f64>() / seeds as f64;
+            let interval = self.interval(key, &observed);
+            let interval = interval.map_or(String::new(), |[low, high]| format!(" [{low:.2}, {high:.2}]"));
+            let (low, high) = observed.iter().fold((f64::MAX, f64::MIN), |(l, h), &o| (l.min(o), h.max(o)));
+            rows.push(vec![name, format!("{mean:.2}{interval}"), format!("{low:.2}"), format!("{high:.2}")]);
+        }
+        let solved = self.constants().iter().map(|&observed| observed >= pois as f64).collect::<Vec<_>>();
+        let played = match self.moves() {
+            true => format!("Each team was chosen by {0} episodes and plays {0} held-out episodes.", self.episodes),
+            false => "Every team plays from the config's starts.".into(),
+        };
+        format!(
+            "{}, {} seeds. N = {teams} random teams per seed, as many as one trial of training evaluates. {played}\n\n\
+             {}\n{}\n",
+            self.config.learning.paradigm,
+            seeds,
+            markdown(&rows),
+            self.solved(&solved)
+        )
+    }
+
+    /// Says which constants observe every POI.
+    fn solved(&self, solved: &[bool]) -> String {
+        let unit = |index: usize| match self.config.policy.actions {
+            Actions::Direct => format!("{} %", (index + 1) * 100 / SPEEDS),
+            Actions::Behaviours => format!("{index}"),
+        };
+        let mut ranges: Vec<String> = vec![];
+        let mut from = None;
+        for (index, &all) in solved.iter().chain([&false]).enumerate() {
+            match (all, from) {
+                (true, None) => from = Some(index),
+                (false, Some(first)) => {
+                    let last = index - 1;
+                    ranges.push(if first == last { unit(first) } else { format!("{} to {}", unit(first), unit(last)) });
+                    from = None;
+                }
+                _ => {}
+            }
+        }
+        let what = match self.config.policy.actions {
+            Actions::Direct => "constant speed (shares of motion.max_speed)",
+            Actions::Behaviours => "constant behaviour (by number)",
+        };
+        match ranges.is_empty() {
+            true => format!("No {what} observes every POI."),
+            false => format!("Observe every POI by a {what}: {}.", ranges.join(", ")),
+        }
+    }
+
+    fn in_json(&self, machine: &Machine) -> String {
+        let actions = self.config.policy.actions;
+        let name = match actions {
+            Actions::Direct => "speed",
+            Actions::Behaviours => "behaviour",
+        };
+        let value = |index: usize| match actions {
+            Actions::Direct => json!((index + 1) as f64 / SPEEDS as f64),
+            Actions::Behaviours => json!(index),
+        };
+        let constants = self.constants().into_iter().enumerate();
+        let constants: Vec<_> = constants.map(|(index, pois)| json!({ name: value(index), "pois": pois })).collect();
+        let chosen: Vec<_> = self.outcomes.iter().map(|outcome| value(outcome.best_constant)).collect();
+        let baselines = self.baselines().map(|(key, _, observed)| {
+            let mean = observed.iter().sum::<f64>() / observed.len() as f64;
+            (key, json!({ "mean": mean, "interval_95": self.interval(key, &observed), "seeds": observed }))
+        });
+        let mut object = json!({
+            "paradigm": self.config.learning.paradigm,
+            "pois": self.pois(),
+            "teams": self.teams(),
+            "seeds": self.outcomes.len(),
+            "episodes": if self.moves() { self.episodes } else { 1 },
+            "backend": machine.backend,
+            "adapter": machine.adapter,
+            "constants": constants,
+            "chosen": chosen,
+        });
+        for (key, found) in baselines {
+            object[key] = found;
+        }
+        format!("{object}\n")
+    }
+}
