@@ -2,10 +2,10 @@
 
 use serde_json::json;
 
-use super::{ConfigFile, Error, Overrides, RunOptions, backend, between, number, print, say};
+use super::{ConfigFile, Error, RunOptions, backend, between, number, print, say};
 use crate::backend::Machine;
 use crate::baseline::{self, Baselines, Outcome, SPEEDS};
-use crate::config::{Actions, Choice, Config, Paradigm};
+use crate::config::{Actions, Choice, Config, Override, Paradigm};
 use crate::evaluate::MAX_EPISODES;
 use crate::report::progress::Meter;
 use crate::report::table::markdown;
@@ -43,10 +43,15 @@ pub struct Args {
 
 /// Plays the baselines of a config, one repetition after the other.
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { generations, population, paradigm, .. } = &args;
-    let [generations, population] = [generations, population].map(Clone::clone);
-    let overrides = Overrides { generations, population, paradigm: paradigm.clone(), ..Overrides::default() };
-    let config = args.config.load(&overrides.list())?;
+    let set = |key: &str, value: Option<toml::Value>| {
+        Some(Override::new(format!("learning.{key}"), value?, format!("--{key}")))
+    };
+    let overrides = [
+        set("generations", args.generations.clone()),
+        set("population", args.population.clone()),
+        set("paradigm", args.paradigm.clone().map(toml::Value::from)),
+    ];
+    let config = args.config.load(&overrides.into_iter().flatten().collect::<Vec<_>>())?;
     let (mut backend, machine) = backend::open(&args.run)?;
     if !args.quiet {
         say(format_args!("playing on {}", backend.describe()));
