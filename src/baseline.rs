@@ -110,6 +110,9 @@ enum Team {
     Network(usize, usize),
 }
 
+/// Makes a random team from its generation and slot.
+type MakeTeam = fn(usize, usize) -> Team;
+
 /// One config and its trials.
 struct Setting {
     config: Config,
@@ -360,8 +363,8 @@ impl Setting {
             self.found.constant[place].push(f64::from(most) / whole);
             self.found.straight[place].push(f64::from(constants[zero]) / whole);
             let (actions, networks) = random.split_at(population);
-            let kinds: [(_, _, fn(usize, usize) -> Team); 2] = [
-                (actions, &mut self.found.actions[place], Team::Action),
+            let kinds = [
+                (actions, &mut self.found.actions[place], Team::Action as MakeTeam),
                 (networks, &mut self.found.random[place], Team::Network),
             ];
             for ((observed, best, team), finalists) in kinds.into_iter().zip(&mut trial.finalists) {

@@ -86,7 +86,7 @@ pub fn record(error: &RecordError, again: &str) -> String {
             "; go on with it by --resume, write over it by --force, or choose another --out".into()
         }
         RecordError::NotOurs { .. } => "; move it away, or choose another --out".into(),
-        RecordError::OfAnotherUser { .. } => "; name what to write with --out".into(),
+        RecordError::OfAnotherUser { .. } => "; to write there all the same, name it with --out".into(),
         RecordError::NoFolder { .. } => "; choose a folder by --out".into(),
         RecordError::Shorter { there, .. } => {
             format!("; resume with --generations {there} or more, or choose another --out")

@@ -85,7 +85,7 @@ pub enum RecordError {
         path: PathBuf,
     },
     /// A folder of another user, to which the user did not ask to write.
-    #[error("{path} belongs to another user, so nothing is written there unless --out names it", path = path.escaped())]
+    #[error("{path} belongs to another user, so nothing is written there", path = path.escaped())]
     OfAnotherUser {
         /// The folder.
         path: PathBuf,
