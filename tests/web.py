@@ -120,6 +120,104 @@ def base64(content):
     return base64.b64encode(content).decode()
 
 
+def visitors(tab, page):
+    """What visitors with a link, a phone, a keyboard or reduced motion ran into."""
+    trouble = "document.querySelector('#trouble').textContent"
+    # Links that are cut or mistyped say so, and the address stays as it was.
+    tab.load(page, layout="chaotic", seed=3)
+    tab.evaluate("page.state.text += '\\n# mine\\n'; configs.pack(page.state.text).then(word => { window.word = word; }); 0")
+    tab.wait("window.word")
+    word = tab.evaluate("window.word")
+    for words in [{"config": word[: len(word) // 2]}, {"layout": "generally_f"}, {"layout": "chaotic", "learners": "lead"}]:
+        tab.load(page, **words)
+        key, value = list(words.items())[-1]
+        assert "This link is damaged" in tab.evaluate(trouble) and key in tab.evaluate(trouble), tab.evaluate(trouble)
+        assert tab.evaluate("location.hash").endswith(value), tab.evaluate("location.hash")
+    # A link is not copied while the config has problems.
+    tab.load(page, layout="chaotic")
+    address = tab.evaluate("location.href")
+    tab.set("#text", "[world]\nsteps = 0\n")
+    tab.wait("!page.state.valid")
+    tab.click("#share")
+    tab.wait("document.querySelector('#said').textContent.startsWith('No link was copied')")
+    assert tab.evaluate("location.href") == address
+    # An emptied field gets back what would be trained.
+    tab.load(page, layout="chaotic", seed=12)
+    tab.set("#seed", "")
+    assert tab.evaluate("document.querySelector('#seed').value") == "12"
+    # A rearranged map is not lost when another layout is looked at.
+    tab.click("[data-mode=arrange]")
+    tab.click("[data-add=pois]")
+    tab.wait("document.querySelector('#layout').value === 'own'")
+    text = tab.evaluate("page.state.text")
+    tab.set("#layout", "strictly_forward")
+    tab.wait("document.querySelector('#layout').value === 'strictly_forward' && page.state.config.world.leaders.length === 2")
+    tab.click("#undo")
+    tab.wait("document.querySelector('#layout').value === 'own'")
+    assert tab.evaluate("page.state.text") == text
+    tab.calm()
+    # The whole map fits in a small window, below the row of modes.
+    tab.window(1280, 800, dark=False)
+    tab.load(page, layout="generally_forward")
+    tab.click("[data-mode=arrange]")
+    tab.wait("page.state.views[0].data")
+    box = tab.evaluate("(() => { const b = page.state.views[0].canvas.getBoundingClientRect(); return [b.top, b.bottom]; })()")
+    assert box[0] >= 0 and box[1] <= 800, box
+    # Results of other settings are said to be that, and are saved with their own config.
+    tab.load(page, on="cpu", pace="full", **SMALL)
+    tab.evaluate("document.querySelector('#train').focus(); document.querySelector('#setup').requestSubmit(); 0")
+    tab.wait(DONE)
+    assert tab.evaluate("document.activeElement.id") == "train", "the focus is lost"
+    assert tab.text("#announced").startswith("Training is finished."), tab.text("#announced")
+    assert tab.evaluate("document.querySelector('#stale').hidden")
+    tab.set("#fitness", "D")
+    tab.wait("!document.querySelector('#stale').hidden")
+    assert "fitness Df, seed 7" in tab.text("#stale"), tab.text("#stale")
+    tab.set("#fitness", "Df")
+    tab.wait("document.querySelector('#stale').hidden")
+    # Following goes on after a look back, or in another trial; a training is stopped, and configs are checked meanwhile.
+    tab.load(page, layout="generally_forward", on="cpu", pace="full", population=4096, generations=100000)
+    tab.evaluate("window.said = []; new MutationObserver(() => said.push(1)).observe(document.querySelector('#announced'), { childList: true }); 0")
+    tab.click("#train")
+    tab.wait("page.state.training && page.state.training.reached >= 2")
+    tab.set("#trial", "1")
+    assert tab.evaluate("page.state.follow")
+    tab.set("#scrub", 0)
+    assert not tab.evaluate("page.state.follow")
+    tab.click("#following")
+    assert tab.evaluate("page.state.follow")
+    tab.set("#text", "[world]\nsteps = 0\n")
+    tab.wait("!page.state.valid", 20)
+    tab.click("#stop")
+    tab.wait("page.state.training.state === 'stopped' && document.querySelector('#stop').disabled")
+    assert tab.text("#announced").startswith("Stopped after generation"), tab.text("#announced")
+    assert tab.evaluate("said.length") <= 3, "the live region changes all the time"
+    # With reduced motion, Replay plays if it is asked to, and there is a slider of steps.
+    tab.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-reduced-motion", "value": "reduce"}])
+    tab.load(page, on="cpu", pace="full", **SMALL)
+    tab.train()
+    tab.wait("page.state.views.every(view => view.data && view.data.episodes[0].generation === 6 && !view.playing)")
+    tab.click("#replay")
+    assert tab.evaluate("page.state.views[0].playing")
+    tab.set("#step", 7)
+    assert tab.evaluate("page.state.views.map(view => [view.place, view.playing])") == [[7, False]] * 2
+    # A tap says where the leader shall go, and it goes there after the finger is lifted.
+    tab.call("Emulation.setTouchEmulationEnabled", enabled=True)
+    tab.window(390, 844, dark=False)
+    tab.load(page, layout="generally_forward")
+    tab.click("[data-mode=drive]")
+    tab.wait("page.state.views[0].data")
+    x, y = tab.place("pois", 0)
+    tab.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
+    tab.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+    tab.wait("page.state.views[0].place >= 5", 30)
+    small = tab.evaluate("[...document.querySelectorAll('input, select, textarea')].filter(e => e.checkVisibility() && parseFloat(getComputedStyle(e).fontSize) < 16).map(e => e.id)")
+    assert not small, small
+    tab.call("Emulation.setTouchEmulationEnabled", enabled=False)
+    tab.window(1280, 900, dark=False)
+    print("links, phones, keyboards and reduced motion are served")
+
+
 def main():
     page, flotilla = (pathlib.Path(argument).resolve() for argument in sys.argv[1:3])
     with tempfile.TemporaryDirectory() as folder:
@@ -335,6 +433,8 @@ def main():
         assert tab.evaluate("[...document.querySelectorAll('.mark')].map(mark => mark.style.top)") == ["48px", "68px"]
         assert not list(tab.complaints())
         print("a broken config tells its problems beside their lines")
+
+        visitors(tab, page)
 
         # 4096 teams, and the page stays responsive. Its observer goes by the clock, and so tells of other programs, too, that had
         # the processor: what the page itself did in a task is told by its thread's time.

@@ -248,9 +248,16 @@ const stage = (() => {
       const words = `POI ${look.over}: ${text}${when(data, look.over)}`, half = Math.max(40, draw.measureText(words).width / 2 + 4);
       label(words, Math.max(half, Math.min(wide - half, x)), Math.max(12, y));
     }
+    // A leader's number goes to the first corner of its arrow where it hides no other label.
+    const corners = [[1.5, 1.6], [1.5, -0.9], [-2.5, 1.6], [-2.5, -0.9]];
     for (let agent = 0; agent < episode.leaders; agent++) {
-      const [x, y] = now[agent];
-      label(String(agent), X(x) + size * 1.5, Y(y) + size * 1.6, "left", episode.leaders > 12);
+      const [x, y] = now[agent], text = String(agent), wide = draw.measureText(text).width;
+      const hides = ([across, down]) => {
+        const left = X(x) + size * across, base = Y(y) + size * down;
+        return taken.some(other => overlap([left - 1, base - 11, left + wide + 1, base + 3], other));
+      };
+      const [across, down] = corners.find(corner => !hides(corner)) || corners[0];
+      label(text, X(x) + size * across, Y(y) + size * down, "left", episode.leaders > 12);
     }
     return { step, near, led, positions: now.map(([x, y]) => [x, y]) };
   }

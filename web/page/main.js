@@ -10,9 +10,8 @@ const page = (() => {
   const still = matchMedia("(prefers-reduced-motion: reduce)");
   const number = value => String(Number(value.toFixed(3)));
   const count = (many, what) => `${many} ${what}${many === 1 ? "" : "s"}`;
-  const NAMES = { "leader-follower": "Led: leaders learn, followers follow", "all-leaders": "Alone: every agent learns" };
-  const SHORT = { "leader-follower": "led", "all-leaders": "alone" };
-  const TONES = { "leader-follower": "--led", "all-leaders": "--alone" };
+  const NAMES = { "leader-follower": "Leader-follower: leaders learn, followers follow", "all-leaders": "All-leaders: every agent learns" };
+  const TONES = { "leader-follower": "--leader-follower", "all-leaders": "--all-leaders" };
   // Controls that are keys of the config.
   const KEYS = { fitness: "learning.fitness", coupling: "world.coupling", seed: "learning.seed", generations: "learning.generations", trials: "learning.trials", population: "learning.population" };
   const quote = key => key === "fitness" ? value => `"${value}"` : value => String(value);
@@ -20,29 +19,32 @@ const page = (() => {
   const state = {
     text: "", config: null, toml: null, pois: 4, both: true, file: null, mode: "watch",
     training: null, follow: true, generation: 0, trial: 0, views: [], gpu: {}, machine: null, settled: null, players: [], policies: null,
+    // The worker that answers questions while the players train; whether the text is a config; texts to go back to.
+    clerk: null, valid: false, past: [],
   };
 
   // ---- Configs ----
 
   // Takes a text as the config, or shows what is wrong with it; false then.
   let newest = 0;
-  async function take(text, { edited = false } = {}) {
+  async function take(text, { edited = false, address = true } = {}) {
     const turn = ++newest;
     state.text = text;
     if (!edited) $("text").value = text;
     let resolved;
     try {
-      resolved = (await state.players[0].ask({ ask: "resolve", text, name: "config.toml", changes: [] })).words;
+      resolved = (await state.clerk.ask({ ask: "resolve", text, name: "config.toml", changes: [] })).words;
     } catch (error) {
-      if (turn === newest) { mark(error.problems, error.message); $("train").disabled = true; }
+      if (turn === newest) { mark(error.problems, error.message); $("train").disabled = true; state.valid = false; }
       return false;
     }
     if (turn !== newest) return false;
     mark([]);
-    Object.assign(state, { config: resolved.config, toml: resolved.toml, pois: resolved.pois });
+    Object.assign(state, { config: resolved.config, toml: resolved.toml, pois: resolved.pois, valid: true });
     $("train").disabled = false;
     fill();
-    remember();
+    if (address) remember();
+    stale();
     return true;
   }
 
@@ -51,15 +53,41 @@ const page = (() => {
   const change = changes => (changing = changing.catch(() => {}).then(() => change_now(changes)));
   async function change_now(changes) {
     let text = state.text;
+    keep();
     for (const [key, value] of changes) text = configs.set(text, key, value);
     try {
       const [plain, wanted] = await Promise.all([
-        state.players[0].ask({ ask: "resolve", text, name: "config.toml", changes: [] }),
-        state.players[0].ask({ ask: "resolve", text: state.text, name: "config.toml", changes }),
+        state.clerk.ask({ ask: "resolve", text, name: "config.toml", changes: [] }),
+        state.clerk.ask({ ask: "resolve", text: state.text, name: "config.toml", changes }),
       ]);
       if (plain.words.toml !== wanted.words.toml) text = wanted.words.toml;
     } catch { /* What is wrong is shown with the text. */ }
     return take(text);
+  }
+
+  // Keeps the present text, so that it can be brought back.
+  function keep() {
+    if (state.past.at(-1)?.text !== state.text) state.past.push({ text: state.text, file: state.file });
+    if (state.past.length > 100) state.past.shift();
+    $("undo").disabled = false;
+  }
+
+  async function undo() {
+    let last;
+    do last = state.past.pop(); while (last && last.text === state.text);
+    $("undo").disabled = state.past.length === 0;
+    if (!last) return;
+    state.file = last.file;
+    await take(last.text);
+  }
+
+  // Says so when the results on the page are of other settings than those in the form.
+  function stale() {
+    const { training } = state, differs = training && training.source && (training.source.text !== state.text || training.source.both !== state.both);
+    $("stale").hidden = !differs;
+    if (!differs) return;
+    const { fitness, seed, population, generations } = training.arms[0].config.learning;
+    $("stale").textContent = `The results below were trained with other settings: fitness ${fitness}, seed ${seed}, population ${population}, ${generations} generations. Train again to see the present ones.`;
   }
 
   // What was typed or chosen a moment ago counts for whatever follows.
@@ -134,8 +162,10 @@ const page = (() => {
   let remembered = 0;
   async function remember() {
     const turn = ++remembered, words = new URLSearchParams(), layout = $("layout").value;
-    if (layout === "own") words.set("config", await configs.pack(state.text));
-    else {
+    if (layout === "own") {
+      // Without compression there is no link: the page works all the same.
+      try { words.set("config", await configs.pack(state.text)); } catch { return; }
+    } else {
       words.set("layout", layout);
       for (const id of Object.keys(KEYS).filter(id => id !== "coupling")) words.set(id, $(id).value);
     }
@@ -145,25 +175,34 @@ const page = (() => {
     if (turn === remembered) history.replaceState(null, "", `#${words}`);
   }
 
+  // Opens the experiment in the address. What cannot be read of it is said, and the address stays as it is.
   async function recall() {
-    const words = new URLSearchParams(location.hash.slice(1));
+    const words = new URLSearchParams(location.hash.slice(1)), unknown = [];
     for (const id of ["on", "pace"]) {
       const value = words.get(id);
       if ([...$(id).options].some(option => option.value === value)) $(id).value = value;
+      else if (value !== null) unknown.push(`${id}=${value}`);
     }
-    let text = configs.layout(configs.LAYOUTS.find(name => name === words.get("layout")) || "generally_forward");
+    const layout = words.get("layout");
+    if (layout !== null && !configs.LAYOUTS.includes(layout)) unknown.push(`layout=${layout}`);
+    let text = configs.layout(configs.LAYOUTS.find(name => name === layout) || "generally_forward");
     if (words.has("config")) {
-      try { text = await configs.unpack(words.get("config")); } catch { trouble("The config in this link is damaged; here is a layout of the paper instead."); }
+      try { text = await configs.unpack(words.get("config")); } catch { unknown.push("config"); }
     } else {
       for (const [id, key] of Object.entries(KEYS)) if (words.has(id)) text = configs.set(text, key, quote(id)(words.get(id)));
     }
-    const learners = words.get("learners");
-    state.both = !learners || !Object.hasOwn(NAMES, learners);
-    if (!state.both) text = configs.set(text, "learning.paradigm", `"${learners}"`);
-    if (await take(text) || state.config) return;
-    // Where the link's config is wrong, there is a map to look at nevertheless.
-    await take(configs.layout("generally_forward"));
-    await take(text);
+    const learners = words.get("learners"), known = learners !== null && Object.hasOwn(NAMES, learners);
+    if (learners !== null && learners !== "both" && !known) unknown.push(`learners=${learners}`);
+    state.both = !known;
+    if (known) text = configs.set(text, "learning.paradigm", `"${learners}"`);
+    const damage = unknown.length ? `This link is damaged: ${unknown.join(", ")} cannot be read. Ask for a new link; what you see is not what it was made for.` : "";
+    const taken = await take(text, { address: !damage });
+    if (!taken && !state.config) {
+      // There is a map to look at even if the link's config is wrong.
+      await take(configs.layout("generally_forward"), { address: false });
+      await take(text);
+    }
+    if (damage) trouble(damage);
   }
 
   // ---- Players ----
@@ -200,44 +239,53 @@ const page = (() => {
   // Workers that do not answer any more are replaced.
   async function renew() {
     const many = Math.max(1, Math.min(16, navigator.hardwareConcurrency || 2)), old = state.players;
-    state.players = await Promise.all(Array.from({ length: many }, () => pool.open()));
+    [state.clerk, ...state.players] = await Promise.all([state.clerk || pool.open(), ...Array.from({ length: many }, () => pool.open())]);
     state.settled = null;
     old.forEach(player => player.stop());
   }
 
   // ---- Training ----
 
+  let starting = false;
   async function train() {
+    if (starting) return;
+    starting = true;
+    const busy = state.training && ["starting", "training"].includes(state.training.state);
     if (state.training) state.training.stop();
     trouble("");
     mode("watch");
-    $("train").disabled = true;
     $("digests").replaceChildren();
+    $("announced").textContent = "";
     let training;
     try {
+      // A worker that is still busy with a long generation would keep the new training waiting.
+      if (busy) await renew();
       await entered();
+      if (!state.valid) return;
       await settle();
       const paradigms = state.both && state.config.world.followers.length ? ["leader-follower", "all-leaders"] : [state.config.learning.paradigm];
       const arms = await Promise.all(paradigms.map(async paradigm => {
         const changes = [["learning.paradigm", `"${paradigm}"`]];
-        const { words } = await state.players[0].ask({ ask: "resolve", text: state.text, name: "config.toml", changes });
-        if (words.bytes > 3 * 2 ** 30) throw new Error(`This config takes ${(words.bytes / 2 ** 30).toFixed(1)} GiB, and a tab has at most 4. Choose a smaller population or fewer trials, or train it by the command line.`);
-        return { label: paradigm, toml: words.toml, config: words.config, pois: words.pois, parameters: words.parameters, command: command(words.config), name: name_of() };
+        const { words } = await state.clerk.ask({ ask: "resolve", text: state.text, name: "config.toml", changes });
+        return { bytes: words.bytes, label: paradigm, toml: words.toml, config: words.config, pois: words.pois, parameters: words.parameters, command: command(words.config), name: name_of() };
       }));
+      const bytes = arms.reduce((sum, arm) => sum + arm.bytes, 0);
+      if (bytes > 3 * 2 ** 30) throw new Error(`This takes ${(bytes / 2 ** 30).toFixed(1)} GiB, and a tab has at most 4. Choose a smaller population, fewer trials or one paradigm, or use the command line.`);
       training = state.training = new Training(arms, state.machine);
-      Object.assign(state, { follow: true, generation: 0, trial: 0, policies: null });
+      training.source = { text: state.text, both: state.both };
+      Object.assign(state, { generation: 0, trial: 0, policies: null });
+      following(true);
       build(training);
       await training.start(state.players);
     } catch (error) {
       if (error.fatal) await renew();
       trouble(error.message);
-      $("train").disabled = false;
       return;
-    }
-    $("train").disabled = false;
+    } finally { starting = false; }
+    stale();
     controls();
     // To watch, generations come at an even pace; what paused does not count.
-    let shown = 0, clock = performance.now(), dirty = true;
+    let shown = 0, clock = performance.now(), dirty = true, news = clock;
     const allowed = () => {
       const now = performance.now(), each = training.last / 8;
       if (!training.paused) shown += (now - clock) / 1000 * Math.max(1, each);
@@ -246,7 +294,11 @@ const page = (() => {
     };
     const paint = () => {
       if (state.training !== training) return;
-      if (dirty) { dirty = false; curves(); follow(); }
+      if (dirty) { dirty = false; news = performance.now(); curves(); follow(); }
+      const silent = (performance.now() - news) / 1000;
+      if (silent > 2 && !training.paused && training.state === "training" && training.reached < training.last) {
+        $("generation").textContent = `generation ${training.reached + 1} of ${training.last}: ${Math.round(silent)} s so far`;
+      }
       if (training.state === "training" || training.state === "starting") requestAnimationFrame(paint);
     };
     requestAnimationFrame(paint);
@@ -264,7 +316,23 @@ const page = (() => {
     curves();
     follow();
     told();
-    if (training.state === "done") digests();
+    if (training.state === "done") {
+      digests();
+      const found = training.arms.map(arm => {
+        const last = arm.trials.map(trial => trial.at(-1).best), mean = last.reduce((sum, best) => sum + best, 0) / last.length;
+        return `${arm.label} observes ${(mean * (arm.pois ?? 1)).toFixed(2)} ${arm.pois === null ? "of its POIs (a share)" : `of ${arm.pois} POIs`}`;
+      });
+      $("announced").textContent = `Training is finished. On average over trials, the best team of ${found.join("; ")}.`;
+    }
+  }
+
+  // Ends a training where it is. What was played can still be watched.
+  function stop() {
+    const { training } = state;
+    if (!training || training.state !== "training") return;
+    training.stop();
+    controls();
+    $("announced").textContent = `Stopped after generation ${Math.max(0, training.reached)}.`;
   }
 
   // Leaves a training and what came out of it.
@@ -274,9 +342,11 @@ const page = (() => {
     $("digests").replaceChildren();
     $("scrub").value = 0;
     $("generation").textContent = "";
+    $("announced").textContent = "";
     $("trial").replaceChildren();
     clear();
     controls();
+    stale();
   }
 
   const name_of = () => state.file || ($("layout").value === "own" ? "config" : $("layout").value);
@@ -284,7 +354,7 @@ const page = (() => {
   // What gives the same by the command line.
   function command({ learning }) {
     const layout = $("layout").value;
-    if (layout === "own") return `flotilla train config.toml --paradigm ${learning.paradigm}`;
+    if (layout === "own") return `flotilla train ${name_of()}.toml --paradigm ${learning.paradigm}`;
     const flags = ["paradigm", "fitness", "seed"].map(key => `--${key} ${learning[key]}`);
     const base = /^\s*(generations|trials|population)\s*=\s*(\d+)/gm, given = Object.fromEntries([...configs.layout(layout).matchAll(base)].map(found => [found[1], Number(found[2])]));
     for (const key of ["generations", "trials", "population"]) if (given[key] !== learning[key]) flags.push(`--${key} ${learning[key]}`);
@@ -300,7 +370,11 @@ const page = (() => {
       make("code", arm.digest, head, { className: "sha" });
       if (arm.command) make("code", arm.command, place);
       const acts = make("div", "", place, { className: "row" });
-      if (arm.zip) make("button", `Take ${SHORT[arm.label]} home (.zip)`, acts, { type: "button", className: "home" }).addEventListener("click", () => save(`${arm.name}-${arm.label}.zip`, arm.zip, "application/zip"));
+      if (arm.zip) make("button", `Save the ${arm.label} run (.zip)`, acts, { type: "button", className: "home" }).addEventListener("click", () => save(`${arm.name}-${arm.label}.zip`, arm.zip, "application/zip"));
+      const { source } = state.training;
+      if (source && arm.command && !arm.command.includes(" configs/")) {
+        make("button", `Save ${arm.name}.toml`, acts, { type: "button" }).addEventListener("click", () => save(`${arm.name}.toml`, source.text, "text/plain"));
+      }
       if (arm.command) make("button", "Copy the command", acts, { type: "button" }).addEventListener("click", () => copy(arm.command, "The command is copied: it comes to the same digest."));
     }
   }
@@ -374,6 +448,7 @@ const page = (() => {
     const look = { crop: view.crop, trails: $("trails").checked, radii: $("radii").checked, groups: true, over: view.over };
     const { step, positions } = stage.paint(data, episode, view.canvas, view.place, look);
     view.drawn = positions;
+    if (view === state.views[0]) steps(view);
     const [observed, said] = stage.say(episode, step);
     if (view.tell) view.tell(step, observed, said);
     else {
@@ -384,15 +459,32 @@ const page = (() => {
     if (view.chosen) ring(view);
   }
 
-  // Shows an episode from its start, or where nothing shall move its end.
-  function show(view, data, moving = true) {
+  // Shows an episode from its start, or its end if nothing is to move. What somebody asked for moves in any case.
+  function show(view, data, moving = true, asked = false) {
     const last = data.episodes[0].shown.length - 1;
-    const plays = moving && !still.matches, [left, below, right, above] = view.crop;
+    const plays = moving && (asked || !still.matches), [left, below, right, above] = view.crop;
     // Stages and jitter may put POIs elsewhere.
     if (data.pois.some(([x, y]) => x < left || x > right || y < below || y > above)) view.crop = stage.whole(data);
     Object.assign(view, { data, place: plays ? 0 : last, playing: plays, ended: plays ? null : performance.now() });
     draw(view);
     wake_up();
+  }
+
+  // Brings the slider of steps to where the first view is.
+  function steps(view) {
+    const last = view.data.episodes[0].shown.length - 1;
+    $("step").disabled = last === 0;
+    $("step").max = last;
+    $("step").value = Math.floor(view.place);
+    $("step").setAttribute("aria-valuetext", `step ${view.data.episodes[0].shown[Math.floor(view.place)]} of ${view.data.steps}`);
+  }
+
+  // Shows all views at a step, and stops there.
+  function step_to(place) {
+    for (const view of state.views.filter(view => view.data)) {
+      Object.assign(view, { playing: false, place: Math.min(place, view.data.episodes[0].shown.length - 1), ended: performance.now() });
+      draw(view);
+    }
   }
 
   let clock = null, running = false;
@@ -459,7 +551,7 @@ const page = (() => {
   function seek(generation) {
     const { training } = state;
     if (!training || training.state === "starting") return;
-    state.follow = false;
+    following(training.state === "training" && generation >= training.reached);
     state.generation = Math.max(0, Math.min(training.reached, generation));
     position();
     curves();
@@ -469,17 +561,22 @@ const page = (() => {
     });
   }
 
+  function following(follow) {
+    state.follow = follow;
+    $("following").checked = follow;
+  }
+
   function position() {
-    const { training, generation } = state;
+    const { training, generation } = state, ahead = state.follow && training.state === "training";
     $("scrub").value = generation;
-    $("generation").textContent = `generation ${generation} of ${training.last}`;
+    $("generation").textContent = `${ahead ? "trained to generation" : "generation"} ${generation} of ${training.last}`;
     $("scrub").setAttribute("aria-valuetext", $("generation").textContent);
   }
 
   function controls() {
     const { training } = state, going = training && training.state === "training";
-    $("pause").disabled = !going;
-    $("pause").textContent = going && training.paused ? "Go on" : "Pause";
+    $("pause").disabled = $("stop").disabled = $("following").disabled = !going;
+    $("pause").textContent = going && training.paused ? "Continue" : "Pause";
     $("scrub").disabled = $("replay").disabled = !training || training.state === "starting";
   }
 
@@ -487,7 +584,7 @@ const page = (() => {
     const { training } = state;
     if (!training || training.state !== "training") return;
     training.paused = !training.paused;
-    if (!training.paused) state.follow = true;
+    if (!training.paused) following(true);
     controls();
     follow();
   }
@@ -576,7 +673,7 @@ const page = (() => {
     only.crop = state.mode === "arrange" ? [0, 0, ...config.world.map] : reach(config);
     if (only.chosen && !config.world[only.chosen[0]][only.chosen[1]]) only.chosen = null;
     if (state.mode === "arrange") {
-      // The whole map, as high as the window has room for.
+      // The whole map, as high as the window has room for below the row of modes.
       const [width, height] = config.world.map;
       only.canvas.style.maxWidth = `${Math.max(280, (innerHeight - 250) * width / height)}px`;
       only.canvas.style.marginInline = "auto";
@@ -727,7 +824,8 @@ const page = (() => {
     };
     only.canvas.addEventListener("pointermove", at);
     only.canvas.addEventListener("pointerdown", event => { at(event); only.canvas.focus(); if (!drive.on) drive_on(); });
-    only.canvas.addEventListener("pointerleave", () => { drive.pointer = null; });
+    // A finger leaves whenever it is lifted: where it was is where the leader shall go.
+    only.canvas.addEventListener("pointerleave", event => { if (event.pointerType !== "touch") drive.pointer = null; });
     const key = event => {
       if (!/^Arrow/.test(event.key)) return;
       if (event.type === "keydown") { drive.keys.add(event.key); drive.pointer = null; if (!drive.on) drive_on(); } else drive.keys.delete(event.key);
@@ -760,7 +858,7 @@ const page = (() => {
     only.chosen = null;
     drive.on = true;
     $("again").textContent = "Start over";
-    const player = state.players[0], toml = configs.set(state.toml, "learning.paradigm", '"leader-follower"');
+    const player = state.clerk, toml = configs.set(state.toml, "learning.paradigm", '"leader-follower"');
     const { each, weights } = state.policies || { each: 0 };
     let told;
     try {
@@ -834,6 +932,7 @@ const page = (() => {
       if (training && training.state === "training") { training.paused = true; controls(); }
       clear();
       show_start();
+      $("modes").scrollIntoView({ block: "start" });
     } else if (wanted === "drive") {
       if (training && training.state === "training") { training.paused = true; controls(); }
       const led = training && training.arms.find(arm => arm.label === "leader-follower" && arm.ended.length);
@@ -842,6 +941,7 @@ const page = (() => {
       options();
       drive_view();
       $("driven").textContent = "";
+      $("modes").scrollIntoView({ block: "start" });
     } else if (training) {
       const { generation, trial } = state;
       build(training);
@@ -869,7 +969,10 @@ const page = (() => {
         const training = await Training.read(state.players[0], state.machine, file.name, found);
         if (state.training) state.training.stop();
         state.training = training;
-        Object.assign(state, { both: false, follow: false, trial: 0, generation: training.last, policies: null });
+        keep();
+        Object.assign(state, { both: false, trial: 0, generation: training.last, policies: null });
+        following(false);
+        training.source = { text: found.words.toml, both: false };
         mode("watch");
         await take(found.words.toml);
         build(training);
@@ -879,10 +982,10 @@ const page = (() => {
         seek(training.last);
         $("said").textContent = `${file.name}: the run is whole, its digest is right.`;
       } else if (/\.safetensors$/i.test(file.name)) {
-        const { words, bytes: weights } = await state.players[0].ask({ ask: "read", text: state.toml }, bytes);
+        const { words, bytes: weights } = await state.clerk.ask({ ask: "read", text: state.toml }, bytes);
         forget();
         state.policies = { each: words.policies, weights };
-        const { words: data } = await state.players[0].ask({ ask: "play", text: state.toml, policies: words.policies }, weights);
+        const { words: data } = await state.clerk.ask({ ask: "play", text: state.toml, policies: words.policies }, weights);
         mode("watch");
         clear();
         const only = view(state.config.learning.paradigm);
@@ -898,6 +1001,7 @@ const page = (() => {
       } else {
         if (!/\.toml$/i.test(file.name)) throw new Error("it is no config (.toml), no run (.zip) and no policies (.safetensors)");
         const text = new TextDecoder("utf-8", { fatal: true }).decode(bytes);
+        keep();
         state.file = file.name.replace(/\.toml$/i, "");
         state.both = false;
         forget();
@@ -940,6 +1044,7 @@ const page = (() => {
       const { fitness, seed } = state.config ? state.config.learning : {};
       let text = configs.layout($("layout").value);
       if (fitness) text = configs.set(configs.set(text, "learning.fitness", `"${fitness}"`), "learning.seed", String(seed));
+      keep();
       forget();
       state.file = null;
       const arranging = state.mode === "arrange";
@@ -948,10 +1053,11 @@ const page = (() => {
     });
     $("paradigm").addEventListener("change", () => {
       state.both = $("paradigm").value === "both";
-      if (state.both) remember(); else change([["learning.paradigm", `"${$("paradigm").value}"`]]);
+      if (state.both) { remember(); stale(); } else change([["learning.paradigm", `"${$("paradigm").value}"`]]);
     });
     for (const [id, key] of Object.entries(KEYS)) {
-      $(id).addEventListener("change", () => { if ($(id).value !== "") change([[key, quote(id)($(id).value)]]); });
+      // An emptied field gets back the value that would be trained.
+      $(id).addEventListener("change", () => { if ($(id).value !== "") change([[key, quote(id)($(id).value)]]); else if (state.config) fill(); });
     }
     for (const id of ["on", "pace"]) $(id).addEventListener("change", remember);
     // A training goes on where it is; the next one is elsewhere.
@@ -962,19 +1068,34 @@ const page = (() => {
     $("again").addEventListener("click", drive_on);
     $("leader").addEventListener("change", () => { if (state.mode === "drive") { drive_off(); drive_view(); } });
     $("pause").addEventListener("click", pause);
+    $("stop").addEventListener("click", stop);
+    $("undo").addEventListener("click", undo);
+    $("step").addEventListener("input", () => step_to(Number($("step").value)));
+    $("following").addEventListener("change", () => {
+      following($("following").checked);
+      if (state.follow) follow(); else seek(state.generation);
+    });
     $("scrub").addEventListener("input", () => {
       if (state.mode !== "watch") mode("watch");
       seek(Number($("scrub").value));
     });
-    $("trial").addEventListener("change", () => { state.trial = Number($("trial").value); seek(state.generation); });
+    $("trial").addEventListener("change", () => {
+      state.trial = Number($("trial").value);
+      if (!state.follow) return seek(state.generation);
+      // Following goes on in the other trial.
+      state.views.forEach((view, run) => { if (view.asking) view.wanted = state.generation; else ask(view, run, state.generation); });
+    });
     $("replay").addEventListener("click", () => {
       if (state.mode !== "watch") mode("watch");
-      for (const view of state.views) if (view.data) show(view, view.data);
+      for (const view of state.views) if (view.data) show(view, view.data, true, true);
     });
     for (const id of ["trails", "radii"]) $(id).addEventListener("change", () => state.views.forEach(draw));
     $("curves").addEventListener("click", event => { if (drawn_chart && state.training) { if (state.mode !== "watch") mode("watch"); seek(drawn_chart.generation(event.offsetX)); } });
     $("verify").addEventListener("click", verify);
-    $("share").addEventListener("click", async () => { await remember(); copy(location.href, "The link is copied: whoever opens it trains the same."); });
+    $("share").addEventListener("click", async () => {
+      if (!state.valid) return void ($("said").textContent = "No link was copied: the config has problems. Correct them first.");
+      await remember(); copy(location.href, "The link is copied: whoever opens it trains the same.");
+    });
     $("open").addEventListener("click", () => $("file").click());
     $("file").addEventListener("change", () => { if ($("file").files[0]) take_file($("file").files[0]); $("file").value = ""; });
     $("save").addEventListener("click", () => save("config.toml", state.text, "text/plain"));
@@ -1010,7 +1131,7 @@ const page = (() => {
       $("machine").textContent = "";
       return trouble(`This browser cannot run it: ${error.message}. It takes WebAssembly with SIMD, as browsers have had since 2023.`);
     }
-    palettes = (await state.players[0].ask({ ask: "colors" })).words;
+    palettes = (await state.clerk.ask({ ask: "colors" })).words;
     $("verify").disabled = !state.gpu.name;
     $("plain-label").hidden = !state.gpu.name;
     $("verified").textContent = state.gpu.name ? "Compares this browser's GPU with its CPU, bit for bit." : `There is no GPU to verify: ${state.gpu.reason}.`;
