@@ -843,7 +843,8 @@ pub(crate) mod work {
         PARSED.set(PARSED.get() + bytes);
     }
 
-    /// Returns the bytes parsed by this thread since the last call.
+    /// Returns the bytes parsed by this thread since the last call. Only sweeps' tests need it.
+    #[cfg(feature = "report")]
     pub(crate) fn take() -> usize {
         PARSED.take()
     }

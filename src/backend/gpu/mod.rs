@@ -8,7 +8,7 @@
 //! | [`device`] | adapters, and what is asked of an opened one |
 //! | [`population`] | policies that stay on the device |
 //! | [`episode`] | whole episodes |
-//! | [`self_test`] | opening a device, and the tests that it must pass |
+//! | [`mod@self_test`] | opening a device, and the tests that it must pass |
 
 pub mod device;
 pub mod episode;
