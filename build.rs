@@ -1,7 +1,7 @@
-//! Tells the program what it is built from: `FLOTILLA_TARGET`, `FLOTILLA_RUSTC`, and `FLOTILLA_COMMIT`, empty where it is
-//! not known.
+//! Sets `FLOTILLA_TARGET`, `FLOTILLA_RUSTC` and `FLOTILLA_COMMIT` for the compiler. `FLOTILLA_COMMIT` is empty if the
+//! commit is unknown.
 //!
-//! Only release builds are told the commit: whoever embeds it is compiled anew at every commit.
+//! Only release builds contain the commit, because a crate that contains it is recompiled at every commit.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -22,8 +22,8 @@ fn main() {
     println!("cargo::rustc-env=FLOTILLA_COMMIT={}", commit.unwrap_or_default());
 }
 
-/// Returns the commit of a source tree with `-dirty` after it if files differ from that commit, and the files that this
-/// depends on. If nobody can say whether files differ, `-unchecked` follows.
+/// Returns the commit of a source tree, and the files that determine it. `-dirty` follows the commit if files differ
+/// from it. `-unchecked` follows if git cannot check that.
 pub fn state(root: &Path) -> (Option<String>, Vec<PathBuf>) {
     let (commit, mut files) = commit(root);
     let Some(commit) = commit else { return (None, files) };
@@ -43,18 +43,18 @@ pub fn state(root: &Path) -> (Option<String>, Vec<PathBuf>) {
     (Some(commit + mark), files)
 }
 
-/// What a build reads.
+/// The files and folders that a build reads.
 const SOURCES: [&str; 7] = ["Cargo.toml", "Cargo.lock", "build.rs", "configs", "shaders", "src", "python/src"];
 
-/// Whether tracked files differ from the commit; none without git.
+/// Returns whether tracked files differ from the commit, or `None` if git fails.
 fn differs(root: &Path) -> Option<bool> {
     let line = ["status", "--porcelain", "--untracked-files=no"];
     let output = Command::new("git").args(line).current_dir(root).output().ok()?;
     output.status.success().then_some(!output.stdout.is_empty())
 }
 
-/// The commit of a source tree, and the files that say so: of a checkout (whole, shallow or a worktree) what HEAD names,
-/// of a crate's archive what cargo wrote into it.
+/// Returns the commit of a source tree, and the files that determine it. A checkout (whole, shallow or a worktree) has
+/// the commit that `HEAD` names. A crate's archive has a file with the commit, written by cargo.
 pub fn commit(root: &Path) -> (Option<String>, Vec<PathBuf>) {
     let archive = root.join(".cargo_vcs_info.json");
     if let Ok(text) = fs::read_to_string(&archive) {
@@ -63,7 +63,7 @@ pub fn commit(root: &Path) -> (Option<String>, Vec<PathBuf>) {
     }
     let mut git = root.join(".git");
     if let Ok(text) = fs::read_to_string(&git) {
-        // A worktree's own part is elsewhere.
+        // In a worktree, `.git` is a file with the path of the git directory.
         git = root.join(text.trim_start_matches("gitdir:").trim());
     }
     let head = git.join("HEAD");
@@ -77,8 +77,8 @@ pub fn commit(root: &Path) -> (Option<String>, Vec<PathBuf>) {
     let packed = shared.join("packed-refs");
     let text = fs::read_to_string(&packed).unwrap_or_default();
     let found = text.lines().find_map(|line| line.strip_suffix(name)?.strip_suffix(' ').and_then(hash));
-    // The next commit makes the loose file: until then, it is the folder that changes. No file is named that is not
-    // there, for cargo takes that for a change.
+    // The next commit creates the loose ref, which changes its folder. Cargo treats a missing file as changed, so only
+    // existing files are listed.
     let folder = loose.ancestors().skip(1).find(|folder| folder.exists()).map(PathBuf::from);
     (found, [head, packed].into_iter().filter(|file| file.exists()).chain(folder).collect())
 }

@@ -1,9 +1,11 @@
-//! What a task gives without learning: the best constant speed, the best of many random constant actions, and the best
-//! of as many random networks as evolution evaluates.
+//! Baselines without learning: the best constant action, the best of many random constant actions, and the best of as
+//! many random networks as evolution evaluates.
 //!
-//! A backend plays them like any team: a constant action is a policy whose only weights are biases of its last layer.
-//! Random teams are drawn by purposes of their own, so that no result of a training changes. Generation `g` of trial
-//! `t` plays from the same starts as that generation of that trial in training.
+//! A backend plays baselines like any team. A constant action is a policy whose only weights are biases of its last
+//! layer.
+//!
+//! Random teams have purposes of their own for random numbers, so training results do not change. Generation `g` of
+//! trial `t` plays from the same starts as in training.
 
 use std::cell::RefCell;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
@@ -20,19 +22,20 @@ use crate::model::policy::BEHAVIOURS;
 use crate::parallel::*;
 use crate::world::World;
 
-/// The number of constant speeds that are tried: 1/20 of the largest, 2/20, …, all of it.
+/// Number of constant speeds: 1/20, 2/20, … and all of the largest speed.
 pub const SPEEDS: usize = 20;
-/// Random teams of each kind that play the selection episodes, where starts or POIs move.
+/// Number of random teams of each kind that play the selection episodes if starts or POIs move.
 const FINALISTS: usize = 20;
-/// Teams drawn at a time, which bounds the memory for their weights.
+/// Number of teams drawn together, which limits the memory for their weights.
 const DRAWN_TOGETHER: usize = 4096;
-/// A bias of this size makes tanh 1 or -1 exactly.
+/// A bias large enough for tanh to be exactly 1 or -1.
 const SATURATING: f32 = 20.0;
 
-/// G of the baselines of one config, in 0..1, `[trials][generations + 1]`.
+/// G of one config's baselines, in 0..1, `[trials][generations + 1]`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Baseline {
-    /// A team whose weights are all zero: every leader drives straight ahead at half its largest speed.
+    /// The zero policy for every leader. It drives straight ahead at half the largest speed, or selects the first
+    /// behaviour.
     pub straight: Vec<Vec<f64>>,
     /// The best constant (see [`constants`]) in each generation.
     pub constant: Vec<Vec<f64>>,
@@ -42,8 +45,8 @@ pub struct Baseline {
     pub random: Vec<Vec<f64>>,
 }
 
-/// G of one trial's baselines, each chosen by the episodes that training plays. Where starts or POIs move, G is from
-/// held-out starts.
+/// G of one trial's baselines. Each is chosen by the episodes that training plays. If starts or POIs move, selection
+/// uses additional episodes, and G is from held-out starts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Outcome {
     /// G of each constant.
@@ -56,8 +59,8 @@ pub struct Outcome {
     pub network: f64,
 }
 
-/// Returns the outputs of the constants that a config's leaders are tried with, all leaders the same: straight ahead at
-/// each of [`SPEEDS`] speeds, or each behaviour.
+/// Returns the outputs of each constant action: straight ahead at each of [`SPEEDS`] speeds, or each behaviour. All
+/// leaders of a team have the same.
 pub fn constants(actions: Actions) -> Vec<Vec<f64>> {
     match actions {
         Actions::Direct => (1..=SPEEDS).map(|speed| vec![0.0, 2.0 * speed as f64 / SPEEDS as f64 - 1.0]).collect(),
@@ -68,7 +71,7 @@ pub fn constants(actions: Actions) -> Vec<Vec<f64>> {
     }
 }
 
-/// Returns the index among [`constants`] of the policy whose weights are all zero: half speed, or the first behaviour.
+/// Returns the index of the zero policy among [`constants`]: half speed, or the first behaviour.
 const fn zero_policy(actions: Actions) -> usize {
     match actions {
         Actions::Direct => SPEEDS / 2 - 1,
@@ -76,7 +79,7 @@ const fn zero_policy(actions: Actions) -> usize {
     }
 }
 
-/// Writes a policy that gives these outputs, each in -1..1, whatever it senses.
+/// Writes a policy with constant outputs, each in -1..1, for all inputs.
 pub fn constant_policy(outputs: &[f64], policy: &mut [f32]) {
     let biases = policy.len() - outputs.len();
     policy.fill(0.0);
@@ -86,20 +89,20 @@ pub fn constant_policy(outputs: &[f64], policy: &mut [f32]) {
     }
 }
 
-/// Writes a random constant action: every output is uniform in -1..1.
+/// Writes a random constant action. Every output is uniform in -1..1.
 fn random_action(key: Key, outputs: usize, policy: &mut [f32]) {
     let uniform = |output| f64::from(key.draw(output)[0]) / (1u64 << 31) as f64 - 1.0;
     constant_policy(&(0..outputs as u32).map(uniform).collect::<Vec<_>>(), policy);
 }
 
-/// Plays the baselines of any number of configs side by side, generation by generation. Each plays in the world of the
-/// file's own keys, whatever its stages change.
+/// Plays the baselines of several configs side by side, generation by generation. Each plays in the world of the
+/// config's own keys, without stages.
 pub struct Baselines {
     places: Vec<Setting>,
     generation: usize,
 }
 
-/// A team of every leader's policy with the same index.
+/// A team in which every leader has the policy with the same index.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Team {
     /// A constant, by its index.
@@ -110,7 +113,7 @@ enum Team {
     Network(usize, usize),
 }
 
-/// Makes a random team from its generation and slot.
+/// Creates a random team from its generation and slot.
 type MakeTeam = fn(usize, usize) -> Team;
 
 /// One config and its trials.
@@ -122,14 +125,15 @@ struct Setting {
     found: Baseline,
 }
 
-/// One trial's teams of the present generation, and what its earlier ones observed.
+/// One trial's teams of the current generation, and the results of its earlier generations.
 struct Trial {
     index: usize,
     /// `[populations][teams][parameters]`
     weights: Vec<f32>,
     /// `[episodes][agents]`, with POIs if they move.
     starts: Vec<Vec<Vec2>>,
-    /// POIs observed in all episodes of the present generation: by constants, by random actions, by random networks.
+    /// POIs observed in all episodes of the current generation: by constants, then random actions, then random
+    /// networks.
     observed: Vec<AtomicU32>,
     /// POIs that each constant observed in all generations.
     constants: Vec<u64>,
@@ -147,25 +151,25 @@ impl Baselines {
         Baselines { places: configs.into_iter().map(all).collect(), generation: 0 }
     }
 
-    /// Prepares the baselines of one trial of a valid config; the trial may be beyond the config's number of them.
+    /// Prepares the baselines of one trial of a valid config. The trial may be beyond the config's number of trials.
     pub fn of_trial(config: Config, trial: usize) -> Baselines {
         Baselines { places: vec![Setting::new(config, trial..trial + 1)], generation: 0 }
     }
 
-    /// Returns the generation that plays next.
+    /// Returns the next generation to play.
     pub fn generation(&self) -> usize {
         self.generation
     }
 
-    /// Whether every config's last generation has been played.
+    /// Returns whether every config's last generation has been played.
     pub fn is_done(&self) -> bool {
         self.places.iter().all(|place| place.config.learning.generations < self.generation)
     }
 
-    /// Plays one generation's teams of every config that has one left.
+    /// Plays one generation of every config that has one left.
     ///
     /// # Errors
-    /// When the backend fails; this generation can then be played again.
+    /// The backend fails. The generation can then be played again.
     pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<(), BackendError> {
         let generation = self.generation;
         let mut playing: Vec<_> =
@@ -194,19 +198,19 @@ impl Baselines {
         Ok(())
     }
 
-    /// Returns G by generation, for each config.
+    /// Returns G per generation, for each config.
     pub fn found(self) -> Vec<Baseline> {
         self.places.into_iter().map(|place| place.found).collect()
     }
 
-    /// Chooses each baseline's team of every config and trial, `[configs][trials]`, after the last generation.
+    /// Chooses the team of each baseline after the last generation, `[configs][trials]`.
     ///
-    /// Where starts or POIs move, the constants and the best random teams play so many more episodes whose starts are
-    /// drawn as in training. The best of each kind is chosen by these, and played from as many held-out starts, those
-    /// of `flotilla rollout`.
+    /// If starts or POIs move, the constants and the best random teams play `episodes` more episodes, with starts drawn
+    /// as in training. These choose the best of each kind. The chosen teams then play from as many held-out starts, the
+    /// same as in `flotilla rollout`.
     ///
     /// # Errors
-    /// When the backend fails.
+    /// The backend fails.
     pub fn outcomes(&self, backend: &mut dyn Backend, episodes: u32) -> Result<Vec<Vec<Outcome>>, BackendError> {
         let mut outcomes = Vec::new();
         for place in &self.places {
@@ -217,7 +221,7 @@ impl Baselines {
     }
 }
 
-/// Teams to play from some starts, and where the POIs that they observe are added up.
+/// Teams to play from some starts, with counters for the POIs that they observe.
 struct Round<'a> {
     world: &'a World,
     /// `[populations][teams][parameters]`
@@ -227,7 +231,7 @@ struct Round<'a> {
     observed: &'a [AtomicU32],
 }
 
-/// Plays all teams from all of their starts, as one batch.
+/// Plays all teams from all their starts as one batch.
 fn play(backend: &mut dyn Backend, rounds: &[Round<'_>]) -> Result<(), BackendError> {
     thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
     let teams = |round: &Round<'_>| evolve::one_policy_a_team(round.observed.len(), round.world.leaders());
@@ -257,7 +261,7 @@ fn play(backend: &mut dyn Backend, rounds: &[Round<'_>]) -> Result<(), BackendEr
     })
 }
 
-/// Returns POIs that each team observes from all of these starts.
+/// Returns the POIs that each team observes over all starts, `[teams]`.
 fn observed(
     backend: &mut dyn Backend,
     world: &World,
@@ -288,12 +292,12 @@ impl Setting {
         Setting { trials: trials.map(trial).collect(), found, constants, config, world }
     }
 
-    /// The number of teams that play in one generation of a trial.
+    /// Returns the number of teams per generation of a trial.
     fn teams(&self) -> usize {
         self.constants.len() + 2 * self.config.learning.population
     }
 
-    /// The team of a place among those of a generation.
+    /// Returns the team at a place among a generation's teams.
     fn team(&self, generation: usize, place: usize) -> Team {
         let (constants, population) = (self.constants.len(), self.config.learning.population);
         match place.checked_sub(constants) {
@@ -303,7 +307,7 @@ impl Setting {
         }
     }
 
-    /// Writes the policy of one population in a team.
+    /// Writes a team's policy for one population.
     fn write_policy(&self, level: Level, trial: usize, team: Team, population: usize, policy: &mut [f32]) {
         let key = |purpose| Key::new(self.config.learning.seed, trial, purpose);
         match team {
@@ -328,7 +332,7 @@ impl Setting {
         });
     }
 
-    /// Draws a generation's starts.
+    /// Draws the starts of a generation.
     fn start(&mut self, generation: usize) {
         for Trial { index, starts, observed, .. } in &mut self.trials {
             for (episode, starts) in starts.iter_mut().enumerate() {
@@ -338,7 +342,7 @@ impl Setting {
         }
     }
 
-    /// Draws some of a generation's teams.
+    /// Draws up to [`DRAWN_TOGETHER`] of a generation's teams.
     fn draw(&mut self, generation: usize, first: usize) {
         let last = self.teams().min(first + DRAWN_TOGETHER);
         let teams: Vec<Team> = (first..last).map(|place| self.team(generation, place)).collect();
@@ -350,7 +354,7 @@ impl Setting {
         self.trials = trials;
     }
 
-    /// Takes in what the generation's teams observed.
+    /// Adds the results of a generation.
     fn conclude(&mut self, generation: usize) {
         let Learning { population, episodes_per_team, .. } = self.config.learning;
         let whole = (self.world.pois.len() * episodes_per_team) as f64;
@@ -419,7 +423,7 @@ impl Setting {
     }
 }
 
-/// Returns the index of the largest value, of equal ones the first.
+/// Returns the index of the largest value. Ties go to the first.
 fn first_largest<T: Ord>(values: &[T]) -> usize {
     (1..values.len()).fold(0, |best, index| if values[index] > values[best] { index } else { best })
 }

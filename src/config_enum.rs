@@ -4,7 +4,7 @@ use serde::Serialize;
 
 /// A key whose values are words, see `config_enum!`.
 pub trait Choice: Copy + Serialize + 'static {
-    /// Every word with its variant, in the order of their numbers.
+    /// Every word with its variant, ordered by number.
     const ALL: &'static [(&'static str, Self)];
 
     /// Returns the words, for a command line's list of possible values.

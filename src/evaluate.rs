@@ -1,4 +1,5 @@
-//! How well teams do: every team plays from the same starts, its own or drawn ones, and is told by mean and spread.
+//! Evaluation of teams: every team plays from the same starts, the config's own or drawn ones. The results are means
+//! and spreads.
 
 use std::cell::RefCell;
 use std::sync::Mutex;
@@ -14,35 +15,35 @@ use crate::world::World;
 
 pub use crate::evolve::one_policy_a_team;
 
-/// Most episodes of one evaluation.
+/// Maximum number of episodes per evaluation.
 pub const MAX_EPISODES: u32 = 1_000_000;
-/// Most bytes of scores that wait to be summed, and most episodes that play as one batch.
+/// Limits per batch: bytes of scores that wait to be summed, and number of episodes.
 const BATCH_BYTES: usize = 1 << 26;
 const BATCH_EPISODES: usize = 256;
-/// Most bytes of a trace in memory at once, unless one team's are more.
+/// Maximum number of bytes of a trace in memory, unless one team needs more.
 const TRACE_BYTES: usize = 1 << 26;
 
-/// Where the agents of each episode start, and where its POIs are.
+/// The start positions of agents and the positions of POIs in each episode.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Starts {
-    /// One episode, from where the config says.
+    /// One episode from the config's own starts.
     Own,
-    /// So many episodes, every start moved by a uniform offset in `-jitter..jitter` on both axes, and every POI
-    /// likewise by `poi_jitter`, drawn from the seed. No training draws from where these are drawn, whatever its seed.
+    /// Several episodes with moved starts. Each agent moves by a uniform offset in `-jitter..jitter` on both axes, and
+    /// each POI by one in `-poi_jitter..poi_jitter`. The draws are held out: no training uses them, whatever its seed.
     Drawn {
-        /// Of each team.
+        /// Number of episodes per team.
         episodes: u32,
-        /// What they are drawn from.
+        /// Random seed.
         seed: u64,
-        /// Of agents, in units.
+        /// Jitter of agents, in units.
         jitter: f64,
-        /// Of POIs, in units.
+        /// Jitter of POIs, in units.
         poi_jitter: f64,
     },
 }
 
 impl Starts {
-    /// Episodes of each team.
+    /// Returns the number of episodes per team.
     pub fn episodes(&self) -> usize {
         match *self {
             Starts::Own => 1,
@@ -50,7 +51,7 @@ impl Starts {
         }
     }
 
-    /// Start positions of an episode, `[agents]`, the same for all teams; after them places of the POIs, if they move.
+    /// Returns an episode's start positions, `[agents]`, the same for all teams. If POIs move, their positions follow.
     pub fn of(&self, episode: usize, world: &World) -> Vec<Vec2> {
         let mut starts = world.starts.clone();
         if let Starts::Drawn { seed, jitter, poi_jitter, .. } = *self {
@@ -62,7 +63,8 @@ impl Starts {
     }
 }
 
-/// A group in parts whose traces do not take much memory at once, each with its first team.
+/// Splits a group into parts whose traces fit in a limited amount of memory. Yields each part with the index of its
+/// first team.
 pub fn parts<'a>(group: &Group<'a>) -> impl Iterator<Item = (usize, Group<'a>)> {
     let (group, leaders) = (*group, group.world.leaders());
     let moments = (group.world.steps() + 1) * group.world.agents() * size_of::<Moment>();
@@ -71,7 +73,7 @@ pub fn parts<'a>(group: &Group<'a>) -> impl Iterator<Item = (usize, Group<'a>)> 
     parts.map(move |(part, chosen)| (part * teams, Group { teams: chosen, ..group }))
 }
 
-/// What a whole number came to over episodes; sums are exact, whatever their order.
+/// Count, sum and sum of squares of a whole number over episodes. Sums are exact, so the order does not matter.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Tally {
     count: u64,
@@ -79,14 +81,14 @@ pub struct Tally {
     squares: u128,
 }
 
-/// Mean, spread and what the mean would be over all episodes there could be, of a [`Tally`].
+/// The mean of a [`Tally`], its spread over episodes, and its confidence interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spread {
-    /// Over episodes.
+    /// Mean over episodes.
     pub mean: f64,
-    /// Sample standard deviation over episodes; none of one.
+    /// Sample standard deviation over episodes. None for one episode.
     pub deviation: Option<f64>,
-    /// The 95 % interval of the mean ([`statistics::mean`]'s); none of one episode.
+    /// The 95 % interval of the mean, see [`statistics::mean`]. None for one episode.
     pub interval: Option<[f64; 2]>,
 }
 
@@ -98,12 +100,12 @@ impl Tally {
         self.squares += u128::from(value) * u128::from(value);
     }
 
-    /// The mean; 0 without values.
+    /// Returns the mean, or 0 without values.
     pub fn mean(&self) -> f64 {
         self.sum as f64 / self.count.max(1) as f64
     }
 
-    /// Of values that are counted in parts of which `unit` make one, and none is above `most`.
+    /// Returns the spread of the values divided by `unit`. The interval is clamped to `0..=most`.
     pub fn spread(&self, unit: usize, most: usize) -> Spread {
         let (count, unit) = (self.count as f64, unit as f64);
         let mean = self.mean() / unit;
@@ -121,60 +123,62 @@ impl Tally {
     }
 }
 
-/// What teams came to over all episodes.
+/// The results of teams over all episodes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Evaluation {
-    /// Of each team.
+    /// Number of episodes per team.
     pub episodes: usize,
-    /// Of a team.
+    /// Number of leaders per team.
     pub leaders: usize,
-    /// Of the world.
+    /// Number of POIs.
     pub pois: usize,
     /// POIs observed, `[teams]`.
     pub observed: Vec<Tally>,
-    /// POIs observed by all teams of an episode together.
+    /// Sum of the POIs observed by all teams, per episode.
     pub together: Tally,
-    /// Sums over episodes of D, Df, D++ and, where it was asked for, Dt, `[teams][leaders]`.
+    /// Sums over episodes of D, Df, D++ and Dt, `[teams][leaders]`. Dt is 0 unless it was requested.
     credits: Vec<[f64; 4]>,
-    /// Whether it was.
+    /// Whether Dt was requested.
     timed: bool,
 }
 
 impl Evaluation {
-    /// POIs observed by a team.
+    /// Returns the spread of the POIs observed by a team.
     pub fn team(&self, team: usize) -> Spread {
         self.observed[team].spread(1, self.pois)
     }
 
-    /// POIs observed by the mean team, its spread from episode to episode.
+    /// Returns the spread over episodes of the POIs observed by the mean team.
     pub fn mean(&self) -> Spread {
         self.together.spread(self.observed.len(), self.pois)
     }
 
-    /// The team that observes most, ties to the lower index.
+    /// Returns the index of the team that observes most. Ties go to the lower index.
     pub fn best(&self) -> usize {
         let sum = |team: usize| self.observed[team].sum;
         (1..self.observed.len()).fold(0, |best, team| if sum(team) > sum(best) { team } else { best })
     }
 
-    /// Means over episodes of G, D, Df and D++ of a leader of a team.
+    /// Returns a leader's mean G, D, Df and D++ over episodes.
     pub fn scores(&self, team: usize, leader: usize) -> [f32; 4] {
         let g = self.observed[team].mean() / self.pois as f64;
         let [d, df, dpp, _] = self.credits[team * self.leaders + leader].map(|sum| sum / self.episodes as f64);
         [g, d, df, dpp].map(|score| score as f32)
     }
 
-    /// The mean over episodes of Dt of a leader of a team, if the group [needed](RecordRequest::sights) sights.
+    /// Returns a leader's mean Dt over episodes, if the group [needed](RecordRequest::sights) sights.
     pub fn dt(&self, team: usize, leader: usize) -> Option<f32> {
         self.timed.then(|| (self.credits[team * self.leaders + leader][3] / self.episodes as f64) as f32)
     }
 }
 
-/// Plays every team of a group from every start, in batches of as many episodes as memory bears, and works out every
-/// fitness, Dt only where the group needs sights; `watch` is told the share that is done, from any thread.
+/// Plays every team of a group from every start and computes every fitness. Dt is computed only if the group needs
+/// sights.
+///
+/// Memory limits the number of episodes per batch. `watch` receives the finished share, in 0..1, from any thread.
 ///
 /// # Errors
-/// When the backend fails.
+/// The backend fails.
 pub fn evaluate(
     backend: &mut dyn Backend,
     group: &Group<'_>,
@@ -215,7 +219,7 @@ pub fn evaluate(
             watch((done.fetch_add(1, Relaxed) + 1) as f64 / (teams * episodes) as f64);
         })?;
         let (observed, credits) = scored.into_inner().unwrap_or_else(|poisoned| poisoned.into_inner());
-        // Episode after episode, so that sums of floats do not depend on who played first.
+        // Episodes are added in order, so that float sums do not depend on which episode finished first.
         for observed in observed.chunks_exact(teams) {
             evaluation.together.add(observed.iter().map(|&observed| u64::from(observed)).sum());
             evaluation.observed.iter_mut().zip(observed).for_each(|(tally, &observed)| tally.add(observed.into()));

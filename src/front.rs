@@ -1,10 +1,10 @@
-//! What programs need, in a few lines: train with a callback, play and trace given policies, step teams by hand, read
-//! runs.
+//! The functions that most programs need: train with a callback, play and trace given policies, step teams by given
+//! actions, and read runs.
 //!
-//! Everything here checks what it is given, and hands back plain arrays; their shapes are written
-//! `[teams][leaders][8]`, the last index moving fastest. Beneath are [`crate::trainer`], [`crate::evaluate`],
-//! [`crate::stepping`] and [`crate::record`]. Runs that keep their files as they train, to be gone on with after
-//! anything, are [`crate::run`]'s.
+//! All functions check their arguments and return flat arrays. The documentation gives their shapes, for example
+//! `[teams][leaders][8]`; the last index changes fastest. The functions build on [`crate::trainer`],
+//! [`crate::evaluate`], [`crate::stepping`] and [`crate::record`]. Training that saves its files as it goes, and can be
+//! resumed, is in [`crate::run`].
 
 use std::borrow::Cow;
 use std::ops::ControlFlow;
@@ -38,88 +38,88 @@ use crate::stepping::{StepError, Stepper};
 use crate::trainer::{Row, Trainer};
 use crate::world::{INPUTS, OUTPUTS, World};
 
-/// Why a function here could not do what it was asked. Nothing was changed then.
+/// The error of a function in this module. A failed call changes nothing.
 #[derive(Debug, thiserror::Error)]
 pub enum Failure {
-    /// Everything that is wrong with a config.
+    /// All problems of a config.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// The machine has less memory than a training takes.
+    /// The machine has less memory than the training needs.
     #[error(transparent)]
     TooLittle(#[from] TooLittle),
-    /// The system gives no memory for this.
+    /// The system cannot allocate the memory.
     #[error("there is no memory for {what}, {bytes} bytes")]
     Memory {
-        /// What it is for.
+        /// The purpose of the memory.
         what: &'static str,
-        /// How much was asked for.
+        /// Number of bytes requested.
         bytes: u128,
     },
     /// Episodes could not be played.
     #[error(transparent)]
     Backend(#[from] BackendError),
-    /// No team, or more than there may be.
+    /// The number of teams is not allowed.
     #[error("{0} teams; there may be 1 to {MAX_POPULATION}")]
     Teams(usize),
-    /// Too few or too many weights for the teams.
+    /// The number of weights does not match the teams.
     #[error(
         "{found} weights for {teams} teams; [leaders][teams][parameters] are [{leaders}][{teams}][{parameters}], or \
          [1][{teams}][{parameters}] where leaders share a policy"
     )]
     Weights {
-        /// How many were given.
+        /// Number of weights given.
         found: usize,
-        /// Of a team.
+        /// Number of leaders per team.
         leaders: usize,
-        /// How many were asked for.
+        /// Number of teams requested.
         teams: usize,
-        /// Weights of a policy.
+        /// Number of weights per policy.
         parameters: usize,
     },
-    /// Policies of fewer or more trials than are trained.
+    /// The number of trials with given policies does not match the config.
     #[error("policies of {found} trials, where {trials} are trained; give each its own, or all the same")]
     Trials {
-        /// How many were given.
+        /// Number of trials given.
         found: usize,
-        /// Of the config.
+        /// Number of trials of the config.
         trials: usize,
     },
-    /// A weight that no policy may have.
+    /// A weight is too large or not a number.
     #[error(
         "weight {parameter} of the policy of leader {leader} in team {team} is {value}, allowed is a size up to {MAX_WEIGHT}"
     )]
     Weight {
-        /// Its place in the team.
+        /// Index of the leader in its team.
         leader: usize,
-        /// From 0.
+        /// Index of the team, from 0.
         team: usize,
-        /// Its place in the policy.
+        /// Index of the weight in the policy.
         parameter: usize,
-        /// What was given.
+        /// The value given.
         value: f32,
     },
-    /// Starts that cannot be drawn.
+    /// The starts cannot be drawn.
     #[error(
         "{episodes} episodes from starts moved by up to {jitter}; there may be 1 to {MAX_EPISODES}, and a jitter from 0 on"
     )]
     Starts {
-        /// Of each team.
+        /// Number of episodes per team.
         episodes: u32,
-        /// In units.
+        /// The jitter in units.
         jitter: f64,
     },
-    /// An episode that [`Starts`] do not have.
+    /// [`Starts`] has no such episode.
     #[error("episode {episode} of {episodes} (they count from 0)")]
     NoEpisode {
-        /// The one asked for, from 0.
+        /// The requested episode, from 0.
         episode: usize,
-        /// How many they have.
+        /// Number of episodes.
         episodes: usize,
     },
-    /// Teams could not be made.
+    /// The teams could not be created.
     #[error(transparent)]
     Step(#[from] StepError),
-    /// A run's folder could not be read.
+    /// A run's directory could not be read.
     #[cfg(feature = "report")]
     #[error(transparent)]
     Run(#[from] runs::ReadError),
@@ -129,35 +129,38 @@ pub enum Failure {
     Record(#[from] RecordError),
 }
 
-/// What episodes are to be played on.
+/// The processor that plays episodes.
 #[cfg(feature = "gpu")]
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Processor {
-    /// A GPU where there is one that can, else the CPU.
+    /// A usable GPU if there is one, else the CPU. Software renderers are ignored.
     #[default]
     Auto,
     /// The CPU.
     Cpu,
-    /// A GPU that is no software renderer.
+    /// A GPU. Software renderers are ignored.
     Gpu,
-    /// The adapter of this number in `gpu::device::adapters`, or whose name contains this; also a software renderer.
+    /// An adapter, selected by its index in `gpu::device::adapters` or by part of its name. It may be a software
+    /// renderer.
     Adapter(String),
 }
 
-/// What was found to play on besides the CPU.
+/// The result of the search for a GPU.
 #[cfg(feature = "gpu")]
 pub struct Found {
-    /// The GPU, opened.
+    /// The opened GPU, if one is used.
     pub gpu: Option<GpuBackend>,
-    /// Why a GPU that is there was passed over.
+    /// The reason why an existing GPU is not used.
     pub passed_over: Option<DeviceError>,
 }
 
-/// Looks for a GPU; none is an error only where one is asked for, or where it alone may hold the populations
-/// ([`Processor::Cpu`] never has one). It holds those that it had better, where nothing else is asked for.
+/// Opens the GPU that the processor asks for, if any. `holding` selects the populations that the GPU keeps between
+/// generations; without it, the backend's default applies.
+///
+/// With [`Processor::Auto`], a missing or unusable GPU is an error only if `holding` is [`ResidencyPolicy::Always`].
 ///
 /// # Errors
-/// There is none that can be used.
+/// The requested GPU does not exist or cannot be used.
 #[cfg(feature = "gpu")]
 pub fn find_gpu(processor: &Processor, holding: Option<ResidencyPolicy>) -> Result<Found, DeviceError> {
     let choice = match processor {
@@ -182,49 +185,49 @@ pub fn find_gpu(processor: &Processor, holding: Option<ResidencyPolicy>) -> Resu
     }
 }
 
-/// Opens what episodes are to be played on; also gives why a GPU that is there was passed over.
+/// Opens the backend for a processor. Also returns why an existing GPU is not used, if so.
 ///
 /// # Errors
-/// There is no such GPU, or none that can be used.
+/// The requested GPU does not exist or cannot be used.
 #[cfg(feature = "gpu")]
 pub fn open(processor: &Processor) -> Result<(OpenBackend, Option<DeviceError>), DeviceError> {
     let Found { gpu, passed_over } = find_gpu(processor, None)?;
     Ok((gpu.map_or_else(cpu, on_gpu), passed_over))
 }
 
-/// The backend that is always there.
+/// Returns the CPU backend, which is always available.
 pub fn cpu() -> OpenBackend {
     (Box::new(Cpu::default()), Machine::of_cpu())
 }
 
-/// A GPU, and what it is.
+/// Returns an opened GPU as a backend, with its description.
 #[cfg(feature = "gpu")]
 pub fn on_gpu(backend: GpuBackend) -> OpenBackend {
     let machine = Machine::of_gpu(&backend);
     (Box::new(backend), machine)
 }
 
-/// A generation of all trials that has been played, its champions too.
+/// One generation of all trials, reported after its teams and champions have played.
 #[derive(Clone, Copy, Debug)]
 pub struct Generation<'a> {
-    /// Which one, from 0, the random start.
+    /// Index of the generation. Generation 0 plays the initial policies.
     pub generation: usize,
-    /// The last that there will be.
+    /// Index of the last generation.
     pub last: usize,
-    /// What it came to, by trial.
+    /// The results, one row per trial.
     pub rows: &'a [Row],
 }
 
-/// What a training came to.
+/// The results of a training.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trained {
-    /// What was trained; where the training was stopped, of fewer generations.
+    /// The config that was trained. If the training was stopped early, it has fewer generations.
     pub config: Config,
-    /// G of each generation's best team, in 0..1: `[trials][generations + 1]`, the random start first.
+    /// G of each generation's best team, in 0..1: `[trials][generations + 1]`, generation 0 first.
     pub best_g: Vec<f64>,
-    /// The mean of a generation's teams, likewise.
+    /// Mean G of each generation's teams: `[trials][generations + 1]`.
     pub mean_g: Vec<f64>,
-    /// The team of every population's best policy, likewise.
+    /// G of the champion, the team of every population's best policy: `[trials][generations + 1]`.
     pub champion_g: Vec<f64>,
     /// The last generation's policies, best first in each population: `[trials]` of `[leaders][policies][parameters]`.
     pub policies: Vec<Vec<f32>>,
@@ -247,10 +250,10 @@ impl Trained {
         trained
     }
 
-    /// Reads what a run came to from its folder.
+    /// Reads the results of a finished run from its directory.
     ///
     /// # Errors
-    /// The folder holds no run, or one that is not finished, or its files are damaged or not as the run left them.
+    /// The directory has no finished run, or its files are damaged or were changed after the run.
     #[cfg(feature = "report")]
     pub fn read(folder: &Path, verification: Verification) -> Result<Trained, Failure> {
         let config = runs::config(folder, verification)?;
@@ -275,14 +278,15 @@ impl Trained {
         let policies = policies::read_all(&path, &config)?;
         let digests = Digests::read(folder, verification)?;
         let trained = Trained::new(config, &rows, policies);
-        // Config and metrics are as the run left them, so policies are what differs.
+        // The config and the metrics match their digests, so the policies must differ.
         match digests.run {
             Some(digest) if digest != trained.digest() => Err(RecordError::Differs { path }.into()),
             _ => Ok(trained),
         }
     }
 
-    /// The digest that `run.json` has of a run that came to the same: of the metrics and all policies.
+    /// Returns the digest of the metrics and all policies, equal to the one that `run.json` records for the same
+    /// results.
     #[cfg(feature = "record")]
     pub fn digest(&self) -> String {
         let trials = self.config.learning.trials;
@@ -297,12 +301,13 @@ impl Trained {
     }
 }
 
-/// Trains all trials of a config. `watch` is told of every generation, and stops the training by
-/// [`ControlFlow::Break`]: then one more generation is played, and what comes out is to the bit what a config of so few
-/// generations comes to.
+/// Trains all trials of a config and calls `watch` after every generation.
+///
+/// If `watch` returns [`ControlFlow::Break`], one more generation plays and the training ends. The results are then bit
+/// for bit those of a config with that many generations.
 ///
 /// # Errors
-/// The config is wrong or too large for the memory there is, or the backend fails.
+/// The config is invalid, its memory does not fit this machine, or the backend fails.
 pub fn train(
     config: &Config,
     backend: &mut dyn Backend,
@@ -311,12 +316,14 @@ pub fn train(
     train_from(config, backend, 0, &[], watch)
 }
 
-/// [`train`], from given policies in place of random ones: one `[leaders][policies][parameters]` for each trial, or one for
-/// all; where leaders share a policy, `[1][policies][parameters]`. Populations that take more are filled up at random, and
-/// those that take fewer take the first.
+/// Trains as [`train`] does, but starts from given policies instead of random ones.
+///
+/// `first` has one array `[leaders][policies][parameters]` per trial, or one for all trials. If leaders share a policy,
+/// the shape is `[1][policies][parameters]`. A larger population fills its remaining slots with random policies. A
+/// smaller one takes the first policies.
 ///
 /// # Errors
-/// See [`train`]; or the policies do not fit the config.
+/// As for [`train`], or the policies do not fit the config.
 pub fn train_from(
     config: &Config,
     backend: &mut dyn Backend,
@@ -327,7 +334,7 @@ pub fn train_from(
     let valid = config.validate()?;
     let mut config = Config::clone(&valid);
     let plan = Peaks::of([&config], current_num_threads());
-    // Nothing is saved on the way, but what comes out is kept: the rows twice, and the policies.
+    // Nothing is saved during training, but the results stay in memory: every row twice, and the policies.
     let rows = config.learning.trials as u64 * (config.learning.generations as u64 + 1);
     let kept = rows * (size_of::<Row>() + 3 * size_of::<f64>()) as u64 + config.policy_bytes();
     let needed = (plan.host.min(plan.gpu_host) - plan.checkpoint).saturating_add(kept);
@@ -366,29 +373,32 @@ pub fn train_from(
     Ok(Trained::new(config, &rows, policies))
 }
 
-/// What teams scored: of several episodes, means.
+/// The scores of teams, averaged over episodes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Played {
-    /// POIs observed, `[teams]`.
+    /// Number of POIs observed, `[teams]`.
     pub observed: Vec<f64>,
-    /// Share of the POIs observed, in 0..1, `[teams]`.
+    /// G, the share of POIs observed, in 0..1, `[teams]`.
     pub g: Vec<f32>,
     /// D, `[teams][leaders]`.
     pub d: Vec<f32>,
-    /// Df, likewise.
+    /// Df, `[teams][leaders]`.
     pub df: Vec<f32>,
-    /// D++, likewise.
+    /// D++, `[teams][leaders]`.
     pub dpp: Vec<f32>,
-    /// Dt, likewise, where it is the config's fitness, else empty: it takes a record of who was seen at every step.
+    /// Dt, `[teams][leaders]`. Empty unless Dt is the config's fitness, because Dt needs a record of who was seen at
+    /// every step.
     pub dt: Vec<f32>,
 }
 
-/// Plays teams of given policies, `[leaders][teams][parameters]`: team `t` is made of every leader's policy `t`. Where
-/// all leaders of a team share one, `[1][teams][parameters]` will do. A policy's parameters stand layer by layer, in
-/// each input by input with the bias last, in each unit by unit.
+/// Plays teams of given policies, `[leaders][teams][parameters]`. Team `t` consists of every leader's policy `t`. If
+/// the leaders of a team share one policy, `[1][teams][parameters]` is enough.
+///
+/// A policy's parameters are its layers in order. Each layer has its weights row-major, `W[in, out]`, then its biases
+/// `b[out]`.
 ///
 /// # Errors
-/// The config, the weights or the starts are wrong, or the backend fails.
+/// The config, the weights or the starts are invalid, or the backend fails.
 pub fn play(
     config: &Config,
     backend: &mut dyn Backend,
@@ -413,27 +423,29 @@ pub fn play(
     })
 }
 
-/// Everything that teams did in one episode.
+/// The states, inputs, outputs and observations of every step of one episode.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Traced {
-    /// Where everyone was, from the start on: `[teams][steps + 1][agents][2]`, leaders first.
+    /// Positions in units, `[teams][steps + 1][agents][2]`. Step 0 is the start. Leaders come first.
     pub positions: Vec<f32>,
-    /// Unit vectors, likewise.
+    /// Headings as unit vectors, `[teams][steps + 1][agents][2]`.
     pub headings: Vec<f32>,
-    /// Units a second, `[teams][steps + 1][agents]`.
+    /// Speeds in units per second, `[teams][steps + 1][agents]`.
     pub speeds: Vec<f32>,
-    /// What leaders sensed there, `[teams][steps][leaders][8]`.
+    /// The leaders' inputs, `[teams][steps][leaders][8]`. Index 0 is sensed at the start.
     pub inputs: Vec<f32>,
-    /// What their policies answered to these, `[teams][steps][leaders][2]`: that leads to the next step's states.
+    /// The outputs of the leaders' policies for these inputs, `[teams][steps][leaders][2]`. They lead to the next
+    /// step's state.
     pub outputs: Vec<f32>,
-    /// The agents near each POI after each step, a bit an agent: `[teams][steps][pois][words]`.
+    /// The agents within the observation radius of each POI after each step, `[teams][steps][pois][words]`. Each agent
+    /// is one bit.
     pub near: Vec<u32>,
 }
 
-/// Plays one episode of given policies, see [`play`], and keeps everything.
+/// Plays one episode of given policies and records every step. See [`play`] for the arguments.
 ///
 /// # Errors
-/// The config, the weights or the starts are wrong, there is no memory for so much, or the backend fails.
+/// The config, the weights or the starts are invalid, the memory is insufficient, or the backend fails.
 pub fn trace(
     config: &Config,
     backend: &mut dyn Backend,
@@ -472,7 +484,7 @@ pub fn trace(
                 traced.headings.extend(moment.heading);
                 traced.speeds.push(moment.speed);
             }
-            // A trace has what led to a state beside it.
+            // A trace stores inputs and outputs with the state that they lead to.
             for moment in (0..leaders).filter(|_| step > 0).map(|leader| trace.moment(step, team, leader)) {
                 traced.inputs.extend(moment.inputs);
                 traced.outputs.extend(moment.outputs);
@@ -483,11 +495,11 @@ pub fn trace(
     Ok(traced)
 }
 
-/// Teams to be stepped by given actions, all at the world's start; with a record, they can be scored, by Dt where that
-/// is the config's fitness.
+/// Creates teams that are stepped by given actions, all at the world's start. With `recording`, the teams can be
+/// scored, including Dt if that is the config's fitness.
 ///
 /// # Errors
-/// The config is wrong, or there may not be so many teams.
+/// The config is invalid, or the number of teams is not allowed.
 pub fn stepper(config: &Config, teams: usize, recording: bool) -> Result<Stepper, Failure> {
     let world = World::new(&*config.validate()?);
     Ok(match (recording, config.learning.fitness) {
@@ -497,7 +509,7 @@ pub fn stepper(config: &Config, teams: usize, recording: bool) -> Result<Stepper
     })
 }
 
-/// Teams of given policies, fit to be played.
+/// Teams of given policies after all checks.
 struct Cast<'a> {
     world: World,
     weights: Cow<'a, [f32]>,
@@ -522,7 +534,7 @@ impl<'a> Cast<'a> {
         if !weights.len().is_multiple_of(teams) || !(shared || weights.len() / teams == leaders * parameters) {
             return Err(Failure::Weights { found: weights.len(), leaders, teams, parameters });
         }
-        // Every leader has a place in a team, and several scores.
+        // Each leader of a team needs an entry of `teams` and several scores.
         let bytes = teams as u128 * leaders as u128 * 28;
         if !usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok()) {
             return Err(Failure::Memory { what: "all teams", bytes });

@@ -5,13 +5,13 @@ use fearless_simd::{Simd, prelude::*};
 
 /// The type of a field of a GPU struct: 32 bits, an array of those, or another GPU struct.
 pub trait Field: Pod {
-    /// The type with one team per lane: floats are copied to all lanes, other fields stay as they are.
+    /// The type with one team per lane: `f32` is copied to all lanes, other fields keep their type.
     type Lanes<S: Simd>: Copy;
 
-    /// Copies floats to all lanes.
+    /// Converts a value to [`Field::Lanes`].
     fn lanes<S: Simd>(self, simd: S) -> Self::Lanes<S>;
 
-    /// Returns the lines that declare such a field in a WGSL struct.
+    /// Returns the WGSL lines that declare a field of this type.
     fn declared(name: &str) -> String;
 }
 
@@ -67,7 +67,7 @@ pub trait GpuStruct: Pod {
     /// Returns the names of the fields.
     fn names() -> &'static [&'static str];
 
-    /// `struct Name { … }`
+    /// Returns the declaration in WGSL: `struct Name { … }`.
     fn wgsl() -> String {
         format!("struct {} {{\n{}}}\n", Self::NAME, Self::fields())
     }
@@ -85,10 +85,10 @@ pub trait GpuStruct: Pod {
     }
 }
 
-/// Declares structs that a shader shares with the host. Each field is one line, from which the `#[repr(C)]` type and
-/// the WGSL text are made. A struct `as` another also gets a form with every float in all lanes.
+/// Declares structs that a shader shares with the host. The `#[repr(C)]` type and the WGSL text are made from the same
+/// list of fields. `pub struct A as B` also declares `B`, with every `f32` field copied to all lanes.
 ///
-/// All fields have 32 bits, so neither side adds padding.
+/// All fields consist of 32-bit words, so neither side adds padding.
 macro_rules! gpu_struct {
     () => {};
     ($(#[$about:meta])* pub struct $name:ident as $lanes:ident { $($fields:tt)+ } $($more:tt)*) => {

@@ -1,8 +1,9 @@
-//! flotilla trains cooperative teams by coevolution, in batches, on any GPU, with the same bits on a CPU.
+//! flotilla trains cooperative teams by coevolution. Episodes play in batches on any GPU or on the CPU, and both give
+//! the same bits.
 //!
-//! # In a few lines
+//! # Example
 //!
-//! Train, with a callback a generation that may stop:
+//! Train with a callback that is called after every generation and may stop the training:
 //!
 //! ```
 //! use std::ops::ControlFlow::{Break, Continue};
@@ -31,7 +32,7 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! [`front`] has these and more; `examples/` has whole programs.
+//! [`front`] has these functions and more. `examples/` has complete programs.
 //!
 //! # Follow one team from config to fitness
 //!
@@ -41,83 +42,84 @@
 //!                       └──────────────┴────────────── next generation ◀───────┘
 //! ```
 //!
-//! 1. [`config`] reads a TOML file and reports everything that is wrong with it. [`model`] has the sections, constants
-//!    and formulas of a step's parts.
-//! 2. [`world`] turns a config into one experiment's constants and start state.
-//! 3. [`trainer`] draws team schedules with [`evolve`], and gives the teams of all trials to a [`backend`] as one batch.
-//! 4. The backend plays each team's whole episode: with [`model`] on the CPU, with its twins under `shaders/` on a GPU.
-//!    It records who was at which POI at which step and which leader each follower saw, or as much of that as the
-//!    fitness needs.
+//! 1. [`config`] reads a TOML file and reports every problem in it. [`model`] has the config sections, constants and
+//!    formulas of the parts of a step.
+//! 2. [`world`] computes one experiment's constants and start state from its config.
+//! 3. [`trainer`] draws team schedules with [`evolve`] and passes the teams of all trials to a [`backend`] as one
+//!    batch.
+//! 4. The backend plays each team's whole episode: with [`model`] on the CPU, with the equivalent shaders under
+//!    `shaders/` on a GPU. It records who was at which POI at which step and which leader each follower saw, or as much
+//!    of that as the fitness needs.
 //! 5. [`credit`] computes G, D, Df, D++ and Dt from that record.
-//! 6. [`evolve`] selects and mutates on the host, or plans the same for a GPU that holds the populations. [`run`] saves
-//!    the results with [`record`]; [`report`] draws them.
+//! 6. [`evolve`] selects and mutates on the host, or plans this for a GPU that holds the populations. [`run`] saves the
+//!    results with [`record`], and [`report`] draws them.
 //!
 //! # Where to change what
 //!
 //! | to | change |
 //! |---|---|
-//! | add a density | `model/sense.rs` and its twin `shaders/sense.wgsl`, `bench/operations.rs` |
+//! | add a density | `model/sense.rs` and its shader `shaders/sense.wgsl`, `bench/operations.rs` |
 //! | add a fitness | `config/learning.rs`, `credit/` (`mod.rs`, `fast.rs` or `replay.rs`), `backend/batch.rs` (what to record) |
-//! | hold populations in a third place | `trainer/residency.rs`, `trainer/populations.rs`, `backend/batch.rs` |
+//! | add a place that holds populations | `trainer/residency.rs`, `trainer/populations.rs`, `backend/batch.rs` |
 //!
 //! # Modules
 //!
-//! Each imports only those above it. A module without a feature is always compiled.
+//! Each module imports only modules above it. Modules without a feature are always compiled.
 //!
-//! | module | feature | holds |
+//! | module | feature | contents |
 //! |---|---|---|
-//! | [`escape`], [`mod@file`], [`shell`] | | names, paths and command lines as input and output |
+//! | [`escape`], [`mod@file`], [`shell`] | | reading and writing of names, files and command lines |
 //! | [`host`], [`parallel`] | | time, waiting and threads |
-//! | [`config_enum`], [`gpu_struct`] | | enums that are words in configs, structs that shaders share |
+//! | [`config_enum`], [`gpu_struct`] | | enums that configs write as words, structs shared with shaders |
 //! | [`reader`] | | reading a TOML text key by key |
-//! | [`kernels`] | | arithmetic on lanes of teams |
+//! | [`kernels`] | | vector arithmetic on many teams at once |
 //! | [`model`] | | the parts of a step: keys, constants, formulas, shaders |
-//! | [`config`] | | the config: what an experiment is |
+//! | [`config`] | | the config, which defines an experiment |
 //! | [`world`] | | one experiment's constants and start state |
-//! | [`reach`] | | how far agents travel at most, and which POIs no team can observe |
+//! | [`reach`] | | how far agents can travel, and which POIs no team can observe |
 //! | [`evolve`] | | random numbers, team schedules, selection and mutation |
 //! | [`sample`] | | random worlds for tests |
 //! | [`backend`] | | whole episodes of many teams on the CPU, and with `gpu` on a GPU |
 //! | [`credit`] | | G, D, Df, D++ and Dt |
 //! | [`trainer`] | | the generation loop |
-//! | [`verify`] | | whether two backends agree bit for bit |
-//! | [`statistics`] | | intervals and tests |
-//! | [`evaluate`] | | trained teams from held-out starts |
+//! | [`verify`] | | check that two backends agree bit for bit |
+//! | [`statistics`] | | confidence intervals and tests |
+//! | [`evaluate`] | | evaluation of trained teams from held-out starts |
 //! | [`baseline`] | | baselines without learning |
-//! | [`stepping`] | | teams stepped with given actions |
+//! | [`stepping`] | | stepping of teams with given actions |
 //! | [`memory`] | | a run's peak memory |
-//! | [`record`] | `record` | files: policies, metrics, checkpoints, folders |
-//! | [`run`] | `record` | a trainer together with its runs' folders |
+//! | [`record`] | `record` | files: policies, metrics, checkpoints, directories |
+//! | [`run`] | `record` | a trainer together with its runs' directories |
 //! | [`report`] | `report` | pictures, films, pages; the paper's claims |
-//! | [`sweep`] | `report` | many runs of a grid |
-//! | [`front`] | | what programs need, in a few lines |
+//! | [`sweep`] | `report` | many runs of a parameter grid |
+//! | [`front`] | | the functions that most programs need |
 //! | [`mod@bench`] | `cli` | a backend's speed, and the machine's arithmetic ceiling |
 //! | [`cli`] | `cli` | the command line |
 //!
-//! Only `backend::gpu` and the GPU's ceiling in [`mod@bench`] use wgpu. The model knows neither threads nor GPUs. Only
-//! [`host`] reads the clock.
+//! Only `backend::gpu` and the GPU's ceiling in [`mod@bench`] use wgpu. The model does not depend on threads or GPUs.
+//! Only [`host`] reads the clock.
 //!
 //! # Features
 //!
-//! | feature | brings | crates in all, about |
+//! | feature | adds | total crates, approximately |
 //! |---|---|---|
-//! | (none) | training, evaluation and verification by the CPU, on one thread; on WebAssembly too | 30 |
-//! | `scalar` | episodes without vector instructions, too, for `verify --report` | 30 |
-//! | `parallel` | all threads, by rayon; the bits stay | 35 |
-//! | `gpu` | any GPU, by wgpu | 80 |
+//! | (none) | training, evaluation and verification on one CPU thread; also on WebAssembly | 30 |
+//! | `scalar` | also episodes without vector instructions, for `verify --report` | 30 |
+//! | `parallel` | all threads, using rayon; results keep the same bits | 35 |
+//! | `gpu` | any GPU, using wgpu | 80 |
 //! | `record` | runs on disk | 55 |
-//! | `report` | `record`, and pictures | 75 |
-//! | `cli` (default) | the program, with all of these | 145 |
+//! | `report` | pictures; includes `record` | 75 |
+//! | `cli` (default) | the program; includes all of the above except `scalar` | 145 |
 
 #![deny(missing_docs)]
 
-/// The commit that this was built from, where that is known; a debug build does not know it.
+/// The commit that this build was made from, if it is known. Debug builds do not know it.
 pub const COMMIT: Option<&str> = {
     let commit = env!("FLOTILLA_COMMIT");
     if commit.is_empty() { None } else { Some(commit) }
 };
 
-/// The version of this crate, as `run.json` has it.
+/// The version of this crate, as recorded in `run.json`.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 pub mod backend;

@@ -1,9 +1,10 @@
-//! What a run takes in memory at its peak, told before it starts.
+//! Estimate of a run's peak memory, made before the run starts.
 //!
-//! Every array that grows with the run is counted where it lives: [`trainer`] tells what every run has, [`backend`]
-//! what episodes take. What does not grow is [`PROGRAM`]. Nothing else is as large: checkpoints and policies are
-//! written straight from the populations, or from one copy, see [`copies_checkpoint`]. A sweep keeps its batches to
-//! half of what is available.
+//! Every array that grows with the run is counted in the module that owns it. [`trainer`] counts what every run needs,
+//! and [`backend`] counts what episodes need. [`PROGRAM`] covers everything that does not grow.
+//!
+//! Nothing else is as large. Checkpoints and policies are written directly from the populations or from a single copy,
+//! see [`copies_checkpoint`]. A sweep limits its batches to half of the available memory.
 
 use std::fs;
 use std::path::Path;
@@ -13,25 +14,26 @@ use crate::config::Config;
 use crate::trainer;
 use crate::world::World;
 
-/// Bytes of the program itself: its code, its threads' stacks and what it reads. A GPU's driver comes on top.
+/// Bytes for the program itself: its code, the stacks of its threads and its input. The driver of a GPU is not
+/// included.
 pub const PROGRAM: u64 = 8 << 20;
-/// Most bytes of populations of which a checkpoint takes a copy, to be written while training goes on.
+/// Maximum bytes of populations that are copied for a checkpoint, so that it can be written while training continues.
 const COPIED: u64 = 64 << 20;
 
-/// Peaks, in bytes.
+/// Peaks of memory use, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Peaks {
-    /// Of the process, where the CPU plays.
+    /// Peak of the process if the CPU plays.
     pub host: u64,
-    /// How much of that is only while a checkpoint is written.
+    /// Part of the process's peak that is only used while a checkpoint is written.
     pub checkpoint: u64,
-    /// Of the process, where a GPU plays, without what its driver keeps there.
+    /// Peak of the process if a GPU plays, without the memory of its driver.
     pub gpu_host: u64,
-    /// Of the GPU's buffers; of those that are read back, the adapter's side.
+    /// Peak of the GPU's buffers. For buffers that are read back, this includes only the adapter's side.
     pub adapter: u64,
 }
 
-/// There is less memory than a run needs.
+/// A run needs more memory than is available.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "this needs {} of memory at its peak, and {} is available; choose a smaller population, fewer trials{} or another \
@@ -40,16 +42,16 @@ pub struct Peaks {
     if *checkpoint > 0 { format!(", no checkpoints (they take {} of it)", human(*checkpoint)) } else { String::new() }
 )]
 pub struct TooLittle {
-    /// Bytes at the run's peak.
+    /// Bytes at the peak of the run.
     pub needed: u64,
-    /// Bytes that the system has to give.
+    /// Bytes that are available.
     pub available: u64,
-    /// How much of what is needed is for checkpoints.
+    /// Part of the needed bytes that is used for checkpoints.
     pub checkpoint: u64,
 }
 
 impl Peaks {
-    /// What it takes to train these (valid) configs side by side, on so many threads.
+    /// Returns the peaks for training these valid configs together on `threads` threads.
     pub fn of<'a>(configs: impl IntoIterator<Item = &'a Config>, threads: usize) -> Peaks {
         let lanes = cpu::lanes();
         let [mut training, mut next, mut checkpoint, mut queue] = [0_u64; 4];
@@ -63,7 +65,7 @@ impl Peaks {
                 })
                 .collect();
             let need = |config: &Config| RecordRequest::Score(config.learning.fitness);
-            // Of what a stage decides, the largest counts.
+            // The largest stage determines each size.
             let most = |size: &dyn Fn(&Config, &World) -> u64| {
                 staged.iter().map(|(config, world)| size(config, world)).max().unwrap_or(0)
             };
@@ -85,41 +87,41 @@ impl Peaks {
                 teams(config).saturating_mul(backend::state_bytes(world, need(config)))
             }));
         }
-        // Episodes and the final sorting of each population take turns.
+        // Episodes and the final sorting of each population do not happen at the same time.
         let playing = threads as u64 * block + queue;
         let sorting = populations.min(threads as u64) * order;
         let always = PROGRAM + training + checkpoint;
-        // A batch ends when the largest of its three large buffers is full; two are under way.
+        // A batch ends when the largest of its three large buffers is full. Two batches are in progress at a time.
         let share = |bytes: u64, batches: u64| {
             let batch =
                 u128::from(bytes) * u128::from(BATCH_BYTES) / u128::from(weights.max(record).max(states).max(1));
             bytes.min(batch as u64 * batches)
         };
-        // What is packed of a record takes at most as much again, and where it does not fit the record comes whole.
+        // The packed form of a record takes at most as much again. If it does not fit, the whole record is read back.
         let records = share(record, 2) * if record < PACKED_FROM { 1 } else { 2 };
         Peaks {
             host: always + playing.max(sorting),
             checkpoint,
-            // A batch is gathered, and two are on their way to the adapter or back.
+            // One batch is assembled on the host, and two are being transferred to or from the adapter.
             gpu_host: always + next + (share(weights, 1) + share(weights, 2) + records).max(sorting),
             adapter: share(weights, 2) + records + share(states, 2) + held,
         }
     }
 
-    /// Refuses what does not fit in the memory that is available now; lets pass where the system does not tell.
+    /// Fails if the peak exceeds the available memory. Passes if the system does not report that value.
     ///
     /// # Errors
-    /// There is less.
+    /// The available memory is smaller than the peak.
     pub fn check(&self, gpu: bool) -> Result<(), TooLittle> {
         check(if gpu { self.gpu_host } else { self.host }, self.checkpoint)
     }
 }
 
-/// Refuses a peak, so much of it for checkpoints, that does not fit in the memory that is available now; lets pass
-/// where the system does not tell.
+/// Fails if a peak exceeds the available memory. `checkpoint` is the part of it that checkpoints use. Passes if the
+/// system does not report the available memory.
 ///
 /// # Errors
-/// There is less.
+/// The available memory is smaller than the peak.
 pub fn check(needed: u64, checkpoint: u64) -> Result<(), TooLittle> {
     match available() {
         Some(available) if available < needed => Err(TooLittle { needed, available, checkpoint }),
@@ -127,22 +129,22 @@ pub fn check(needed: u64, checkpoint: u64) -> Result<(), TooLittle> {
     }
 }
 
-/// Whether a checkpoint of these configs' trainer is a copy, written while training goes on. Larger ones are written
-/// from the populations themselves, and training waits.
+/// Returns whether a checkpoint of these configs is copied and written while training continues. Larger checkpoints are
+/// written directly from the populations, and training waits.
 pub fn copies_checkpoint<'a>(configs: impl IntoIterator<Item = &'a Config>) -> bool {
     configs.into_iter().map(trainer::snapshot_bytes).sum::<u64>() <= COPIED
 }
 
-/// What a checkpoint copies.
+/// Returns the bytes that a checkpoint copies.
 fn checkpoint_bytes(config: &Config) -> u64 {
     let due = config.checkpoint.generations > 0 || config.checkpoint.seconds > 0.0;
     if due && copies_checkpoint([config]) { trainer::snapshot_bytes(config) } else { 0 }
 }
 
-/// Returns the bytes that this process may still take: what the system has free or can free, within the limits of its
-/// control groups and of its address space. None if the system does not say.
+/// Returns the bytes that this process may still use, or `None` if the system does not report them.
 ///
-/// On macOS and Windows only the program (the feature `cli`) asks.
+/// This is what the system has free or can free, within the limits of the process's control groups and address space.
+/// On macOS and Windows, only the program (the feature `cli`) can query it.
 pub fn available() -> Option<u64> {
     match () {
         #[cfg(all(feature = "cli", any(target_os = "macos", windows)))]
@@ -160,7 +162,7 @@ fn free_of_system() -> Option<u64> {
     Some(system.available_memory()).filter(|&bytes| bytes > 0)
 }
 
-/// [`available`] on Linux, whose files are under this folder.
+/// Implementation of [`available`] on Linux, with the system's files below `root`.
 fn available_under(root: &Path) -> Option<u64> {
     let read = |path: &str| fs::read_to_string(root.join(path)).ok();
     let kib = |text: String, name: &str| field(&text, name).map(|kib| kib.saturating_mul(1024));
@@ -174,12 +176,12 @@ fn available_under(root: &Path) -> Option<u64> {
     limits.chain(address_space()).chain([free]).min()
 }
 
-/// Returns what the memory limits of a control group and of the groups above it leave. `line` is the group's in
-/// `/proc/self/cgroup`: `0::/path` in version 2, `number:controllers:/path` in version 1.
+/// Returns what the memory limits of a control group and of its parent groups leave. `line` is the line of the group in
+/// `/proc/self/cgroup`. Its format is `0::/path` in version 2 and `number:controllers:/path` in version 1.
 fn limits_of_group(root: &Path, line: &str) -> Vec<u64> {
     let mut parts = line.splitn(3, ':').skip(1);
     let (Some(controllers), Some(path)) = (parts.next(), parts.next()) else { return vec![] };
-    // Each version's folder, its file with the limit, and what its processes hold besides files, which can be dropped.
+    // Per version: the folder, the file with the limit, and the memory in use without files, which can be dropped.
     let (mount, limit, held) = match controllers {
         "" => ("sys/fs/cgroup", "memory.max", "anon "),
         _ if controllers.split(',').any(|name| name == "memory") => {
@@ -193,16 +195,16 @@ fn limits_of_group(root: &Path, line: &str) -> Vec<u64> {
         let most: u64 = read(limit)?.trim().parse().ok()?;
         Some(most.saturating_sub(field(&read("memory.stat")?, held).unwrap_or(0)))
     };
-    // In a container the path may be the host's: then only the group at the top is there.
+    // In a container the path may be that of the host. Only the group at the top exists in that case.
     Path::new(path).ancestors().filter_map(left).collect()
 }
 
-/// The number after a name at the start of a line.
+/// Returns the number after a name at the start of a line.
 fn field(text: &str, name: &str) -> Option<u64> {
     text.lines().find_map(|line| line.strip_prefix(name)?.split_whitespace().next()?.parse().ok())
 }
 
-/// "3.6 GiB"
+/// Formats bytes, such as "3.6 GiB".
 fn human(bytes: u64) -> String {
     let mib = bytes as f64 / f64::from(1 << 20);
     if mib < 1024.0 { format!("{mib:.1} MiB") } else { format!("{:.1} GiB", mib / 1024.0) }
@@ -220,7 +222,7 @@ mod tests {
         assert_eq!(field(text, "none"), None);
     }
 
-    /// A folder with files as Linux has them.
+    /// Creates a folder with files like those of Linux.
     fn system(files: &[(&str, &str)]) -> tempfile::TempDir {
         let root = tempfile::tempdir().unwrap();
         for (name, text) in files {
@@ -238,7 +240,7 @@ mod tests {
         let available = |files: &[(&str, &str)]| available_under(system(files).path());
         assert_eq!(available(&[]), None);
         assert_eq!(available(&[FREE]), Some(8_192_000));
-        // Version 2: a limit of the group above, and "max" below.
+        // Version 2: the parent group has a limit, and the group itself has "max".
         let second = [
             FREE,
             ("proc/self/cgroup", "0::/jobs/one\n"),
@@ -248,7 +250,7 @@ mod tests {
             ("sys/fs/cgroup/jobs/memory.stat", "anon 1000000\nanon_thp 9\n"),
         ];
         assert_eq!(available(&second), Some(4_000_000));
-        // Version 1, as Slurm makes groups: a job's limit above its steps, whose own is none.
+        // Version 1, as Slurm creates groups: the job has a limit, and its step has none.
         let first = [
             FREE,
             ("proc/self/cgroup", "5:cpuset:/\n4:hugetlb,memory:/slurm/job_7/step_0\n0::/\n"),
@@ -260,7 +262,7 @@ mod tests {
             ("sys/fs/cgroup/memory/slurm/job_7/step_0/memory.stat", "total_rss 500000\n"),
         ];
         assert_eq!(available(&first), Some(2_500_000));
-        // Version 1 in a container: the path is the host's.
+        // Version 1 in a container: the path is that of the host.
         let contained = [
             FREE,
             ("proc/self/cgroup", "4:memory:/docker/0123\n"),

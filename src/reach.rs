@@ -1,7 +1,7 @@
-//! How far agents can travel at most, and which POIs no team can observe.
+//! Bounds on how far agents can travel, and the POIs that no team can observe.
 //!
-//! These are bounds: a POI that is reported here cannot be observed by any policy. One that is not reported may still be
-//! out of reach, since bounds ignore turns and the formation of a team.
+//! A POI that is reported here cannot be observed by any policy. A POI that is not reported may still be out of reach,
+//! because the bounds ignore turns and the formation of a team.
 
 use std::fmt::{self, Display};
 
@@ -15,35 +15,35 @@ const ROUNDING: f64 = 1e-5;
 /// A POI that no team can observe.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Unreachable {
-    /// Its index.
+    /// Index of the POI.
     pub poi: usize,
-    /// Why nobody can observe it.
+    /// The reason.
     pub why: Why,
 }
 
-/// Why no team can observe a POI.
+/// The reason why no team can observe a POI.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Why {
     /// Too few agents get there in time.
     Far {
-        /// How many must be there at once.
+        /// Number of agents that must be there in the same step.
         needed: usize,
-        /// What the agents that count are called: "agent", "leader" or "follower".
+        /// The name of the agents that count: "agent", "leader" or "follower".
         who: &'static str,
-        /// How far from the POI the last one that is needed starts, at best.
+        /// Start distance between the POI and the farthest agent needed, less jitter, in units.
         distance: f64,
-        /// Within this distance it would be at the POI.
+        /// The observation radius in units.
         radius: f64,
-        /// How far an agent travels at most until the POI's last step.
+        /// Maximum distance that an agent travels until the POI's last step, in units.
         travel: f64,
         /// The last step at which the POI can be observed.
         steps: usize,
     },
-    /// Its last step comes before it can be observed, because it comes after another POI.
+    /// The POI comes after another one, and its last step is too early for that.
     After {
         /// The other POI.
         other: usize,
-        /// The first step at which the other can be observed, if there is one.
+        /// The first step at which the other POI can be observed, if any.
         observed: Option<usize>,
     },
 }
@@ -77,14 +77,14 @@ impl Display for Unreachable {
     }
 }
 
-/// How far an agent travels at most, in units, after each of so many steps, 0 at the start.
+/// Returns the maximum distance that an agent travels after each step, in units: `[steps + 1]`, 0 at the start.
 ///
-/// It accelerates as fast as it can and never turns. Walls only shorten its way.
+/// The agent accelerates as fast as it can and never turns. Walls can only shorten its path.
 pub fn travel(world: &World, steps: usize) -> Vec<f64> {
     let motion = &world.constants.motion;
     let [change, least, most, dt] =
         [motion.max_speed_change, motion.min_speed, motion.max_speed, motion.dt].map(f64::from);
-    // A position is rounded in f32 and then to the grid, on both axes.
+    // Positions are rounded to f32 and then to the grid, on both axes.
     let largest = f64::from(motion.map_x.max(motion.map_y));
     let rounding = 2f64.sqrt() * (1.0 / f64::from(GRID) + largest * f64::from(f32::EPSILON));
     let (mut speed, mut far) = (f64::from(world.constants.speed), 0.0);
@@ -96,20 +96,20 @@ pub fn travel(world: &World, steps: usize) -> Vec<f64> {
     std::iter::once(0.0).chain((0..steps).map(step)).collect()
 }
 
-/// The POIs that no team can observe in any episode of a config (of its own keys, without its stages).
+/// Returns the POIs that no team can observe in any episode. Uses the config's own keys and ignores its stages.
 pub fn unreachable(config: &Config) -> Vec<Unreachable> {
     let world = World::new(config);
     let steps = world.steps();
     let travel = travel(&world, steps);
     let radius = config.world.observation_radius;
-    // Jitter moves both ends by up to so much on each axis.
+    // Jitter moves agent and POI, each by up to this much per axis.
     let jitter = 2f64.sqrt() * (config.learning.start_jitter + config.learning.poi_jitter);
     let who = match config.world.observers {
         Observers::All => "agent",
         Observers::Leaders => "leader",
         Observers::Followers => "follower",
     };
-    // How far the last agent that a POI needs is away, and the first step at which it can be there.
+    // Distance to the farthest agent that a POI needs.
     let distance = |poi: usize| {
         let from = |agent: usize| world.starts[agent].as_dvec2().distance(world.pois[poi].as_dvec2());
         let mut distances: Vec<f64> = (0..world.agents()).filter(|&agent| world.rule.counts(agent)).map(from).collect();
@@ -142,7 +142,7 @@ pub fn unreachable(config: &Config) -> Vec<Unreachable> {
     never.map(|poi| Unreachable { poi, why: why(poi) }).collect()
 }
 
-/// The fewest steps in which every POI could be reached, if the length of an episode is what keeps some from it.
+/// Returns the smallest number of steps in which every POI could be reached. None if longer episodes would not help.
 pub fn fewest_steps(config: &Config, unreachable: &[Unreachable]) -> Option<usize> {
     let far = unreachable.iter().filter_map(|unreachable| match unreachable.why {
         Why::Far { distance, radius, .. } => Some(distance - radius),
@@ -171,7 +171,7 @@ mod tests {
     #[test]
     fn an_agent_accelerates_to_its_largest_speed() {
         let far = travel(&World::new(&config("coupling = 1\n")), 25);
-        // 1, 2 and then 3 units a second, for 0.2 s each.
+        // 1, 2 and then 3 units per second, for 0.2 s each.
         for (steps, expected) in [(0, 0.0), (1, 0.2), (2, 0.6), (3, 1.2), (25, 14.4)] {
             assert!(far[steps] >= expected && far[steps] < expected + 1e-3, "{steps}: {}", far[steps]);
         }
@@ -181,7 +181,8 @@ mod tests {
 
     #[test]
     fn the_last_agent_that_is_needed_decides() {
-        // From (10, 20) it is 20 units to the first POI, of which the radius covers 5; the others are 30 away.
+        // The agent at (10, 20) starts 20 units from the first POI, and the radius covers 5 of them. The others start
+        // 30 away.
         assert!(found("coupling = 1\nsteps = 26\n").is_empty());
         assert_eq!(
             found("coupling = 1\nsteps = 25\n"),

@@ -1,5 +1,5 @@
-//! Recorded runs, side by side: one trainer, and for each run its folder and its checkpoints. One run is a batch of
-//! one.
+//! Sessions: recorded runs that train together, with one trainer for all of them. Each run has its own folder and
+//! checkpoints. A single run is a session of one.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -20,49 +20,49 @@ use crate::record::policies::{self, Init, Policies};
 use crate::record::{RecordError, config_digest};
 use crate::trainer::{Row, Snapshot, SnapshotError, Trainer};
 
-/// How often runs hand their metrics to the system.
+/// Interval at which runs pass their metrics to the system.
 const FLUSH: Duration = Duration::from_secs(1);
-/// Most runs that have files flushed to the disk at a time, each by a thread of its own.
+/// Maximum number of runs whose files are flushed at the same time, each on its own thread.
 const MAX_WRITERS: usize = 32;
-/// Why a run could not go on.
+/// Reason why a run failed.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
-    /// Its files could not be written, read or used.
+    /// The files of a run could not be written, read or used.
     #[error(transparent)]
     Record(#[from] RecordError),
-    /// The machine has less memory than it takes.
+    /// The machine has too little memory.
     #[error(transparent)]
     TooLittle(#[from] TooLittle),
-    /// Whether all before the generation is saved, is told too.
+    /// The backend failed. The message also reports whether the earlier generations are saved.
     #[error("{error}\ngeneration {generation} could not be played{}", after(saved))]
     Backend {
-        /// What failed.
+        /// Error of the backend.
         error: BackendError,
-        /// The one that was to be played.
+        /// Generation that could not be played.
         generation: usize,
-        /// Why not, if it is not.
+        /// Whether the earlier generations were saved.
         saved: Result<(), Box<RunError>>,
     },
-    /// The system gives no memory for this.
+    /// An allocation failed.
     #[error(
         "there is no memory for {what}, {bytes} bytes; choose a smaller population, fewer trials or another machine"
     )]
     Memory {
-        /// What it is for.
+        /// Purpose of the memory.
         what: &'static str,
-        /// How much was asked for.
+        /// Requested bytes.
         bytes: u64,
     },
     /// The config of a run is invalid.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// Populations cannot be brought to the host to be saved.
+    /// The populations could not be read back from the backend for a checkpoint.
     #[error("no checkpoint could be made: {0}")]
     Held(BackendError),
 }
 
 impl RunError {
-    /// There is no snapshot of so many bytes of policies.
+    /// Converts the error of a snapshot of `bytes` bytes of policies.
     pub fn of_snapshot(error: SnapshotError, what: &'static str, bytes: u64) -> RunError {
         match error {
             SnapshotError::Memory(_) => RunError::Memory { what, bytes },
@@ -78,55 +78,56 @@ fn after(saved: &Result<(), Box<RunError>>) -> String {
     }
 }
 
-/// What others may want of runs while they run.
+/// Inputs and callbacks of a session.
 pub struct Options<'a> {
-    /// What was typed to start this, for `run.json`.
+    /// Command that started this session, for `run.json`.
     pub command: &'a str,
-    /// Set by whoever wants the runs to finish their generation, save and stop.
+    /// Set by the caller to make the runs finish their generation, save and stop.
     pub stop: &'a AtomicBool,
-    /// Set by whoever wants a checkpoint of each now.
+    /// Set by the caller to request a checkpoint of every run.
     pub save: &'a AtomicBool,
-    /// Asked for another backend when one fails.
+    /// Called after a backend fails. Returns another backend to use, if there is one.
     pub instead: &'a mut dyn FnMut(&BackendError) -> Option<OpenBackend>,
-    /// Told once of an error of a backend that held populations, where it was made up for: they are the host's then.
+    /// Called at most once, with the error of a backend that held the populations, if training recovered from it. The
+    /// host holds the populations from then on.
     pub setback: &'a mut dyn FnMut(&BackendError),
-    /// Told of every generation played.
+    /// Called after every generation.
     pub watch: &'a mut dyn FnMut(&Progress<'_>),
 }
 
-/// A generation just played.
+/// State after a generation.
 pub struct Progress<'a> {
-    /// The generation that each run plays next, two past its last when it is done.
+    /// Generation that each run plays next. It is two past the last generation if the run is finished.
     pub generations: &'a [usize],
-    /// Rows that became complete, by run (their arm), generation and trial.
+    /// Rows that became complete, sorted by run (the field `arm`), generation and trial.
     pub rows: &'a [Row],
 }
 
-/// What a run came to.
+/// Results of a finished run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Results {
-    /// The first and the last generation of every trial.
+    /// Rows of the first and the last generation of every trial.
     pub story: Story,
-    /// See [`Folder::digest`].
+    /// Digest of the run. See [`Folder::digest`].
     pub digest: String,
 }
 
 /// How a session ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ended {
-    /// Every run to its last generation.
+    /// Every run is finished.
     Done,
-    /// Everything is saved.
+    /// The session was asked to stop, and everything is saved.
     Stopped,
 }
 
-/// Runs in their folders, whose locks are the last to go.
+/// Runs in their folders. Each run finishes its pending writes before its folder is unlocked.
 pub struct Session {
     members: Vec<Member>,
     /// See [`Progress::generations`].
     generations: Vec<usize>,
     trainer: Trainer,
-    /// The run of each of the trainer's arms: those that had something left to do.
+    /// Index of the run for each of the trainer's experiments. Finished runs have no experiment.
     arms: Vec<usize>,
     since: Instant,
 }
@@ -138,24 +139,25 @@ struct Member {
     folder: Folder,
     run: Run,
     results: Option<Results>,
-    /// Time trained in earlier sessions.
+    /// Training time of earlier sessions, in seconds.
     before: f64,
 }
 
-/// What a run has while there is something left to do.
+/// State of an unfinished run.
 struct Going {
     arm: usize,
     metrics: metrics::Writer,
     keeper: Keeper,
-    /// Where the metrics were before the last generation's rows.
+    /// Extent of the metrics before the rows of the last generation.
     ending: Option<Extent>,
 }
 
 impl Session {
-    /// Starts or resumes runs, each a config and its folder; also gives what there is to tell about their folders.
+    /// Starts or resumes runs, each with a config and a folder. Also returns notes for the user, each with the index of
+    /// its run.
     ///
     /// # Errors
-    /// A folder cannot be used (see [`Folder::open`]), or there is no memory for the populations.
+    /// A folder cannot be used (see [`Folder::open`]), or there is not enough memory for the populations.
     pub fn open(
         runs: Vec<(Config, PathBuf)>,
         start: Start,
@@ -165,11 +167,12 @@ impl Session {
         Session::open_all(runs, StartFrom::Random, start, disk)
     }
 
-    /// [`Session::open`], each run from given policies if there are any, read for its config. Where there are none, a run
-    /// that is resumed may have been started from some.
+    /// Opens runs like [`Session::open`]. Each run may start from given policies, which were read for its config. A
+    /// resumed run without given policies may have started from any.
     ///
     /// # Errors
-    /// See [`Session::open`]; or a run to go on with started from others, or has no checkpoint and needs them.
+    /// See [`Session::open`]. It is also an error if a resumed run started from other policies, or needs its policies
+    /// because it has no checkpoint.
     pub fn open_from(
         runs: Vec<(Config, PathBuf, Option<Init>)>,
         start: Start,
@@ -184,19 +187,19 @@ impl Session {
         start: Start,
         disk: &Disk,
     ) -> Result<(Session, Vec<(usize, Note)>), RunError> {
-        // This generation and the next one; asked for first, since later a refusal would be an abort.
+        // This generation and the next one. A failed allocation is an error here, but would abort the process later.
         let bytes = 2 * runs.iter().map(|(config, ..)| config.policy_bytes()).sum::<u64>();
         Vec::<u8>::new()
             .try_reserve_exact(bytes.try_into().unwrap_or(usize::MAX))
             .map_err(|_| RunError::Memory { what: "twice the policies of all trials", bytes })?;
-        // Before any of them is touched.
+        // All configs and folders are checked before any folder is changed.
         let configs = runs.iter().map(|(config, ..)| config.validate()).collect::<Result<Vec<ValidConfig>, _>>()?;
         folder::check(disk, runs.iter().map(|(config, path, _)| (&**path, config)), start)?;
         let opened =
             side_by_side(runs, |(config, path, init)| Member::open(config, path, init, otherwise, start, disk))?;
         let (mut members, mut snapshots, mut notes) = (Vec::new(), Vec::new(), Vec::new());
         for (member, snapshot, told) in opened {
-            // One warning is enough for all runs.
+            // One warning about missing locks is enough for all runs.
             let is_new = |note: &Note| *note != Note::NotLocked || !notes.iter().any(|(_, other)| other == note);
             let told: Vec<Note> = told.into_iter().filter(is_new).collect();
             notes.extend(told.into_iter().map(|note| (members.len(), note)));
@@ -231,7 +234,7 @@ impl Session {
         Ok((Session { members, generations, trainer, arms, since: Instant::now() }, notes))
     }
 
-    /// Whether there is nothing left to do.
+    /// Returns whether all runs are finished.
     pub fn is_done(&self) -> bool {
         self.members.iter().all(|member| member.going.is_none())
     }
@@ -241,25 +244,25 @@ impl Session {
         &self.generations
     }
 
-    /// What a run came to, once it is done.
+    /// Returns the results of a run, or `None` if it is not finished.
     pub fn results(&self, run: usize) -> Option<&Results> {
         self.members[run].results.as_ref()
     }
 
-    /// The disk within a run's folder.
+    /// Returns the disk that writes in the folder of a run.
     pub fn disk(&self, run: usize) -> &Disk {
         &self.members[run].folder.disk
     }
 
-    /// What `run.json` says of a run.
+    /// Returns the content of `run.json` of a run.
     pub fn run(&self, run: usize) -> &Run {
         &self.members[run].run
     }
 
-    /// Trains all to the end, or until stopped.
+    /// Trains all runs until they are finished or the caller stops them.
     ///
     /// # Errors
-    /// The backend fails (what came before is saved then), or something cannot be written.
+    /// The backend fails (earlier generations are saved first), or a file cannot be written.
     pub fn train(&mut self, player: &mut OpenBackend, options: &mut Options<'_>) -> Result<Ended, RunError> {
         self.since = Instant::now();
         for member in self.members.iter_mut().filter(|member| member.going.is_some()) {
@@ -271,7 +274,8 @@ impl Session {
         self.write_runs(Status::Running)?;
         self.save_starts()?;
         let (mut flushed, mut setback, mut told) = (Instant::now(), None, false);
-        // Once, and only what a generation has made up for: a device that is gone for good is told of as such.
+        // An error is reported once, and only after a generation has recovered from it. A lost device ends the session
+        // with an error instead.
         let mut tell = |error: Option<BackendError>| {
             if let Some(error) = error.filter(|_| !told) {
                 told = true;
@@ -313,7 +317,7 @@ impl Session {
                 () => continue,
             };
             match saved {
-                // The device failed, which the next generation makes up for or ends at.
+                // The device failed. The next generation either recovers from this or ends with the error.
                 Err(RunError::Held(error)) => {
                     options.save.store(!stop, Relaxed);
                     setback = Some(error);
@@ -330,11 +334,11 @@ impl Session {
         Ok(Ended::Done)
     }
 
-    /// Makes the generation that is played next the last of each run, or leaves it at an earlier one; gives the last of
-    /// all. What each then comes to is what a run of so many generations comes to.
+    /// Makes the generation that each run plays next its last, unless an earlier one is. Returns the largest of these
+    /// last generations. The results are those of a config with that number of generations.
     ///
     /// # Errors
-    /// A config or a checkpoint cannot be written.
+    /// A config or checkpoint cannot be read or written.
     pub fn end(&mut self) -> Result<usize, RunError> {
         let mut last = 0;
         for member in &mut self.members {
@@ -352,12 +356,12 @@ impl Session {
         Ok(last)
     }
 
-    /// The runs that have something left to do.
+    /// Returns the indices of the unfinished runs.
     fn going(&self) -> impl Iterator<Item = usize> {
         self.members.iter().enumerate().filter(|(_, member)| member.going.is_some()).map(|(run, _)| run)
     }
 
-    /// What they run on from now on.
+    /// Records the backend of all unfinished runs.
     fn settle_on(&mut self, (backend, machine): &OpenBackend) {
         for run in self.members.iter_mut().filter(|member| member.going.is_some()).map(|member| &mut member.run) {
             let Machine { backend: kind, adapter, driver, threads } = machine.clone();
@@ -367,7 +371,7 @@ impl Session {
         }
     }
 
-    /// Adds complete rows to the metrics; gives them by run, generation and trial.
+    /// Adds complete rows to the metrics. Returns them sorted by run, generation and trial.
     fn add(&mut self, mut rows: Vec<Row>) -> Result<Vec<Row>, RunError> {
         rows.iter_mut().for_each(|row| row.arm = self.arms[row.arm]);
         rows.sort_by_key(|row| (row.arm, row.generation, row.trial));
@@ -379,7 +383,7 @@ impl Session {
         Ok(rows)
     }
 
-    /// Writes what came out of the runs that have just played their last champions.
+    /// Writes the results of the runs that have just played their last champions.
     fn finish(&mut self) -> Result<(), RunError> {
         let seconds = self.seconds();
         let over = self.members.iter_mut().zip(&self.generations);
@@ -393,19 +397,19 @@ impl Session {
         side_by_side(ends, |(member, (policies, end))| member.finish(&policies, end, seconds)).map(drop)
     }
 
-    /// Whether any run wants a checkpoint; then all make one.
+    /// Returns whether any run is due for a checkpoint. All runs then write one.
     fn is_due(&self) -> bool {
         self.members.iter().zip(&self.generations).any(|(member, &next)| member.is_due(next))
     }
 
-    /// Starts writing a checkpoint of every run that is not done.
+    /// Starts to write a checkpoint of every unfinished run.
     fn save(&mut self) -> Result<(), RunError> {
         let seconds = self.seconds();
         let (mut held, mut writing) = (Ok(()), Vec::new());
         for run in self.going().collect::<Vec<_>>() {
             let member = &mut self.members[run];
             match member.save(&mut self.trainer, self.generations[run], seconds) {
-                // What others have may still be had.
+                // The populations of the other runs may still be available.
                 Err(error @ RunError::Held(_)) => held = held.and(Err(error)),
                 saved => saved?,
             }
@@ -417,7 +421,7 @@ impl Session {
         held
     }
 
-    /// Starts writing a checkpoint of every run that starts from given policies now, so that it can go on without them.
+    /// Writes a checkpoint of every run that starts now from given policies, so that it can be resumed without them.
     fn save_starts(&mut self) -> Result<(), RunError> {
         let seconds = self.seconds();
         for run in self.going().collect::<Vec<_>>() {
@@ -430,7 +434,7 @@ impl Session {
         Ok(())
     }
 
-    /// Saves and waits until all is on the disk.
+    /// Saves all runs and waits until everything is on the disk.
     fn stop(&mut self) -> Result<(), RunError> {
         let saved = self.save();
         let waited = self.members.iter_mut().try_for_each(Member::wait);
@@ -438,20 +442,20 @@ impl Session {
         saved.and(waited).and(written)
     }
 
-    /// Writes `run.json` of every run that is not done.
+    /// Writes `run.json` of every unfinished run.
     fn write_runs(&mut self, state: Status) -> Result<(), RunError> {
         let seconds = self.seconds();
         let going = self.members.iter_mut().zip(&self.generations).filter(|(member, _)| member.going.is_some());
         side_by_side(going.collect(), |(member, &next)| member.write_run(state, next, seconds, None)).map(drop)
     }
 
-    /// Time trained in this session.
+    /// Returns the training time of this session in seconds.
     fn seconds(&self) -> f64 {
         self.since.elapsed().as_secs_f64()
     }
 }
 
-/// What a run goes on from, or starts from.
+/// State from which a run starts or resumes.
 enum Beginning {
     Checkpoint(Snapshot),
     Policies(Init),
@@ -459,7 +463,7 @@ enum Beginning {
 }
 
 impl Member {
-    /// A run, where it goes on, and what there is to tell about its folder.
+    /// Opens a run. Returns its initial state and the notes about its folder.
     fn open(
         config: Config,
         path: PathBuf,
@@ -511,7 +515,7 @@ impl Member {
         self.going.as_ref().is_some_and(|going| going.keeper.is_due(&Schedule { generations, seconds }, next))
     }
 
-    /// Adds complete rows of one generation.
+    /// Adds complete rows.
     fn add(&mut self, rows: &[Row], seconds: f64) -> Result<(), RunError> {
         let failed = self.metrics_failed();
         let Some(Going { metrics, ending, .. }) = &mut self.going else { return Ok(()) };
@@ -524,8 +528,8 @@ impl Member {
         add().map_err(failed)
     }
 
-    /// Starts writing a checkpoint, once the one before is written: there is memory for one. A large one is written
-    /// before training goes on, for there may not be memory for any.
+    /// Starts to write a checkpoint after the previous one is complete, because there is memory for only one copy. A
+    /// large checkpoint is written before training continues, because there may not be memory for any copy.
     fn save(&mut self, trainer: &mut Trainer, next: usize, seconds: f64) -> Result<(), RunError> {
         let failed = self.metrics_failed();
         let Some(Going { arm, metrics, keeper, .. }) = &mut self.going else { return Ok(()) };
@@ -546,7 +550,7 @@ impl Member {
         Ok(keeper.save(Checkpoint { config, init, seconds, metrics, snapshot }, output, since)?)
     }
 
-    /// Writes what came out, so that at any moment there is something whole to go on from.
+    /// Writes the results in an order that leaves a usable checkpoint at any moment.
     fn finish(&mut self, policies: &[&[f32]], end: Snapshot<&[f32]>, seconds: f64) -> Result<(), RunError> {
         let failed = self.metrics_failed();
         let Some(Going { metrics, keeper, ending, .. }) = &mut self.going else { return Ok(()) };
@@ -560,7 +564,8 @@ impl Member {
         keeper.save(Checkpoint { config, init, seconds: seconds_in_all, metrics, snapshot }, output, since)?;
         let path = self.folder.file(POLICIES);
         if path.exists() {
-            // What this run was extended from goes with them: only now is there something else.
+            // The old checkpoints of an extended run need the old policies. The new checkpoint must be complete before
+            // the policies are replaced.
             keeper.wait()?;
         }
         let checksum = policies::write(&self.folder.disk, &path, &self.config, policies)?;
@@ -587,20 +592,20 @@ impl Member {
     }
 }
 
-/// A run that is the same training as another, under another config.
+/// A run with the same training as another run but with another config.
 pub struct Twin {
-    /// The folder of the other, which is done.
+    /// Folder of the other run, which is finished.
     pub of: PathBuf,
-    /// The other's config.
+    /// Config of the other run.
     pub of_config: Config,
-    /// Its own folder.
+    /// Folder of this run.
     pub folder: PathBuf,
-    /// Its own config.
+    /// Config of this run.
     pub config: Config,
 }
 
-/// Records runs that others stand for, as if they had been trained: the others' metrics and policies, under their own
-/// config. Those that are there already are left alone.
+/// Records runs without training them. Each gets the metrics and policies of its twin, under its own config. Runs that
+/// are already recorded are not changed.
 ///
 /// # Errors
 /// A folder cannot be used (see [`Folder::open`]), read or written.
@@ -630,7 +635,8 @@ impl Twin {
     }
 }
 
-/// Does something slow (files are flushed to the disk) with each, side by side on as many threads as the system allows.
+/// Applies a slow function (such as flushing files) to all items on as many threads as the system allows, up to
+/// [`MAX_WRITERS`].
 fn side_by_side<T: Send, R: Send>(
     all: Vec<T>,
     each: impl Fn(T) -> Result<R, RunError> + Sync,

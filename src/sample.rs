@@ -1,4 +1,5 @@
-//! Random worlds for verification: a spread of sizes, shapes and gains, rich in the exact ties that real layouts have.
+//! Random worlds for verification. They vary in size, shape and gains, and have many of the exact ties that real
+//! layouts have.
 
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
@@ -6,22 +7,22 @@ use rand::{RngExt, SeedableRng};
 use crate::config::*;
 use crate::world::World;
 
-/// How a world's agents and POIs are laid out.
+/// The layout of a world's agents and POIs.
 #[derive(Clone, Copy)]
 enum Placing {
     /// Anywhere on the map.
     Scattered,
-    /// Within a few radii of one point, as in a team that has come together.
+    /// Within a few radii of one point, like a team that has gathered.
     Crowded,
-    /// On a grid of halves: radii and quadrants are met exactly.
+    /// On a grid of spacing 0.5, so that distances equal radii and positions lie on quadrant borders exactly.
     Grid,
-    /// As the paper has it: groups side by side, followers behind or around their leader, a POI straight ahead.
+    /// As in the paper: groups side by side, followers behind or around their leader, a POI straight ahead.
     Groups,
     /// All at one point.
     OnePoint,
     /// On walls and in corners.
     Walls,
-    /// On the axes and diagonals through the first leader, at exactly a radius or a range from it.
+    /// On the axes and diagonals through the first leader. Offsets per axis are 0 or exactly a radius or a range.
     Boundaries,
 }
 
@@ -38,12 +39,14 @@ const LAYOUTS: [Placing; 10] = [
     Placing::Boundaries,
 ];
 
-/// A valid config of 1 to 40 agents and 1 to 8 POIs, a pure function of the seed: a hundred seeds in a row hold every
-/// kind of layout, both paradigms and densities, 0 to 3 hidden layers, gains, speeds and turn rates down to 0, and
-/// every kind of observers, windows and orders of POIs, beside worlds with none of these.
+/// Returns a valid config of 1 to 40 agents and 1 to 8 POIs, a pure function of the seed.
+///
+/// A hundred consecutive seeds cover every kind of layout, both paradigms, all densities and 0 to 3 hidden layers. They
+/// cover gains, speeds and turn rates down to 0. They cover every kind of observers, windows and POI order, and worlds
+/// without any of these.
 pub fn world(seed: u64) -> Config {
     let mut config = plain_world(seed);
-    // By a stream of its own, so that the world is otherwise as it would be without.
+    // A separate random stream leaves the rest of the world unchanged.
     let rng = &mut ChaCha8Rng::seed_from_u64(seed ^ 0x7275_6c65);
     if rng.random_bool(0.5) {
         observe_otherwise(rng, &mut config);
@@ -53,7 +56,7 @@ pub fn world(seed: u64) -> Config {
     config
 }
 
-/// Gives a world observers, windows and an order of its POIs.
+/// Sets the observers of a world and maybe the windows and the order of its POIs.
 fn observe_otherwise(rng: &mut ChaCha8Rng, config: &mut Config) {
     let (leaders, agents) = (config.learners(), config.world.leaders.len() + config.world.followers.len());
     let world = &mut config.world;
@@ -81,7 +84,7 @@ fn observe_otherwise(rng: &mut ChaCha8Rng, config: &mut Config) {
         world.windows = (0..pois).map(|_| window(rng)).collect();
     }
     if rng.random_bool(0.6) {
-        // Each comes after some of those before it in an order that starts anywhere.
+        // Each POI comes after some of the POIs before it in an order that starts at any POI.
         let (first, step) = (rng.random_range(0..pois), if rng.random_bool(0.5) { 1 } else { pois - 1 });
         let order: Vec<usize> = (0..pois).map(|place| (first + place * step) % pois).collect();
         world.after = vec![vec![]; pois];
@@ -182,11 +185,11 @@ fn plain_world(seed: u64) -> Config {
     } else {
         Coupling::Same(coupling())
     };
-    // What came later has draws of its own: the worlds of the seeds stay as they were in all else.
+    // Keys that were added later draw from a separate stream, so the other keys of each seed stay the same.
     let later = &mut ChaCha8Rng::seed_from_u64(!seed);
     let actions = if later.random_bool(0.3) { Actions::Behaviours } else { Actions::Direct };
-    // Of the generations that are trained when worlds are compared, the last may be longer and elsewhere: windows stay
-    // within it.
+    // Generations from 2 on may play longer episodes with moved POIs. The stage has at least as many steps as the
+    // world, so windows stay valid.
     let stages = match later.random_bool(0.2) {
         true => {
             let set = [
@@ -271,12 +274,13 @@ fn plain_world(seed: u64) -> Config {
     }
 }
 
-/// Any word of a choice.
+/// Returns a random word of a choice.
 fn word<T: Choice>(rng: &mut ChaCha8Rng) -> T {
     T::ALL[rng.random_range(0..T::ALL.len())].1
 }
 
-/// Weights `[leaders][policies][parameters]`, nearly normal; of some policies all small, all large, or mostly 0.
+/// Returns weights `[leaders][policies][parameters]` that are approximately normal. Some policies have only small
+/// weights, only large ones, or mostly zeros.
 pub fn weights(world: &World, policies: usize, seed: u64) -> Vec<f32> {
     let rng = &mut ChaCha8Rng::seed_from_u64(seed);
     let mut weights = Vec::with_capacity(world.leaders() * policies * world.parameters());
@@ -288,7 +292,8 @@ pub fn weights(world: &World, policies: usize, seed: u64) -> Vec<f32> {
             _ => (1.0, 0.0),
         };
         weights.extend((0..world.parameters()).map(|_| {
-            // The sum of twelve uniform numbers has variance 1, and needs no function that a platform could round.
+            // The sum of twelve uniform numbers minus 6 has variance 1. It needs no function that platforms round
+            // differently.
             let normal = (0..12).map(|_| rng.random::<f32>()).sum::<f32>() - 6.0;
             let weight = if rng.random_bool(zeros) { 0.0 } else { scale * normal };
             if weight.abs() < LEAST_WEIGHT { 0.0 } else { weight }
@@ -297,5 +302,5 @@ pub fn weights(world: &World, policies: usize, seed: u64) -> Vec<f32> {
     weights
 }
 
-/// Smaller weights are 0, so that no product of the kernels is denormal.
+/// Smaller weights become 0, so that no product in the kernels is denormal.
 const LEAST_WEIGHT: f32 = 1.0 / (1 << 30) as f32;

@@ -1,58 +1,59 @@
-//! Estimates from trials, with what chance leaves open, and tests of differences.
+//! Estimates from trials with their confidence intervals, and tests of differences.
 //!
-//! Trials of two arms with one seed are pairs: the same starts and, where sizes agree, the same first populations.
-//! Their differences are one sample, of which [`mean`] gives the interval and [`p_value`] the test.
+//! Trials of two arms with the same seed are pairs. They share their starts and, if sizes agree, their first
+//! populations. The differences of pairs are one sample: [`mean`] gives its interval and [`p_value`] its test.
 //!
-//! Whatever else has a mean and an error has them of an [`Average`].
+//! [`Average`] gives mean, deviation and standard error of any other values.
 //!
-//! What asks less of the samples: [`bootstrap`] gives the interval of a mean or a difference, [`rank_sum`] tests two
-//! samples, [`signed_rank`] pairs, and [`holm`] corrects for many tests. A G takes few values, so ranks are full of
-//! ties; `statrs` has no exact p of such samples, so both tests count them here.
+//! Some functions make fewer assumptions about the distribution. [`bootstrap`] gives the interval of a mean or a
+//! difference, [`rank_sum`] tests two samples, and [`signed_rank`] tests pairs. [`holm`] corrects for multiple tests. G
+//! takes few values, so ranks have many ties. `statrs` has no exact p-values for ties, so both rank tests compute them
+//! here.
 
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 use serde::Serialize;
 use statrs::distribution::{Beta, ContinuousCDF, Normal, StudentsT};
 
-/// The share of intervals that hold what they estimate.
+/// Confidence level of all intervals.
 pub const CONFIDENCE: f64 = 0.95;
-/// Samples that a [`bootstrap`] draws.
+/// Number of samples that [`bootstrap`] draws.
 pub const RESAMPLES: usize = 9999;
-/// Most values, in both samples together, whose p is counted out; above, it is that of a normal distribution.
+/// Maximum number of values, counting both samples, for exact p-values. Larger samples use the normal distribution.
 pub const EXACT: usize = 100;
 
-/// A number with its 95 % interval, both ends included.
+/// A number with its 95 % interval. Both ends are included.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Estimate {
-    /// The number itself.
+    /// The number.
     pub value: f64,
-    /// The interval's lower end.
+    /// Lower end of the interval.
     pub low: f64,
-    /// The interval's upper end.
+    /// Upper end of the interval.
     pub high: f64,
 }
 
 impl Estimate {
-    /// What is known without trials.
+    /// Returns an estimate without uncertainty.
     pub fn exact(value: f64) -> Estimate {
         Estimate { value, low: value, high: value }
     }
 
-    /// The same of a number that cannot lie beyond these.
+    /// Returns the estimate with its interval clamped to `least..=most`.
     pub fn within(self, least: f64, most: f64) -> Estimate {
         Estimate { low: self.low.max(least), high: self.high.min(most), ..self }
     }
 }
 
-/// Mean, standard deviation and standard error of any number of values, gathered one by one.
+/// Mean, standard deviation and standard error of values that are added one by one.
 ///
-/// Values that are all alike come to exactly themselves, without any error; others to the same mean in any order, as
-/// long as their sum is exact, as that of shares in halves and quarters is.
+/// If all values are equal, the mean is exactly that value and the error is 0. Otherwise the mean does not depend on
+/// the order if the sum is exact, as for halves and quarters.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Average {
     count: u32,
     sum: f64,
-    /// The mean so far, and the sum of squared distances from it, by Welford's recurrence.
+    /// The running mean and the sum of squared distances from it, by Welford's recurrence.
     mean: f64,
     squares: f64,
 }
@@ -67,22 +68,22 @@ impl Average {
         self.squares += before * (value - self.mean);
     }
 
-    /// How many values there were.
+    /// Returns the number of values.
     pub fn count(&self) -> u32 {
         self.count
     }
 
-    /// Theirs; 0 of none.
+    /// Returns the mean, or 0 without values.
     pub fn mean(&self) -> f64 {
         if self.squares == 0.0 { self.mean } else { self.sum / f64::from(self.count) }
     }
 
-    /// Of the sample; 0 of fewer than two values.
+    /// Returns the sample standard deviation, or 0 for fewer than two values.
     pub fn deviation(&self) -> f64 {
         if self.count < 2 { 0.0 } else { (self.squares / f64::from(self.count - 1)).sqrt() }
     }
 
-    /// Of the mean; 0 of fewer than two values.
+    /// Returns the standard error of the mean, or 0 for fewer than two values.
     pub fn error(&self) -> f64 {
         if self.count < 2 { 0.0 } else { self.deviation() / f64::from(self.count).sqrt() }
     }
@@ -96,16 +97,16 @@ impl<'a> FromIterator<&'a f64> for Average {
     }
 }
 
-/// The mean of a sample by Student's t; none of fewer than two values.
+/// Returns the mean of a sample with its Student's t interval. None for fewer than two values.
 ///
-/// Values that are all alike say nothing of how far they may lie apart. Then as many are taken to be off by one `step`,
-/// the least by which two can differ, as could have gone unseen: none of n by [`share`].
+/// A sample of equal values has no measurable spread. The half-width of its interval is then `step` times the upper
+/// bound of [`share`] for 0 of n. `step` is the smallest possible difference between two values.
 pub fn mean(values: &[f64], step: f64) -> Option<Estimate> {
     let (value, error) = moments(values)?;
     Some(interval(value, error, values.len(), step))
 }
 
-/// The interval of [`mean`], of so many values, two at least, whose mean and standard error are known.
+/// Returns the interval of [`mean`] from the mean, its standard error and the number of values, at least 2.
 pub fn interval(value: f64, error: f64, count: usize, step: f64) -> Estimate {
     let room = match error {
         0.0 => step * share(0, count).map_or(0.0, |share| share.high),
@@ -114,7 +115,7 @@ pub fn interval(value: f64, error: f64, count: usize, step: f64) -> Estimate {
     Estimate { value, low: value - room, high: value + room }
 }
 
-/// A share by Clopper and Pearson's exact interval; none of nothing.
+/// Returns a share with the exact interval of Clopper and Pearson. None if `of` is 0.
 pub fn share(count: usize, of: usize) -> Option<Estimate> {
     let (some, others) = (count as f64, of.checked_sub(count)? as f64);
     let bound = |a: f64, b: f64, at: f64| Some(Beta::new(a, b).ok()?.inverse_cdf(at));
@@ -126,8 +127,9 @@ pub fn share(count: usize, of: usize) -> Option<Estimate> {
     })
 }
 
-/// The two-sided p of Student's test that the mean of a sample of differences is 0; where all are alike, which leaves
-/// nothing to measure them by, that of the sign test.
+/// Returns the two-sided p-value of Student's test that the mean of a sample of differences is 0.
+///
+/// If all differences are equal, Student's test is undefined, and the sign test is used.
 pub fn p_value(differences: &[f64]) -> Option<f64> {
     let (mean, error) = moments(differences)?;
     Some(match error {
@@ -137,8 +139,10 @@ pub fn p_value(differences: &[f64]) -> Option<f64> {
     })
 }
 
-/// How far each value lies from the median of all. Their mean is how far apart the values are; between two arms, the
-/// test of their paired differences is that of Brown and Forsythe for pairs.
+/// Returns the distance of each value from the median of all values.
+///
+/// The mean of the distances measures spread. Testing the paired differences of two arms' distances is the
+/// Brown-Forsythe test for pairs.
 pub fn distances(values: &[f64]) -> Vec<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -147,29 +151,29 @@ pub fn distances(values: &[f64]) -> Vec<f64> {
     values.iter().map(|value| (value - median).abs()).collect()
 }
 
-/// Mean and standard error; none of fewer than two values.
+/// Returns mean and standard error. None for fewer than two values.
 fn moments(values: &[f64]) -> Option<(f64, f64)> {
     let average: Average = values.iter().collect();
     (average.count > 1).then(|| (average.mean(), average.error()))
 }
 
-/// Student's distribution for the mean of so many values, two at least.
+/// Returns Student's distribution for the mean of `count` values, at least 2.
 fn student(count: usize) -> StudentsT {
     StudentsT::new(0.0, 1.0, (count - 1) as f64).expect("two values leave a degree of freedom")
 }
 
-/// The mean of the first sample, less that of the second where there is one, with its bootstrap interval:
-/// bias-corrected and accelerated (BCa) over [`RESAMPLES`] samples, by one seed, so that the same values always have
-/// the same interval. None where a sample has fewer than two values.
+/// Returns the mean of the first sample, minus that of the second if given, with its bootstrap interval. None if a
+/// sample has fewer than two values.
 ///
-/// Where all values of each sample are alike, the interval has no width.
+/// The interval is bias-corrected and accelerated (BCa) over [`RESAMPLES`] samples. The seed is fixed, so equal values
+/// always have equal intervals. If all values of each sample are equal, the interval has no width.
 pub fn bootstrap(samples: &[&[f64]]) -> Option<Estimate> {
     if samples.is_empty()
         || samples.iter().any(|sample| sample.len() < 2 || !sample.iter().all(|value| value.is_finite()))
     {
         return None;
     }
-    // Sums something over the first sample and what is taken off.
+    // Sums a function over the first sample with sign 1 and the second with sign -1.
     let total = |of: &mut dyn FnMut(&[f64], f64) -> f64| -> f64 {
         samples.iter().zip([1.0, -1.0]).map(|(sample, sign)| of(sample, sign)).sum()
     };
@@ -194,7 +198,7 @@ pub fn bootstrap(samples: &[&[f64]]) -> Option<Estimate> {
     };
     let mut drawn: Vec<f64> = (0..RESAMPLES).map(|_| total(&mut draw)).collect();
     drawn.sort_by(f64::total_cmp);
-    // Means that only rounding tells apart are the same.
+    // Means that differ only by rounding count as equal.
     let grain = 1e-9 * spread.sqrt();
     let [below, most] = [value - grain, value + grain].map(|at| drawn.partition_point(|&drawn| drawn < at));
     let normal = Normal::standard();
@@ -209,20 +213,20 @@ pub fn bootstrap(samples: &[&[f64]]) -> Option<Estimate> {
     Some(Estimate { value, low: end(tail), high: end(1.0 - tail) })
 }
 
-/// What a test of two samples says.
+/// The result of a test of two samples or of pairs.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Tested {
-    /// Vargha and Delaney's A: the share of pairings in which the first sample has the larger value, half of those in
-    /// which both have the same added. 0.5 where neither is ahead.
+    /// Vargha and Delaney's A: the share of pairings in which the first sample has the larger value, plus half of the
+    /// ties. 0.5 means that neither is ahead.
     pub a: f64,
-    /// Two-sided.
+    /// The two-sided p-value.
     pub p: f64,
 }
 
-/// Mann and Whitney's test, over all pairings of two samples; none where one is empty.
+/// Returns the Mann-Whitney test over all pairings of two samples. None if one is empty.
 ///
-/// The p is exact up to [`EXACT`] values: twice the smaller tail over all ways to deal the values out, ties as they
-/// are. Above, it is by the normal distribution, corrected for ties and continuity.
+/// The p-value is exact up to [`EXACT`] values: twice the smaller tail over all assignments of the values, with their
+/// ties. For more values it uses the normal distribution, corrected for ties and continuity.
 pub fn rank_sum(one: &[f64], other: &[f64]) -> Option<Tested> {
     if one.is_empty() || other.is_empty() || !one.iter().chain(other).all(|value| value.is_finite()) {
         return None;
@@ -233,7 +237,7 @@ pub fn rank_sum(one: &[f64], other: &[f64]) -> Option<Tested> {
     let pairings = (count * other.len()) as f64;
     let a = (sum - count * (count + 1)) as f64 / 2.0 / pairings;
     let p = if all <= EXACT {
-        // The fewer the values in the sample, the fewer sums.
+        // The smaller sample has fewer sums to enumerate.
         let (size, sum) = if 2 * count <= all { (count, sum) } else { (other.len(), ranks[count..].iter().sum()) };
         two_sided(&sums_of(&ranks, size), sum)
     } else {
@@ -244,10 +248,11 @@ pub fn rank_sum(one: &[f64], other: &[f64]) -> Option<Tested> {
     Some(Tested { a, p })
 }
 
-/// Wilcoxon's signed-rank test of the differences between pairs; none of none.
+/// Returns Wilcoxon's signed-rank test of the differences of pairs. None without differences.
 ///
-/// Pairs without a difference have no say in p; it is exact for up to [`EXACT`] others, over all their signs, and by
-/// the normal distribution above, as in [`rank_sum`]. A is over the pairs themselves.
+/// Pairs with a difference of 0 do not affect p. For up to [`EXACT`] others p is exact, over all their signs. For more
+/// it uses the normal distribution, as in [`rank_sum`]. A is over the pairs themselves, including those with a
+/// difference of 0.
 pub fn signed_rank(differences: &[f64]) -> Option<Tested> {
     if !differences.iter().all(|difference| difference.is_finite()) {
         return None;
@@ -269,7 +274,7 @@ pub fn signed_rank(differences: &[f64]) -> Option<Tested> {
     Some(Tested { a: (1.0 + (up_count - down_count) / count) / 2.0, p })
 }
 
-/// Holm's correction of p-values for being many: in their order, none above 1.
+/// Returns p-values with Holm's correction for multiple tests, in the given order, each at most 1.
 pub fn holm(p: &[f64]) -> Vec<f64> {
     let mut order: Vec<usize> = (0..p.len()).collect();
     order.sort_by(|&a, &b| p[a].total_cmp(&p[b]));
@@ -281,12 +286,12 @@ pub fn holm(p: &[f64]) -> Vec<f64> {
     corrected
 }
 
-/// A value without what rounding leaves in its last digits, so that ties are ties.
+/// Rounds a value to 12 decimal places, so that rounding errors do not break ties.
 fn grained(value: f64) -> f64 {
     (value * 1e12).round() / 1e12
 }
 
-/// Twice the rank of every value, from 1, ties sharing the middle of theirs: whole numbers.
+/// Returns twice the rank of every value, from 1. Ties share their mean rank; doubling makes it a whole number.
 fn twice_ranks(values: &[f64]) -> Vec<usize> {
     let values: Vec<f64> = values.iter().map(|&value| grained(value)).collect();
     let mut sorted = values.clone();
@@ -295,7 +300,7 @@ fn twice_ranks(values: &[f64]) -> Vec<usize> {
     values.iter().map(|&value| sorted.partition_point(|&other| other < value) + up_to(value) + 1).collect()
 }
 
-/// How many choices of `size` ranks have which sum.
+/// Returns the number of ways to choose `size` ranks for each sum.
 fn sums_of(ranks: &[usize], size: usize) -> Vec<f64> {
     let most = ranks.iter().sum::<usize>();
     let mut ways = vec![vec![0.0; most + 1]; size + 1];
@@ -309,7 +314,7 @@ fn sums_of(ranks: &[usize], size: usize) -> Vec<f64> {
     ways.swap_remove(size)
 }
 
-/// How likely which sum is where each rank is chosen or not with equal chances.
+/// Returns the probability of each sum if every rank is chosen with probability 1/2.
 fn sums_of_any(ranks: &[usize]) -> Vec<f64> {
     let mut ways = vec![0.0; ranks.iter().sum::<usize>() + 1];
     ways[0] = 1.0;
@@ -321,15 +326,16 @@ fn sums_of_any(ranks: &[usize]) -> Vec<f64> {
     ways
 }
 
-/// Twice the smaller tail of a distribution from one of its sums on.
+/// Returns the two-sided p-value of a sum: twice the smaller tail of the distribution, at most 1.
 fn two_sided(ways: &[f64], sum: usize) -> f64 {
     let [low, high, all] = [&ways[..=sum], &ways[sum..], ways].map(|ways| ways.iter().sum::<f64>());
     (2.0 * low.min(high) / all).min(1.0)
 }
 
-/// The same of a sum of doubled ranks that is so far off its mean, by the normal distribution.
+/// Returns the two-sided p-value of a sum of doubled ranks by the normal distribution. `off` is its distance from the
+/// mean.
 fn normal(off: f64, variance: f64) -> f64 {
-    // Doubled, half a rank is one.
+    // Continuity correction: half a rank is 1 after doubling.
     let z = (off.abs() - 1.0) / variance.sqrt();
     if variance > 0.0 { (2.0 * Normal::standard().sf(z)).min(1.0) } else { 1.0 }
 }

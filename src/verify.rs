@@ -1,7 +1,7 @@
 //! Verification that a backend agrees with the CPU bit for bit.
 //!
-//! Compares random worlds stage by stage; all of them as one batch, by record and by scores; breeding on the device;
-//! and short training runs.
+//! Verification compares random worlds stage by stage, then all of them as one batch, by records and by scores. It also
+//! compares breeding on the device and short training runs.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -31,11 +31,11 @@ pub struct Plan {
     pub generations: usize,
 }
 
-/// Worlds that train for a few generations, side by side.
+/// Number of worlds that train for a few generations, side by side.
 const TRAINED: usize = 8;
 
 impl Plan {
-    /// Returns random worlds of every kind, including degenerate ones.
+    /// Returns a plan with random worlds of every kind, including degenerate ones.
     pub fn random(seeds: Range<u64>, teams: usize) -> Plan {
         let seed = seeds.start;
         let worlds = seeds.map(|seed| (format!("random world {seed}"), sample::world(seed))).collect();
@@ -63,12 +63,12 @@ pub fn short_trainings() -> Vec<(String, Config)> {
     trainings
 }
 
-/// How much was compared, and the first difference, if any.
+/// The amount that was compared, and the first difference, if any.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Agreement {
     /// Worlds played on both backends.
     pub worlds: usize,
-    /// Steps of agents in these worlds.
+    /// Agent-steps played in these worlds.
     pub agent_steps: u64,
     /// A description of the first difference.
     pub mismatch: Option<String>,
@@ -80,7 +80,7 @@ struct Teams {
     policies: usize,
     weights: Vec<f32>,
     choice: Vec<u32>,
-    /// See [`Group::starts`].
+    /// Start positions, see [`Group::starts`].
     places: Vec<Vec2>,
     /// Every other world also records sightings, which needs kernels of its own.
     need: RecordRequest,
@@ -112,7 +112,7 @@ impl Teams {
 /// Compares a backend with the reference. Stops at the first difference.
 ///
 /// # Errors
-/// A backend failed.
+/// A backend fails.
 pub fn compare(
     plan: &Plan,
     reference: &mut dyn Backend,

@@ -86,5 +86,5 @@ def parallel_env(config: Config, render_mode: str | None = None, reward: str = "
 
 
 if hasattr(os, "register_at_fork"):
-    # Threads and devices are not copied to a forked process.
+    # A forked process does not have its parent's threads and devices.
     os.register_at_fork(after_in_child=_native.forked)

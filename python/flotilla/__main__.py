@@ -1,4 +1,4 @@
-"""The program: what `flotilla` does in a shell, by `python -m flotilla` or the command that comes with the package."""
+"""The command-line program `flotilla`, also available as `python -m flotilla`."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from flotilla import _native
 
 
 def main() -> None:
-    """Does what was typed, and ends with the program's exit code."""
-    # The program listens for signals itself, and saves before it stops.
+    """Runs the command line, and exits with the program's exit code."""
+    # The program handles signals itself, and saves before it stops.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     if sys.platform.startswith("linux") and not os.path.isabs(os.environ.get("XDG_RUNTIME_DIR", "")):
-        # Vulkan's layers look for a display there, and complain where they cannot.
+        # Vulkan layers look for a display in this directory, and print warnings if it is not set.
         os.environ["XDG_RUNTIME_DIR"] = "/dev/null"
     command = os.path.join(sysconfig.get_path("scripts"), "flotilla" + (sysconfig.get_config_var("EXE") or ""))
     program = command if os.path.exists(command) else "flotilla"

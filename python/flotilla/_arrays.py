@@ -1,4 +1,4 @@
-"""Checks of arguments, and aligned arrays."""
+"""Argument checks and aligned arrays."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float32]
 
 
-# Cache lines, vector instructions and zero-copy exchange with JAX ask for this.
+# Bytes: required for zero-copy exchange with JAX, and fits cache lines and vector instructions.
 ALIGNMENT = 64
 
 
 def aligned(shape: tuple[int, ...]) -> Floats:
-    """A new float32 array whose first element lies at a multiple of 64 bytes. Its values are undefined."""
+    """Returns a new float32 array, aligned to 64 bytes. Its values are undefined."""
     size = 4 * math.prod(shape)
     memory = np.empty(size + ALIGNMENT, np.uint8)
     start = -memory.__array_interface__["data"][0] % ALIGNMENT
@@ -39,7 +39,7 @@ def floats(what: str, values: ArrayLike, axes: int) -> Floats:
 
 
 def whole(what: str, value: Any, least: int, most: int) -> int:
-    """A whole number within bounds."""
+    """Returns `value` as an int. Raises an error if it is not a whole number from `least` to `most`."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -50,7 +50,7 @@ def whole(what: str, value: Any, least: int, most: int) -> int:
 
 
 def number(what: str, value: Any, least: float, most: float) -> float:
-    """A number within bounds."""
+    """Returns `value` as a float. Raises an error if it is not a number from `least` to `most`."""
     try:
         found = float(value)
     except (TypeError, ValueError, OverflowError):
@@ -61,7 +61,7 @@ def number(what: str, value: Any, least: float, most: float) -> float:
 
 
 def text(what: str, value: Any) -> str:
-    """Text that names something."""
+    """Returns `value` if it is a str without control characters or surrogates. Otherwise raises an error."""
     if not isinstance(value, str):
         raise TypeError(f"{what} is {type(value).__name__}, allowed is text")
     if any(ord(letter) < 32 or 0xD800 <= ord(letter) <= 0xDFFF for letter in value):
@@ -70,7 +70,7 @@ def text(what: str, value: Any) -> str:
 
 
 def backend_name(value: Any) -> str:
-    """What to play on, as a name."""
+    """Returns a backend as text: its name, or an adapter's name or number."""
     if isinstance(value, int) and not isinstance(value, bool):
         return str(value)
     return text("backend", value)

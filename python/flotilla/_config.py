@@ -1,4 +1,4 @@
-"""What an experiment is."""
+"""Configs of experiments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Teams of given policies: what they score, what they do, and what a policy answers."""
+"""Rollouts and traces of given policies, and the forward pass of a policy."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Rollout:
 
 
 def _near(words: NDArray[np.uint32], agents: int) -> NDArray[np.bool_]:
-    """Bits as truths, the first agent in the lowest bit."""
+    """Converts bit sets `[..., words]` to bools `[..., agents]`. The first agent has the lowest bit."""
     bits = np.unpackbits(words.astype("<u4", copy=False).view(np.uint8), axis=-1, bitorder="little")
     return bits[..., :agents].astype(np.bool_)
 
@@ -146,7 +146,10 @@ def rollout(
 
 
 def _layers(config: Config | None, parameters: int) -> list[int]:
-    """Widths of a policy's layers, inputs and outputs included."""
+    """Returns the widths of a policy's layers, inputs and outputs included.
+
+    Without a config, the policy has at most one hidden layer, whose width follows from the number of parameters.
+    """
     if config is not None and not isinstance(config, Config):
         raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config")
     if config is None:
@@ -164,7 +167,10 @@ def _layers(config: Config | None, parameters: int) -> list[int]:
 
 
 def _chosen(inputs: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The most wanted behaviour as a turn and a speed: hold, towards and away from POIs, towards and away from agents."""
+    """Returns the turn and speed of the most wanted behaviour.
+
+    Behaviours are: hold, towards POIs, away from POIs, towards agents, away from agents.
+    """
     behaviour = wanted.argmax(-1)
     inputs = np.broadcast_to(inputs, (*behaviour.shape, inputs.shape[-1]))
     sensed = np.where((behaviour < 3)[..., None], inputs[..., :4], inputs[..., 4:])

@@ -1,4 +1,4 @@
-"""The program's own commands, each as a function: they run beside this process, and give back what they print as JSON."""
+"""Commands of the program as functions. Each runs in a child process, and returns the JSON that it prints."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flotilla._run import Run
 
 
 def program(command: str, *words: str, **flags: Any) -> dict[str, Any]:
-    """Runs a command with flags (`by=None` is none, `force=True` is `--force`); what it told, as a dictionary."""
+    """Runs a command and returns its JSON. Flags that are None or False are left out; `force=True` gives `--force`."""
     line = [sys.executable, "-m", "flotilla", command, *words, "--json"]
     if command != "compare":
         line.append("--quiet")
@@ -27,7 +27,7 @@ def program(command: str, *words: str, **flags: Any) -> dict[str, Any]:
             line.append(flag)
         elif value is not None and value is not False:
             line += [flag, os.fspath(value) if isinstance(value, os.PathLike) else str(value)]
-    # In a session of its own, so that what interrupts this process reaches it once: it saves, and is waited for.
+    # In its own session, the child does not get Ctrl-C from the terminal. It is forwarded below, and the child saves.
     pipe = subprocess.PIPE
     with subprocess.Popen(line, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, start_new_session=True) as running:
         try:

@@ -1,4 +1,4 @@
-"""Training, and what it came to."""
+"""Training and its results."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Run:
         self.unverified = False
 
     def _show_arrays(self) -> None:
-        """Makes the public attributes. They are read-only, and `save` does not use them: it writes what was trained."""
+        """Sets the public attributes to read-only arrays. `save` uses the private ones, even if these are replaced."""
         for metric in self._metrics:
             metric.flags.writeable = False
         for policies in self._policies:
@@ -184,7 +184,7 @@ class Run:
         return plot([self])
 
     def __getstate__(self) -> dict[str, Any]:
-        # A temporary folder is this process's.
+        # A temporary folder belongs to this process. A copy of the run makes its own.
         folder = self._folder if self._kept is None else None
         return {**self.__dict__, "_kept": None, "_folder": folder, "config": self.config}
 
@@ -216,7 +216,7 @@ def _shown_by_default() -> bool:
 
 
 def _with_bar(callback: Callback | None, config: Config, progress: bool | None) -> tuple[Callback | None, Callable[[], None]]:
-    """The callback with a bar that it moves, and what ends the bar."""
+    """Returns the callback, extended by a progress bar if one is wanted, and a function that closes the bar."""
     if progress is False or (progress is None and not _shown_by_default()):
         return callback, lambda: None
     try:

@@ -1,4 +1,4 @@
-"""Replays and curves, to be looked at."""
+"""Replays and learning curves."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def _write(path: str | os.PathLike[str], content: bytes) -> None:
-    """Whole, or not at all."""
+    """Writes a file atomically, through a temporary file beside it."""
     place = os.fspath(path)
     beside = f"{place}.{os.getpid()}.part"
     try:

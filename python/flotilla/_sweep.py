@@ -1,4 +1,4 @@
-"""A grid of runs: here, in other processes, or on other machines."""
+"""Sweeps: grids of runs, trained in this process, in other processes or on other machines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from flotilla._run import Run, train
 if TYPE_CHECKING:
     import pandas
 
-# How often a point is handed out again when a worker is lost with it; after that it is played here.
+# Attempts per point on an executor's workers. If all of these are lost, the point is trained in this process.
 TRIES = 3
 
 
@@ -76,7 +76,7 @@ class Sweep:
 
 
 def _play(config: str, backend: str) -> Run:
-    """A point, as a worker plays it."""
+    """Trains a point in a worker. It is at module level so that it can be pickled."""
     return train(Config.parse(config), backend=backend, progress=False)
 
 
@@ -161,7 +161,7 @@ def _there(executor: Any, configs: list[str], backend: str, progress: Callable[[
             if progress is not None:
                 progress(len(runs), len(configs))
     except BaseException:
-        # Whoever waits for the executor waits for nothing more.
+        # Cancel the remaining points, so that shutting down the executor does not wait for them.
         for future in handed:
             if hasattr(future, "cancel"):
                 future.cancel()
@@ -173,7 +173,7 @@ def _hand(executor: Any, config: str, backend: str) -> Any:
     try:
         return executor.submit(_play, config, backend)
     except (RuntimeError, OSError):
-        # Nobody is left there to play anything.
+        # The executor has no workers left. The point is then trained in this process.
         return None
 
 
@@ -188,7 +188,7 @@ def _taken(executor: Any, config: str, backend: str, future: Any) -> Run:
         except (Error, ValueError, TypeError, MemoryError, ImportError):
             raise
         except Exception as error:
-            # A worker is lost.
+            # Any other error means that a worker is lost.
             lost = error
             future = _hand(executor, config, backend)
     warnings.warn(f"a point is trained here, since no worker plays it: {lost or 'none is left'!r}", RuntimeWarning, stacklevel=4)

@@ -1,4 +1,4 @@
-"""Environments of many teams, stepped by actions."""
+"""Environments of many teams, stepped with actions."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class TeamBatch:
         return self.stepper.observed
 
     def inputs(self, out: Floats | None = None) -> Floats:
-        """What every leader senses, ``[teams, leaders, 8]``, in a new array or in `out`."""
+        """Returns what every leader senses, ``[teams, leaders, 8]``, in a new array or in `out`."""
         if out is None:
             out = aligned((self.count, self.leaders, _native.INPUTS))
         self.stepper.read_inputs(out)
@@ -98,14 +98,14 @@ class TeamBatch:
             finished &= ~idle
         if finished_before is not None and finished.any():
             self.stepper.fitness(self.reward, self.rewards)
-            # A team that was finished before this step has had its reward.
+            # A team that had finished before this step has already received its reward.
             self.rewards[~finished | finished_before] = 0
         elif finished_before is not None:
             self.rewards.fill(0)
         return finished
 
     def state(self) -> Floats:
-        """The whole state of each team, ``[teams, agents * 5 + pois]``."""
+        """Returns the full state of each team, ``[teams, agents * 5 + pois]``."""
         positions, headings, speeds = self.stepper.states()
         parts = (positions, headings, speeds[..., None])
         moving = np.concatenate(parts, axis=-1).reshape(self.count, -1)
@@ -219,7 +219,7 @@ class VectorEnv(Base):
         return self
 
     def _observe(self, copy: bool) -> Floats:
-        """Observations of all environments, ``[num_envs, ...]``."""
+        """Returns the observations of all environments, ``[num_envs, ...]``."""
         if not self.time_input:
             found = self._teams.inputs(None if copy else self._inputs)
         else:
@@ -229,11 +229,11 @@ class VectorEnv(Base):
         return found.reshape(self.num_envs, *self._single)
 
     def _per_environment(self, teams: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """A value per team as a new array with a value per environment."""
+        """Converts one value per team to a new array with one value per environment."""
         return np.repeat(teams, self.leaders) if self.layout == "flat" else teams.copy()
 
     def _reward(self) -> Floats:
-        """Rewards in the layout's shape, in a new array or in the one that is reused."""
+        """Returns rewards in the layout's shape, in a new array if `copy` is set, else in the reused one."""
         out = aligned(self._rewards.shape) if self.copy else self._rewards
         if self.layout == "team":
             np.mean(self._teams.rewards, axis=1, out=out)
@@ -327,7 +327,7 @@ class VectorEnv(Base):
         return self._observe(self.copy), rewards, terminated, truncated, infos
 
     def _final_info(self, ended: NDArray[np.bool_]) -> dict[str, Any]:
-        """What finished teams have reached, before they are reset."""
+        """Returns G, observed POIs and state of finished teams, before they are reset. Masks mark these teams."""
         copies = self.leaders if self.layout == "flat" else 1
         found: dict[str, Any] = {}
         observed = self._teams.observed
@@ -382,7 +382,7 @@ def one_of(what: str, word: str, allowed: tuple[str, ...]) -> None:
 
 
 def _autoreset_mode(mode: str) -> Any:
-    """Gymnasium's constant for the mode, or its value if gymnasium is not installed."""
+    """Returns gymnasium's constant for the mode, or its value if gymnasium is not installed."""
     try:
         from gymnasium.vector import AutoresetMode
     except ImportError:

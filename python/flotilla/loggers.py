@@ -34,7 +34,7 @@ def tensorboard(folder: str | os.PathLike[str]) -> Logger:
     """Event files in a folder, by tensorboardX (``pip install flotilla-teams[tensorboard]``)."""
     from tensorboardX import SummaryWriter
 
-    # It writes from a thread of its own, whose rows a flush does not wait for, but its end does.
+    # The writer has its own thread. `flush` does not wait for queued rows, but `close` does.
     writer = SummaryWriter(os.fspath(folder), flush_secs=1)
     atexit.register(writer.close)
 

@@ -1,4 +1,4 @@
-//! Configs, made of text or of Python's values.
+//! Configs, made from text or from Python values.
 
 use std::path::PathBuf;
 
@@ -12,7 +12,7 @@ use toml::Value;
 
 use crate::errors::Raise;
 
-/// A config that may be trained.
+/// A valid config.
 #[pyclass(frozen, eq)]
 #[derive(PartialEq)]
 pub struct Config(pub flotilla::Config);
@@ -29,7 +29,7 @@ impl Config {
         flotilla::Config::parse(text, name).raise().map(Config)
     }
 
-    /// One of the paper's layouts.
+    /// Returns the config of one of the paper's layouts.
     #[staticmethod]
     fn paper(layout: &str) -> PyResult<Config> {
         let arms = arms(&[]).raise()?;
@@ -42,7 +42,7 @@ impl Config {
         })
     }
 
-    /// Of dotted keys and their values alone.
+    /// Builds a config from dotted keys and their values. All other keys have their defaults.
     #[staticmethod]
     fn build(keys: Vec<(String, Bound<'_, PyAny>)>) -> PyResult<Config> {
         flotilla::Config::read("", "the config", &[], &overrides(keys)?).raise().map(Config)
@@ -67,7 +67,7 @@ impl Config {
         self.0.learners()
     }
 
-    /// Of a policy's layers, inputs and outputs included.
+    /// Widths of a policy's layers, inputs and outputs included.
     #[getter]
     fn widths(&self) -> Vec<usize> {
         self.0.policy.widths()
@@ -79,7 +79,7 @@ impl Config {
     }
 }
 
-/// Every key of a config: its name, unit, kind, range, default, meaning and where the paper has it.
+/// Returns every config key: name, unit, kind, range, default, meaning, and the paper's section.
 #[pyfunction]
 #[expect(clippy::type_complexity, reason = "it is taken apart at once")]
 pub fn keys() -> Vec<(String, String, String, String, Option<String>, String, String)> {
@@ -90,7 +90,7 @@ pub fn keys() -> Vec<(String, String, String, String, Option<String>, String, St
     config::keys().into_iter().map(row).collect()
 }
 
-/// The points of a sweep: its axes' keys, and for every point its number, its values and its config.
+/// Reads a sweep. Returns the keys of its axes, each point's number, values and config, and its normalised text.
 #[pyfunction]
 #[expect(clippy::type_complexity, reason = "it is taken apart at once")]
 pub fn sweep<'py>(
@@ -120,7 +120,7 @@ fn overrides(keys: Vec<(String, Bound<'_, PyAny>)>) -> PyResult<Vec<Override>> {
     keys.into_iter().map(set).collect()
 }
 
-/// Why a value is none of a config's.
+/// The reason why a value cannot be part of a config.
 enum Odd {
     Value(String),
     Python(PyErr),
@@ -132,7 +132,7 @@ impl From<PyErr> for Odd {
     }
 }
 
-/// Most lists and tables within each other.
+/// Maximum nesting depth of lists and tables.
 const DEEPEST: usize = 8;
 
 fn to_toml(value: &Bound<'_, PyAny>, depth: usize) -> Result<Value, Odd> {
@@ -159,7 +159,7 @@ fn to_toml(value: &Bound<'_, PyAny>, depth: usize) -> Result<Value, Odd> {
         let values = value.try_iter()?.map(|value| to_toml(&value?, depth + 1));
         Ok(Value::Array(values.collect::<Result<_, _>>()?))
     } else if let Ok(plain) = value.call_method0("tolist") {
-        // NumPy's arrays and numbers.
+        // NumPy arrays and scalars.
         to_toml(&plain, depth + 1)
     } else {
         Err(Odd::Value(format!("found {}", value.get_type().name()?)))

@@ -1,4 +1,4 @@
-//! The crate's errors as Python's exceptions, with the crate's own words.
+//! Converts the crate's errors to Python exceptions with the same messages.
 
 use flotilla::backend::BackendError;
 use flotilla::backend::gpu::device::DeviceError;
@@ -12,12 +12,12 @@ use flotilla::stepping::StepError;
 use pyo3::exceptions::{PyFileExistsError, PyMemoryError, PyValueError};
 use pyo3::prelude::*;
 
-/// What becomes of a crate's error in Python.
+/// Converts an error of the crate to a Python exception.
 pub trait Raised {
     fn raised(self) -> PyErr;
 }
 
-/// Results whose errors are Python's.
+/// Converts the error of a result to a Python exception.
 pub trait Raise<T> {
     fn raise(self) -> PyResult<T>;
 }
@@ -28,7 +28,7 @@ impl<T, E: Raised> Raise<T> for Result<T, E> {
     }
 }
 
-/// An exception that `flotilla/_errors.py` makes.
+/// Returns an exception made by the function or class `by` of `flotilla/_errors.py`.
 fn made(by: &str, arguments: impl for<'py> pyo3::call::PyCallArgs<'py>) -> PyErr {
     Python::attach(|py| {
         let made = py.import("flotilla._errors").and_then(|module| module.call_method1(by, arguments));
@@ -36,7 +36,7 @@ fn made(by: &str, arguments: impl for<'py> pyo3::call::PyCallArgs<'py>) -> PyErr
     })
 }
 
-/// `flotilla.Error`: what was asked for was right, but could not be done.
+/// Returns a `flotilla.Error`: the request was valid, but failed.
 pub fn failed(text: impl ToString) -> PyErr {
     made("Error", (text.to_string(),))
 }

@@ -1,7 +1,7 @@
-//! flotilla's Python package, its private part: the crate's own functions on NumPy's arrays.
+//! The native module of flotilla's Python package: the crate's functions on NumPy arrays.
 //!
-//! What people see is `flotilla/*.py`; shapes and words are checked and told there where that is simpler. Nothing here holds
-//! the interpreter while it works.
+//! The public interface is `flotilla/*.py`, which also checks arguments where that is simpler. Long-running functions
+//! release the interpreter's lock.
 
 use pyo3::prelude::*;
 
@@ -14,7 +14,7 @@ mod step;
 mod train;
 mod workers;
 
-/// The private part of `flotilla`.
+/// The native module of `flotilla`.
 #[pymodule(gil_used = false)]
 mod _native {
     use pyo3::prelude::*;

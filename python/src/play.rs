@@ -1,4 +1,4 @@
-//! Teams of given policies.
+//! Plays teams of given policies.
 
 use flotilla::evaluate::Starts;
 use flotilla::front::{self, Failure, Played, Traced};
@@ -11,7 +11,7 @@ use crate::config::Config;
 use crate::errors::Raise;
 use crate::workers;
 
-/// Where episodes start: the config's own places, or so many drawn ones.
+/// Returns the starts of episodes: the config's own, or held-out ones, from `(episodes, seed, jitter, poi_jitter)`.
 fn drawn(drawn: Option<(u32, u64, f64, f64)>) -> Starts {
     drawn.map_or(Starts::Own, |(episodes, seed, jitter, poi_jitter)| Starts::Drawn {
         episodes,
@@ -21,7 +21,7 @@ fn drawn(drawn: Option<(u32, u64, f64, f64)>) -> Starts {
     })
 }
 
-/// A team's policies, `[leaders or 1][teams][parameters]`, as they lie in memory.
+/// Returns the number of teams and the policies, `[leaders or 1][teams][parameters]`, without a copy.
 fn weights<'a>(config: &Config, policies: &'a PyReadonlyArray3<'_, f32>) -> PyResult<(usize, &'a [f32])> {
     let (&[leaders, teams, parameters], config) = (policies.shape(), &config.0) else { unreachable!("three axes") };
     let (all, expected) = (config.learners(), config.parameters());
@@ -43,8 +43,9 @@ type Scores<'py> = (
     Option<Bound<'py, PyArray2<f32>>>,
 );
 
-/// What teams score: POIs observed and G `[teams]`, and D, Df, D++ and, where it is the config's fitness, Dt `[teams,
-/// leaders]`.
+/// Plays teams. Returns POIs observed and G, `[teams]`, and D, Df, D++ and Dt, `[teams, leaders]`.
+///
+/// Dt is `None` unless it is the config's fitness.
 #[pyfunction]
 pub fn rollout<'py>(
     py: Python<'py>,
@@ -81,7 +82,11 @@ type Motion<'py> = (
     Bound<'py, PyArray4<u32>>,
 );
 
-/// All that teams do in one episode: positions, headings, speeds, inputs, outputs, and who is near which POI.
+/// Plays one episode, and returns every step of all teams.
+///
+/// The arrays are positions and headings `[teams, steps + 1, agents, 2]`, speeds `[teams, steps + 1, agents]`, inputs
+/// `[teams, steps, leaders, 8]` and outputs `[teams, steps, leaders, 2]`. The last array is
+/// `[teams, steps, pois, words]`, with one bit per agent within the observation radius of each POI.
 #[pyfunction]
 pub fn trace<'py>(
     py: Python<'py>,
@@ -110,7 +115,9 @@ pub fn trace<'py>(
     ))
 }
 
-/// Where teams start, `[count, agents, 2]`: moved by up to the jitter, each by its own draw from a number on.
+/// Draws start positions, `[count, agents, 2]`, moved by at most `jitter` on each axis, in map units.
+///
+/// Team `i` uses draw number `first + i`.
 #[pyfunction]
 pub fn starts<'py>(
     py: Python<'py>,

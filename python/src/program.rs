@@ -1,4 +1,4 @@
-//! The program itself, and what it can play on.
+//! The command-line program, and the adapters it can use.
 
 use std::ffi::OsString;
 
@@ -8,14 +8,14 @@ use pyo3::prelude::*;
 
 use crate::workers;
 
-/// Does what was typed, the program's name first; gives the exit code.
+/// Runs a command line, with the program's name first, and returns the exit code.
 #[pyfunction]
 pub fn main(py: Python<'_>, words: Vec<OsString>) -> u8 {
-    // It starts its own threads, as many as the command says.
+    // Without `workers::aside`, because the program starts as many threads as the command line asks for.
     py.detach(|| cli::main(Some(words)))
 }
 
-/// Adapters that a driver offers: name, driver, interface, kind.
+/// Returns the available adapters: name, driver, graphics API and kind.
 #[pyfunction]
 pub fn adapters(py: Python<'_>) -> Vec<(String, String, String, String)> {
     let found = workers::aside(py, device::adapters);

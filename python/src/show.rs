@@ -1,4 +1,4 @@
-//! Replays and curves, to be looked at.
+//! Replays and learning curves.
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -15,7 +15,7 @@ use pyo3::types::PyBytes;
 use crate::errors::Raise;
 use crate::workers;
 
-/// Episodes that were played again.
+/// Replayed episodes.
 #[pyclass(frozen)]
 pub struct Replay {
     name: String,
@@ -23,7 +23,7 @@ pub struct Replay {
     played: Vec<Replayed>,
 }
 
-/// Plays the best teams of some generations of a trial again.
+/// Replays the best teams of some generations of a trial.
 #[pyfunction]
 pub fn replay(
     py: Python<'_>,
@@ -57,7 +57,7 @@ pub fn replay(
 
 #[pymethods]
 impl Replay {
-    /// Trial, generation, team, G and POIs observed of each episode.
+    /// Trial, generation, team, G and number of observed POIs, per episode.
     #[getter]
     fn episodes(&self) -> Vec<(usize, usize, usize, f64, usize)> {
         let row = |played: &Replayed| {
@@ -90,7 +90,7 @@ impl Replay {
 #[pyclass(frozen)]
 pub struct Figure(Scene);
 
-/// The learning curves of one run, or of several side by side.
+/// Returns the learning curves of one run, or of several side by side.
 #[pyfunction]
 pub fn figure(py: Python<'_>, folders: Vec<PathBuf>, unverified: bool) -> PyResult<Figure> {
     let verification = Verification::unless(unverified);
@@ -103,7 +103,9 @@ impl Figure {
         self.0.svg()
     }
 
-    /// The picture as the file that a path's ending says, of so many pixels across.
+    /// Returns the content of a picture file, in the format of the path's extension.
+    ///
+    /// `width` is in pixels, and only counts for .png.
     fn file<'py>(&self, py: Python<'py>, path: PathBuf, width: Option<u32>) -> PyResult<Bound<'py, PyBytes>> {
         let Some(kind) = Format::of(&path) else {
             let text = format!("{}: its name must end in .svg, .pdf or .png", path.display());

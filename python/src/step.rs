@@ -1,4 +1,4 @@
-//! Teams that are stepped by given actions, with NumPy arrays in and out.
+//! Steps teams with given actions, with NumPy arrays in and out.
 
 use std::sync::{Mutex, MutexGuard, TryLockError};
 
@@ -22,7 +22,7 @@ use crate::workers;
 
 type States<'py> = (Bound<'py, PyArray3<f32>>, Bound<'py, PyArray3<f32>>, Bound<'py, PyArray2<f32>>);
 
-/// Teams of one world that are stepped by given actions.
+/// Teams of one world that are stepped with given actions.
 #[pyclass(frozen)]
 pub struct Stepper {
     config: flotilla::Config,
@@ -30,7 +30,8 @@ pub struct Stepper {
 }
 
 impl Stepper {
-    /// The stepper, if no other thread uses it. Waiting would hide that two threads step one environment.
+    /// Returns the stepper, or an error if another thread uses it. Waiting would hide that two threads share one
+    /// environment.
     fn stepper(&self) -> PyResult<MutexGuard<'_, stepping::Stepper>> {
         match self.inner.try_lock() {
             Ok(stepper) => Ok(stepper),
@@ -86,8 +87,10 @@ impl Stepper {
         })
     }
 
-    /// Plays a step by actions `[teams, leaders, 2]`. Writes the share of POIs that each leader's team has just observed for
-    /// the first time to `rewards`, `[teams, leaders]`.
+    /// Plays a step with actions `[teams, leaders, 2]`.
+    ///
+    /// Writes to `rewards`, `[teams, leaders]`, the share of POIs that each leader's team has just observed for the
+    /// first time.
     fn step(
         &self,
         py: Python<'_>,
@@ -176,7 +179,7 @@ impl Stepper {
 
     /// Draws a team, `[height, width, 3]`; the longer side has the given number of pixels.
     fn render<'py>(&self, py: Python<'py>, team: usize, pixels: u32) -> PyResult<Bound<'py, PyArray3<u8>>> {
-        /// Millimetres of the longer side; letters are sized for it.
+        /// Longer side in millimetres. The size of labels depends on it.
         const SIDE: f64 = 80.0;
         let drawn = workers::aside(py, || {
             let mut stepper = self.stepper()?;
@@ -201,7 +204,7 @@ impl Stepper {
     }
 }
 
-/// The present state of a team as the map draws it, leaders in their colours.
+/// Returns the current state of a team in the form that the map draws.
 fn team_of(stepper: &mut stepping::Stepper, team: usize) -> Team {
     let (agents, leaders) = (stepper.world().agents(), stepper.world().leaders());
     let at = |values: &[f32], agent: usize| {

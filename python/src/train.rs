@@ -1,4 +1,4 @@
-//! Training: in memory, or kept in a folder as the program keeps it.
+//! Trains in memory, or in a run directory as the program does.
 
 use std::ops::ControlFlow;
 use std::path::PathBuf;
@@ -25,7 +25,7 @@ use crate::config::Config;
 use crate::errors::{Raise, failed};
 use crate::workers;
 
-/// How often Ctrl-C is looked for.
+/// Minimum time between checks for Ctrl-C if there is no callback.
 const PATIENCE: Duration = Duration::from_millis(50);
 
 /// A generation that has been played, as a callback of :func:`train` is told of it.
@@ -81,12 +81,12 @@ impl Generation {
     }
 }
 
-/// Who is told of every generation: the callback, and whoever presses Ctrl-C.
+/// Calls the callback after every generation, and checks for Ctrl-C.
 struct Watcher<'a> {
     callback: Option<&'a Py<PyAny>>,
     asked: Instant,
     error: Option<PyErr>,
-    /// When each generation was complete, in seconds.
+    /// Seconds since the start of training at which each generation was complete.
     times: Vec<f64>,
     since: Instant,
 }
@@ -96,7 +96,7 @@ impl<'a> Watcher<'a> {
         Watcher { callback, asked: Instant::now(), error: None, times: vec![], since: Instant::now() }
     }
 
-    /// Tells of a generation; whether to stop.
+    /// Reports a generation to the callback. Returns whether to stop.
     fn tell(&mut self, rows: &[Row], last: usize) -> bool {
         self.times.push(self.since.elapsed().as_secs_f64());
         if self.callback.is_none() && self.asked.elapsed() < PATIENCE {
@@ -125,8 +125,10 @@ impl<'a> Watcher<'a> {
     }
 }
 
-/// What a training came to: its config, the three metrics `[trials, generations + 1]`, every trial's policies `[leaders or 1,
-/// policies, parameters]`, and its digest.
+/// The result of a training: config, metrics, policies and digest.
+///
+/// Each of the three metrics is `[trials, generations + 1]`, and each trial's policies are
+/// `[leaders or 1, policies, parameters]`.
 type Outcomes<'py> = (Config, [Bound<'py, PyArray2<f64>>; 3], Vec<Bound<'py, PyArray3<f32>>>, String);
 
 fn outcomes(py: Python<'_>, trained: Trained, digest: String) -> PyResult<Outcomes<'_>> {
@@ -140,15 +142,14 @@ fn outcomes(py: Python<'_>, trained: Trained, digest: String) -> PyResult<Outcom
     Ok((Config(config), metrics, policies, digest))
 }
 
-/// What played, in words, "cpu" or "gpu" and its description; and the digest of the policies that it started from, if not at
-/// random.
+/// The backend, "cpu" or "gpu", its description, and the digest of the initial policies if they were given.
 type Played = (String, String, Option<String>);
 
 fn named((backend, machine): &OpenBackend) -> Played {
     (machine.backend.clone(), backend.describe(), None)
 }
 
-/// Trains in memory; also tells by what, and when each generation was complete.
+/// Trains in memory. Also returns the backend, and the seconds at which each generation was complete.
 #[pyfunction]
 pub fn train<'py>(
     py: Python<'py>,
@@ -170,13 +171,12 @@ pub fn train<'py>(
     if let Some(error) = watcher.error {
         return Err(error);
     }
-    // The generation that a stop is followed by was not told of.
+    // After a stop, one more generation is played, which the watcher has not seen.
     watcher.times.resize(trained.config.learning.generations + 1, watcher.since.elapsed().as_secs_f64());
     Ok((outcomes(py, trained, digest)?, played, watcher.times))
 }
 
-/// Trains in a folder, as `flotilla train` does; what there is to tell about it comes back. What came out is there to be
-/// opened.
+/// Trains in a run directory, as `flotilla train` does, and returns warnings. [`open`] reads the results.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "these are all that a run is")]
 pub fn train_into(
@@ -228,7 +228,7 @@ pub fn train_into(
                 break;
             }
             if outcome == Ended::Stopped {
-                // The callback's wish: as much as there is, and its champions, is what the run comes to.
+                // The callback stopped the training. The generation that plays next becomes the run's last one.
                 last = session.end().raise()?;
                 watcher.callback = None;
                 stop.store(false, Relaxed);
@@ -239,20 +239,20 @@ pub fn train_into(
     if let Some(error) = watcher.error {
         return Err(error);
     }
-    // What was trained is whole without a picture of it.
+    // The run is complete without its picture, so a failure here is only a warning.
     let failed = workers::aside(py, || draw(&out)).err();
     notes.extend(failed.map(|error| format!("curves.svg was not written: {error}")));
     Ok(notes)
 }
 
-/// Draws a run's curves beside it, as the program does.
+/// Writes a run's learning curves to its directory, as the program does.
 fn draw(folder: &PathBuf) -> PyResult<()> {
     let svg = runs::figure(std::slice::from_ref(folder), Verification::Required).raise()?.scene().svg();
     let disk = ownership::enter(&Disk::default(), folder, true).raise()?;
     ownership::publish(&disk, &folder.join(CURVES), |output| output.write_all(svg.as_bytes())).raise()
 }
 
-/// Reads a run that is done.
+/// Reads a finished run.
 #[pyfunction]
 pub fn open(py: Python<'_>, folder: PathBuf, unverified: bool) -> PyResult<(Outcomes<'_>, Played, Vec<f64>)> {
     let (trained, digest, run, times) = workers::aside(py, || {
@@ -269,7 +269,7 @@ pub fn open(py: Python<'_>, folder: PathBuf, unverified: bool) -> PyResult<(Outc
     Ok((outcomes(py, trained, digest)?, (run.backend, run.description, run.init), times))
 }
 
-/// Writes what a training in memory came to as the folder of a run; gives its digest.
+/// Writes the results of a training in memory as a run directory, and returns the digest.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "these are all that a run is")]
 pub fn save(

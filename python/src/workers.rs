@@ -1,4 +1,4 @@
-//! What episodes are played on, kept from call to call, and the threads of processes that were forked.
+//! Keeps backends open between calls, and starts threads, also in forked processes.
 
 use std::cell::Cell;
 use std::sync::Mutex;
@@ -12,37 +12,38 @@ use pyo3::prelude::*;
 
 use crate::errors::Raise;
 
-/// Backends that nobody plays on, each with what it was asked for by: opening a GPU takes longer than many a rollout.
+/// Open backends that are not in use, by requested name. Opening a GPU takes longer than many rollouts.
 static IDLE: Mutex<Vec<(String, OpenBackend)>> = Mutex::new(Vec::new());
-/// Most of them.
+/// Maximum number of idle backends.
 const MOST: usize = 4;
-/// Whether this process is the copy of one that may have had threads, which are not copied.
+/// Whether this process was forked. Threads of its parent do not exist in it.
 static FORKED: AtomicBool = AtomicBool::new(false);
 
 thread_local! { static HAS_THREADS: Cell<bool> = const { Cell::new(false) }; }
 
-/// Tells a forked process that its threads and devices are its parent's.
+/// Marks this process as forked: it must not use its parent's threads and devices.
 #[pyfunction]
 pub fn forked() {
     FORKED.store(true, Relaxed);
     if let Ok(mut idle) = IDLE.try_lock() {
-        // What they would give back is not this process's.
+        // These backends belong to the parent, so they must not be dropped here.
         std::mem::forget(std::mem::take(&mut *idle));
     }
 }
 
-/// Starts as many threads as the system allows. A thread of a forked process gets workers of its own: those of the parent
-/// would never answer.
+/// Starts as many threads as the system allows.
+///
+/// In a forked process, each calling thread gets its own workers, because those of the parent would never answer.
 fn gain_threads() {
     if !FORKED.load(Relaxed) {
         parallel::start(None);
     } else if !HAS_THREADS.replace(true) {
-        // Where that fails, the thread has some.
+        // This fails if the thread already belongs to a pool, which is fine.
         std::mem::forget(rayon::ThreadPoolBuilder::new().use_current_thread().build());
     }
 }
 
-/// Does something without holding the interpreter.
+/// Runs `work` without the interpreter's lock.
 pub fn aside<R: Send>(py: Python<'_>, work: impl FnOnce() -> R + Send) -> R {
     py.detach(|| {
         gain_threads();
@@ -50,8 +51,9 @@ pub fn aside<R: Send>(py: Python<'_>, work: impl FnOnce() -> R + Send) -> R {
     })
 }
 
-/// Plays on a backend without holding the interpreter: "auto", "cpu", "gpu", or the number or a part of the name of an
-/// adapter.
+/// Runs `work` on a backend, without the interpreter's lock.
+///
+/// `backend` is "auto", "cpu", "gpu", or an adapter's number or part of its name.
 pub fn play<R: Send>(
     py: Python<'_>,
     backend: &str,

@@ -1,4 +1,4 @@
-//! Opens what episodes are played on.
+//! Opens the backends that play episodes.
 
 use super::{BackendChoice, Breed, Error, RunOptions, remedy, say};
 use crate::backend::OpenBackend;
@@ -6,18 +6,18 @@ use crate::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
 use crate::front::{self, Found, Processor};
 use crate::parallel;
 
-/// Opens the backend that was asked for; `--threads` holds for the whole process.
+/// Opens the requested backend. `--threads` applies to the whole process.
 ///
 /// # Errors
-/// There is no such backend here.
+/// Fails if the backend is not available, or if the flags contradict each other.
 pub fn open(options: &RunOptions) -> Result<OpenBackend, Error> {
     Ok(open_gpu(options)?.map_or_else(front::cpu, front::on_gpu))
 }
 
-/// The GPU that was asked for, if any; `--threads` holds for the whole process.
+/// Opens the requested GPU. Returns `None` if the CPU plays. `--threads` applies to the whole process.
 ///
 /// # Errors
-/// There is no such GPU here.
+/// Fails if the GPU is not available, or if the flags contradict each other.
 pub fn open_gpu(options: &RunOptions) -> Result<Option<GpuBackend>, Error> {
     start_threads(options.threads);
     let holding = match options.breed {
@@ -47,7 +47,8 @@ pub fn open_gpu(options: &RunOptions) -> Result<Option<GpuBackend>, Error> {
     Ok(gpu)
 }
 
-/// Starts the threads of the whole process, as many as `--threads` says; fewer where the system allows no more.
+/// Starts the threads of the whole process: as many as `--threads` requests, or fewer if the system does not allow
+/// them.
 pub fn start_threads(threads: Option<u16>) {
     let threads = parallel::start(threads.map(usize::from));
     if threads.is_short() {

@@ -1,4 +1,4 @@
-//! `flotilla baseline`: what a task gives without learning.
+//! `flotilla baseline`: plays teams that do not learn.
 
 use serde_json::json;
 
@@ -82,7 +82,7 @@ struct Found<'a> {
 }
 
 impl Found<'_> {
-    /// The number of random teams of each kind per seed.
+    /// Returns the number of random teams of each kind per seed.
     fn teams(&self) -> usize {
         self.config.learning.population * (self.config.learning.generations + 1)
     }
@@ -91,17 +91,17 @@ impl Found<'_> {
         self.config.world.pois.len()
     }
 
-    /// Whether starts or POIs move, so that teams are chosen by some episodes and measured by others.
+    /// Returns whether starts or POIs move. If they do, some episodes choose a team and others measure it.
     fn moves(&self) -> bool {
         self.config.learning.start_jitter > 0.0 || self.config.learning.poi_jitter > 0.0
     }
 
-    /// POIs observed, by seed.
+    /// Returns the number of observed POIs per seed.
     fn observed(&self, g: impl Fn(&Outcome) -> f64) -> Vec<f64> {
         self.outcomes.iter().map(|outcome| g(outcome) * self.pois() as f64).collect()
     }
 
-    /// Each baseline's name and the POIs that it observes, by seed.
+    /// Returns each baseline's key, its name and the POIs that it observes per seed.
     fn baselines(&self) -> [(&'static str, String, Vec<f64>); 3] {
         let constant = match self.config.policy.actions {
             Actions::Direct => format!("best of {SPEEDS} constant speeds, straight ahead"),
@@ -115,14 +115,15 @@ impl Found<'_> {
         ]
     }
 
-    /// The 95 % interval of a mean over seeds. A constant has none where nothing moves, because all seeds are the same.
+    /// Returns the 95 % interval of a mean over seeds. The constant-action baseline has none if nothing moves, because
+    /// all seeds are the same.
     fn interval(&self, key: &str, observed: &[f64]) -> Option<[f64; 2]> {
         let mean = statistics::mean(observed, 1.0).filter(|_| key != "constant" || self.moves())?;
         let mean = mean.within(0.0, self.pois() as f64);
         Some([mean.low, mean.high])
     }
 
-    /// The POIs that each constant observes: the mean over seeds.
+    /// Returns the POIs that each constant action observes, as a mean over seeds.
     fn constants(&self) -> Vec<f64> {
         let seeds = self.outcomes.len() as f64;
         let mean = |index| self.observed(|outcome| outcome.constants[index]).iter().sum::<f64>() / seeds;
@@ -155,7 +156,7 @@ impl Found<'_> {
         )
     }
 
-    /// Says which constants observe every POI.
+    /// Returns a sentence about which constant actions observe every POI.
     fn solved(&self, solved: &[bool]) -> String {
         let unit = |index: usize| match self.config.policy.actions {
             Actions::Direct => format!("{} %", (index + 1) * 100 / SPEEDS),

@@ -1,4 +1,4 @@
-//! `flotilla bench`: how fast teams are played, alone and within whole generations.
+//! `flotilla bench`: measures how fast teams are played, alone and within whole generations.
 
 use std::fmt::Write;
 use std::path::PathBuf;
@@ -16,7 +16,7 @@ use crate::front;
 use crate::memory::Peaks;
 use crate::run::RunError;
 
-/// Team counts of the table, and of the JSON object.
+/// Default numbers of teams, for the table and for JSON.
 const TEAMS: [u32; 3] = [50, 4096, 131_072];
 const JSON_TEAMS: u32 = 4096;
 
@@ -55,7 +55,7 @@ pub struct Args {
     json: bool,
 }
 
-/// Prints a table, or JSON objects: a line for every combination of teams, steps and agents.
+/// Prints a table or JSON objects, with one row per combination of teams, steps and agents.
 pub fn run(args: Args) -> Result<(), Error> {
     if !bench::has_clock() {
         let message = "the system's monotonic clock stands still, so nothing can be timed; run bench where it advances";
@@ -68,7 +68,7 @@ pub fn run(args: Args) -> Result<(), Error> {
             ("configs/generally_forward.toml".into(), text.into())
         }
     };
-    // Of stages the first, as `verify` plays it.
+    // Only the first stage is measured.
     let config = Config::read(&text, &name, &[], &args.overrides.list())?.at(0);
     let configs = combinations(&config, &args)?;
     let (mut player, machine) = open(&args)?;
@@ -94,7 +94,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     if args.json { Ok(()) } else { print(LEGEND) }
 }
 
-/// The config of every row.
+/// Returns the config of every row.
 fn combinations(config: &Config, args: &Args) -> Result<Vec<Config>, Error> {
     let own_agents = [config.clone()];
     let laid_out = |&agents: &u32| {
@@ -189,7 +189,7 @@ fn line(measure: &Timing) -> String {
     line
 }
 
-/// Each stage of a generation in ms, in order; some are a part of the rollout before them.
+/// Returns the stages of a generation in order, each with its time in ms. `true` marks a part of the rollout before it.
 fn stages(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
     let Profile { generations, times, stages, .. } = profile;
     let mut rows = vec![("teams_and_starts", false, times.prepare), ("rollout_and_scores", false, times.play)];
@@ -210,7 +210,8 @@ fn stages(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
     rows.into_iter().map(|(name, part, time)| (name, part, ms(time))).collect()
 }
 
-/// What goes over a GPU's bus in a generation, in bytes: all of it, and the rollout's part.
+/// Returns the bytes per generation that cross a GPU's bus, in both directions. `true` marks the rollout's part of the
+/// total before it.
 fn traffic(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
     let Profile { generations, stages, traffic, .. } = profile;
     let rows = stages.iter().flat_map(|stages| {

@@ -1,4 +1,4 @@
-//! `flotilla check`: the config as resolved, and what a run of it costs.
+//! `flotilla check`: prints the resolved config, and the cost of a run.
 
 use std::path::PathBuf;
 
@@ -24,14 +24,14 @@ pub struct Args {
     out: Option<PathBuf>,
 }
 
-/// What a whole run takes: all trials, all generations and the random start, every team and the champions.
+/// The cost of a whole run: all trials, all generations including the random start, all teams and the champions.
 #[derive(Serialize)]
 struct Cost {
     agents: usize,
     learners: usize,
-    /// How far an agent travels at most in an episode, in units.
+    /// Largest distance that an agent can travel in an episode, in units.
     travel: f64,
-    /// Episodes played.
+    /// Number of episodes, each played by one team.
     teams: u128,
     team_steps: u128,
     agent_steps: u128,
@@ -39,13 +39,13 @@ struct Cost {
     parameters: usize,
     /// Bytes of all trials' policies.
     policy_bytes: u64,
-    /// Bytes of one team's record: who was near which POI at which step, which leader each follower saw and, for Dt,
-    /// when.
+    /// Bytes of one team's record. It contains which agents were at which POI at each step, which leader each follower
+    /// saw and, for Dt, when.
     record_bytes: u64,
-    /// Peak of the process where the CPU plays, and how much of it only while a checkpoint is written.
+    /// Peak memory of the process if the CPU plays, and the part of it that is used only while a checkpoint is written.
     host_bytes: u64,
     checkpoint_bytes: u64,
-    /// Peak of the process where a GPU plays, and of the GPU's buffers.
+    /// Peak memory of the process if a GPU plays, and of the GPU's buffers.
     gpu_host_bytes: u64,
     adapter_bytes: u64,
 }
@@ -55,7 +55,7 @@ impl Cost {
         let wide = |count: usize| count as u128;
         let [mut teams, mut team_steps, mut agent_steps] = [0; 3];
         let (mut agents, mut record_bytes, mut travel) = (0, 0, 0.0_f64);
-        // Of stages all that they play, and the size of the largest.
+        // Over the stages, played episodes and steps add up. Sizes are those of the largest stage.
         for share in config.shares() {
             let (world, learning) = (World::new(&share), &share.learning);
             let played = wide(learning.trials)
@@ -95,7 +95,7 @@ struct Report<'a> {
     notes: &'a [String],
 }
 
-/// Prints the config, so that standard output is a config file again, with the cost as comments below it.
+/// Prints the config with the cost as comments below it, so that standard output is a config file again.
 pub fn run(args: Args) -> Result<(), Error> {
     super::backend::start_threads(None);
     let kind = args.out.as_deref().map(plot::kind_of).transpose()?;

@@ -1,4 +1,4 @@
-//! `flotilla compare`: runs, or the points of a sweep along an axis, with intervals and tests.
+//! `flotilla compare`: compares runs, or the points of a sweep along an axis, with intervals and tests.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -56,7 +56,7 @@ fn at(text: &str) -> Result<At, String> {
     }
 }
 
-/// Arms with what they have in common.
+/// The arms of one comparison, after a description of what they have in common.
 type Contest = (String, Vec<Cohort>);
 
 pub fn run(args: Args) -> Result<(), Error> {
@@ -68,7 +68,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let verification = Verification::unless(args.unverified);
     let folders = groups.iter().flat_map(|(_, arms)| arms).flat_map(|arm| &arm.folders);
     digests::without(folders.map(|folder| &**folder)).into_iter().for_each(say);
-    // Told even if nothing can be compared: they may say why.
+    // Printed even if nothing can be compared, because the notes may explain that.
     let tell = |notes: &[String]| notes.iter().for_each(|note| say(format_args!("note: {note}")));
     tell(&notes);
     let told = notes.len();
@@ -94,7 +94,7 @@ pub fn run(args: Args) -> Result<(), Error> {
                 .into(),
         );
     }
-    // Of runs, all that there was to tell yet is that their layouts differ or that one is another.
+    // For several runs, the notes so far report different layouts or copies. Then pairing is no useful advice.
     let alike = args.folders.len() == 1 || told == 0;
     if !args.paired && alike && groups.iter().all(|(_, arms)| comparison::paired(arms)) {
         notes.push("these arms have the same seeds, so their trials are pairs: --paired compares pair by pair".into());
@@ -125,7 +125,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     print(&(mark + &text))
 }
 
-/// Every run an arm, named by what sets it apart.
+/// Reads every run as an arm, named after what sets it apart from the others.
 fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<Vec<Cohort>, Error> {
     let verification = Verification::unless(args.unverified);
     if let Some(by) = &args.by {
@@ -136,7 +136,7 @@ fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<
     }
     if folders.len() < 2 {
         let folder = folders[0].escaped();
-        // What is wrong with the folder goes first.
+        // Problems of the folder are reported first.
         runs::config(&folders[0], verification)?;
         return Err(Error::Usage(format!("{folder} is one run; name another to compare it with")));
     }
@@ -164,7 +164,7 @@ fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<
     Ok(arms.map(read).collect::<Result<_, _>>()?)
 }
 
-/// What is to be told of runs that are one and the same: between them there is nothing to compare.
+/// Returns a note for each run that is a copy of another, because there is nothing to compare between them.
 fn copies(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
     let digest = |folder: &PathBuf| Run::read(&folder.join(RUN)).ok()?.digest;
     let runs: Vec<_> = folders.iter().zip(configs.iter().map(record::without_checkpoint)).collect();
@@ -177,7 +177,7 @@ fn copies(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
     (0..folders.len()).filter_map(original).collect()
 }
 
-/// The values of an axis as arms, for each combination of the others; those without runs are noted.
+/// Returns the values of an axis as arms, for each combination of the other axes. Notes list the points without runs.
 fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Contest>, Error> {
     let sweep = Sweep::load(&out.join(SWEEP), &[], false)?;
     let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
@@ -234,7 +234,7 @@ fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Cont
     }
 }
 
-/// Refuses more arms than anybody reads.
+/// Rejects more arms than a reader can compare.
 fn too_many(count: usize, what: &str) -> Result<(), Error> {
     match count <= MAX_RUNS {
         true => Ok(()),

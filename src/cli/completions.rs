@@ -1,4 +1,4 @@
-//! `flotilla completions`: what a shell needs to complete commands and flags.
+//! `flotilla completions`: prints a script that completes commands and flags in a shell.
 
 use clap::CommandFactory;
 use clap_complete::Shell;
@@ -12,7 +12,7 @@ pub struct Args {
     shell: Shell,
 }
 
-/// Prints the script; README says where each shell looks for it.
+/// Prints the script. `docs/reference/commands.md` describes where each shell looks for it.
 pub fn run(args: Args) -> Result<(), Error> {
     let mut script = Vec::new();
     clap_complete::generate(args.shell, &mut Cli::command(), "flotilla", &mut script);

@@ -1,4 +1,4 @@
-//! `flotilla devices`: what episodes can be played on, and under which pass.
+//! `flotilla devices`: lists the processors and GPUs that can play episodes, and the pass of each GPU.
 
 use serde_json::json;
 
@@ -15,7 +15,7 @@ pub struct Args {
     json: bool,
 }
 
-/// Opens every adapter in turn, since only an open device can be tested.
+/// Opens every adapter in turn, because only an open device can be tested.
 pub fn run(args: Args) -> Result<(), Error> {
     backend::start_threads(None);
     let adapters: Vec<_> = device::adapters()

@@ -1,4 +1,4 @@
-//! `flotilla init`: a config to start from, every key with what there is to know of it.
+//! `flotilla init`: writes a config to start from, with a comment about every key.
 
 use std::fs::OpenOptions;
 use std::io::{self, Write};
@@ -13,13 +13,13 @@ use crate::config::{self, Config, Definition};
 use crate::escape::PathExt;
 use crate::record::RecordError;
 
-/// The paper's layouts, as they are asked for and as their config files are named, with the text of each.
+/// The paper's layouts. Each has the name of the argument, the name of the config file, and the file's text.
 const LAYOUTS: [([&str; 2], &str); 3] = [
     (["generally-forward", "generally_forward"], include_str!("../../configs/generally_forward.toml")),
     (["strictly-forward", "strictly_forward"], include_str!("../../configs/strictly_forward.toml")),
     (["chaotic"; 2], include_str!("../../configs/chaotic.toml")),
 ];
-/// Letters of a line at most.
+/// Maximum number of characters in a line.
 const WIDTH: usize = 110;
 
 #[derive(clap::Args)]
@@ -44,7 +44,7 @@ pub struct Args {
     force: bool,
 }
 
-/// Their names, by either of which they are found.
+/// Returns the parser of layout names. A paper's layout is also found by the name of its file.
 fn layouts() -> PossibleValuesParser {
     let papers = LAYOUTS.map(|([name, file], _)| PossibleValue::new(name).alias(file));
     PossibleValuesParser::new(papers.into_iter().chain(SHAPES.map(|(name, _)| PossibleValue::new(name))))
@@ -62,7 +62,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     print(&format!("{}\n", path.escaped()))
 }
 
-/// The config to start from: one of the paper's, or one with as many groups and POIs as were asked for.
+/// Returns the text of the config to start from: one of the paper's, or a layout with the requested groups and POIs.
 fn template(args: &Args) -> Result<String, Error> {
     let Some((_, shape)) = SHAPES.into_iter().find(|(name, _)| *name == args.layout) else {
         let given = [("--groups", args.groups), ("--followers", args.followers), ("--pois", args.pois)];
@@ -84,20 +84,20 @@ fn template(args: &Args) -> Result<String, Error> {
     }
 }
 
-/// Writes a file that is not there yet.
+/// Writes a file that must not exist yet.
 fn write_new(path: &Path, text: &str) -> io::Result<()> {
     let mut file = OpenOptions::new().write(true).create_new(true).open(path).map_err(|error| match error.kind() {
         io::ErrorKind::AlreadyExists => io::Error::other("it is there already; choose another --out, or --force"),
         _ => error,
     })?;
     file.write_all(text.as_bytes()).inspect_err(|_| {
-        // Half a config is worse than none.
+        // An incomplete config is worse than none.
         let _ = std::fs::remove_file(path);
     })
 }
 
-/// The config file that says what `config` does, opened by the comment of the file that it is from; every key stands
-/// there, with its meaning, unit, kind, range and default as a comment.
+/// Returns `config` as a config file, after the opening comment of the text `from`. Each key has a comment with its
+/// meaning, unit, kind, range and default.
 fn commented(from: &str, config: &Config) -> String {
     let values: Table = config.to_toml().parse().expect("it was just written");
     let opening: String =
@@ -117,7 +117,7 @@ fn commented(from: &str, config: &Config) -> String {
     text
 }
 
-/// Meaning and facts, on a line of their own each where one does not hold both.
+/// Returns a key's comment. Meaning and facts are on separate lines if they do not fit on one.
 fn comment(Definition { unit, kind, range, default, meaning, .. }: &Definition) -> String {
     let unit = if unit.is_empty() { String::new() } else { format!("{unit}; ") };
     let default = default.as_ref().map_or("has to be given".into(), |default| format!("default {default}"));
@@ -138,7 +138,7 @@ fn wrapped(text: &str) -> String {
     lines + &line + "\n"
 }
 
-/// A value as TOML, a list of positions in rows of four where it is long.
+/// Returns a value as TOML. A list of more than four items is written in rows of four.
 fn written(value: &Value) -> String {
     match value {
         Value::Array(items) if items.len() > 4 => {

@@ -1,4 +1,4 @@
-//! Layouts to start an experiment of one's own from: groups of a leader and its followers, and POIs ahead of them.
+//! Layouts for new experiments: groups of a leader and its followers, and POIs ahead of them.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 use std::fmt::Write;
@@ -9,7 +9,7 @@ use crate::config::{Config, ConfigError, MAX_AGENTS, MAX_POIS};
 use crate::reach;
 use crate::world::World;
 
-/// How groups and POIs are arranged.
+/// The arrangement of groups and POIs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Pattern {
     /// Groups around the centre look outwards; POIs are around them.
@@ -20,18 +20,18 @@ pub(super) enum Pattern {
     Grid,
 }
 
-/// The shapes by name.
+/// The patterns by name.
 pub(super) const SHAPES: [(&str, Pattern); 3] =
     [("ring", Pattern::Ring), ("row", Pattern::Row), ("grid", Pattern::Grid)];
 
-/// From a leader to the POI ahead of it, and between groups side by side, in units.
+/// Distance from a leader to the POI ahead of it, and between groups side by side, in units.
 const APART: f64 = 10.0;
-/// From a leader back to its first followers, which see it within the attraction radius of 5.
+/// Distance from a leader back to its first followers, in units. They see it within the default attraction radius of 5.
 const BEHIND: f64 = 3.0;
-/// Around everything, to the edge of the map: a POI's observation radius and some room.
+/// Margin around all agents and POIs, in units: a POI's observation radius and some room.
 const EDGE: f64 = 8.0;
 
-/// A layout that was asked for.
+/// A requested layout.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct StartLayout {
     pub shape: Pattern,
@@ -40,14 +40,14 @@ pub(super) struct StartLayout {
     pub pois: usize,
 }
 
-/// One group: its leader's place, and which way it looks.
+/// The position and heading of a group's leader at the start.
 struct LeaderStart {
     place: DVec2,
     heading: f64,
 }
 
 impl StartLayout {
-    /// What is wrong with the numbers.
+    /// Returns an error message if a number is not allowed.
     pub fn problem(&self) -> Option<String> {
         let agents = self.groups.saturating_mul(self.followers.saturating_add(1));
         match agents {
@@ -63,13 +63,13 @@ impl StartLayout {
         }
     }
 
-    /// The config file: a comment that says what the layout is, and the keys that make it.
+    /// Returns the text of the config file: a comment that describes the layout, and the layout's keys.
     ///
     /// # Errors
-    /// The layout does not make a valid config.
+    /// Fails if the layout does not result in a valid config.
     pub fn text(&self) -> Result<String, ConfigError> {
         let short = Config::parse(&self.with_steps(1), "layout")?;
-        // The farthest POI is reached with time to spare.
+        // An episode is long enough to reach the farthest POI with time to spare.
         let nearest = |poi: &[f64; 2]| {
             let away = |leader: &[f64; 2]| DVec2::from(*poi).distance((*leader).into());
             short.world.leaders.iter().map(away).fold(f64::INFINITY, f64::min)
@@ -95,7 +95,7 @@ impl StartLayout {
         (0..self.groups).map(group).collect()
     }
 
-    /// The radius of the leaders' ring, so wide that neighbouring groups do not attract each other.
+    /// Returns the radius of the leaders' ring. It is large enough that neighbouring groups do not attract each other.
     fn radius(&self) -> f64 {
         let around = 8.0 * self.groups as f64 / TAU + BEHIND;
         if self.groups == 1 { 0.0 } else { around.max(6.0) }
@@ -104,7 +104,7 @@ impl StartLayout {
     fn pois(&self) -> Vec<DVec2> {
         let pois = self.pois;
         let width = APART * (self.groups - 1) as f64;
-        // In the middle of equal shares of a width.
+        // The middle of one of `count` equal shares of a width.
         let spread = |index: usize, count: usize, width: f64| (index as f64 + 0.5) / count as f64 * width;
         let at = |index: usize| match self.shape {
             Pattern::Ring => DVec2::from_angle(TAU * index as f64 / pois as f64) * (self.radius() + APART),
@@ -121,7 +121,7 @@ impl StartLayout {
         (0..pois).map(at).collect()
     }
 
-    /// Where followers start relative to a leader that looks along the x axis: in rows behind it.
+    /// Returns where followers start relative to a leader that faces along the x axis: in rows behind it.
     fn behind(&self) -> Vec<DVec2> {
         let columns = self.followers.min(3).max(self.followers.div_ceil(3)).max(1);
         let across = |column: usize, of: usize| match of {

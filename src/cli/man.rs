@@ -1,4 +1,4 @@
-//! `flotilla man`: manual pages, one a command.
+//! `flotilla man`: writes manual pages, one per command.
 
 use std::fs;
 use std::path::PathBuf;
@@ -19,10 +19,10 @@ pub struct Args {
     out: PathBuf,
 }
 
-/// How a manual page says that it is about this program.
+/// The text by which a manual page of this program is recognised, so that it can be overwritten.
 const TITLE: &str = ".TH flotilla";
 
-/// Writes the pages in the place of earlier versions of them.
+/// Writes the pages, and overwrites earlier versions of them.
 pub fn run(args: Args) -> Result<(), Error> {
     let disk = Disk::default();
     let failed = |path: PathBuf| move |error| RecordError::Write { path, error };

@@ -1,6 +1,7 @@
-//! One file a command; what was typed becomes ready objects here.
+//! The command line. Each command has a file of its own, and this module contains what they share.
 //!
-//! A command's file holds `Args` (its flags) and `run(Args) -> Result<(), Error>`; the list `commands!` below names it.
+//! A command's file contains `Args` (its flags) and `run(Args) -> Result<(), Error>`. The list `commands!` below names
+//! it.
 
 use std::ffi::OsString;
 use std::fmt::Display;
@@ -51,7 +52,7 @@ mod train;
 mod verify;
 mod warnings;
 
-/// Lists the commands, each with its file, and calls the one that was typed.
+/// Declares the commands, each with its file, and runs the one that was typed.
 macro_rules! commands {
     ($($(#[$doc:meta])* $name:ident($file:ident),)*) => {
         /// What to do.
@@ -109,31 +110,31 @@ struct Cli {
     command: Command,
 }
 
-/// What `--version` tells: also what this was built from, and for what.
+/// Text of `--version`: the version, and the commit and target of the build.
 static VERSION: LazyLock<String> = LazyLock::new(|| {
     let commit = crate::COMMIT.unwrap_or("not recorded");
     format!("{}\ncommit  {commit}\ntarget  {}", env!("CARGO_PKG_VERSION"), env!("FLOTILLA_TARGET"))
 });
 
-/// What was typed, the program's name first, where that is not what this process was started by.
+/// The command line, program name first, if it differs from the process's own arguments.
 static WORDS: OnceLock<Vec<OsString>> = OnceLock::new();
 
-/// What was typed, the program's name first.
+/// Returns the command line, program name first.
 fn words() -> Vec<OsString> {
     WORDS.get().cloned().unwrap_or_else(|| std::env::args_os().collect())
 }
 
-/// The program to call for more of the same.
+/// Returns the program's path, for commands that start more processes.
 fn program() -> PathBuf {
     let named = WORDS.get().and_then(|words| words.first()).map(PathBuf::from);
     named.or_else(|| std::env::current_exe().ok()).unwrap_or_else(|| "flotilla".into())
 }
 
-/// Sets the process up, runs the command, reports its error, and returns the exit code. Wrong usage ends the process here,
-/// with exit code 2.
+/// Sets the process up, runs the command, reports its error, and returns the exit code. If clap rejects the command
+/// line, the process exits here with code 2.
 ///
-/// `words` are the command, the program that it would be typed to first, if this process was started by other words. Only
-/// the first call's words count.
+/// `words` replaces the process's own arguments, with the program's name first. Only the `words` of the first call are
+/// used.
 pub fn main(words: Option<Vec<OsString>>) -> u8 {
     if let Some(words) = words {
         WORDS.get_or_init(|| words);
@@ -159,7 +160,8 @@ fn run() -> Result<(), Error> {
     }
 }
 
-/// Replaces clap's advice about an unknown flag, to pass it as a value, which helps nobody here.
+/// Removes clap's advice to pass an unknown flag as a value, which does not apply to any command. Suggests `--team` in
+/// place of `--champion` and `--best`.
 fn hinted(mut error: clap::Error) -> clap::Error {
     if error.kind() == ErrorKind::UnknownArgument {
         error.remove(ContextKind::Suggested);
@@ -172,9 +174,9 @@ fn hinted(mut error: clap::Error) -> clap::Error {
     error
 }
 
-/// The command line, to be parsed or described without being run.
+/// Returns the definition of the command line, without parsing or running anything.
 pub fn command() -> clap::Command {
-    // A number below 0 is a value, if a wrong one, and no flag.
+    // A negative number is a value, even if an invalid one, and not a flag.
     Cli::command().mut_subcommands(|command| {
         command.mut_args(|arg| match arg.get_long().is_some() && arg.get_action().takes_values() {
             true => arg.allow_negative_numbers(true),
@@ -183,22 +185,22 @@ pub fn command() -> clap::Command {
     })
 }
 
-/// A number for a config key, whose range is told with the config; gives it as TOML has it.
+/// Parses a number for a config key, and returns it as TOML. The config checks its range.
 fn number(text: &str) -> Result<String, String> {
     let digits = text.strip_prefix(['-', '+']).unwrap_or(text);
-    // Whole numbers stay as they were typed: some are too large for TOML, and no float says which.
+    // Whole numbers do not become floats, which would lose digits. Those too large for TOML stay as typed.
     match !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit()) {
         true => Ok(text.parse::<i64>().map_or(text.into(), |number| number.to_string())),
         false => real(text).map(|number| toml::Value::from(number).to_string()),
     }
 }
 
-/// A count, or a place from 0.
+/// Parses a whole number, from 0.
 fn whole(text: &str) -> Result<usize, String> {
     text.parse().map_err(|_| "allowed a whole number, from 0".into())
 }
 
-/// A whole number of a range.
+/// Returns a parser of whole numbers in a range.
 fn between<T>(allowed: RangeInclusive<T>) -> impl Fn(&str) -> Result<T, String> + Clone + Send + Sync
 where
     T: FromStr + PartialOrd + Display + Clone + Send + Sync,
@@ -209,13 +211,13 @@ where
     }
 }
 
-/// A number.
+/// Parses a number.
 fn real(text: &str) -> Result<f64, String> {
     text.parse().map_err(|_| "allowed a number".into())
 }
 
-/// Refuses names and values that hold line breaks or escape sequences: none is needed, and any could end up in a
-/// script, a table or on a terminal as something else than a name.
+/// Rejects names and values with control characters, such as line breaks and escape sequences. Nothing needs them, and
+/// in a script, a table or a terminal they could act as something else than a name.
 fn reject_control_chars(words: impl Iterator<Item = OsString>) -> Result<(), Error> {
     for word in words {
         if word.to_string_lossy().contains(escape::is_control) {
@@ -228,16 +230,16 @@ fn reject_control_chars(words: impl Iterator<Item = OsString>) -> Result<(), Err
     Ok(())
 }
 
-/// Why a command failed.
+/// The error of a command.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A config that cannot be read or is wrong.
+    /// A config that cannot be read or is invalid.
     #[error("{}{}", .0, remedy::config(.0))]
     Config(#[from] ConfigError),
     /// Episodes that could not be played.
     #[error("{}{}", .0, remedy::backend(.0))]
     Backend(#[from] BackendError),
-    /// A GPU that could not be had, or that failed.
+    /// A GPU that could not be opened, or that failed.
     #[error("{}{}", .0, remedy::device(.0))]
     Device(#[from] DeviceError),
     /// There is no GPU to compare with the CPU.
@@ -246,10 +248,10 @@ pub enum Error {
     /// Files of runs that could not be written, read or used.
     #[error("{}{}", .0, remedy::record(.0, "run it again"))]
     Record(#[from] RecordError),
-    /// A run that could not go on.
+    /// A run that could not continue.
     #[error("{}{}", .0, remedy::run(.0))]
     Run(#[from] RunError),
-    /// A run that could not be read to be shown.
+    /// A run that could not be read to show it.
     #[error("{}{}", .0, remedy::shown(.0))]
     Shown(#[from] crate::report::runs::ReadError),
     /// A question that could not be answered.
@@ -261,31 +263,31 @@ pub enum Error {
     /// Results that could not be printed.
     #[error("standard output cannot be written: {0}")]
     Output(io::Error),
-    /// The system does not let signals be listened for.
+    /// Signal handlers that could not be installed.
     #[error("signals cannot be listened for: {0}")]
     Signals(io::Error),
-    /// Wrong usage that only shows once flags are read together.
+    /// Wrong usage that is only found when flags are read together.
     #[error("{0}")]
     Usage(String),
-    /// What was to be equal is not.
+    /// Results that differ but should be equal.
     #[error("{0}")]
     Different(String),
-    /// What is there must stay.
+    /// A command that is refused, for example because it would overwrite files.
     #[error("{0}")]
     Refused(String),
-    /// Results that are not there yet.
+    /// Results that do not exist yet.
     #[error("{0}")]
     Missing(String),
-    /// Stopped by a signal, with everything saved.
+    /// Stopped by a signal. Runs are saved and can be resumed.
     #[error("{0}")]
     Stopped(String),
 }
 
 impl Error {
-    /// The process's exit code: 1 failed, 2 wrong usage, 75 stopped and ready to be resumed.
+    /// Returns the process's exit code: 1 for a failure, 2 for wrong usage, 75 if stopped and ready to be resumed.
     ///
-    /// A value given by a flag is wrong usage wherever that is found: also one that does not fit the file or the
-    /// machine that it is used with. Where the file is wrong as well, the run failed.
+    /// A flag's value that does not fit the file or the machine is wrong usage, too. If the file is also invalid, the
+    /// code is 1.
     pub fn exit_code(&self) -> u8 {
         match self {
             Error::Usage(_)
@@ -302,17 +304,17 @@ impl Error {
     }
 }
 
-/// Tells something on standard error, with whatever would steer a terminal written out; with standard error gone there
-/// is nobody left to tell.
+/// Prints a message to standard error, with control characters escaped. A failure is ignored, because there is no other
+/// place to report it.
 pub fn say(text: impl Display) {
     let _ = writeln!(io::stderr(), "{}", escape::lines(&text.to_string()));
 }
 
-/// Writes a result to standard output, with whatever would steer a terminal written out. A reader that has heard enough
-/// (`| head`) is no failure.
+/// Prints a result to standard output, with control characters escaped. A reader that closes the pipe early (`| head`)
+/// causes no error.
 ///
 /// # Errors
-/// Standard output is closed or full.
+/// Fails if standard output cannot be written, for example because the disk is full.
 pub fn print(text: &str) -> Result<(), Error> {
     let mut stdout = io::stdout().lock();
     match stdout.write_all(escape::lines(text).as_bytes()).and_then(|()| stdout.flush()) {
@@ -321,11 +323,11 @@ pub fn print(text: &str) -> Result<(), Error> {
     }
 }
 
-/// Writes a result as one line of JSON to standard output. What could steer a terminal is written as JSON's own escapes,
-/// so every reader gets the same text back.
+/// Prints a result as one line of JSON to standard output. Control characters are written as JSON escapes, so that
+/// every reader gets the same text back.
 ///
 /// # Errors
-/// Standard output is closed or full.
+/// Fails if standard output cannot be written, for example because the disk is full.
 pub fn print_json(value: &impl Serialize) -> Result<(), Error> {
     let text = serde_json::to_string(value).expect("numbers, texts and lists of them are JSON");
     print(&(escape::json(&text).into_owned() + "\n"))
@@ -343,15 +345,15 @@ pub struct ConfigFile {
 }
 
 impl ConfigFile {
-    /// The config in it, with some keys set by a command's own flags.
+    /// Loads the config, with the keys that a command's own flags set.
     ///
     /// # Errors
-    /// Everything that is wrong with the file and the flags.
+    /// Fails if the file cannot be read, or if it or a flag is invalid. The error lists the problems.
     pub fn load(&self, overrides: &[Override]) -> Result<Config, Error> {
         Ok(self.load_noted(overrides)?.0)
     }
 
-    /// [`ConfigFile::load`], and what the config's author should know.
+    /// Loads the config as [`ConfigFile::load`] does, and returns notes for its author.
     fn load_noted(&self, overrides: &[Override]) -> Result<(Config, Vec<String>), Error> {
         let text = config::read_file(&self.path)?;
         Ok(Config::read_noted(&Document::parse(&text), &config::name(&self.path), &[], overrides)?)
@@ -370,7 +372,7 @@ pub struct ConfigArgs {
 }
 
 impl ConfigArgs {
-    /// What the file is called, without folder and extension; `config` on standard input.
+    /// Returns the file's name without folder and extension, or `config` for standard input.
     pub fn name(&self) -> String {
         match &self.file.path {
             path if config::is_standard_input(path) => "config".into(),
@@ -378,11 +380,11 @@ impl ConfigArgs {
         }
     }
 
-    /// The config that was meant, with more keys set by a command's own flags; reports what its author should know, and
-    /// returns that as well.
+    /// Loads the config, with the keys that the flags and `more` set. Prints the notes for its author, and returns them
+    /// as well.
     ///
     /// # Errors
-    /// Everything that is wrong with the file and the flags.
+    /// Fails if the file cannot be read, or if it or a flag is invalid. The error lists the problems.
     pub fn load(&self, more: Vec<Override>) -> Result<(Config, Vec<String>), Error> {
         let (config, notes) = self.file.load_noted(&[self.overrides.list(), more].concat())?;
         notes.iter().for_each(|note| say(format_args!("note: {note}")));
@@ -416,7 +418,7 @@ pub struct Overrides {
     pub set: Vec<Override>,
 }
 
-/// A key and its value, which is TOML or a word.
+/// Parses `KEY=VALUE`. The value is TOML or a word.
 fn assignment(text: &str) -> Result<Override, String> {
     let (key, value) = text.split_once('=').ok_or("allowed KEY=VALUE, as world.steps=60")?;
     let (key, value) = (key.trim(), value.trim());
@@ -425,7 +427,7 @@ fn assignment(text: &str) -> Result<Override, String> {
     Ok(Override { key: key.into(), text, name: format!("--set {key}") })
 }
 
-/// The word as a list of words has it, in whatever case it was typed.
+/// Returns the spelling in `names` of a word typed in any case. An unknown word stays as typed.
 fn canonical(mut names: impl Iterator<Item = &'static str>, typed: &str) -> toml::Value {
     match names.find(|name| name.eq_ignore_ascii_case(typed)) {
         Some(name) => name.into(),
@@ -434,7 +436,7 @@ fn canonical(mut names: impl Iterator<Item = &'static str>, typed: &str) -> toml
 }
 
 impl Overrides {
-    /// The keys that were set, each named as its flag.
+    /// Returns the keys that were set, each with its flag as its name in errors.
     pub fn list(&self) -> Vec<Override> {
         let Overrides { seed, trials, generations, population, fitness, paradigm, set: given } = self;
         let numbers = [("seed", seed), ("trials", trials), ("generations", generations), ("population", population)]

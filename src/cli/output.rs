@@ -1,4 +1,4 @@
-//! Files that a command was told to write.
+//! Checks and writes the output files of commands.
 
 use std::fs;
 use std::io::{self, Write};
@@ -13,18 +13,18 @@ use crate::file;
 use crate::record::disk::Disk;
 use crate::record::{RecordError, folder, ownership};
 
-/// Where a picture or a page goes.
+/// The file that a picture or a page is written to.
 pub enum Destination {
-    /// The user named the file, whatever it is.
+    /// A file that the user named. It is overwritten whatever it contains.
     Named(PathBuf),
-    /// A file of a run's folder.
+    /// A file in a run's folder.
     OfRun(PathBuf),
-    /// A file of the present folder, by a name that the user did not choose.
+    /// A file in the current folder, with a name that the user did not choose.
     Here(PathBuf),
 }
 
 impl Destination {
-    /// The file.
+    /// Returns the file's path.
     pub fn path(&self) -> &Path {
         match self {
             Destination::Named(path) | Destination::OfRun(path) | Destination::Here(path) => path,
@@ -34,7 +34,7 @@ impl Destination {
     /// Refuses a file that flotilla did not make, unless the user named it.
     ///
     /// # Errors
-    /// It is such, or the folder belongs to another user.
+    /// Fails if it is such a file, or if the folder belongs to another user.
     pub fn check(&self) -> Result<(), RecordError> {
         match self {
             Destination::Named(_) => Ok(()),
@@ -44,10 +44,10 @@ impl Destination {
         }
     }
 
-    /// Writes the file, whole or not at all.
+    /// Writes the file completely or not at all.
     ///
     /// # Errors
-    /// It cannot be written, or [`Destination::check`].
+    /// Fails if the file cannot be written, or for the reasons of [`Destination::check`].
     pub fn write(&self, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Error> {
         self.check()?;
         match self {
@@ -60,25 +60,26 @@ impl Destination {
         }
     }
 
-    /// The disk within the file's folder, which no flag names.
+    /// Returns a disk that is limited to the file's folder.
     fn disk(&self) -> Result<Disk, RecordError> {
         ownership::enter(&Disk::default(), file::folder(self.path()), matches!(self, Destination::Named(_)))
     }
 }
 
-/// Refuses to write over what is read, over another output, or over what a run needs. Each file comes with its flag.
+/// Refuses outputs that would overwrite an input, another output, or a file that a run needs. Each output comes with
+/// its flag.
 ///
 /// # Errors
-/// An output stands for something else already.
+/// Fails for such an output, for a directory, and for a file whose folder does not exist.
 pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), Error> {
     let mut taken: Vec<_> = inputs.iter().map(|path| (file::resolved(path), "is read from".to_string())).collect();
     for &(flag, path) in outputs {
         let Some(path) = path else { continue };
-        // Devices take whatever comes.
+        // Devices and pipes have no content that could be lost.
         if path.exists() && !path.is_file() && !path.is_dir() {
             continue;
         }
-        // Better told before hours of playing than after.
+        // This fails now, because the file may only be written after hours of computation.
         if let Err(error) = fs::metadata(file::folder(path)) {
             return Err(RecordError::Write { path: path.into(), error }.into());
         }
@@ -100,10 +101,10 @@ pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), 
     Ok(())
 }
 
-/// Writes a file, whole or not at all. A pipe is waited for until somebody reads from it.
+/// Writes a file completely or not at all. A pipe blocks until a reader opens it.
 ///
 /// # Errors
-/// It cannot be written.
+/// Fails if the file cannot be written.
 pub fn write(path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Error> {
     let opened = tell_of_waiting(path);
     let content = |output: &mut dyn Write| {
@@ -113,12 +114,12 @@ pub fn write(path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>
     Ok(Disk::default().deliver(path, content).map_err(|error| RecordError::Write { path: path.into(), error })?)
 }
 
-/// Says that a pipe waits for somebody to read from it, unless what this gives is dropped soon, once it is open.
+/// Reports that a pipe has no reader yet, unless the returned sender is dropped within [`PATIENCE`].
 fn tell_of_waiting(path: &Path) -> mpsc::Sender<()> {
     let (opened, waiting) = mpsc::channel();
     if fs::metadata(path).is_ok_and(|there| !there.is_file() && !there.is_dir()) {
         let path = path.to_path_buf();
-        // Without a thread nobody is told, which changes nothing else.
+        // If no thread can be started, only the message is missing.
         let _ = thread::Builder::new().spawn(move || {
             if waiting.recv_timeout(PATIENCE) == Err(mpsc::RecvTimeoutError::Timeout) {
                 say(format_args!("waiting for somebody to read from {}", path.escaped()));
@@ -128,5 +129,5 @@ fn tell_of_waiting(path: &Path) -> mpsc::Sender<()> {
     opened
 }
 
-/// Until it is told that somebody is waited for.
+/// Time until a pipe without a reader is reported.
 const PATIENCE: Duration = Duration::from_secs(1);

@@ -1,4 +1,4 @@
-//! `flotilla paper`: the paper's experiments, its figures and its claims, measured here.
+//! `flotilla paper`: trains the paper's experiments, draws its figures and checks its claims.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -27,11 +27,11 @@ use crate::shell;
 use crate::sweep::questions::letter;
 use crate::trainer::Row;
 
-/// In a paper's folder: what came out, for people and for programs.
+/// The results in a paper's folder, for people and for programs.
 const CLAIMS: &str = "claims.md";
 const SUMMARY: &str = "summary.json";
 
-/// Where a paper goes by default.
+/// The default folder of a paper.
 const OUT: &str = "paper";
 
 #[derive(clap::Args)]
@@ -81,12 +81,12 @@ impl Args {
         [overrides.list(), self.checkpoints.list()].concat()
     }
 
-    /// Whether the user chose the folder.
+    /// Returns whether the user chose the folder.
     pub(super) fn is_out_named(&self) -> bool {
         self.out != Path::new(OUT)
     }
 
-    /// What to do with what is in the folder.
+    /// Returns what to do with a paper that is in the folder.
     pub(super) fn start(&self) -> Start {
         match (self.resume, self.force) {
             (true, _) => Start::Resume,
@@ -95,7 +95,7 @@ impl Args {
         }
     }
 
-    /// What to type to go on.
+    /// Returns the command that resumes the paper.
     pub(super) fn command_to_resume(&self) -> String {
         let (overrides, out) = (self.overrides(), shell::argument(&self.out));
         let letters: Vec<String> = self.questions.iter().map(char::to_string).collect();
@@ -107,7 +107,7 @@ impl Args {
     }
 }
 
-/// Trains every experiment side by side, each as a run, and writes what came out.
+/// Trains the experiments side by side, each as a run, and writes figures, claims and summary.
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { ref out, quiet, .. } = args;
     let mut arms = paper::arms(&args.overrides())?;
@@ -122,14 +122,14 @@ pub fn run(args: Args) -> Result<(), Error> {
     disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
     let disk = ownership::enter(&disk, out, args.is_out_named())?;
     let _lock = folder::lock(&disk, out)?;
-    // Only now is nobody else writing here.
+    // Compared again, because another process could write here until the folder was locked.
     marks.compare(out, start)?;
     let folders: Vec<PathBuf> = arms.iter().map(|arm| out.join(ARMS).join(arm_name(arm))).collect();
     let configs_of_arms = arms.iter().map(|arm| &arm.config);
     folder::check(&disk, folders.iter().map(|path| &**path).zip(configs_of_arms), start)?;
     ownership::check(&disk, products().map(|name| out.join(name)))?;
     marks.claim(out, start, &disk)?;
-    // The first arm of each training is trained, the others are the same.
+    // Several arms can have the same config. Only the first of them is trained, and the others are copies.
     let trained: Vec<usize> =
         (0..configs.len()).filter_map(|place| places.iter().position(|at| *at == place)).collect();
     let runs: Vec<_> = configs.iter().cloned().zip(trained.iter().map(|&arm| folders[arm].clone())).collect();
@@ -140,7 +140,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
     let twins: Vec<usize> = (0..arms.len()).filter(|&arm| trained[places[arm]] != arm).collect();
     if start == Start::Force {
-        // What is written over is gone before anything can stop this.
+        // Old results are removed now, so that none are left if this run is stopped.
         for &arm in &twins {
             Folder::open(&folders[arm], start, &arms[arm].config, StartFrom::Random, disk.clone())?;
         }
@@ -291,7 +291,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     ))
 }
 
-/// Figures, as files.
+/// File names of the figures.
 const FIGURES: [&str; 9] = [
     "figure4.svg",
     "figure4.png",
@@ -304,17 +304,17 @@ const FIGURES: [&str; 9] = [
     "figure6.pdf",
 ];
 
-/// All that is made of the runs.
+/// Returns the names of all files that are made from the runs.
 fn products() -> impl Iterator<Item = &'static str> {
     [CLAIMS, SUMMARY].into_iter().chain(FIGURES)
 }
 
-/// An arm's folder: "chaotic-all-leaders-Df".
+/// Returns the name of an arm's folder, such as `chaotic-all-leaders-Df`.
 fn arm_name(arm: &Experiment) -> String {
     arm.name().replace(", ", "-").replace(' ', "-")
 }
 
-/// What all arms of a paper have in common, as its folder says it.
+/// The keys that all arms of a paper have in common, as recorded in its folder.
 struct Marks([(&'static str, u64); 3]);
 
 impl Marks {
@@ -327,7 +327,7 @@ impl Marks {
         self.0.iter().map(|(key, value)| format!("{key} = {value}\n")).collect()
     }
 
-    /// Refuses a folder that holds something else.
+    /// Refuses a folder with other content.
     fn compare(&self, out: &Path, start: Start) -> Result<(), Error> {
         if out.is_file() {
             return Err(RecordError::NoFolder { path: out.into() }.into());
@@ -368,7 +368,7 @@ impl Marks {
         }
     }
 
-    /// Refuses to go on with another paper, but for more generations.
+    /// Refuses to resume another paper. Only the number of generations may be larger than before.
     fn compare_paper(&self, out: &Path) -> Result<(), Error> {
         let path = out.join(PAPER);
         let text = config::read_file(&path)?;
@@ -395,7 +395,7 @@ impl Marks {
         )))
     }
 
-    /// Marks the folder as this paper's, without what is drawn of another.
+    /// Marks the folder as this paper's. `Start::Force` first removes what was made from earlier runs.
     fn claim(&self, out: &Path, start: Start, disk: &Disk) -> Result<(), Error> {
         let failed = |path: &Path| {
             let path = path.to_path_buf();

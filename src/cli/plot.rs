@@ -1,4 +1,4 @@
-//! `flotilla plot`: the curves of one run, or of several side by side.
+//! `flotilla plot`: draws the curves of one run, or of several side by side.
 
 use std::path::{Path, PathBuf};
 
@@ -62,19 +62,19 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
 }
 
-/// What a picture is written as, by the end of its file's name.
+/// Returns the format of a picture, from the extension of its file name.
 ///
 /// # Errors
-/// Nothing that a picture can be.
+/// Fails if the extension is not that of a picture.
 pub(super) fn kind_of(path: &Path) -> Result<Format, Error> {
     let wrong = || Error::Usage(format!("--out {}: its name must end in .svg, .pdf or .png", path.escaped()));
     Format::of(path).ok_or_else(wrong)
 }
 
-/// Writes a picture, whole or not at all.
+/// Writes a picture completely or not at all.
 ///
 /// # Errors
-/// The file cannot be written.
+/// Fails if the file cannot be written.
 pub(super) fn write(scene: &Scene, kind: Format, path: &Path) -> Result<(), Error> {
     let failed = |error| RecordError::Write { path: path.into(), error };
     let content = scene.file(kind, PRINT).map_err(failed)?;

@@ -1,4 +1,4 @@
-//! Folders of sweeps named in the place of a run's.
+//! Reads a run's folder, and helps if a sweep's folder is named in its place.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -11,13 +11,13 @@ use crate::record::folder::SWEEP;
 use crate::report::runs::{self, ReadError};
 use crate::sweep::{Sweep, results};
 
-/// Most points that are listed.
+/// Maximum number of points that are listed.
 const MOST: usize = 40;
 
-/// Reads a run's config. For the folder of a sweep the error lists its points with their values.
+/// Reads a run's config. If the folder is a sweep's, the error lists its points with their values.
 ///
 /// # Errors
-/// The folder is no run's, or its config is damaged.
+/// Fails if the folder is not a run directory, or if its config is damaged.
 pub(super) fn config(folder: &Path, verification: Verification) -> Result<Config, Error> {
     runs::config(folder, verification).map_err(|error| match error {
         ReadError::Collection { what: "a sweep", .. } => match Sweep::load(&folder.join(SWEEP), &[], false) {

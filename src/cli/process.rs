@@ -1,11 +1,11 @@
-//! What a process sets up before its command, for the program and for the command that comes with the Python package.
+//! Sets up the process before its command, for the program and for the command in the Python package.
 
 use super::Error;
 
-/// Sets the process up: calms drivers, and makes the system's limits errors instead of surprises.
+/// Sets the process up: silences drivers, and turns the system's limits into errors that can be reported.
 ///
 /// # Errors
-/// The system does not let signals be listened for.
+/// Fails if the system does not allow signal handlers.
 pub fn set_up() -> Result<(), Error> {
     calm_drivers();
     #[cfg(unix)]
@@ -16,9 +16,9 @@ pub fn set_up() -> Result<(), Error> {
     Ok(())
 }
 
-/// Vulkan's layers look for a Wayland display, and its library complains on standard error if XDG_RUNTIME_DIR does not say
-/// in which folder. Nothing here needs a display, so this names a folder that cannot exist. Processes that have threads
-/// already (Python's, once NumPy is loaded) set this themselves.
+/// Vulkan's layers look for a Wayland display. Its library prints a complaint if XDG_RUNTIME_DIR does not name the
+/// display's folder. Nothing here needs a display, so this names a folder that cannot exist. A process that already has
+/// threads is left alone, because changing its environment is unsafe. The Python package sets the variable itself.
 fn calm_drivers() {
     let name = "XDG_RUNTIME_DIR";
     let valid = std::env::var_os(name).is_some_and(|folder| std::path::Path::new(&folder).is_absolute());
@@ -32,11 +32,12 @@ fn calm_drivers() {
     }
 }
 
-/// A sweep keeps files of all its points open, and some systems allow a process 256 unless it asks for more.
+/// Raises the limit of open files. A sweep keeps files of all its points open, and some systems allow only 256 by
+/// default.
 #[cfg(unix)]
 fn allow_many_files() {
     use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
-    /// macOS allows no more, whatever it says that it would.
+    /// macOS allows no more, even if it reports a larger limit.
     const MOST: u64 = 10_240;
     let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
     let wanted = maximum.map_or(MOST, |maximum| maximum.min(MOST));
@@ -46,7 +47,8 @@ fn allow_many_files() {
     }
 }
 
-/// Where the system limits the size of files (`ulimit -f`), writing beyond it is an error to report, not the end.
+/// Turns writing beyond the system's file size limit (`ulimit -f`) into an error. Otherwise the signal would end the
+/// process.
 #[cfg(unix)]
 fn fail_large_files() -> Result<(), Error> {
     let never_read = std::sync::Arc::default();

@@ -1,4 +1,4 @@
-//! `flotilla paper --questions`: what answers the questions that the paper leaves open.
+//! `flotilla paper --questions`: trains experiments for the questions that the paper leaves open.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering::Relaxed;
@@ -25,21 +25,21 @@ use crate::sweep::results::point_folder;
 use crate::sweep::run::{self, SweepOptions};
 use crate::sweep::{Sweep, shard};
 
-/// What came out, as a page.
+/// The page with the results.
 const PAGE: &str = "questions.md";
 
-/// All parts of all questions.
+/// Returns all parts of all questions.
 fn all_parts() -> impl Iterator<Item = &'static Study> {
     QUESTIONS.iter().flat_map(|question| question.parts)
 }
 
-/// The files that are made of each part.
+/// Returns the names of the files that are made for each part.
 fn files() -> impl Iterator<Item = String> {
     let endings = || Format::ALL.map(Format::extension).into_iter().chain(["csv"]);
     all_parts().flat_map(move |part| endings().map(|ending| format!("{}.{ending}", part.name)))
 }
 
-/// Trains every part of the questions, each as a sweep in a folder of its own, and writes what came out.
+/// Trains every part of the questions, each as a sweep in a folder of its own, and writes the results.
 pub fn run(args: &Args) -> Result<(), Error> {
     let (out, start) = (&args.out, args.start());
     let parts: Vec<(&Study, Sweep)> = questions::parts(&args.questions)
@@ -80,7 +80,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
     }
 
     let warm: Vec<_> = parts.iter().map(|(part, sweep)| part.warm(sweep, out)).collect();
-    // Nothing of one part is lost, and no time, to a folder of another that cannot be had.
+    // All folders are checked before training, so that no part is trained only to fail at another part's folder.
     let points = parts.iter().flat_map(|(part, sweep)| {
         sweep.points.iter().map(|point| (point_folder(&out.join(part.name), point), &point.config))
     });
@@ -92,7 +92,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
     let mut meter = Meter::new(args.quiet);
     let stopped = || Error::Stopped(format!("with everything saved; go on with\n  {}", args.command_to_resume()));
     let cost = |sweep: &Sweep| sweep.points.iter().map(shard::cost).sum::<u128>() as f64;
-    // What starts from others' policies plays as much again, each time.
+    // Each warm start costs as much as an average point of its sweep.
     let times = |at: usize| 1.0 + warm[at].len() as f64 / parts[at].1.points.len() as f64;
     let whole: f64 = parts.iter().enumerate().map(|(at, (_, sweep))| cost(sweep) * times(at)).sum();
     let mut before = 0.0;

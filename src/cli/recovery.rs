@@ -1,4 +1,4 @@
-//! What the commands that train recorded runs have in common: flags, signals, and what is told when a device fails.
+//! Shared by the commands that train recorded runs: flags, signals, and reports of failing devices.
 
 use std::ffi::OsString;
 use std::io;
@@ -32,7 +32,7 @@ pub enum OnLoss {
 }
 
 impl Loss {
-    /// The backend to go on with after another failed, if that was asked for.
+    /// Returns the CPU backend to continue with after another backend failed, if `--on-device-loss cpu` was given.
     pub fn instead(self, error: &BackendError) -> Option<OpenBackend> {
         (self.on_device_loss == OnLoss::Cpu).then(|| {
             let (backend, machine) = front::cpu();
@@ -42,7 +42,7 @@ impl Loss {
     }
 }
 
-/// Tells that populations moved to the host.
+/// Reports that populations moved to the host.
 pub fn setback(error: &BackendError) {
     say(format_args!("{error}\nthe populations are kept by the host from here on, to the same results"));
 }
@@ -59,7 +59,7 @@ pub struct Checkpoints {
 }
 
 impl Checkpoints {
-    /// The keys that were set, each named as its flag.
+    /// Returns the keys that were set, each with its flag as its name in errors.
     pub fn list(&self) -> Vec<Override> {
         let Checkpoints { checkpoint_generations, checkpoint_seconds } = self;
         let set = |(name, value): (&str, &Option<String>)| {
@@ -69,7 +69,7 @@ impl Checkpoints {
     }
 }
 
-/// Flags that set config keys, as typed.
+/// Returns the flags that set config keys, as typed.
 pub fn words_of(overrides: &[Override]) -> impl Iterator<Item = OsString> {
     overrides.iter().flat_map(|set| match set.name.split_once(' ') {
         Some((flag, key)) => [flag.into(), format!("{key}={}", set.text).into()],
@@ -77,7 +77,7 @@ pub fn words_of(overrides: &[Override]) -> impl Iterator<Item = OsString> {
     })
 }
 
-/// The flags that say what to run on, as typed, without those at their defaults.
+/// Returns the flags that choose what to run on, as typed, without those at their defaults.
 pub fn words_of_machine(run: &RunOptions, loss: Loss) -> Vec<OsString> {
     fn word<T: ValueEnum + PartialEq>(value: T, default: T) -> Option<String> {
         (value != default).then(|| value.to_possible_value()).flatten().map(|value| value.get_name().to_string())
@@ -91,7 +91,7 @@ pub fn words_of_machine(run: &RunOptions, loss: Loss) -> Vec<OsString> {
         ("--on-device-loss", word(loss.on_device_loss, OnLoss::Stop)),
     ];
     let words = |(flag, value): (&str, Option<String>)| match value? {
-        // It would be read as a flag.
+        // As a separate word it would be read as a flag.
         value if value.starts_with('-') => Some(vec![format!("{flag}={value}").into()]),
         value => Some(vec![flag.into(), value.into()]),
     };
@@ -103,10 +103,10 @@ pub fn quoted(path: &Path) -> String {
     shell::quoted(shell::argument(path))
 }
 
-/// Most characters of a command line that are kept.
+/// Maximum number of characters of a command line that are kept.
 const MOST: usize = 1 << 13;
 
-/// What was typed, as a shell reads it.
+/// Returns the command line, quoted for a shell.
 pub fn typed() -> String {
     let line = shell::command(super::words());
     match line.char_indices().nth(MOST) {
@@ -117,9 +117,9 @@ pub fn typed() -> String {
 
 /// Flags that signals set.
 pub struct Signals {
-    /// The run saves and stops.
+    /// Set if the run should save and stop.
     pub stop: Arc<AtomicBool>,
-    /// The run saves and continues.
+    /// Set if the run should save and continue.
     pub save: Arc<AtomicBool>,
 }
 
@@ -131,7 +131,7 @@ impl Signals {
     /// these twice at a time limit.
     ///
     /// # Errors
-    /// The system does not allow it.
+    /// Fails if the system does not allow signal handlers.
     pub fn listen() -> Result<Signals, Error> {
         use signal_hook::consts::{SIGINT, SIGTERM};
         use signal_hook::flag;

@@ -1,5 +1,5 @@
-//! What to type about an error of the library, which knows of no flags: each gives what is added to the error's own
-//! text.
+//! Advice on errors of the library, which does not know the command line's flags. Each function returns the text that
+//! follows the error's own.
 
 use std::ffi::OsString;
 use std::io;
@@ -19,10 +19,10 @@ use crate::report::runs;
 use crate::run::RunError;
 use crate::shell;
 
-/// `EMFILE`, which every Unix gives this number and Rust no name.
+/// `EMFILE`. It has this number on every Unix, and no name in Rust.
 const TOO_MANY_FILES: i32 = 24;
 
-/// About a device that cannot be had, or failed.
+/// Returns advice on a device that could not be opened, or that failed.
 pub fn device(error: &DeviceError) -> &'static str {
     match error {
         DeviceError::NoRealAdapter { .. } => {
@@ -39,7 +39,7 @@ pub fn device(error: &DeviceError) -> &'static str {
     }
 }
 
-/// About episodes that could not be played.
+/// Returns advice on episodes that could not be played.
 pub fn backend(error: &BackendError) -> &'static str {
     match error {
         BackendError::Gpu(error) => device(error),
@@ -49,7 +49,7 @@ pub fn backend(error: &BackendError) -> &'static str {
     }
 }
 
-/// About a file that cannot be read.
+/// Returns advice on a file that cannot be read.
 fn unread(error: &io::Error) -> &'static str {
     match error.kind() {
         NotFound | NotADirectory => "; check the path",
@@ -58,7 +58,7 @@ fn unread(error: &io::Error) -> &'static str {
     }
 }
 
-/// About a config or a sweep that cannot be used.
+/// Returns advice on a config or a sweep that cannot be used.
 pub fn config(error: &ConfigError) -> &'static str {
     match error {
         ConfigError::Unreadable { is_missing: true, .. } => "; check the path, or write a config with `flotilla init`",
@@ -66,7 +66,7 @@ pub fn config(error: &ConfigError) -> &'static str {
     }
 }
 
-/// About files, before `again`.
+/// Returns advice on files of runs. `again` is the next action after the advice, such as "run it again".
 pub fn record(error: &RecordError, again: &str) -> String {
     match error {
         RecordError::Write { error, .. } | RecordError::Read { error, .. }
@@ -126,7 +126,7 @@ pub fn record(error: &RecordError, again: &str) -> String {
     }
 }
 
-/// About a run that could not go on.
+/// Returns advice on a run that could not continue.
 pub fn run(error: &RunError) -> String {
     match error {
         RunError::Record(error) => record(error, "go on with --resume"),
@@ -143,7 +143,7 @@ pub fn run(error: &RunError) -> String {
     }
 }
 
-/// About a run that could not be shown.
+/// Returns advice on a run that could not be shown.
 pub fn shown(error: &runs::ReadError) -> String {
     match error {
         runs::ReadError::Missing(folder) => {
@@ -168,7 +168,7 @@ pub fn shown(error: &runs::ReadError) -> String {
     }
 }
 
-/// About an episode that could not be replayed.
+/// Returns advice on an episode that could not be replayed.
 pub fn replayed(error: &ReplayError) -> String {
     match error {
         ReplayError::Run(error) => shown(error),

@@ -1,4 +1,4 @@
-//! `flotilla replay`: the episode of a team of any trial and generation, to look at.
+//! `flotilla replay`: shows the episode of a team from any trial and generation.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering::Relaxed;
@@ -64,7 +64,7 @@ pub struct Args {
     run: RunOptions,
 }
 
-/// Which trial is looked at.
+/// The trial to show.
 #[derive(Clone, Copy, Debug)]
 enum WhichTrial {
     Best,
@@ -88,7 +88,7 @@ impl std::str::FromStr for WhichTrial {
 }
 
 impl WhichTrial {
-    /// Its number in a run.
+    /// Returns the trial's number in a run.
     fn find(
         self,
         folder: &Path,
@@ -201,7 +201,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     report(&played, json, quiet, &text, json!({ "out": out.escaped().to_string(), "bytes": content.len() }))
 }
 
-/// Says what was played and where it was written, as text or as one JSON object.
+/// Prints what was played and where it was written, as text or as one JSON object.
 fn report(
     played: &[Replayed],
     json: bool,
@@ -233,7 +233,7 @@ fn report(
     print_json(&object)
 }
 
-/// What was played, in a line.
+/// Returns one line about what was played.
 fn tell(played: &Replayed) -> String {
     let Replayed { team_g, episodes, world, which, .. } = played;
     let (pois, digits) = (world.pois.len(), if *episodes > 1 { 2 } else { 0 });
@@ -247,7 +247,7 @@ fn tell(played: &Replayed) -> String {
     )
 }
 
-/// What an episode is written as.
+/// The kind of file that an episode is written as.
 enum Form {
     Page,
     Gif,
@@ -273,7 +273,7 @@ impl Form {
         }
     }
 
-    /// Refuses flags that would say nothing.
+    /// Rejects flags that have no effect.
     fn takes(&self, out: &Path, width: Option<u32>, fps: Option<u32>, step: Option<usize>) -> Result<(), Error> {
         let moves = matches!(self, Form::Gif | Form::Film(_));
         let pixels = moves || matches!(self, Form::Still(Format::Png));
@@ -291,19 +291,19 @@ impl Form {
     }
 }
 
-/// How to make a film of a format that takes another program: one picture per moment, which `ffmpeg` joins.
+/// Returns an error message that explains how to make a film with `ffmpeg`, from one picture per moment.
 fn film(path: &Path, fps: Option<u32>) -> String {
     let (out, fps) = (path.to_string_lossy(), fps.unwrap_or(FPS).to_string());
     let frames = path.with_extension("");
     let frames = format!("{}-%04d.png", frames.to_string_lossy().replace('%', "_"));
-    // The same command with another --out, however that was given.
+    // The same command with another `--out`, in any spelling of that flag.
     let typed = words().into_iter().skip(1).map(|word| word.to_string_lossy().into_owned());
     let replaced = typed.map(|word| match word.strip_suffix(&*out) {
         Some(flag) if ["", "-o", "-o=", "--out="].contains(&flag) => format!("{flag}{frames}"),
         _ => word,
     });
     let pictures = shell::command(["flotilla".to_string()].into_iter().chain(replaced));
-    // Video has even sizes.
+    // Video needs an even width and height.
     let even = "pad=ceil(iw/2)*2:ceil(ih/2)*2";
     let joined = ["ffmpeg", "-framerate", &fps, "-i", &frames, "-vf", even, "-pix_fmt", "yuv420p", &out];
     format!(
@@ -322,7 +322,8 @@ struct Numbered {
 }
 
 impl Numbered {
-    /// Finds the first such place. A letter or digit after it makes it an ordinary part of the name, as in `100%done`.
+    /// Finds the first place for a number. A letter or digit after it makes it an ordinary part of the name, as in
+    /// `100%done`.
     fn of(name: &str) -> Option<Numbered> {
         name.match_indices('%').find_map(|(at, _)| {
             let rest = &name[at + 1..];

@@ -22,7 +22,7 @@ use crate::report::replay::numbered;
 use crate::world::World;
 
 const HELD_OUT: &str = "Held-out starts";
-/// Columns of a trace, and what leaders add to them: the eight inputs and two outputs of their policies.
+/// Columns of a trace. Only leaders fill `SENSED`: the eight inputs and two outputs of their policies.
 const STATES: &str = "team,step,agent,role,x,y,heading_x,heading_y,speed";
 const SENSED: &str = "pois_back_right,pois_front_right,pois_front_left,pois_back_left,\
                       agents_back_right,agents_front_right,agents_front_left,agents_back_left,turn_output,speed_output";
@@ -83,7 +83,7 @@ pub struct Args {
 }
 
 impl Args {
-    /// Where episodes start, given the config's jitters.
+    /// Returns where episodes start, given the config's jitters.
     fn starts(&self, jitter: f64, poi_jitter: f64) -> Result<Starts, Error> {
         let (Some(episodes), seed) = (self.episodes, self.seed.unwrap_or(0)) else { return Ok(Starts::Own) };
         if jitter == 0.0 && poi_jitter == 0.0 && (episodes > 1 || self.seed.is_some()) {
@@ -96,7 +96,7 @@ impl Args {
     }
 }
 
-/// Team j is made of the policies with index j of every leader.
+/// Plays the teams. Team j consists of policy j of every leader.
 pub fn run(args: Args) -> Result<(), Error> {
     let outputs = [("--scores", args.scores.as_deref()), ("--trace", args.trace.as_deref())];
     let (config, trained) = match args.path.is_dir() {
@@ -155,7 +155,7 @@ pub fn run(args: Args) -> Result<(), Error> {
 
     let meter = Mutex::new(Meter::new(args.quiet));
     let evaluation = evaluate::evaluate(&mut *backend, &group, &starts, &|part| {
-        // Whoever comes while another shows something has nothing newer to tell.
+        // If another thread is updating the meter, this update is not needed.
         if let Ok(mut meter) = meter.try_lock() {
             let (teams, episodes) = (policies.policies, starts.episodes());
             meter.show(part, || format!("playing {}", counted(teams, episodes)));
@@ -179,7 +179,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     print(&(in_words(&evaluation, &starts) + &mark))
 }
 
-/// Compares a config and policies that are a run's with the digests in its `run.json`.
+/// Compares a config and policies with the digests in `run.json`, if they belong to a run.
 fn verify(config: &Path, policies: &Path, unverified: bool) -> Result<(), Error> {
     let verification = Verification::unless(unverified);
     let mut folders = Vec::new();
@@ -264,7 +264,7 @@ fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> serde
     object
 }
 
-/// Floats are printed in the fewest digits that read back to the same bits.
+/// Writes the scores as CSV. Floats have the fewest digits that read back to the same bits.
 fn write_scores(file: &mut dyn Write, evaluation: &Evaluation) -> io::Result<()> {
     let Evaluation { episodes, leaders, observed, .. } = evaluation;
     let several = if *episodes > 1 { ",episodes,pois,pois_deviation,pois_low,pois_high" } else { "" };
@@ -285,7 +285,7 @@ fn write_scores(file: &mut dyn Write, evaluation: &Evaluation) -> io::Result<()>
     Ok(())
 }
 
-/// A row for every agent at every step of every team, episode after episode.
+/// Writes a trace as CSV, with one row per episode, team, step and agent.
 fn write_trace(
     path: &Path,
     backend: &mut dyn Backend,
@@ -317,7 +317,7 @@ fn write_trace(
                             let role = if agent < leaders { "leader" } else { "follower" };
                             let index = first + team;
                             write!(file, "{index},{step},{agent},{role},{x},{y},{hx},{hy},{speed}")?;
-                            // What a leader senses in a state moves it on to the next.
+                            // The inputs and outputs of a leader in this state are stored with the next state.
                             let next = (agent < leaders && step < steps).then(|| trace.moment(step + 1, team, agent));
                             match next {
                                 Some(Moment { inputs, outputs, .. }) => {

@@ -1,4 +1,4 @@
-//! `flotilla sweep`: a grid of runs, on one machine or many.
+//! `flotilla sweep`: trains a grid of runs, on one machine or many.
 
 use std::collections::HashSet;
 use std::ffi::OsString;
@@ -117,7 +117,7 @@ fn shard_count(text: &str) -> Result<usize, String> {
     count.ok_or_else(|| format!("allowed 1 to {MAX_SHARDS}"))
 }
 
-/// Slurm's ways to write a time: minutes, M:S, H:M:S, days-hours and so on.
+/// Parses a Slurm time limit: minutes, M:S, H:M:S, days-hours and so on.
 fn time_limit(text: &str) -> Result<String, String> {
     let number = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
     let (days, clock) = text.split_once('-').unwrap_or(("0", text));
@@ -147,7 +147,7 @@ impl Args {
         self.out.clone().unwrap_or_else(|| Path::new("runs").join(&sweep.name))
     }
 
-    /// The command that does this sweep again, without what differs from process to process.
+    /// Returns the arguments that run this sweep again, without those that differ between processes.
     fn words(&self, sweep: &Path, out: &Path) -> Vec<OsString> {
         let mut words = vec!["sweep".into(), shell::argument(sweep), "--out".into(), shell::argument(out)];
         words.extend(recovery::words_of(&self.overrides.list()));
@@ -159,14 +159,14 @@ impl Args {
         words
     }
 
-    /// A command line of this sweep with more flags.
+    /// Returns a command line of this sweep with more flags.
     fn command(&self, out: &Path, more: &[&str]) -> String {
         let words = self.words(&self.sweep, out);
         let more = more.iter().map(OsString::from);
         shell::command([OsString::from("flotilla")].into_iter().chain(words).chain(more))
     }
 
-    /// The grid's axes that pictures have across and down.
+    /// Returns the axes that pictures have across and down.
     fn picture_axes(&self, sweep: &Sweep) -> Result<Vec<usize>, Error> {
         let find = |name: &String| {
             let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
@@ -188,7 +188,7 @@ pub fn run(mut args: Args) -> Result<(), Error> {
     let sweep = Sweep::load(&args.sweep, &args.overrides.list(), args.skip_impossible)?;
     let out = args.out(&sweep);
     if config::is_standard_input(&args.sweep) {
-        // Whoever goes on with it finds it where it is kept.
+        // Later commands cannot read standard input again, so they use the copy in the folder.
         args.sweep = out.join(SWEEP);
     }
     let axes = args.picture_axes(&sweep)?;
@@ -226,12 +226,12 @@ pub fn run(mut args: Args) -> Result<(), Error> {
     }
 }
 
-/// Whether a file is there; an error where that cannot be seen.
+/// Returns whether a file exists, or an error if the system does not allow checking that.
 fn there(path: &Path) -> Result<bool, RecordError> {
     file::exists(path).map_err(|error| RecordError::Read { path: path.into(), error })
 }
 
-/// Refuses a folder that holds something else.
+/// Refuses a folder with other content than this sweep.
 pub(super) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let path = out.join(SWEEP);
     if out.is_file() {
@@ -261,7 +261,7 @@ pub(super) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         };
     }
     let there = config::read_file(&path)?;
-    // Somebody may have written it by hand.
+    // A person may have written the file, so the same sweep may be formatted differently.
     let normal = |text: &str| Some(Sweep::read(text, SWEEP, &[], sweep.skipped > 0).ok()?.text);
     if there == sweep.text || normal(&there).as_ref() == Some(&sweep.text) {
         return Ok(());
@@ -281,7 +281,7 @@ pub(super) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     ))
 }
 
-/// Marks the folder as this sweep's. Shards that start at the same moment all write the same.
+/// Marks the folder as this sweep's. Shards that start at the same moment write the same content.
 pub(super) fn claim(disk: &Disk, sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let failed = |path: &Path| {
         let path = path.to_path_buf();
@@ -297,7 +297,7 @@ pub(super) fn claim(disk: &Disk, sweep: &Sweep, out: &Path) -> Result<(), Error>
     same_sweep(sweep, out)
 }
 
-/// Enters a sweep's folder, in which nothing that is written in the end may be another's.
+/// Enters a sweep's folder. Refuses it if a file to be written there was not made by flotilla.
 fn enter(args: &Args, out: &Path) -> Result<Disk, Error> {
     let disk = ownership::enter(&Disk::default(), out, args.out.is_some())?;
     let products = pictures::names().chain([folder::RESULTS, folder::POINTS].map(String::from));
@@ -347,7 +347,7 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
         },
         watch: &mut |progress| ticker.tick(progress),
         note: &mut |point, note| {
-            // What every resumed point says is no news.
+            // Every resumed point has a note. Only damage is reported.
             if note.is_damage() {
                 say(format_args!("{}: {note}", sweep.describe(point)));
             }
@@ -377,12 +377,12 @@ fn train(args: &Args, sweep: &Sweep, out: &Path, shard: Shard) -> Result<(), Err
     }
 }
 
-/// Half of the memory that is free now, or 2 GiB where the system does not tell.
+/// Returns half of the memory that is free now in bytes, or 2 GiB if the system does not report it.
 pub(super) fn free_memory() -> usize {
     memory::available().map_or(2 << 30, |bytes| (bytes / 2) as usize)
 }
 
-/// Puts together what is there, draws it, and fails where something is missing.
+/// Collects the results that exist, draws them, and fails if some are missing.
 fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(), Error> {
     enter(args, out)?;
     let verification = Verification::unless(args.unverified);
@@ -440,7 +440,7 @@ fn collect(args: &Args, sweep: &Sweep, out: &Path, axes: &[usize]) -> Result<(),
     )))
 }
 
-/// What a program wants to know at the end.
+/// Returns the results for programs.
 fn as_json(
     sweep: &Sweep,
     outcomes: &[Result<Outcome, Missing>],
@@ -486,7 +486,7 @@ fn as_json(
     })
 }
 
-/// What a person wants to know at the end: the best and the worst points.
+/// Returns the results for people: the best and the worst points.
 fn summary(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>], options: &results::Detail) -> String {
     const LISTED: usize = 12;
     let done = sweep.points.iter().zip(outcomes).filter_map(|(point, outcome)| Some((point, outcome.as_ref().ok()?)));
@@ -558,7 +558,7 @@ fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> 
         options: &args.sbatch,
     };
     let script = job.script().map_err(Error::Usage)?;
-    // The tasks' logs go there, and Slurm creates no folder.
+    // Slurm writes the tasks' logs to this folder, but does not create it.
     claim(&Disk::default(), sweep, &out)?;
     match file {
         None => print(&script),
@@ -570,7 +570,7 @@ fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> 
     }
 }
 
-/// Shows how the points come on.
+/// Shows the progress of the points.
 struct Ticker(Meter);
 
 impl Ticker {

@@ -1,4 +1,4 @@
-//! `flotilla train`: a run from its config to its policies.
+//! `flotilla train`: trains the teams of a config, and saves the run.
 
 use std::ffi::OsString;
 use std::fmt::Write;
@@ -29,9 +29,9 @@ use crate::run::{Ended, Options, Results, RunError, Session};
 use crate::shell;
 use crate::trainer::Row;
 
-/// Where runs without `--out` go.
+/// The folder of runs without `--out`.
 const RUNS: &str = "runs";
-/// Event files for TensorBoard, in a run's folder.
+/// The folder of event files for TensorBoard, in a run's folder.
 const TENSORBOARD: &str = "tensorboard";
 
 #[derive(clap::Args)]
@@ -70,7 +70,7 @@ pub struct Args {
 }
 
 impl Args {
-    /// What to type to go on.
+    /// Returns the command that resumes the run.
     fn command_to_resume(&self, folder: &Path) -> String {
         let words: [OsString; 3] = ["flotilla".into(), "train".into(), shell::argument(&folder.join(folder::CONFIG))];
         let out = ["--out".into(), shell::argument(folder), "--resume".into()];
@@ -79,7 +79,7 @@ impl Args {
         shell::command(words.into_iter().chain(out).chain(events).chain(machine))
     }
 
-    /// The run's folder, and what to do with a run in it.
+    /// Returns the run's folder, and what to do with a run in it.
     fn folder(&self) -> Result<(PathBuf, Start), Error> {
         let start = match (self.resume, self.force) {
             (true, _) => Start::Resume,
@@ -119,7 +119,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let disk = Disk::default();
     if folder.is_dir() {
         let disk = ownership::enter(&disk, &folder, args.out.is_some())?;
-        // A run that is resumed is not held up by a picture.
+        // A foreign picture must not prevent a run from being resumed.
         if start != Start::Resume {
             ownership::check(&disk, [folder.join(CURVES)])?;
         }
@@ -131,7 +131,8 @@ pub fn run(args: Args) -> Result<(), Error> {
             "{error}\nfor event files of the run that is there:\n  {}",
             args.command_to_resume(&folder)
         )),
-        // Before its origin is recorded, a run that is resumed would start from random policies.
+        // This avoids the advice to use `--resume`. Until the run's origin is recorded, a resumed run would start from
+        // random policies.
         RunError::Record(error) if args.init.is_some() => error.into(),
         error => error.into(),
     })?;
@@ -146,13 +147,13 @@ pub fn run(args: Args) -> Result<(), Error> {
         || Events::create(&disk, &path, config.learning.trials, &folder.join(METRICS)).map_err(events_failed).ok();
     let mut events = args.tensorboard.then(events).flatten();
     if start == Start::Force && !args.tensorboard {
-        // They are of the run that was written over.
+        // The event files belong to the run that was overwritten.
         Events::clear(&disk, &path).unwrap_or_else(events_failed);
     }
     let told =
         Told { config: &config, notes: &notes_on_config, name: args.config.name(), folder: &folder, runs_on: &runs_on };
     if session.is_done() {
-        // A session that ended between the run and its picture left an older one, or none.
+        // A session that ended after the run but before its picture left an older picture, or none.
         let digest = session.results(0).map_or("", |results| &results.digest);
         if !fs::read_to_string(folder.join(CURVES)).is_ok_and(|svg| Scene::shows(&svg, digest)) {
             draw(&disk, &folder);
@@ -200,7 +201,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
 }
 
-/// Draws the run's curves. All that was learned is saved by now, so a picture that fails is no failure of the run.
+/// Draws the run's curves. A failure is only reported, because everything that was learned is already saved.
 fn draw(disk: &Disk, folder: &Path) {
     let path = folder.join(CURVES);
     let drawn = runs::figure(&[folder.to_path_buf()], Verification::Required).map(|figure| figure.scene().svg());
@@ -213,13 +214,13 @@ fn draw(disk: &Disk, folder: &Path) {
     }
 }
 
-/// What was trained just now.
+/// The generations that this process trained, and when it started.
 struct Training {
     generations: usize,
     since: Instant,
 }
 
-/// What a run is told by.
+/// The facts that a run's report is made from.
 struct Told<'a> {
     config: &'a Config,
     notes: &'a [String],
@@ -229,7 +230,7 @@ struct Told<'a> {
 }
 
 impl Told<'_> {
-    /// Prints what a run came to; `trained` is none where it was done already.
+    /// Prints the results of a run. `trained` is `None` if the run was finished before.
     fn print(&self, session: &Session, trained: Option<Training>, quiet: bool, json: bool) -> Result<(), Error> {
         let results = session.results(0).expect("the run is done");
         let done_already = trained.is_none();
@@ -302,13 +303,13 @@ impl Told<'_> {
     }
 }
 
-/// One of a row's scores, G in 0..1.
+/// A score of a row, as G in 0..1.
 type Score = fn(&Row) -> f64;
-/// All of them.
+/// All scores, with their names.
 const SCORES: [(&str, Score); 3] =
     [("best team", |row| row.best_g), ("mean team", |row| row.mean_g), ("champion", |row| row.champion_g)];
 
-/// Where trials are.
+/// The mean, lowest and highest value over trials.
 struct Extremes {
     mean: f64,
     lowest: f64,
@@ -328,12 +329,12 @@ impl Extremes {
     }
 }
 
-/// "1 trial", "2 trials".
+/// Returns a count with its noun: "1 trial", "2 trials".
 fn counted(count: usize, what: &str) -> String {
     format!("{count} {what}{}", if count == 1 { "" } else { "s" })
 }
 
-/// A time in seconds, or if it is short in milliseconds.
+/// Returns a time in seconds, or in milliseconds if it is short.
 fn time(seconds: f64) -> String {
     match seconds * 1000.0 {
         short if short < 9.95 => format!("{short:.1} ms"),
@@ -342,10 +343,10 @@ fn time(seconds: f64) -> String {
     }
 }
 
-/// What a person wants to know at the end.
+/// Returns the report of a run for people.
 fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> String {
     let Results { story, digest } = results;
-    // Stages may have POIs of their own.
+    // `None` if stages have different numbers of POIs.
     let counted = config.pois();
     let what = counted.map_or("Share of POIs observed".into(), |pois| format!("POIs observed, of {pois}"));
     let pois = counted.unwrap_or(1);
@@ -353,7 +354,7 @@ fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> S
     let last = format!("generation {}", config.learning.generations);
     let mut table = vec![["", SCORES[0].0, SCORES[1].0, SCORES[2].0].map(String::from)];
     let rows = [("start", &story.first), (&*last, &story.last)];
-    // A run of no generations after the start has one row.
+    // A run without generations after the start has one row.
     let shown = if config.learning.generations == 0 { 1 } else { rows.len() };
     for (name, rows) in rows.into_iter().take(shown) {
         let [best, mean, champion] = SCORES.map(|(_, share)| {
@@ -362,7 +363,7 @@ fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> S
         });
         table.push([name.into(), best, mean, champion]);
     }
-    // As wide as what stands in them: 100 POIs take more room than 4.
+    // Columns fit their contents, because 100 POIs need more room than 4.
     let width = |column: usize| table.iter().map(|row| row[column].len()).max().unwrap_or(0);
     for [name, best, mean, champion] in &table {
         let line =

@@ -1,4 +1,4 @@
-//! `flotilla verify`: every adapter against the CPU, bit for bit.
+//! `flotilla verify`: compares every adapter with the CPU, bit for bit.
 
 use std::ops::ControlFlow::Continue;
 use std::path::PathBuf;
@@ -61,7 +61,7 @@ pub struct Args {
     quiet: bool,
 }
 
-/// Prints a table of adapters, passes and kernels, and after it what differs.
+/// Prints a table of adapters, passes and kernels, and the differences below it.
 pub fn run(args: Args) -> Result<(), Error> {
     backend::start_threads(None);
     let config = args.config.as_deref().filter(|path| !config::is_standard_input(path));
@@ -72,7 +72,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         lines.extend(instruction_sets(&plan, args.quiet));
     }
     let adapters = match adapters(args.adapter.as_deref()) {
-        // Then the processor alone has something to tell.
+        // The report still contains the comparison of the processor's instruction sets.
         Err(Error::NoneToVerify(DeviceError::NoAdapter)) if args.report.is_some() => vec![],
         adapters => adapters?,
     };
@@ -121,14 +121,14 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
 }
 
-/// Random worlds to compare, of which a budget may leave out the last.
+/// Default number of random worlds. A time budget may leave out the last ones.
 const WORLDS: u32 = 200;
-/// Worlds compared between two looks at the clock: one of each layout.
+/// Number of worlds that are compared between two checks of the clock: one of each layout.
 const PART: usize = 10;
-/// The time that comparing takes if nobody says how many worlds.
+/// Time for all comparisons, if no config, number of worlds or report is requested.
 const BUDGET: Duration = Duration::from_secs(60);
 
-/// What is compared with the CPU.
+/// A combination that is compared with the CPU.
 struct Combination<'a> {
     choice: &'a Wanted,
     info: &'a AdapterInfo,
@@ -136,7 +136,7 @@ struct Combination<'a> {
     kernel: Kernel,
 }
 
-/// Says what is compared and how long that takes.
+/// Returns a message about what is compared and how long that takes.
 fn expected(plan: &Plan, budget: Option<Duration>, combinations: usize) -> String {
     let by = format!(
         "{combinations} {} of adapter, pass and kernel",
@@ -154,7 +154,8 @@ fn expected(plan: &Plan, budget: Option<Duration>, combinations: usize) -> Strin
     }
 }
 
-/// Compares a plan part by part until the budget is spent, at least one part; without a budget the whole plan at once.
+/// Compares a plan part by part until the budget is spent, but at least one part. Without a budget, it compares the
+/// whole plan at once.
 fn compare_within<E>(
     plan: &Plan,
     budget: Option<Duration>,
@@ -178,7 +179,7 @@ fn compare_within<E>(
     Ok(all)
 }
 
-/// One line of the table; an error of the device counts as a failure.
+/// Returns one line of the table. An error of the device counts as a difference.
 fn line(adapter: String, reference: &Cpu, result: Result<Agreement, Error>) -> Compared {
     let against = reference.describe();
     let outcome =
@@ -188,7 +189,7 @@ fn line(adapter: String, reference: &Cpu, result: Result<Agreement, Error>) -> C
     Compared { adapter, pass: None, kernel: None, against, worlds, agent_steps, equal, failure }
 }
 
-/// Every instruction set of the processor against the narrowest.
+/// Compares every instruction set of the processor with the narrowest.
 fn instruction_sets(plan: &Plan, quiet: bool) -> Vec<Compared> {
     let levels = Cpu::levels();
     let wider = levels[1..].iter().map(|&level| {
@@ -201,7 +202,7 @@ fn instruction_sets(plan: &Plan, quiet: bool) -> Vec<Compared> {
     wider.collect()
 }
 
-/// Shows how far a comparison has come.
+/// Returns a callback that shows the progress of a comparison.
 fn meter_of<'a>(meter: &'a mut Meter, plan: &'a Plan, what: String) -> impl FnMut(&Agreement) + 'a {
     move |outcome| {
         let (done, all) = (outcome.worlds, plan.worlds.len());
@@ -209,7 +210,7 @@ fn meter_of<'a>(meter: &'a mut Meter, plan: &'a Plan, what: String) -> impl FnMu
     }
 }
 
-/// What was compared, on what, and what short trainings come to here.
+/// Returns the comparisons, the hardware and the digests of short trainings, for a report.
 fn evidence(lines: &[Compared], note: Option<String>, quiet: bool) -> Result<Sighting, Error> {
     let (mut trained, mut meter) = (Vec::new(), Meter::new(quiet));
     let trainings = short_trainings();
@@ -232,7 +233,7 @@ fn evidence(lines: &[Compared], note: Option<String>, quiet: bool) -> Result<Sig
     })
 }
 
-/// What the processor calls itself, where the system says.
+/// Returns the processor's name, if the system reports it.
 fn processor() -> Option<String> {
     let told = match std::env::consts::OS {
         "linux" => std::fs::read_to_string("/proc/cpuinfo").ok().and_then(|text| {
@@ -249,7 +250,7 @@ fn processor() -> Option<String> {
     told.map(|name| escape::line(name.trim()).into_owned()).filter(|name| !name.is_empty())
 }
 
-/// A table, and below it what differs.
+/// Returns a table, and the differences below it.
 fn in_words(lines: &[Compared]) -> String {
     let mut text =
         format!("{:<15} {:<12} {:>7} {:>13} {:<10} adapter\n", "pass", "kernel", "worlds", "agent-steps", "result");
@@ -266,7 +267,7 @@ fn in_words(lines: &[Compared]) -> String {
     text + &failures
 }
 
-/// What is compared, and for how long if nobody says how much.
+/// Returns what to compare, and the time budget if no amount is requested.
 fn plan(args: &Args) -> Result<(Plan, Option<Duration>), Error> {
     let (seed, teams) = (u64::from(args.seed), args.teams as usize);
     let is_open = args.config.is_none() && args.worlds.is_none() && args.report.is_none();
@@ -284,7 +285,7 @@ fn plan(args: &Args) -> Result<(Plan, Option<Duration>), Error> {
     Ok((plan, is_open.then_some(BUDGET)))
 }
 
-/// The adapters to verify, each with what opens it.
+/// Returns the adapters to verify, each with the request that opens it.
 fn adapters(name: Option<&str>) -> Result<Vec<(Wanted, AdapterInfo)>, Error> {
     let found = device::adapters();
     let all = found.iter().cloned().enumerate().map(|(index, info)| (Wanted::Named(index.to_string()), info));
@@ -316,7 +317,7 @@ fn kernels(name: Option<&str>) -> impl Iterator<Item = Kernel> {
     all.into_iter().filter(move |kernel| name.is_none_or(|name| kernel.to_string() == name))
 }
 
-/// Compares a combination with the CPU; `shown` gets the part that is done, and what was found by then.
+/// Compares a combination with the CPU. `shown` receives the fraction that is done, and the result so far.
 fn verify(
     plan: &Plan,
     budget: Option<Duration>,

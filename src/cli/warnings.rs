@@ -7,7 +7,7 @@ use crate::config::Config;
 use crate::reach;
 use crate::sweep::{Point, Sweep};
 
-/// Most POIs that are named one by one.
+/// Maximum number of POIs that are named one by one.
 const MOST: usize = 6;
 
 /// Warns about every POI of a config that no team can observe.

@@ -1,4 +1,4 @@
-//! `[learning]` and `[checkpoint]`: their data and their keys.
+//! The sections `[learning]` and `[checkpoint]`: their data and keys.
 
 use serde::{Serialize, Serializer};
 
@@ -7,13 +7,13 @@ use crate::config_enum::config_enum;
 use crate::model::{LEAST, LONGEST};
 use crate::reader::{NumberOrPercentage, Reader, between, section};
 
-/// Most teams (policies a population) in one generation.
+/// Maximum number of teams in one generation, and of policies in a population.
 pub const MAX_POPULATION: usize = 1 << 20;
-/// Most generations after the random start.
+/// Maximum number of generations after the random start.
 pub const MAX_GENERATIONS: usize = 1_000_000;
-/// Most trials in one run.
+/// Maximum number of trials in one run.
 pub const MAX_TRIALS: usize = 4096;
-/// Most episodes averaged for one team's score.
+/// Maximum number of episodes that a team's score is averaged over.
 pub const MAX_EPISODES: usize = 1000;
 section! {
     /// `[learning]`: the cooperative coevolution. `led_within` and `led_by` are a world's [`Led`](crate::world::Led).
@@ -63,63 +63,63 @@ section! {
 }
 
 config_enum! {
-    /// Who learns.
+    /// The agents that learn.
     Paradigm {
-        /// The leaders; followers keep their preset behaviour.
+        /// Leaders learn. Followers keep their preset behaviour.
         LeaderFollower = "leader-follower",
-        /// Every agent: the followers' places become leaders, appended after the leaders.
+        /// All agents learn. The followers' start positions become leaders, appended after the other leaders.
         AllLeaders = "all-leaders",
     }
 }
 
 config_enum! {
-    /// Which leaders have a policy in common.
+    /// The leaders that share a policy.
     Sharing {
-        /// None: each has a population of its own.
+        /// No leaders: each has its own population.
         None = "none",
-        /// All: there is one population, and every leader of a team plays the same policy.
+        /// All leaders: there is one population, and every leader of a team plays the same policy.
         All = "all",
     }
 }
 
 config_enum! {
-    /// Which score a policy is selected by (see [`crate::credit`]).
+    /// The score that policies are selected by (see [`crate::credit`]).
     Fitness {
         /// The team's score.
         G = "G",
-        /// Difference evaluation.
+        /// Difference evaluation without the leader.
         D = "D",
-        /// Difference evaluation that takes a leader's followers out with it.
+        /// Difference evaluation without the leader and its followers.
         Df = "Df",
         /// Difference evaluation with copies of the leader as stepping stones.
         Dpp = "D++",
-        /// Difference evaluation that takes a leader's followers out with it at the steps at which it leads them.
+        /// Difference evaluation without the leader and, at each step, the followers that it leads then.
         Dt = "Dt",
     }
 }
 
 config_enum! {
-    /// Which policies may become parents.
+    /// The policies that may become parents.
     Parents {
-        /// All of them, by binary tournaments.
+        /// All policies, by binary tournaments.
         All = "all",
         /// The elites, each with the same probability.
         Elites = "elites",
     }
 }
 
-/// How many of a population's policies survive unchanged.
+/// The number of policies in a population that survive unchanged.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Elites {
-    /// This many.
+    /// A number of policies.
     Count(usize),
-    /// This percentage of the population.
+    /// A percentage of the population.
     Percentage(f64),
 }
 
 impl Elites {
-    /// Returns the number of elites of a population: a share is rounded to the nearest whole number, and is at least 1.
-    /// It never exceeds the population.
+    /// Returns the number of elites in a population. A percentage is rounded to the nearest whole number, and gives at
+    /// least 1. The result never exceeds the population.
     pub fn count(self, population: usize) -> usize {
         let count = match self {
             Elites::Count(count) => count,
@@ -145,27 +145,27 @@ impl Serialize for Elites {
 }
 
 config_enum! {
-    /// By which of the leaders that it saw a follower is led.
+    /// The leaders that lead a follower, of those that it saw.
     LedBy {
-        /// The one that it saw at most steps.
+        /// The leader that it saw at the most steps.
         MostSeen = "most-seen",
-        /// All of them.
+        /// All leaders that it saw.
         AnySeen = "any-seen",
     }
 }
 
 config_enum! {
-    /// How a mutated weight gains its noise.
+    /// The noise that is added to a mutated weight w.
     Mutation {
-        /// Times itself.
+        /// w·N(0, σ).
         Scaled = "scaled",
-        /// Plainly.
+        /// N(0, σ).
         Additive = "additive",
     }
 }
 
 impl Paradigm {
-    /// Asks for it; it says which agents there are.
+    /// Reads the paradigm. It is read before other keys, because they depend on which agents learn.
     pub(super) fn read(r: &mut Reader<'_>) -> Paradigm {
         Learning::paradigm(r).choice(Paradigm::LeaderFollower)
     }

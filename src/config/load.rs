@@ -1,4 +1,4 @@
-//! Configs from files.
+//! Reads configs from files and standard input.
 
 use std::io::{ErrorKind, Read};
 use std::path::Path;
@@ -7,33 +7,33 @@ use super::{Config, ConfigError};
 use crate::escape::PathExt;
 use crate::file;
 
-/// Most bytes in a config file.
+/// Maximum size of a config file, in bytes.
 pub const MAX_FILE_BYTES: u64 = 1 << 20;
 
 impl Config {
     /// Reads a config file.
     ///
     /// # Errors
-    /// A file that cannot be read, or everything that is wrong with what it says.
+    /// Fails if the file cannot be read or its config is invalid. The error lists all problems.
     pub fn load(path: &Path) -> Result<Config, ConfigError> {
         Config::parse(&read_file(path)?, &name(path))
     }
 }
 
-/// Whether a config is to come from standard input, not from a file.
+/// Returns whether a path is `-`, which means standard input.
 pub fn is_standard_input(path: &Path) -> bool {
     path == "-"
 }
 
-/// What errors call a config or sweep file.
+/// Returns the name of a config or sweep file in errors.
 pub fn name(path: &Path) -> String {
     if is_standard_input(path) { "standard input".into() } else { path.escaped().to_string() }
 }
 
-/// The text of a config or sweep file; of standard input, where that is what `-` means.
+/// Reads the text of a config or sweep file, or of standard input if the path is `-`.
 ///
 /// # Errors
-/// No such file, not a file, larger than [`MAX_FILE_BYTES`], not UTF-8.
+/// Fails if the file cannot be read, is a directory, is larger than [`MAX_FILE_BYTES`] or is not UTF-8.
 pub fn read_file(path: &Path) -> Result<String, ConfigError> {
     let fail = |reason: String| ConfigError::Unreadable { name: name(path), reason, is_missing: false };
     let missing = |error: std::io::Error| ConfigError::Unreadable {

@@ -1,9 +1,11 @@
-//! The config: what an experiment is, with a default for every key but where leaders and POIs stand.
+//! The config of an experiment. Every key has a default except `world.leaders` and `world.pois`.
 //!
-//! A config is read from a file by [`Config::load`], or from text by [`Config::read`] where flags or a sweep change
-//! some of its keys. Each section is plain data beside its keys, and each key stands once, with its unit, its meaning,
-//! where the paper has it, what it allows and its default: those of a step's parts with these parts, in
-//! [`crate::model`], the others here. Everything wrong with a text is found in one pass and reported by line, see
+//! [`Config::load`] reads a config from a file. [`Config::read`] reads it from text, together with keys that flags or a
+//! sweep set.
+//!
+//! Each section is a struct of plain data, next to the declarations of its keys. A key is declared once, with its unit,
+//! meaning, place in the paper, allowed values and default. Keys of a part of the step are declared with that part in
+//! [`crate::model`], the others in this module. All problems of a text are found in one pass and reported by line, see
 //! [`crate::reader`].
 
 use serde::Serialize;
@@ -33,14 +35,14 @@ mod stages;
 mod valid;
 mod world;
 
-/// Most bytes that the policies of all trials of a run may take.
+/// Maximum size of the policies of all trials of a run, in bytes.
 pub const MAX_POLICY_BYTES: u64 = 1 << 38;
-/// The section that makes a config a sweep: values to combine.
+/// The section that makes a config a sweep: lists of values to combine.
 pub const GRID: &str = "grid";
-/// The section of values to try one at a time.
+/// The section of a sweep with values to try one at a time.
 pub const VARY: &str = "vary";
 
-/// Every key of a config, in the order of [`Config::to_toml`].
+/// Returns every key of a config, in the order of [`Config::to_toml`].
 pub fn keys() -> Vec<Definition> {
     let (config, mut keys) = reader::keys(Config::ask);
     let mut order = Vec::new();
@@ -59,7 +61,7 @@ pub fn keys() -> Vec<Definition> {
 /// One experiment, as written in a config file.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Config {
-    /// `[world]`: where everything starts.
+    /// `[world]`: start positions, the length of an episode, and how POIs are observed.
     pub world: Domain,
     /// `[motion]`: how agents move.
     pub motion: Motion,
@@ -73,26 +75,26 @@ pub struct Config {
     pub learning: Learning,
     /// `[checkpoint]`: how often a run saves.
     pub checkpoint: Saving,
-    /// What changes from some generations on, see [`Config::staged`].
+    /// `[[stages]]`: keys that change from some generation on, see [`Config::staged`].
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub stages: Vec<Stage>,
 }
 
 impl Config {
-    /// Reads a config from its text; `name` stands for the file in errors.
+    /// Reads a config from its text. Errors use `name` as the file's name.
     ///
     /// # Errors
-    /// Everything that is wrong with the text.
+    /// Fails if the text is invalid. The error lists its problems.
     pub fn parse(text: &str, name: &str) -> Result<Config, ConfigError> {
         Config::read(text, name, &[], &[])
     }
 
-    /// Reads a config with some keys set from elsewhere, checked together with the rest.
+    /// Reads a config with some keys set by overrides, and checks text and overrides together.
     ///
-    /// Sections named in `foreign` belong to somebody else (a sweep's `grid`) and are passed over.
+    /// Sections named in `foreign`, such as a sweep's `grid`, are ignored.
     ///
     /// # Errors
-    /// All problems of the text and the overrides.
+    /// Fails if the text or an override is invalid. The error lists their problems.
     pub fn read(text: &str, name: &str, foreign: &[&str], overrides: &[Override]) -> Result<Config, ConfigError> {
         Config::read_document(&Document::parse(text), name, foreign, overrides)
     }
@@ -100,7 +102,7 @@ impl Config {
     /// Reads a config from a parsed text, as [`Config::read`] does.
     ///
     /// # Errors
-    /// All problems of the text and the overrides.
+    /// Fails if the text or an override is invalid. The error lists their problems.
     pub fn read_document(
         document: &Document<'_>,
         name: &str,
@@ -110,11 +112,11 @@ impl Config {
         Ok(Config::read_noted(document, name, foreign, overrides)?.0)
     }
 
-    /// [`Config::read_document`], and what the author of the config should know: which defaults other keys leave no room for,
-    /// and what [`Config::notes`] says.
+    /// Reads a config as [`Config::read_document`] does, and returns notes for its author. The notes report defaults
+    /// that other keys do not allow, stages that are left out, and the results of [`Config::notes`].
     ///
     /// # Errors
-    /// All problems of the text and the overrides.
+    /// Fails if the text or an override is invalid. The error lists their problems.
     pub fn read_noted(
         document: &Document<'_>,
         name: &str,
@@ -155,7 +157,7 @@ impl Config {
         Ok((config, notes))
     }
 
-    /// Returns what is allowed and yet likely a mistake, once per line.
+    /// Returns a note for each setting that is valid but likely a mistake.
     pub fn notes(&self) -> Vec<String> {
         let too_short = |config: &Config| config.motion.too_short(config.world.dt, config.world.map);
         let mut notes: Vec<String> = self.staged().iter().filter_map(|(_, config)| too_short(config)).collect();
@@ -163,7 +165,7 @@ impl Config {
         notes
     }
 
-    /// Reads all keys except the stages. These are changes of the config that the other keys make.
+    /// Reads all keys except the stages, which change the config that these keys make.
     fn without_stages(
         document: &Document<'_>,
         foreign: &[&str],
@@ -177,20 +179,20 @@ impl Config {
         reader::read_document(document, others, overrides, Config::ask)
     }
 
-    /// This config with some keys changed.
+    /// Returns this config with some keys changed.
     ///
     /// # Errors
-    /// Everything that is wrong with the overrides.
+    /// Fails if an override is invalid. The error lists the problems.
     pub fn with(&self, overrides: &[Override]) -> Result<Config, ConfigError> {
         Config::read(&self.to_toml(), "the config", &[], overrides)
     }
 
-    /// The config file that says this, every key written out.
+    /// Returns the text of a config file for this config, with every key written out.
     pub fn to_toml(&self) -> String {
         toml::to_string(self).expect("numbers, words and lists of them under plain keys are TOML")
     }
 
-    /// Everything that learns: the leaders, and in the all-leaders paradigm the followers too.
+    /// Returns the number of agents that learn: the leaders, and in the all-leaders paradigm also the followers.
     pub fn learners(&self) -> usize {
         match self.learning.paradigm {
             Paradigm::LeaderFollower => self.world.leaders.len(),
@@ -198,7 +200,7 @@ impl Config {
         }
     }
 
-    /// Populations of a trial: one a learner, or one for all of them.
+    /// Returns the number of populations in a trial: one per learner, or a single one if all leaders share a policy.
     pub fn populations(&self) -> usize {
         match self.learning.sharing {
             Sharing::None => self.learners(),
@@ -206,19 +208,19 @@ impl Config {
         }
     }
 
-    /// Weights of one policy, biases included.
+    /// Returns the number of weights in one policy, including biases.
     pub fn parameters(&self) -> usize {
         self.policy.parameters()
     }
 
-    /// Bytes that the policies of all trials take.
+    /// Returns the size of the policies of all trials, in bytes.
     pub fn policy_bytes(&self) -> u64 {
         let counts = [self.learning.trials, self.populations(), self.learning.population, self.parameters()];
         counts.map(|count| count as u64).iter().product::<u64>() * size_of::<f32>() as u64
     }
 
-    /// Asks for every key. A faulty number reads as the most that is allowed, a faulty list as none, so that what
-    /// depends on it is not reported as well.
+    /// Reads every key. An invalid number reads as the largest allowed one, and an invalid list as empty. This way keys
+    /// that depend on them are not reported as well.
     fn ask(r: &mut Reader<'_>) -> Config {
         let (motion, start_speed) = Motion::read(r);
         let paradigm = Paradigm::read(r);
@@ -243,33 +245,34 @@ impl Config {
     }
 }
 
-/// Why there is no config.
+/// An error in reading or validating a config.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ConfigError {
-    /// There is no such file, it is no text, or it is too large.
+    /// The file cannot be read: it does not exist, is not UTF-8 text or is too large.
     #[error("{name}: cannot be read: {reason}")]
     Unreadable {
-        /// What errors call the file.
+        /// The file's name in errors.
         name: String,
-        /// The system's words.
+        /// The reason, from the system or from flotilla.
         reason: String,
-        /// Whether there is no such file.
+        /// Whether the file does not exist.
         is_missing: bool,
     },
-    /// All that is wrong, by line; what came from outside the file (see [`Override`]) last.
+    /// The config is invalid. Problems are listed by line, and those from outside the file (see [`Override`]) come
+    /// last.
     #[error("{}", list(name, problems, *unlisted))]
     Invalid {
-        /// What errors call the file.
+        /// The file's name in errors.
         name: String,
-        /// What is wrong; where that is much, the first of it.
+        /// The first problems. Those beyond a limit are only counted.
         problems: Vec<Problem>,
-        /// How much more there is.
+        /// Number of problems that are not listed.
         unlisted: usize,
     },
 }
 
 impl ConfigError {
-    /// Whether nothing in the file is wrong, but flags given beside it are.
+    /// Returns whether all problems come from flags and none from the file.
     pub fn is_usage(&self) -> bool {
         match self {
             ConfigError::Unreadable { .. } => false,

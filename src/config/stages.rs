@@ -1,7 +1,7 @@
-//! `[[stages]]`: what changes from which generation on.
+//! `[[stages]]`: keys that change from some generation on.
 //!
-//! Each stage starts from the file, not from the stage before: its config is the file's with some keys set. What makes
-//! the populations, and the plan of the run, is the same in all of them.
+//! Each stage changes keys of the file's own config, and not of the stage before. Keys of the populations and of the
+//! run as a whole are the same in all stages.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -12,13 +12,13 @@ use toml::de::DeValue;
 use super::{Config, MAX_GENERATIONS, Override, Problem};
 use crate::reader::{Document, Number};
 
-/// The list that a config has them in.
+/// The list of stages in a config.
 pub const STAGES: &str = "stages";
-/// Most stages of a config.
+/// Maximum number of stages in a config.
 pub const MAX_STAGES: usize = 256;
-/// The key that says how long a run is.
+/// The key with the length of a run.
 pub const GENERATIONS: &str = "learning.generations";
-/// What is the same in all stages.
+/// Keys that stages cannot change. A name that ends with a dot is a whole section.
 const FIXED: [&str; 10] = [
     "policy.",
     "checkpoint.",
@@ -32,17 +32,17 @@ const FIXED: [&str; 10] = [
     "learning.seed",
 ];
 
-/// One of them, as written.
+/// A stage, as written in the config.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Stage {
-    /// The first of its generations.
+    /// The first generation of the stage.
     pub from: usize,
-    /// Dotted keys, and what they are set to.
+    /// Dotted keys, with the values that they are set to.
     pub set: BTreeMap<String, toml::Value>,
 }
 
 impl Stage {
-    /// Its keys; errors call each by its place.
+    /// Returns the stage's keys as overrides. Errors name each by its place in the config.
     fn overrides(&self, index: usize) -> Vec<Override> {
         let one = |(key, value): (&String, &toml::Value)| {
             Override::new(key.clone(), value.clone(), format!("{STAGES}[{index}].set.{key}"))
@@ -52,8 +52,8 @@ impl Stage {
 }
 
 impl Config {
-    /// The configs that play, each with the first of its generations: where the first stage comes later than generation
-    /// 0, the file's own plays before it. Of a valid config, whose stages were seen to be valid too.
+    /// Returns the config of each stage with its first generation. If the first stage starts after generation 0, the
+    /// file's own config comes before it. The config must be valid, because this panics if a stage is not.
     pub fn staged(&self) -> Vec<(usize, Config)> {
         let own = Config { stages: vec![], ..self.clone() };
         let mut staged = Vec::with_capacity(self.stages.len() + 1);
@@ -67,23 +67,24 @@ impl Config {
         staged
     }
 
-    /// Which of [`Config::staged`] a generation belongs to.
+    /// Returns the index of a generation's stage in [`Config::staged`].
     pub fn stage_of(&self, generation: usize) -> usize {
         let begun = self.stages.iter().filter(|stage| stage.from <= generation).count();
         begun - usize::from(self.stages.first().is_some_and(|first| first.from == 0))
     }
 
-    /// The first generation of the last stage; 0 without stages.
+    /// Returns the first generation of the last stage, or 0 without stages.
     pub fn last_from(&self) -> usize {
         self.stages.last().map_or(0, |stage| stage.from)
     }
 
-    /// The config by which a generation plays.
+    /// Returns the config that a generation plays with.
     pub fn at(&self, generation: usize) -> Config {
         self.staged().swap_remove(self.stage_of(generation)).1
     }
 
-    /// The configs that play, each with as many generations as are its own.
+    /// Returns the config of each stage, with `learning.generations` set to the generations after the stage's first
+    /// one.
     pub fn shares(&self) -> Vec<Config> {
         let mut staged = self.staged();
         let mut end = self.learning.generations + 1;
@@ -94,7 +95,7 @@ impl Config {
         staged.into_iter().map(|(_, config)| config).collect()
     }
 
-    /// How many POIs there are, if as many in all stages.
+    /// Returns the number of POIs, or `None` if it differs between stages.
     pub fn pois(&self) -> Option<usize> {
         let staged = self.staged();
         let count = |(_, config): &(usize, Config)| config.world.pois.len();
@@ -102,18 +103,18 @@ impl Config {
     }
 }
 
-/// A key of a stage, as written: its line, and its value's text.
+/// The line and the text of a value, as written in a stage.
 struct Written<'a> {
     line: Option<usize>,
     text: &'a str,
 }
 
-/// Reads the stages of a document whose other keys make a valid config. Their keys have lines unless the document comes
-/// from outside the file.
-/// `shortened`: the run's length was set from outside, so that stages may begin after its end.
+/// Reads the stages of a document whose other keys make a valid config. Problems have lines unless the document comes
+/// from outside the file. `shortened` means that the run's length was set from outside, in which case stages may begin
+/// after its end.
 ///
 /// # Errors
-/// All problems of the stages, by line.
+/// Fails if a stage is invalid. The error lists all problems by line.
 pub(super) fn read(
     document: &Document<'_>,
     outside: bool,
@@ -161,7 +162,7 @@ pub(super) fn read(
                     for (key, value) in set {
                         let line = line_of(key.span().start);
                         match value.get_ref() {
-                            // `set = { world.coupling = 1 }` says the same without quotes.
+                            // `set = { world.coupling = 1 }` is the same key without quotes.
                             DeValue::Table(leaves) => {
                                 for (leaf, value) in leaves {
                                     let text = text.get(value.span()).unwrap_or_default();
@@ -228,8 +229,8 @@ pub(super) fn read(
     if problems.is_empty() { Ok(stages) } else { Err(problems) }
 }
 
-/// Attributes the problems of stages to the flags that cause them, if the file is valid without flags: to each flag that
-/// alone makes it invalid, or else to all flags together.
+/// Attributes the problems of stages to the flags that cause them, if the file is valid without flags. A flag causes
+/// them if it alone makes the config invalid. If there is no such flag, all flags cause them together.
 pub(super) fn attribute(
     problems: Vec<Problem>,
     flags: &[Override],

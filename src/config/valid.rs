@@ -1,4 +1,4 @@
-//! Configs that were validated as a whole.
+//! Configs that are validated as a whole.
 
 use std::ops::Deref;
 
@@ -24,7 +24,7 @@ impl Config {
     /// Validates a config whose fields a program has set, as if it had been read from a file.
     ///
     /// # Errors
-    /// Everything that is wrong with it.
+    /// Fails if the config is invalid. The error lists its problems.
     pub fn validate(&self) -> Result<ValidConfig, ConfigError> {
         let name = "the config";
         let text = toml::to_string(self).map_err(|error| {
@@ -40,7 +40,7 @@ impl ValidConfig {
     /// Validates several configs.
     ///
     /// # Errors
-    /// Everything that is wrong with the first invalid one.
+    /// Fails at the first invalid config. The error lists its problems.
     pub fn all(configs: &[Config]) -> Result<Vec<ValidConfig>, ConfigError> {
         configs.iter().map(Config::validate).collect()
     }
@@ -50,7 +50,7 @@ impl ValidConfig {
         &self.stages
     }
 
-    /// Returns the config with fewer generations, if it has more. Stages that begin later are never played.
+    /// Returns the config with at most this number of generations. Stages that begin later are never played.
     pub fn ending_at(mut self, generation: usize) -> ValidConfig {
         self.config.learning.generations = self.config.learning.generations.min(generation);
         self

@@ -1,4 +1,4 @@
-//! `[world]`: its data and its keys.
+//! The section `[world]`: its data and keys.
 
 use super::{Coupling, Observers, Paradigm};
 use crate::model::couple::observation_radius;
@@ -7,15 +7,15 @@ use crate::model::start::Heading;
 use crate::model::{LEAST, LONGEST};
 use crate::reader::{Allowed, Reader, between, section};
 
-/// Most agents (leaders and followers) in a team.
+/// Maximum number of agents (leaders and followers) in a team.
 pub const MAX_AGENTS: usize = 1024;
-/// Most POIs in a world.
+/// Maximum number of POIs in a world.
 pub const MAX_POIS: usize = 256;
-/// Most steps in an episode.
+/// Maximum number of steps in an episode.
 pub const MAX_STEPS: usize = 10_000;
-/// A team's record stays under a gigabyte whatever the config.
+/// Checks that a team's record is smaller than 1 GiB in every config.
 const _: () = {
-    // Half of the agents follow where sights take most.
+    // Sightings take the most memory if half of the agents are followers.
     let (sets, sights) = (MAX_POIS * MAX_AGENTS.div_ceil(32), MAX_AGENTS / 2 * (MAX_AGENTS / 2).div_ceil(32));
     assert!(MAX_STEPS * (sets + sights) * size_of::<u32>() < 1 << 30);
 };
@@ -54,7 +54,7 @@ section! {
 }
 
 impl Domain {
-    /// Reads the section; agents start with one of these speeds, and learn by this paradigm.
+    /// Reads the section. `start_speed` limits the agents' start speed.
     pub(super) fn read(r: &mut Reader<'_>, start_speed: Allowed<f64>, paradigm: Paradigm) -> Domain {
         let map = Domain::map(r).pair(between(1.0, LONGEST), [50.0, 50.0]);
         let sides = map.map(|side| between(LEAST, side).or_zero().because("the map"));
@@ -100,7 +100,7 @@ impl Domain {
         }
     }
 
-    /// The heading of each agent at the start, leaders first, in radians.
+    /// Returns each agent's heading at the start in radians, leaders first.
     pub fn headings(&self) -> Vec<f64> {
         self.heading.of_each(&self.leaders, &self.followers)
     }

@@ -1,4 +1,4 @@
-//! Which way agents face at the start. The key stands in `[world]`.
+//! Start headings of agents. The key is in `[world]`.
 
 use std::f64::consts::FRAC_PI_2;
 

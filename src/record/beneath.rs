@@ -1,33 +1,33 @@
-//! A folder and what is below it, reached name by name from an open handle, so that no symbolic link is followed.
+//! Access to a folder and the entries below it, name by name from an open handle, so that no symbolic link is followed.
 //!
-//! Only the way to the folder itself may lead through links: that is the name that the user gave. On systems other than
-//! Unix every name is looked at before it is used.
+//! Only the path to the folder itself may contain links, because the user gave that path. Systems other than Unix have
+//! no such handles, so every name is checked before it is used.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
 use std::io::{self, ErrorKind};
 use std::path::{Component, Path, PathBuf};
 
-/// A folder that is held open.
+/// A folder that is kept open.
 pub struct Root {
     path: PathBuf,
     handle: Handle,
 }
 
-/// What is at a path, links not followed.
+/// Type of the entry at a path. Links are not followed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FileKind {
     /// A plain file.
     File,
     /// A folder.
     Folder,
-    /// A symbolic link, wherever it leads.
+    /// A symbolic link, whatever its target.
     Link,
     /// A pipe, a socket or a device.
     Other,
 }
 
-/// A name in a folder that is held open; whether anything has that name is another matter.
+/// A name in an open folder. No file needs to exist under that name.
 pub struct FolderEntry {
     parent: Handle,
     name: OsString,
@@ -35,31 +35,31 @@ pub struct FolderEntry {
 }
 
 impl Root {
-    /// Opens a folder; links on the way to it are followed.
+    /// Opens a folder. Links in its path are followed.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn open(path: &Path) -> io::Result<Root> {
         Ok(Root { path: path.into(), handle: system::open(path)? })
     }
 
-    /// The folder's path, as it was given.
+    /// Returns the path of the folder as it was given.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// The numbers of the folder's owner and of the present user, where the system has such.
+    /// Returns the user ids `[owner, current user]`, or `None` on systems without user ids.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn owners(&self) -> io::Result<Option<[u32; 2]>> {
         system::owners(&self.handle)
     }
 
-    /// The entry of a path, which begins with the folder's own.
+    /// Returns the entry of a path, which must begin with the path of this folder.
     ///
     /// # Errors
-    /// A folder on the way is a link or is missing, or the path leads elsewhere.
+    /// A folder on the way is a link or is missing, or the path is not below this folder.
     pub fn entry(&self, path: &Path) -> io::Result<FolderEntry> {
         let (folders, name) = self.names(path)?;
         let mut parent = system::copy(&self.handle)?;
@@ -71,10 +71,10 @@ impl Root {
         Ok(FolderEntry { parent, name: name.into(), path: path.into() })
     }
 
-    /// Creates a folder and those above it, down from this one.
+    /// Creates a folder and its missing parents, starting from this folder.
     ///
     /// # Errors
-    /// Something else has the name, a link as well, or what the system says.
+    /// Another file or a link has one of the names, or the system returns an error.
     pub fn create_folder(&self, path: &Path) -> io::Result<()> {
         if path == self.path {
             return Ok(());
@@ -91,7 +91,7 @@ impl Root {
         Ok(())
     }
 
-    /// The names that lead from the folder to a path: the folders on the way, and the last.
+    /// Splits a path below this folder into the folders on the way and the last name.
     fn names<'a>(&self, path: &'a Path) -> io::Result<(Vec<&'a OsStr>, &'a OsStr)> {
         let elsewhere = || {
             let text = format!("it is not in {}, where alone this is written", self.path.display());
@@ -108,18 +108,18 @@ impl Root {
 }
 
 impl FolderEntry {
-    /// What has the name, if anything.
+    /// Returns the type of the entry, or `None` if it does not exist.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn kind(&self) -> io::Result<Option<FileKind>> {
         system::kind(&self.parent, &self.name, &self.path)
     }
 
-    /// Refuses a name that something else than a plain file has.
+    /// Returns `Some` for a plain file and `None` if nothing has the name.
     ///
     /// # Errors
-    /// It has, or what the system says.
+    /// The entry is not a plain file, or the system returns an error.
     pub fn only_file(&self) -> io::Result<Option<()>> {
         match self.kind()? {
             None => Ok(None),
@@ -134,80 +134,80 @@ impl FolderEntry {
         }
     }
 
-    /// Creates a file; nothing may have its name yet.
+    /// Creates a file. Fails if the name is taken.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn create_new(&self) -> io::Result<File> {
         system::create_new(&self.parent, &self.name, &self.path)
     }
 
-    /// Opens a plain file to read it.
+    /// Opens a plain file for reading.
     ///
     /// # Errors
-    /// It is none, or what the system says.
+    /// The file is missing or not a plain file, or the system returns an error.
     pub fn read(&self) -> io::Result<File> {
         self.only_file()?.ok_or(ErrorKind::NotFound)?;
         system::read(&self.parent, &self.name, &self.path)
     }
 
-    /// Opens a plain file to write to it; what it holds stays.
+    /// Opens an existing plain file for writing and keeps its content.
     ///
     /// # Errors
-    /// It is none, or what the system says.
+    /// The file is missing or not a plain file, or the system returns an error.
     pub fn write(&self) -> io::Result<File> {
         self.only_file()?;
         system::write(&self.parent, &self.name, &self.path)
     }
 
-    /// Opens a plain file to write to its end, and creates it if it is not there.
+    /// Opens a plain file for appending, and creates it if it is missing.
     ///
     /// # Errors
-    /// It is none, or what the system says.
+    /// The entry is not a plain file, or the system returns an error.
     pub fn extend(&self) -> io::Result<File> {
         self.only_file()?;
         system::extend(&self.parent, &self.name, &self.path)
     }
 
-    /// Removes a file.
+    /// Removes a plain file.
     ///
     /// # Errors
-    /// It is a link or a folder, or what the system says.
+    /// The entry is not a plain file, or the system returns an error.
     pub fn remove(&self) -> io::Result<()> {
         self.only_file()?;
         system::remove(&self.parent, &self.name, &self.path)
     }
 
-    /// Gives a file another name, in the place of any file that has it.
+    /// Renames a file and replaces any plain file that has the new name.
     ///
     /// # Errors
-    /// A link or a folder has it, or what the system says.
+    /// The new name belongs to something other than a plain file, or the system returns an error.
     pub fn rename(&self, to: &FolderEntry) -> io::Result<()> {
         to.only_file()?;
         system::rename((&self.parent, &self.name, &self.path), (&to.parent, &to.name, &to.path))
     }
 
-    /// Makes the names of the entry's folder last, where the system can.
+    /// Flushes the names in the parent folder to the disk, if the system can.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn sync_folder(&self) -> io::Result<()> {
         match system::sync(&self.parent) {
-            // Some network file systems cannot.
+            // Some network file systems cannot flush a folder.
             Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
             synced => synced,
         }
     }
 }
 
-/// The error of a link that something would be written through.
+/// Returns the error for writing through a link.
 pub fn is_link(path: &Path) -> io::Error {
     let text =
         format!("{} is a symbolic link, and nothing is written through one here; remove the link", path.display());
     io::Error::new(ErrorKind::InvalidInput, text)
 }
 
-/// What a path needs to be a folder that can be stepped into.
+/// Returns the error for a path that should be a folder, given the type of the entry found there.
 fn not_a_folder(kind: Option<FileKind>, path: &Path, error: io::Error) -> io::Error {
     match kind {
         Some(FileKind::Link) => is_link(path),
@@ -218,7 +218,7 @@ fn not_a_folder(kind: Option<FileKind>, path: &Path, error: io::Error) -> io::Er
     }
 }
 
-/// A folder held open; nothing where the system has no such thing.
+/// An open folder. Empty on systems without such handles.
 struct Handle(#[cfg(unix)] std::os::fd::OwnedFd);
 
 #[cfg(unix)]
@@ -233,9 +233,9 @@ mod system {
     use super::{FileKind, Handle, not_a_folder};
 
     const FOLDER: OFlags = OFlags::RDONLY.union(OFlags::DIRECTORY).union(OFlags::CLOEXEC);
-    /// A pipe that is put in the place of a file is not waited for.
+    /// `NONBLOCK` prevents a hang if a pipe replaces a file between the check and the open.
     const FILE: OFlags = OFlags::NOFOLLOW.union(OFlags::CLOEXEC).union(OFlags::NONBLOCK);
-    /// As files and folders are commonly created; the user's mask takes from it.
+    /// Usual permissions of new files and folders, reduced by the user's umask.
     const FILE_MODE: Mode = Mode::from_bits_truncate(0o666);
     const FOLDER_MODE: Mode = Mode::from_bits_truncate(0o777);
 

@@ -1,10 +1,11 @@
-//! Checkpoints: all that a run needs to go on, in `checkpoints/GENERATION.safetensors`.
+//! Checkpoints: the state from which a run resumes, in `checkpoints/GENERATION.safetensors`.
 //!
-//! A [`Keeper`] writes them on a thread of its own and keeps the last two. Each says which config it belongs to and up
-//! to where `metrics.csv` had come, and stands under the checksum of [`super::tensors`].
+//! A [`Keeper`] writes them on a separate thread. It keeps the last two, and also the checkpoint of generation 0 if
+//! there is one. Each checkpoint records the digest of its config and the length of `metrics.csv` at that time. The
+//! checksum of [`super::tensors`] protects it.
 //!
-//! A finished run leaves one more, to be extended from: its weights are those of `policies.safetensors`, put back into
-//! the order that their fitness tells.
+//! A finished run leaves one more checkpoint, so that the run can be extended. Its weights are those of
+//! `policies.safetensors`, put back into the order given by their fitness.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -28,48 +29,48 @@ use crate::parallel::Aside;
 use crate::trainer::{Row, Snapshot};
 
 const KIND: &str = "checkpoint 1";
-/// Maximum training time of a checkpoint, 30 000 years. A longer one counts as 0.
+/// Maximum training time in a checkpoint, in seconds (30 000 years). A larger value is read as 0.
 const MAX_SECONDS: f64 = 1e12;
-/// Tensors, of all trials together.
+/// Names of the tensors. Each holds all trials.
 const WEIGHTS: &str = "weights.0";
 const FITNESS: &str = "fitness.0";
 const PENDING: &str = "pending.0";
-/// Metadata: [`Snapshot::last`].
+/// Metadata key of [`Snapshot::last`].
 const LAST: &str = "generations";
-/// Metadata: [`Checkpoint::init`].
+/// Metadata key of [`Checkpoint::init`].
 const INIT: &str = "init";
 const EXTENSION: &str = ".safetensors";
-/// Digits of the generation in a checkpoint's name.
+/// Number of digits of the generation in a file name.
 const DIGITS: usize = 9;
-/// How many are kept.
+/// Number of recent checkpoints that are kept.
 const KEPT: usize = 2;
-/// Of a run's time, checkpoints by the clock take one part in this at most.
+/// Checkpoints that are due by time take at most one part in `SHARE` of the run's time.
 const SHARE: u32 = 20;
 
-/// A run at one moment.
+/// State of a run before a generation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Checkpoint<N = Vec<f32>> {
-    /// [`config_digest`] of the run's config.
+    /// [`config_digest`] of the config of the run.
     pub config: String,
-    /// [`policies::Init::digest`] of what the run started from, if not at random.
+    /// [`policies::Init::digest`] of the policies that the run started from. `None` for a random start.
     pub init: Option<String>,
-    /// Time trained.
+    /// Training time in seconds.
     pub seconds: f64,
-    /// How far `metrics.csv` had come.
+    /// Length and hash of `metrics.csv`.
     pub metrics: Extent,
-    /// Without weights where these are kept in `policies.safetensors`.
+    /// State of the trainer. The weights are empty if `policies.safetensors` has them.
     pub snapshot: Snapshot<N>,
 }
 
 impl<N> Checkpoint<N> {
-    /// Whether it is of a run of this config, or of the same that was to be shorter.
+    /// Returns whether the checkpoint belongs to a run of this config, or to the same run with fewer generations.
     pub fn is_of(&self, config: &Config) -> bool {
         let last = self.snapshot.last;
         last <= config.learning.generations && self.config == config_digest(&of_length(config, last))
     }
 }
 
-/// The config of a run that is as long as this: stages that begin later are none of it.
+/// Returns the config with `last` generations. Stages that begin after that generation are removed.
 pub fn of_length(config: &Config, last: usize) -> Config {
     let mut config = config.clone();
     config.learning.generations = last;
@@ -78,18 +79,18 @@ pub fn of_length(config: &Config, last: usize) -> Config {
 }
 
 impl<N: AsRef<[f32]>> Checkpoint<N> {
-    /// Writes it, whole or not at all.
+    /// Writes the checkpoint, whole or not at all.
     ///
     /// # Errors
-    /// The file cannot be written; nothing else was touched then.
+    /// The file cannot be written. Nothing else was changed in that case.
     pub fn write(&self, disk: &Disk, path: &Path, of: &Config) -> std::io::Result<()> {
         disk.replace(path, |output| self.put(output, of))
     }
 
-    /// Writes what such a file holds into a stream.
+    /// Writes the content of a checkpoint file to a stream.
     ///
     /// # Errors
-    /// The stream refuses it.
+    /// Returns the stream's error.
     pub fn put(&self, output: &mut dyn Write, of: &Config) -> std::io::Result<()> {
         let Checkpoint { config, init, seconds, metrics, snapshot } = self;
         let mut metadata = BTreeMap::from(
@@ -108,7 +109,7 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
         let Shapes { weights, fitness, .. } = Shapes::of(of);
         let pending: Vec<[f64; 2]> = snapshot.pending.iter().flatten().map(|row| [row.best_g, row.mean_g]).collect();
         let mut list = Vec::new();
-        // Numbers of 8 bytes first, so that all are aligned.
+        // The 8-byte numbers come first, so that all tensors are aligned.
         if !pending.is_empty() {
             let (shape, parts) = (vec![pending.len(), 2], vec![bytemuck::cast_slice(&pending)]);
             list.push(Tensor { name: PENDING.into(), dtype: Dtype::F64, shape, parts });
@@ -124,10 +125,10 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
 }
 
 impl Checkpoint {
-    /// Reads a checkpoint of a run of a config.
+    /// Reads a checkpoint of a run with the given config.
     ///
     /// # Errors
-    /// What is wrong with it, in words.
+    /// Returns a description of the problem.
     pub fn read(source: impl Read + Seek, of: &Config) -> Result<Checkpoint, String> {
         let mut file = TensorFile::open(source)?;
         if file.kind() != Some(KIND) {
@@ -138,19 +139,19 @@ impl Checkpoint {
             text(key)?.parse::<u64>().map_err(|error| format!("its {key} is no number that can be: {error}"))
         };
         let config = text("config")?;
-        // A longer time would make lines of metrics.csv too long for every reader. It has no influence on results.
+        // A longer time would make lines of `metrics.csv` too long for its readers. It has no influence on results.
         let seconds: Option<f64> = text("seconds")?.parse().ok();
         let seconds = seconds.filter(|seconds| (0.0..=MAX_SECONDS).contains(seconds)).unwrap_or(0.0);
         let metrics = Extent { bytes: number("metrics_bytes")?, sha256: text("metrics_sha256")? };
         let generation = number("generation")? as usize;
         let learning = &of.learning;
-        // Those of an earlier version do not say it, and are of runs that were not extended.
+        // Earlier versions did not write this key, and their runs were never extended.
         let last = file.metadata(LAST).map_or(Ok(learning.generations as u64), |_| number(LAST))? as usize;
         if generation > last + 1 {
             return Err(format!("its generation is {generation}, past the last, {last}"));
         }
         let shapes = Shapes::of(of);
-        // What comes after the last generation may be kept elsewhere.
+        // After the last generation, `policies.safetensors` may hold the weights.
         let elsewhere = generation == last + 1 && file.info(WEIGHTS).is_none();
         let mut floats = |name: &str, shape: &[usize]| -> Result<Vec<Vec<f32>>, String> {
             let mut trials: Vec<Vec<f32>> = file.read(name, Dtype::F32, shape, shape[0])?;
@@ -161,7 +162,7 @@ impl Checkpoint {
         };
         let weights = if elsewhere { vec![] } else { floats(WEIGHTS, &shapes.weights)? };
         let fitness = floats(FITNESS, &shapes.fitness)?;
-        // Rows wait from the first generation on until the champions have played.
+        // From generation 1 on, rows are pending until their champions have played.
         let pending: Vec<[f64; 2]> = match generation {
             0 => vec![],
             _ => file.read(PENDING, Dtype::F64, &[learning.trials, 2], 1)?.pop().unwrap_or_default(),
@@ -179,10 +180,11 @@ impl Checkpoint {
         Ok(Checkpoint { config, init, seconds, metrics, snapshot })
     }
 
-    /// Takes the weights that it lacks from `policies.safetensors`; false where that is not of the same run.
+    /// Adds the missing weights from `policies.safetensors`. Returns false if that file does not belong to the same
+    /// run.
     #[must_use]
     fn complete(&mut self, mut file: TensorFile<impl Read + Seek>, of: &Config) -> bool {
-        // One without a kind has no checksum either: another program's.
+        // A file without a kind has no checksum either: another program wrote it.
         if file.kind().is_none() || file.metadata(policies::CONFIG) != Some(&self.config) {
             return false;
         }
@@ -200,7 +202,7 @@ impl Checkpoint {
                 let mut put = |slot: usize, policy: &[f32]| {
                     slots[slot * parameters..(slot + 1) * parameters].copy_from_slice(policy);
                 };
-                // The best of all is the champion.
+                // The overall best policy is the champion.
                 put(population, &sorted[..parameters]);
                 let order = evolve::best(fitness, population);
                 order.into_iter().zip(sorted.chunks_exact(parameters)).for_each(|(slot, policy)| put(slot, policy));
@@ -212,7 +214,7 @@ impl Checkpoint {
     }
 }
 
-/// Shapes of the tensors, all trials together.
+/// Shapes of the tensors, with all trials in one tensor.
 struct Shapes {
     weights: [usize; 4],
     fitness: [usize; 3],
@@ -229,7 +231,7 @@ impl Shapes {
     }
 }
 
-/// The generations of the checkpoints in a folder, oldest first; leftovers of writing are none.
+/// Returns the generations of the checkpoints in a folder, oldest first. Temporary files are ignored.
 ///
 /// # Errors
 /// The folder cannot be read.
@@ -247,29 +249,29 @@ pub fn list(folder: &Path) -> Result<Vec<usize>, RecordError> {
     Ok(generations)
 }
 
-/// The generation that a checkpoint's name says; none of any other name.
+/// Returns the generation in the file name of a checkpoint, or `None` for any other name.
 fn generation_of(name: &str) -> Option<usize> {
     let digits = name.strip_suffix(EXTENSION)?;
     (digits.len() == DIGITS && digits.bytes().all(|byte| byte.is_ascii_digit())).then(|| digits.parse().ok()).flatten()
 }
 
-/// Where the checkpoint of a generation is.
+/// Returns the path of the checkpoint of a generation.
 pub fn path(folder: &Path, generation: usize) -> PathBuf {
     folder.join(format!("{generation:0DIGITS$}{EXTENSION}"))
 }
 
-/// Opens one and reads it, with the weights that a finished run keeps in its `policies`; none where these are of
-/// another run by now.
+/// Reads the checkpoint at a path. The weights of a finished run come from the file `policies`. Returns `None` if that
+/// file is missing, damaged or from another run.
 ///
 /// # Errors
-/// It or the policies cannot be read, or it is damaged.
+/// The checkpoint or the policies cannot be read, or the checkpoint is damaged.
 pub fn read(path: &Path, policies: &Path, config: &Config) -> Result<Option<Checkpoint>, RecordError> {
     let file = file::open(path).map_err(RecordError::read(path))?;
     let mut found = Checkpoint::read(file, config).map_err(|reason| RecordError::damaged(path, reason))?;
     let whole = !found.snapshot.weights.is_empty()
         || match tensors::open(policies) {
             Ok(file) => found.complete(file, config),
-            // The system may let it be read another time.
+            // The system may be able to read the file later, so the checkpoint must be kept.
             Err(RecordError::Read { path, error }) if error.kind() != ErrorKind::NotFound => {
                 return Err(RecordError::Read { path, error });
             }
@@ -278,35 +280,35 @@ pub fn read(path: &Path, policies: &Path, config: &Config) -> Result<Option<Chec
     Ok(whole.then_some(found))
 }
 
-/// When a run's checkpoints are due; 0 is never.
+/// How often a run writes checkpoints. A value of 0 disables that trigger.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Schedule {
-    /// After so many generations, waiting where the last one is still being written.
+    /// Number of generations between checkpoints. Training waits if the previous checkpoint is still being written.
     pub generations: usize,
-    /// After so many seconds, and not before writing has taken less than a twentieth of the time.
+    /// Seconds between checkpoints. The interval is extended until writing took at most 1/20 of it.
     pub seconds: f64,
 }
 
-/// Writes checkpoints beside training, one at a time.
+/// Writes checkpoints during training, one at a time.
 pub struct Keeper {
     disk: Disk,
     folder: PathBuf,
     config: Arc<Config>,
-    /// Generations of the checkpoints that are whole, oldest first.
+    /// Generations of the complete checkpoints, oldest first.
     kept: Vec<usize>,
     writing: Option<Aside<Result<(usize, Duration), RecordError>>>,
-    /// The generation, the moment and the cost of the last.
+    /// Generation, time and cost of the last checkpoint.
     last: (usize, Instant, Duration),
 }
 
 impl Keeper {
-    /// Keeps checkpoints in a folder, which exists and has these already.
+    /// Creates a keeper for an existing folder that already has the checkpoints `kept`.
     pub fn new(disk: Disk, folder: PathBuf, config: Config, kept: Vec<usize>, generation: usize) -> Keeper {
         let last = (generation, Instant::now(), Duration::ZERO);
         Keeper { disk, folder, config: Arc::new(config), kept, writing: None, last }
     }
 
-    /// Whether a checkpoint should be made before a generation plays.
+    /// Returns whether a checkpoint is due before a generation is played.
     pub fn is_due(&self, schedule: &Schedule, generation: usize) -> bool {
         let (last, moment, cost) = self.last;
         if generation == last {
@@ -318,10 +320,10 @@ impl Keeper {
             || seconds > 0.0 && !writing && elapsed.as_secs_f64() >= seconds && elapsed >= cost * SHARE
     }
 
-    /// Hands over a checkpoint to be written; waits for the one before it. `metrics` is brought to the disk first.
+    /// Starts to write a checkpoint after the previous one is complete. `metrics` is flushed to the disk first.
     ///
     /// # Errors
-    /// The one before it could not be written.
+    /// The previous checkpoint could not be written.
     pub fn save(&mut self, checkpoint: Checkpoint, metrics: Output, since: Instant) -> Result<(), RecordError> {
         self.wait()?;
         let generation = checkpoint.snapshot.generation;
@@ -336,10 +338,10 @@ impl Keeper {
         Ok(())
     }
 
-    /// [`Keeper::save`], here and now, of numbers that are not its own.
+    /// Writes a checkpoint of borrowed weights before it returns. See [`Keeper::save`].
     ///
     /// # Errors
-    /// This checkpoint or the one before it could not be written.
+    /// This checkpoint or the previous one could not be written.
     pub fn save_now(
         &mut self,
         checkpoint: &Checkpoint<&[f32]>,
@@ -355,7 +357,7 @@ impl Keeper {
         self.keep(generation)
     }
 
-    /// Waits until all is written, and removes what is not kept.
+    /// Waits until the last checkpoint is written, and removes old ones.
     ///
     /// # Errors
     /// The last checkpoint could not be written.
@@ -366,11 +368,11 @@ impl Keeper {
         self.keep(generation)
     }
 
-    /// Counts a checkpoint as whole, and removes what is not kept.
+    /// Records a checkpoint as complete, and removes old ones.
     fn keep(&mut self, generation: usize) -> Result<(), RecordError> {
         self.kept.retain(|&kept| kept != generation);
         self.kept.push(generation);
-        // What a run started from is kept beside them: its first generations cannot be played again without it.
+        // The checkpoint of generation 0 is kept, because the first generations cannot be repeated without it.
         let first = usize::from(self.kept.first() == Some(&0));
         while self.kept.len() > first + KEPT {
             let path = path(&self.folder, self.kept[first]);
@@ -380,10 +382,10 @@ impl Keeper {
         Ok(())
     }
 
-    /// Makes all that are kept checkpoints of the same run, but as short as this config's.
+    /// Rewrites all checkpoints for the same run with the fewer generations of `config`.
     ///
     /// # Errors
-    /// One could not be read or written.
+    /// A checkpoint could not be read or written.
     pub fn shorten(&mut self, config: &Config) -> Result<(), RecordError> {
         self.wait()?;
         for &generation in &self.kept {
@@ -399,7 +401,7 @@ impl Keeper {
         Ok(())
     }
 
-    /// Notices that a checkpoint is written, or could not be.
+    /// Completes the last checkpoint if its writer has finished.
     ///
     /// # Errors
     /// The last checkpoint could not be written.
@@ -407,7 +409,7 @@ impl Keeper {
         if self.writing.as_ref().is_some_and(Aside::is_finished) { self.wait() } else { Ok(()) }
     }
 
-    /// The generation of the newest whole checkpoint.
+    /// Returns the generation of the newest complete checkpoint.
     pub fn newest(&self) -> Option<usize> {
         self.kept.last().copied()
     }
@@ -415,14 +417,14 @@ impl Keeper {
 
 impl Drop for Keeper {
     fn drop(&mut self) {
-        // Whoever leaves early still lets the writer finish: the folder's lock goes next.
+        // Wait for the writer even after an error, because the lock of the folder is released next.
         if let Some(writing) = self.writing.take() {
             writing.end();
         }
     }
 }
 
-/// Clears away what an interrupted writer left, and gives what is there, oldest first.
+/// Removes temporary files of interrupted writers, and returns the generations of the checkpoints, oldest first.
 ///
 /// # Errors
 /// The folder cannot be read or written.
@@ -438,7 +440,7 @@ pub fn tidy(disk: &Disk, folder: &Path) -> Result<Vec<usize>, RecordError> {
     Ok(generations)
 }
 
-/// Where a checkpoint that cannot be used is put aside.
+/// Returns the path to which an unusable checkpoint is renamed.
 pub fn aside(path: &Path) -> PathBuf {
     path.with_extension("safetensors.damaged")
 }

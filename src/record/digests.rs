@@ -1,7 +1,10 @@
-//! Compares what a run's folder holds with the digests in its `run.json`.
+//! Comparison of a run's files with the digests in its `run.json`.
 //!
-//! Digests are of what a file says, not of its bytes: of the config without `[checkpoint]` and comments, of the metrics
-//! without the columns `seconds` and `stage`, of the policies by the checksum that their file carries.
+//! A digest covers the content that matters for results, not every byte of a file:
+//!
+//! - the config without `[checkpoint]` and comments,
+//! - the metrics without the columns `seconds` and `stage`,
+//! - the policies, through the checksum in their file.
 
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -12,32 +15,32 @@ use super::folder::{FileSums, Origin, RUN, Run, Status};
 use super::{RecordError, hex};
 use crate::config::Config;
 
-/// Marks what was read without a comparison.
+/// Warning for output made from files that were not compared.
 pub const UNVERIFIED: &str = "Unverified: files were not compared with the digests in run.json";
 
-/// Whether files of a run are compared with their digests.
+/// Whether the files of a run are compared with their digests.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Verification {
-    /// A file that differs is an error.
+    /// A file with another digest is an error.
     #[default]
     Required,
-    /// Nothing is compared.
+    /// No file is compared.
     Skipped,
 }
 
 impl Verification {
-    /// What a flag `--unverified` says.
+    /// Returns the value for a flag `--unverified`.
     pub fn unless(unverified: bool) -> Verification {
         if unverified { Verification::Skipped } else { Verification::Required }
     }
 
-    /// Whether nothing is compared.
+    /// Returns whether no file is compared.
     pub fn is_skipped(self) -> bool {
         self == Verification::Skipped
     }
 }
 
-/// The digests of a finished run. An unfinished run has none yet, and a run of an earlier version has none of its files.
+/// Digests of a finished run. Unfinished runs have no digests. Runs of earlier versions have no digests of their files.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Digests {
     /// See [`Run::digest`].
@@ -47,7 +50,7 @@ pub struct Digests {
 }
 
 impl Digests {
-    /// Reads the digests of the run in a folder; none where nothing is to be compared.
+    /// Reads the digests of the run in a folder. They are empty if nothing is to be compared.
     ///
     /// # Errors
     /// `run.json` is damaged or cannot be read.
@@ -63,18 +66,18 @@ impl Digests {
         }
     }
 
-    /// Compares the config that was read from a file.
+    /// Compares a config that was read from a file.
     ///
     /// # Errors
-    /// It is another one.
+    /// The config differs.
     pub fn compare_config(&self, path: &Path, config: &Config) -> Result<(), RecordError> {
         same(path, self.origin.as_ref().is_none_or(|origin| *origin == Origin::of(config)))
     }
 
-    /// Compares the metrics that were read from a file, see [`super::metrics::Rows::digest`].
+    /// Compares metrics that were read from a file. See [`super::metrics::Rows::digest`].
     ///
     /// # Errors
-    /// They are other ones.
+    /// The metrics differ.
     pub fn compare_metrics(&self, path: &Path, found: Sha256) -> Result<(), RecordError> {
         same(path, self.files.as_ref().is_none_or(|files| files.metrics == hex(&found.finalize())))
     }
@@ -82,7 +85,7 @@ impl Digests {
     /// Compares the checksum of policies that were read from a file.
     ///
     /// # Errors
-    /// They are other ones.
+    /// The checksum differs.
     pub fn compare_policies(&self, path: &Path, checksum: Option<&str>) -> Result<(), RecordError> {
         same(path, self.files.as_ref().is_none_or(|files| Some(&*files.policies) == checksum))
     }
@@ -92,7 +95,7 @@ fn same(path: &Path, same: bool) -> Result<(), RecordError> {
     if same { Ok(()) } else { Err(RecordError::Differs { path: path.into() }) }
 }
 
-/// Says, once for all of them, which finished runs have no digests of their files; none where all have them.
+/// Returns one note about all finished runs that have no digests of their files, or `None` if all have them.
 pub fn without<'a>(folders: impl IntoIterator<Item = &'a Path>) -> Option<String> {
     let lacks =
         |folder: &&Path| Run::read(&folder.join(RUN)).is_ok_and(|run| run.state == Status::Done && run.files.is_none());

@@ -1,4 +1,4 @@
-//! Everything that is written goes through here: a file is replaced whole or not at all, and tests can make any
+//! Access to the disk for everything that is written. Files are replaced whole or not at all, and tests can make any
 //! single operation fail.
 
 use std::fs::{self, File, OpenOptions};
@@ -10,29 +10,29 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use super::beneath::{FileKind, FolderEntry, Root};
 use crate::file;
 
-/// One thing done to a disk.
+/// Kind of operation on a disk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Operation {
-    /// A folder, and those above it.
+    /// Creates a folder and its missing parents.
     CreateFolder,
-    /// A file, to be written.
+    /// Creates a file for writing.
     Create,
-    /// Some bytes to a file.
+    /// Writes some bytes to a file.
     Write,
-    /// A file's or a folder's contents to the disk.
+    /// Flushes a file or a folder to the disk.
     Flush,
-    /// A file cut to a length.
+    /// Truncates a file to a length.
     Truncate,
-    /// A file to its final name.
+    /// Renames a file to its final name.
     Rename,
-    /// A file or a folder.
+    /// Removes a file.
     Remove,
 }
 
-/// Asked before each operation; its error becomes the operation's.
+/// Called before each operation. If it returns an error, the operation fails with that error.
 pub type Gate = dyn Fn(Operation, &Path) -> io::Result<()> + Send + Sync;
 
-/// The file system, or a test's failing one, as a whole or within one folder.
+/// The file system, optionally limited to one folder. Tests can add a gate that makes operations fail.
 #[derive(Clone, Default)]
 pub struct Disk {
     gate: Option<Arc<Gate>>,
@@ -40,26 +40,30 @@ pub struct Disk {
 }
 
 impl Disk {
-    /// A disk whose operations fail when `gate` says so. A write that fails has written the first half.
+    /// Returns a disk whose operations fail if `gate` returns an error. A failed write still writes the first half of
+    /// its bytes.
     pub fn failing(gate: impl Fn(Operation, &Path) -> io::Result<()> + Send + Sync + 'static) -> Disk {
         Disk { gate: Some(Arc::new(gate)), root: None }
     }
 
-    /// The same disk within a folder, which must exist: below it no symbolic link is followed, and nothing outside of it
-    /// is written. Links on the way to the folder are followed, unless the disk is within a folder above it already.
+    /// Returns the same disk limited to a folder, which must exist. No symbolic link below the folder is followed, and
+    /// nothing outside of it is written.
+    ///
+    /// Links in the path of the folder are followed. A disk that is already limited to a parent folder keeps that
+    /// limit. In that case, the path is only checked for links.
     ///
     /// # Errors
-    /// The folder cannot be opened, or is a link in a folder that the disk is within.
+    /// The folder cannot be opened, or the disk is limited to a parent folder and the path contains a link.
     pub fn within(&self, folder: &Path) -> io::Result<Disk> {
         if let Some(root) = &self.root {
-            // One handle for all folders of a sweep: a process may have few.
+            // All folders of a sweep share one handle, because the number of open files per process is limited.
             root.entry(&folder.join("x"))?;
             return Ok(self.clone());
         }
         Ok(Disk { gate: self.gate.clone(), root: Some(Arc::new(Root::open(folder)?)) })
     }
 
-    /// The folder that the disk is within, if it is.
+    /// Returns the folder that the disk is limited to, if any.
     pub(super) fn root(&self) -> Option<&Root> {
         self.root.as_deref()
     }
@@ -68,7 +72,7 @@ impl Disk {
         self.gate.as_ref().map_or(Ok(()), |gate| gate(operation, path))
     }
 
-    /// A path's entry: below the disk's folder, or in whatever folder the path names.
+    /// Returns the entry of a path. Without a root folder, the path may be in any folder.
     pub(super) fn entry(&self, path: &Path) -> io::Result<FolderEntry> {
         match &self.root {
             Some(root) => root.entry(path),
@@ -80,10 +84,10 @@ impl Disk {
         }
     }
 
-    /// What has a path's name, if anything; a link is not followed.
+    /// Returns the type of the entry at a path, or `None` if there is none. Links are not followed.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn kind(&self, path: &Path) -> io::Result<Option<FileKind>> {
         match self.entry(path) {
             Ok(entry) => entry.kind(),
@@ -92,10 +96,10 @@ impl Disk {
         }
     }
 
-    /// Creates a folder and those above it.
+    /// Creates a folder and its missing parents.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn create_folder(&self, path: &Path) -> io::Result<()> {
         self.pass(Operation::CreateFolder, path)?;
         if let Some(root) = &self.root {
@@ -109,29 +113,29 @@ impl Disk {
         })
     }
 
-    /// A new file in the place of any other; a link that stands there is refused.
+    /// Creates a file and replaces any plain file at its path. A link is an error.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn create(&self, path: &Path) -> io::Result<Output> {
         self.remove(path)?;
         self.create_new(path)
     }
 
-    /// A new file, where nothing is yet.
+    /// Creates a file. Fails if the name is taken.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn create_new(&self, path: &Path) -> io::Result<Output> {
         self.pass(Operation::Create, path)?;
         let file = self.entry(path)?.create_new()?;
         Ok(Output { disk: self.clone(), path: path.into(), file })
     }
 
-    /// The file as it is up to `length` bytes, to be written on from there; a link to another file is refused.
+    /// Opens an existing file, truncates it to `length` bytes and continues writing from there. A link is an error.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn append(&self, path: &Path, length: u64) -> io::Result<Output> {
         let mut file = self.entry(path)?.write()?;
         self.pass(Operation::Truncate, path)?;
@@ -140,10 +144,10 @@ impl Disk {
         Ok(Output { disk: self.clone(), path: path.into(), file })
     }
 
-    /// Adds bytes to the end of a file, which is created if it is not there; gives the file, to bring it to the disk.
+    /// Appends bytes to a file, which is created if it is missing. Returns the file, so that the caller can flush it.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn extend(&self, path: &Path, bytes: &[u8]) -> io::Result<Output> {
         self.pass(Operation::Create, path)?;
         let file = self.entry(path)?.extend()?;
@@ -152,22 +156,22 @@ impl Disk {
         Ok(output)
     }
 
-    /// Gives a file new content: after a crash at any moment it has either all of the old or all of the new. Only one
-    /// process at a time may do so.
+    /// Replaces the content of a file. After a crash at any moment, the file has either all of the old content or all
+    /// of the new. Only one process at a time may replace a file.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn replace(&self, path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
-        // What a process left that was killed is in the way of none.
+        // A killed process may have left a temporary file, which is replaced.
         let open = |temporary: &Path| self.create(temporary);
         self.replace_by(path, temporary(path), open, content, || Ok(()))
     }
 
-    /// [`Disk::replace`] where others may do so at the same moment; `before` is called once the new content is on the
-    /// disk, before it gets its name.
+    /// Replaces a file like [`Disk::replace`], but several processes may do so at the same time. `before` is called
+    /// after the new content is on the disk and before the file gets its name.
     ///
     /// # Errors
-    /// What the system or `before` says.
+    /// Returns the error of the system or of `before`.
     pub fn replace_shared(
         &self,
         path: &Path,
@@ -181,7 +185,7 @@ impl Disk {
             let number = NEXT.fetch_add(1, Relaxed);
             let temporary = path.with_file_name(format!("{PREFIX}{}-{number}-{name}.tmp", std::process::id()));
             match self.create_new(&temporary) {
-                // Another machine may have a process of the same number.
+                // A process on another machine may have the same id.
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => continue,
                 Err(error) => return Err(error),
                 Ok(output) => taken = Some((temporary, output)),
@@ -208,16 +212,16 @@ impl Disk {
             self.rename(&temporary, path)
         };
         write().inspect_err(|_| {
-            // Whatever is left is cleared away with the next attempt.
+            // The first error is the one to report, so a failed removal is ignored.
             let _ = self.remove(&temporary);
         })
     }
 
-    /// Writes a file that the user named, whole or not at all; a link to a file is followed. What is no file (a device,
-    /// a pipe, `/dev/stdout`) is written to as it stands.
+    /// Writes a file that the user named, whole or not at all. A link to a file is followed. A device or a pipe, such
+    /// as `/dev/stdout`, is written to directly.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn deliver(&self, path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
         let there = fs::metadata(path);
         if there.as_ref().is_ok_and(|there| !there.is_file() && !there.is_dir()) {
@@ -226,7 +230,7 @@ impl Disk {
             return output.flush();
         }
         if there.is_ok() {
-            // A file that may not be written is not replaced either.
+            // A file without write permission must not be replaced.
             OpenOptions::new().write(true).open(path)?;
         }
         let path = &file::resolved(path);
@@ -234,7 +238,7 @@ impl Disk {
             return Err(io::Error::new(io::ErrorKind::NotFound, "there is no such folder; make it first"));
         }
         self.pass(Operation::Create, path)?;
-        // A name that nobody has: beside the user's own files none can be taken for a leftover.
+        // A random name, because the folder may contain any files of the user.
         let mut builder = tempfile::Builder::new();
         #[cfg(unix)]
         builder.permissions(match &there {
@@ -251,10 +255,10 @@ impl Disk {
         self.sync_folder(file::folder(path))
     }
 
-    /// Renames within a folder, for good.
+    /// Renames a file and flushes the new name to the disk.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
         self.pass(Operation::Rename, to)?;
         let target = self.entry(to)?;
@@ -263,10 +267,10 @@ impl Disk {
         target.sync_folder()
     }
 
-    /// Removes a file, if it is there.
+    /// Removes a file if it exists.
     ///
     /// # Errors
-    /// It is a link or a folder, or what the system says.
+    /// The entry is not a plain file, or the system returns an error.
     pub fn remove(&self, path: &Path) -> io::Result<()> {
         if self.kind(path)?.is_none() {
             return Ok(());
@@ -275,50 +279,50 @@ impl Disk {
         self.entry(path)?.remove()
     }
 
-    /// Opens a plain file to read it; a link is refused.
+    /// Opens a plain file for reading. A link is an error.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn read(&self, path: &Path) -> io::Result<File> {
         self.entry(path)?.read()
     }
 
-    /// Opens a file that stands for a lock, creating it if it is not there.
+    /// Opens a lock file, and creates it if it is missing.
     ///
     /// # Errors
-    /// It is a link or a folder, or what the system says.
+    /// The entry is not a plain file, or the system returns an error.
     pub fn open_lock(&self, path: &Path) -> io::Result<File> {
         self.entry(path)?.extend()
     }
 
-    /// Makes the names in a folder last, where the system can.
+    /// Flushes the names in a folder to the disk, if the system can.
     fn sync_folder(&self, path: &Path) -> io::Result<()> {
         self.pass(Operation::Flush, path)?;
         Root::open(path)?.entry(&path.join("x"))?.sync_folder()
     }
 }
 
-/// An error of a temporary file without its path, which is nobody's business.
+/// Removes the path of a temporary file from an error, because the user does not know that file.
 pub fn without_path(error: io::Error) -> io::Error {
     if error.get_ref().is_some() { error.kind().into() } else { error }
 }
 
-/// What the names of files begin with that have no content to be kept: only flotilla makes them.
+/// Prefix of the names of temporary files, which only flotilla creates.
 const PREFIX: &str = ".flotilla-";
 
-/// Where a file's next content is written until it is whole.
+/// Returns the path of the temporary file in which the new content of a file is written.
 pub fn temporary(path: &Path) -> PathBuf {
     let name = path.file_name().unwrap_or_default();
     let name = [PREFIX.as_ref(), name, ".tmp".as_ref()].into_iter().collect::<std::ffi::OsString>();
     path.with_file_name(name)
 }
 
-/// The name of the file whose [`temporary`] a path is, if it is one.
+/// Returns the name of the file to which a [`temporary`] path belongs, or `None` for other paths.
 pub fn of_temporary(path: &Path) -> Option<&str> {
     path.file_name()?.to_str()?.strip_prefix(PREFIX)?.strip_suffix(".tmp")
 }
 
-/// A file being written.
+/// A file that is being written.
 pub struct Output {
     disk: Disk,
     path: PathBuf,
@@ -326,24 +330,24 @@ pub struct Output {
 }
 
 impl Output {
-    /// Waits until all that was written is on the disk.
+    /// Waits until all written bytes are on the disk.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn sync(&self) -> io::Result<()> {
         self.disk.pass(Operation::Flush, &self.path)?;
         self.file.sync_all()
     }
 
-    /// Where it is.
+    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// The same file, to flush it from another thread.
+    /// Returns a second handle of the same file, so that another thread can flush it.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn share(&self) -> io::Result<Output> {
         Ok(Output { disk: self.disk.clone(), path: self.path.clone(), file: self.file.try_clone()? })
     }

@@ -1,94 +1,94 @@
-//! What was seen on a machine: the small file that `flotilla verify --report` writes. `docs/develop/evidence.md` is made of
-//! such.
+//! Record of a check on one machine. `flotilla verify --report` writes it as a small file, and
+//! `docs/develop/evidence.md` is generated from these files.
 
 use serde::{Deserialize, Serialize};
 
 use super::folder::now;
 
-/// Of the files' layout.
+/// Version of the file format.
 pub const SCHEMA: u32 = 1;
 
-/// What a file tells.
+/// Content of a report file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Sighting {
-    /// [`SCHEMA`].
+    /// Version of the file format, [`SCHEMA`].
     pub schema: u32,
-    /// How much it is worth.
+    /// Strength of the evidence.
     pub tier: Tier,
-    /// Day, UTC: "2026-01-31".
+    /// Date in UTC, such as "2026-01-31".
     pub date: String,
-    /// Of the program.
+    /// Version of the program.
     pub version: String,
-    /// What the program was built from, where that is known.
+    /// Commit that the program was built from, if known.
     pub commit: Option<String>,
-    /// What the program was built for: "x86_64-unknown-linux-gnu".
+    /// Target that the program was built for, such as "x86_64-unknown-linux-gnu".
     pub target: String,
-    /// The compiler that built it: "rustc 1.95.0 (…)".
+    /// Compiler that built the program, such as "rustc 1.95.0 (…)".
     pub toolchain: String,
-    /// What the processor calls itself, where the system says.
+    /// Name of the processor, if the system reports it.
     pub processor: Option<String>,
-    /// The widest instruction set that it was played by.
+    /// Widest instruction set that was used to play.
     pub instructions: Option<String>,
-    /// Anything else that was there: an emulator, a driver.
+    /// Other conditions, such as an emulator or a driver.
     pub note: Option<String>,
-    /// What was done and found besides comparing, in words.
+    /// Other actions and findings, as text.
     #[serde(default)]
     pub findings: Vec<String>,
-    /// Backends compared, bit by bit.
+    /// Backends that were compared bit by bit.
     #[serde(default)]
     pub comparisons: Vec<Compared>,
-    /// What short trainings came to.
+    /// Results of short trainings.
     #[serde(default)]
     pub trained: Vec<ShortTraining>,
 }
 
-/// How much a row is worth, the most first.
+/// Strength of the evidence, strongest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Tier {
-    /// It ran there, and the bits were compared.
+    /// The program ran there, and the bits were compared.
     Executed,
-    /// A driver's own compiler made code for it, which was read.
+    /// The driver's own compiler produced machine code, which was read.
     MachineCodeRead,
-    /// It compiles.
+    /// The program compiles for it.
     Compiled,
 }
 
-/// Episodes and trainings played on two sides.
+/// Comparison of episodes and trainings on two backends.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Compared {
-    /// What was compared: an adapter with its driver, or "cpu (AVX2)".
+    /// The compared processor: an adapter with its driver, or "cpu (AVX2)".
     pub adapter: String,
-    /// Where that is a GPU.
+    /// Compile pass of the shaders, for a GPU.
     pub pass: Option<String>,
-    /// How its shaders were made: `generic`, or `specialised` for each world.
+    /// How the shaders were compiled: `generic`, or `specialised` for each world.
     pub kernel: Option<String>,
-    /// What it was compared with: "cpu (SSE2)".
+    /// The reference processor, such as "cpu (SSE2)".
     pub against: String,
-    /// Worlds that were found equal.
+    /// Number of worlds with equal results.
     pub worlds: usize,
-    /// Steps of agents in these.
+    /// Number of agent steps in these worlds.
     pub agent_steps: u64,
-    /// Whether every bit was the same.
+    /// Whether all bits were equal.
     pub equal: bool,
-    /// What differs, or went wrong.
+    /// Description of a difference or an error.
     pub failure: Option<String>,
 }
 
-/// A training, and the digest that `flotilla train` prints of it.
+/// A short training and the digest that `flotilla train` prints for it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ShortTraining {
-    /// What was trained.
+    /// Name of the config.
     pub config: String,
-    /// SHA-256 of its results.
+    /// SHA-256 of the results.
     pub digest: String,
 }
 
 impl Sighting {
-    /// Of this program, today.
+    /// Creates a report of this program with today's date.
     pub fn new(tier: Tier) -> Sighting {
         Sighting {
             schema: SCHEMA,
@@ -107,10 +107,10 @@ impl Sighting {
         }
     }
 
-    /// Reads the text of such a file.
+    /// Reads the text of a report file.
     ///
     /// # Errors
-    /// What is wrong with it, in words.
+    /// Returns a description of the problem.
     pub fn parse(text: &str) -> Result<Sighting, String> {
         let found: Sighting = serde_json::from_str(text).map_err(|error| format!("it is no evidence: {error}"))?;
         match found.schema {
@@ -119,7 +119,7 @@ impl Sighting {
         }
     }
 
-    /// As a file holds it.
+    /// Returns the text of a report file.
     pub fn to_json(&self) -> String {
         let text = serde_json::to_string_pretty(self).expect("texts and numbers are JSON");
         format!("{text}\n")

@@ -1,4 +1,4 @@
-//! A run's folder: who may write in it, what is in it, and where a run in it goes on.
+//! The folder of a run: its lock, its files, and where a run in it resumes.
 
 use std::fmt;
 use std::fs::{self, File, TryLockError};
@@ -21,130 +21,131 @@ use crate::file;
 use crate::host;
 use crate::trainer::Row;
 
-/// Stands in a folder while a run from given policies begins in it, until `run.json` says so.
+/// Exists while a run from given policies starts in a folder, until `run.json` records those policies.
 const INIT_MARK: &str = ".init";
-/// Locked by whoever trains in the folder. The lock is the system's: it goes with the process, however that ends.
+/// Locked by the process that trains in the folder. The system releases the lock when the process ends, even after a
+/// crash.
 const LOCK: &str = ".lock";
-/// Most bytes in a `config.toml` that is kept where another takes its place.
+/// Maximum size in bytes of a `config.toml` that is kept before another replaces it.
 const MAX_KEPT_BYTES: u64 = 1 << 20;
 
-/// What to do with a folder that holds a run already.
+/// The way to treat a folder that already holds a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Start {
-    /// Refuse it.
+    /// Fail.
     Fresh,
-    /// Write over it.
+    /// Replace the run.
     Force,
-    /// Go on with it, or start it where there is none.
+    /// Resume the run, or start one if there is none.
     Resume,
 }
 
-/// `run.json`: what a run ran on, and how far it came.
+/// Content of `run.json`: the machine of a run and its progress.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Run {
-    /// Of the program.
+    /// Version of the program.
     pub version: String,
-    /// How far it came.
+    /// Progress of the run.
     pub state: Status,
-    /// Its config's.
+    /// Random seed in the config.
     pub seed: u64,
-    /// "cpu" or "gpu".
+    /// Backend, "cpu" or "gpu".
     pub backend: String,
-    /// What it runs on, in words.
+    /// Description of the backend.
     pub description: String,
-    /// The GPU, if one was used.
+    /// Name of the GPU, if one was used.
     pub adapter: Option<String>,
-    /// Its driver.
+    /// Driver of the GPU.
     pub driver: Option<String>,
-    /// Threads of the CPU that work.
+    /// Number of CPU threads that work.
     pub threads: usize,
-    /// UTC, of the first session's start.
+    /// Start of the first session, in UTC.
     pub started: String,
-    /// UTC, of this file's writing.
+    /// Time of the last write to this file, in UTC.
     pub updated: String,
-    /// Time trained in all sessions.
+    /// Training time of all sessions, in seconds.
     pub seconds: f64,
-    /// How often it was started or resumed.
+    /// Number of times that the run was started or resumed.
     pub sessions: u64,
-    /// Generations played, the random start included.
+    /// Number of generations played, including generation 0.
     pub generations: usize,
-    /// See [`RunSums::run`]; once the run is done.
+    /// See [`RunSums::run`]. Only for a finished run.
     pub digest: Option<String>,
-    /// What it was started with. Runs of earlier versions do not have it.
+    /// Config that the run was started with. Runs of earlier versions do not have it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub origin: Option<Origin>,
-    /// Digests of its files, once the run is done. Runs of earlier versions do not have them.
+    /// Digests of the files of a finished run. Runs of earlier versions do not have them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub files: Option<FileSums>,
-    /// [`policies::Init::digest`] of what it started from, if not at random.
+    /// [`policies::Init::digest`] of the policies that the run started from. `None` for a random start.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub init: Option<String>,
-    /// What the last session was started by, as a shell reads it.
+    /// Command of the last session, quoted for a shell.
     #[serde(default)]
     pub command: String,
-    /// The commit that the program was built from, where it was built from one.
+    /// Commit that the program was built from, if known.
     #[serde(default)]
     pub commit: Option<String>,
 }
 
-/// The config that a run was started with, which it keeps when it is resumed.
+/// Identity of the config that a run was started with. A resumed run keeps it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Origin {
-    /// [`config_digest`] of it.
+    /// [`config_digest`] of the config.
     pub config: String,
-    /// Its generations, which alone may grow.
+    /// Number of generations in the config. Only this value may grow.
     pub generations: usize,
 }
 
 impl Origin {
-    /// The origin of a run of a config.
+    /// Returns the origin of a run with this config.
     pub fn of(config: &Config) -> Origin {
         Origin { config: config_digest(config), generations: config.learning.generations }
     }
 
-    /// Whether a run that was started so may be resumed with a config.
+    /// Returns whether a run with this origin may be resumed with a config.
     fn allows(&self, config: &Config) -> bool {
         self.generations <= config.learning.generations
             && self.config == config_digest(&checkpoint::of_length(config, self.generations))
     }
 }
 
-/// Digests of a finished run's files.
+/// Digests of the files of a finished run.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FileSums {
-    /// See [`RunSums::metrics`].
+    /// Digest of `metrics.csv`. See [`RunSums::metrics`].
     #[serde(rename = "metrics.csv")]
     pub metrics: String,
-    /// The checksum that the file carries, see [`super::tensors`].
+    /// Checksum that is stored in the file itself. See [`super::tensors`].
     #[serde(rename = "policies.safetensors")]
     pub policies: String,
 }
 
-/// Digests of what a run came to.
+/// Digests of the results of a run.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RunSums {
-    /// SHA-256 of the metrics and then of every trial's policies, see [`Folder::digest`].
+    /// SHA-256 of the metrics and then of the policies of every trial. See [`Folder::digest`].
     pub run: String,
-    /// SHA-256 of `metrics.csv` without `seconds` and `stage`.
+    /// SHA-256 of `metrics.csv` without the columns `seconds` and `stage`.
     pub metrics: String,
 }
 
-/// How far a run came.
+/// Progress of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Status {
-    /// It trains, or was killed.
+    /// The run is training, or its process was killed.
     Running,
-    /// By a signal or an error, after saving.
+    /// The run stopped because of a signal or an error, after an attempt to save its state.
     Stopped,
-    /// It has played its last generation.
+    /// The run is finished.
     Done,
-    /// It takes the place of another run, whose files are not all gone yet: what is there counts for nothing.
+    /// The run replaces another one, some of whose files may remain. The files in the folder must not be used.
     Replacing,
 }
 
 impl Run {
-    /// A run that has not started yet.
+    /// Creates the record of a run that has not started yet.
     pub fn new(config: &Config) -> Run {
         Run {
             version: String::new(),
@@ -169,10 +170,10 @@ impl Run {
         }
     }
 
-    /// Reads `run.json`.
+    /// Reads `run.json` from a path.
     ///
     /// # Errors
-    /// It cannot be read, or is not what it should be.
+    /// The file cannot be read, has invalid content, or a newer version wrote it.
     pub fn read(path: &Path) -> Result<Run, RecordError> {
         let text = read_text(path, MAX_RUN_BYTES)?;
         Run::parse(&text).map_err(|reason| match newer_version(&text) {
@@ -181,21 +182,21 @@ impl Run {
         })
     }
 
-    /// Reads the text of a `run.json`.
+    /// Parses the text of `run.json`.
     ///
     /// # Errors
-    /// What is wrong with it, in words.
+    /// Returns a description of the problem.
     pub fn parse(text: &str) -> Result<Run, String> {
         serde_json::from_str(text).map_err(|error| format!("it is no record of a run: {error}"))
     }
 
-    /// The text of `run.json`.
+    /// Returns the text of `run.json`.
     pub fn to_json(&self) -> String {
         serde_json::to_string_pretty(self).expect("plain fields are JSON") + "\n"
     }
 }
 
-/// The version in the text of a `run.json`, if it is newer than this program's.
+/// Returns the version in the text of `run.json` if it is newer than this program.
 fn newer_version(text: &str) -> Option<String> {
     let numbers = |version: &str| -> Option<Vec<u64>> {
         version.split(['-', '+']).next()?.split('.').map(|number| number.parse().ok()).collect()
@@ -204,76 +205,76 @@ fn newer_version(text: &str) -> Option<String> {
     (numbers(&version)? > numbers(crate::VERSION)?).then_some(version)
 }
 
-/// What a run is told to start from.
+/// Policies from which a run should start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StartFrom<'a> {
-    /// Nothing was said: a run that is resumed keeps what it was started from.
+    /// Not specified: a resumed run keeps its own start.
     Unsaid,
-    /// Random policies, which is all that the run can have been started from.
+    /// Random policies. The caller knows that the run cannot have started from others.
     Random,
-    /// Policies with this [`policies::Init::digest`].
+    /// Given policies with this [`policies::Init::digest`].
     Policies(&'a str),
 }
 
 impl StartFrom<'_> {
-    /// The digest of the given policies.
+    /// Returns the digest of the given policies.
     fn digest(self) -> Option<String> {
         if let StartFrom::Policies(digest) = self { Some(digest.into()) } else { None }
     }
 }
 
-/// A folder that this process, and no other, trains in.
+/// A folder in which this process trains. No other process can, if the file system supports locks.
 pub struct Folder {
-    /// Where it is.
+    /// Path of the folder.
     pub path: PathBuf,
-    /// What it is written through.
+    /// Disk that writes in the folder.
     pub disk: Disk,
     lock: Option<File>,
 }
 
-/// Where a run goes on, and what there is to tell about it.
+/// State of a run that was found in its folder.
 pub struct Resumed {
-    /// The newest whole checkpoint, and metrics cut to where it stands.
+    /// Newest usable checkpoint, and the metrics truncated to match it.
     pub checkpoint: Option<(Checkpoint, metrics::Writer)>,
-    /// Generations of all checkpoints that may be used, oldest first.
+    /// Generations of all usable checkpoints, oldest first.
     pub kept: Vec<usize>,
-    /// `run.json` as the last session left it.
+    /// Content of `run.json` after the folder was opened.
     pub run: Option<Run>,
-    /// What the run came to, where it is done and all its files are as it left them; nothing else is looked at then.
+    /// Results of a finished run, if all its files match their digests. Checkpoints are not searched in that case.
     pub finished: Option<Story>,
-    /// What there is to tell.
+    /// Notes for the user.
     pub notes: Vec<Note>,
 }
 
-/// What was found in a folder, and what is done about it.
+/// Observation about a folder and the resulting action, for the user.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Note {
-    /// A checkpoint that cannot be used, for this reason.
+    /// A checkpoint cannot be used, for this reason.
     SetAside(String),
-    /// A small file that cannot be read, for this reason.
+    /// A small file cannot be read, for this reason.
     WrittenAnew(String),
-    /// The folder's config was written by hand, and another takes its place.
+    /// The text of `config.toml` was written by hand, and another text replaces it.
     ConfigKept {
-        /// Where what was there is from now on.
+        /// Path of the copy of the old text.
         path: PathBuf,
     },
-    /// A replacement of the run was interrupted.
+    /// The replacement of a run was interrupted.
     Replacing,
-    /// There is a whole checkpoint.
+    /// The run resumes from a checkpoint.
     GoingOn {
-        /// The one that plays next.
+        /// Generation that is played next.
         generation: usize,
     },
     /// None of the checkpoints can be used.
     StartingOver,
-    /// There are none.
+    /// There are no checkpoints.
     Starting,
-    /// The file system has no locks.
+    /// The file system does not support locks.
     NotLocked,
 }
 
 impl Note {
-    /// Returns whether a person has to know this: every resumed run has the other notes.
+    /// Returns whether the user must be warned. The other notes are normal for a resumed run.
     pub fn is_damage(&self) -> bool {
         matches!(self, Note::SetAside(_) | Note::WrittenAnew(_) | Note::StartingOver | Note::NotLocked)
     }
@@ -298,22 +299,26 @@ impl fmt::Display for Note {
     }
 }
 
-/// Where a run came from and to, `[trials]` each.
+/// Rows of a run's first and last generation, `[trials]` each.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Story {
-    /// Of the random start.
+    /// Rows of generation 0.
     pub first: Vec<Row>,
-    /// Of the last generation.
+    /// Rows of the last generation.
     pub last: Vec<Row>,
 }
 
 impl Folder {
-    /// Takes a folder for a run of a config, creating it where needed. What the run starts from is recorded before
-    /// anything else is written.
+    /// Opens a folder for a run of a config, and creates the folder if needed. The policies that the run starts from
+    /// are recorded before anything else is written.
     ///
     /// # Errors
-    /// It holds a run that must not be written over, is in use, belongs to another config or a newer version, started
-    /// from other or unknown policies, or needs those that it started from; or it cannot be written.
+    /// Fails in these cases:
+    ///
+    /// - The folder holds a run that must not be overwritten, or another process trains in it.
+    /// - The run belongs to another config or to a newer version.
+    /// - The run started from other or unknown policies, or needs the policies that it started from.
+    /// - The folder cannot be read or written.
     pub fn open(
         path: &Path,
         start: Start,
@@ -334,11 +339,12 @@ impl Folder {
         ownership::refuse_links(&disk, path)?;
         let mark = path.join(INIT_MARK);
         if from.digest().is_some() && !file::exists(&path.join(RUN)).map_err(RecordError::read(path))? {
-            // Whoever resumes a run that was killed before `run.json` was whole must not take random policies.
+            // If the process is killed before `run.json` is complete, a resumed run must not start from random
+            // policies.
             disk.create(&mark).map_err(RecordError::write(&mark))?;
         }
         let lock = lock(&disk, path)?;
-        // Only now is nobody else writing here.
+        // Another process may have written here before the lock was taken, so the check is repeated.
         let there = holds_run()?;
         let folder = Folder { path: path.into(), disk, lock };
         let mut found = Resumed { checkpoint: None, kept: vec![], run: None, finished: None, notes: vec![] };
@@ -367,15 +373,15 @@ impl Folder {
         folder.disk.remove(&mark).map_err(RecordError::write(&mark))?;
         let checkpoints = folder.file(CHECKPOINTS);
         folder.disk.create_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
-        // A file that says the same may be somebody's own, with comments.
+        // A config with the same content may have the user's comments, so it is not replaced.
         if Config::load(&folder.file(CONFIG)).ok().as_ref() != Some(config) {
             found.notes.extend(folder.write_config(config)?);
         }
         Ok((folder, found))
     }
 
-    /// Writes into `run.json` what a run starts from, unless it is there. A finished run that goes on is no longer
-    /// finished, so that nobody compares its files with digests that are about to be wrong.
+    /// Records in `run.json` what a run starts from. A finished run that is extended is marked as running, so that its
+    /// files are no longer compared with outdated digests.
     fn record_origin(&self, config: &Config, from: StartFrom<'_>, found: &mut Resumed) -> Result<(), RecordError> {
         let there = found.checkpoint.as_ref().and_then(|(checkpoint, _)| checkpoint.init.clone());
         let before = found.run.clone();
@@ -384,7 +390,7 @@ impl Folder {
         if run.state == Status::Done {
             run = Run { state: Status::Running, digest: None, files: None, ..run };
         }
-        // What an earlier version left out.
+        // Earlier versions did not write the origin.
         run.origin = run.origin.or_else(|| Some(Origin::of(config)));
         if before.as_ref() != Some(&run) {
             self.write_run(&run)?;
@@ -393,17 +399,17 @@ impl Folder {
         Ok(())
     }
 
-    /// Writes `config.toml`; a text that was written by hand is kept beside it, which the note says.
+    /// Writes `config.toml`. A text that was written by hand is copied first, and the returned note names the copy.
     ///
     /// # Errors
-    /// It cannot be written.
+    /// The file cannot be written.
     pub fn write_config(&self, config: &Config) -> Result<Option<Note>, RecordError> {
         let kept = self.keep_config()?;
         self.write_text(CONFIG, &config.to_toml())?;
         Ok(kept.map(|path| Note::ConfigKept { path }))
     }
 
-    /// Copies `config.toml` if it is another text than flotilla writes; gives where the copy is.
+    /// Copies `config.toml` unless flotilla wrote its text. Returns the path of the copy.
     fn keep_config(&self) -> Result<Option<PathBuf>, RecordError> {
         let Ok(text) = read_text(&self.file(CONFIG), MAX_KEPT_BYTES) else { return Ok(None) };
         if Config::parse(&text, CONFIG).is_ok_and(|config| config.to_toml() == text) {
@@ -417,7 +423,7 @@ impl Folder {
                     .map_err(RecordError::write(&path))?;
                 return Ok(Some(path));
             }
-            // Kept already, where what came after was interrupted.
+            // An interrupted session already made this copy.
             if read_text(&path, MAX_KEPT_BYTES).is_ok_and(|there| there == text) {
                 return Ok(Some(path));
             }
@@ -425,8 +431,8 @@ impl Folder {
         unreachable!("there are more numbers than files")
     }
 
-    /// Removes a run; whatever else is in the folder stays. From its first step on `run.json` says that the run is being
-    /// replaced, and by what.
+    /// Removes a run and keeps all other files in the folder. During the removal, `run.json` has the state `Replacing`
+    /// and the data of the new run.
     fn clear(&self, by: &Run, config: &Config, found: &mut Resumed) -> Result<(), RecordError> {
         self.write_run(&Run { state: Status::Replacing, ..by.clone() })?;
         let checkpoints = self.file(CHECKPOINTS);
@@ -438,14 +444,14 @@ impl Folder {
         for name in [CURVES, REPLAY] {
             ownership::withdraw(&self.disk, &self.file(name))?;
         }
-        // Replaced whole, since the new run may be read from it.
+        // The config is replaced as a whole, because the new run may have been read from it.
         if Config::load(&self.file(CONFIG)).ok().as_ref() != Some(config) {
             found.notes.extend(self.write_config(config)?);
         }
         self.write_run(&Run { state: Status::Running, ..by.clone() })
     }
 
-    /// Finds where the run goes on; what cannot go on is left as it is.
+    /// Finds the checkpoint from which the run resumes. Unusable checkpoints are renamed or removed.
     fn find(&self, config: &Config, from: StartFrom<'_>, found: &mut Resumed) -> Result<(), RecordError> {
         let (checkpoints, init) = (self.file(CHECKPOINTS), from.digest());
         let init = init.as_deref();
@@ -463,7 +469,7 @@ impl Folder {
         if found.finished.is_some() {
             return began.map_or(Ok(()), |there| self.started_alike(there, init));
         }
-        // Where nothing says otherwise, the file there was edited: it says the same as the config given.
+        // If the config file agrees with the given config but the origin does not, then the file was edited.
         let edited = || {
             let origin = found.run.as_ref()?.origin.as_ref().filter(|origin| !origin.allows(config))?;
             let (path, there, here) = (self.path.clone(), origin.generations, config.learning.generations);
@@ -480,7 +486,7 @@ impl Folder {
         let any = !kept.is_empty();
         while let Some(&generation) = kept.last() {
             let path = checkpoint::path(&checkpoints, generation);
-            // Those of an earlier version do not say how long their run was to be, but the config there does.
+            // Checkpoints of earlier versions lack the number of generations. The config in the folder has it.
             let reason = match checkpoint::read(&path, &self.file(POLICIES), before.as_ref().unwrap_or(config)) {
                 Ok(Some(checkpoint)) if checkpoint.is_of(config) => {
                     self.started_alike(checkpoint.init.clone(), init)?;
@@ -501,7 +507,8 @@ impl Folder {
                     return Err(RecordError::ConfigDiffers { path: self.path.clone(), differences });
                 }
                 Ok(None) => {
-                    // Only the end of a run leaves one, before the policies that belong to it or after others.
+                    // Only the end of a run writes such a checkpoint. Its policies were not written yet, or others
+                    // replaced them.
                     self.disk.remove(&path).map_err(RecordError::write(&path))?;
                     kept.pop();
                     continue;
@@ -538,13 +545,13 @@ impl Folder {
         Ok(())
     }
 
-    /// Refuses files that a newer version of the program wrote, before any of them is touched.
+    /// Fails if a newer version of the program wrote any of the files. Callers check this before they change a file.
     fn refuse_newer(&self, checkpoints: &Path) -> Result<(), RecordError> {
         let generations = checkpoint::list(checkpoints)?.into_iter();
         let files = generations.map(|generation| checkpoint::path(checkpoints, generation));
         for path in files.chain([self.file(POLICIES)]) {
             if let Some(version) = tensors::newer(&path) {
-                // Only checkpoints say which version wrote them.
+                // Only checkpoints contain the version that wrote them.
                 let recorded = || Some(Run::read(&self.file(RUN)).ok()?.version);
                 return Err(RecordError::Newer { path, version: version.or_else(recorded) });
             }
@@ -552,7 +559,7 @@ impl Folder {
         Ok(())
     }
 
-    /// Refuses other policies to start from than the run's own.
+    /// Fails if the given policies are not those that the run started from.
     fn started_alike(&self, there: Option<String>, here: Option<&str>) -> Result<(), RecordError> {
         match here {
             Some(here) if there.as_deref() != Some(here) => {
@@ -562,8 +569,8 @@ impl Folder {
         }
     }
 
-    /// Refuses another config than the one the run was started with, but for more generations; gives that one, where it
-    /// is there.
+    /// Fails if the given config differs from the one in the folder. Only more generations are allowed. Returns the
+    /// config in the folder, if it can be read.
     fn compare(&self, config: &Config, found: &mut Resumed, checkpoints: bool) -> Result<Option<Config>, RecordError> {
         let path = self.file(CONFIG);
         match Config::load(&path) {
@@ -597,23 +604,24 @@ impl Folder {
     /// Writes `run.json`.
     ///
     /// # Errors
-    /// It cannot be written.
+    /// The file cannot be written.
     pub fn write_run(&self, run: &Run) -> Result<(), RecordError> {
         self.write_text(RUN, &run.to_json())
     }
 
-    /// Where a file of the folder is.
+    /// Returns the path of a file in the folder.
     pub fn file(&self, name: &str) -> PathBuf {
         self.path.join(name)
     }
 
-    /// Reads the whole of the metrics of a finished run: where it came from and to, and its digests.
+    /// Reads all metrics of a finished run. Returns the first and the last generation, and the digests.
     ///
-    /// The digest is SHA-256 over `metrics.csv` without `seconds` (and `stage`), then over every trial's policies as in
-    /// their file (f32, little-endian). It is the same for all runs of a config, on any backend, however often resumed.
+    /// The run digest is the SHA-256 of `metrics.csv` without `seconds` and `stage`, then of the policies of every
+    /// trial as in their file (f32, little-endian). All runs of a config have the same digest, on any backend and after
+    /// any number of resumes.
     ///
     /// # Errors
-    /// The metrics cannot be read, or have not one row for every trial and generation.
+    /// The metrics cannot be read, or they do not have exactly one row per trial and generation.
     pub fn digest(&self, config: &Config, policies: &[impl AsRef<[f32]>]) -> Result<(Story, RunSums), RecordError> {
         let path = self.file(METRICS);
         let damaged = |reason: String| RecordError::damaged(&path, reason);
@@ -647,7 +655,7 @@ impl Folder {
         Ok((story, RunSums { run: hex(&hash.finalize()), metrics }))
     }
 
-    /// What a run that is done came to; none where its files are not all as it left them.
+    /// Returns the results of a finished run, or `None` if a file has changed since the run ended.
     fn finished(&self, run: &Run, config: &Config) -> Result<Option<Story>, RecordError> {
         let Some(digest) = run.digest.as_ref().filter(|_| run.state == Status::Done) else { return Ok(None) };
         if run.generations != config.learning.generations + 1 {
@@ -669,7 +677,8 @@ impl Folder {
         };
         match policies.and_then(|policies| self.digest(config, &policies)) {
             Ok((story, found)) => Ok(same(&found).then_some(story)),
-            // What is gone or damaged is made again; what cannot be read now may be whole.
+            // Missing or damaged files are written again. A file that cannot be read now may still be intact, so that
+            // is an error.
             Err(RecordError::Read { path, error }) if error.kind() != ErrorKind::NotFound => {
                 Err(RecordError::Read { path, error })
             }
@@ -678,10 +687,10 @@ impl Folder {
     }
 }
 
-/// Whether a folder holds anything of a run.
+/// Returns whether a folder contains any file of a run.
 ///
 /// # Errors
-/// The folder cannot be looked into.
+/// The folder cannot be read.
 pub fn holds_run(path: &Path) -> Result<bool, RecordError> {
     for name in [CONFIG, RUN, METRICS, POLICIES, CHECKPOINTS] {
         let name = path.join(name);
@@ -692,16 +701,16 @@ pub fn holds_run(path: &Path) -> Result<bool, RecordError> {
     Ok(false)
 }
 
-/// Where the text of a config is kept whose place another took.
+/// Returns the name of the copy of a replaced `config.toml`.
 fn numbered_config(number: usize) -> String {
     if number == 1 { "config.old.toml".into() } else { format!("config.old-{number}.toml") }
 }
 
-/// Whether runs may be started in folders, of which none is touched: none holds a run where it is not to be written
-/// over or gone on with, and where it is, nobody trains in it.
+/// Checks whether runs may be started in folders, without changing them. With `Start::Fresh`, no folder may hold a run.
+/// Otherwise no other process may train in them.
 ///
 /// # Errors
-/// The first folder that may not be used, or that cannot be looked into.
+/// One of the folders may not be used or cannot be read.
 pub(crate) fn check<'a>(
     disk: &Disk,
     folders: impl IntoIterator<Item = (&'a Path, &'a Config)>,
@@ -711,9 +720,10 @@ pub(crate) fn check<'a>(
         if ownership::holds_run(path, config)? && start == Start::Fresh {
             return Err(RecordError::Exists { path: path.into() });
         }
-        // Where there is no lock, nobody has one.
+        // Without a lock file, no process trains in the folder.
         if start != Start::Fresh && path.join(LOCK).exists() {
-            // Closing the file is not enough where a process being started has a copy of it for a moment.
+            // Closing the file may not release the lock, because a process that is being started can briefly hold a
+            // copy of the file.
             if let Some(lock) = lock(&disk.within(path).map_err(RecordError::write(path))?, path)? {
                 let _ = lock.unlock();
             }
@@ -724,17 +734,17 @@ pub(crate) fn check<'a>(
 
 impl Drop for Folder {
     fn drop(&mut self) {
-        // As in `check`.
+        // The lock is released explicitly for the same reason as in `check`.
         if let Some(lock) = &self.lock {
             let _ = lock.unlock();
         }
     }
 }
 
-/// Locks a folder for this process, as long as what this gives is kept; nothing where the file system has no locks.
+/// Locks a folder for this process while the returned file is open. Returns `None` if the file system has no locks.
 ///
 /// # Errors
-/// Another process has it, or it cannot be written.
+/// Another process holds the lock, or the file cannot be written.
 pub(crate) fn lock(disk: &Disk, path: &Path) -> Result<Option<File>, RecordError> {
     let name = path.join(LOCK);
     let file = disk.open_lock(&name).map_err(RecordError::write(&name))?;
@@ -746,19 +756,19 @@ pub(crate) fn lock(disk: &Disk, path: &Path) -> Result<Option<File>, RecordError
     }
 }
 
-/// Returns whether a lock failed because the file system has none: NFS without its lock service says `ENOLCK`.
+/// Returns whether the file system does not support locks. NFS without its lock service returns `ENOLCK`.
 fn has_no_locks(error: &io::Error) -> bool {
     const ENOLCK: i32 = if cfg!(target_os = "linux") { 37 } else { 77 };
     error.kind() == ErrorKind::Unsupported || cfg!(unix) && error.raw_os_error() == Some(ENOLCK)
 }
 
-/// What a folder holds many runs of, if it does: "a paper" or "a sweep".
+/// Returns "a paper" or "a sweep" if the folder contains the runs of one.
 pub fn collection(path: &Path) -> Option<&'static str> {
     let all = [(PAPER, "a paper"), (SWEEP, "a sweep")];
     all.into_iter().find(|(name, _)| path.join(name).exists()).map(|(_, what)| what)
 }
 
-/// The folder of the run, sweep or paper that a file is needed by, if it is one of theirs; pictures are not needed.
+/// Returns the folder of the run, sweep or paper that needs a file. Pictures and pages are not needed.
 pub fn owner(path: &Path) -> Option<PathBuf> {
     let path = file::resolved(path);
     let (folder, name) = (file::folder(&path), path.file_name()?.to_str()?);
@@ -775,10 +785,10 @@ pub fn owner(path: &Path) -> Option<PathBuf> {
     }
 }
 
-/// Creates and gives the one after the last of `stem`, `stem-2`, `stem-3`, … that exists.
+/// Creates the next folder after the last existing one of `stem`, `stem-2`, `stem-3`, … and returns its path.
 ///
 /// # Errors
-/// A folder cannot be created.
+/// The folder cannot be created.
 pub fn next_free(parent: &Path, stem: &str) -> Result<PathBuf, RecordError> {
     fs::create_dir_all(parent).map_err(RecordError::write(parent))?;
     let mut number = newest(parent, stem) + 1;
@@ -792,12 +802,12 @@ pub fn next_free(parent: &Path, stem: &str) -> Result<PathBuf, RecordError> {
     }
 }
 
-/// The last of `stem`, `stem-2`, … that exists, or else `stem`.
+/// Returns the last existing path of `stem`, `stem-2`, …, or `stem` if none exists.
 pub fn latest(parent: &Path, stem: &str) -> PathBuf {
     numbered(parent, stem, newest(parent, stem).max(1))
 }
 
-/// The largest number of those that exist; 0 without any.
+/// Returns the largest number of the existing folders, or 0 if there is none.
 fn newest(parent: &Path, stem: &str) -> usize {
     let number = |name: &str| match name.strip_prefix(stem)? {
         "" => Some(1),
@@ -811,7 +821,7 @@ fn numbered(parent: &Path, stem: &str, number: usize) -> PathBuf {
     parent.join(if number == 1 { stem.to_string() } else { format!("{stem}-{number}") })
 }
 
-/// The keys in which two configs differ, those without a say in the results left out.
+/// Returns a line for each key in which two configs differ. Keys without influence on the results are ignored.
 pub fn differences(old: &Config, new: &Config) -> Vec<String> {
     let table = |config: &Config| toml::Table::try_from(super::without_checkpoint(config)).unwrap_or_default();
     let (old, new) = (table(old), table(new));
@@ -844,12 +854,12 @@ fn shorten(value: &toml::Value) -> String {
     if text.len() > 60 { text.chars().take(60).chain(['…']).collect() } else { text }
 }
 
-/// Returns the current time, such as "2026-01-31T23:59:59Z".
+/// Returns the current time in UTC, such as "2026-01-31T23:59:59Z".
 pub fn now() -> String {
     timestamp(host::since_1970())
 }
 
-/// Returns a time since 1970 as text. A clock beyond the year 9999, the last of the format, counts as its last second.
+/// Formats a time since 1970. The format ends with the year 9999, so later times count as its last second.
 fn timestamp(since_1970: Duration) -> String {
     const LAST: Duration = Duration::from_secs(253_402_300_799);
     humantime::format_rfc3339_seconds(UNIX_EPOCH + since_1970.min(LAST)).to_string()

@@ -1,9 +1,10 @@
-//! `metrics.csv`: how every trial came on, generation by generation.
+//! `metrics.csv`: the scores of every trial in every generation.
 //!
-//! One line a trial and generation, generation by generation and in each trial by trial. G is in 0..1; `seconds` is the
-//! time trained until the line was complete, earlier sessions of a resumed run included. Where the config has stages, a
-//! last column `stage` tells of which a generation is, from 0: G is of that stage's POIs. All but `seconds` is the same
-//! bits on every backend.
+//! The file has one line per trial and generation, sorted by generation and then by trial. G is in 0..1. `seconds` is
+//! the training time until the line was complete, including earlier sessions of a resumed run.
+//!
+//! If the config has stages, a last column `stage` gives the stage of the generation, from 0. G then refers to the POIs
+//! of that stage. All columns except `seconds` have the same bits on every backend.
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
@@ -17,49 +18,49 @@ use crate::config::{Config, MAX_GENERATIONS, MAX_TRIALS};
 use crate::file;
 use crate::trainer::Row;
 
-/// The first line.
+/// Header of the file.
 pub const HEADER: &str = "trial,generation,best_g,mean_g,champion_g,seconds";
-/// The first line, where a config has stages.
+/// Header of the file if the config has stages.
 pub const STAGED: &str = "trial,generation,best_g,mean_g,champion_g,seconds,stage";
-/// Most bytes in one line.
+/// Maximum number of bytes per line.
 const MAX_LINE: u64 = 256;
 
-/// How far a file has come, to be found there again.
+/// Length and hash of a file at some moment. A resumed run uses them to find that place again.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Extent {
-    /// Its first so many.
+    /// Length in bytes.
     pub bytes: u64,
     /// SHA-256 of these bytes.
     pub sha256: String,
 }
 
 impl Extent {
-    /// The end of a text.
+    /// Returns the extent of a whole text.
     pub fn after(text: &str) -> Extent {
         Extent { bytes: text.len() as u64, sha256: hex(&Sha256::digest(text)) }
     }
 }
 
-/// The lines of a config's file, each with its end.
+/// Formatter for the lines of a config's file. Each line includes its line break.
 pub struct Lines {
-    /// The first generation of each stage after stage 0, and whether there is a column for it.
+    /// First generation of each stage after stage 0, and whether the file has the column `stage`.
     stages: Vec<usize>,
     staged: bool,
 }
 
 impl Lines {
-    /// How the lines of this config's runs are written.
+    /// Creates the formatter for runs of this config.
     pub fn of(config: &Config) -> Lines {
         let stages = config.stages.iter().map(|stage| stage.from).filter(|&from| from > 0).collect();
         Lines { stages, staged: !config.stages.is_empty() }
     }
 
-    /// The first line.
+    /// Returns the header.
     pub fn header(&self) -> String {
         format!("{}\n", if self.staged { STAGED } else { HEADER })
     }
 
-    /// A row's line; `seconds` is the time trained until it was complete.
+    /// Returns the line of a row. `seconds` is the training time until the row was complete.
     pub fn line(&self, row: &Row, seconds: f64) -> String {
         let stage = self.stages.partition_point(|&from| from <= row.generation);
         let stage = if self.staged { format!(",{stage}") } else { String::new() };
@@ -67,7 +68,7 @@ impl Lines {
     }
 }
 
-/// A file being written.
+/// A metrics file that is being written.
 pub struct Writer {
     output: BufWriter<Output>,
     bytes: u64,
@@ -76,10 +77,10 @@ pub struct Writer {
 }
 
 impl Writer {
-    /// Starts a file with its header, in the place of any other.
+    /// Creates a file with its header and replaces any other file.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn create(disk: &Disk, path: &Path, config: &Config) -> io::Result<Writer> {
         let output = BufWriter::new(disk.create(path)?);
         let mut writer = Writer { output, bytes: 0, hash: Sha256::new(), lines: Lines::of(config) };
@@ -88,17 +89,18 @@ impl Writer {
         Ok(writer)
     }
 
-    /// Goes on from a mark, dropping what was written after it; none where the file no longer is what was marked.
+    /// Continues a file at a mark and drops everything after it. Returns `None` if the file is missing or its content
+    /// up to the mark has changed.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn resume(disk: &Disk, path: &Path, mark: &Extent, config: &Config) -> io::Result<Option<Writer>> {
         let mut hash = Sha256::new();
         let mut file = match file::open(path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
             file => BufReader::new(file?).take(mark.bytes),
         };
-        // A run that ended before its stages came keeps their column.
+        // A run that was shortened to end before its later stages keeps the column `stage`.
         let mut first = Vec::new();
         file.by_ref().take(MAX_LINE).read_until(b'\n', &mut first)?;
         hash.update(&first);
@@ -123,26 +125,26 @@ impl Writer {
         self.output.write_all(line.as_bytes())
     }
 
-    /// Adds rows that became complete after so many seconds.
+    /// Adds rows that became complete after `seconds` of training.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn add(&mut self, rows: &[Row], seconds: f64) -> io::Result<()> {
         rows.iter().try_for_each(|row| self.write(&self.lines.line(row, seconds)))
     }
 
-    /// Hands all lines to the system, so that others can read them.
+    /// Passes all lines to the system, so that other processes can read them.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn flush(&mut self) -> io::Result<()> {
         self.output.flush()
     }
 
-    /// Where the file stands, and the file, for whoever has to see that this much of it is on the disk.
+    /// Returns the current extent, and the file, so that the caller can flush this part to the disk.
     ///
     /// # Errors
-    /// What the system says.
+    /// Returns the system's error.
     pub fn mark(&mut self) -> io::Result<(Extent, Output)> {
         self.output.flush()?;
         let sha256 = hex(&self.hash.clone().finalize());
@@ -150,23 +152,24 @@ impl Writer {
     }
 }
 
-/// A row's line without its seconds, which is the same bits on every backend.
+/// Returns the line of a row without its seconds. These bits are the same on every backend.
 fn shared(row: &Row) -> String {
     let Row { trial, generation, best_g, mean_g, champion_g, .. } = row;
     format!("{trial},{generation},{best_g},{mean_g},{champion_g}")
 }
 
-/// Whether a file begins as one of these, as far as it goes: its first line may be torn.
+/// Returns whether a file starts like a metrics file. The header may be incomplete.
 ///
 /// # Errors
-/// What the system says.
+/// Returns the system's error.
 pub fn begins(path: &Path) -> io::Result<bool> {
     let mut start = Vec::new();
     file::open(path)?.take("trial,generation,".len() as u64).read_to_end(&mut start)?;
     Ok(HEADER.as_bytes().starts_with(&start))
 }
 
-/// SHA-256 over rows as in a file, without their seconds, and then over policies: a run's digest.
+/// Returns the digest of a run: SHA-256 of its rows, formatted as in the file but without seconds, and then of its
+/// policies.
 pub fn digest(rows: impl Iterator<Item = Row>, policies: &[impl AsRef<[f32]>]) -> [u8; 32] {
     let mut hash = Sha256::new();
     for line in std::iter::once(without_last(HEADER).to_string()).chain(rows.map(|row| shared(&row))) {
@@ -177,37 +180,39 @@ pub fn digest(rows: impl Iterator<Item = Row>, policies: &[impl AsRef<[f32]>]) -
     hash.finalize().into()
 }
 
-/// What is wrong with a file's rows.
+/// Reason why the rows of a file are rejected.
 #[derive(Debug, thiserror::Error)]
 pub enum RowsError {
-    /// As the last line of a file that is still being written.
+    /// An incomplete or overlong line, such as the last line of a file that is still being written.
     #[error("line {0} is cut short or longer than {MAX_LINE} bytes")]
     CutShort(usize),
-    /// A line that is no row, or a row out of its place.
+    /// A line that is not a row, or a row in the wrong place.
     #[error("line {line} is not {what}")]
     Wrong {
-        /// From 1.
+        /// Line number, from 1.
         line: usize,
-        /// What should stand there.
+        /// The columns that the line should contain.
         what: String,
     },
-    /// The system's words.
+    /// The system returned an error.
     #[error("cannot be read: {0}")]
     Read(#[from] io::Error),
 }
 
-/// The rows of a file one by one, with the seconds of each; stops at the first that is wrong.
+/// Iterator over the rows of a file, each with its seconds. It stops at the first error.
 pub struct Rows<R> {
     source: R,
     line: usize,
     done: bool,
-    /// Whether lines have a stage after the seconds.
+    /// Whether each line has a stage after the seconds.
     staged: bool,
-    /// SHA-256 of every line without its seconds and its stage.
+    /// SHA-256 of all lines without their seconds and stages.
     hash: Sha256,
 }
 
 impl<R: BufRead> Rows<R> {
+    /// Reads the header of a metrics file.
+    ///
     /// # Errors
     /// The first line is not the header.
     pub fn new(source: R) -> Result<Rows<R>, RowsError> {
@@ -215,7 +220,7 @@ impl<R: BufRead> Rows<R> {
         match rows.line() {
             Ok(Some(header)) if header == HEADER => Ok(rows),
             Ok(Some(header)) if header == STAGED => {
-                // The first line's part, too, is that of any other file.
+                // The digest must not depend on the column `stage`, so the plain header is hashed.
                 let mut hash = Sha256::new();
                 hash.update(without_last(HEADER));
                 hash.update("\n");
@@ -266,13 +271,13 @@ impl<R: BufRead> Rows<R> {
         parse().map(Some).ok_or_else(|| self.wrong(format!("{header} with every G in 0..1")))
     }
 
-    /// SHA-256 over all that was read, without the seconds.
+    /// Returns the SHA-256 of all lines that were read, without seconds and stages.
     pub fn digest(self) -> Sha256 {
         self.hash
     }
 }
 
-/// A line without its last field.
+/// Returns a line without its last field.
 fn without_last(line: &str) -> &str {
     line.rsplit_once(',').map_or("", |(before, _)| before)
 }
@@ -294,10 +299,10 @@ impl<R: BufRead> Iterator for Rows<R> {
     }
 }
 
-/// Opens a run's metrics.
+/// Opens the metrics of a run.
 ///
 /// # Errors
-/// No such file, or another first line.
+/// The file is missing or has another header.
 pub fn open(path: &Path) -> Result<Rows<BufReader<File>>, RecordError> {
     let file = file::open(path).map_err(RecordError::read(path))?;
     Rows::new(BufReader::new(file)).map_err(|reason| RecordError::damaged(path, reason))

@@ -1,20 +1,20 @@
-//! What a run leaves on disk, and how it is found again after anything.
+//! Files of a run, and how a run is restored from them.
 //!
-//! | module | holds |
+//! | module | contents |
 //! |---|---|
-//! | [`beneath`] | a folder and what is below it, reached without following links |
-//! | [`disk`] | files replaced whole or not at all; the one place that writes, so that tests can make any write fail |
-//! | [`tensors`] | safetensors files under a checksum |
+//! | [`beneath`] | access to a folder and the entries below it without following links |
+//! | [`disk`] | atomic replacement of files; all writes use it, so that tests can make any write fail |
+//! | [`tensors`] | safetensors files with a checksum |
 //! | [`policies`] | `policies.safetensors` |
 //! | [`metrics`] | `metrics.csv` |
-//! | [`ownership`] | what may be written, replaced, renamed and deleted |
-//! | [`checkpoint`] | `checkpoints/`, written beside training |
-//! | [`folder`] | the run's folder, its lock and `run.json` |
-//! | [`digests`] | whether files are as `run.json` says |
-//! | [`evidence`] | what was seen on a machine, for `docs/develop/evidence.md` |
+//! | [`ownership`] | which files may be written, replaced, renamed and deleted |
+//! | [`checkpoint`] | `checkpoints/`, written during training |
+//! | [`folder`] | the folder of a run, its lock and `run.json` |
+//! | [`digests`] | comparison of files with the digests in `run.json` |
+//! | [`evidence`] | results of checks on a machine, for `docs/develop/evidence.md` |
 //!
-//! Every file that is read is taken as hostile: its size is checked before memory is taken, what it says is checked
-//! before it is used, and nothing in it names another file.
+//! Every file that is read is untrusted. Its size is checked before memory is allocated, and its values are checked
+//! before they are used. Nothing in it can name another file.
 
 use std::fmt::Display;
 use std::io;
@@ -37,139 +37,139 @@ pub mod ownership;
 pub mod policies;
 pub mod tensors;
 
-/// Why a run's files could not be written, read or used.
+/// Reason why the files of a run could not be written, read or used.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// What to do about it depends on the command.
+    /// A write failed. The command adds what the user can do.
     #[error("{path}: cannot be written: {error}", path = path.escaped())]
     Write {
-        /// The file or the folder.
+        /// Path of the file or folder.
         path: PathBuf,
-        /// The system's words.
+        /// Error that the system returned.
         error: io::Error,
     },
-    /// The system does not let it be read.
+    /// A read failed.
     #[error("{path}: cannot be read: {error}", path = path.escaped())]
     Read {
-        /// The file or the folder.
+        /// Path of the file or folder.
         path: PathBuf,
-        /// The system's words.
+        /// Error that the system returned.
         error: io::Error,
     },
-    /// The file is not what it should be; `reason` says in what.
+    /// A file has invalid content.
     #[error("{path}: {reason}", path = path.escaped())]
     Damaged {
-        /// The file or the folder.
+        /// Path of the file or folder.
         path: PathBuf,
-        /// What is wrong.
+        /// Description of the problem.
         reason: String,
     },
-    /// Policies of a trial that the file does not have.
+    /// The file has no policies of the requested trial.
     #[error("{path}: {reason}", path = path.escaped())]
     NoTrial {
-        /// The file or the folder.
+        /// Path of the file or folder.
         path: PathBuf,
-        /// What is wrong.
+        /// Description of the problem.
         reason: String,
     },
-    /// A run that would be written over.
+    /// The folder already holds a run, which would be overwritten.
     #[error("{path} holds a run already", path = path.escaped())]
     Exists {
-        /// The file or the folder.
+        /// Path of the folder.
         path: PathBuf,
     },
-    /// A file that flotilla did not make.
+    /// A file that flotilla did not create would be overwritten.
     #[error("{path} was not made by flotilla and would be overwritten", path = path.escaped())]
     NotOurs {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
     },
-    /// A folder of another user, to which the user did not ask to write.
+    /// The folder belongs to another user, and the user did not name it as the output folder.
     #[error("{path} belongs to another user, so nothing is written there", path = path.escaped())]
     OfAnotherUser {
-        /// The folder.
+        /// Path of the folder.
         path: PathBuf,
     },
-    /// A file where the folder should be.
+    /// A file has the path of the folder.
     #[error("{path} is a file", path = path.escaped())]
     NoFolder {
-        /// The file or the folder.
+        /// Path of the file.
         path: PathBuf,
     },
-    /// A run that has more generations than are asked for.
+    /// The run has more generations than requested.
     #[error("{path} is a run of {there} generations, which cannot become one of {here}", path = path.escaped())]
     Shorter {
-        /// The file or the folder.
+        /// Path of the folder.
         path: PathBuf,
-        /// Generations that it has.
+        /// Generations of the run.
         there: usize,
-        /// Generations asked for.
+        /// Requested generations.
         here: usize,
     },
-    /// Two processes would write the same files.
+    /// Another process already trains in the folder.
     #[error("another process is training in {path}", path = path.escaped())]
     Locked {
-        /// The file or the folder.
+        /// Path of the folder.
         path: PathBuf,
     },
-    /// A run that started from given policies, or that did not, cannot go on as if it had started from others.
+    /// The run started from other policies than those given, so it cannot be resumed with them.
     #[error("{path} {}, so it cannot go on as a run {}", started(there), started_from(here), path = path.escaped())]
     InitDiffers {
-        /// The file or the folder.
+        /// Path of the folder.
         path: PathBuf,
-        /// [`policies::Init::digest`] of what it started from, if not at random.
+        /// [`policies::Init::digest`] of the policies that the run started from. `None` for a random start.
         there: Option<String>,
-        /// The digest of what was given.
+        /// Digest of the given policies.
         here: String,
     },
-    /// A run that starts over needs the policies that it started from.
+    /// The run has no usable checkpoint, so it needs the policies that it started from.
     #[error("{path} {}, and has no checkpoint yet: it starts over from these alone", started(&Some(there.clone())), path = path.escaped())]
     InitNeeded {
-        /// The file or the folder.
+        /// Path of the folder.
         path: PathBuf,
-        /// [`policies::Init::digest`] of these.
+        /// [`policies::Init::digest`] of these policies.
         there: String,
     },
-    /// A run that was started from nobody knows what.
+    /// It is not known which policies the run started from.
     #[error("{path}: its run.json is missing or damaged, so it is not known what policies this run started from")]
     OriginUnknown {
-        /// The folder.
+        /// Path of the folder.
         path: PathBuf,
     },
-    /// A config that was changed after its run was started.
+    /// The config was changed after the run was started.
     #[error("{path}: it is not the config that this run was started with (run.json has another digest)")]
     Edited {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
     },
-    /// A file that is not as the run left it.
+    /// The file has changed since the run wrote it.
     #[error("{path}: it is not as the run left it (run.json has another digest)")]
     Differs {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
     },
-    /// A file of a newer version of the program.
+    /// A newer version of the program wrote the file.
     #[error(
         "{path}: it was written by {}, in a format that is newer than this version ({}) reads",
         by(version),
         crate::VERSION
     )]
     Newer {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The version that wrote it, if that is known.
+        /// Version that wrote the file, if known.
         version: Option<String>,
     },
-    /// A run that cannot go on under the config given.
+    /// The run cannot be resumed with the given config.
     #[error(
         "{path} is a run of another config, so it cannot go on with this one; what differs:\n{}",
         differences.join("\n"),
         path = path.escaped()
     )]
     ConfigDiffers {
-        /// The file or the folder.
+        /// Path of the folder.
         path: PathBuf,
-        /// A line for each key.
+        /// One line for each key.
         differences: Vec<String>,
     },
 }
@@ -189,7 +189,7 @@ fn started_from(digest: &str) -> String {
     format!("from the file with SHA-256 {}", brief(digest))
 }
 
-/// The start of a digest, enough to tell files apart.
+/// Returns the start of a digest, which is enough to distinguish files.
 fn brief(digest: &str) -> String {
     digest.chars().take(16).chain(['…']).collect()
 }
@@ -208,7 +208,7 @@ impl RecordError {
     }
 }
 
-/// A small text file, refused where it is larger than `most` bytes.
+/// Reads a text file of at most `most` bytes.
 fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
     let file = file::open(path).map_err(RecordError::read(path))?;
     file::text(file, most).map_err(|error| match error {
@@ -217,8 +217,8 @@ fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
     })
 }
 
-/// Keys that came later, at their defaults: they are left out of a config's digest, so that a run of an earlier version
-/// can go on.
+/// Keys of later versions with their default values. A config's digest omits these lines, so that runs of earlier
+/// versions can be resumed.
 const LATER: [&str; 10] = [
     "observers = \"all\"\n",
     "windows = []\n",
@@ -232,19 +232,19 @@ const LATER: [&str; 10] = [
     "parents = \"all\"\n",
 ];
 
-/// SHA-256 of all of a config that has a say in the results.
+/// Returns the SHA-256 of the part of a config that affects results.
 pub fn config_digest(config: &Config) -> String {
     let text = without_checkpoint(config).to_toml();
     let lines: String = text.split_inclusive('\n').filter(|line| !LATER.contains(line)).collect();
     hex(&Sha256::digest(lines))
 }
 
-/// The config with `[checkpoint]`, which may differ between sessions of one run, at its defaults.
+/// Returns the config with the default `[checkpoint]`, because that section may differ between sessions of a run.
 pub fn without_checkpoint(config: &Config) -> Config {
     Config { checkpoint: config::Saving::default(), ..config.clone() }
 }
 
-/// Lowercase hexadecimal.
+/// Formats bytes as lowercase hexadecimal.
 pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }

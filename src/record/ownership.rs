@@ -1,12 +1,13 @@
-//! What flotilla may write, replace, rename and delete: everything that writes in a folder of its own asks here.
+//! Rules for which files flotilla may write, replace, rename and delete. All code that writes in one of flotilla's
+//! folders uses this module.
 //!
-//! - Below such a folder no symbolic link is followed ([`enter`], [`Disk::within`]).
-//! - A folder that belongs to another user is written in only if the user named it as the place to write.
-//! - A run's own files (config, metrics, policies, checkpoints, `run.json`) may be replaced in a folder that holds a run,
-//!   which `run.json` or a checkpoint says ([`holds_run`]).
-//! - What is made of runs (pictures, pages, tables) is written by [`publish`], which first notes its SHA-256 in [`LIST`].
-//!   A file may be replaced or deleted only if it still is what that list says.
-//! - A file that the user named is the user's own choice, and does not ask here.
+//! - No symbolic link below such a folder is followed ([`enter`], [`Disk::within`]).
+//! - A folder of another user is written to only if the user named it as the output folder.
+//! - The files of a run (config, metrics, policies, checkpoints, `run.json`) may be replaced if the folder holds a run.
+//!   A valid `run.json` or checkpoint shows that ([`holds_run`]).
+//! - [`publish`] writes files made from runs (pictures, pages, tables). It first records their SHA-256 in [`LIST`].
+//!   Such a file may be replaced or deleted only if its content is still in that list.
+//! - Files that the user named are not subject to these rules.
 
 use std::collections::BTreeMap;
 use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
@@ -21,42 +22,42 @@ use super::{RecordError, checkpoint, hex, metrics, policies, read_text, tensors,
 use crate::config::Config;
 use crate::file;
 
-/// The config, every key written out.
+/// The config with every key.
 pub const CONFIG: &str = "config.toml";
-/// What the run is and what became of it, see [`super::folder::Run`].
+/// Description and state of the run. See [`super::folder::Run`].
 pub const RUN: &str = "run.json";
-/// See [`super::metrics`].
+/// Scores of every trial in every generation. See [`super::metrics`].
 pub const METRICS: &str = "metrics.csv";
-/// See [`super::policies`].
+/// Policies that the run learned. See [`super::policies`].
 pub const POLICIES: &str = "policies.safetensors";
-/// The folder of [`super::checkpoint`]s.
+/// Folder of the [`super::checkpoint`]s.
 pub const CHECKPOINTS: &str = "checkpoints";
-/// What marks a folder as a paper's, and the folder of its runs.
+/// File that marks a folder as the folder of a paper.
 pub const PAPER: &str = "paper.toml";
-/// The folder of a paper's runs.
+/// Folder of the runs of a paper.
 pub const ARMS: &str = "arms";
-/// In a sweep's folder: the sweep as it was run, and its tables.
+/// The sweep as it was run. This file marks a folder as the folder of a sweep.
 pub const SWEEP: &str = "sweep.toml";
-/// A sweep's rows, one a trial.
+/// Results of a sweep, one line per trial.
 pub const RESULTS: &str = "results.csv";
-/// A sweep's points, one a line.
+/// Points of a sweep, one per line.
 pub const POINTS: &str = "points.csv";
-/// Pictures and pages of a run in its folder.
+/// Training curves in the folder of a run.
 pub const CURVES: &str = "curves.svg";
-/// See [`CURVES`].
+/// Replay page in the folder of a run.
 pub const REPLAY: &str = "replay.html";
-/// The list of what was made of runs: a line each, SHA-256 and name, as `sha256sum` has it.
+/// List of the files made from runs. Each line has SHA-256 and name, in the format of `sha256sum`.
 pub const LIST: &str = ".flotilla.sha256";
-/// Most bytes in `run.json`.
+/// Maximum size of `run.json` in bytes.
 pub(super) const MAX_RUN_BYTES: u64 = 1 << 16;
-/// Most bytes in [`LIST`].
+/// Maximum number of bytes that are read from [`LIST`].
 const MAX_LIST_BYTES: u64 = 1 << 24;
 
-/// Enters a folder to write in it: below it no symbolic link is followed. `named` is whether the user named the folder as
-/// the place to write.
+/// Prepares a folder for writing. No symbolic link below it is followed. `named` is true if the user named the folder
+/// as the output folder.
 ///
 /// # Errors
-/// It cannot be opened, or belongs to another user and was not named.
+/// The folder cannot be opened, or it belongs to another user and was not named.
 pub fn enter(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordError> {
     let inside = disk.within(folder).map_err(RecordError::write(folder))?;
     let owners = inside.root().map_or(Ok(None), |root| root.owners()).map_err(RecordError::write(folder))?;
@@ -68,12 +69,12 @@ pub fn enter(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordErro
     }
 }
 
-/// Whether a user may write in an owner's folder.
+/// Returns whether a user may write in the folder of an owner.
 pub fn may_enter(owner: u32, user: u32, named: bool) -> bool {
     named || owner == user
 }
 
-/// The facts that every `run.json` of any version has.
+/// Fields that every version of `run.json` has.
 #[derive(Deserialize)]
 #[expect(dead_code, reason = "that they are there is what counts")]
 struct RunMark {
@@ -82,10 +83,10 @@ struct RunMark {
     seed: u64,
 }
 
-/// Whether a folder holds a run, by its `run.json` or a checkpoint, or what is left of one of this config.
+/// Returns whether a folder holds a run, shown by a `run.json`, a checkpoint or leftover files of a run of this config.
 ///
 /// # Errors
-/// It holds no run, but a file that one would replace; or it cannot be looked into.
+/// The folder has a file that a run would replace but holds no run, or it cannot be read.
 pub fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordError> {
     let there = |name: &str| {
         let path = folder.join(name);
@@ -112,7 +113,7 @@ pub fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordError> {
         return refuse(path);
     }
     if let Some(path) = there(CONFIG)? {
-        // One that says the same is what a run may start from.
+        // A run may start from a config with the same content.
         match Config::load(&path) {
             Ok(there) if without_checkpoint(&there) == without_checkpoint(config) => {}
             _ => return refuse(path),
@@ -134,10 +135,10 @@ pub fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordError> {
     Ok(left)
 }
 
-/// Refuses a run's folder in which one of the run's own names is a link, before anything in it is touched.
+/// Fails if one of the run's own files is a link. Callers check this before they change anything.
 ///
 /// # Errors
-/// The first such name; or the folder cannot be looked into.
+/// A file of the run is a link, or the folder cannot be read.
 pub fn refuse_links(disk: &Disk, folder: &Path) -> Result<(), RecordError> {
     for path in [RUN, CONFIG, METRICS, POLICIES, CHECKPOINTS].map(|name| folder.join(name)) {
         if disk.kind(&path).map_err(RecordError::write(&path))? == Some(FileKind::Link) {
@@ -147,10 +148,10 @@ pub fn refuse_links(disk: &Disk, folder: &Path) -> Result<(), RecordError> {
     Ok(())
 }
 
-/// Refuses to write what is made of runs where a file of that name was not made by flotilla, or not left as it was.
+/// Fails if one of the files exists and flotilla did not create it, or its content has changed.
 ///
 /// # Errors
-/// The first such file; or a folder cannot be looked into.
+/// A file may not be replaced, or a folder cannot be read.
 pub fn check<P: AsRef<Path>>(disk: &Disk, paths: impl IntoIterator<Item = P>) -> Result<(), RecordError> {
     let mut lists = BTreeMap::new();
     for path in paths {
@@ -167,10 +168,10 @@ pub fn check<P: AsRef<Path>>(disk: &Disk, paths: impl IntoIterator<Item = P>) ->
     Ok(())
 }
 
-/// Writes a file that is made of runs, whole or not at all.
+/// Writes a file made from runs, whole or not at all.
 ///
 /// # Errors
-/// A file of that name was not made by flotilla, or not left as it was; or the file cannot be written.
+/// A file of that name was not created by flotilla or has changed, or the file cannot be written.
 pub fn publish(
     disk: &Disk,
     path: &Path,
@@ -181,23 +182,23 @@ pub fn publish(
     let listed = listed(disk, folder)?;
     let hash = std::cell::RefCell::new(Sha256::new());
     let content = |output: &mut dyn Write| content(&mut Hashing { output, hash: &mut hash.borrow_mut() });
-    // Listed before it is there: a crash in between leaves a line too many, which harms nobody.
+    // The digest is listed before the file gets its name. A crash in between leaves only an unused line.
     let list = || {
         let line = line(&hex(&hash.borrow().clone().finalize()), path);
         if listed.contains(&line) {
             return Ok(());
         }
-        // A crash may have cut the last line short.
+        // A crash may have left an incomplete last line.
         let torn = listed.last().is_some_and(|last| !last.ends_with('\n'));
         disk.extend(&folder.join(LIST), format!("{}{line}", if torn { "\n" } else { "" }).as_bytes())?.sync()
     };
     disk.replace_shared(path, content, list).map_err(RecordError::write(path))
 }
 
-/// Deletes a file that is made of runs; one that flotilla did not make, or that was changed, stays.
+/// Deletes a file made from runs. A file that flotilla did not create, or that has changed, is kept.
 ///
 /// # Errors
-/// It cannot be deleted, or looked at.
+/// The file cannot be read or deleted.
 pub fn withdraw(disk: &Disk, path: &Path) -> Result<(), RecordError> {
     match check(disk, [path]) {
         Ok(()) => disk.remove(path).map_err(RecordError::write(path)),
@@ -206,7 +207,7 @@ pub fn withdraw(disk: &Disk, path: &Path) -> Result<(), RecordError> {
     }
 }
 
-/// Whether flotilla drew a picture, by what it holds: an SVG or a PNG.
+/// Returns whether the content of a file is an SVG or PNG that flotilla drew.
 pub fn is_drawing(path: &Path) -> bool {
     let mut start = Vec::new();
     let read = file::open(path).and_then(|file| file.take(1 << 12).read_to_end(&mut start));
@@ -216,15 +217,15 @@ pub fn is_drawing(path: &Path) -> bool {
     read.is_ok() && (svg || start.starts_with(b"\x89PNG") && holds(SOFTWARE))
 }
 
-/// The text chunk of a PNG that says what drew it.
+/// PNG text chunk that names flotilla as the software.
 const SOFTWARE: &[u8] = b"tEXtSoftware\0flotilla";
 
-/// A line of [`LIST`].
+/// Returns the line of a file in [`LIST`].
 fn line(digest: &str, path: &Path) -> String {
     format!("{digest}  {}\n", path.file_name().unwrap_or_default().to_string_lossy())
 }
 
-/// The lines of a folder's [`LIST`].
+/// Reads the lines of the [`LIST`] in a folder.
 fn listed(disk: &Disk, folder: &Path) -> Result<Vec<String>, RecordError> {
     let path = folder.join(LIST);
     let list = match disk.read(&path) {
@@ -240,12 +241,12 @@ fn listed(disk: &Disk, folder: &Path) -> Result<Vec<String>, RecordError> {
     Ok(lines)
 }
 
-/// SHA-256 of a file, if it is there.
+/// Returns the SHA-256 of a file, or `None` if it does not exist.
 fn digest(disk: &Disk, path: &Path) -> Result<Option<String>, RecordError> {
     if disk.kind(path).map_err(RecordError::write(path))?.is_none() {
         return Ok(None);
     }
-    // A link, a folder or a pipe could not be written either.
+    // A link, a folder or a pipe is an error, because it could not be replaced either.
     let mut there = disk.read(path).map_err(RecordError::write(path))?;
     let mut hash = Sha256::new();
     let mut chunk = vec![0; 1 << 16];
@@ -257,7 +258,7 @@ fn digest(disk: &Disk, path: &Path) -> Result<Option<String>, RecordError> {
     }
 }
 
-/// Takes all that is written into a digest.
+/// Writer that also hashes all bytes it writes.
 struct Hashing<'a> {
     output: &'a mut dyn Write,
     hash: &'a mut Sha256,

@@ -1,9 +1,11 @@
-//! `policies.safetensors`: what a run learned.
+//! `policies.safetensors`: the policies that a run learned.
 //!
-//! One f32 tensor `weights.N` a trial, `[leaders, policies, parameters]`, or `[1, policies, parameters]` where all
-//! leaders share a policy; best policy first in each population, so that the team of all first policies is the trial's
-//! champion; metadata `layers` is the policies' network, "8,10,2", and `config` the digest of the config that they were
-//! trained by. Other programs may write such files too, also with a single tensor `weights`.
+//! The file has one f32 tensor `weights.N` per trial, `[leaders, policies, parameters]`. The first size is 1 if all
+//! leaders share a policy. Each population is sorted with the best policy first. The first policies of all populations
+//! therefore form the champion team of the trial.
+//!
+//! The metadata key `layers` is the shape of the network, such as "8,10,2". The key `config` is the digest of the
+//! config of the training. Other programs may write such files too, also with a single tensor `weights`.
 
 use std::collections::BTreeMap;
 use std::io::{self, Read, Seek, Write};
@@ -20,26 +22,26 @@ use crate::escape;
 use crate::evolve::{MAX_WEIGHT, admit};
 
 const KIND: &str = "policies 1";
-/// The tensor of a file for all trials.
+/// Name of a tensor that applies to all trials.
 const ALL: &str = "weights";
-/// Metadata: [`super::config_digest`] of the config.
+/// Metadata key of the config's [`super::config_digest`].
 pub(super) const CONFIG: &str = "config";
 
 /// Policies of one trial.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Policies {
-    /// How many each leader has.
+    /// Number of policies per leader.
     pub policies: usize,
-    /// `[leaders][policies][parameters]`, or `[1][policies][parameters]` for all leaders.
+    /// Parameters, `[leaders][policies][parameters]`, or `[1][policies][parameters]` if all leaders share a policy.
     pub weights: Vec<f32>,
 }
 
-/// What the tensor of a trial is called.
+/// Returns the name of the tensor of a trial.
 fn tensor(trial: usize) -> String {
     format!("weights.{trial}")
 }
 
-/// Widths of a config's policies, "8,10,2".
+/// Returns the layer widths of a config's policies, such as "8,10,2".
 pub fn layers(config: &Config) -> String {
     config.policy.widths().iter().map(ToString::to_string).collect::<Vec<_>>().join(",")
 }
@@ -48,7 +50,7 @@ pub fn layers(config: &Config) -> String {
 /// checksum.
 ///
 /// # Errors
-/// The file cannot be written; the one before it is then still there.
+/// The file cannot be written. The previous file remains in that case.
 pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f32]>]) -> Result<String, RecordError> {
     let mut checksum = String::new();
     let content = |output: &mut dyn Write| put(output, config, trials).map(|sum| checksum = sum);
@@ -56,21 +58,21 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
     Ok(checksum)
 }
 
-/// Whether a file can be read and says that it is of a run of this config.
+/// Returns whether a file can be read and belongs to a run of this config.
 pub fn are_of(path: &Path, config: &Config) -> bool {
     mark(path).0 == Some(super::config_digest(config))
 }
 
-/// The digest of the config that a file says it is of, and its checksum; none where it does not say so or cannot be read.
+/// Returns the config digest and the checksum in a file. Each is `None` if it is missing or the file cannot be read.
 pub fn mark(path: &Path) -> (Option<String>, Option<String>) {
     let Ok(file) = tensors::open(path) else { return (None, None) };
     (file.metadata(CONFIG).map(String::from), file.checksum().map(String::from))
 }
 
-/// Writes what such a file holds into a stream. Returns its checksum.
+/// Writes the content of such a file to a stream. Returns its checksum.
 ///
 /// # Errors
-/// The stream refuses it.
+/// Returns the stream's error.
 pub fn put(output: &mut dyn Write, config: &Config, trials: &[impl AsRef<[f32]>]) -> io::Result<String> {
     let shape = vec![config.populations(), config.learning.population, config.parameters()];
     let of_trial = |(trial, weights)| Tensor::floats(tensor(trial), shape.clone(), [weights]);
@@ -80,11 +82,11 @@ pub fn put(output: &mut dyn Write, config: &Config, trials: &[impl AsRef<[f32]>]
     tensors::put(output, KIND, &metadata, &tensors)
 }
 
-/// Reads the policies of one trial for teams of a config: tensor `weights.N`, or without a number `weights`, else
-/// `weights.0`. A policy that all leaders share fits any number of them.
+/// Reads the policies of one trial for teams of a config. Trial N is read from the tensor `weights.N`. Without a trial,
+/// the tensor is `weights`, or else `weights.0`. A policy that all leaders share fits any number of leaders.
 ///
 /// # Errors
-/// No such file, damage, another shape than the config's, or weights that no policy may have.
+/// The file is missing or damaged, its shape does not match the config, or its weights are not allowed.
 pub fn read(path: &Path, config: &Config, trial: Option<usize>) -> Result<Policies, RecordError> {
     let mut file = tensors::open(path)?;
     from_file(&mut file, config, &[config.learners(), 1], trial).map_err(|reason| match trial {
@@ -95,17 +97,17 @@ pub fn read(path: &Path, config: &Config, trial: Option<usize>) -> Result<Polici
     })
 }
 
-/// What a run starts from, in place of policies drawn at random.
+/// Initial policies of a run, instead of random ones.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Init {
     /// SHA-256 of the file.
     pub digest: String,
-    /// A trial each, of as many populations as the config has.
+    /// Policies of each trial. Each has as many populations as the config.
     pub trials: Vec<Policies>,
 }
 
-/// Reads what all trials of a config start from: trial i from tensor `weights.i`, or where there is none from
-/// `weights`.
+/// Reads the initial policies of all trials of a config. Trial i is read from the tensor `weights.i`, or from `weights`
+/// if there is no `weights.i`.
 ///
 /// # Errors
 /// See [`read`].
@@ -123,7 +125,7 @@ pub fn read_init(path: &Path, config: &Config) -> Result<Init, RecordError> {
     Ok(Init { digest: super::hex(&hash.finalize()), trials })
 }
 
-/// Takes what is written into a digest.
+/// Writer that only hashes what is written.
 struct HashWriter<'a>(&'a mut Sha256);
 
 impl Write for HashWriter<'_> {
@@ -137,10 +139,10 @@ impl Write for HashWriter<'_> {
     }
 }
 
-/// Reads the policies of all trials of a config's own training.
+/// Reads the policies of all trials that a run of this config wrote.
 ///
 /// # Errors
-/// See [`read`]; or they are not as many as the config's populations have.
+/// See [`read`]. It is also an error if the number of policies is not the config's population size.
 pub fn read_all(path: &Path, config: &Config) -> Result<Vec<Vec<f32>>, RecordError> {
     let mut file = tensors::open(path)?;
     let trial = |trial| {
@@ -157,18 +159,18 @@ pub fn read_all(path: &Path, config: &Config) -> Result<Vec<Vec<f32>>, RecordErr
         .map_err(|reason| RecordError::damaged(path, reason))
 }
 
-/// [`read`], from anything.
+/// Reads like [`read`], from any source.
 ///
 /// # Errors
-/// What is wrong, in words.
+/// Returns a description of the problem.
 pub fn from_source(source: impl Read + Seek, config: &Config, trial: Option<usize>) -> Result<Policies, String> {
     from_file(&mut TensorFile::open(source)?, config, &[config.learners(), 1], trial)
 }
 
-/// [`read`], from a file that is open, which has one of so many populations.
+/// Reads like [`read`], from an open file. `populations` lists the accepted numbers of populations.
 ///
 /// # Errors
-/// What is wrong, in words.
+/// Returns a description of the problem.
 pub fn from_file(
     file: &mut TensorFile<impl Read + Seek>,
     config: &Config,

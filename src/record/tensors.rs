@@ -1,8 +1,11 @@
-//! Safetensors files under a checksum.
+//! Safetensors files with a checksum.
 //!
-//! Such a file is plain safetensors to every other program. Its metadata has `flotilla`, which says what the file is
-//! and in which version, and `sha256`, the checksum of the whole file with that checksum's 64 digits set to 0. Files
-//! of other programs have neither, and are read without a check; a damaged byte cannot hide both.
+//! Other programs can read such a file as plain safetensors. Its metadata has two more keys. `flotilla` gives the kind
+//! of the file and the version of its format. `sha256` is the checksum of the whole file, computed with the 64 digits
+//! of the checksum set to 0.
+//!
+//! Files of other programs have neither key and are read without a check. A single damaged byte cannot hide both keys,
+//! so it cannot disable the check.
 
 use std::collections::BTreeMap;
 use std::io::{self, BufReader, Read, Seek, SeekFrom, Write};
@@ -16,40 +19,40 @@ use super::disk::Disk;
 use super::{RecordError, hex};
 use crate::file;
 
-/// Most bytes in the header of a file.
+/// Maximum size of a file's header in bytes.
 pub const MAX_HEADER_BYTES: u64 = 1 << 20;
 const KIND: &str = "flotilla";
 const CHECKSUM: &str = "sha256";
-/// Metadata: the version of the program that wrote the file, where it says so.
+/// Metadata key of the program version that wrote the file. Not all files have it.
 pub(super) const VERSION: &str = "version";
 const NO_CHECKSUM: &str = "0000000000000000000000000000000000000000000000000000000000000000";
 
 #[cfg(target_endian = "big")]
 compile_error!("safetensors hold little-endian numbers, which are read and written in place");
 
-/// A tensor to write: its data in parts, one after another.
+/// A tensor to write. Its data is given in consecutive parts.
 pub struct Tensor<'a> {
-    /// As the file has it: `weights.0`.
+    /// Name in the file, such as `weights.0`.
     pub name: String,
-    /// What its numbers are.
+    /// Type of the numbers.
     pub dtype: Dtype,
-    /// The last index moves fastest.
+    /// Shape, in row-major order.
     pub shape: Vec<usize>,
-    /// Little-endian; together as long as the shape says.
+    /// Little-endian data. The total length matches the shape.
     pub parts: Vec<&'a [u8]>,
 }
 
 impl<'a> Tensor<'a> {
-    /// A tensor of f32.
+    /// Creates a tensor of f32.
     pub fn floats(name: String, shape: Vec<usize>, parts: impl IntoIterator<Item = &'a [f32]>) -> Tensor<'a> {
         Tensor { name, dtype: Dtype::F32, shape, parts: parts.into_iter().map(bytemuck::cast_slice).collect() }
     }
 }
 
-/// Writes a file of a kind ("policies 1"), whole or not at all.
+/// Writes a file of a kind (such as "policies 1"), whole or not at all.
 ///
 /// # Errors
-/// What the system says; nothing else was touched then.
+/// Returns the system's error. Nothing else was changed in that case.
 pub fn write(
     disk: &Disk,
     path: &Path,
@@ -60,10 +63,10 @@ pub fn write(
     disk.replace(path, |output| put(output, kind, metadata, tensors).map(drop))
 }
 
-/// Writes what such a file holds into a stream. Returns its checksum.
+/// Writes the content of such a file to a stream. Returns its checksum.
 ///
 /// # Errors
-/// The stream refuses it.
+/// Returns the stream's error.
 pub fn put(
     output: &mut dyn Write,
     kind: &str,
@@ -84,7 +87,7 @@ pub fn put(
         );
     }
     let mut header = Value::Object(header).to_string();
-    // Tensors start at a multiple of 8.
+    // The header is padded so that the tensors start at a multiple of 8.
     header.extend(std::iter::repeat_n(' ', header.len().next_multiple_of(8) - header.len()));
 
     let length = (header.len() as u64).to_le_bytes();
@@ -99,19 +102,19 @@ pub fn put(
     Ok(checksum)
 }
 
-/// A file whose header was read and, where it has a checksum, found whole.
+/// An open file with a valid header. If the file has a checksum, it matches.
 pub struct TensorFile<R> {
     source: BufReader<R>,
     header: Metadata,
-    /// Where the tensors start.
+    /// Offset of the first tensor in bytes.
     start: u64,
 }
 
 impl<R: Read + Seek> TensorFile<R> {
-    /// Opens a file and checks it.
+    /// Opens a file and verifies its checksum.
     ///
     /// # Errors
-    /// What is wrong with the file, in words.
+    /// Returns a description of the problem.
     pub fn open(source: R) -> Result<TensorFile<R>, String> {
         let mut source = BufReader::with_capacity(1 << 16, source);
         let told = |error: io::Error| match error.kind() {
@@ -151,7 +154,7 @@ impl<R: Read + Seek> TensorFile<R> {
         Ok(file)
     }
 
-    /// Compares the checksum.
+    /// Compares the checksum with the content.
     fn verify(&mut self, length: [u8; 8], mut header: Vec<u8>) -> Result<(), String> {
         const DAMAGED: &str = "it is damaged: its checksum does not fit";
         let checksum = self.metadata(CHECKSUM).filter(|checksum| checksum.len() == NO_CHECKSUM.len()).ok_or(DAMAGED)?;
@@ -171,35 +174,35 @@ impl<R: Read + Seek> TensorFile<R> {
         if hex(&hash.finalize()) == checksum { Ok(()) } else { Err(DAMAGED.into()) }
     }
 
-    /// The checksum that it carries, which was compared; none in a file of another program.
+    /// Returns the verified checksum, or `None` for a file of another program.
     pub fn checksum(&self) -> Option<&str> {
         self.metadata(CHECKSUM)
     }
 
-    /// What kind of file it says it is, none for another program's.
+    /// Returns the kind of the file, or `None` for a file of another program.
     pub fn kind(&self) -> Option<&str> {
         self.metadata(KIND)
     }
 
-    /// What the file says of itself under a key.
+    /// Returns the metadata value of a key.
     pub fn metadata(&self, key: &str) -> Option<&str> {
         self.header.metadata().as_ref()?.get(key).map(String::as_str)
     }
 
-    /// A tensor's type and shape.
+    /// Returns the type and shape of a tensor.
     pub fn info(&self, name: &str) -> Option<&TensorInfo> {
         self.header.info(name)
     }
 
-    /// The names of all tensors.
+    /// Returns the names of all tensors.
     pub fn names(&self) -> Vec<String> {
         self.header.offset_keys()
     }
 
-    /// A tensor's numbers, in so many equal parts.
+    /// Reads the numbers of a tensor, split into `parts` equal parts.
     ///
     /// # Errors
-    /// No such tensor, another type or shape, or no memory for it.
+    /// The tensor is missing, has another type or shape, or there is not enough memory.
     pub fn read<T: bytemuck::Pod>(
         &mut self,
         name: &str,
@@ -227,8 +230,8 @@ impl<R: Read + Seek> TensorFile<R> {
     }
 }
 
-/// Whether the file at a path says that it is of a later format than this program writes: then the version that wrote
-/// it, where the file says that. A file that cannot be read is none.
+/// Checks whether a file has a newer format than this program writes. If so, returns the version that wrote it, or
+/// `Some(None)` if the file does not contain it. A file that cannot be read gives `None`.
 pub fn newer(path: &Path) -> Option<Option<String>> {
     let mut file = file::open(path).ok()?;
     let mut length = [0; 8];
@@ -237,7 +240,8 @@ pub fn newer(path: &Path) -> Option<Option<String>> {
     file.read_exact(&mut header).ok()?;
     let header: Metadata = serde_json::from_slice(&header).ok()?;
     let metadata = header.metadata().as_ref()?;
-    // All formats so far are the first of their kind. A damaged byte can make one look later, but then no checksum fits.
+    // All current formats have version 1. A damaged byte may look like a newer version, but then the checksum does not
+    // match.
     let (_, format) = metadata.get(KIND)?.rsplit_once(' ')?;
     let later = format.parse::<u64>().ok()? > 1 && open(path).is_ok();
     later.then(|| metadata.get(VERSION).cloned())
@@ -246,7 +250,7 @@ pub fn newer(path: &Path) -> Option<Option<String>> {
 /// Opens the file at a path.
 ///
 /// # Errors
-/// No such file, or what is wrong with it.
+/// The file is missing, cannot be read or is damaged.
 pub fn open(path: &Path) -> Result<TensorFile<std::fs::File>, RecordError> {
     let file = file::open(path).map_err(RecordError::read(path))?;
     TensorFile::open(file).map_err(|reason| RecordError::damaged(path, reason))

@@ -1,4 +1,4 @@
-//! Arms side by side: what their trials came to, with 95 % intervals, and a test of every pair.
+//! Compares arms: the mean of every measure over trials with its 95 % interval, and a test of every pair of arms.
 
 use std::fmt::Write;
 use std::io;
@@ -12,32 +12,32 @@ use crate::escape::{self, PathExt};
 use crate::record::digests::Verification;
 use crate::statistics::{self, Estimate, Tested};
 
-/// Trials that are compared with those of others.
+/// The trials of one arm of a comparison.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cohort {
-    /// What sets it apart: "fitness Df".
+    /// The arm's name, such as "fitness Df".
     pub name: String,
-    /// The runs whose trials these are.
+    /// The directories of the runs that the trials belong to.
     pub folders: Vec<PathBuf>,
-    /// Generations that these were to have.
+    /// The largest number of generations that one of the runs was configured to train.
     pub planned: usize,
-    /// All of them, run by run.
+    /// The trials of all runs, run by run.
     pub trials: Vec<Trial>,
 }
 
 /// One trial of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trial {
-    /// The run's seed and the trial's number: trials of two arms that share both are a pair.
+    /// The run's seed and the trial's number. Trials of two arms with the same key form a pair.
     pub key: (u64, usize),
-    /// G of the best team and of the champion, by generation.
+    /// G of the best team and of the champion, `[generations]`.
     pub course: Vec<[f64; 2]>,
-    /// The first generation of its last stage; 0 where it has none.
+    /// The first generation of the run's last stage; 0 without stages.
     pub from: usize,
 }
 
 impl Cohort {
-    /// Reads the trials of some runs, as far as they have come.
+    /// Reads the trials of some runs, which may be unfinished.
     ///
     /// # Errors
     /// A run cannot be read.
@@ -57,7 +57,7 @@ impl Cohort {
         Ok(arm)
     }
 
-    /// Its name, and where its runs are.
+    /// Returns the arm's name and its directories, for messages.
     fn told(&self) -> String {
         const MOST: usize = 3;
         let folders: Vec<String> = self.folders.iter().map(|folder| folder.escaped().to_string()).collect();
@@ -70,7 +70,7 @@ impl Cohort {
         }
     }
 
-    /// The last generation that all its trials have come to.
+    /// Returns the last generation that all its trials have reached, if any.
     fn last(&self) -> Option<usize> {
         self.trials.iter().map(|trial| trial.course.len()).min()?.checked_sub(1)
     }
@@ -80,7 +80,7 @@ impl Cohort {
     }
 }
 
-/// Whether all arms have the same seeds and trials, so that these are pairs.
+/// Reports whether all arms have the same seeds and trials, so that their trials form pairs.
 pub fn paired(arms: &[Cohort]) -> bool {
     arms.iter().all(|arm| arm.keys() == arms[0].keys())
 }
@@ -88,79 +88,81 @@ pub fn paired(arms: &[Cohort]) -> bool {
 /// A generation to compare at.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum At {
-    /// This one, from 0.
+    /// A given generation, from 0.
     Generation(usize),
-    /// The last one that all trials of all arms have come to.
+    /// The last generation that all trials of all arms have reached.
     Last,
 }
 
-/// What is compared, and how.
+/// Options of a comparison.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Question {
-    /// At which generations G is compared.
+    /// Generations at which G is compared.
     pub at: Vec<At>,
-    /// The best team's G (in 0..1) whose first generation is compared.
+    /// G of the best team, in 0..1. The first generation that reaches it is compared.
     pub reach: f64,
-    /// Compare pair by pair.
+    /// Whether trials are compared pair by pair.
     pub paired: bool,
 }
 
 /// Why arms cannot be compared.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ComparisonError {
-    /// An arm, by its name, of a single trial.
+    /// An arm, by its name, has a single trial.
     #[error("{0} has one trial, of which no interval can be had; that takes two or more")]
     OneTrial(String),
-    /// An arm, by its name, whose trials have no generation in common.
+    /// The trials of an arm, by its name, have no generation in common.
     #[error("{0} has no generation that every trial has come to")]
     TooShort(String),
-    /// A generation that the arms have not come to.
+    /// Some arms have not reached a requested generation.
     #[error("the arms have come to generation {last}")]
     Beyond {
-        /// The one asked for.
+        /// The requested generation.
         at: usize,
-        /// The last that all have.
+        /// The last generation that all arms have reached.
         last: usize,
     },
-    /// Two arms, by their names, that cannot be compared pair by pair.
+    /// Two arms, by their names, cannot be compared pair by pair.
     #[error("{0} and {1} have not the same seeds and numbers of trials, so their trials are no pairs")]
     NoPairs(String, String),
 }
 
-/// What is measured in every trial.
+/// A quantity that is measured in every trial.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(tag = "measure", rename_all = "snake_case")]
 pub enum Measure {
     /// G of the best team at a generation.
     BestG {
-        /// From 0.
+        /// The generation, from 0.
         generation: usize,
     },
-    /// G of the champion.
+    /// G of the champion at a generation.
     ChampionG {
-        /// From 0.
+        /// The generation, from 0.
         generation: usize,
     },
-    /// The first generation, of the last stage where there are stages, at which the best team's G is at least this. A
-    /// trial that does not come to it up to a last generation counts as one that does at the next.
+    /// The first generation at which the best team's G is at least `reach`. With stages, only the last stage counts.
+    ///
+    /// A trial that does not reach it by `generation` counts as one that reaches it at the next.
     GenerationsToReach {
-        /// In 0..1.
+        /// G to reach, in 0..1.
         reach: f64,
-        /// The last that is looked at.
+        /// The last generation to look at.
         generation: usize,
     },
-    /// G of the last champion over so many episodes in which each POI is moved by up to `poi_jitter` on both axes; of one
-    /// episode where POIs stand.
+    /// Mean G of the last champion over episodes in which each POI moves by up to `poi_jitter` on both axes.
+    ///
+    /// With a jitter of 0, POIs stay in place and one episode suffices.
     Played {
-        /// In world units.
+        /// The largest shift per axis, in world units.
         poi_jitter: f64,
-        /// How many.
+        /// Number of episodes.
         episodes: u32,
     },
 }
 
 impl Measure {
-    /// None where the course of a trial does not tell.
+    /// Returns the measured value of a trial, or none if the trial's course does not determine it.
     fn of(self, trial: &Trial) -> Option<f64> {
         match self {
             Measure::BestG { generation } => Some(trial.course[generation][0]),
@@ -173,7 +175,7 @@ impl Measure {
         }
     }
 
-    /// In how many trials it was reached, if that is the question.
+    /// Counts the trials that reached G, if this measures when they do.
     fn reached(self, values: &[f64]) -> Option<usize> {
         match self {
             Measure::GenerationsToReach { generation, .. } => {
@@ -183,12 +185,12 @@ impl Measure {
         }
     }
 
-    /// Digits that are told of it.
+    /// Returns the number of decimals to print.
     pub fn digits(self) -> usize {
         if let Measure::GenerationsToReach { .. } = self { 1 } else { 3 }
     }
 
-    /// As in JSON and CSV.
+    /// Returns the name of the measure in CSV.
     fn key(self) -> &'static str {
         match self {
             Measure::BestG { .. } => "best_g",
@@ -212,75 +214,75 @@ impl std::fmt::Display for Measure {
     }
 }
 
-/// Arms side by side.
+/// The result of a comparison.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Comparison {
-    /// What the arms of a sweep have in common: "coupling 3". Empty of runs.
+    /// Settings that all arms of a sweep share, such as "coupling 3". Empty when runs are compared.
     #[serde(rename = "where")]
     pub place: String,
-    /// The last generation that all have come to.
+    /// The last generation that all arms have reached.
     pub generation: usize,
-    /// In the order given.
+    /// The arms, in the order given.
     pub arms: Vec<Named>,
-    /// What was measured of them.
+    /// One result per measure.
     pub measures: Vec<Measured>,
-    /// What a reader has to know.
+    /// Remarks for the reader, such as arms that are unfinished.
     pub notes: Vec<String>,
 }
 
-/// An arm as it is told of.
+/// An arm as output names it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Named {
-    /// What sets it apart.
+    /// The arm's name, such as "fitness Df".
     pub name: String,
-    /// The runs whose trials these are.
+    /// The directories of the arm's runs, escaped for output.
     pub folders: Vec<String>,
-    /// How many.
+    /// Number of trials.
     pub trials: usize,
 }
 
-/// What one measure came to.
+/// The result of one measure.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Measured {
-    /// Which one.
+    /// The measure.
     #[serde(flatten)]
     pub measure: Measure,
-    /// By arm.
+    /// Means of the arms, `[arms]`.
     pub arms: Vec<Mean>,
-    /// Every two arms once.
+    /// Differences between arms, one per pair of arms.
     pub pairs: Vec<Versus>,
 }
 
 /// The mean over an arm's trials.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Mean {
-    /// With its 95 % interval.
+    /// The mean with its 95 % interval.
     #[serde(flatten)]
     pub mean: Estimate,
-    /// In how many trials a G was reached.
+    /// Number of trials that reached G, if that was measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reached: Option<usize>,
 }
 
-/// What sets two arms apart.
+/// The difference between two arms.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Versus {
-    /// Their places among the arms.
+    /// Indices of the two arms.
     pub arms: [usize; 2],
-    /// The first's mean less the second's.
+    /// The first arm's mean minus the second's.
     #[serde(flatten)]
     pub difference: Estimate,
-    /// Whether that is more than chance.
+    /// The test of the difference.
     #[serde(flatten)]
     pub test: Tested,
-    /// Corrected for the number of pairs.
+    /// The p value with Holm's correction for the number of pairs.
     pub p_holm: f64,
 }
 
-/// Compares every two of two or more arms; `place` is what they have in common.
+/// Compares every pair of two or more arms. `place` states what the arms have in common.
 ///
 /// # Errors
-/// The arms have too few trials or generations, or are no pairs where pairs are asked for.
+/// An arm has too few trials or generations, or pairs were requested and the trials do not form pairs.
 pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Comparison, ComparisonError> {
     let mut last = usize::MAX;
     for arm in arms {
@@ -327,7 +329,7 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
     Ok(Comparison { place: place.into(), generation: last, arms: arms.iter().map(named).collect(), measures, notes })
 }
 
-/// Compares what trials of two or more arms came to by other measures than those of their courses, `[arms][trials]` each.
+/// Compares two or more arms by given values per measure, `[arms][trials]` each.
 ///
 /// # Errors
 /// An arm has fewer than two trials.
@@ -344,7 +346,7 @@ pub fn of_values(
     Ok(Comparison { place: place.into(), generation, arms, measures, notes: vec![] })
 }
 
-/// Of `[arms][trials]`, two trials each at least.
+/// Evaluates one measure of values `[arms][trials]` with at least two trials per arm.
 fn measured(measure: Measure, values: &[Vec<f64>], paired: bool) -> Measured {
     let two = "arms of two trials or more";
     let means = values
@@ -369,7 +371,7 @@ fn measured(measure: Measure, values: &[Vec<f64>], paired: bool) -> Measured {
 }
 
 impl Comparison {
-    /// A row an arm, its means side by side.
+    /// Returns a table with one row per arm and one column per measure.
     fn means(&self) -> Vec<Vec<String>> {
         let mut head = vec!["arm".to_string(), "trials".into()];
         head.extend(self.measures.iter().map(|measured| measured.measure.to_string()));
@@ -383,7 +385,7 @@ impl Comparison {
         [head].into_iter().chain(rows).collect()
     }
 
-    /// A row a measure and pair.
+    /// Returns a table with one row per measure and pair.
     fn pairs(&self) -> Vec<Vec<String>> {
         let head = ["measure", "pair", "difference", "A", "p", "p (Holm)"].map(String::from).to_vec();
         let row = |measure: Measure, pair: &Versus| {
@@ -400,9 +402,9 @@ impl Comparison {
     }
 }
 
-/// "0.92 [0.86, 0.97]", with minus signs as typeset.
+/// Formats an estimate as "0.92 [0.86, 0.97]", with typographic minus signs.
 pub fn estimate(Estimate { value, low, high }: Estimate, digits: usize, signed: bool) -> String {
-    // No "-0.000".
+    // Adding 0.0 turns -0.0 into 0.0, which prints no sign.
     let [value, low, high] = [value, low, high].map(|x| {
         let tens = 10f64.powi(digits as i32);
         (x * tens).round() / tens + 0.0
@@ -411,12 +413,12 @@ pub fn estimate(Estimate { value, low, high }: Estimate, digits: usize, signed: 
     format!("{value} [{low:.digits$}, {high:.digits$}]").replace('-', "−")
 }
 
-/// "0.042", or "< 0.001".
+/// Formats a probability as "0.042" or "< 0.001".
 pub fn probability(p: f64) -> String {
     if p < 0.001 { "< 0.001".into() } else { format!("{p:.3}") }
 }
 
-/// How the tables are to be read.
+/// Explains how to read the tables.
 fn legend(all: &[Comparison], options: &Question) -> String {
     let (test, a) = match options.paired {
         true => ("Wilcoxon's signed ranks", "a pair's first trial"),
@@ -439,7 +441,7 @@ fn legend(all: &[Comparison], options: &Question) -> String {
     text
 }
 
-/// For people.
+/// Returns the comparisons as Markdown tables with a legend.
 pub fn text(all: &[Comparison], options: &Question) -> String {
     let mut text = String::new();
     for comparison in all {
@@ -451,7 +453,7 @@ pub fn text(all: &[Comparison], options: &Question) -> String {
     text + &legend(all, options)
 }
 
-/// For a paper: two tables a comparison, and how to read them as comments.
+/// Returns two LaTeX tables per comparison, with the legend as comments.
 pub fn latex(all: &[Comparison], options: &Question) -> String {
     let comment = |text: &str| text.lines().map(|line| format!("% {line}\n")).collect::<String>();
     let mut text = comment(&legend(all, options));
@@ -462,7 +464,7 @@ pub fn latex(all: &[Comparison], options: &Question) -> String {
     text
 }
 
-/// For other programs: a row a measure and arm, then one a measure and pair.
+/// Writes the comparisons as CSV: one row per measure and arm, then one per measure and pair.
 ///
 /// # Errors
 /// The output cannot be written.

@@ -1,38 +1,38 @@
-//! Learning curves: what the trials came to by generation, and the figure that compares them.
+//! Learning curves: means over trials by generation, and the figure that compares them.
 
 use serde::Serialize;
 
 use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
 use crate::statistics::Average;
 
-/// A column of a two-column paper, in millimetres.
+/// Width of a column of a two-column paper, in millimetres.
 pub const COLUMN: f64 = 85.0;
-/// Pixels a millimetre of a PNG: 300 a column inch.
+/// Pixels per millimetre of a PNG: 300 pixels per inch.
 pub const PRINT: f64 = 300.0 / 25.4;
-/// Most points that a curve is drawn with.
+/// Maximum number of points of a drawn curve.
 const MAX_POINTS: usize = 300;
-/// Sizes of letters, 7 and 8 points.
+/// Font size of 7 points, in millimetres. The next one is 8 points.
 pub const SMALL: f64 = 2.47;
 const NORMAL: f64 = 2.82;
 const REFERENCES: [&[f64]; 2] = [&[2.6, 1.0], &[0.7, 0.7]];
 const DASHES: [&[f64]; 5] = [&[], &[1.6, 0.7], &[1.8, 0.6, 0.4, 0.6], &[0.5, 0.5], &[3.0, 0.8]];
 
-/// Mean and standard error over trials, at some generations.
+/// Mean and standard error over trials by generation.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Curve {
-    /// Places on the x axis, from 0.
+    /// Generations, from 0: the x values.
     pub generation: Vec<f64>,
-    /// At each of these.
+    /// Mean over trials, `[points]`.
     pub mean: Vec<f64>,
-    /// Standard error of the mean, at each.
+    /// Standard error of the mean, `[points]`.
     pub error: Vec<f64>,
-    /// How many trials these are of, at most.
+    /// The largest number of trials of a point.
     #[serde(skip)]
     pub trials: u32,
 }
 
 impl Curve {
-    /// One tally a generation, from generation 0; generations without values are left out.
+    /// Makes a curve from one average per generation, from generation 0. Generations without values are left out.
     pub fn new(tallies: &[Average]) -> Curve {
         let mut curve = Curve::default();
         for (generation, tally) in tallies.iter().enumerate().filter(|(_, tally)| tally.count() > 0) {
@@ -44,13 +44,13 @@ impl Curve {
         curve
     }
 
-    /// The same values times a number: shares of POIs become POIs.
+    /// Multiplies all values by a factor, for example to convert shares of POIs into numbers of POIs.
     pub fn scaled(mut self, by: f64) -> Curve {
         self.mean.iter_mut().chain(&mut self.error).for_each(|value| *value *= by);
         self
     }
 
-    /// A curve of few enough points to draw, each the average of as many generations as the second value says.
+    /// Returns a curve with few enough points to draw, and the number of generations that each point averages.
     pub fn thinned(&self) -> (Curve, usize) {
         let each = self.mean.len().div_ceil(MAX_POINTS).max(1);
         let average = |values: &[f64]| -> Vec<f64> {
@@ -64,11 +64,11 @@ impl Curve {
 /// One set of axes.
 #[derive(Clone, Debug, Default)]
 pub struct Panel {
-    /// Above it.
+    /// Title above the axes.
     pub title: String,
-    /// Each with its place in the legend, which gives it its look.
+    /// The curves, each with its index in the legend, which determines its style.
     pub curves: Vec<(usize, Curve)>,
-    /// Generations with which a stage begins, from the second stage on.
+    /// The first generation of each stage, from the second stage on.
     pub stages: Vec<usize>,
 }
 
@@ -77,29 +77,29 @@ pub struct Panel {
 pub struct Figure {
     /// From left to right.
     pub panels: Vec<Panel>,
-    /// What curves are, by their place.
+    /// Labels of the curves, by index.
     pub legend: Vec<String>,
-    /// What curves are held against: the next places in the legend, in grey, with neither bands nor marks.
+    /// Labels of the references, whose indices follow those of the curves. References are grey, without bands or marks.
     pub references: Vec<String>,
-    /// Of the axis that they share.
+    /// Label of the shared y axis.
     pub y_label: String,
-    /// The y axis runs from 0 to this.
+    /// The upper end of the y axis, which starts at 0.
     pub y_max: f64,
-    /// Shares of the POIs, not their number.
+    /// Whether values are shares of the POIs instead of numbers of POIs.
     pub shares: bool,
-    /// The digest of the one run that it shows, once that is done.
+    /// The digest of the run, if the figure shows a single finished run.
     pub source: Option<String>,
-    /// What a reader should know before trusting it.
+    /// A warning to print below the figure.
     pub warning: Option<String>,
 }
 
 impl Figure {
-    /// The figure at the width of a column.
+    /// Draws the figure at the width of a column.
     pub fn scene(&self) -> Scene {
         const RIGHT: f64 = 3.0;
         const GAP: f64 = 5.5;
         const BELOW: f64 = 9.0;
-        // Shares take more room than whole numbers.
+        // Labels of shares are wider than whole numbers.
         let edge = if self.shares { 12.5 } else { 10.0 };
         let labels = distinct(&[&self.legend[..], &self.references].concat(), COLUMN - 20.0, SMALL);
         let rows = legend_rows(&labels);
@@ -176,7 +176,7 @@ impl Figure {
         format!("{} by generation{of}", self.y_label)
     }
 
-    /// What a place in the legend is drawn with.
+    /// Returns the pen for an index in the legend.
     fn pen(&self, index: usize) -> Pen {
         match index.checked_sub(self.legend.len()) {
             None => Look::of(index).pen(),
@@ -184,7 +184,7 @@ impl Figure {
         }
     }
 
-    /// From where to where each curve goes.
+    /// Describes the first and last point of each curve.
     fn description(&self) -> String {
         let mut text = format!("Learning curves, on an axis from 0 to {}.", number(self.y_max));
         for panel in &self.panels {
@@ -212,7 +212,7 @@ impl Figure {
     }
 }
 
-/// What a band is, if any of the curves has one.
+/// Returns the caption of the bands, if any curve has one.
 pub fn band_caption<'a>(curves: impl Iterator<Item = &'a Curve>) -> Option<String> {
     let curves: Vec<&Curve> = curves.collect();
     curves.iter().any(|curve| curve.error.iter().any(|&error| error > 0.0)).then_some(())?;
@@ -222,14 +222,14 @@ pub fn band_caption<'a>(curves: impl Iterator<Item = &'a Curve>) -> Option<Strin
     Some(format!("mean ± standard error over {trials} trials"))
 }
 
-/// Draws what a band is, from a place on the baseline.
+/// Draws the caption of the bands from a place on the baseline.
 pub fn draw_caption(scene: &mut Scene, [x, y]: [f64; 2], caption: &str) {
     scene.rectangle([x, y - 1.9, 6.0, 2.2], Some(Fill { color: GREY, opacity: 0.3 }), None);
     scene.line(vec![[x, y - 0.8], [x + 6.0, y - 0.8]], Pen::new(GREY, 0.4));
     scene.text([x + 7.0, y], caption, SMALL, Anchor::Start, BLACK);
 }
 
-/// The entries of each row of the legend, with where each starts.
+/// Returns the entries of each row of the legend, each with its x coordinate.
 fn legend_rows(labels: &[String]) -> Vec<Vec<(usize, f64)>> {
     const START: f64 = 10.0;
     let mut rows: Vec<Vec<(usize, f64)>> = Vec::new();
@@ -246,7 +246,7 @@ fn legend_rows(labels: &[String]) -> Vec<Vec<(usize, f64)>> {
     rows
 }
 
-/// A panel's place in the picture, and its ranges.
+/// Position and ranges of one panel, in millimetres and data units.
 struct Axes {
     left: f64,
     above: f64,
@@ -287,7 +287,7 @@ impl Axes {
         scene.line(vec![[left, above], [left, below], [right, below]], Pen::new(BLACK, 0.2));
     }
 
-    /// A line where each stage begins, with its number where there is room.
+    /// Draws a line at the start of each stage, labelled with its number if there is room.
     fn stages(&self, scene: &mut Scene, stages: &[usize]) {
         for (index, &from) in stages.iter().enumerate() {
             let [x, below] = self.at(from as f64, 0.0);
@@ -300,7 +300,7 @@ impl Axes {
         }
     }
 
-    /// The standard error to both sides of the mean.
+    /// Draws the band of one standard error on both sides of the mean.
     fn band(&self, scene: &mut Scene, curve: &Curve, color: Color) {
         let side = |sign: f64| {
             let values = curve.mean.iter().zip(&curve.error).map(move |(mean, error)| mean + sign * error);
@@ -316,7 +316,7 @@ impl Axes {
         curve.generation.iter().zip(&curve.mean).map(|(&x, &y)| self.at(x, y)).collect()
     }
 
-    /// The mean, with a few marks; those of different curves stand apart, since curves may run into each other.
+    /// Draws the mean with a few marks. Marks of different curves are shifted, because curves may overlap.
     fn curve(&self, scene: &mut Scene, curve: &Curve, index: usize, of: usize) {
         const MARKS: usize = 5;
         let look = Look::of(index);
@@ -333,7 +333,7 @@ impl Axes {
     }
 }
 
-/// What tells one curve from the next: colour, dashes and marks, each by itself for the first five.
+/// Style of a curve: colour, dashes and mark. The first five curves differ in both colour and dashes.
 #[derive(Clone, Copy)]
 struct Look {
     color: Color,
@@ -362,21 +362,22 @@ impl Look {
     }
 }
 
-/// The least round number (1, 2 or 5 times a power of ten) that is no less than another.
+/// Returns the smallest round number (1, 2 or 5 times a power of ten) that is at least `least`.
 pub fn round_step(least: f64) -> f64 {
     let power = libm::pow(10.0, libm::log10(least).floor());
     [1.0, 2.0, 5.0].into_iter().map(|step| step * power).find(|&step| step >= least * 0.999).unwrap_or(10.0 * power)
 }
 
-/// Whole round numbers from 0 up to an end, in about so many steps.
+/// Returns round whole numbers from 0 to an end, in about the given number of steps.
 fn whole_ticks(end: f64, steps: usize) -> Vec<f64> {
     let step = round_step((end / steps as f64).max(1.0));
     (0..).map(|index| f64::from(index) * step).take_while(|&tick| tick <= end * 1.0001).collect()
 }
 
-/// Numbers of POIs for an axis from none to all of them, both included.
+/// Returns axis ticks for numbers of POIs, from 0 to all of them inclusive.
 pub fn poi_ticks(pois: usize) -> Vec<usize> {
-    // Steps that come out even, round ones first; else round ones up to what leaves room for the last.
+    // Prefer a step that divides the number of POIs, round steps first. Otherwise use a round step, and drop ticks too
+    // close to the last.
     let fits = |step: &usize| pois.is_multiple_of(*step) && (3..=6).contains(&(pois / step));
     let even = [1, 2, 5, 10, 20, 25, 50].into_iter().find(fits).or_else(|| (1..=pois).find(fits));
     let step = if pois <= 8 { 1 } else { even.unwrap_or(round_step(pois as f64 / 6.0) as usize) };
@@ -389,20 +390,20 @@ fn number(value: f64) -> String {
     text.trim_end_matches('0').trim_end_matches('.').to_string()
 }
 
-/// Labels cut to a width, so that what tells one from the others stays.
+/// Shortens labels to a width but keeps them distinct.
 pub fn distinct(labels: &[String], width: f64, size: f64) -> Vec<String> {
     let fits = |label: &String| text_width(label, size) <= width;
     if labels.iter().all(fits) {
         return labels.to_vec();
     }
-    // What all begin and end with tells none from another.
+    // A prefix or suffix that all labels share does not distinguish them.
     let letters: Vec<Vec<char>> = labels.iter().map(|label| label.chars().collect()).collect();
     let least = letters.iter().map(Vec::len).min().unwrap_or(0);
     let alike = |at: &dyn Fn(&[char]) -> char| letters.windows(2).all(|pair| at(&pair[0]) == at(&pair[1]));
     let head = if labels.len() > 1 { (0..least).take_while(|&i| alike(&|label| label[i])).count() } else { 0 };
     let room = if labels.len() > 1 { least - head } else { 0 };
     let tail = (0..room).take_while(|&i| alike(&|label| label[label.len() - 1 - i])).count();
-    // A few letters are worth no ellipsis.
+    // Replacing fewer than four letters with an ellipsis saves no room.
     let (head, tail) = (if head < 4 { 0 } else { head }, if tail < 4 { 0 } else { tail });
     let cut = |label: &Vec<char>| {
         let middle: String = label[head..label.len() - tail].iter().collect();
@@ -411,7 +412,7 @@ pub fn distinct(labels: &[String], width: f64, size: f64) -> Vec<String> {
     };
     let short: Vec<String> = letters.iter().map(cut).collect();
     let twice = |label: &String| short.iter().filter(|other| *other == label).count() > 1;
-    // What differs in its middle alone: by number, in the order in which they were named.
+    // Labels that differ only in their middle are numbered, in the given order.
     let numbered = |(index, label): (usize, &String)| match twice(label) {
         true => middle_out(&format!("{} {label}", index + 1), width, size),
         false => label.clone(),
@@ -419,7 +420,7 @@ pub fn distinct(labels: &[String], width: f64, size: f64) -> Vec<String> {
     short.iter().enumerate().map(numbered).collect()
 }
 
-/// A text without its middle, if it is longer than a width.
+/// Removes the middle of a text that is wider than `width`.
 fn middle_out(text: &str, width: f64, size: f64) -> String {
     let letters: Vec<char> = text.chars().collect();
     let without = |left: usize| {

@@ -1,17 +1,17 @@
-//! Figures of a grid of results: heat maps over two axes, curves by the values of an axis, and dots for keys that are
-//! varied one at a time.
+//! Figures of a sweep: heat maps over two axes, curves by the values of an axis, and dots for keys that are varied one
+//! at a time.
 
 use super::curves::{Curve, band_caption, distinct, draw_caption};
 use super::scene::{Anchor, BLACK, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
 
-/// Widest a figure gets before its panels go to the next row, in millimetres.
+/// Maximum width of a figure in millimetres. Further panels go to the next row.
 const WIDEST: f64 = 180.0;
 const SMALL: f64 = 2.47;
 const NORMAL: f64 = 2.82;
 const GAP: f64 = 5.0;
 
-/// A sequential palette whose lightness falls all the way (ColorBrewer's YlGnBu): it keeps its order for the
-/// colour-blind and in grey.
+/// A sequential palette of decreasing lightness (ColorBrewer's YlGnBu). It keeps its order for colour-blind readers and
+/// in greyscale.
 const PALETTE: [Color; 9] = [
     [255, 255, 217],
     [237, 248, 177],
@@ -24,7 +24,7 @@ const PALETTE: [Color; 9] = [
     [8, 29, 88],
 ];
 
-/// The colour of a value in 0..1.
+/// Returns the colour of a value in 0..1.
 pub fn shade(value: f64) -> Color {
     let place = value.clamp(0.0, 1.0) * (PALETTE.len() - 1) as f64;
     let low = (place as usize).min(PALETTE.len() - 2);
@@ -33,50 +33,50 @@ pub fn shade(value: f64) -> Color {
     std::array::from_fn(|channel| mix(PALETTE[low][channel], PALETTE[low + 1][channel]))
 }
 
-/// White or black, whichever is read more easily on a colour (sRGB's weights of the channels).
+/// Returns white or black, whichever is more legible on a colour. The weights are those of luma (ITU-R BT.601).
 fn ink(on: Color) -> Color {
     let [r, g, b] = on.map(f64::from);
     if 0.299 * r + 0.587 * g + 0.114 * b > 140.0 { BLACK } else { WHITE }
 }
 
-/// The values of one axis.
+/// One axis of a sweep.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Scale {
     /// The axis's key.
     pub label: String,
-    /// As they are written.
+    /// The axis's values, as text.
     pub values: Vec<String>,
 }
 
-/// What a cell shows.
+/// Content of one cell of a heat map.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub enum Cell {
-    /// Nothing ran there.
+    /// Nothing ran here.
     #[default]
     Empty,
-    /// A shade in 0..1, and what is written on it.
+    /// A shade in 0..1 and the text on it.
     Value(f64, String),
-    /// There is no value, and this is why.
+    /// No value, and the reason.
     Word(String),
 }
 
-/// A value for each pair of values of two axes, in a panel for each value of the rest.
+/// A heat map over two axes, with one panel per combination of the other axes' values.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct HeatMap {
-    /// Above everything.
+    /// Title above all panels.
     pub title: String,
-    /// To the right.
+    /// The horizontal axis.
     pub x: Scale,
-    /// Without values: a single row.
+    /// The vertical axis. Without values there is a single row.
     pub y: Scale,
-    /// Title and cells `[y][x]`.
+    /// Title and cells `[y][x]` of each panel.
     pub panels: Vec<(String, Vec<Cell>)>,
-    /// What the shades stand for: places in 0..1 with their values.
+    /// Labels of the colour bar, each with its position in 0..1.
     pub key: Vec<(f64, String)>,
 }
 
 impl HeatMap {
-    /// The picture.
+    /// Draws the figure.
     pub fn scene(&self) -> Scene {
         const HIGH: f64 = 7.5;
         let longest = |labels: &[String]| labels.iter().map(|label| text_width(label, SMALL)).fold(0.0, f64::max);
@@ -106,7 +106,7 @@ impl HeatMap {
                 scene.rectangle(area, Some(fill.into()), Some(Pen::new(WHITE, 0.3)));
                 let middle = [area[0] + wide / 2.0, area[1] + HIGH / 2.0 + 0.9];
                 if *cell == Cell::Empty {
-                    // A place that cannot be: crossed out, so that it is not taken for a low value.
+                    // An impossible combination is crossed out, so that it is not taken for a low value.
                     let [x, y] = [area[0], area[1]];
                     scene.line(vec![[x + 1.0, y + HIGH - 1.0], [x + wide - 1.0, y + 1.0]], Pen::new(LIGHT, 0.3));
                 }
@@ -132,7 +132,7 @@ impl HeatMap {
         for step in 0..steps {
             let part = key_width / f64::from(steps);
             let color = shade((f64::from(step) + 0.5) / f64::from(steps));
-            // Each to the end, under the next: side by side they would show seams.
+            // Each step extends to the end of the bar, below the next one. Adjacent rectangles would show seams.
             let start = part * f64::from(step);
             let area = [left + start, key_above, key_width - start, 2.6];
             scene.rectangle(area, Some(color.into()), None);
@@ -146,7 +146,7 @@ impl HeatMap {
         scene
     }
 
-    /// Every cell, row by row.
+    /// Describes every cell, row by row.
     fn description(&self) -> String {
         let (columns, [x, y]) = (self.x.values.len(), [&self.x.label, &self.y.label]);
         let mut text = format!("A heat map by {x}{}{y}.", if y.is_empty() { "" } else { " and " });
@@ -167,23 +167,23 @@ impl HeatMap {
     }
 }
 
-/// Curves of G in 0..1 by generation, one for each value of an axis, in a panel for each value of the rest.
+/// Curves of G in 0..1 by generation: one curve per value of an axis, one panel per combination of the others.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Curves {
-    /// Above everything.
+    /// Title above all panels.
     pub title: String,
-    /// What G is the G of.
+    /// Label of the y axis: whose G is shown.
     pub y_label: String,
-    /// What sets the curves apart.
+    /// The axis whose values distinguish the curves.
     pub by: Scale,
-    /// Panels in a row, as many as fit where it is 0.
+    /// Number of panels per row; 0 for as many as fit.
     pub columns: usize,
-    /// Title, and curves by the index of their value.
+    /// Title of each panel, and its curves, each with the index of its value.
     pub panels: Vec<(String, Vec<(usize, Curve)>)>,
 }
 
 impl Curves {
-    /// The picture.
+    /// Draws the figure.
     pub fn scene(&self) -> Scene {
         const HEIGHT: f64 = 26.0;
         const LEFT: f64 = 14.0;
@@ -200,7 +200,6 @@ impl Curves {
             .width()
             .max(text_width(&self.title, 3.2) * 1.1 + 6.0)
             .max(legend + entries.iter().fold(0.0, |a, &b| f64::max(a, b)));
-        // The legend takes as many rows as it needs.
         let mut places = Vec::new();
         let (mut x, mut y) = (legend, 10.0);
         for entry in entries {
@@ -273,7 +272,7 @@ impl Curves {
         scene
     }
 
-    /// Where each curve ends.
+    /// Describes the last point of each curve.
     fn description(&self) -> String {
         let mut text = format!("Learning curves by {}, with the mean of the last generation.", self.by.label);
         for (title, curves) in &self.panels {
@@ -287,7 +286,7 @@ impl Curves {
         text
     }
 
-    /// A value's line: darker the later it stands on its axis, and dashed in turn.
+    /// Returns the pen for the value of an axis: darker for later values, with alternating dashes.
     fn pen(&self, value: usize) -> Pen {
         const DASHES: [&[f64]; 3] = [&[], &[1.8, 0.7], &[0.7, 0.6]];
         let last = self.by.values.len().saturating_sub(1).max(1) as f64;
@@ -295,25 +294,25 @@ impl Curves {
     }
 }
 
-/// A share in 0..1 with the ends of its interval.
+/// Mean, lower end and upper end of an interval, in 0..1.
 pub type Interval = [f64; 3];
 
-/// One value with its interval for each value of each of several keys, beside that of what was not varied, in a panel
-/// for each of several settings.
+/// A figure of means with intervals for keys that are varied one at a time, next to the unvaried result. Each panel
+/// shows one setting.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Dots {
-    /// Above everything.
+    /// Title above all panels.
     pub title: String,
-    /// What the values are.
+    /// Label of the x axis.
     pub x_label: String,
-    /// Down the side: a key with its own value, and its other values.
+    /// The varied keys, from top to bottom: a label with the key's unvaried value, and its other values.
     pub groups: Vec<(String, Vec<String>)>,
-    /// Title, what comes out with every key's own value, and for each row of all groups what comes out there.
+    /// Title of each panel, the unvaried result, and the results of all rows of all groups.
     pub panels: Vec<(String, Option<Interval>, Vec<Option<Interval>>)>,
 }
 
 impl Dots {
-    /// What each panel has, row by row.
+    /// Describes each panel, row by row.
     fn description(&self) -> String {
         let told = |spread: &Option<Interval>| spread.map_or("missing".into(), |[mean, ..]| format!("{mean:.2}"));
         let headed = |name: &str| if name.is_empty() { String::new() } else { format!("{name}: ") };
@@ -331,18 +330,18 @@ impl Dots {
         self.panels.iter().map(panel).collect::<Vec<_>>().join(" ")
     }
 
-    /// The picture.
+    /// Draws the figure.
     pub fn scene(&self) -> Scene {
         const HIGH: f64 = 4.0;
         const RADIUS: f64 = 0.75;
-        // Room for what is written beside each row.
+        // Width of the text beside each row.
         const WRITTEN: f64 = 8.5;
         let values = self.groups.iter().flat_map(|(_, values)| values).map(|value| text_width(value, SMALL) + 4.0);
         let names = self.groups.iter().map(|(name, _)| text_width(name, SMALL) * 1.1);
         let left = 5.0 + values.chain(names).fold(0.0, f64::max);
         let titles = self.panels.iter().map(|(title, ..)| text_width(title, SMALL)).fold(0.0, f64::max);
         let rows: f64 = self.groups.iter().map(|(_, values)| 1.25 + values.len() as f64).sum();
-        // What is written below a panel may reach as far as what is written beside it.
+        // The label below a panel may also use the width of the text beside the rows.
         let (plot, height) = (titles.max(34.0).max(text_width(&self.x_label, SMALL) - WRITTEN), HIGH * rows);
         let panels = Panels::new(self.panels.len(), plot + WRITTEN, height, left, 15.0);
         let whole = panels.width().max(text_width(&self.title, 3.2) * 1.1 + 6.0);
@@ -391,7 +390,7 @@ impl Dots {
     }
 }
 
-/// Where panels of one size stand: in rows, the first of each with its labels to the left.
+/// Layout of panels of equal size in rows. The first panel of each row has labels on its left.
 struct Panels {
     count: usize,
     columns: usize,

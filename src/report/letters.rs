@@ -1,31 +1,31 @@
-//! The letters of every picture: DejaVu Sans, cut down to what pictures say and embedded, so that each machine and each
-//! viewer shows the same ones in the same room.
+//! Text as outlines of an embedded font, a subset of DejaVu Sans. Every machine and viewer therefore shows the same
+//! letters at the same widths.
 
 use std::sync::LazyLock;
 
 use tiny_skia::PathBuilder;
 use ttf_parser::{Face, OutlineBuilder};
 
-/// The font's file.
+/// The font file.
 pub const FILE: &[u8] = include_bytes!("font/dejavu-sans.ttf");
 
 static FONT: LazyLock<Face<'static>> = LazyLock::new(|| Face::parse(FILE, 0).expect("the embedded font is whole"));
 
-/// The font itself.
+/// Returns the parsed font.
 pub fn font() -> &'static Face<'static> {
     &FONT
 }
 
-/// Units of the font in an em.
+/// Returns the number of font units per em.
 pub fn units_per_em() -> f64 {
     f64::from(FONT.units_per_em())
 }
 
-/// A text's glyphs, each with its place from the text's start in the font's units, and the text's length.
+/// Returns a text's glyphs, each with its x offset and character, and the text's length. Lengths are in font units.
 pub fn set(text: &str) -> (Vec<(ttf_parser::GlyphId, u32, char)>, u32) {
     let mut x = 0;
     let glyphs = text.chars().map(|c| {
-        // What the font lacks is its empty box; what cannot be seen at all leaves a gap.
+        // Control characters become spaces. Characters that the font lacks become its empty box.
         let c = if c.is_control() { ' ' } else { c };
         let glyph = FONT.glyph_index(c).unwrap_or_default();
         let place = x;
@@ -35,14 +35,14 @@ pub fn set(text: &str) -> (Vec<(ttf_parser::GlyphId, u32, char)>, u32) {
     (glyphs.collect(), x)
 }
 
-/// How long a text is, in millimetres, in letters of a size (millimetres an em).
+/// Returns the width of a text in millimetres at a font size (millimetres per em).
 pub fn text_width(text: &str, size: f64) -> f64 {
     f64::from(set(text).1) * size / units_per_em()
 }
 
-/// A glyph's outline as the data of an SVG path, in the font's units with y downwards; none of a space.
+/// Returns a glyph's outline as SVG path data in font units, with y downwards. A space has none.
 pub fn outline(glyph: ttf_parser::GlyphId) -> Option<String> {
-    /// Writes each point as its way from the one before, which takes fewer digits.
+    /// Writes each point relative to the previous one, which takes fewer digits.
     struct Strokes {
         path: String,
         at: [i32; 2],
@@ -60,7 +60,7 @@ pub fn outline(glyph: ttf_parser::GlyphId) -> Option<String> {
                 }
             }
             for (index, number) in numbers.iter().enumerate() {
-                // A minus parts numbers as well as a space does.
+                // A minus sign separates numbers as well as a space does.
                 if index > 0 && *number >= 0 {
                     self.path.push(' ');
                 }
@@ -92,7 +92,8 @@ pub fn outline(glyph: ttf_parser::GlyphId) -> Option<String> {
     Some(outline.path)
 }
 
-/// The outlines of a text whose baseline starts at `(start, 0)`, in millimetres.
+/// Returns the outlines of a text whose baseline starts at `(start, 0)`, in millimetres. None if it has no visible
+/// glyph.
 pub fn letters(text: &str, size: f64, start: f64) -> Option<tiny_skia::Path> {
     struct Letters {
         builder: PathBuilder,

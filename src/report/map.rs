@@ -1,4 +1,4 @@
-//! A team on its map at one moment: agents with their trails and numbers, and POIs with what they need.
+//! A team on its map at one moment: agents with trails and numbers, and POIs with their couplings.
 
 use glam::DVec2;
 
@@ -8,10 +8,11 @@ use crate::config::{Config, Observers};
 use crate::model::rule::Rule;
 use crate::world::World;
 
-/// Colours of leaders and their followers on white. Green is the observed POIs', and grey nobody's.
+/// Colours of leaders and their followers on white. Green is reserved for observed POIs and grey for agents without a
+/// group.
 ///
-/// They were chosen one by one, each as far from all others as can be to normal and to red- or green-blind eyes, among
-/// those that stand out from white by 3 to 1 or more.
+/// Each colour was chosen to be as far as possible from all others for normal and red- or green-blind vision. All have
+/// a contrast of at least 3 to 1 to white.
 pub const GROUPS: [Color; 16] = [
     [0x00, 0x72, 0xb2],
     [0xd5, 0x5e, 0x00],
@@ -30,7 +31,7 @@ pub const GROUPS: [Color; 16] = [
     [0x66, 0x00, 0xff],
     [0x00, 0x44, 0x00],
 ];
-/// The same on a dark ground.
+/// Colours of leaders and their followers on a dark background.
 pub const GROUPS_DARK: [Color; 16] = [
     [0x4a, 0xa8, 0xe0],
     [0xf0, 0x88, 0x3e],
@@ -49,48 +50,49 @@ pub const GROUPS_DARK: [Color; 16] = [
     [0xff, 0x44, 0x00],
     [0x22, 0xcc, 0xff],
 ];
-/// Once the colours are used up, they come again in dashes; what these do not tell apart, the numbers do.
+/// Dashes distinguish groups once all colours are used. Beyond that, only the leaders' numbers do.
 const DASHES: [&[f64]; 3] = [&[], &[0.9, 0.5], &[0.3, 0.35]];
 
-/// The circle of a POI that cannot be observed now.
+/// Dashes of the circle around a POI that cannot be observed now.
 const CLOSED: &[f64] = &[0.3, 1.2];
 
-/// Sizes of letters, in millimetres.
+/// Font sizes of labels, in millimetres: the usual one and the smallest.
 const LABEL: f64 = 2.4;
 const LEAST: f64 = 1.9;
 const PALE: Color = [250, 250, 250];
-/// Of what is there to be looked past.
+/// Colour of secondary text.
 pub const FAINT: Color = [95, 95, 95];
 
-/// One agent.
+/// An agent to draw.
 pub struct Marker {
-    /// Where it is, in units.
+    /// Position in map units.
     pub place: DVec2,
-    /// Its heading, of any length but 0.
+    /// Heading, a vector of any length except 0.
     pub heading: DVec2,
-    /// The leader in whose group it is.
+    /// The leader in whose group the agent is.
     pub group: Option<usize>,
-    /// Whether its presence at a POI counts.
+    /// Whether the agent is an observer.
     pub counts: bool,
-    /// Where it was, up to its place.
+    /// Earlier positions, in map units, up to the current one.
     pub trail: Vec<DVec2>,
 }
 
-/// One POI.
+/// A POI to draw.
 pub struct Poi {
-    /// Where it is, in units.
+    /// Position in map units.
     pub place: DVec2,
-    /// What stands beside it.
+    /// Text next to the POI.
     pub label: String,
-    /// How much of what it needs is there, 0 to 1; none before an episode.
+    /// Observers present divided by the coupling. None before an episode.
     pub share: Option<f64>,
-    /// Whether it has been observed by now.
+    /// Whether the POI has been observed.
     pub observed: bool,
-    /// Whether enough agents would observe it now: it is its time, and those that it comes after are observed.
+    /// Whether enough observers would observe the POI now: its window is open, and all POIs that it comes after are
+    /// observed.
     pub open: bool,
 }
 
-/// A POI's label: what it needs, or has of it, and by its number when it can be observed, where that is not always.
+/// Returns a POI's label: `needs`, and for a timed rule also the POI's number and when it can be observed.
 pub fn poi_label(rule: &Rule, poi: usize, needs: String) -> String {
     if !rule.is_timed() {
         return needs;
@@ -104,50 +106,50 @@ pub fn poi_label(rule: &Rule, poi: usize, needs: String) -> String {
     format!("{poi}: {needs}{}{after}", window.unwrap_or_default())
 }
 
-/// An observed POI's label: the step at which it was observed.
+/// Returns an observed POI's label: the step at which it was observed.
 pub fn observed_label(rule: &Rule, poi: usize, step: usize) -> String {
     if rule.is_timed() { format!("{poi}: at step {step}") } else { format!("at step {step}") }
 }
 
-/// A team at one moment.
+/// A team at one moment, to draw.
 pub struct Team {
-    /// The first of the agents lead.
+    /// Number of leaders.
     pub leaders: usize,
-    /// Leaders first.
+    /// The agents, leaders first.
     pub agents: Vec<Marker>,
-    /// All of the world's.
+    /// All POIs of the world.
     pub pois: Vec<Poi>,
 }
 
-/// Where a part of the map is drawn.
+/// The area of a picture in which a part of the map is drawn.
 #[derive(Clone, Copy)]
 pub struct Viewport {
     left: f64,
     above: f64,
-    /// Millimetres a unit of the map.
+    /// Millimetres per map unit.
     scale: f64,
-    /// Corners of the part.
+    /// Lower left corner of the part, in map units. `to` is the upper right one.
     from: DVec2,
     to: DVec2,
     map: DVec2,
-    /// How far a POI sees.
+    /// Observation radius in map units.
     radius: f64,
 }
 
 impl Viewport {
-    /// A part of a config's map, from corner to corner, as large as fits into a square of so many millimetres.
+    /// Fits a part of a config's map, given by its corners, into a square of `side` millimetres.
     pub fn new(config: &Config, [from, to]: [DVec2; 2], side: f64) -> Viewport {
         let scale = side / (to - from).max_element();
         let (map, radius) = (config.world.map.into(), config.world.observation_radius);
         Viewport { left: 0.0, above: 0.0, scale, from, to, map, radius }
     }
 
-    /// The same view from another upper left corner, in millimetres.
+    /// Returns the same view with another upper left corner, in millimetres.
     pub fn moved_to(self, [left, above]: [f64; 2]) -> Viewport {
         Viewport { left, above, ..self }
     }
 
-    /// Width and height in millimetres.
+    /// Returns width and height in millimetres.
     pub fn size(&self) -> [f64; 2] {
         ((self.to - self.from) * self.scale).to_array()
     }
@@ -157,7 +159,7 @@ impl Viewport {
         [self.left, self.above, width, height]
     }
 
-    /// The corners of its area: `[left, above, right, below]`.
+    /// Returns the area's corners in millimetres: `[left, above, right, below]`.
     fn whole(&self) -> [f64; 4] {
         let [left, above, width, height] = self.area();
         [left, above, left + width, above + height]
@@ -173,7 +175,7 @@ impl Viewport {
         scene.rectangle(self.area(), Some(PALE.into()), Some(Pen::new(LIGHT, 0.2)));
         let labels = self.poi_labels(team);
         let ring = labels.is_none().then(|| self.ring(team));
-        // What reaches beyond the part of the map; agents do not.
+        // Walls and POIs may extend beyond the visible part of the map; agents do not.
         scene.clipped(self.area(), |scene| {
             let corners = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
             let walls = corners.map(|corner| self.at(self.map * DVec2::from(corner)));
@@ -234,7 +236,7 @@ impl Viewport {
         }
     }
 
-    /// How large the rings around POIs may be that stand in for labels where these have no room.
+    /// Returns the radius of the rings that replace POI labels when these have no room, in millimetres.
     fn ring(&self, team: &Team) -> f64 {
         let apart = |index: usize, poi: &Poi| {
             team.pois[..index].iter().map(|other| other.place.distance(poi.place)).fold(f64::INFINITY, f64::min)
@@ -243,7 +245,7 @@ impl Viewport {
         (nearest * self.scale * 0.4).clamp(0.5, 1.3)
     }
 
-    /// Where each POI's label stands and how large it is; none if they would run into each other.
+    /// Returns each POI label's position and font size, or none if labels would overlap.
     fn poi_labels(&self, team: &Team) -> Option<Vec<([f64; 2], f64)>> {
         [LABEL, LEAST].into_iter().find_map(|size| {
             let crosses: Vec<_> = team.pois.iter().map(|poi| around(self.at(poi.place), 0.8)).collect();
@@ -252,7 +254,7 @@ impl Viewport {
             let place = |poi: &Poi| {
                 let [x, y] = self.at(poi.place);
                 let half = text_width(&poi.label, size) / 2.0;
-                // In large circles at the top, since agents gather in the middle.
+                // Labels of large circles are at the top, because agents gather in the middle.
                 let top = y - self.radius * self.scale + size + 0.8;
                 let places = [
                     [x, if top < y - 2.5 { top } else { y - 1.6 }],
@@ -273,9 +275,9 @@ impl Viewport {
         })
     }
 
-    /// The leaders' numbers beside their arrows, as far as there is room.
+    /// Draws the leaders' numbers beside their arrows, as far as there is room.
     fn numbers(&self, scene: &mut Scene, team: &Team, mut taken: Vec<[f64; 4]>) {
-        // So many have no room in any case, and to try takes time.
+        // More numbers than this never fit, and trying takes time.
         const MOST: usize = 256;
         let arrow = self.agent_size(team) * 1.35;
         let leaders = &team.agents[..team.leaders.min(MOST)];
@@ -306,7 +308,7 @@ impl Viewport {
         }
     }
 
-    /// Marks the map's units at the left and lower edge.
+    /// Draws scales in map units at the left and lower edges.
     pub fn rule(&self, scene: &mut Scene) {
         let [left, above, width, height] = self.area();
         let below = above + height;
@@ -331,7 +333,7 @@ impl Viewport {
         scene.upright([left - 7.2, above + height / 2.0], "y, map units", LABEL, BLACK);
     }
 
-    /// What the signs mean: how each is drawn at a place, and the words for it.
+    /// Returns the legend of the symbols that occur on the maps of these teams.
     pub fn legend(&self, teams: &[Team], counts: &str) -> Legend {
         let mut entries: Vec<Gloss> = Vec::new();
         let Some(team) = teams.first() else { return Legend::default() };
@@ -413,22 +415,22 @@ impl Viewport {
 
 type Gloss = (f64, String, Box<dyn Fn(&mut Scene, [f64; 2])>);
 
-/// What the signs of a map mean.
+/// The legend below a map.
 #[derive(Default)]
 pub struct Legend {
-    /// A sign's width, its words, and how it is drawn from a place on the baseline.
+    /// Width of each symbol, its text, and a function that draws it from a place on the baseline.
     entries: Vec<Gloss>,
 }
 
 impl Legend {
     const ROW: f64 = 4.2;
 
-    /// Adds a remark.
+    /// Adds a remark without a symbol.
     pub fn note(&mut self, text: impl Into<String>) {
         self.entries.push((0.0, text.into(), Box::new(|_, _| ())));
     }
 
-    /// Where each entry stands, in rows of a width, and the height of all.
+    /// Returns the position of each entry in rows of a given width, and the height of all rows, in millimetres.
     fn places(&self, width: f64) -> (Vec<[f64; 2]>, f64) {
         let (mut x, mut y) = (0.0, 0.0);
         let mut places = Vec::new();
@@ -443,12 +445,12 @@ impl Legend {
         (places, y + Self::ROW)
     }
 
-    /// How high the legend below a map of this width is, in millimetres.
+    /// Returns the height of the legend below a map of this width, in millimetres.
     pub fn height(&self, width: f64) -> f64 {
         self.places(width).1
     }
 
-    /// Draws it from a place on the first row's baseline.
+    /// Draws the legend from a place on the first row's baseline.
     pub fn draw(&self, scene: &mut Scene, [left, first]: [f64; 2], width: f64) {
         for ((sign, text, draw), [x, y]) in self.entries.iter().zip(self.places(width).0) {
             draw(scene, [left + x, first + y]);
@@ -458,7 +460,7 @@ impl Legend {
     }
 }
 
-/// The layout of a config before any training: where everyone starts and looks to, and what each POI needs.
+/// Draws the layout of a config before training: start positions, headings and the coupling of each POI.
 pub fn layout(name: &str, config: &Config) -> Scene {
     const LEFT: f64 = 11.0;
     const EDGE: f64 = 3.0;
@@ -548,30 +550,30 @@ pub fn layout(name: &str, config: &Config) -> Scene {
     scene
 }
 
-/// When the first of so many POIs can be observed, for whoever does not see it.
+/// Describes when POIs can be observed, for at most 12 of them.
 fn pois_in_words(rule: &Rule, pois: usize) -> String {
     let list: Vec<_> = (0..pois.min(12)).map(|poi| poi_label(rule, poi, "any time".into())).collect();
     format!(" POIs can be observed: {}{}.", list.join("; "), if pois > 12 { "; …" } else { "" })
 }
 
-/// "1 leader", "2 leaders".
+/// Formats a count as "1 leader" or "2 leaders".
 pub fn count(number: usize, what: &str) -> String {
     format!("{number} {what}{}", if number == 1 { "" } else { "s" })
 }
 
-/// An agent's arrow: full for a leader, hollow for a follower.
+/// Draws an agent's arrow: filled for a leader, hollow for a follower.
 fn arrow(scene: &mut Scene, [px, py]: [f64; 2], heading: DVec2, size: f64, group: Option<usize>, leads: bool) {
     let [x, y] = heading.normalize_or(DVec2::Y).to_array();
     let corner = |ahead: f64, aside: f64| [px + size * (x * ahead - y * aside), py - size * (y * ahead + x * aside)];
     let corners = vec![corner(1.0, 0.0), corner(-0.75, 0.7), corner(-0.4, 0.0), corner(-0.75, -0.7)];
     match leads {
-        // Small ones keep more colour than outline.
+        // A thin outline leaves enough colour in small arrows.
         true => scene.polygon(corners, Some(group_color(group).into()), Some(Pen::new(BLACK, (size * 0.1).min(0.2)))),
         false => scene.polygon(corners, Some(WHITE.into()), Some(group_pen(group, 0.35))),
     }
 }
 
-/// A stroke across the arrow of an agent that does not count.
+/// Draws a stroke across the arrow of an agent that does not observe.
 fn strike(scene: &mut Scene, [px, py]: [f64; 2], heading: DVec2, size: f64) {
     let [x, y] = heading.normalize_or(DVec2::Y).to_array();
     let end = |side: f64| [px - side * size * y, py - side * size * x];
@@ -580,7 +582,7 @@ fn strike(scene: &mut Scene, [px, py]: [f64; 2], heading: DVec2, size: f64) {
     }
 }
 
-/// A leader's own colour, its followers' too.
+/// Returns the colour of a leader and its followers, or grey without a group.
 fn group_color(group: Option<usize>) -> Color {
     group.map_or(GREY, |group| GROUPS[group % GROUPS.len()])
 }
@@ -590,13 +592,13 @@ fn group_pen(group: Option<usize>, width: f64) -> Pen {
     Pen { dash, ..Pen::new(group_color(group), width) }
 }
 
-/// What a label covers, `[left, above, right, below]`, that is centred on a place of its baseline.
+/// Returns the area of a label centred on a place of its baseline: `[left, above, right, below]`.
 fn label_area([x, y]: [f64; 2], text: &str, size: f64) -> [f64; 4] {
     let half = text_width(text, size) / 2.0 + 0.2;
     [x - half, y - 0.8 * size, x + half, y + 0.12 * size]
 }
 
-/// Makes what lies under a label pale, so that it can be read, and takes its room.
+/// Makes the background of a label pale for legibility, and marks its area as taken.
 fn plate(scene: &mut Scene, taken: &mut Vec<[f64; 4]>, place: [f64; 2], text: &str, size: f64) {
     let area = label_area(place, text, size);
     let [left, above, right, below] = area;

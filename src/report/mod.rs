@@ -1,19 +1,19 @@
-//! Pictures of what was learned, for people.
+//! Figures, tables, replays and progress for people.
 //!
-//! | module | holds |
+//! | module | contents |
 //! |---|---|
 //! | [`scene`] | a picture described once, written as SVG, PDF or PNG |
-//! | [`letters`], [`pdf`] | its letters; how it becomes a PDF |
+//! | [`letters`], [`pdf`] | its text as outlines; its PDF form |
 //! | [`map`] | a team on its map: agents, POIs, trails |
-//! | [`curves`] | learning curves: mean and standard error over trials, and the figure that shows them |
-//! | [`runs`] | what runs' folders say of their curves, and what is wrong with them |
-//! | [`comparison`] | arms side by side, with intervals and tests |
+//! | [`curves`] | learning curves: mean and standard error over trials, and their figure |
+//! | [`runs`] | reading the curves of run directories, with errors |
+//! | [`comparison`] | comparison of arms, with intervals and tests |
 //! | [`grid`] | heat maps and curves over the axes of a sweep |
-//! | [`paper`] | the paper's experiments, its figures and its claims, one by one |
+//! | [`paper`] | the paper's experiments, figures and claims |
 //! | [`replay`] | episodes of any trial and generation, as a page or a picture |
 //! | [`tensorboard`] | event files for TensorBoard |
-//! | [`table`] | tables of text, for people and for LaTeX |
-//! | [`progress`] | every arm's curve on the terminal while it grows |
+//! | [`table`] | text tables, for people and for LaTeX |
+//! | [`progress`] | progress of training and other work on the terminal |
 
 pub mod comparison;
 pub mod curves;

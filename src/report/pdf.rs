@@ -1,4 +1,4 @@
-//! A picture as a PDF document of one page, with the embedded font in it: its texts can be searched and copied.
+//! Writes a picture as a PDF document of one page. It embeds the font, so that text can be searched and copied.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -8,13 +8,13 @@ use pdf_writer::{Content, Filter, Finish, Name, Pdf, Rect, Ref, Str, TextStr};
 use super::letters;
 use super::scene::{Anchor, BOLD, Color, Fill, Mark, Pen, Scene};
 
-/// Points of a PDF in a millimetre.
+/// Points per millimetre.
 const POINTS: f64 = 72.0 / 25.4;
 const FONT: Name<'static> = Name(b"DejaVuSans");
 const INFO: SystemInfo<'static> = SystemInfo { registry: Str(b"Adobe"), ordering: Str(b"Identity"), supplement: 0 };
 
 impl Scene {
-    /// The picture as a PDF file.
+    /// Returns the picture as a PDF file.
     pub fn pdf(&self) -> Vec<u8> {
         pdf(self)
     }
@@ -94,24 +94,24 @@ fn packed(bytes: &[u8]) -> Vec<u8> {
     miniz_oxide::deflate::compress_to_vec_zlib(bytes, 9)
 }
 
-/// The name of the state with an opacity in percent.
+/// Returns the name of the graphics state with an opacity in percent.
 fn state(percent: u8) -> String {
     format!("O{percent}")
 }
 
-/// What a page's content needs from its resources.
+/// Resources that the page's content uses.
 #[derive(Default)]
 struct Page {
-    /// In percent.
+    /// Opacities in percent.
     opacities: BTreeSet<u8>,
-    /// What each glyph stands for.
+    /// The character of each glyph.
     glyphs: BTreeMap<u16, char>,
 }
 
 impl Page {
     fn content(&mut self, scene: &Scene) -> Vec<u8> {
         let mut content = Content::new();
-        // Millimetres from the upper edge, as the scene has them.
+        // The scene measures millimetres from the upper edge. PDF measures points from the lower edge.
         let scale = POINTS as f32;
         content.transform([scale, 0.0, 0.0, -scale, 0.0, (scene.height * POINTS) as f32]);
         content.set_line_join(LineJoinStyle::RoundJoin);
@@ -133,7 +133,7 @@ impl Page {
                     self.paint(&mut content, path, fill.as_ref(), pen.as_ref());
                 }
                 Mark::Circle { center: [x, y], radius, fill, pen } => {
-                    // Of four cubic curves, which stray from it by less than a thousandth of its radius.
+                    // Four cubic curves approximate the circle to within a thousandth of its radius.
                     const REACH: f64 = 0.552_284_75;
                     let path = |content: &mut Content| {
                         let at = |dx: f64, dy: f64| (round(x + radius * dx), round(y + radius * dy));
@@ -208,7 +208,7 @@ impl Page {
         }
     }
 
-    /// What comes next covers as much of what is there.
+    /// Sets the opacity of the following marks.
     fn opacity(&mut self, content: &mut Content, opacity: f64) {
         let percent = (opacity * 100.0).round() as u8;
         self.opacities.insert(percent);
@@ -220,7 +220,7 @@ fn rgb(color: Color) -> [f32; 3] {
     color.map(|channel| (f32::from(channel) / 255.0 * 1000.0).round() / 1000.0)
 }
 
-/// A thousandth of a millimetre is enough.
+/// Rounds to a thousandth of a millimetre, which keeps the file small.
 fn round(at: f64) -> f32 {
     ((at * 1000.0).round() / 1000.0) as f32
 }

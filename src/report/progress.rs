@@ -1,5 +1,5 @@
-//! How work comes on: on a terminal a bar, or of training every arm's curve as it grows; elsewhere a line from time to
-//! time.
+//! Progress on standard error: a bar or the learning curve of every arm on a terminal, otherwise a line every few
+//! seconds.
 
 use std::io::{self, IsTerminal, Write};
 use std::time::Duration;
@@ -9,17 +9,17 @@ use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use crate::host::Instant;
 use crate::trainer::Row;
 
-/// Letters that a curve takes; with the longest name and the value it fits the usual 80.
+/// Characters per curve. With the longest name and the value, a line fits the usual 80 columns.
 const CURVE: usize = 24;
-/// Curves that a terminal has lines for.
+/// Maximum number of curves on a terminal.
 const MOST: usize = 24;
-/// How often a line is written where there is no terminal, and how often a terminal changes.
+/// Interval between lines without a terminal. The next one is the interval between redraws on a terminal.
 const LINES: Duration = Duration::from_secs(10);
 const DRAWS: Duration = Duration::from_millis(100);
-/// What a bar's length is divided into.
+/// Number of steps of a full bar.
 const PARTS: u64 = 1000;
 
-/// How progress is shown, and when the next time.
+/// Decides whether and when progress is shown.
 struct Pace {
     quiet: bool,
     terminal: bool,
@@ -35,7 +35,7 @@ impl Pace {
         Pace { quiet, terminal, since: now, shown: now, pause: if terminal { DRAWS } else { LINES } }
     }
 
-    /// Whether it is time to show something, as is then done.
+    /// Reports whether it is time to show progress. If so, restarts the interval.
     fn is_due(&mut self) -> bool {
         let due = !self.quiet && self.shown.elapsed() >= self.pause;
         if due {
@@ -49,17 +49,17 @@ impl Pace {
     }
 }
 
-/// Whether what was drawn can be drawn over, on a terminal of this name.
+/// Reports whether standard error can be redrawn. `name` is the value of `TERM`.
 fn is_capable(terminal: bool, name: Option<&str>) -> bool {
     terminal && name.map_or(cfg!(windows), |name| name != "dumb")
 }
 
-/// Writes a line; with standard error gone there is nobody left to tell.
+/// Writes a line. Errors are ignored, because a closed standard error must not stop the work.
 fn line(to: &mut dyn Write, text: &str) {
     let _ = writeln!(to, "{text}");
 }
 
-/// Shows on standard error how much of one thing is done.
+/// Shows the progress of one task on standard error.
 pub struct Meter {
     pace: Pace,
     bar: Option<ProgressBar>,
@@ -67,7 +67,7 @@ pub struct Meter {
 }
 
 impl Meter {
-    /// A meter that starts now, and never shows anything where `quiet`.
+    /// Starts a meter. With `quiet` it never shows anything.
     pub fn new(quiet: bool) -> Meter {
         let pace = Pace::new(quiet);
         let bar = pace.terminal.then(|| {
@@ -78,7 +78,7 @@ impl Meter {
         Meter { pace, bar, lines: Box::new(io::stderr()) }
     }
 
-    /// So much is done, of a whole of 1; `told` says what is under way.
+    /// Shows the completed fraction, 0 to 1. `told` describes the current work and is called only if it is shown.
     pub fn show(&mut self, part: f64, told: impl FnOnce() -> String) {
         if !self.pace.is_due() {
             return;
@@ -96,7 +96,7 @@ impl Meter {
         }
     }
 
-    /// Clears the terminal for what follows.
+    /// Clears the bar, so that other output can follow.
     pub fn clear(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
@@ -104,11 +104,11 @@ impl Meter {
     }
 }
 
-/// Shows on standard error how arms train side by side.
+/// Shows the training progress of several arms on standard error.
 pub struct Board {
     arms: Vec<Growing>,
     last: usize,
-    /// Where this session started.
+    /// The generation at which this session started.
     from: usize,
     pace: Pace,
     terminal: Option<Terminal>,
@@ -120,16 +120,16 @@ struct Terminal {
     generation: ProgressBar,
 }
 
-/// One arm's curve so far: the best teams' G, summed, by part of the run.
+/// One arm's curve so far: for each part of the run, the sum of the best teams' G and the number of rows.
 struct Growing {
     name: String,
-    /// None where stages differ in them.
+    /// Number of POIs. None if stages differ in it.
     pois: Option<usize>,
     parts: Vec<(f64, u32)>,
     newest: Newest,
 }
 
-/// The newest generation: G of its best and mean teams, summed over so many trials.
+/// The newest generation: sums of the best and the mean teams' G over trials.
 #[derive(Clone, Copy, Default)]
 struct Newest {
     generation: usize,
@@ -151,7 +151,7 @@ impl Growing {
         self.newest.trials += 1;
     }
 
-    /// The curve so far, a letter a part of the run.
+    /// Returns the curve so far, one character per part of the run.
     fn spark(&self) -> String {
         const LEVELS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
         let level = |&(sum, count): &(f64, u32)| match count {
@@ -161,7 +161,8 @@ impl Growing {
         self.parts.iter().map(level).collect()
     }
 
-    /// What the newest generation came to, over trials: in POIs of the best team, or also in words.
+    /// Returns the newest generation's mean over trials, in POIs if their number is known. `in_words` adds the mean
+    /// team and labels.
     fn value(&self, in_words: bool) -> String {
         let Newest { best, mean, trials, .. } = self.newest;
         let pois = |sum: f64| sum / f64::from(trials.max(1)) * self.pois.unwrap_or(1) as f64;
@@ -175,7 +176,9 @@ impl Growing {
 }
 
 impl Board {
-    /// Arms by name and number of POIs, none where that changes on the way, which train to generation `last`, this time from generation `from`.
+    /// Starts a board for arms, each with its name and number of POIs (none if that changes during the run).
+    ///
+    /// The arms train up to generation `last`. This session starts at generation `from`.
     pub fn new(arms: Vec<(String, Option<usize>)>, from: usize, last: usize, quiet: bool) -> Board {
         let parts = vec![(0.0, 0); CURVE.min(last + 1)];
         let arms: Vec<Growing> = arms
@@ -187,7 +190,7 @@ impl Board {
         Board { arms, last, from, pace, terminal }
     }
 
-    /// Takes in the rows that became complete; `next` is the generation that plays next.
+    /// Adds complete rows. `next` is the generation that plays next.
     pub fn show(&mut self, next: usize, rows: &[Row]) {
         for row in rows {
             if let Some(arm) = self.arms.get_mut(row.arm) {
@@ -220,7 +223,7 @@ impl Board {
         }
     }
 
-    /// Clears the terminal for what follows.
+    /// Clears the curves, so that other output can follow.
     pub fn clear(&self) {
         if let Some(Terminal { all, .. }) = &self.terminal {
             let _ = all.clear();
@@ -259,7 +262,7 @@ mod tests {
         assert_eq!(is_capable(true, None), cfg!(windows));
     }
 
-    /// Sends what is written in pieces.
+    /// A writer that sends every piece through a channel.
     struct Sent(mpsc::Sender<String>);
 
     impl Write for Sent {

@@ -1,8 +1,8 @@
-//! Replays: the very episode that a team of a generation was scored on.
+//! Replays exactly the episode that a team of a generation was scored on.
 //!
-//! Training is a pure function of config and seed, and fast. So nothing of a generation needs to be kept: its trial is
-//! trained again up to it (from a checkpoint where one is on the way), its teams play again, and one team's episode is
-//! traced. The G of the best team, or the champion's, is compared with the run's `metrics.csv`.
+//! Training is a fast, pure function of config and seed, so no generation has to be stored. A replay retrains the trial
+//! up to the generation, from a checkpoint if possible. It then plays the generation's teams again and traces one
+//! team's episode. G of the best team or champion is compared with the run's `metrics.csv`.
 
 use std::path::Path;
 
@@ -25,108 +25,108 @@ use crate::record::folder::{CHECKPOINTS, POLICIES, RUN, Run};
 use crate::trainer::{Snapshot, Trainer};
 use crate::world::World;
 
-/// Most bytes of motion in a page, before they are written as text (4/3 of it). What is longer is thinned out.
+/// Maximum number of bytes of motion in a page, before base64 adds a third. Longer motion is thinned out.
 const MOTION_BYTES: usize = 1_300_000;
-/// Most bytes of motion that is kept as the f32 that were computed.
+/// Maximum number of bytes of motion that is stored as the exact f32 values.
 const EXACT_BYTES: usize = 600_000;
 
-/// Why an episode could not be replayed.
+/// The reason why an episode cannot be replayed.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
     /// The run cannot be read.
     #[error(transparent)]
     Run(#[from] ReadError),
-    /// Its generations could not be played.
+    /// The generations cannot be played.
     #[error(transparent)]
     Backend(#[from] BackendError),
-    /// The run has fewer trials.
+    /// The run has no such trial.
     #[error("{folder} has no trial {trial}: its config has {}", numbered(*trials, "trial"))]
     NoTrial {
-        /// The run's.
+        /// The run directory.
         folder: String,
-        /// The one asked for, from 0.
+        /// The requested trial, from 0.
         trial: usize,
-        /// How many it has.
+        /// The number of trials.
         trials: usize,
     },
-    /// The run has not come to the generation.
+    /// The run has not reached the generation.
     #[error(
         "{folder}: metrics.csv has no generation {generation} of trial {trial}{}",
         newest.map_or(String::new(), |newest| format!("; the newest is {newest}: choose one up to that"))
     )]
     NoGeneration {
-        /// The run's.
+        /// The run directory.
         folder: String,
-        /// The one asked for, from 0.
+        /// The requested trial, from 0.
         trial: usize,
-        /// The one asked for, from 0.
+        /// The requested generation, from 0.
         generation: usize,
-        /// The newest that it has.
+        /// The trial's newest generation, if any.
         newest: Option<usize>,
     },
-    /// A generation has fewer teams.
+    /// A generation has no such team.
     #[error("no team {team}: a generation has {teams} teams, {}; choose one of them, best or champion", places(*teams))]
     NoTeam {
-        /// The one asked for, from 0.
+        /// The requested team, from 0.
         team: usize,
-        /// How many there are.
+        /// The number of teams.
         teams: usize,
     },
-    /// What it started from is not there.
+    /// The policies that the run started from are missing.
     #[error(
         "{folder} started from given policies, and no checkpoint that holds them or what came of them is left: it cannot be \
          played again up to generation {generation}"
     )]
     NoStart {
-        /// The run's.
+        /// The run directory.
         folder: String,
-        /// The one asked for, from 0.
+        /// The requested generation, from 0.
         generation: usize,
     },
-    /// Trained again, it comes to something else.
+    /// Retraining gives another result than the run's metrics.
     #[error(
         "{folder}: trained again, the {who} of trial {trial}, generation {generation} has G = {found}, but metrics.csv \
          says {expected}: it was made with another config or another version of this program; repeat the run, then \
          replay it"
     )]
     Differs {
-        /// The run's.
+        /// The run directory.
         folder: String,
         /// Whose G differs: "best team" or "champion".
         who: &'static str,
-        /// The one asked for, from 0.
+        /// The trial, from 0.
         trial: usize,
-        /// The one asked for, from 0.
+        /// The generation, from 0.
         generation: usize,
-        /// G now.
+        /// G of the replay.
         found: f64,
-        /// G as the run has it.
+        /// G in the run's metrics.
         expected: f64,
     },
-    /// Whoever watched said stop.
+    /// The caller's `watch` stopped the replay.
     #[error("stopped")]
     Stopped,
 }
 
-/// "3 trials, 0 to 2", "1 trial, 0".
+/// Formats a count and its indices as "3 trials, 0 to 2" or "1 trial, 0".
 pub(crate) fn numbered(count: usize, what: &str) -> String {
     format!("{}, {}", map::count(count, what), places(count))
 }
 
-/// "0 to 2", "0".
+/// Formats the indices of a count as "0 to 2" or "0".
 fn places(count: usize) -> String {
     if count > 1 { format!("0 to {}", count - 1) } else { "0".into() }
 }
 
-/// Which team of a generation plays again.
+/// The team of a generation to replay.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Which {
-    /// The team with the largest G, the first of those.
+    /// The team with the largest G; the first one if several are equal.
     #[default]
     Best,
-    /// The team of the best policy of every population, once the generation is scored.
+    /// The team of the best policy of each population after the generation is scored.
     Champion,
-    /// The team of this number among those of its generation.
+    /// The team with this index in its generation.
     Number(usize),
 }
 
@@ -144,44 +144,46 @@ impl std::str::FromStr for Which {
     }
 }
 
-/// One team's episode, with what it was worth.
+/// One team's episode and its scores.
 pub struct Replayed {
-    /// Which trial it is of.
+    /// The trial.
     pub trial: usize,
-    /// Which generation it is of.
+    /// The generation.
     pub generation: usize,
-    /// What the team was asked for as.
+    /// The team as it was requested.
     pub which: Which,
-    /// Index of the team among those of its generation; of the champion, which is none of them, their number.
+    /// Index of the team in its generation. The champion is none of these teams and has their number instead.
     pub team: usize,
-    /// The team's G over all its episodes; of the best team and the champion as in `metrics.csv`.
+    /// The team's mean G over all its episodes. For the best team and the champion it equals the value in
+    /// `metrics.csv`.
     pub team_g: f64,
-    /// Episodes that the team's G is the mean of; this is the first.
+    /// Number of episodes that `team_g` averages. This is the first of them.
     pub episodes: usize,
-    /// The one that this generation played in.
+    /// The world of the generation, with the POIs where this episode had them.
     pub world: World,
-    /// Of this team alone.
+    /// The trace of this team alone.
     pub trace: Trace,
-    /// What the episode was worth.
+    /// The scores of this episode.
     pub scores: Scores,
-    /// The leader in whose group each agent is for Df, or [`credit::NOBODY`].
+    /// The leader to whose group each agent belongs for Df, or [`credit::NOBODY`]. `[agents]`.
     pub owner: Vec<u32>,
-    /// Where the run's fitness is Dt: whom each follower is led by at each step, as [`credit::lead`] finds it.
+    /// The leaders of each follower at each step, as [`credit::lead`] writes them. Empty unless the run's fitness is
+    /// Dt.
     pub led: Vec<u32>,
-    /// The step at which each POI was observed first.
+    /// The step at which each POI was first observed, `[pois]`.
     pub observed: Vec<Option<usize>>,
-    /// Whether the run's files were not compared with their digests.
+    /// Whether the comparison of the run's files with their digests was skipped.
     pub unverified: bool,
 }
 
 /// The metrics of one trial.
 pub struct History {
-    /// G of the best team and of the champion by generation; none where there is no row.
+    /// G of the best team and of the champion, `[generations]`; none for a missing row.
     rows: Vec<Option<[f64; 2]>>,
 }
 
 impl History {
-    /// Reads a trial's G by generation.
+    /// Reads one trial's G by generation.
     ///
     /// # Errors
     /// The metrics cannot be read.
@@ -195,7 +197,7 @@ impl History {
         Ok(all.into_iter().nth(trial).unwrap_or(History { rows: vec![] }))
     }
 
-    /// Reads all trials' G by generation.
+    /// Reads every trial's G by generation, `[trials]`.
     ///
     /// # Errors
     /// The metrics cannot be read.
@@ -211,28 +213,30 @@ impl History {
         Ok(all)
     }
 
-    /// The newest generation that has a row.
+    /// Returns the newest generation that has a row.
     pub fn newest(&self) -> Option<usize> {
         self.rows.iter().rposition(Option::is_some)
     }
 
-    /// The largest G of a best team or champion in any generation.
+    /// Returns the largest G of a best team or champion in any generation; 0 without rows.
     pub fn most(&self) -> f64 {
         self.rows.iter().flatten().flatten().copied().fold(0.0, f64::max)
     }
 
-    /// G of a generation's champion, if that was asked for, or else of its best team; none if it has no row.
+    /// Returns a generation's G of the champion if `which` requests it, otherwise of the best team. None without a row.
     pub fn get(&self, generation: usize, which: Which) -> Option<f64> {
         let [best, champion] = self.rows.get(generation).copied().flatten()?;
         Some(if which == Which::Champion { champion } else { best })
     }
 }
 
-/// The trials with the largest and the smallest G of a generation (of the newest that all have), the first of those if
-/// several are equal: by the champions' G if these are asked for, or else by the best teams'.
+/// Returns the trials with the largest and the smallest G of a generation. Ties go to the lower index.
+///
+/// G is the champion's if `which` requests it, otherwise the best team's. Without a generation, the newest that all
+/// trials have is used.
 ///
 /// # Errors
-/// The run cannot be read, or has no such generation.
+/// The run cannot be read or lacks the generation.
 pub fn extreme_trials(
     folder: &Path,
     config: &Config,
@@ -253,12 +257,12 @@ pub fn extreme_trials(
     Ok([first(|b, a| b > a), first(|b, a| b < a)].map(|trial| trial.unwrap_or(0)))
 }
 
-/// Plays a team of each of some generations of a trial of a run again, in their order.
+/// Replays one team of each given generation of a trial, and returns the episodes in the given order.
 ///
-/// `watch` is told the generation about to be trained; false from it stops.
+/// `watch` is called with each generation before it is trained. If it returns false, the replay stops.
 ///
 /// # Errors
-/// The run cannot be read, has no such generation or team, or did not come to what it comes to here.
+/// The run cannot be read, lacks the generation or team, or its metrics differ from the replay.
 pub fn replay(
     folder: &Path,
     trial: usize,
@@ -293,12 +297,12 @@ pub fn replay(
     let mut trainer = Trainer::of_trial(&config.validate().map_err(BackendError::from)?, trial);
     for index in order {
         let generation = generations[index];
-        // A champion has its slot once its generation is over.
+        // The champion is in its slot only after its generation is over.
         let wanted = generation + usize::from(which == Which::Champion);
-        // A run that started from given policies has those of generation 0.
+        // A run that started from given policies has them in checkpoint 0, so a fresh trainer's search includes it.
         let next = trainer.generation(0);
         if let Some(snapshot) = nearest(folder, &config, trial, next + usize::from(next > 0)..=wanted) {
-            // A checkpoint of other sizes is of another config: training on from the start does without.
+            // A checkpoint of other sizes belongs to another config. It is ignored, and training continues without it.
             let _ = trainer.restore(0, snapshot);
         } else if next == 0 && Run::read(&folder.join(RUN)).is_ok_and(|run| run.init.is_some()) {
             return Err(ReplayError::NoStart { folder: name(), generation });
@@ -327,7 +331,7 @@ pub fn replay(
     Ok(played.into_iter().flatten().collect())
 }
 
-/// One trial's share of the newest checkpoint of some generations, if it can be used.
+/// Returns one trial's part of the newest usable checkpoint within a range of generations.
 fn nearest(
     folder: &Path,
     config: &Config,
@@ -353,7 +357,7 @@ fn nearest(
     })
 }
 
-/// Plays the teams of the generation before which a trial's trainer (of that trial alone) stands, and traces the best.
+/// Plays the current generation of a trainer with a single trial, and traces its best team.
 ///
 /// # Errors
 /// The backend fails.
@@ -366,8 +370,8 @@ pub fn best(
     Ok(team(config, trainer, trial, Which::Best, backend)?.0)
 }
 
-/// Plays the teams of the generation before which a trial's trainer (of that trial alone) stands, and traces one of
-/// them. Also gives the largest G of all of them.
+/// Plays the current generation of a trainer with a single trial, and traces one team. Also returns the largest G of
+/// all teams.
 fn team(
     config: &Config,
     trainer: &mut Trainer,
@@ -386,15 +390,15 @@ fn team(
     Ok((Replayed { trial, generation, which, team, team_g: g[team], ..played }, g[first_best]))
 }
 
-/// Plays and traces the champion of the generation that a trial's trainer (of that trial alone) has just finished,
-/// whose config this is.
+/// Plays and traces the champion of the generation that a trainer with a single trial has just finished. `config` is
+/// the config of that generation.
 fn champion(
     config: &Config,
     trainer: &mut Trainer,
     trial: usize,
     backend: &mut dyn Backend,
 ) -> Result<Replayed, BackendError> {
-    // It plays beside the next generation, from its starts, but in the world of its own.
+    // A champion plays with the starts of the next generation, but in the world of its own generation.
     let (next, world) = (trainer.generation(0), World::new(config));
     let population = config.learning.population;
     let teams = vec![population as u32; world.leaders()];
@@ -404,13 +408,13 @@ fn champion(
     Ok(Replayed { trial, generation: next - 1, which: Which::Champion, team: population, team_g, ..played })
 }
 
-/// Teams of one generation, and what they play.
+/// The teams of one generation, and the episodes that they play.
 struct Episodes<'a> {
     config: &'a Config,
     world: &'a World,
     weights: &'a [f32],
     teams: &'a [u32],
-    /// Of each episode.
+    /// The start positions of each episode, `[episodes]`.
     starts: Vec<Vec<Vec2>>,
 }
 
@@ -437,7 +441,7 @@ impl<'a> Episodes<'a> {
         Group { world: self.world, starts, weights: self.weights.into(), policies, teams, need }
     }
 
-    /// The G of every team over all its episodes.
+    /// Returns the mean G of every team over all episodes, `[teams]`.
     fn play(&self, backend: &mut dyn Backend) -> Result<Vec<f64>, BackendError> {
         use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
         let episodes = self.starts.len();
@@ -453,7 +457,7 @@ impl<'a> Episodes<'a> {
         Ok(observed.into_iter().map(|observed| f64::from(observed.into_inner()) / whole).collect())
     }
 
-    /// Plays the first episode of a team again, and traces it.
+    /// Plays a team's first episode again and traces it.
     fn trace(&self, team: usize, backend: &mut dyn Backend) -> Result<Replayed, BackendError> {
         let leaders = self.world.leaders();
         let need =
@@ -463,7 +467,7 @@ impl<'a> Episodes<'a> {
     }
 }
 
-/// Plays one team, a group of its own, and traces it; who leads at each step is told where the group needs sights.
+/// Plays and traces a group of a single team. `led` is filled only if the group requests sights.
 ///
 /// # Errors
 /// The backend fails.
@@ -479,7 +483,7 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     credit::lead(&episode.sights, world, &mut led);
     let observed = credit::observed_at(episode.sets, world);
     let team_g = f64::from(scores.observed) / world.pois.len() as f64;
-    // POIs are drawn where they were.
+    // POIs are drawn where this episode had them.
     let pois = group.moved_pois().unwrap_or(&world.pois).to_vec();
     let world = World { pois, ..world.clone() };
     let (trial, generation, which, team, episodes, unverified) = (0, 0, Which::Champion, 0, 1, false);
@@ -500,14 +504,14 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     })
 }
 
-/// Observers in one set.
+/// Counts the observers in a set.
 fn near(world: &World, sets: &Strided<'_>, set: usize) -> u32 {
     let words = world.constants.words as usize;
     world.rule.count((set * words..(set + 1) * words).map(|word| sets.get(word)))
 }
 
 impl Replayed {
-    /// Which team it is, to open a sentence: "Best team (number 3)".
+    /// Names the team at the start of a sentence: "Best team (number 3)".
     pub fn name(&self) -> String {
         match self.which {
             Which::Best => format!("Best team (number {})", self.team),
@@ -516,12 +520,12 @@ impl Replayed {
         }
     }
 
-    /// The trial and generation that it is of.
+    /// Names the trial and generation: "trial 0, generation 7".
     pub fn place(&self) -> String {
         format!("trial {}, generation {}", self.trial, self.generation)
     }
 
-    /// Observers near a POI after a step, 0 at the start.
+    /// Counts the observers within the observation radius of a POI after a step. At the start the count is 0.
     pub fn near(&self, step: usize, poi: usize) -> u32 {
         let sets = Strided { words: &self.trace.sets, stride: 1, offset: 0 };
         step.checked_sub(1).map_or(0, |step| near(&self.world, &sets, step * self.world.pois.len() + poi))
@@ -535,20 +539,21 @@ impl Replayed {
         self.trace.moment(step, 0, agent).heading
     }
 
-    /// The leader in whose group an agent is after a step: for Dt the first of those that lead it then, else for Df.
+    /// Returns the leader to whose group an agent belongs after a step. For Dt it is the first leader at that step,
+    /// otherwise the group is that of Df.
     fn group(&self, step: usize, agent: usize) -> Option<usize> {
         let leaders = self.world.leaders();
         match agent.checked_sub(leaders).filter(|_| !self.led.is_empty()) {
-            // The start is like the first step, which nobody has moved before.
+            // The start shows the groups of the first step, whose sights precede any motion.
             Some(follower) => (0..leaders)
                 .find(|&leader| credit::leads(&self.led, &self.world, step.saturating_sub(1), follower, leader)),
             None => (self.owner[agent] != credit::NOBODY).then_some(self.owner[agent] as usize),
         }
     }
 
-    /// The team `place` steps from the start, with its trails up to there.
+    /// Returns the team at `place` steps from the start, with its trails.
     fn team(&self, place: f64) -> Team {
-        // Long trails of many agents are drawn by fewer points.
+        // Limits the points of all trails together, for long episodes of many agents.
         const POINTS: usize = 40_000;
         let (step, part) = (place as usize, place.fract());
         let world = &self.world;
@@ -564,14 +569,14 @@ impl Replayed {
             let counts = world.rule.counts(agent);
             Marker { place, heading: toward(step, agent).lerp(toward(next, agent), part), group, counts, trail }
         };
-        // What a step finds observed.
+        // The POIs that were observed before this step decide which POIs are open.
         let before: Vec<bool> = self.observed.iter().map(|at| at.is_some_and(|at| at < step.max(1))).collect();
         let poi = |(poi, place): (usize, &Vec2)| {
             let (near, needed) = (self.near(step, poi), world.coupling[poi]);
             let observed = self.observed[poi].filter(|&observed| observed <= step);
             Poi {
                 place: place.as_dvec2(),
-                // Once it is observed, nobody needs to be there any more.
+                // An observed POI needs no agents any more.
                 label: match observed {
                     Some(observed) => map::observed_label(&world.rule, poi, observed),
                     None => map::poi_label(&world.rule, poi, format!("{near}/{needed}")),
@@ -588,7 +593,7 @@ impl Replayed {
         }
     }
 
-    /// What is to be seen of it after a step, in words.
+    /// Describes the state after a step in a sentence.
     fn say(&self, step: usize) -> String {
         const MOST: usize = 12;
         let (world, pois) = (&self.world, self.world.pois.len());
@@ -609,7 +614,7 @@ impl Replayed {
         )
     }
 
-    /// Steps that a page or a trail shows, if it has room for so many.
+    /// Returns evenly spaced steps to show, at most `most` but at least 2. The last step is always included.
     fn shown(&self, most: usize) -> Vec<usize> {
         let steps = self.world.steps();
         let every = steps.div_ceil(most.max(2) - 1).max(1);
@@ -621,17 +626,17 @@ impl Replayed {
     }
 }
 
-/// A page that plays episodes of one run, side by side; `name` is the run's.
+/// Returns a page that plays episodes of one run side by side. `name` is the run's name.
 pub fn page(name: &str, config: &Config, played: &[Replayed]) -> String {
     // Inside a script element, only "<" could end it early.
     let data = data(name, config, played).to_string().replace('<', "\\u003c");
     include_str!("replay.html").replacen("\"STAGE\"", STAGE, 1).replacen("\"DATA\"", &data, 1)
 }
 
-/// The script that draws episodes, on this page and wherever else they are shown.
+/// The script that draws episodes. Every page that shows them includes it.
 pub const STAGE: &str = include_str!("stage.js");
 
-/// What a page needs to play episodes of one run, side by side.
+/// Returns the data that a page needs to play episodes of one run.
 pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Value {
     let count = played.len().max(1);
     let size = |per_agent: usize, played: &Replayed| {
@@ -647,7 +652,7 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         })
         .collect();
     let world = &config.world;
-    // Where they move, they are where the first episode has them.
+    // Moving POIs are listed where the first episode had them.
     let pois = match played.first().filter(|_| config.learning.poi_jitter > 0.0) {
         Some(first) => first.world.pois.iter().map(|poi| poi.as_dvec2().to_array()).collect(),
         None => world.pois.clone(),
@@ -672,7 +677,7 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
     })
 }
 
-/// The colours of leaders and their followers, on a light and on a dark ground.
+/// Returns the colours of leaders and their followers for light and dark backgrounds.
 pub fn colors() -> serde_json::Value {
     json!({ "light": hex(&map::GROUPS), "dark": hex(&map::GROUPS_DARK) })
 }
@@ -681,13 +686,13 @@ fn hex(colors: &[Color]) -> Vec<String> {
     colors.iter().map(|[r, g, b]| format!("#{r:02x}{g:02x}{b:02x}")).collect()
 }
 
-/// One episode as the page reads it: motion as base64 of little-endian numbers, `[shown][agents]`.
+/// Returns one episode as the page reads it. Motion is base64 of little-endian numbers, `[shown][agents]`.
 fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value {
     let Replayed { world, scores, .. } = played;
     let map = world.map().to_array();
     let (mut positions, mut headings, mut near, mut led) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for &step in shown {
-        // Of the step that led here, as `Replayed::group` has it.
+        // These are the groups of the step that ended here, as in `Replayed::group`.
         let words = played.led.len() / world.steps();
         let of_step = &played.led[step.saturating_sub(1) * words..][..words];
         led.extend(of_step.iter().flat_map(|word| word.to_le_bytes()));
@@ -731,7 +736,7 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
     })
 }
 
-/// Episodes side by side, to be drawn at any of their moments.
+/// Episodes side by side, to be drawn at any moment.
 struct Screen<'a> {
     played: &'a [Replayed],
     view: Viewport,
@@ -743,11 +748,11 @@ impl<'a> Screen<'a> {
     const SIDE: f64 = 80.0;
     const EDGE: f64 = 2.5;
     const HEAD: f64 = 12.6;
-    /// Room for the axes left of each map and below it.
+    /// Room for the axes on the left of each map. The next one is the room below it.
     const LEFT: f64 = 8.0;
     const BELOW: f64 = 7.4;
 
-    /// `note` stands below the pictures, among what their signs mean.
+    /// Lays out the pictures. `note` is added to the legend.
     fn new(config: &Config, played: &'a [Replayed], note: Option<String>) -> Screen<'a> {
         let view = Viewport::new(config, busy(config, played), Self::SIDE);
         let width = view.size()[0].max(60.0);
@@ -764,7 +769,7 @@ impl<'a> Screen<'a> {
         Screen { played, view, width, legend }
     }
 
-    /// The picture `place` steps from the start; between steps, motion is drawn straight.
+    /// Draws the picture `place` steps from the start. Motion between steps is interpolated linearly.
     fn scene(&self, place: f64) -> Scene {
         let step = place as usize;
         let columns = self.played.len().max(1) as f64;
@@ -796,13 +801,14 @@ impl<'a> Screen<'a> {
     }
 }
 
-/// Episodes side by side after a step, each with its trails up to there.
+/// Draws episodes side by side after a step, with the trails up to it.
 pub fn still(config: &Config, played: &[Replayed], step: usize) -> Scene {
     Screen::new(config, played, None).scene(step as f64)
 }
 
-/// The part of the map, from corner to corner, where anything happens in any of the episodes, at least half as high as
-/// wide or the other way round.
+/// Returns the corners of the part of the map that holds all POIs and agents of all episodes.
+///
+/// The shorter side is at least half the longer one, as far as the map allows.
 fn busy(config: &Config, played: &[Replayed]) -> [DVec2; 2] {
     let map = DVec2::from(config.world.map);
     let around = |at: DVec2, margin: f64| [at - margin, at + margin];
@@ -825,29 +831,29 @@ fn busy(config: &Config, played: &[Replayed]) -> [DVec2; 2] {
     [from, to]
 }
 
-/// How a moving picture is made: pixels across, and pictures a second.
+/// Options of a film.
 #[derive(Clone, Copy, Debug)]
 pub struct Film {
-    /// As many as fit into 960 by 720 pixels where it is not given.
+    /// Width in pixels. By default the picture fits into 960 by 720 pixels.
     pub width: Option<u32>,
-    /// Pictures a second.
+    /// Frames per second.
     pub fps: u32,
 }
 
-/// Pictures a second, and the longest that a moving picture lasts, in seconds; longer episodes play faster.
+/// Default number of frames per second. The next one is the longest film in seconds; longer episodes play faster.
 pub const FPS: u32 = 20;
 const LONGEST: f64 = 15.0;
 
-/// The pictures of a moving picture, one after the other.
+/// The frames of a film.
 pub struct Frames<'a> {
     stage: Screen<'a>,
-    /// Steps from the start, of each picture.
+    /// The time of each frame, in steps from the start.
     pub places: Vec<f64>,
     per_mm: f64,
 }
 
 impl<'a> Frames<'a> {
-    /// Frames of these episodes, as fast as `motion` says.
+    /// Plans the frames of these episodes.
     pub fn new(config: &Config, played: &'a [Replayed], motion: Film) -> Frames<'a> {
         let steps = played.first().map_or(0, |first| first.world.steps()) as f64;
         let seconds = steps * config.world.dt;
@@ -867,16 +873,16 @@ impl<'a> Frames<'a> {
         Frames { stage, places, per_mm }
     }
 
-    /// One of the pictures, with its pixels a millimetre.
+    /// Returns the picture at a place, and its pixels per millimetre.
     pub fn scene(&self, place: f64) -> (Scene, f64) {
         (self.stage.scene(place), self.per_mm)
     }
 }
 
-/// Episodes side by side as a GIF that repeats.
+/// Returns the episodes side by side as a GIF that repeats.
 ///
 /// # Errors
-/// The encoder refused, which it does for want of memory alone.
+/// The encoder fails, which happens only if memory runs out.
 pub fn gif(config: &Config, played: &[Replayed], motion: Film) -> std::io::Result<Vec<u8>> {
     let frames = Frames::new(config, played, motion);
     let picture = |place: f64| {
@@ -885,7 +891,7 @@ pub fn gif(config: &Config, played: &[Replayed], motion: Film) -> std::io::Resul
     };
     let places = &frames.places;
     let Some(&end) = places.last() else { return Ok(vec![]) };
-    // The last picture has all the colours there are.
+    // The palette is computed from the last frame, which contains all colours.
     let last = picture(end);
     let colors = color_quant::NeuQuant::new(10, 255, last.data());
     let mut known = std::collections::HashMap::new();
@@ -898,7 +904,7 @@ pub fn gif(config: &Config, played: &[Replayed], motion: Film) -> std::io::Resul
         let mut before: Vec<u8> = Vec::new();
         for (index, &place) in places.iter().enumerate() {
             let pixmap = picture(place);
-            // What stays as it was is transparent, which packs well; index 255 is no colour.
+            // Unchanged pixels are transparent, which compresses well. Index 255 is reserved for them.
             let color = |(at, pixel): (usize, &[u8])| {
                 if before.get(4 * at..4 * at + 4) == Some(pixel) {
                     return 255;
@@ -907,7 +913,7 @@ pub fn gif(config: &Config, played: &[Replayed], motion: Film) -> std::io::Resul
                 *known.entry(pixel).or_insert_with(|| colors.index_of(&pixel) as u8)
             };
             let buffer: Vec<u8> = pixmap.data().chunks_exact(4).enumerate().map(color).collect();
-            // Hundredths of a second, so that the pictures together take as long as they should.
+            // Delays are whole hundredths of a second. Rounding the cumulative time keeps the total duration right.
             let due = |index: usize| (index as u32 * 100).div_ceil(motion.fps);
             let delay = if index + 1 == places.len() { 200 } else { due(index + 1) - due(index) };
             let frame = gif::Frame {

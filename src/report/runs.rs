@@ -1,4 +1,4 @@
-//! Finished and unfinished runs, read back for their curves.
+//! Reads the configs and metrics of finished and unfinished runs.
 
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -14,61 +14,61 @@ use crate::record::metrics::{self, RowsError};
 use crate::statistics::Average;
 use crate::trainer::Row;
 
-/// Most runs that one figure can tell apart.
+/// Maximum number of runs in one figure.
 pub const MAX_RUNS: usize = 24;
 
-/// Why a run could not be shown.
+/// The reason why a run cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadError {
-    /// There is nothing of this name.
+    /// The path does not exist.
     #[error("{}: no such folder", .0.escaped())]
     Missing(PathBuf),
-    /// A run is a folder.
+    /// The path is a file instead of a directory.
     #[error("{} is a file; name the folder of a run", .0.escaped())]
     NoFolder(PathBuf),
-    /// A folder of something else.
+    /// The directory is not a run.
     #[error("{folder} is no run's folder: it has no {name}", folder = folder.escaped())]
     Foreign {
-        /// The one named.
+        /// The given directory.
         folder: PathBuf,
-        /// The file that every run has.
+        /// The missing file that every run has.
         name: &'static str,
     },
-    /// A run whose config is wrong.
+    /// The run's config is invalid.
     #[error("{folder}: {error}", folder = folder.escaped())]
     Config {
-        /// The one named.
+        /// The given directory.
         folder: PathBuf,
-        /// What is wrong with it.
+        /// The error in the config.
         error: ConfigError,
     },
-    /// A folder of several runs.
+    /// The directory contains several runs.
     #[error("{folder} holds {what}; name one of the runs in it, as {folder}/{example}", folder = folder.escaped())]
     Collection {
-        /// The one named.
+        /// The given directory.
         folder: PathBuf,
-        /// What it holds: "a sweep".
+        /// The kind of its contents, such as "a sweep".
         what: &'static str,
-        /// A run in it.
+        /// The path of a run in it.
         example: &'static str,
     },
-    /// A run without what is to be shown.
+    /// The run lacks the requested data.
     #[error("{folder}: {reason}", folder = folder.escaped())]
     Unfinished {
-        /// The one named.
+        /// The given directory.
         folder: PathBuf,
-        /// What it lacks.
+        /// The missing data.
         reason: String,
     },
-    /// Its files cannot be read.
+    /// The run's files cannot be read.
     #[error(transparent)]
     Record(#[from] RecordError),
 }
 
-/// A run's config.
+/// Reads a run's config.
 ///
 /// # Errors
-/// The folder is not there, is no run's, or its config is damaged or not as the run left it.
+/// The directory does not exist, is not a run, or its config is damaged or was changed after the run.
 pub fn config(folder: &Path, verification: Verification) -> Result<Config, ReadError> {
     let kind = std::fs::metadata(folder).map_err(|error| match error.kind() {
         ErrorKind::NotFound => ReadError::Missing(folder.into()),
@@ -90,15 +90,17 @@ pub fn config(folder: &Path, verification: Verification) -> Result<Config, ReadE
     Ok(config)
 }
 
-/// Whether a file is there; an error where that cannot be seen.
+/// Reports whether a file exists.
 fn seen(path: &Path) -> Result<bool, RecordError> {
     file::exists(path).map_err(|error| RecordError::Read { path: path.into(), error })
 }
 
-/// A run's metrics, row by row as far as they are whole; what is cut off at the end is still being written.
+/// Calls `each` with every complete row of a run's metrics. A partial last line is ignored, because it is still being
+/// written.
 ///
 /// # Errors
-/// There are none yet, or they are not this run's or not as the run left them, which may show only after all rows.
+/// The metrics are missing, belong to another run, or were changed after the run. The last error may appear only after
+/// all rows.
 pub fn metrics(
     folder: &Path,
     config: &Config,
@@ -106,7 +108,7 @@ pub fn metrics(
     mut each: impl FnMut(&Row),
 ) -> Result<(), ReadError> {
     let path = folder.join(METRICS);
-    // Before the metrics, since the run may come to its end now.
+    // The digests are read before the metrics, because the run may finish in between.
     let digests = Digests::read(folder, verification)?;
     let unfinished = |reason: String| ReadError::Unfinished { folder: folder.into(), reason };
     if !seen(&path)? {
@@ -118,7 +120,7 @@ pub fn metrics(
     for row in &mut rows {
         let row = match row {
             Ok((row, _)) => row,
-            // A line that is cut short is the last one, of a run that goes on or was killed.
+            // A partial last line belongs to a run that is still training or was killed.
             Err(RowsError::CutShort(_)) => break,
             Err(error) => return Err(damaged(error.to_string())),
         };
@@ -137,19 +139,19 @@ pub fn metrics(
     if count == 0 { Err(unfinished(format!("its {METRICS} has no rows yet"))) } else { Ok(()) }
 }
 
-/// What a run's metrics came to, by generation: shares of the POIs.
+/// A run's metrics by generation, as shares of the POIs averaged over trials.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Courses {
-    /// Of the best team, over trials.
+    /// G of the best team.
     pub best: Vec<Average>,
-    /// Of the mean team.
+    /// G of the mean team.
     pub mean: Vec<Average>,
-    /// Of the champion.
+    /// G of the champion.
     pub champion: Vec<Average>,
 }
 
 impl Courses {
-    /// Reads a run's metrics; memory grows with generations alone.
+    /// Reads a run's metrics. Memory grows only with the number of generations.
     ///
     /// # Errors
     /// See [`metrics()`].
@@ -171,10 +173,10 @@ impl Courses {
     }
 }
 
-/// G of the best team and of the champion, `[trials][generations]`, as far as the run has come.
+/// Reads G of the best team and of the champion, `[trials][generations]`, as far as the run has progressed.
 ///
 /// # Errors
-/// See [`metrics()`]; or a trial's rows are not in order.
+/// See [`metrics()`]. It also fails if a trial's rows are out of order.
 pub fn trials(folder: &Path, config: &Config, verification: Verification) -> Result<Vec<Vec<[f64; 2]>>, ReadError> {
     let mut trials = vec![vec![]; config.learning.trials];
     let mut skipped = None;
@@ -191,7 +193,9 @@ pub fn trials(folder: &Path, config: &Config, verification: Verification) -> Res
     }
 }
 
-/// The curves of one run (best, mean and champion), or the best teams of several, by what differs between them.
+/// Returns the figure of one run (best team, champion and mean team), or of the best teams of several runs.
+///
+/// Several runs are labelled by the config keys that differ.
 ///
 /// # Errors
 /// A run cannot be read.
@@ -199,7 +203,7 @@ pub fn figure(folders: &[PathBuf], verification: Verification) -> Result<Figure,
     let configs = folders.iter().map(|folder| config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
     let all = folders.iter().zip(&configs).map(|(folder, config)| Courses::read(folder, config, verification));
     let all = all.collect::<Result<Vec<_>, _>>()?;
-    // Stages may have POIs of their own.
+    // Stages may have different numbers of POIs.
     let counts: Vec<Option<usize>> = configs.iter().map(Config::pois).collect();
     let pois = counts.first().copied().flatten().unwrap_or(1);
     let same = counts.iter().all(|count| *count == Some(pois));
@@ -213,7 +217,7 @@ pub fn figure(folders: &[PathBuf], verification: Verification) -> Result<Figure,
         all => labels(folders, &configs).into_iter().zip(all.iter().map(|courses| curve(&courses.best))).unzip(),
     };
     let what = if all.len() == 1 { "" } else { " by the best team" };
-    // A run may not have come to all of its stages. Where runs have different ones, no line is all of theirs.
+    // Only stages that the run has reached are marked. If runs have different stages, none are marked.
     let last = curves.iter().filter_map(|curve| curve.generation.last()).fold(0.0_f64, |most, &last| most.max(last));
     let begun = |config: &Config| {
         let froms = config.stages.iter().map(|stage| stage.from);
@@ -237,8 +241,9 @@ pub fn figure(folders: &[PathBuf], verification: Verification) -> Result<Figure,
     })
 }
 
-/// Whether trials of several runs are pairs: with one seed, each trial has the same starts and the same luck in every
-/// draw in all of them and, where sizes agree, the same first populations.
+/// Reports whether trials of several runs form pairs, because all runs have the same seed.
+///
+/// Paired trials share their starts and all random numbers. If sizes agree, they also share their first populations.
 ///
 /// # Errors
 /// A run cannot be read.
@@ -248,7 +253,7 @@ pub fn paired(folders: &[PathBuf], verification: Verification) -> Result<bool, R
     Ok(seeds.len() > 1 && seeds.iter().all(|seed| *seed == seeds[0]))
 }
 
-/// Labels runs by the config keys that differ between them, or by their folders where none do.
+/// Labels runs by the config keys that differ between them, or by their directories if none differ.
 pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
     let tables: Vec<toml::Table> = configs.iter().map(|config| config.to_toml().parse().unwrap_or_default()).collect();
     let Some(first) = tables.first() else { return vec![] };
@@ -258,7 +263,7 @@ pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
     };
     let mut keys = Vec::new();
     for (section, entries) in first {
-        // How often a run is saved has no say in its results.
+        // The checkpoint interval does not affect results.
         for key in entries.as_table().into_iter().flat_map(toml::Table::keys).filter(|_| section != "checkpoint") {
             let differs = tables.iter().any(|table| value(table, section, key) != value(first, section, key));
             if differs {
@@ -277,7 +282,7 @@ pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
             .iter()
             .map(|(section, key)| {
                 let value = value(table, section, key);
-                // Positions are too long to tell apart.
+                // Long values such as positions are unreadable in a label.
                 if value.len() > 24 { String::new() } else { format!("{key} {value}") }
             })
             .filter(|part| !part.is_empty())
@@ -286,7 +291,7 @@ pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
         if parts.is_empty() { folder.escaped().to_string() } else { parts.join(", ") }
     };
     let labels: Vec<String> = folders.iter().zip(&tables).zip(configs).map(label).collect();
-    // Runs that are labelled alike differ in something long: say where they are, too.
+    // Equal labels mean that only a long value differs. Such labels also get the directory.
     let twice = |label: &String| labels.iter().filter(|other| *other == label).count() > 1;
     let full = |(label, folder): (&String, &PathBuf)| {
         let name = folder.escaped().to_string();

@@ -1,7 +1,7 @@
-//! A picture described once, in millimetres, and written as SVG, as PDF, as pixels or as PNG.
+//! Pictures described once, in millimetres, and written as SVG, PDF, PNG or pixels.
 //!
-//! All of them draw the same letters, by the outlines of one embedded font: how long a text is does not depend on who
-//! shows it. What is to be seen stands in the files in words, too, for those who cannot see it.
+//! All formats draw text with the outlines of one embedded font, so its width does not depend on the viewer. Files also
+//! contain a title and a description for readers who cannot see the picture. A PDF also contains the text itself.
 
 use std::collections::BTreeSet;
 use std::fmt::Write;
@@ -13,55 +13,56 @@ use tiny_skia::{
 use super::letters;
 pub use super::letters::text_width;
 
-/// Units of an SVG in a millimetre: letters one unit high would be less than browsers can draw.
+/// SVG units per millimetre. At 1 unit per millimetre, letters would be too small for browsers to draw.
 const SVG_UNITS: f64 = 10.0;
-/// How thick the outline of bold letters is, in ems.
+/// Width of the outline that makes letters bold, in ems.
 pub(super) const BOLD: f64 = 0.04;
-/// Pixels of the longest side of a picture.
+/// Maximum number of pixels of a picture's longer side.
 const MAX_PIXELS: f64 = 8192.0;
 
-/// Red, green, blue.
+/// Red, green and blue.
 pub type Color = [u8; 3];
 
-/// Of text.
+/// Text.
 pub const BLACK: Color = [0, 0, 0];
-/// Of paper.
+/// Background.
 pub const WHITE: Color = [255, 255, 255];
-/// Of what matters less.
+/// Secondary elements.
 pub const GREY: Color = [120, 120, 120];
-/// Of grids.
+/// Grid lines.
 pub const LIGHT: Color = [222, 222, 222];
 
-/// Colours that the colour-blind tell apart, by Okabe and Ito, those first that stay apart in grey as well.
+/// Colours that colour-blind readers can distinguish, after Okabe and Ito. The first ones are also distinct in
+/// greyscale.
 pub const COLORS: [Color; 7] =
     [[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [140, 109, 0], [0, 0, 0]];
 
-/// How a line is drawn.
+/// The style of a line.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pen {
-    /// Of the line.
+    /// Colour of the line.
     pub color: Color,
-    /// Millimetres.
+    /// Width in millimetres.
     pub width: f64,
-    /// Lengths of dashes and gaps in turn, in millimetres; none for a solid line.
+    /// Alternating lengths of dashes and gaps, in millimetres. Empty for a solid line.
     pub dash: &'static [f64],
-    /// From 0, nothing, to 1.
+    /// Opacity from 0 (invisible) to 1.
     pub opacity: f64,
 }
 
 impl Pen {
-    /// A line of this colour and width, whole.
+    /// Returns a solid, opaque pen.
     pub fn new(color: Color, width: f64) -> Pen {
         Pen { color, width, dash: &[], opacity: 1.0 }
     }
 }
 
-/// What an area is filled with.
+/// The fill of an area.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fill {
-    /// Of the area.
+    /// Colour of the area.
     pub color: Color,
-    /// From 0, nothing, to 1.
+    /// Opacity from 0 (invisible) to 1.
     pub opacity: f64,
 }
 
@@ -71,14 +72,14 @@ impl From<Color> for Fill {
     }
 }
 
-/// Which part of a text stands at its place.
+/// The part of a text that is placed at the given position.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Anchor {
-    /// Its left end.
+    /// The left end.
     Start,
-    /// The middle of its width.
+    /// The middle of the text's width.
     Middle,
-    /// Its right end.
+    /// The right end.
     End,
 }
 
@@ -96,7 +97,7 @@ pub(super) enum Mark {
         fill: Option<Fill>,
         pen: Option<Pen>,
     },
-    /// `place` is on the baseline.
+    /// Text; `place` is on the baseline.
     Text {
         place: [f64; 2],
         text: String,
@@ -106,48 +107,48 @@ pub(super) enum Mark {
         upright: bool,
         bold: bool,
     },
-    /// What follows is seen within `[x, y, width, height]` only, or everywhere again.
+    /// Clips the following marks to `[x, y, width, height]`. None ends clipping.
     Clip(Option<[f64; 4]>),
 }
 
-/// A picture; places are millimetres from its left and upper edge.
+/// A picture. Positions are in millimetres from its left and upper edges.
 #[derive(Clone, Debug)]
 pub struct Scene {
-    /// Millimetres.
+    /// Width in millimetres.
     pub width: f64,
-    /// Millimetres.
+    /// Height in millimetres.
     pub height: f64,
-    /// What the picture is, in a few words.
+    /// A short title.
     pub title: String,
-    /// What is to be seen in it, in sentences with figures, for those who cannot see it.
+    /// A description in sentences, with numbers, for readers who cannot see the picture.
     pub description: String,
-    /// The digest of the run that it shows, which an SVG carries.
+    /// The digest of the run that the picture shows. SVG files contain it.
     pub source: Option<String>,
     pub(super) marks: Vec<Mark>,
 }
 
-/// What a picture is written as.
+/// A file format of pictures.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
-    /// Vectors, for the web.
+    /// Vector graphics for the web.
     Svg,
-    /// Pixels.
+    /// A pixel image.
     Png,
-    /// Vectors, for print.
+    /// Vector graphics for print.
     Pdf,
 }
 
 impl Format {
-    /// Every kind.
+    /// All formats.
     pub const ALL: [Format; 3] = [Format::Svg, Format::Png, Format::Pdf];
 
-    /// By the end of a file's name.
+    /// Returns the format that a file name's extension selects.
     pub fn of(path: &std::path::Path) -> Option<Format> {
         let extension = path.extension()?.to_ascii_lowercase();
         Format::ALL.into_iter().find(|kind| extension == kind.extension())
     }
 
-    /// A file's ending, without its dot.
+    /// Returns the file name extension, without the dot.
     pub fn extension(self) -> &'static str {
         match self {
             Format::Svg => "svg",
@@ -158,13 +159,13 @@ impl Format {
 }
 
 impl Scene {
-    /// An empty picture of this size, in points.
+    /// Returns an empty picture of this size, in millimetres.
     pub fn new(width: f64, height: f64) -> Scene {
         let (title, description, marks) = (String::new(), String::new(), Vec::new());
         Scene { width, height, title, description, source: None, marks }
     }
 
-    /// Adds a line below all of it.
+    /// Adds a line of text below the picture and extends its description by it.
     pub fn warn(&mut self, text: &str) {
         const SIZE: f64 = 2.47;
         self.height += 4.0;
@@ -172,47 +173,47 @@ impl Scene {
         self.description += &format!(" {text}.");
     }
 
-    /// The element by which an SVG says which run it shows.
+    /// Returns the SVG element that names the run.
     fn metadata(source: &str) -> String {
         format!("<metadata>run {source}</metadata>\n")
     }
 
-    /// Whether the text of an SVG shows the run with this digest.
+    /// Reports whether an SVG names the run with this digest.
     pub fn shows(svg: &str, source: &str) -> bool {
         svg.contains(&Scene::metadata(source))
     }
 
-    /// A line through places.
+    /// Draws a line through points.
     pub fn line(&mut self, points: Vec<[f64; 2]>, pen: Pen) {
         self.marks.push(Mark::Shape { points, closed: false, fill: None, pen: Some(pen) });
     }
 
-    /// A polygon, filled, outlined or both.
+    /// Draws a polygon that is filled, outlined or both.
     pub fn polygon(&mut self, points: Vec<[f64; 2]>, fill: Option<Fill>, pen: Option<Pen>) {
         self.marks.push(Mark::Shape { points, closed: true, fill, pen });
     }
 
-    /// An upright rectangle, by its corner and sides.
+    /// Draws an upright rectangle, given by its corner and sides.
     pub fn rectangle(&mut self, [x, y, width, height]: [f64; 4], fill: Option<Fill>, pen: Option<Pen>) {
         self.polygon(vec![[x, y], [x + width, y], [x + width, y + height], [x, y + height]], fill, pen);
     }
 
-    /// A circle.
+    /// Draws a circle.
     pub fn circle(&mut self, center: [f64; 2], radius: f64, fill: Option<Fill>, pen: Option<Pen>) {
         self.marks.push(Mark::Circle { center, radius, fill, pen });
     }
 
-    /// Text of a size (millimetres an em) from a place on its baseline.
+    /// Writes text of a size in millimetres per em. `place` is on its baseline.
     pub fn text(&mut self, place: [f64; 2], text: impl Into<String>, size: f64, anchor: Anchor, color: Color) {
         self.write(Mark::Text { place, text: text.into(), size, anchor, color, upright: false, bold: false });
     }
 
-    /// Bold text at a place.
+    /// Writes bold text. `place` is on its baseline.
     pub fn bold(&mut self, place: [f64; 2], text: impl Into<String>, size: f64, anchor: Anchor, color: Color) {
         self.write(Mark::Text { place, text: text.into(), size, anchor, color, upright: false, bold: true });
     }
 
-    /// Text that reads upwards, centred at a place.
+    /// Writes text that reads upwards, centred on `place`.
     pub fn upright(&mut self, place: [f64; 2], text: impl Into<String>, size: f64, color: Color) {
         let text = text.into();
         self.write(Mark::Text { place, text, size, anchor: Anchor::Middle, color, upright: true, bold: false });
@@ -224,14 +225,14 @@ impl Scene {
         }
     }
 
-    /// Shows what `draw` draws within `[x, y, width, height]` only.
+    /// Clips everything that `draw` draws to `[x, y, width, height]`.
     pub fn clipped(&mut self, area: [f64; 4], draw: impl FnOnce(&mut Scene)) {
         self.marks.push(Mark::Clip(Some(area)));
         draw(self);
         self.marks.push(Mark::Clip(None));
     }
 
-    /// The picture as an SVG document.
+    /// Returns the picture as an SVG document.
     pub fn svg(&self) -> String {
         let mut svg = String::new();
         // Writing to a string cannot fail.
@@ -252,7 +253,7 @@ impl Scene {
             Escaped(&self.description),
         )?;
         self.source.iter().for_each(|source| svg.push_str(&Scene::metadata(source)));
-        // Each letter that occurs is drawn once, and used from there.
+        // Each glyph that occurs is defined once and then referenced.
         let texts =
             self.marks.iter().filter_map(|mark| if let Mark::Text { text, .. } = mark { Some(text) } else { None });
         let glyphs: BTreeSet<_> = texts.flat_map(|text| letters::set(text).0).map(|(glyph, _, _)| glyph).collect();
@@ -291,7 +292,7 @@ impl Scene {
                     };
                     write!(svg, "<g aria-label=\"{}\" fill=\"{}\"", Escaped(text), hex(*color))?;
                     if *bold {
-                        // The font has one weight; an outline makes it the other.
+                        // The font has a single weight, so an outline makes letters bold.
                         let width = Rounded(letters::units_per_em() * BOLD);
                         write!(svg, " stroke=\"{}\" stroke-width=\"{width}\"", hex(*color))?;
                     }
@@ -322,7 +323,7 @@ impl Scene {
         Ok(())
     }
 
-    /// The picture in pixels, so many a millimetre (fewer where the longest side would take over 8192).
+    /// Renders the picture with the given number of pixels per millimetre, or fewer if a side would exceed 8192 pixels.
     pub fn pixels(&self, per_mm: f64) -> Pixmap {
         let scale = per_mm.min(MAX_PIXELS / self.width.max(self.height));
         let side = |length: f64| ((length * scale).round() as u32).max(1);
@@ -360,7 +361,7 @@ impl Scene {
                     };
                     let turn = if *upright { -90.0 } else { 0.0 };
                     let place = transform.pre_translate(*x as f32, *y as f32).pre_concat(Transform::from_rotate(turn));
-                    // The embedded font has one weight; an outline makes it the other.
+                    // The font has a single weight, so an outline makes letters bold.
                     let pen = bold.then(|| Pen::new(*color, size * BOLD));
                     let pens = (Some(&Fill::from(*color)), pen.as_ref());
                     let path = letters::letters(text, *size, start);
@@ -379,10 +380,11 @@ impl Scene {
         pixmap
     }
 
-    /// The picture as a PNG file, so many pixels a millimetre, which the file says, too: it prints at the scene's size.
+    /// Returns the picture as a PNG file with the given number of pixels per millimetre. The file states its
+    /// resolution, so that it prints at the scene's size.
     ///
     /// # Errors
-    /// The encoder refused, which it does for want of memory alone.
+    /// The encoder fails, which happens only if memory runs out.
     pub fn png(&self, per_mm: f64) -> std::io::Result<Vec<u8>> {
         let pixmap = self.pixels(per_mm);
         let mut file = Vec::new();
@@ -396,7 +398,7 @@ impl Scene {
         for (key, text) in [("Title", &self.title), ("Description", &self.description)] {
             encoder.add_itxt_chunk(key.into(), text.clone()).map_err(std::io::Error::other)?;
         }
-        // Nothing shows through a picture's white ground.
+        // The background is opaque, so no alpha channel is needed.
         let rgb: Vec<u8> = pixmap.data().chunks_exact(4).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
         let mut writer = encoder.write_header().map_err(std::io::Error::other)?;
         writer.write_image_data(&rgb).map_err(std::io::Error::other)?;
@@ -404,10 +406,10 @@ impl Scene {
         Ok(file)
     }
 
-    /// The picture as a file; a PNG of so many pixels a millimetre.
+    /// Returns the picture as a file. `per_mm` is the number of pixels per millimetre of a PNG.
     ///
     /// # Errors
-    /// An encoder refused, which it does for want of memory alone.
+    /// An encoder fails, which happens only if memory runs out.
     pub fn file(&self, kind: Format, per_mm: f64) -> std::io::Result<Vec<u8>> {
         match kind {
             Format::Svg => Ok(self.svg().into_bytes()),
@@ -473,7 +475,7 @@ fn hex([r, g, b]: Color) -> String {
     format!("#{r:02x}{g:02x}{b:02x}")
 }
 
-/// Printed with two digits after the point at most, and none that say nothing. (A tenth of a unit is 0.01 mm.)
+/// A number printed with at most two decimals and without trailing zeros.
 struct Rounded(f64);
 
 impl std::fmt::Display for Rounded {
@@ -483,7 +485,7 @@ impl std::fmt::Display for Rounded {
     }
 }
 
-/// As text or an attribute of XML.
+/// Text escaped for XML content and attributes.
 struct Escaped<'a>(&'a str);
 
 impl std::fmt::Display for Escaped<'_> {
@@ -493,7 +495,7 @@ impl std::fmt::Display for Escaped<'_> {
             '>' => f.write_str("&gt;"),
             '&' => f.write_str("&amp;"),
             '"' => f.write_str("&quot;"),
-            // XML cannot hold most of these, and a picture has no use for any.
+            // XML forbids most of these characters, and pictures need none of them.
             c if c.is_control() || matches!(c, '\u{fffe}' | '\u{ffff}') => f.write_char(' '),
             c => f.write_char(c),
         })

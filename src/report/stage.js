@@ -1,13 +1,13 @@
-// Draws episodes: shared by every page that shows them. A scene's motion lies in flat arrays, [frames][agents].
+// Draws episodes on every page that shows them. Motion is stored in flat arrays, [frames][agents].
 const stage = (() => {
   "use strict";
-  // Once a group's colours are used up, they come again in dashes, for which there are the numbers, too.
+  // Dashes distinguish groups once all colours are used; beyond that, only the leaders' numbers do.
   const DASHES = [[], [5, 3], [1.5, 2]];
   const night = matchMedia("(prefers-color-scheme: dark)");
   const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer;
   const turn = Array.from({ length: 256 }, (_, index) => index / 256 * 2 * Math.PI);
 
-  // Turns what was sent as text into arrays, in place.
+  // Decodes the base64 texts into arrays, in place.
   function unpack(data) {
     for (const episode of data.episodes) {
       episode.positions = data.exact ? new Float32Array(bytes(episode.positions)) : new Uint16Array(bytes(episode.positions));
@@ -18,7 +18,7 @@ const stage = (() => {
     return data;
   }
 
-  // Position and heading of an agent at a frame.
+  // Returns position and heading of an agent at a frame: [x, y, heading x, heading y].
   function moment(data, episode, frame, agent) {
     const at = frame * episode.agents + agent, { positions, headings } = episode;
     if (data.exact) return [positions[2 * at], positions[2 * at + 1], headings[2 * at], headings[2 * at + 1]];
@@ -26,7 +26,7 @@ const stage = (() => {
     return [positions[2 * at] * (width / 65535), positions[2 * at + 1] * (height / 65535), Math.cos(angle), Math.sin(angle)];
   }
 
-  // Between two frames.
+  // Returns the same between two frames, interpolated linearly.
   function between(data, episode, place, agent) {
     const last = episode.shown.length - 1, frame = Math.min(Math.floor(place), last), part = place - frame;
     const now = moment(data, episode, frame, agent);
@@ -35,7 +35,8 @@ const stage = (() => {
     return now.map((value, index) => value + (next[index] - value) * part);
   }
 
-  // The part of the map where anything happens, in all episodes; at least half as high as wide, or the other way round.
+  // Returns the part of the map that holds all POIs and agents of all episodes. The shorter side is at least half the
+  // longer.
   function busy(data) {
     const [width, height] = data.map;
     let [left, below, right, above] = [Infinity, Infinity, -Infinity, -Infinity];
@@ -58,7 +59,8 @@ const stage = (() => {
     return [left, below, right, above];
   }
 
-  // The leaders that lead an agent at a frame: for Dt those of that step, else the one in whose group it is for Df.
+  // Returns the leaders of an agent at a frame: for Dt those of that step, otherwise the one whose group it joins for
+  // Df.
   function leaders_of(episode, frame, agent) {
     if (agent < episode.leaders) return [agent];
     if (episode.led.length === 0) return episode.owner[agent] < 0 ? [] : [episode.owner[agent]];
@@ -69,7 +71,7 @@ const stage = (() => {
     return found;
   }
 
-  // Whether a POI can be observed by a step, and when, in words.
+  // is_open reports whether a POI can be observed at a step. when describes its window and order.
   function is_open(data, episode, poi, step) {
     const [first, end] = data.windows[poi] || [1, data.steps], others = data.after[poi] || [];
     const done = other => episode.observed[other] !== null && episode.observed[other] < step;
@@ -84,7 +86,7 @@ const stage = (() => {
 
   const whole = data => [0, 0, ...data.map];
 
-  // How places of a part of the map become places of a canvas.
+  // Maps positions in a part of the map to positions on a canvas.
   function place_on(canvas, [left, below, right, above]) {
     const wide = canvas.clientWidth, scale = wide / (right - left);
     return { wide, tall: (above - below) * scale, scale, X: x => (x - left) * scale, Y: y => (above - y) * scale };
@@ -94,8 +96,8 @@ const stage = (() => {
 
   const palette = data => night.matches ? data.colors.dark : data.colors.light;
 
-  // Draws an episode `place` frames from its start onto a canvas as wide as its room. `look` says what to show: `crop` (a
-  // part of the map), `trails`, `radii`, `groups`, and `over`, the POI that the pointer is at, or none.
+  // Draws an episode, `place` frames from its start, at the canvas's width. `look` selects what to show: `crop` (a part
+  // of the map), `trails`, `radii`, `groups`, and `over` (the POI under the pointer, or null).
   function paint(data, episode, canvas, place, look) {
     const { wide, tall, scale, X, Y } = place_on(canvas, look.crop);
     const dots = window.devicePixelRatio || 1;
@@ -111,7 +113,7 @@ const stage = (() => {
     const group = agent => led[agent].length === 0 ? color("--faint") : colors[led[agent][0] % colors.length];
     const draw = canvas.getContext("2d");
     const taken = [];
-    // Letters on a pale edge; none, where they would hide others and may be left out.
+    // Writes text with a pale outline. A `spare` label is omitted if it would hide another one.
     const label = (text, x, y, align, spare) => {
       draw.font = "600 12px system-ui, sans-serif";
       const half = draw.measureText(text).width / 2, middle = align === "left" ? x + half : x;
@@ -128,7 +130,6 @@ const stage = (() => {
     draw.setTransform(dots, 0, 0, dots, 0, 0);
     draw.clearRect(0, 0, wide, tall);
     draw.lineJoin = "round";
-    // The walls.
     const [width, height] = data.map;
     draw.strokeStyle = color("--ink");
     draw.lineWidth = 2;
@@ -136,7 +137,7 @@ const stage = (() => {
     const frame = Math.floor(place), step = episode.shown[frame];
     const circle = (x, y, radius) => { draw.beginPath(); draw.arc(X(x), Y(y), radius * scale, 0, 2 * Math.PI); };
 
-    // POIs: a ring fills as agents arrive, and the disc turns once it is observed.
+    // POIs: a ring fills as agents arrive, and the disc changes colour once the POI is observed.
     const pois = data.pois.length, near = episode.near.slice(frame * pois, (frame + 1) * pois);
     const ring = Math.max(7, Math.min(12, 1.3 * scale));
     const counts = data.pois.map(([x, y], poi) => {
@@ -212,7 +213,7 @@ const stage = (() => {
       }
       draw.globalAlpha = 1;
     }
-    // Leaders last, on top.
+    // Leaders are drawn last, on top of followers.
     const size = Math.max(many ? 2.5 : 5, Math.min(9, 0.8 * scale));
     for (let agent = episode.agents - 1; agent >= 0; agent--) {
       const [x, y, ahead, aside] = now[agent], leads = agent < episode.leaders;
@@ -234,7 +235,7 @@ const stage = (() => {
         }
       }
     }
-    // Words last: counts if all of them have room, else the one under the pointer; then the leaders' numbers.
+    // Labels come last: all counts if they fit, and that of the POI under the pointer; then the leaders' numbers.
     draw.font = "600 12px system-ui, sans-serif";
     const told = counts.map(([text], poi) => when(data, poi) ? `${poi}: ${text}${when(data, poi)}` : text);
     const areas = counts.map(([, x, y], poi) => {
@@ -248,7 +249,7 @@ const stage = (() => {
       const words = `POI ${look.over}: ${text}${when(data, look.over)}`, half = Math.max(40, draw.measureText(words).width / 2 + 4);
       label(words, Math.max(half, Math.min(wide - half, x)), Math.max(12, y));
     }
-    // A leader's number goes to the first corner of its arrow where it hides no other label.
+    // A leader's number is placed at the first corner of its arrow where it hides no other label.
     const corners = [[1.5, 1.6], [1.5, -0.9], [-2.5, 1.6], [-2.5, -0.9]];
     for (let agent = 0; agent < episode.leaders; agent++) {
       const [x, y] = now[agent], text = String(agent), wide = draw.measureText(text).width;
@@ -262,14 +263,14 @@ const stage = (() => {
     return { step, near, led, positions: now.map(([x, y]) => [x, y]) };
   }
 
-  // POIs that were observed by a step, in words after their number.
+  // Returns the number of POIs observed by a step, and a description.
   function say(episode, step) {
     const seen = episode.observed.flatMap((at, poi) => at !== null && at <= step ? [`POI ${poi} at step ${at}`] : []);
     const list = seen.slice(0, 12).join(", ") + (seen.length > 12 ? " and more" : "");
     return [seen.length, `${seen.length} of ${episode.observed.length} POIs observed${list ? ": " + list : ""}`];
   }
 
-  // The POI under a place on a canvas, the nearest within its radius.
+  // Returns the POI nearest to a place on a canvas, if it is within the POI's radius.
   function poi_at(data, canvas, crop, x, y) {
     const { scale, X, Y } = place_on(canvas, crop);
     let [best, least] = [null, Math.max(14, data.observation_radius * scale)];
@@ -280,7 +281,7 @@ const stage = (() => {
     return best;
   }
 
-  // The place that is so many seconds of play on. Frames are not all as many steps apart: the last may be nearer.
+  // Returns the place after some more seconds of play. Frames are not equally spaced: the last interval may be shorter.
   function later(data, episode, place, seconds) {
     const { shown } = episode, last = shown.length - 1;
     let left = seconds / data.dt;

@@ -1,8 +1,8 @@
-//! Tables of text: for a terminal or a page, and for LaTeX.
+//! Text tables: Markdown for terminals and pages, and LaTeX.
 
 use std::fmt::Write;
 
-/// Returns a Markdown table with aligned columns; the first row is the head. A `|` in a cell does not end the cell.
+/// Returns a Markdown table with aligned columns. The first row is the head. A `|` in a cell is escaped.
 pub fn markdown(rows: &[Vec<String>]) -> String {
     let escaped = |row: &Vec<String>| row.iter().map(|cell| cell.replace('|', r"\|")).collect();
     let rows: Vec<Vec<String>> = rows.iter().map(escaped).collect();
@@ -18,7 +18,7 @@ pub fn markdown(rows: &[Vec<String>]) -> String {
     std::iter::once(head).chain([rule]).chain(body).collect()
 }
 
-/// A LaTeX `tabular` that needs no package; the first row is the head, columns of numbers stand to the right.
+/// Returns a LaTeX `tabular` that needs no package. The first row is the head. Columns of numbers are right-aligned.
 pub fn latex(rows: &[Vec<String>]) -> String {
     let is_number = |cell: &String| cell.starts_with(|c: char| c.is_ascii_digit() || "+−<".contains(c));
     let place = |column: usize| if rows[1..].iter().all(|row| is_number(&row[column])) { 'r' } else { 'l' };
@@ -31,7 +31,7 @@ pub fn latex(rows: &[Vec<String>]) -> String {
     text + "\\hline\n\\end{tabular}\n"
 }
 
-/// A text as LaTeX sets it: nothing in it is a command.
+/// Escapes a text for LaTeX, so that nothing in it is a command.
 pub fn tex(text: &str) -> String {
     let escaped = |c: char| match c {
         '\\' => "\\textbackslash{}".into(),
@@ -42,7 +42,7 @@ pub fn tex(text: &str) -> String {
         '<' | '>' | '|' => format!("${c}$"),
         _ => c.to_string(),
     };
-    // A row that starts with a bracket or a star would be read as part of the line break before it.
+    // LaTeX would read a bracket or star at the start of a row as part of the preceding line break.
     let guard = if text.starts_with(['[', '*']) { "{}" } else { "" };
     guard.chars().map(String::from).chain(text.chars().map(escaped)).collect()
 }

@@ -1,8 +1,7 @@
-//! Event files for TensorBoard: `best_g`, `mean_g` and `champion_g` by generation, a TensorBoard run a trial.
+//! Event files for TensorBoard: `best_g`, `mean_g` and `champion_g` by generation, with one TensorBoard run per trial.
 //!
-//! A file is a sequence of records (length, its checksum, content, its checksum, as TFRecord has it), each a protocol
-//! buffer `Event`. Of the latter only the few fields are written that scalars need, by hand. The numbers are f64, the
-//! same as in `metrics.csv`.
+//! A file is a sequence of TFRecords: length, its checksum, content, its checksum. Each content is a protocol buffer
+//! `Event`. This module encodes by hand only the few fields that scalars need. Values are f64, as in `metrics.csv`.
 
 use std::fs;
 use std::io::{self, ErrorKind, Read};
@@ -15,31 +14,32 @@ use crate::record::disk::Disk;
 use crate::record::metrics;
 use crate::trainer::Row;
 
-/// Most bytes of a trial that wait to be written.
+/// Number of buffered bytes of a trial above which they are flushed.
 const MOST: usize = 1 << 16;
-/// How often what is new is written.
+/// Interval between flushes.
 const FLUSH: Duration = Duration::from_secs(2);
-/// What TensorBoard knows event files by.
+/// The part of a file name by which TensorBoard recognises event files.
 const MARK: &str = "tfevents";
-/// The end of the names of those that are written here.
+/// The suffix of files that this module writes.
 const OURS: &str = ".flotilla";
 
 /// The event files of one run.
 pub struct Events {
     disk: Disk,
-    /// One file a trial.
+    /// One file per trial.
     files: Vec<PathBuf>,
-    /// What is not in the files yet.
+    /// Buffered bytes that are not in the files yet, `[trials]`.
     new: Vec<Vec<u8>>,
     flushed: Instant,
 }
 
 impl Events {
-    /// Starts event files in `folder/trial-N`, a folder per trial, with all that is in `metrics` so far; they take the
-    /// place of those that an earlier session wrote. `disk` is within the run's folder.
+    /// Creates event files in `folder/trial-N`, one directory per trial, with all rows of `metrics` so far.
+    ///
+    /// The new files replace those of earlier sessions. `disk` is limited to the run directory.
     ///
     /// # Errors
-    /// They cannot be written.
+    /// The files cannot be written.
     pub fn create(disk: &Disk, folder: &Path, trials: usize, metrics: &Path) -> io::Result<Events> {
         let digits = trials.saturating_sub(1).to_string().len();
         let mut files = Vec::with_capacity(trials);
@@ -52,7 +52,7 @@ impl Events {
         let first = record(&event(now(), 0, &Content::Version));
         let mut events = Events { disk: disk.clone(), files, new: vec![first; trials], flushed: Instant::now() };
         let rows = || metrics::open(metrics).map_err(io::Error::other).map(|rows| rows.map_while(Result::ok));
-        // As if they had been written when they became complete, all sessions in one.
+        // Rows get the times at which they became complete, as if all sessions had been a single one.
         let start = now() - rows()?.last().map_or(0.0, |(_, seconds)| seconds);
         for (row, seconds) in rows()? {
             events.add_at(&row, start + seconds);
@@ -64,13 +64,13 @@ impl Events {
         Ok(events)
     }
 
-    /// Removes a run's event files, and nothing else: by their names and by how they begin.
+    /// Removes a run's event files and nothing else. It recognises them by name and by content.
     ///
     /// # Errors
-    /// One cannot be removed.
+    /// A file cannot be removed.
     pub fn clear(disk: &Disk, folder: &Path) -> io::Result<()> {
         for trial in names(folder)?.into_iter().filter(|trial| named(trial, "trial-", "")) {
-            // A link is not listed either.
+            // Links are skipped, so that nothing outside the run is removed.
             if !fs::symlink_metadata(&trial)?.is_dir() {
                 continue;
             }
@@ -89,22 +89,22 @@ impl Events {
         }
     }
 
-    /// Takes in rows that became complete; from time to time they are written.
+    /// Adds complete rows. They are written at intervals.
     ///
     /// # Errors
-    /// They cannot be written.
+    /// The files cannot be written.
     pub fn add(&mut self, rows: &[Row]) -> io::Result<()> {
         rows.iter().for_each(|row| self.add_at(row, now()));
         if self.flushed.elapsed() >= FLUSH { self.flush() } else { Ok(()) }
     }
 
-    /// Writes all that is new.
+    /// Writes all buffered rows.
     ///
     /// # Errors
-    /// It cannot be written.
+    /// The files cannot be written.
     pub fn flush(&mut self) -> io::Result<()> {
         for (file, new) in self.files.iter().zip(&mut self.new).filter(|(_, new)| !new.is_empty()) {
-            // Opened each time: there may be more trials than a process may have files.
+            // Files are opened for each flush, because there may be more trials than a process may have open files.
             self.disk.extend(file, new)?;
             new.clear();
         }
@@ -113,7 +113,8 @@ impl Events {
     }
 }
 
-/// Creates a trial's event file, whose name says when; a later second where the name is taken.
+/// Creates a trial's event file, named after the current time in seconds. If the name is taken, tries the following
+/// seconds.
 fn new_file(disk: &Disk, folder: &Path, mut seconds: u64) -> io::Result<PathBuf> {
     loop {
         let path = folder.join(format!("events.out.{MARK}.{seconds:010}{OURS}"));
@@ -124,7 +125,7 @@ fn new_file(disk: &Disk, folder: &Path, mut seconds: u64) -> io::Result<PathBuf>
     }
 }
 
-/// What is in a folder, if it is there.
+/// Returns the paths in a directory; none if it does not exist.
 fn names(folder: &Path) -> io::Result<Vec<PathBuf>> {
     match fs::read_dir(folder) {
         Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => Ok(vec![]),
@@ -132,24 +133,24 @@ fn names(folder: &Path) -> io::Result<Vec<PathBuf>> {
     }
 }
 
-/// Whether a path's name is a number between these.
+/// Reports whether a path's name consists of a prefix, a number and a suffix.
 fn named(path: &Path, before: &str, after: &str) -> bool {
     let name = path.file_name().and_then(|name| name.to_str());
     let number = name.and_then(|name| name.strip_prefix(before)?.strip_suffix(after));
     number.is_some_and(|number| !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit()))
 }
 
-/// Whether a file begins as an event file does, as far as it goes.
+/// Reports whether a file is empty or begins with the first event that this module writes.
 fn begins(disk: &Disk, path: &Path) -> io::Result<bool> {
     let first = record(&event(0.0, 0, &Content::Version));
     let mut start = Vec::new();
     disk.read(path)?.take(first.len() as u64).read_to_end(&mut start)?;
-    // The length of the record, and after the time the step and the version.
+    // Compare all bytes except the time and the last checksum.
     let same = |range: std::ops::Range<usize>| start.get(range.clone()).is_none_or(|bytes| *bytes == first[range]);
     Ok(start.is_empty() || start.len() == first.len() && same(0..13) && same(21..first.len() - 4))
 }
 
-/// Seconds since 1970.
+/// Returns the seconds since 1970.
 fn now() -> f64 {
     host::since_1970().as_secs_f64()
 }
@@ -160,7 +161,7 @@ enum Content<'a> {
     Row(&'a Row),
 }
 
-/// An `Event`.
+/// Encodes an `Event`.
 fn event(wall_time: f64, step: u64, content: &Content<'_>) -> Vec<u8> {
     let mut event = Message::default();
     event.double(1, wall_time);
@@ -178,7 +179,7 @@ fn event(wall_time: f64, step: u64, content: &Content<'_>) -> Vec<u8> {
     event.0
 }
 
-/// A `Summary.Value` that the scalars plugin shows: a tensor without dimensions.
+/// Encodes a `Summary.Value` for the scalars plugin: a tensor without dimensions.
 fn scalar(tag: &str, value: f64) -> Vec<u8> {
     const DOUBLE: u64 = 2;
     const SCALAR: u64 = 1;
@@ -196,7 +197,7 @@ fn scalar(tag: &str, value: f64) -> Vec<u8> {
     scalar.0
 }
 
-/// A protocol buffer, field by field.
+/// An encoder of protocol buffers.
 #[derive(Default)]
 struct Message(Vec<u8>);
 
@@ -226,19 +227,19 @@ impl Message {
     }
 }
 
-/// A TFRecord.
+/// Encodes a TFRecord.
 fn record(content: &[u8]) -> Vec<u8> {
     let length = (content.len() as u64).to_le_bytes();
     let parts: [&[u8]; 4] = [&length, &masked_checksum(&length), content, &masked_checksum(content)];
     parts.concat()
 }
 
-/// CRC-32C, rotated and shifted, so that a checksum of checksums is no weaker.
+/// Returns a CRC-32C that is rotated and shifted, as TFRecord requires, so that checksums of checksums stay strong.
 fn masked_checksum(bytes: &[u8]) -> [u8; 4] {
     crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8).to_le_bytes()
 }
 
-/// Castagnoli's checksum, a byte a time.
+/// Computes a CRC-32C byte by byte.
 fn crc32c(bytes: &[u8]) -> u32 {
     const TABLE: [u32; 256] = {
         let mut table = [0; 256];
@@ -262,7 +263,7 @@ fn crc32c(bytes: &[u8]) -> u32 {
 mod tests {
     use super::crc32c;
 
-    /// RFC 3720, appendix B.4.
+    /// The expected values are those of RFC 3720, appendix B.4.
     #[test]
     fn crc32c_has_its_published_values() {
         let ascending: Vec<u8> = (0..32).collect();

@@ -11,7 +11,7 @@ const SEED: &str = "learning.seed";
 /// Points that differ only in the values of one axis and in seeds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Series<'a> {
-    /// The values of the other axes: "coupling 3, fitness Df". Empty without other axes.
+    /// The values of the other axes: "coupling 3, fitness Df". Empty if there are none.
     pub place: String,
     /// The points by value of the axis: "repulsion_gain 2.0".
     pub arms: Vec<(String, Vec<&'a Point>)>,

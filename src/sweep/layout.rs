@@ -1,10 +1,12 @@
 //! The paper's geometry for any number of groups and followers.
 //!
-//! Group g = 1, 2, … has its leader at (10 g, 5) and a POI at (10 g, 15). The map is 50 high and 10 (groups + 1) wide, at
-//! least 50. Followers start on the first of 64 [`places`] around their leader: those of the paper at (±2, −3), those of
-//! its chaotic layout at (±2, +2), then always the point of the unit lattice within 5 of the leader that is farthest from
-//! all places so far. A layout with fewer followers is therefore a part of one with more. Agents start at least 1 apart,
-//! and more than 5 away from every POI.
+//! Group g = 1, 2, … has its leader at (10 g, 5) and a POI at (10 g, 15). The map is 50 high and 10 (groups + 1) wide,
+//! at least 50.
+//!
+//! Followers start on the first of 64 [`places`] around their leader. The first two are those of the paper at (±2, −3),
+//! the next two those of its chaotic layout at (±2, +2). Each further place is the point of the unit lattice within 5
+//! of the leader that is farthest from all earlier places. A layout with fewer followers is therefore a part of one
+//! with more. Agents start at least 1 apart, and more than 5 away from every POI.
 
 use toml::{Table, Value};
 

@@ -1,11 +1,13 @@
 //! Sweeps: many runs from one file, shared between processes.
 //!
-//! A sweep file is a config with a section `[grid]`. Its keys are dotted config keys with lists of values, or the special
-//! axes of [`layout`]. Every combination of values is a [`Point`]: one config, trained as a run in `points/NNNN`. Its
-//! results do not depend on the points that train beside it. The keys of a section `[vary]` change one at a time: every
-//! combination of `[grid]` has a point with the file's values, and one for each value of each key of `[vary]`.
+//! A sweep file is a config with a section `[grid]`. Its keys are dotted config keys with lists of values, or the
+//! special axes of [`layout`]. Every combination of values is a [`Point`]: one config, trained as a run in
+//! `points/NNNN`. Its results do not depend on the points that train beside it.
 //!
-//! | module | holds |
+//! The keys of a section `[vary]` change one at a time. Every combination of `[grid]` has a point with the file's
+//! values, and one for each value of each key of `[vary]`.
+//!
+//! | module | contents |
 //! |---|---|
 //! | [`layout`] | the paper's geometry for any number of groups and followers |
 //! | [`shard`] | the assignment of points to processes by cost |
@@ -67,7 +69,7 @@ pub struct Axis {
     pub key: String,
     /// The values. The first of a varied key is the file's.
     pub values: Vec<Value>,
-    /// Whether the key is varied: a point has at most one varied key with another than its first value.
+    /// Whether the key is varied. At most one varied key of a point differs from its first value.
     pub varied: bool,
 }
 
@@ -184,7 +186,7 @@ impl Sweep {
     }
 }
 
-/// A combination of values with its config, or the problems of that.
+/// A combination of values with its config, or with the problems of that config.
 struct Tried {
     index: usize,
     values: Vec<usize>,
@@ -342,8 +344,8 @@ impl Grid {
         problems
     }
 
-    /// Returns the index of a point's value on each axis. The last axis of the grid changes fastest, and each combination
-    /// has its variations.
+    /// Returns the index of a point's value on each axis. The variations of a combination are consecutive. Among
+    /// combinations, the last axis of the grid changes fastest.
     fn values(&self, index: usize) -> Vec<usize> {
         let (mut combination, mut variation) = (index / self.variations(), index % self.variations());
         let mut values = vec![0; self.axes.len()];
@@ -368,8 +370,8 @@ impl Grid {
         set.map(|(axis, value)| Override::new(&axis.key, axis.values[value].clone(), axis.name_of(value))).collect()
     }
 
-    /// Returns the problems of the points, each once. With `skip`, points may be invalid, but not all points of one value,
-    /// because such a value is a mistake.
+    /// Returns the problems of the points, each once. With `skip`, points may be invalid, but not all points with the
+    /// same value, because such a value is a mistake.
     fn problems(&self, tried: &[Tried], skip: bool) -> Vec<Problem> {
         let mut works: Vec<Vec<bool>> = self.axes.iter().map(|(axis, _)| vec![false; axis.values.len()]).collect();
         for tried in tried.iter().filter(|tried| tried.config.is_ok()) {

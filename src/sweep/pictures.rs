@@ -1,5 +1,5 @@
-//! The figures of a sweep: `final`, `reach` and `curves`, or only `final` for varied keys. Each is written as SVG, PNG and
-//! PDF.
+//! The figures of a sweep: `final`, `reach` and `curves`, or only `final` for varied keys. Each is written as SVG, PNG
+//! and PDF.
 
 use std::path::Path;
 
@@ -32,7 +32,8 @@ struct Facets<'a> {
     panels: Vec<(String, Vec<Spot<'a>>)>,
 }
 
-/// The names of the figures: final G and, for grids, generations to reach one and learning curves.
+/// The names of the figures. `final` shows the final G. For grids, `reach` shows the generations to reach a G, and
+/// `curves` the learning curves.
 const FIGURES: [&str; 3] = ["final", "reach", "curves"];
 
 /// Returns the names of all files.
@@ -40,7 +41,8 @@ pub fn names() -> impl Iterator<Item = String> {
     FIGURES.into_iter().flat_map(|name| Format::ALL.map(|kind| format!("{name}.{}", kind.extension())))
 }
 
-/// Draws the figures of the finished points over one or two axes. Returns the names of the files, and why one is missing.
+/// Draws the figures of the finished points over one or two axes. Returns the names of the files, or the reason why
+/// there are none.
 ///
 /// # Errors
 /// A file cannot be written.

@@ -1,8 +1,10 @@
-//! The questions that the paper leaves open, as sweeps in `configs/questions/`, and what they came to.
+//! The open questions of the paper, as sweeps in `configs/questions/`, and their results.
 //!
-//! A [`Study`] is one sweep, whose arms are compared along one axis as [`comparison`] does it; its rows are what it came to
-//! at each combination of the others. What no sweep can say is added here: runs that start from what others learned, and
-//! champions that play where they did not learn.
+//! A [`Study`] is one sweep. Its arms are compared along one axis, as in [`comparison`]. Each combination of the other
+//! axes is a row of its results.
+//!
+//! This module adds two experiments that a sweep cannot express. Some runs start from the policies of other runs, and
+//! some champions play where they did not learn.
 
 use std::path::{Path, PathBuf};
 
@@ -23,49 +25,49 @@ use crate::report::scene::Scene;
 use crate::report::table;
 use crate::world::World;
 
-/// Episodes that champions play from moved POIs.
+/// Number of episodes that champions play with moved POIs.
 pub const EPISODES: u32 = 200;
-/// What a question's page has around each part's table.
+/// The mark after each part's table in a question's page.
 pub const END: &str = "<!-- so far -->";
 
-/// A question, with the parts that answer it.
+/// A question, with the studies that answer it.
 #[derive(Clone, Copy, Debug)]
 pub struct OpenQuestion {
-    /// What it is asked for by.
+    /// The letter that selects the question.
     pub letter: char,
-    /// As a page's heading says it.
+    /// The heading on a page.
     pub title: &'static str,
-    /// Each a sweep of its own.
+    /// The studies, each a sweep.
     pub parts: &'static [Study],
 }
 
-/// One sweep and what is told of it.
+/// One sweep, and what its table and figure show.
 #[derive(Clone, Copy, Debug)]
 pub struct Study {
-    /// What its config, folder and files are called.
+    /// The name of its config, folder and files.
     pub name: &'static str,
     config: &'static str,
-    /// What its table and figure are of.
+    /// The title of its table and figure.
     pub title: &'static str,
-    /// The axis whose values are its arms, if any.
+    /// The axis whose values are the arms. Empty if there is none.
     by: &'static str,
-    /// The axis with a panel of the figure for each value, if any.
+    /// The axis with one panel of the figure per value, if any.
     panels: Option<&'static str>,
-    /// Words for the values of axes, where these say little themselves.
+    /// Words for the values of axes that are not self-explanatory.
     words: &'static [(&'static str, &'static [&'static str])],
-    /// The two arms of each difference that the table tells.
+    /// The two arms of each difference in the table.
     pairs: &'static [[usize; 2]],
-    /// Generations at which the best team's G is told; the last where there are none.
+    /// Generations at which the best team's G is reported. Empty means the last.
     at: &'static [usize],
-    /// Whether the generations to this G are told, too.
+    /// The G whose first generation is reported, if any.
     reach: Option<f64>,
-    /// Whether the champion's G is.
+    /// Whether the champion's G is reported.
     champion: bool,
-    /// A part whose points of these indices have policies for the points here to start from, each with a name: arms beside
-    /// those that start from random policies.
+    /// A source study with indices of its points, each with a name. The points of this study also start from the
+    /// policies of those points, as additional arms.
     warm_from: Option<(&'static str, &'static [(usize, &'static str)])>,
-    /// How far POIs are moved where champions play, beside where they stand; then nothing else is measured, and a team that
-    /// goes straight ahead is one arm more.
+    /// The jitter of POIs, in units, with which champions play in addition to fixed POIs. Nothing else is then
+    /// measured, and a team with the zero policy is an additional arm.
     moved: Option<f64>,
 }
 
@@ -96,10 +98,10 @@ macro_rules! part {
 }
 
 const SHARING: (&str, &[&str]) = ("sharing", &["own policies", "one policy"]);
-/// Places among G, D, Df and Dt.
+/// The pairs G − Df, G − Dt and Df − Dt by their index among G, D, Df and Dt.
 const OF_CREDIT: &[[usize; 2]] = &[[0, 2], [0, 3], [2, 3]];
 
-/// All of them.
+/// All questions.
 pub const QUESTIONS: &[OpenQuestion] = &[
     OpenQuestion {
         letter: 'a',
@@ -213,7 +215,7 @@ pub const QUESTIONS: &[OpenQuestion] = &[
             title: "POIs each another way, from random policies or from those of other layouts",
             pairs: &[[0, 1], [0, 2], [0, 3]],
             at: &[0, 10, 100],
-            // Leaders with followers, each with a policy of its own.
+            // These points are leader-follower teams in which each leader has its own policy.
             warm_from: Some(("asymmetry", &[(0, "from ahead"), (2, "from either side"), (4, "from ahead and behind")])),
         )],
     },
@@ -231,36 +233,36 @@ pub const QUESTIONS: &[OpenQuestion] = &[
     },
 ];
 
-/// Why a question has no answer.
+/// The reason why a question has no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum Unanswered {
-    /// Runs of it cannot be read.
+    /// Runs cannot be read.
     #[error(transparent)]
     Read(#[from] ReadError),
-    /// Its files cannot be written.
+    /// Files cannot be written.
     #[error(transparent)]
     Record(#[from] RecordError),
     /// Champions could not be played.
     #[error(transparent)]
     Backend(#[from] BackendError),
-    /// Its arms cannot be compared.
+    /// Arms cannot be compared.
     #[error(transparent)]
     Comparison(#[from] ComparisonError),
 }
 
-/// A run that starts from what another one learned.
+/// A run that starts from the policies of another run.
 pub struct Warm {
-    /// What the arm is called.
+    /// The name of the arm.
     pub from: &'static str,
-    /// What it trains.
+    /// The config to train.
     pub config: Config,
-    /// Where its files are, or will be.
+    /// The folder of the run, which may not exist yet.
     pub folder: PathBuf,
-    /// The other run's policies.
+    /// The file with the other run's policies.
     pub policies: PathBuf,
 }
 
-/// A question's letter.
+/// Parses a question's letter.
 ///
 /// # Errors
 /// There is no such question.
@@ -270,7 +272,7 @@ pub fn letter(text: &str) -> Result<char, String> {
     QUESTIONS.iter().find(is).map(|question| question.letter).ok_or_else(|| format!("allowed {}", letters()))
 }
 
-/// The parts that questions of these letters take, each once, sources of others first.
+/// Returns the studies that questions with these letters need, each once. Sources of other studies come first.
 pub fn parts(letters: &[char]) -> Vec<&'static Study> {
     let mut parts: Vec<&'static Study> = Vec::new();
     for part in QUESTIONS.iter().filter(|question| letters.contains(&question.letter)).flat_map(|asked| asked.parts) {
@@ -284,26 +286,26 @@ pub fn parts(letters: &[char]) -> Vec<&'static Study> {
 }
 
 impl Study {
-    /// Its sweep, with some keys changed.
+    /// Returns the sweep, with some keys changed.
     ///
     /// # Errors
-    /// What is wrong with the overrides.
+    /// An override is invalid.
     pub fn sweep(&self, overrides: &[Override]) -> Result<Sweep, ConfigError> {
         Sweep::read(self.config, &format!("configs/questions/{}.toml", self.name), overrides, false)
     }
 
-    /// The part whose runs those here start from, if any.
+    /// Returns the study whose runs the runs of this study start from, if any.
     pub fn source(&self) -> Option<&'static Study> {
         let (name, _) = self.warm_from?;
         QUESTIONS.iter().flat_map(|question| question.parts).find(|part| part.name == name)
     }
 
-    /// The runs that start from what others learned; `out` holds the folders of all parts.
+    /// Returns the runs that start from other runs' policies. `out` has the folders of all studies.
     pub fn warm(&self, sweep: &Sweep, out: &Path) -> Vec<Warm> {
         sweep.points.iter().flat_map(|point| self.warm_of(point, out)).collect()
     }
 
-    /// Those of one point.
+    /// Returns the runs of one point that start from other runs' policies.
     fn warm_of(&self, point: &Point, out: &Path) -> Vec<Warm> {
         let Some((source, places)) = self.warm_from else { return vec![] };
         let run = |(at, &(index, from)): (usize, &(usize, &'static str))| Warm {
@@ -315,7 +317,7 @@ impl Study {
         places.iter().enumerate().map(run).collect()
     }
 
-    /// What the value of an axis is called.
+    /// Returns the name of an axis's value.
     fn word(&self, axis: &Axis, value: usize) -> String {
         match self.words.iter().find(|(leaf, _)| *leaf == axis.leaf()) {
             Some((_, words)) => words[value].into(),
@@ -324,14 +326,14 @@ impl Study {
         }
     }
 
-    /// What the part came to, once all its runs are in their folders: a comparison for each combination of the axes that
-    /// are no arms.
+    /// Returns the study's results from the folders of all its finished runs. There is one comparison per combination
+    /// of the axes that are not arms.
     ///
     /// # Errors
-    /// A run cannot be read, or a champion not be played.
+    /// A run cannot be read, or a champion cannot be played.
     pub fn answer(&self, sweep: &Sweep, out: &Path, backend: &mut dyn Backend) -> Result<Answer, Unanswered> {
         let by = sweep.axis(self.by);
-        // By the values of the axes that are no arms, in their order.
+        // Groups by the values of the axes that are not arms, in order.
         let place = |point: &Point| -> Vec<(usize, usize)> {
             point.values.iter().copied().enumerate().filter(|&(axis, _)| Some(axis) != by).collect()
         };
@@ -381,7 +383,7 @@ impl Study {
         Ok(Answer { part: *self, rows })
     }
 
-    /// Every trial's champion where POIs stand and where they are moved, and a team that goes straight ahead.
+    /// Plays every trial's champion, and the zero policy, with fixed POIs and with moved ones.
     fn played(
         &self,
         place: &str,
@@ -425,7 +427,7 @@ impl Study {
     }
 }
 
-/// The champion of every trial as a team each, `[leaders][trials][parameters]`.
+/// Returns the champion of every trial as one team each, `[leaders][trials][parameters]`.
 fn champions(path: &Path, config: &Config) -> Result<Vec<f32>, RecordError> {
     let (leaders, trials, parameters) = (config.learners(), config.learning.trials, config.parameters());
     let mut champions = vec![0.0; leaders * trials * parameters];
@@ -439,13 +441,13 @@ fn champions(path: &Path, config: &Config) -> Result<Vec<f32>, RecordError> {
     Ok(champions)
 }
 
-/// What a part came to.
+/// The results of a study.
 pub struct Answer {
     part: Study,
     rows: Vec<OfPlace>,
 }
 
-/// Arms at one place.
+/// The comparison of the arms at one combination of the other axes.
 struct OfPlace {
     panel: Option<String>,
     name: String,
@@ -453,12 +455,12 @@ struct OfPlace {
 }
 
 impl Answer {
-    /// Everything that was compared.
+    /// Returns all comparisons.
     pub fn comparisons(&self) -> impl Iterator<Item = &Comparison> {
         self.rows.iter().map(|row| &row.comparison)
     }
 
-    /// The measures that are told, by their place among all.
+    /// Returns the measures to report, with their index among all.
     fn told(&self) -> Vec<(usize, Measure)> {
         let measures = self.rows.first().map_or(&[][..], |row| &row.comparison.measures);
         let is_told = |measure: &Measure| match measure {
@@ -470,7 +472,7 @@ impl Answer {
         measures.filter(|(_, measure)| is_told(measure)).collect()
     }
 
-    /// For a page: a table a measure, of means and differences.
+    /// Returns one table per measure for a page, with means and differences.
     pub fn tables(&self) -> String {
         let tables = self.told().into_iter().map(|(at, measure)| {
             let arms = self.rows.first().map_or(&[][..], |row| &row.comparison.arms);
@@ -503,12 +505,12 @@ impl Answer {
         tables.collect::<Vec<_>>().join("\n")
     }
 
-    /// The table between the marks that a page has around it.
+    /// Returns the tables between their marks in a page.
     pub fn block(&self) -> String {
         format!("{}\n\n{}\n{END}\n", mark(self.part.name), self.tables())
     }
 
-    /// The means with their intervals.
+    /// Draws the means with their intervals.
     pub fn scene(&self) -> Scene {
         let told: Vec<_> = self.told().into_iter().filter(|(_, measure)| measure.digits() > 1).collect();
         let mut groups: Vec<(String, Vec<String>)> = Vec::new();
@@ -541,12 +543,12 @@ impl Answer {
     }
 }
 
-/// What stands before a part's table in a page.
+/// Returns the mark before a part's table in a page.
 pub fn mark(name: &str) -> String {
     format!("<!-- {name}: flotilla paper --questions -->")
 }
 
-/// All that came out, a section a question.
+/// Returns the page with all results, one section per question.
 pub fn page(answers: &[(OpenQuestion, Vec<Answer>)], heading: &str) -> String {
     let mut page = format!("# The questions that the paper leaves open\n\n{heading}\n");
     for (OpenQuestion { letter, title, .. }, answers) in answers {

@@ -1,4 +1,5 @@
-//! The tables of a sweep, from its points' folders. Their bytes do not depend on who trained the points, or in what order.
+//! The tables of a sweep, from the folders of its points. Their bytes do not depend on which process trained the
+//! points, or in what order.
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -50,8 +51,8 @@ impl Outcome {
         self.champion.iter().collect()
     }
 
-    /// Returns the median over trials of the first generation that reaches G. Trials that never do count as infinite, and
-    /// an infinite median is none.
+    /// Returns the median over trials of the first generation that reaches G. Trials that never reach it count as
+    /// infinite. None if the median is infinite.
     pub fn median_reached(&self) -> Option<f64> {
         let mut reached: Vec<usize> = self.reached.iter().map(|reached| reached.unwrap_or(usize::MAX)).collect();
         reached.sort_unstable();
@@ -68,13 +69,13 @@ pub fn point_folder(out: &Path, point: &Point) -> PathBuf {
 /// The reason why a point has no results.
 #[derive(Debug, thiserror::Error)]
 pub enum Missing {
-    /// Its folder has no run.
+    /// The point's folder has no run.
     #[error("it was not run")]
     NotRun,
-    /// Its run is at the first generation of the second.
+    /// The point's run has reached the first of these generations. The second is its last.
     #[error("it has come to generation {0} of {1}")]
     Unfinished(usize, usize),
-    /// Its files cannot be used.
+    /// The point's files cannot be used.
     #[error("{0}")]
     Damaged(String),
 }

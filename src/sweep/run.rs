@@ -14,9 +14,9 @@ use crate::run::{self, Ended, RunError, Session};
 /// Maximum number of points per batch. Each keeps two files open, and most systems allow a process at least 1024.
 const MAX_BATCH: usize = 400;
 
-/// How points are trained.
+/// The options of training points.
 pub struct SweepOptions<'a> {
-    /// How to treat existing runs.
+    /// The treatment of existing runs.
     pub start: Start,
     /// The disk within the sweep's folder, or within one above it.
     pub disk: &'a Disk,

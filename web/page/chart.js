@@ -1,7 +1,8 @@
-// Learning curves: of each arm the mean over trials of the best team's POIs, and every trial thin behind it.
+// Draws learning curves: POIs observed by the best team, per arm the mean over trials, with each trial as a thin line.
 const chart = (() => {
   "use strict";
-  // `arms` are { tone, trials: [[POIs by generation]] }, of every so many generations; `cursor` is a generation to mark, or none.
+  // `arms` are { tone, trials }. Each trial is an array of POIs, one value per `every` generations. `cursor` is the
+  // generation to mark, or null.
   function paint(canvas, arms, every, last, pois, cursor) {
     const wide = canvas.clientWidth, tall = canvas.clientHeight, dots = window.devicePixelRatio || 1;
     if (canvas.width !== Math.round(wide * dots) || canvas.height !== Math.round(tall * dots)) {
@@ -66,7 +67,7 @@ const chart = (() => {
     draw.stroke();
   }
 
-  // By generation, as far as all trials have come.
+  // Returns the mean over trials, up to the last generation that all trials have reached.
   function mean(trials) {
     const length = trials.length ? Math.min(...trials.map(trial => trial.length)) : 0;
     return Array.from({ length }, (_, generation) => trials.reduce((sum, trial) => sum + trial[generation], 0) / trials.length);

@@ -1,10 +1,10 @@
-// Configs as texts: the paper's layouts, changes of single keys, and the whole in an address.
+// Configs as text: the paper's layouts, changes of single keys, and encoding for links.
 const configs = (() => {
   "use strict";
   const LAYOUTS = ["generally_forward", "strictly_forward", "chaotic"];
   const layout = name => document.getElementById(`layout-${name}`).textContent;
 
-  // Where a value that starts here ends: at the end of its line, or where its brackets close.
+  // Returns the index at which a value that starts at `at` ends: at a comment or the end of a line, outside brackets.
   function end(text, at) {
     let depth = 0, quote = null;
     for (; at < text.length; at++) {
@@ -22,7 +22,7 @@ const configs = (() => {
     return at;
   }
 
-  // The text with a key set to a value (as TOML), its comments kept.
+  // Returns the text with `key` set to `value` (as TOML). Comments are kept.
   function set(text, key, value) {
     const [section, leaf] = key.split(".");
     const header = new RegExp(`^[ \\t]*\\[${section}\\][ \\t]*(#.*)?$`, "m").exec(text);
@@ -40,7 +40,7 @@ const configs = (() => {
   const positions = list => `[${list.map(([x, y]) => `[${decimal(x)}, ${decimal(y)}]`).join(", ")}]`;
   const decimal = value => Number.isInteger(value) ? value.toFixed(1) : String(value);
 
-  // Texts in an address: deflated, in the letters of URLs.
+  // Texts in links are deflated and encoded as URL-safe base64.
   async function pack(text) {
     const packed = new Blob([text]).stream().pipeThrough(new CompressionStream("deflate-raw"));
     const bytes = new Uint8Array(await new Response(packed).arrayBuffer());

@@ -1,4 +1,4 @@
-// The page: what was chosen, what is shown, and what follows when somebody acts.
+// The page: its state, its views, and its event listeners.
 const page = (() => {
   const $ = id => document.getElementById(id);
   const make = (name, text = "", parent = null, more = {}) => {
@@ -12,20 +12,21 @@ const page = (() => {
   const count = (many, what) => `${many} ${what}${many === 1 ? "" : "s"}`;
   const NAMES = { "leader-follower": "Leader-follower: leaders learn, followers follow", "all-leaders": "All-leaders: every agent learns" };
   const TONES = { "leader-follower": "--leader-follower", "all-leaders": "--all-leaders" };
-  // Controls that are keys of the config.
+  // Controls that set a key of the config.
   const KEYS = { fitness: "learning.fitness", coupling: "world.coupling", seed: "learning.seed", generations: "learning.generations", trials: "learning.trials", population: "learning.population" };
   const quote = key => key === "fitness" ? value => `"${value}"` : value => String(value);
 
   const state = {
     text: "", config: null, toml: null, pois: 4, both: true, file: null, mode: "watch",
     training: null, follow: true, generation: 0, trial: 0, views: [], gpu: {}, machine: null, settled: null, players: [], policies: null,
-    // The worker that answers questions while the players train; whether the text is a config; texts to go back to.
+    // `clerk`: the worker that answers requests while the players train. `valid`: whether the text is a valid config.
+    // `past`: earlier texts, for undo.
     clerk: null, valid: false, past: [],
   };
 
   // ---- Configs ----
 
-  // Takes a text as the config, or shows what is wrong with it; false then.
+  // Makes a text the config. If it is invalid, shows its problems and returns false.
   let newest = 0;
   async function take(text, { edited = false, address = true } = {}) {
     const turn = ++newest;
@@ -48,7 +49,7 @@ const page = (() => {
     return true;
   }
 
-  // Sets keys of the config, its comments kept where that can be done; one change after the other.
+  // Sets keys of the config, and keeps its comments if possible. Changes run one after the other.
   let changing = Promise.resolve();
   const change = changes => (changing = changing.catch(() => {}).then(() => change_now(changes)));
   async function change_now(changes) {
@@ -65,7 +66,7 @@ const page = (() => {
     return take(text);
   }
 
-  // Keeps the present text, so that it can be brought back.
+  // Saves the current text for undo.
   function keep() {
     if (state.past.at(-1)?.text !== state.text) state.past.push({ text: state.text, file: state.file });
     if (state.past.length > 100) state.past.shift();
@@ -81,7 +82,7 @@ const page = (() => {
     await take(last.text);
   }
 
-  // Says so when the results on the page are of other settings than those in the form.
+  // Shows a note if the results were trained with settings that differ from those in the form.
   function stale() {
     const { training } = state, differs = training && training.source && (training.source.text !== state.text || training.source.both !== state.both);
     $("stale").hidden = !differs;
@@ -90,7 +91,7 @@ const page = (() => {
     $("stale").textContent = `The results below were trained with other settings: fitness ${fitness}, seed ${seed}, population ${population}, ${generations} generations. Train again to see the present ones.`;
   }
 
-  // What was typed or chosen a moment ago counts for whatever follows.
+  // Edits are applied after a delay. `entered` applies pending ones at once, so that what follows uses them.
   let typed = null;
   const type = () => { typed = null; return take($("text").value, { edited: true }); };
   async function entered() {
@@ -98,7 +99,7 @@ const page = (() => {
     await changing;
   }
 
-  // Brings the controls to what the config says.
+  // Sets the controls to the values of the config.
   function fill() {
     const { learning, world } = state.config;
     for (const id of ["seed", "generations", "trials", "population"]) $(id).value = learning[id];
@@ -114,7 +115,7 @@ const page = (() => {
     options();
   }
 
-  // Whether nothing but what the command line's flags say differs from a layout.
+  // `plain` removes the keys that have a command-line flag. `same_world` compares the rest with a layout.
   const plain = text => text.split("\n").filter(line => !/^\s*(paradigm|fitness|seed|trials|generations|population)\s*=/.test(line)).join("\n");
   const same_world = name => plain(state.text) === plain(configs.layout(name));
 
@@ -163,7 +164,7 @@ const page = (() => {
   async function remember() {
     const turn = ++remembered, words = new URLSearchParams(), layout = $("layout").value;
     if (layout === "own") {
-      // Without compression there is no link: the page works all the same.
+      // If the browser cannot compress, there is no link. The rest of the page works.
       try { words.set("config", await configs.pack(state.text)); } catch { return; }
     } else {
       words.set("layout", layout);
@@ -175,7 +176,7 @@ const page = (() => {
     if (turn === remembered) history.replaceState(null, "", `#${words}`);
   }
 
-  // Opens the experiment in the address. What cannot be read of it is said, and the address stays as it is.
+  // Opens the experiment in the address. Reports the parts that cannot be read, and then leaves the address unchanged.
   async function recall() {
     const words = new URLSearchParams(location.hash.slice(1)), unknown = [];
     for (const id of ["on", "pace"]) {
@@ -198,7 +199,7 @@ const page = (() => {
     const damage = unknown.length ? `This link is damaged: ${unknown.join(", ")} cannot be read. Ask for a new link; what you see is not what it was made for.` : "";
     const taken = await take(text, { address: !damage });
     if (!taken && !state.config) {
-      // There is a map to look at even if the link's config is wrong.
+      // Show a map even if the config in the link is invalid.
       await take(configs.layout("generally_forward"), { address: false });
       await take(text);
     }
@@ -207,7 +208,7 @@ const page = (() => {
 
   // ---- Players ----
 
-  // Sees what there is to play on, and takes what was chosen.
+  // Opens the chosen backend, or the CPU if no GPU is exact. `auto` also ignores software renderers.
   async function settle() {
     const wanted = $("on").value, { gpu } = state;
     if (state.settled === wanted) return;
@@ -236,7 +237,7 @@ const page = (() => {
     $("machine").textContent = `Runs on ${workers}${speed}${machine.why ? ` (${machine.why})` : ""}`;
   }
 
-  // Workers that do not answer any more are replaced.
+  // Replaces the players, for example after they stopped responding.
   async function renew() {
     const many = Math.max(1, Math.min(16, navigator.hardwareConcurrency || 2)), old = state.players;
     [state.clerk, ...state.players] = await Promise.all([state.clerk || pool.open(), ...Array.from({ length: many }, () => pool.open())]);
@@ -258,7 +259,7 @@ const page = (() => {
     $("announced").textContent = "";
     let training;
     try {
-      // A worker that is still busy with a long generation would keep the new training waiting.
+      // A worker that still plays a long generation would delay the new training.
       if (busy) await renew();
       await entered();
       if (!state.valid) return;
@@ -284,7 +285,7 @@ const page = (() => {
     } finally { starting = false; }
     stale();
     controls();
-    // To watch, generations come at an even pace; what paused does not count.
+    // For watching, the pace is limited to `last / 8` generations per second, but at least 1. Pauses do not count.
     let shown = 0, clock = performance.now(), dirty = true, news = clock;
     const allowed = () => {
       const now = performance.now(), each = training.last / 8;
@@ -326,7 +327,7 @@ const page = (() => {
     }
   }
 
-  // Ends a training where it is. What was played can still be watched.
+  // Stops a training. The generations played so far can still be watched.
   function stop() {
     const { training } = state;
     if (!training || training.state !== "training") return;
@@ -335,7 +336,7 @@ const page = (() => {
     $("announced").textContent = `Stopped after generation ${Math.max(0, training.reached)}.`;
   }
 
-  // Leaves a training and what came out of it.
+  // Discards a training and its results.
   function forget() {
     if (state.training) state.training.stop();
     Object.assign(state, { training: null, policies: null });
@@ -351,7 +352,7 @@ const page = (() => {
 
   const name_of = () => state.file || ($("layout").value === "own" ? "config" : $("layout").value);
 
-  // What gives the same by the command line.
+  // Returns the command that gives the same results.
   function command({ learning }) {
     const layout = $("layout").value;
     if (layout === "own") return `flotilla train ${name_of()}.toml --paradigm ${learning.paradigm}`;
@@ -396,13 +397,13 @@ const page = (() => {
 
   // ---- Views ----
 
-  // Where an agent may come to in an episode, and all POIs.
+  // Returns the part of the map that contains all POIs and every place that agents can reach in an episode.
   function reach({ world, motion }) {
     const far = world.steps * world.dt * motion.max_speed + 2, [width, height] = world.map;
     const starts = [...world.leaders, ...world.followers].map(place => [...place, far]);
     const all = [...starts, ...world.pois.map(place => [...place, world.observation_radius + 1])];
     const side = (axis, sign) => all.map(place => place[axis] + sign * place[2]);
-    // Beyond a wall there is room for whoever stands at it.
+    // A margin beyond the walls, so that agents at a wall are drawn whole.
     const low = axis => Math.max(-1.5, Math.min(...side(axis, -1))), high = (axis, end) => Math.min(end + 1.5, Math.max(...side(axis, 1)));
     let [left, below, right, above] = [low(0), low(1), high(0, width), high(1, height)];
     const least = (right - left) * 0.42;
@@ -459,18 +460,19 @@ const page = (() => {
     if (view.chosen) ring(view);
   }
 
-  // Shows an episode from its start, or its end if nothing is to move. What somebody asked for moves in any case.
+  // Plays an episode from its start, or shows its end if `moving` is false. Visitors who prefer reduced motion also see
+  // the end, unless they asked to play it.
   function show(view, data, moving = true, asked = false) {
     const last = data.episodes[0].shown.length - 1;
     const plays = moving && (asked || !still.matches), [left, below, right, above] = view.crop;
-    // Stages and jitter may put POIs elsewhere.
+    // Stages and jitter may move POIs out of the view.
     if (data.pois.some(([x, y]) => x < left || x > right || y < below || y > above)) view.crop = stage.whole(data);
     Object.assign(view, { data, place: plays ? 0 : last, playing: plays, ended: plays ? null : performance.now() });
     draw(view);
     wake_up();
   }
 
-  // Brings the slider of steps to where the first view is.
+  // Sets the step slider to the first view's step.
   function steps(view) {
     const last = view.data.episodes[0].shown.length - 1;
     $("step").disabled = last === 0;
@@ -479,7 +481,7 @@ const page = (() => {
     $("step").setAttribute("aria-valuetext", `step ${view.data.episodes[0].shown[Math.floor(view.place)]} of ${view.data.steps}`);
   }
 
-  // Shows all views at a step, and stops there.
+  // Shows all views at a step, and pauses them.
   function step_to(place) {
     for (const view of state.views.filter(view => view.data)) {
       Object.assign(view, { playing: false, place: Math.min(place, view.data.episodes[0].shown.length - 1), ended: performance.now() });
@@ -501,7 +503,7 @@ const page = (() => {
     const { training } = state, live = training && training.state === "training" && state.follow;
     for (const view of state.views.filter(view => view.playing)) {
       const [episode] = view.data.episodes, last = episode.shown.length - 1;
-      // While training goes on, an episode takes 1.6 s; later, three.
+      // An episode takes 1.6 s during training. Afterwards it plays in simulated time, but for at most 4 s.
       const whole = view.data.steps * view.data.dt, times = whole / (live ? 1.6 : Math.min(whole, 4));
       view.place = stage.later(view.data, episode, view.place, seconds * times);
       if (view.place >= last) {
@@ -515,7 +517,7 @@ const page = (() => {
     if (running) requestAnimationFrame(tick);
   }
 
-  // Asks for the best team of the moment for every view that has played its last one.
+  // Requests the current best team for every view that has finished its episode.
   function follow() {
     const { training } = state;
     if (!training || state.mode !== "watch" || !state.follow || training.state === "starting") return;
@@ -547,7 +549,7 @@ const page = (() => {
     }
   }
 
-  // Goes to a generation of all arms.
+  // Shows a generation of all arms.
   function seek(generation) {
     const { training } = state;
     if (!training || training.state === "starting") return;
@@ -592,9 +594,9 @@ const page = (() => {
   let drawn_chart = null;
   function curves() {
     const { training } = state;
-    // Shares of them, where stages have more and fewer.
+    // If the number of POIs differs between stages, the curves show shares instead.
     const pois = (training ? training.arms[0].pois : state.pois) ?? 1;
-    // No more points than can be told apart.
+    // About 1000 points per curve are enough for the width of the chart.
     const every = training ? Math.ceil(Math.max(1, training.reached) / 1000) : 1;
     const sample = trial => Array.from({ length: Math.ceil(trial.length / every) }, (_, index) => trial[index * every].best * pois);
     const arms = (training ? training.arms : []).map(({ label, trials }) => ({ tone: TONES[label], trials: trials.map(sample) }));
@@ -616,9 +618,9 @@ const page = (() => {
     if (training) told();
   }
 
-  // ---- The start, and rearranging it ----
+  // ---- Start positions ----
 
-  // The start as an episode of no step.
+  // Returns the start as an episode without steps.
   function start_scene(config) {
     const { world, follow } = config, agents = [...world.leaders, ...world.followers];
     const coupling = Array.isArray(world.coupling) ? world.coupling : world.pois.map(() => world.coupling);
@@ -639,7 +641,8 @@ const page = (() => {
       }],
     };
   }
-  // The heading of each agent at the start. Of one per leader, a follower takes that of the leader nearest to it.
+  // Returns the heading of each agent at the start. If headings are given per leader, each follower uses that of its
+  // nearest leader.
   function headings_of({ heading, leaders, followers }) {
     const agents = [...leaders, ...followers];
     if (!Array.isArray(heading)) return agents.map(() => heading);
@@ -673,7 +676,7 @@ const page = (() => {
     only.crop = state.mode === "arrange" ? [0, 0, ...config.world.map] : reach(config);
     if (only.chosen && !config.world[only.chosen[0]][only.chosen[1]]) only.chosen = null;
     if (state.mode === "arrange") {
-      // The whole map, as high as the window has room for below the row of modes.
+      // Show the whole map, as high as the window allows below the row of modes.
       const [width, height] = config.world.map;
       only.canvas.style.maxWidth = `${Math.max(280, (innerHeight - 250) * width / height)}px`;
       only.canvas.style.marginInline = "auto";
@@ -702,7 +705,7 @@ const page = (() => {
     draw(view);
   }
 
-  // Lets the pointer and keys move what is on the map.
+  // Lets the pointer and the keys move agents and POIs.
   function hands(view) {
     if (view.canvas.classList.contains("hands")) return;
     view.canvas.classList.add("hands");
@@ -716,7 +719,7 @@ const page = (() => {
     };
     view.canvas.addEventListener("pointerdown", event => {
       const { scale } = stage.place_on(view.canvas, view.crop), at = place(event);
-      // Agents lie above POIs.
+      // Agents are drawn above POIs, so they take precedence.
       const away = ([list, , [x, y]]) => Math.hypot(x - at[0], y - at[1]) + (list === "pois" ? 1 : 0);
       const near = items(state.config).sort((a, b) => away(a) - away(b))[0];
       if (!near || away(near) > Math.max(18 / scale, state.config.world.observation_radius * 0.6)) return choose(view, null);
@@ -764,7 +767,7 @@ const page = (() => {
   function add(list) {
     const { world } = state.config, [width, height] = world.map, [first] = state.views;
     const taken = items(state.config).map(([, , place]) => place);
-    // A free place near the middle.
+    // Search for a free place, on a spiral from the middle of the map.
     let place = [width / 2, height / 2];
     for (let ring = 0; taken.some(([x, y]) => Math.hypot(x - place[0], y - place[1]) < 2) && ring < 200; ring++) {
       place = [width / 2 + 1.5 * Math.sqrt(ring) * Math.cos(2.4 * ring), height / 2 + 1.5 * Math.sqrt(ring) * Math.sin(2.4 * ring)].map(at => Math.round(at * 10) / 10);
@@ -790,7 +793,7 @@ const page = (() => {
     if (over !== view.over) { view.over = over; draw(view); }
   }
 
-  // ---- Taking a leader ----
+  // ---- Driving a leader ----
 
   const drive = { on: false, timer: null, wish: [0, 0], pointer: null, keys: new Set() };
 
@@ -824,7 +827,7 @@ const page = (() => {
     };
     only.canvas.addEventListener("pointermove", at);
     only.canvas.addEventListener("pointerdown", event => { at(event); only.canvas.focus(); if (!drive.on) drive_on(); });
-    // A finger leaves whenever it is lifted: where it was is where the leader shall go.
+    // Lifting a finger also fires `pointerleave`. The leader then keeps going to the last place touched.
     only.canvas.addEventListener("pointerleave", event => { if (event.pointerType !== "touch") drive.pointer = null; });
     const key = event => {
       if (!/^Arrow/.test(event.key)) return;
@@ -837,7 +840,7 @@ const page = (() => {
     return only;
   }
 
-  // What the hand wants: a turn in parts of a half turn, and a speed from -1 to 1; nothing while it rests.
+  // Returns the wanted turn, in half turns to the left, and speed, each in -1..1. Returns null without input.
   function wish(positions, headings, leader) {
     const [x, y] = positions.slice(2 * leader, 2 * leader + 2), [cos, sin] = headings.slice(2 * leader, 2 * leader + 2);
     if (drive.pointer) {
@@ -1036,7 +1039,7 @@ const page = (() => {
     $("verify").disabled = false;
   }
 
-  // ---- What follows when somebody acts ----
+  // ---- Event listeners ----
 
   function listen() {
     $("setup").addEventListener("submit", event => { event.preventDefault(); train(); });
@@ -1056,11 +1059,11 @@ const page = (() => {
       if (state.both) { remember(); stale(); } else change([["learning.paradigm", `"${$("paradigm").value}"`]]);
     });
     for (const [id, key] of Object.entries(KEYS)) {
-      // An emptied field gets back the value that would be trained.
+      // An empty field is reset to the config's value.
       $(id).addEventListener("change", () => { if ($(id).value !== "") change([[key, quote(id)($(id).value)]]); else if (state.config) fill(); });
     }
     for (const id of ["on", "pace"]) $(id).addEventListener("change", remember);
-    // A training goes on where it is; the next one is elsewhere.
+    // A training in progress keeps its backend. The next one uses the new choice.
     $("on").addEventListener("change", () => { if (!state.training || state.training.state === "done" || state.training.state === "stopped") settle().catch(error => trouble(error.message)); });
     for (const button of document.querySelectorAll("[data-mode]")) button.addEventListener("click", () => mode(button.dataset.mode));
     for (const button of document.querySelectorAll("[data-add]")) button.addEventListener("click", () => add(button.dataset.add));
@@ -1082,7 +1085,7 @@ const page = (() => {
     $("trial").addEventListener("change", () => {
       state.trial = Number($("trial").value);
       if (!state.follow) return seek(state.generation);
-      // Following goes on in the other trial.
+      // Keep following, in the other trial.
       state.views.forEach((view, run) => { if (view.asking) view.wanted = state.generation; else ask(view, run, state.generation); });
     });
     $("replay").addEventListener("click", () => {

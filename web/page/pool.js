@@ -1,10 +1,10 @@
-// Workers that run flotilla, and what they can play on.
+// Workers that run flotilla, and the detection of a GPU.
 const pool = (() => {
   "use strict";
   const text = id => document.getElementById(id).textContent;
   let compiled = null, script = null;
 
-  // WebAssembly is on the page, compressed: it is unpacked and compiled once, for all workers.
+  // The page contains the WebAssembly module, compressed. It is compiled once for all workers.
   async function compile() {
     const packed = await fetch(`data:application/octet-stream;base64,${text("wasm")}`);
     const plain = packed.body.pipeThrough(new DecompressionStream("deflate"));
@@ -34,7 +34,7 @@ const pool = (() => {
       this.asked.clear();
       this.failed = true;
     }
-    // What is transferred is no longer here.
+    // Buffers in `transferred` move to the worker, and cannot be used here afterwards.
     ask(words, bytes, more = {}, transferred = []) {
       if (this.failed) return Promise.reject(Object.assign(new Error("the worker has failed; load the page again"), { problems: [], fatal: true }));
       const id = this.count++;
@@ -50,7 +50,7 @@ const pool = (() => {
     }
   }
 
-  // A worker that is ready to be asked.
+  // Starts a worker, and returns it once it accepts requests.
   async function open() {
     compiled ??= compile();
     const player = new Player();
@@ -59,7 +59,7 @@ const pool = (() => {
     return player;
   }
 
-  // What the browser's GPU is, or why there is none to play on.
+  // Returns the name of the browser's GPU and whether it is a software renderer, or the reason why none can be used.
   async function gpu() {
     if (!navigator.gpu) return { reason: "this browser has no WebGPU, or keeps it to pages of https and localhost" };
     if (typeof WebAssembly.Suspending !== "function") return { reason: "this browser cannot suspend WebAssembly, which waiting for a GPU takes" };

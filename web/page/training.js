@@ -1,5 +1,5 @@
-// One training of one or two arms: on the GPU all of it as one batch by one worker, on the CPU trial by trial by as many
-// workers as there are cores. Which of them plays what changes no bit.
+// A training of one or two arms. On the GPU, one worker trains everything as one batch. On the CPU, the trials are
+// divided among the workers. The division does not change the results.
 class Training {
   constructor(arms, machine) {
     this.arms = arms.map(arm => ({ ...arm, trials: Array.from({ length: arm.config.learning.trials }, () => []), ended: [] }));
@@ -14,11 +14,11 @@ class Training {
   }
 
   get last() { return Math.max(...this.arms.map(arm => arm.config.learning.generations)); }
-  // The generation that all trials have reached.
+  // Returns the last generation that all trials have finished, or -1.
   get reached() { return Math.min(...this.arms.flatMap(arm => arm.trials.map(trial => trial.length))) - 1; }
   get rate() { return this.teams / Math.max(1e-9, Math.max(0, ...this.busy)); }
 
-  // Divides the work among players, and starts it.
+  // Divides the trials among players, and starts the training.
   async start(players) {
     const tasks = this.arms.flatMap((arm, run) => arm.trials.map((_, trial) => [run, trial]));
     const whole = this.machine.backend === "gpu";
@@ -33,7 +33,8 @@ class Training {
     this.state = "training";
   }
 
-  // Plays on until all is done or it is stopped; `allowed` tells up to which generation, `changed` is told of news.
+  // Trains until everything is finished or `stop` is called. `allowed` returns how many generations may be played so
+  // far. `changed` is called when there are new results.
   async play(allowed, changed) {
     const from = performance.now();
     let idle = 0;
@@ -64,8 +65,8 @@ class Training {
     changed();
   }
 
-  // Puts each run's folder together, and brings home its digest. All of the policies may be much: they go from worker to
-  // worker, and only the champions stay.
+  // Makes each run's archive and digest. All policies may take much memory. Their buffers are therefore transferred
+  // from worker to worker, and only the champions are kept here.
   async finish() {
     for (const [run, arm] of this.arms.entries()) {
       const answers = await Promise.all(this.players.map(player => player.ask({ ask: "ends", run })));
@@ -102,7 +103,7 @@ class Training {
     Object.assign(arm, { digest: words.digest, zip });
   }
 
-  // A run from a file, that nothing is left to do of.
+  // Makes a finished training from a run's archive.
   static async read(player, machine, name, { words, bytes }) {
     const arm = { name, label: words.config.learning.paradigm, toml: words.toml, config: words.config, pois: words.pois, parameters: words.parameters, digest: words.digest };
     const training = new Training([arm], machine), [own] = training.arms;
@@ -122,10 +123,12 @@ class Training {
     return training;
   }
 
-  // The best team of a generation of a trial, as a page shows it; the one that is at hand where none is named.
+  // Returns the episode of the best team of a generation of a trial, for display. Without `generation`, the worker's
+  // current one is used.
   async best(run, trial, generation) {
     const { words } = await this.owners.get(`${run}/${trial}`).ask({ ask: "best", run, trial, generation });
-    // What was read may have started from other policies than are drawn here, or be another version's.
+    // Training here starts from random policies. A run from a file may have started from given ones, or be from another
+    // version.
     const [episode] = words.episodes, told = this.arms[run].trials[trial][episode.generation];
     if (told && told.best !== episode.best_g) throw new Error(`Trained again, generation ${episode.generation} comes to G = ${episode.best_g}, where the run says ${told.best}: it started from given policies, or another version made it.`);
     return stage.unpack(words);
@@ -134,7 +137,7 @@ class Training {
   stop() { if (this.state !== "done") this.state = "stopped"; }
 }
 
-// The first policy of each population, of bytes that start with `[populations][policies][parameters]` of so many numbers.
+// Returns the first policy of each population. `bytes` start with `numbers` f32, `[populations][policies][parameters]`.
 function champions({ config, parameters }, bytes, numbers) {
   const each = 4 * config.learning.population * parameters, many = numbers * 4 / each, own = new Uint8Array(many * 4 * parameters);
   for (let at = 0; at < many; at++) own.set(bytes.subarray(at * each, at * each + 4 * parameters), at * 4 * parameters);

@@ -1,8 +1,8 @@
-// Runs flotilla beside the page: answers one question after the other. The glue that wasm-bindgen makes stands above.
+// Runs flotilla in a worker, one request at a time. The build puts the glue code of wasm-bindgen before this script.
 const suspends = typeof WebAssembly.Suspending === "function" && typeof WebAssembly.promising === "function";
 let woken = false, resume = null;
 
-// What the crate takes from its host.
+// Functions that the crate imports.
 const now = () => performance.now();
 const tell = text => self.postMessage({ told: JSON.parse(text) });
 function wake() {
@@ -15,7 +15,7 @@ async function park() {
   resume = null;
 }
 
-// Where the browser can suspend WebAssembly, the one import that waits does that.
+// If the browser can suspend WebAssembly, replace the import that waits with one that suspends.
 if (suspends) {
   const Instance = WebAssembly.Instance;
   WebAssembly.Instance = function (module, imports) {
@@ -25,7 +25,7 @@ if (suspends) {
   };
 }
 
-// Numbers may come in parts.
+// Joins numbers that were sent in parts.
 function joined(parts) {
   const whole = new Uint8Array(parts.reduce((sum, part) => sum + part.byteLength, 0));
   parts.reduce((at, part) => (whole.set(part, at), at + part.byteLength), 0);
@@ -50,6 +50,6 @@ async function answer({ id, words, bytes, module }) {
   }
 }
 
-// Questions wait for their turn: there is one stack to suspend.
+// Requests run one after the other, because only one WebAssembly stack can be suspended at a time.
 let turn = Promise.resolve();
 self.onmessage = ({ data }) => { turn = turn.then(() => answer(data)); };

@@ -1,4 +1,4 @@
-//! Runs on their way out of a tab and into it: a run's folder as a zip archive, as the program would have written it.
+//! Exports and imports runs as zip archives of a run directory, in the format of `flotilla train`.
 
 use std::io::{Cursor, Read, Write};
 
@@ -19,11 +19,13 @@ use zip::{ZipArchive, ZipWriter, write::SimpleFileOptions};
 
 use crate::ask::{Answer, Refusal, described, floats, refuse};
 
-/// Most bytes of a file of an archive.
+/// Maximum bytes read from one file of an archive.
 const MOST: u64 = 1 << 30;
 
-/// A finished run; its numbers are the rows, `[rows][7]` f64 (run, trial, generation, best, mean and champion G, seconds) in
-/// the order of `metrics.csv`, and then every trial's policies and its fitness, as f32.
+/// Describes a finished run to export.
+///
+/// Its numbers start with the rows, `[rows][7]` f64, in the order of `metrics.csv`. A row is run, trial, generation,
+/// best, mean and champion G, seconds. After the rows follow each trial's policies and fitness, as f32.
 #[derive(Deserialize)]
 pub struct Recorded {
     text: String,
@@ -35,11 +37,11 @@ pub struct Recorded {
     threads: usize,
     started: String,
     rows: usize,
-    /// Each trial's, of the last generation: best and mean G.
+    /// Best and mean G of the last generation, per trial.
     pending: Vec<Option<[f64; 2]>>,
 }
 
-/// The folder of a finished run, and its digest.
+/// Returns the digest of a finished run, and its directory as a zip archive.
 pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
     let config = Config::parse(&recorded.text, "the config")?;
     let (trials, last) = (config.learning.trials, config.learning.generations);
@@ -74,7 +76,7 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
 
     let lines = Lines::of(&config);
     let mut text = lines.header();
-    // Where a longer run would go on: before the rows of the last generation.
+    // A longer run would resume before the rows of the last generation.
     let mut ending = None;
     for (row, seconds) in &rows {
         if row.generation == last && ending.is_none() {
@@ -132,8 +134,10 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
     Ok((json!({ "digest": digest }), archive))
 }
 
-/// What a dropped file holds: a run's archive gives its config, the rows as `[rows][7]` and every trial's policies; a file of
-/// policies, for the config that is at hand, gives these.
+/// Reads a file that was dropped on the page.
+///
+/// An archive of a run gives its config, the rows `[rows][7]` f64, and each trial's policies as f32. Any other file is
+/// read as policies for the config in `text`.
 pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
     if !bytes.starts_with(b"PK") {
         let config = Config::parse(text.unwrap_or_default(), "the config")?;
@@ -146,7 +150,7 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
         ZipArchive::new(Cursor::new(bytes)).map_err(|error| refuse(format!("no archive of a run: {error}")))?;
     let names: Vec<String> = zip.file_names().flatten().map(Into::into).collect();
     let mut file = |name: &str| -> Result<Vec<u8>, Refusal> {
-        // Whoever packs a folder may have its name in front.
+        // Archives may contain the directory itself, so only the last part of a path is compared.
         let found = names.iter().find(|found| found.rsplit('/').next() == Some(name));
         let found = found.ok_or_else(|| refuse(format!("the archive has no {name}: it is no run's")))?;
         let mut content = Vec::new();
@@ -196,8 +200,9 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
     Ok((words, bytes))
 }
 
-/// The episode of the champions, the first policy of every leader, in the world of the last generation:
-/// `[leaders][policies][parameters]`, or `[1][policies][parameters]` for all leaders.
+/// Plays the champions, the first policy of every leader, in the world of the last generation.
+///
+/// `weights` are `[leaders][policies][parameters]`, or `[1][policies][parameters]` if all leaders share a policy.
 pub fn play(config: &Config, policies: usize, mut weights: Vec<f32>) -> Result<Value, Refusal> {
     let config = &config.at(config.learning.generations);
     let world = World::new(config);

@@ -1,4 +1,4 @@
-//! What a page may ask, and who answers.
+//! The requests of a page, and their dispatch.
 
 use std::fmt::Display;
 
@@ -18,10 +18,10 @@ use crate::archive::{self, Recorded};
 use crate::drive::Drive;
 use crate::train::{Chosen, Training};
 
-/// Words and numbers.
+/// JSON and little-endian numbers.
 pub type Answer = (Value, Vec<u8>);
 
-/// Why there is no answer: words for people, or what is wrong with a config, line by line.
+/// An error as JSON: a message, and for an invalid config its problems by line.
 pub struct Refusal(Value);
 
 impl From<Refusal> for Value {
@@ -42,48 +42,52 @@ impl From<ConfigError> for Refusal {
     }
 }
 
-/// Whatever else went wrong.
+/// Wraps any error that has only a message.
 pub fn refuse(error: impl Display) -> Refusal {
     Refusal(json!({ "error": error.to_string() }))
 }
 
-/// Everything that a page may ask.
+/// A request of the page.
 #[derive(Deserialize)]
 #[serde(tag = "ask", rename_all = "snake_case")]
 enum Ask {
-    /// What a config comes to, with some keys changed: all of it as TOML and as JSON.
+    /// Returns a config with some keys changed, complete, as TOML and as JSON.
     Resolve { text: String, name: String, changes: Vec<(String, String)> },
-    /// The colours of leaders and their followers.
+    /// Returns the colours of leaders and their followers.
     Colors,
-    /// Chooses what plays: the CPU, or the browser's GPU under a pass or the first that proves exact.
+    /// Chooses the backend: the CPU, or the browser's GPU. Without `pass`, the first exact pass is used.
     Open { gpu: bool, pass: Option<String> },
-    /// Starts the training of some trials of each of some configs.
+    /// Starts training the chosen trials of each config.
     Train { runs: Vec<Chosen> },
-    /// Plays up to so many generations, and no longer than so many milliseconds; numbers are the rows.
+    /// Plays at least one generation, until either limit is reached. The numbers of the answer are the rows.
     Advance { generations: usize, milliseconds: f64 },
-    /// The best team of a generation of a trial, the generation that is at hand where none is named.
+    /// Replays the best team of a generation of a trial. Without `generation`, that is the one that plays next.
     Best { run: usize, trial: usize, generation: Option<usize> },
-    /// What came out of a run's trials that are done; numbers are policies and fitness.
+    /// Returns the results of a run's finished trials. The numbers are policies and fitness.
     Ends { run: usize },
-    /// A finished run's folder as an archive, from its rows, policies and fitness.
+    /// Returns a finished run's directory as an archive, made from its rows, policies and fitness.
     Record(Recorded),
-    /// What such an archive or a file of policies holds, see [`archive::read`].
+    /// Reads an archive or a file of policies, see [`archive::read`].
     Read { text: Option<String> },
-    /// The episode of the team of every first policy.
+    /// Plays an episode of the champion: the team of every leader's first policy.
     Play { text: String, policies: usize },
-    /// Compares the GPU, under a pass, with the CPU over so many random worlds.
+    /// Compares the GPU with the CPU on random worlds. Without `pass`, the first exact pass is used.
     Verify { worlds: u64, teams: usize, seed: u64, pass: Option<String> },
-    /// Takes one leader of a team whose others play the policies that the numbers are, or go straight ahead.
+    /// Starts an episode in which the visitor drives one leader.
+    ///
+    /// The other leaders use the policies in the numbers, or the zero policy if there are none that fit.
     Drive { text: String, leader: usize, policies: usize },
-    /// Plays one step of it.
+    /// Plays one step of the driven episode.
     Step { turn: f32, speed: f32 },
 }
 
-/// Bytes of one buffer that a batch aims for: few enough that slow devices are done in a frame or two, and tabs have room.
-/// An estimate, not a measurement.
+/// Target bytes of one buffer of a batch.
+///
+/// The size should let slow devices finish a batch within a frame or two, and fit a tab's memory. It was estimated, not
+/// measured.
 const BATCH_BYTES: u64 = 16 << 20;
 
-/// What a worker keeps between questions.
+/// State that a worker keeps between requests.
 pub struct Session {
     player: OpenBackend,
     training: Training,
@@ -100,7 +104,7 @@ fn parse(text: &str) -> Result<Config, Refusal> {
     Ok(Config::parse(text, "the config")?)
 }
 
-/// Numbers, from wherever they lie.
+/// Copies bytes of any alignment to f32 numbers. Incomplete trailing bytes are ignored.
 pub fn floats(bytes: &[u8]) -> Vec<f32> {
     bytemuck::pod_collect_to_vec(&bytes[..bytes.len() / 4 * 4])
 }
@@ -144,16 +148,16 @@ fn resolve(text: &str, name: &str, changes: Vec<(String, String)>) -> Result<Val
     let changes: Vec<Override> = changes.into_iter().map(change).collect();
     let config = Config::read(text, name, &[], &changes)?;
     let mut words = described(&config);
-    // What it started from is kept, and in the end all of it is packed up.
+    // Besides training itself, snapshots are kept, and packing the archive copies all policies.
     words["bytes"] = (flotilla::memory::Peaks::of([&config], 1).host + 5 * config.policy_bytes()).into();
     Ok(words)
 }
 
-/// A config as a page needs it: as text, as a tree, and what is worked out from it.
+/// Returns a config as TOML and as JSON, with its number of POIs (null if stages differ) and parameters per policy.
 pub fn described(config: &Config) -> Value {
     let (toml, pois, parameters) = (config.to_toml(), config.pois(), config.parameters());
     let mut words = json!({ "toml": toml, "config": config, "pois": pois, "parameters": parameters });
-    // JavaScript's numbers do not hold every seed.
+    // JavaScript numbers cannot represent every 64-bit seed.
     words["config"]["learning"]["seed"] = config.learning.seed.to_string().into();
     words
 }
@@ -163,7 +167,7 @@ fn machine((backend, machine): &OpenBackend) -> Value {
     json!({ "description": backend.describe(), "backend": kind, "adapter": adapter, "driver": driver, "threads": threads })
 }
 
-/// The browser's GPU: there is one at most, and the page has looked whether it is a software renderer.
+/// Opens the browser's only GPU. Selecting it by index also accepts software renderers; the page decides about those.
 fn open_gpu(pass: Option<&str>) -> Result<Gpu, Refusal> {
     let pass = pass.map(|name| {
         let all = [Pass::NoContraction, Pass::Guarded, Pass::Plain];
@@ -179,7 +183,7 @@ fn episodes(gpu: Gpu) -> Result<GpuBackend, Refusal> {
 
 fn verify(worlds: u64, teams: usize, seed: u64, pass: Option<&str>) -> Result<Value, Refusal> {
     let gpu = open_gpu(pass)?;
-    // The probes come first, for the canary's sake: a pass that is no good may be lucky in few worlds.
+    // The probes run first, because an inexact pass may agree with the CPU on a few worlds by chance.
     if let Some(mismatch) = gpu::self_test(&gpu).map_err(refuse)? {
         return Ok(json!({ "worlds": 0, "agent_steps": 0, "mismatch": mismatch.to_string() }));
     }

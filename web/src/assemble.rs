@@ -1,8 +1,9 @@
-//! Makes the page: one file that needs no server, no network and nobody else.
+//! Builds the page: one self-contained file that needs no server and no network.
 //!
 //!     assemble WASM FOLDER
 //!
-//! `FOLDER/index.html` holds the style, the scripts, the paper's layouts, and WebAssembly, compressed, as text.
+//! `FOLDER/index.html` contains the style, the scripts, the paper's layouts, and the WebAssembly module, compressed and
+//! encoded as text.
 
 #[cfg(target_family = "wasm")]
 fn main() {}
@@ -31,7 +32,7 @@ mod page {
     use miniz_oxide::deflate::compress_to_vec_zlib;
     use wasm_bindgen_cli_support::Bindgen;
 
-    /// The scripts of the page, in their order.
+    /// Scripts of the page, in the order in which they are joined.
     const SCRIPTS: [&str; 6] = [
         "../src/report/stage.js",
         "page/pool.js",

@@ -1,4 +1,4 @@
-//! One leader of a team in somebody's hands; the others do what they learned, or go straight ahead.
+//! An episode in which the visitor drives one leader. The other leaders use trained policies or the zero policy.
 
 use flotilla::config::Config;
 use flotilla::front;
@@ -11,9 +11,9 @@ use crate::ask::{Refusal, refuse};
 pub struct Drive {
     stepper: Stepper,
     leader: usize,
-    /// Whether the others do what they learned.
+    /// Whether the other leaders use trained policies.
     learned: bool,
-    /// One policy a leader, `[leaders][parameters]`.
+    /// One policy per leader, `[leaders][parameters]`.
     policies: Vec<f32>,
     /// Widths of the policies' layers.
     widths: Vec<usize>,
@@ -22,8 +22,10 @@ pub struct Drive {
 }
 
 impl Drive {
-    /// `weights` are `[leaders][policies][parameters]`, of which the first of each plays, or `[1][policies][parameters]` for
-    /// all leaders; where there are none, they go straight ahead.
+    /// Starts an episode.
+    ///
+    /// `weights` are `[leaders][policies][parameters]`, or `[1][policies][parameters]` if all leaders share a policy.
+    /// The first policy of each leader plays. If the sizes do not match, the other leaders use the zero policy.
     pub fn new(config: &Config, leader: usize, policies: usize, weights: Vec<f32>) -> Result<Drive, Refusal> {
         let stepper = front::stepper(config, 1, true).map_err(refuse)?;
         let (leaders, parameters) = (stepper.world().leaders(), stepper.world().parameters());
@@ -43,7 +45,7 @@ impl Drive {
         Ok(Drive { stepper, leader, learned: fits, policies, widths, observed })
     }
 
-    /// Plays one step, with this turn and speed for the leader that was taken.
+    /// Plays one step. `own` is the driven leader's turn and speed, each in -1..1.
     pub fn step(&mut self, own: [f32; 2]) -> Result<(), Refusal> {
         let parameters = self.policies.len() / self.stepper.world().leaders();
         let inputs = self.stepper.inputs().as_chunks::<INPUTS>().0;
@@ -65,7 +67,7 @@ impl Drive {
         Ok(())
     }
 
-    /// Where everyone is, and what has been observed; at the end, also what each leader was worth.
+    /// Returns positions, headings and observed POIs as JSON. After the last step, also G and each leader's D and Df.
     pub fn state(&mut self) -> Result<Value, Refusal> {
         let step = self.stepper.steps()[0];
         let words = self.stepper.near().len() / self.observed.len();
@@ -85,12 +87,12 @@ impl Drive {
     }
 }
 
-/// What a policy answers, near enough: nothing that is drawn hangs on the last bit.
+/// Returns the action of a policy. It is not bit-exact, which a drawing does not need.
 fn act(policy: &[f32], widths: &[usize], inputs: &[f32]) -> [f32; 2] {
     let (mut layer, mut policy) = (inputs.to_vec(), policy);
     for width in widths.windows(2) {
         let (weights, rest) = policy.split_at((width[0] + 1) * width[1]);
-        // A row of units an input, then the biases.
+        // Weights are row-major `[inputs, units]`, followed by the biases `[units]`.
         let sum = |unit: usize| {
             let inputs = layer.iter().zip(weights[unit..].iter().step_by(width[1]));
             inputs.fold(weights[width[0] * width[1] + unit], |sum, (input, weight)| sum + input * weight)
@@ -104,7 +106,7 @@ fn act(policy: &[f32], widths: &[usize], inputs: &[f32]) -> [f32; 2] {
     }
 }
 
-/// What the most wanted behaviour is as a turn and a speed, see [`flotilla::model::policy::choose`].
+/// Returns the turn and speed of the most wanted behaviour, see [`flotilla::model::policy::choose`].
 fn choose(inputs: &[f32], wanted: &[f32]) -> [f32; OUTPUTS] {
     let largest = |of: &[f32]| (1..of.len()).fold(0, |most, at| if of[at] > of[most] { at } else { most });
     let behaviour = largest(wanted);

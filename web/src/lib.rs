@@ -1,8 +1,10 @@
-//! flotilla in a browser tab: the crate, compiled to WebAssembly, and what a page asks of it.
+//! flotilla in a browser tab: the crate, compiled to WebAssembly, and its interface to the page.
 //!
-//! One worker has one of these. It is asked by [`put`] and [`call`], and answers by [`answer`] and [`bytes`]: words as
-//! JSON, numbers as little-endian bytes. `call` alone may wait for a GPU: a page calls it as a promise where the browser
-//! can suspend WebAssembly, and else plays on the CPU, which never waits.
+//! Each worker has its own instance. A request is passed with [`put`] and run with [`call`]. The response is read with
+//! [`answer`], as JSON, and [`bytes`], as little-endian numbers.
+//!
+//! Only `call` may wait for a GPU. If the browser can suspend WebAssembly, the page calls it as a promise. Otherwise
+//! the page uses the CPU, which never waits.
 #![cfg(target_family = "wasm")]
 
 use std::cell::RefCell;
@@ -26,10 +28,10 @@ extern "C" {
     /// Milliseconds since the start of 1970.
     #[wasm_bindgen(js_namespace = Date, js_name = now)]
     fn date() -> f64;
-    /// Waits until `wake` is called; the page makes it one that suspends.
+    /// Waits until `wake` is called. The worker replaces this import with one that suspends WebAssembly.
     fn park();
     fn wake();
-    /// Hands progress to the page, as JSON.
+    /// Sends progress to the page, as JSON.
     fn tell(text: &str);
 }
 
@@ -43,7 +45,7 @@ fn milliseconds(count: f64) -> Duration {
     Duration::from_secs_f64(count / 1000.0)
 }
 
-/// To be called once, before all else.
+/// Installs the panic hook and the host functions. Call it once, before any other function.
 #[wasm_bindgen]
 pub fn start() {
     std::panic::set_hook(Box::new(|info| tell(&json!({ "panic": info.to_string() }).to_string())));
@@ -51,13 +53,13 @@ pub fn start() {
     host::install(Host { now: || milliseconds(now()), since_1970, park: || park(), wake: || wake() });
 }
 
-/// Takes a question, which [`call`] answers.
+/// Sets the request that the next [`call`] runs.
 #[wasm_bindgen]
 pub fn put(text: String, bytes: Vec<u8>) {
     ASKED.set((text, bytes));
 }
 
-/// Answers the question that was put last.
+/// Runs the request that was set last.
 #[wasm_bindgen]
 pub fn call() {
     let (text, bytes) = ASKED.take();
@@ -65,13 +67,13 @@ pub fn call() {
     ANSWERED.set(answered.unwrap_or_else(|error| (error.into(), vec![])));
 }
 
-/// The answer's words.
+/// Returns the JSON of the response, and clears it.
 #[wasm_bindgen]
 pub fn answer() -> String {
     ANSWERED.with_borrow_mut(|(words, _)| std::mem::take(words).to_string())
 }
 
-/// The answer's numbers.
+/// Returns the numbers of the response, and clears them.
 #[wasm_bindgen]
 pub fn bytes() -> Vec<u8> {
     ANSWERED.with_borrow_mut(|(_, bytes)| std::mem::take(bytes))

@@ -1,4 +1,4 @@
-//! Training, generation by generation, and any generation's best team again.
+//! Trains generation by generation, and replays the best team of any generation.
 
 use std::collections::BTreeMap;
 
@@ -13,31 +13,31 @@ use serde_json::{Value, json};
 
 use crate::ask::{Answer, Refusal, refuse};
 
-/// A config, and the trials of it that are to be trained here; all where none is named.
+/// A config, and the trials of it that this worker trains. `None` means all trials.
 #[derive(Deserialize)]
 pub struct Chosen {
     text: String,
     trials: Option<Vec<usize>>,
 }
 
-/// Bytes of snapshots that are kept to replay generations from.
+/// Maximum bytes of the snapshots from which generations are replayed.
 const KEPT_BYTES: usize = 48 << 20;
 
-/// Trials that advance together: all of several configs, or one of one.
+/// Trials that advance together: all trials of several configs, or a single trial.
 struct Batch {
     trainer: Trainer,
-    /// Which run each arm is, and which trial it is alone of.
+    /// Per arm, the index of its run, and the trial if the arm is a single trial.
     arms: Vec<(usize, Option<usize>)>,
 }
 
-/// Where trials stood at some generations, each trial by itself.
+/// Snapshots of single trials, by run, trial and generation.
 struct Kept {
     snapshots: BTreeMap<(usize, usize, usize), Snapshot>,
-    /// Generations from one snapshot to the next.
+    /// Generations between snapshots.
     every: usize,
 }
 
-/// All that is being trained by one worker.
+/// The training of one worker.
 #[derive(Default)]
 pub struct Training {
     configs: Vec<Config>,
@@ -76,7 +76,9 @@ impl Training {
         Ok(training)
     }
 
-    /// Numbers of the answer: run, trial, generation, best, mean and champion G of every row, as f64.
+    /// Plays at least one generation, at most `most`, and starts none after `time` milliseconds.
+    ///
+    /// The numbers of the answer are the rows, `[rows][6]` f64: run, trial, generation, best, mean and champion G.
     pub fn advance(&mut self, backend: &mut dyn Backend, most: usize, time: f64) -> Result<Answer, Refusal> {
         let (start, mut rows, mut played) = (Instant::now(), Vec::new(), 0);
         while played < most && !self.is_done() && (played == 0 || start.elapsed().as_secs_f64() * 1000.0 < time) {
@@ -100,7 +102,7 @@ impl Training {
         self.batches.iter().all(|batch| batch.trainer.is_done())
     }
 
-    /// Keeps where all trials stand, if it is their turn.
+    /// Keeps snapshots of the trials whose generation is due. Above [`KEPT_BYTES`], drops every second generation.
     fn keep(&mut self) -> Result<(), Refusal> {
         for batch in &mut self.batches {
             for arm in 0..batch.arms.len() {
@@ -122,7 +124,11 @@ impl Training {
         Ok(())
     }
 
-    /// The best team of a generation, as [`replay::data`] tells it. It is played by the CPU: the bits are the same.
+    /// Returns the episode of a generation's best team, as [`replay::data`].
+    ///
+    /// The CPU plays it, which gives the same bits as a GPU.
+    ///
+    /// `generation` defaults to the one that plays next, but at most the last.
     pub fn best(&mut self, run: usize, trial: usize, generation: Option<usize>) -> Result<Value, Refusal> {
         let config = self.configs.get(run).ok_or_else(|| refuse(format!("no run {run}")))?;
         if trial >= config.learning.trials {
@@ -139,7 +145,7 @@ impl Training {
         let mut trainer = Trainer::of_trial(&config.validate()?, trial);
         let before = self.kept.snapshots.range((run, trial, 0)..=(run, trial, generation)).next_back();
         if let Some((_, snapshot)) = before {
-            // One of other sizes cannot be; from the start it comes to the same.
+            // The sizes always match. If they did not, training from the start would give the same result.
             let _ = trainer.restore(0, snapshot.clone());
         }
         let mut cpu = Cpu::default();
@@ -151,7 +157,9 @@ impl Training {
         Ok(replay::data("", &config, &[played]))
     }
 
-    /// What every trial of a run came to that is done here; its numbers are the policies, then the fitness.
+    /// Returns the results of a run's trials that this worker has finished.
+    ///
+    /// The numbers are, per trial, the policies and then the fitness, as f32.
     pub fn ends(&mut self, run: usize) -> Result<Answer, Refusal> {
         let (mut words, mut numbers) = (Vec::new(), Vec::<u8>::new());
         for Batch { trainer, arms } in self.batches.iter_mut().filter(|batch| batch.trainer.is_done()) {
@@ -176,7 +184,7 @@ impl Training {
 }
 
 impl Batch {
-    /// Keeps where the trials of an arm stand.
+    /// Keeps a snapshot of each trial of an arm.
     fn keep(&mut self, arm: usize, kept: &mut Kept) -> Result<(), Refusal> {
         let (run, alone) = self.arms[arm];
         let Snapshot { generation, last, weights, fitness, pending } = self.trainer.snapshot(arm).map_err(refuse)?;

@@ -1,8 +1,8 @@
-//! Every sentence of the paper that says something measurable of these experiments, held to its own words.
+//! Every measurable sentence of the paper about these experiments, tested as it is worded.
 //!
-//! Each gets one measure and, for each source of policies, a verdict: *yes* where the 95 % interval lies within what
-//! the words allow, *no* where it lies without, *not decided* where it holds the threshold. Where the paper gives no
-//! number, [`SMALL`] and [`FEW`] stand for its words.
+//! Each claim has one measure and, for each source of policies, a verdict. It is *yes* if the 95 % interval lies within
+//! what the words allow, *no* if it lies outside, and *not decided* if it contains the threshold. If the paper gives no
+//! number, [`SMALL`] and [`FEW`] replace its words.
 
 use serde::Serialize;
 
@@ -10,24 +10,24 @@ use super::{Course, Evidence, LAYOUTS, SOURCES, Source};
 use crate::config::Paradigm;
 use crate::statistics::{self, Estimate};
 
-/// Differences up to this share of the POIs are "about similar", "comparable" or "slight".
+/// Maximum difference, as a share of the POIs, that counts as "about similar", "comparable" or "slight".
 pub const SMALL: f64 = 0.1;
-/// A share of trials up to this is "almost never", one above it "some of the time", and all but so many are "all",
-/// unless one is seen that is not.
+/// Maximum share of trials that counts as "almost never". A larger share is "some of the time". "All" requires a share
+/// of at least 1 - [`FEW`], with no counterexample.
 pub const FEW: f64 = 0.1;
-/// "After 100 generations": where the paper judges what came out.
+/// The generation at which the paper judges results: "After 100 generations".
 pub const END: usize = 100;
 
-/// Whether a claim came out.
+/// Whether a claim holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub enum Verdict {
-    /// It did, beyond what chance leaves open.
+    /// The claim holds, and chance does not explain it.
     #[serde(rename = "yes")]
     Yes,
-    /// It did not, beyond what chance leaves open.
+    /// The claim does not hold, and chance does not explain it.
     #[serde(rename = "no")]
     No,
-    /// The interval holds the threshold.
+    /// The interval contains the threshold.
     #[serde(rename = "not decided")]
     Undecided,
     /// There are too few generations or trials to judge.
@@ -46,22 +46,22 @@ impl std::fmt::Display for Verdict {
     }
 }
 
-/// What one claim came to for one source of policies.
+/// The result of one claim for one source of policies.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Finding {
-    /// The [`SOURCES`] entry in whose column it stands.
+    /// Index of the table column in [`SOURCES`].
     #[serde(skip)]
     pub column: usize,
-    /// What was measured: the source, or the two that are compared ("Df − G").
+    /// The measured source, or the two sources of a comparison ("Df − G").
     pub of: String,
-    /// Whether the claim came out.
+    /// Whether the claim holds.
     pub verdict: Verdict,
-    /// For people: "3.58 [3.43, 3.73]".
+    /// The measurement as text: "3.58 [3.43, 3.73]".
     pub measured: String,
-    /// The number behind it, where there is one.
+    /// The measured number with its interval, if there is one.
     #[serde(flatten)]
     pub estimate: Option<Estimate>,
-    /// Of a test of difference, two-sided.
+    /// Two-sided p-value of a test of difference.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub p: Option<f64>,
 }
@@ -69,49 +69,50 @@ pub struct Finding {
 /// One claim of the paper.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Claim {
-    /// Where it stands in the paper.
+    /// The section of the paper.
     pub place: &'static str,
-    /// Of which layout it is said.
+    /// The layout that the claim is about.
     pub layout: &'static str,
     /// The paper's words.
     pub words: &'static str,
-    /// What they are taken to say of the best teams.
+    /// The measure that represents the words.
     pub measure: &'static str,
-    /// What came out, by source.
+    /// The findings, one per source.
     pub findings: Vec<Finding>,
 }
 
 impl Claim {
-    /// The findings on what evolved: the paper speaks of nothing else.
+    /// Returns the findings on evolved teams. The paper's claims are about no other teams.
     pub fn on_evolution(&self) -> impl Iterator<Item = &Finding> {
         self.findings.iter().filter(|found| matches!(SOURCES[found.column], Source::Evolved(_)))
     }
 }
 
-/// The values that the words allow: at least the first, under the second.
+/// The values that the words allow: at least the first number, less than the second.
 type Band = [f64; 2];
 const ABOVE_0: Band = [f64::MIN_POSITIVE, f64::INFINITY];
 const BELOW_0: Band = [f64::NEG_INFINITY, 0.0];
 const MOST: Band = [0.5 + f64::EPSILON, f64::INFINITY];
 
-/// What was measured and what the words allow.
+/// The measured values, and the values that the words allow.
 enum Criterion {
-    /// By trial, in POIs.
+    /// Values per trial, in POIs.
     Mean(Vec<f64>, Band),
-    /// By pair of trials, in POIs.
+    /// Differences per pair of trials, in POIs.
     Difference(Vec<f64>, Band),
-    /// By pair of trials, in shares of the POIs, of which a layout has four at most.
+    /// Differences per pair of trials, in shares of the POIs. The smallest step is 0.25, because layouts have at most
+    /// four POIs.
     Shares(Vec<f64>, Band),
-    /// As [`Criterion::Difference`], with the p of its test.
+    /// The same as [`Criterion::Difference`], with the p-value of its test.
     Tested(Vec<f64>, Band),
-    /// In how many of so many trials or pairs.
+    /// The number of trials or pairs that meet the criterion, and the number of all.
     Share(usize, usize, Band),
-    /// The same, and it should be all.
+    /// The same numbers as [`Criterion::Share`]. All trials should meet the criterion.
     All(usize, usize),
 }
 
 impl Criterion {
-    /// Of teams that can observe so many POIs.
+    /// Tests the criterion for teams that can observe `pois` POIs.
     fn find(self, column: usize, of: String, certain: bool, pois: f64) -> Option<Finding> {
         let estimate = |values: &[f64], least: f64| match certain {
             true => values.first().copied().map(Estimate::exact),
@@ -143,7 +144,8 @@ impl Criterion {
             }
             &Criterion::All(count, of) => {
                 let estimate = share(count, of)?;
-                // One that does not is enough to refute; so many that do have to be seen to believe it of all.
+                // One counterexample refutes the claim. To confirm it, the interval of the share must start at 1 - FEW
+                // or above.
                 let verdict = if count < of { Verdict::No } else { judge(estimate, [1.0 - FEW, f64::INFINITY]) };
                 (estimate, verdict, format!("{count} of {of}"))
             }
@@ -154,13 +156,13 @@ impl Criterion {
         };
         let interval = if certain { String::new() } else { format!(" [{:.2}, {:.2}]", estimate.low, estimate.high) };
         let test = p.map_or(String::new(), |p| if p < 0.001 { ", p < 0.001".into() } else { format!(", p = {p:.3}") });
-        // Minus signs as typeset.
+        // Typographic minus signs.
         let measured = format!("{measured}{interval}{test}").replace("-", "−");
         Some(Finding { column, of, verdict, measured, estimate: Some(estimate), p })
     }
 }
 
-/// Whether an interval lies within what is allowed.
+/// Returns the verdict on whether an interval lies within what is allowed.
 fn judge(estimate: Estimate, [from, below]: Band) -> Verdict {
     match estimate {
         Estimate { low, high, .. } if low >= from && high < below => Verdict::Yes,
@@ -169,7 +171,7 @@ fn judge(estimate: Estimate, [from, below]: Band) -> Verdict {
     }
 }
 
-/// Where a claim is looked up.
+/// The results that a claim is tested on.
 #[derive(Clone, Copy)]
 struct Lookup<'a> {
     results: Evidence<'a>,
@@ -182,51 +184,54 @@ impl<'a> Lookup<'a> {
         self.results.course(self.layout, paradigm, self.source)
     }
 
-    /// What all-leaders teams came to.
+    /// Returns the results of all-leaders teams.
     fn all(&'a self) -> Option<Course<'a>> {
         self.course(Paradigm::AllLeaders)
     }
 
-    /// What leader-follower teams came to.
+    /// Returns the results of leader-follower teams.
     fn led(&'a self) -> Option<Course<'a>> {
         self.course(Paradigm::LeaderFollower)
     }
 
-    /// POIs observed after all generations by leader-follower teams less those by all-leaders teams, by pair.
+    /// Returns the POIs observed by leader-follower teams minus those by all-leaders teams at generation [`END`], per
+    /// pair.
     fn lead(&self) -> Option<Vec<f64>> {
         Some(less(&self.led()?.observed(END)?, &self.all()?.observed(END)?))
     }
 
-    /// The same of two ways to learn.
+    /// Returns the difference of a measure between two sources of leader-follower teams at generation [`END`], per
+    /// pair.
     fn between(&self, by: Source, other: Source, measure: fn(&[f64]) -> Vec<f64>) -> Option<Vec<f64>> {
         let course = |source| self.results.course(self.layout, Paradigm::LeaderFollower, source)?.observed(END);
         Some(less(&measure(&course(by)?), &measure(&course(other)?)))
     }
 
-    /// What agents came to that all lead and choose among known behaviours.
+    /// Returns the results of all-leaders teams that choose among known behaviours.
     fn selecting(&'a self) -> Option<Course<'a>> {
         let Source::Evolved(fitness) = self.source else { return None };
         self.results.selecting(self.layout, fitness)
     }
 
-    /// A share of the POIs.
+    /// Returns a share of the POIs as a number of POIs.
     fn pois(&self, share: f64) -> f64 {
         share * self.led().map_or(0, |course| course.pois) as f64
     }
 }
 
-/// Pair by pair.
+/// Returns the differences, pair by pair.
 fn less(values: &[f64], others: &[f64]) -> Vec<f64> {
     values.iter().zip(others).map(|(value, other)| value - other).collect()
 }
 
 impl Course<'_> {
-    /// The generation at which a trial's best team first observes every POI, if any up to a last one.
+    /// Returns the first generation at which each trial's best team observes every POI. None within a trial means never
+    /// up to `last`.
     fn solved(&self, last: usize) -> Option<Vec<Option<usize>>> {
         self.best.iter().map(|trial| Some(trial.get(..=last)?.iter().position(|&g| g >= 1.0))).collect()
     }
 
-    /// How many trials do so.
+    /// Returns the number of trials whose best team observes every POI at or before `last`.
     fn count_solved(&self, last: usize) -> Option<usize> {
         Some(self.solved(last)?.iter().flatten().count())
     }
@@ -236,27 +241,27 @@ impl Course<'_> {
     }
 }
 
-/// A claim and how to find out.
+/// A claim and how to test it.
 struct Test {
     place: &'static str,
     layout: usize,
     words: &'static str,
     measure: &'static str,
-    /// Generations that the claim speaks of.
+    /// The last generation that the claim needs.
     needs: usize,
     sources: &'static [Source],
     find: fn(Lookup<'_>) -> Option<Criterion>,
 }
 
-/// Everyone leads: there Df is D, and the same training.
+/// The sources for claims about all-leaders teams. Df is omitted because it equals D without followers.
 const ALONE: &[Source] = SOURCES.split_at(4).0;
 const EVOLVED: &[Source] = SOURCES.split_at(2).1;
 const G: Source = SOURCES[2];
 const D: Source = SOURCES[3];
 const DF: Source = SOURCES[4];
 
-/// Each fitness held against itself where everyone leads and chooses among behaviours; [`EVOLVED`] holds them against
-/// each other.
+/// Sources for comparisons with all-leaders teams that choose among behaviours, each with the same fitness. The order
+/// must differ from [`EVOLVED`], because [`Test::finding`] treats that slice as comparisons between fitnesses.
 const AGAINST_SELECTING: &[Source] = &[DF, D, G];
 
 const GENERAL: usize = 0;
@@ -279,7 +284,7 @@ fn more_optimal(view: Lookup<'_>) -> Option<Criterion> {
 
 fn much_faster(view: Lookup<'_>) -> Option<Criterion> {
     let (led, all) = (view.led()?.solved(END)?, view.all()?.solved(END)?);
-    // Who never gets there gets there after the end at the earliest.
+    // A trial that never succeeds counts as succeeding after the end.
     let sooner = |(led, all): &(&Option<usize>, &Option<usize>)| {
         led.is_some_and(|led| 2 * led <= all.unwrap_or(END + 1) && Some(led) != **all)
     };
@@ -294,7 +299,7 @@ fn more_reliably(view: Lookup<'_>) -> Option<Criterion> {
     Some(Criterion::Share(pairs().filter(|pair| *pair == (true, false)).count(), odd, MOST))
 }
 
-/// What section 1 says of every layout, of agents who learn to select between known behaviours.
+/// The claims of section 1 about every layout, compared with agents that learn to select between known behaviours.
 const MORE_THAN_SELECTING: Test = Test {
     place: "§1",
     layout: GENERAL,
@@ -314,7 +319,7 @@ const FASTER_THAN_SELECTING: Test = Test {
     ..MORE_THAN_SELECTING
 };
 
-/// In how many pairs the first observes all POIs before the second does, if that ever does.
+/// Counts the pairs in which the first observes all POIs before the second does, or the second never does.
 fn sooner(one: Course<'_>, other: Course<'_>) -> Option<Criterion> {
     let (one, other) = (one.solved(END)?, other.solved(END)?);
     let pairs = one.iter().zip(&other);
@@ -323,7 +328,7 @@ fn sooner(one: Course<'_>, other: Course<'_>) -> Option<Criterion> {
     Some(Criterion::Share(pairs.filter(sooner).count(), one.len(), MOST))
 }
 
-/// The other fitness that one is compared with, so that every two are once.
+/// Returns the fitness that a fitness is compared with, so that every pair of fitnesses occurs once.
 fn next(source: Source) -> Source {
     match source {
         G => D,
@@ -541,7 +546,7 @@ const TESTS: &[Test] = &[
         words: "alone, “a high likelihood of random actions successfully causing the agents to observe the POI”",
         measure: "all-leaders, trials in which one of generation 0's random teams observes a POI: over half",
         needs: 0,
-        // Before any selection, fitness has no say.
+        // Before any selection, fitness has no effect.
         sources: &[Source::Random, G],
         find: |view| {
             let all = view.all()?;
@@ -651,13 +656,13 @@ const TESTS: &[Test] = &[
     },
 ];
 
-/// Every claim of the paper on these experiments.
+/// Tests every claim of the paper on these results.
 pub fn claims(results: Evidence<'_>) -> Vec<Claim> {
     TESTS.iter().map(|test| test.claim(results)).collect()
 }
 
 impl Test {
-    /// The same claim of another layout.
+    /// Returns the same claim for another layout.
     const fn within(self, layout: usize) -> Test {
         Test { layout, ..self }
     }

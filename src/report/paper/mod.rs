@@ -1,10 +1,10 @@
-//! The paper's experiments, its figures 4 to 6, and what it claims of them.
+//! The paper's experiments, its figures 4 to 6, and its claims about them.
 //!
-//! | module | holds |
+//! | module | contents |
 //! |---|---|
-//! | this | the experiments, what came out of them, and the figures |
-//! | [`claims`] | every sentence of the paper that can be measured on them, with its measure and verdict |
-//! | [`tables`] | what came out, as text: what needs no learning first |
+//! | this | the experiments, their results, and the figures |
+//! | [`claims`] | every measurable sentence of the paper about them, with its measure and verdict |
+//! | [`tables`] | the results as text, those without learning first |
 
 use serde::Serialize;
 
@@ -18,17 +18,17 @@ use crate::trainer::Row;
 pub mod claims;
 pub mod tables;
 
-/// A layout of the paper's section 4.4, or one that its conclusion speaks of.
+/// A layout of the paper's section 4.4 or of its conclusion.
 #[derive(Clone, Copy, Debug)]
 pub struct Layout {
-    /// As the paper calls it.
+    /// The paper's name for the layout.
     pub name: &'static str,
     /// The paper's figure with its results, if it shows any.
     pub figure: Option<usize>,
     config: &'static str,
 }
 
-/// The paper's layouts, in its order, and one with more followers to a leader than any of them.
+/// The paper's layouts in its order, and one with more followers per leader than any of them.
 pub const LAYOUTS: [Layout; 4] = [
     Layout {
         name: "generally forward",
@@ -47,33 +47,35 @@ pub const LAYOUTS: [Layout; 4] = [
         config: include_str!("../../../configs/questions/eight_followers.toml"),
     },
 ];
-/// Panels (a) and (b) of each figure.
+/// The paradigms, one panel per figure: (a) and (b).
 pub const PARADIGMS: [Paradigm; 2] = [Paradigm::AllLeaders, Paradigm::LeaderFollower];
-/// One curve each.
+/// The fitnesses, one curve per panel.
 pub const FITNESSES: [Fitness; 3] = [Fitness::G, Fitness::D, Fitness::Df];
 
-/// One experiment: a curve of one of the figures, or what these are held against.
+/// One experiment: a curve of a figure, or a comparison for one.
 #[derive(Clone, Debug)]
 pub struct Experiment {
-    /// Where it is played.
+    /// The layout.
     pub layout: Layout,
-    /// Who learns.
+    /// The paradigm.
     pub paradigm: Paradigm,
-    /// Whether its agents learn to choose among known behaviours.
+    /// Whether policies choose among known behaviours.
     pub selects: bool,
-    /// By which score.
+    /// The fitness.
     pub fitness: Fitness,
-    /// All of it.
+    /// The whole config.
     pub config: Config,
     /// G of the best team, `[trials][generations + 1]`.
     pub best: Vec<Vec<f64>>,
 }
 
-/// All of the paper's experiments, with some keys changed in each: layouts, in each the paradigms, in each the fitnesses;
-/// then, of the layouts that it shows, those "learning to select between policies", where everyone leads.
+/// Returns all experiments of the paper, with some keys changed in each.
+///
+/// The order is by layout, then paradigm, then fitness. The experiments that "learn to select between policies" follow.
+/// They are all-leaders, on the layouts of the paper's figures.
 ///
 /// # Errors
-/// What is wrong with the overrides.
+/// An override is invalid.
 pub fn arms(overrides: &[Override]) -> Result<Vec<Experiment>, ConfigError> {
     let shown = |layout: &Layout| layout.figure.is_some();
     let places = LAYOUTS.into_iter().flat_map(|layout| PARADIGMS.map(|paradigm| (layout, paradigm, false)));
@@ -95,7 +97,8 @@ pub fn arms(overrides: &[Override]) -> Result<Vec<Experiment>, ConfigError> {
     Ok(arms)
 }
 
-/// The configs to train for all arms, and which of these each arm is: where everyone leads, nobody follows, and Df is D.
+/// Returns the configs to train, and for each arm the index of its config. All-leaders with Df share the training with
+/// D, because Df equals D without followers.
 pub fn trained(arms: &[Experiment]) -> (Vec<Config>, Vec<usize>) {
     let mut configs: Vec<Config> = Vec::new();
     let place = |arm: &Experiment| {
@@ -113,50 +116,50 @@ pub fn trained(arms: &[Experiment]) -> (Vec<Config>, Vec<usize>) {
 }
 
 impl Experiment {
-    /// Takes in a row; a trial's rows come in order of generations.
+    /// Adds a row. The rows of a trial must come in order of generations.
     pub fn add(&mut self, row: &Row) {
         self.best[row.trial].push(row.best_g);
     }
 
-    /// "chaotic, all-leaders, Df".
+    /// Returns a name like "chaotic, all-leaders, Df".
     pub fn name(&self) -> String {
         let behaviours = if self.selects { ", behaviours" } else { "" };
         format!("{}, {}{behaviours}, {}", self.layout.name, self.paradigm, self.fitness)
     }
 
-    /// POIs of its layout.
+    /// Returns the number of POIs of the layout.
     pub fn pois(&self) -> usize {
         self.config.world.pois.len()
     }
 }
 
-/// The configs to play baselines of, one a layout and paradigm, in their order: fitness has no say in them.
+/// Returns the configs to play baselines of, one per layout and paradigm. The fitness does not matter for them.
 pub fn grounds(arms: &[Experiment]) -> Vec<Config> {
     let firsts = arms.iter().filter(|arm| arm.fitness == FITNESSES[0] && !arm.selects);
     firsts.map(|arm| arm.config.clone()).collect()
 }
 
-/// All that came out.
+/// All results.
 #[derive(Clone, Copy, Debug)]
 pub struct Evidence<'a> {
-    /// Those of [`arms()`].
+    /// The experiments of [`arms()`], with their results.
     pub arms: &'a [Experiment],
-    /// Those of [`grounds`].
+    /// The baselines of [`grounds`].
     pub baselines: &'a [Baseline],
 }
 
-/// What a team's policies come from.
+/// The source of a team's policies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Source {
-    /// All weights are zero: straight ahead at half speed.
+    /// The zero policy: straight ahead at half speed.
     Straight,
     /// The best so far of as many random teams as evolution evaluated.
     Random,
-    /// The best of a generation that evolved by this fitness.
+    /// The best team of a generation that evolved with this fitness.
     Evolved(Fitness),
 }
 
-/// All of them: what needs no learning first.
+/// All sources, those without learning first.
 pub const SOURCES: [Source; 5] = [
     Source::Straight,
     Source::Random,
@@ -175,19 +178,19 @@ impl std::fmt::Display for Source {
     }
 }
 
-/// What one source came to in one place.
+/// The results of one source for one layout and paradigm.
 #[derive(Clone, Copy, Debug)]
 pub struct Course<'a> {
     /// G of the best team, `[trials][generations + 1]`.
     pub best: &'a [Vec<f64>],
-    /// Of the layout.
+    /// Number of POIs of the layout.
     pub pois: usize,
-    /// Whether chance has no part in it: every trial is the same.
+    /// Whether chance does not matter, because all trials are the same.
     pub certain: bool,
 }
 
 impl Evidence<'_> {
-    /// What a source came to in one of [`LAYOUTS`]; none where there are no such arms.
+    /// Returns the results of a source on one of [`LAYOUTS`]. None if there are no such arms.
     pub fn course(&self, layout: usize, paradigm: Paradigm, source: Source) -> Option<Course<'_>> {
         let name = LAYOUTS.get(layout)?.name;
         let is_here = |arm: &&Experiment| (arm.layout.name, arm.paradigm, arm.selects) == (name, paradigm, false);
@@ -199,12 +202,12 @@ impl Evidence<'_> {
             Source::Random => &self.baselines.get(ground)?.random,
             Source::Evolved(fitness) => &here.find(|arm| arm.fitness == fitness)?.best,
         };
-        // The paper's starts are fixed; where something moves, it hangs on the trial.
+        // The paper's starts are fixed. If starts or POIs move, results depend on the trial.
         let certain = source == Source::Straight && best.windows(2).all(|pair| pair[0] == pair[1]);
         Some(Course { best, pois, certain })
     }
 
-    /// What agents came to in one of [`LAYOUTS`] that all lead and choose among known behaviours.
+    /// Returns the results of all-leaders teams on one of [`LAYOUTS`] that choose among known behaviours.
     pub fn selecting(&self, layout: usize, fitness: Fitness) -> Option<Course<'_>> {
         let name = LAYOUTS.get(layout)?.name;
         let arm = self.arms.iter().find(|arm| (arm.layout.name, arm.selects, arm.fitness) == (name, true, fitness))?;
@@ -213,18 +216,18 @@ impl Evidence<'_> {
 }
 
 impl Course<'_> {
-    /// POIs that the best team observed, by trial; none where the run is shorter.
+    /// Returns the POIs that the best team observed, per trial. None if the run is shorter.
     pub fn observed(&self, generation: usize) -> Option<Vec<f64>> {
         self.best.iter().map(|trial| Some(trial.get(generation)? * self.pois as f64)).collect()
     }
 
-    /// The same for the best team so far.
+    /// Returns the POIs that the best team so far observed, per trial. None if the run is shorter.
     pub fn observed_by(&self, generation: usize) -> Option<Vec<f64>> {
         let most = |trial: &Vec<f64>| Some(trial.get(..=generation)?.iter().copied().fold(0.0, f64::max));
         self.best.iter().map(|trial| Some(most(trial)? * self.pois as f64)).collect()
     }
 
-    /// POIs over trials, by generation.
+    /// Averages the POIs over trials, per generation.
     fn tallies(&self) -> Vec<Average> {
         let mut tallies = vec![Average::default(); self.best.iter().map(Vec::len).max().unwrap_or(0)];
         for trial in self.best {
@@ -238,7 +241,8 @@ impl Course<'_> {
     }
 }
 
-/// A figure of the paper: one panel a paradigm, one curve a fitness, and what needs no learning in grey.
+/// Returns a figure of the paper: one panel per paradigm, one curve per fitness, and the baselines without learning in
+/// grey.
 pub fn figure(results: Evidence<'_>, layout: usize) -> Figure {
     let [straight, random, evolved @ ..] = SOURCES;
     let sources = [evolved.as_slice(), &[straight, random]].concat();
@@ -272,54 +276,54 @@ fn title(paradigm: Paradigm) -> &'static str {
     }
 }
 
-/// Everything measured, for `summary.json`.
+/// All measurements, for `summary.json`.
 #[derive(Serialize)]
 pub struct Summary<'a> {
-    /// Of the program.
+    /// Version of the program.
     pub version: &'static str,
-    /// What it ran on.
+    /// The backend that played the episodes.
     pub backend: String,
-    /// From start to end.
+    /// Duration of the whole experiment, in seconds.
     pub seconds: f64,
-    /// Of every experiment.
+    /// Random seed of every experiment.
     pub seed: u64,
-    /// Of every experiment.
+    /// Number of trials of every experiment.
     pub trials: usize,
-    /// Of every experiment.
+    /// Number of generations of every experiment.
     pub generations: usize,
-    /// Of every arm, and of what needs no learning.
+    /// The curves of every arm and of the baselines without learning.
     #[serde(rename = "arms")]
     pub curves: Vec<Trajectory>,
-    /// The paper's, checked.
+    /// The paper's claims with their verdicts.
     pub claims: &'a [claims::Claim],
 }
 
-/// One curve, in POIs observed by the best team of each generation; of random teams, by the best so far.
+/// One curve: the POIs observed by the best team of each generation. For random teams, by the best team so far.
 #[derive(Serialize)]
 pub struct Trajectory {
-    /// Its name.
+    /// Name of the layout.
     pub layout: &'static str,
-    /// Who learns.
+    /// The paradigm.
     pub paradigm: Paradigm,
     /// `straight ahead`, `random teams`, or the fitness.
     pub source: String,
-    /// Of what evolved.
+    /// The fitness, for evolved teams only.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fitness: Option<Fitness>,
-    /// Whether it chose among known behaviours.
+    /// Whether policies choose among known behaviours.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub selects: bool,
-    /// Of the layout.
+    /// Number of POIs of the layout.
     pub pois: usize,
-    /// Means and standard errors, by generation.
+    /// Means and standard errors, per generation.
     #[serde(flatten)]
     pub curve: Curve,
-    /// Over trials.
+    /// Standard deviations over trials, per generation.
     pub deviation: Vec<f64>,
 }
 
 impl Trajectory {
-    /// Every curve, by layout, paradigm and source; then of those who choose among behaviours.
+    /// Returns every curve by layout, paradigm and source. The curves of teams that choose among behaviours follow.
     pub fn all(results: Evidence<'_>) -> Vec<Trajectory> {
         let mut all = Vec::new();
         let mut add = |layout: usize, paradigm, source: Source, selects, course: Option<Course<'_>>| {

@@ -1,4 +1,4 @@
-//! What came out, as Markdown that also reads well as plain text.
+//! The results as Markdown tables that are also readable as plain text.
 
 use super::claims::{Claim, END, Verdict};
 use super::{Evidence, LAYOUTS, PARADIGMS, SOURCES, Source};
@@ -6,8 +6,8 @@ use crate::config::Learning;
 use crate::report::table::markdown;
 use crate::statistics;
 
-/// What needs no learning: the figures of straight ahead and of random teams beside those of evolution, and whether
-/// evolution came further than random search.
+/// Returns tables of the baselines without learning, next to evolution. They also show whether evolution beats random
+/// search.
 pub fn without_learning(results: Evidence<'_>) -> String {
     let last = results.arms.first().map_or(0, |arm| arm.config.learning.generations).min(END);
     let teams = results.arms.first().map_or(0, |arm| arm.config.learning.population) * (last + 1);
@@ -70,7 +70,7 @@ pub fn without_learning(results: Evidence<'_>) -> String {
     format!("{meaning}\n\n{}\n{}", markdown(&rows), markdown(&races))
 }
 
-/// The verdict on every claim, without figures: for a terminal and the first page.
+/// Returns the verdicts on all claims without figures, for a terminal and the first page.
 pub fn verdicts(claims: &[Claim]) -> String {
     let mut rows = vec![[vec!["Layout".to_string(), "The paper says".into()], sources()].concat()];
     for claim in claims {
@@ -80,7 +80,7 @@ pub fn verdicts(claims: &[Claim]) -> String {
     markdown(&rows)
 }
 
-/// Every claim with its measure and figures.
+/// Returns all claims with their measures and figures.
 pub fn full(claims: &[Claim]) -> String {
     let head = ["Layout", "Where", "The paper says", "Measured here"].map(String::from).to_vec();
     let mut rows = vec![[head, sources()].concat()];
@@ -96,7 +96,7 @@ fn sources() -> Vec<String> {
     SOURCES.map(|source| source.to_string()).to_vec()
 }
 
-/// A claim's cells by source; one that compares says what.
+/// Returns a claim's cells by source. A cell of a comparison names what is compared.
 fn cells(claim: &Claim, say: impl Fn(Verdict, &str) -> String) -> Vec<String> {
     let cell = |(column, source): (usize, Source)| {
         let Some(found) = claim.findings.iter().find(|found| found.column == column) else { return "·".into() };
@@ -106,7 +106,7 @@ fn cells(claim: &Claim, say: impl Fn(Verdict, &str) -> String) -> Vec<String> {
     SOURCES.into_iter().enumerate().map(cell).collect()
 }
 
-/// How many verdicts came out how.
+/// Counts the verdicts by kind.
 pub fn count(claims: &[Claim]) -> String {
     let all: Vec<Verdict> = claims.iter().flat_map(Claim::on_evolution).map(|found| found.verdict).collect();
     let count = |verdict| all.iter().filter(|&&other| other == verdict).count();
@@ -116,13 +116,13 @@ pub fn count(claims: &[Claim]) -> String {
     format!("{verdicts} verdicts on {claims} claims: {yes} yes, {no} no, {undecided} not decided{open}.")
 }
 
-/// What the figures are of.
+/// Returns the heading: number of trials, generations and seed.
 pub fn heading(learning: &Learning, claims: &[Claim]) -> String {
     let Learning { trials, generations, seed, .. } = learning;
     format!("{} {trials} trials, {generations} generations, seed {seed}.", count(claims))
 }
 
-/// `claims.md`: what needs no learning first.
+/// Returns `claims.md`, with the results without learning first.
 pub fn page(without_learning: &str, heading: &str, full: &str) -> String {
     format!(
         "# What the paper says, measured\n\n## Before anything is learned\n\n{without_learning}\n{RACE}\n\n\
@@ -130,14 +130,14 @@ pub fn page(without_learning: &str, heading: &str, full: &str) -> String {
     )
 }
 
-/// How the table of baselines is to be read.
+/// Explains the table of baselines.
 pub const RACE: &str = "\
 Means over trials of each generation's best team, in POIs, with 95 % intervals. Random teams are as many as evolution
 evaluated, drawn as its first generation is, and their best so far is kept; in the second table evolution's best so far
 is kept too, since it would not be a fair race otherwise. Trials with one seed are pairs, whatever the arm: the same
 starts, the same luck in every draw, and, where the sizes agree, the same first populations; differences are of pairs.";
 
-/// How the table of claims is to be read.
+/// Explains the table of claims.
 pub const LEGEND: &str = "\
 *yes*: the 95 % interval, in brackets, lies within what the words allow; *no*: it lies outside; *not decided*: it holds
 the threshold, and more trials might tell; *open*: too few generations or trials. Means and differences by Student's t,
