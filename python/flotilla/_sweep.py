@@ -179,7 +179,7 @@ def _hand(executor: Any, config: str, backend: str) -> Any:
 
 def _taken(executor: Any, config: str, backend: str, future: Any) -> Run:
     lost: BaseException | None = None
-    for _ in range(TRIES):
+    for attempt in range(1, TRIES + 1):
         if future is None:
             break
         try:
@@ -190,6 +190,6 @@ def _taken(executor: Any, config: str, backend: str, future: Any) -> Run:
         except Exception as error:
             # Any other error means that a worker is lost.
             lost = error
-            future = _hand(executor, config, backend)
+            future = _hand(executor, config, backend) if attempt < TRIES else None
     warnings.warn(f"a point is trained here, since no worker plays it: {lost or 'none is left'!r}", RuntimeWarning, stacklevel=4)
     return _play(config, backend)
