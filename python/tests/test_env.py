@@ -84,7 +84,9 @@ def test_observations_outlive_the_environment():
 
 @pytest.mark.parametrize("library", ["torch", "jax"])
 def test_other_libraries_take_every_row_without_a_copy_of_ours(library):
-    module = pytest.importorskip(library, reason=f"{library} is not installed")
+    # PyTorch takes gigabytes: only the long form of the tests installs it.
+    why = "by request: FLOTILLA_LONG=1" if library == "torch" else "jax is not installed"
+    module = pytest.importorskip(library, reason=why)
     convert = module.from_numpy if library == "torch" else module.device_put
     env, other = VectorEnv(Config.paper(), 70), VectorEnv(Config.paper(), 70)
     env.reset(), other.reset()
