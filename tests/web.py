@@ -211,7 +211,7 @@ def visitors(tab, page):
     tab.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
     tab.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
     tab.wait("page.state.views[0].place >= 5", 30)
-    small = tab.evaluate("[...document.querySelectorAll('input, select, textarea')].filter(e => e.checkVisibility() && parseFloat(getComputedStyle(e).fontSize) < 16).map(e => e.id)")
+    small = tab.evaluate("[...document.querySelectorAll('input[type=number], select, textarea')].filter(e => e.checkVisibility() && parseFloat(getComputedStyle(e).fontSize) < 16).map(e => e.id)")
     assert not small, small
     tab.call("Emulation.setTouchEmulationEnabled", enabled=False)
     tab.window(1280, 900, dark=False)
