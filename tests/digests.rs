@@ -93,7 +93,7 @@ fn an_edited_metric_is_noticed_by_every_reader() {
     good("plot run");
 }
 
-/// What a command that may lack `--backend` prints, and says.
+/// Runs a command, checks its exit code, and returns standard output followed by standard error.
 fn run(place: &Place, code: i32, command: &str) -> String {
     let mut line = place.command();
     line.args(command.split_whitespace());

@@ -41,7 +41,7 @@ const GRID: &str = "[grid]\n\"learning.fitness\" = ['D', 'Df']\n";
 /// A command that takes longer than this hangs.
 const LIMIT: Duration = Duration::from_secs(120);
 
-/// What is started, disturbed and gone on with.
+/// A command that is started, disturbed by a fault, and resumed.
 struct Scenario {
     name: &'static str,
     /// Makes what is there before, undisturbed.
@@ -135,7 +135,7 @@ const SCENARIOS: [Scenario; 9] = [
     },
 ];
 
-/// What happens to a call.
+/// The fault injected into a system call.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Fault {
     /// The disk is full, for this call only.
@@ -158,7 +158,7 @@ struct Case<'a> {
     fault: Fault,
 }
 
-/// What scenarios start from and come to.
+/// The folder that a scenario starts from, and the results of an undisturbed run.
 struct Prepared {
     before: TempDir,
     expected: BTreeMap<String, Vec<u8>>,
@@ -219,7 +219,7 @@ fn program(folder: &Path, words: &str) -> Command {
     command
 }
 
-/// What a command comes to; one that hangs is a failure.
+/// Runs a command and returns how it ended. A command that hangs fails the test.
 fn output(mut command: Command, context: &str) -> Output {
     let mut child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     let since = Instant::now();
@@ -254,8 +254,8 @@ fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// What came out: every file but those that say when and where, metrics without their seconds, and of event files, which
-/// say when, the size.
+/// Returns the results: every file except those that record time and place. Metrics come without their seconds. Event files
+/// contain times, so only their sizes count.
 fn outcome(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     let mut found = BTreeMap::new();
     let mut folders = vec![folder.to_path_buf()];

@@ -1,4 +1,4 @@
-//! What flotilla did not make, it neither replaces nor deletes, and in its folders it writes through no link.
+//! flotilla never replaces or deletes a file that it did not make, and never writes through a link in its folders.
 
 #![cfg(feature = "cli")]
 
