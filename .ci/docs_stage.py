@@ -2,8 +2,10 @@
 
     python3 .ci/docs_stage.py [FLOTILLA]
 
-A file outside docs/ that a page links to becomes repository/PATH in the site, and the links follow. With the program's path,
-the page of commands gets the full help of each command.
+A file outside docs/ that a page links to becomes repository/PATH in the site, and the links follow. `<!-- site: TEXT -->` on a
+page becomes TEXT, for links that only the site has: the Rust library's pages and the browser page. On the Python page, mkdocstrings
+takes the place of the text after the introduction. With the program's path, the page of commands gets the full help of each
+command.
 """
 
 import posixpath
@@ -15,12 +17,17 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 STAGE = ROOT / "target/docs"
+PYTHON = ROOT / "target/docs-python"
+SITE_ONLY = re.compile(r"<!-- site: (.*?) -->", re.S)
+# mkdocstrings documents what the package exports, member by member.
+PYTHON_API = "::: flotilla\n    options:\n      show_root_heading: false\n      show_root_toc_entry: false\n"
 LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
 
 
 def in_site(path):
     """Returns where a file of the repository is in the site."""
-    return path.removeprefix("docs/") if path.startswith("docs/") else "repository/" + path
+    # MkDocs leaves out names that begin with a dot.
+    return path.removeprefix("docs/") if path.startswith("docs/") else "repository/" + path.lstrip(".")
 
 
 def target(page, link):
@@ -51,7 +58,18 @@ def command_help(program):
     return "\n## Every flag\n" + "".join(texts)
 
 
+def stage_python():
+    """Copies the Python package with its docstrings as mkdocstrings reads them: sections of examples, no roles of Sphinx."""
+    shutil.rmtree(PYTHON, ignore_errors=True)
+    for path in [*(ROOT / "python/flotilla").glob("*.py"), *(ROOT / "python/flotilla").glob("*.pyi")]:
+        text = re.sub(r"^( *)Example:$", r"\1Examples:", path.read_text(), flags=re.M)
+        there = PYTHON / "flotilla" / path.name
+        there.parent.mkdir(parents=True, exist_ok=True)
+        there.write_text(re.sub(r":(?:meth|class|func|attr|mod):`~?", "`", text))
+
+
 def main():
+    stage_python()
     shutil.rmtree(STAGE, ignore_errors=True)
     shutil.copytree(ROOT / "docs", STAGE, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
     waiting = [path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rglob("*.md")]
@@ -70,11 +88,19 @@ def main():
                 there = STAGE / in_site(path)
                 there.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(ROOT / path, there)
+        if page == "docs/reference/python.md":
+            introduction = text.split("\n## ")[0].split("\nThis page is made from")[0]
+            text = f"{introduction}\n{PYTHON_API}"
         if page == "docs/reference/commands.md" and len(sys.argv) > 1:
             text += command_help(sys.argv[1])
         there = STAGE / in_site(page)
         there.parent.mkdir(parents=True, exist_ok=True)
-        there.write_text(rewritten(text, page))
+        there.write_text(SITE_ONLY.sub(r"\1", rewritten(text, page)))
+    for built, place in (("target/doc", "rust"), ("web/dist", "page")):
+        if not (ROOT / built).is_dir():
+            sys.exit(f"{built} is missing; .ci/docs builds it")
+        # rustdoc's pages of source code take most of its space.
+        shutil.copytree(ROOT / built, STAGE / place, ignore=shutil.ignore_patterns("src", ".lock"))
 
 
 main()

@@ -14,8 +14,8 @@ use std::time::{Duration, Instant};
 
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, Group, RecordRequest};
-use flotilla::config::Config;
+use flotilla::backend::{Backend, Group};
+use flotilla::config::{Config, Sharing};
 use flotilla::evolve::{Key, Purpose, random_policy};
 use flotilla::stepping::Stepper;
 use flotilla::world::{OUTPUTS, World};
@@ -47,12 +47,13 @@ fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result
         starts: &world.starts,
         weights,
         policies: teams,
+        sharing: Sharing::PerLeader,
         teams: &order,
-        need: RecordRequest::Scores,
+        fitnesses: &[],
     };
     let groups = [group(&world, weights[0][..].into()), group(&small, weights[1][..].into())];
     let mut cpu = Cpu::at_level(level);
-    let mut rollout = |group| cpu.rollout(&[group], &|episode| _ = std::hint::black_box(episode));
+    let mut rollout = |group| cpu.play(&[group]).map(|scores| _ = std::hint::black_box(scores));
 
     let mut first = world.clone();
     first.constants.steps = 1;

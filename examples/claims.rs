@@ -52,8 +52,8 @@ fn measure(keys: &[Override]) -> Result<String, String> {
     let mut backend = Cpu::default();
     let mut trainer = Trainer::new(ValidConfig::all(&configs).unwrap());
     for row in trainer.finish(&mut backend).map_err(|error| error.to_string())? {
-        for (arm, _) in places.iter().enumerate().filter(|&(_, &place)| place == row.arm) {
-            arms[arm].add(&Row { arm, ..row });
+        for (arm, _) in places.iter().enumerate().filter(|&(_, &place)| place == row.experiment) {
+            arms[arm].add(&Row { experiment: arm, ..row });
         }
     }
     let mut baselines = Baselines::new(paper::grounds(&arms));

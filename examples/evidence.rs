@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::{env, fs};
 
-use flotilla::record::evidence::{Compared, Sighting, Tier};
+use flotilla::record::evidence::{Compared, MachineReport, Tier};
 
 #[allow(dead_code, reason = "a test that takes this file in calls `page`")]
 fn main() -> ExitCode {
@@ -107,13 +107,13 @@ pub fn page(folder: &Path) -> Result<String, String> {
 ///
 /// # Errors
 /// As for [`page`].
-pub fn read(folder: &Path) -> Result<BTreeMap<String, Sighting>, String> {
+pub fn read(folder: &Path) -> Result<BTreeMap<String, MachineReport>, String> {
     let told = |path: &Path, error: &dyn std::fmt::Display| format!("{}: {error}", path.display());
     let mut rows = BTreeMap::new();
     for entry in fs::read_dir(folder).map_err(|error| told(folder, &error))? {
         let path = entry.map_err(|error| told(folder, &error))?.path();
         let text = fs::read_to_string(&path).map_err(|error| told(&path, &error))?;
-        let evidence = Sighting::parse(&text).map_err(|error| told(&path, &error))?;
+        let evidence = MachineReport::parse(&text).map_err(|error| told(&path, &error))?;
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         rows.insert(name, evidence);
     }
@@ -121,7 +121,7 @@ pub fn read(folder: &Path) -> Result<BTreeMap<String, Sighting>, String> {
 }
 
 /// One line a file, and the digests.
-fn overview(rows: &BTreeMap<String, Sighting>) -> String {
+fn overview(rows: &BTreeMap<String, MachineReport>) -> String {
     let mut text = String::from(
         "## All rows\n\n| row | tier | built for | compared | agent-steps | result | short trainings | date |\n|---|---|---|---|---|---|---|---|\n",
     );
@@ -144,7 +144,7 @@ fn overview(rows: &BTreeMap<String, Sighting>) -> String {
             0 => "equal".to_string(),
             others => format!("**{others} of {} other digests**", evidence.trained.len()),
         };
-        let Sighting { target, date, comparisons, .. } = evidence;
+        let MachineReport { target, date, comparisons, .. } = evidence;
         text += &format!(
             "| [{name}](#{name}) | {tier} | {target} | {} | {} | {result} | {trained} | {date} |\n",
             count(comparisons.len() as u64),
@@ -162,7 +162,7 @@ fn overview(rows: &BTreeMap<String, Sighting>) -> String {
 }
 
 /// By training, the digest that the most rows have.
-pub fn digests(rows: &BTreeMap<String, Sighting>) -> BTreeMap<String, String> {
+pub fn digests(rows: &BTreeMap<String, MachineReport>) -> BTreeMap<String, String> {
     let mut votes: BTreeMap<&str, BTreeMap<&str, usize>> = BTreeMap::new();
     for came in rows.values().flat_map(|evidence| &evidence.trained) {
         *votes.entry(&came.config).or_default().entry(&came.digest).or_default() += 1;
@@ -174,8 +174,8 @@ pub fn digests(rows: &BTreeMap<String, Sighting>) -> BTreeMap<String, String> {
 }
 
 /// All of one file.
-fn section(name: &str, evidence: &Sighting) -> String {
-    let Sighting { date, version, commit, target, toolchain, processor, instructions, note, .. } = evidence;
+fn section(name: &str, evidence: &MachineReport) -> String {
+    let MachineReport { date, version, commit, target, toolchain, processor, instructions, note, .. } = evidence;
     let commit =
         commit.as_ref().map_or(String::new(), |commit| format!(" of commit {}", &commit[..commit.len().min(10)]));
     let mut text = format!("\n### {name}\n\nflotilla {version}{commit}, built for {target} by {toolchain}");

@@ -24,8 +24,9 @@ This page is made from the docstrings by `python python/api.py > docs/reference/
 ORDER = [
     ("Configs", ["Config", "Key", "ConfigError", "Problem"]),
     ("Training", ["train", "Run", "Generation", "Error", "loggers"]),
+    ("Your own fitness", ["Coevolution", "Asked", "Played"]),
     ("Looking", ["Replay", "Episode", "Figure", "plot", "compare"]),
-    ("Evaluating", ["rollout", "Rollout", "Trace", "forward", "to_onnx"]),
+    ("Evaluating", ["rollout", "Rollout", "Trace", "forward", "collect", "Collected", "to_onnx"]),
     ("Environments", ["VectorEnv", "parallel_env"]),
     ("Many runs", ["sweep", "Sweep", "Point", "paper"]),
     ("The machine", ["devices", "verify"]),
@@ -92,7 +93,7 @@ def told(name: str, thing: object, level: str) -> str:
 
 
 # Made by functions, not by whoever reads this.
-HIDDEN = {"Run", "Replay", "Figure", "Rollout", "Trace", "Sweep", "Generation"}
+HIDDEN = {"Run", "Replay", "Figure", "Rollout", "Trace", "Sweep", "Generation", "Asked", "Played", "Collected"}
 
 
 def page() -> str:
@@ -105,6 +106,8 @@ def page() -> str:
             if inspect.isclass(thing):
                 members = [(member, value) for member, value in vars(thing).items() if not member.startswith("_")]
                 for member, value in members:
+                    if (inspect.getdoc(value) or "").startswith("The former name of"):
+                        continue
                     function = getattr(value, "__func__", value)
                     if inspect.isfunction(function) or (isinstance(value, property) and inspect.getdoc(value)):
                         parts.append(told(f"{name}.{member}", function, "####"))

@@ -14,8 +14,8 @@ struct Packed {
     // Words used; more than `room` if they did not fit.
     used: atomic<u32>,
     room: u32,
-    // Per task a table `[teams + 1]` of the offsets of its teams' sets and, if requested, the leaders that followers
-    // saw most, `[words][teams]`. Then the sets, `[rows][pois][words]` per team.
+    // Per task a table `[teams + 1]` of the offsets of its teams' sets, its status word and, if requested, the leaders
+    // that followers saw most, `[words][teams]`. Then the sets, `[rows][pois][words]` per team.
     words: array<u32>,
 }
 
@@ -151,13 +151,10 @@ fn pack(
         let team = item % task.teams;
         keep(task, sizes, team, item / task.teams, homes[team], atomicLoad(&rows[team]));
     }
-    if task.owners == NOWHERE {
-        return;
-    }
     let nobody = select(0xffffu, 0xffu, sizes.leaders < 255u);
     let bits = select(16u, 8u, sizes.leaders < 255u);
     let a_word = 32u / bits;
-    let owner_items = (sizes.followers + a_word - 1u) / a_word * task.teams;
+    let owner_items = select((sizes.followers + a_word - 1u) / a_word * task.teams, 0u, task.owners == NOWHERE);
     for (var item = thread; item < owner_items; item += WORKGROUP) {
         let team = item % task.teams;
         let first = item / task.teams * a_word;
@@ -167,5 +164,9 @@ fn pack(
             word |= owner(task, sizes, team, follower, nobody) << ((follower - first) * bits);
         }
         packed.words[task.owners + item] = word;
+    }
+    storageBarrier();
+    if thread == 0u && task.teams > 0u {
+        packed.words[task.table + task.teams + 1u] = record[task.status];
     }
 }

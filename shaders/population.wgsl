@@ -16,6 +16,8 @@ const UNCHANGED: u32 = 0x80000000u;
 @group(0) @binding(2) var<storage, read> plan: array<u32>;
 @group(0) @binding(3) var<storage, read> policies: array<f32>;
 @group(0) @binding(4) var<storage, read_write> children: array<f32>;
+// Per leader the number of workgroups that finished, over all generations.
+@group(0) @binding(5) var<storage, read_write> finished: array<atomic<u32>>;
 
 @group(0) @binding(1) var<storage, read> job: GatherJob;
 // The policy of each leader in each team, `[teams][leaders]`.
@@ -57,9 +59,17 @@ fn breed(
     let item = (workgroup.y * workgroups.x + workgroup.x) * WORKGROUP + thread;
     let slot = item / counters;
     let counter = item % counters;
-    if slot >= brood.slots {
-        return;
+    if slot < brood.slots {
+        fill(slot, counter);
     }
+    storageBarrier();
+    if thread == 0u {
+        atomicAdd(&finished[brood.leader], 1u);
+    }
+}
+
+// Copies four weights of a slot's parent, and mutates them.
+fn fill(slot: u32, counter: u32) {
     let planned = plan[brood.parents + slot];
     let parent = (planned & ~UNCHANGED) * brood.parameters;
     let child = slot * brood.parameters;

@@ -7,15 +7,11 @@
 //! Random teams have purposes of their own for random numbers, so training results do not change. Generation `g` of
 //! trial `t` plays from the same starts as in training.
 
-use std::cell::RefCell;
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
-
 use fearless_simd::Level;
 use glam::Vec2;
 
-use crate::backend::{Backend, BackendError, Episode, Group, RecordRequest};
-use crate::config::{Actions, Config, Fitness, Learning};
-use crate::credit::Credit;
+use crate::backend::{Backend, BackendError, Group};
+use crate::config::{Actions, Config, Learning, Sharing};
 use crate::evaluate::Starts;
 use crate::evolve::{self, Key, MIN_WEIGHT, Purpose};
 use crate::model::policy::BEHAVIOURS;
@@ -34,9 +30,6 @@ const SATURATING: f32 = 20.0;
 /// G of one config's baselines, in 0..1, `[trials][generations + 1]`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Baseline {
-    /// The zero policy for every leader. It drives straight ahead at half the largest speed, or selects the first
-    /// behaviour.
-    pub straight: Vec<Vec<f64>>,
     /// The best constant (see [`constants`]) in each generation.
     pub constant: Vec<Vec<f64>>,
     /// The best random constant action so far, with as many drawn in each generation as the population has policies.
@@ -68,14 +61,6 @@ pub fn constants(actions: Actions) -> Vec<Vec<f64>> {
             let chosen = |behaviour| (0..BEHAVIOURS).map(|other| if other == behaviour { 1.0 } else { -1.0 }).collect();
             (0..BEHAVIOURS).map(chosen).collect()
         }
-    }
-}
-
-/// Returns the index of the zero policy among [`constants`]: half speed, or the first behaviour.
-const fn zero_policy(actions: Actions) -> usize {
-    match actions {
-        Actions::Direct => SPEEDS / 2 - 1,
-        Actions::Behaviours => 0,
     }
 }
 
@@ -134,7 +119,7 @@ struct Trial {
     starts: Vec<Vec<Vec2>>,
     /// POIs observed in all episodes of the current generation: by constants, then random actions, then random
     /// networks.
-    observed: Vec<AtomicU32>,
+    observed: Vec<u32>,
     /// POIs that each constant observed in all generations.
     constants: Vec<u64>,
     /// The random actions and networks that observed most, best first.
@@ -181,21 +166,24 @@ impl Baselines {
             let mut rounds = Vec::new();
             for place in &playing {
                 let teams = place.teams().min(first + DRAWN_TOGETHER).saturating_sub(first);
-                for trial in place.trials.iter().filter(|_| teams > 0) {
-                    let observed = &trial.observed[first..first + teams];
-                    rounds.push(Round {
-                        world: &place.world,
-                        weights: &trial.weights,
-                        starts: &trial.starts,
-                        observed,
-                    });
-                }
+                rounds.extend(place.trials.iter().filter(|_| teams > 0).map(|trial| place.round(trial, teams)));
             }
-            play(backend, &rounds)?;
+            let mut observed = play(backend, &rounds)?.into_iter();
+            for place in &mut playing {
+                let playing = place.teams() > first;
+                place.trials.iter_mut().filter(|_| playing).zip(&mut observed).for_each(|(trial, observed)| {
+                    trial.observed.extend(observed);
+                });
+            }
         }
-        playing.iter_mut().for_each(|place| place.conclude(generation));
+        playing.iter_mut().for_each(|place| place.collect_results(generation));
         self.generation += 1;
         Ok(())
+    }
+
+    /// Returns G of the generations played so far, for each config.
+    pub fn so_far(&self) -> impl Iterator<Item = &Baseline> {
+        self.places.iter().map(|place| &place.found)
     }
 
     /// Returns G per generation, for each config.
@@ -221,57 +209,42 @@ impl Baselines {
     }
 }
 
-/// Teams to play from some starts, with counters for the POIs that they observe.
+/// Teams to play from some starts.
 struct Round<'a> {
     world: &'a World,
+    teams: usize,
     /// `[populations][teams][parameters]`
     weights: &'a [f32],
+    sharing: Sharing,
     starts: &'a [Vec<Vec2>],
-    /// `[teams]`
-    observed: &'a [AtomicU32],
 }
 
-/// Plays all teams from all their starts as one batch.
-fn play(backend: &mut dyn Backend, rounds: &[Round<'_>]) -> Result<(), BackendError> {
-    thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
-    let teams = |round: &Round<'_>| evolve::one_policy_a_team(round.observed.len(), round.world.leaders());
+/// Plays all teams from all their starts as one batch. Returns the POIs that each team of each round observes over all
+/// starts, `[rounds][teams]`.
+fn play(backend: &mut dyn Backend, rounds: &[Round<'_>]) -> Result<Vec<Vec<u32>>, BackendError> {
+    let teams = |round: &Round<'_>| evolve::one_policy_a_team(round.teams, round.world.leaders());
     let teams: Vec<Vec<u32>> = rounds.iter().map(teams).collect();
-    let (mut groups, mut homes) = (Vec::new(), Vec::new());
+    let mut groups = Vec::new();
     for (round, teams) in rounds.iter().zip(&teams) {
-        for starts in round.starts {
-            let (weights, policies) = (round.weights.into(), round.observed.len());
-            groups.push(Group {
-                world: round.world,
-                starts,
-                weights,
-                policies,
-                teams,
-                need: RecordRequest::Score(Fitness::G),
-            });
-            homes.push(round);
-        }
+        groups.extend(round.starts.iter().map(|starts| Group {
+            world: round.world,
+            starts,
+            weights: round.weights.into(),
+            policies: round.teams,
+            sharing: round.sharing,
+            teams,
+            fitnesses: &[],
+        }));
     }
-    backend.rollout(&groups, &|episode: Episode<'_>| {
-        let round = homes[episode.group];
-        CREDIT.with_borrow_mut(|(credit, scores)| {
-            scores.resize(round.world.leaders(), 0.0);
-            let observed = credit.score(&episode, round.world, Fitness::G, scores);
-            round.observed[episode.team].fetch_add(observed, Relaxed);
-        });
-    })
-}
-
-/// Returns the POIs that each team observes over all starts, `[teams]`.
-fn observed(
-    backend: &mut dyn Backend,
-    world: &World,
-    weights: &[f32],
-    teams: usize,
-    starts: &[Vec<Vec2>],
-) -> Result<Vec<u32>, BackendError> {
-    let observed: Vec<AtomicU32> = std::iter::repeat_with(AtomicU32::default).take(teams).collect();
-    play(backend, &[Round { world, weights, starts, observed: &observed }])?;
-    Ok(observed.into_iter().map(AtomicU32::into_inner).collect())
+    let mut scores = backend.play(&groups)?.into_iter();
+    let of_round = |round: &Round<'_>| {
+        let mut observed = vec![0; round.teams];
+        for scores in scores.by_ref().take(round.starts.len()) {
+            observed.iter_mut().zip(scores.observed).for_each(|(sum, observed)| *sum += observed);
+        }
+        observed
+    };
+    Ok(rounds.iter().map(of_round).collect())
 }
 
 impl Setting {
@@ -280,12 +253,12 @@ impl Setting {
         let constants = constants(config.policy.actions);
         let Learning { population, episodes_per_team, generations, .. } = config.learning;
         let none = || vec![Vec::with_capacity(generations + 1); trials.len()];
-        let found = Baseline { straight: none(), constant: none(), actions: none(), random: none() };
+        let found = Baseline { constant: none(), actions: none(), random: none() };
         let trial = |index| Trial {
             index,
             weights: vec![],
             starts: vec![vec![]; episodes_per_team],
-            observed: std::iter::repeat_with(AtomicU32::default).take(constants.len() + 2 * population).collect(),
+            observed: Vec::with_capacity(constants.len() + 2 * population),
             constants: vec![0; constants.len()],
             finalists: [vec![], vec![]],
         };
@@ -295,6 +268,12 @@ impl Setting {
     /// Returns the number of teams per generation of a trial.
     fn teams(&self) -> usize {
         self.constants.len() + 2 * self.config.learning.population
+    }
+
+    /// Returns the round of a trial's teams whose policies are written.
+    fn round<'a>(&'a self, trial: &'a Trial, teams: usize) -> Round<'a> {
+        let Setting { world, config, .. } = self;
+        Round { world, teams, weights: &trial.weights, sharing: config.learning.sharing, starts: &trial.starts }
     }
 
     /// Returns the team at a place among a generation's teams.
@@ -338,7 +317,7 @@ impl Setting {
             for (episode, starts) in starts.iter_mut().enumerate() {
                 evolve::places(&self.config.learning, *index, generation, episode, &self.world, starts);
             }
-            observed.iter().for_each(|observed| observed.store(0, Relaxed));
+            observed.clear();
         }
     }
 
@@ -355,17 +334,14 @@ impl Setting {
     }
 
     /// Adds the results of a generation.
-    fn conclude(&mut self, generation: usize) {
+    fn collect_results(&mut self, generation: usize) {
         let Learning { population, episodes_per_team, .. } = self.config.learning;
         let whole = (self.world.pois.len() * episodes_per_team) as f64;
-        let zero = zero_policy(self.config.policy.actions);
         for (place, trial) in self.trials.iter_mut().enumerate() {
-            let observed: Vec<u32> = trial.observed.iter().map(|observed| observed.load(Relaxed)).collect();
-            let (constants, random) = observed.split_at(self.constants.len());
+            let (constants, random) = trial.observed.split_at(self.constants.len());
             trial.constants.iter_mut().zip(constants).for_each(|(sum, &observed)| *sum += u64::from(observed));
             let most = constants.iter().copied().max().unwrap_or(0);
             self.found.constant[place].push(f64::from(most) / whole);
-            self.found.straight[place].push(f64::from(constants[zero]) / whole);
             let (actions, networks) = random.split_at(population);
             let kinds = [
                 (actions, &mut self.found.actions[place], Team::Action as MakeTeam),
@@ -405,7 +381,9 @@ impl Setting {
         let candidates = [&all[..], &actions, &networks].concat();
         let mut weights = Vec::new();
         self.write_policies(trial.index, &candidates, &mut weights);
-        let chosen = observed(backend, &self.world, &weights, candidates.len(), &starts)?;
+        let (world, sharing) = (&self.world, self.config.learning.sharing);
+        let round = Round { world, teams: candidates.len(), weights: &weights, sharing, starts: &starts };
+        let chosen = play(backend, &[round])?.concat();
         let (of_constants, rest) = chosen.split_at(all.len());
         let (of_actions, of_networks) = rest.split_at(actions.len());
         let [action, network] =
@@ -415,7 +393,8 @@ impl Setting {
         let starts: Vec<Vec<Vec2>> = (0..episodes as usize).map(|episode| held_out.of(episode, &self.world)).collect();
         let teams = [&all[..], &[action, network]].concat();
         self.write_policies(trial.index, &teams, &mut weights);
-        let found = observed(backend, &self.world, &weights, teams.len(), &starts)?;
+        let round = Round { world, teams: teams.len(), weights: &weights, sharing, starts: &starts };
+        let found = play(backend, &[round])?.concat();
         let whole = (self.world.pois.len() * starts.len()) as f64;
         let mut g: Vec<f64> = found.into_iter().map(|observed| f64::from(observed) / whole).collect();
         let random = g.split_off(all.len());

@@ -55,17 +55,6 @@ pub fn csv_cell(text: &str) -> Cow<'_, str> {
     }
 }
 
-/// A JSON text in which control characters within strings are escaped as JSON has it, beyond what JSON itself asks for.
-pub fn json(text: &str) -> Cow<'_, str> {
-    // JSON's writers escape those of ASCII; all others that are escaped here have four digits.
-    let bad = |c: char| !c.is_ascii() && is_control(c);
-    if !text.contains(bad) {
-        return text.into();
-    }
-    let escape = |c: char| if bad(c) { format!("\\u{:04x}", u32::from(c)) } else { c.to_string() };
-    text.chars().map(escape).collect::<String>().into()
-}
-
 fn escaped(text: &str, bad: impl Fn(char) -> bool + Copy) -> Cow<'_, str> {
     if !text.contains(bad) {
         return text.into();
@@ -83,7 +72,6 @@ mod tests {
         assert_eq!(line("Zürich — 4/4 'POIs' \\"), "Zürich — 4/4 'POIs' \\");
         assert_eq!(line("a\nb\t\u{1b}[31mred\u{9b}1m\r\u{202e}"), r"a\nb\t\u{1b}[31mred\u{9b}1m\r\u{202e}");
         assert_eq!(lines("a\nb\tc\u{7}"), "a\nb\tc\\u{7}");
-        assert_eq!(json("\"\u{202e}é\u{9b}\\n\""), r#""\u202eé\u009b\n""#);
     }
 
     #[test]

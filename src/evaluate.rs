@@ -1,19 +1,29 @@
 //! Evaluation of teams: every team plays from the same starts, the config's own or drawn ones. The results are means
 //! and spreads.
 
-use std::cell::RefCell;
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+use std::ops::ControlFlow;
+use std::time::Duration;
 
 use glam::Vec2;
 
-use crate::backend::{Backend, BackendError, Group, Moment, RecordRequest};
-use crate::credit::Credit;
+use crate::backend::{Backend, BackendError, Group, Moment};
+use crate::config::Fitness;
 use crate::evolve::{self, Key, Purpose};
+use crate::host::Instant;
 use crate::statistics::{self, Estimate};
 use crate::world::World;
 
 pub use crate::evolve::one_policy_a_team;
+
+/// The fitnesses of an evaluation, besides G.
+pub const SCORES: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp];
+/// [`SCORES`] and Dt, which needs a record of who was seen at every step.
+pub const SCORES_AND_DT: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp, Fitness::Dt];
+
+/// Returns what an evaluation computes beside a fitness: Dt only if that is asked for.
+pub fn scores_beside(fitness: Fitness) -> &'static [Fitness] {
+    if fitness == Fitness::Dt { SCORES_AND_DT } else { SCORES }
+}
 
 /// Maximum number of episodes per evaluation.
 pub const MAX_EPISODES: u32 = 1_000_000;
@@ -166,7 +176,7 @@ impl Evaluation {
         [g, d, df, dpp].map(|score| score as f32)
     }
 
-    /// Returns a leader's mean Dt over episodes, if the group [needed](RecordRequest::sights) sights.
+    /// Returns a leader's mean Dt over episodes, if the group was scored by it.
     pub fn dt(&self, team: usize, leader: usize) -> Option<f32> {
         self.timed.then(|| (self.credits[team * self.leaders + leader][3] / self.episodes as f64) as f32)
     }
@@ -175,7 +185,7 @@ impl Evaluation {
 /// Plays every team of a group from every start and computes every fitness. Dt is computed only if the group needs
 /// sights.
 ///
-/// Memory limits the number of episodes per batch. `watch` receives the finished share, in 0..1, from any thread.
+/// Memory limits the number of episodes per batch. `watch` receives the finished share, in 0..1, after each batch.
 ///
 /// # Errors
 /// The backend fails.
@@ -183,13 +193,41 @@ pub fn evaluate(
     backend: &mut dyn Backend,
     group: &Group<'_>,
     starts: &Starts,
-    watch: &(dyn Fn(f64) + Sync),
+    watch: &mut dyn FnMut(f64),
 ) -> Result<Evaluation, BackendError> {
-    thread_local! { static CREDIT: RefCell<Credit> = RefCell::default(); }
+    evaluate_until(backend, group, starts, watch, &mut |_| ControlFlow::Continue(()))
+}
+
+/// Some episodes of all teams, as [`evaluate_until`] reports them.
+#[derive(Clone, Copy, Debug)]
+pub struct Batch<'a> {
+    /// The first episode, and POIs observed in it and the following ones, `[episodes][teams]`. Empty while episodes are
+    /// incomplete.
+    pub first: usize,
+    /// See `first`.
+    pub observed: &'a [u32],
+    /// D, Df, D++ and Dt, `[episodes][teams][leaders]`.
+    pub credits: &'a [[f32; 4]],
+}
+
+/// [`evaluate`], which calls `each` several times per second, from this thread and in the order of episodes. If that
+/// breaks, the evaluation ends after the episodes reported so far.
+///
+/// # Errors
+/// The backend fails.
+pub fn evaluate_until(
+    backend: &mut dyn Backend,
+    group: &Group<'_>,
+    starts: &Starts,
+    watch: &mut dyn FnMut(f64),
+    each: &mut dyn FnMut(Batch<'_>) -> ControlFlow<()>,
+) -> Result<Evaluation, BackendError> {
     let world = group.world;
     let (teams, leaders, episodes) = (group.team_count(), world.leaders(), starts.episodes());
-    let at_once = BATCH_BYTES / (teams * leaders * size_of::<[f32; 4]>()).max(1);
-    let at_once = at_once.clamp(1, BATCH_EPISODES).min(episodes);
+    let timed = group.fitnesses.contains(&Fitness::Dt);
+    let fitnesses = if timed { SCORES_AND_DT } else { SCORES };
+    let fits = BATCH_BYTES / (teams * leaders * size_of::<[f32; 4]>()).max(1);
+    let fits = fits.clamp(1, BATCH_EPISODES).min(episodes);
     let mut evaluation = Evaluation {
         episodes,
         leaders,
@@ -197,28 +235,46 @@ pub fn evaluate(
         observed: vec![Tally::default(); teams],
         together: Tally::default(),
         credits: vec![[0.0; 4]; teams * leaders],
-        timed: group.need.sights(),
+        timed,
     };
-    let need = if group.need.sights() { RecordRequest::Sights } else { RecordRequest::Scores };
-    let done = AtomicUsize::new(0);
-    for first in (0..episodes).step_by(at_once) {
-        let batch: Vec<Vec<Vec2>> =
-            (first..episodes.min(first + at_once)).map(|episode| starts.of(episode, world)).collect();
-        let groups: Vec<Group<'_>> = batch.iter().map(|starts| Group { starts, need, ..*group }).collect();
-        let scored = Mutex::new((vec![0; batch.len() * teams], vec![[0_f32; 4]; batch.len() * teams * leaders]));
-        backend.rollout(&groups, &|episode| {
-            let scores = CREDIT.with_borrow_mut(|credit| credit.all(&episode, world));
-            let place = episode.group * teams + episode.team;
-            let mut scored = scored.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-            scored.0[place] = scores.observed;
-            for (leader, to) in scored.1[place * leaders..][..leaders].iter_mut().enumerate() {
-                let dt = scores.dt.get(leader).copied().unwrap_or(0.0);
-                *to = [scores.d[leader], scores.df[leader], scores.dpp[leader], dt];
+    let mut done = 0;
+    // Episodes of teams that are played at once, so that this takes a fraction of a second.
+    let mut limit = (FIRST_STEPS / world.steps()).max(1);
+    let mut first = 0;
+    while first < episodes {
+        let at_once = (limit / teams).clamp(1, fits).min(episodes - first);
+        let batch: Vec<Vec<Vec2>> = (first..first + at_once).map(|episode| starts.of(episode, world)).collect();
+        let (mut observed, mut credits) = (vec![0; at_once * teams], vec![[0_f32; 4]; at_once * teams * leaders]);
+        let mut first_team = 0;
+        while first_team < teams {
+            let count = limit.max(1).min(teams - first_team);
+            let chosen = &group.teams[first_team * leaders..(first_team + count) * leaders];
+            let groups: Vec<Group<'_>> =
+                batch.iter().map(|starts| Group { starts, fitnesses, teams: chosen, ..*group }).collect();
+            let started = Instant::now();
+            for (episode, scores) in backend.play(&groups)?.into_iter().enumerate() {
+                let first = episode * teams + first_team;
+                observed[first..first + count].copy_from_slice(&scores.observed);
+                let of_teams = scores.scores.chunks_exact(fitnesses.len() * leaders);
+                for (to, scores) in credits[first * leaders..].chunks_exact_mut(leaders).zip(of_teams) {
+                    for (place, &score) in scores.iter().enumerate() {
+                        to[place % leaders][place / leaders] = score;
+                    }
+                }
             }
-            drop(scored);
-            watch((done.fetch_add(1, Relaxed) + 1) as f64 / (teams * episodes) as f64);
-        })?;
-        let (observed, credits) = scored.into_inner().unwrap_or_else(|poisoned| poisoned.into_inner());
+            done += groups.len() * count;
+            watch(done as f64 / (teams * episodes) as f64);
+            let took = started.elapsed();
+            if took < SHORT {
+                limit = limit.saturating_mul(2);
+            } else if took > LONG {
+                limit = (limit / 2).max(1);
+            }
+            first_team += count;
+            if first_team < teams && each(Batch { first, observed: &[], credits: &[] }).is_break() {
+                return Ok(evaluation);
+            }
+        }
         // Episodes are added in order, so that float sums do not depend on which episode finished first.
         for observed in observed.chunks_exact(teams) {
             evaluation.together.add(observed.iter().map(|&observed| u64::from(observed)).sum());
@@ -229,9 +285,18 @@ pub fn evaluate(
                 sums.iter_mut().zip(scores).for_each(|(sum, &score)| *sum += f64::from(score));
             }
         }
+        if each(Batch { first, observed: &observed, credits: &credits }).is_break() {
+            break;
+        }
+        first += at_once;
     }
     Ok(evaluation)
 }
+
+/// Steps of teams that [`evaluate_until`] plays first at once, and the time that later ones should take.
+const FIRST_STEPS: usize = 1 << 16;
+const SHORT: Duration = Duration::from_millis(100);
+const LONG: Duration = Duration::from_millis(300);
 
 #[cfg(test)]
 mod tests {

@@ -7,21 +7,24 @@
 //! resumed, is in [`crate::run`].
 
 use std::borrow::Cow;
-use std::ops::ControlFlow;
+use std::cell::RefCell;
+use std::ops::{ControlFlow, Range};
 #[cfg(feature = "report")]
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
 
-use crate::backend::cpu::Cpu;
+use crate::backend::cpu::{Cpu, Noise, StepArrays};
 #[cfg(feature = "gpu")]
 use crate::backend::gpu::{
     self,
     device::{DeviceError, Wanted},
     episode::{GpuBackend, ResidencyPolicy},
 };
-use crate::backend::{Backend, BackendError, Group, Machine, OpenBackend, RecordRequest};
-use crate::config::{Config, ConfigError, Fitness, MAX_POPULATION};
+use crate::backend::{Backend, BackendError, Group, Machine, OpenBackend};
+use crate::config::{Config, ConfigError, Fitness, MAX_POPULATION, Sharing, ValidConfig};
+use crate::credit::{self, Credit};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
-use crate::evolve::{self, MAX_WEIGHT};
+use crate::evolve::{self, Key, MAX_WEIGHT, Purpose};
 use crate::memory::{self, Peaks, TooLittle};
 use crate::parallel::current_num_threads;
 #[cfg(feature = "record")]
@@ -29,14 +32,19 @@ use crate::record::{RecordError, hex, metrics};
 #[cfg(feature = "report")]
 use crate::record::{
     digests::{Digests, Verification},
+    finished,
     folder::POLICIES,
     policies,
 };
 #[cfg(feature = "report")]
 use crate::report::runs;
 use crate::stepping::{StepError, Stepper};
-use crate::trainer::{Row, Trainer};
+use crate::trainer::{Ending, Row, Trainer};
 use crate::world::{INPUTS, OUTPUTS, World};
+
+mod coevolution;
+
+pub use coevolution::{Coevolution, Progress};
 
 /// The error of a function in this module. A failed call changes nothing.
 #[derive(Debug, thiserror::Error)]
@@ -116,6 +124,15 @@ pub enum Failure {
         /// Number of episodes.
         episodes: usize,
     },
+    /// The fitness that was told does not fit, or is not finite.
+    #[error("fitness: {0}")]
+    Fitness(String),
+    /// A saved state does not fit the config.
+    #[error("the state is of another config, or damaged")]
+    State,
+    /// All generations were played.
+    #[error("all generations were played")]
+    Done,
     /// The teams could not be created.
     #[error(transparent)]
     Step(#[from] StepError),
@@ -231,10 +248,13 @@ pub struct Trained {
     pub champion_g: Vec<f64>,
     /// The last generation's policies, best first in each population: `[trials]` of `[leaders][policies][parameters]`.
     pub policies: Vec<Vec<f32>>,
+    /// State that a longer run continues from, beside the policies. `None` if the run was read from a directory without its
+    /// last checkpoint.
+    pub ending: Option<Ending>,
 }
 
 impl Trained {
-    fn new(config: Config, rows: &[Row], policies: Vec<Vec<f32>>) -> Trained {
+    fn new(config: Config, rows: &[Row], policies: Vec<Vec<f32>>, ending: Option<Ending>) -> Trained {
         let columns = config.learning.generations + 1;
         let mut trained = Trained {
             best_g: vec![0.0; config.learning.trials * columns],
@@ -242,6 +262,7 @@ impl Trained {
             champion_g: vec![0.0; config.learning.trials * columns],
             config,
             policies,
+            ending,
         };
         for row in rows {
             let at = row.trial * columns + row.generation;
@@ -277,7 +298,8 @@ impl Trained {
         let path = folder.join(POLICIES);
         let policies = policies::read_all(&path, &config)?;
         let digests = Digests::read(folder, verification)?;
-        let trained = Trained::new(config, &rows, policies);
+        let ending = finished::read_ending(folder, &config);
+        let trained = Trained::new(config, &rows, policies, ending);
         // The config and the metrics match their digests, so the policies must differ.
         match digests.run {
             Some(digest) if digest != trained.digest() => Err(RecordError::Differs { path }.into()),
@@ -294,7 +316,7 @@ impl Trained {
             (0..trials).map(move |trial| {
                 let at = trial * (self.config.learning.generations + 1) + generation;
                 let (best_g, mean_g, champion_g) = (self.best_g[at], self.mean_g[at], self.champion_g[at]);
-                Row { arm: 0, trial, generation, best_g, mean_g, champion_g }
+                Row { experiment: 0, trial, generation, best_g, mean_g, champion_g }
             })
         });
         hex(&metrics::digest(rows, &self.policies))
@@ -333,13 +355,38 @@ pub fn train_from(
 ) -> Result<Trained, Failure> {
     let valid = config.validate()?;
     let mut config = Config::clone(&valid);
-    let plan = Peaks::of([&config], current_num_threads());
+    let (mut trainer, mut rows, mut stopped) = (trainer_of(valid)?, Vec::new(), false);
+    start_from(&mut trainer, &config, policies, first)?;
+    while !trainer.is_done() {
+        let played = trainer.advance(backend)?;
+        if let Some(&Row { generation, .. }) = played.first().filter(|_| !stopped) {
+            let last = config.learning.generations;
+            stopped = watch(Generation { generation, last, rows: &played }).is_break();
+            if stopped {
+                config.learning.generations = trainer.end(0);
+                config.stages.retain(|stage| stage.from <= config.learning.generations);
+            }
+        }
+        rows.extend(played);
+    }
+    let policies = trainer.policies(0);
+    let ending = trainer.ends(&[0]).first().map(|(_, end)| Ending::of(end));
+    Ok(Trained::new(config, &rows, policies, ending))
+}
+
+/// Checks that a training fits this machine's memory, and returns its trainer.
+fn trainer_of(config: ValidConfig) -> Result<Trainer, Failure> {
+    let plan = Peaks::of([&*config], current_num_threads());
     // Nothing is saved during training, but the results stay in memory: every row twice, and the policies.
     let rows = config.learning.trials as u64 * (config.learning.generations as u64 + 1);
     let kept = rows * (size_of::<Row>() + 3 * size_of::<f64>()) as u64 + config.policy_bytes();
     let needed = (plan.host.min(plan.gpu_host) - plan.checkpoint).saturating_add(kept);
     memory::check(needed, 0)?;
-    let (mut trainer, mut rows, mut stopped) = (Trainer::new([valid]), Vec::new(), false);
+    Ok(Trainer::new([config]))
+}
+
+/// Puts given policies into the populations of a new trainer.
+fn start_from(trainer: &mut Trainer, config: &Config, policies: usize, first: &[Vec<f32>]) -> Result<(), Failure> {
     let (leaders, parameters, trials) = (config.populations(), config.parameters(), config.learning.trials);
     if first.len() > 1 && first.len() != trials {
         return Err(Failure::Trials { found: first.len(), trials });
@@ -357,20 +404,7 @@ pub fn train_from(
             unreachable!("the weights are as many as the config takes");
         }
     }
-    while !trainer.is_done() {
-        let played = trainer.advance(backend)?;
-        if let Some(&Row { generation, .. }) = played.first().filter(|_| !stopped) {
-            let last = config.learning.generations;
-            stopped = watch(Generation { generation, last, rows: &played }).is_break();
-            if stopped {
-                config.learning.generations = trainer.end(0);
-                config.stages.retain(|stage| stage.from <= config.learning.generations);
-            }
-        }
-        rows.extend(played);
-    }
-    let policies = trainer.policies(0);
-    Ok(Trained::new(config, &rows, policies))
+    Ok(())
 }
 
 /// The scores of teams, averaged over episodes.
@@ -406,21 +440,118 @@ pub fn play(
     weights: &[f32],
     starts: &Starts,
 ) -> Result<Played, Failure> {
+    let each = &mut |_: evaluate::Batch<'_>| ControlFlow::Continue(());
+    Ok(Played::from(&play_until(config, backend, teams, weights, starts, each)?))
+}
+
+/// Plays teams as [`play`] does, and calls `each` several times per second, see [`evaluate::evaluate_until`].
+///
+/// # Errors
+/// As for [`play`].
+pub fn play_until(
+    config: &Config,
+    backend: &mut dyn Backend,
+    teams: usize,
+    weights: &[f32],
+    starts: &Starts,
+    each: &mut dyn FnMut(evaluate::Batch<'_>) -> ControlFlow<()>,
+) -> Result<Evaluation, Failure> {
     let cast = Cast::new(config, teams, weights, starts)?;
-    let need = if config.learning.fitness == Fitness::Dt { RecordRequest::Sights } else { RecordRequest::Scores };
-    let group = Group { need, ..cast.group(&cast.world.starts) };
-    let evaluation = evaluate::evaluate(backend, &group, starts, &|_| ())?;
-    let Evaluation { leaders, .. } = evaluation;
-    let scores: Vec<[f32; 4]> =
-        (0..teams * leaders).map(|place| evaluation.scores(place / leaders, place % leaders)).collect();
-    Ok(Played {
-        observed: evaluation.observed.iter().map(evaluate::Tally::mean).collect(),
-        g: scores.iter().step_by(leaders).map(|&[g, ..]| g).collect(),
-        d: scores.iter().map(|&[_, d, ..]| d).collect(),
-        df: scores.iter().map(|&[_, _, df, _]| df).collect(),
-        dpp: scores.iter().map(|&[.., dpp]| dpp).collect(),
-        dt: (0..teams * leaders).filter_map(|place| evaluation.dt(place / leaders, place % leaders)).collect(),
-    })
+    let group = Group { fitnesses: scores_of(config), ..cast.group(&cast.world.starts) };
+    Ok(evaluate::evaluate_until(backend, &group, starts, &mut |_| (), each)?)
+}
+
+/// Returns the fitnesses that teams of a config are scored by: Dt only if it is the config's fitness.
+fn scores_of(config: &Config) -> &'static [Fitness] {
+    evaluate::scores_beside(config.learning.fitness)
+}
+
+impl From<&Evaluation> for Played {
+    fn from(evaluation: &Evaluation) -> Played {
+        let (teams, leaders) = (evaluation.observed.len(), evaluation.leaders);
+        let places = || (0..teams * leaders).map(|place| (place / leaders, place % leaders));
+        let scores: Vec<[f32; 4]> = places().map(|(team, leader)| evaluation.scores(team, leader)).collect();
+        Played {
+            observed: evaluation.observed.iter().map(evaluate::Tally::mean).collect(),
+            g: scores.iter().step_by(leaders).map(|&[g, ..]| g).collect(),
+            d: scores.iter().map(|&[_, d, ..]| d).collect(),
+            df: scores.iter().map(|&[_, _, df, _]| df).collect(),
+            dpp: scores.iter().map(|&[.., dpp]| dpp).collect(),
+            dt: places().filter_map(|(team, leader)| evaluation.dt(team, leader)).collect(),
+        }
+    }
+}
+
+/// Noise on the actions of leaders: its seed, and the standard deviation of each leader's turn and speed, `[leaders]`.
+#[derive(Clone, Copy, Debug)]
+pub struct ActionNoise<'a> {
+    /// Random seed.
+    pub seed: u64,
+    /// `[leaders]`, each from 0 on.
+    pub deviations: &'a [[f32; OUTPUTS]],
+}
+
+/// The results of [`record`], of each episode's teams.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Recorded {
+    /// Number of POIs observed, `[episodes][teams]`.
+    pub observed: Vec<u32>,
+    /// D, Df, D++ and Dt, `[episodes][teams][leaders]`. Dt is 0 unless it is the config's fitness.
+    pub credits: Vec<[f32; 4]>,
+    /// The step, from 1, at which each POI was observed, or 0, `[episodes][teams][pois]`.
+    pub observed_at: Vec<u32>,
+}
+
+/// Plays some episodes of given policies on the CPU, writes the steps of all teams, and scores them. The teams of an
+/// episode follow those of the one before. See [`play`] for the other arguments.
+///
+/// Without noise, the states and scores are those of [`trace`] and [`play`].
+///
+/// # Errors
+/// The config, the weights or the starts are invalid, an array has the wrong length, or there is no such episode.
+pub fn record(
+    config: &Config,
+    teams: usize,
+    weights: &[f32],
+    starts: &Starts,
+    episodes: Range<usize>,
+    noise: Option<ActionNoise<'_>>,
+    arrays: StepArrays<'_>,
+) -> Result<Recorded, Failure> {
+    thread_local! { static CREDIT: RefCell<Credit> = RefCell::default(); }
+    let cast = Cast::new(config, teams, weights, starts)?;
+    if episodes.end > starts.episodes() || episodes.is_empty() {
+        return Err(Failure::NoEpisode { episode: episodes.end, episodes: starts.episodes() });
+    }
+    let (world, leaders, pois) = (&cast.world, cast.world.leaders(), cast.world.pois.len());
+    let drawn: Vec<Vec<glam::Vec2>> = episodes.clone().map(|episode| starts.of(episode, world)).collect();
+    let fitnesses = scores_of(config);
+    let groups: Vec<Group<'_>> = drawn.iter().map(|starts| Group { fitnesses, ..cast.group(starts) }).collect();
+    let all = teams * drawn.len();
+    let recorded = Mutex::new(Recorded {
+        observed: vec![0; all],
+        credits: vec![[0.0; 4]; all * leaders],
+        observed_at: vec![0; all * pois],
+    });
+    let noise = noise.map(|ActionNoise { seed, deviations }| Noise {
+        key: Key::new(seed, 0, Purpose::Exploration),
+        deviations,
+        first: (episodes.start * teams) as u32,
+    });
+    Cpu::default().record(&groups, noise, arrays, &|group, team, episode| {
+        let scores = CREDIT.with_borrow_mut(|credit| credit.all(episode, world));
+        let at = credit::observed_at(episode.sets, world);
+        let place = group * teams + team;
+        let mut recorded = recorded.lock().unwrap_or_else(PoisonError::into_inner);
+        recorded.observed[place] = scores.observed;
+        for (leader, to) in recorded.credits[place * leaders..][..leaders].iter_mut().enumerate() {
+            let dt = scores.dt.get(leader).copied().unwrap_or(0.0);
+            *to = [scores.d[leader], scores.df[leader], scores.dpp[leader], dt];
+        }
+        let to = recorded.observed_at[place * pois..].iter_mut();
+        to.zip(at).for_each(|(to, step)| *to = step.unwrap_or(0) as u32);
+    })?;
+    Ok(recorded.into_inner().unwrap_or_else(PoisonError::into_inner))
 }
 
 /// The states, inputs, outputs and observations of every step of one episode.
@@ -514,6 +645,7 @@ struct Cast<'a> {
     world: World,
     weights: Cow<'a, [f32]>,
     policies: usize,
+    sharing: Sharing,
     teams: Vec<u32>,
 }
 
@@ -547,11 +679,12 @@ impl<'a> Cast<'a> {
             return Err(Failure::Weight { leader: policy / teams, team: policy % teams, parameter, value });
         }
         let order = evaluate::one_policy_a_team(teams, leaders);
-        Ok(Cast { world, weights, policies: teams, teams: order })
+        let sharing = if shared { Sharing::Shared } else { Sharing::PerLeader };
+        Ok(Cast { world, weights, policies: teams, sharing, teams: order })
     }
 
     fn group<'b>(&'b self, starts: &'b [glam::Vec2]) -> Group<'b> {
-        let Cast { world, weights, policies, teams } = self;
-        Group { world, starts, weights: weights[..].into(), policies: *policies, teams, need: RecordRequest::Scores }
+        let &Cast { ref world, ref weights, policies, sharing, ref teams } = self;
+        Group { world, starts, weights: weights[..].into(), policies, sharing, teams, fitnesses: &[] }
     }
 }

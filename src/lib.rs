@@ -37,9 +37,9 @@
 //! # Follow one team from config to fitness
 //!
 //! ```text
-//! config ─▶ world ─▶ trainer ──▶ backend.rollout(teams) ──▶ credit ──▶ evolve ─┐
-//!                       ▲              │ sense ▸ policy ▸ follow ▸ motion ▸ couple
-//!                       └──────────────┴────────────── next generation ◀───────┘
+//! config ─▶ world ─▶ trainer ──▶ backend.play(teams) ──▶ scores ──▶ evolve ─┐
+//!                       ▲              │ sense ▸ policy ▸ follow ▸ motion ▸ couple ▸ credit
+//!                       └──────────────┴──────────── next generation ◀──────┘
 //! ```
 //!
 //! 1. [`config`] reads a TOML file and reports every problem in it. [`model`] has the config sections, constants and
@@ -49,8 +49,9 @@
 //!    batch.
 //! 4. The backend plays each team's whole episode: with [`model`] on the CPU, with the equivalent shaders under
 //!    `shaders/` on a GPU. It records who was at which POI at which step and which leader each follower saw, or as much
-//!    of that as the fitness needs.
-//! 5. [`credit`] computes G, D, Df, D++ and Dt from that record.
+//!    of that as the fitness needs. Records do not leave the backend.
+//! 5. [`credit`] computes G, D, Df, D++ and Dt from a record, on the CPU while other teams play. The backend returns
+//!    these scores.
 //! 6. [`evolve`] selects and mutates on the host, or plans this for a GPU that holds the populations. [`run`] saves the
 //!    results with [`record`], and [`report`] draws them.
 //!
@@ -79,12 +80,12 @@
 //! | [`reach`] | | how far agents can travel, and which POIs no team can observe |
 //! | [`evolve`] | | random numbers, team schedules, selection and mutation |
 //! | [`sample`] | | random worlds for tests |
+//! | [`credit`] | | the record of an episode, and G, D, Df, D++ and Dt from it |
 //! | [`backend`] | | whole episodes of many teams on the CPU, and with `gpu` on a GPU |
-//! | [`credit`] | | G, D, Df, D++ and Dt |
 //! | [`trainer`] | | the generation loop |
-//! | [`verify`] | | check that two backends agree bit for bit |
 //! | [`statistics`] | | confidence intervals and tests |
 //! | [`evaluate`] | | evaluation of trained teams from held-out starts |
+//! | [`verify`] | | check that two backends agree bit for bit |
 //! | [`baseline`] | | baselines without learning |
 //! | [`stepping`] | | stepping of teams with given actions |
 //! | [`memory`] | | a run's peak memory |
@@ -93,6 +94,7 @@
 //! | [`report`] | `report` | pictures, films, pages; the paper's claims |
 //! | [`sweep`] | `report` | many runs of a parameter grid |
 //! | [`front`] | | the functions that most programs need |
+//! | [`ops`] | `gpu` and `report` | the use cases of the program, and their errors |
 //! | [`mod@bench`] | `cli` | a backend's speed, and the machine's arithmetic ceiling |
 //! | [`cli`] | `cli` | the command line |
 //!
@@ -107,7 +109,7 @@
 //! | `scalar` | also episodes without vector instructions, for `verify --report` | 30 |
 //! | `parallel` | all threads, using rayon; results keep the same bits | 35 |
 //! | `gpu` | any GPU, using wgpu | 80 |
-//! | `record` | runs on disk | 55 |
+//! | `record` | runs on disk | 60 |
 //! | `report` | pictures; includes `record` | 75 |
 //! | `cli` (default) | the program; includes all of the above except `scalar` | 145 |
 
@@ -141,6 +143,8 @@ pub mod host;
 pub mod kernels;
 pub mod memory;
 pub mod model;
+#[cfg(all(feature = "gpu", feature = "report"))]
+pub mod ops;
 pub mod parallel;
 pub mod reach;
 pub mod reader;

@@ -9,7 +9,7 @@
 use std::fs;
 use std::path::Path;
 
-use crate::backend::{self, BATCH_BYTES, PACKED_FROM, RecordRequest, cpu};
+use crate::backend::{self, BATCH_BYTES, PACKED_FROM, cpu};
 use crate::config::Config;
 use crate::trainer;
 use crate::world::World;
@@ -64,7 +64,6 @@ impl Peaks {
                     (config, world)
                 })
                 .collect();
-            let need = |config: &Config| RecordRequest::Score(config.learning.fitness);
             // The largest stage determines each size.
             let most = |size: &dyn Fn(&Config, &World) -> u64| {
                 staged.iter().map(|(config, world)| size(config, world)).max().unwrap_or(0)
@@ -75,16 +74,16 @@ impl Peaks {
             next += trainer::next_bytes(config);
             checkpoint += checkpoint_bytes(config);
             queue += most(&|config, _| teams(config).div_ceil(lanes) * 16);
-            block = block.max(most(&|config, world| cpu::block_bytes(world, need(config))));
+            block = block.max(most(&|config, world| cpu::block_bytes(world, config.learning.fitness)));
             order = order.max((policies * size_of::<usize>()) as u64);
             populations += trials * config.populations() as u64;
             held += trials * backend::held_bytes([config.populations(), policies + 1, config.parameters()]);
             weights = weights.saturating_add(most(&|config, world| teams(config) * backend::weight_bytes(world)));
             record = record.saturating_add(most(&|config, world| {
-                teams(config).saturating_mul(backend::record_bytes(world, need(config)))
+                teams(config).saturating_mul(backend::record_bytes(world, config.learning.fitness))
             }));
             states = states.saturating_add(most(&|config, world| {
-                teams(config).saturating_mul(backend::state_bytes(world, need(config)))
+                teams(config).saturating_mul(backend::state_bytes(world, config.learning.fitness))
             }));
         }
         // Episodes and the final sorting of each population do not happen at the same time.

@@ -59,7 +59,9 @@ impl<T: Send + 'static> Aside<T> {
 
 #[cfg(not(feature = "parallel"))]
 mod sequential {
-    use std::slice::{ChunksExact, ChunksExactMut, ChunksMut, Iter, IterMut};
+    #[cfg(feature = "gpu")]
+    use std::slice::Iter;
+    use std::slice::{ChunksExact, ChunksExactMut, ChunksMut, IterMut};
 
     /// Returns the number of threads, 1.
     pub(crate) fn current_num_threads() -> usize {
@@ -78,6 +80,7 @@ mod sequential {
 
     /// The methods of rayon's slices.
     pub(crate) trait ParallelSlices<T> {
+        #[cfg(feature = "gpu")]
         fn par_iter(&self) -> Iter<'_, T>;
         fn par_iter_mut(&mut self) -> IterMut<'_, T>;
         fn par_chunks_mut(&mut self, size: usize) -> ChunksMut<'_, T>;
@@ -87,6 +90,7 @@ mod sequential {
     }
 
     impl<T> ParallelSlices<T> for [T] {
+        #[cfg(feature = "gpu")]
         fn par_iter(&self) -> Iter<'_, T> {
             self.iter()
         }

@@ -38,7 +38,7 @@ pub struct Definition {
 }
 
 /// A key that is set from outside the config file.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Override {
     /// The dotted key: `learning.population`.
     pub key: String,
@@ -821,7 +821,11 @@ fn hint(name: &str, known: &[&str]) -> String {
     let distance = |key: &str| (strsim::damerau_levenshtein(&last(key), &leaf), !same_section(key));
     let nearest = known.iter().filter(|_| name.len() <= LONGEST_NAME).min_by_key(|key| distance(key));
     if let Some(key) = nearest.filter(|key| distance(key).0 <= leaf.len() / 3) {
-        return format!(", did you mean `{key}`?");
+        // The same name may be in several sections.
+        let equal =
+            known.iter().filter(|other| **other == *key || distance(key).0 == 0 && distance(other) == distance(key));
+        let names: Vec<String> = equal.map(|key| format!("`{key}`")).collect();
+        return format!(", did you mean {}?", names.join(" or "));
     }
     let siblings: Vec<String> = known.iter().filter(|key| same_section(key)).map(|key| last(key)).collect();
     match siblings.is_empty() {

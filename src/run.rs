@@ -12,13 +12,14 @@ use crate::host::Instant;
 use crate::memory::{self, TooLittle};
 use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule};
 use crate::record::disk::Disk;
+use crate::record::finished;
 use crate::record::folder::{
     self, FileSums, Folder, METRICS, Note, Origin, POLICIES, Run, RunSums, Start, StartFrom, Status, Story,
 };
 use crate::record::metrics::{self, Extent};
 use crate::record::policies::{self, Init, Policies};
 use crate::record::{RecordError, config_digest};
-use crate::trainer::{Row, Snapshot, SnapshotError, Trainer};
+use crate::trainer::{Ending, Row, Snapshot, SnapshotError, Trainer};
 
 /// Interval at which runs pass their metrics to the system.
 const FLUSH: Duration = Duration::from_secs(1);
@@ -58,7 +59,7 @@ pub enum RunError {
     Config(#[from] ConfigError),
     /// The populations could not be read back from the backend for a checkpoint.
     #[error("no checkpoint could be made: {0}")]
-    Held(BackendError),
+    Fetch(BackendError),
 }
 
 impl RunError {
@@ -66,7 +67,7 @@ impl RunError {
     pub fn of_snapshot(error: SnapshotError, what: &'static str, bytes: u64) -> RunError {
         match error {
             SnapshotError::Memory(_) => RunError::Memory { what, bytes },
-            SnapshotError::Backend(error) => RunError::Held(error),
+            SnapshotError::Backend(error) => RunError::Fetch(error),
         }
     }
 }
@@ -99,7 +100,7 @@ pub struct Options<'a> {
 pub struct Progress<'a> {
     /// Generation that each run plays next. It is two past the last generation if the run is finished.
     pub generations: &'a [usize],
-    /// Rows that became complete, sorted by run (the field `arm`), generation and trial.
+    /// Rows that became complete, sorted by run (the field `experiment`), generation and trial.
     pub rows: &'a [Row],
 }
 
@@ -145,7 +146,8 @@ struct Member {
 
 /// State of an unfinished run.
 struct Going {
-    arm: usize,
+    /// Index of its experiment in the trainer.
+    experiment: usize,
     metrics: metrics::Writer,
     keeper: Keeper,
     /// Extent of the metrics before the rows of the last generation.
@@ -215,13 +217,13 @@ impl Session {
                 generations.push(member.config.learning.generations + 2);
                 continue;
             };
-            going.arm = arms.len();
+            going.experiment = arms.len();
             arms.push(run);
             let fits = match snapshot {
-                Beginning::Checkpoint(snapshot) => trainer.restore(going.arm, snapshot),
+                Beginning::Checkpoint(snapshot) => trainer.restore(going.experiment, snapshot),
                 Beginning::Policies(Init { trials, .. }) => {
                     (trials.into_iter().enumerate()).all(|(trial, Policies { policies, weights })| {
-                        trainer.start_from(going.arm, trial, policies, &weights)
+                        trainer.start_from(going.experiment, trial, policies, &weights)
                     })
                 }
                 Beginning::Chance => true,
@@ -229,7 +231,7 @@ impl Session {
             if !fits {
                 unreachable!("checkpoints and policies are read in the sizes of their config");
             }
-            generations.push(trainer.generation(going.arm));
+            generations.push(trainer.generation(going.experiment));
         }
         Ok((Session { members, generations, trainer, arms, since: Instant::now() }, notes))
     }
@@ -318,7 +320,7 @@ impl Session {
             };
             match saved {
                 // The device failed. The next generation either recovers from this or ends with the error.
-                Err(RunError::Held(error)) => {
+                Err(RunError::Fetch(error)) => {
                     options.save.store(!stop, Relaxed);
                     setback = Some(error);
                 }
@@ -342,8 +344,8 @@ impl Session {
     pub fn end(&mut self) -> Result<usize, RunError> {
         let mut last = 0;
         for member in &mut self.members {
-            if let Some(Going { arm, keeper, .. }) = &mut member.going {
-                let shorter = checkpoint::of_length(&member.config, self.trainer.end(*arm));
+            if let Some(Going { experiment, keeper, .. }) = &mut member.going {
+                let shorter = checkpoint::of_length(&member.config, self.trainer.end(*experiment));
                 if shorter != member.config {
                     keeper.shorten(&shorter)?;
                     member.folder.write_config(&shorter)?;
@@ -373,10 +375,11 @@ impl Session {
 
     /// Adds complete rows to the metrics. Returns them sorted by run, generation and trial.
     fn add(&mut self, mut rows: Vec<Row>) -> Result<Vec<Row>, RunError> {
-        rows.iter_mut().for_each(|row| row.arm = self.arms[row.arm]);
-        rows.sort_by_key(|row| (row.arm, row.generation, row.trial));
+        rows.iter_mut().for_each(|row| row.experiment = self.arms[row.experiment]);
+        rows.sort_by_key(|row| (row.experiment, row.generation, row.trial));
         let seconds = self.seconds();
-        rows.chunk_by(|a, b| a.arm == b.arm).try_for_each(|rows| self.members[rows[0].arm].add(rows, seconds))?;
+        rows.chunk_by(|a, b| a.experiment == b.experiment)
+            .try_for_each(|rows| self.members[rows[0].experiment].add(rows, seconds))?;
         for (arm, &run) in self.arms.iter().enumerate() {
             self.generations[run] = self.trainer.generation(arm);
         }
@@ -389,7 +392,7 @@ impl Session {
         let over = self.members.iter_mut().zip(&self.generations);
         let over = over.filter(|(member, next)| **next > member.config.learning.generations + 1);
         let (arms, over): (Vec<usize>, Vec<&mut Member>) =
-            over.filter_map(|(member, _)| Some((member.going.as_ref()?.arm, member))).unzip();
+            over.filter_map(|(member, _)| Some((member.going.as_ref()?.experiment, member))).unzip();
         if over.is_empty() {
             return Ok(());
         }
@@ -410,7 +413,7 @@ impl Session {
             let member = &mut self.members[run];
             match member.save(&mut self.trainer, self.generations[run], seconds) {
                 // The populations of the other runs may still be available.
-                Err(error @ RunError::Held(_)) => held = held.and(Err(error)),
+                Err(error @ RunError::Fetch(_)) => held = held.and(Err(error)),
                 saved => saved?,
             }
             writing.push(run);
@@ -493,7 +496,7 @@ impl Member {
         let checkpoints = member.folder.file(folder::CHECKPOINTS);
         let keeper =
             Keeper::new(member.folder.disk.clone(), checkpoints, member.config.clone(), found.kept, generation);
-        let going = Some(Going { arm: 0, metrics, keeper, ending: None });
+        let going = Some(Going { experiment: 0, metrics, keeper, ending: None });
         Ok((Member { going, before, ..member }, from, found.notes))
     }
 
@@ -511,7 +514,7 @@ impl Member {
     }
 
     fn is_due(&self, next: usize) -> bool {
-        let config::Saving { generations, seconds } = self.config.checkpoint;
+        let config::CheckpointConfig { generations, seconds } = self.config.checkpoint;
         self.going.as_ref().is_some_and(|going| going.keeper.is_due(&Schedule { generations, seconds }, next))
     }
 
@@ -532,7 +535,7 @@ impl Member {
     /// large checkpoint is written before training continues, because there may not be memory for any copy.
     fn save(&mut self, trainer: &mut Trainer, next: usize, seconds: f64) -> Result<(), RunError> {
         let failed = self.metrics_failed();
-        let Some(Going { arm, metrics, keeper, .. }) = &mut self.going else { return Ok(()) };
+        let Some(Going { experiment, metrics, keeper, .. }) = &mut self.going else { return Ok(()) };
         keeper.wait()?;
         if keeper.newest() == Some(next) {
             return Ok(());
@@ -541,12 +544,12 @@ impl Member {
         let (metrics, output) = metrics.mark().map_err(failed)?;
         let (config, init, seconds) = (config_digest(&self.config), self.run.init.clone(), self.before + seconds);
         if !memory::copies_checkpoint([&self.config]) {
-            let snapshot = trainer.view(*arm).map_err(RunError::Held)?;
+            let snapshot = trainer.view(*experiment).map_err(RunError::Fetch)?;
             return Ok(keeper.save_now(&Checkpoint { config, init, seconds, metrics, snapshot }, &output, since)?);
         }
         let bytes = self.config.policy_bytes();
         let of_snapshot = |error| RunError::of_snapshot(error, "a checkpoint beside training", bytes);
-        let snapshot = trainer.snapshot(*arm).map_err(of_snapshot)?;
+        let snapshot = trainer.snapshot(*experiment).map_err(of_snapshot)?;
         Ok(keeper.save(Checkpoint { config, init, seconds, metrics, snapshot }, output, since)?)
     }
 
@@ -556,12 +559,10 @@ impl Member {
         let Some(Going { metrics, keeper, ending, .. }) = &mut self.going else { return Ok(()) };
         let since = Instant::now();
         let (mark, output) = metrics.mark().map_err(failed)?;
-        let Snapshot { generation, last, fitness, pending, .. } = end;
-        let fitness = fitness.into_iter().map(<[f32]>::to_vec).collect();
-        let snapshot = Snapshot { generation, last, weights: vec![], fitness, pending };
-        let (config, metrics) = (config_digest(&self.config), ending.take().unwrap_or(mark));
-        let (init, seconds_in_all) = (self.run.init.clone(), self.before + seconds);
-        keeper.save(Checkpoint { config, init, seconds: seconds_in_all, metrics, snapshot }, output, since)?;
+        let (init, in_all) = (self.run.init.clone(), self.before + seconds);
+        let metrics = ending.take().unwrap_or(mark);
+        let last = finished::last_checkpoint(&self.config, init, in_all, metrics, Ending::of(&end));
+        keeper.save(last, output, since)?;
         let path = self.folder.file(POLICIES);
         if path.exists() {
             // The old checkpoints of an extended run need the old policies. The new checkpoint must be complete before
@@ -572,7 +573,7 @@ impl Member {
         let (story, RunSums { run: digest, metrics }) = self.folder.digest(&self.config, policies)?;
         keeper.wait()?;
         self.run.files = Some(FileSums { metrics, policies: checksum });
-        self.write_run(Status::Done, generation, seconds, Some(digest.clone()))?;
+        self.write_run(Status::Done, end.generation, seconds, Some(digest.clone()))?;
         self.results = Some(Results { story, digest });
         self.going = None;
         Ok(())

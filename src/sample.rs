@@ -203,7 +203,7 @@ fn plain_world(seed: u64) -> Config {
     };
     let gain = |rng: &mut ChaCha8Rng, high: f64| if rng.random_bool(0.1) { 0.0 } else { rng.random_range(0.1..high) };
     Config {
-        world: crate::config::Domain {
+        world: crate::config::WorldConfig {
             map,
             leaders: starts[..leaders].to_vec(),
             followers: starts[leaders..].to_vec(),
@@ -252,7 +252,7 @@ fn plain_world(seed: u64) -> Config {
         },
         learning: Learning {
             paradigm: if rng.random_bool(0.25) { Paradigm::AllLeaders } else { Paradigm::LeaderFollower },
-            sharing: if later.random_bool(0.2) { Sharing::All } else { Sharing::None },
+            sharing: if later.random_bool(0.2) { Sharing::Shared } else { Sharing::PerLeader },
             fitness: word(rng),
             population: rng.random_range(2..=20),
             generations: 3,
@@ -269,7 +269,7 @@ fn plain_world(seed: u64) -> Config {
             poi_jitter: if later.random_bool(0.3) { later.random_range(0.5..5.0) } else { 0.0 },
             seed,
         },
-        checkpoint: Saving::default(),
+        checkpoint: CheckpointConfig::default(),
         stages,
     }
 }

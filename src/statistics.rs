@@ -102,29 +102,72 @@ impl<'a> FromIterator<&'a f64> for Average {
 /// A sample of equal values has no measurable spread. The half-width of its interval is then `step` times the upper
 /// bound of [`share`] for 0 of n. `step` is the smallest possible difference between two values.
 pub fn mean(values: &[f64], step: f64) -> Option<Estimate> {
+    mean_at(CONFIDENCE, values, step)
+}
+
+/// Returns the same as [`mean`], with an interval of any confidence level.
+pub fn mean_at(confidence: f64, values: &[f64], step: f64) -> Option<Estimate> {
     let (value, error) = moments(values)?;
-    Some(interval(value, error, values.len(), step))
+    Some(interval_at(confidence, value, error, values.len(), step))
 }
 
 /// Returns the interval of [`mean`] from the mean, its standard error and the number of values, at least 2.
 pub fn interval(value: f64, error: f64, count: usize, step: f64) -> Estimate {
+    interval_at(CONFIDENCE, value, error, count, step)
+}
+
+fn interval_at(confidence: f64, value: f64, error: f64, count: usize, step: f64) -> Estimate {
     let room = match error {
-        0.0 => step * share(0, count).map_or(0.0, |share| share.high),
-        error => error * student(count).inverse_cdf(1.0 - (1.0 - CONFIDENCE) / 2.0),
+        0.0 => step * share_at(confidence, 0, count).map_or(0.0, |share| share.high),
+        error => error * half_width_at(confidence, count),
     };
     Estimate { value, low: value - room, high: value + room }
 }
 
+/// Returns the half-width of the 95 % interval of a mean of `count` values, in standard errors. 0 for fewer than two.
+pub fn half_width(count: usize) -> f64 {
+    half_width_at(CONFIDENCE, count)
+}
+
+fn half_width_at(confidence: f64, count: usize) -> f64 {
+    if count < 2 { 0.0 } else { student(count).inverse_cdf(1.0 - (1.0 - confidence) / 2.0) }
+}
+
 /// Returns a share with the exact interval of Clopper and Pearson. None if `of` is 0.
 pub fn share(count: usize, of: usize) -> Option<Estimate> {
+    share_at(CONFIDENCE, count, of)
+}
+
+/// Returns the same as [`share`], with an interval of any confidence level.
+pub fn share_at(confidence: f64, count: usize, of: usize) -> Option<Estimate> {
     let (some, others) = (count as f64, of.checked_sub(count)? as f64);
     let bound = |a: f64, b: f64, at: f64| Some(Beta::new(a, b).ok()?.inverse_cdf(at));
-    let tail = (1.0 - CONFIDENCE) / 2.0;
+    let tail = (1.0 - confidence) / 2.0;
     Some(Estimate {
         value: (of > 0).then_some(some / of as f64)?,
         low: if count == 0 { 0.0 } else { bound(some, others + 1.0, tail)? },
         high: if count == of { 1.0 } else { bound(some + 1.0, others, 1.0 - tail)? },
     })
+}
+
+/// Returns the smallest alpha, from 1e-12 to 1, at which a condition holds for the interval of confidence 1 - alpha.
+///
+/// This is the p-value of the test that the interval inverts. The condition must hold for narrower intervals, too. None
+/// if it does not hold for the narrowest.
+pub fn smallest_alpha(holds: impl Fn(f64) -> bool) -> Option<f64> {
+    let alpha = |exponent: f64| libm::pow(10.0, exponent);
+    let (mut fails, mut meets) = (-12.0, -1e-9);
+    if !holds(1.0 - alpha(meets)) {
+        return None;
+    }
+    if holds(1.0 - alpha(fails)) {
+        return Some(alpha(fails));
+    }
+    for _ in 0..50 {
+        let middle = (fails + meets) / 2.0;
+        *if holds(1.0 - alpha(middle)) { &mut meets } else { &mut fails } = middle;
+    }
+    Some(alpha(meets))
 }
 
 /// Returns the two-sided p-value of Student's test that the mean of a sample of differences is 0.

@@ -1,18 +1,17 @@
 //! Verification that a backend agrees with the CPU bit for bit.
 //!
-//! Verification compares random worlds stage by stage, then all of them as one batch, by records and by scores. It also
-//! compares breeding on the device and short training runs.
+//! Verification compares random worlds stage by stage, then the scores of all of them as one batch, and by each fitness. It
+//! also compares breeding on the device and short training runs.
 
-use std::collections::BTreeMap;
 use std::ops::Range;
-use std::sync::Mutex;
 
 use glam::Vec2;
 
 use crate::backend::compare::{Mismatch, first_mismatch};
-use crate::backend::{Backend, BackendError, Group, RecordRequest};
-use crate::config::{Config, Paradigm, ValidConfig};
-use crate::credit::{Credit, Scores};
+use crate::backend::{Backend, BackendError, Group, GroupScores};
+use crate::config::{Config, Fitness, Paradigm, Sharing, ValidConfig};
+use crate::credit::RecordRequest;
+use crate::evaluate::{SCORES, SCORES_AND_DT};
 use crate::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use crate::sample;
 use crate::trainer::{Row, Trainer};
@@ -82,9 +81,14 @@ struct Teams {
     choice: Vec<u32>,
     /// Start positions, see [`Group::starts`].
     places: Vec<Vec2>,
-    /// Every other world also records sightings, which needs kernels of its own.
-    need: RecordRequest,
+    sharing: Sharing,
+    /// Every other world is also scored by Dt, which needs a record of sightings and so kernels of its own.
+    fitnesses: &'static [Fitness],
 }
+
+/// The fitnesses that worlds are scored by, in turns.
+pub const KINDS: [&[Fitness]; 6] =
+    [SCORES, &[Fitness::G], &[Fitness::D], &[Fitness::Df], &[Fitness::Dpp], &[Fitness::Dt]];
 
 impl Teams {
     fn new(config: &Config, teams: usize, seed: u64, sights: bool) -> Teams {
@@ -99,13 +103,13 @@ impl Teams {
         let mut places = world.starts.clone();
         let learning = &config.learning;
         evolve::jitter_pois(Key::new(seed, 0, Purpose::Pois), 0, 0, &world, learning.poi_jitter, &mut places);
-        let need = if sights { RecordRequest::Sights } else { RecordRequest::Record };
-        Teams { policies, weights, choice, places, need, world }
+        let fitnesses = if sights { SCORES_AND_DT } else { SCORES };
+        Teams { policies, weights, choice, places, sharing: learning.sharing, fitnesses, world }
     }
 
     fn group(&self) -> Group<'_> {
-        let Teams { world, policies, weights, choice, places, need } = self;
-        Group { world, starts: places, weights: weights[..].into(), policies: *policies, teams: choice, need: *need }
+        let &Teams { ref world, policies, ref weights, ref choice, ref places, sharing, fitnesses } = self;
+        Group { world, starts: places, weights: weights[..].into(), policies, sharing, teams: choice, fitnesses }
     }
 }
 
@@ -134,17 +138,15 @@ pub fn compare(
         all.push(teams);
     }
     let groups: Vec<Group<'_>> = all.iter().map(Teams::group).collect();
-    if let Some((group, team)) = compare_batch(&groups, reference, backend)? {
-        let (name, _) = &plan.worlds[group];
-        outcome.mismatch = Some(format!("{name}: the record of team {team} differs when all worlds are one batch"));
+    if let Some((group, difference)) = compare_scores(&groups, reference, backend)? {
+        outcome.mismatch = Some(format!("{}: all worlds as one batch, {difference}", plan.worlds[group].0));
         return Ok(outcome);
     }
     // With few worlds, each is played several times, so that every kind of scores is requested.
-    let turns = RecordRequest::OF_SCORES.len().div_ceil(groups.len().max(1));
+    let turns = KINDS.len().div_ceil(groups.len().max(1));
     for turn in 0..turns {
-        if let Some((group, team, difference)) = compare_scores(&groups, turn, reference, backend)? {
-            let (name, _) = &plan.worlds[group];
-            outcome.mismatch = Some(format!("{name}: stage credit, team {team}, {difference}"));
+        if let Some((group, difference)) = compare_kinds(&groups, turn, reference, backend)? {
+            outcome.mismatch = Some(format!("{}: stage credit, {difference}", plan.worlds[group].0));
             return Ok(outcome);
         }
     }
@@ -169,83 +171,52 @@ fn compare_stages(
     Ok(first_mismatch(&teams.world, &expected, &found))
 }
 
-/// Plays all groups as one batch, without a trace. Returns the first group and team whose records differ.
-fn compare_batch(
+/// Plays groups as one batch. Returns the first group whose scores differ, and how.
+fn compare_scores(
     groups: &[Group<'_>],
     reference: &mut dyn Backend,
     backend: &mut dyn Backend,
-) -> Result<Option<(usize, usize)>, BackendError> {
-    let play = |backend: &mut dyn Backend| {
-        let records: Vec<Vec<Mutex<Vec<u32>>>> =
-            groups.iter().map(|group| (0..group.team_count()).map(|_| Mutex::default()).collect()).collect();
-        backend.rollout(groups, &|episode| {
-            // A team that is visited twice gets a record of twice the length.
-            let mut record = records[episode.group][episode.team].lock().expect("no visit panics");
-            record.extend(episode.sets.iter().chain(episode.seen.words().iter()).chain(episode.sights.iter()));
-        })?;
-        Ok::<_, BackendError>(records)
+) -> Result<Option<(usize, String)>, BackendError> {
+    let (expected, found) = (reference.play(groups)?, backend.play(groups)?);
+    let differs = |(index, (expected, found)): (usize, (&GroupScores, &GroupScores))| {
+        let group = &groups[index];
+        let (per_team, fitnesses) = (group.fitnesses.len() * group.world.leaders(), group.fitnesses);
+        let of = |scores: &GroupScores, team: usize| {
+            let own = scores.scores[team * per_team..][..per_team].iter().map(|score| score.to_bits());
+            (scores.observed[team], own.collect::<Vec<u32>>())
+        };
+        let team = (0..group.team_count()).find(|&team| of(expected, team) != of(found, team))?;
+        let shown = |scores: &GroupScores| {
+            format!("{} POIs and {:?}", scores.observed[team], &scores.scores[team * per_team..][..per_team])
+        };
+        let (expected, found) = (shown(expected), shown(found));
+        Some((index, format!("team {team}, scores by {fitnesses:?}: expected {expected}, found {found}")))
     };
-    let (expected, found) = (play(reference)?, play(backend)?);
-    let differs = |(group, team): &(usize, usize)| {
-        let record = |records: &[Vec<Mutex<Vec<u32>>>]| records[*group][*team].lock().expect("no visit panics").clone();
-        record(&expected) != record(&found)
-    };
-    let teams =
-        groups.iter().enumerate().flat_map(|(index, group)| (0..group.team_count()).map(move |team| (index, team)));
-    Ok(teams.into_iter().find(differs))
+    Ok(expected.iter().zip(&found).enumerate().find_map(differs))
 }
 
-/// Plays all groups in three batches that request scores only, and compares them with the scores of the reference's
-/// whole record. Returns the first group and team that differ, and how. The kind of scores that a group requests
-/// changes with each turn.
-fn compare_scores(
+/// Plays all groups in three batches. Each group is scored by one of [`KINDS`], which changes with each turn. Returns the
+/// first group that differs, and how.
+fn compare_kinds(
     groups: &[Group<'_>],
     turn: usize,
     reference: &mut dyn Backend,
     backend: &mut dyn Backend,
-) -> Result<Option<(usize, usize, String)>, BackendError> {
-    let need_of =
-        |group: usize| RecordRequest::OF_SCORES[(turn * groups.len() + group) % RecordRequest::OF_SCORES.len()];
+) -> Result<Option<(usize, String)>, BackendError> {
     // A batch is packed only if all its groups can be, so those that cannot are separate.
-    let mut batches = [vec![], vec![], vec![]];
+    let mut batches: [Vec<(usize, Group<'_>)>; 3] = Default::default();
     for (index, group) in groups.iter().enumerate() {
-        let (whole, timed) = (need_of(index).least(1).is_none(), group.world.rule.is_timed());
-        batches[if whole { 0 } else { 1 + usize::from(timed) }].push(index);
+        let fitnesses = KINDS[(turn * groups.len() + index) % KINDS.len()];
+        let (whole, timed) = (RecordRequest(fitnesses).sights(), group.world.rule.is_timed());
+        batches[if whole { 0 } else { 1 + usize::from(timed) }].push((index, Group { fitnesses, ..*group }));
     }
-    let played = |backend: &mut dyn Backend, needs: &dyn Fn(usize) -> RecordRequest| {
-        let scores: Vec<Mutex<BTreeMap<usize, Scores>>> = groups.iter().map(|_| Mutex::default()).collect();
-        for batch in &batches {
-            let asked: Vec<Group<'_>> =
-                batch.iter().map(|&index| Group { need: needs(index), ..groups[index] }).collect();
-            backend.rollout(&asked, &|episode| {
-                let index = batch[episode.group];
-                let (world, mut credit) = (groups[index].world, Credit::default());
-                let found = match need_of(index) {
-                    // Dt was not requested.
-                    RecordRequest::Record | RecordRequest::Sights | RecordRequest::Scores => {
-                        Scores { dt: vec![], ..credit.all(&episode, world) }
-                    }
-                    RecordRequest::Score(fitness) => {
-                        let mut one = vec![0.0; world.leaders()];
-                        let observed = credit.score(&episode, world, fitness, &mut one);
-                        Scores { observed, d: one, ..Scores::default() }
-                    }
-                };
-                scores[index].lock().expect("no visit panics").insert(episode.team, found);
-            })?;
+    for batch in batches {
+        let (places, groups): (Vec<usize>, Vec<Group<'_>>) = batch.into_iter().unzip();
+        if let Some((group, difference)) = compare_scores(&groups, reference, backend)? {
+            return Ok(Some((places[group], difference)));
         }
-        Ok::<_, BackendError>(scores.into_iter().map(|scores| scores.into_inner().expect("no visit panics")))
-    };
-    let expected = played(reference, &|_| RecordRequest::Sights)?;
-    let found = played(backend, &need_of)?;
-    Ok(expected.zip(found).enumerate().find_map(|(group, (expected, found))| {
-        let differs = |(team, expected): (&usize, &Scores)| {
-            let found = found.get(team);
-            let differs = found != Some(expected);
-            differs.then(|| (group, *team, format!("expected {expected:?}, found {found:?}")))
-        };
-        expected.iter().find_map(differs)
-    }))
+    }
+    Ok(None)
 }
 
 /// Breeds a world's policies on the device. Returns the first weight that differs.
@@ -305,7 +276,7 @@ fn compare_training(
     let ((rows, weights), (found_rows, found_weights)) = (train(reference)?, train(backend)?);
     let name = |arm: usize| plan.worlds[arm].0.as_str();
     if let Some((a, b)) = rows.iter().zip(&found_rows).find(|(a, b)| a != b) {
-        return Ok(Some(format!("{}: training differs: {a:?}, found {b:?}", name(a.arm))));
+        return Ok(Some(format!("{}: training differs: {a:?}, found {b:?}", name(a.experiment))));
     }
     let differs = (0..configs.len()).find(|&arm| weights[arm] != found_weights[arm]);
     Ok(differs.map(|arm| format!("{}: the trained weights differ", name(arm))))

@@ -53,13 +53,13 @@ fn check(text: impl AsRef<[u8]>, flags: &[&str]) -> Output {
     flotilla(&[&["check", path.to_str().unwrap()], flags].concat())
 }
 
-/// What standard error says of a failed run, without the folder's name.
+/// Standard error of a failed run, without the folder's name.
 fn refusal(output: Output) -> String {
     assert_eq!(output.status.code(), Some(1), "{}", String::from_utf8_lossy(&output.stderr));
     told(output)
 }
 
-/// What standard error says, without the folder's name; nothing may be on standard output.
+/// Standard error, without the folder's name; nothing may be on standard output.
 fn told(output: Output) -> String {
     let error = String::from_utf8(output.stderr).unwrap();
     assert!(output.stdout.is_empty(), "{}", String::from_utf8_lossy(&output.stdout));
@@ -470,7 +470,7 @@ fn bench_tells_where_a_generation_goes() {
     assert!(rollout > rest.into_iter().fold(0.0, f64::max), "what takes longest: {object}");
 }
 
-/// Of stages the first plays, however it is laid out; a generation is one episode, as a rollout is.
+/// With stages, `bench` plays the first one. A generation is one episode, as a rollout is.
 #[test]
 fn bench_plays_the_first_stage() {
     let text = format!(
@@ -508,4 +508,42 @@ fn bench_refuses_what_it_cannot_lay_out() {
         assert!(error.contains(named), "{error}");
         assert!(output.stdout.is_empty());
     }
+}
+
+#[test]
+fn a_flag_named_like_a_config_key_is_offered_as_set() {
+    let told = |arguments: &[&str]| String::from_utf8(flotilla(arguments).stderr).unwrap();
+    assert!(told(&["train", "x.toml", "--steps", "50"]).contains("'--set world.steps=VALUE'"));
+    assert!(told(&["check", "x.toml", "--start-jitter=2"]).contains("'--set learning.start_jitter=VALUE'"));
+    // Not by a command that has no --set, and not for a name that is no key.
+    assert!(!told(&["plot", "run", "--steps", "50"]).contains("--set"));
+    assert!(!told(&["train", "x.toml", "--colour", "red"]).contains("VALUE"));
+    let (_folder, path) = written(include_str!("../configs/chaotic.toml"));
+    let twice = told(&["check", path.to_str().unwrap(), "--set", "generations=3"]);
+    assert!(twice.contains("`learning.generations`") && twice.contains("`checkpoint.generations`"), "{twice}");
+}
+
+#[test]
+fn help_lists_every_command_once_in_a_group() {
+    let help = String::from_utf8(flotilla(&["help"]).stdout).unwrap();
+    let mut group = "";
+    let mut found = Vec::new();
+    for line in help.lines() {
+        match line.strip_prefix("  ") {
+            Some(command) if !command.starts_with('-') => found.push((group, command.split(' ').next().unwrap())),
+            Some(_) => {}
+            None => group = line,
+        }
+    }
+    let all: Vec<_> =
+        flotilla::cli::command().get_subcommands().map(|command| command.get_name().to_string()).collect();
+    let mut names: Vec<_> = found.iter().map(|(_, name)| name.to_string()).collect();
+    names.sort();
+    assert_eq!(names, {
+        let mut all = all;
+        all.retain(|name| name != "help");
+        all.sort();
+        all
+    });
+    assert!(found.contains(&("Train:", "sweep")) && found.contains(&("Look at results:", "replay")), "{found:?}");
 }

@@ -17,33 +17,16 @@ use flotilla::record::checkpoint;
 use flotilla::record::disk::Disk;
 use flotilla::record::hex;
 use sha2::{Digest, Sha256};
-use support::Place;
-
-/// Takes milliseconds.
-const SMALL: &str = "\
-[world]
-leaders = [[10, 5], [20, 5]]
-followers = [[12, 2], [22, 2]]
-pois = [[10, 9], [20, 9]]
-coupling = 2
-steps = 8
-[policy]
-hidden = [3]
-[learning]
-population = 6
-generations = 4
-trials = 2
-[checkpoint]
-generations = 1
-";
+use support::{Place, TINY, tiny};
 
 /// Takes minutes, with many short generations.
 fn long() -> String {
-    SMALL.replace("generations = 4", "generations = 200000").replace("generations = 1\n", "generations = 0\n")
+    tiny(200000, "generations = 0")
 }
 
 fn place() -> Place {
-    Place::new(&[("small.toml", SMALL), ("grid.toml", &format!("{SMALL}[grid]\n\"world.coupling\" = [1, 2]\n"))])
+    let small = tiny(4, "generations = 1");
+    Place::new(&[("small.toml", &small), ("grid.toml", &format!("{small}[grid]\n\"world.coupling\" = [1, 2]\n"))])
 }
 
 /// Builds a library that replaces functions of the C library, to be named in `LD_PRELOAD`.
@@ -122,12 +105,12 @@ fn a_config_whose_name_is_dots_gets_a_folder_of_its_own() {
 #[test]
 fn a_flag_that_does_not_fit_a_stage_is_named() {
     let stage = "[[stages]]\nfrom = 3\nset = { \"world.coupling\" = 3 }\n";
-    let place = Place::new(&[("staged.toml", &format!("{SMALL}{stage}"))]);
+    let place = Place::new(&[("staged.toml", &format!("{TINY}{stage}"))]);
     place.good("check staged.toml");
     let text = place.refused(2, "check staged.toml --seed 7 --set world.observers=\"leaders\"");
     assert!(text.contains("--set") && text.contains("stages[0]") && !text.contains("--seed"), "{text}");
     // What is wrong in the file stays the file's.
-    place.write("wrong.toml", format!("{SMALL}{}", stage.replace("= 3 }", "= 300 }")));
+    place.write("wrong.toml", format!("{TINY}{}", stage.replace("= 3 }", "= 300 }")));
     let text = place.refused(1, "check wrong.toml --seed 7");
     assert!(text.contains("wrong.toml:") && !text.contains("--seed"), "{text}");
 }
@@ -292,7 +275,7 @@ fn the_longest_config_is_read_in_seconds() {
         }
         text
     };
-    let stages = format!("{SMALL}[[stages]]\nfrom = 1\n[stages.set]\n");
+    let stages = format!("{TINY}[[stages]]\nfrom = 1\n[stages.set]\n");
     let texts = [
         ("returns", repeated("", "\r", "")),
         ("escapes", repeated("a=\"", r"\q", "\"")),

@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use flotilla::config::{
-    Actions, Config, ConfigError, Coupling, Density, Domain, Elites, Fitness, Follow, Heading, Learning, LedBy,
-    MAX_EPISODES, MAX_GENERATIONS, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Motion,
-    Mutation, Observers, Override, Paradigm, Parents, Policy, Problem, Saving, Sense, Sharing,
+    Actions, CheckpointConfig, Config, ConfigError, Coupling, Density, Elites, Fitness, Follow, Heading, Learning,
+    LedBy, MAX_EPISODES, MAX_GENERATIONS, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS,
+    Motion, Mutation, Observers, Override, Paradigm, Parents, Policy, Problem, Sense, Sharing, WorldConfig,
 };
 use flotilla::reader::Document;
 use proptest::collection::vec;
@@ -25,7 +25,7 @@ fn problems(text: &str) -> Vec<Problem> {
 fn every_key_but_leaders_and_pois_has_its_default() {
     let config = Config::parse(SMALLEST, "test.toml").unwrap();
     let expected = Config {
-        world: Domain {
+        world: WorldConfig {
             map: [50.0, 50.0],
             leaders: vec![[1.0, 2.0]],
             followers: vec![],
@@ -57,7 +57,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
         policy: Policy { hidden: vec![10], actions: Actions::Direct },
         learning: Learning {
             paradigm: Paradigm::LeaderFollower,
-            sharing: Sharing::None,
+            sharing: Sharing::PerLeader,
             fitness: Fitness::Df,
             population: 50,
             generations: 100,
@@ -74,7 +74,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             poi_jitter: 0.0,
             seed: 0,
         },
-        checkpoint: Saving { generations: 0, seconds: 30.0 },
+        checkpoint: CheckpointConfig { generations: 0, seconds: 30.0 },
         stages: vec![],
     };
     assert_eq!(config, expected);
@@ -204,7 +204,7 @@ fn word<T: flotilla::config::Choice + std::fmt::Debug>() -> impl Strategy<Value 
     (0..T::ALL.len()).prop_map(|index| T::ALL[index].1)
 }
 
-fn worlds() -> impl Strategy<Value = (Domain, Motion)> {
+fn worlds() -> impl Strategy<Value = (WorldConfig, Motion)> {
     let speeds = (size_or_zero(1e-6, 1e3), 0.0..=1.0, 0.0..=1.0).prop_map(|(max, a, b): (f64, f64, f64)| {
         let tidy = |speed: f64| if speed < 1e-6 { 0.0 } else { speed };
         let min = tidy(max * a);
@@ -244,7 +244,7 @@ fn worlds() -> impl Strategy<Value = (Domain, Motion)> {
                     };
                     let after: Vec<_> = follows.into_iter().enumerate().map(before).filter(|_| kind & 2 > 0).collect();
                     (
-                        Domain {
+                        WorldConfig {
                             map,
                             leaders,
                             followers,
@@ -327,7 +327,7 @@ fn configs() -> impl Strategy<Value = Config> {
         },
     );
     let checkpoint = (0..=MAX_GENERATIONS, prop_oneof![Just(0.0), 0.01..=1e9])
-        .prop_map(|(generations, seconds)| Saving { generations, seconds });
+        .prop_map(|(generations, seconds)| CheckpointConfig { generations, seconds });
     (worlds(), follow, sense, policy, learning, checkpoint).prop_map(
         |((mut world, motion), follow, sense, policy, mut learning, checkpoint)| {
             if learning.elites == Elites::Count(0) {
@@ -438,7 +438,7 @@ fn counts_at_their_limits_are_valid() {
     }
 }
 
-/// What is wrong with who observes, when and in what order is told with its line and its place in the list.
+/// Errors in observers, windows and order name the line and the place in the list.
 #[test]
 fn rules_that_cannot_be_are_refused_where_they_stand() {
     let world = |rest: &str| {

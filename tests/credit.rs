@@ -1,9 +1,8 @@
 //! Credit against its definition: the record is edited (agents taken out, copies added) and G counted anew, step by step
 //! as the rule has it.
 
-use flotilla::backend::{Episode, RecordRequest, Seen, Strided, owner_bits};
 use flotilla::config::{Fitness, LedBy, Observers};
-use flotilla::credit::{Credit, Scores};
+use flotilla::credit::{Credit, Episode, RecordRequest, Scores, Seen, Strided, owner_bits};
 use flotilla::model::rule;
 use flotilla::world::{Constants, Led, World};
 use glam::Vec2;
@@ -33,7 +32,7 @@ struct Rule {
     after: Vec<Vec<usize>>,
 }
 
-/// What a record by hand leaves out.
+/// The parts that a record made by hand leaves out.
 const EMPTY: Record = Record {
     leaders: 0,
     followers: 0,
@@ -96,7 +95,7 @@ impl Record {
 
     /// What a need leaves of the record: of each POI the sets that are large enough and that no other contains, and the
     /// leader that each follower saw most.
-    fn packed(&self, need: RecordRequest) -> (Vec<u32>, Vec<u32>) {
+    fn packed(&self, need: RecordRequest<'_>) -> (Vec<u32>, Vec<u32>) {
         let (pois, words) = (self.coupling.len(), (self.leaders + self.followers).div_ceil(32));
         let contains = |a: &[usize], b: &[usize]| b.iter().all(|agent| a.contains(agent));
         let kept = |poi: usize| {
@@ -304,7 +303,7 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
     let [sets, seen, sights] = record.words(stride, offset, rng);
     let strided = |words| Strided { words, stride, offset };
     let (sights, seen) = (strided(&sights), Seen::Counts(strided(&seen)));
-    let episode = Episode { group: 0, team: 0, sets: strided(&sets), seen, sights };
+    let episode = Episode { sets: strided(&sets), seen, sights };
     let expected = record.scores();
     assert_eq!(credit.all(&episode, &world), expected);
     let without = Episode { sights: Strided::NONE, ..episode };
@@ -319,13 +318,14 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
     if world.rule.is_timed() {
         return expected;
     }
-    let needs = [Fitness::G, Fitness::D, Fitness::Df, Fitness::Dpp].map(RecordRequest::Score);
-    for need in [RecordRequest::Scores].into_iter().chain(needs) {
-        let (sets, owners) = record.packed(need);
+    let needs: [&[Fitness]; 5] =
+        [&[Fitness::D, Fitness::Df, Fitness::Dpp], &[Fitness::G], &[Fitness::D], &[Fitness::Df], &[Fitness::Dpp]];
+    for need in needs {
+        let (sets, owners) = record.packed(RecordRequest(need));
         let whole = |words| Strided { words, stride: 1, offset: 0 };
         let seen = Seen::Owners(whole(&owners));
-        let episode = Episode { group: 0, team: 0, sets: whole(&sets), seen, sights: Strided::NONE };
-        let RecordRequest::Score(fitness) = need else {
+        let episode = Episode { sets: whole(&sets), seen, sights: Strided::NONE };
+        let &[fitness] = need else {
             let found = Scores { dt: expected.dt.clone(), ..credit.all(&episode, &world) };
             assert_eq!(found, expected, "packed");
             continue;

@@ -7,8 +7,9 @@ use std::path::{Path, PathBuf};
 
 use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::{Backend, BackendError, Group, RecordRequest, Trace, Visit};
-use flotilla::record::evidence::{Compared, SCHEMA, Sighting, Tier};
+use flotilla::backend::{Backend, BackendError, Group, GroupScores, Trace};
+use flotilla::config::Fitness;
+use flotilla::record::evidence::{Compared, MachineReport, SCHEMA, Tier};
 use flotilla::verify::{self, Plan};
 
 #[path = "../examples/evidence.rs"]
@@ -35,7 +36,7 @@ fn a_report_needs_no_gpu() {
     let table = String::from_utf8(output.stdout).unwrap();
 
     let text = fs::read_to_string(&file).unwrap();
-    let found = Sighting::parse(&text).unwrap();
+    let found = MachineReport::parse(&text).unwrap();
     assert_eq!((found.schema, found.tier, found.note.as_deref()), (SCHEMA, Tier::Executed, Some("a test")));
     assert_eq!(found.date.len(), "2026-01-31".len());
     assert!(found.target.starts_with(std::env::consts::ARCH), "{}", found.target);
@@ -58,17 +59,17 @@ fn a_report_needs_no_gpu() {
 /// Right but where scores of one kind are asked for: there teams play each other's policies.
 struct Liar {
     cpu: Cpu,
-    about: RecordRequest,
+    about: &'static [Fitness],
 }
 
 impl Backend for Liar {
-    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
+    fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         let reversed: Vec<Vec<u32>> = groups.iter().map(|group| group.teams.iter().rev().copied().collect()).collect();
         let told = groups.iter().zip(&reversed);
         let told: Vec<Group<'_>> = told
-            .map(|(group, teams)| if group.need == self.about { Group { teams, ..*group } } else { *group })
+            .map(|(group, teams)| if group.fitnesses == self.about { Group { teams, ..*group } } else { *group })
             .collect();
-        self.cpu.rollout(&told, visit)
+        self.cpu.play(&told)
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
@@ -84,7 +85,7 @@ impl Backend for Liar {
 fn one_world_is_asked_for_scores_of_every_kind() {
     let worlds = verify::short_trainings().into_iter().take(1).collect();
     let plan = Plan { worlds, teams: 64, seed: 0, generations: 0 };
-    for about in RecordRequest::OF_SCORES {
+    for about in verify::KINDS {
         let mut liar = Liar { cpu: Cpu::default(), about };
         let found = verify::compare(&plan, &mut Cpu::default(), &mut liar, |_| {}).unwrap();
         assert!(found.mismatch.as_ref().is_some_and(|told| told.contains("stage credit")), "{about:?}: {found:?}");
@@ -140,7 +141,7 @@ fn a_row_that_differs_shows() {
         };
         let trained =
             vec![flotilla::record::evidence::ShortTraining { config: "chaotic".into(), digest: digest.into() }];
-        let evidence = Sighting { comparisons: vec![comparison], trained, ..Sighting::new(Tier::Executed) };
+        let evidence = MachineReport { comparisons: vec![comparison], trained, ..MachineReport::new(Tier::Executed) };
         fs::write(folder.path().join(format!("{name}.json")), evidence.to_json()).unwrap();
     };
     row("one", "aa", None);
@@ -156,7 +157,7 @@ fn a_row_that_differs_shows() {
     assert!(error.contains("four.json"), "{error}");
 }
 
-/// What the page says is tested is a test that there is.
+/// Every test that the page names exists.
 #[test]
 fn the_tests_that_the_page_names_are_there() {
     let page = fs::read_to_string(root().join("docs/develop/evidence.md")).unwrap();

@@ -8,7 +8,7 @@ use std::collections::HashSet;
 
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, Group, RecordRequest};
+use flotilla::backend::{Backend, Group};
 use flotilla::config::{Actions, Config, Elites, Fitness, Learning, Mutation, Paradigm, Parents, Sharing, ValidConfig};
 use flotilla::credit::Credit;
 use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, UNCHANGED};
@@ -507,12 +507,12 @@ fn arms() -> Vec<Config> {
         }),
         config(GENERALLY_FORWARD, |config| {
             small(config, 11, 4, 2);
-            (config.learning.sharing, config.learning.fitness) = (Sharing::All, Fitness::D);
+            (config.learning.sharing, config.learning.fitness) = (Sharing::Shared, Fitness::D);
             (config.learning.start_jitter, config.learning.episodes_per_team) = (0.5, 2);
         }),
         config(STRICTLY_FORWARD, |config| {
             small(config, 13, 5, 1);
-            (config.learning.sharing, config.learning.paradigm) = (Sharing::All, Paradigm::AllLeaders);
+            (config.learning.sharing, config.learning.paradigm) = (Sharing::Shared, Paradigm::AllLeaders);
             config.policy.actions = Actions::Behaviours;
             (config.learning.poi_jitter, config.learning.episodes_per_team) = (3.0, 3);
             config.world.coupling = flotilla::config::Coupling::Same(2);
@@ -558,7 +558,7 @@ fn train(configs: &[Config]) -> Vec<(Vec<Row>, Vec<Vec<f32>>)> {
     let (mut trainer, mut backend) = (Trainer::new(ValidConfig::all(configs).unwrap()), Cpu::default());
     let mut rows = vec![Vec::new(); configs.len()];
     for row in trainer.finish(&mut backend).unwrap() {
-        rows[row.arm].push(row);
+        rows[row.experiment].push(row);
     }
     rows.into_iter().enumerate().map(|(arm, rows)| (rows, trainer.policies(arm))).collect()
 }
@@ -568,7 +568,7 @@ fn arms_side_by_side_come_out_as_alone() {
     let configs = arms();
     for (arm, (rows, policies)) in train(&configs).into_iter().enumerate() {
         let (mut alone, same) = train(&configs[arm..=arm]).remove(0);
-        alone.iter_mut().for_each(|row| row.arm = arm);
+        alone.iter_mut().for_each(|row| row.experiment = arm);
         assert_eq!(rows, alone, "arm {arm}");
         assert_eq!(policies, same, "arm {arm}");
         let config = &configs[arm].learning;
@@ -609,24 +609,27 @@ impl Plain<'_> {
             evolve::jitter_starts(key, generation, episode, &of_stage, start_jitter, &mut starts);
             evolve::jitter_pois(self.key(Purpose::Pois), generation, episode, &of_stage, poi_jitter, &mut starts);
             let teams = vec![0; team.len()];
-            let (world, weights, need) = (&of_stage, weights[..].into(), RecordRequest::Sights);
-            let group = Group { world, starts: &starts, weights, policies: 1, teams: &teams, need };
-            let found = std::sync::Mutex::new(None);
-            let visit = |episode: flotilla::backend::Episode<'_>| {
-                let scores = Credit::default().all(&episode, &of_stage);
-                let mine = match fitness {
-                    Fitness::G => vec![scores.g; team.len()],
-                    Fitness::D => scores.d,
-                    Fitness::Df => scores.df,
-                    Fitness::Dpp => scores.dpp,
-                    Fitness::Dt => scores.dt,
-                };
-                assert!(found.lock().unwrap().replace((scores.observed, mine)).is_none(), "one visit a team");
+            let group = Group {
+                world: &of_stage,
+                starts: &starts,
+                weights: weights[..].into(),
+                policies: 1,
+                sharing: Sharing::PerLeader,
+                teams: &teams,
+                fitnesses: &[Fitness::Dt],
             };
-            Cpu::default().rollout(&[group], &visit).unwrap();
-            let (pois, scores) = found.into_inner().unwrap().unwrap();
-            observed += pois;
-            totals.iter_mut().zip(scores).for_each(|(total, score)| *total += f64::from(score));
+            // From the whole record.
+            let trace = Cpu::default().trace(&group).unwrap();
+            let scores = Credit::default().all(&trace.episode(&of_stage, 0), &of_stage);
+            let mine = match fitness {
+                Fitness::G => vec![scores.g; team.len()],
+                Fitness::D => scores.d,
+                Fitness::Df => scores.df,
+                Fitness::Dpp => scores.dpp,
+                Fitness::Dt => scores.dt,
+            };
+            observed += scores.observed;
+            totals.iter_mut().zip(mine).for_each(|(total, score)| *total += f64::from(score));
         }
         (
             f64::from(observed) / (of_stage.pois.len() * episodes_per_team) as f64,
@@ -647,7 +650,7 @@ impl Plain<'_> {
             let stage = self.config.at(generation);
             let mut teams = vec![0; population * leaders];
             evolve::form_teams(self.key(Purpose::Teams), generation, leaders, &mut teams);
-            let shared = self.config.learning.sharing == Sharing::All;
+            let shared = self.config.learning.sharing == Sharing::Shared;
             let (mut observed, mut fitness) = (Vec::new(), vec![vec![0.0; population]; self.policies.len()]);
             for (index, team) in teams.chunks(leaders).enumerate() {
                 let team: Vec<usize> =
@@ -675,7 +678,7 @@ impl Plain<'_> {
             let champion: Vec<usize> = (0..leaders).map(|leader| ranked[if shared { 0 } else { leader }][0]).collect();
             let (champion, _) = self.play(generation + 1, &stage, &champion);
             rows.push(Row {
-                arm: 0,
+                experiment: 0,
                 trial: self.trial,
                 generation,
                 best_g: observed.iter().copied().fold(0.0, f64::max),
@@ -715,7 +718,7 @@ fn mean(shares: &[f64], stage: &Config) -> f64 {
 fn a_shared_policy_scores_the_mean_of_its_leaders() {
     let config = config(GENERALLY_FORWARD, |config| {
         (config.learning.population, config.learning.trials) = (40, 1);
-        (config.learning.sharing, config.learning.fitness) = (Sharing::All, Fitness::D);
+        (config.learning.sharing, config.learning.fitness) = (Sharing::Shared, Fitness::D);
         (config.world.coupling, config.world.steps) = (flotilla::config::Coupling::Same(1), 80);
         config.world.observation_radius = 8.0;
     });
@@ -784,7 +787,7 @@ fn the_trainer_is_algorithm_1() {
             let fresh = (0..config.populations()).map(population).collect();
             let (expected, weights) = Plain { config, world, trial, policies: fresh }.train();
             let rows: Vec<Row> =
-                rows.iter().filter(|row| row.trial == trial).map(|&row| Row { arm: 0, ..row }).collect();
+                rows.iter().filter(|row| row.trial == trial).map(|&row| Row { experiment: 0, ..row }).collect();
             assert_eq!(rows, expected, "arm {arm}, trial {trial}");
             assert_eq!(bits(policies), bits(&weights), "arm {arm}, trial {trial}");
             improved += usize::from(rows.last().unwrap().mean_g > rows[0].mean_g);

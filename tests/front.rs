@@ -1,4 +1,4 @@
-//! What programs are offered comes to what the program comes to, and refuses what is wrong without a panic.
+//! The library's functions give the program's results, and refuse wrong input without a panic.
 
 #![cfg(feature = "cli")]
 
@@ -10,7 +10,8 @@ use std::path::Path;
 
 use flotilla::Config;
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::{Backend, Group, RecordRequest};
+use flotilla::backend::{Backend, Group};
+use flotilla::config::Sharing;
 use flotilla::config::{Fitness, MAX_AGENTS, MAX_POPULATION, MAX_STEPS, Stage};
 use flotilla::evaluate::Starts;
 use flotilla::front::{self, Failure, Processor, Trained};
@@ -44,7 +45,7 @@ fn config(seed: u64) -> Config {
     config
 }
 
-/// What the program makes of a config in a folder.
+/// The program's result for a config in a folder.
 fn recorded(config: &Config, folder: &Path) -> String {
     recorded_from(config, folder, None)
 }
@@ -220,8 +221,9 @@ fn given_policies_are_played_and_traced_team_by_team() {
             starts: &from,
             weights: weights[..].into(),
             policies: teams,
+            sharing: Sharing::PerLeader,
             teams: &order,
-            need: RecordRequest::Record,
+            fitnesses: &[],
         };
         let trace = backend.trace(&group).expect("it fits");
         let (agents, steps) = (world.agents(), world.steps());
@@ -334,7 +336,7 @@ fn a_processor_is_found() {
     assert!(error.to_string().contains("no such adapter"), "{error}");
 }
 
-/// Which flag helps, the command line tells.
+/// The command line names the flag that helps.
 #[test]
 fn errors_of_the_library_speak_of_no_flags() {
     fn walk(folder: &Path, found: &mut Vec<String>) {

@@ -12,7 +12,7 @@ use std::sync::LazyLock;
 use flotilla::backend::cpu::{Cpu, level_name};
 #[cfg(feature = "gpu")]
 use flotilla::backend::gpu::{self, episode::GpuBackend};
-use flotilla::backend::{Backend, BackendError, Episode, Group, RecordRequest, Trace, Visit};
+use flotilla::backend::{Backend, BackendError, Group, GroupScores, Trace};
 use flotilla::config::{Config, Override, ValidConfig};
 use flotilla::trainer::{Row, Trainer};
 use flotilla::world::World;
@@ -37,7 +37,7 @@ coupling = 4
 /// Name, what is covered, the config and what of it is changed.
 type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
-/// Which between them cover every choice that a config has, and sizes on both sides of every special case.
+/// Together these cases cover every choice that a config has, and sizes on both sides of every special case.
 const CASES: [Case; 27] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
@@ -217,7 +217,7 @@ fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// What a run came to.
+/// The result of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Golden {
     /// Bytes hashed and their SHA-256, as `flotilla train` tells it.
@@ -233,8 +233,8 @@ pub fn train(configs: &[Config], backend: &mut dyn Backend) -> Vec<(Golden, f64)
     let mut texts = vec![String::from("trial,generation,best_g,mean_g,champion_g\n"); configs.len()];
     let mut most = vec![0f64; configs.len()];
     for row in trainer.finish(backend).unwrap() {
-        most[row.arm] = most[row.arm].max(row.best_g);
-        let Row { arm, trial, generation, best_g, mean_g, champion_g } = row;
+        most[row.experiment] = most[row.experiment].max(row.best_g);
+        let Row { experiment: arm, trial, generation, best_g, mean_g, champion_g } = row;
         writeln!(texts[arm], "{trial},{generation},{best_g},{mean_g},{champion_g}").unwrap();
     }
     let golden = |(arm, text): (usize, &String)| {
@@ -260,15 +260,16 @@ fn trace(backend: &mut dyn Backend, config: &Config, world: &World, weights: &[f
         starts: &world.starts,
         weights: weights.into(),
         policies,
+        sharing: config.learning.sharing,
         teams: &teams,
-        need: RecordRequest::Record,
+        fitnesses: &[],
     };
     let trace = backend.trace(&group).unwrap();
     let floats: Vec<f32> = bytemuck::cast_slice(&trace.moments).iter().map(|float: &f32| float + 0.0).collect();
     hex(&Sha256::digest(bytemuck::cast_slice::<f32, u8>(&floats)))
 }
 
-/// What it takes to compare runs with those of the past, or to mint them.
+/// The recorded runs. `FLOTILLA_MINT=1` records them anew.
 static GOLDEN: LazyLock<Vec<Golden>> = LazyLock::new(|| {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden.txt");
     // Not read from disk, where there is none.
@@ -346,17 +347,16 @@ struct Few {
 }
 
 impl Backend for Few {
-    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
-        for (index, group) in groups.iter().enumerate() {
-            let leaders = group.world.leaders();
-            for (chunk, teams) in group.teams.chunks(self.teams * leaders).enumerate() {
-                let team = |team: usize| chunk * self.teams + team;
-                self.backend.rollout(&[Group { teams, ..*group }], &|episode| {
-                    visit(Episode { group: index, team: team(episode.team), ..episode });
-                })?;
+    fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
+        let mut all = vec![GroupScores::default(); groups.len()];
+        for (group, all) in groups.iter().zip(&mut all) {
+            for teams in group.teams.chunks(self.teams * group.world.leaders()) {
+                let few = self.backend.play(&[Group { teams, ..*group }])?.remove(0);
+                all.observed.extend(few.observed);
+                all.scores.extend(few.scores);
             }
         }
-        Ok(())
+        Ok(all)
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {

@@ -9,28 +9,13 @@ use std::fs;
 use std::os::unix::ffi::OsStrExt;
 use std::process::Command;
 
-use support::Place;
+use support::{Place, TINY};
 
-/// Takes milliseconds.
-const SMALL: &str = "\
-[world]
-leaders = [[10, 5], [20, 5]]
-followers = [[12, 2], [22, 2]]
-pois = [[10, 9], [20, 9]]
-coupling = 2
-steps = 8
-[policy]
-hidden = [3]
-[learning]
-population = 6
-generations = 4
-trials = 2
-";
 const SWEEP: &str = "[grid]\n\"world.coupling\" = [1, 2]\n\"learning.fitness\" = [\"G\", \"Df\"]\n";
 
 /// A folder to type in, with `small.toml` and `grid.toml`.
 fn place() -> Place {
-    Place::new(&[("small.toml", SMALL), ("grid.toml", &format!("{SMALL}{SWEEP}"))])
+    Place::new(&[("small.toml", TINY), ("grid.toml", &format!("{TINY}{SWEEP}"))])
 }
 
 /// With a run in `run`.
@@ -296,7 +281,7 @@ fn a_replay_counts_pois() {
     assert!(!told.contains("G = ") && told.contains(" of 2 POIs"), "{told}");
     let nine: Vec<_> = (1..=9).map(|at| format!("[{}, 9]", 5 * at)).collect();
     let config =
-        SMALL.replace("[[10, 9], [20, 9]]", &format!("[{}]", nine.join(", "))).replace("coupling = 2", "coupling = 1");
+        TINY.replace("[[10, 9], [20, 9]]", &format!("[{}]", nine.join(", "))).replace("coupling = 2", "coupling = 1");
     fs::write(place.path("nine.toml"), &config).unwrap();
     place.good("train nine.toml --out nine --quiet");
     let (told, _) = place.good("replay nine --out r.svg");
@@ -412,7 +397,7 @@ fn files_cannot_steer_a_terminal() {
         "\"learning.fitness\" = [\"x\\ny\", \"x\\ny\"]",
         "\"learning.fitness\" = \"x\\ny\"",
     ] {
-        fs::write(place.path("bad.toml"), format!("{SMALL}[grid]\n{grid}\n")).unwrap();
+        fs::write(place.path("bad.toml"), format!("{TINY}[grid]\n{grid}\n")).unwrap();
         let told = place.refused(1, "sweep bad.toml");
         assert!(!told.contains('\u{1b}') && told.lines().count() == 1, "{told:?}");
     }
@@ -450,12 +435,12 @@ fn a_wrong_value_by_flag_is_wrong_usage_wherever_it_is_found() {
         &["verify", "--adapter", ""],
         &["verify", "--worlds", "4294967295"],
         &["sweep", "grid.toml", "--slurm", "--time", ":"],
-        &["bench", "--adapter", "nonsense", "--json"],
+        &["bench", "--adapter", "nonsense"],
     ] {
         place.refused(2, words);
     }
     // A file that is wrong is a failure, alone or with a flag.
-    fs::write(place.path("wrong.toml"), SMALL.replace("steps = 8", "steps = 0")).unwrap();
+    fs::write(place.path("wrong.toml"), TINY.replace("steps = 8", "steps = 0")).unwrap();
     place.refused(1, "check wrong.toml");
     place.refused(1, "check wrong.toml --seed -1");
     place.refused(1, "check missing.toml --seed -1");
@@ -503,7 +488,7 @@ fn names_that_are_no_text_work_but_for_scripts() {
 #[cfg(target_os = "linux")]
 #[test]
 fn few_threads_are_enough() {
-    let place = Place::new(&[("small.toml", SMALL)]);
+    let place = Place::new(&[("small.toml", TINY)]);
     let all = std::os::unix::fs::PermissionsExt::from_mode(0o777);
     std::fs::set_permissions(place.root(), all).unwrap();
     if place.shell("prlimit --version && setpriv --version").status.code() != Some(0) {
@@ -542,7 +527,7 @@ fn few_threads_are_enough() {
 #[cfg(target_os = "linux")]
 #[test]
 fn little_address_space_is_an_error() {
-    let place = Place::new(&[("small.toml", SMALL)]);
+    let place = Place::new(&[("small.toml", TINY)]);
     let mut refused = 0;
     for mib in (20..=120).step_by(10) {
         let line = "flotilla train small.toml --backend cpu --threads 4 --quiet --out run";

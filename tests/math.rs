@@ -6,7 +6,7 @@ use fearless_simd::{Level, dispatch, prelude::*};
 use flotilla::kernels::math;
 use rayon::prelude::*;
 
-/// What a test runs over slices.
+/// A function over slices to test.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Function {
     Rsqrt,
@@ -110,13 +110,13 @@ fn power(exponent: i32) -> f32 {
 
 #[test]
 fn rsqrt_is_within_2_ulp() {
-    assert!(sweep(Rsqrt, power(-80), power(40), |x| 1.0 / x.sqrt()).ulp < 2.0);
+    assert!(sweep(Rsqrt, power(-80), power(48), |x| 1.0 / x.sqrt()).ulp < 2.0);
     assert_eq!(0.0 * run(Level::new(), Rsqrt, &[0.0; 16])[0], 0.0);
 }
 
 #[test]
 fn root_is_within_2_ulp() {
-    assert!(sweep(Root, power(-80), power(40), f64::sqrt).ulp < 2.1);
+    assert!(sweep(Root, power(-80), power(48), f64::sqrt).ulp < 2.1);
     assert_eq!(run(Level::new(), Root, &[0.0; 16])[0].to_bits(), 0);
 }
 

@@ -109,7 +109,7 @@ fn a_run_that_does_not_fit_does_not_start() {
     assert!(!out.exists(), "nothing is written");
 }
 
-/// Of configs side by side, what lives in turn counts once, and the rest adds up.
+/// For configs that train together, memory that is used in turn counts once, and the rest adds up.
 #[test]
 fn plans_add_up() {
     let config = |population| Config::parse(&text(population, 2, 1, "generations = 1"), "config").unwrap();
@@ -123,7 +123,7 @@ fn plans_add_up() {
     assert!(!memory::copies_checkpoint(&[config(40_000)]));
 }
 
-/// Of stages, the one that takes most counts, whenever it comes.
+/// With stages, the one that takes most memory counts, wherever it is in the order.
 #[test]
 fn stages_take_what_the_largest_takes() {
     let plain = text(1000, 2, 9, "generations = 1");
@@ -165,7 +165,7 @@ fn states_between_dispatches_are_counted() {
     assert_eq!(Peaks::of([&config], 1).adapter, 2 * 51 * (weights + record + states) / 2);
 }
 
-/// What is written from the populations is what would be written from a copy of them.
+/// Writing from the populations and writing from a copy of them give the same file.
 #[test]
 fn checkpoints_need_no_copy() {
     let config = Config::parse(&text(60, 2, 9, "generations = 1"), "config").unwrap();

@@ -12,9 +12,9 @@ mod support;
 use std::f64::consts::PI;
 
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, Group, Moment, RecordRequest, Trace};
+use flotilla::backend::{Backend, Group, Moment, Trace};
 use flotilla::bench::with_agents;
-use flotilla::config::{Actions, Config, Coupling, Density, Paradigm};
+use flotilla::config::{Actions, Config, Coupling, Density, Fitness, Paradigm, Sharing};
 use flotilla::sample;
 use flotilla::world::World;
 use flotilla::world::on_grid;
@@ -89,7 +89,7 @@ impl Pull {
     }
 }
 
-/// What the followers' rule makes of an agent's surroundings.
+/// The followers' rule, applied to an agent's surroundings.
 struct Force {
     s: DVec2,
     /// Lengths of all parts together: roundings of `s` are in proportion to it.
@@ -332,7 +332,7 @@ impl Model {
     }
 }
 
-/// What was compared, and how closely it agreed.
+/// The number of comparisons, and the largest difference.
 #[derive(Default)]
 struct Tally {
     agent_steps: u64,
@@ -387,11 +387,18 @@ fn check(cpu: &mut Cpu, world: &Config, model: &Model, seed: u64) -> Tally {
         .map(|start| start + Vec2::new(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0)) * jitter)
         .map(|start| on_grid(start, model.map.as_vec2()))
         .collect();
-    let (world, need) = (&compiled, RecordRequest::Sights);
     // POIs of an episode may be elsewhere than the world's.
     let moved: Vec<Vec2> = model.moved.iter().flatten().map(|poi| poi.as_vec2()).collect();
     let places = [&starts[..], &moved].concat();
-    let group = Group { world, starts: &places, weights: weights[..].into(), policies, teams: &teams, need };
+    let group = Group {
+        world: &compiled,
+        starts: &places,
+        weights: weights[..].into(),
+        policies,
+        sharing: Sharing::PerLeader,
+        teams: &teams,
+        fitnesses: &[Fitness::Dt],
+    };
     let trace = cpu.trace(&group).unwrap();
     assert_eq!((trace.teams, trace.agents), (TEAMS, model.agents));
     let mut tally = Tally::default();
@@ -590,8 +597,9 @@ actions = 'behaviours'";
             starts: &world.starts,
             weights: weights[..].into(),
             policies: 1,
+            sharing: Sharing::PerLeader,
             teams: &teams,
-            need: RecordRequest::Record,
+            fitnesses: &[],
         };
         for level in Cpu::levels() {
             let trace = Cpu::at_level(level).trace(&group).unwrap();
@@ -609,8 +617,9 @@ actions = 'behaviours'";
         starts: &world.starts,
         weights: weights[..].into(),
         policies: 1,
+        sharing: Sharing::PerLeader,
         teams: &[0, 0],
-        need: RecordRequest::Record,
+        fitnesses: &[],
     };
     let trace = Cpu::default().trace(&group).unwrap();
     assert_eq!(trace.moment(1, 0, 0).outputs, front_right);

@@ -31,7 +31,7 @@ const CHIPS: [&str; 3] = ["sm_75", "sm_86", "sm_90"];
 /// lets one more workgroup run beside it.
 const STACK: u64 = 24;
 
-/// What Metal's library gives, for CUDA.
+/// Metal's library functions, for CUDA.
 const HEADER: &str = "
 #define INLINE __host__ __device__ __forceinline__ constexpr
 namespace metal {
@@ -217,7 +217,7 @@ fn with_float_literals(line: &str) -> String {
     out + rest
 }
 
-/// What came of a kernel.
+/// The result of compiling a kernel.
 struct Compiled {
     registers: u64,
     /// Bytes: of local memory, and what spills write and read of it.
@@ -336,10 +336,10 @@ fn table() {
 /// Notes what was read where `FLOTILLA_EVIDENCE` says.
 #[cfg(feature = "record")]
 fn note(findings: Vec<String>) {
-    use flotilla::record::evidence::{Sighting, Tier};
+    use flotilla::record::evidence::{MachineReport, Tier};
     let Some(folder) = std::env::var_os("FLOTILLA_EVIDENCE") else { return };
     let note = format!("NVIDIA's {}, of naga's Metal text made CUDA, for chips that were not there", version());
-    let sighting = Sighting { note: Some(note), findings, ..Sighting::new(Tier::MachineCodeRead) };
+    let sighting = MachineReport { note: Some(note), findings, ..MachineReport::new(Tier::MachineCodeRead) };
     std::fs::write(Path::new(&folder).join("nvidia.json"), sighting.to_json()).expect("the folder takes a file");
 }
 

@@ -398,6 +398,73 @@ mod links {
         unchanged(&place, &victim, &[&format!("{paper} --force"), &format!("{paper} --resume")]);
     }
 
+    /// A file that a flag names is no exception: somebody else may have planted the link.
+    #[test]
+    fn named_files_in_our_folders_are_not_written_through_links() {
+        let place = with_run();
+        let victim = victim(&place);
+        place.good("sweep grid.toml --out sweep --quiet");
+        let run = ["plot run --out run/x.svg", "replay run --quiet --out run/x.html"];
+        let rollout = "rollout small.toml --policies run/policies.safetensors";
+        let others = [
+            format!("{rollout} --scores run/x.csv"),
+            format!("{rollout} --trace sweep/points/0000/x.csv"),
+            "sweep grid.toml --out new --slurm=sweep/x.sh".to_string(),
+        ];
+        for line in run.into_iter().chain(others.iter().map(String::as_str)) {
+            let path = place.path(line.rsplit([' ', '=']).next().unwrap());
+            for target in ["file", "new"] {
+                symlink(victim.join(target), &path).unwrap();
+                unchanged(&place, &victim, &[line]);
+                assert!(path.is_symlink(), "{line}");
+                fs::remove_file(&path).unwrap();
+            }
+            place.good(line);
+            assert!(path.is_file(), "{line}");
+        }
+        // The same holds from within the folder, and for a folder on the way.
+        let inside = |line: &str| {
+            let output = place.command().current_dir(place.path("run")).args(line.split(' ')).output().unwrap();
+            String::from_utf8(output.stderr).unwrap()
+        };
+        fs::remove_file(place.path("run/x.svg")).unwrap();
+        symlink(victim.join("file"), place.path("run/x.svg")).unwrap();
+        assert!(inside("plot . --out x.svg").contains("is a symbolic link"));
+        symlink(&victim, place.path("run/pictures")).unwrap();
+        unchanged(&place, &victim, &["plot run --out run/pictures/x.svg"]);
+        // What is beside the run is the user's own.
+        symlink(victim.join("file"), place.path("x.svg")).unwrap();
+        place.good("plot run --out run/../x.svg");
+        assert!(
+            fs::read_to_string(victim.join("file")).unwrap().starts_with("<svg") && place.path("x.svg").is_symlink()
+        );
+    }
+
+    #[test]
+    fn questions_are_not_written_through_links() {
+        let place = place();
+        let victim = victim(&place);
+        let questions = "paper --questions=g --trials 2 --generations 1 --out questions --quiet";
+        place.good(questions);
+        let both = [format!("{questions} --resume"), format!("{questions} --force")];
+        let both: Vec<&str> = both.iter().map(String::as_str).collect();
+        for name in ["questions.md", "places.csv", "places.svg", "places/points/0000/metrics.csv"] {
+            let path = place.path("questions").join(name);
+            fs::rename(&path, place.path("kept")).unwrap();
+            symlink(victim.join("file"), &path).unwrap();
+            unchanged(&place, &victim, &both);
+            fs::remove_file(&path).unwrap();
+            fs::rename(place.path("kept"), &path).unwrap();
+        }
+        let points = place.path("questions/places/points");
+        fs::rename(&points, place.path("points")).unwrap();
+        symlink(&victim, &points).unwrap();
+        unchanged(&place, &victim, &both);
+        fs::remove_file(&points).unwrap();
+        fs::rename(place.path("points"), &points).unwrap();
+        place.good(both[0]);
+    }
+
     /// The folder that the user names may be reached through links.
     #[test]
     fn a_link_may_be_named() {

@@ -1,4 +1,5 @@
-//! Every command of README.md and of the pages below docs/, as it stands there.
+//! Every command of README.md, CONTRIBUTING.md and the pages below docs/, as it stands there. Python blocks are run by
+//! `python/tests/test_docs.py`.
 //!
 //! The blocks of a page are run in order, in a folder of its own that is empty but for the repository's `configs/`:
 //!
@@ -28,7 +29,7 @@ use std::time::{Duration, Instant};
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use tempfile::TempDir;
 
-/// What one command may take.
+/// The time limit of one command.
 const PATIENCE: Duration = Duration::from_secs(300);
 
 fn pages() -> Vec<PathBuf> {
@@ -45,7 +46,7 @@ fn pages() -> Vec<PathBuf> {
         }
     }
     pages.sort();
-    pages.insert(0, root.join("README.md"));
+    pages.splice(0..0, ["README.md", "CONTRIBUTING.md"].map(|page| root.join(page)));
     pages
 }
 
@@ -125,7 +126,7 @@ fn read(text: &str) -> (Vec<Block>, Vec<(usize, String)>) {
     (blocks, inline)
 }
 
-/// What is wrong with the flags of a command of the program's.
+/// Returns the error in the flags of a command, if any.
 fn misread(command: &str) -> Option<String> {
     let (mut words, mut quote) = (vec![String::new()], None);
     for c in command.chars() {
@@ -214,7 +215,7 @@ fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// What a page came to.
+/// The result of a page.
 #[derive(Default)]
 struct Tried {
     ran: usize,
@@ -235,9 +236,11 @@ fn try_page(name: &str, text: &str, long: bool) -> Tried {
         }
     };
     inline.iter().for_each(|(number, command)| parse(&mut tried, *number, command));
-    let (mut broken, mut printed) = (false, String::new());
+    let (mut broken, mut printed, mut after_python) = (false, String::new(), false);
     for block in blocks {
-        if block.output && !broken {
+        // The Python package's tests run Python and compare what it prints.
+        after_python = block.language == "python" || after_python && block.output;
+        if block.output && !broken && !after_python {
             if let Some((number, line)) = not_printed(&block, &printed) {
                 tried.failed.push(format!("{name}:{number}: {line}\nis not what the last command printed:\n{printed}"));
             }
@@ -322,6 +325,14 @@ fn what_fails_in_a_page_is_told_with_its_place() {
 }
 
 #[test]
+fn output_of_python_is_left_to_pythons_tests() {
+    let page = "```\necho one\n```\n\n```python\nprint(2)\n```\n\n<!-- output -->\n\n```text\n2\n```\n";
+    assert!(try_page("p.md", page, false).failed.is_empty());
+    let page = page.replace("python\nprint(2)", "\necho two");
+    assert_eq!(try_page("p.md", &page, false).failed.len(), 1);
+}
+
+#[test]
 fn output_that_differs_is_reported() {
     let page = "```\nprintf 'one 1\\ntwo 2\\nthree 3\\n'\n```\n\n<!-- output -->\n\n```text\none 1\nth…3\n```\n";
     assert!(try_page("p.md", page, false).failed.is_empty());
@@ -343,7 +354,12 @@ fn broken_links(page: &Path) -> Vec<String> {
     let anchors = |text: &str| -> Vec<String> {
         text.lines().filter(|line| line.starts_with('#')).map(|line| anchor(line.trim_start_matches('#'))).collect()
     };
-    let text = fs::read_to_string(page).unwrap();
+    // What only the site shows leads to what only the site has; `tests/site.py` follows those links.
+    let text = fs::read_to_string(page).unwrap().replace("<!-- site:", "\0<!--");
+    let text: String = text
+        .split('\0')
+        .map(|part| part.split_once("-->").filter(|_| part.starts_with("<!--")).map_or(part, |(_, rest)| rest))
+        .collect();
     let links = text.split("](").skip(1).filter_map(|rest| rest.split_once(')')).map(|(link, _)| link);
     let broken = links.filter(|link| {
         if link.contains("://") || link.starts_with("mailto:") || link.contains(char::is_whitespace) {
@@ -361,8 +377,7 @@ fn broken_links(page: &Path) -> Vec<String> {
 #[test]
 fn every_link_of_the_pages_leads_somewhere() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let others =
-        ["CHANGELOG.md", "CONTRIBUTING.md", "python/README.md", "benches/README.md", "benches/peers/README.md"];
+    let others = ["CHANGELOG.md", "python/README.md", "benches/README.md", "benches/peers/README.md"];
     let pages = pages().into_iter().chain(others.map(|other| root.join(other)));
     let broken: Vec<_> = pages.filter(|page| page.exists()).flat_map(|page| broken_links(&page)).collect();
     assert!(broken.is_empty(), "{broken:#?}");

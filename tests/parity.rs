@@ -7,16 +7,14 @@
 
 mod support;
 
-use std::sync::Mutex;
-
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::device::Request;
 use flotilla::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy, State, Task};
 use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::population::{Brood, GatherJob};
-use flotilla::backend::{Backend, Group, Moment, RecordRequest, Weights};
-use flotilla::config::{Config, Coupling, Fitness, Observers, ValidConfig};
-use flotilla::evaluate::{Starts, evaluate};
+use flotilla::backend::{Backend, Group, Moment, Weights};
+use flotilla::config::{Config, Coupling, Fitness, Observers, Sharing, ValidConfig};
+use flotilla::evaluate::{SCORES_AND_DT, Starts, evaluate};
 use flotilla::evolve::{Breeding, Key, Purpose};
 use flotilla::gpu_struct::GpuStruct;
 use flotilla::trainer::Trainer;
@@ -31,6 +29,12 @@ const KERNELS: [Kernel; 2] = [Kernel::Generic, Kernel::Specialised];
 fn open(request: &Request, pass: Pass, kernel: Kernel) -> GpuBackend {
     let gpu = gpu::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
     GpuBackend::new(gpu).unwrap().playing(kernel).holding(ResidencyPolicy::Always).bringing(Records::Packed)
+}
+
+/// Teams that choose from each leader's own policies, scored by every fitness.
+fn of_random_policies<'a>(world: &'a World, weights: &'a [f32], policies: usize, teams: &'a [u32]) -> Group<'a> {
+    let (starts, sharing, fitnesses) = (&world.starts, Sharing::PerLeader, SCORES_AND_DT);
+    Group { world, starts, weights: weights.into(), policies, sharing, teams, fitnesses }
 }
 
 fn check(plan: &Plan, mut backend: GpuBackend) -> Agreement {
@@ -155,29 +159,18 @@ fn long_episodes_agree() {
 
 /// Batches are cut to the device's memory; where they are cut must not show.
 #[test]
-fn batches_cut_small_give_the_same_record() {
+fn batches_cut_small_give_the_same_scores() {
     let config = sample::world(3);
     let world = World::new(&config);
     let (policies, teams) = (4, 300);
     let weights = sample::weights(&world, policies, 1);
     let choice: Vec<u32> = (0..teams * world.leaders()).map(|i| (i * 7 % policies) as u32).collect();
-    let need = RecordRequest::Record;
-    let group =
-        Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &choice, need };
-    let record = |backend: &mut dyn Backend| {
-        let record = Mutex::new(vec![Vec::new(); teams]);
-        backend
-            .rollout(&[group], &|episode| {
-                record.lock().unwrap()[episode.team].extend(episode.sets.iter());
-            })
-            .unwrap();
-        record.into_inner().unwrap()
-    };
-    let expected = record(&mut Cpu::default());
-    for (request, info) in support::adapters("batches_cut_small_give_the_same_record") {
+    let group = of_random_policies(&world, &weights, policies, &choice);
+    let expected = Cpu::default().play(&[group]).unwrap();
+    for (request, info) in support::adapters("batches_cut_small_give_the_same_scores") {
         for bytes in [1 << 12, 1 << 15, 1 << 28] {
             let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
-            assert_eq!(record(&mut backend.batched(bytes)), expected, "{info}, batches of {bytes} bytes");
+            assert_eq!(backend.batched(bytes).play(&[group]).unwrap(), expected, "{info}, batches of {bytes} bytes");
         }
     }
 }
@@ -204,7 +197,7 @@ fn training_gives_the_same_metrics_and_weights() {
     };
     let both = [config.clone(), jittered.clone(), relay.clone()];
     let (rows, weights) = train(&mut Cpu::default(), &both);
-    assert!(rows.iter().any(|row| row.arm == 2 && row.best_g > 0.0), "nothing was relayed: {rows:?}");
+    assert!(rows.iter().any(|row| row.experiment == 2 && row.best_g > 0.0), "nothing was relayed: {rows:?}");
     assert!(rows.iter().any(|row| row.best_g > 0.0), "nothing was observed: {rows:?}");
     for (arm, config) in both.iter().enumerate() {
         assert_eq!(train(&mut Cpu::default(), std::slice::from_ref(config)).1[0], weights[arm]);
@@ -244,17 +237,15 @@ fn held_out_episodes_come_to_the_same_on_every_backend() {
     let (policies, leaders) = (5, world.leaders());
     let weights = sample::weights(&world, policies, 11);
     let teams: Vec<u32> = (0..policies as u32).flat_map(|policy| std::iter::repeat_n(policy, leaders)).collect();
-    let need = RecordRequest::Record;
-    let group =
-        Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams, need };
+    let group = of_random_policies(&world, &weights, policies, &teams);
     let starts = Starts::Drawn { episodes: 300, seed: 5, jitter: 6.0, poi_jitter: 4.0 };
-    let expected = evaluate(&mut Cpu::default(), &group, &starts, &|_| ()).unwrap();
+    let expected = evaluate(&mut Cpu::default(), &group, &starts, &mut |_| ()).unwrap();
     let others = Starts::Drawn { episodes: 300, seed: 5, jitter: 6.0, poi_jitter: 0.0 };
-    assert_ne!(evaluate(&mut Cpu::default(), &group, &others, &|_| ()).unwrap(), expected, "moved POIs matter");
+    assert_ne!(evaluate(&mut Cpu::default(), &group, &others, &mut |_| ()).unwrap(), expected, "moved POIs matter");
     let spreads: Vec<_> = (0..policies).map(|team| expected.team(team)).collect();
     assert!(spreads.iter().any(|spread| spread.deviation > Some(0.0)), "nobody observes anything: {spreads:?}");
     for (request, info) in support::adapters("held_out_episodes_come_to_the_same_on_every_backend") {
-        let found = evaluate(&mut open(&request, Pass::Guarded, Kernel::Best), &group, &starts, &|_| ()).unwrap();
+        let found = evaluate(&mut open(&request, Pass::Guarded, Kernel::Best), &group, &starts, &mut |_| ()).unwrap();
         assert_eq!(found, expected, "{info}");
     }
 }
@@ -277,24 +268,23 @@ fn verify_tells_as_json_what_it_compared() {
     }
 }
 
-/// What does not fit together is an error that says what, on every backend, before anything is played.
+/// Inconsistent input is an error that names it, on every backend, before anything is played.
 #[test]
 fn a_wrong_index_is_an_error() {
     let world = World::new(&support::layout("generally_forward"));
     let (policies, leaders) = (3, world.leaders());
     let weights = sample::weights(&world, policies, 1);
     let teams: Vec<u32> = (0..2 * leaders as u32).map(|place| place % 3).collect();
-    let need = RecordRequest::Record;
-    let good =
-        Group { world: &world, starts: &world.starts, weights: weights[..].into(), policies, teams: &teams, need };
+    let good = of_random_policies(&world, &weights, policies, &teams);
     let mut wrong = teams.clone();
     wrong[leaders + 2] = 3;
     let few = &weights[1..];
-    let bad: [(Group<'_>, &str); 4] = [
+    let bad: [(Group<'_>, &str); 5] = [
         (Group { teams: &wrong, ..good }, "leader 2 of team 1 plays policy 3 of 3"),
         (Group { teams: &teams[1..], ..good }, "7 choices"),
         (Group { starts: &world.starts[1..], ..good }, "11 start positions for 12 agents"),
         (Group { weights: few.into(), ..good }, "weights"),
+        (Group { sharing: Sharing::Shared, ..good }, "1 populations of 3 have 336"),
     ];
     let mut backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::default())];
     for (request, _) in support::adapters("a_wrong_index_is_an_error") {
@@ -302,12 +292,14 @@ fn a_wrong_index_is_an_error() {
     }
     for backend in &mut backends {
         for (group, named) in &bad {
-            let played = backend.rollout(std::slice::from_ref(group), &|_| panic!("nothing is played"));
-            for error in [played.expect_err(named), backend.trace(group).map(drop).expect_err(named)] {
+            for error in [
+                backend.play(std::slice::from_ref(group)).expect_err(named),
+                backend.trace(group).map(drop).expect_err(named),
+            ] {
                 assert!(error.to_string().contains(named), "{}: {error}", backend.describe());
             }
         }
-        backend.rollout(&[good], &|_| ()).unwrap();
+        backend.play(&[good]).unwrap();
         let sizes = [leaders, policies, world.parameters()];
         let Some(mut held) = backend.hold(&weights, sizes).unwrap() else { continue };
         let learning = support::layout("chaotic").learning;
@@ -325,8 +317,8 @@ fn a_wrong_index_is_an_error() {
         held.fetch(&mut found).unwrap();
         assert_eq!(found, weights);
         let other = Group { weights: Weights::OnDevice(&*held), policies: 4, ..good };
-        let error = backend.rollout(&[other], &|_| panic!("nothing is played")).expect_err("there are three");
-        assert!(error.to_string().contains("stand for"), "{error}");
+        let error = backend.play(&[other]).expect_err("there are three");
+        assert!(error.to_string().contains("populations of sizes [4, 3, 112]"), "{error}");
     }
 }
 
@@ -338,15 +330,8 @@ fn kernels_are_compiled_for_few_worlds_and_shared() {
     let config = Config::parse(text, "small.toml").unwrap();
     let play = |backend: &mut GpuBackend, worlds: &[World]| {
         let weights: Vec<Vec<f32>> = worlds.iter().map(|world| sample::weights(world, 1, 0)).collect();
-        let groups = worlds.iter().zip(&weights).map(|(world, weights)| Group {
-            world,
-            starts: &world.starts,
-            weights: weights[..].into(),
-            policies: 1,
-            teams: &[0],
-            need: RecordRequest::Record,
-        });
-        backend.rollout(&groups.collect::<Vec<_>>(), &|_| ()).unwrap();
+        let groups = worlds.iter().zip(&weights).map(|(world, weights)| of_random_policies(world, weights, 1, &[0]));
+        backend.play(&groups.collect::<Vec<_>>()).unwrap();
         backend.compiled()
     };
     let gains = (1..5).map(|gain| {
@@ -376,9 +361,11 @@ fn kernels_are_compiled_for_few_worlds_and_shared() {
 fn few_kernels_are_kept() {
     let worlds: Vec<World> = (1..=5u32)
         .map(|pois| {
-            let places: Vec<String> = (0..pois).map(|poi| format!("[{}.0, 15.0]", 2 * poi)).collect();
+            let places: Vec<String> = (0..pois).map(|poi| format!("[{}.0, 7.0]", 2 * poi)).collect();
             let places = places.join(", ");
-            let text = format!("[world]\nleaders = [[10.0, 5.0]]\npois = [{places}]\nsteps = 9\n[policy]\nhidden = []");
+            let text = format!(
+                "[world]\nleaders = [[10.0, 5.0]]\npois = [{places}]\nsteps = 9\ncoupling = 1\n[policy]\nhidden = []"
+            );
             World::new(&Config::parse(&text, "small.toml").unwrap())
         })
         .collect();
@@ -386,27 +373,11 @@ fn few_kernels_are_kept() {
     let teams: Vec<u32> = (0..7).collect();
     // The first world comes once more, so that its kernel is let go of and made again.
     let order = [0, 1, 2, 3, 4, 0];
-    let groups: Vec<Group<'_>> = order
-        .map(|index| Group {
-            world: &worlds[index],
-            starts: &worlds[index].starts,
-            weights: weights[index][..].into(),
-            policies: 7,
-            teams: &teams,
-            need: RecordRequest::Record,
-        })
-        .into();
-    let play = |backend: &mut dyn Backend, groups: &[Group<'_>]| {
-        let records: Vec<Mutex<Vec<u32>>> = (0..groups.len() * 7).map(|_| Mutex::default()).collect();
-        backend
-            .rollout(groups, &|episode| {
-                records[episode.group * 7 + episode.team].lock().unwrap().extend(episode.sets.iter());
-            })
-            .unwrap();
-        records.into_iter().map(|record| record.into_inner().unwrap()).collect::<Vec<_>>()
-    };
+    let groups: Vec<Group<'_>> =
+        order.map(|index| of_random_policies(&worlds[index], &weights[index], 7, &teams)).into();
+    let play = |backend: &mut dyn Backend, groups: &[Group<'_>]| backend.play(groups).unwrap();
     let expected = play(&mut Cpu::default(), &groups);
-    assert!(expected.iter().all(|record| !record.is_empty()));
+    assert!(expected.iter().any(|scores| scores.observed.iter().any(|&observed| observed > 0)));
     for (request, info) in support::adapters("few_kernels_are_kept") {
         for most in [1, 2, 64] {
             let gpu = gpu::open(request.clone()).unwrap();
@@ -421,8 +392,7 @@ fn few_kernels_are_kept() {
         let mut backend = GpuBackend::new(gpu).unwrap().playing(Kernel::Best).keeping(64, 2);
         assert_eq!(play(&mut backend, &groups), expected, "{info}");
         for (world, left) in [(0, 5), (0, 5), (1, 2), (0, 2), (0, 2), (0, 1)] {
-            let records = &expected[7 * world..][..7];
-            assert_eq!(play(&mut backend, &groups[world..][..1]), records, "{info}");
+            assert_eq!(play(&mut backend, &groups[world..][..1]), expected[world..][..1], "{info}");
             assert_eq!(backend.compiled(), [0, left], "{info}");
         }
         assert_eq!(play(&mut backend, &groups), expected, "{info}");
@@ -448,14 +418,7 @@ fn own_headings_and_ranges_of_zero_agree() {
         let world = World::new(config);
         let weights = sample::weights(&world, 3, 5);
         let teams: Vec<u32> = (0..6).map(|slot| slot / 2).collect();
-        let group = Group {
-            world: &world,
-            starts: &world.starts,
-            weights: weights[..].into(),
-            policies: 3,
-            teams: &teams,
-            need: RecordRequest::Record,
-        };
+        let group = of_random_policies(&world, &weights, 3, &teams);
         let trace = Cpu::default().trace(&group).unwrap();
         for (agent, heading) in world.headings.iter().enumerate() {
             assert_eq!(trace.moment(0, 0, agent).heading, heading.to_array(), "{ranges}, agent {agent}");

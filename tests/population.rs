@@ -13,7 +13,7 @@ use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu;
 use flotilla::backend::gpu::device::{self, DeviceError, Kind};
 use flotilla::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
-use flotilla::backend::{Backend, BackendError, DevicePopulation, Group, HELD_FROM, Trace, Visit, Weights};
+use flotilla::backend::{Backend, BackendError, DevicePopulation, Group, GroupScores, HELD_FROM, Trace, Weights};
 use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::{
     Config, Coupling, Elites, Fitness, Learning, Mutation, Paradigm, Parents, Sharing, ValidConfig,
@@ -106,7 +106,7 @@ fn arms() -> Vec<Config> {
     // Six leaders, more than are gathered at a time, share a population.
     let mut fourth = support::layout("strictly_forward");
     (fourth.learning.trials, fourth.learning.generations, fourth.learning.population) = (2, 4, 35);
-    (fourth.learning.paradigm, fourth.learning.sharing) = (Paradigm::AllLeaders, Sharing::All);
+    (fourth.learning.paradigm, fourth.learning.sharing) = (Paradigm::AllLeaders, Sharing::Shared);
     // Parents are drawn from the elites, a share of the population.
     let mut fifth = support::layout("chaotic");
     (fifth.learning.trials, fifth.learning.generations, fifth.learning.population) = (2, 4, 30);
@@ -115,7 +115,7 @@ fn arms() -> Vec<Config> {
     vec![first, second, third, fourth, fifth]
 }
 
-/// What a trainer of [`arms`] comes to, and what it would save before each generation.
+/// The result of a trainer of [`arms`], and its snapshot before each generation.
 #[derive(Debug, PartialEq)]
 struct Story {
     rows: Vec<Row>,
@@ -126,7 +126,7 @@ fn policies(trainer: &Trainer) -> Vec<Vec<Vec<f32>>> {
     (0..arms().len()).map(|arm| trainer.policies(arm)).collect()
 }
 
-/// Of all arms.
+/// For all arms.
 fn snapshots_of(trainer: &mut Trainer) -> Result<Vec<Snapshot>, SnapshotError> {
     (0..arms().len()).map(|arm| trainer.snapshot(arm)).collect()
 }
@@ -143,7 +143,7 @@ fn train(trainer: &mut Trainer, backend: &mut dyn Backend) -> Story {
     Story { rows: trainer.finish(backend).unwrap(), policies: policies(trainer) }
 }
 
-/// What the CPU comes to, and its snapshots before each generation.
+/// The CPU's result, and its snapshots before each generation.
 fn reference() -> (Story, Vec<Vec<Snapshot>>) {
     let (mut trainer, mut rows, mut snapshots) =
         (Trainer::new(ValidConfig::all(&arms()).unwrap()), Vec::new(), Vec::new());
@@ -223,7 +223,8 @@ fn arms_of_different_ages_train_side_by_side() {
             }
             assert_eq!(policies(&trainer), expected.policies, "from {from:?}, lost at {nth:?}");
             for (arm, &from) in from.iter().enumerate() {
-                let of_arm = |rows: &[Row]| rows.iter().filter(|row| row.arm == arm).copied().collect::<Vec<_>>();
+                let of_arm =
+                    |rows: &[Row]| rows.iter().filter(|row| row.experiment == arm).copied().collect::<Vec<_>>();
                 let due =
                     of_arm(&expected.rows).into_iter().filter(|row| row.generation + 1 >= from).collect::<Vec<_>>();
                 assert_eq!(of_arm(&rows), due, "arm {arm} from {from}, lost at {nth:?}");
@@ -398,7 +399,7 @@ impl DevicePopulation for OnDevice {
 }
 
 impl Backend for Device {
-    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
+    fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         self.state.call()?;
         // Groups from the host come once populations were brought home.
         let weights = |group: &Group<'_>| match group.weights {
@@ -413,7 +414,7 @@ impl Backend for Device {
             .zip(&weights)
             .map(|(group, weights)| Group { weights: weights[..].into(), ..*group })
             .collect();
-        self.cpu.rollout(&groups, visit)
+        self.cpu.play(&groups)
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
@@ -469,7 +470,7 @@ fn populations_lost_with_their_device_are_made_again() {
 #[test]
 fn a_run_survives_the_loss_of_the_device_that_holds_its_populations() {
     let mut config = arms().remove(0);
-    config.checkpoint = flotilla::config::Saving { generations: 2, seconds: 0.0 };
+    config.checkpoint = flotilla::config::CheckpointConfig { generations: 2, seconds: 0.0 };
     let folder = tempfile::tempdir().unwrap();
     let run = |name: &str, start: Start, device: Option<Device>, change: bool| {
         let path = folder.path().join(name);

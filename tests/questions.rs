@@ -30,7 +30,7 @@ fn good(folder: &Path, line: &str) -> String {
     out
 }
 
-/// What a page has of a part, its marks included.
+/// The text of a part in a page, with its marks.
 fn block<'a>(page: &'a str, part: &Study) -> &'a str {
     let start = page.find(&mark(part.name)).unwrap_or_else(|| panic!("no {}", mark(part.name)));
     &page[start..start + page[start..].find(END).unwrap() + END.len()]

@@ -5,18 +5,17 @@
 
 mod support;
 
-use std::collections::BTreeMap;
-use std::sync::Mutex;
-
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy};
 use flotilla::backend::gpu::{self, device::Request};
-use flotilla::backend::{Backend, Group, RecordRequest};
-use flotilla::config::{Config, Coupling, Fitness, Observers, Paradigm, ValidConfig};
+use flotilla::backend::{Backend, Group, GroupScores};
+use flotilla::config::{Config, Coupling, Fitness, Observers, Paradigm, Sharing, ValidConfig};
 use flotilla::credit::Credit;
+use flotilla::evaluate::SCORES_AND_DT;
 use flotilla::sample;
 use flotilla::sweep::Sweep;
 use flotilla::trainer::Trainer;
+use flotilla::verify::KINDS;
 use flotilla::world::World;
 
 /// Some teams of one world; their policies' weights are random, or all 0.
@@ -36,9 +35,10 @@ impl Teams {
         Teams { choice: (0..teams * world.leaders()).map(|place| (place * 7 % 5) as u32).collect(), weights, world }
     }
 
-    fn group(&self, need: RecordRequest) -> Group<'_> {
-        let Teams { world, weights, choice } = self;
-        Group { world, starts: &world.starts, weights: weights[..].into(), policies: 5, teams: choice, need }
+    fn group(&self, fitnesses: &'static [Fitness]) -> Group<'_> {
+        let (world, sharing) = (&self.world, Sharing::PerLeader);
+        let (starts, weights, teams) = (&world.starts, self.weights[..].into(), &self.choice[..]);
+        Group { world, starts, weights, policies: 5, sharing, teams, fitnesses }
     }
 
     /// Bytes of their whole record.
@@ -48,56 +48,59 @@ impl Teams {
     }
 }
 
-/// POIs observed and what the need asks for, of every team of every group.
-type Scores = BTreeMap<(usize, usize), (u32, Vec<Vec<f32>>)>;
-
-/// The need of a group where those that a packed record answers come by turns, from `first` on; or Dt, which none does.
-fn need_of(group: usize, first: usize) -> RecordRequest {
-    let (packed, _) = RecordRequest::OF_SCORES.split_at(5);
-    if first == DT { RecordRequest::Score(Fitness::Dt) } else { packed[(group + first) % packed.len()] }
+/// The fitnesses that a group is scored by: those that a packed record answers come by turns, from `first` on; or Dt,
+/// which none does.
+fn fitnesses_of(group: usize, first: usize) -> &'static [Fitness] {
+    let (packed, dt) = KINDS.split_at(5);
+    if first == DT { dt[0] } else { packed[(group + first) % packed.len()] }
 }
 
 const DT: usize = usize::MAX;
 
-/// Plays all teams as one batch, the needs of the groups by turns from `first` on; `asked` is what the backend is told.
-fn scores(
-    backend: &mut dyn Backend,
-    all: &[Teams],
-    first: usize,
-    asked: impl Fn(RecordRequest) -> RecordRequest,
-) -> Scores {
-    let need = |group: usize| need_of(group, first);
-    let groups: Vec<_> = all.iter().enumerate().map(|(index, teams)| teams.group(asked(need(index)))).collect();
-    let scores = Mutex::new(Scores::new());
-    let visit = |episode: flotilla::backend::Episode<'_>| {
-        let (world, mut credit) = (groups[episode.group].world, Credit::default());
-        let found = match need(episode.group) {
-            RecordRequest::Score(fitness) => {
-                let mut one = vec![0.0; world.leaders()];
-                (credit.score(&episode, world, fitness, &mut one), vec![one])
-            }
-            _ => {
-                // Dt is not asked for, whatever the record tells.
-                let all = credit.all(&episode, world);
-                (all.observed, vec![all.d, all.df, all.dpp])
-            }
-        };
-        let before = scores.lock().unwrap().insert((episode.group, episode.team), found);
-        assert!(before.is_none(), "a team is visited twice");
-    };
-    backend.rollout(&groups, &visit).unwrap();
-    scores.into_inner().unwrap()
+/// Plays all teams as one batch, the fitnesses of the groups by turns from `first` on.
+fn scores(backend: &mut dyn Backend, all: &[Teams], first: usize) -> Vec<GroupScores> {
+    let groups: Vec<_> = all.iter().enumerate().map(|(index, teams)| teams.group(fitnesses_of(index, first))).collect();
+    backend.play(&groups).unwrap()
 }
 
-fn expected(all: &[Teams], first: usize) -> Scores {
-    scores(&mut Cpu::default(), all, first, |_| RecordRequest::Sights)
+/// The same from the whole record, traced on the CPU.
+fn expected(all: &[Teams], first: usize) -> Vec<GroupScores> {
+    let of_group = |(index, teams): (usize, &Teams)| {
+        let group = teams.group(SCORES_AND_DT);
+        let (world, leaders, mut credit) = (group.world, group.world.leaders(), Credit::default());
+        let mut scores = GroupScores::default();
+        for (team, teams) in group.teams.chunks(leaders).enumerate() {
+            let trace = Cpu::default().trace(&Group { teams, ..group }).unwrap();
+            for (place, &fitness) in fitnesses_of(index, first).iter().enumerate() {
+                let mut one = vec![0.0; leaders];
+                let observed = credit.score(&trace.episode(world, 0), world, fitness, &mut one);
+                scores.scores.extend(one);
+                match place {
+                    0 => scores.observed.push(observed),
+                    _ => assert_eq!(scores.observed[team], observed),
+                }
+            }
+        }
+        scores
+    };
+    all.iter().enumerate().map(of_group).collect()
+}
+
+/// Whether every team observed so many POIs.
+fn all_observed(scores: &[GroupScores], pois: u32) -> bool {
+    scores.iter().flat_map(|scores| &scores.observed).all(|&observed| observed == pois)
 }
 
 fn open(request: &Request, records: Records) -> GpuBackend {
     GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().bringing(records)
 }
 
-/// What came from the device since this was last asked.
+/// Returns the bytes of the status words of this many workgroups.
+fn status(workgroups: u64) -> u64 {
+    4 * workgroups
+}
+
+/// Bytes that came from the device since the last call.
 fn down(backend: &mut GpuBackend) -> u64 {
     backend.take_stages().traffic.down
 }
@@ -142,20 +145,20 @@ fn worlds() -> Vec<Config> {
 #[test]
 fn scores_are_the_same_from_whole_and_packed_records() {
     let all: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37, true)).collect();
-    let expected: Vec<Scores> = (0..2).map(|first| expected(&all, first)).collect();
-    let different = expected[0].values().filter(|(observed, _)| *observed > 0).count();
+    let expected: Vec<Vec<GroupScores>> = (0..2).map(|first| expected(&all, first)).collect();
+    let different = expected[0].iter().flat_map(|scores| &scores.observed).filter(|&&observed| observed > 0).count();
     assert!(different > 100, "only {different} teams observe anything");
     for (request, info) in support::adapters("scores_are_the_same_from_whole_and_packed_records") {
         for (first, expected) in expected.iter().enumerate() {
             for (records, bytes) in [(Records::Whole, 1 << 28), (Records::Packed, 1 << 28), (Records::Packed, 1 << 15)]
             {
                 let mut backend = open(&request, records).batched(bytes).playing(Kernel::Generic);
-                let found = scores(&mut backend, &all, first, |need| need);
-                assert!(found == *expected, "{info}: needs from {first} on, {records:?}, batches of {bytes} bytes");
+                let found = scores(&mut backend, &all, first);
+                assert!(found == *expected, "{info}: fitnesses from {first} on, {records:?}, batches of {bytes} bytes");
             }
         }
         let mut checked = open(&Request { checked: true, ..request }, Records::Packed);
-        assert!(scores(&mut checked, &all, 0, |need| need) == expected[0], "{info}: checked");
+        assert!(scores(&mut checked, &all, 0) == expected[0], "{info}: checked");
     }
 }
 
@@ -176,7 +179,7 @@ fn a_changed_rule_is_noticed() {
             // SAFETY: the edits change comparisons and shorten a loop; every index stays in bounds.
             #[expect(unsafe_code, reason = "an edited shader is compiled without bounds checks")]
             let mut backend = unsafe { open(&request, Records::Packed).edited(edit) };
-            assert!(scores(&mut backend, &all, 0, |need| need) != expected, "{info}: edit {index} was not noticed");
+            assert!(scores(&mut backend, &all, 0) != expected, "{info}: edit {index} was not noticed");
         }
     }
 }
@@ -195,26 +198,26 @@ fn everything_or_nothing_may_matter() {
     };
     let (dense, empty) = (file(20.3), file(45.0));
     let [for_dense, for_empty] = [&dense, &empty].map(|teams| expected(teams, 0));
-    assert!(for_dense.values().all(|(observed, _)| *observed == 1) && for_empty.values().all(|(o, _)| *o == 0));
+    assert!(all_observed(&for_dense, 1) && all_observed(&for_empty, 0));
     let (whole, table) = (dense[0].whole(), 501 * 4);
     for (request, info) in support::adapters("everything_or_nothing_may_matter") {
         let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
-        let mut play = |all: &[Teams], expected: &Scores| {
-            assert!(scores(&mut backend, all, 0, |need| need) == *expected, "{info}");
+        let mut play = |all: &[Teams], expected: &[GroupScores]| {
+            assert!(scores(&mut backend, all, 0) == *expected, "{info}");
             down(&mut backend)
         };
         let first = play(&empty, &for_empty);
         assert!(first >= table && first < whole / 4, "{info}: {first} of {whole} bytes");
         let overflown = play(&dense, &for_dense);
         assert!(overflown > whole && overflown < whole + whole / 4, "{info}: {overflown} of {whole} bytes");
-        assert_eq!(play(&dense, &for_dense), whole + 8, "{info}: known to be dense");
+        assert_eq!(play(&dense, &for_dense), whole + 8 + status(100), "{info}: known to be dense");
         // It packs again once less matters.
         let again = (0..60).map(|_| play(&empty, &for_empty)).find(|&bytes| bytes < whole / 4);
         assert!(again.is_some(), "{info}: whole records for ever");
     }
 }
 
-/// Whole records come home where they are asked for, where one dispatch cannot pack them, and by default from software.
+/// Whole records come home where one dispatch cannot pack them, and where that is not worth it.
 #[test]
 fn whole_records_come_where_they_must() {
     let text = |steps: usize| {
@@ -228,16 +231,14 @@ fn whole_records_come_where_they_must() {
     let [for_short, for_long, for_longest] = [&short, &long, &longest].map(|teams| expected(teams, 0));
     for (request, info) in support::adapters("whole_records_come_where_they_must") {
         let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
-        assert!(scores(&mut backend, &short, 0, |_| RecordRequest::Record) == for_short, "{info}");
-        assert_eq!(down(&mut backend), short[0].whole(), "{info}: the record was asked for");
         // Several dispatches.
-        assert!(scores(&mut backend, &long, 0, |need| need) == for_long, "{info}");
+        assert!(scores(&mut backend, &long, 0) == for_long, "{info}");
         assert!(down(&mut backend) < long[0].whole(), "{info}: 3000 steps");
-        assert!(scores(&mut backend, &longest, 0, |need| need) == for_longest, "{info}");
-        assert_eq!(down(&mut backend), longest[0].whole(), "{info}: 10 000 steps");
+        assert!(scores(&mut backend, &longest, 0) == for_longest, "{info}");
+        assert_eq!(down(&mut backend), longest[0].whole() + status(2), "{info}: 10 000 steps");
         let mut small = open(&request, Records::PackedFrom(1 << 20)).playing(Kernel::Generic);
-        assert!(scores(&mut small, &short, 0, |need| need) == for_short, "{info}");
-        assert_eq!(down(&mut small), short[0].whole(), "{info}: not worth packing");
+        assert!(scores(&mut small, &short, 0) == for_short, "{info}");
+        assert_eq!(down(&mut small), short[0].whole() + status(2), "{info}: not worth packing");
     }
 }
 
@@ -297,16 +298,16 @@ fn records_are_packed_only_where_time_does_not_matter() {
         for (what, packed, change) in cases {
             let all = of(change);
             let expected = expected(&all, 0);
-            assert!(expected.values().any(|(observed, _)| *observed > 0), "{what}: nothing is observed");
+            assert!(!all_observed(&expected, 0), "{what}: nothing is observed");
             let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
-            assert!(scores(&mut backend, &all, 0, |need| need) == expected, "{info}, {what}");
+            assert!(scores(&mut backend, &all, 0) == expected, "{info}, {what}");
             let moved = down(&mut backend);
             assert_eq!(moved < all[0].whole() / 2, packed, "{info}, {what}: {moved} bytes");
             // Dt asks when its followers were led: nothing is packed, and sights come with the rest.
-            let expected = scores(&mut Cpu::default(), &all, DT, |_| RecordRequest::Sights);
-            assert!(scores(&mut backend, &all, DT, |need| need) == expected, "{info}, {what}, Dt");
+            let expected = self::expected(&all, DT);
+            assert!(scores(&mut backend, &all, DT) == expected, "{info}, {what}, Dt");
             let sights = (200 * 4 * all[0].world.sight_words()) as u64;
-            assert_eq!(down(&mut backend), all[0].whole() + sights, "{info}, {what}, Dt");
+            assert_eq!(down(&mut backend), all[0].whole() + sights + status(10), "{info}, {what}, Dt");
         }
     }
 }

@@ -18,7 +18,7 @@ use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu;
 use flotilla::backend::gpu::device::DeviceError;
 use flotilla::backend::gpu::episode::GpuBackend;
-use flotilla::backend::{Backend, BackendError, Group, Trace, Visit};
+use flotilla::backend::{Backend, BackendError, Group, GroupScores, Trace};
 use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::Config;
 use flotilla::record::checkpoint::{self, Checkpoint};
@@ -27,29 +27,16 @@ use flotilla::record::folder::{CONFIG, Folder, METRICS, Note, POLICIES, RUN, Run
 use flotilla::record::{RecordError, metrics, policies};
 use flotilla::run::{Ended, Options, Results, RunError, Session};
 use rand::{RngExt, SeedableRng, rngs::ChaCha8Rng};
+use support::tiny;
 use tempfile::TempDir;
 
 /// A run of 14 generations that takes milliseconds.
-const SMALL: &str = "
-[world]
-leaders = [[10, 5], [20, 5]]
-followers = [[12, 2], [22, 2]]
-pois = [[10, 9], [20, 9]]
-coupling = 2
-steps = 8
-[policy]
-hidden = [3]
-[learning]
-population = 6
-generations = 14
-trials = 2
-[checkpoint]
-generations = 1
-seconds = 0
-";
+fn text() -> String {
+    tiny(14, "generations = 1\nseconds = 0")
+}
 
 fn small() -> Config {
-    Config::parse(SMALL, "small.toml").unwrap()
+    Config::parse(&text(), "small.toml").unwrap()
 }
 
 fn cpu() -> OpenBackend {
@@ -399,7 +386,7 @@ fn no_failing_disk_operation_costs_a_run() {
             let context = format!("operation {at}: {operation:?} {}", file.display());
             if let Err(error) = told.end {
                 let error = flotilla::cli::Error::from(error).to_string();
-                assert!(error.contains("free some space, then go on with --resume"), "{context}: {error}");
+                assert!(error.contains("free some space, then continue with --resume"), "{context}: {error}");
                 kinds.push(operation);
             }
             let (results, again) = resume(&config, &path);
@@ -578,21 +565,21 @@ fn a_folder_is_one_process_at_a_time_and_one_run() {
     assert_eq!(fs::read(path.join("notes.txt")).unwrap(), b"mine");
 }
 
-/// Fails at one rollout.
+/// Fails at one call of `play`.
 struct Failing {
     cpu: Cpu,
     left: usize,
 }
 
 impl Backend for Failing {
-    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
+    fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         // Half the work is done when it fails.
-        self.cpu.rollout(&groups[..groups.len().div_ceil(2)], visit)?;
+        self.cpu.play(&groups[..groups.len().div_ceil(2)])?;
         self.left = self
             .left
             .checked_sub(1)
             .ok_or(BackendError::from(DeviceError::Lost { adapter: "test".into(), reason: "pulled out".into() }))?;
-        self.cpu.rollout(groups, visit)
+        self.cpu.play(groups)
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
@@ -606,7 +593,7 @@ impl Backend for Failing {
 
 #[test]
 fn a_lost_device_costs_nothing() {
-    let config = Config::parse(&SMALL.replace("[checkpoint]\ngenerations = 1", "[checkpoint]"), "small.toml").unwrap();
+    let config = Config::parse(&tiny(14, "seconds = 0"), "small.toml").unwrap();
     let expected = reference(&config);
     for left in 0..=config.learning.generations + 1 {
         let failing = || -> OpenBackend { (Box::new(Failing { cpu: Cpu::default(), left }), Machine::default()) };
@@ -748,7 +735,7 @@ fn a_killed_run_goes_on_to_the_same_results() {
             };
             let told = without_warnings(&read_all(child.stderr.take()));
             // A row is written once the checkpoint before its generation's is whole, and none of that is done again.
-            if let Some((_, start)) = told.split_once("going on before generation ") {
+            if let Some((_, start)) = told.split_once("resuming at generation ") {
                 let start: usize = start.split_whitespace().next().unwrap().parse().unwrap();
                 // Only the last row is there before the policies, without which the end is none to go on from.
                 let last: usize = length.parse().unwrap();
@@ -877,7 +864,7 @@ fn a_second_process_is_refused_until_the_first_is_gone() {
     }
     let third = flotilla_train(&file, &out, &[]).output().unwrap();
     assert_eq!(third.status.code(), Some(1));
-    assert!(stderr(&third).contains("holds a run already; go on with it by --resume"), "{}", stderr(&third));
+    assert!(stderr(&third).contains("holds a run already; pass --resume to continue it"), "{}", stderr(&third));
     first.kill().unwrap();
     first.wait().unwrap();
     let changed = flotilla_train(&file, &out, &["--resume", "--seed", "3"]).output().unwrap();
@@ -907,7 +894,7 @@ fn where_one_of_several_runs_cannot_start_none_is_touched() {
     drop(held);
 }
 
-/// What is no run's is not written over, by whatever flag.
+/// No flag overwrites files that are not of a run.
 #[test]
 fn other_files_are_left_alone() {
     let place = tempfile::tempdir().unwrap();
@@ -1020,14 +1007,14 @@ mod unix {
             signal(&child, name);
             let (status, told) = ended(child);
             assert_eq!(status.code(), Some(75), "{told}");
-            let (_, command) = told.split_once("go on with\n  flotilla ").expect(&told);
+            let (_, command) = told.split_once("continue with\n  flotilla ").expect(&told);
             assert!(
                 without_warnings(&told).starts_with("stopped: before generation") && command.contains("--backend cpu"),
                 "{told}"
             );
             let again = flotilla().args(command.split_whitespace()).output().unwrap();
             assert_eq!(again.status.code(), Some(0), "{}", stderr(&again));
-            assert!(stderr(&again).contains("going on before generation"), "{}", stderr(&again));
+            assert!(stderr(&again).contains("resuming at generation"), "{}", stderr(&again));
             assert!(String::from_utf8_lossy(&again.stdout).contains(&expected.0.digest));
             assert_eq!(what_came_out(&out), expected.1);
         }
@@ -1094,7 +1081,7 @@ mod unix {
     #[test]
     fn a_folder_that_cannot_be_is_told() {
         let folder = tempfile::tempdir().unwrap();
-        let file = config_file(folder.path(), SMALL);
+        let file = config_file(folder.path(), &text());
         let output = flotilla_train(&file, &file, &[]).output().unwrap();
         assert_eq!(output.status.code(), Some(1));
         let told = stderr(&output);

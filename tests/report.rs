@@ -6,6 +6,7 @@ mod support;
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
@@ -13,8 +14,10 @@ use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::{Config, Fitness, Override};
+use flotilla::record::digests::Verification;
 use flotilla::record::ownership::LIST;
 use flotilla::report::curves::{distinct, poi_ticks};
+use flotilla::report::replay::{self, Which};
 use flotilla::report::scene::{Color, text_width};
 use flotilla::report::{map, paper};
 use flotilla::trainer::Trainer;
@@ -108,7 +111,7 @@ impl Run {
     }
 }
 
-/// What a page plays.
+/// The data that a page plays.
 fn data(path: &Path) -> Value {
     let page = fs::read_to_string(path).unwrap();
     let start = page.find("id=\"data\">").unwrap() + "id=\"data\">".len();
@@ -132,7 +135,7 @@ fn a_run_plots_as_svg_and_png() {
     let run = Run::new(CONFIG, &[]);
     succeed(&["plot", &run.text()]);
     let svg = fs::read_to_string(run.file("curves.svg")).unwrap();
-    for label in ["best team", "champion", "mean team", "Generation", "POIs observed"] {
+    for label in ["best team", "champion", "mean team", "Generation", "G (share of POIs observed)"] {
         assert!(svg.contains(label), "{label}");
     }
     let picture = run.file("curves.png");
@@ -171,22 +174,41 @@ fn training_draws_its_curves() {
     assert!(fs::read_to_string(run.file("curves.svg")).unwrap().contains("champion"));
 }
 
+/// Reads the only event file in a folder, with its checksums, and returns the step of every record.
+fn event_steps(folder: &Path) -> Vec<u8> {
+    let files: Vec<_> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    assert_eq!(files.len(), 1, "{files:?}");
+    let bytes = fs::read(&files[0]).unwrap();
+    let number = |bytes: &[u8]| u32::from_le_bytes(bytes.try_into().unwrap());
+    let (mut rest, mut steps) = (&bytes[..], Vec::new());
+    while !rest.is_empty() {
+        // Each record: length, checksum, content, checksum.
+        let (length, more) = rest.split_at(8);
+        let content = &more[4..][..u64::from_le_bytes(length.try_into().unwrap()) as usize];
+        let end = 12 + content.len();
+        assert_eq!(number(&rest[8..12]), checksum(length));
+        assert_eq!(number(&rest[end..end + 4]), checksum(content));
+        // The time takes 9 bytes, then comes the step.
+        assert_eq!(content[9], 2 << 3);
+        steps.push(content[10]);
+        rest = &rest[end + 4..];
+    }
+    steps
+}
+
+/// The masked CRC-32C of TFRecord, bit by bit.
+fn checksum(bytes: &[u8]) -> u32 {
+    let bit = |crc: u32, _| crc >> 1 ^ if crc & 1 == 1 { 0x82f6_3b78 } else { 0 };
+    let crc = !bytes.iter().fold(u32::MAX, |crc, &byte| (0..8).fold(crc ^ u32::from(byte), bit));
+    crc.rotate_right(15).wrapping_add(0xa282_ead8)
+}
+
 #[test]
 fn event_files_have_every_generation_of_every_trial_once() {
     let run = Run::new(CONFIG, &["--tensorboard"]);
     for trial in 0..3 {
-        let folder = run.file("tensorboard").join(format!("trial-{trial}"));
-        let files: Vec<_> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
-        let bytes = fs::read(&files[0]).unwrap();
-        assert_eq!(files.len(), 1);
-        // Records: length, checksum, content, checksum.
-        let (mut rest, mut records) = (&bytes[..], 0);
-        while !rest.is_empty() {
-            let length = u64::from_le_bytes(rest[..8].try_into().unwrap()) as usize;
-            rest = &rest[12 + length + 4..];
-            records += 1;
-        }
-        assert_eq!(records, 1 + 7, "the version, and generations 0 to 6");
+        let steps = event_steps(&run.file("tensorboard").join(format!("trial-{trial}")));
+        assert_eq!(steps, [0, 0, 1, 2, 3, 4, 5, 6], "the version, and generations 0 to 6");
     }
 }
 
@@ -274,6 +296,110 @@ fn every_generation_replays_with_the_score_it_had() {
         let observed = episode["observed"].as_array().unwrap().iter().filter(|step| !step.is_null()).count();
         assert_eq!(observed as f64 / 2.0, best);
     }
+}
+
+#[test]
+fn without_a_leader_a_team_loses_what_its_credit_says() {
+    // D removes the leader alone. Df removes its group of the whole episode, Dt its group at each step.
+    let mut lost = 0;
+    for fitness in ["Df", "Dt"] {
+        let run = Run::new(CONFIG, &["--fitness", fitness]);
+        for (trial, generation) in run.best().into_keys() {
+            let (which, verification) = (Which::Best, Verification::Required);
+            let watch = &mut |_| true;
+            let played =
+                replay::replay(&run.path(), trial, &[generation], which, verification, &mut Cpu::default(), watch);
+            let played = &played.unwrap()[0];
+            let count = |observed: &[Option<usize>]| observed.iter().flatten().count() as f32;
+            let by_group = if fitness == "Dt" { &played.scores.dt } else { &played.scores.df };
+            for (leader, (&alone, &with_group)) in played.scores.d.iter().zip(by_group).enumerate() {
+                for (group, score) in [(false, alone), (true, with_group)] {
+                    let without = played.without(leader, group);
+                    let difference = (count(&played.observed) - count(&without.observed)) / 2.0;
+                    assert_eq!(difference, score, "{fitness} {trial} {generation} {leader} {group}");
+                    lost += usize::from(difference > 0.0);
+                }
+            }
+        }
+    }
+    assert!(lost > 10, "hardly any leader is worth anything: {lost}");
+}
+
+/// Packs the files of a folder, each below `top`.
+fn zip(folder: &Path, top: &str, to: &Path) {
+    let mut zip = zip::ZipWriter::new(fs::File::create(to).unwrap());
+    let mut folders = vec![folder.to_path_buf()];
+    while let Some(next) = folders.pop() {
+        for entry in fs::read_dir(next).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+                continue;
+            }
+            let name = path.strip_prefix(folder).unwrap().to_str().unwrap().replace('\\', "/");
+            zip.start_file(format!("{top}{name}"), zip::write::SimpleFileOptions::default()).unwrap();
+            zip.write_all(&fs::read(&path).unwrap()).unwrap();
+        }
+    }
+    zip.finish().unwrap();
+}
+
+#[test]
+fn a_zipped_run_is_read_like_its_folder() {
+    let run = Run::new(CONFIG, &["--checkpoint-generations", "2"]);
+    let at = |name: &str| run.folder.path().join(name).to_str().unwrap().to_string();
+    for (index, top) in ["", "run/", "deep/er/run/"].into_iter().enumerate() {
+        let archive = at(&format!("run{index}.zip"));
+        zip(&run.path(), top, archive.as_ref());
+        for (command, extension) in [("plot", "svg"), ("replay", "svg")] {
+            let (one, other) = (at(&format!("one.{extension}")), at(&format!("other.{extension}")));
+            succeed(&[command, &run.text(), "--out", &one]);
+            succeed(&[command, &archive, "--out", &other]);
+            assert_eq!(fs::read(&one).unwrap(), fs::read(&other).unwrap(), "{command}");
+        }
+        let rollout = |path: &str| {
+            let scores = at("scores.csv");
+            succeed(&["rollout", path, "--scores", &scores, "--quiet", "--backend", "cpu"]);
+            fs::read(scores).unwrap()
+        };
+        assert_eq!(rollout(&run.text()), rollout(&archive));
+        succeed(&["compare", &run.text(), &archive]);
+    }
+    // Without --out, nothing is written beside the unpacked files, which are removed.
+    let here = run.folder.path().join("here");
+    fs::create_dir(&here).unwrap();
+    for (command, name) in [("plot", "curves.svg"), ("replay", "replay.html")] {
+        let output = support::flotilla().current_dir(&here).args([command, &at("run1.zip")]).output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        assert!(here.join(name).exists(), "{name}");
+    }
+}
+
+#[test]
+fn a_zip_file_that_is_no_run_is_refused() {
+    let run = Run::new(CONFIG, &[]);
+    let at = |name: &str| run.folder.path().join(name).to_str().unwrap().to_string();
+    let (none, two, cut) = (at("none.zip"), at("two.zip"), at("cut.zip"));
+    let other = run.folder.path().join("other");
+    fs::create_dir_all(other.join("a")).unwrap();
+    fs::write(other.join("a/notes.txt"), "nothing").unwrap();
+    zip(&other, "", none.as_ref());
+    fail(&["plot", &none], &["none.zip", "no config.toml"]);
+    for name in ["a", "b"] {
+        fs::create_dir_all(other.join(name)).unwrap();
+        fs::write(other.join(name).join("config.toml"), "").unwrap();
+    }
+    zip(&other, "", two.as_ref());
+    fail(&["replay", &two], &["two.zip", "2 runs"]);
+    // Names that lead out of the folder are no reason to write there.
+    let evil = at("evil.zip");
+    zip(&run.path(), "../../evil/", evil.as_ref());
+    succeed(&["plot", &evil, "--out", &at("evil.svg")]);
+    assert!(!run.folder.path().join("evil").exists() && !std::env::temp_dir().join("evil").exists());
+    zip(&run.path(), "", cut.as_ref());
+    let bytes = fs::read(&cut).unwrap();
+    fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
+    fail(&["plot", &cut], &["cut.zip"]);
 }
 
 #[test]
@@ -546,15 +672,70 @@ fn pictures_look_the_same_everywhere_and_say_what_they_show() {
     // With the figures that are to be seen.
     let last: Vec<f64> =
         run.best().into_iter().filter(|((_, generation), _)| *generation == 6).map(|(_, g)| g).collect();
-    let mean = format!("{:.3}", last.iter().sum::<f64>() / 3.0 * 2.0);
+    let mean = format!("{:.3}", last.iter().sum::<f64>() / 3.0);
     let mean = mean.trim_end_matches('0').trim_end_matches('.');
     let described = curves.split("<desc").nth(1).unwrap().split("</desc").next().unwrap();
     assert!(described.contains("best team from ") && described.contains(&format!(" to {mean}")), "{mean}: {described}");
-    assert!(curves.contains("mean ± standard error over 3 trials"));
+    assert!(curves.contains("mean and 95 % interval over 3 trials"));
     assert!(still.contains("generation 6, step 20 of 20: ") && still.contains(" of 2 POIs observed"));
     // One trial has no band to explain.
     let one = Run::new(CONFIG, &["--trials", "1"]);
-    assert!(!svg(&["plot", &one.text()]).contains("standard error"));
+    assert!(!svg(&["plot", &one.text()]).contains("interval over"));
+}
+
+/// The bands of a figure: each one's largest height in millimetres.
+fn band_heights(svg: &str) -> Vec<f64> {
+    let bands = svg.lines().filter(|line| line.starts_with("<polygon") && line.contains("fill-opacity=\"0.2\""));
+    let height = |line: &str| {
+        let points: Vec<[f64; 2]> = line
+            .split('"')
+            .nth(1)
+            .unwrap()
+            .split(' ')
+            .map(|point| {
+                let (x, y) = point.split_once(',').unwrap();
+                [x.parse().unwrap(), y.parse().unwrap()]
+            })
+            .collect();
+        let (upper, lower) = points.split_at(points.len() / 2);
+        upper.iter().zip(lower.iter().rev()).map(|(a, b)| (b[1] - a[1]).abs() / 10.0).fold(0.0, f64::max)
+    };
+    bands.map(height).collect()
+}
+
+#[test]
+fn curves_show_the_requested_team_and_band() {
+    let (one, other) = (Run::new(CONFIG, &[]), Run::new(CONFIG, &["--fitness", "G"]));
+    let plot = |runs: &[&Run], flags: &[&str]| {
+        let out = one.file("picture.svg");
+        let mut arguments = vec!["plot".to_string()];
+        arguments.extend(runs.iter().map(|run| run.text()));
+        let flags: Vec<String> = flags.iter().map(ToString::to_string).collect();
+        let arguments = [arguments, vec!["--out".into(), out.to_str().unwrap().into()], flags].concat();
+        succeed(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
+        fs::read_to_string(out).unwrap()
+    };
+    for (measure, label) in [("best", "best team"), ("champion", "champion"), ("mean", "mean team")] {
+        for runs in [&[&one][..], &[&one, &other]] {
+            let svg = plot(runs, &["--measure", measure]);
+            assert!(svg.contains(&format!("aria-label=\"G of the {label}\"")), "{measure}: {svg}");
+            // As many curves as runs; a single one is named.
+            assert_eq!(svg.contains(&format!("aria-label=\"{label}\"")), runs.len() == 1, "{measure}");
+        }
+    }
+    // Several runs show their best teams unless told otherwise.
+    assert!(plot(&[&one, &other], &[]).contains("G of the best team"));
+    let [interval, error, none] = ["interval", "error", "none"].map(|band| plot(&[&one], &["--band", band]));
+    assert_eq!(plot(&[&one], &[]), interval);
+    assert!(error.contains("mean ± standard error over 3 trials") && !none.contains("over 3 trials"));
+    let [interval, error, none] = [interval, error, none].map(|svg| band_heights(&svg));
+    // A curve whose trials are equal has no band.
+    assert!((1..=3).contains(&interval.len()) && interval.len() == error.len() && none.is_empty());
+    // Student's factor for 3 trials is 4.30. Bands end at 0 and 1.
+    let most = |heights: &[f64]| heights.iter().copied().fold(0.0, f64::max);
+    assert!(most(&interval) > 1.5 * most(&error) && most(&interval) <= 4.4 * most(&error), "{interval:?} {error:?}");
+    fail_with(2, &["plot", &one.text(), "--band", "wide"], &["allowed interval, error or none"]);
+    fail_with(2, &["plot", &one.text(), "--measure", "worst"], &["allowed best, champion or mean"]);
 }
 
 #[test]
@@ -802,13 +983,13 @@ fn the_papers_figures_come_with_its_claims() {
     for figure in 4..=6 {
         let svg = fs::read_to_string(out.join(format!("figure{figure}.svg"))).unwrap();
         assert!(svg.contains("All leaders") && svg.contains("Leaders and followers"));
-        assert!(svg.contains("straight ahead") && svg.contains("best of as many random teams"));
+        assert!(svg.contains("best constant speed") && svg.contains("best of as many random networks"));
         assert!(fs::metadata(out.join(format!("figure{figure}.png"))).unwrap().len() > 10_000);
         assert!(fs::metadata(out.join(format!("figure{figure}.pdf"))).unwrap().len() > 10_000);
     }
     let summary: Value = serde_json::from_str(&fs::read_to_string(out.join("summary.json")).unwrap()).unwrap();
     let arms = summary["arms"].as_array().unwrap();
-    assert_eq!(arms.len(), 33 + 16);
+    assert_eq!(arms.len(), 33 + 24);
     for arm in arms {
         for curve in ["generation", "mean", "error", "deviation"] {
             assert_eq!(arm[curve].as_array().unwrap().len(), 4, "{curve}");
@@ -828,10 +1009,11 @@ fn the_papers_figures_come_with_its_claims() {
     };
     for folder in &folders {
         let text = fs::read_to_string(folder.join("metrics.csv")).unwrap();
+        let champion = text.lines().next().unwrap().split(',').position(|name| name == "champion_g").unwrap();
         let best: Vec<f64> = text
             .lines()
             .filter(|line| line.split(',').nth(1) == Some("3"))
-            .map(|line| line.split(',').nth(2).unwrap().parse().unwrap())
+            .map(|line| line.split(',').nth(champion).unwrap().parse().unwrap())
             .collect();
         let name = folder.file_name().unwrap().to_str().unwrap();
         assert!((best.iter().sum::<f64>() / 2.0 - last(name)).abs() < 1e-9, "{name}");
@@ -862,12 +1044,12 @@ fn the_papers_figures_come_with_its_claims() {
     let claims = fs::read_to_string(out.join("claims.md")).unwrap();
     assert_eq!(claims.lines().filter(|line| line.starts_with("| ")).count(), (2 + 8) + (2 + 8) + (2 + 36));
     // What needs no learning comes first, wherever something is shown.
-    assert!(claims.find("straight ahead").unwrap() < claims.find("The paper says").unwrap());
-    assert!(said.find("straight ahead").unwrap() < said.find("The paper says").unwrap());
-    let straight = arms.iter().filter(|arm| arm["source"] == "straight ahead");
-    let solved = straight
+    assert!(claims.find("best constant speed").unwrap() < claims.find("The paper says").unwrap());
+    assert!(said.find("best constant speed").unwrap() < said.find("The paper says").unwrap());
+    let constant = arms.iter().filter(|arm| arm["source"] == "constant speed");
+    let solved = constant
         .filter(|arm| arm["mean"].as_array().unwrap().iter().all(|mean| *mean == arm["pois"].as_f64().unwrap()));
-    assert_eq!(solved.count(), 6);
+    assert_eq!(solved.count(), 8);
 }
 
 /// A paper's folder and what it holds.
@@ -1007,21 +1189,7 @@ fn event_files_of_a_run_that_is_there_are_written_by_resuming_it() {
     let config = run.folder.path().join("small.toml");
     let (config, text) = (config.to_str().unwrap().to_string(), run.text());
     let train = ["train", &config, "--out", &text, "--backend", "cpu", "--quiet"];
-    let records = |trial: usize| {
-        let folder = run.file("tensorboard").join(format!("trial-{trial}"));
-        let files: Vec<_> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
-        assert_eq!(files.len(), 1, "{files:?}");
-        let bytes = fs::read(&files[0]).unwrap();
-        let (mut rest, mut steps) = (&bytes[..], Vec::new());
-        while !rest.is_empty() {
-            let length = u64::from_le_bytes(rest[..8].try_into().unwrap()) as usize;
-            // The time takes 9 bytes, then comes the step.
-            assert_eq!(rest[12 + 9], 2 << 3);
-            steps.push(rest[12 + 10]);
-            rest = &rest[12 + length + 4..];
-        }
-        steps
-    };
+    let records = |trial: usize| event_steps(&run.file("tensorboard").join(format!("trial-{trial}")));
     fail(&[&train[..], &["--tensorboard"]].concat(), &["holds a run already", "--resume --tensorboard"]);
     succeed(&[&train[..], &["--resume", "--tensorboard"]].concat());
     for trial in 0..3 {

@@ -5,15 +5,16 @@
 #   apt-get install slurmctld slurmd slurm-client munge
 #   tests/slurm.sh [path/to/flotilla [PART...]]
 #
-# The parts are array, cancelled, preempted, node and limit; without a name all run.
+# The parts are page, array, cancelled, preempted, node and limit; without a name all run.
 # Needs root: munged runs as its own user, and slurmd starts jobs. All daemons have their own ports and files in a
 # temporary folder, and are always stopped. Takes five to ten minutes: the shortest time limit of Slurm is a minute, and
 # two jobs have to reach it.
 set -euo pipefail
 
 flotilla=$(realpath "${1:-target/debug/flotilla}")
+page=$(realpath "$(dirname "$0")/../docs/how-to/clusters.md")
 parts=("${@:2}")
-[ ${#parts[@]} != 0 ] || parts=(array cancelled preempted node limit)
+[ ${#parts[@]} != 0 ] || parts=(page array cancelled preempted node limit)
 for program in slurmctld slurmd sbatch munged; do
     PATH=$PATH:/usr/sbin command -v "$program" > /dev/null || { echo "skipped: there is no $program here"; exit 0; }
 done
@@ -162,6 +163,27 @@ sed -e 's/trials = 2/trials = 20/' -e 's/generations = 5$/generations = 200/' "$
 
 say "starting munge and Slurm $(slurmctld -V | cut -d' ' -f2) in $work"
 start_slurm
+
+# What a reader of the page does, command by command.
+part_page() {
+    local job command
+    say "the commands of ${page##*/}"
+    mkdir "$work/page" "$work/bin"
+    ln -s "$flotilla" "$work/bin/flotilla"
+    awk '/^```toml/ { on = 1; next } /^```/ { on = 0 } on' "$page" > "$work/page/sweep.toml"
+    while read -r command; do
+        case $command in
+            sbatch*)
+                # shellcheck disable=SC2086 # the words of the command
+                job=$(cd "$work/page" && sbatch --parsable ${command#sbatch})
+                wait_for "$job" 300
+                ;;
+            *) (cd "$work/page" && PATH=$work/bin:$PATH bash -c "$command") ;;
+        esac < /dev/null
+    done < <(awk '/^## / { slurm = $2 == "Slurm" } /^```/ { on = !on; next } slurm && on' "$page")
+    [ "$(tail -n +2 "$work/page/cluster/points.csv" | wc -l)" = 6 ] || { say "points are missing"; exit 1; }
+    say "all points are there"
+}
 
 part_array() {
     local job

@@ -412,7 +412,7 @@ fn a_shared_policy_fits_any_number_of_leaders() {
     let (code, _, told) = run(&folder, "train small.toml --out cold --init missing.safetensors");
     assert!(code == Some(1) && told.contains("missing.safetensors: cannot be read"), "{told}");
     assert!(!folder.join("cold").exists());
-    assert_eq!(Config::load(&folder.join("run/config.toml")).unwrap().learning.sharing, Sharing::All);
+    assert_eq!(Config::load(&folder.join("run/config.toml")).unwrap().learning.sharing, Sharing::Shared);
 }
 
 #[test]

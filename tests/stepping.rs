@@ -3,9 +3,10 @@
 
 mod support;
 
+use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, BackendError, Episode, Group, Moment, RecordRequest, Seen, Strided, Trace};
-use flotilla::config::{Fitness, MAX_AGENTS, MAX_POIS, MAX_POPULATION};
+use flotilla::backend::{Backend, BackendError, Group, Moment, Trace};
+use flotilla::config::{Fitness, MAX_AGENTS, MAX_POIS, MAX_POPULATION, Sharing};
 use flotilla::credit::{self, Credit, Scores};
 use flotilla::evaluate::Starts;
 use flotilla::model::rule::Rule;
@@ -14,7 +15,7 @@ use flotilla::stepping::{StepError, Stepper};
 use flotilla::world::World;
 use glam::Vec2;
 
-/// What teams of random policies do from some starts.
+/// Actions of teams of random policies from some starts.
 struct Played {
     world: World,
     starts: Vec<Vec2>,
@@ -36,14 +37,15 @@ impl Played {
             starts: &starts,
             weights,
             policies: teams,
+            sharing: Sharing::PerLeader,
             teams: &order,
-            need: RecordRequest::Sights,
+            fitnesses: &[Fitness::Dt],
         };
         let trace = Cpu::default().trace(&group).expect("the group fits the world");
         Played { world, starts, trace }
     }
 
-    /// What the leaders of a team answered at a step, from 0.
+    /// The leaders' actions of a team at a step, from 0.
     fn actions(&self, step: usize, team: usize) -> impl Iterator<Item = f32> {
         (0..self.world.leaders()).flat_map(move |leader| self.trace.moment(step + 1, team, leader).outputs)
     }
@@ -52,7 +54,7 @@ impl Played {
         bytemuck::cast_slice(&self.starts).repeat(teams)
     }
 
-    /// What a stepper's team in a step is to look like, place by place in bits.
+    /// The expected state of a stepper's team after a step, as bits.
     fn check(&self, stepper: &mut Stepper, step: usize, team: usize, about: &str) {
         let (leaders, agents) = (self.world.leaders(), self.world.agents());
         let about = format!("{about}, team {team}, step {step}");
@@ -81,7 +83,7 @@ impl Played {
         let now = step.checked_sub(1).map_or(vec![0; pois * words], |step| sets[step].to_vec());
         assert_eq!(stepper.near()[team * now.len()..][..now.len()], now, "near, {about}");
         let words = &self.trace.sets[team * self.world.set_words()..][..self.world.set_words()];
-        let at = credit::observed_at(Strided { words, stride: 1, offset: 0 }, &self.world);
+        let at = credit::observed_at(credit::Strided { words, stride: 1, offset: 0 }, &self.world);
         let by = |step: usize| at.iter().map(move |at| at.is_some_and(|at| at <= step)).collect::<Vec<bool>>();
         let (observed, before) = (by(step), by(step.saturating_sub(1)));
         let newly: Vec<bool> = observed.iter().zip(before).map(|(&observed, before)| observed && !before).collect();
@@ -95,16 +97,7 @@ impl Played {
     }
 
     fn scores(&self, team: usize) -> Scores {
-        let (sets, seen) = (self.world.set_words(), self.world.leaders() * self.world.followers());
-        let plain = |words| Strided { words, stride: 1, offset: 0 };
-        let episode = Episode {
-            group: 0,
-            team,
-            sets: plain(&self.trace.sets[team * sets..][..sets]),
-            seen: Seen::Counts(plain(&self.trace.seen[team * seen..][..seen])),
-            sights: plain(&self.trace.sights[team * self.world.sight_words()..][..self.world.sight_words()]),
-        };
-        Credit::default().all(&episode, &self.world)
+        Credit::default().all(&self.trace.episode(&self.world, team), &self.world)
     }
 }
 
@@ -211,10 +204,11 @@ fn what_cannot_be_stepped_is_told_and_nothing_moves() {
             starts: &world.starts,
             weights: none[..].into(),
             policies: 1,
+            sharing: Sharing::PerLeader,
             teams: &teams,
-            need: RecordRequest::Scores,
+            fitnesses: &[],
         };
-        let refused = Cpu::default().rollout(&[group], &|_| unreachable!("nobody plays")).expect_err("nor here");
+        let refused = Cpu::default().play(&[group]).expect_err("nor here");
         assert!(matches!(refused, BackendError::InvalidInput(_)), "{refused}");
         error
     };
@@ -340,4 +334,126 @@ fn actions_are_taken_within_their_range_and_starts_on_the_grid() {
     stepper.reset_to(&beside).expect("they are on the map");
     assert_eq!(stepper.states().positions, on_grid);
     assert_eq!(positions([0.1, 0.2], Some(&beside)), positions([0.1, 0.2], None));
+}
+
+#[test]
+fn a_restored_stepper_continues_with_the_same_bits() {
+    for seed in 0..12 {
+        let config = sample::world(seed);
+        let world = World::new(&config);
+        let (teams, leaders, agents, pois) = (13, world.leaders(), world.agents(), world.pois.len());
+        let make = |level| {
+            let stepper = Stepper::at_level(level, world.clone(), teams, true).unwrap();
+            if seed % 2 == 0 { stepper.with_sights().unwrap() } else { stepper }
+        };
+        let mut original = make(Level::new());
+        // Every third world has POIs of its own in each team.
+        let moved = if seed % 3 == 0 { pois } else { 0 };
+        let starts: Vec<f32> = (0..teams * (agents + moved))
+            .flat_map(|place| [(place % 7) as f32, (place % 5) as f32].map(|at| at * 0.125 * world.map().min_element()))
+            .collect();
+        original.reset_to(&starts).unwrap();
+        let actions = |step: usize| -> Vec<f32> {
+            (0..teams * leaders * 2).map(|index| ((index * 31 + step * 17) % 19) as f32 / 9.0 - 1.0).collect()
+        };
+        for step in 0..world.steps() / 2 {
+            original.step(&actions(step)).unwrap();
+        }
+        // Teams at different steps.
+        let chosen: Vec<bool> = (0..teams).map(|team| team % 4 == 1).collect();
+        original.reset_some(&chosen, None).unwrap();
+        original.step(&actions(99)).unwrap();
+        let state = original.save();
+        for level in Cpu::levels() {
+            let (mut restored, mut reference) = (make(level), make(Level::new()));
+            restored.restore(&state).unwrap();
+            reference.restore(&state).unwrap();
+            assert_eq!(restored.save(), state, "world {seed}");
+            for step in 0..world.steps() + 2 {
+                let show = |stepper: &mut Stepper| {
+                    let states = stepper.states();
+                    let bits = [states.positions, states.headings, states.speeds].concat();
+                    let bits: Vec<u32> = bits.iter().chain(stepper.inputs()).map(|number| number.to_bits()).collect();
+                    let shown = (stepper.near().to_vec(), stepper.observed().to_vec(), stepper.steps().to_vec());
+                    (
+                        bits,
+                        shown,
+                        stepper.newly_observed().to_vec(),
+                        (0..teams).map(|t| stepper.scores(t)).collect::<Vec<_>>(),
+                    )
+                };
+                assert_eq!(show(&mut restored), show(&mut reference), "world {seed} step {step}");
+                restored.step(&actions(step)).unwrap();
+                reference.step(&actions(step)).unwrap();
+            }
+        }
+        // The original was never put together from bytes.
+        let mut after: Vec<Vec<u32>> = vec![];
+        let mut restored = make(Level::new());
+        restored.restore(&state).unwrap();
+        for stepper in [&mut original, &mut restored] {
+            (0..world.steps()).for_each(|step| stepper.step(&actions(step)).unwrap());
+            after.push(stepper.inputs().iter().map(|input| input.to_bits()).collect());
+        }
+        assert_eq!(after[0], after[1], "world {seed}");
+    }
+}
+
+#[test]
+fn a_state_that_does_not_fit_changes_nothing() {
+    let world = World::new(&sample::world(1));
+    let mut stepper = Stepper::recording(world.clone(), 3).unwrap();
+    stepper.step(&vec![0.5; 3 * world.leaders() * 2]).unwrap();
+    let state = stepper.save();
+    let refused = |stepper: &mut Stepper, state: &[u8]| {
+        assert!(matches!(stepper.restore(state), Err(StepError::State(_))), "{} bytes", state.len());
+    };
+    for length in [0, 3, 20, 24, state.len() - 4, state.len() - 1] {
+        refused(&mut stepper, &state[..length]);
+    }
+    refused(&mut stepper, &[&state[..], &[0; 4]].concat());
+    refused(&mut Stepper::new(world.clone(), 3).unwrap(), &state);
+    refused(&mut Stepper::recording(world, 4).unwrap(), &state);
+    for word in 0..state.len() / 4 {
+        let mut damaged = state.clone();
+        damaged[word * 4..word * 4 + 4].copy_from_slice(&f32::NAN.to_le_bytes());
+        // Counts and sets may hold any bits, so not every damage is found, but none panics.
+        let _ = stepper.restore(&damaged);
+    }
+    stepper.restore(&state).unwrap();
+    assert_eq!(stepper.save(), state);
+}
+
+#[test]
+fn teams_may_have_pois_of_their_own() {
+    let world = World::new(&sample::world(2));
+    let (teams, agents, pois) = (9, world.agents(), world.pois.len());
+    let starts = Starts::Drawn { episodes: teams as u32, seed: 5, jitter: 1.0, poi_jitter: 3.0 };
+    let drawn: Vec<Vec<Vec2>> = (0..teams).map(|team| starts.of(team, &world)).collect();
+    let flat: Vec<f32> = drawn.iter().flatten().flat_map(|place| place.to_array()).collect();
+    let mut together = Stepper::new(world.clone(), teams).unwrap();
+    together.reset_to(&flat).unwrap();
+    let actions = vec![0.75; world.leaders() * 2];
+    for (team, places) in drawn.iter().enumerate() {
+        // The same world with its POIs there.
+        let own = World { pois: places[agents..].to_vec(), ..world.clone() };
+        let mut alone = Stepper::new(own, 1).unwrap();
+        let start: Vec<f32> = places[..agents].iter().flat_map(|place| place.to_array()).collect();
+        alone.reset_to(&start).unwrap();
+        together.reset_to(&flat).unwrap();
+        assert_eq!(together.pois(team), &places[agents..]);
+        for step in 0..world.steps() {
+            let size = world.leaders() * 8;
+            assert_eq!(&together.inputs()[team * size..][..size], alone.inputs(), "team {team} step {step}");
+            together.step(&actions.repeat(teams)).unwrap();
+            alone.step(&actions).unwrap();
+            assert_eq!(&together.observed()[team * pois..][..pois], alone.observed());
+        }
+    }
+    // A reset to the world's start brings back the world's POIs, for the chosen team alone.
+    let chosen: Vec<bool> = (0..teams).map(|team| team == 2).collect();
+    together.reset_some(&chosen, None).unwrap();
+    assert_eq!((together.pois(2), together.pois(3)), (&world.pois[..], &drawn[3][agents..]));
+    together.reset();
+    assert_eq!(together.pois(3), &world.pois[..]);
 }

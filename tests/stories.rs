@@ -1,46 +1,118 @@
 //! The paper's claims (Sections 1, 5 and 6, Figures 4 to 6) over thirty trials: tables in docs/results/claims.md and
 //! docs/results/claims-measured.md are what comes out, verdict by verdict, whether the paper's claims hold or not.
 //!
-//! Where results change on purpose, `FLOTILLA_WRITE_CLAIMS=1 cargo test --test stories` writes the tables anew.
+//! docs/results/claims/trials.csv has every trial's result at generation 100. The first trials are trained again, and
+//! the means on the page are those of the file. `FLOTILLA_LONG=1 cargo test --release --test stories` trains all of it;
+//! with `FLOTILLA_WRITE_CLAIMS=1` it writes file, tables and figures anew.
 
 #![cfg(feature = "cli")]
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use flotilla::backend::cpu::Cpu;
 use flotilla::baseline::Baselines;
 use flotilla::config::{Override, ValidConfig};
-use flotilla::report::paper::{self, Evidence, claims, tables};
+use flotilla::report::paper::{self, Evidence, Experiment, claims, tables};
+use flotilla::statistics;
 use flotilla::trainer::Row;
 use flotilla::trainer::Trainer;
 
-const TRIALS: u32 = 30;
+const TRIALS: usize = 30;
 const SEED: u32 = 777;
+/// The generation that the page reports.
+const LAST: usize = 100;
+
+/// Trains the paper's experiments.
+fn trained(trials: usize) -> Vec<Experiment> {
+    let set = |key: &str, value: u32| Override::new(key, value, key);
+    let mut arms = paper::arms(&[set("learning.trials", trials as u32), set("learning.seed", SEED)]).unwrap();
+    let learning = &arms[0].config.learning;
+    assert_eq!((learning.population, learning.generations), (50, LAST));
+    let (configs, places) = paper::trained(&arms);
+    let mut trainer = Trainer::new(ValidConfig::all(&configs).unwrap());
+    for row in trainer.finish(&mut Cpu::default()).unwrap() {
+        let of = (0..arms.len()).filter(|&arm| places[arm] == row.experiment);
+        of.for_each(|arm| arms[arm].add(&Row { experiment: arm, ..row }));
+    }
+    arms
+}
+
+fn root(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
+}
+
+/// One row per arm: its name, and for each trial a digit, the POIs that the champion and the best team observe.
+fn listed(arms: &[Experiment]) -> String {
+    let mut text = String::from("arm,champion_pois,best_pois\n");
+    for arm in arms {
+        let digits = |g: &[Vec<f64>]| -> String {
+            g.iter().map(|trial| (trial[LAST] * arm.pois() as f64).round().to_string()).collect()
+        };
+        text += &format!("{:?},{},{}\n", arm.name(), digits(&arm.champion), digits(&arm.best));
+    }
+    text
+}
+
+#[test]
+fn the_file_of_trials_is_what_comes_out() {
+    let text = fs::read_to_string(root("docs/results/claims/trials.csv")).unwrap();
+    let page = fs::read_to_string(root("docs/results/claims.md")).unwrap();
+    let arms = trained(3);
+    let mut table = csv::Reader::from_reader(text.as_bytes());
+    let mut rows = table.records().map(Result::unwrap);
+    for line in listed(&arms).lines().skip(1) {
+        let row = rows.next().unwrap();
+        let (name, results) = line.rsplit_once("\",").unwrap();
+        assert_eq!(&row[0], name.trim_matches('"'));
+        let first: Vec<&str> = results.split(',').collect();
+        assert!(row[1].starts_with(first[0]) && row[2].starts_with(first[1]), "{name}: {results}");
+        assert!(row[1].len() == TRIALS && row[2].len() == TRIALS, "{name}");
+    }
+    for (arm, row) in arms.iter().zip(csv::Reader::from_reader(text.as_bytes()).records().map(Result::unwrap)) {
+        let [champion, best] = [&row[1], &row[2]]
+            .map(|digits| -> Vec<f64> { digits.bytes().map(|digit| f64::from(digit - b'0')).collect() });
+        let mean = statistics::mean(&champion, 1.0).unwrap().within(0.0, arm.pois() as f64);
+        let best = best.iter().sum::<f64>() / TRIALS as f64;
+        let cell = format!("{:.2} [{:.2}, {:.2}] ({best:.2})", mean.value, mean.low, mean.high);
+        let name = format!("| {}, {} ", arm.layout.name, arm.paradigm);
+        let line = page.lines().find(|line| line.starts_with(&name)).unwrap();
+        // Agents that choose among behaviours are not in this table.
+        assert!(arm.selects || line.contains(&cell), "{}: {cell}", arm.name());
+    }
+}
 
 #[test]
 fn the_pages_tell_what_comes_out() {
-    let set = |key: &str, value: u32| Override::new(key, value, key);
-    let mut arms = paper::arms(&[set("learning.trials", TRIALS), set("learning.seed", SEED)]).unwrap();
-    let learning = arms[0].config.learning.clone();
-    assert_eq!((learning.population, learning.generations), (50, 100));
-    let (configs, places) = paper::trained(&arms);
-    let (mut trainer, mut backend) = (Trainer::new(ValidConfig::all(&configs).unwrap()), Cpu::default());
-    for row in trainer.finish(&mut backend).unwrap() {
-        let of = (0..arms.len()).filter(|&arm| places[arm] == row.arm);
-        of.for_each(|arm| arms[arm].add(&Row { arm, ..row }));
+    if !std::env::var("FLOTILLA_LONG").is_ok_and(|long| long == "1") {
+        return;
     }
+    let arms = trained(TRIALS);
     let mut baselines = Baselines::new(paper::grounds(&arms));
     while !baselines.is_done() {
-        baselines.advance(&mut backend).unwrap();
+        baselines.advance(&mut Cpu::default()).unwrap();
     }
     let baselines = baselines.found();
     let results = Evidence { arms: &arms, baselines: &baselines };
     let claims = claims::claims(results);
-    let (baseline, heading) = (tables::without_learning(results), tables::heading(&learning, &claims));
+    let (baseline, heading) = (tables::without_learning(results), tables::heading(&arms[0].config.learning, &claims));
     let first_page = format!("{baseline}\n{heading}\n\n{}", tables::verdicts(&claims));
     println!("{first_page}");
     let all = format!("{heading}\n\n{}", tables::full(&claims));
+    let path = root("docs/results/claims/trials.csv");
+    match std::env::var_os("FLOTILLA_WRITE_CLAIMS") {
+        Some(_) => fs::write(path, listed(&arms)).unwrap(),
+        None => assert_eq!(fs::read_to_string(path).unwrap(), listed(&arms)),
+    }
+    for (index, layout) in paper::LAYOUTS.iter().enumerate() {
+        let Some(number) = layout.figure else { continue };
+        let (path, svg) =
+            (root(&format!("docs/pictures/figure{number}.svg")), paper::figure(results, index).scene().svg());
+        match std::env::var_os("FLOTILLA_WRITE_CLAIMS") {
+            Some(_) => fs::write(path, svg).unwrap(),
+            None => assert_eq!(fs::read_to_string(path).unwrap(), svg, "figure {number}"),
+        }
+    }
     holds("docs/results/claims.md", &first_page);
     holds("docs/results/claims-measured.md", &all);
 }
@@ -48,7 +120,7 @@ fn the_pages_tell_what_comes_out() {
 /// Fails unless a page has this between its marks, or puts it there if that is asked for.
 fn holds(page: &str, text: &str) {
     const MARKS: [&str; 2] = ["<!-- what comes out: cargo test --test stories -->\n", "<!-- so far -->\n"];
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(page);
+    let path = root(page);
     let whole = fs::read_to_string(&path).unwrap();
     let (before, rest) = whole.split_once(MARKS[0]).unwrap_or_else(|| panic!("{page} has no {:?}", MARKS[0]));
     let (there, after) = rest.split_once(MARKS[1]).unwrap_or_else(|| panic!("{page} has no {:?}", MARKS[1]));

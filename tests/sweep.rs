@@ -438,7 +438,7 @@ fn points_come_out_of_one_batch_as_they_do_alone() {
         let rows = trainer.finish(&mut Cpu::default()).unwrap();
         (0..arms)
             .map(|arm| {
-                let rows = rows.iter().filter(|row| row.arm == arm);
+                let rows = rows.iter().filter(|row| row.experiment == arm);
                 let rows: Vec<_> = rows.map(|r| (r.trial, r.generation, r.best_g, r.mean_g, r.champion_g)).collect();
                 (rows, trainer.policies(arm))
             })
@@ -490,11 +490,26 @@ fn the_union_of_any_shards_is_the_unsharded_run() {
             "sweep.toml"
         ]
     );
+    // Both the heat map and the curves label G in the same way, and the colours are explained.
+    for (picture, labels) in [
+        ("final.svg", &["G of the best team", "mean over trials; below: 95 % interval"][..]),
+        ("reach.svg", &["Median generation that reaches G 0.75", "below: trials that reach it"]),
+        ("curves.svg", &["G of the best team", "mean and 95 % interval over 2 trials"]),
+    ] {
+        let svg = fs::read_to_string(whole.join(picture)).unwrap();
+        for label in labels {
+            assert!(svg.contains(&format!("aria-label=\"{label}\"")), "{picture}: {label}");
+        }
+    }
     let text = fs::read_to_string(whole.join("results.csv")).unwrap();
     let head = "world.coupling,world.steps,learning.generations,point,trial,generation,best_g,mean_g,champion_g";
     assert_eq!(text.lines().next(), Some(head));
     // 4 points of 3 generations and 4 of 12, two trials each, and every run's random start.
     assert_eq!(text.lines().count(), 1 + 2 * (4 * 4 + 4 * 13));
+
+    done(flotilla(&sweep, &whole, &["--collect", "--measure", "champion", "--band", "error"]));
+    let svg = fs::read_to_string(whole.join("final.svg")).unwrap();
+    assert!(svg.contains("G of the champion") && svg.contains("below: ± standard error"), "{svg}");
 
     for count in [2, 3, 11] {
         let out = folder.path().join(format!("{count}"));
@@ -618,7 +633,7 @@ fn killed_shards_resume_to_the_same_bytes() {
                 assert!(matches!(output.status.code(), Some(75 | 0)), "{told}");
                 if output.status.code() == Some(75) {
                     let command = told.lines().last().unwrap();
-                    assert!(told.starts_with("stopped: everything is saved; go on with"), "{told}");
+                    assert!(told.starts_with("stopped: everything is saved; continue with"), "{told}");
                     assert!(command.contains("--backend cpu --shard 2/2 --resume"), "{told}");
                 }
             }

@@ -281,7 +281,7 @@ fn a_finished_run_is_extended() {
     let error = place.refused(1, "train small.toml --out run --resume --generations 5");
     assert!(error.contains("run is a run of 6 generations, which cannot become one of 5"), "{error}");
     let (summary, told) = place.good("train small.toml --out run --resume --generations 11");
-    assert!(told.contains("going on before generation 7"), "{told}");
+    assert!(told.contains("resuming at generation 7"), "{told}");
     assert!(summary.starts_with("Trained 3 trials"), "{summary}");
     for name in ["policies.safetensors", "config.toml"] {
         assert!(fs::read(place.path("run").join(name)).unwrap() == fs::read(place.path("whole").join(name)).unwrap());
@@ -651,7 +651,7 @@ fn summaries_of_the_shortest_runs_read_well() {
     assert!(summary.contains("\n  start ") && summary.contains("\n  generation 1 "), "{summary}");
 }
 
-/// What the config leaves to a default that does not fit, and what its author had better know, is told and in the JSON.
+/// A default that does not fit, and other notes on a config, are printed and are in the JSON.
 #[test]
 fn notes_on_a_config_are_told() {
     let place = place();

@@ -10,13 +10,14 @@ import { execFileSync } from "node:child_process";
 import { mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
+import { opening } from "./opening.mjs";
+import { Training } from "./page/training.js";
 import { Player, contents } from "./player.mjs";
 
 const [page, flotilla] = process.argv.slice(2);
 const text = contents(page);
 const source = name => readFileSync(new URL(name, import.meta.url), "utf8");
 
-const Training = new Function(`${source("page/training.js")} return Training;`)();
 const player = await Player.of(text);
 const { words: machine } = await player.ask({ ask: "open", gpu: false, pass: null });
 assert.equal(machine.description, "cpu (SIMD128, 1 thread)");
@@ -40,6 +41,9 @@ for (const [name, layout, changes] of [
   assert.equal((await digest(layout, changes)).digest, golden[name], `golden digest ${name}`);
   console.log(`${name}: the golden digest`);
 }
+
+assert.equal(await opening(player, text), source("page/opening.json"), "the opening is another episode: node web/opening.mjs web/dist/index.html");
+console.log("the opening is what training gives");
 
 // Whoever takes a leader plays with teammates that do what they learned.
 const { words: resolved } = await player.ask({ ask: "resolve", text: text("layout-generally_forward"), name: "", changes: SMALL });

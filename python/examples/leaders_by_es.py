@@ -19,11 +19,11 @@ CANDIDATES, SIGMA, RATE = 200, 0.3, 0.3
 def main(generations: int = 60) -> None:
     config = flotilla.Config.paper("generally_forward")
     rng = np.random.default_rng(1)
-    means = rng.normal(0, 0.5, (config.leaders, 1, config.parameters))
+    means = rng.normal(0, 0.5, (config.num_learners, 1, config.parameters))
     start = time.perf_counter()
     for generation in range(generations):
         # Every draw and its mirror.
-        half = rng.normal(size=(config.leaders, CANDIDATES // 2, config.parameters))
+        half = rng.normal(size=(config.num_learners, CANDIDATES // 2, config.parameters))
         noise = np.concatenate([half, -half], axis=1)
         scores = flotilla.rollout(config, means + SIGMA * noise, backend="cpu")
         ranks = scores.df.T.argsort(axis=1).argsort(axis=1) / (CANDIDATES - 1) - 0.5

@@ -31,9 +31,9 @@ def main(generations: int = 60) -> None:
     start, key = time.perf_counter(), jax.random.key(1)
 
     def keys(number: int) -> jax.Array:
-        return jax.random.split(jax.random.fold_in(key, number), config.leaders)
+        return jax.random.split(jax.random.fold_in(key, number), config.num_learners)
 
-    means = 0.5 * jax.random.normal(key, (config.leaders, config.parameters))
+    means = 0.5 * jax.random.normal(key, (config.num_learners, config.parameters))
     state = init(keys(0), means, params)
     for generation in range(generations):
         candidates, state = ask(keys(2 * generation + 1), state, params)

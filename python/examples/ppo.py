@@ -27,9 +27,9 @@ class Leaders(torch.nn.Module):
         super().__init__()
         self.widths = [8, *config["policy.hidden"], 2]
         # The starts that evolution has, only less far from zero.
-        self.weights = torch.nn.Parameter(0.5 * torch.randn(config.leaders, config.parameters))
-        self.spread = torch.nn.Parameter(torch.full((config.leaders, 2), -0.7))
-        inputs = config.leaders * 8 + 1
+        self.weights = torch.nn.Parameter(0.5 * torch.randn(config.num_learners, config.parameters))
+        self.spread = torch.nn.Parameter(torch.full((config.num_learners, 2), -0.7))
+        inputs = config.num_learners * 8 + 1
         layers = [torch.nn.Linear(inputs, 64), torch.nn.Tanh(), torch.nn.Linear(64, 64), torch.nn.Tanh()]
         self.critic = torch.nn.Sequential(*layers, torch.nn.Linear(64, 1))
 

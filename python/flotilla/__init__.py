@@ -13,9 +13,10 @@ import os
 from typing import TYPE_CHECKING
 
 from flotilla import _native, loggers
+from flotilla._coevolution import Asked, Coevolution, Played
 from flotilla._config import Config, Key
 from flotilla._errors import ConfigError, Error, Problem
-from flotilla._play import Rollout, Trace, forward, rollout, to_onnx
+from flotilla._play import Collected, Rollout, Trace, collect, forward, rollout, to_onnx
 from flotilla._program import compare, devices, paper, verify
 from flotilla._run import Generation, Run, train
 from flotilla._show import Episode, Figure, Replay, plot
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
 __version__: str = _native.__version__
 
 __all__ = [
+    "Asked",
+    "Coevolution",
+    "Collected",
     "Config",
     "ConfigError",
     "Episode",
@@ -35,6 +39,7 @@ __all__ = [
     "Figure",
     "Generation",
     "Key",
+    "Played",
     "Point",
     "Problem",
     "Replay",
@@ -43,6 +48,7 @@ __all__ = [
     "Sweep",
     "Trace",
     "VectorEnv",
+    "collect",
     "compare",
     "devices",
     "forward",
@@ -58,7 +64,13 @@ __all__ = [
 ]
 
 
-def parallel_env(config: Config, render_mode: str | None = None, reward: str = "G") -> TeamEnv:
+def parallel_env(
+    config: Config,
+    render_mode: str | None = None,
+    reward: str = "G",
+    jitter: float | None = None,
+    poi_jitter: float | None = None,
+) -> TeamEnv:
     """One team as a PettingZoo ``ParallelEnv``: agents ``leader_0``, ``leader_1``, …
 
     Needs PettingZoo (``pip install flotilla-teams[pettingzoo]``). Observations are float32 ``[8]``, actions float32 ``[2]``
@@ -68,7 +80,9 @@ def parallel_env(config: Config, render_mode: str | None = None, reward: str = "
     Args:
         config: the world.
         render_mode: None or ``"rgb_array"``.
-        reward: as of :class:`VectorEnv`.
+        reward: see :class:`VectorEnv`, as for the next two.
+        jitter: largest offset of a start on each axis, in map units.
+        poi_jitter: the same for POIs.
 
     Raises:
         ImportError: PettingZoo is not installed.
@@ -82,7 +96,7 @@ def parallel_env(config: Config, render_mode: str | None = None, reward: str = "
     """
     from flotilla._parallel import TeamEnv
 
-    return TeamEnv(config, render_mode, reward)
+    return TeamEnv(config, render_mode, reward, jitter, poi_jitter)
 
 
 if hasattr(os, "register_at_fork"):

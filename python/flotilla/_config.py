@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, KeysView, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from flotilla import _native as native
+from flotilla._arrays import renamed
 
 
 class Key(NamedTuple):
     """A key of a config.
 
     Example:
-        >>> [key for key in flotilla.Config.keys() if key.name == "world.steps"][0].range
+        >>> [key for key in flotilla.Config.reference() if key.name == "world.steps"][0].range
         '1 to 10000'
     """
 
@@ -41,11 +42,21 @@ def _flat(sections: Mapping[str, Any]) -> list[tuple[str, Any]]:
     return keys
 
 
-class Config:
+class _Keys:
+    """`config.keys()` are the sections, as of any mapping. `Config.keys()` is the former name of `Config.reference()`."""
+
+    def __get__(self, config: Config | None, owner: type[Config]) -> Callable[[], Any]:
+        if config is not None:
+            return lambda: KeysView(config)
+        renamed("Config.keys", "Config.reference")
+        return owner.reference
+
+
+class Config(Mapping[str, Any]):
     """One experiment: its world, its agents, its learning. A config cannot be changed; :meth:`replace` makes another.
 
     Keys that are not given have the defaults of ``docs/reference/config.md``. A config can be compared, hashed, copied and
-    pickled.
+    pickled. It is a mapping of sections: ``"world.steps" in config``, ``dict(config)``.
 
     Args:
         sections: a mapping for every section of a config file: ``world={"leaders": [[5, 5]], "pois": [[5, 15]]}``, and a
@@ -94,7 +105,7 @@ class Config:
             ConfigError: everything that is wrong with the text, by line.
 
         Example:
-            >>> flotilla.Config.parse("[world]\\nleaders = [[1, 1]]\\npois = [[2, 2]]").leaders
+            >>> flotilla.Config.parse("[world]\\nleaders = [[1, 1]]\\npois = [[2, 2]]").num_learners
             1
         """
         return cls._of(native.Config.parse(text, name))
@@ -114,14 +125,16 @@ class Config:
         return config.replace(learning={"fitness": fitness, "paradigm": paradigm})
 
     @staticmethod
-    def keys() -> list[Key]:
-        """Every key that a config has.
+    def reference() -> list[Key]:
+        """Every key that a config can have.
 
         Example:
-            >>> flotilla.Config.keys()[0].name
+            >>> flotilla.Config.reference()[0].name
             'world.map'
         """
         return [Key(*key) for key in native.keys()]
+
+    keys = _Keys()  # pyright: ignore[reportAssignmentType]
 
     def replace(self, **sections: Mapping[str, Any] | Sequence[Any]) -> Config:
         """This config with some keys changed; those of a section that are not named stay.
@@ -165,10 +178,22 @@ class Config:
             found = found[part]
         return found
 
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.to_dict())
+
+    def __len__(self) -> int:
+        return len(self.to_dict())
+
+    @property
+    def num_learners(self) -> int:
+        """Number of agents that learn: the leaders and, in the all-leaders paradigm, everyone."""
+        return self._native.learners
+
     @property
     def leaders(self) -> int:
-        """How many learn: the leaders and, in the all-leaders paradigm, everyone."""
-        return self._native.learners
+        """The former name of ``num_learners``."""
+        renamed("Config.leaders", "Config.num_learners")
+        return self.num_learners
 
     @property
     def parameters(self) -> int:

@@ -21,8 +21,15 @@ Space = spaces.Space[Array]
 class TeamEnv(ParallelEnv[str, Array, Array]):  # type: ignore[misc, unused-ignore]
     """See :func:`flotilla.parallel_env`."""
 
-    def __init__(self, config: Config, render_mode: str | None = None, reward: str = "G") -> None:
-        self._teams = TeamBatch(config, 1, reward, render_mode)
+    def __init__(
+        self,
+        config: Config,
+        render_mode: str | None = None,
+        reward: str = "G",
+        jitter: float | None = None,
+        poi_jitter: float | None = None,
+    ) -> None:
+        self._teams = TeamBatch(config, 1, reward, render_mode, jitter, poi_jitter)
         self.config, self.render_mode = config, render_mode
         self.metadata: dict[str, Any] = {
             "name": "flotilla_v0",

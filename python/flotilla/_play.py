@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
-from flotilla._arrays import Floats, backend_name, floats, number, whole
+from flotilla._arrays import Floats, as_bools, backend_name, floats, jitters, renamed, whole
 from flotilla._config import Config
 
 MAX_EPISODES = 1_000_000
@@ -17,69 +21,145 @@ MAX_EPISODES = 1_000_000
 
 @dataclass(frozen=True)
 class Trace:
-    """All that teams did in one episode.
+    """What teams did at every step of one episode. Fields that were not recorded are None.
 
     Attributes:
-        positions: where everyone was, from the start on, ``[teams, steps + 1, agents, 2]``, leaders first, in map units.
-        headings: unit vectors, likewise.
-        speeds: ``[teams, steps + 1, agents]``, in units a second.
-        inputs: what leaders sensed, ``[teams, steps, leaders, 8]``: the density of POIs, then of agents, in four quadrants
+        positions: positions from the start on, ``[teams, steps + 1, agents, 2]``, leaders first, in map units.
+        headings: unit vectors, of the same shape.
+        speeds: ``[teams, steps + 1, agents]``, in units per second.
+        inputs: what leaders sense, ``[teams, steps, leaders, 8]``: the density of POIs, then of agents, in four quadrants
             around their heading: back right, front right, front left, back left.
-        outputs: what their policies answered, ``[teams, steps, leaders, 2]`` in -1..1: that leads to the next step's states.
-        near: which agents were near which POI after each step, ``[teams, steps, pois, agents]``, bool.
+        outputs: the answers of their policies, ``[teams, steps, leaders, 2]`` in -1..1, which lead to the next step's
+            states.
+        agents_at_poi: which agents are within the observation radius of each POI after each step,
+            ``[teams, steps, pois, agents]``, bool.
 
     Example:
         >>> config = flotilla.Config.paper()
         >>> still = np.zeros((4, 1, config.parameters), np.float32)
-        >>> flotilla.rollout(config, still, trace=True).trace.positions.shape
-        (1, 26, 12, 2)
+        >>> trace = flotilla.rollout(config, still, record=("positions",)).trace
+        >>> trace.positions.shape, trace.speeds
+        ((1, 26, 12, 2), None)
     """
 
-    positions: Floats
-    headings: Floats
-    speeds: Floats
-    inputs: Floats
-    outputs: Floats
-    near: NDArray[np.bool_]
+    positions: Any = None
+    headings: Any = None
+    speeds: Any = None
+    inputs: Any = None
+    outputs: Any = None
+    agents_at_poi: Any = None
+
+    @property
+    def near(self) -> Any:
+        """The former name of ``agents_at_poi``."""
+        renamed("Trace.near", "Trace.agents_at_poi")
+        return self.agents_at_poi
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """What teams scored; of several episodes, means.
+    """The scores of teams; means over episodes. ``rollout["Df"]`` is a score by the name of the fitness.
 
     Attributes:
         observed: POIs observed, ``[teams]``.
-        g: these over all POIs, ``[teams]``.
-        d: what the team would have lost without each leader, ``[teams, leaders]``, as the next two.
-        df: without it and the followers that it led.
-        dpp: what it would have gained by copies of it, where that is more.
-        dt: without it and, at each step, the followers that it led then; None but where the config's fitness is Dt.
-        trace: all that the teams did, if that was asked for.
+        g: the share of POIs observed, float64 ``[teams]``, as in a run's metrics.
+        d: what the team would have lost without each leader, ``[teams, leaders]``, as the next three.
+        df: without the leader and the followers that it led.
+        dpp: what copies of the leader would have gained, if that is more.
+        dt: without the leader and, at each step, the followers that it led then; None unless the config's fitness is Dt.
+        trace: what the teams did, if that was asked for.
+        deviation: the standard deviation of G over episodes, ``[teams]``, if ``spread`` was asked for, as the next two.
+        interval: the 95 % interval of the mean G, ``[teams, 2]``, as ``flotilla rollout`` computes it.
+        episodes: G of each episode, ``[episodes, teams]``.
 
     Example:
         >>> config = flotilla.Config.paper()
         >>> scores = flotilla.rollout(config, np.zeros((1, 3, config.parameters), np.float32))
-        >>> scores.g, scores.df.shape
-        (array([1., 1., 1.], dtype=float32), (3, 4))
+        >>> scores.g, scores["Df"].shape
+        (array([1., 1., 1.]), (3, 4))
     """
 
     observed: NDArray[np.float64]
-    g: Floats
+    g: NDArray[np.float64]
     d: Floats
     df: Floats
     dpp: Floats
     dt: Floats | None = None
     trace: Trace | None = None
+    deviation: NDArray[np.float64] | None = None
+    interval: NDArray[np.float64] | None = None
+    episodes: NDArray[np.float64] | None = None
+
+    def __getitem__(self, fitness: str) -> NDArray[Any]:
+        """Returns a score by the name of the fitness: ``"G"``, ``"D"``, ``"Df"``, ``"D++"`` or ``"Dt"``."""
+        scores: dict[str, NDArray[Any] | None] = {"G": self.g, "D": self.d, "Df": self.df, "D++": self.dpp, "Dt": self.dt}
+        found = scores.get(fitness)
+        if found is None:
+            raise KeyError(fitness)
+        return found
 
     def __repr__(self) -> str:
         teams, leaders = self.d.shape
         return f"<flotilla.Rollout: {teams} teams of {leaders} leaders, G {self.g.mean():.3f} on average>"
 
 
-def _near(words: NDArray[np.uint32], agents: int) -> NDArray[np.bool_]:
-    """Converts bit sets `[..., words]` to bools `[..., agents]`. The first agent has the lowest bit."""
-    bits = np.unpackbits(words.astype("<u4", copy=False).view(np.uint8), axis=-1, bitorder="little")
-    return bits[..., :agents].astype(np.bool_)
+FIELDS = ("positions", "headings", "speeds", "inputs", "outputs", "agents_at_poi")
+# Seconds that a block of episodes should take, so that Ctrl-C is answered soon.
+BLOCK_SECONDS = 0.2
+
+
+def _checked(config: Any, policies: ArrayLike) -> Floats:
+    """Returns policies as an array `[leaders, teams, parameters]`."""
+    if not isinstance(config, Config):
+        raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config")
+    return floats("policies", policies, 3)
+
+
+def _shapes(config: Config, teams: int) -> dict[str, tuple[int, ...]]:
+    """Returns the shape of every array of steps, that of `agents_at_poi` in words of 32 agents."""
+    agents, steps = len(config["world.leaders"]) + len(config["world.followers"]), int(config["world.steps"])
+    leaders, pois = config.num_learners, len(config["world.pois"])
+    return {
+        "positions": (teams, steps + 1, agents, 2),
+        "headings": (teams, steps + 1, agents, 2),
+        "speeds": (teams, steps + 1, agents),
+        "inputs": (teams, steps, leaders, _native.INPUTS),
+        "outputs": (teams, steps, leaders, _native.OUTPUTS),
+        "actions": (teams, steps, leaders, _native.OUTPUTS),
+        "agents_at_poi": (teams, steps, pois, -(-agents // 32)),
+    }
+
+
+def _record(
+    config: Config,
+    policies: Floats,
+    starts: tuple[int, int, float, float] | None,
+    noise: tuple[int, Floats] | None,
+    arrays: dict[str, Any],
+) -> tuple[list[Any], NDArray[np.uint32]]:
+    """Plays in blocks and fills the arrays. Returns scores, and the step at which each POI was observed, or 0.
+
+    Blocks are episodes of all teams, or if there is one episode, some teams of it.
+    """
+    teams, episodes = policies.shape[1], 1 if starts is None else starts[0]
+    whole_teams = episodes > 1 or noise is not None
+    total, block, first = (episodes if whole_teams else teams), 1 if whole_teams else 256, 0
+    parts: list[tuple[Any, ...]] = []
+    while first < total:
+        count = min(block, total - first)
+        chosen = policies if count == teams or whole_teams else np.ascontiguousarray(policies[:, first : first + count])
+        begin, end = (first * teams, (first + count) * teams) if whole_teams else (first, first + count)
+        of_block = [arrays[name][begin:end] if name in arrays else None for name in (*FIELDS[:5], "actions")]
+        near = arrays["agents_at_poi"][begin:end] if "agents_at_poi" in arrays else None
+        span = (first, first + count) if whole_teams else (0, 1)
+        began = time.perf_counter()
+        scores, at = _native.record(config._native, chosen, starts, span, noise, of_block, near)
+        took = time.perf_counter() - began
+        parts.append((*scores, at))
+        first += count
+        block = block * 2 if took < BLOCK_SECONDS / 2 else max(block // 2, 1) if took > BLOCK_SECONDS * 2 else block
+    joined: list[Any] = [None if part[0] is None else np.concatenate(part) for part in zip(*parts)]
+    return joined[:-1], joined[-1]
 
 
 def rollout(
@@ -90,28 +170,36 @@ def rollout(
     seed: int = 0,
     jitter: float | None = None,
     poi_jitter: float | None = None,
+    spread: bool = False,
     trace: bool = False,
+    record: Sequence[str] = (),
+    out: Mapping[str, NDArray[Any]] | None = None,
     backend: str | int = "auto",
 ) -> Rollout:
-    """Plays teams of given policies, and scores every leader.
+    """Plays teams of given policies, and scores every leader. Ctrl-C stops it.
 
     Args:
         config: the world, and the policies' network.
         policies: float32 ``[leaders, teams, parameters]``: team ``t`` is made of every leader's policy ``t``; or
-            ``[1, teams, parameters]`` where the leaders of a team share one. Not copied where they are C-contiguous
-            float32. A policy's parameters stand layer by layer, in each input by input with the bias last, in each unit by
-            unit.
-        episodes: play every team from so many starts that no training saw; None plays once, from the config's own.
-        seed: of these starts; the same for all policies.
-        jitter: how far a start is moved at most on each axis, in map units; None is the config's ``learning.start_jitter``.
-        poi_jitter: likewise of each POI; None is the config's ``learning.poi_jitter``.
-        trace: also give all that the teams did in the first episode.
-        backend: what to play on, to the same bits: ``"auto"``, ``"cpu"``, ``"gpu"``, or an adapter's number or name.
+            ``[1, teams, parameters]`` if the leaders of a team share one. C-contiguous float32 arrays are not copied.
+            A policy's parameters are its layers in order, each as weights ``W[in, out]`` (row-major), then biases ``b[out]``.
+        episodes: number of held-out starts that every team plays from. None plays once, from the config's own start.
+        seed: seed of these starts, which are the same for all policies.
+        jitter: largest offset of a start on each axis, in map units; None takes the config's ``learning.start_jitter``.
+        poi_jitter: the same for POIs; None takes the config's ``learning.poi_jitter``.
+        spread: also return G of each episode, its standard deviation and its interval.
+        trace: also return all fields of a :class:`Trace`, of the first episode.
+        record: the fields of the trace to return, if not all: ``("positions",)``. Steps are recorded on the CPU, to the
+            same bits as on any GPU.
+        out: C-contiguous arrays for fields of the trace, by name, which are then not allocated: float32, and bool for
+            ``agents_at_poi``.
+        backend: where to play, with the same bits: ``"auto"``, ``"cpu"``, ``"gpu"``, or an adapter's number or name.
 
     Raises:
-        ValueError: the policies have another shape, or hold a NaN, an infinity or a size above 1e6.
+        ValueError: the policies have another shape, or hold a NaN, an infinity or a size above 1e6; or another argument is
+            not allowed.
         TypeError: the policies are no numbers.
-        MemoryError: there is not enough for so many.
+        MemoryError: there is not enough memory for so many.
         Error: the backend fails.
 
     Example:
@@ -120,29 +208,165 @@ def rollout(
         >>> scores = flotilla.rollout(config, run.policies[0])
         >>> bool(scores.g[0] == run.metrics["champion_g"][0, -1])
         True
+        >>> held_out = flotilla.rollout(config, run.policies[0][:, :1], episodes=100, jitter=1.0, spread=True)
+        >>> held_out.episodes.shape, held_out.interval.shape
+        ((100, 1), (1, 2))
     """
-    if not isinstance(config, Config):
-        raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config")
-    array, name = floats("policies", policies, 3), backend_name(backend)
+    array, name = _checked(config, policies), backend_name(backend)
+    fields = _fields(record, trace, out)
     starts = None
     if episodes is not None:
-        learning = config["learning"]
-        reaches = [learning["start_jitter"] if jitter is None else jitter]
-        reaches.append(learning["poi_jitter"] if poi_jitter is None else poi_jitter)
-        starts = (
-            whole("episodes", episodes, 1, MAX_EPISODES),
-            whole("seed", seed, 0, 2**63 - 1),
-            number("jitter", reaches[0], 0, 1e9),
-            number("poi_jitter", reaches[1], 0, 1e9),
-        )
+        reaches = jitters(config, jitter, poi_jitter)
+        starts = (whole("episodes", episodes, 1, MAX_EPISODES), whole("seed", seed, 0, 2**63 - 1), *reaches)
+        if starts[0] > 1 and max(reaches) == 0:
+            text = f"{episodes} episodes without jitter are all the same; pass jitter= or poi_jitter="
+            warnings.warn(text, UserWarning, stacklevel=2)
     elif jitter is not None or poi_jitter is not None:
-        raise ValueError("a jitter is of starts that are drawn, say how many by episodes")
-    observed, g, d, df, dpp, dt = _native.rollout(config._native, array, starts, name)
+        raise ValueError("a jitter applies to drawn starts; pass episodes= with their number")
+    pois = len(config["world.pois"])
     traced = None
-    if trace:
-        positions, headings, speeds, inputs, outputs, near = _native.trace(config._native, array, starts, 0, name)
-        traced = Trace(positions, headings, speeds, inputs, outputs, _near(near, positions.shape[2]))
-    return Rollout(observed, g, d, df, dpp, dt, traced)
+    if fields:
+        first = None if starts is None else (1, *starts[1:])
+        arrays = _allocate(_shapes(config, array.shape[1]), fields, out)
+        (observed, d, df, dpp, dt), _ = _record(config, array, first, None, arrays)
+        traced = _traced(config, arrays, out)
+        if starts is None and not spread:
+            return Rollout(observed, observed / pois, d, df, dpp, dt, traced)
+    (observed, d, df, dpp, dt), spreads = _native.rollout(config._native, array, starts, name, bool(spread))
+    scores = Rollout(observed, observed / pois, d, df, dpp, dt, traced)
+    if spreads is not None:
+        rows, each = spreads
+        scores = replace(scores, deviation=rows[:, 0] / pois, interval=rows[:, 1:] / pois, episodes=each / pois)
+    return scores
+
+
+def _fields(record: Sequence[str], trace: bool, out: Mapping[str, Any] | None) -> tuple[str, ...]:
+    """Returns the fields of a trace that are wanted."""
+    named = ("agents_at_poi" if field == "near" else field for field in ((record,) if isinstance(record, str) else record))
+    fields = FIELDS if trace else tuple(dict.fromkeys([*named, *(out or ())]))
+    for field in fields:
+        if field not in FIELDS:
+            raise ValueError(f"record {field!r}, allowed are {', '.join(map(repr, FIELDS))}")
+    return fields
+
+
+def _allocate(
+    shapes: Mapping[str, tuple[int, ...]], fields: Sequence[str], out: Mapping[str, NDArray[Any]] | None
+) -> dict[str, Any]:
+    """Returns the arrays to record fields in: those of `out`, or new ones."""
+    arrays: dict[str, Any] = {}
+    for field in fields:
+        given = None if out is None or field == "agents_at_poi" else out.get(field)
+        if given is None:
+            arrays[field] = np.empty(shapes[field], np.uint32 if field == "agents_at_poi" else np.float32)
+            continue
+        right = isinstance(given, np.ndarray) and given.dtype == np.float32 and given.shape == shapes[field]
+        if not right or not given.flags.c_contiguous or not given.flags.writeable:
+            text = f"out[{field!r}] must be a writable C-contiguous float32 array of shape {shapes[field]}"
+            raise ValueError(text)
+        arrays[field] = given
+    return arrays
+
+
+def _traced(config: Config, arrays: dict[str, Any], out: Mapping[str, NDArray[Any]] | None) -> Trace:
+    """Returns a trace of recorded arrays."""
+    if "agents_at_poi" in arrays:
+        agents = len(config["world.leaders"]) + len(config["world.followers"])
+        found = as_bools(arrays["agents_at_poi"], agents)
+        given = None if out is None else out.get("agents_at_poi")
+        if given is not None:
+            if given.dtype != np.bool_ or given.shape != found.shape:
+                raise ValueError(f"out['agents_at_poi'] must be a bool array of shape {found.shape}")
+            given[...] = found
+            found = given
+        arrays = {**arrays, "agents_at_poi": found}
+    return Trace(**arrays)
+
+
+@dataclass(frozen=True)
+class Collected:
+    """Episodes with noise on the actions, for trainers such as PPO. Episodes of a team follow each other by teams.
+
+    Attributes:
+        observations: what leaders sense, ``[episodes * teams, steps, leaders, 8]``.
+        actions: what they did before it was clamped to -1..1: their policy's answer plus noise,
+            ``[episodes * teams, steps, leaders, 2]``.
+        means: the answers of their policies, of the same shape.
+        rewards: ``[episodes * teams, steps, leaders]``, as of :class:`VectorEnv`.
+        masks: False at the last step of an episode, else True, ``[episodes * teams, steps]``.
+        g: G, ``[episodes * teams]``.
+    """
+
+    observations: Floats
+    actions: Floats
+    means: Floats
+    rewards: Floats
+    masks: NDArray[np.bool_]
+    g: NDArray[np.float64]
+
+
+def collect(
+    config: Config,
+    policies: ArrayLike,
+    noise: ArrayLike = 0.1,
+    seed: int = 0,
+    *,
+    episodes: int = 1,
+    jitter: float | None = None,
+    poi_jitter: float | None = None,
+    reward: str = "G",
+) -> Collected:
+    """Plays episodes with normal noise on the actions, at a rollout's speed, and returns what a trainer needs.
+
+    Args:
+        config: the world, and the policies' network.
+        policies: see :func:`rollout`.
+        noise: the standard deviation of the noise: one number, ``[2]`` for turn and speed, or ``[leaders, 2]``.
+        seed: seed of the noise and of the starts.
+        episodes: number of episodes per team.
+        jitter: see :func:`rollout`; here, too, None takes the config's.
+        poi_jitter: the same for POIs.
+        reward: see :class:`VectorEnv`.
+
+    Raises:
+        ValueError: an argument is not allowed.
+        MemoryError: there is not enough memory for so many.
+
+    Example:
+        >>> config = flotilla.Config.paper()
+        >>> policies = np.zeros((1, 1, config.parameters), np.float32)
+        >>> batch = flotilla.collect(config, policies, noise=0.3, seed=1, episodes=64)
+        >>> batch.observations.shape, batch.actions.shape, batch.rewards.shape
+        ((64, 25, 4, 8), (64, 25, 4, 2), (64, 25, 4))
+        >>> bool((batch.rewards.sum(1)[:, 0] == batch.g).all())
+        True
+    """
+    array = _checked(config, policies)
+    if reward not in _native.FITNESSES:
+        raise ValueError(f"reward {reward!r}, allowed are {', '.join(_native.FITNESSES)}")
+    scored = config.replace(learning={"fitness": reward})
+    deviations = np.asarray(noise, np.float32)
+    if deviations.shape not in ((), (2,), (config.num_learners, 2)) or not (np.isfinite(deviations) & (deviations >= 0)).all():
+        raise ValueError("noise must be a number from 0 on, or an array of them, [2] or [leaders, 2]")
+    deviations = np.ascontiguousarray(np.broadcast_to(deviations, (config.num_learners, 2)))
+    number = whole("seed", seed, 0, 2**63 - 1)
+    starts = (whole("episodes", episodes, 1, MAX_EPISODES), number, *jitters(config, jitter, poi_jitter))
+    total = starts[0] * array.shape[1]
+    shapes = _shapes(config, total)
+    arrays = {name: np.empty(shapes[name], np.float32) for name in ("inputs", "outputs", "actions")}
+    (observed, d, df, dpp, dt), at = _record(scored, array, starts, (number, deviations), arrays)
+    steps, pois = int(config["world.steps"]), len(config["world.pois"])
+    rewards = np.zeros((total, steps, config.num_learners), np.float32)
+    if reward == "G":
+        team, poi = np.nonzero(at)
+        counts = np.zeros((total, steps), np.float32)
+        np.add.at(counts, (team, at[team, poi].astype(np.int64) - 1), 1)
+        rewards[...] = (counts / np.float32(pois))[..., None]
+    else:
+        rewards[:, -1] = {"D": d, "Df": df, "D++": dpp, "Dt": dt}[reward]
+    masks = np.ones((total, steps), np.bool_)
+    masks[:, -1] = False
+    return Collected(arrays["inputs"], arrays["actions"], arrays["outputs"], rewards, masks, observed / pois)
 
 
 def _layers(config: Config | None, parameters: int) -> list[int]:
@@ -166,37 +390,20 @@ def _layers(config: Config | None, parameters: int) -> list[int]:
     return found
 
 
-def _chosen(inputs: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the turn and speed of the most wanted behaviour.
-
-    Behaviours are: hold, towards POIs, away from POIs, towards agents, away from agents.
-    """
-    behaviour = wanted.argmax(-1)
-    inputs = np.broadcast_to(inputs, (*behaviour.shape, inputs.shape[-1]))
-    sensed = np.where((behaviour < 3)[..., None], inputs[..., :4], inputs[..., 4:])
-    turn = np.array([-0.75, -0.25, 0.25, 0.75])[sensed.argmax(-1)]
-    away = (behaviour == 2) | (behaviour == 4)
-    turn = np.where(away, np.where(turn < 0, turn + 1, turn - 1), turn)
-    turn = np.where(sensed.max(-1) > 0, turn, 0.0)
-    hold = behaviour == 0
-    return np.stack([np.where(hold, 0.0, turn), np.where(hold, -1.0, 1.0)], axis=-1)
-
-
 def forward(policies: ArrayLike, inputs: ArrayLike, config: Config | None = None) -> Floats:
-    """What policies answer, in plain NumPy: a fully connected network with a bias and tanh in every layer.
+    """Returns what policies answer to inputs, to the bit as in an episode.
 
-    Within 5e-6 of the program's answers, which have arithmetic of their own that is the same everywhere. Where a config says
-    that policies choose among behaviours, this chooses too; two that are wanted alike within that much may be taken for each
-    other.
+    A policy is a fully connected network with a bias and tanh in every layer. If a config says that policies choose among
+    behaviours, the answer is the turn and speed of the chosen one.
 
     Args:
-        policies: ``[..., parameters]``: layer by layer, in each input by input with the bias last, in each unit by unit.
+        policies: ``[..., parameters]``, see :func:`rollout`.
         inputs: ``[..., 8]``; the axes before the last are broadcast against those of the policies.
-        config: whose policies they are; None where they have at most one hidden layer, and answer directly.
+        config: the config of the policies; None if they have at most one hidden layer, and answer directly.
 
     Returns:
-        float32 ``[..., 2]`` in -1..1: the turn, in parts of a half turn to the left, and the speed, from standing still to
-        the highest.
+        float32 ``[..., 2]`` in -1..1: the turn, as a fraction of a half turn to the left, and the speed, from standing still
+        to the largest.
 
     Raises:
         ValueError: the shapes do not fit.
@@ -212,17 +419,16 @@ def forward(policies: ArrayLike, inputs: ArrayLike, config: Config | None = None
             raise ValueError(f"{what} are {array.dtype} of shape {array.shape}, allowed are arrays of numbers")
     if given.shape[-1] != _native.INPUTS:
         raise ValueError(f"inputs have the shape {given.shape}, allowed is [..., {_native.INPUTS}]")
-    layers, at = _layers(config, weights.shape[-1]), 0
-    values = sensed = given.astype(np.float64)
-    for before, after in zip(layers, layers[1:]):
-        layer = weights[..., at : at + (before + 1) * after].astype(np.float64)
-        layer = layer.reshape(*weights.shape[:-1], before + 1, after)
-        values = np.tanh(np.einsum("...iu,...i->...u", layer[..., :-1, :], values) + layer[..., -1, :])
-        at += (before + 1) * after
-    if layers[-1] != _native.OUTPUTS:
-        values = _chosen(sensed, values)
-    answers: Floats = values.astype(np.float32)
-    return answers
+    layers = _layers(config, weights.shape[-1])
+    shape = np.broadcast_shapes(weights.shape[:-1], given.shape[:-1])
+    rows = np.ascontiguousarray(np.broadcast_to(given, (*shape, _native.INPUTS)), np.float32).reshape(-1, _native.INPUTS)
+    if not np.isfinite(rows).all():
+        raise ValueError("inputs hold a NaN or an infinity")
+    table = np.ascontiguousarray(weights, np.float32).reshape(-1, weights.shape[-1])
+    chosen = np.arange(len(table), dtype=np.int64).reshape(weights.shape[:-1])
+    answers = np.empty((len(rows), _native.OUTPUTS), np.float32)
+    _native.forward(layers, table, rows, np.ascontiguousarray(np.broadcast_to(chosen, shape)).reshape(-1), answers)
+    return answers.reshape(*shape, _native.OUTPUTS)
 
 
 def to_onnx(policy: ArrayLike, path: str | os.PathLike[str], config: Config | None = None) -> None:

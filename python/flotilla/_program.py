@@ -1,63 +1,33 @@
-"""Commands of the program as functions. Each runs in a child process, and returns the JSON that it prints."""
+"""Use cases of the program as functions. Each returns what the command prints with ``--json``."""
 
 from __future__ import annotations
 
 import json
 import os
-import signal
-import subprocess
-import sys
 from collections.abc import Sequence
 from typing import Any
 
 from flotilla import _native
-from flotilla._arrays import backend_name
-from flotilla._errors import Error
-from flotilla._run import Run
+from flotilla._arrays import backend_name, text, whole
+from flotilla._run import Run, _command
 
 
-def program(command: str, *words: str, **flags: Any) -> dict[str, Any]:
-    """Runs a command and returns its JSON. Flags that are None or False are left out; `force=True` gives `--force`."""
-    line = [sys.executable, "-m", "flotilla", command, *words, "--json"]
-    if command != "compare":
-        line.append("--quiet")
-    for name, value in flags.items():
-        flag = "--" + name.rstrip("_").replace("_", "-")
-        if value is True:
-            line.append(flag)
-        elif value is not None and value is not False:
-            line += [flag, os.fspath(value) if isinstance(value, os.PathLike) else str(value)]
-    # In its own session, the child does not get Ctrl-C from the terminal. It is forwarded below, and the child saves.
-    pipe = subprocess.PIPE
-    with subprocess.Popen(line, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, start_new_session=True) as running:
-        try:
-            printed, told = running.communicate()
-        except KeyboardInterrupt:
-            if os.name != "nt":
-                running.send_signal(signal.SIGINT)
-            running.communicate()
-            raise
-    text = told.decode(errors="replace").strip()
-    if running.returncode == 75:
-        raise KeyboardInterrupt(text)
-    try:
-        found = json.loads(printed)
-    except ValueError:
-        found = None
-    if running.returncode == 2:
-        raise ValueError(text.removeprefix("error: "))
-    if found is None or (running.returncode != 0 and command != "verify"):
-        raise Error(text.removeprefix("error: ") or f"flotilla {command} ended with {running.returncode}")
-    given: dict[str, Any] = found
-    return given
+def program(use_case: str, backend: str = "auto", **request: Any) -> dict[str, Any]:
+    """Runs a use case and returns its outcome. Values that are None have the program's defaults."""
+    given = {name: value for name, value in request.items() if value is not None}
+    line = json.dumps({"use_case": use_case, **given})
+    outcome: dict[str, Any] = json.loads(_native.answer(line, backend, _command()))
+    return outcome
 
 
-def compare(runs: Sequence[Run | str | os.PathLike[str]], *, at: str | int = "last", paired: bool = False) -> dict[str, Any]:
+def compare(
+    runs: Sequence[Run | str | os.PathLike[str]], *, at: str | int | Sequence[str | int] = "last", paired: bool = False
+) -> dict[str, Any]:
     """Runs side by side: means, 95 % intervals, and a test of every pair, as ``flotilla compare`` tells them.
 
     Args:
         runs: two at least, or their folders; or the folder of one sweep.
-        at: generations to compare at: ``"0,50,last"``.
+        at: generations to compare at: ``[0, 50, "last"]``.
         paired: compare pair by pair: trials with one seed and number are pairs.
 
     Returns:
@@ -76,7 +46,11 @@ def compare(runs: Sequence[Run | str | os.PathLike[str]], *, at: str | int = "la
     folders = [run.folder if isinstance(run, Run) else os.fspath(run) for run in runs]
     if not folders:
         raise ValueError("no runs, allowed are two at least or the folder of a sweep")
-    return program("compare", *folders, at=at, paired=paired)
+    wanted = [at] if isinstance(at, (str, int)) else list(at) if isinstance(at, Sequence) else []
+    if not wanted or not all(isinstance(each, (str, int)) and not isinstance(each, bool) for each in wanted):
+        raise TypeError(f"at is {at!r}, allowed are generations: a number, 'last', or a list of these")
+    generations = [part.strip() for each in wanted for part in str(each).split(",")]
+    return program("compare", folders=[text("a run", folder) for folder in folders], at=generations, paired=bool(paired))
 
 
 def paper(
@@ -112,10 +86,14 @@ def paper(
         >>> len(found["arms"]), flotilla.Run.open(found["arms"][0]["folder"]).config["learning.generations"]
         (33, 2)
     """
-    machine = _machine(backend)
-    return program(
-        "paper", out=out, trials=trials, generations=generations, seed=seed, resume=resume, force=force, **machine
-    )
+    if resume and force:
+        raise ValueError("resume goes on with a paper and force writes over it, leave out one of the two")
+    start = "resume" if resume else "force" if force else "fresh"
+    keys = {"trials": trials, "generations": generations, "seed": seed}
+    given = {key: whole(key, value, 0, 2**63 - 1) for key, value in keys.items() if value is not None}
+    set_ = [{"key": f"learning.{key}", "text": str(value), "name": key} for key, value in given.items()]
+    folder = text("out", os.fspath(out))
+    return program("paper", backend_name(backend), out=folder, start=start, set=set_)
 
 
 def verify(*, worlds: int | None = None, teams: int | None = None, adapter: str | int | None = None) -> dict[str, Any]:
@@ -132,7 +110,9 @@ def verify(*, worlds: int | None = None, teams: int | None = None, adapter: str 
     Raises:
         Error: there is no GPU at all.
     """
-    return program("verify", worlds=worlds, teams=teams, adapter=adapter)
+    given = {"worlds": worlds, "teams": teams}
+    counts: dict[str, Any] = {name: whole(name, value, 1, 100_000) for name, value in given.items() if value is not None}
+    return program("verify", adapter=None if adapter is None else backend_name(adapter), **counts)
 
 
 def devices() -> list[dict[str, str | int]]:
@@ -147,8 +127,3 @@ def devices() -> list[dict[str, str | int]]:
         {"index": index, "name": name, "driver": driver, "api": api, "kind": kind}
         for index, (name, driver, api, kind) in rows
     ]
-
-
-def _machine(backend: str | int) -> dict[str, str]:
-    name = backend_name(backend)
-    return {"backend": name} if name in ("auto", "cpu", "gpu") else {"adapter": name}

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable
+import weakref
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
-from flotilla._arrays import Floats, backend_name, whole
+from flotilla._arrays import Floats, backend_name, floats, whole
 from flotilla._config import Config
 from flotilla._show import Figure, Replay, plot
 
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 
 Generation = _native.Generation
 Callback = Callable[[Generation], Any]
+Init = Any
 
 METRICS = ("best_g", "mean_g", "champion_g")
 
@@ -50,14 +53,15 @@ class Run:
     """
 
     def __init__(self, outcome: _native.Outcome, played: _native.Played, times: list[float] | None, folder: str | None):
-        config, metrics, policies, digest = outcome
+        config, metrics, policies, digest, self._end = outcome
         self.config = Config._of(config)
         self._metrics, self._policies = tuple(metrics), tuple(policies)
         self.digest: str = digest
         self._show_arrays()
         self.backend = played[1]
         self._played, self._times, self._folder = played, times, folder
-        self._kept: tempfile.TemporaryDirectory[str] | None = None
+        # Whether the folder is a temporary one of this process.
+        self._temporary = False
         self.unverified = False
 
     def _show_arrays(self) -> None:
@@ -97,11 +101,17 @@ class Run:
     def folder(self) -> str:
         """Where the run's files are; of a run that was trained in memory a temporary folder, which goes with it."""
         if self._folder is None:
-            self._kept = tempfile.TemporaryDirectory(prefix="flotilla-")
-            folder = os.path.join(self._kept.name, "run")
+            folder = os.path.join(self._temporary_folder(), "run")
             self._write(folder, force=False)
             self._folder = folder
         return self._folder
+
+    def _temporary_folder(self) -> str:
+        """Makes a folder that is removed together with this run."""
+        folder = tempfile.mkdtemp(prefix="flotilla-")
+        weakref.finalize(self, shutil.rmtree, folder, True)
+        self._temporary = True
+        return folder
 
     def save(self, folder: str | os.PathLike[str], force: bool = False) -> None:
         """Writes the run as ``flotilla train`` does, so that the program reads it, too.
@@ -121,11 +131,14 @@ class Run:
             ['metrics.csv', 'policies.safetensors', 'run.json']
         """
         self._write(os.fspath(folder), force)
+        if self._temporary and self._folder is not None and self._played[2] is not None:
+            # Only its checkpoints have the policies that it started from.
+            shutil.copytree(self._folder, folder, dirs_exist_ok=True)
 
     def _write(self, folder: str, force: bool) -> None:
         metrics, policies = list(self._metrics), list(self._policies)
         times = self._times or [0.0] * metrics[0].shape[-1]
-        arguments = (self.config._native, metrics, policies, times, self._played, folder, force, _command())
+        arguments = (self.config._native, metrics, policies, self._end, times, self._played, folder, force, _command())
         _native.save(*arguments)
 
     def to_pandas(self) -> pandas.DataFrame:
@@ -174,7 +187,7 @@ class Run:
         return Replay(_native.replay(self.folder, number, generations, self.unverified, backend_name(backend)))
 
     def plot(self) -> Figure:
-        """The learning curves: best team, champion and mean team, mean and standard error over trials.
+        """The learning curves: best team, champion and mean team, each with its 95 % interval over trials.
 
         Example:
             >>> run = flotilla.train(flotilla.Config.paper().replace(learning={"generations": 2}))
@@ -185,8 +198,8 @@ class Run:
 
     def __getstate__(self) -> dict[str, Any]:
         # A temporary folder belongs to this process. A copy of the run makes its own.
-        folder = self._folder if self._kept is None else None
-        return {**self.__dict__, "_kept": None, "_folder": folder, "config": self.config}
+        folder = None if self._temporary else self._folder
+        return {**self.__dict__, "_temporary": False, "_folder": folder, "config": self.config}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -194,7 +207,7 @@ class Run:
 
     def __repr__(self) -> str:
         best = self.metrics["best_g"][:, -1]
-        where = f", in {self._folder}" if self._folder is not None and self._kept is None else ""
+        where = f", in {self._folder}" if self._folder is not None and not self._temporary else ""
         where += ", unverified" if self.unverified else ""
         last = self.metrics["best_g"].shape[1] - 1
         return (
@@ -205,7 +218,8 @@ class Run:
 
 def _command() -> str:
     """Returns the command that started this process as a shell reads it, for a run's record."""
-    return shlex.join([os.path.basename(sys.executable or "python"), *sys.argv])[:8000]
+    program, *words = sys.orig_argv or ["python"]
+    return shlex.join([os.path.basename(program), *words])[:8000]
 
 
 def _shown_by_default() -> bool:
@@ -215,21 +229,28 @@ def _shown_by_default() -> bool:
     return sys.stderr is not None and sys.stderr.isatty()
 
 
-def _with_bar(callback: Callback | None, config: Config, progress: bool | None) -> tuple[Callback | None, Callable[[], None]]:
-    """Returns the callback, extended by a progress bar if one is wanted, and a function that closes the bar."""
+def _with_bar(called: list[Callback], config: Config, progress: bool | None) -> tuple[Callback | None, Callable[[], None]]:
+    """Returns all callbacks as one, with a progress bar if that is wanted, and a function that closes the bar."""
+
+    def told(generation: Generation) -> Any:
+        answers = [callback(generation) for callback in called]
+        # A wrong answer is reported as it is.
+        return next((answer for answer in answers if answer is not None and answer is not False), None)
+
+    inner = called[0] if len(called) == 1 else told if called else None
     if progress is False or (progress is None and not _shown_by_default()):
-        return callback, lambda: None
+        return inner, lambda: None
     try:
         from tqdm.auto import tqdm
     except ImportError:
         if progress:
             raise ImportError("progress=True draws a bar by tqdm: pip install tqdm") from None
-        return callback, lambda: None
+        return inner, lambda: None
     bar = tqdm(total=config["learning.generations"] + 1, unit="generation", leave=False)
 
     def moved(generation: Generation) -> Any:
         bar.update(generation.generation + 1 - bar.n)
-        return callback(generation) if callback is not None else None
+        return inner(generation) if inner is not None else None
 
     return moved, bar.close
 
@@ -241,9 +262,10 @@ def train(
     *,
     resume: bool = False,
     force: bool = False,
-    init: Run | str | os.PathLike[str] | None = None,
+    init: Run | str | os.PathLike[str] | ArrayLike | Sequence[ArrayLike] | None = None,
     backend: str | int = "auto",
-    callback: Callback | None = None,
+    callback: Callback | Sequence[Callback] | None = None,
+    champions: bool = False,
     progress: bool | None = None,
 ) -> Run:
     """Trains the teams of a config.
@@ -255,13 +277,17 @@ def train(
             with. None trains in memory; :meth:`Run.save` still writes it.
         resume: go on with the run in ``out``, or start it where there is none.
         force: write over the run in ``out``.
-        init: what to start from in place of random policies: a :class:`Run`, or a ``policies.safetensors``; trial i
-            starts from its trial i. It has as many leaders and parameters as the config; populations that take more policies
-            are filled up at random. Needs ``out``, where generation 0 is kept.
+        init: initial policies in place of random ones: a :class:`Run`, a ``policies.safetensors``, or arrays
+            ``[leaders, policies, parameters]``, one for each trial or one for all. Trial i starts from trial i of a run or
+            file. Larger populations are filled with random policies. A run that starts from policies is kept in ``out``,
+            or else in a temporary folder that is removed with the :class:`Run`.
         backend: what to play on, to the same bits: ``"auto"`` (a GPU where there is one), ``"cpu"``, ``"gpu"``, or an
             adapter's number or name.
-        callback: told of every :class:`Generation` once it is played; stops the training by returning True. What comes out
-            is to the bit what a config of so few generations comes to.
+        callback: called with every :class:`Generation` once it has played, or several such functions. The training stops
+            if one returns True. The results are then those of a config with so many generations. A callback with a method
+            ``close`` is closed at the end, however the training ends.
+        champions: give every generation its ``champions``. The populations then stay in the host's memory, and the run is
+            trained in memory.
         progress: draw a bar by tqdm; None does so in notebooks and terminals, where tqdm is installed.
 
     Returns:
@@ -284,29 +310,83 @@ def train(
     """
     if not isinstance(config, Config):
         raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config")
-    if callback is not None and not callable(callback):
-        raise TypeError(f"callback is {type(callback).__name__}, allowed is what can be called with a generation")
+    called = _together(callback)
     if out is None and (resume or force):
         raise ValueError("resume and force are of a run in a folder, say which by out")
-    if out is None and init is not None:
-        raise ValueError("a run that starts from policies is kept in a folder, say which by out")
-    if isinstance(init, Run):
-        init = os.path.join(init.folder, "policies.safetensors")
+    if champions and (out is not None or init is not None):
+        raise ValueError("champions are given for training in memory from random policies; leave out out= and init=")
     if resume and force:
         raise ValueError("resume goes on with a run and force writes over it, leave out one of the two")
     if seed is not None:
         config = config.replace(learning={"seed": seed})
     name = backend_name(backend)
-    told, end = _with_bar(callback, config, progress)
+    told, end = _with_bar(called, config, progress)
+    temporary = init is not None and out is None
+    folder = tempfile.mkdtemp(prefix="flotilla-") if temporary else "" if out is None else os.fspath(out)
     try:
-        if out is None:
-            outcome, played, times = _native.train(config._native, name, told)
+        if out is None and init is None:
+            outcome, played, times = _native.train(config._native, name, told, bool(champions))
             return Run(outcome, played, times, None)
+        where = os.path.join(folder, "run") if temporary else folder
         start = "resume" if resume else "force" if force else "fresh"
-        folder = os.fspath(out)
-        first = None if init is None else os.fspath(init)
-        for note in _native.train_into(config._native, folder, start, first, name, _command(), told):
-            warnings.warn(f"{folder}: {note}", RuntimeWarning, stacklevel=2)
-        return Run.open(folder)
+        with tempfile.TemporaryDirectory(prefix="flotilla-") as aside:
+            first = None if init is None else _init_file(init, config, aside)
+            for note in _native.train_into(config._native, where, start, first, name, _command(), told):
+                warnings.warn(f"{where}: {note}", RuntimeWarning, stacklevel=2)
+        run = Run.open(where)
+        if temporary:
+            run._temporary = True
+            weakref.finalize(run, shutil.rmtree, folder, True)
+            temporary = False
+        return run
     finally:
+        if temporary:
+            shutil.rmtree(folder, True)
         end()
+        for each in called:
+            if callable(getattr(each, "close", None)):
+                each.close()  # type: ignore[attr-defined]
+
+
+def _together(callback: Any) -> list[Callback]:
+    """Returns one or several callbacks as a list."""
+    called = [] if callback is None else [callback] if callable(callback) else callback
+    if not isinstance(called, (list, tuple)) or not all(map(callable, called)):
+        raise TypeError(f"callback is {type(callback).__name__}, allowed are functions of a generation, one or a list")
+    return list(called)
+
+
+def first_policies(init: Any) -> list[Floats]:
+    """Returns initial policies as one array `[leaders, policies, parameters]` per trial, or one for all."""
+    trials = init if isinstance(init, (list, tuple)) and len(init) and np.ndim(init[0]) == 3 else [init]
+    try:
+        if np.ndim(init) == 0:
+            raise TypeError
+        return [floats("init", trial, 3) for trial in trials]
+    except TypeError:
+        kind = type(init).__name__
+        raise TypeError(f"init is {kind}, allowed are a Run, a file of policies, or arrays [leaders, policies, parameters]") from None
+
+
+def _init_file(init: Any, config: Config, aside: str) -> str:
+    """Returns a file with initial policies. Arrays are written to a folder."""
+    if isinstance(init, Run):
+        return os.path.join(init.folder, "policies.safetensors")
+    if isinstance(init, (str, os.PathLike)):
+        return os.fspath(init)
+    policies = first_policies(init)
+    trials = int(config["learning.trials"])
+    if len(policies) not in (1, trials):
+        raise ValueError(f"init has policies of {len(policies)} trials, allowed are {trials}, or one array for all")
+    leaders = config.num_learners if config["learning.sharing"] == "none" else 1
+    population = policies[0].shape[1]
+    shape = (leaders, population, config.parameters)
+    for trial in policies:
+        if trial.shape != shape or population < 2:
+            allowed = f"[leaders, policies, parameters] = [{leaders}, 2 or more, {config.parameters}]"
+            raise ValueError(f"init has the shape {list(trial.shape)}, allowed is {allowed}, the same for all trials")
+    sizes = {"population": population, "trials": trials, "elites": 1}
+    sized = config.replace(learning=sizes)
+    path = os.path.join(aside, "policies.safetensors")
+    _native.write_policies(sized._native, policies * (trials // len(policies)), path)
+    return path

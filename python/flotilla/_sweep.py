@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from flotilla import _native
 from flotilla._arrays import backend_name
+from flotilla._arrays import text as check_text
 from flotilla._config import Config
 from flotilla._errors import Error
-from flotilla._program import _machine, program
+from flotilla._program import program
 from flotilla._run import Run, train
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class Point(NamedTuple):
 
 
 class Sweep:
-    """What a sweep came to; ``len()`` and iteration are over its points.
+    """The results of a sweep; ``len()``, iteration and ``sweep[0]`` are over its points.
 
     Attributes:
         axes: the keys that vary.
@@ -48,6 +49,9 @@ class Sweep:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __getitem__(self, index: int) -> Point:
+        return self.points[index]
 
     def __iter__(self) -> Iterator[Point]:
         return iter(self.points)
@@ -81,9 +85,10 @@ def _play(config: str, backend: str) -> Run:
 
 
 def sweep(
-    sweep: str | os.PathLike[str],
+    sweep: str | os.PathLike[str] | Config,
     executor: Any = None,
     *,
+    grid: Mapping[str, Sequence[Any]] | None = None,
     out: str | os.PathLike[str] | None = None,
     skip_impossible: bool = False,
     backend: str | int = "auto",
@@ -92,7 +97,8 @@ def sweep(
     """Trains every point of a grid.
 
     Args:
-        sweep: a sweep file, or its text: a config with a section ``[grid]`` of lists of values.
+        sweep: a :class:`Config`, with a grid; or a sweep file, or its text: a config with a section ``[grid]``.
+        grid: lists of values by dotted keys, for a config: ``{"world.coupling": [1, 3]}``.
         executor: who plays the points: any ``concurrent.futures.Executor``, of processes or of Dask's, MPI's or Slurm's
             (submitit) workers. Points travel as configs, and results come back as arrays. Where a worker is lost, its
             points are played again, to the same bits. None trains them here, side by side.
@@ -106,13 +112,15 @@ def sweep(
         Error: a point cannot be played.
 
     Example:
-        >>> text = flotilla.Config.paper("chaotic").replace(learning={"trials": 1, "generations": 2}).to_toml()
-        >>> text = text.replace("coupling = 3", "") + '[grid]\\n"world.coupling" = [1, 3]\\n'
-        >>> [point.values for point in flotilla.sweep(text)]
-        [{'world.coupling': 1}, {'world.coupling': 3}]
+        >>> config = flotilla.Config.paper("chaotic").replace(learning={"trials": 1, "generations": 2})
+        >>> found = flotilla.sweep(config, grid={"world.coupling": [1, 3]})
+        >>> [point.values for point in found], found[0].run.config["world.coupling"]
+        ([{'world.coupling': 1}, {'world.coupling': 3}], 1)
     """
-    given = os.fspath(sweep)
-    is_text = isinstance(sweep, str) and "\n" in sweep
+    if isinstance(sweep, Config) != (grid is not None):
+        raise TypeError("a config needs grid={key: values}; a sweep file or text has its own")
+    given = _with_grid(sweep, grid) if isinstance(sweep, Config) and grid is not None else os.fspath(sweep)  # type: ignore[arg-type]
+    is_text = not isinstance(sweep, os.PathLike) and "\n" in given
     name, text = ("the sweep", given) if is_text else (given, _text(given))
     machine = backend_name(backend)
     axes, points, normal = _native.sweep(text, name, skip_impossible)
@@ -128,6 +136,48 @@ def sweep(
     return Sweep(axes, [Point(point[0], of, run) for point, of, run in zip(points, values, runs)])
 
 
+def _with_grid(config: Config, grid: Mapping[str, Sequence[Any]]) -> str:
+    """Returns the text of a sweep: a config without the keys of a grid, and the grid."""
+    if not isinstance(grid, Mapping) or not grid:
+        raise TypeError("grid must map dotted keys to lists of values, and not be empty")
+    lines = ["[grid]"]
+    for key, values in grid.items():
+        if isinstance(values, (str, bytes)) or not isinstance(values, (Sequence, np.ndarray)):
+            raise TypeError(f"grid[{key!r}] is {type(values).__name__}, allowed is a list of values")
+        # The whole config with each value: it is checked, and written as TOML.
+        section, _, name = key.rpartition(".")
+        texts = [_value(config.replace(**{section: {name: value}}), section, name) for value in values]
+        lines.append(f'"{key}" = [{", ".join(texts)}]')
+    return _without(config.to_toml(), grid) + "\n" + "\n".join(lines) + "\n"
+
+
+def _value(config: Config, section: str, name: str) -> str:
+    """Returns one value as its line in the config's text has it."""
+    return next(text for table, key, text in _lines(config.to_toml()) if (table, key) == (section, name))
+
+
+def _lines(text: str) -> Iterator[tuple[str, str, str]]:
+    """Yields section, key and value of each line of a config's text. A value is on one line."""
+    section = ""
+    for line in text.splitlines():
+        if line.startswith("["):
+            section = line.strip("[]")
+        elif " = " in line:
+            key, _, value = line.partition(" = ")
+            yield section, key, value
+
+
+def _without(text: str, keys: Mapping[str, Any]) -> str:
+    """Returns a config's text without some keys."""
+    kept, section = [], ""
+    for line in text.splitlines():
+        if line.startswith("["):
+            section = line.strip("[]")
+        if f"{section}.{line.partition(' = ')[0]}" not in keys:
+            kept.append(line)
+    return "\n".join(kept)
+
+
 def _text(path: str) -> str:
     try:
         with open(path, encoding="utf-8") as file:
@@ -140,11 +190,9 @@ def _text(path: str) -> str:
 
 def _here(text: str, out: str | os.PathLike[str] | None, backend: str) -> list[Run]:
     with tempfile.TemporaryDirectory(prefix="flotilla-") as folder:
-        file = os.path.join(folder, "sweep.toml")
-        with open(file, "w", encoding="utf-8") as to:
-            to.write(text)
-        kept = os.path.join(folder, "out") if out is None else os.fspath(out)
-        found = program("sweep", file, out=kept, resume=out is not None, **_machine(backend))
+        kept = os.path.join(folder, "out") if out is None else check_text("out", os.fspath(out))
+        start = "fresh" if out is None else "resume"
+        found = program("sweep", backend, text=text, name="sweep", out=kept, named=True, start=start)
         runs = [Run.open(point["folder"]) for point in found["points"]]
         if out is None:
             for run in runs:

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
-from flotilla._arrays import Floats, aligned, floats, whole
+from flotilla._arrays import Floats, aligned, as_bools, floats, jitters, renamed, whole
 from flotilla._config import Config
-from flotilla._play import _near
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -40,7 +39,15 @@ class TeamBatch:
     array that Rust is writing.
     """
 
-    def __init__(self, config: Config, teams: int, reward: str, render_mode: str | None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        teams: int,
+        reward: str,
+        render_mode: str | None,
+        jitter: float | None = None,
+        poi_jitter: float | None = None,
+    ) -> None:
         if not isinstance(config, Config):
             raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config")
         if reward not in _native.FITNESSES:
@@ -49,16 +56,27 @@ class TeamBatch:
             raise ValueError(f"render_mode {render_mode!r}, allowed are None and 'rgb_array'")
         self.config, self.reward, self.render_mode = config, reward, render_mode
         self.count = whole("the number of teams", teams, 1, MAX_TEAMS)
-        # The fitness decides what the stepper records.
-        scored = config.replace(learning={"fitness": reward})
-        self.stepper = _native.Stepper(scored._native, self.count, reward != "G")
-        self.leaders, self.length = config.leaders, int(config["world.steps"])
+        self.stepper = self._make_stepper()
+        self.leaders, self.length = config.num_learners, int(config["world.steps"])
         self.agents = len(config["world.leaders"]) + len(config["world.followers"])
         self.pois = len(config["world.pois"])
-        self.jitter = float(config["learning.start_jitter"])
+        self.jitters = jitters(config, jitter, poi_jitter)
         self.seed: int | None = None
         self.drawn = 0
         self.rewards = np.zeros((self.count, self.leaders), np.float32)
+
+    def _make_stepper(self) -> _native.Stepper:
+        # The fitness decides what the stepper records.
+        scored = self.config.replace(learning={"fitness": self.reward})
+        return _native.Stepper(scored._native, self.count, self.reward != "G")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "stepper": self.stepper.save()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.stepper = self._make_stepper()
+        self.stepper.restore(state["stepper"])
 
     @property
     def steps(self) -> NDArray[np.uint32]:
@@ -82,10 +100,10 @@ class TeamBatch:
         if seed is not None:
             self.seed, self.drawn = whole("seed", seed, 0, 2**63 - 1), 0
         starts = None
-        if self.jitter > 0:
+        if max(self.jitters) > 0:
             if self.seed is None:
                 self.seed = secrets.randbits(63)
-            starts = _native.starts(self.config._native, self.seed, self.jitter, self.drawn, self.count)
+            starts = _native.starts(self.config._native, self.seed, *self.jitters, self.drawn, self.count)
             self.drawn += self.count
         self.stepper.reset(chosen, starts)
 
@@ -115,9 +133,9 @@ class TeamBatch:
 class VectorEnv(Base):
     """Many teams of one world that step together: a ``gymnasium.vector.VectorEnv`` if gymnasium is installed.
 
-    An episode takes ``world.steps`` steps. If the config's ``learning.start_jitter`` is above 0, every team of every
-    episode starts from a place of its own, drawn from the seed of :meth:`reset`; otherwise all teams start where the
-    config says. POIs stay where the config has them.
+    An episode takes ``world.steps`` steps. With a jitter, every team of every episode starts from a place of its own,
+    drawn from the seed of :meth:`reset`; otherwise all teams start where the config says. With a POI jitter, the same
+    holds for the POIs. An environment can be pickled and deep-copied: the copy continues with the same bits.
 
     A leader's observation is the density of POIs, then of agents, in four quadrants around its heading: back right,
     front right, front left, back left. Its action is a turn, from -1 (half a turn to the right) to 1 (half a turn to the
@@ -141,6 +159,8 @@ class VectorEnv(Base):
         horizon: how the end of an episode is reported, ``"truncated"`` or ``"terminated"``.
         time_input: append the played share of the episode to each leader's observation, which then has 9 numbers.
         render_mode: None or ``"rgb_array"``.
+        jitter: largest offset of a start on each axis, in map units; None takes the config's ``learning.start_jitter``.
+        poi_jitter: the same for POIs; None takes the config's ``learning.poi_jitter``.
 
     Raises:
         ValueError: a number or word is not allowed.
@@ -172,15 +192,17 @@ class VectorEnv(Base):
         horizon: Horizon = "truncated",
         time_input: bool = False,
         render_mode: str | None = None,
+        jitter: float | None = None,
+        poi_jitter: float | None = None,
     ) -> None:
         one_of("layout", layout, ("leaders", "team", "flat"))
         one_of("autoreset", autoreset, ("next_step", "same_step", "disabled"))
         one_of("horizon", horizon, ("truncated", "terminated"))
-        self._teams = TeamBatch(config, num_envs, reward, render_mode)
+        self._teams = TeamBatch(config, num_envs, reward, render_mode, jitter, poi_jitter)
         self.config, self.render_mode = config, render_mode
-        self.leaders, self.layout, self.autoreset = self._teams.leaders, layout, autoreset
+        self.num_learners, self.layout, self.autoreset = self._teams.leaders, layout, autoreset
         self.copy, self.horizon, self.time_input = bool(copy), horizon, bool(time_input)
-        self.num_envs = self._teams.count * (self.leaders if layout == "flat" else 1)
+        self.num_envs = self._teams.count * (self.num_learners if layout == "flat" else 1)
         self.metadata: dict[str, Any] = {
             "render_modes": list(RENDER_MODES),
             "autoreset_mode": _autoreset_mode(autoreset),
@@ -190,11 +212,24 @@ class VectorEnv(Base):
         self._finished = np.zeros(self._teams.count, np.bool_)
         self._any_finished = False
         inputs = _native.INPUTS + self.time_input
-        self._single = (inputs,) if layout == "flat" else (self.leaders, inputs)
-        self._inputs = aligned((self._teams.count, self.leaders, _native.INPUTS))
-        self._observations = aligned((self._teams.count, self.leaders, inputs)) if time_input else self._inputs
-        self._rewards = aligned((self.num_envs,) + ((self.leaders,) if layout == "leaders" else ()))
+        self._single = (inputs,) if layout == "flat" else (self.num_learners, inputs)
+        self._make_arrays()
         self._make_spaces()
+
+    def _make_arrays(self) -> None:
+        """Makes the arrays that are reused at every step, if `copy` is False."""
+        teams, leaders = self._teams.count, self.num_learners
+        self._inputs = aligned((teams, leaders, _native.INPUTS))
+        self._observations = aligned((teams, leaders, self._single[-1])) if self.time_input else self._inputs
+        self._rewards = aligned((self.num_envs,) + ((leaders,) if self.layout == "leaders" else ()))
+
+    def __getstate__(self) -> dict[str, Any]:
+        scratch = ("_inputs", "_observations", "_rewards")
+        return {name: value for name, value in self.__dict__.items() if name not in scratch}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._make_arrays()
 
     def _make_spaces(self) -> None:
         """Makes the spaces once, so that a seed given to one of them stays."""
@@ -230,7 +265,7 @@ class VectorEnv(Base):
 
     def _per_environment(self, teams: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Converts one value per team to a new array with one value per environment."""
-        return np.repeat(teams, self.leaders) if self.layout == "flat" else teams.copy()
+        return np.repeat(teams, self.num_learners) if self.layout == "flat" else teams.copy()
 
     def _reward(self) -> Floats:
         """Returns rewards in the layout's shape, in a new array if `copy` is set, else in the reused one."""
@@ -306,7 +341,7 @@ class VectorEnv(Base):
         if self.layout == "flat":
             if array.shape != (self.num_envs, _native.OUTPUTS):
                 raise ValueError(f"actions are {list(array.shape)}, allowed is [num_envs, 2] = [{self.num_envs}, 2]")
-            array = array.reshape(teams.count, self.leaders, _native.OUTPUTS)
+            array = array.reshape(teams.count, self.num_learners, _native.OUTPUTS)
         if self.autoreset == "next_step" and self._any_finished:
             # These teams ignore this step's action.
             fresh = self._finished
@@ -328,7 +363,7 @@ class VectorEnv(Base):
 
     def _final_info(self, ended: NDArray[np.bool_]) -> dict[str, Any]:
         """Returns G, observed POIs and state of finished teams, before they are reset. Masks mark these teams."""
-        copies = self.leaders if self.layout == "flat" else 1
+        copies = self.num_learners if self.layout == "flat" else 1
         found: dict[str, Any] = {}
         observed = self._teams.observed
         for name, values in (("g", observed.mean(axis=1)), ("observed", observed), ("state", self._teams.state())):
@@ -344,14 +379,25 @@ class VectorEnv(Base):
         """
         return self._teams.stepper.states()
 
-    def near(self) -> NDArray[np.bool_]:
+    def agents_at_poi(self) -> NDArray[np.bool_]:
         """Agents within the observation radius of each POI after the last step, ``[teams, pois, agents]``.
 
         Example:
-            >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).near().shape
+            >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).agents_at_poi().shape
             (2, 4, 12)
         """
-        return _near(self._teams.stepper.near, self._teams.agents)
+        return as_bools(self._teams.stepper.near, self._teams.agents)
+
+    def near(self) -> NDArray[np.bool_]:
+        """The former name of :meth:`agents_at_poi`."""
+        renamed("VectorEnv.near", "VectorEnv.agents_at_poi")
+        return self.agents_at_poi()
+
+    @property
+    def leaders(self) -> int:
+        """The former name of ``num_learners``."""
+        renamed("VectorEnv.leaders", "VectorEnv.num_learners")
+        return self.num_learners
 
     @property
     def observed(self) -> NDArray[np.bool_]:
@@ -372,7 +418,7 @@ class VectorEnv(Base):
         self.closed = True
 
     def __repr__(self) -> str:
-        return f"<flotilla.VectorEnv: {self._teams.count} teams of {self.leaders} leaders, {self.autoreset} reset>"
+        return f"<flotilla.VectorEnv: {self._teams.count} teams of {self.num_learners} leaders, {self.autoreset} reset>"
 
 
 def one_of(what: str, word: str, allowed: tuple[str, ...]) -> None:

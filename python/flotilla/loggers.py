@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import os
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +9,20 @@ from typing import Any
 from flotilla._config import Config
 from flotilla._run import Generation
 
-Logger = Callable[[Generation], None]
+class Logger:
+    """A callback that logs elsewhere. :func:`flotilla.train` closes it at the end, also if it stops early or fails."""
+
+    def __init__(self, log: Callable[[Generation], Any], close: Callable[[], Any]) -> None:
+        self._log, self._close, self.closed = log, close, False
+
+    def __call__(self, generation: Generation) -> None:
+        self._log(generation)
+
+    def close(self) -> None:
+        """Ends the log. Closing it again does nothing."""
+        if not self.closed:
+            self.closed = True
+            self._close()
 
 
 def scalars(generation: Generation) -> dict[str, float]:
@@ -36,15 +48,12 @@ def tensorboard(folder: str | os.PathLike[str]) -> Logger:
 
     # The writer has its own thread. `flush` does not wait for queued rows, but `close` does.
     writer = SummaryWriter(os.fspath(folder), flush_secs=1)
-    atexit.register(writer.close)
 
     def log(generation: Generation) -> None:
         for name, value in scalars(generation).items():
             writer.add_scalar(name, value, generation.generation)
-        if generation.generation == generation.last:
-            writer.close()
 
-    return log
+    return Logger(log, writer.close)
 
 
 def wandb(config: Config, **options: Any) -> Logger:
@@ -55,10 +64,8 @@ def wandb(config: Config, **options: Any) -> Logger:
 
     def log(generation: Generation) -> None:
         run.log(scalars(generation), step=generation.generation)
-        if generation.generation == generation.last:
-            run.finish()
 
-    return log
+    return Logger(log, run.finish)
 
 
 def mlflow(config: Config, **options: Any) -> Logger:
@@ -70,7 +77,5 @@ def mlflow(config: Config, **options: Any) -> Logger:
 
     def log(generation: Generation) -> None:
         client.log_metrics(scalars(generation), step=generation.generation, run_id=run.info.run_id)
-        if generation.generation == generation.last:
-            client.end_run()
 
-    return log
+    return Logger(log, client.end_run)

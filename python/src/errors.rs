@@ -4,12 +4,13 @@ use flotilla::backend::BackendError;
 use flotilla::backend::gpu::device::DeviceError;
 use flotilla::config::{ConfigError, Problem};
 use flotilla::front::Failure;
+use flotilla::ops;
 use flotilla::record::RecordError;
 use flotilla::report::replay::ReplayError;
 use flotilla::report::runs;
 use flotilla::run::RunError;
 use flotilla::stepping::StepError;
-use pyo3::exceptions::{PyFileExistsError, PyMemoryError, PyValueError};
+use pyo3::exceptions::{PyFileExistsError, PyKeyboardInterrupt, PyMemoryError, PyValueError};
 use pyo3::prelude::*;
 
 /// Converts an error of the crate to a Python exception.
@@ -110,6 +111,22 @@ impl Raised for ReplayError {
 impl Raised for runs::ReadError {
     fn raised(self) -> PyErr {
         failed(self)
+    }
+}
+
+impl Raised for ops::Error {
+    fn raised(self) -> PyErr {
+        let text = self.to_string();
+        match self {
+            ops::Error::Config(error) => error.raised(),
+            ops::Error::Stopped(_) => PyKeyboardInterrupt::new_err(text),
+            error if error.is_usage() => PyValueError::new_err(text),
+            error => match error.code() {
+                "exists" => PyFileExistsError::new_err(text),
+                "memory" => PyMemoryError::new_err(text),
+                _ => failed(text),
+            },
+        }
     }
 }
 

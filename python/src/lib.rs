@@ -5,6 +5,7 @@
 
 use pyo3::prelude::*;
 
+mod coevolution;
 mod config;
 mod errors;
 mod play;
@@ -20,17 +21,19 @@ mod _native {
     use pyo3::prelude::*;
 
     #[pymodule_export]
+    use crate::coevolution::Coevolution;
+    #[pymodule_export]
     use crate::config::{Config, keys, sweep};
     #[pymodule_export]
-    use crate::play::{rollout, starts, trace};
+    use crate::play::{forward, record, rollout, starts};
     #[pymodule_export]
-    use crate::program::{adapters, main};
+    use crate::program::{adapters, answer, main};
     #[pymodule_export]
     use crate::show::{Figure, Replay, figure, replay};
     #[pymodule_export]
     use crate::step::Stepper;
     #[pymodule_export]
-    use crate::train::{Generation, open, save, train, train_into};
+    use crate::train::{Generation, open, save, train, train_into, write_policies};
     #[pymodule_export]
     use crate::workers::forked;
 

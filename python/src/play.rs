@@ -1,9 +1,19 @@
 //! Plays teams of given policies.
 
-use flotilla::evaluate::Starts;
-use flotilla::front::{self, Failure, Played, Traced};
+use std::ops::ControlFlow;
+use std::time::{Duration, Instant};
+
+use flotilla::backend::cpu::{self, StepArrays};
+use flotilla::config::{Fitness, MAX_HIDDEN_UNITS};
+use flotilla::evaluate::{Batch, Spread, Starts};
+use flotilla::evolve::{self, MAX_WEIGHT};
+use flotilla::front::{self, ActionNoise, Failure, Played};
+use flotilla::model::policy::{MAX_HIDDEN_LAYERS, PolicyConstants};
 use flotilla::world::{INPUTS, OUTPUTS, World};
-use numpy::{PyArray1, PyArray2, PyArray3, PyArray4, PyArrayMethods, PyReadonlyArray3, PyUntypedArrayMethods};
+use numpy::{
+    Element, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
+    PyReadwriteArray2, PyReadwriteArrayDyn, PyUntypedArrayMethods,
+};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
@@ -36,16 +46,22 @@ fn weights<'a>(config: &Config, policies: &'a PyReadonlyArray3<'_, f32>) -> PyRe
 
 type Scores<'py> = (
     Bound<'py, PyArray1<f64>>,
-    Bound<'py, PyArray1<f32>>,
     Bound<'py, PyArray2<f32>>,
     Bound<'py, PyArray2<f32>>,
     Bound<'py, PyArray2<f32>>,
     Option<Bound<'py, PyArray2<f32>>>,
 );
+/// The standard deviation and the interval of POIs observed, of each team, and these of each episode.
+type Spreads<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>);
 
-/// Plays teams. Returns POIs observed and G, `[teams]`, and D, Df, D++ and Dt, `[teams, leaders]`.
+/// Minimum time between checks for Ctrl-C.
+const PATIENCE: Duration = Duration::from_millis(50);
+
+/// Plays teams. Returns POIs observed, `[teams]`, and D, Df, D++ and Dt, `[teams, leaders]`. Dt is `None` unless it is
+/// the config's fitness.
 ///
-/// Dt is `None` unless it is the config's fitness.
+/// With `spread`, also returns deviation, low and high of POIs observed, `[teams, 3]`, NaN for one episode, and POIs
+/// observed in each episode, `[episodes, teams]`.
 #[pyfunction]
 pub fn rollout<'py>(
     py: Python<'py>,
@@ -53,69 +69,156 @@ pub fn rollout<'py>(
     policies: PyReadonlyArray3<'py, f32>,
     starts: Option<(u32, u64, f64, f64)>,
     backend: &str,
-) -> PyResult<Scores<'py>> {
+    spread: bool,
+) -> PyResult<(Scores<'py>, Option<Spreads<'py>>)> {
     let (teams, weights) = weights(config, &policies)?;
     let starts = drawn(starts);
-    let played = workers::play(py, backend, |(backend, _)| {
-        front::play(&config.0, &mut **backend, teams, weights, &starts).raise()
+    let episodes = starts.episodes();
+    let mut each = Vec::new();
+    if spread && each.try_reserve_exact(episodes.saturating_mul(teams)).is_err() {
+        let bytes = 4 * episodes as u128 * teams as u128;
+        return Err(Failure::Memory { what: "the scores of all episodes", bytes }).raise();
+    }
+    let (mut interrupted, mut asked) = (None, Instant::now());
+    let evaluation = workers::play(py, backend, |(backend, _)| {
+        let watch = &mut |batch: Batch<'_>| {
+            if spread {
+                each.extend_from_slice(batch.observed);
+            }
+            if asked.elapsed() > PATIENCE {
+                asked = Instant::now();
+                interrupted = Python::attach(|py| py.check_signals()).err();
+            }
+            if interrupted.is_some() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        };
+        front::play_until(&config.0, &mut **backend, teams, weights, &starts, watch).raise()
     })?;
-    let Played { observed, g, d, df, dpp, dt, .. } = played;
+    if let Some(error) = interrupted {
+        return Err(error);
+    }
+    let spreads = spread.then(|| {
+        let of_team = |team| {
+            let Spread { deviation, interval, .. } = evaluation.team(team);
+            let [low, high] = interval.unwrap_or([f64::NAN; 2]);
+            [deviation.unwrap_or(f64::NAN), low, high]
+        };
+        let rows: Vec<f64> = workers::aside(py, || (0..teams).flat_map(of_team).collect());
+        let each = PyArray1::from_vec(py, each).reshape([episodes, teams])?;
+        PyResult::Ok((PyArray1::from_vec(py, rows).reshape([teams, 3])?, each))
+    });
+    let Played { observed, d, df, dpp, dt, .. } = Played::from(&evaluation);
     let timed = !dt.is_empty();
     let shape = [teams, config.0.learners()];
     let rows = |scores: Vec<f32>| PyArray1::from_vec(py, scores).reshape(shape);
-    Ok((
-        PyArray1::from_vec(py, observed),
-        PyArray1::from_vec(py, g),
-        rows(d)?,
-        rows(df)?,
-        rows(dpp)?,
-        timed.then(|| rows(dt)).transpose()?,
-    ))
+    let dt = timed.then(|| rows(dt)).transpose()?;
+    Ok(((PyArray1::from_vec(py, observed), rows(d)?, rows(df)?, rows(dpp)?, dt), spreads.transpose()?))
 }
 
-type Motion<'py> = (
-    Bound<'py, PyArray4<f32>>,
-    Bound<'py, PyArray4<f32>>,
-    Bound<'py, PyArray3<f32>>,
-    Bound<'py, PyArray4<f32>>,
-    Bound<'py, PyArray4<f32>>,
-    Bound<'py, PyArray4<u32>>,
-);
+/// The scores of each episode's teams, and the step at which each POI was observed, or 0, `[episodes, teams, pois]`.
+type Recorded<'py> = (Scores<'py>, Bound<'py, PyArray2<u32>>);
 
-/// Plays one episode, and returns every step of all teams.
+/// Plays some episodes on the CPU, and writes every step of all teams to the arrays that are given.
 ///
 /// The arrays are positions and headings `[teams, steps + 1, agents, 2]`, speeds `[teams, steps + 1, agents]`, inputs
-/// `[teams, steps, leaders, 8]` and outputs `[teams, steps, leaders, 2]`. The last array is
-/// `[teams, steps, pois, words]`, with one bit per agent within the observation radius of each POI.
+/// `[teams, steps, leaders, 8]`, outputs and actions `[teams, steps, leaders, 2]`, all float32, and near
+/// `[teams, steps, pois, words]`, uint32, with one bit per agent within the observation radius of each POI. The teams of
+/// all episodes follow each other. `noise` is a seed and the standard deviations `[leaders, 2]`.
 #[pyfunction]
-pub fn trace<'py>(
+#[expect(clippy::too_many_arguments, reason = "these are all that an episode is")]
+pub fn record<'py>(
     py: Python<'py>,
     config: &Config,
     policies: PyReadonlyArray3<'py, f32>,
     starts: Option<(u32, u64, f64, f64)>,
-    episode: usize,
-    backend: &str,
-) -> PyResult<Motion<'py>> {
+    episodes: (usize, usize),
+    noise: Option<(u64, PyReadonlyArray2<'py, f32>)>,
+    arrays: [Option<PyReadwriteArrayDyn<'py, f32>>; 6],
+    near: Option<PyReadwriteArrayDyn<'py, u32>>,
+) -> PyResult<Recorded<'py>> {
     let (teams, weights) = weights(config, &policies)?;
     let starts = drawn(starts);
-    let (world, traced) = workers::play(py, backend, |(backend, _)| {
-        let traced = front::trace(&config.0, &mut **backend, teams, weights, &starts, episode).raise()?;
-        Ok((World::new(&config.0), traced))
+    let (mut arrays, mut near) = (arrays, near);
+    let mut slices = [(); 6].map(|()| Default::default());
+    for (slice, array) in slices.iter_mut().zip(&mut arrays) {
+        *slice = contiguous(array)?;
+    }
+    let [positions, headings, speeds, inputs, outputs, actions] = slices;
+    let near = contiguous(&mut near)?;
+    let deviations: Option<Vec<[f32; OUTPUTS]>> = noise.as_ref().map(|(_, deviations)| {
+        let deviations = deviations.as_array();
+        deviations.rows().into_iter().map(|row| std::array::from_fn(|output| row[output])).collect()
+    });
+    let noise = noise.as_ref().zip(deviations.as_deref());
+    let noise = noise.map(|(&(seed, _), deviations)| ActionNoise { seed, deviations });
+    let arrays = StepArrays { positions, headings, speeds, inputs, outputs, actions, near };
+    let recorded = workers::aside(py, || {
+        front::record(&config.0, teams, weights, &starts, episodes.0..episodes.1, noise, arrays).raise()
     })?;
-    let Traced { positions, headings, speeds, inputs, outputs, near, .. } = traced;
-    let (steps, agents, leaders, pois) = (world.steps(), world.agents(), world.leaders(), world.pois.len());
-    let of_four = |values, shape: [usize; 4]| PyArray1::from_vec(py, values).reshape(shape);
-    Ok((
-        of_four(positions, [teams, steps + 1, agents, 2])?,
-        of_four(headings, [teams, steps + 1, agents, 2])?,
-        PyArray1::from_vec(py, speeds).reshape([teams, steps + 1, agents])?,
-        of_four(inputs, [teams, steps, leaders, INPUTS])?,
-        of_four(outputs, [teams, steps, leaders, OUTPUTS])?,
-        PyArray1::from_vec(py, near).reshape([teams, steps, pois, world.constants.words as usize])?,
-    ))
+    let front::Recorded { observed, credits, observed_at } = recorded;
+    let shape = [observed.len(), config.0.learners()];
+    let scores = |index: usize| PyArray1::from_iter(py, credits.iter().map(|credits| credits[index])).reshape(shape);
+    let timed = config.0.learning.fitness == Fitness::Dt;
+    let dt = timed.then(|| scores(3)).transpose()?;
+    let counts = PyArray1::from_iter(py, observed.iter().map(|&observed| f64::from(observed)));
+    let at = PyArray1::from_vec(py, observed_at).reshape([observed.len(), config.0.world.pois.len()])?;
+    Ok(((counts, scores(0)?, scores(1)?, scores(2)?, dt), at))
 }
 
-/// Draws start positions, `[count, agents, 2]`, moved by at most `jitter` on each axis, in map units.
+/// Returns the elements of an array, or none.
+fn contiguous<'a, T: Element>(array: &'a mut Option<PyReadwriteArrayDyn<'_, T>>) -> PyResult<&'a mut [T]> {
+    let Some(array) = array else { return Ok(&mut []) };
+    array.as_slice_mut().map_err(|_| PyValueError::new_err("arrays of steps must be C-contiguous"))
+}
+
+/// Writes what policies answer to inputs, as in an episode: `inputs` are `[rows, 8]`, `outputs` `[rows, 2]`.
+///
+/// `policies` are `[policies, parameters]`, with layers of the given widths. Row i is answered by policy `chosen[i]`.
+#[pyfunction]
+pub fn forward(
+    py: Python<'_>,
+    widths: Vec<u32>,
+    policies: PyReadonlyArray2<'_, f32>,
+    inputs: PyReadonlyArray2<'_, f32>,
+    chosen: PyReadonlyArray1<'_, i64>,
+    mut outputs: PyReadwriteArray2<'_, f32>,
+) -> PyResult<()> {
+    let mut padded = [0; MAX_HIDDEN_LAYERS + 2];
+    let small = |&width: &u32| (1..=MAX_HIDDEN_UNITS as u32).contains(&width);
+    if !(2..=padded.len()).contains(&widths.len()) || !widths.iter().all(small) {
+        return Err(PyValueError::new_err(format!(
+            "layers of {widths:?} units, allowed are up to {MAX_HIDDEN_LAYERS} \
+             hidden ones of 1 to {MAX_HIDDEN_UNITS}"
+        )));
+    }
+    padded[..widths.len()].copy_from_slice(&widths);
+    let parameters: u32 = widths.windows(2).map(|widths| (widths[0] + 1) * widths[1]).sum();
+    let policy = PolicyConstants { layers: widths.len() as u32 - 1, widths: padded, parameters };
+    let fits = widths[0] as usize == INPUTS && policy.actions().is_some();
+    let (count, rows) = (policies.shape()[0], inputs.shape()[0]);
+    let chosen = chosen.as_slice()?;
+    if !fits
+        || policies.shape()[1] != parameters as usize
+        || inputs.shape()[1] != INPUTS
+        || outputs.shape() != [rows, OUTPUTS]
+        || chosen.len() != rows
+        || !chosen.iter().all(|&policy| (0..count as i64).contains(&policy))
+    {
+        return Err(PyValueError::new_err("the arrays do not fit each other"));
+    }
+    let (mut weights, inputs) = (policies.as_slice()?.to_vec(), inputs.as_slice()?);
+    let outputs = outputs.as_slice_mut()?;
+    if let Some(place) = evolve::admit(&mut weights) {
+        let (policy, parameter) = (place / parameters as usize, place % parameters as usize);
+        let value = weights[place];
+        let text = format!("weight {parameter} of policy {policy} is {value}, allowed is a size up to {MAX_WEIGHT}");
+        return Err(PyValueError::new_err(text));
+    }
+    workers::aside(py, || cpu::forward(&policy, &weights, inputs, &|row| chosen[row] as usize, outputs));
+    Ok(())
+}
+
+/// Draws start positions, `[count, agents, 2]`, moved by at most `jitter` on each axis, in map units. If `poi_jitter` is
+/// above 0, the POIs follow, `[count, agents + pois, 2]`, moved by at most that.
 ///
 /// Team `i` uses draw number `first + i`.
 #[pyfunction]
@@ -124,22 +227,26 @@ pub fn starts<'py>(
     config: &Config,
     seed: u64,
     jitter: f64,
+    poi_jitter: f64,
     first: usize,
     count: usize,
 ) -> PyResult<Bound<'py, PyArray3<f32>>> {
     let world = World::new(&config.0);
-    let bytes = (count as u128) * world.agents() as u128 * 8;
-    if !(jitter.is_finite() && jitter >= 0.0 && usize::try_from(bytes).is_ok_and(|bytes| bytes < 1 << 36)) {
+    let places = world.agents() + if poi_jitter > 0.0 { world.pois.len() } else { 0 };
+    let bytes = (count as u128) * places as u128 * 8;
+    if ![jitter, poi_jitter].iter().all(|jitter| jitter.is_finite() && *jitter >= 0.0)
+        || !(usize::try_from(bytes).is_ok_and(|bytes| bytes < 1 << 36))
+    {
         return Err(Failure::Starts { episodes: count.try_into().unwrap_or(u32::MAX), jitter }).raise();
     }
-    let starts = Starts::Drawn { episodes: 1, seed, jitter, poi_jitter: 0.0 };
-    let places = workers::aside(py, || {
-        let mut places = Vec::with_capacity(count * world.agents() * 2);
+    let starts = Starts::Drawn { episodes: 1, seed, jitter, poi_jitter };
+    let drawn = workers::aside(py, || {
+        let mut drawn = Vec::with_capacity(count * places * 2);
         (0..count).for_each(|team| {
-            let drawn = starts.of(first.wrapping_add(team), &world);
-            places.extend(drawn.into_iter().flat_map(|place| place.to_array()));
+            let of_team = starts.of(first.wrapping_add(team), &world);
+            drawn.extend(of_team.into_iter().flat_map(|place| place.to_array()));
         });
-        places
+        drawn
     });
-    PyArray1::from_vec(py, places).reshape([count, world.agents(), 2])
+    PyArray1::from_vec(py, drawn).reshape([count, places, 2])
 }

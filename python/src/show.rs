@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use flotilla::record::digests::Verification;
-use flotilla::report::curves::PRINT;
+use flotilla::report::curves::{Band, PRINT};
 use flotilla::report::replay::{self as again, Film, ReplayError, Replayed, Which};
 use flotilla::report::runs;
 use flotilla::report::scene::{Format, Scene};
@@ -94,7 +94,10 @@ pub struct Figure(Scene);
 #[pyfunction]
 pub fn figure(py: Python<'_>, folders: Vec<PathBuf>, unverified: bool) -> PyResult<Figure> {
     let verification = Verification::unless(unverified);
-    workers::aside(py, || runs::figure(&folders, verification).map(|figure| Figure(figure.scene()))).raise()
+    workers::aside(py, || {
+        runs::figure(&folders, None, Band::Interval, verification).map(|figure| Figure(figure.scene()))
+    })
+    .raise()
 }
 
 #[pymethods]

@@ -15,6 +15,7 @@ use numpy::{
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+use pyo3::types::PyBytes;
 
 use crate::config::Config;
 use crate::errors::Raise;
@@ -65,7 +66,19 @@ impl Stepper {
         Ok(self.stepper()?.teams())
     }
 
-    /// Resets all teams, or the chosen ones, to the world's start or to the given starts `[teams, agents, 2]`.
+    /// Returns the state of all teams, for `restore`.
+    fn save<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyBytes>> {
+        let state = workers::aside(py, || Ok::<_, PyErr>(self.stepper()?.save()))?;
+        Ok(PyBytes::new(py, &state))
+    }
+
+    /// Puts all teams into a state that `save` returned.
+    fn restore(&self, py: Python<'_>, state: &[u8]) -> PyResult<()> {
+        workers::aside(py, || self.stepper()?.restore(state).raise())
+    }
+
+    /// Resets all teams, or the chosen ones, to the world's start or to the given starts `[teams, agents, 2]`, or
+    /// `[teams, agents + pois, 2]` with POI positions.
     fn reset(
         &self,
         py: Python<'_>,
@@ -234,7 +247,7 @@ fn team_of(stepper: &mut stepping::Stepper, team: usize) -> Team {
     Team {
         leaders,
         agents: places.into_iter().enumerate().map(agent).collect(),
-        pois: world.pois.iter().enumerate().map(poi).collect(),
+        pois: stepper.pois(team).iter().enumerate().map(poi).collect(),
     }
 }
 

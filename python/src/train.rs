@@ -5,18 +5,23 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
-use flotilla::backend::OpenBackend;
-use flotilla::front::{self, Trained};
+use flotilla::backend::{Backend, OpenBackend};
+use flotilla::front::{self, Coevolution, Trained};
 use flotilla::memory::Peaks;
 use flotilla::record::digests::Verification;
 use flotilla::record::disk::Disk;
-use flotilla::record::folder::{self, FileSums, Folder, METRICS, POLICIES, RunSums, Start, StartFrom, Status};
+use flotilla::record::finished::Finished;
+use flotilla::record::folder::{self, Folder, METRICS, Start, StartFrom};
 use flotilla::record::ownership::{self, CURVES};
 use flotilla::record::{RecordError, metrics, policies};
+use flotilla::report::curves::Band;
 use flotilla::report::runs;
 use flotilla::run::{Ended, Options, RunError, Session};
-use flotilla::trainer::Row;
-use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
+use flotilla::trainer::{Ending, Row};
+use numpy::{
+    PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
+    PyUntypedArrayMethods,
+};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyBool;
@@ -35,7 +40,9 @@ const PATIENCE: Duration = Duration::from_millis(50);
 ///     last: the number of the last that there will be.
 ///     best_g: G of its best team, float64 ``[trials]``.
 ///     mean_g: of its mean team, likewise.
-///     champion_g: of the team of every population's best policy, likewise.
+///     champion_g: G of the champion, the team of every population's best policy, likewise.
+///     champions: the policies of the champion, float32 ``[trials, leaders, parameters]``, or
+///         ``[trials, 1, parameters]`` if leaders share a policy. None unless :func:`train` was asked for ``champions``.
 ///
 /// Example:
 ///     >>> seen = []
@@ -50,9 +57,18 @@ pub struct Generation {
     #[pyo3(get)]
     last: usize,
     rows: Vec<Row>,
+    /// `[trials][populations][parameters]`, and the number of populations.
+    champions: Option<(Vec<f32>, usize)>,
 }
 
 impl Generation {
+    /// Returns the generations of some rows, in their order.
+    pub fn of_rows(rows: &[Row], last: usize) -> Vec<Generation> {
+        let same = |a: &Row, b: &Row| a.generation == b.generation;
+        let of = |rows: &[Row]| Generation { generation: rows[0].generation, last, rows: rows.into(), champions: None };
+        rows.chunk_by(same).map(of).collect()
+    }
+
     fn column<'py>(&self, py: Python<'py>, of: impl Fn(&Row) -> f64) -> Bound<'py, PyArray1<f64>> {
         PyArray1::from_iter(py, self.rows.iter().map(of))
     }
@@ -73,6 +89,14 @@ impl Generation {
     #[getter]
     fn champion_g<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         self.column(py, |row| row.champion_g)
+    }
+
+    #[getter]
+    fn champions<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArray3<f32>>>> {
+        let Some((champions, populations)) = &self.champions else { return Ok(None) };
+        let trials = self.rows.len();
+        let shape = [trials, *populations, champions.len() / (trials * populations).max(1)];
+        PyArray1::from_slice(py, champions).reshape(shape).map(Some)
     }
 
     fn __repr__(&self) -> String {
@@ -97,7 +121,7 @@ impl<'a> Watcher<'a> {
     }
 
     /// Reports a generation to the callback. Returns whether to stop.
-    fn tell(&mut self, rows: &[Row], last: usize) -> bool {
+    fn tell(&mut self, rows: &[Row], last: usize, champions: Option<(Vec<f32>, usize)>) -> bool {
         self.times.push(self.since.elapsed().as_secs_f64());
         if self.callback.is_none() && self.asked.elapsed() < PATIENCE {
             return false;
@@ -105,8 +129,12 @@ impl<'a> Watcher<'a> {
         let told = Python::attach(|py| {
             py.check_signals()?;
             let (Some(callback), Some(row)) = (self.callback, rows.first()) else { return Ok(false) };
-            let answer =
-                callback.bind(py).call1((Generation { generation: row.generation, last, rows: rows.into() },))?;
+            let answer = callback.bind(py).call1((Generation {
+                generation: row.generation,
+                last,
+                rows: rows.into(),
+                champions,
+            },))?;
             if answer.is_none() {
                 return Ok(false);
             }
@@ -129,18 +157,26 @@ impl<'a> Watcher<'a> {
 ///
 /// Each of the three metrics is `[trials, generations + 1]`, and each trial's policies are
 /// `[leaders or 1, policies, parameters]`.
-type Outcomes<'py> = (Config, [Bound<'py, PyArray2<f64>>; 3], Vec<Bound<'py, PyArray3<f32>>>, String);
+pub type Outcomes<'py> =
+    (Config, [Bound<'py, PyArray2<f64>>; 3], Vec<Bound<'py, PyArray3<f32>>>, String, End<Bound<'py, PyArray1<f32>>>);
 
-fn outcomes(py: Python<'_>, trained: Trained, digest: String) -> PyResult<Outcomes<'_>> {
-    let Trained { config, best_g, mean_g, champion_g, policies, .. } = trained;
+pub fn outcomes(py: Python<'_>, trained: Trained, digest: String) -> PyResult<Outcomes<'_>> {
+    let Trained { config, best_g, mean_g, champion_g, policies, ending, .. } = trained;
     let learning = &config.learning;
     let table = |values| PyArray1::from_vec(py, values).reshape([learning.trials, learning.generations + 1]);
     let shape = [config.populations(), learning.population, config.parameters()];
     let policies = policies.into_iter().map(|trial| PyArray1::from_vec(py, trial).reshape(shape));
     let metrics = [table(best_g)?, table(mean_g)?, table(champion_g)?];
     let policies = policies.collect::<PyResult<_>>()?;
-    Ok((Config(config), metrics, policies, digest))
+    let end = ending.map(|Ending { fitness, pending }| {
+        (fitness.into_iter().map(|scores| PyArray1::from_vec(py, scores)).collect(), pending)
+    });
+    Ok((Config(config), metrics, policies, digest, end))
 }
+
+/// State that a longer run continues from: each trial's scores, `[leaders or 1][policies]`, and the best and mean G of the last
+/// generation.
+type End<T> = Option<(Vec<T>, Vec<Option<[f64; 2]>>)>;
 
 /// The backend, "cpu" or "gpu", its description, and the digest of the initial policies if they were given.
 type Played = (String, String, Option<String>);
@@ -156,12 +192,18 @@ pub fn train<'py>(
     config: &Config,
     backend: &str,
     callback: Option<Py<PyAny>>,
+    champions: bool,
 ) -> PyResult<(Outcomes<'py>, Played, Vec<f64>)> {
     let mut watcher = Watcher::new(callback.as_ref());
     let (trained, digest, played) = workers::play(py, backend, |player| {
         let played = named(player);
+        if champions {
+            let trained = with_champions(&config.0, &mut *player.0, &mut watcher)?;
+            let digest = trained.digest();
+            return Ok((trained, digest, played));
+        }
         let trained = front::train(&config.0, &mut *player.0, |generation| {
-            let stop = watcher.error.is_none() && watcher.tell(generation.rows, generation.last);
+            let stop = watcher.error.is_none() && watcher.tell(generation.rows, generation.last, None);
             if stop { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         });
         let trained = trained.raise()?;
@@ -174,6 +216,62 @@ pub fn train<'py>(
     // After a stop, one more generation is played, which the watcher has not seen.
     watcher.times.resize(trained.config.learning.generations + 1, watcher.since.elapsed().as_secs_f64());
     Ok((outcomes(py, trained, digest)?, played, watcher.times))
+}
+
+/// Trains with the champions of every generation for the callback. The populations stay on the host.
+fn with_champions(
+    config: &flotilla::Config,
+    backend: &mut dyn Backend,
+    watcher: &mut Watcher<'_>,
+) -> PyResult<Trained> {
+    let mut coevolution = Coevolution::new(config).raise()?;
+    let (mut champions, mut stopped) = (Vec::new(), false);
+    while !coevolution.is_done() {
+        let told = coevolution.tell(backend, None).raise()?;
+        let (rows, last) = (told.rows.to_vec(), told.last);
+        let next = coevolution.best().raise()?;
+        // A generation is complete when its champions have played with the next one.
+        for (place, rows) in rows.chunk_by(|a, b| a.generation == b.generation).enumerate() {
+            let own = if place == 0 && !champions.is_empty() { &champions } else { &next };
+            if !stopped
+                && watcher.error.is_none()
+                && watcher.tell(rows, last, Some((own.clone(), config.populations())))
+            {
+                stopped = true;
+                if !coevolution.is_done() {
+                    coevolution.stop();
+                }
+            }
+        }
+        champions = next;
+    }
+    coevolution.finish().raise()
+}
+
+/// Returns the number of policies, and the given policies, `[populations][policies][parameters]`, of each trial.
+pub fn first_policies(policies: &[PyReadonlyArray3<'_, f32>]) -> PyResult<(usize, Vec<Vec<f32>>)> {
+    let count = policies.first().map_or(0, |policies| policies.shape()[1]);
+    if policies.iter().any(|policies| policies.shape()[1] != count) {
+        return Err(PyValueError::new_err("init: all trials must have the same number of policies"));
+    }
+    let contiguous = |policies: &PyReadonlyArray3<'_, f32>| {
+        let slice = policies.as_slice().map_err(|_| PyValueError::new_err("init is not C-contiguous"))?;
+        PyResult::Ok(slice.to_vec())
+    };
+    Ok((count, policies.iter().map(contiguous).collect::<PyResult<_>>()?))
+}
+
+/// Writes policies, one array `[populations, policies, parameters]` per trial, as a file of a config that has so many.
+#[pyfunction]
+pub fn write_policies(config: &Config, policies: Vec<PyReadonlyArray3<'_, f32>>, path: PathBuf) -> PyResult<()> {
+    let shape = [config.0.populations(), config.0.learning.population, config.0.parameters()];
+    if policies.len() != config.0.learning.trials || policies.iter().any(|policies| policies.shape() != shape) {
+        return Err(PyValueError::new_err(format!("init must have the shape {shape:?}")));
+    }
+    let (_, weights) = first_policies(&policies)?;
+    let weights: Vec<&[f32]> = weights.iter().map(|weights| &weights[..]).collect();
+    policies::write(&Disk::default(), &path, &config.0, &weights).raise()?;
+    Ok(())
 }
 
 /// Trains in a run directory, as `flotilla train` does, and returns warnings. [`open`] reads the results.
@@ -211,7 +309,7 @@ pub fn train_into(
             let mut watch = |progress: &flotilla::run::Progress<'_>| {
                 for rows in progress.rows.chunk_by(|a, b| a.generation == b.generation) {
                     if !stop.load(Relaxed) {
-                        stop.store(watcher.tell(rows, last), Relaxed);
+                        stop.store(watcher.tell(rows, last, None), Relaxed);
                     }
                 }
             };
@@ -247,7 +345,8 @@ pub fn train_into(
 
 /// Writes a run's learning curves to its directory, as the program does.
 fn draw(folder: &PathBuf) -> PyResult<()> {
-    let svg = runs::figure(std::slice::from_ref(folder), Verification::Required).raise()?.scene().svg();
+    let svg =
+        runs::figure(std::slice::from_ref(folder), None, Band::Interval, Verification::Required).raise()?.scene().svg();
     let disk = ownership::enter(&Disk::default(), folder, true).raise()?;
     ownership::publish(&disk, &folder.join(CURVES), |output| output.write_all(svg.as_bytes())).raise()
 }
@@ -277,6 +376,7 @@ pub fn save(
     config: &Config,
     metrics: [PyReadonlyArray2<'_, f64>; 3],
     policies: Vec<PyReadonlyArray3<'_, f32>>,
+    end: End<PyReadonlyArray1<'_, f32>>,
     times: Vec<f64>,
     played: Played,
     folder: PathBuf,
@@ -289,7 +389,11 @@ pub fn save(
     let fits = metrics.iter().all(|metrics| metrics.shape() == [trials, columns])
         && policies.len() == trials
         && policies.iter().all(|policies| policies.shape() == shape)
-        && times.len() == columns;
+        && times.len() == columns
+        && end.iter().all(|(fitness, pending)| {
+            let scores = config.populations() * learning.population;
+            fitness.len() == trials && pending.len() == trials && fitness.iter().all(|trial| trial.len() == scores)
+        });
     let slices = |fits: bool| {
         let metrics = metrics.iter().map(|metrics| metrics.as_slice().ok()).collect::<Option<Vec<_>>>()?;
         let policies = policies.iter().map(|policies| policies.as_slice().ok()).collect::<Option<Vec<_>>>()?;
@@ -298,46 +402,36 @@ pub fn save(
     let Some((scores, weights)) = slices(fits) else {
         return Err(PyValueError::new_err("the run's arrays no longer have the shapes that its config gives them"));
     };
+    let ending = end.map(|(fitness, pending)| {
+        let fitness = fitness.iter().map(|trial| trial.as_array().iter().copied().collect()).collect();
+        Ending { fitness, pending }
+    });
+    let rows = (0..columns).flat_map(|generation| (0..trials).map(move |trial| (generation, trial)));
+    let row = |(generation, trial): (usize, usize)| {
+        let of = |score: &[f64]| score[trial * columns + generation];
+        let (best_g, mean_g, champion_g) = (of(scores[0]), of(scores[1]), of(scores[2]));
+        (Row { experiment: 0, trial, generation, best_g, mean_g, champion_g }, times[generation])
+    };
+    let rows: Vec<(Row, f64)> = rows.map(row).collect();
     workers::aside(py, || {
         let disk = Disk::default();
         let start = if force { Start::Force } else { Start::Fresh };
-        let (kept, _) = Folder::open(&folder, start, config, StartFrom::Random, disk).raise()?;
-        let disk = &kept.disk;
-        let path = kept.file(METRICS);
-        let write = || {
-            let mut writer = metrics::Writer::create(disk, &path, config)?;
-            for (generation, &seconds) in times.iter().enumerate() {
-                let row = |trial: usize| {
-                    let of = |score: &[f64]| score[trial * columns + generation];
-                    let (best_g, mean_g, champion_g) = (of(scores[0]), of(scores[1]), of(scores[2]));
-                    Row { arm: 0, trial, generation, best_g, mean_g, champion_g }
-                };
-                writer.add(&(0..trials).map(row).collect::<Vec<_>>(), seconds)?;
-            }
-            writer.flush()
-        };
-        write().map_err(|error| RecordError::Write { path: path.clone(), error }).raise()?;
-        let checksum = policies::write(disk, &kept.file(POLICIES), config, &weights).raise()?;
-        let (_, RunSums { run: digest, metrics }) = kept.digest(config, &weights).raise()?;
+        let (mut kept, _) = Folder::open(&folder, start, config, StartFrom::Random, disk).raise()?;
         let (backend, description, init) = played;
         let run = folder::Run {
             version: env!("CARGO_PKG_VERSION").into(),
-            state: Status::Done,
             backend,
             description,
             threads: rayon::current_num_threads(),
             updated: folder::now(),
-            seconds: times.last().copied().unwrap_or(0.0),
             sessions: 1,
-            generations: columns,
-            digest: Some(digest.clone()),
-            files: Some(FileSums { metrics, policies: checksum }),
             command: command.into(),
             commit: flotilla::COMMIT.map(String::from),
             init,
             ..folder::Run::new(config)
         };
-        kept.write_run(&run).raise()?;
+        let finished = Finished { config, rows: &rows, policies: &weights, ending, run };
+        let digest = finished.write(&mut kept).raise()?;
         draw(&folder)?;
         Ok(digest)
     })

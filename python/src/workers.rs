@@ -1,8 +1,7 @@
 //! Keeps backends open between calls, and starts threads, also in forked processes.
 
-use std::cell::Cell;
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Mutex, PoisonError};
 
 use flotilla::backend::OpenBackend;
 use flotilla::front::{self, Processor};
@@ -19,36 +18,57 @@ const MOST: usize = 4;
 /// Whether this process was forked. Threads of its parent do not exist in it.
 static FORKED: AtomicBool = AtomicBool::new(false);
 
-thread_local! { static HAS_THREADS: Cell<bool> = const { Cell::new(false) }; }
+/// The threads of a forked process.
+static POOL: Mutex<Option<&'static rayon::ThreadPool>> = Mutex::new(None);
 
 /// Marks this process as forked: it must not use its parent's threads and devices.
 #[pyfunction]
 pub fn forked() {
     FORKED.store(true, Relaxed);
+    if let Ok(mut pool) = POOL.try_lock() {
+        // These threads, too, belong to the parent.
+        *pool = None;
+    }
     if let Ok(mut idle) = IDLE.try_lock() {
         // These backends belong to the parent, so they must not be dropped here.
         std::mem::forget(std::mem::take(&mut *idle));
     }
 }
 
-/// Starts as many threads as the system allows.
+/// Runs `work` with as many threads as the system allows.
 ///
-/// In a forked process, each calling thread gets its own workers, because those of the parent would never answer.
-fn gain_threads() {
+/// A forked process does not have its parent's threads. Its first calling thread becomes part of a new pool, in which
+/// all other threads work, too.
+fn with_threads<R: Send>(work: impl FnOnce() -> R + Send) -> R {
     if !FORKED.load(Relaxed) {
         parallel::start(None);
-    } else if !HAS_THREADS.replace(true) {
-        // This fails if the thread already belongs to a pool, which is fine.
-        std::mem::forget(rayon::ThreadPoolBuilder::new().use_current_thread().build());
+        return work();
     }
+    let pool = {
+        let mut pool = POOL.lock().unwrap_or_else(PoisonError::into_inner);
+        if pool.is_none() && rayon::current_thread_index().is_none() {
+            // The calling thread is idle between its calls, so there has to be one more for the others.
+            let threads = std::thread::available_parallelism().map_or(2, |threads| threads.get().max(2));
+            let builder = rayon::ThreadPoolBuilder::new().num_threads(wanted_threads(threads)).use_current_thread();
+            *pool = builder.build().ok().map(|pool| &*Box::leak(Box::new(pool)));
+        }
+        *pool
+    };
+    match pool {
+        Some(pool) if rayon::current_thread_index().is_none() => pool.install(work),
+        _ => work(),
+    }
+}
+
+/// Returns the number of threads that `RAYON_NUM_THREADS` asks for, at least 2, or else the given one.
+fn wanted_threads(otherwise: usize) -> usize {
+    let wanted = std::env::var("RAYON_NUM_THREADS").ok().and_then(|text| text.parse().ok());
+    wanted.filter(|&threads: &usize| threads > 0).map_or(otherwise, |threads| threads.max(2))
 }
 
 /// Runs `work` without the interpreter's lock.
 pub fn aside<R: Send>(py: Python<'_>, work: impl FnOnce() -> R + Send) -> R {
-    py.detach(|| {
-        gain_threads();
-        work()
-    })
+    py.detach(|| with_threads(work))
 }
 
 /// Runs `work` on a backend, without the interpreter's lock.
@@ -60,19 +80,35 @@ pub fn play<R: Send>(
     work: impl FnOnce(&mut OpenBackend) -> PyResult<R> + Send,
 ) -> PyResult<R> {
     aside(py, || {
-        let mut player = match take(backend) {
-            Some(player) => player,
-            None => open(backend)?,
-        };
-        let done = work(&mut player);
-        if done.is_ok()
-            && let Ok(mut idle) = IDLE.try_lock()
+        let mut lent = Lent::open(backend)?;
+        let done = work(&mut lent.player)?;
+        lent.give_back();
+        Ok(done)
+    })
+}
+
+/// A backend in use.
+pub struct Lent<'a> {
+    name: &'a str,
+    /// The open backend.
+    pub player: OpenBackend,
+}
+
+impl Lent<'_> {
+    /// Takes an idle backend, or opens one.
+    pub fn open(name: &str) -> PyResult<Lent<'_>> {
+        let player = take(name).map_or_else(|| open(name), Ok)?;
+        Ok(Lent { name, player })
+    }
+
+    /// Keeps the backend for the next call. Call this only if the backend did not fail.
+    pub fn give_back(self) {
+        if let Ok(mut idle) = IDLE.try_lock()
             && idle.len() < MOST
         {
-            idle.push((backend.into(), player));
+            idle.push((self.name.into(), self.player));
         }
-        done
-    })
+    }
 }
 
 fn take(backend: &str) -> Option<OpenBackend> {

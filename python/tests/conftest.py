@@ -45,7 +45,7 @@ def _elsewhere(tmp_path, monkeypatch) -> None:
 
 
 def random_policies(config: flotilla.Config, teams: int, seed: int = 0, leaders: int | None = None) -> np.ndarray:
-    shape = (leaders or config.leaders, teams, config.parameters)
+    shape = (leaders or config.num_learners, teams, config.parameters)
     return np.random.default_rng(seed).normal(0, 1.5, shape).astype(np.float32)
 
 

@@ -13,7 +13,7 @@ def test_a_file_is_read_and_written():
     config = Config.load(ROOT / "configs/chaotic.toml")
     assert Config.parse(config.to_toml()) == config == Config.paper("chaotic")
     assert config["world.steps"] == 50 and config["world"]["steps"] == 50
-    assert (config.leaders, config.parameters) == (4, 112)
+    assert (config.num_learners, config.parameters) == (4, 112)
     with pytest.raises(KeyError):
         config["world.step"]
 
@@ -56,10 +56,10 @@ def test_a_config_is_made_of_python_s_values():
 
 
 def test_every_section_and_key_of_the_crate_is_there():
-    names = {key.name for key in Config.keys()}
+    names = {key.name for key in Config.reference()}
     sections = Config.paper().to_dict()
     assert {f"{section}.{key}" for section in sections for key in sections[section]} == names
-    assert len(names) >= 40 and all(key.meaning and key.range for key in Config.keys() if key.kind != "true or false")
+    assert len(names) >= 40 and all(key.meaning and key.range for key in Config.reference() if key.kind != "true or false")
 
 
 def test_a_config_is_a_value():

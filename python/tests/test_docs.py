@@ -47,18 +47,25 @@ def test_examples_do_what_they_say(name, thing):
     assert not said, "".join(said)
 
 
+SNIPPET = re.compile(
+    r"(?P<why><!-- not run: .*? -->\n\n?)?```python\n(?P<code>.*?)```(?:\n+<!-- output -->\n+```text\n(?P<output>.*?)```)?", re.S
+)
+
+
 def snippets():
-    pages = ("README.md", "python/README.md", "docs/reference/python.md", "docs/tutorial/python.md", "docs/how-to/another-optimiser.md")
-    for page in map(ROOT.joinpath, pages):
-        for number, (why, code) in enumerate(re.findall(r"(<!-- not run: .*? -->\n\n?)?```python\n(.*?)```", page.read_text(), re.S)):
-            if not why and ">>>" not in code:
-                yield pytest.param(code, id=f"{page.relative_to(ROOT)} {number}")
+    """Every Python block of every page, with the output that the page shows."""
+    for page in sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "python/README.md", *(ROOT / "docs").rglob("*.md")]):
+        for number, found in enumerate(SNIPPET.finditer(page.read_text())):
+            if not found["why"] and ">>>" not in found["code"]:
+                yield pytest.param(found["code"], found["output"], id=f"{page.relative_to(ROOT)} {number}")
 
 
-@pytest.mark.parametrize("code", list(snippets()))
-def test_snippets_run(code):
+@pytest.mark.parametrize("code, output", list(snippets()))
+def test_snippets_run(code, output, capsys):
     os.symlink(ROOT / "configs", "configs")
     exec(compile(code, "snippet", "exec"), {"__name__": "snippet"})
+    if output is not None:
+        assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == output.rstrip().splitlines()
 
 
 def test_the_api_page_is_current():

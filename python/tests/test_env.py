@@ -1,3 +1,5 @@
+import copy
+import pickle
 import threading
 import warnings
 
@@ -17,13 +19,13 @@ def by_policies(env, trace, step):
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("reward", ["G", "D", "Df", "D++", "Dt"])
 def test_fed_with_a_policy_s_answers_it_gives_the_bits_of_a_rollout(seed, reward):
-    config = random_config(seed).replace(learning={"start_jitter": 0.0, "fitness": reward})
+    config = random_config(seed).replace(learning={"start_jitter": 0.0, "poi_jitter": 0.0, "fitness": reward})
     policies = random_policies(config, 11, seed)
     scores = rollout(config, policies, trace=True)
     trace, steps = scores.trace, config["world.steps"]
     env = VectorEnv(config, 11, reward, autoreset="disabled")
     inputs, infos = env.reset()
-    total = np.zeros((11, config.leaders))
+    total = np.zeros((11, config.num_learners))
     for step in range(steps):
         assert np.array_equal(inputs.view(np.uint32), trace.inputs[:, step].view(np.uint32)), step
         inputs, rewards, terminated, truncated, infos = env.step(by_policies(env, trace, step))
@@ -31,7 +33,7 @@ def test_fed_with_a_policy_s_answers_it_gives_the_bits_of_a_rollout(seed, reward
         assert np.array_equal(positions.view(np.uint32), trace.positions[:, step + 1].view(np.uint32))
         assert np.array_equal(headings.view(np.uint32), trace.headings[:, step + 1].view(np.uint32))
         assert np.array_equal(speeds.view(np.uint32), trace.speeds[:, step + 1].view(np.uint32))
-        assert np.array_equal(env.near(), trace.near[:, step])
+        assert np.array_equal(env.agents_at_poi(), trace.agents_at_poi[:, step])
         total += rewards
         assert truncated.all() == (step == steps - 1) and not terminated.any() and infos == {}
         if reward != "G" and step < steps - 1:
@@ -390,17 +392,17 @@ def test_pettingzoo_s_own_tests_pass():
 
 def test_one_team_is_the_first_of_many():
     pytest.importorskip("pettingzoo", reason="pettingzoo is not installed")
-    config = random_config(3).replace(learning={"start_jitter": 0.0})
+    config = random_config(3).replace(learning={"start_jitter": 0.0, "poi_jitter": 0.0})
     for reward in ("G", "Df"):
         one, many = flotilla.parallel_env(config, reward=reward), VectorEnv(config, 3, reward, autoreset="disabled")
         seen, _ = one.reset(seed=1)
         inputs, _ = many.reset()
         rng = np.random.default_rng(1)
         while one.agents:
-            assert one.agents == [f"leader_{leader}" for leader in range(config.leaders)]
+            assert one.agents == [f"leader_{leader}" for leader in range(config.num_learners)]
             assert np.array_equal(np.stack(list(seen.values())), inputs[0])
             assert one.state().shape == one.state_space.shape
-            actions = rng.uniform(-1, 1, (3, config.leaders, 2)).astype(np.float32)
+            actions = rng.uniform(-1, 1, (3, config.num_learners, 2)).astype(np.float32)
             seen, rewards, terminated, truncated, _ = one.step(dict(zip(one.agents, actions[0])))
             inputs, expected, _, over, _ = many.step(actions)
             assert list(rewards.values()) == [float(reward) for reward in expected[0]]
@@ -408,3 +410,86 @@ def test_one_team_is_the_first_of_many():
         with pytest.raises(ValueError, match="no action for leader_0"):
             one.reset()
             one.step({})
+
+
+@pytest.mark.parametrize("layout", ["leaders", "team", "flat"])
+@pytest.mark.parametrize("reward", ["G", "Df", "Dt"])
+def test_a_copy_continues_with_the_same_bits(layout, reward):
+    learning = {"start_jitter": 1.0, "poi_jitter": 2.0}
+    config = Config.paper("chaotic").replace(learning=learning)
+    env = VectorEnv(config, 7, reward, layout=layout, autoreset="same_step", time_input=True, copy=False)
+    env.reset(seed=4)
+    rng = np.random.default_rng(2)
+    shape = (28, 2) if layout == "flat" else (7, 4, 2)
+    for _ in range(60):
+        env.step(rng.uniform(-1, 1, shape))
+    copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    for _ in range(70):
+        actions = rng.uniform(-1, 1, shape)
+        expected = env.step(actions)
+        for other in copies:
+            found = other.step(actions)
+            assert all(np.array_equal(a, b) for a, b in zip(found[:4], expected[:4]))
+            assert found[0].ctypes.data % 64 == 0
+            assert np.array_equal(other.states()[0], env.states()[0])
+    assert env.observed.any()
+
+
+def test_a_parallel_environment_can_be_copied():
+    pytest.importorskip("pettingzoo", reason="pettingzoo is not installed")
+    env = flotilla.parallel_env(Config.paper(), reward="Df", jitter=1.0)
+    env.reset(seed=1)
+    actions = {agent: np.float32([0.3, 0.9]) for agent in env.agents}
+    for _ in range(12):
+        env.step(actions)
+    for other in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        first = copy.deepcopy(env)
+        while first.agents:
+            found, expected = other.step(actions), first.step(actions)
+            assert found[1] == expected[1] and all(np.array_equal(found[0][a], expected[0][a]) for a in found[0])
+        assert not other.agents
+
+
+def test_pois_of_each_team_move():
+    config, seed = Config.paper("chaotic"), 5
+    env = VectorEnv(config, 6, jitter=1.0, poi_jitter=4.0)
+    still = VectorEnv(config, 6, jitter=1.0)
+    seen, other = env.reset(seed=seed)[0], still.reset(seed=seed)[0]
+    # Agents start alike, but what they sense of POIs differs.
+    assert np.array_equal(env.states()[0], still.states()[0])
+    assert (seen[..., :4] != other[..., :4]).any(axis=(1, 2)).all() and np.array_equal(seen[..., 4:], other[..., 4:])
+    # Episode i of a rollout has the starts of team i.
+    policies = random_policies(config, 1, 1)
+    batch = flotilla.collect(config, policies, noise=0, seed=seed, episodes=6, jitter=1.0, poi_jitter=4.0)
+    assert np.array_equal(batch.observations[:, 0], seen)
+    for step in range(config["world.steps"]):
+        assert np.array_equal(seen, batch.observations[:, step])
+        seen, rewards, *_ = env.step(batch.actions[:, step])
+        assert np.array_equal(rewards, batch.rewards[:, step])
+
+
+def test_old_names_warn():
+    env = VectorEnv(Config.paper(), 2)
+    with pytest.warns(DeprecationWarning, match="num_learners"):
+        assert env.leaders == env.num_learners == 4
+    with pytest.warns(DeprecationWarning, match="agents_at_poi"):
+        assert np.array_equal(env.near(), env.agents_at_poi())
+    with pytest.warns(DeprecationWarning, match="Config.num_learners"):
+        assert Config.paper().leaders == 4
+    with pytest.warns(DeprecationWarning, match="Config.reference"):
+        assert Config.keys() == Config.reference()
+    with pytest.warns(DeprecationWarning, match="Trace.agents_at_poi"):
+        assert rollout(Config.paper(), np.zeros((1, 1, 112)), trace=True).trace.near.shape == (1, 25, 4, 12)
+
+
+def test_supersuit_concatenates_copies():
+    supersuit = pytest.importorskip("supersuit", reason="supersuit is not installed")
+    env = flotilla.parallel_env(Config.paper(), jitter=1.0)
+    vector = supersuit.concat_vec_envs_v1(supersuit.pettingzoo_env_to_vec_env_v1(env), 3, base_class="gymnasium")
+    seen, _ = vector.reset(seed=1)
+    assert seen.shape == (12, 8)
+    first, last = seen[:4], seen[8:]
+    assert not np.array_equal(first, last)
+    for _ in range(60):
+        seen, rewards, terminated, truncated, _ = vector.step(np.ones((12, 2), np.float32))
+    assert seen.shape == (12, 8) and np.isfinite(seen).all()

@@ -1,4 +1,8 @@
 import csv
+import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -43,27 +47,24 @@ ACTIONS = ("direct", "behaviours")
 def test_a_trace_is_what_policies_answered(seed):
     config = random_config(seed).replace(policy={"hidden": [[10], [], [7, 5], [1, 2, 3]][seed % 4], "actions": ACTIONS[seed // 8]})
     policies = random_policies(config, 9, seed)
-    if config["policy.actions"] == "behaviours":
-        # Answers so large that tanh is 1 of several would leave open which of them is wanted most.
-        policies *= np.float32(0.2)
     trace = rollout(config, policies, trace=True).trace
     agents = len(config["world.leaders"]) + len(config["world.followers"])
     steps, pois = config["world.steps"], len(config["world.pois"])
     assert trace.positions.shape == trace.headings.shape == (9, steps + 1, agents, 2)
     assert trace.speeds.shape == (9, steps + 1, agents)
-    assert trace.inputs.shape == (9, steps, config.leaders, 8) and trace.outputs.shape == (9, steps, config.leaders, 2)
-    assert trace.near.shape == (9, steps, pois, agents) and trace.near.dtype == np.bool_
+    assert trace.inputs.shape == (9, steps, config.num_learners, 8) and trace.outputs.shape == (9, steps, config.num_learners, 2)
+    assert trace.agents_at_poi.shape == (9, steps, pois, agents) and trace.agents_at_poi.dtype == np.bool_
     # [teams, 1, leaders, parameters] against [teams, steps, leaders, 8]
     answers = forward(policies.transpose(1, 0, 2)[:, None], trace.inputs, config)
-    assert np.abs(answers - trace.outputs).max() < 5e-6
+    assert np.array_equal(answers.view(np.uint32), trace.outputs.view(np.uint32))
     assert config["policy.actions"] == "direct" or set(np.unique(answers[..., 1])) <= {-1, 1}
     # Who is near is near.
     place = np.asarray(config["world.pois"])[None, None, :, None]
     distance = np.linalg.norm(trace.positions[:, 1:, None] - place, axis=-1)
     radius = config["world.observation_radius"]
     clear = np.abs(distance - radius) > 1e-3
-    assert np.array_equal((distance < radius)[clear], trace.near[clear])
-    observed = (trace.near.sum(-1) >= np.asarray(config["world.coupling"])).any(1).sum(1)
+    assert np.array_equal((distance < radius)[clear], trace.agents_at_poi[clear])
+    observed = (trace.agents_at_poi.sum(-1) >= np.asarray(config["world.coupling"])).any(1).sum(1)
     assert np.array_equal(observed, rollout(config, policies).observed)
 
 
@@ -113,6 +114,141 @@ def test_wrong_policies_are_one_sentence(config, change, error, says):
     with pytest.raises(error, match=says) as found:
         rollout(config, change(random_policies(config, 5)))
     assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize("hidden", [[64, 64, 64], [64], [3, 1], []])
+@pytest.mark.parametrize("actions", ACTIONS)
+def test_forward_is_exact_for_any_network(hidden, actions):
+    config = Config.paper("chaotic").replace(policy={"hidden": hidden, "actions": actions}, world={"steps": 20})
+    policies = random_policies(config, 37, len(hidden))
+    trace = rollout(config, policies, record=("inputs", "outputs")).trace
+    answers = forward(policies.transpose(1, 0, 2)[:, None], trace.inputs, config)
+    assert np.array_equal(answers.view(np.uint32), trace.outputs.view(np.uint32))
+    # One policy for many inputs, and many policies for one.
+    one = forward(policies[2, 5], trace.inputs[5, :, 2], config)
+    assert np.array_equal(one, trace.outputs[5, :, 2])
+    first = forward(policies[:, :, :], trace.inputs[0, 0, 0], config)
+    assert first.shape == (4, 37, 2) and np.array_equal(first[0, 0], trace.outputs[0, 0, 0])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_trace_is_played_once_with_the_scores_of_a_rollout(seed):
+    config = random_config(seed)
+    policies = random_policies(config, 300, seed)
+    alone, traced = rollout(config, policies), rollout(config, policies, trace=True)
+    for name in ("G", "D", "Df", "D++"):
+        assert np.array_equal(alone[name], traced[name]), name
+    assert (alone.dt is None) == (traced.dt is None) and (alone.dt is None or np.array_equal(alone.dt, traced.dt))
+    drawn = {"episodes": 3, "seed": 2, "jitter": 1.0, "poi_jitter": 2.0}
+    alone, traced = rollout(config, policies, **drawn), rollout(config, policies, **drawn, trace=True)
+    assert np.array_equal(alone.df, traced.df)
+    first = rollout(config, policies, **{**drawn, "episodes": 1}, trace=True)
+    for name in ("positions", "headings", "speeds", "inputs", "outputs", "agents_at_poi"):
+        whole = getattr(traced.trace, name)
+        assert np.array_equal(whole, getattr(first.trace, name))
+        some = rollout(config, policies, **{**drawn, "episodes": 1}, record=(name,)).trace
+        assert np.array_equal(whole, getattr(some, name)) and sum(value is not None for value in vars(some).values()) == 1
+        out = np.empty_like(whole)
+        given = rollout(config, policies, **{**drawn, "episodes": 1}, out={name: out}).trace
+        assert getattr(given, name) is out and np.array_equal(out, whole)
+
+
+def test_wrong_records_are_told(config):
+    policies = random_policies(config, 5)
+    with pytest.raises(ValueError, match="record 'place'"):
+        rollout(config, policies, record=("place",))
+    for wrong in (np.empty((5, 26, 12, 1), np.float32), np.empty((5, 26, 12, 2)), [1, 2]):
+        with pytest.raises(ValueError, match="positions"):
+            rollout(config, policies, out={"positions": wrong})
+    with pytest.raises(KeyError):
+        rollout(config, policies)["Dt"]
+
+
+def test_episodes_without_jitter_warn(config):
+    with pytest.warns(UserWarning, match="without jitter"):
+        rollout(config, random_policies(config, 2), episodes=3)
+
+
+def test_each_episode_and_the_program_s_interval(config, program):
+    run = train(config, out="run")
+    scores = rollout(config, run.policies[0], episodes=40, seed=5, jitter=2, spread=True)
+    assert scores.episodes.shape == (40, 20) and np.allclose(scores.episodes.mean(0), scores.g, atol=1e-12)
+    assert np.allclose(scores.episodes.std(0, ddof=1), scores.deviation, atol=1e-12)
+    words = ("run/config.toml", "--policies", "run/policies.safetensors", "--json")
+    told = json.loads(program("rollout", *words, "--episodes", "40", "--seed", "5", "--start-jitter", "2"))
+    best = told["best"]
+    assert np.allclose(scores.interval[best["team"]] * 4, best["interval_95"], atol=1e-12)
+    # Alone, each episode has the same G.
+    one = rollout(config, run.policies[0], episodes=1, seed=5, jitter=2)
+    assert np.array_equal(one.g, scores.episodes[0])
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+@pytest.mark.parametrize("call", ["rollout(c, p, episodes=1_000_000, jitter=1)", "rollout(c, p, record=('speeds',))"])
+def test_ctrl_c_stops_within_a_second(call):
+    code = f"""
+import numpy as np, os, signal, threading, time
+from flotilla import Config, rollout
+c = Config.paper().replace(world={{"steps": 2000}})
+p = np.zeros((1, 20_000, c.parameters), np.float32)
+rollout(c, p[:, :1])
+def stop():
+    global asked
+    time.sleep(2)
+    asked = time.perf_counter()
+    os.kill(os.getpid(), signal.SIGINT)
+threading.Thread(target=stop, daemon=True).start()
+try:
+    {call}
+    print(-1)
+except KeyboardInterrupt:
+    print(time.perf_counter() - asked)
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    took = float(ended.stdout)
+    # A second on a machine that does nothing else.
+    assert 0 <= took < 5, ended
+
+
+@pytest.mark.parametrize("reward", ["G", "D", "Df", "D++", "Dt"])
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_collected_is_what_the_environment_gives(reward, seed):
+    config = random_config(seed)
+    policies = random_policies(config, 5, seed)
+    batch = flotilla.collect(config, policies, noise=0.5, seed=3, episodes=2, jitter=1.0, poi_jitter=1.0, reward=reward)
+    assert np.array_equal(batch.means, forward(np.tile(policies.transpose(1, 0, 2), (2, 1, 1))[:, None], batch.observations, config))
+    starts = flotilla._native.starts(config._native, 3, 1.0, 1.0, 0, 2)
+    env = flotilla.VectorEnv(config, 10, reward, autoreset="disabled")
+    env._teams.stepper.reset(None, np.repeat(starts, 5, axis=0))
+    seen = env._teams.inputs()
+    for step in range(config["world.steps"]):
+        assert np.array_equal(seen, batch.observations[:, step])
+        seen, rewards, *_ = env.step(batch.actions[:, step])
+        assert np.array_equal(rewards, batch.rewards[:, step])
+    assert np.array_equal(env.observed.mean(1), batch.g)
+    assert batch.masks.sum() == 10 * (config["world.steps"] - 1) and not batch.masks[:, -1].any()
+
+
+def test_noise_is_normal_and_drawn_from_the_seed():
+    config = Config.paper()
+    policies = random_policies(config, 1)
+    batch = flotilla.collect(config, policies, noise=[0.5, 0.0], seed=1, episodes=2000)
+    noise = batch.actions - batch.means
+    assert not noise[..., 1].any()
+    drawn = noise[..., 0].ravel() / 0.5
+    assert abs(drawn.mean()) < 0.01 and abs(drawn.std() - 1) < 0.01 and abs((np.abs(drawn) < 1).mean() - 0.6827) < 0.005
+    # Neighbours in every axis are independent.
+    shaped = noise[..., 0]
+    for axis in range(3):
+        moved = np.swapaxes(shaped, 0, axis)
+        assert abs(np.corrcoef(moved[1:].ravel(), moved[:-1].ravel())[0, 1]) < 0.01
+    again = flotilla.collect(config, policies, noise=[0.5, 0.0], seed=1, episodes=300)
+    assert np.array_equal(again.actions, batch.actions[:300])
+    other = flotilla.collect(config, policies, noise=[0.5, 0.0], seed=2, episodes=300)
+    assert not np.array_equal(other.actions, again.actions)
+    for wrong in (-1, np.nan, [1, 2, 3], np.ones((3, 2))):
+        with pytest.raises(ValueError, match="noise"):
+            flotilla.collect(config, policies, noise=wrong)
 
 
 def test_the_network_in_numpy():

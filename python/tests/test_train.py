@@ -1,8 +1,10 @@
 import filecmp
 import json
 import os
+import pathlib
 import pickle
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -118,12 +120,17 @@ def test_a_training_starts_from_what_another_came_to(config, program):
     assert filecmp.cmp("copy/metrics.csv", "warm/metrics.csv", shallow=False)
     with pytest.raises(flotilla.Error, match="started from given policies"):
         Run.open("copy").replay()
+    # It keeps the last checkpoint, so that it is extended without what it started from.
+    longer = second.replace(learning={"generations": 9})
+    assert train(longer, out="copy", resume=True).digest == train(longer, init=first).digest
+    # Without the checkpoint it would start over.
+    warm.save("bare")
+    shutil.rmtree("bare/checkpoints")
     with pytest.raises(flotilla.Error, match="starts over from these alone"):
-        train(second.replace(learning={"generations": 9}), out="copy", resume=True)
+        train(longer, out="bare", resume=True)
     stopped = train(second, out="stopped", init=first, callback=lambda generation: generation.generation == 2)
     assert stopped.replay(compare=0).episodes[0].generation == 0
-    with pytest.raises(ValueError, match="by out"):
-        train(second, init=first)
+    assert train(second, init=first).digest == warm.digest
     with pytest.raises(flotilla.Error, match="nowhere"):
         train(second, out="other", init="nowhere/policies.safetensors")
     wider = second.replace(policy={"hidden": [3]})
@@ -311,3 +318,45 @@ def test_the_recorded_command_is_one_that_a_shell_reads(tmp_path):
     subprocess.run([sys.executable, *words], check=True, cwd=tmp_path)
     command = json.loads((tmp_path / "kept/run.json").read_text())["command"]
     assert shlex.split(command)[1:] == words
+
+
+def _files(folder):
+    """Returns what a run's folder holds, without times and without who wrote it."""
+    found = {}
+    for path in sorted(pathlib.Path(folder).rglob("*")):
+        name = str(path.relative_to(folder))
+        if not path.is_file() or name in (".lock", ".flotilla.sha256"):
+            continue
+        content = path.read_bytes()
+        if name == "metrics.csv":
+            content = [line.rsplit(",", 1)[0] for line in path.read_text().splitlines()]
+        elif name == "run.json":
+            content = json.loads(content)
+            for key in ("started", "updated", "seconds", "sessions", "command", "commit", "threads", "adapter", "driver"):
+                content.pop(key, None)
+        elif name.startswith("checkpoints"):
+            header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+            tensors = {key: value for key, value in header.items() if key != "__metadata__"}
+            kept = {key: header["__metadata__"][key] for key in ("config", "generation", "generations")}
+            content = tensors, kept, content[8 + int.from_bytes(content[:8], "little") :]
+        found[name] = content
+    return found
+
+
+def test_a_run_is_the_same_whoever_trains_it_and_is_extended_without_training_again(config, program, tmp_path):
+    (tmp_path / "c.toml").write_text(config.to_toml())
+    program("train", "c.toml", "--out", "program", "--quiet", "--backend", "cpu", cwd=tmp_path)
+    train(config, out=tmp_path / "python", backend="cpu")
+    train(config, backend="cpu").save(tmp_path / "memory")
+    Run.open(tmp_path / "program").save(tmp_path / "copy")
+    whole = ["--generations", str(config["learning.generations"] + 10), "--backend", "cpu", "--json", "--quiet"]
+    straight = json.loads(program("train", "c.toml", "--out", "straight", *whole, cwd=tmp_path))
+    first = _files(tmp_path / "program")
+    assert any(name.startswith("checkpoints") for name in first)
+    for name in ("python", "memory", "copy"):
+        assert _files(tmp_path / name) == first
+    for name in ("program", "python", "memory", "copy"):
+        extended = json.loads(program("train", f"{name}/config.toml", "--out", name, "--resume", *whole, cwd=tmp_path))
+        assert extended["digest"] == straight["digest"]
+        # The last generation is played again, because the champions of a longer run play with the next generation.
+        assert extended["trained_generations"] <= 11, name

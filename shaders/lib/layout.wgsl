@@ -7,7 +7,7 @@
 // Per task `[fours of a policy's weights][leaders][teams]`, so that neighbouring threads load neighbouring weights.
 @group(0) @binding(4) var<storage, read> weights: array<vec4<f32>>;
 // Per task the sets `[steps][pois][words][teams]`, the counts `[followers][leaders][teams]` and, if SIGHTED, the
-// sightings `[steps][followers][words of leaders][teams]`.
+// sightings `[steps][followers][words of leaders][teams]`, and a status word.
 @group(0) @binding(5) var<storage, read_write> record: array<u32>;
 // Per task `[steps + 1][teams][agents]`; written only if TRACE.
 @group(0) @binding(6) var<storage, read_write> moments: array<Moment>;

@@ -1,9 +1,10 @@
-//! The input of a backend: groups of teams to play.
+//! The input of a backend, groups of teams to play, and their scores.
 
 use glam::Vec2;
 
 use super::{BackendError, DevicePopulation};
-use crate::config::Fitness;
+use crate::config::{Fitness, Sharing};
+use crate::credit::RecordRequest;
 use crate::world::World;
 
 /// Teams of one world that start at the same positions and choose from the same policies.
@@ -16,12 +17,14 @@ pub struct Group<'a> {
     pub starts: &'a [Vec2],
     /// The policies.
     pub weights: Weights<'a>,
-    /// Policies per leader.
+    /// Policies per population.
     pub policies: usize,
+    /// Whether each leader chooses from a population of its own.
+    pub sharing: Sharing,
     /// The policy of each leader in each team, `[teams][leaders]`.
     pub teams: &'a [u32],
-    /// The requested record.
-    pub need: RecordRequest,
+    /// The fitnesses to score every leader by. A trace has sightings only if Dt is among them.
+    pub fitnesses: &'a [Fitness],
 }
 
 impl<'a> Group<'a> {
@@ -35,12 +38,24 @@ impl<'a> Group<'a> {
         Some(&self.starts[self.world.agents()..]).filter(|pois| !pois.is_empty())
     }
 
+    /// Returns the part of a record that the fitnesses are computed from.
+    pub(crate) fn records(&self) -> RecordRequest<'a> {
+        RecordRequest(self.fitnesses)
+    }
+
+    /// Returns the number of populations: one per leader, or one for all.
+    pub fn populations(&self) -> usize {
+        match self.sharing {
+            Sharing::PerLeader => self.world.leaders(),
+            Sharing::Shared => 1,
+        }
+    }
+
     /// Returns the index of a policy's first weight.
     #[inline]
-    pub(crate) fn place(&self, weights: &[f32], leader: usize, policy: usize) -> usize {
-        let parameters = self.world.parameters();
-        let shared = weights.len() == self.policies * parameters;
-        (if shared { policy } else { leader * self.policies + policy }) * parameters
+    pub(crate) fn place(&self, leader: usize, policy: usize) -> usize {
+        let population = if self.sharing == Sharing::Shared { 0 } else { leader };
+        (population * self.policies + policy) * self.world.parameters()
     }
 
     /// Checks the group. Every backend calls this before it plays.
@@ -60,12 +75,13 @@ impl<'a> Group<'a> {
         if !teams.len().is_multiple_of(leaders) {
             return invalid(format!("{} choices of policies for teams of {leaders} leaders", teams.len()));
         }
-        let shared = policies * world.parameters();
-        let numbers = leaders * shared;
+        let populations = self.populations();
+        let numbers = populations * policies * world.parameters();
         if let Weights::OnHost(weights) = weights
-            && ![shared, numbers].contains(&weights.len())
+            && weights.len() != numbers
         {
-            return invalid(format!("{} weights, but {policies} policies a leader have {numbers}", weights.len()));
+            let found = weights.len();
+            return invalid(format!("{found} weights, but {populations} populations of {policies} have {numbers}"));
         }
         match teams.iter().position(|&policy| policy as usize >= policies) {
             None => Ok(()),
@@ -79,58 +95,16 @@ impl<'a> Group<'a> {
     }
 }
 
-/// A request for what to record of an episode. A backend may record more if that costs nothing.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum RecordRequest {
-    /// The whole record, except which leaders were seen at which step.
-    Record,
-    /// The whole record. Every fitness can be computed from it.
-    Sights,
-    /// The part that every fitness but Dt is computed from.
-    Scores,
-    /// The part that one fitness is computed from.
-    Score(Fitness),
+/// The scores of one group's teams.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct GroupScores {
+    /// POIs observed, `[teams]`.
+    pub observed: Vec<u32>,
+    /// The leaders' scores, `[teams][fitnesses][leaders]`.
+    pub scores: Vec<f32>,
 }
 
-impl RecordRequest {
-    /// Every request that asks for scores only.
-    pub const OF_SCORES: [RecordRequest; 6] = [
-        RecordRequest::Scores,
-        RecordRequest::Score(Fitness::G),
-        RecordRequest::Score(Fitness::D),
-        RecordRequest::Score(Fitness::Df),
-        RecordRequest::Score(Fitness::Dpp),
-        RecordRequest::Score(Fitness::Dt),
-    ];
-
-    /// Returns the minimum number of agents in a set that can affect a score, at a POI of this coupling. `None` if the
-    /// whole record is requested.
-    pub fn least(self, coupling: u32) -> Option<u32> {
-        match self {
-            // Dt depends on when sets occur.
-            RecordRequest::Record | RecordRequest::Sights | RecordRequest::Score(Fitness::Dt) => None,
-            // D++ depends on how many agents are missing.
-            RecordRequest::Scores | RecordRequest::Score(Fitness::Dpp) => Some(1),
-            RecordRequest::Score(Fitness::G | Fitness::D | Fitness::Df) => Some(coupling),
-        }
-    }
-
-    /// Reports whether the leader that each follower saw most is needed.
-    pub fn owners(self) -> bool {
-        matches!(
-            self,
-            RecordRequest::Record | RecordRequest::Sights | RecordRequest::Scores | RecordRequest::Score(Fitness::Df)
-        )
-    }
-
-    /// Reports whether the leaders that each follower saw at each step are needed.
-    pub fn sights(self) -> bool {
-        matches!(self, RecordRequest::Sights | RecordRequest::Score(Fitness::Dt))
-    }
-}
-
-/// The policies of a group: `[leaders][policies][parameters]`, or `[1][policies][parameters]` if all leaders choose
-/// from the same. Each number is 0, or of size 2^-30 to 2^20.
+/// The policies of a group, `[populations][policies][parameters]`. Each number is 0, or of size 2^-30 to 2^20.
 #[derive(Clone, Copy, Debug)]
 pub enum Weights<'a> {
     /// In the host's memory.

@@ -2,14 +2,16 @@
 //!
 //! | file | holds |
 //! |---|---|
-//! | `batch` | what is to be played: groups of teams, where their policies are, what to record |
-//! | `record` | the record of one team's episode, which credit is computed from |
+//! | `batch` | what is to be played: groups of teams, where their policies are, how to score them; and the scores |
+//! | `scores` | the scores of a batch, computed while it plays |
 //! | `trace` | every stage of every step, for comparison and replays |
 //! | `error` | why episodes could not be played |
 
 use std::any::Any;
 use std::fmt::Debug;
 
+use crate::config::Fitness;
+use crate::credit::RecordRequest;
 use crate::evolve::Breeding;
 use crate::parallel::current_num_threads;
 use crate::world::World;
@@ -20,26 +22,27 @@ pub mod cpu;
 mod error;
 #[cfg(feature = "gpu")]
 pub mod gpu;
-mod record;
+mod scores;
 mod trace;
 
-pub use batch::{Group, RecordRequest, Weights};
+pub use batch::{Group, GroupScores, Weights};
 pub use error::BackendError;
-pub use record::{Episode, Seen, Strided, owner_bits};
 pub use trace::{Moment, Trace};
 
-/// Plays episodes. Every implementation returns the same bits.
+/// Plays episodes and scores them. Every implementation returns the same bits.
+///
+/// Records of episodes are private to a backend: only scores leave it.
 pub trait Backend: Send {
-    /// Plays every team of every group once.
+    /// Plays every team of every group once. Returns the scores of each group.
     ///
     /// # Errors
     /// A group is inconsistent or exceeds a limit of the device, or the device failed.
-    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError>;
+    fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError>;
 
     /// Plays one group and returns every stage of every step.
     ///
     /// # Errors
-    /// See [`Backend::rollout`].
+    /// See [`Backend::play`].
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError>;
 
     /// Copies the populations of one trial, `[populations][slots][parameters]`, to the device, to be bred there.
@@ -58,9 +61,6 @@ pub trait Backend: Send {
     /// Describes the hardware for people: "cpu (AVX2, 2 threads)".
     fn describe(&self) -> String;
 }
-
-/// Called once for each team, from any thread, in any order.
-pub type Visit<'a> = dyn Fn(Episode<'_>) + Sync + 'a;
 
 /// The populations of one trial in a device's memory, which dropping them frees.
 ///
@@ -127,15 +127,15 @@ pub const BATCH_BYTES: u64 = 256 << 20;
 /// Weights that a GPU thread loads at once.
 const FOUR: usize = 4;
 
-/// Returns the words of a team's record: sets, counts and, if requested, sightings.
-fn record_words(world: &World, need: RecordRequest) -> usize {
-    let sights = if need.sights() { world.sight_words() } else { 0 };
+/// Returns the words of a team's record: sets, counts and, if needed, sightings.
+fn record_words(world: &World, records: RecordRequest<'_>) -> usize {
+    let sights = if records.sights() { world.sight_words() } else { 0 };
     world.set_words() + world.leaders() * world.followers() + sights
 }
 
-/// Returns the bytes of a team's record.
-pub fn record_bytes(world: &World, need: RecordRequest) -> u64 {
-    (record_words(world, need) * size_of::<u32>()) as u64
+/// Returns the bytes of the record of a team that is scored by a fitness.
+pub fn record_bytes(world: &World, fitness: Fitness) -> u64 {
+    (record_words(world, RecordRequest(&[fitness])) * size_of::<u32>()) as u64
 }
 
 /// Returns the weights of a team as an episode on a GPU loads them, in fours.
@@ -149,12 +149,12 @@ pub fn weight_bytes(world: &World) -> u64 {
 }
 
 /// Returns the bytes of a team's states that a GPU keeps between dispatches, 0 if one dispatch plays the whole episode.
-pub fn state_bytes(world: &World, request: RecordRequest) -> u64 {
+pub fn state_bytes(world: &World, fitness: Fitness) -> u64 {
     #[cfg(feature = "gpu")]
-    let bytes = gpu::episode::state_bytes(world, request);
+    let bytes = gpu::episode::state_bytes(world, RecordRequest(&[fitness]));
     #[cfg(not(feature = "gpu"))]
     let bytes = {
-        let _ = (world, request);
+        let _ = (world, fitness);
         0
     };
     bytes

@@ -1,7 +1,8 @@
 //! The trace of a group: every stage of every step.
 
+use crate::credit::Episode;
 use crate::gpu_struct::gpu_struct;
-use crate::world::{INPUTS, OUTPUTS};
+use crate::world::{INPUTS, OUTPUTS, World};
 
 gpu_struct! {
     /// The floats of one agent at one step of a [`Trace`], in this order.
@@ -37,7 +38,8 @@ pub struct Trace {
     /// The number of steps at which each follower saw each leader, `[teams][followers][leaders]`.
     pub seen: Vec<u32>,
     /// The leaders that each follower saw before the move of each step, one bit per leader,
-    /// `[teams][steps][followers][words of leaders]`. Empty unless [requested](super::RecordRequest::sights).
+    /// `[teams][steps][followers][words of leaders]`. Empty unless Dt is among the group's
+    /// [fitnesses](super::Group::fitnesses).
     pub sights: Vec<u32>,
 }
 
@@ -45,5 +47,12 @@ impl Trace {
     /// Returns what one agent of one team did at one step.
     pub fn moment(&self, step: usize, team: usize, agent: usize) -> &Moment {
         &self.moments[(step * self.teams + team) * self.agents + agent]
+    }
+
+    /// Returns the record of one team, which credit is computed from.
+    pub fn episode(&self, world: &World, team: usize) -> Episode<'_> {
+        let part = |words, size: usize| <[u32]>::get(words, team * size..(team + 1) * size).unwrap_or_default();
+        let counts = part(&self.seen, world.leaders() * world.followers());
+        Episode::whole(part(&self.sets, world.set_words()), counts, part(&self.sights, world.sight_words()))
     }
 }

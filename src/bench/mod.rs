@@ -1,8 +1,5 @@
 //! The speed of episodes and of whole generations, and the share of the machine's arithmetic ceiling that they reach.
 
-use std::cell::RefCell;
-use std::hint::black_box;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::Duration;
 
 use fearless_simd::Level;
@@ -10,9 +7,8 @@ use fearless_simd::Level;
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu::device::Traffic;
 use crate::backend::gpu::episode::{GpuBackend, Stages};
-use crate::backend::{Backend, BackendError, Group, RecordRequest, Weights};
+use crate::backend::{Backend, BackendError, Group, Weights};
 use crate::config::{Config, Coupling};
-use crate::credit::Credit;
 use crate::evolve::{Key, Purpose, random_policy, teams_of};
 use crate::host::Instant;
 use crate::sweep::layout::{self, MAX_FOLLOWERS, MAX_GROUPS};
@@ -184,7 +180,7 @@ pub fn measure(config: &Config, player: &mut Subject, generations: Generations) 
         Generations::Timed => (Some(self::generations(config, player)?.0), None),
         Generations::Profiled => {
             if let Subject::Gpu(gpu) = player {
-                gpu.use_clock()?;
+                gpu.use_clock();
             }
             let (generation, profile) = self::generations(config, player)?;
             (Some(generation), Some(profile))
@@ -233,7 +229,6 @@ fn rollout(
     backend: &mut dyn Backend,
     ceiling: &mut Peak,
 ) -> Result<([f64; 2], f64, Reach), BackendError> {
-    thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
     let (population, leaders, seed) = (config.learning.population, world.leaders(), config.learning.seed);
     let mut weights = vec![0.0; config.populations() * population * world.parameters()];
     let key = Key::new(seed, 0, Purpose::Weights);
@@ -244,22 +239,22 @@ fn rollout(
     // If generations play from the device's memory, so do these rollouts.
     let held = backend.hold(&weights, [config.populations(), population, world.parameters()])?;
     let played = held.as_deref().map_or(weights[..].into(), Weights::OnDevice);
-    let need = RecordRequest::Score(config.learning.fitness);
-    let group = Group { world, starts: &world.starts, weights: played, policies: population, teams: &teams, need };
-    let observed = AtomicU64::new(0);
+    let group = Group {
+        world,
+        starts: &world.starts,
+        weights: played,
+        policies: population,
+        sharing: config.learning.sharing,
+        teams: &teams,
+        fitnesses: std::slice::from_ref(&config.learning.fitness),
+    };
+    let mut observed = 0;
     let play = || {
-        observed.store(0, Relaxed);
-        backend.rollout(&[group], &|episode| {
-            CREDIT.with_borrow_mut(|(credit, scores)| {
-                scores.resize(leaders, 0.0);
-                let pois = credit.score(&episode, world, config.learning.fitness, scores);
-                observed.fetch_add(u64::from(pois), Relaxed);
-                black_box(scores);
-            });
-        })
+        observed = backend.play(&[group])?.iter().flat_map(|scores| &scores.observed).sum::<u32>();
+        Ok(())
     };
     let times = time(play, ceiling)?;
-    let mean_g = observed.into_inner() as f64 / (population * world.pois.len()) as f64;
+    let mean_g = f64::from(observed) / (population * world.pois.len()) as f64;
     let pairs = world.steps() * world.agents() * world.agents();
     let traced = (TRACED_PAIRS / pairs).clamp(1, TRACED_TEAMS).min(population);
     // The CPU traces, because every backend's trace is the same.

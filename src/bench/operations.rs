@@ -157,8 +157,8 @@ pub fn per_team_step(world: &World, reach: &Reach) -> f64 {
 mod tests {
     use super::*;
     use crate::backend::cpu::Cpu;
-    use crate::backend::{Backend, Group, RecordRequest};
-    use crate::config::Config;
+    use crate::backend::{Backend, Group};
+    use crate::config::{Config, Sharing};
     use crate::sample;
 
     fn world(text: &str) -> World {
@@ -168,9 +168,15 @@ mod tests {
     fn reach(world: &World, teams: usize) -> Reach {
         let weights = sample::weights(world, teams, 0);
         let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; world.leaders()]).collect();
-        let need = RecordRequest::Record;
-        let group =
-            Group { world, starts: &world.starts, weights: weights[..].into(), policies: teams, teams: &order, need };
+        let group = Group {
+            world,
+            starts: &world.starts,
+            weights: weights[..].into(),
+            policies: teams,
+            sharing: Sharing::PerLeader,
+            teams: &order,
+            fitnesses: &[],
+        };
         Reach::of(world, &Cpu::default().trace(&group).expect("the CPU plays"))
     }
 

@@ -2,8 +2,8 @@
 
 use serde_json::json;
 
-use super::{ConfigFile, Error, RunOptions, backend, between, number, print, say};
-use crate::backend::Machine;
+use super::choice::Work;
+use super::{ConfigFile, Error, Processor, RunOptions, SetKeys, backend, between, number, print, print_json, say};
 use crate::baseline::{self, Baselines, Outcome, SPEEDS};
 use crate::config::{Actions, Choice, Config, Override, Paradigm};
 use crate::evaluate::MAX_EPISODES;
@@ -19,22 +19,24 @@ pub struct Args {
     /// Independent repetitions of the random baselines
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = between(1..=4096u32))]
     seeds: u32,
-    /// Held-out episodes per team, and as many to choose the team by, where starts or POIs move
+    /// Held-out episodes per team, if starts or POIs vary; as many others choose the team
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = between(1..=MAX_EPISODES))]
     episodes: u32,
-    /// Generations after the random start; they set how many random teams are drawn [default: the config's]
+    /// Draw as many random teams as a training with this many generations plays [default: the config's]
     #[arg(long, value_name = "N", value_parser = number)]
     generations: Option<toml::Value>,
-    /// Policies per population; they set how many random teams are drawn [default: the config's]
+    /// Draw as many random teams as a training with this population plays [default: the config's]
     #[arg(long, value_name = "N", value_parser = number)]
     population: Option<toml::Value>,
     /// Who learns [default: the config's]
     #[arg(long, value_name = "NAME", value_parser = Words::new(Paradigm::names()))]
     paradigm: Option<String>,
+    #[command(flatten)]
+    set: SetKeys,
     /// Print one JSON object (docs/reference/json.md)
     #[arg(long)]
     json: bool,
-    /// No progress on standard error
+    /// Print no progress
     #[arg(long, short)]
     quiet: bool,
     #[command(flatten)]
@@ -51,8 +53,9 @@ pub fn run(args: Args) -> Result<(), Error> {
         set("population", args.population.clone()),
         set("paradigm", args.paradigm.clone().map(toml::Value::from)),
     ];
-    let config = args.config.load(&overrides.into_iter().flatten().collect::<Vec<_>>())?;
-    let (mut backend, machine) = backend::open(&args.run)?;
+    let config =
+        args.config.load(&overrides.into_iter().flatten().chain(args.set.set.iter().cloned()).collect::<Vec<_>>())?;
+    let (mut backend, machine) = backend::open_for(&args.run, Work::of([&config]))?.0;
     if !args.quiet {
         say(format_args!("playing on {}", backend.describe()));
     }
@@ -71,7 +74,12 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
     meter.clear();
     let found = Found { config: &config, episodes: args.episodes, outcomes };
-    print(&if args.json { found.in_json(&machine) } else { found.in_words() })
+    if !args.json {
+        return print(&found.in_words());
+    }
+    let mut object = found.in_json();
+    Processor::of(&machine, &backend.describe()).add_to(&mut object);
+    print_json(&object)
 }
 
 /// The outcomes of all seeds.
@@ -185,7 +193,7 @@ impl Found<'_> {
         }
     }
 
-    fn in_json(&self, machine: &Machine) -> String {
+    fn in_json(&self) -> serde_json::Value {
         let actions = self.config.policy.actions;
         let name = match actions {
             Actions::Direct => "speed",
@@ -208,14 +216,12 @@ impl Found<'_> {
             "teams": self.teams(),
             "seeds": self.outcomes.len(),
             "episodes": if self.moves() { self.episodes } else { 1 },
-            "backend": machine.backend,
-            "adapter": machine.adapter,
             "constants": constants,
             "chosen": chosen,
         });
         for (key, found) in baselines {
             object[key] = found;
         }
-        format!("{object}\n")
+        object
     }
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 use fearless_simd::Level;
 use serde_json::json;
 
-use super::{BackendChoice, Breed, Error, Overrides, RunOptions, backend, between, print, print_json};
+use super::{BackendChoice, Breed, Error, Overrides, Processor, RunOptions, backend, between, print, print_json, said};
 use crate::backend::Machine;
 use crate::backend::cpu::{Cpu, level_name};
 use crate::bench::{self, Generations, Profile, Subject, Timing};
@@ -44,12 +44,15 @@ pub struct Args {
     /// Measure rollouts only, not whole generations
     #[arg(long)]
     rollout_only: bool,
-    /// Also tell where a generation's time goes, and on a GPU what goes over its bus
+    /// Also print where a generation's time goes, and on a GPU the bytes over its bus
     #[arg(long, conflicts_with = "rollout_only")]
     profile: bool,
-    /// Instruction set of the CPU backend, of those that this processor has [default: the widest]
+    /// Instruction set of the CPU backend [default: the widest that this processor has]
     #[arg(long, value_name = "NAME")]
     instructions: Option<String>,
+    /// Teams per workgroup of a GPU's specialised kernels: 32, 16 or 8 [default: the faster one of 32 and 16, measured]
+    #[arg(long, value_name = "N", value_parser = ["32", "16", "8"])]
+    packing: Option<String>,
     /// Print JSON objects, one per line
     #[arg(long)]
     json: bool,
@@ -87,7 +90,11 @@ pub fn run(args: Args) -> Result<(), Error> {
     for config in configs {
         let measure = bench::measure(&config, &mut player, generations)?;
         match args.json {
-            true => print_json(&json(&measure, &machine))?,
+            true => {
+                let mut object = json(&measure);
+                Processor::of(&machine, &player.backend().describe()).add_to(&mut object);
+                print_json(&object)?;
+            }
             false => print(&line(&measure))?,
         }
     }
@@ -98,7 +105,8 @@ pub fn run(args: Args) -> Result<(), Error> {
 fn combinations(config: &Config, args: &Args) -> Result<Vec<Config>, Error> {
     let own_agents = [config.clone()];
     let laid_out = |&agents: &u32| {
-        bench::with_agents(config, agents as usize).map_err(|message| Error::Usage(format!("--agents: {message}")))
+        bench::with_agents(config, agents as usize)
+            .map_err(|message| Error::Usage(format!("--agents: {message}").into()))
     };
     let laid_out = args.agents.iter().map(laid_out).collect::<Result<Vec<_>, _>>()?;
     let worlds = if laid_out.is_empty() { &own_agents[..] } else { &laid_out };
@@ -130,28 +138,37 @@ fn open(args: &Args) -> Result<(Subject, Machine), Error> {
     let level = match &args.instructions {
         None => Level::new(),
         Some(_) if args.run.backend == BackendChoice::Gpu => {
-            return Err(Error::Usage("--instructions is for the CPU backend; leave out --backend gpu".into()));
+            return Err(Error::Usage(said("--instructions is for the CPU backend", "leave out --backend gpu")));
         }
         Some(name) => {
             let levels = Cpu::levels();
             let Some(&level) = levels.iter().find(|level| level_name(**level).eq_ignore_ascii_case(name)) else {
                 let names: Vec<_> = levels.iter().map(|level| level_name(*level)).collect();
                 let names = names.join(", ");
-                return Err(Error::Usage(format!("--instructions: found {name}, this processor has {names}")));
+                return Err(Error::Usage(format!("--instructions: found {name}, this processor has {names}").into()));
             };
             if args.run.adapter.is_some() || args.run.breed == Breed::Device {
-                return Err(Error::Usage(
-                    "--instructions is for the CPU backend; leave out --adapter and --breed device".into(),
-                ));
+                return Err(Error::Usage(said(
+                    "--instructions is for the CPU backend",
+                    "leave out --adapter and --breed device",
+                )));
             }
             backend::start_threads(args.run.threads);
             return Ok((Subject::Cpu(Cpu::at_level(level), level), front::cpu().1));
         }
     };
-    Ok(match backend::open_gpu(&args.run)? {
+    Ok(match backend::open_gpu(&args.run, None)?.0 {
         Some(gpu) => {
+            let gpu = match args.packing.as_deref().and_then(|teams| teams.parse().ok()) {
+                Some(teams) => gpu.packing(teams),
+                None => gpu,
+            };
             let machine = Machine::of_gpu(&gpu);
             (Subject::Gpu(Box::new(gpu)), machine)
+        }
+        None if args.packing.is_some() => {
+            let message = "--packing is for specialised kernels of a GPU, and none is used";
+            return Err(Error::Usage(said(message, "leave it out, or name a GPU with --adapter")));
         }
         None => (Subject::Cpu(Cpu::at_level(level), level), front::cpu().1),
     })
@@ -181,6 +198,10 @@ fn line(measure: &Timing) -> String {
             let name = format!("{}{}", if part { "  of it, " } else { "" }, name.replace('_', " "));
             let _ = writeln!(line, "{:>8} {name:<24} {ms:>12.4} ms {:>5.1}%", "", 100.0 * ms / whole);
         }
+        if let Some(stages) = &profile.stages {
+            let ms = 1e3 * stages.longest.as_secs_f64();
+            let _ = writeln!(line, "{:>8} {:<24} {ms:>12.4} ms", "", "longest submission");
+        }
         for (name, part, bytes) in traffic(profile) {
             let name = format!("{}{}", if part { "  of it, " } else { "" }, name.replace('_', " "));
             let _ = writeln!(line, "{:>8} {name:<24} {:>12.4} MB", "", 1e-6 * bytes);
@@ -205,7 +226,7 @@ fn stages(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
             rows.push(("gpu_by_its_clock", true, stages.gpu));
         }
     }
-    rows.extend([("fitness_and_champions", false, times.conclude), ("selection_and_mutation", false, times.breed)]);
+    rows.extend([("fitness_and_champions", false, times.collect), ("selection_and_mutation", false, times.breed)]);
     let ms = |time: Duration| 1e3 * time.as_secs_f64() / *generations as f64;
     rows.into_iter().map(|(name, part, time)| (name, part, ms(time))).collect()
 }
@@ -226,13 +247,10 @@ fn traffic(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
     rows.map(|(name, part, bytes)| (name, part, bytes as f64 / *generations as f64)).collect()
 }
 
-fn json(measure: &Timing, machine: &Machine) -> serde_json::Value {
+fn json(measure: &Timing) -> serde_json::Value {
     let Timing { teams, leaders, followers, pois, steps, rollout, mean_g, reach, operations, ceiling, .. } = measure;
     let agents = measure.agents();
     let mut object = json!({
-        "backend": machine.backend,
-        "adapter": machine.adapter,
-        "threads": machine.threads,
         "teams": teams,
         "agents": agents,
         "leaders": leaders,
@@ -259,7 +277,9 @@ fn json(measure: &Timing, machine: &Machine) -> serde_json::Value {
     if let Some(profile) = &measure.profile {
         let stages = stages(profile).into_iter().map(|(name, _, ms)| (format!("{name}_ms"), json!(ms)));
         let traffic = traffic(profile).into_iter().map(|(name, _, bytes)| (format!("{name}_bytes"), json!(bytes)));
-        object["profile"] = serde_json::Value::Object(stages.chain(traffic).collect());
+        let longest = profile.stages.map(|stages| 1e3 * stages.longest.as_secs_f64());
+        let longest = longest.map(|ms| ("longest_submission_ms".to_string(), json!(ms)));
+        object["profile"] = serde_json::Value::Object(stages.chain(longest).chain(traffic).collect());
     }
     object
 }

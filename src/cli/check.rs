@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::{ConfigArgs, Error, output, plot, print, print_json, warnings};
-use crate::backend::{self, RecordRequest};
+use crate::backend;
 use crate::config::Config;
 use crate::memory::Peaks;
 use crate::reach;
@@ -67,7 +67,7 @@ impl Cost {
             agent_steps += played * wide(world.steps()) * wide(world.agents());
             agents = agents.max(world.agents());
             travel = reach::travel(&world, world.steps()).into_iter().fold(travel, f64::max);
-            record_bytes = record_bytes.max(backend::record_bytes(&world, RecordRequest::Score(learning.fitness)));
+            record_bytes = record_bytes.max(backend::record_bytes(&world, learning.fitness));
         }
         let plan = Peaks::of([config], rayon::current_num_threads());
         Cost {

@@ -1,41 +1,33 @@
 //! `flotilla compare`: compares runs, or the points of a sweep along an axis, with intervals and tests.
 
-use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
-
-use serde_json::json;
+use std::path::PathBuf;
 
 use super::sweep::share;
-use super::{Error, print, print_json, say};
-use crate::config::{Config, Domain};
-use crate::escape::PathExt;
-use crate::file;
-use crate::record;
-use crate::record::digests::{self, UNVERIFIED, Verification};
-use crate::record::folder::{self, RUN, Run, SWEEP};
-use crate::report::comparison::{self, At, Cohort, Comparison, ComparisonError, Question};
-use crate::report::runs::{self, MAX_RUNS, ReadError};
-use crate::sweep::{Sweep, results};
-use crate::{shell, statistics};
+use super::{Error, console, print, print_json};
+use crate::ops;
+use crate::ops::compare::{Request, at};
+use crate::record::archive::RunFolder;
+use crate::record::digests::UNVERIFIED;
+use crate::report::comparison;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folders that `flotilla train` made, two at least, or one that `flotilla sweep` made
+    /// At least two run directories, or the directory of one sweep
     #[arg(required = true, value_name = "RUN")]
     folders: Vec<PathBuf>,
-    /// Of a sweep: the axis whose values are compared, for each combination of the others [default: its only one]
+    /// Axis of a sweep whose values are compared, for each combination of the others [default: its only axis]
     #[arg(long, value_name = "AXIS")]
     by: Option<String>,
     /// Generations at which to compare G, as 0,50,last; last is the last one that all arms have reached
-    #[arg(long, value_name = "N,…", value_delimiter = ',', default_value = "last", value_parser = at)]
-    at: Vec<At>,
-    /// G whose first generation is compared, in 0..1
+    #[arg(long, value_name = "N,…", value_delimiter = ',', default_value = "last", value_parser = generation)]
+    at: Vec<String>,
+    /// Compare the generations that the best team needs to reach this G, in 0..1
     #[arg(long, value_name = "G", default_value_t = 0.75, value_parser = share)]
     reach: f64,
     /// Compare pair by pair; trials with the same seed and number are pairs
     #[arg(long)]
     paired: bool,
-    /// Read files that differ from their digests in run.json, too, and mark what comes out
+    /// Also read files that differ from their digests in run.json, and mark the results as unverified
     #[arg(long)]
     unverified: bool,
     /// Print one JSON object (docs/reference/json.md)
@@ -49,195 +41,30 @@ pub struct Args {
     latex: bool,
 }
 
-fn at(text: &str) -> Result<At, String> {
-    match text {
-        "last" => Ok(At::Last),
-        _ => text.parse().map(At::Generation).map_err(|_| "allowed generations, from 0, or last".into()),
-    }
+/// Checks a generation to compare at.
+fn generation(text: &str) -> Result<String, String> {
+    at(text).map(|_| text.to_string())
 }
-
-/// The arms of one comparison, after a description of what they have in common.
-type Contest = (String, Vec<Cohort>);
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let mut notes = Vec::new();
-    let groups = match &*args.folders {
-        [folder] if folder::collection(folder) == Some("a sweep") => of_sweep(folder, &args, &mut notes)?,
-        folders => vec![(String::new(), of_runs(folders, &args, &mut notes)?)],
-    };
-    let verification = Verification::unless(args.unverified);
-    let folders = groups.iter().flat_map(|(_, arms)| arms).flat_map(|arm| &arm.folders);
-    digests::without(folders.map(|folder| &**folder)).into_iter().for_each(say);
-    // Printed even if nothing can be compared, because the notes may explain that.
-    let tell = |notes: &[String]| notes.iter().for_each(|note| say(format_args!("note: {note}")));
-    tell(&notes);
-    let told = notes.len();
-    let options = Question { at: args.at.clone(), reach: args.reach, paired: args.paired };
-    let compare = |(place, arms): &Contest| {
-        comparison::compare(place, arms, &options).map_err(|error| match error {
-            ComparisonError::Beyond { at, .. } => Error::Usage(format!("--at {at}: {error}")),
-            ComparisonError::NoPairs(..) => Error::Usage(format!("--paired: {error}")),
-            ComparisonError::OneTrial(_) => Error::Refused(format!("{error}: `flotilla train CONFIG --trials 5`")),
-            ComparisonError::TooShort(_) => Error::Missing(error.to_string()),
-        })
-    };
-    let all = groups.iter().map(compare).collect::<Result<Vec<Comparison>, Error>>()?;
-    for comparison in &all {
-        let place = if comparison.place.is_empty() { String::new() } else { format!("{}: ", comparison.place) };
-        notes.extend(comparison.notes.iter().map(|note| format!("{place}{note}")));
-    }
-    let nothing = |arm: &Cohort| arm.trials.iter().all(|trial| trial.course.iter().flatten().all(|&g| g == 0.0));
-    if groups.iter().all(|(_, arms)| arms.iter().all(nothing)) {
-        notes.push(
-            "no team of these runs observed any POI in any generation: there is nothing to compare; `flotilla check CONFIG` \
-             names POIs that cannot be reached"
-                .into(),
-        );
-    }
-    // For several runs, the notes so far report different layouts or copies. Then pairing is no useful advice.
-    let alike = args.folders.len() == 1 || told == 0;
-    if !args.paired && alike && groups.iter().all(|(_, arms)| comparison::paired(arms)) {
-        notes.push("these arms have the same seeds, so their trials are pairs: --paired compares pair by pair".into());
-    }
-    tell(&notes[told..]);
-    if args.csv {
+    let Args { folders, by, at, reach, paired, unverified, json, csv, latex } = args;
+    let opened = folders.iter().map(|folder| RunFolder::open(folder)).collect::<Result<Vec<_>, _>>()?;
+    let folders = opened.iter().map(|folder| folder.path().into()).collect();
+    let request = Request { folders, by, at, reach, paired, unverified };
+    let found = console::tell(false, |context| ops::compare::run(&request, context))?;
+    if csv {
         let mut text = Vec::new();
-        comparison::csv(&all, &mut text).map_err(Error::Output)?;
+        comparison::csv(&found.comparisons, &mut text).map_err(Error::Output)?;
         return print(&String::from_utf8_lossy(&text));
     }
-    if args.json {
-        let told = json!({
-            "confidence": statistics::CONFIDENCE,
-            "resamples": statistics::RESAMPLES,
-            "test": if args.paired { "wilcoxon" } else { "mann-whitney" },
-            "comparisons": all,
-            "notes": notes,
-            "unverified": args.unverified,
-        });
-        return print_json(&told);
+    if json {
+        return print_json(&found);
     }
-    let text = if args.latex { comparison::latex(&all, &options) } else { comparison::text(&all, &options) };
-    let mark = match (verification, args.latex) {
-        (Verification::Required, _) => String::new(),
-        (Verification::Skipped, false) => format!("{UNVERIFIED}\n"),
-        (Verification::Skipped, true) => format!("% {UNVERIFIED}\n"),
+    let text = if latex { comparison::latex } else { comparison::text }(&found.comparisons, &found.question);
+    let mark = match (unverified, latex) {
+        (false, _) => String::new(),
+        (true, false) => format!("{UNVERIFIED}\n"),
+        (true, true) => format!("% {UNVERIFIED}\n"),
     };
     print(&(mark + &text))
-}
-
-/// Reads every run as an arm, named after what sets it apart from the others.
-fn of_runs(folders: &[PathBuf], args: &Args, notes: &mut Vec<String>) -> Result<Vec<Cohort>, Error> {
-    let verification = Verification::unless(args.unverified);
-    if let Some(by) = &args.by {
-        return Err(Error::Usage(format!(
-            "--by {by}: that takes the folder of one sweep, which {} is not",
-            folders[0].escaped()
-        )));
-    }
-    if folders.len() < 2 {
-        let folder = folders[0].escaped();
-        // Problems of the folder are reported first.
-        runs::config(&folders[0], verification)?;
-        return Err(Error::Usage(format!("{folder} is one run; name another to compare it with")));
-    }
-    too_many(folders.len(), "runs")?;
-    let mut seen = BTreeSet::new();
-    if let Some(twice) = folders.iter().find(|folder| !seen.insert(file::resolved(folder))) {
-        return Err(Error::Usage(format!("{} is named twice; name other runs", twice.escaped())));
-    }
-    let configs = folders.iter().map(|folder| runs::config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
-    let first = &configs[0].world;
-    let differs = |differs: fn(&Domain, &Domain) -> bool| configs.iter().any(|config| differs(&config.world, first));
-    let layouts = [
-        ("world.map", differs(|a, b| a.map != b.map)),
-        ("world.leaders", differs(|a, b| a.leaders != b.leaders)),
-        ("world.followers", differs(|a, b| a.followers != b.followers)),
-        ("world.pois", differs(|a, b| a.pois != b.pois)),
-    ];
-    let layouts: Vec<&str> = layouts.into_iter().filter(|(_, differ)| *differ).map(|(key, _)| key).collect();
-    if !layouts.is_empty() {
-        notes.push(format!("the arms play in different layouts: {} differ", layouts.join(", ")));
-    }
-    notes.extend(copies(folders, &configs));
-    let arms = runs::labels(folders, &configs).into_iter().zip(folders);
-    let read = |(name, folder): (String, &PathBuf)| Cohort::read(name, vec![folder.clone()], verification);
-    Ok(arms.map(read).collect::<Result<_, _>>()?)
-}
-
-/// Returns a note for each run that is a copy of another, because there is nothing to compare between them.
-fn copies(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
-    let digest = |folder: &PathBuf| Run::read(&folder.join(RUN)).ok()?.digest;
-    let runs: Vec<_> = folders.iter().zip(configs.iter().map(record::without_checkpoint)).collect();
-    let digests: Vec<_> = folders.iter().map(digest).collect();
-    let original = |place: usize| {
-        let first = (0..place).find(|&first| runs[first].1 == runs[place].1 && digests[first] == digests[place])?;
-        digests[place].as_ref()?;
-        Some(format!("{} is a copy of {}: the same run", folders[place].escaped(), folders[first].escaped()))
-    };
-    (0..folders.len()).filter_map(original).collect()
-}
-
-/// Returns the values of an axis as arms, for each combination of the other axes. Notes list the points without runs.
-fn of_sweep(out: &Path, args: &Args, notes: &mut Vec<String>) -> Result<Vec<Contest>, Error> {
-    let sweep = Sweep::load(&out.join(SWEEP), &[], false)?;
-    let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
-    let by = match (&args.by, sweep.axes.len()) {
-        (Some(name), _) => sweep
-            .axis(name)
-            .ok_or_else(|| Error::Usage(format!("--by {name}: that is no axis of the sweep; it has {}", keys())))?,
-        (None, 1) => 0,
-        (None, _) => return Err(Error::Usage(format!("the sweep has several axes; name one by --by: {}", keys()))),
-    };
-    let verification = Verification::unless(args.unverified);
-    let mut groups = Vec::new();
-    for group in sweep.arms(by) {
-        let mut arms = Vec::new();
-        for (name, points) in group.arms {
-            let mut folders = Vec::new();
-            for point in points {
-                let folder = results::point_folder(out, point);
-                let read = runs::config(&folder, verification)
-                    .and_then(|config| runs::metrics(&folder, &config, verification, |_| {}).map(|()| config));
-                match read {
-                    Ok(config) if record::without_checkpoint(&config) == record::without_checkpoint(&point.config) => {
-                        folders.push(folder);
-                    }
-                    Ok(_) => return Err(Error::Refused(format!("{} is a run of another config", folder.escaped()))),
-                    Err(ReadError::Missing(_) | ReadError::Unfinished { .. }) => {
-                        notes.push(format!(
-                            "{} was not run, and is left out: {}",
-                            folder.escaped(),
-                            sweep.describe(point)
-                        ));
-                    }
-                    Err(error) => return Err(error.into()),
-                }
-            }
-            if !folders.is_empty() {
-                arms.push(Cohort::read(name, folders, verification)?);
-            }
-        }
-        too_many(arms.len(), "values")?;
-        if arms.len() > 1 {
-            groups.push((group.place, arms));
-        }
-    }
-    let [file, folder] = [out.join(SWEEP), out.into()].map(|path: PathBuf| shell::argument(&path));
-    let command = shell::command(["flotilla".into(), "sweep".into(), file, "--out".into(), folder, "--resume".into()]);
-    match groups.is_empty() {
-        false => Ok(groups),
-        true => Err(Error::Missing(format!(
-            "{}: no two values of {} have runs to compare; `{command}` trains them",
-            out.escaped(),
-            sweep.axes[by].key,
-        ))),
-    }
-}
-
-/// Rejects more arms than a reader can compare.
-fn too_many(count: usize, what: &str) -> Result<(), Error> {
-    match count <= MAX_RUNS {
-        true => Ok(()),
-        false => Err(Error::Usage(format!("{count} {what} are too many to compare, two by two; {MAX_RUNS} at most"))),
-    }
 }

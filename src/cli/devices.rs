@@ -2,11 +2,13 @@
 
 use serde_json::json;
 
-use super::{Error, backend, print, print_json, remedy};
+use super::{Error, backend, print, print_json};
 use crate::backend::Backend;
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu;
-use crate::backend::gpu::device::{self, Gpu, Wanted};
+use crate::backend::gpu::device::{self, DeviceError, Gpu, Wanted};
+use crate::host::Instant;
+use crate::ops::advice_on_device;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -21,18 +23,24 @@ pub fn run(args: Args) -> Result<(), Error> {
     let adapters: Vec<_> = device::adapters()
         .into_iter()
         .enumerate()
-        .map(|(index, info)| (index, info, gpu::open(Wanted::Named(index.to_string()))))
+        .map(|(index, info)| {
+            let start = Instant::now();
+            let opened = gpu::open(Wanted::Named(index.to_string()));
+            (index, info, opened, start.elapsed().as_secs_f64())
+        })
         .collect();
     if args.json {
         let adapters: Vec<_> = adapters
             .iter()
-            .map(|(index, info, opened)| {
+            .map(|(index, info, opened, seconds)| {
                 json!({
                     "index": index,
                     "name": info.name,
                     "driver": info.driver,
                     "api": info.backend,
                     "kind": info.kind.to_string(),
+                    "compiler": device::compiler(&info.backend),
+                    "open_s": seconds,
                     "pass": opened.as_ref().ok().map(|gpu| gpu.pass.to_string()),
                     "refused": opened.as_ref().err().map(ToString::to_string),
                     "limits": opened.as_ref().ok().map(|gpu| json!({
@@ -47,26 +55,28 @@ pub fn run(args: Args) -> Result<(), Error> {
         return print_json(&json!({ "cpu": Cpu::default().describe(), "adapters": adapters }));
     }
     let mut text = format!("{}\n", Cpu::default().describe());
-    for (index, info, opened) in &adapters {
+    for (index, info, opened, seconds) in &adapters {
         text += &format!("{index}: {info}\n");
         text += &match opened {
-            Ok(gpu) => exact(gpu),
-            Err(error) => format!("   not usable: {error}{}\n", remedy::device(error)),
+            Ok(gpu) => exact(gpu, *seconds),
+            Err(error) => format!("   not usable: {error}{}\n", advice_on_device(error)),
         };
     }
     if adapters.is_empty() {
-        text += "no GPU adapter found: no Vulkan, Metal or DirectX 12 driver answers\n";
+        text += &format!("{}\n", DeviceError::NoAdapter);
     }
     print(&text)
 }
 
-fn exact(gpu: &Gpu) -> String {
+fn exact(gpu: &Gpu, seconds: f64) -> String {
     let limits = &gpu.limits;
     format!(
-        "   exact under the {} pass; workgroups of {} threads and {} KiB, buffers of {} MiB\n",
+        "   exact under the {} pass; workgroups of {} threads and {} KiB, buffers of {} MiB\n   \
+         opened and tested in {seconds:.2} s, with {}\n",
         gpu.pass,
         limits.max_compute_invocations_per_workgroup,
         limits.max_compute_workgroup_storage_size >> 10,
         limits.max_storage_buffer_binding_size.min(limits.max_buffer_size) >> 20,
+        device::compiler(&gpu.adapter.backend),
     )
 }

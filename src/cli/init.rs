@@ -8,7 +8,7 @@ use clap::builder::{PossibleValue, PossibleValuesParser};
 use toml::{Table, Value};
 
 use super::layout::{SHAPES, StartLayout};
-use super::{Error, output, print, whole};
+use super::{Error, output, print, said, whole};
 use crate::config::{self, Config, Definition};
 use crate::escape::PathExt;
 use crate::record::RecordError;
@@ -27,19 +27,19 @@ pub struct Args {
     /// Layout to start from: one of the paper's, or groups and POIs on a ring, in a row or in a grid
     #[arg(default_value = LAYOUTS[0].0[0], value_parser = layouts())]
     layout: String,
-    /// Groups, each of a leader and its followers, of a ring, row or grid [default: 4]
+    /// Number of groups in a ring, row or grid, a leader with its followers each [default: 4]
     #[arg(long, value_name = "N", value_parser = whole)]
     groups: Option<usize>,
-    /// Followers per group, of a ring, row or grid [default: 3]
+    /// Followers per group in a ring, row or grid [default: 3]
     #[arg(long, value_name = "N", value_parser = whole)]
     followers: Option<usize>,
-    /// POIs of a ring, row or grid [default: as many as groups]
+    /// Number of POIs in a ring, row or grid [default: one per group]
     #[arg(long, value_name = "N", value_parser = whole)]
     pois: Option<usize>,
-    /// File to write; it must not exist yet [default: standard output]
+    /// New file to write [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Write over the file
+    /// Overwrite the file
     #[arg(long, requires = "out")]
     force: bool,
 }
@@ -68,8 +68,9 @@ fn template(args: &Args) -> Result<String, Error> {
         let given = [("--groups", args.groups), ("--followers", args.followers), ("--pois", args.pois)];
         if let Some((flag, _)) = given.into_iter().find(|(_, number)| number.is_some()) {
             let layout = &args.layout;
-            return Err(Error::Usage(format!(
-                "{flag}: the layout {layout} is the paper's; use it with ring, row or grid"
+            return Err(Error::Usage(said(
+                format!("{flag}: the layout {layout} is the paper's"),
+                "use it with ring, row or grid",
             )));
         }
         let paper = LAYOUTS.into_iter().find(|(names, _)| names.contains(&&*args.layout));
@@ -79,7 +80,7 @@ fn template(args: &Args) -> Result<String, Error> {
     let layout =
         StartLayout { shape, groups, followers: args.followers.unwrap_or(3), pois: args.pois.unwrap_or(groups) };
     match layout.problem() {
-        Some(problem) => Err(Error::Usage(problem)),
+        Some(problem) => Err(Error::Usage(problem.into())),
         None => Ok(layout.text()?),
     }
 }

@@ -14,7 +14,7 @@ use crate::record::ownership;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder for the pages, flotilla.1, flotilla-train.1, …
+    /// Directory for the pages flotilla.1, flotilla-train.1, …
     #[arg(long, short, value_name = "DIR", default_value = "man")]
     out: PathBuf,
 }

@@ -9,6 +9,8 @@ use std::io::{self, Write};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::str::FromStr;
+use std::sync::atomic::AtomicBool;
+use std::sync::atomic::Ordering::Relaxed;
 use std::sync::{LazyLock, OnceLock};
 
 use clap::builder::PossibleValuesParser as Words;
@@ -16,23 +18,20 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use serde::Serialize;
 
-use crate::backend::BackendError;
-use crate::backend::gpu::device::DeviceError;
-use crate::config::{self, Choice, Config, ConfigError, Fitness, Override, Paradigm};
+use crate::config::{self, Choice, Config, Fitness, Override, Paradigm};
 use crate::escape;
 use crate::file;
+pub use crate::ops::{Error, Processor, said};
 use crate::reader::Document;
-use crate::record::RecordError;
-use crate::report::replay::ReplayError;
-use crate::run::RunError;
-use crate::sweep::questions::Unanswered;
 
 mod backend;
 mod baseline;
 mod bench;
 mod check;
+mod choice;
 mod compare;
 mod completions;
+mod console;
 mod devices;
 mod init;
 mod layout;
@@ -42,64 +41,78 @@ mod paper;
 mod plot;
 mod points;
 mod process;
-mod questions;
 mod recovery;
-mod remedy;
 mod replay;
 mod rollout;
 mod sweep;
+mod tasks;
 mod train;
 mod verify;
 mod warnings;
 
-/// Declares the commands, each with its file, and runs the one that was typed.
+/// Declares the commands, each with its file, and runs the one that was typed. Help lists them by group.
 macro_rules! commands {
-    ($($(#[$doc:meta])* $name:ident($file:ident),)*) => {
-        /// What to do.
+    ($($group:literal { $($(#[$doc:meta])* $name:ident($file:ident),)* })*) => {
+        /// A command with its flags.
         #[derive(Subcommand)]
         enum Command {
-            $($(#[$doc])* $name($file::Args),)*
+            $($($(#[$doc])* $name($file::Args),)*)*
         }
 
         impl Command {
             fn run(self) -> Result<(), Error> {
-                match self { $(Command::$name(args) => $file::run(args),)* }
+                match self { $($(Command::$name(args) => $file::run(args),)*)* }
             }
         }
+
+        /// The names of the commands by group, with a capital.
+        const GROUPS: &[(&str, &[&str])] = &[$(($group, &[$(stringify!($name)),*])),*];
     };
 }
 
 commands! {
-    /// Write a commented config to start from.
-    Init(init),
-    /// Check a config; print it with every value written out, and the cost of a run.
-    Check(check),
-    /// Train the teams of a config, and save what they learned.
-    Train(train),
-    /// Play what needs no learning: constant actions and random teams.
-    Baseline(baseline),
-    /// Play teams of given policies without training, and score every leader.
-    Rollout(rollout),
-    /// Train all of the paper's experiments, draw its figures and check its claims.
-    Paper(paper),
-    /// Draw the learning curves of one run, or of several side by side.
-    Plot(plot),
-    /// Compare runs, or the points of a sweep along an axis, with intervals and tests.
-    Compare(compare),
-    /// Play a team of a trial and generation again, as a page or a picture.
-    Replay(replay),
-    /// Measure how fast teams are played, alone and in whole generations.
-    Bench(bench),
-    /// Compare every GPU with the CPU, bit for bit.
-    Verify(verify),
-    /// List the processors and GPUs to train on.
-    Devices(devices),
-    /// Train every point of a grid side by side, on one machine or many.
-    Sweep(sweep),
-    /// Print a shell completion script.
-    Completions(completions),
-    /// Write manual pages.
-    Man(man),
+    "Design an experiment" {
+        /// Write a commented config to start from.
+        Init(init),
+        /// Check a config, and show its values, cost and layout.
+        Check(check),
+        /// Score teams that need no learning.
+        Baseline(baseline),
+    }
+    "Train" {
+        /// Train teams, and save what they learned.
+        Train(train),
+        /// Train a grid of configs, on one machine or a cluster.
+        Sweep(sweep),
+        /// Train the paper's experiments, and check its claims.
+        Paper(paper),
+        /// Train a suite of tasks, and check which need learning.
+        Tasks(tasks),
+    }
+    "Look at results" {
+        /// Draw learning curves of one run or several.
+        Plot(plot),
+        /// Compare runs, with intervals and tests.
+        Compare(compare),
+        /// Show an episode as a page, a film or a picture.
+        Replay(replay),
+        /// Score trained or given policies, also from new starts.
+        Rollout(rollout),
+    }
+    "Check the machine" {
+        /// List the processors and GPUs to train on.
+        Devices(devices),
+        /// Measure speed.
+        Bench(bench),
+        /// Compare every GPU with the CPU, bit for bit.
+        Verify(verify),
+    }
+    "Set up the shell" {
+        /// Print a shell completion script.
+        Completions(completions),
+        /// Write manual pages.
+        Man(man),
+    }
 }
 
 /// Trains cooperative teams by coevolution on any GPU, with the same bits on a CPU.
@@ -130,8 +143,10 @@ fn program() -> PathBuf {
     named.or_else(|| std::env::current_exe().ok()).unwrap_or_else(|| "flotilla".into())
 }
 
-/// Sets the process up, runs the command, reports its error, and returns the exit code. If clap rejects the command
-/// line, the process exits here with code 2.
+/// Sets the process up, runs the command, reports its error, and returns the exit code.
+///
+/// With `--json`, the error is also printed as JSON on standard output, unless the command has already printed its
+/// results there.
 ///
 /// `words` replaces the process's own arguments, with the program's name first. Only the `words` of the first call are
 /// used.
@@ -139,29 +154,64 @@ pub fn main(words: Option<Vec<OsString>>) -> u8 {
     if let Some(words) = words {
         WORDS.get_or_init(|| words);
     }
-    match process::set_up().and_then(|()| run()) {
-        Ok(()) => 0,
+    let failed = match process::set_up().and_then(|()| run()) {
+        Ok(Ok(())) => return 0,
+        // Help and the version are no errors to clap's caller.
+        Ok(Err(rejected)) => {
+            let _ = rejected.print();
+            if !rejected.use_stderr() {
+                return 0;
+            }
+            of_clap(&rejected)
+        }
         Err(error) => {
             let word = if matches!(error, Error::Stopped(_)) { "stopped" } else { "error" };
             say(format_args!("{word}: {error}"));
-            error.exit_code()
+            error
         }
+    };
+    if wants_json(&self::words()) && !PRINTED.load(Relaxed) {
+        // The exit code already reports a failure.
+        let _ = print_json(&failed);
     }
+    failed.exit_code()
 }
 
-fn run() -> Result<(), Error> {
+/// Runs the command, or returns clap's error if it rejects the command line.
+fn run() -> Result<Result<(), clap::Error>, Error> {
     let words = words();
     reject_control_chars(words.iter().skip(1).cloned())?;
-    let matches = command().try_get_matches_from(words).unwrap_or_else(|error| hinted(error).exit());
-    let typed = Cli::from_arg_matches(&matches);
-    match typed.unwrap_or_else(|error| error.format(&mut command()).exit()).command {
-        Command::Paper(args) if !args.questions.is_empty() => questions::run(&args),
-        command => command.run(),
+    let matches = match command().try_get_matches_from(words) {
+        Ok(matches) => matches,
+        Err(error) => return Ok(Err(hinted(error))),
+    };
+    match Cli::from_arg_matches(&matches) {
+        Err(error) => return Ok(Err(error.format(&mut command()))),
+        Ok(Cli { command }) => command.run()?,
     }
+    Ok(Ok(()))
+}
+
+/// Returns whether a command line asks for JSON. It may be one that clap rejects.
+fn wants_json(words: &[OsString]) -> bool {
+    words.iter().take_while(|word| *word != "--").any(|word| word == "--json")
+}
+
+/// Whether results were printed as JSON.
+static PRINTED: AtomicBool = AtomicBool::new(false);
+
+/// Converts clap's error, which has its advice in paragraphs after the message.
+fn of_clap(error: &clap::Error) -> Error {
+    let text = error.to_string();
+    let text = text.trim().trim_start_matches("error: ");
+    Error::Usage(match text.split_once("\n\n") {
+        None => text.into(),
+        Some((message, advice)) => said(message, advice.trim()),
+    })
 }
 
 /// Removes clap's advice to pass an unknown flag as a value, which does not apply to any command. Suggests `--team` in
-/// place of `--champion` and `--best`.
+/// place of `--champion` and `--best`, and `--set` in place of flags named like config keys.
 fn hinted(mut error: clap::Error) -> clap::Error {
     if error.kind() == ErrorKind::UnknownArgument {
         error.remove(ContextKind::Suggested);
@@ -169,20 +219,57 @@ fn hinted(mut error: clap::Error) -> clap::Error {
         if let Some(flag @ ("--champion" | "--best")) = unknown.as_deref() {
             let meant = format!("--team {}", flag.trim_start_matches('-'));
             error.insert(ContextKind::SuggestedArg, ContextValue::String(meant));
+        } else if let Some(key) = unknown.and_then(|flag| key_of(&flag)).filter(|_| takes_set()) {
+            let meant = format!("--set {key}=VALUE");
+            error.insert(ContextKind::SuggestedArg, ContextValue::String(meant));
         }
     }
     error
 }
 
+/// Returns the config key that a flag is named like: `world.steps` for `--steps`.
+fn key_of(flag: &str) -> Option<&'static str> {
+    let leaf = flag.strip_prefix("--")?.replace('-', "_");
+    config::keys().iter().map(|key| key.name).find(|key| key.rsplit('.').next() == Some(&*leaf))
+}
+
+/// Reports whether the command that was typed has `--set`.
+fn takes_set() -> bool {
+    let words = words();
+    let typed = words.get(1).and_then(|word| word.to_str()).unwrap_or_default();
+    let command = Cli::command();
+    command
+        .find_subcommand(typed)
+        .is_some_and(|command| command.get_arguments().any(|arg| arg.get_long() == Some("set")))
+}
+
 /// Returns the definition of the command line, without parsing or running anything.
 pub fn command() -> clap::Command {
+    let command = Cli::command();
+    let template = template(&command);
     // A negative number is a value, even if an invalid one, and not a flag.
-    Cli::command().mut_subcommands(|command| {
+    command.help_template(template).mut_subcommands(|command| {
         command.mut_args(|arg| match arg.get_long().is_some() && arg.get_action().takes_values() {
             true => arg.allow_negative_numbers(true),
             false => arg,
         })
     })
+}
+
+/// Returns the help of the whole program, with its commands by group.
+fn template(command: &clap::Command) -> String {
+    let line = |name: &&str| {
+        let name = name.to_lowercase();
+        let about = command.find_subcommand(&name).and_then(clap::Command::get_about);
+        format!("  {name:<13}{}\n", about.map_or(String::new(), ToString::to_string))
+    };
+    let group =
+        |(title, names): &(&str, &[&str])| format!("{title}:\n{}\n", names.iter().map(line).collect::<String>());
+    let groups: String = GROUPS.iter().map(group).collect();
+    format!(
+        "{{about-with-newline}}\n{{usage-heading}} {{usage}}\n\n{groups}Options:\n{{options}}\n\n\
+         'flotilla help COMMAND' lists the flags of a command. To begin: flotilla init --out my.toml"
+    )
 }
 
 /// Parses a number for a config key, and returns it as TOML. The config checks its range.
@@ -221,87 +308,16 @@ fn real(text: &str) -> Result<f64, String> {
 fn reject_control_chars(words: impl Iterator<Item = OsString>) -> Result<(), Error> {
     for word in words {
         if word.to_string_lossy().contains(escape::is_control) {
-            return Err(Error::Usage(format!(
-                "'{}' holds a line break or another control character, which no name or value may have",
-                escape::line(&word.to_string_lossy())
-            )));
+            return Err(Error::Usage(
+                format!(
+                    "'{}' holds a line break or another control character, which no name or value may have",
+                    escape::line(&word.to_string_lossy())
+                )
+                .into(),
+            ));
         }
     }
     Ok(())
-}
-
-/// The error of a command.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// A config that cannot be read or is invalid.
-    #[error("{}{}", .0, remedy::config(.0))]
-    Config(#[from] ConfigError),
-    /// Episodes that could not be played.
-    #[error("{}{}", .0, remedy::backend(.0))]
-    Backend(#[from] BackendError),
-    /// A GPU that could not be opened, or that failed.
-    #[error("{}{}", .0, remedy::device(.0))]
-    Device(#[from] DeviceError),
-    /// There is no GPU to compare with the CPU.
-    #[error("{0}; --report FILE without --adapter compares the instruction sets of the processor alone")]
-    NoneToVerify(DeviceError),
-    /// Files of runs that could not be written, read or used.
-    #[error("{}{}", .0, remedy::record(.0, "run it again"))]
-    Record(#[from] RecordError),
-    /// A run that could not continue.
-    #[error("{}{}", .0, remedy::run(.0))]
-    Run(#[from] RunError),
-    /// A run that could not be read to show it.
-    #[error("{}{}", .0, remedy::shown(.0))]
-    Shown(#[from] crate::report::runs::ReadError),
-    /// A question that could not be answered.
-    #[error(transparent)]
-    Unanswered(#[from] Unanswered),
-    /// An episode that could not be replayed.
-    #[error("{}{}", .0, remedy::replayed(.0))]
-    Replayed(#[from] ReplayError),
-    /// Results that could not be printed.
-    #[error("standard output cannot be written: {0}")]
-    Output(io::Error),
-    /// Signal handlers that could not be installed.
-    #[error("signals cannot be listened for: {0}")]
-    Signals(io::Error),
-    /// Wrong usage that is only found when flags are read together.
-    #[error("{0}")]
-    Usage(String),
-    /// Results that differ but should be equal.
-    #[error("{0}")]
-    Different(String),
-    /// A command that is refused, for example because it would overwrite files.
-    #[error("{0}")]
-    Refused(String),
-    /// Results that do not exist yet.
-    #[error("{0}")]
-    Missing(String),
-    /// Stopped by a signal. Runs are saved and can be resumed.
-    #[error("{0}")]
-    Stopped(String),
-}
-
-impl Error {
-    /// Returns the process's exit code: 1 for a failure, 2 for wrong usage, 75 if stopped and ready to be resumed.
-    ///
-    /// A flag's value that does not fit the file or the machine is wrong usage, too. If the file is also invalid, the
-    /// code is 1.
-    pub fn exit_code(&self) -> u8 {
-        match self {
-            Error::Usage(_)
-            | Error::Device(DeviceError::UnknownAdapter { .. })
-            | Error::NoneToVerify(DeviceError::UnknownAdapter { .. })
-            | Error::Record(RecordError::NoTrial { .. })
-            | Error::Replayed(
-                ReplayError::NoTrial { .. } | ReplayError::NoGeneration { .. } | ReplayError::NoTeam { .. },
-            ) => 2,
-            Error::Config(error) if error.is_usage() => 2,
-            Error::Stopped(_) => 75,
-            _ => 1,
-        }
-    }
 }
 
 /// Prints a message to standard error, with control characters escaped. A failure is ignored, because there is no other
@@ -316,21 +332,44 @@ pub fn say(text: impl Display) {
 /// # Errors
 /// Fails if standard output cannot be written, for example because the disk is full.
 pub fn print(text: &str) -> Result<(), Error> {
+    write_out(&escape::lines(text))
+}
+
+fn write_out(text: &str) -> Result<(), Error> {
     let mut stdout = io::stdout().lock();
-    match stdout.write_all(escape::lines(text).as_bytes()).and_then(|()| stdout.flush()) {
+    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Error::Output(error)),
         _ => Ok(()),
     }
 }
 
-/// Prints a result as one line of JSON to standard output. Control characters are written as JSON escapes, so that
-/// every reader gets the same text back.
+/// Writes characters that steer a terminal as JSON's own escapes, where serde leaves them as they are.
+struct TerminalSafe;
+
+impl serde_json::ser::Formatter for TerminalSafe {
+    fn write_string_fragment<W: ?Sized + Write>(&mut self, writer: &mut W, fragment: &str) -> io::Result<()> {
+        for piece in fragment.split_inclusive(escape::is_control) {
+            let text = piece.trim_end_matches(escape::is_control);
+            writer.write_all(text.as_bytes())?;
+            for control in piece[text.len()..].chars() {
+                write!(writer, "\\u{:04x}", u32::from(control))?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Prints a result as one line of JSON to standard output. JSON does not have the escapes of [`print()`].
 ///
 /// # Errors
 /// Fails if standard output cannot be written, for example because the disk is full.
 pub fn print_json(value: &impl Serialize) -> Result<(), Error> {
-    let text = serde_json::to_string(value).expect("numbers, texts and lists of them are JSON");
-    print(&(escape::json(&text).into_owned() + "\n"))
+    let mut text = Vec::new();
+    let mut serializer = serde_json::Serializer::with_formatter(&mut text, TerminalSafe);
+    value.serialize(&mut serializer).expect("numbers, texts and lists of them are JSON");
+    text.push(b'\n');
+    PRINTED.store(true, Relaxed);
+    write_out(&String::from_utf8(text).expect("JSON is UTF-8"))
 }
 
 const IN_CONFIG: &str = "Config overrides";
@@ -401,19 +440,27 @@ pub struct Overrides {
     /// Independent repetitions
     #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
     pub trials: Option<String>,
-    /// Generations after generation 0, which is random
+    /// Number of generations after the random generation 0
     #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
     pub generations: Option<String>,
     /// Policies per population, and teams per generation
     #[arg(long, help_heading = IN_CONFIG, value_name = "N", value_parser = number)]
     pub population: Option<String>,
-    /// Score that policies are selected by
+    /// Fitness: the score that selects policies
     #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = Words::new(Fitness::names()), ignore_case = true)]
     pub fitness: Option<String>,
     /// Who learns
     #[arg(long, help_heading = IN_CONFIG, value_name = "NAME", value_parser = Words::new(Paradigm::names()), ignore_case = true)]
     pub paradigm: Option<String>,
-    /// Any key of the config, as world.steps=60; may be given more than once
+    /// Any other key.
+    #[command(flatten)]
+    pub set: SetKeys,
+}
+
+/// The flag that sets any key of a config.
+#[derive(clap::Args, Default)]
+pub struct SetKeys {
+    /// Set any config key, for example world.steps=60; can be repeated
     #[arg(long, help_heading = IN_CONFIG, value_name = "KEY=VALUE", value_parser = assignment)]
     pub set: Vec<Override>,
 }
@@ -438,7 +485,7 @@ fn canonical(mut names: impl Iterator<Item = &'static str>, typed: &str) -> toml
 impl Overrides {
     /// Returns the keys that were set, each with its flag as its name in errors.
     pub fn list(&self) -> Vec<Override> {
-        let Overrides { seed, trials, generations, population, fitness, paradigm, set: given } = self;
+        let Overrides { seed, trials, generations, population, fitness, paradigm, set: SetKeys { set: given } } = self;
         let numbers = [("seed", seed), ("trials", trials), ("generations", generations), ("population", population)]
             .map(|(name, value)| (name, value.clone()));
         let fitness = fitness.as_ref().map(|typed| canonical(Fitness::names(), typed));
@@ -452,16 +499,16 @@ impl Overrides {
     }
 }
 
-/// What to run on.
+/// The processor and its threads.
 #[derive(clap::Args, Clone, Debug)]
 pub struct RunOptions {
-    /// Processor
+    /// Processor to run on
     #[arg(long, help_heading = WHERE, value_enum, default_value_t = BackendChoice::Auto)]
     pub backend: BackendChoice,
-    /// GPU of this number in `flotilla devices`, or whose name contains this; also one that is a software renderer
+    /// GPU by its number in `flotilla devices` or part of its name; also selects software renderers
     #[arg(long, help_heading = WHERE, value_name = "NAME")]
     pub adapter: Option<String>,
-    /// Where populations are kept and the next generation is bred
+    /// Memory that holds the populations, and processor that breeds them
     #[arg(long, help_heading = WHERE, value_enum, default_value_t = Breed::Auto)]
     pub breed: Breed,
     /// CPU threads [default: all]
@@ -469,25 +516,24 @@ pub struct RunOptions {
     pub threads: Option<u16>,
 }
 
-/// Which kind of processor plays the episodes.
+/// The kind of processor that plays the episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum BackendChoice {
-    /// A GPU where there is one, else the CPU
+    /// A GPU if it is expected to finish before the CPU, otherwise the CPU
     Auto,
     /// All cores, or `--threads`
     Cpu,
-    /// A GPU, or fail; a software renderer is none, and taken only by --adapter
+    /// A GPU; fails without one, and ignores software renderers
     Gpu,
 }
 
 /// Where populations are kept between generations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Breed {
-    /// With a GPU, in its memory from 1 MiB a trial on and where they fit (an estimate, not measured); else in the
-    /// host's
+    /// GPU memory if populations have at least 1 MiB per trial and fit, otherwise main memory
     Auto,
-    /// In the host's memory
+    /// Main memory
     Host,
-    /// In the GPU's memory, or fail
+    /// GPU memory; fails if they do not fit
     Device,
 }

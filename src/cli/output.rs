@@ -7,7 +7,7 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::Duration;
 
-use super::{Error, say};
+use super::{Error, said, say};
 use crate::escape::PathExt;
 use crate::file;
 use crate::record::disk::Disk;
@@ -87,9 +87,11 @@ pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), 
             let error = io::ErrorKind::IsADirectory.into();
             return Err(RecordError::Write { path: path.into(), error }.into());
         }
+        disk(path).map_err(|error| RecordError::Write { path: path.into(), error })?;
         let resolved = file::resolved(path);
-        let refused =
-            |why: &str| Err(Error::Usage(format!("{flag} {}: this file {why}; name another to write", path.escaped())));
+        let refused = |why: &str| {
+            Err(Error::Usage(said(format!("{flag} {}: this file {why}", path.escaped()), "name another to write")))
+        };
         if let Some((_, why)) = taken.iter().find(|(other, _)| *other == resolved) {
             return refused(why);
         }
@@ -101,7 +103,8 @@ pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), 
     Ok(())
 }
 
-/// Writes a file completely or not at all. A pipe blocks until a reader opens it.
+/// Writes a file completely or not at all. A pipe blocks until a reader opens it. In the folder of a run, sweep or paper
+/// no link is followed, because other users may write there.
 ///
 /// # Errors
 /// Fails if the file cannot be written.
@@ -111,7 +114,16 @@ pub fn write(path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>
         drop(opened);
         content(output)
     };
-    Ok(Disk::default().deliver(path, content).map_err(|error| RecordError::Write { path: path.into(), error })?)
+    let written = disk(path).and_then(|disk| disk.deliver(path, content));
+    Ok(written.map_err(|error| RecordError::Write { path: path.into(), error })?)
+}
+
+/// Returns the disk for a file that the user named, which is not a link in one of flotilla's folders.
+fn disk(path: &Path) -> io::Result<Disk> {
+    let Some(folder) = folder::around(path) else { return Ok(Disk::default()) };
+    let disk = Disk::default().within(folder)?;
+    disk.refuse_link(path)?;
+    Ok(disk)
 }
 
 /// Reports that a pipe has no reader yet, unless the returned sender is dropped within [`PATIENCE`].

@@ -21,7 +21,7 @@ const MOST: usize = 40;
 pub(super) fn config(folder: &Path, verification: Verification) -> Result<Config, Error> {
     runs::config(folder, verification).map_err(|error| match error {
         ReadError::Collection { what: "a sweep", .. } => match Sweep::load(&folder.join(SWEEP), &[], false) {
-            Ok(sweep) => Error::Refused(list(&sweep, folder)),
+            Ok(sweep) => Error::Refused(list(&sweep, folder).into()),
             Err(error) => error.into(),
         },
         error => error.into(),

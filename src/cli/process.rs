@@ -7,7 +7,7 @@ use super::Error;
 /// # Errors
 /// Fails if the system does not allow signal handlers.
 pub fn set_up() -> Result<(), Error> {
-    calm_drivers();
+    suppress_driver_noise();
     #[cfg(unix)]
     {
         allow_many_files();
@@ -19,7 +19,7 @@ pub fn set_up() -> Result<(), Error> {
 /// Vulkan's layers look for a Wayland display. Its library prints a complaint if XDG_RUNTIME_DIR does not name the
 /// display's folder. Nothing here needs a display, so this names a folder that cannot exist. A process that already has
 /// threads is left alone, because changing its environment is unsafe. The Python package sets the variable itself.
-fn calm_drivers() {
+fn suppress_driver_noise() {
     let name = "XDG_RUNTIME_DIR";
     let valid = std::env::var_os(name).is_some_and(|folder| std::path::Path::new(&folder).is_absolute());
     let alone = || std::fs::read_dir("/proc/self/task").is_ok_and(|threads| threads.count() == 1);

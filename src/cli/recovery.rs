@@ -8,43 +8,31 @@ use std::sync::atomic::AtomicBool;
 
 use clap::ValueEnum;
 
-use super::{Error, RunOptions, number, say};
-use crate::backend::BackendError;
-use crate::backend::OpenBackend;
+use super::{Error, RunOptions, number};
 use crate::config::Override;
-use crate::front;
 use crate::shell;
 
-/// What to do about a failing device.
+/// The reaction to a failing device.
 #[derive(clap::Args, Clone, Copy)]
 pub struct Loss {
-    /// What to do if the device fails during a run
+    /// Reaction to a device that fails during a run
     #[arg(long, value_enum, value_name = "WHAT", default_value_t = OnLoss::Stop)]
     on_device_loss: OnLoss,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum OnLoss {
-    /// Save and fail, to be resumed
+    /// Save, and stop with an error
     Stop,
-    /// Continue on the CPU, to the same results
+    /// Continue on the CPU, with the same results
     Cpu,
 }
 
 impl Loss {
-    /// Returns the CPU backend to continue with after another backend failed, if `--on-device-loss cpu` was given.
-    pub fn instead(self, error: &BackendError) -> Option<OpenBackend> {
-        (self.on_device_loss == OnLoss::Cpu).then(|| {
-            let (backend, machine) = front::cpu();
-            say(format_args!("{error}\ngoing on with {}, to the same results", backend.describe()));
-            (backend, machine)
-        })
+    /// Returns whether the CPU continues after another backend failed.
+    pub fn falls_back(self) -> bool {
+        self.on_device_loss == OnLoss::Cpu
     }
-}
-
-/// Reports that populations moved to the host.
-pub fn setback(error: &BackendError) {
-    say(format_args!("{error}\nthe populations are kept by the host from here on, to the same results"));
 }
 
 /// How often runs are saved, instead of what their config says.

@@ -5,12 +5,14 @@ use std::sync::atomic::Ordering::Relaxed;
 
 use serde_json::json;
 
+use super::choice::Work;
 use super::output::Destination;
 use super::recovery::Signals;
-use super::{Error, RunOptions, backend, between, points, print, print_json, say, whole, words};
-use crate::config::Config;
+use super::{Error, RunOptions, backend, between, points, print, print_json, said, say, whole, words};
+use crate::config::{Config, Learning};
 use crate::escape::PathExt;
 use crate::record::RecordError;
+use crate::record::archive::RunFolder;
 use crate::record::digests::{self, UNVERIFIED, Verification};
 use crate::record::disk::Disk;
 use crate::record::ownership::{self, REPLAY};
@@ -22,7 +24,7 @@ use crate::{file, shell};
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder that `flotilla train` made
+    /// Run directory, made by `flotilla train`, or a zip file of a run
     #[arg(value_name = "RUN")]
     folder: PathBuf,
     /// Trial to look at: a number from 0, or the one with the largest (best) or smallest (worst) G
@@ -41,23 +43,23 @@ pub struct Args {
     /// Step to stop at, in a still picture [default: the last]
     #[arg(long, value_name = "N", value_parser = whole)]
     step: Option<usize>,
-    /// File to write: .html to play, .gif moving, .svg, .pdf or .png still. A name with %d or %04d before .png makes a
-    /// picture per moment, numbered there, for a film [default: replay.html in RUN]
+    /// File to write: .html plays in a browser, .gif moves, .svg, .pdf and .png are stills. A .png name with %d or %04d
+    /// writes numbered pictures for a film [default: replay.html in RUN]
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Pixels across, of a .gif or .png [default: a .gif fits into 960 x 720, a .png has 300 an inch]
+    /// Width of a .gif or .png in pixels [default: a .gif fits into 960 x 720, a .png has 300 dots per inch]
     #[arg(long, value_name = "PIXELS", value_parser = between(100..=8192u32))]
     width: Option<u32>,
     /// Pictures per second, for a .gif or a film [default: 20]
     #[arg(long, value_name = "N", value_parser = between(1..=50u32))]
     fps: Option<u32>,
-    /// Read files that differ from their digests in run.json, too, and mark what comes out
+    /// Also read files that differ from their digests in run.json, and mark the results as unverified
     #[arg(long)]
     unverified: bool,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
-    /// No progress on standard error, and no summary on standard output but by --json
+    /// Print no progress and no summary; --json still prints its object
     #[arg(long, short)]
     quiet: bool,
     #[command(flatten)]
@@ -110,7 +112,13 @@ impl WhichTrial {
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { folder, trial, generation, team, compare, step, out, width, fps, unverified, json, quiet, run } = args;
     let verification = Verification::unless(unverified);
-    let place = out.map_or_else(|| Destination::OfRun(folder.join(REPLAY)), Destination::Named);
+    let opened = RunFolder::open(&folder)?;
+    let folder = opened.path().to_path_buf();
+    let place = match out {
+        Some(out) => Destination::Named(out),
+        None if opened.is_unpacked() => Destination::Here(REPLAY.into()),
+        None => Destination::OfRun(folder.join(REPLAY)),
+    };
     let out = place.path().to_path_buf();
     let kind = Form::of(&out, fps)?;
     kind.takes(&out, width, fps, step)?;
@@ -126,9 +134,9 @@ pub fn run(args: Args) -> Result<(), Error> {
     };
     let generations: Vec<usize> = compare.into_iter().chain([generation]).collect();
     if let Some(other) = generations.iter().find(|&&other| config.stage_of(other) != config.stage_of(generation)) {
-        return Err(Error::Usage(format!(
-            "generations {other} and {generation} are of different stages: show one alone"
-        )));
+        return Err(Error::Usage(
+            format!("generations {other} and {generation} are of different stages: show one alone").into(),
+        ));
     }
     let config = config.at(generation);
     if generations.len() > 1 && config.learning.poi_jitter > 0.0 {
@@ -139,9 +147,10 @@ pub fn run(args: Args) -> Result<(), Error> {
     place.check()?;
     let steps = config.world.steps;
     if let Some(step) = step.filter(|&step| step > steps) {
-        return Err(Error::Usage(format!("--step {step}: the episode has steps 0 to {steps}")));
+        return Err(Error::Usage(format!("--step {step}: the episode has steps 0 to {steps}").into()));
     }
-    let (mut backend, _) = backend::open(&run)?;
+    let learning = Learning { trials: 1, ..config.learning.clone() };
+    let ((mut backend, _), _) = backend::open_for(&run, Work::of([&Config { learning, ..config.clone() }]))?;
     let signals = Signals::listen()?;
     let (mut meter, last) = (Meter::new(quiet), generations.iter().max().copied().unwrap_or(0));
     let mut watch = |generation: usize| {
@@ -152,7 +161,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let played = replay::replay(&folder, trial, &generations, team, verification, &mut *backend, &mut watch);
     meter.clear();
     let played = played.map_err(|error| match error {
-        ReplayError::Stopped => Error::Stopped("before the episode was played; nothing was written".into()),
+        ReplayError::Stopped => Error::Stopped(said("before the episode was played", "nothing was written")),
         error => error.into(),
     })?;
 
@@ -261,14 +270,14 @@ impl Form {
         match (extension.as_ref().and_then(|extension| extension.to_str()), Format::of(path)) {
             (Some("html"), _) => Ok(Form::Page),
             (Some("gif"), _) => Ok(Form::Gif),
-            (Some("mp4" | "m4v" | "mov" | "mkv" | "webm" | "avi"), _) => Err(Error::Usage(film(path, fps))),
+            (Some("mp4" | "m4v" | "mov" | "mkv" | "webm" | "avi"), _) => Err(Error::Usage(film(path, fps).into())),
             (_, Some(kind)) => {
                 let numbered = path.file_name().and_then(|name| Numbered::of(name.to_str()?));
                 Ok(numbered.filter(|_| kind == Format::Png).map_or(Form::Still(kind), Form::Film))
             }
             _ => {
                 let path = path.escaped();
-                Err(Error::Usage(format!("--out {path}: its name must end in .html, .gif, .svg, .pdf or .png")))
+                Err(Error::Usage(format!("--out {path}: its name must end in .html, .gif, .svg, .pdf or .png").into()))
             }
         }
     }
@@ -284,7 +293,7 @@ impl Form {
         ];
         match unused.into_iter().find(|(_, unused, _)| *unused) {
             Some((flag, _, of)) => {
-                Err(Error::Usage(format!("{flag} has no meaning for --out {}: it is of {of}", out.escaped())))
+                Err(Error::Usage(format!("{flag} has no meaning for --out {}: it is of {of}", out.escaped()).into()))
             }
             None => Ok(()),
         }

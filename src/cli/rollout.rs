@@ -2,19 +2,21 @@
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
 
 use clap::builder::PossibleValuesParser as Words;
 use serde_json::json;
 
+use super::choice::Work;
 use super::{
-    ConfigFile, Error, RunOptions, assignment, backend, between, canonical, output, points, print, print_json, real,
-    say, whole,
+    ConfigFile, Error, Processor, RunOptions, SetKeys, backend, between, canonical, output, points, print, print_json,
+    real, said, say, whole,
 };
-use crate::backend::{Backend, Group, Machine, Moment, RecordRequest};
-use crate::config::{Choice, Config, Override, Paradigm};
+use crate::backend::{Backend, Group, Moment};
+use crate::config::{Choice, Config, Override, Paradigm, Sharing};
+use crate::escape::PathExt;
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Spread, Starts};
 use crate::file;
+use crate::record::archive::RunFolder;
 use crate::record::digests::{self, Digests, UNVERIFIED, Verification};
 use crate::record::{folder, policies, tensors};
 use crate::report::progress::Meter;
@@ -29,13 +31,12 @@ const SENSED: &str = "pois_back_right,pois_front_right,pois_front_left,pois_back
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder that `flotilla train` made; or a config file (TOML), - for standard input, with --policies
+    /// Run directory, or a zip file of a run; with --policies also a config file (TOML), or - for standard input
     #[arg(value_name = "RUN|CONFIG")]
     path: PathBuf,
-    /// Any key of the config, as world.steps=60; may be given more than once
-    #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
-    set: Vec<Override>,
-    /// Who learned, instead of the config's
+    #[command(flatten)]
+    set: SetKeys,
+    /// Paradigm of the policies, if it is not the config's
     #[arg(long, value_name = "NAME", value_parser = Words::new(Paradigm::names()), ignore_case = true)]
     paradigm: Option<String>,
     #[command(flatten)]
@@ -47,22 +48,22 @@ pub struct Args {
     /// Take the tensor `weights.N` [default: `weights`, or else `weights.0`]
     #[arg(long, value_name = "N", value_parser = whole)]
     trial: Option<usize>,
-    /// Play in the world of the config's stage N, from 0 [default: that of the file's own keys]
+    /// Play in the world of the config's stage N, from 0 [default: the world before any stage]
     #[arg(long, value_name = "N", value_parser = whole)]
     stage: Option<usize>,
-    /// Write every agent's state after every step, and what leaders sense and answer there
+    /// Write every agent's state after each step, and every leader's inputs and outputs
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
-    /// Write every leader's scores: team,leader,g,d,df,dpp,dt; of several episodes their means, and the spread of POIs
+    /// Write every leader's scores: team,leader,g,d,df,dpp,dt; for several episodes their means, and the spread of POIs
     #[arg(long, value_name = "FILE")]
     scores: Option<PathBuf>,
-    /// Read files that differ from their digests in run.json, too, and mark what comes out
+    /// Also read files that differ from their digests in run.json, and mark the results as unverified
     #[arg(long)]
     unverified: bool,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
-    /// No progress on standard error
+    /// Print no progress
     #[arg(long, short)]
     quiet: bool,
 
@@ -70,7 +71,7 @@ pub struct Args {
     #[arg(long, value_name = "N", value_parser = between(1..=MAX_EPISODES),
         help_heading = HELD_OUT)]
     episodes: Option<u32>,
-    /// Start of these starts' randomness [default: 0, so that policies of any run meet the same starts]
+    /// Random seed of these starts [default: 0, so that all policies get the same starts]
     #[arg(long, value_name = "S", requires = "episodes", value_parser = between(0..=i64::MAX as u64),
         help_heading = HELD_OUT)]
     seed: Option<u64>,
@@ -87,9 +88,10 @@ impl Args {
     fn starts(&self, jitter: f64, poi_jitter: f64) -> Result<Starts, Error> {
         let (Some(episodes), seed) = (self.episodes, self.seed.unwrap_or(0)) else { return Ok(Starts::Own) };
         if jitter == 0.0 && poi_jitter == 0.0 && (episodes > 1 || self.seed.is_some()) {
-            return Err(Error::Usage(format!(
-                "--episodes {episodes}: learning.start_jitter is 0, so all episodes are the same; \
-                 set it or learning.poi_jitter in the config, or give --start-jitter or --poi-jitter"
+            return Err(Error::Usage(said(
+                format!("--episodes {episodes}: learning.start_jitter is 0, so all episodes are the same"),
+                "\
+                 set it or learning.poi_jitter in the config, or give --start-jitter or --poi-jitter",
             )));
         }
         Ok(Starts::Drawn { episodes, seed, jitter, poi_jitter })
@@ -99,17 +101,18 @@ impl Args {
 /// Plays the teams. Team j consists of policy j of every leader.
 pub fn run(args: Args) -> Result<(), Error> {
     let outputs = [("--scores", args.scores.as_deref()), ("--trace", args.trace.as_deref())];
-    let (config, trained) = match args.path.is_dir() {
-        true => {
-            points::config(&args.path, Verification::unless(args.unverified))?;
-            (args.path.join(folder::CONFIG), Some(args.path.join(folder::POLICIES)))
+    let opened = RunFolder::open(&args.path)?;
+    let (config, trained) = match opened.path() {
+        path if path.is_dir() => {
+            points::config(path, Verification::unless(args.unverified))?;
+            (path.join(folder::CONFIG), Some(path.join(folder::POLICIES)))
         }
-        false => (args.path.clone(), None),
+        path => (path.to_path_buf(), None),
     };
     let Some(policies) = args.policies.clone().or(trained) else {
-        return Err(Error::Usage(format!(
-            "--policies: a config file needs a file of policies; or name a run's folder in place of {}",
-            args.path.display()
+        return Err(Error::Usage(said(
+            "--policies: a config file needs a file of policies",
+            format!("or name a run's folder in place of {}", args.path.escaped()),
         )));
     };
     let config_path = config.clone();
@@ -123,14 +126,17 @@ pub fn run(args: Args) -> Result<(), Error> {
         set("start_jitter", args.start_jitter.map(toml::Value::from)),
         set("poi_jitter", args.poi_jitter.map(toml::Value::from)),
     ];
-    let config = config.load(&overrides.into_iter().flatten().chain(args.set.iter().cloned()).collect::<Vec<_>>())?;
+    let config =
+        config.load(&overrides.into_iter().flatten().chain(args.set.set.iter().cloned()).collect::<Vec<_>>())?;
     let config = match args.stage {
         None => config,
         Some(stage) => {
             let mut staged = config.staged();
             if stage >= staged.len() {
                 let stages = staged.len();
-                return Err(Error::Usage(format!("--stage {stage}: the config has {}", numbered(stages, "stage"))));
+                return Err(Error::Usage(
+                    format!("--stage {stage}: the config has {}", numbered(stages, "stage")).into(),
+                ));
             }
             staged.swap_remove(stage).1
         }
@@ -139,9 +145,13 @@ pub fn run(args: Args) -> Result<(), Error> {
     verify(&config_path, &policies, args.unverified)?;
     let policies = policies::read(&policies, &config, args.trial)?;
     let world = World::new(&config);
-    let (mut backend, machine) = backend::open(&args.run)?;
+    // The file says whether its leaders share a policy, not the config, which may be another layout's.
+    let own = policies.policies * world.leaders() * world.parameters();
+    let sharing = if policies.weights.len() == own { Sharing::PerLeader } else { Sharing::Shared };
+    let work = Work::of_teams(&config, policies.policies * args.episodes.unwrap_or(1) as usize);
+    let ((mut backend, machine), on) = backend::open_for(&args.run, work)?;
     if !args.quiet {
-        say(format_args!("playing on {}", backend.describe()));
+        say(format_args!("playing on {on}"));
     }
     let teams = evaluate::one_policy_a_team(policies.policies, world.leaders());
     let group = Group {
@@ -150,18 +160,15 @@ pub fn run(args: Args) -> Result<(), Error> {
         weights: policies.weights[..].into(),
         policies: policies.policies,
         teams: &teams,
-        need: if args.scores.is_some() { RecordRequest::Sights } else { RecordRequest::Scores },
+        sharing,
+        fitnesses: if args.scores.is_some() { evaluate::SCORES_AND_DT } else { evaluate::SCORES },
     };
 
-    let meter = Mutex::new(Meter::new(args.quiet));
-    let evaluation = evaluate::evaluate(&mut *backend, &group, &starts, &|part| {
-        // If another thread is updating the meter, this update is not needed.
-        if let Ok(mut meter) = meter.try_lock() {
-            let (teams, episodes) = (policies.policies, starts.episodes());
-            meter.show(part, || format!("playing {}", counted(teams, episodes)));
-        }
+    let mut meter = Meter::new(args.quiet);
+    let evaluation = evaluate::evaluate(&mut *backend, &group, &starts, &mut |part| {
+        let (teams, episodes) = (policies.policies, starts.episodes());
+        meter.show(part, || format!("playing {}", counted(teams, episodes)));
     });
-    let mut meter = meter.into_inner().unwrap_or_else(|poisoned| poisoned.into_inner());
     meter.clear();
     let evaluation = evaluation?;
     if let Some(path) = &args.scores {
@@ -171,7 +178,8 @@ pub fn run(args: Args) -> Result<(), Error> {
         write_trace(path, &mut *backend, &group, &starts, &mut meter)?;
     }
     if args.json {
-        let mut object = in_json(&evaluation, &starts, &machine);
+        let mut object = in_json(&evaluation, &starts);
+        Processor::of(&machine, &backend.describe()).add_to(&mut object);
         object["unverified"] = args.unverified.into();
         return print_json(&object);
     }
@@ -236,7 +244,7 @@ fn in_words(evaluation: &Evaluation, starts: &Starts) -> String {
     text
 }
 
-fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> serde_json::Value {
+fn in_json(evaluation: &Evaluation, starts: &Starts) -> serde_json::Value {
     let spread = |spread: Spread| {
         let Spread { mean, deviation, interval } = spread;
         json!({ "mean": mean, "standard_deviation": deviation, "interval_95": interval })
@@ -250,8 +258,6 @@ fn in_json(evaluation: &Evaluation, starts: &Starts, machine: &Machine) -> serde
         "seed": null,
         "start_jitter": null,
         "poi_jitter": null,
-        "backend": machine.backend,
-        "adapter": machine.adapter,
         "team_0": spread(evaluation.team(0)),
         "best": spread(evaluation.team(best)),
         "mean": spread(evaluation.mean()),
@@ -301,7 +307,7 @@ fn write_trace(
         for episode in 0..episodes {
             let starts = starts.of(episode, group.world);
             let last = if episodes > 1 { format!(",{episode}") } else { String::new() };
-            for (first, part) in evaluate::parts(&Group { starts: &starts, need: RecordRequest::Record, ..*group }) {
+            for (first, part) in evaluate::parts(&Group { starts: &starts, fitnesses: &[], ..*group }) {
                 let trace = match backend.trace(&part) {
                     Ok(trace) => trace,
                     Err(error) => {

@@ -7,25 +7,28 @@ use std::path::{Path, PathBuf};
 
 use serde_json::json;
 
+use super::choice::Work;
 use super::recovery::{self, Checkpoints, Loss, Signals, quoted};
-use super::{ConfigArgs, Error, RunOptions, backend, print, print_json, say, warnings};
+use super::{ConfigArgs, Error, Processor, RunOptions, backend, print, print_json, said, say, warnings};
 use crate::config::Config;
 use crate::escape::PathExt;
 use crate::file;
 use crate::host::Instant;
 use crate::memory::Peaks;
+use crate::ops::{Context, Event};
 use crate::record::RecordError;
 use crate::record::digests::Verification;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, METRICS, POLICIES, Start};
 use crate::record::ownership::{self, CURVES};
 use crate::record::policies;
+use crate::report::curves::Band;
 use crate::report::progress::Board;
 use crate::report::replay::History;
 use crate::report::runs;
 use crate::report::scene::Scene;
 use crate::report::tensorboard::Events;
-use crate::run::{Ended, Options, Results, RunError, Session};
+use crate::run::{Ended, Progress, Results, RunError, Session};
 use crate::shell;
 use crate::trainer::Row;
 
@@ -40,27 +43,26 @@ pub struct Args {
     config: ConfigArgs,
     #[command(flatten)]
     run: RunOptions,
-    /// Output directory [default: runs/NAME of the config (runs/config for standard input), or the next free
-    /// runs/NAME-2, …]
+    /// Output directory [default: runs/NAME after the config's file, or the next free runs/NAME-2, …]
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Resume the run in the directory (without --out the latest of this config's name), or start it if there is none
+    /// Resume the run in the directory, or start it if there is none (without --out: the latest of this config's name)
     #[arg(long, conflicts_with = "force")]
     resume: bool,
-    /// Start from the policies of a safetensors file, in place of random ones: trial i from its tensor `weights.i`, or
-    /// all from `weights`, f32 [leaders, policies, parameters]; missing policies are filled with random ones
+    /// Start from the policies in a safetensors file instead of random ones. Trial i takes the tensor `weights.i`, or
+    /// all take `weights`: f32 [leaders, policies, parameters]. Missing policies are random
     #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
-    /// Write over the run in the folder (without --out in runs/NAME of the config)
+    /// Overwrite the run in the directory (without --out: runs/NAME)
     #[arg(long)]
     force: bool,
-    /// No progress on standard error, and no summary on standard output but by --json
+    /// Print no progress and no summary; --json still prints its object
     #[arg(long, short)]
     quiet: bool,
     /// Print the results as one JSON object (docs/reference/json.md)
     #[arg(long)]
     json: bool,
-    /// Also write event files for TensorBoard, in OUT/tensorboard; with --resume also of what was trained before
+    /// Also write event files for TensorBoard to OUT/tensorboard; with --resume, earlier generations too
     #[arg(long)]
     tensorboard: bool,
     #[command(flatten)]
@@ -99,21 +101,23 @@ impl Args {
 
 pub fn run(args: Args) -> Result<(), Error> {
     let (config, notes_on_config) = args.config.load(args.checkpoints.list())?;
-    let mut player = backend::open(&args.run)?;
+    let (mut player, runs_on) = backend::open_for(&args.run, Work::of([&config]))?;
     Peaks::of([&config], rayon::current_num_threads()).check(player.1.backend == "gpu").map_err(RunError::from)?;
     warnings::unreachable(&config);
-    let runs_on = player.0.describe();
     let init = args.init.as_deref().map(|path| policies::read_init(path, &config)).transpose()?;
     let (folder, start) = args.folder()?;
     if let Some(what) = folder::collection(&folder) {
-        return Err(Error::Refused(format!("{} holds {what}, not a run; choose another --out", folder.escaped())));
+        return Err(Error::Refused(said(
+            format!("{} holds {what}, not a run", folder.escaped()),
+            "choose another --out",
+        )));
     }
     if let Some(path) =
         args.init.as_deref().filter(|path| file::resolved(path) == file::resolved(&folder.join(POLICIES)))
     {
-        return Err(Error::Usage(format!(
-            "--init {}: this run would be written over it; choose another --out",
-            path.escaped()
+        return Err(Error::Usage(said(
+            format!("--init {}: this run would be written over it", path.escaped()),
+            "choose another --out",
         )));
     }
     let disk = Disk::default();
@@ -127,9 +131,9 @@ pub fn run(args: Args) -> Result<(), Error> {
     let signals = Signals::listen()?;
     let opened = Session::open_from(vec![(config.clone(), folder.clone(), init)], start, &disk);
     let (mut session, notes) = opened.map_err(|error| match error {
-        RunError::Record(RecordError::Exists { .. }) if args.tensorboard => Error::Refused(format!(
-            "{error}\nfor event files of the run that is there:\n  {}",
-            args.command_to_resume(&folder)
+        RunError::Record(RecordError::Exists { .. }) if args.tensorboard => Error::Refused(said(
+            format!("{error}\nfor event files of the run that is there:"),
+            format!("  {}", args.command_to_resume(&folder)),
         )),
         // This avoids the advice to use `--resume`. Until the run's origin is recorded, a resumed run would start from
         // random policies.
@@ -166,23 +170,26 @@ pub fn run(args: Args) -> Result<(), Error> {
 
     let (since, from, last) = (Instant::now(), session.generations()[0], config.learning.generations);
     let mut shown = Board::new(vec![(String::new(), config.pois())], from, last, args.quiet);
-    let ended = session.train(
-        &mut player,
-        &mut Options {
-            command: &recovery::typed(),
-            stop: &signals.stop,
-            save: &signals.save,
-            instead: &mut |error| args.loss.instead(error),
-            setback: &mut recovery::setback,
-            watch: &mut |progress| {
-                shown.show(progress.generations[0], progress.rows);
-                if let Some(Err(error)) = events.as_mut().map(|events| events.add(progress.rows)) {
-                    events_failed(error);
-                    events = None;
-                }
-            },
+    let command = recovery::typed();
+    let context = Context {
+        tell: &|event| {
+            if let Event::Warning(text) = event {
+                say(text);
+            }
         },
-    );
+        stop: &signals.stop,
+        save: &signals.save,
+        command: &command,
+        falls_back: args.loss.falls_back(),
+    };
+    let mut watch = |progress: &Progress<'_>| {
+        shown.show(progress.generations[0], progress.rows);
+        if let Some(Err(error)) = events.as_mut().map(|events| events.add(progress.rows)) {
+            events_failed(error);
+            events = None;
+        }
+    };
+    let ended = context.train(&mut watch, |options| session.train(&mut player, options));
     shown.clear();
     if let Some(Err(error)) = events.as_mut().map(Events::flush) {
         events_failed(error);
@@ -194,9 +201,9 @@ pub fn run(args: Args) -> Result<(), Error> {
             let trained = Training { generations: next.min(last + 1) - from.min(last + 1), since };
             told.print(&session, Some(trained), args.quiet, args.json)
         }
-        Ended::Stopped => Err(Error::Stopped(format!(
-            "before generation {next} of {last}, with everything saved; go on with\n  {}",
-            args.command_to_resume(&folder)
+        Ended::Stopped => Err(Error::Stopped(said(
+            format!("before generation {next} of {last}, with everything saved"),
+            format!("continue with\n  {}", args.command_to_resume(&folder)),
         ))),
     }
 }
@@ -204,7 +211,8 @@ pub fn run(args: Args) -> Result<(), Error> {
 /// Draws the run's curves. A failure is only reported, because everything that was learned is already saved.
 fn draw(disk: &Disk, folder: &Path) {
     let path = folder.join(CURVES);
-    let drawn = runs::figure(&[folder.to_path_buf()], Verification::Required).map(|figure| figure.scene().svg());
+    let drawn = runs::figure(&[folder.to_path_buf()], None, Band::Interval, Verification::Required)
+        .map(|figure| figure.scene().svg());
     let written = drawn.map_err(|error| error.to_string()).and_then(|svg| {
         let written = ownership::publish(disk, &path, |output| output.write_all(svg.as_bytes()));
         written.map_err(|error| error.to_string())
@@ -246,7 +254,7 @@ impl Told<'_> {
         let (generations, seconds) =
             trained.map_or((0, 0.0), |trained| (trained.generations, trained.since.elapsed().as_secs_f64()));
         if json {
-            return print_json(&self.json(results, generations, seconds));
+            return print_json(&self.json(session.run(0), results, generations, seconds));
         }
         if quiet {
             return Ok(());
@@ -267,7 +275,7 @@ impl Told<'_> {
         print(&report(self.config, self.folder, results, &trained))
     }
 
-    fn json(&self, results: &Results, trained: usize, seconds: f64) -> serde_json::Value {
+    fn json(&self, run: &folder::Run, results: &Results, trained: usize, seconds: f64) -> serde_json::Value {
         let learning = &self.config.learning;
         let course = |rows: &[Row]| {
             let [best, mean, champion] = SCORES.map(|(_, share)| {
@@ -277,7 +285,7 @@ impl Told<'_> {
             json!({ "best_g": best, "mean_g": mean, "champion_g": champion })
         };
         let file = |name: &str| self.folder.join(name).escaped().to_string();
-        json!({
+        let mut object = json!({
             "folder": self.folder.escaped().to_string(),
             "config": self.name,
             "digest": results.digest,
@@ -288,7 +296,6 @@ impl Told<'_> {
             "pois": self.config.pois(),
             "trained_generations": trained,
             "seconds": seconds,
-            "backend": self.runs_on,
             "notes": self.notes,
             "first": course(&results.story.first),
             "last": course(&results.story.last),
@@ -299,7 +306,9 @@ impl Told<'_> {
                 "policies": file(POLICIES),
                 "curves": file(CURVES),
             },
-        })
+        });
+        Processor::of_run(run).add_to(&mut object);
+        object
     }
 }
 

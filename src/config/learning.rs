@@ -76,9 +76,9 @@ config_enum! {
     /// The leaders that share a policy.
     Sharing {
         /// No leaders: each has its own population.
-        None = "none",
+        PerLeader = "none",
         /// All leaders: there is one population, and every leader of a team plays the same policy.
-        All = "all",
+        Shared = "all",
     }
 }
 
@@ -188,7 +188,7 @@ impl Learning {
         }
         Learning {
             paradigm,
-            sharing: Learning::sharing(r).choice(Sharing::None),
+            sharing: Learning::sharing(r).choice(Sharing::PerLeader),
             fitness: Learning::fitness(r).choice(Fitness::Df),
             population,
             generations: Learning::generations(r).number(between(0, MAX_GENERATIONS), 100),
@@ -210,7 +210,7 @@ impl Learning {
 
 section! {
     /// `[checkpoint]`: how often a run saves what it needs to go on, without a say in its results; 0 is never.
-    Saving = "checkpoint" {
+    CheckpointConfig = "checkpoint" {
         /// between checkpoints, which change no result; 0 is never
         generations: usize = "generations", "",
         /// between checkpoints, which change no result; 0 is never
@@ -218,17 +218,18 @@ section! {
     }
 }
 
-impl Default for Saving {
-    fn default() -> Saving {
-        Saving { generations: 0, seconds: 30.0 }
+impl Default for CheckpointConfig {
+    fn default() -> CheckpointConfig {
+        CheckpointConfig { generations: 0, seconds: 30.0 }
     }
 }
 
-impl Saving {
-    pub(super) fn read(r: &mut Reader<'_>) -> Saving {
-        Saving {
-            generations: Saving::generations(r).number(between(0, MAX_GENERATIONS), 0),
-            seconds: Saving::seconds(r).number(between(0.01, 1e9).or_zero(), Saving::default().seconds),
+impl CheckpointConfig {
+    pub(super) fn read(r: &mut Reader<'_>) -> CheckpointConfig {
+        CheckpointConfig {
+            generations: CheckpointConfig::generations(r).number(between(0, MAX_GENERATIONS), 0),
+            seconds: CheckpointConfig::seconds(r)
+                .number(between(0.01, 1e9).or_zero(), CheckpointConfig::default().seconds),
         }
     }
 }

@@ -21,13 +21,13 @@ pub use crate::model::sense::{Density, Sense};
 pub use crate::model::start::Heading;
 pub use crate::reader::{Definition, Override, Problem};
 pub use learning::{
-    Elites, Fitness, Learning, LedBy, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm,
-    Parents, Saving, Sharing,
+    CheckpointConfig, Elites, Fitness, Learning, LedBy, MAX_EPISODES, MAX_GENERATIONS, MAX_POPULATION, MAX_TRIALS,
+    Mutation, Paradigm, Parents, Sharing,
 };
 pub use load::{MAX_FILE_BYTES, is_standard_input, name, read_file};
 pub use stages::{GENERATIONS, MAX_STAGES, STAGES, Stage};
 pub use valid::ValidConfig;
-pub use world::{Domain, MAX_AGENTS, MAX_POIS, MAX_STEPS};
+pub use world::{MAX_AGENTS, MAX_POIS, MAX_STEPS, WorldConfig};
 
 mod learning;
 mod load;
@@ -62,7 +62,7 @@ pub fn keys() -> Vec<Definition> {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Config {
     /// `[world]`: start positions, the length of an episode, and how POIs are observed.
-    pub world: Domain,
+    pub world: WorldConfig,
     /// `[motion]`: how agents move.
     pub motion: Motion,
     /// `[follow]`: what followers do.
@@ -74,7 +74,7 @@ pub struct Config {
     /// `[learning]`: the coevolution.
     pub learning: Learning,
     /// `[checkpoint]`: how often a run saves.
-    pub checkpoint: Saving,
+    pub checkpoint: CheckpointConfig,
     /// `[[stages]]`: keys that change from some generation on, see [`Config::staged`].
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub stages: Vec<Stage>,
@@ -203,8 +203,8 @@ impl Config {
     /// Returns the number of populations in a trial: one per learner, or a single one if all leaders share a policy.
     pub fn populations(&self) -> usize {
         match self.learning.sharing {
-            Sharing::None => self.learners(),
-            Sharing::All => 1,
+            Sharing::PerLeader => self.learners(),
+            Sharing::Shared => 1,
         }
     }
 
@@ -225,13 +225,13 @@ impl Config {
         let (motion, start_speed) = Motion::read(r);
         let paradigm = Paradigm::read(r);
         let config = Config {
-            world: Domain::read(r, start_speed, paradigm),
+            world: WorldConfig::read(r, start_speed, paradigm),
             motion,
             follow: Follow::read(r),
             sense: Sense::read(r),
             policy: Policy::read(r),
             learning: Learning::read(r, paradigm),
-            checkpoint: Saving::read(r),
+            checkpoint: CheckpointConfig::read(r),
             stages: vec![],
         };
         if r.error_count() == 0 && config.policy_bytes() > MAX_POLICY_BYTES {

@@ -23,7 +23,7 @@ const _: () = {
 section! {
     /// `[world]`: where everything starts, how long an episode is, and who observes a POI. Positions are `[x, y]` in
     /// map units, time is in seconds, angles in radians.
-    Domain = "world" {
+    WorldConfig = "world" {
         /// width and height; positions stay within 0 to these
         map: [f64; 2] = "units", "3.1",
         /// start positions of the leaders, which are agents 0 to L − 1
@@ -53,14 +53,14 @@ section! {
     }
 }
 
-impl Domain {
+impl WorldConfig {
     /// Reads the section. `start_speed` limits the agents' start speed.
-    pub(super) fn read(r: &mut Reader<'_>, start_speed: Allowed<f64>, paradigm: Paradigm) -> Domain {
-        let map = Domain::map(r).pair(between(1.0, LONGEST), [50.0, 50.0]);
+    pub(super) fn read(r: &mut Reader<'_>, start_speed: Allowed<f64>, paradigm: Paradigm) -> WorldConfig {
+        let map = WorldConfig::map(r).pair(between(1.0, LONGEST), [50.0, 50.0]);
         let sides = map.map(|side| between(LEAST, side).or_zero().because("the map"));
-        let leaders = Domain::leaders(r).positions(1..=MAX_AGENTS, sides, None);
-        let followers = Domain::followers(r).positions(0..=MAX_AGENTS - 1, sides, Some(vec![]));
-        let pois = Domain::pois(r).positions(1..=MAX_POIS, sides, None);
+        let leaders = WorldConfig::leaders(r).positions(1..=MAX_AGENTS, sides, None);
+        let followers = WorldConfig::followers(r).positions(0..=MAX_AGENTS - 1, sides, Some(vec![]));
+        let pois = WorldConfig::pois(r).positions(1..=MAX_POIS, sides, None);
         let agents = leaders.as_ref().zip(followers.as_ref()).map_or(MAX_AGENTS, |(l, f)| l.len() + f.len());
         if agents > MAX_AGENTS {
             let message = format!("found {agents} agents with the leaders, allowed 1 to {MAX_AGENTS}");
@@ -79,11 +79,11 @@ impl Domain {
             r.report_key("world.observers", format!("found \"{observers}\", but {why}, so nobody would observe"));
         }
         let places = pois.as_ref().map(Vec::len);
-        let steps = Domain::steps(r).number(between(1, MAX_STEPS), 25);
+        let steps = WorldConfig::steps(r).number(between(1, MAX_STEPS), 25);
         let counts =
             leaders.as_ref().zip(followers.as_ref()).map(|(leaders, followers)| [leaders.len(), followers.len()]);
         let heading = Heading::read(r, counts);
-        Domain {
+        WorldConfig {
             map,
             coupling: Coupling::read(r, counted.clamp(1, MAX_AGENTS), observers.counted(), places),
             observers,
@@ -94,9 +94,9 @@ impl Domain {
             pois: pois.unwrap_or_default(),
             observation_radius: observation_radius(r),
             steps,
-            dt: Domain::dt(r).number(between(1e-4, 10.0), 0.2),
+            dt: WorldConfig::dt(r).number(between(1e-4, 10.0), 0.2),
             heading,
-            speed: Domain::speed(r).number(start_speed, 0.0),
+            speed: WorldConfig::speed(r).number(start_speed, 0.0),
         }
     }
 

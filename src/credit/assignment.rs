@@ -1,7 +1,6 @@
 //! Assignment of followers to leaders: over the episode (Df), or at each step (Dt).
 
-use super::each_bit;
-use crate::backend::{Seen, Strided, owner_bits};
+use super::{Seen, Strided, each_bit, owner_bits};
 use crate::config::LedBy;
 use crate::world::{Led, World};
 

@@ -1,8 +1,7 @@
 //! The fast path: every fitness but Dt, under the default rule, in one pass over the sets.
 
 use super::assignment::{assign, gather};
-use super::{Credit, each_bit, stepping_stone};
-use crate::backend::{Episode, Strided};
+use super::{Credit, Episode, Strided, each_bit, stepping_stone};
 use crate::world::World;
 
 impl Credit {

@@ -7,17 +7,18 @@
 //! Under the default [rule](crate::model::rule::Rule) no fitness but Dt depends on when or how often a set of agents
 //! was at a POI. A set changes nothing if another set of the same POI contains it: the larger set still has at least
 //! as many agents after any removal or copy. So only the maximal sets of each POI matter and, except for D++, only
-//! those with at least as many agents as the POI needs. A backend may drop the others, see [`crate::backend::RecordRequest`].
+//! those with at least as many agents as the POI needs. A record may lack the others, see [`RecordRequest`].
 //! Dt, and rules with windows or orders, need the whole record.
 
 mod assignment;
 mod fast;
+mod record;
 mod replay;
 
 pub use assignment::{NOBODY, assign, lead, leads};
+pub use record::{Episode, RecordRequest, Seen, Strided, owner_bits};
 pub use replay::observed_at;
 
-use crate::backend::Episode;
 use crate::config::Fitness;
 use crate::world::World;
 
@@ -69,8 +70,7 @@ pub struct Credit {
 
 impl Credit {
     /// Scores every leader of the team by `fitness` into `scores`, `[leaders]`, and returns how many POIs the team
-    /// observed. The episode must be of `world`, and played with a [request](crate::backend::RecordRequest) for that
-    /// fitness.
+    /// observed. The episode must be of `world`, with the [record](RecordRequest) that the fitness needs.
     pub fn score(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
         if !world.rule.is_plain() || fitness == Fitness::Dt {
             return self.replay(episode, world, fitness, scores);
@@ -103,8 +103,8 @@ impl Credit {
         self.count_observed()
     }
 
-    /// Returns every fitness of every leader. The episode must be of `world`, and played with a request for all scores
-    /// or the record.
+    /// Returns every fitness of every leader. The episode must be of `world`, with the [record](RecordRequest) that D++
+    /// and Df need.
     pub fn all(&mut self, episode: &Episode<'_>, world: &World) -> Scores {
         let leaders = world.leaders();
         let mut by = |fitness| {

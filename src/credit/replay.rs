@@ -3,8 +3,7 @@
 use std::ops::RangeInclusive;
 
 use super::assignment::{assign, gather, lead, leads};
-use super::{Credit, each_bit, share, stepping_stone};
-use crate::backend::{Episode, Strided};
+use super::{Credit, Episode, Strided, each_bit, share, stepping_stone};
 use crate::config::Fitness;
 use crate::model::rule::NEVER;
 use crate::world::World;

@@ -10,7 +10,7 @@ pub mod selection;
 pub mod weights;
 
 pub use mutation::{Breeding, InvalidInput, Offspring, breed, mutate, mutation_threshold};
-pub use random::{Key, Purpose};
+pub use random::{Key, Purpose, noise};
 pub use schedule::{form_teams, jitter_pois, jitter_starts, one_policy_a_team, places, shuffle, teams_of};
 pub use selection::{Selection, UNCHANGED, best, draw_parents, keep_parents, tournament};
 pub use weights::{MAX_WEIGHT, MIN_WEIGHT, admit, is_weight, random_policy};

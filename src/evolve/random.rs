@@ -28,6 +28,8 @@ pub enum Purpose {
     HeldOutPois = 9,
     /// Random constant actions that evolution is compared with.
     ConstantActions = 10,
+    /// Noise on the actions of leaders, see [`noise`].
+    Exploration = 11,
 }
 
 /// A key of the counter-based random number generator. [`Key::draw`] returns the words of a counter.
@@ -80,6 +82,15 @@ impl Key {
         let word = |word| S::u32s::simd_from(simd, word);
         math::pcg4d::<S>(word(x), word(y), word(z), counter ^ w)
     }
+}
+
+/// Returns the noise on one leader's turn and speed at one step: two standard normal deviates, one team per lane. `key` is
+/// of [`Purpose::Exploration`].
+#[inline(always)]
+pub fn noise<S: Simd>(key: Key, step: usize, leader: usize, team: S::u32s) -> [S::f32s; 2] {
+    let [a, b, c, d] = key.at_lanes::<S>(step, leader, team);
+    let [a, b, c, d] = math::pcg4d::<S>(a, b, c, d);
+    [math::normal::<S>(a, b), math::normal::<S>(c, d)]
 }
 
 /// Maps a random word to a number in `0..below`.

@@ -22,7 +22,7 @@ pub fn form_teams(key: Key, generation: usize, leaders: usize, teams: &mut [u32]
 /// `t`; otherwise see [`form_teams`].
 pub fn teams_of(learning: &Learning, trial: usize, generation: usize, leaders: usize) -> Vec<u32> {
     let mut teams = one_policy_a_team(learning.population, leaders);
-    if learning.sharing == Sharing::None {
+    if learning.sharing == Sharing::PerLeader {
         form_teams(Key::new(learning.seed, trial, Purpose::Teams), generation, leaders, &mut teams);
     }
     teams

@@ -15,7 +15,9 @@ use fearless_simd::prelude::*;
 
 use super::{larger, smaller, zero_if};
 
-/// 1/√x for x in 2^-80..2^40 within 2 ULP; some finite value for 0. 12 operations.
+/// 1/√x for x in 2^-80..2^48 within 2 ULP; some finite value for 0. 12 operations.
+///
+/// No force of a valid config has a larger square, see the test of [`follow`](crate::model::follow).
 ///
 /// The seed, with its exponent halved and negated, approximates 2^(-1/3)/√x within 4 %. A quadratic in x·y² reduces the
 /// error to 3e-5. A Newton step, whose factor of x·y² is 1 at this scale, reduces it to rounding.
@@ -25,7 +27,7 @@ pub fn rsqrt<S: Simd>(x: S::f32s) -> S::f32s {
     y * (S::f32s::splat(x.token(), 1.8898816) - x * y * y)
 }
 
-/// √x for 0 and x in 2^-80..2^40 within 2.1 ULP. 12 operations: one fewer than `x * rsqrt(x)`.
+/// √x for 0 and x in 2^-80..2^48 within 2.1 ULP. 12 operations: one fewer than `x * rsqrt(x)`.
 #[inline(always)]
 pub fn exact_sqrt<S: Simd>(x: S::f32s) -> S::f32s {
     let y = rough_rsqrt::<S>(x);

@@ -15,6 +15,9 @@ use crate::reader::{Reader, between, section};
 /// The shader of this part.
 pub const WGSL: &str = include_str!("../../shaders/follow.wgsl");
 
+/// Maximum gain of a force.
+const MAX_GAIN: f64 = 1e3;
+
 section! {
     /// `[follow]`: the followers' preset behaviour.
     Follow = "follow" {
@@ -36,7 +39,7 @@ impl Follow {
     pub(crate) fn read(r: &mut Reader<'_>) -> Follow {
         let attraction_radius = Follow::attraction_radius(r).number(between(0.01, LONGEST), 5.0);
         let closest = between(0.01, attraction_radius).because("follow.attraction_radius");
-        let gain = between(1e-3, 1e3).or_zero();
+        let gain = between(1e-3, MAX_GAIN).or_zero();
         Follow {
             attraction_radius,
             repulsion_radius: Follow::repulsion_radius(r).number(closest, 1.0),
@@ -212,4 +215,40 @@ pub fn steer<S: Simd, const BY_SINE: bool>(
     let ahead = select::<S>(world.motion.min_speed, force2 * inverse, along.simd_gt(zero));
     let wanted = select::<S>(speed, zero_unless::<S>(ahead, pulled), pull.influenced);
     (next_x, next_y, wanted)
+}
+
+#[cfg(test)]
+mod tests {
+    use fearless_simd::{Level, dispatch};
+
+    use super::*;
+    use crate::config::Config;
+    use crate::world::World;
+
+    /// Each component of a force is at most the two gains, as each mean offset is within its radius, and the push of the
+    /// walls, which is at most the gain times the radius or the side. So the square is in the range of [`rsqrt`], whose
+    /// error holds up to 2^48.
+    #[test]
+    fn the_largest_force_of_any_config_is_in_the_range_of_rsqrt() {
+        const RANGE: f64 = (1u64 << 48) as f64;
+        let rounding = 1.0 + f64::from(f32::EPSILON) * 2048.0;
+        let component = (2.0 * MAX_GAIN + LONGEST * MAX_GAIN) * rounding;
+        assert!(2.0 * component * component < RANGE);
+        // A follower in a corner of the largest map, with walls, radii and gains as large as may be.
+        let text = format!(
+            "[world]\nmap = [{LONGEST:?}, {LONGEST:?}]\nleaders = [[1, 1]]\nfollowers = [[0, 0]]\npois = [[9, 9]]\n\
+             [follow]\nattraction_radius = {LONGEST:?}\nrepulsion_radius = {LONGEST:?}\nattraction_gain = {MAX_GAIN:?}\n\
+             repulsion_gain = {MAX_GAIN:?}\nwall_gain = {MAX_GAIN:?}"
+        );
+        let world = World::new(&Config::parse(&text, "largest.toml").expect("the largest values are valid"));
+        fn squared<S: Simd>(simd: S, world: &World) -> f32 {
+            let (lanes, zero) = (Lanes::new(simd, world.constants), splat(simd, 0.0));
+            let force2 = sizes::<S>(&force::<S>(&lanes, &Sums::new(simd), zero, zero)).0;
+            force2[0]
+        }
+        let found = f64::from(dispatch!(Level::new(), simd => squared(simd, &world)));
+        assert!((1e14..RANGE).contains(&found), "{found:e}");
+        let over = text.replace(&format!("wall_gain = {MAX_GAIN:?}"), "wall_gain = 1001.0");
+        assert!(Config::parse(&over, "larger.toml").is_err());
+    }
 }

@@ -34,11 +34,11 @@ section! {
 }
 
 config_enum! {
-    /// What a policy's outputs are.
+    /// The meaning of a policy's outputs.
     Actions {
-        /// What the leader does: its wanted change of heading and its wanted speed.
+        /// The wanted change of heading and the wanted speed.
         Direct = "direct",
-        /// How much each behaviour is wanted: the leader does the most wanted one, ties to the first.
+        /// A weight per behaviour. The leader does the one with the largest weight; ties go to the first.
         Behaviours = "behaviours",
     }
 }

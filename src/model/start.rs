@@ -19,7 +19,7 @@ pub enum Heading {
 impl Heading {
     /// Reads the key; `counts` are the numbers of leaders and followers, none if these are not known.
     pub(crate) fn read(r: &mut Reader<'_>, counts: Option<[usize; 2]>) -> Heading {
-        let faults = r.error_count();
+        let errors_before = r.error_count();
         let heading = r
             .key(
                 "world.heading",
@@ -33,7 +33,7 @@ impl Heading {
         match heading {
             OneOrList::One(heading) => Heading::Same(heading),
             OneOrList::List(headings) => {
-                if let (Some([leaders, followers]), true) = (counts, r.error_count() == faults)
+                if let (Some([leaders, followers]), true) = (counts, r.error_count() == errors_before)
                     && headings.len() != leaders
                     && headings.len() != leaders + followers
                 {

@@ -172,7 +172,7 @@ impl Checkpoint {
         }
         let row = |trial: usize| {
             let &[best_g, mean_g] = pending.get(trial)?;
-            Some(Row { arm: 0, trial, generation: generation - 1, best_g, mean_g, champion_g: 0.0 })
+            Some(Row { experiment: 0, trial, generation: generation - 1, best_g, mean_g, champion_g: 0.0 })
         };
         let pending = (0..learning.trials).map(row).collect();
         let snapshot = Snapshot { generation, last, weights, fitness, pending };

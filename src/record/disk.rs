@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-use super::beneath::{FileKind, FolderEntry, Root};
+use super::beneath::{FileKind, FolderEntry, Root, is_link};
 use crate::file;
 
 /// Kind of operation on a disk.
@@ -94,6 +94,14 @@ impl Disk {
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
             Err(error) => Err(error),
         }
+    }
+
+    /// Fails if the entry at a path is a link.
+    ///
+    /// # Errors
+    /// It is one, or the system returns an error.
+    pub fn refuse_link(&self, path: &Path) -> io::Result<()> {
+        if self.kind(path)? == Some(FileKind::Link) { Err(is_link(path)) } else { Ok(()) }
     }
 
     /// Creates a folder and its missing parents.
@@ -217,12 +225,19 @@ impl Disk {
         })
     }
 
-    /// Writes a file that the user named, whole or not at all. A link to a file is followed. A device or a pipe, such
-    /// as `/dev/stdout`, is written to directly.
+    /// Writes a file that the user named, whole or not at all. A link to a file is followed, except on a disk that is
+    /// limited to a folder. A device or a pipe, such as `/dev/stdout`, is written to directly.
     ///
     /// # Errors
     /// Returns the system's error.
     pub fn deliver(&self, path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
+        if self.root.is_some() && self.kind(path)? != Some(FileKind::Other) {
+            if self.kind(path)?.is_some() {
+                // A link must not be replaced, nor a file without write permission.
+                self.entry(path)?.write()?;
+            }
+            return self.replace_shared(path, content, || Ok(()));
+        }
         let there = fs::metadata(path);
         if there.as_ref().is_ok_and(|there| !there.is_file() && !there.is_dir()) {
             let mut output = BufWriter::new(OpenOptions::new().write(true).open(path)?);

@@ -11,7 +11,7 @@ pub const SCHEMA: u32 = 1;
 /// Content of a report file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Sighting {
+pub struct MachineReport {
     /// Version of the file format, [`SCHEMA`].
     pub schema: u32,
     /// Strength of the evidence.
@@ -87,10 +87,10 @@ pub struct ShortTraining {
     pub digest: String,
 }
 
-impl Sighting {
+impl MachineReport {
     /// Creates a report of this program with today's date.
-    pub fn new(tier: Tier) -> Sighting {
-        Sighting {
+    pub fn new(tier: Tier) -> MachineReport {
+        MachineReport {
             schema: SCHEMA,
             tier,
             date: now()[..10].into(),
@@ -111,8 +111,8 @@ impl Sighting {
     ///
     /// # Errors
     /// Returns a description of the problem.
-    pub fn parse(text: &str) -> Result<Sighting, String> {
-        let found: Sighting = serde_json::from_str(text).map_err(|error| format!("it is no evidence: {error}"))?;
+    pub fn parse(text: &str) -> Result<MachineReport, String> {
+        let found: MachineReport = serde_json::from_str(text).map_err(|error| format!("it is no evidence: {error}"))?;
         match found.schema {
             SCHEMA => Ok(found),
             other => Err(format!("it has schema {other}, known is {SCHEMA}")),

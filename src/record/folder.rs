@@ -3,7 +3,7 @@
 use std::fmt;
 use std::fs::{self, File, TryLockError};
 use std::io::{self, ErrorKind};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use std::time::{Duration, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
@@ -30,7 +30,8 @@ const LOCK: &str = ".lock";
 const MAX_KEPT_BYTES: u64 = 1 << 20;
 
 /// The way to treat a folder that already holds a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Start {
     /// Fail.
     Fresh,
@@ -289,7 +290,7 @@ impl fmt::Display for Note {
                 write!(f, "{CONFIG} has changed; the text that was there is kept as {}", path.display())
             }
             Note::Replacing => f.write_str("the run that was here was being replaced: what is left of it is removed"),
-            Note::GoingOn { generation } => write!(f, "going on before generation {generation}"),
+            Note::GoingOn { generation } => write!(f, "resuming at generation {generation}"),
             Note::StartingOver => f.write_str("no checkpoint can be used: starting over, to the same results"),
             Note::NotLocked => f.write_str(
                 "this file system has no locks, so another process is not kept from training here; start one at a time",
@@ -783,6 +784,23 @@ pub fn owner(path: &Path) -> Option<PathBuf> {
         (_, true) => Some(file::folder(folder).into()),
         _ => None,
     }
+}
+
+/// Returns the outermost folder of a run, sweep or paper that a path lies in, as the path names it.
+pub fn around(path: &Path) -> Option<&Path> {
+    let is_ours = |folder: &Path| {
+        let has = |name: &str| folder.join(name).exists();
+        has(CONFIG) && [RUN, METRICS, CHECKPOINTS].into_iter().any(has)
+            || has(SWEEP) && has("points")
+            || has(PAPER) && has(ARMS)
+    };
+    let descends = |folder: &&Path| {
+        let below = path.strip_prefix(folder).unwrap_or(path);
+        below.components().all(|part| matches!(part, Component::Normal(_)))
+    };
+    let folders =
+        path.ancestors().skip(1).map(|folder| if folder.as_os_str().is_empty() { Path::new(".") } else { folder });
+    folders.filter(descends).filter(|folder| is_ours(folder)).last()
 }
 
 /// Creates the next folder after the last existing one of `stem`, `stem-2`, `stem-3`, … and returns its path.

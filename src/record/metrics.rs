@@ -256,7 +256,7 @@ impl<R: BufRead> Rows<R> {
             let mut fields = line.split(',');
             let mut field = || fields.next();
             let row = Row {
-                arm: 0,
+                experiment: 0,
                 trial: field()?.parse().ok().filter(|&trial| trial < MAX_TRIALS)?,
                 generation: field()?.parse().ok().filter(|&generation| generation <= MAX_GENERATIONS)?,
                 best_g: share(field()?)?,

@@ -11,6 +11,8 @@
 //! | [`checkpoint`] | `checkpoints/`, written during training |
 //! | [`folder`] | the folder of a run, its lock and `run.json` |
 //! | [`digests`] | comparison of files with the digests in `run.json` |
+//! | [`archive`] | runs in zip files |
+//! | [`finished`] | a finished run that was trained in memory |
 //! | [`evidence`] | results of checks on a machine, for `docs/develop/evidence.md` |
 //!
 //! Every file that is read is untrusted. Its size is checked before memory is allocated, and its values are checked
@@ -26,11 +28,13 @@ use crate::config::{self, Config};
 use crate::escape::{self, PathExt};
 use crate::file::{self, TextError};
 
+pub mod archive;
 pub mod beneath;
 pub mod checkpoint;
 pub mod digests;
 pub mod disk;
 pub mod evidence;
+pub mod finished;
 pub mod folder;
 pub mod metrics;
 pub mod ownership;
@@ -113,7 +117,7 @@ pub enum RecordError {
         path: PathBuf,
     },
     /// The run started from other policies than those given, so it cannot be resumed with them.
-    #[error("{path} {}, so it cannot go on as a run {}", started(there), started_from(here), path = path.escaped())]
+    #[error("{path} {}, so it cannot continue as a run {}", started(there), started_from(here), path = path.escaped())]
     InitDiffers {
         /// Path of the folder.
         path: PathBuf,
@@ -162,7 +166,7 @@ pub enum RecordError {
     },
     /// The run cannot be resumed with the given config.
     #[error(
-        "{path} is a run of another config, so it cannot go on with this one; what differs:\n{}",
+        "{path} is a run of another config, so it cannot continue with this one; what differs:\n{}",
         differences.join("\n"),
         path = path.escaped()
     )]
@@ -241,7 +245,7 @@ pub fn config_digest(config: &Config) -> String {
 
 /// Returns the config with the default `[checkpoint]`, because that section may differ between sessions of a run.
 pub fn without_checkpoint(config: &Config) -> Config {
-    Config { checkpoint: config::Saving::default(), ..config.clone() }
+    Config { checkpoint: config::CheckpointConfig::default(), ..config.clone() }
 }
 
 /// Formats bytes as lowercase hexadecimal.

@@ -7,7 +7,8 @@
 //!   A valid `run.json` or checkpoint shows that ([`holds_run`]).
 //! - [`publish`] writes files made from runs (pictures, pages, tables). It first records their SHA-256 in [`LIST`].
 //!   Such a file may be replaced or deleted only if its content is still in that list.
-//! - Files that the user named are not subject to these rules.
+//! - Files that the user named are not subject to these rules, except that no link is followed in the folder of a run,
+//!   sweep or paper ([`super::folder::around`]).
 
 use std::collections::BTreeMap;
 use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
@@ -16,7 +17,6 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
-use super::beneath::{FileKind, is_link};
 use super::disk::Disk;
 use super::{RecordError, checkpoint, hex, metrics, policies, read_text, tensors, without_checkpoint};
 use crate::config::Config;
@@ -141,9 +141,7 @@ pub fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordError> {
 /// A file of the run is a link, or the folder cannot be read.
 pub fn refuse_links(disk: &Disk, folder: &Path) -> Result<(), RecordError> {
     for path in [RUN, CONFIG, METRICS, POLICIES, CHECKPOINTS].map(|name| folder.join(name)) {
-        if disk.kind(&path).map_err(RecordError::write(&path))? == Some(FileKind::Link) {
-            return Err(RecordError::write(&path)(is_link(&path)));
-        }
+        disk.refuse_link(&path).map_err(RecordError::write(&path))?;
     }
     Ok(())
 }

@@ -1,9 +1,11 @@
 //! Learning curves: means over trials by generation, and the figure that compares them.
 
+use std::collections::BTreeSet;
+
 use serde::Serialize;
 
 use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
-use crate::statistics::Average;
+use crate::statistics::{self, Average};
 
 /// Width of a column of a two-column paper, in millimetres.
 pub const COLUMN: f64 = 85.0;
@@ -17,6 +19,67 @@ const NORMAL: f64 = 2.82;
 const REFERENCES: [&[f64]; 2] = [&[2.6, 1.0], &[0.7, 0.7]];
 const DASHES: [&[f64]; 5] = [&[], &[1.6, 0.7], &[1.8, 0.6, 0.4, 0.6], &[0.5, 0.5], &[3.0, 0.8]];
 
+/// The meaning of the band around a mean.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Band {
+    /// The 95 % interval of the mean, by Student's t.
+    #[default]
+    Interval,
+    /// One standard error on both sides.
+    Error,
+    /// No band.
+    None,
+}
+
+impl std::fmt::Display for Band {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Band::Interval => "interval",
+            Band::Error => "error",
+            Band::None => "none",
+        })
+    }
+}
+
+impl std::str::FromStr for Band {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Band, String> {
+        match text {
+            "interval" => Ok(Band::Interval),
+            "error" => Ok(Band::Error),
+            "none" => Ok(Band::None),
+            _ => Err("allowed interval, error or none".into()),
+        }
+    }
+}
+
+impl Band {
+    /// Returns lower end, mean and upper end of a share's band, within 0..1.
+    pub fn around(self, average: &Average) -> [f64; 3] {
+        let (mean, half) = (average.mean(), self.half_width(average));
+        [(mean - half).max(0.0), mean, (mean + half).min(1.0)]
+    }
+
+    fn half_width(self, average: &Average) -> f64 {
+        match self {
+            Band::Interval => average.error() * statistics::half_width(average.count() as usize),
+            Band::Error => average.error(),
+            Band::None => 0.0,
+        }
+    }
+
+    /// Describes the band, for captions: "mean and 95 % interval".
+    pub fn describe(self) -> &'static str {
+        match self {
+            Band::Interval => "mean and 95 % interval",
+            Band::Error => "mean ± standard error",
+            Band::None => "mean",
+        }
+    }
+}
+
 /// Mean and standard error over trials by generation.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Curve {
@@ -26,6 +89,9 @@ pub struct Curve {
     pub mean: Vec<f64>,
     /// Standard error of the mean, `[points]`.
     pub error: Vec<f64>,
+    /// Half-width of the 95 % interval of the mean, `[points]`.
+    #[serde(skip)]
+    pub interval: Vec<f64>,
     /// The largest number of trials of a point.
     #[serde(skip)]
     pub trials: u32,
@@ -34,20 +100,41 @@ pub struct Curve {
 impl Curve {
     /// Makes a curve from one average per generation, from generation 0. Generations without values are left out.
     pub fn new(tallies: &[Average]) -> Curve {
+        Curve::at(tallies.iter().enumerate())
+    }
+
+    /// Makes a curve from generations, each with its average. Generations without values are left out.
+    pub fn at<'a>(averages: impl IntoIterator<Item = (usize, &'a Average)>) -> Curve {
         let mut curve = Curve::default();
-        for (generation, tally) in tallies.iter().enumerate().filter(|(_, tally)| tally.count() > 0) {
+        // The factor takes time and rarely changes.
+        let (mut count, mut factor) = (0, 0.0);
+        for (generation, average) in averages.into_iter().filter(|(_, average)| average.count() > 0) {
+            if average.count() != count {
+                (count, factor) = (average.count(), statistics::half_width(average.count() as usize));
+            }
             curve.generation.push(generation as f64);
-            curve.mean.push(tally.mean());
-            curve.error.push(tally.error());
-            curve.trials = curve.trials.max(tally.count());
+            curve.mean.push(average.mean());
+            curve.error.push(average.error());
+            curve.interval.push(average.error() * factor);
+            curve.trials = curve.trials.max(average.count());
         }
         curve
     }
 
-    /// Multiplies all values by a factor, for example to convert shares of POIs into numbers of POIs.
-    pub fn scaled(mut self, by: f64) -> Curve {
-        self.mean.iter_mut().chain(&mut self.error).for_each(|value| *value *= by);
-        self
+    /// Returns the outline of a band around the mean, clamped to `0..=most`: the upper side by generation, then the
+    /// lower side backwards. None if the band has no width.
+    pub fn outline(&self, band: Band, most: f64) -> Option<Vec<(f64, f64)>> {
+        let half = match band {
+            Band::Interval => &self.interval,
+            Band::Error => &self.error,
+            Band::None => return None,
+        };
+        half.iter().any(|&half| half > 0.0).then_some(())?;
+        let side = |sign: f64| {
+            let values = self.mean.iter().zip(half).map(move |(mean, half)| (mean + sign * half).clamp(0.0, most));
+            self.generation.iter().copied().zip(values)
+        };
+        Some(side(1.0).chain(side(-1.0).rev()).collect())
     }
 
     /// Returns a curve with few enough points to draw, and the number of generations that each point averages.
@@ -56,8 +143,9 @@ impl Curve {
         let average = |values: &[f64]| -> Vec<f64> {
             values.chunks(each).map(|values| values.iter().sum::<f64>() / values.len() as f64).collect()
         };
-        let [generation, mean, error] = [&self.generation, &self.mean, &self.error].map(|values| average(values));
-        (Curve { generation, mean, error, trials: self.trials }, each)
+        let [generation, mean, error, interval] =
+            [&self.generation, &self.mean, &self.error, &self.interval].map(|values| average(values));
+        (Curve { generation, mean, error, interval, trials: self.trials }, each)
     }
 }
 
@@ -87,6 +175,8 @@ pub struct Figure {
     pub y_max: f64,
     /// Whether values are shares of the POIs instead of numbers of POIs.
     pub shares: bool,
+    /// Meaning of the bands.
+    pub band: Band,
     /// The digest of the run, if the figure shows a single finished run.
     pub source: Option<String>,
     /// A warning to print below the figure.
@@ -108,7 +198,8 @@ impl Figure {
         let columns = self.panels.len().max(1) as f64;
         let height = if columns > 1.0 { 36.0 } else { 46.0 };
         let width = (COLUMN - edge - RIGHT - GAP * (columns - 1.0)) / columns;
-        let banded = band_caption(self.panels.iter().flat_map(|panel| &panel.curves).map(|(_, curve)| curve));
+        let banded =
+            band_caption(self.band, self.panels.iter().flat_map(|panel| &panel.curves).map(|(_, curve)| curve));
         let caption = if banded.is_some() { 4.0 } else { 0.0 };
         let mut scene = Scene::new(COLUMN, above + height + BELOW + caption);
         (scene.title, scene.description) = (self.title(), self.description());
@@ -156,7 +247,7 @@ impl Figure {
                 let (curves, references): (Vec<_>, Vec<_>) =
                     curves.iter().partition(|(index, _)| *index < self.legend.len());
                 for (index, (curve, _)) in &curves {
-                    axes.band(scene, curve, Look::of(*index).color);
+                    axes.band(scene, curve.outline(self.band, self.y_max), Look::of(*index).color);
                 }
                 for (index, (curve, _)) in references {
                     scene.line(axes.points(curve), self.pen(*index));
@@ -191,10 +282,15 @@ impl Figure {
             let course = |(index, curve): &(usize, Curve)| {
                 let label = self.legend.iter().chain(&self.references).nth(*index)?;
                 let last = curve.mean.len().checked_sub(1)?;
-                let [from, to] = [0, last].map(|at| (curve.generation[at], number(curve.mean[at]), curve.error[at]));
-                let error = if to.2 > 0.0 { format!(" ± {}", number(to.2)) } else { String::new() };
+                let [from, to] = [0, last].map(|at| (curve.generation[at], number(curve.mean[at])));
+                let room = match self.band {
+                    Band::Interval => curve.interval[last],
+                    Band::Error => curve.error[last],
+                    Band::None => 0.0,
+                };
+                let room = if room > 0.0 { format!(" ± {}", number(room)) } else { String::new() };
                 Some(format!(
-                    "{label} from {} at generation {} to {}{error} at generation {}",
+                    "{label} from {} at generation {} to {}{room} at generation {}",
                     from.1, from.0, to.1, to.0
                 ))
             };
@@ -204,8 +300,8 @@ impl Figure {
             let stages = panel.stages.iter().enumerate();
             text.extend(stages.map(|(index, from)| format!(" Stage {} begins at generation {from}.", index + 1)));
         }
-        if let Some(caption) = band_caption(self.panels.iter().flat_map(|panel| &panel.curves).map(|(_, curve)| curve))
-        {
+        let curves = self.panels.iter().flat_map(|panel| &panel.curves).map(|(_, curve)| curve);
+        if let Some(caption) = band_caption(self.band, curves) {
             text += &format!(" Band: {caption}.");
         }
         text
@@ -213,13 +309,13 @@ impl Figure {
 }
 
 /// Returns the caption of the bands, if any curve has one.
-pub fn band_caption<'a>(curves: impl Iterator<Item = &'a Curve>) -> Option<String> {
+pub fn band_caption<'a>(band: Band, curves: impl Iterator<Item = &'a Curve>) -> Option<String> {
     let curves: Vec<&Curve> = curves.collect();
-    curves.iter().any(|curve| curve.error.iter().any(|&error| error > 0.0)).then_some(())?;
-    let trials: std::collections::BTreeSet<u32> = curves.iter().map(|curve| curve.trials).collect();
+    curves.iter().any(|curve| curve.outline(band, f64::INFINITY).is_some()).then_some(())?;
+    let trials: BTreeSet<u32> = curves.iter().map(|curve| curve.trials).collect();
     let (least, most) = (trials.first()?, trials.last()?);
     let trials = if least == most { most.to_string() } else { format!("{least} to {most}") };
-    Some(format!("mean ± standard error over {trials} trials"))
+    Some(format!("{} over {trials} trials", band.describe()))
 }
 
 /// Draws the caption of the bands from a place on the baseline.
@@ -300,16 +396,11 @@ impl Axes {
         }
     }
 
-    /// Draws the band of one standard error on both sides of the mean.
-    fn band(&self, scene: &mut Scene, curve: &Curve, color: Color) {
-        let side = |sign: f64| {
-            let values = curve.mean.iter().zip(&curve.error).map(move |(mean, error)| mean + sign * error);
-            curve.generation.iter().zip(values).map(|(&generation, value)| self.at(generation, value))
-        };
-        let outline: Vec<_> = side(1.0).chain(side(-1.0).rev()).collect();
-        if curve.error.iter().any(|&error| error > 0.0) {
-            scene.polygon(outline, Some(Fill { color, opacity: 0.2 }), None);
-        }
+    /// Draws the band around a mean, if it has one.
+    fn band(&self, scene: &mut Scene, outline: Option<Vec<(f64, f64)>>, color: Color) {
+        let Some(outline) = outline else { return };
+        let outline = outline.into_iter().map(|(generation, value)| self.at(generation, value)).collect();
+        scene.polygon(outline, Some(Fill { color, opacity: 0.2 }), None);
     }
 
     fn points(&self, curve: &Curve) -> Vec<[f64; 2]> {

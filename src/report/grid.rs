@@ -1,7 +1,7 @@
 //! Figures of a sweep: heat maps over two axes, curves by the values of an axis, and dots for keys that are varied one
 //! at a time.
 
-use super::curves::{Curve, band_caption, distinct, draw_caption};
+use super::curves::{Band, Curve, band_caption, distinct, draw_caption};
 use super::scene::{Anchor, BLACK, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
 
 /// Maximum width of a figure in millimetres. Further panels go to the next row.
@@ -54,8 +54,8 @@ pub enum Cell {
     /// Nothing ran here.
     #[default]
     Empty,
-    /// A shade in 0..1 and the text on it.
-    Value(f64, String),
+    /// A shade in 0..1, the text on it, and smaller text below that, such as its interval.
+    Value(f64, String, String),
     /// No value, and the reason.
     Word(String),
 }
@@ -73,23 +73,35 @@ pub struct HeatMap {
     pub panels: Vec<(String, Vec<Cell>)>,
     /// Labels of the colour bar, each with its position in 0..1.
     pub key: Vec<(f64, String)>,
+    /// Text to the right of the colour bar: the meaning of the colours, and of the cells' second line.
+    pub key_label: [String; 2],
 }
 
 impl HeatMap {
     /// Draws the figure.
     pub fn scene(&self) -> Scene {
-        const HIGH: f64 = 7.5;
+        const HIGH: f64 = 9.0;
+        const NOTE: f64 = 2.0;
+        const KEY: f64 = 50.0;
         let longest = |labels: &[String]| labels.iter().map(|label| text_width(label, SMALL)).fold(0.0, f64::max);
         let titles = self.panels.iter().map(|(title, _)| text_width(title, NORMAL)).fold(0.0, f64::max);
         let columns = self.x.values.len();
-        let wide = (longest(&self.x.values) + 3.0).clamp(11.0, 40.0).max((titles + 2.0) / columns as f64);
+        let notes = self.panels.iter().flat_map(|(_, cells)| cells).filter_map(|cell| match cell {
+            Cell::Value(_, _, note) => Some(text_width(note, NOTE) + 2.0),
+            _ => None,
+        });
+        let notes = notes.fold(0.0, f64::max);
+        let wide = (longest(&self.x.values) + 3.0).clamp(11.0, 40.0).max((titles + 2.0) / columns as f64).max(notes);
         let rows = self.y.values.len().max(1);
         let left = if self.y.values.is_empty() { 3.0 } else { 8.0 + longest(&self.y.values) };
-        let (width, height) = (wide * columns as f64, HIGH * rows as f64);
-        let panels = Panels::new(self.panels.len(), width, height, left, 15.0);
-        let (key_width, key_above) = (55.0, panels.above + panels.height() + 3.0);
-        let whole = panels.width().max(text_width(&self.title, 3.2) * 1.1 + 6.0).max(key_width + left + 6.0);
-        let mut scene = Scene::new(whole, key_above + 9.5);
+        let key_label = self.key_label.iter().map(|label| text_width(label, SMALL)).fold(0.0, f64::max);
+        let least = (text_width(&self.title, 3.2) * 1.1 + 6.0).max(left + KEY + 4.0 + key_label + 3.0);
+        let mut panels = Panels::new(self.panels.len(), wide * columns as f64, HIGH * rows as f64, left, 15.0);
+        panels.fill(least);
+        panels.above -= if titles > 0.0 { 0.0 } else { 4.0 };
+        let (width, height, wide) = (panels.width, panels.height, panels.width / columns as f64);
+        let (key_width, key_above) = (KEY, panels.above + panels.height() + 3.0);
+        let mut scene = Scene::new(panels.width().max(least), key_above + 9.5);
         scene.bold([3.0, 5.0], &*self.title, 3.2, Anchor::Start, BLACK);
         (scene.title, scene.description) = (self.title.clone(), self.description());
 
@@ -98,19 +110,21 @@ impl HeatMap {
             scene.text([x + width / 2.0, y - 1.6], &**title, NORMAL, Anchor::Middle, BLACK);
             for (at, cell) in cells.iter().enumerate() {
                 let area = [x + wide * (at % columns) as f64, y + HIGH * (at / columns) as f64, wide, HIGH];
-                let (fill, text, color) = match cell {
-                    Cell::Empty => (WHITE, "", GREY),
-                    Cell::Value(value, text) => (shade(*value), &**text, ink(shade(*value))),
-                    Cell::Word(text) => (LIGHT, &**text, BLACK),
+                let (fill, text, note, color) = match cell {
+                    Cell::Empty => (WHITE, "", "", GREY),
+                    Cell::Value(value, text, note) => (shade(*value), &**text, &**note, ink(shade(*value))),
+                    Cell::Word(text) => (LIGHT, &**text, "", BLACK),
                 };
                 scene.rectangle(area, Some(fill.into()), Some(Pen::new(WHITE, 0.3)));
-                let middle = [area[0] + wide / 2.0, area[1] + HIGH / 2.0 + 0.9];
+                let lift = if note.is_empty() { 0.0 } else { 1.5 };
+                let middle = [area[0] + wide / 2.0, area[1] + HIGH / 2.0 + 0.9 - lift];
                 if *cell == Cell::Empty {
                     // An impossible combination is crossed out, so that it is not taken for a low value.
                     let [x, y] = [area[0], area[1]];
                     scene.line(vec![[x + 1.0, y + HIGH - 1.0], [x + wide - 1.0, y + 1.0]], Pen::new(LIGHT, 0.3));
                 }
                 scene.text(middle, text, SMALL, Anchor::Middle, color);
+                scene.text([middle[0], middle[1] + 3.0], note, NOTE, Anchor::Middle, color);
             }
             scene.rectangle([x, y, width, height], None, Some(Pen::new(GREY, 0.2)));
             for (at, label) in self.x.values.iter().enumerate() {
@@ -143,6 +157,10 @@ impl HeatMap {
             scene.line(vec![[x, key_above + 2.6], [x, key_above + 3.4]], Pen::new(BLACK, 0.2));
             scene.text([x, key_above + 6.3], &**label, SMALL, Anchor::Middle, BLACK);
         }
+        for (row, label) in self.key_label.iter().enumerate() {
+            let place = [left + key_width + 4.0, key_above + 2.2 + 4.0 * row as f64];
+            scene.text(place, &**label, SMALL, Anchor::Start, BLACK);
+        }
         scene
     }
 
@@ -150,13 +168,18 @@ impl HeatMap {
     fn description(&self) -> String {
         let (columns, [x, y]) = (self.x.values.len(), [&self.x.label, &self.y.label]);
         let mut text = format!("A heat map by {x}{}{y}.", if y.is_empty() { "" } else { " and " });
+        let labels: Vec<_> = self.key_label.iter().filter(|label| !label.is_empty()).map(String::as_str).collect();
+        if !labels.is_empty() {
+            text += &format!(" {}.", labels.join("; "));
+        }
         for (title, cells) in &self.panels {
             for (row, cells) in cells.chunks(columns.max(1)).enumerate() {
                 let row = self.y.values.get(row).map(|value| format!("{y} {value}"));
                 let place: Vec<_> = [title.clone()].into_iter().filter(|title| !title.is_empty()).chain(row).collect();
                 let said = |(value, cell): (&String, &Cell)| match cell {
                     Cell::Empty => format!("{value}: none"),
-                    Cell::Value(_, word) | Cell::Word(word) => format!("{value}: {word}"),
+                    Cell::Value(_, word, note) if !note.is_empty() => format!("{value}: {word} ({note})"),
+                    Cell::Value(_, word, _) | Cell::Word(word) => format!("{value}: {word}"),
                 };
                 let said: Vec<_> = self.x.values.iter().zip(cells).map(said).collect();
                 text +=
@@ -178,6 +201,8 @@ pub struct Curves {
     pub by: Scale,
     /// Number of panels per row; 0 for as many as fit.
     pub columns: usize,
+    /// Meaning of the bands.
+    pub band: Band,
     /// Title of each panel, and its curves, each with the index of its value.
     pub panels: Vec<(String, Vec<(usize, Curve)>)>,
 }
@@ -188,11 +213,11 @@ impl Curves {
         const HEIGHT: f64 = 26.0;
         const LEFT: f64 = 14.0;
         let titles = self.panels.iter().map(|(title, _)| text_width(title, SMALL)).fold(0.0, f64::max);
-        let width = titles.max(38.0) + 1.0;
+        let least = titles.max(38.0) + 1.0;
         let labels = distinct(&self.by.values, WIDEST / 3.0, SMALL);
         let entries: Vec<f64> = labels.iter().map(|value| 9.0 + text_width(value, SMALL)).collect();
         let legend = text_width(&self.by.label, NORMAL) + 6.0;
-        let mut panels = Panels::new(self.panels.len(), width, HEIGHT, LEFT, 12.0);
+        let mut panels = Panels::new(self.panels.len(), least, HEIGHT, LEFT, 12.0);
         if self.columns > 0 {
             panels.columns = panels.columns.min(self.columns);
         }
@@ -200,6 +225,8 @@ impl Curves {
             .width()
             .max(text_width(&self.title, 3.2) * 1.1 + 6.0)
             .max(legend + entries.iter().fold(0.0, |a, &b| f64::max(a, b)));
+        panels.fill(whole);
+        let width = panels.width;
         let mut places = Vec::new();
         let (mut x, mut y) = (legend, 10.0);
         for entry in entries {
@@ -209,8 +236,8 @@ impl Curves {
             places.push([x, y]);
             x += entry + 1.5;
         }
-        panels.above += y;
-        let banded = band_caption(self.panels.iter().flat_map(|(_, curves)| curves).map(|(_, curve)| curve));
+        panels.above = y + if titles > 0.0 { 9.0 } else { 5.0 };
+        let banded = band_caption(self.band, self.panels.iter().flat_map(|(_, curves)| curves).map(|(_, curve)| curve));
         let caption = if banded.is_some() { 4.5 } else { 0.0 };
         let mut scene = Scene::new(whole, panels.above + panels.height() - 2.0 + caption);
         (scene.title, scene.description) = (self.title.clone(), self.description());
@@ -246,7 +273,7 @@ impl Curves {
                 let [x, y] = at(generation, 0.0);
                 scene.text([x, y + 3.4], generation.to_string(), SMALL, anchor, BLACK);
             }
-            scene.text([left + width / 2.0, above + HEIGHT + 3.4], "generation", SMALL, Anchor::Middle, BLACK);
+            scene.text([left + width / 2.0, above + HEIGHT + 3.4], "Generation", SMALL, Anchor::Middle, BLACK);
             scene.text([left + width / 2.0, above - 1.6], &**title, SMALL, Anchor::Middle, BLACK);
             if panels.is_first(index) {
                 scene.upright([4.0, above + HEIGHT / 2.0], &*self.y_label, SMALL, BLACK);
@@ -254,13 +281,9 @@ impl Curves {
             scene.clipped([left - 0.4, above - 0.4, width + 0.8, HEIGHT + 0.8], |scene| {
                 let curves: Vec<_> = curves.iter().map(|(value, curve)| (*value, curve.thinned().0)).collect();
                 for (value, curve) in &curves {
-                    let side = |sign: f64| {
-                        let values = curve.mean.iter().zip(&curve.error).map(move |(mean, error)| mean + sign * error);
-                        curve.generation.iter().zip(values).map(|(&x, y)| at(x, y.clamp(0.0, 1.0)))
-                    };
-                    if curve.error.iter().any(|&error| error > 0.0) {
+                    if let Some(outline) = curve.outline(self.band, 1.0) {
                         let fill = Fill { color: self.pen(*value).color, opacity: 0.15 };
-                        scene.polygon(side(1.0).chain(side(-1.0).rev()).collect(), Some(fill), None);
+                        scene.polygon(outline.into_iter().map(|(x, y)| at(x, y)).collect(), Some(fill), None);
                     }
                 }
                 for (value, curve) in &curves {
@@ -277,8 +300,13 @@ impl Curves {
         let mut text = format!("Learning curves by {}, with the mean of the last generation.", self.by.label);
         for (title, curves) in &self.panels {
             let end = |(value, curve): &(usize, Curve)| {
-                let (mean, error) = (curve.mean.last()?, curve.error.last()?);
-                Some(format!("{}: {mean:.2} ± {error:.2}", self.by.values.get(*value)?))
+                let (mean, value) = (curve.mean.last()?, self.by.values.get(*value)?);
+                let half = match self.band {
+                    Band::Interval => curve.interval.last(),
+                    Band::Error => curve.error.last(),
+                    Band::None => None,
+                };
+                Some(format!("{value}: {mean:.2}{}", half.map_or(String::new(), |half| format!(" ± {half:.2}"))))
             };
             let ends: Vec<_> = curves.iter().filter_map(end).collect();
             text += &format!(" {title}{}{}.", if title.is_empty() { "" } else { ": " }, ends.join(", "));
@@ -343,8 +371,11 @@ impl Dots {
         let rows: f64 = self.groups.iter().map(|(_, values)| 1.25 + values.len() as f64).sum();
         // The label below a panel may also use the width of the text beside the rows.
         let (plot, height) = (titles.max(34.0).max(text_width(&self.x_label, SMALL) - WRITTEN), HIGH * rows);
-        let panels = Panels::new(self.panels.len(), plot + WRITTEN, height, left, 15.0);
+        let mut panels = Panels::new(self.panels.len(), plot + WRITTEN, height, left, 15.0);
         let whole = panels.width().max(text_width(&self.title, 3.2) * 1.1 + 6.0);
+        panels.fill(whole);
+        panels.above -= if titles > 0.0 { 0.0 } else { 4.0 };
+        let plot = panels.width - WRITTEN;
         let mut scene = Scene::new(whole, panels.above + panels.height());
         (scene.title, scene.description) = (self.title.clone(), self.description());
         scene.bold([3.0, 5.0], &*self.title, 3.2, Anchor::Start, BLACK);
@@ -404,12 +435,20 @@ struct Panels {
 impl Panels {
     fn new(count: usize, width: f64, height: f64, left: f64, below: f64) -> Panels {
         let fit = ((WIDEST - left) / (width + GAP)) as usize;
-        Panels { count, columns: fit.clamp(1, count.max(1)), width, height, left, above: 12.0, below }
+        // As few rows as fit, with panels spread evenly over them.
+        let rows = count.div_ceil(fit.clamp(1, count.max(1))).max(1);
+        Panels { count, columns: count.div_ceil(rows).max(1), width, height, left, above: 12.0, below }
     }
 
     fn place(&self, index: usize) -> [f64; 2] {
         let (row, column) = (index / self.columns, index % self.columns);
         [self.left + (self.width + GAP) * column as f64, self.above + (self.height + self.below) * row as f64]
+    }
+
+    /// Widens the panels so that a row of them is at least as wide as the picture.
+    fn fill(&mut self, whole: f64) {
+        let wide = (whole - self.left) / self.columns as f64 - GAP;
+        self.width = self.width.max(wide);
     }
 
     fn is_first(&self, index: usize) -> bool {

@@ -335,7 +335,7 @@ impl Viewport {
 
     /// Returns the legend of the symbols that occur on the maps of these teams.
     pub fn legend(&self, teams: &[Team], counts: &str) -> Legend {
-        let mut entries: Vec<Gloss> = Vec::new();
+        let mut entries: Vec<LegendEntry> = Vec::new();
         let Some(team) = teams.first() else { return Legend::default() };
         let mut pois = teams.iter().flat_map(|team| &team.pois);
         let up = DVec2::Y;
@@ -360,7 +360,7 @@ impl Viewport {
             let (fill, pen) = (Fill { color: COLORS[2], opacity: 0.22 }, Pen::new(COLORS[2], 0.25));
             entries.push((
                 3.0,
-                "observed POI".into(),
+                "observed POI, with its step".into(),
                 Box::new(move |scene, [x, y]| scene.circle([x + 1.2, y - 0.8], 1.2, Some(fill), Some(pen.clone()))),
             ));
         }
@@ -413,13 +413,13 @@ impl Viewport {
     }
 }
 
-type Gloss = (f64, String, Box<dyn Fn(&mut Scene, [f64; 2])>);
+type LegendEntry = (f64, String, Box<dyn Fn(&mut Scene, [f64; 2])>);
 
 /// The legend below a map.
 #[derive(Default)]
 pub struct Legend {
     /// Width of each symbol, its text, and a function that draws it from a place on the baseline.
-    entries: Vec<Gloss>,
+    entries: Vec<LegendEntry>,
 }
 
 impl Legend {

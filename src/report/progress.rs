@@ -193,7 +193,7 @@ impl Board {
     /// Adds complete rows. `next` is the generation that plays next.
     pub fn show(&mut self, next: usize, rows: &[Row]) {
         for row in rows {
-            if let Some(arm) = self.arms.get_mut(row.arm) {
+            if let Some(arm) = self.arms.get_mut(row.experiment) {
                 arm.add(row, self.last);
             }
         }

@@ -14,21 +14,24 @@ use serde_json::json;
 use super::map::{self, FAINT, Legend, Marker, Poi, Team, Viewport};
 use super::runs::{self, ReadError};
 use super::scene::{Anchor, BLACK, Color, Scene};
-use crate::backend::{Backend, BackendError, Episode, Group, RecordRequest, Seen, Strided, Trace};
-use crate::config::{Config, Fitness, Observers};
-use crate::credit::{self, Credit, Scores};
+use crate::backend::{Backend, BackendError, Group, Trace};
+use crate::config::{Config, Observers};
+use crate::credit::{self, Credit, Scores, Strided};
 use crate::escape::PathExt;
 use crate::evolve;
 use crate::record::checkpoint;
 use crate::record::digests::{UNVERIFIED, Verification};
 use crate::record::folder::{CHECKPOINTS, POLICIES, RUN, Run};
 use crate::trainer::{Snapshot, Trainer};
-use crate::world::World;
+use crate::world::{INPUTS, OUTPUTS, World};
 
 /// Maximum number of bytes of motion in a page, before base64 adds a third. Longer motion is thinned out.
 const MOTION_BYTES: usize = 1_300_000;
 /// Maximum number of bytes of motion that is stored as the exact f32 values.
 const EXACT_BYTES: usize = 600_000;
+
+/// Maximum number of bytes of the senses of an episode, and of what is observed without its leaders.
+const DETAIL_BYTES: usize = 1_000_000;
 
 /// The reason why an episode cannot be replayed.
 #[derive(Debug, thiserror::Error)]
@@ -436,46 +439,47 @@ impl<'a> Episodes<'a> {
         Episodes { config, world, weights, teams, starts }
     }
 
-    fn group<'b>(&'b self, episode: usize, teams: &'b [u32], need: RecordRequest) -> Group<'b> {
-        let (starts, policies) = (&self.starts[episode], self.config.learning.population + 1);
-        Group { world: self.world, starts, weights: self.weights.into(), policies, teams, need }
+    /// Returns the group of some of the teams in one episode, with sightings if the fitness needs them.
+    fn group<'b>(&'b self, episode: usize, teams: &'b [u32]) -> Group<'b> {
+        let learning = &self.config.learning;
+        Group {
+            world: self.world,
+            starts: &self.starts[episode],
+            weights: self.weights.into(),
+            policies: learning.population + 1,
+            sharing: learning.sharing,
+            teams,
+            fitnesses: std::slice::from_ref(&learning.fitness),
+        }
     }
 
     /// Returns the mean G of every team over all episodes, `[teams]`.
     fn play(&self, backend: &mut dyn Backend) -> Result<Vec<f64>, BackendError> {
-        use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
-        let episodes = self.starts.len();
         let groups: Vec<_> =
-            (0..episodes).map(|episode| self.group(episode, self.teams, RecordRequest::Record)).collect();
-        let teams = self.teams.len() / self.world.leaders();
-        let observed: Vec<AtomicU32> = std::iter::repeat_with(AtomicU32::default).take(teams).collect();
-        backend.rollout(&groups, &|episode: Episode<'_>| {
-            let seen = credit::observed_at(episode.sets, self.world).iter().flatten().count();
-            observed[episode.team].fetch_add(seen as u32, Relaxed);
-        })?;
-        let whole = (self.world.pois.len() * episodes) as f64;
-        Ok(observed.into_iter().map(|observed| f64::from(observed.into_inner()) / whole).collect())
+            (0..self.starts.len()).map(|episode| Group { fitnesses: &[], ..self.group(episode, self.teams) }).collect();
+        let mut observed = vec![0; self.teams.len() / self.world.leaders()];
+        for scores in backend.play(&groups)? {
+            observed.iter_mut().zip(scores.observed).for_each(|(sum, observed)| *sum += observed);
+        }
+        let whole = (self.world.pois.len() * groups.len()) as f64;
+        Ok(observed.into_iter().map(|observed| f64::from(observed) / whole).collect())
     }
 
     /// Plays a team's first episode again and traces it.
     fn trace(&self, team: usize, backend: &mut dyn Backend) -> Result<Replayed, BackendError> {
         let leaders = self.world.leaders();
-        let need =
-            if self.config.learning.fitness == Fitness::Dt { RecordRequest::Sights } else { RecordRequest::Record };
-        let played = one(&self.group(0, &self.teams[team * leaders..(team + 1) * leaders], need), backend)?;
+        let played = one(&self.group(0, &self.teams[team * leaders..(team + 1) * leaders]), backend)?;
         Ok(Replayed { episodes: self.starts.len(), ..played })
     }
 }
 
-/// Plays and traces a group of a single team. `led` is filled only if the group requests sights.
+/// Plays and traces a group of a single team. `led` is filled only if Dt is among the group's fitnesses.
 ///
 /// # Errors
 /// The backend fails.
 pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, BackendError> {
     let (world, trace) = (group.world, backend.trace(group)?);
-    let whole = |words| Strided { words, stride: 1, offset: 0 };
-    let (sets, seen, sights) = (whole(&trace.sets), Seen::Counts(whole(&trace.seen)), whole(&trace.sights));
-    let episode = Episode { group: 0, team: 0, sets, seen, sights };
+    let episode = trace.episode(world, 0);
     let scores = Credit::default().all(&episode, world);
     let mut owner = Vec::new();
     credit::assign(&episode.seen, world, &mut owner);
@@ -510,6 +514,26 @@ fn near(world: &World, sets: &Strided<'_>, set: usize) -> u32 {
     world.rule.count((set * words..(set + 1) * words).map(|word| sets.get(word)))
 }
 
+/// An episode without some agents: the same motion, and what the others observe.
+pub struct Counterfactual<'a> {
+    world: &'a World,
+    /// The remaining agents at each POI after each step, `[steps][pois][words]`.
+    sets: Vec<u32>,
+    /// The step at which each POI would be observed, `[pois]`.
+    pub observed: Vec<Option<usize>>,
+}
+
+impl Counterfactual<'_> {
+    /// Returns the observation steps and the observers near each POI, base64 of u16 `[shown][pois]`.
+    fn json(&self, shown: &[usize]) -> serde_json::Value {
+        let (sets, pois) = (Strided { words: &self.sets, stride: 1, offset: 0 }, self.world.pois.len());
+        let count = |step: usize, poi| step.checked_sub(1).map_or(0, |step| near(self.world, &sets, step * pois + poi));
+        let counts = shown.iter().flat_map(|&step| (0..pois).map(move |poi| count(step, poi) as u16));
+        let near: Vec<u8> = counts.flat_map(u16::to_le_bytes).collect();
+        json!({ "observed": self.observed, "near": BASE64_STANDARD.encode(near) })
+    }
+}
+
 impl Replayed {
     /// Names the team at the start of a sentence: "Best team (number 3)".
     pub fn name(&self) -> String {
@@ -529,6 +553,24 @@ impl Replayed {
     pub fn near(&self, step: usize, poi: usize) -> u32 {
         let sets = Strided { words: &self.trace.sets, stride: 1, offset: 0 };
         step.checked_sub(1).map_or(0, |step| near(&self.world, &sets, step * self.world.pois.len() + poi))
+    }
+
+    /// Removes a leader from the record, and with `group` also the followers that it led. All others move as they did.
+    pub fn without(&self, leader: usize, group: bool) -> Counterfactual<'_> {
+        let Replayed { world, trace, owner, led, .. } = self;
+        let (pois, words, leaders) = (world.pois.len(), world.constants.words as usize, world.leaders());
+        let follows = |step: usize, agent: usize| match agent.checked_sub(leaders) {
+            None => false,
+            Some(follower) if !led.is_empty() => credit::leads(led, world, step, follower, leader),
+            Some(_) => owner[agent] as usize == leader,
+        };
+        let mut sets = trace.sets.clone();
+        for (at, set) in sets.chunks_exact_mut(words).enumerate() {
+            let removed = (0..world.agents()).filter(|&agent| agent == leader || group && follows(at / pois, agent));
+            removed.for_each(|agent| set[agent / 32] &= !(1 << (agent % 32)));
+        }
+        let observed = credit::observed_at(Strided { words: &sets, stride: 1, offset: 0 }, world);
+        Counterfactual { world, sets, observed }
     }
 
     fn position(&self, step: usize, agent: usize) -> [f32; 2] {
@@ -635,6 +677,37 @@ pub fn page(name: &str, config: &Config, played: &[Replayed]) -> String {
 
 /// The script that draws episodes. Every page that shows them includes it.
 pub const STAGE: &str = include_str!("stage.js");
+
+/// Returns [`data`], and per episode D++, the senses and actions of leaders, and what the team observes without them.
+///
+/// Per episode that adds `dpp`, `[leaders]`; `senses`, base64 of f32 `[shown][leaders][8 inputs, 2 outputs]`; and
+/// `without`, `[leaders]`. Its entries `alone` and `group` (with the followers that the leader led) have `observed` and
+/// `near` like the episode. Very long episodes have neither of the last two.
+pub fn detailed(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Value {
+    let mut data = data(name, config, played);
+    for (played, episode) in played.iter().zip(data["episodes"].as_array_mut().into_iter().flatten()) {
+        let shown: Vec<usize> =
+            episode["shown"].as_array().into_iter().flatten().flat_map(|step| Some(step.as_u64()? as usize)).collect();
+        let (leaders, pois) = (played.world.leaders(), played.world.pois.len());
+        episode["dpp"] = json!(played.scores.dpp);
+        if shown.len() * leaders * (INPUTS + OUTPUTS) * size_of::<f32>() <= DETAIL_BYTES {
+            let moments = shown.iter().flat_map(|&step| (0..leaders).map(move |leader| (step, leader)));
+            let senses = moments.flat_map(|(step, leader)| {
+                let moment = played.trace.moment(step, 0, leader);
+                moment.inputs.iter().chain(&moment.outputs).flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>()
+            });
+            episode["senses"] = BASE64_STANDARD.encode(senses.collect::<Vec<u8>>()).into();
+        }
+        if shown.len() * leaders * pois * 2 * size_of::<u16>() <= DETAIL_BYTES {
+            let without = (0..leaders).map(|leader| {
+                let [alone, group] = [false, true].map(|group| played.without(leader, group).json(&shown));
+                json!({ "alone": alone, "group": group })
+            });
+            episode["without"] = without.collect();
+        }
+    }
+    data
+}
 
 /// Returns the data that a page needs to play episodes of one run.
 pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Value {
@@ -747,7 +820,7 @@ struct Screen<'a> {
 impl<'a> Screen<'a> {
     const SIDE: f64 = 80.0;
     const EDGE: f64 = 2.5;
-    const HEAD: f64 = 12.6;
+    const HEAD: f64 = 14.0;
     /// Room for the axes on the left of each map. The next one is the room below it.
     const LEFT: f64 = 8.0;
     const BELOW: f64 = 7.4;
@@ -885,25 +958,44 @@ impl<'a> Frames<'a> {
 /// The encoder fails, which happens only if memory runs out.
 pub fn gif(config: &Config, played: &[Replayed], motion: Film) -> std::io::Result<Vec<u8>> {
     let frames = Frames::new(config, played, motion);
+    let places = &frames.places;
+    let Some(&end) = places.last() else { return Ok(vec![]) };
     let picture = |place: f64| {
         let (scene, per_mm) = frames.scene(place);
         scene.pixels(per_mm)
     };
-    let places = &frames.places;
-    let Some(&end) = places.last() else { return Ok(vec![]) };
-    // The palette is computed from the last frame, which contains all colours.
     let last = picture(end);
-    let colors = color_quant::NeuQuant::new(10, 255, last.data());
+    // Delays are whole hundredths of a second. Rounding the cumulative time keeps the total duration right.
+    let due = |index: usize| (index as u32 * 100).div_ceil(motion.fps);
+    let delay = |index| if index + 1 == places.len() { 200 } else { due(index + 1) - due(index) };
+    let size = [last.width() as u16, last.height() as u16];
+    let pictures =
+        places.iter().enumerate().map(|(index, &place)| (picture(place).data().to_vec(), delay(index) as u16));
+    animate(size, last.data(), pictures)
+}
+
+/// Returns pictures of one size, in pixels, as a GIF that repeats. Each is RGBA `[height][width][4]`, with its delay in
+/// hundredths of a second. The palette is computed from `last`, which should contain all colours.
+///
+/// # Errors
+/// A picture has another size, or memory runs out.
+pub fn animate(
+    [width, height]: [u16; 2],
+    last: &[u8],
+    pictures: impl Iterator<Item = (Vec<u8>, u16)>,
+) -> std::io::Result<Vec<u8>> {
+    let colors = color_quant::NeuQuant::new(10, 255, last);
     let mut known = std::collections::HashMap::new();
-    let (width, height) = (last.width() as u16, last.height() as u16);
     let mut file = Vec::new();
     {
         let failed = |error: gif::EncodingError| std::io::Error::other(error.to_string());
         let mut encoder = gif::Encoder::new(&mut file, width, height, &colors.color_map_rgb()).map_err(failed)?;
         encoder.set_repeat(gif::Repeat::Infinite).map_err(failed)?;
         let mut before: Vec<u8> = Vec::new();
-        for (index, &place) in places.iter().enumerate() {
-            let pixmap = picture(place);
+        for (picture, delay) in pictures {
+            if picture.len() != usize::from(width) * usize::from(height) * 4 {
+                return Err(std::io::Error::other("a picture has another size"));
+            }
             // Unchanged pixels are transparent, which compresses well. Index 255 is reserved for them.
             let color = |(at, pixel): (usize, &[u8])| {
                 if before.get(4 * at..4 * at + 4) == Some(pixel) {
@@ -912,20 +1004,17 @@ pub fn gif(config: &Config, played: &[Replayed], motion: Film) -> std::io::Resul
                 let pixel = [pixel[0], pixel[1], pixel[2], pixel[3]];
                 *known.entry(pixel).or_insert_with(|| colors.index_of(&pixel) as u8)
             };
-            let buffer: Vec<u8> = pixmap.data().chunks_exact(4).enumerate().map(color).collect();
-            // Delays are whole hundredths of a second. Rounding the cumulative time keeps the total duration right.
-            let due = |index: usize| (index as u32 * 100).div_ceil(motion.fps);
-            let delay = if index + 1 == places.len() { 200 } else { due(index + 1) - due(index) };
+            let buffer: Vec<u8> = picture.chunks_exact(4).enumerate().map(color).collect();
             let frame = gif::Frame {
                 width,
                 height,
                 buffer: buffer.into(),
                 transparent: Some(255),
-                delay: delay as u16,
+                delay,
                 ..gif::Frame::default()
             };
             encoder.write_frame(&frame).map_err(failed)?;
-            before = pixmap.data().to_vec();
+            before = picture;
         }
     }
     Ok(file)

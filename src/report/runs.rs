@@ -3,7 +3,7 @@
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use super::curves::{Curve, Figure, Panel};
+use super::curves::{Band, Curve, Figure, Panel};
 use crate::config::{Config, ConfigError};
 use crate::escape::PathExt;
 use crate::file;
@@ -139,8 +139,72 @@ pub fn metrics(
     if count == 0 { Err(unfinished(format!("its {METRICS} has no rows yet"))) } else { Ok(()) }
 }
 
+/// The team of a generation whose G a picture shows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TeamKind {
+    /// The team with the largest G.
+    #[default]
+    Best,
+    /// The team of the best policy of each population.
+    Champion,
+    /// The mean over all teams.
+    Mean,
+}
+
+impl TeamKind {
+    /// All kinds.
+    pub const ALL: [TeamKind; 3] = [TeamKind::Best, TeamKind::Champion, TeamKind::Mean];
+
+    /// Returns the kind's name in pictures.
+    pub fn name(self) -> &'static str {
+        match self {
+            TeamKind::Best => "best team",
+            TeamKind::Champion => "champion",
+            TeamKind::Mean => "mean team",
+        }
+    }
+
+    /// Returns the label of G of this kind of team, the same in all pictures.
+    pub fn label(self) -> String {
+        format!("G of the {}", self.name())
+    }
+
+    /// Returns this kind's G from a row of metrics.
+    pub fn of(self, row: &Row) -> f64 {
+        match self {
+            TeamKind::Best => row.best_g,
+            TeamKind::Champion => row.champion_g,
+            TeamKind::Mean => row.mean_g,
+        }
+    }
+}
+
+impl std::fmt::Display for TeamKind {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            TeamKind::Best => "best",
+            TeamKind::Champion => "champion",
+            TeamKind::Mean => "mean",
+        })
+    }
+}
+
+impl std::str::FromStr for TeamKind {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<TeamKind, String> {
+        match text {
+            "best" => Ok(TeamKind::Best),
+            "champion" => Ok(TeamKind::Champion),
+            "mean" => Ok(TeamKind::Mean),
+            _ => Err("allowed best, champion or mean".into()),
+        }
+    }
+}
+
 /// A run's metrics by generation, as shares of the POIs averaged over trials.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Courses {
     /// G of the best team.
     pub best: Vec<Average>,
@@ -151,12 +215,21 @@ pub struct Courses {
 }
 
 impl Courses {
+    /// Returns G of one kind of team.
+    pub fn of(&self, kind: TeamKind) -> &[Average] {
+        match kind {
+            TeamKind::Best => &self.best,
+            TeamKind::Champion => &self.champion,
+            TeamKind::Mean => &self.mean,
+        }
+    }
+
     /// Reads a run's metrics. Memory grows only with the number of generations.
     ///
     /// # Errors
     /// See [`metrics()`].
     pub fn read(folder: &Path, config: &Config, verification: Verification) -> Result<Courses, ReadError> {
-        let mut courses = Courses { best: vec![], mean: vec![], champion: vec![] };
+        let mut courses = Courses::default();
         metrics(folder, config, verification, |row| {
             for (course, g) in [
                 (&mut courses.best, row.best_g),
@@ -193,30 +266,36 @@ pub fn trials(folder: &Path, config: &Config, verification: Verification) -> Res
     }
 }
 
-/// Returns the figure of one run (best team, champion and mean team), or of the best teams of several runs.
+/// Returns the figure of G by generation: of one kind of team in each run, or of all kinds in a single run.
 ///
-/// Several runs are labelled by the config keys that differ.
+/// By default, one run shows all kinds of teams, and several runs show their best teams. Several runs are labelled by
+/// the config keys that differ.
 ///
 /// # Errors
 /// A run cannot be read.
-pub fn figure(folders: &[PathBuf], verification: Verification) -> Result<Figure, ReadError> {
+pub fn figure(
+    folders: &[PathBuf],
+    measure: Option<TeamKind>,
+    band: Band,
+    verification: Verification,
+) -> Result<Figure, ReadError> {
     let configs = folders.iter().map(|folder| config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
     let all = folders.iter().zip(&configs).map(|(folder, config)| Courses::read(folder, config, verification));
     let all = all.collect::<Result<Vec<_>, _>>()?;
-    // Stages may have different numbers of POIs.
-    let counts: Vec<Option<usize>> = configs.iter().map(Config::pois).collect();
-    let pois = counts.first().copied().flatten().unwrap_or(1);
-    let same = counts.iter().all(|count| *count == Some(pois));
-    let scale = if same { pois as f64 } else { 1.0 };
-    let curve = |tallies: &[Average]| Curve::new(tallies).scaled(scale);
-    let (legend, curves): (Vec<String>, Vec<Curve>) = match &*all {
-        [Courses { best, mean, champion }] => [("best team", best), ("champion", champion), ("mean team", mean)]
-            .map(|(label, tallies)| (label.to_string(), curve(tallies)))
-            .into_iter()
-            .unzip(),
-        all => labels(folders, &configs).into_iter().zip(all.iter().map(|courses| curve(&courses.best))).unzip(),
+    let (legend, curves): (Vec<String>, Vec<Curve>) = match (&*all, measure) {
+        ([courses], None) => {
+            TeamKind::ALL.into_iter().map(|kind| (kind.name().to_string(), Curve::new(courses.of(kind)))).unzip()
+        }
+        ([courses], Some(kind)) => (vec![kind.name().to_string()], vec![Curve::new(courses.of(kind))]),
+        (all, kind) => {
+            let curves = all.iter().map(|courses| Curve::new(courses.of(kind.unwrap_or_default())));
+            labels(folders, &configs).into_iter().zip(curves).unzip()
+        }
     };
-    let what = if all.len() == 1 { "" } else { " by the best team" };
+    let y_label = match (all.len(), measure) {
+        (1, None) => "G (share of POIs observed)".into(),
+        (_, kind) => kind.unwrap_or_default().label(),
+    };
     // Only stages that the run has reached are marked. If runs have different stages, none are marked.
     let last = curves.iter().filter_map(|curve| curve.generation.last()).fold(0.0_f64, |most, &last| most.max(last));
     let begun = |config: &Config| {
@@ -230,9 +309,10 @@ pub fn figure(folders: &[PathBuf], verification: Verification) -> Result<Figure,
         panels: vec![Panel { title: String::new(), curves: curves.into_iter().enumerate().collect(), stages }],
         legend,
         references: vec![],
-        y_label: if same { format!("POIs observed{what}") } else { format!("Share of POIs observed{what}") },
-        y_max: scale,
-        shares: !same,
+        y_label,
+        y_max: 1.0,
+        shares: true,
+        band,
         source: match folders {
             [folder] => Digests::read(folder, verification)?.run,
             _ => None,

@@ -96,8 +96,27 @@ const stage = (() => {
 
   const palette = data => night.matches ? data.colors.dark : data.colors.light;
 
+  // Draws how often agents were at a place up to a frame, in squares of one unit.
+  function paint_heat(draw, data, episode, frame, { X, Y, scale }, tone) {
+    const counts = new Map();
+    for (let past = 0; past <= frame; past++)
+      for (let agent = 0; agent < episode.agents; agent++) {
+        const [x, y] = moment(data, episode, past, agent), place = `${Math.floor(x)} ${Math.floor(y)}`;
+        counts.set(place, (counts.get(place) || 0) + 1);
+      }
+    const most = Math.max(1, ...counts.values());
+    draw.fillStyle = tone;
+    for (const [place, many] of counts) {
+      const [x, y] = place.split(" ").map(Number);
+      draw.globalAlpha = 0.12 + 0.6 * Math.sqrt(many / most);
+      draw.fillRect(X(x), Y(y + 1), scale + 0.5, scale + 0.5);
+    }
+    draw.globalAlpha = 1;
+  }
+
   // Draws an episode, `place` frames from its start, at the canvas's width. `look` selects what to show: `crop` (a part
-  // of the map), `trails`, `radii`, `groups`, and `over` (the POI under the pointer, or null).
+  // of the map), `trails`, `radii`, `groups`, and `over` (the POI under the pointer, or null). It may have `heat` (where
+  // agents were), `removed` (a leader, and whether its followers are removed, too) and `dark` (the POIs lost by that).
   function paint(data, episode, canvas, place, look) {
     const { wide, tall, scale, X, Y } = place_on(canvas, look.crop);
     const dots = window.devicePixelRatio || 1;
@@ -135,6 +154,8 @@ const stage = (() => {
     draw.lineWidth = 2;
     draw.strokeRect(X(0), Y(height), width * scale, height * scale);
     const frame = Math.floor(place), step = episode.shown[frame];
+    if (look.heat) paint_heat(draw, data, episode, frame, { X, Y, scale }, color("--all-leaders"));
+    const gone = agent => Boolean(look.removed) && (agent === look.removed.leader || look.removed.group && led[agent].includes(look.removed.leader));
     const circle = (x, y, radius) => { draw.beginPath(); draw.arc(X(x), Y(y), radius * scale, 0, 2 * Math.PI); };
 
     // POIs: a ring fills as agents arrive, and the disc changes colour once the POI is observed.
@@ -142,10 +163,11 @@ const stage = (() => {
     const ring = Math.max(7, Math.min(12, 1.3 * scale));
     const counts = data.pois.map(([x, y], poi) => {
       const done = episode.observed[poi] !== null && episode.observed[poi] <= step, needed = episode.coupling[poi];
-      const closed = !done && !is_open(data, episode, poi, Math.max(1, step)), tone = color(done ? "--seen" : "--poi");
+      const closed = !done && !is_open(data, episode, poi, Math.max(1, step));
+      const dark = (look.dark || []).includes(poi), tone = color(dark ? "--wrong" : done ? "--seen" : "--poi");
       circle(x, y, data.observation_radius);
       draw.fillStyle = tone;
-      draw.globalAlpha = done ? 0.22 : closed ? 0.02 : 0.07;
+      draw.globalAlpha = dark ? 0.16 : done ? 0.22 : closed ? 0.02 : 0.07;
       draw.fill();
       draw.globalAlpha = 1;
       if (look.radii) {
@@ -163,7 +185,7 @@ const stage = (() => {
         const full = Math.min(near[poi] / needed, 1) * 2 * Math.PI;
         draw.beginPath(); draw.arc(X(x), Y(y), ring, -Math.PI / 2, full - Math.PI / 2); draw.stroke();
       }
-      return [`${near[poi]}/${needed}${done ? " ✓" : ""}`, X(x), Y(y) - ring - 6];
+      return [`${near[poi]}/${needed}${done ? " ✓" : dark ? " ✗ dark" : ""}`, X(x), Y(y) - ring - 6];
     });
 
     const many = episode.agents > 100;
@@ -172,6 +194,7 @@ const stage = (() => {
       draw.globalAlpha = many ? 0.3 : 0.6;
       const from = many ? Math.max(0, frame - 40) : 0;
       for (let agent = 0; agent < episode.agents; agent++) {
+        if (gone(agent)) continue;
         draw.strokeStyle = group(agent);
         draw.setLineDash(dashes(agent));
         draw.beginPath();
@@ -190,6 +213,7 @@ const stage = (() => {
     const now = Array.from({ length: episode.agents }, (_, agent) => between(data, episode, place, agent));
     const followers = episode.agents > episode.leaders;
     for (let leader = 0; leader < episode.leaders && followers && look.radii; leader++) {
+      if (gone(leader)) continue;
       circle(now[leader][0], now[leader][1], data.attraction_radius);
       draw.strokeStyle = group(leader);
       draw.globalAlpha = many ? 0.3 : 0.7;
@@ -204,6 +228,7 @@ const stage = (() => {
       draw.globalAlpha = 0.55;
       for (let agent = episode.leaders; agent < episode.agents; agent++) {
         for (const leader of led[agent]) {
+          if (gone(agent) || gone(leader)) continue;
           draw.strokeStyle = group(leader);
           draw.beginPath();
           draw.moveTo(X(now[agent][0]), Y(now[agent][1]));
@@ -225,8 +250,11 @@ const stage = (() => {
       draw.fillStyle = leads ? group(agent) : color("--card");
       draw.strokeStyle = leads ? color("--ink") : group(agent);
       draw.lineWidth = leads ? 1.2 : 1.6;
+      draw.globalAlpha = gone(agent) ? 0.18 : 1;
       draw.fill();
       draw.stroke();
+      draw.globalAlpha = 1;
+      if (gone(agent)) continue;
       if (!counts_at_pois(data, episode, agent)) {
         for (const [tone, wide] of [[color("--sea"), 4], [color("--ink"), 1.6]]) {
           draw.strokeStyle = tone;
@@ -294,5 +322,5 @@ const stage = (() => {
     return place;
   }
 
-  return { night, unpack, busy, whole, place_on, palette, paint, say, poi_at, later };
+  return { night, bytes, moment, unpack, busy, whole, place_on, palette, paint, say, poi_at, later };
 })();

@@ -6,10 +6,12 @@ use fearless_simd::{Simd, f32x4, prelude::*};
 use glam::Vec2;
 
 use crate::backend::cpu::{Agent, Block, BlockState, transpose_rows, transpose4};
-use crate::backend::{Episode, Seen, Strided};
+use crate::credit::Episode;
 use crate::kernels::{clamp_to, splat};
 use crate::parallel::*;
 use crate::world::{INPUTS, OUTPUTS, World};
+
+use super::state::Saved;
 
 /// The arrays that a stepper shows, of all teams.
 pub(super) struct Observations {
@@ -30,9 +32,13 @@ pub(super) trait Vectors: Send + Sync {
         world: &World,
         chosen: Option<&[bool]>,
         starts: Option<&[Vec2]>,
+        moved: &[Vec2],
         observations: &mut Observations,
     );
-    fn step(&mut self, world: &World, actions: &[f32], observations: &mut Observations);
+    /// Plays a step. `moved` are the POI positions, `[teams][pois]`; empty if all teams have the world's.
+    fn step(&mut self, world: &World, moved: &[Vec2], actions: &[f32], observations: &mut Observations);
+    /// Puts all teams into a saved state, except what is shown of them; of that it sets the inputs.
+    fn restore(&mut self, world: &World, saved: &Saved<'_>, moved: &[Vec2], observations: &mut Observations);
     fn states(&mut self, world: &World, observations: &mut Observations);
     /// Allocates a record of sightings for all steps.
     fn keep_sights(&mut self, world: &World);
@@ -63,6 +69,8 @@ struct Workspace<S: Simd> {
     sights: Vec<u32>,
     /// Agents and counts before a step, if some teams' episodes are over.
     kept: (Vec<Agent<S>>, Vec<S::u32s>),
+    /// The POI positions, `[pois]`; empty if every lane has the world's.
+    moved: Vec<[S::f32s; 2]>,
 }
 
 /// All vectors of teams, and the workspaces that no thread is using.
@@ -91,23 +99,43 @@ impl<S: Simd> Vectors for TeamBlocks<S> {
         world: &World,
         chosen: Option<&[bool]>,
         starts: Option<&[Vec2]>,
+        moved: &[Vec2],
         observations: &mut Observations,
     ) {
         let simd = self.simd;
         self.each(world, observations, &|workspace, block, observations| {
             simd.vectorize(
                 #[inline(always)]
-                || workspace.reset(simd, world, block, chosen, starts, observations),
+                || {
+                    workspace.move_pois(simd, world, moved, block.first, block.teams);
+                    workspace.reset(simd, world, block, chosen, starts, observations);
+                },
             );
         });
     }
 
-    fn step(&mut self, world: &World, actions: &[f32], observations: &mut Observations) {
+    fn step(&mut self, world: &World, moved: &[Vec2], actions: &[f32], observations: &mut Observations) {
         let simd = self.simd;
         self.each(world, observations, &|workspace, block, observations| {
             simd.vectorize(
                 #[inline(always)]
-                || workspace.step(simd, world, block, actions, observations),
+                || {
+                    workspace.move_pois(simd, world, moved, block.first, block.teams);
+                    workspace.step(simd, world, block, actions, observations);
+                },
+            );
+        });
+    }
+
+    fn restore(&mut self, world: &World, saved: &Saved<'_>, moved: &[Vec2], observations: &mut Observations) {
+        let simd = self.simd;
+        self.each(world, observations, &|workspace, block, observations| {
+            simd.vectorize(
+                #[inline(always)]
+                || {
+                    workspace.move_pois(simd, world, moved, block.first, block.teams);
+                    workspace.restore(simd, world, block, saved, observations.inputs);
+                },
             );
         });
     }
@@ -134,10 +162,8 @@ impl<S: Simd> Vectors for TeamBlocks<S> {
         let sets = block.record.get(lane * words..(lane + 1) * words)?;
         seen.clear();
         seen.extend(block.state.counts.iter().map(|count| count[lane]));
-        let plain = |words| Strided { words, stride: 1, offset: 0 };
         let (first, words) = (lane * world.sight_words(), world.sight_words());
-        let sights = plain(block.sights.get(first..first + words).unwrap_or_default());
-        Some(Episode { group: 0, team, sets: plain(sets), seen: Seen::Counts(plain(seen)), sights })
+        Some(Episode::whole(sets, seen, block.sights.get(first..first + words).unwrap_or_default()))
     }
 }
 
@@ -238,7 +264,47 @@ impl<S: Simd> Workspace<S> {
     fn new(simd: S, world: &World) -> Workspace<S> {
         let sets = vec![0; world.pois.len() * world.constants.words as usize * S::f32s::LEN];
         let sights = vec![0; world.followers() * world.leader_words() * S::f32s::LEN];
-        Workspace { block: Block::new(simd, world), sets, sights, kept: Default::default() }
+        Workspace { block: Block::new(simd, world), sets, sights, kept: Default::default(), moved: vec![] }
+    }
+
+    /// Loads the POI positions of a vector of teams.
+    #[inline(always)]
+    fn move_pois(&mut self, simd: S, world: &World, moved: &[Vec2], first: usize, teams: usize) {
+        self.moved.clear();
+        if moved.is_empty() {
+            return;
+        }
+        let pois = world.pois.len();
+        self.moved.resize(pois, [splat(simd, 0.0); 2]);
+        for (lane, team) in lanes::<S>(teams) {
+            for ([x, y], poi) in self.moved.iter_mut().zip(&moved[(first + team) * pois..]) {
+                (x[lane], y[lane]) = (poi.x, poi.y);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn restore(&mut self, simd: S, world: &World, block: &mut TeamBlock<S>, saved: &Saved<'_>, inputs: &mut [f32]) {
+        let TeamBlock { first, teams, ref mut state, ref mut record, ref mut sights } = *block;
+        let (agents, pairs) = (world.agents(), world.followers() * world.leaders());
+        self.block.swap(state);
+        for (lane, team) in lanes::<S>(teams) {
+            let at = (first + team) * agents;
+            for (agent, index) in self.block.agents.iter_mut().zip(at..) {
+                (agent.x[lane], agent.y[lane]) = (saved.positions[index * 2], saved.positions[index * 2 + 1]);
+                (agent.hx[lane], agent.hy[lane]) = (saved.headings[index * 2], saved.headings[index * 2 + 1]);
+                agent.speed[lane] = saved.speeds[index];
+            }
+            if !saved.counts.is_empty() {
+                let counts = &saved.counts[(first + team) * pairs..][..pairs];
+                self.block.counts.iter_mut().zip(counts).for_each(|(count, &saved)| count[lane] = saved);
+            }
+        }
+        let (size, seen) = (record.len() / teams, sights.len() / teams);
+        record.copy_from_slice(&saved.record[first * size..][..teams * size]);
+        sights.copy_from_slice(&saved.sights[first * seen..][..teams * seen]);
+        self.sense(simd, world, inputs);
+        self.block.swap(state);
     }
 
     #[inline(always)]
@@ -308,7 +374,11 @@ impl<S: Simd> Workspace<S> {
             self.block.go();
             lanes::<S>(teams).filter(|&(_, team)| steps[team] >= last).for_each(|(lane, _)| self.keep(lane));
         }
-        self.block.couple(&world.pois, &mut self.sets);
+        if self.moved.is_empty() {
+            self.block.couple(&world.pois, &mut self.sets);
+        } else {
+            self.block.couple(&self.moved, &mut self.sets);
+        }
         let (pois, words) = (world.pois.len(), world.constants.words as usize);
         let width = S::f32s::LEN;
         let sets = bytemuck::cast_slice::<u32, f32>(&self.sets);
@@ -395,7 +465,11 @@ impl<S: Simd> Workspace<S> {
 
     #[inline(always)]
     fn sense(&mut self, simd: S, world: &World, inputs: &mut [f32]) {
-        self.block.look(&world.pois);
+        if self.moved.is_empty() {
+            self.block.look(&world.pois);
+        } else {
+            self.block.look(&self.moved);
+        }
         let columns = self.block.inputs.as_flattened();
         to_rows(
             simd,

@@ -29,6 +29,7 @@ use crate::parallel::*;
 use crate::world::{GRID, INPUTS, OUTPUTS, World, on_grid};
 
 mod engine;
+mod state;
 
 use engine::{FEW, Observations, Vectors, vectors};
 
@@ -40,6 +41,8 @@ pub struct Stepper {
     world: World,
     vectors: Box<dyn Vectors>,
     observations: Observations,
+    /// Each team's POI positions, `[teams][pois]`; empty if all teams have the world's.
+    moved: Vec<Vec2>,
 }
 
 /// The state of all agents.
@@ -104,6 +107,19 @@ pub enum StepError {
         /// The position, in units.
         at: [f32; 2],
     },
+    /// A POI is off the map.
+    #[error("POI {poi} of team {team} would be at ({}, {}), which is not on the map", at[0], at[1])]
+    Poi {
+        /// The team, from 0.
+        team: usize,
+        /// The POI, from 0.
+        poi: usize,
+        /// The position, in units.
+        at: [f32; 2],
+    },
+    /// A saved state does not fit.
+    #[error("the saved state does not fit: {0}")]
+    State(&'static str),
     /// The team does not exist.
     #[error("team {team} of {teams} (they count from 0)")]
     NoTeam {
@@ -172,7 +188,7 @@ impl Stepper {
             headings: vec![0.0; teams * agents * 2],
             speeds: vec![0.0; teams * agents],
         };
-        let mut stepper = Stepper { world, vectors, observations };
+        let mut stepper = Stepper { world, vectors, observations, moved: vec![] };
         stepper.reset();
         Ok(stepper)
     }
@@ -205,29 +221,41 @@ impl Stepper {
 
     /// Resets all teams to the world's start.
     pub fn reset(&mut self) {
-        self.vectors.reset(&self.world, None, None, &mut self.observations);
+        self.moved.clear();
+        self.vectors.reset(&self.world, None, None, &self.moved, &mut self.observations);
     }
 
-    /// Resets all teams to given start positions, `[teams][agents][2]`, each rounded to the kernels' grid (within
-    /// 2^-19). [`crate::evaluate::Starts`] draws such positions.
+    /// Resets all teams to given start positions, `[teams][agents][2]`, or `[teams][agents + pois][2]` with POI positions
+    /// that replace the world's. Each is rounded to the kernels' grid (within 2^-19). [`crate::evaluate::Starts`] draws
+    /// such positions.
     ///
     /// # Errors
     /// The length is wrong, or a position is off the map.
     pub fn reset_to(&mut self, starts: &[f32]) -> Result<(), StepError> {
-        let starts = self.checked(starts, None)?;
-        self.vectors.reset(&self.world, None, Some(&starts), &mut self.observations);
+        let (starts, pois) = self.checked(starts, None)?;
+        self.moved = pois;
+        self.vectors.reset(&self.world, None, Some(&starts), &self.moved, &mut self.observations);
         Ok(())
     }
 
-    /// Resets the chosen teams, `[teams]`, to the world's start, or to given start positions like
-    /// [`Stepper::reset_to`]. The other teams, and their positions in `starts`, are ignored.
+    /// Resets the chosen teams, `[teams]`, to the world's start, or to given positions like [`Stepper::reset_to`]. The
+    /// other teams, and their positions in `starts`, are ignored.
     ///
     /// # Errors
     /// A length is wrong, or a position is off the map.
     pub fn reset_some(&mut self, chosen: &[bool], starts: Option<&[f32]>) -> Result<(), StepError> {
         self.check_length("choices", "[teams]", self.teams(), chosen.len())?;
         let starts = starts.map(|starts| self.checked(starts, Some(chosen))).transpose()?;
-        self.vectors.reset(&self.world, Some(chosen), starts.as_deref(), &mut self.observations);
+        let given = starts.as_ref().map_or(&[][..], |(_, pois)| pois);
+        if self.moved.is_empty() && !given.is_empty() {
+            self.moved = self.world.pois.repeat(self.teams());
+        }
+        let pois = self.world.pois.len();
+        for (team, moved) in self.moved.chunks_exact_mut(pois).enumerate().filter(|&(team, _)| chosen[team]) {
+            moved.copy_from_slice(given.get(team * pois..).map_or(&self.world.pois, |given| &given[..pois]));
+        }
+        let starts = starts.as_ref().map(|(starts, _)| &starts[..]);
+        self.vectors.reset(&self.world, Some(chosen), starts, &self.moved, &mut self.observations);
         Ok(())
     }
 
@@ -256,8 +284,14 @@ impl Stepper {
                 value: actions[index],
             });
         }
-        self.vectors.step(&self.world, actions, &mut self.observations);
+        self.vectors.step(&self.world, &self.moved, actions, &mut self.observations);
         Ok(())
+    }
+
+    /// Returns a team's POI positions, `[pois]`.
+    pub fn pois(&self, team: usize) -> &[Vec2] {
+        let pois = self.world.pois.len();
+        self.moved.get(team * pois..).filter(|rest| !rest.is_empty()).map_or(&self.world.pois, |rest| &rest[..pois])
     }
 
     /// Returns what every leader senses, `[teams][leaders][8]`: the density of POIs, then of agents, in four quadrants
@@ -344,24 +378,29 @@ impl Stepper {
         if found == expected { Ok(()) } else { Err(StepError::Length { what, shape, expected, found }) }
     }
 
-    /// Returns the start positions of the chosen teams, rounded to the grid.
-    fn checked(&self, starts: &[f32], chosen: Option<&[bool]>) -> Result<Vec<Vec2>, StepError> {
-        let (agents, constants) = (self.world.agents(), &self.world.constants);
-        self.check_length("coordinates", "[teams][agents][2]", self.teams() * agents * 2, starts.len())?;
-        let map = Vec2::new(constants.motion.map_x, constants.motion.map_y);
-        let mut placed = Vec::with_capacity(self.teams() * agents);
+    /// Returns the start positions of the chosen teams, `[teams][agents]`, and their POI positions, `[teams][pois]`, which
+    /// are empty unless given; all rounded to the grid.
+    fn checked(&self, starts: &[f32], chosen: Option<&[bool]>) -> Result<(Vec<Vec2>, Vec<Vec2>), StepError> {
+        let (teams, agents, pois) = (self.teams(), self.world.agents(), self.world.pois.len());
+        let each = if starts.len() == teams * (agents + pois) * 2 { agents + pois } else { agents };
+        self.check_length("coordinates", "[teams][agents][2]", teams * each * 2, starts.len())?;
+        let map = self.world.map();
+        let (mut placed, mut moved) = (Vec::with_capacity(teams * agents), Vec::with_capacity(teams * (each - agents)));
         for (index, &[x, y]) in starts.as_chunks::<2>().0.iter().enumerate() {
-            let (team, agent) = (index / agents, index % agents);
+            let (team, agent) = (index / each, index % each);
             let on_map = (0.0..=map.x).contains(&x) && (0.0..=map.y).contains(&y);
+            let to = if agent < agents { &mut placed } else { &mut moved };
             if chosen.is_some_and(|chosen| !chosen[team]) {
-                placed.push(Vec2::ZERO);
+                to.push(Vec2::ZERO);
             } else if on_map {
-                placed.push(settled(Vec2::new(x, y), map));
-            } else {
+                to.push(settled(Vec2::new(x, y), map));
+            } else if agent < agents {
                 return Err(StepError::Start { team, agent, at: [x, y] });
+            } else {
+                return Err(StepError::Poi { team, poi: agent - agents, at: [x, y] });
             }
         }
-        Ok(placed)
+        Ok((placed, moved))
     }
 }
 

@@ -9,7 +9,7 @@ use crate::record::RecordError;
 use crate::record::digests::UNVERIFIED;
 use crate::record::disk::Disk;
 use crate::record::ownership;
-use crate::report::curves::{Curve, PRINT, SMALL, distinct};
+use crate::report::curves::{Band, Curve, PRINT, SMALL, distinct};
 use crate::report::grid::{Cell, Curves, Dots, HeatMap, Interval, Scale};
 use crate::report::scene::Format;
 
@@ -54,11 +54,11 @@ pub fn draw(
     out: &Path,
 ) -> Result<(Vec<String>, Option<String>), RecordError> {
     let scenes = if sweep.axes.iter().any(|axis| axis.varied) {
-        dots(sweep, outcomes).map(|dots| vec![(FIGURES[0], dots.scene())])
+        dots(sweep, outcomes, options).map(|dots| vec![(FIGURES[0], dots.scene())])
     } else {
         let of_grid = |grid: Facets<'_>| {
-            let (last, reach) = (grid.last().scene(), grid.reach(options).scene());
-            FIGURES.into_iter().zip([last, reach, grid.curves(sweep).scene()]).collect()
+            let (last, reach) = (grid.last(options).scene(), grid.reach(options).scene());
+            FIGURES.into_iter().zip([last, reach, grid.curves(sweep, options).scene()]).collect()
         };
         Facets::new(sweep, outcomes, axes).map(of_grid)
     };
@@ -83,9 +83,9 @@ pub fn draw(
     Ok((names, None))
 }
 
-/// Draws the best team's G in the last generation for every value of every varied key, with one panel for each
+/// Draws G in the last generation for every value of every varied key, with one panel for each
 /// combination of the grid.
-fn dots(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>]) -> Result<Dots, String> {
+fn dots(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>], options: &Detail) -> Result<Dots, String> {
     let (varied, grid): (Vec<usize>, Vec<usize>) = (0..sweep.axes.len()).partition(|&axis| sweep.axes[axis].varied);
     let rows: usize = varied.iter().map(|&axis| sweep.axes[axis].values.len() - 1).sum();
     let count = grid.iter().fold(1_usize, |count, &axis| count.saturating_mul(sweep.axes[axis].values.len()));
@@ -95,8 +95,8 @@ fn dots(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>]) -> Result<Dots, St
         ));
     }
     let mut dots = Dots {
-        title: "G of the best team, last generation: mean over trials, two standard errors either way".into(),
-        x_label: "G (line and band: as in the file)".into(),
+        title: format!("{}, last generation: {} over trials", options.measure.label(), options.band.describe()),
+        x_label: "G (dashed line and grey band: the file's own values)".into(),
         groups: varied.iter().map(|&axis| group(&sweep.axes[axis])).collect(),
         panels: vec![(String::new(), None, vec![None; rows]); count],
     };
@@ -109,8 +109,8 @@ fn dots(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>]) -> Result<Dots, St
             *title = words.collect::<Vec<_>>().join(", ");
         }
         let Ok(outcome) = outcome else { continue };
-        let (mean, error) = (outcome.best().mean(), outcome.best().error());
-        let spread: Interval = [mean, mean - 2.0 * error, mean + 2.0 * error];
+        let [low, mean, high] = options.band.around(&outcome.measured());
+        let spread: Interval = [mean, low, high];
         let mut row = 0;
         let changed = varied.iter().find_map(|&axis| {
             let value = point.values[axis];
@@ -174,7 +174,12 @@ impl<'a> Facets<'a> {
         Ok(Facets { x: &sweep.axes[x], y: y.map(|y| &sweep.axes[y]), panels })
     }
 
-    fn heat_map(&self, title: String, key: Vec<(f64, String)>, cell: impl Fn(&Point, &Outcome) -> Cell) -> HeatMap {
+    fn heat_map(
+        &self,
+        title: String,
+        (key, key_label): (Vec<(f64, String)>, [String; 2]),
+        cell: impl Fn(&Point, &Outcome) -> Cell,
+    ) -> HeatMap {
         let cells = |points: &Vec<Spot<'_>>| {
             points.iter().map(|at| at.map_or(Cell::Empty, |(point, outcome)| cell(point, outcome))).collect()
         };
@@ -184,15 +189,31 @@ impl<'a> Facets<'a> {
             y: self.y.map(scale).unwrap_or_default(),
             panels: self.panels.iter().map(|(title, points)| (title.clone(), cells(points))).collect(),
             key,
+            key_label,
         }
     }
 
-    /// Draws the best team's G in the last generation.
-    fn last(&self) -> HeatMap {
+    /// Draws G in the last generation.
+    fn last(&self, options: &Detail) -> HeatMap {
         let key = [0.0, 0.25, 0.5, 0.75, 1.0].map(|g| (g, g.to_string())).to_vec();
-        self.heat_map("G of the best team, last generation, mean over trials".into(), key, |_, outcome| {
-            let mean = outcome.best().mean();
-            Cell::Value(mean, format!("{mean:.2}"))
+        let what = options.measure.label();
+        let cells = match options.band {
+            Band::Interval => "mean over trials; below: 95 % interval",
+            Band::Error => "mean over trials; below: ± standard error",
+            Band::None => "mean over trials",
+        };
+        let title = format!("{what}, last generation, {} over trials", options.band.describe());
+        self.heat_map(title, (key, [what, cells.into()]), |_, outcome| {
+            let measured = outcome.measured();
+            let [low, mean, high] = options.band.around(&measured);
+            let note = match options.band {
+                Band::Interval => format!("{low:.2}–{high:.2}"),
+                Band::Error => format!("±{:.2}", measured.error()),
+                Band::None => String::new(),
+            };
+            // A single trial has no interval.
+            let note = if measured.count() > 1 { note } else { String::new() };
+            Cell::Value(mean, format!("{mean:.2}"), note)
         })
     }
 
@@ -206,27 +227,28 @@ impl<'a> Facets<'a> {
         ticks.push(last);
         let key = ticks.into_iter().map(|tick| (place(tick), tick.to_string())).collect();
         let title = format!("Generations until the best team's G is {}, median over trials", options.reach);
-        self.heat_map(title, key, |_, outcome| match outcome.median_reached() {
-            Some(median) => Cell::Value(place(median), median.to_string()),
-            None => Cell::Word("never".into()),
+        let label =
+            [format!("Median generation that reaches G {}", options.reach), "below: trials that reach it".into()];
+        self.heat_map(title, (key, label), |_, outcome| {
+            let reached = outcome.reached.iter().flatten().count();
+            let note = format!("{reached} of {}", outcome.reached.len());
+            match outcome.median_reached() {
+                Some(median) => Cell::Value(place(median), median.to_string(), note),
+                None if reached == 0 => Cell::Word("never".into()),
+                None => Cell::Word(format!("{reached} of {}", outcome.reached.len())),
+            }
         })
     }
 
     /// Draws learning curves, one for each value of the x axis.
-    fn curves(&self, sweep: &Sweep) -> Curves {
+    fn curves(&self, sweep: &Sweep, options: &Detail) -> Curves {
         let width = self.x.values.len();
         let mut panels = Vec::new();
         for row in 0..self.y.map_or(1, |y| y.values.len()) {
             for (title, points) in &self.panels {
                 let curve = |(value, at): (usize, &Spot<'_>)| {
                     let outcome = (*at)?.1;
-                    let mut curve = Curve { trials: outcome.best.len() as u32, ..Curve::default() };
-                    for &(generation, mean, error) in &outcome.curve {
-                        curve.generation.push(generation as f64);
-                        curve.mean.push(mean);
-                        curve.error.push(error);
-                    }
-                    Some((value, curve))
+                    Some((value, Curve::at(outcome.curve.iter().map(|(generation, average)| (*generation, average)))))
                 };
                 let curves = points[row * width..(row + 1) * width].iter().enumerate().filter_map(curve).collect();
                 let row = self.y.map(|y| format!("{} = {}", y.leaf(), y.label(row)));
@@ -235,9 +257,10 @@ impl<'a> Facets<'a> {
             }
         }
         Curves {
-            title: format!("{}: G of the best team, mean and standard error over trials", sweep.name),
-            y_label: "G, best team".into(),
+            title: format!("{}: {}, {} over trials", sweep.name, options.measure.label(), options.band.describe()),
+            y_label: options.measure.label(),
             by: scale(self.x),
+            band: options.band,
             columns: if self.panels.len() > 1 { self.panels.len() } else { 0 },
             panels,
         }

@@ -10,8 +10,9 @@ use std::path::{Path, PathBuf};
 
 use super::results::point_folder;
 use super::{Axis, Point, Sweep};
-use crate::backend::{Backend, BackendError, Group, RecordRequest};
-use crate::config::{Config, ConfigError, Override};
+use crate::backend::{Backend, BackendError, Group};
+use crate::baseline::{self, Baselines};
+use crate::config::{Config, ConfigError, Override, Sharing};
 use crate::escape::PathExt;
 use crate::evaluate::{self, Starts};
 use crate::record::RecordError;
@@ -67,7 +68,7 @@ pub struct Study {
     /// policies of those points, as additional arms.
     warm_from: Option<(&'static str, &'static [(usize, &'static str)])>,
     /// The jitter of POIs, in units, with which champions play in addition to fixed POIs. Nothing else is then
-    /// measured, and a team with the zero policy is an additional arm.
+    /// measured, and the best constant speed is an additional arm.
     moved: Option<f64>,
 }
 
@@ -383,7 +384,7 @@ impl Study {
         Ok(Answer { part: *self, rows })
     }
 
-    /// Plays every trial's champion, and the zero policy, with fixed POIs and with moved ones.
+    /// Plays every trial's champion, and the best constant speed, with fixed POIs and with moved ones.
     fn played(
         &self,
         place: &str,
@@ -399,8 +400,8 @@ impl Study {
             named.push(Named { name: name.clone(), folders: vec![folder.escaped().to_string()], trials });
             weights.push(champions(&folder.join(POLICIES), config)?);
         }
-        named.push(Named { name: "straight ahead".into(), folders: vec![], trials });
-        weights.push(vec![0.0; trials * config.learners() * config.parameters()]);
+        named.push(Named { name: "best constant speed".into(), folders: vec![], trials });
+        weights.push(best_constant(config, jitter, backend)?.repeat(trials * config.learners()));
         let mut values = Vec::new();
         for (poi_jitter, episodes) in [(0.0, 1), (jitter, EPISODES)] {
             let mut config = config.clone();
@@ -414,11 +415,16 @@ impl Study {
             };
             let mut of_arms = Vec::new();
             for weights in &weights {
-                let (weights, starts_here) = (weights[..].into(), &world.starts);
-                let need = RecordRequest::Scores;
-                let group =
-                    Group { world: &world, starts: starts_here, weights, policies: trials, teams: &teams, need };
-                let played = evaluate::evaluate(backend, &group, &starts, &|_| {})?;
+                let group = Group {
+                    world: &world,
+                    starts: &world.starts,
+                    weights: weights[..].into(),
+                    policies: trials,
+                    sharing: Sharing::PerLeader,
+                    teams: &teams,
+                    fitnesses: evaluate::SCORES,
+                };
+                let played = evaluate::evaluate(backend, &group, &starts, &mut |_| {})?;
                 of_arms.push((0..trials).map(|team| played.team(team).mean / played.pois as f64).collect());
             }
             values.push((Measure::Played { poi_jitter, episodes }, of_arms));
@@ -427,8 +433,26 @@ impl Study {
     }
 }
 
+/// Returns the policy of the constant speed that observes most of the moved POIs. The episodes that choose it are not
+/// those that measure it.
+fn best_constant(config: &Config, jitter: f64, backend: &mut dyn Backend) -> Result<Vec<f32>, BackendError> {
+    let mut config = config.clone();
+    (config.learning.poi_jitter, config.learning.generations, config.learning.population) = (jitter, 0, 2);
+    let mut baselines = Baselines::of_trial(config.clone(), 0);
+    while !baselines.is_done() {
+        baselines.advance(backend)?;
+    }
+    let outcome = baselines.outcomes(backend, EPISODES)?.concat().remove(0);
+    let mut policy = vec![0.0; config.parameters()];
+    baseline::constant_policy(&baseline::constants(config.policy.actions)[outcome.best_constant], &mut policy);
+    Ok(policy)
+}
+
 /// Returns the champion of every trial as one team each, `[leaders][trials][parameters]`.
-fn champions(path: &Path, config: &Config) -> Result<Vec<f32>, RecordError> {
+///
+/// # Errors
+/// The policies cannot be read, or belong to another config.
+pub fn champions(path: &Path, config: &Config) -> Result<Vec<f32>, RecordError> {
     let (leaders, trials, parameters) = (config.learners(), config.learning.trials, config.parameters());
     let mut champions = vec![0.0; leaders * trials * parameters];
     for trial in 0..trials {

@@ -13,6 +13,8 @@ use crate::record::disk::Disk;
 use crate::record::folder::{CONFIG, METRICS, POINTS, RESULTS};
 use crate::record::{RecordError, without_checkpoint};
 use crate::record::{metrics, ownership};
+use crate::report::curves::Band;
+use crate::report::runs::TeamKind;
 use crate::statistics::Average;
 use crate::trainer::Row;
 
@@ -25,6 +27,10 @@ pub struct Detail {
     pub reach: f64,
     /// Whether points' files are compared with their digests.
     pub verification: Verification,
+    /// The team whose G the pictures show.
+    pub measure: TeamKind,
+    /// Meaning of the pictures' bands.
+    pub band: Band,
 }
 
 /// The results of a point's trials.
@@ -36,8 +42,9 @@ pub struct Outcome {
     pub champion: Vec<f64>,
     /// The first generation of every trial whose best G is at least [`Detail::reach`].
     pub reached: Vec<Option<usize>>,
-    /// Generation, mean and standard error of the best G over the trials, for each row of `results.csv`.
-    pub curve: Vec<(usize, f64, f64)>,
+    /// [`Detail::measure`]'s G by generation, averaged over the trials, for each row of `results.csv`. The last
+    /// generation is the last entry.
+    pub curve: Vec<(usize, Average)>,
 }
 
 impl Outcome {
@@ -49,6 +56,11 @@ impl Outcome {
     /// Returns the average over trials of the champion's G in the last generation.
     pub fn champion(&self) -> Average {
         self.champion.iter().collect()
+    }
+
+    /// Returns the average over trials of [`Detail::measure`]'s G in the last generation.
+    pub fn measured(&self) -> Average {
+        self.curve.last().map_or(Average::default(), |(_, average)| *average)
     }
 
     /// Returns the median over trials of the first generation that reaches G. Trials that never reach it count as
@@ -194,8 +206,9 @@ fn read(point: &Point, out: &Path, options: &Detail) -> Result<(Vec<Row>, Outcom
     }
     let ends = || rows.iter().filter_map(|rows| rows.last());
     let curve = (0..rows[0].len()).map(|at| {
-        let best: Average = rows.iter().map(|rows| &rows[at].best_g).collect();
-        (rows[0][at].generation, best.mean(), best.error())
+        let mut average = Average::default();
+        rows.iter().for_each(|rows| average.add(options.measure.of(&rows[at])));
+        (rows[0][at].generation, average)
     });
     let outcome = Outcome {
         best: ends().map(|row| row.best_g).collect(),

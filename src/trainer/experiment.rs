@@ -1,7 +1,6 @@
 //! One experiment of a trainer: its trials, and how far they are.
 
 use std::ops::Range;
-use std::sync::atomic::AtomicU32;
 
 use fearless_simd::Level;
 
@@ -9,6 +8,7 @@ use super::residency::Residency;
 use super::schedule::TeamSchedule;
 use super::stages::{Stage, Stages};
 use super::{Row, Snapshot};
+use crate::backend::GroupScores;
 use crate::config::{Learning, ValidConfig};
 use crate::evolve::{self, Key, Purpose};
 use crate::parallel::*;
@@ -37,10 +37,10 @@ pub(super) struct TrialState {
     /// This generation, `[populations][policies + 1][parameters]`, and memory for the next.
     pub weights: Vec<f32>,
     pub children: Vec<f32>,
-    /// POIs observed, `[episodes][policies + 1]`.
-    pub observed: Vec<AtomicU32>,
-    /// Scores, f32 as bits, `[episodes][policies + 1][leaders]`.
-    pub scores: Vec<AtomicU32>,
+    /// The scores of the generation that played, `[episodes]`. The last team is the champion's, if it played there.
+    pub scores: Vec<GroupScores>,
+    /// The scores of the champion's team if it played in the previous stage, `[episodes]`; else empty.
+    pub previous_stage_scores: Vec<GroupScores>,
     /// The mean score of every policy, `[populations][policies]`.
     pub fitness: Vec<f32>,
     /// The plan of the next generation, see [`evolve::draw_parents`], `[populations][policies + 1]`.
@@ -141,7 +141,7 @@ impl Experiment {
             self.trials.iter_mut().zip(weights.into_iter().zip(fitness).zip(pending))
         {
             (trial.weights, trial.fitness) = (weights, fitness);
-            trial.pending = pending.map(|row| Row { arm: index, ..row });
+            trial.pending = pending.map(|row| Row { experiment: index, ..row });
         }
         self.generation = generation.min(self.last() + 2);
         self.residency = Residency::on_host(self.generation);
@@ -155,11 +155,11 @@ impl Experiment {
 }
 
 impl TrialState {
-    /// Returns a trial with random policies. Scratch memory is enough for every stage's episodes.
+    /// Returns a trial with random policies.
     fn new(stages: &Stages, index: usize, level: Level) -> TrialState {
         let Stage { config, world, .. } = stages.of(0);
         let Learning { seed, population, .. } = config.learning;
-        let (leaders, populations, parameters) = (world.leaders(), config.populations(), world.parameters());
+        let (populations, parameters) = (config.populations(), world.parameters());
         let key = Key::new(seed, index, Purpose::Weights);
         let mut weights = vec![0.0; populations * (population + 1) * parameters];
         weights.par_chunks_exact_mut((population + 1) * parameters).enumerate().for_each(|(leader, policies)| {
@@ -169,13 +169,12 @@ impl TrialState {
                 .enumerate()
                 .for_each(|(slot, policy)| evolve::random_policy(level, key.at(0, leader, slot), policy));
         });
-        let slots = stages.max_episodes() * (population + 1);
         TrialState {
             index,
             children: vec![0.0; weights.len()],
             weights,
-            observed: std::iter::repeat_with(AtomicU32::default).take(slots).collect(),
-            scores: std::iter::repeat_with(AtomicU32::default).take(slots * leaders).collect(),
+            scores: vec![],
+            previous_stage_scores: vec![],
             fitness: vec![0.0; populations * population],
             parents: vec![0; populations * (population + 1)],
             pending: None,

@@ -23,6 +23,7 @@ use crate::host::Instant;
 use crate::parallel::*;
 use crate::world::World;
 
+mod asked;
 mod experiment;
 mod populations;
 mod residency;
@@ -31,6 +32,7 @@ mod schedule;
 mod size;
 mod stages;
 
+pub use asked::Asked;
 pub use size::{bytes, next_bytes, snapshot_bytes};
 
 use experiment::Experiment;
@@ -48,7 +50,7 @@ pub struct Trainer {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Row {
     /// The experiment's index in its trainer; 0 in a run by itself.
-    pub arm: usize,
+    pub experiment: usize,
     /// The trial, from 0.
     pub trial: usize,
     /// The generation, from 0, the random start.
@@ -79,6 +81,23 @@ pub struct Snapshot<N = Vec<f32>> {
     pub pending: Vec<Option<Row>>,
 }
 
+/// State that a finished experiment needs, beside its policies, to be extended.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Ending {
+    /// A trial's scores of the last generation, `[populations][policies]`.
+    pub fitness: Vec<Vec<f32>>,
+    /// Best and mean G of the last generation's teams, by trial.
+    pub pending: Vec<Option<[f64; 2]>>,
+}
+
+impl Ending {
+    /// Copies what is needed of a snapshot after the last generation.
+    pub fn of(snapshot: &Snapshot<&[f32]>) -> Ending {
+        let pending = snapshot.pending.iter().map(|row| row.map(|row| [row.best_g, row.mean_g])).collect();
+        Ending { fitness: snapshot.fitness.iter().map(|scores| scores.to_vec()).collect(), pending }
+    }
+}
+
 /// The time that generations took, by phase.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Times {
@@ -87,7 +106,7 @@ pub struct Times {
     /// Rollouts and scores.
     pub play: Duration,
     /// Rows and fitness.
-    pub conclude: Duration,
+    pub collect: Duration,
     /// Selection and mutation.
     pub breed: Duration,
 }
@@ -225,19 +244,19 @@ impl Trainer {
         let played = Instant::now();
         let collect = |(index, experiment): &mut (usize, &mut Experiment)| match experiment.is_over() {
             true => experiment.collect_last_rows(),
-            false => experiment.collect_results(*index),
+            false => experiment.collect_results(*index, None),
         };
         let mut rows = playing.par_iter_mut().flat_map_iter(collect).collect::<Vec<_>>();
-        let concluded = Instant::now();
+        let collected = Instant::now();
         playing.retain(|(_, experiment)| !experiment.is_over());
         let setbacks: Vec<_> =
             playing.par_iter_mut().filter_map(|(_, experiment)| experiment.breed(level).err()).collect();
         self.setback = setbacks.into_iter().next().or(self.setback.take());
-        rows.sort_by_key(|row| (row.arm, row.trial, row.generation));
+        rows.sort_by_key(|row| (row.experiment, row.trial, row.generation));
         self.times.prepare += prepared - start;
         self.times.play += played - prepared;
-        self.times.conclude += concluded - played;
-        self.times.breed += concluded.elapsed();
+        self.times.collect += collected - played;
+        self.times.breed += collected.elapsed();
         Ok(rows)
     }
 
@@ -369,5 +388,6 @@ fn play_and_draw_next(
         },
     );
     playing.iter_mut().zip(next).for_each(|((_, experiment), next)| experiment.next_schedules = next);
-    played
+    results::keep(played?, playing);
+    Ok(())
 }

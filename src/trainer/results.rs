@@ -1,8 +1,6 @@
 //! The results of a generation: plays it, scores it, and turns scores into rows and fitness.
 
-use std::cell::RefCell;
 use std::ops::Range;
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use glam::Vec2;
 
@@ -10,19 +8,17 @@ use super::Row;
 use super::experiment::{Experiment, TrialState};
 use super::schedule::{MIN_POLICIES_PER_TASK, TeamSchedule, min_populations_per_task};
 use super::stages::Stage;
-use crate::backend::{Backend, BackendError, Episode, Group, RecordRequest, Weights};
+use crate::backend::{Backend, BackendError, Group, GroupScores, Weights};
 use crate::config::Sharing;
-use crate::credit::Credit;
 use crate::parallel::*;
 
-/// Plays the teams of every trial of some experiments as one batch, and keeps their scores. An experiment that is over
-/// plays its champions only.
+/// Plays the teams of every trial of some experiments as one batch. Returns their scores, for [`keep`]. An experiment
+/// that is over plays its champions only.
 pub(super) fn play<'a>(
     backend: &mut dyn Backend,
     experiments: &'a [(usize, &'a mut Experiment)],
-) -> Result<(), BackendError> {
-    thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
-    let (mut groups, mut places) = (Vec::new(), Vec::new());
+) -> Result<Vec<GroupScores>, BackendError> {
+    let mut groups = Vec::new();
     for (_, experiment) in experiments {
         let (stage, range) = (experiment.stage(), experiment.playing());
         let (population, leaders) = (stage.config.learning.population, stage.world.leaders());
@@ -31,13 +27,16 @@ pub(super) fn play<'a>(
         for (index, (trial, schedule)) in experiment.trials.iter().zip(&experiment.schedules).enumerate() {
             let weights = on_device.get(index).map_or(trial.weights[..].into(), |held| Weights::OnDevice(&**held));
             let mut add = |stage: &'a Stage, starts: &'a [Vec<Vec2>], range: Range<usize>| {
-                let (world, fitness) = (&stage.world, stage.config.learning.fitness);
-                let (teams, need) =
-                    (&schedule.teams[range.start * leaders..range.end * leaders], RecordRequest::Score(fitness));
-                for (episode, starts) in starts.iter().enumerate() {
-                    groups.push(Group { world, starts, weights, policies: population + 1, teams, need });
-                    places.push((world, fitness, trial, episode * (population + 1) + range.start));
-                }
+                let learning = &stage.config.learning;
+                groups.extend(starts.iter().map(|starts| Group {
+                    world: &stage.world,
+                    starts,
+                    weights,
+                    policies: population + 1,
+                    sharing: learning.sharing,
+                    teams: &schedule.teams[range.start * leaders..range.end * leaders],
+                    fitnesses: std::slice::from_ref(&learning.fitness),
+                }));
             };
             // Champions play in the stage that they come from.
             let end = if previous.is_some() { population } else { range.end };
@@ -47,18 +46,18 @@ pub(super) fn play<'a>(
             }
         }
     }
-    backend.rollout(&groups, &|episode: Episode<'_>| {
-        let (world, fitness, trial, first) = places[episode.group];
-        let (team, leaders) = (first + episode.team, world.leaders());
-        CREDIT.with_borrow_mut(|(credit, scores)| {
-            scores.resize(leaders, 0.0);
-            let observed = credit.score(&episode, world, fitness, scores);
-            trial.observed[team].store(observed, Relaxed);
-            for (to, score) in trial.scores[team * leaders..].iter().zip(&*scores) {
-                to.store(score.to_bits(), Relaxed);
-            }
-        });
-    })
+    backend.play(&groups)
+}
+
+/// Gives each trial its scores, in the order in which [`play`] plays.
+pub(super) fn keep(scores: Vec<GroupScores>, experiments: &mut [(usize, &mut Experiment)]) {
+    let mut scores = scores.into_iter();
+    for (_, Experiment { trials, schedules, .. }) in experiments {
+        for (trial, schedule) in trials.iter_mut().zip(schedules) {
+            trial.scores = scores.by_ref().take(schedule.starts.len()).collect();
+            trial.previous_stage_scores = scores.by_ref().take(schedule.previous_stage_starts.len()).collect();
+        }
+    }
 }
 
 impl Experiment {
@@ -71,36 +70,42 @@ impl Experiment {
     }
 
     /// Turns a generation's scores into fitness, and returns the rows that its champions complete. `index` is the
-    /// experiment's in its trainer.
-    pub fn collect_results(&mut self, index: usize) -> Vec<Row> {
+    /// experiment's in its trainer. `told` replaces the scores, `[trials][policies][leaders]`, one team per policy.
+    pub fn collect_results(&mut self, index: usize, told: Option<&[f32]>) -> Vec<Row> {
         let generation = self.residency.generation();
         let Experiment { stages, trials, schedules, .. } = self;
         let Stage { config, world, .. } = stages.of(generation);
         let population = config.learning.population;
         let pois_before = stages.ending_before(generation).map_or(world.pois.len(), |stage| stage.world.pois.len());
         let mut rows = Vec::with_capacity(trials.len());
-        for (trial, schedule) in trials.iter_mut().zip(schedules) {
-            let [best_g, mean_g] = trial.team_g(schedule, world.pois.len(), population);
-            let champion_g = trial.champion_g(schedule, pois_before, population);
-            rows.extend(trial.pending.map(|row| Row { champion_g, ..row }));
-            trial.pending = Some(Row { arm: index, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
+        for (number, (trial, schedule)) in trials.iter_mut().zip(schedules).enumerate() {
+            let size = population * world.leaders();
+            let [best_g, mean_g] = team_g(&trial.scores, world.pois.len(), population);
+            rows.extend(trial.pending.map(|row| Row { champion_g: trial.champion_g(pois_before), ..row }));
+            trial.pending =
+                Some(Row { experiment: index, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
+            let score = |place: usize| match told {
+                Some(told) => told[number * size + place],
+                None => mean_score(&trial.scores, place),
+            };
             match config.learning.sharing {
-                Sharing::None => trial.assign_fitness(schedule, world.leaders(), population),
-                Sharing::All => trial.assign_shared_fitness(schedule, world.leaders(), population),
+                Sharing::PerLeader => assign_fitness(score, schedule, population, &mut trial.fitness),
+                Sharing::Shared => assign_shared_fitness(score, world.leaders(), &mut trial.fitness),
             }
+            trial.forget_scores();
         }
         rows
     }
 
     /// Returns the last generation's rows, which its champions have just completed. The experiment is done then.
     pub fn collect_last_rows(&mut self) -> Vec<Row> {
-        let Stage { config, world, .. } = self.stage();
-        let (pois, population) = (world.pois.len(), config.learning.population);
-        let row = |(trial, schedule): (&TrialState, &TeamSchedule)| {
-            let champion_g = trial.champion_g(schedule, pois, population);
-            trial.pending.map(|row| Row { champion_g, ..row })
+        let pois = self.stage().world.pois.len();
+        let row = |trial: &mut TrialState| {
+            let row = trial.pending.map(|row| Row { champion_g: trial.champion_g(pois), ..row });
+            trial.forget_scores();
+            row
         };
-        let rows = self.trials.iter().zip(&self.schedules).filter_map(row).collect();
+        let rows = self.trials.iter_mut().filter_map(row).collect();
         // The weights were fetched before.
         self.residency.lose();
         self.residency.bred();
@@ -109,59 +114,58 @@ impl Experiment {
 }
 
 impl TrialState {
-    /// Returns G of the best team, and the mean over teams.
-    fn team_g(&self, schedule: &TeamSchedule, pois: usize, population: usize) -> [f64; 2] {
-        let episodes = schedule.starts.len();
-        let observed = |team: usize| self.observed(team, episodes, population);
-        let whole = (pois * episodes) as f64;
-        let best = (0..population).map(observed).max().unwrap_or(0);
-        let total: u64 = (0..population).map(observed).sum();
-        [best as f64 / whole, total as f64 / (whole * population as f64)]
+    /// Returns G of the champion's team, the last of those that played.
+    fn champion_g(&self, pois: usize) -> f64 {
+        let of_stage = if self.previous_stage_scores.is_empty() { &self.scores } else { &self.previous_stage_scores };
+        let observed = |episode: &GroupScores| u64::from(episode.observed.last().copied().unwrap_or(0));
+        of_stage.iter().map(observed).sum::<u64>() as f64 / (pois * of_stage.len()) as f64
     }
 
-    /// Returns G of the champion's team, which may have played in the previous stage.
-    fn champion_g(&self, schedule: &TeamSchedule, pois: usize, population: usize) -> f64 {
-        let TeamSchedule { starts, previous_stage_starts, .. } = schedule;
-        let episodes = if previous_stage_starts.is_empty() { starts.len() } else { previous_stage_starts.len() };
-        self.observed(population, episodes, population) as f64 / (pois * episodes) as f64
-    }
-
-    /// Returns how many POIs a team observed in all episodes.
-    fn observed(&self, team: usize, episodes: usize, population: usize) -> u64 {
-        (0..episodes).map(|episode| u64::from(self.observed[episode * (population + 1) + team].load(Relaxed))).sum()
-    }
-
-    /// Assigns each policy its leader's score in its team, averaged over episodes.
-    fn assign_fitness(&mut self, schedule: &TeamSchedule, leaders: usize, population: usize) {
-        let TeamSchedule { orders, starts, .. } = schedule;
-        let TrialState { scores, fitness, .. } = self;
-        let episodes = starts.len();
-        let populations = fitness.par_chunks_exact_mut(population).zip(orders.par_chunks_exact(population));
-        populations.with_min_len(min_populations_per_task(population)).enumerate().for_each(
-            |(leader, (fitness, order))| {
-                for (team, &policy) in order.iter().enumerate() {
-                    fitness[policy as usize] = mean_score(scores, episodes, population + 1, team, leaders, leader);
-                }
-            },
-        );
-    }
-
-    /// Assigns each policy of a shared population the mean of its leaders' scores, summed in the leaders' order.
-    fn assign_shared_fitness(&mut self, schedule: &TeamSchedule, leaders: usize, population: usize) {
-        let (episodes, scores) = (schedule.starts.len(), &self.scores);
-        let min_len = MIN_POLICIES_PER_TASK.div_ceil(leaders);
-        self.fitness.par_iter_mut().with_min_len(min_len).enumerate().for_each(|(team, fitness)| {
-            let score = |leader| f64::from(mean_score(scores, episodes, population + 1, team, leaders, leader));
-            *fitness = ((0..leaders).map(score).sum::<f64>() / leaders as f64) as f32;
-        });
+    /// Frees the memory of scores that were used.
+    fn forget_scores(&mut self) {
+        (self.scores, self.previous_stage_scores) = (vec![], vec![]);
     }
 }
 
-/// Returns the score of one leader of a team, averaged over episodes. `scores` are `[episodes][teams][leaders]`.
+/// Returns G of the best team, and the mean over teams. `episodes` are the scores of each episode.
+fn team_g(episodes: &[GroupScores], pois: usize, population: usize) -> [f64; 2] {
+    let observed = |team: usize| episodes.iter().map(|episode| u64::from(episode.observed[team])).sum();
+    let whole = (pois * episodes.len()) as f64;
+    let best: u64 = (0..population).map(observed).max().unwrap_or(0);
+    let total: u64 = (0..population).map(observed).sum();
+    [best as f64 / whole, total as f64 / (whole * population as f64)]
+}
+
+/// Assigns each policy its leader's score in its team. `score` takes a place of `[teams][leaders]`, `fitness` is
+/// `[leaders][policies]`.
+fn assign_fitness(
+    score: impl Fn(usize) -> f32 + Sync,
+    schedule: &TeamSchedule,
+    population: usize,
+    fitness: &mut [f32],
+) {
+    let leaders = fitness.len() / population;
+    let populations = fitness.par_chunks_exact_mut(population).with_min_len(min_populations_per_task(population));
+    populations.enumerate().for_each(|(leader, fitness)| {
+        let policies = schedule.teams[leader..population * leaders].iter().step_by(leaders);
+        for (place, &policy) in (leader..).step_by(leaders).zip(policies) {
+            fitness[policy as usize] = score(place);
+        }
+    });
+}
+
+/// Assigns each policy of a shared population the mean of its leaders' scores, summed in the leaders' order.
+fn assign_shared_fitness(score: impl Fn(usize) -> f32 + Sync, leaders: usize, fitness: &mut [f32]) {
+    let min_len = MIN_POLICIES_PER_TASK.div_ceil(leaders);
+    fitness.par_iter_mut().with_min_len(min_len).enumerate().for_each(|(team, fitness)| {
+        let score = |leader| f64::from(score(team * leaders + leader));
+        *fitness = ((0..leaders).map(score).sum::<f64>() / leaders as f64) as f32;
+    });
+}
+
+/// Returns the score at one place of `[teams][leaders]`, averaged over episodes.
 #[inline(always)]
-fn mean_score(scores: &[AtomicU32], episodes: usize, teams: usize, team: usize, leaders: usize, leader: usize) -> f32 {
-    let score =
-        |episode: usize| f64::from(f32::from_bits(scores[(episode * teams + team) * leaders + leader].load(Relaxed)));
-    let total: f64 = (0..episodes).map(score).sum();
-    (total / episodes as f64) as f32
+pub(super) fn mean_score(episodes: &[GroupScores], place: usize) -> f32 {
+    let total: f64 = episodes.iter().map(|episode| f64::from(episode.scores[place])).sum();
+    (total / episodes.len() as f64) as f32
 }

@@ -22,9 +22,9 @@ pub(super) fn min_populations_per_task(population: usize) -> usize {
 pub(super) struct TeamSchedule {
     /// The generation and the index of its stage. `None` before the first draw. Ending a run early can change the stage.
     drawn_for: Option<(usize, usize)>,
-    /// The policy of each team, `[populations][policies]`: for fitness.
-    pub orders: Vec<u32>,
-    /// The policy of each leader, `[policies + 1][leaders]`: for the backend. The last team is the champion's.
+    /// Scratch memory: each population's policies in the order of their teams, `[populations][policies]`.
+    orders: Vec<u32>,
+    /// The policy of each leader, `[policies + 1][leaders]`. The last team is the champion's.
     pub teams: Vec<u32>,
     /// Start positions, followed by POI positions if POIs move, `[episodes][agents + pois]`.
     pub starts: Vec<Vec<Vec2>>,
@@ -65,10 +65,10 @@ impl TeamSchedule {
         }
     }
 
-    /// Writes `orders` and `teams`.
+    /// Writes `teams`.
     fn form_teams(&mut self, level: Level, learning: &Learning, trial: usize, generation: usize) {
         // With a shared population, team t always plays policy t.
-        if learning.sharing == Sharing::All {
+        if learning.sharing == Sharing::Shared {
             return;
         }
         let population = learning.population;

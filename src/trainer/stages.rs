@@ -45,11 +45,6 @@ impl Stages {
         self.index(generation.min(self.last_generation))
     }
 
-    /// Returns the largest number of episodes per team of any stage.
-    pub fn max_episodes(&self) -> usize {
-        self.stages.iter().map(|stage| stage.config.learning.episodes_per_team).max().unwrap_or(1)
-    }
-
     fn index(&self, generation: usize) -> usize {
         self.stages.iter().rposition(|stage| stage.first_generation <= generation).unwrap_or(0)
     }

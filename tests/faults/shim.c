@@ -4,7 +4,7 @@
  * the C library. The handler counts a call and then either makes it, fails it or ends the process.
  *
  * FAULT_AT     the call that fails, from 1; 0 counts only
- * FAULT_KIND   ENOSPC, EIO or KILL; a later call is not touched unless FAULT_ALL is set
+ * FAULT_KIND   ENOSPC, EIO, EROFS or KILL; a later call is not touched unless FAULT_ALL is set
  * FAULT_COUNT  a file that takes the number of calls as the process ends
  */
 #define _GNU_SOURCE
@@ -110,7 +110,7 @@ __attribute__((constructor)) static void begin(void) {
     at = atol(where);
     all = getenv("FAULT_ALL") != NULL;
     counted = getenv("FAULT_COUNT");
-    result = !kind || !strcmp(kind, "ENOSPC") ? -ENOSPC : !strcmp(kind, "EIO") ? -EIO : 0;
+    result = !kind || !strcmp(kind, "ENOSPC") ? -ENOSPC : !strcmp(kind, "EIO") ? -EIO : !strcmp(kind, "EROFS") ? -EROFS : 0;
 
     struct sigaction action = {.sa_sigaction = on_call, .sa_flags = SA_SIGINFO | SA_NODEFER | SA_ONSTACK | SA_RESTART};
     struct sock_filter filter[COUNT + 9];

@@ -7,7 +7,7 @@ use std::ops::Range;
 /// Where an operand is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Place {
-    /// So many vector registers from one on.
+    /// A number of consecutive vector registers.
     Vector(usize, usize),
     Scalar(usize, usize),
     /// As 32 bits and as 64.
@@ -53,7 +53,7 @@ impl Operand {
         Some(Operand { place: named.or_else(|| registers(bare))?, negative, absolute: bare != rest })
     }
 
-    /// Its registers in their row.
+    /// The registers in order.
     pub fn registers(&self) -> Range<usize> {
         match self.place {
             Place::Vector(first, count) => first..first + count,
@@ -102,7 +102,7 @@ fn registers(text: &str) -> Option<Place> {
     }
 }
 
-/// What an instruction does, and where its operands stand.
+/// The operation of an instruction, and the places of its operands.
 #[derive(Clone, Copy)]
 pub enum Action {
     /// To, from up to three, lane by lane; whether it rounds.
@@ -127,7 +127,7 @@ pub enum Action {
     LoadScalars,
     Load,
     Store,
-    /// So many words; from two addresses if there are words that tell these apart.
+    /// A number of words; from two addresses if the instruction has both offsets.
     LocalLoad(usize, Option<usize>),
     LocalStore(usize),
     Branch(When),
@@ -146,13 +146,13 @@ pub enum When {
     Empty,
 }
 
-/// What a scalar instruction leaves as the condition.
+/// The condition that a scalar instruction sets.
 #[derive(Clone, Copy)]
 pub enum Change {
     Kept,
     NotZero,
     Carry,
-    /// Of a sum of signed numbers, or of a difference.
+    /// For a sum or a difference of signed numbers.
     Overflow,
     OverflowDown,
 }
@@ -161,7 +161,7 @@ pub struct Instruction {
     pub text: String,
     pub action: Action,
     pub operands: Vec<Operand>,
-    /// Of memory; and of a workgroup's memory, in elements.
+    /// An offset in memory; for a workgroup's memory, in elements.
     pub offset: u32,
     pub offsets: [u32; 2],
     /// Whether each lane has an address of its own.
@@ -305,7 +305,7 @@ pub fn f(bits: u32) -> f32 {
     f32::from_bits(bits)
 }
 
-/// What an instruction of this name does.
+/// Returns the operation of an instruction with this name.
 fn action(name: &str, rest: &str) -> Option<Action> {
     if let Some(name) = name.strip_prefix("v_") {
         return vector_action(name.trim_end_matches("_e32").trim_end_matches("_e64"));

@@ -1,12 +1,11 @@
 //! A layout of the paper, the teams of it that one workgroup plays, and what must come of that.
 
-use std::sync::Mutex;
-
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::episode::{Kernel, Workgroup, workgroup_of};
 use flotilla::backend::gpu::exact::Pass;
-use flotilla::backend::{Backend, Group, RecordRequest};
+use flotilla::backend::{Backend, Group};
 use flotilla::bench::operations::{self, Reach};
+use flotilla::config::Sharing;
 use flotilla::sample;
 use flotilla::world::World;
 
@@ -24,16 +23,16 @@ pub struct Case {
     /// Whether a smaller workgroup than it takes by itself was asked for.
     is_cut: bool,
     pub workgroup: Workgroup,
-    /// What the CPU makes of it.
+    /// The CPU's result.
     record: Vec<u32>,
     states: Vec<u32>,
-    /// What a step of a team is counted as.
+    /// The operations counted for a step of a team.
     operations: f64,
     steps: usize,
     pub agent_steps: u64,
 }
 
-/// What came of running it on a chip.
+/// The result of running it on a chip.
 pub struct Run {
     /// Words of the record, and of where the agents stand in the end, that are not the CPU's.
     pub differ: usize,
@@ -63,21 +62,21 @@ impl Case {
             starts: &world.starts,
             weights: weights[..].into(),
             policies: MOST,
+            sharing: Sharing::PerLeader,
             teams: &choice[..teams * world.leaders()],
-            need: RecordRequest::Record,
+            fitnesses: &[],
         };
         let name = format!("{name}, {kernel}, {threads}");
         let workgroup = workgroup_of(&group(MOST), kernel, threads).unwrap_or_else(|error| panic!("{name}: {error}"));
         let teams = workgroup.teams;
-        let record = Mutex::new(vec![0; workgroup.buffers[RECORD].len()]);
-        let played = Cpu::default().rollout(&[group(teams)], &|episode| {
-            let mut record = record.lock().expect("nobody panicked");
-            for (index, word) in episode.sets.iter().chain(episode.seen.words().iter()).enumerate() {
-                record[index * teams + episode.team] = word;
-            }
-        });
-        played.expect("the CPU plays");
         let trace = Cpu::default().trace(&group(teams)).expect("the CPU plays");
+        let mut record = vec![0; workgroup.buffers[RECORD].len()];
+        for team in 0..teams {
+            let episode = trace.episode(world, team);
+            for (index, word) in episode.sets.iter().chain(episode.seen.words().iter()).enumerate() {
+                record[index * teams + team] = word;
+            }
+        }
         let ends = &trace.moments[world.steps() * teams * world.agents()..];
         let states = ends.iter().flat_map(|end| {
             let ([x, y], [hx, hy]) = (end.position, end.heading);
@@ -89,7 +88,7 @@ impl Case {
             kernel,
             is_cut: threads < 1024,
             workgroup,
-            record: record.into_inner().expect("nobody panicked"),
+            record,
             states: states.collect(),
             operations: operations::per_team_step(world, &reach),
             steps: world.steps(),

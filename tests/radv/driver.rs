@@ -1,4 +1,4 @@
-//! What a Vulkan driver says of a compute shader that it compiles. wgpu cannot open a device that is not there; this can.
+//! Asks a Vulkan driver to compile a compute shader and reads its statistics. Unlike wgpu, this opens devices that are absent.
 
 use std::collections::BTreeMap;
 use std::ffi::{CStr, c_char};

@@ -17,7 +17,7 @@ const SCALAR_MEMORY: u64 = 200;
 const LOCAL_MEMORY: u64 = 64;
 /// Bytes of a workgroup's own memory.
 const LOCAL_BYTES: usize = 64 << 10;
-/// What is in registers and memory that nothing has been written to: read as a float it is no number.
+/// The content of registers and memory that were never written: as a float it is NaN.
 pub const GARBAGE: u32 = 0xffff_dead;
 
 /// How a chip runs waves.
@@ -47,7 +47,7 @@ impl fmt::Display for Chip {
     }
 }
 
-/// What running a kernel came to.
+/// The result of running a kernel.
 #[derive(Clone, Copy, Debug)]
 pub struct Cost {
     /// Vector instructions of all waves of the workgroup.

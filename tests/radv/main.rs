@@ -309,11 +309,11 @@ fn run(case: &Case, chip: Chip, pass: Pass, compiled: &Compiled) -> u64 {
 
 /// Notes what was read where `FLOTILLA_EVIDENCE` says, each with the driver that compiled it.
 fn note(read: Vec<(String, String)>) {
-    use flotilla::record::evidence::{Sighting, Tier};
+    use flotilla::record::evidence::{MachineReport, Tier};
     let Some(folder) = std::env::var_os("FLOTILLA_EVIDENCE") else { return };
     let note = read.first().map(|(version, _)| format!("Mesa's RADV, {version}, for chips that were not there"));
     let findings = read.into_iter().map(|(_, finding)| finding).collect();
-    let sighting = Sighting { note, findings, ..Sighting::new(Tier::MachineCodeRead) };
+    let sighting = MachineReport { note, findings, ..MachineReport::new(Tier::MachineCodeRead) };
     fs::write(Path::new(&folder).join("radv.json"), sighting.to_json()).expect("the folder takes a file");
 }
 

@@ -1,4 +1,4 @@
-//! What tests share: a folder to run commands in, GPU adapters, small things that many ask for.
+//! Shared by tests: a folder to run commands in, GPU adapters, and small helpers.
 #![allow(dead_code, unused_imports, reason = "no test needs all of it")]
 
 #[cfg(feature = "gpu")]
@@ -26,6 +26,27 @@ population = 8
 generations = 6
 trials = 3
 ";
+
+/// A smaller config, for tests that train many times.
+pub const TINY: &str = "\
+[world]
+leaders = [[10, 5], [20, 5]]
+followers = [[12, 2], [22, 2]]
+pois = [[10, 9], [20, 9]]
+coupling = 2
+steps = 8
+[policy]
+hidden = [3]
+[learning]
+population = 6
+generations = 4
+trials = 2
+";
+
+/// Returns [`TINY`] with another number of generations, and with these keys of `[checkpoint]`.
+pub fn tiny(generations: usize, checkpoint: &str) -> String {
+    format!("{}[checkpoint]\n{checkpoint}\n", TINY.replace("generations = 4", &format!("generations = {generations}")))
+}
 
 /// One of the project's own configs, by its name.
 pub fn layout(name: &str) -> Config {
@@ -172,7 +193,7 @@ mod commands {
             self.command().args(words).output().unwrap()
         }
 
-        /// What a script of `bash` comes to.
+        /// Runs a script with `bash`.
         pub fn shell(&self, script: &str) -> Output {
             self.alone(shell("bash", script)).output().unwrap()
         }
@@ -193,13 +214,19 @@ mod commands {
             (String::from_utf8(output.stdout).unwrap(), told)
         }
 
-        /// What is said of a command that must be refused or fail with this code, and print nothing.
+        /// Runs a command that must fail with this code and print nothing, or with `--json` its error as an object. Returns
+        /// its error message.
         pub fn refused(&self, code: i32, words: impl Words) -> String {
             let words = words.words();
             let output = self.run(&words[..]);
             let told = String::from_utf8(output.stderr).unwrap();
             assert_eq!(output.status.code(), Some(code), "{words:?}: {told}");
-            assert!(output.stdout.is_empty(), "{words:?}");
+            if words.iter().any(|word| *word == "--json") {
+                let object: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+                assert!(object["code"].is_string() && object["message"].is_string(), "{words:?}: {object}");
+            } else {
+                assert!(output.stdout.is_empty(), "{words:?}");
+            }
             assert!(told.contains("error: ") && !told.contains("panicked"), "{words:?}: {told}");
             told
         }

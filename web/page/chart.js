@@ -1,7 +1,10 @@
+// @ts-check
 // Draws learning curves: POIs observed by the best team, per arm the mean over trials, with each trial as a thin line.
-const chart = (() => {
-  "use strict";
-  // `arms` are { tone, trials }. Each trial is an array of POIs, one value per `every` generations. `cursor` is the
+
+export const chart = (() => {
+  const DASHES = [[], [7, 3], [12, 4], [3, 3], [10, 3, 3, 3], [16, 3]];
+  // `arms` are { tone, trials, constant, random }. Each trial is an array of POIs, one value per `every` generations.
+  // `constant` is what the best constant action observes, or null, and `random` the best random team, per generation. `cursor` is the
   // generation to mark, or null.
   function paint(canvas, arms, every, last, pois, cursor) {
     const wide = canvas.clientWidth, tall = canvas.clientHeight, dots = window.devicePixelRatio || 1;
@@ -46,12 +49,22 @@ const chart = (() => {
       for (const trial of trials) line(draw, trial, every, X, Y);
       draw.globalAlpha = 1;
     }
+    // Baselines: a dotted line for the best constant action, and a dotted curve for random teams.
+    for (const { tone, constant, random } of arms) {
+      draw.strokeStyle = color(tone);
+      draw.lineWidth = 1.6;
+      draw.setLineDash([1.5, 4]);
+      if (constant !== null) { draw.beginPath(); draw.moveTo(left, Y(constant)); draw.lineTo(wide - right, Y(constant)); draw.stroke(); }
+      draw.setLineDash([6, 3, 1.5, 3]);
+      if (random.length) line(draw, random, 1, X, Y);
+      draw.setLineDash([]);
+    }
     arms.forEach(({ tone, trials }, index) => {
       const means = mean(trials);
       if (!means.length) return;
       draw.strokeStyle = color(tone);
       draw.lineWidth = 2.5;
-      draw.setLineDash(index ? [7, 3] : []);
+      draw.setLineDash(DASHES[index % DASHES.length]);
       line(draw, means, every, X, Y);
       draw.setLineDash([]);
       const end = means.length - 1;

@@ -1,6 +1,7 @@
+// @ts-check
 // Workers that run flotilla, and the detection of a GPU.
-const pool = (() => {
-  "use strict";
+
+export const pool = (() => {
   const text = id => document.getElementById(id).textContent;
   let compiled = null, script = null;
 
@@ -15,6 +16,8 @@ const pool = (() => {
     constructor() {
       this.asked = new Map();
       this.count = 0;
+      this.suspends = false;
+      /** @type {(told: any) => void} */
       this.told = () => {};
       script ??= URL.createObjectURL(new Blob([text("worker")], { type: "text/javascript" }));
       this.worker = new Worker(script);

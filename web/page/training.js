@@ -1,7 +1,11 @@
+// @ts-check
 // A training of one or two arms. On the GPU, one worker trains everything as one batch. On the CPU, the trials are
 // divided among the workers. The division does not change the results.
-class Training {
+
+export class Training {
   constructor(arms, machine) {
+    /** The text and the paradigms that were trained. @type {any} */
+    this.source = null;
     this.arms = arms.map(arm => ({ ...arm, trials: Array.from({ length: arm.config.learning.trials }, () => []), ended: [] }));
     this.machine = machine;
     this.players = [];
@@ -97,7 +101,7 @@ class Training {
     }
     const { description, backend, adapter, driver, threads } = this.machine;
     const { words, bytes: zip } = await this.players[0].ask({
-      ask: "record", text, command, description, backend, adapter, driver, threads,
+      ask: "record", name: `${arm.name}-${arm.label}`.replaceAll("++", "pp").replace(/[^\w.-]+/g, "-"), text, command, description, backend, adapter, driver, threads,
       started: this.started, rows: rows.length / 7, pending: ended.map(({ pending }) => pending),
     }, [new Uint8Array(rows.buffer), ...ended.map(({ part }) => part)], {}, [rows.buffer, ...buffers]);
     Object.assign(arm, { digest: words.digest, zip });
@@ -131,7 +135,7 @@ class Training {
     // version.
     const [episode] = words.episodes, told = this.arms[run].trials[trial][episode.generation];
     if (told && told.best !== episode.best_g) throw new Error(`Trained again, generation ${episode.generation} comes to G = ${episode.best_g}, where the run says ${told.best}: it started from given policies, or another version made it.`);
-    return stage.unpack(words);
+    return words;
   }
 
   stop() { if (this.state !== "done") this.state = "stopped"; }

@@ -2,9 +2,8 @@
 
 use std::io::{Cursor, Read, Write};
 
-use flotilla::backend::cpu::Cpu;
-use flotilla::backend::{Group, RecordRequest};
-use flotilla::config::{Config, Fitness};
+use flotilla::backend::{Group, cpu::Cpu};
+use flotilla::config::{Config, Sharing};
 use flotilla::evolve;
 use flotilla::record::checkpoint::{self, Checkpoint};
 use flotilla::record::folder::{self, FileSums, Origin, Run, Status};
@@ -24,10 +23,12 @@ const MOST: u64 = 1 << 30;
 
 /// Describes a finished run to export.
 ///
-/// Its numbers start with the rows, `[rows][7]` f64, in the order of `metrics.csv`. A row is run, trial, generation,
+/// The numbers start with the rows, `[rows][7]` f64, in the order of `metrics.csv`. A row is run, trial, generation,
 /// best, mean and champion G, seconds. After the rows follow each trial's policies and fitness, as f32.
 #[derive(Deserialize)]
 pub struct Recorded {
+    /// The folder in the archive that holds the run.
+    name: String,
     text: String,
     command: String,
     description: String,
@@ -61,7 +62,7 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
         .iter()
         .map(|&[_, trial, generation, best_g, mean_g, champion_g, seconds]| {
             let (trial, generation) = (trial as usize, generation as usize);
-            (Row { arm: 0, trial, generation, best_g, mean_g, champion_g }, seconds)
+            (Row { experiment: 0, trial, generation, best_g, mean_g, champion_g }, seconds)
         })
         .collect();
     let trial = |bytes: &[u8]| {
@@ -87,7 +88,7 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
     let seconds = rows.last().map_or(0.0, |&(_, seconds)| seconds);
     let pending = recorded.pending.iter().enumerate().map(|(trial, pending)| {
         let [best_g, mean_g] = (*pending)?;
-        Some(Row { arm: 0, trial, generation: last, best_g, mean_g, champion_g: 0.0 })
+        Some(Row { experiment: 0, trial, generation: last, best_g, mean_g, champion_g: 0.0 })
     });
     let end = Checkpoint {
         config: config_digest(&config),
@@ -127,7 +128,7 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
         (folder::RUN, run.to_json().as_bytes()),
         (path.to_str().unwrap_or_default(), &checkpoint[..]),
     ] {
-        zip.start_file(name, SimpleFileOptions::default()).map_err(refuse)?;
+        zip.start_file(format!("{}/{name}", recorded.name), SimpleFileOptions::default()).map_err(refuse)?;
         zip.write_all(content).map_err(refuse)?;
     }
     let archive = zip.finish().map_err(refuse)?.into_inner();
@@ -211,10 +212,16 @@ pub fn play(config: &Config, policies: usize, mut weights: Vec<f32>) -> Result<V
     if !fits || evolve::admit(&mut weights).is_some() {
         return Err(refuse("these policies are not for this config"));
     }
-    let need = if config.learning.fitness == Fitness::Dt { RecordRequest::Sights } else { RecordRequest::Record };
-    let weights = weights[..].into();
-    let group = Group { world: &world, starts: &world.starts, weights, policies, teams: &vec![0; leaders], need };
+    let group = Group {
+        world: &world,
+        starts: &world.starts,
+        policies,
+        sharing: if weights.len() == numbers { Sharing::Shared } else { Sharing::PerLeader },
+        weights: weights[..].into(),
+        teams: &vec![0; leaders],
+        fitnesses: std::slice::from_ref(&config.learning.fitness),
+    };
     let played = replay::one(&group, &mut Cpu::default()).map_err(refuse)?;
     let generation = config.learning.generations;
-    Ok(replay::data("", config, &[replay::Replayed { generation, ..played }]))
+    Ok(replay::detailed("", config, &[replay::Replayed { generation, ..played }]))
 }

@@ -15,7 +15,9 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 
 use crate::archive::{self, Recorded};
+use crate::baseline::{self, Random};
 use crate::drive::Drive;
+use crate::edit;
 use crate::train::{Chosen, Training};
 
 /// JSON and little-endian numbers.
@@ -53,8 +55,18 @@ pub fn refuse(error: impl Display) -> Refusal {
 enum Ask {
     /// Returns a config with some keys changed, complete, as TOML and as JSON.
     Resolve { text: String, name: String, changes: Vec<(String, String)> },
-    /// Returns the colours of leaders and their followers.
-    Colors,
+    /// Returns a config's text with some keys set to TOML values. Comments and layout are kept.
+    Edit { text: String, changes: Vec<(String, String)> },
+    /// Returns G of the best constant action.
+    Constant { text: String },
+    /// Starts the baseline of random networks.
+    Random { text: String },
+    /// Plays generations of that baseline, and returns G of the best network so far.
+    MoreRandom { milliseconds: f64 },
+    /// Joins pictures to a GIF. The numbers are RGBA `[pictures][height][width][4]`. `delay` is in hundredths of a second.
+    Gif { width: u16, height: u16, delay: u16 },
+    /// Returns the version, and the colours of leaders and their followers.
+    About,
     /// Chooses the backend: the CPU, or the browser's GPU. Without `pass`, the first exact pass is used.
     Open { gpu: bool, pass: Option<String> },
     /// Starts training the chosen trials of each config.
@@ -92,11 +104,12 @@ pub struct Session {
     player: OpenBackend,
     training: Training,
     drive: Option<Drive>,
+    random: Option<Random>,
 }
 
 impl Default for Session {
     fn default() -> Session {
-        Session { player: front::cpu(), training: Training::default(), drive: None }
+        Session { player: front::cpu(), training: Training::default(), drive: None, random: None }
     }
 }
 
@@ -113,7 +126,26 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
     let words = |words: Value| Ok((words, vec![]));
     match serde_json::from_str(text).map_err(refuse)? {
         Ask::Resolve { text, name, changes } => words(resolve(&text, &name, changes)?),
-        Ask::Colors => words(replay::colors()),
+        Ask::Edit { text, changes } => words(json!({ "text": edit::set(&text, &changes).map_err(refuse)? })),
+        Ask::Constant { text } => words(baseline::constant(parse(&text)?)?),
+        Ask::Random { text } => {
+            session.random = Some(Random::new(parse(&text)?));
+            words(json!({}))
+        }
+        Ask::MoreRandom { milliseconds } => {
+            let random = session.random.as_mut().ok_or_else(|| refuse("no baseline was started"))?;
+            words(random.advance(milliseconds)?)
+        }
+        Ask::Gif { width, height, delay } => {
+            let size = usize::from(width) * usize::from(height) * 4;
+            let last = bytes.rchunks_exact(size.max(1)).next().ok_or_else(|| refuse("no pictures"))?;
+            // The last picture stays for two seconds.
+            let count = bytes.len() / size;
+            let delays = (1..=count).map(|picture| if picture == count { 200 } else { delay });
+            let pictures = bytes.chunks_exact(size).map(<[u8]>::to_vec).zip(delays);
+            Ok((json!({}), replay::animate([width, height], last, pictures).map_err(refuse)?))
+        }
+        Ask::About => words(json!({ "version": flotilla::VERSION, "colors": replay::colors() })),
         Ask::Open { gpu, pass } => {
             session.player = if gpu { front::on_gpu(episodes(open_gpu(pass.as_deref())?)?) } else { front::cpu() };
             words(machine(&session.player))

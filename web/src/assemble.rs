@@ -32,20 +32,23 @@ mod page {
     use miniz_oxide::deflate::compress_to_vec_zlib;
     use wasm_bindgen_cli_support::Bindgen;
 
-    /// Scripts of the page, in the order in which they are joined.
-    const SCRIPTS: [&str; 6] = [
-        "../src/report/stage.js",
-        "page/pool.js",
-        "page/config.js",
-        "page/chart.js",
-        "page/training.js",
-        "page/main.js",
-    ];
+    /// Modules of the page, in the order in which they are joined to one script.
+    const MODULES: &str = "dom pool config chart training compare table senses state experiment address machine curves scene \
+        views credit baselines train arrange drive modes files verify exports gallery guide opening main";
+    /// Experiments of the gallery.
+    const GALLERY: [&str; 6] = ["two_groups", "population", "blind", "eight_followers", "relay", "places"];
     const LAYOUTS: [&str; 3] = ["generally_forward", "strictly_forward", "chaotic"];
 
     fn source(name: &str) -> Result<String, Box<dyn Error>> {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(name);
         fs::read_to_string(&path).map_err(|error| format!("{}: cannot be read: {error}", path.display()).into())
+    }
+
+    /// Returns a module without its imports and exports. Names are unique among modules; the browser reports any that
+    /// are not.
+    fn joined(module: &str) -> String {
+        let lines = module.lines().filter(|line| !line.starts_with("import "));
+        lines.map(|line| format!("{}\n", line.strip_prefix("export ").unwrap_or(line))).collect()
     }
 
     pub fn make(wasm: &Path, folder: &Path) -> Result<(), Box<dyn Error>> {
@@ -64,7 +67,14 @@ mod page {
         for layout in LAYOUTS {
             texts.push((format!("layout-{layout}"), source(&format!("../configs/{layout}.toml"))?));
         }
-        let scripts = SCRIPTS.map(source).into_iter().collect::<Result<Vec<_>, _>>()?.join("\n");
+        for name in GALLERY {
+            texts.push((format!("gallery-{name}"), source(&format!("gallery/{name}.toml"))?));
+        }
+        texts.push(("opening".into(), source("page/opening.json")?));
+        let mut scripts = source("../src/report/stage.js")?;
+        for module in MODULES.split_whitespace() {
+            scripts += &joined(&source(&format!("page/{module}.js"))?);
+        }
         let mut page = source("page/index.html")?;
         page = page.replacen("/* STYLE */", &source("page/style.css")?, 1).replacen("/* SCRIPTS */", &scripts, 1);
         let mut inert = String::new();

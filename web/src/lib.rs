@@ -16,7 +16,9 @@ use wasm_bindgen::prelude::*;
 
 mod archive;
 mod ask;
+mod baseline;
 mod drive;
+mod edit;
 mod train;
 
 use ask::{Answer, Session};

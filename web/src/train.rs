@@ -83,7 +83,7 @@ impl Training {
         let (start, mut rows, mut played) = (Instant::now(), Vec::new(), 0);
         while played < most && !self.is_done() && (played == 0 || start.elapsed().as_secs_f64() * 1000.0 < time) {
             for Batch { trainer, arms } in self.batches.iter_mut().filter(|batch| !batch.trainer.is_done()) {
-                for Row { arm, trial, generation, best_g, mean_g, champion_g } in
+                for Row { experiment: arm, trial, generation, best_g, mean_g, champion_g } in
                     trainer.advance(backend).map_err(refuse)?
                 {
                     rows.extend([arms[arm].0 as f64, trial as f64, generation as f64, best_g, mean_g, champion_g]);
@@ -124,7 +124,7 @@ impl Training {
         Ok(())
     }
 
-    /// Returns the episode of a generation's best team, as [`replay::data`].
+    /// Returns the episode of a generation's best team, as [`replay::detailed`].
     ///
     /// The CPU plays it, which gives the same bits as a GPU.
     ///
@@ -154,7 +154,7 @@ impl Training {
         }
         let config = config.at(generation);
         let played = replay::best(&config, &mut trainer, trial, &mut cpu).map_err(refuse)?;
-        Ok(replay::data("", &config, &[played]))
+        Ok(replay::detailed("", &config, &[played]))
     }
 
     /// Returns the results of a run's trials that this worker has finished.

@@ -12,29 +12,37 @@ pub(super) struct WorldBatch<'a> {
     pub(super) teams: usize,
     /// Whether sightings are recorded.
     pub(super) sighted: bool,
+    /// The number of teams up to the end of each group, `[groups]`.
+    ends: Vec<usize>,
 }
 
-impl WorldBatch<'_> {
+impl<'a> WorldBatch<'a> {
+    /// Joins groups, at least one, in the same world. `first` is the index of the first in its batch.
+    pub(super) fn new(groups: &'a [Group<'a>], first: usize) -> WorldBatch<'a> {
+        let mut teams = 0;
+        let add = |group: &Group<'_>| {
+            teams += group.team_count();
+            teams
+        };
+        let ends = groups.iter().map(add).collect();
+        let sighted = groups.iter().any(|group| group.records().sights());
+        WorldBatch { world: groups[0].world, first, groups, teams, sighted, ends }
+    }
+
     /// Returns the group, by its index here, and the team in it of a team of this batch.
-    pub(super) fn locate(&self, mut team: usize) -> (usize, usize) {
-        for (index, group) in self.groups.iter().enumerate() {
-            if team < group.team_count() {
-                return (index, team);
-            }
-            team -= group.team_count();
-        }
-        unreachable!("a team of the run")
+    pub(super) fn locate(&self, team: usize) -> (usize, usize) {
+        let group = self.ends.partition_point(|&end| end <= team);
+        (group, team - group.checked_sub(1).map_or(0, |before| self.ends[before]))
     }
 }
 
+/// Joins consecutive groups in the same world.
 pub(super) fn world_batches<'a>(groups: &'a [Group<'a>]) -> Vec<WorldBatch<'a>> {
     let mut first = 0;
-    let mut batches = Vec::new();
-    for groups in groups.chunk_by(|a, b| std::ptr::eq(a.world, b.world)) {
-        let teams = groups.iter().map(Group::team_count).sum();
-        let sighted = groups.iter().any(|group| group.need.sights());
-        batches.push(WorldBatch { world: groups[0].world, first, groups, teams, sighted });
+    let join = |groups: &'a [Group<'a>]| {
+        let batch = WorldBatch::new(groups, first);
         first += groups.len();
-    }
-    batches
+        batch
+    };
+    groups.chunk_by(|a, b| std::ptr::eq(a.world, b.world)).map(join).collect()
 }

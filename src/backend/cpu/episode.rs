@@ -7,7 +7,7 @@ use fearless_simd::{Simd, prelude::*};
 use super::batch::WorldBatch;
 use super::block::{Block, PoiPosition};
 use super::network::Network;
-use crate::backend::{Episode, Seen, Strided};
+use crate::credit::{Episode, Seen, Strided};
 use crate::kernels::splat;
 use crate::world::World;
 
@@ -23,7 +23,7 @@ pub(super) struct EpisodeBlock<S: Simd> {
     sets: Vec<u32>,
     seen: Vec<u32>,
     /// The sightings, `[steps][followers][words of leaders][lanes]`; empty unless recorded.
-    pub(super) sights: Vec<u32>,
+    sights: Vec<u32>,
 }
 
 /// Returns the words of a team's sightings: 0 unless recorded.
@@ -35,7 +35,7 @@ impl<S: Simd> EpisodeBlock<S> {
     pub(super) fn new(simd: S, world: &World, sighted: bool) -> EpisodeBlock<S> {
         EpisodeBlock {
             block: Block::new(simd, world),
-            network: Network::new(simd, world),
+            network: Network::new(simd, &world.constants.policy, world.leaders()),
             places: Vec::with_capacity(S::f32s::LEN),
             moved: Vec::new(),
             sets: vec![0; world.set_words() * S::f32s::LEN],
@@ -44,48 +44,93 @@ impl<S: Simd> EpisodeBlock<S> {
         }
     }
 
+    /// Reports whether it has the sizes and constants of a world and its record.
+    pub(super) fn fits(&self, world: &World, sighted: bool) -> bool {
+        self.block.world.constants == world.constants && self.sights.len() == sight_words(world, sighted) * S::f32s::LEN
+    }
+
     /// Puts `teams` teams of the batch, from `first` on, at their start. Unused lanes repeat the first team.
     #[inline(always)]
-    pub(super) fn load(&mut self, run: &WorldBatch<'_>, first: usize, teams: usize) {
+    pub(super) fn load(&mut self, batch: &WorldBatch<'_>, first: usize, teams: usize) {
         let EpisodeBlock { block, network, places, moved, .. } = self;
         moved.clear();
         places.clear();
-        places.extend((0..S::f32s::LEN).map(|lane| run.locate(first + if lane < teams { lane } else { 0 })));
+        places.extend((0..S::f32s::LEN).map(|lane| batch.locate(first + if lane < teams { lane } else { 0 })));
         for (lane, &(group, _)) in places.iter().enumerate() {
-            block.place(lane, run.groups[group].starts, &run.world.headings);
+            block.place(lane, batch.groups[group].starts, &batch.world.headings);
         }
-        if places.iter().any(|&(group, _)| run.groups[group].moved_pois().is_some()) {
-            moved.resize(run.world.pois.len(), [splat(block.simd, 0.0); 2]);
+        if places.iter().any(|&(group, _)| batch.groups[group].moved_pois().is_some()) {
+            moved.resize(batch.world.pois.len(), [splat(block.simd, 0.0); 2]);
             for (lane, &(group, _)) in places.iter().enumerate() {
-                let pois = run.groups[group].moved_pois().unwrap_or(&run.world.pois);
+                let pois = batch.groups[group].moved_pois().unwrap_or(&batch.world.pois);
                 for ([x, y], poi) in moved.iter_mut().zip(pois) {
                     (x[lane], y[lane]) = (poi.x, poi.y);
                 }
             }
         }
         block.start();
-        network.load(run, places);
+        network.load(batch, places);
     }
 
     /// Plays some steps.
     #[inline(always)]
     pub(super) fn play(&mut self, world: &World, steps: Range<usize>) {
-        let EpisodeBlock { block, network, moved, sets, seen, sights, .. } = self;
+        let EpisodeBlock { block, network, moved, sets, sights, .. } = self;
         if moved.is_empty() {
             play(block, network, &world.pois, sets, sights, steps);
         } else {
             play(block, network, moved, sets, sights, steps);
         }
-        for (words, count) in seen.chunks_exact_mut(S::f32s::LEN).zip(&block.counts) {
+        self.store_counts();
+    }
+
+    /// Writes the counts to the record, after the last step that was played.
+    #[inline(always)]
+    pub(super) fn store_counts(&mut self) {
+        for (words, count) in self.seen.chunks_exact_mut(S::f32s::LEN).zip(&self.block.counts) {
             count.store_slice(words);
         }
     }
 
+    /// The first half of a step: leaders sense, and their policies answer.
+    #[inline(always)]
+    pub(super) fn sense(&mut self, world: &World) {
+        let EpisodeBlock { block, network, moved, .. } = self;
+        if moved.is_empty() {
+            block.look(&world.pois);
+        } else {
+            block.look(moved);
+        }
+        network.decide(&block.inputs, &mut block.outputs);
+    }
+
+    /// The second half of a step: all agents move, and the record is written.
+    #[inline(always)]
+    pub(super) fn advance(&mut self, world: &World, step: usize) {
+        let EpisodeBlock { block, moved, sets, sights, .. } = self;
+        let (size, of_step) = (sets.len() / world.steps(), sights.len() / world.steps());
+        if of_step > 0 {
+            block.watch(&mut sights[step * of_step..]);
+        }
+        block.go();
+        if moved.is_empty() {
+            block.couple(&world.pois, &mut sets[step * size..]);
+        } else {
+            block.couple(moved, &mut sets[step * size..]);
+        }
+    }
+
+    /// Returns the sets of a step, `[pois * words][lanes]`.
+    #[inline(always)]
+    pub(super) fn sets_of(&self, step: usize, words: usize) -> &[u32] {
+        &self.sets[step * words * S::f32s::LEN..][..words * S::f32s::LEN]
+    }
+
     /// Returns one lane's record.
-    pub(super) fn episode(&self, lane: usize, group: usize, team: usize) -> Episode<'_> {
+    pub(super) fn episode(&self, lane: usize) -> Episode<'_> {
         let strided = |words| Strided { words, stride: S::f32s::LEN, offset: lane };
         let seen = Seen::Counts(strided(&self.seen));
-        Episode { group, team, sets: strided(&self.sets), seen, sights: strided(&self.sights) }
+        Episode { sets: strided(&self.sets), seen, sights: strided(&self.sights) }
     }
 }
 

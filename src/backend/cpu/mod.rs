@@ -3,11 +3,14 @@
 //! The loops here may skip whatever adds nothing (an agent out of reach in every lane), since sums start at +0 and
 //! keep their order. The formulas are those of [`crate::model`].
 
-use std::sync::{Mutex, PoisonError};
+use std::any::Any;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
-use super::{Backend, BackendError, Group, RecordRequest, Trace, Visit};
+use super::scores::ScoreTable;
+use super::{Backend, BackendError, Group, GroupScores, Trace};
+use crate::config::Fitness;
 use crate::parallel::*;
 use crate::world::World;
 
@@ -15,12 +18,17 @@ mod agent;
 mod batch;
 mod block;
 mod episode;
+mod forward;
 mod neighbours;
 mod network;
 mod record;
+mod steps;
 mod transpose;
 
 pub(crate) use agent::Agent;
+pub use forward::forward;
+pub use steps::{Noise, StepArrays, step_sizes};
+
 pub(crate) use block::{Block, BlockState};
 pub(crate) use transpose::{transpose_rows, transpose4};
 
@@ -30,7 +38,12 @@ use episode::{EpisodeBlock, sight_words};
 /// Plays episodes on the CPU, with the widest instruction set that it has, on the threads of the current rayon pool.
 pub struct Cpu {
     level: Level,
+    /// A [`Workspace`] per thread, kept between batches.
+    workspaces: Option<Box<dyn Any + Send>>,
 }
+
+/// The memory of a thread for one vector of teams, as it was last used.
+type Workspace<S> = Option<EpisodeBlock<S>>;
 
 impl Default for Cpu {
     fn default() -> Cpu {
@@ -41,7 +54,7 @@ impl Default for Cpu {
 impl Cpu {
     /// Returns a backend that uses a given instruction set, for tests and benchmarks.
     pub fn at_level(level: Level) -> Cpu {
-        Cpu { level }
+        Cpu { level, workspaces: None }
     }
 
     /// Returns every instruction set of this CPU, narrowest first. With the feature `scalar` the first uses no vectors.
@@ -88,11 +101,12 @@ pub fn level_name(level: Level) -> &'static str {
 }
 
 impl Backend for Cpu {
-    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
+    fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         groups.iter().try_for_each(|group| group.check().and(group.weights.on_host().map(drop)))?;
-        let level = self.level;
-        dispatch!(level, simd => rollout(simd, groups, visit));
-        Ok(())
+        let Cpu { level, workspaces } = self;
+        let (level, scores) = (*level, ScoreTable::new(groups));
+        dispatch!(level, simd => play(simd, groups, workspaces, &scores));
+        Ok(scores.finish())
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
@@ -108,68 +122,66 @@ impl Backend for Cpu {
     }
 }
 
-fn rollout<S: Simd>(simd: S, groups: &[Group<'_>], visit: &Visit<'_>) {
+/// Plays all groups. Threads take one vector of teams after another from a common counter, so that none waits for a lock
+/// and none is left with much to do at the end.
+fn play<S: Simd>(simd: S, groups: &[Group<'_>], workspaces: &mut Option<Box<dyn Any + Send>>, scores: &ScoreTable<'_>) {
     let width = S::f32s::LEN;
-    let runs = world_batches(groups);
+    let batches = world_batches(groups);
     let blocks: Vec<(&WorldBatch<'_>, usize)> =
-        runs.iter().flat_map(|run| (0..run.teams).step_by(width).map(move |team| (run, team))).collect();
-    // Blocks that no thread is using. As many are allocated as threads play at once.
-    let idle: Mutex<Vec<EpisodeBlock<S>>> = Mutex::default();
-    let take = |&WorldBatch { world, sighted, .. }: &WorldBatch<'_>| {
-        let mut idle = idle.lock().unwrap_or_else(PoisonError::into_inner);
-        let fits = idle.iter().position(|whole| {
-            whole.block.world.constants == world.constants
-                && whole.sights.len() == sight_words(world, sighted) * S::f32s::LEN
-        });
-        if fits.is_none() {
-            // They are of an earlier world.
-            idle.clear();
+        batches.iter().flat_map(|batch| (0..batch.teams).step_by(width).map(move |team| (batch, team))).collect();
+    let mut own = workspaces.take().and_then(|kept| kept.downcast::<Vec<Workspace<S>>>().ok()).unwrap_or_default();
+    own.resize_with(current_num_threads(), || None);
+    let next = AtomicUsize::new(0);
+    let threads = own.len().min(blocks.len());
+    own[..threads].par_iter_mut().with_max_len(1).for_each(|workspace| {
+        while let Some(&(batch, first)) = blocks.get(next.fetch_add(1, Relaxed)) {
+            let episodes = match workspace {
+                Some(episodes) if episodes.fits(batch.world, batch.sighted) => episodes,
+                // It is of another world.
+                _ => workspace.insert(EpisodeBlock::new(simd, batch.world, batch.sighted)),
+            };
+            let teams = width.min(batch.teams - first);
+            simd.vectorize(
+                #[inline(always)]
+                || {
+                    episodes.load(batch, first, teams);
+                    episodes.play(batch.world, 0..batch.world.steps());
+                },
+            );
+            for lane in 0..teams {
+                let (group, team) = batch.locate(first + lane);
+                scores.score(batch.first + group, team, &episodes.episode(lane));
+            }
         }
-        fits.map(|index| idle.swap_remove(index))
-    };
-    blocks.par_iter().with_max_len(1).for_each(|&(run, first)| {
-        let mut whole = take(run).unwrap_or_else(|| EpisodeBlock::new(simd, run.world, run.sighted));
-        let teams = width.min(run.teams - first);
-        simd.vectorize(
-            #[inline(always)]
-            || {
-                whole.load(run, first, teams);
-                whole.play(run.world, 0..run.world.steps());
-            },
-        );
-        for lane in 0..teams {
-            let (group, team) = run.locate(first + lane);
-            visit(whole.episode(lane, run.first + group, team));
-        }
-        idle.lock().unwrap_or_else(PoisonError::into_inner).push(whole);
     });
+    *workspaces = Some(own);
 }
 
 fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
     let world = group.world;
     let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
-    let sighted = group.need.sights();
-    let run = WorldBatch { world, first: 0, groups: std::slice::from_ref(group), teams, sighted };
+    let sighted = group.records().sights();
+    let batch = WorldBatch::new(std::slice::from_ref(group), 0);
     let mut moments = vec![bytemuck::Zeroable::zeroed(); (steps + 1) * teams * agents];
     let (mut sets, mut seen, mut sights) = (Vec::new(), Vec::new(), Vec::new());
-    let mut whole = EpisodeBlock::new(simd, world, sighted);
+    let mut episodes = EpisodeBlock::new(simd, world, sighted);
     for first in (0..teams).step_by(S::f32s::LEN) {
         let lanes = S::f32s::LEN.min(teams - first);
-        whole.load(&run, first, lanes);
+        episodes.load(&batch, first, lanes);
         for step in 0..=steps {
             if step > 0 {
                 simd.vectorize(
                     #[inline(always)]
-                    || whole.play(world, step - 1..step),
+                    || episodes.play(world, step - 1..step),
                 );
             }
             for lane in 0..lanes {
                 let at = (step * teams + first + lane) * agents;
-                whole.block.moments(lane, step > 0, &mut moments[at..at + agents]);
+                episodes.block.moments(lane, step > 0, &mut moments[at..at + agents]);
             }
         }
         for lane in 0..lanes {
-            let episode = whole.episode(lane, 0, first + lane);
+            let episode = episodes.episode(lane);
             sets.extend(episode.sets.iter());
             seen.extend(episode.seen.words().iter());
             sights.extend(episode.sights.iter());
@@ -186,10 +198,10 @@ pub fn lanes() -> u64 {
     dispatch!(Level::new(), simd => count(simd))
 }
 
-/// Returns the bytes of one vector of teams, with the record that is requested.
-pub fn block_bytes(world: &World, need: RecordRequest) -> u64 {
+/// Returns the bytes of one vector of teams that are scored by a fitness.
+pub fn block_bytes(world: &World, fitness: Fitness) -> u64 {
     let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
-    let record = world.set_words() + followers * leaders + sight_words(world, need.sights());
+    let record = world.set_words() + followers * leaders + sight_words(world, fitness == Fitness::Dt);
     let words = 8 * agents + leaders * world.constants.policy.words() + 3 * followers + record;
     words as u64 * lanes() * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8) as u64
 }

@@ -6,14 +6,15 @@ use super::batch::WorldBatch;
 use super::transpose::transpose_rows;
 use crate::backend::Weights;
 use crate::kernels::{math, splat};
+use crate::model::policy;
 use crate::model::policy::PolicyConstants;
-use crate::model::{Constants, policy};
-use crate::world::{INPUTS, OUTPUTS, World};
+use crate::world::{INPUTS, OUTPUTS};
 
 /// The leaders' policies of one vector of teams.
 pub(super) struct Network<S: Simd> {
     simd: S,
-    constants: Constants,
+    leaders: usize,
+    constants: PolicyConstants,
     /// `[leaders][parameters]`, layer by layer. Units that are computed together (see [`together`]) form a block: one
     /// row per input, then the biases.
     weights: Vec<S::f32s>,
@@ -24,13 +25,11 @@ pub(super) struct Network<S: Simd> {
 }
 
 impl<S: Simd> Network<S> {
-    pub(super) fn new(simd: S, world: &World) -> Network<S> {
-        let constants = world.constants;
-        let zero = splat(simd, 0.0);
-        let widest = constants.policy.widest();
-        let mut slots = vec![0; world.parameters()];
+    pub(super) fn new(simd: S, policy: &PolicyConstants, leaders: usize) -> Network<S> {
+        let (zero, widest, parameters) = (splat(simd, 0.0), policy.widest(), policy.parameters as usize);
+        let mut slots = vec![0; parameters];
         let (mut first, mut slot) = (0, 0);
-        for widths in constants.policy.widths[..=constants.policy.layers as usize].windows(2) {
+        for widths in policy.widths[..=policy.layers as usize].windows(2) {
             let (rows, columns) = (widths[0] as usize + 1, widths[1] as usize);
             let mut column = 0;
             while column < columns {
@@ -45,33 +44,48 @@ impl<S: Simd> Network<S> {
         }
         Network {
             simd,
-            constants,
-            weights: vec![zero; world.leaders() * world.parameters()],
+            leaders,
+            constants: *policy,
+            weights: vec![zero; leaders * parameters],
             slots,
-            hidden: [vec![zero; world.leaders() * widest], vec![zero; world.leaders() * widest]],
+            hidden: [vec![zero; leaders * widest], vec![zero; leaders * widest]],
         }
     }
 
     /// Loads the policies of each lane's group and team.
     #[inline(always)]
-    pub(super) fn load(&mut self, run: &WorldBatch<'_>, places: &[(usize, usize)]) {
+    pub(super) fn load(&mut self, batch: &WorldBatch<'_>, places: &[(usize, usize)]) {
+        let (leaders, parameters) = (batch.world.leaders(), batch.world.parameters());
+        self.load_policies(
+            #[inline(always)]
+            |leader, lane| {
+                let (group, team) = places[lane];
+                let group = &batch.groups[group];
+                let policy = group.teams[team * leaders + leader] as usize;
+                let Weights::OnHost(weights) = group.weights else { unreachable!("seen before playing") };
+                &weights[group.place(leader, policy)..][..parameters]
+            },
+        );
+    }
+
+    /// Loads the policy of each leader and lane.
+    #[inline(always)]
+    pub(super) fn load_policies<'a>(&mut self, policy: impl Fn(usize, usize) -> &'a [f32]) {
         let Network { simd, weights, slots, .. } = self;
-        let (leaders, parameters) = (run.world.leaders(), run.world.parameters());
-        for (leader, weights) in weights.chunks_exact_mut(parameters).enumerate() {
+        for (leader, weights) in weights.chunks_exact_mut(slots.len()).enumerate() {
             // Four lanes at a time, the width of the narrowest vector.
-            for (quad, places) in places.as_chunks::<4>().0.iter().enumerate() {
-                let policies = places.map(|(group, team)| {
-                    let group = &run.groups[group];
-                    let policy = group.teams[team * leaders + leader] as usize;
-                    let Weights::OnHost(weights) = group.weights else { unreachable!("seen before playing") };
-                    &weights[group.place(weights, leader, policy)..][..parameters]
-                });
+            for lane in (0..S::f32s::LEN).step_by(4) {
                 transpose_rows(
                     *simd,
-                    policies,
+                    [
+                        policy(leader, lane),
+                        policy(leader, lane + 1),
+                        policy(leader, lane + 2),
+                        policy(leader, lane + 3),
+                    ],
                     #[inline(always)]
                     |parameter, lanes| {
-                        weights[slots[parameter]].as_mut_slice()[quad * 4..quad * 4 + 4].copy_from_slice(lanes);
+                        weights[slots[parameter]].as_mut_slice()[lane..lane + 4].copy_from_slice(lanes);
                     },
                 );
             }
@@ -81,15 +95,15 @@ impl<S: Simd> Network<S> {
     /// Computes the leaders' outputs.
     #[inline(always)]
     pub(super) fn decide(&mut self, inputs: &[[S::f32s; INPUTS]], outputs: &mut [[S::f32s; OUTPUTS]]) {
-        let Network { weights, hidden, constants, .. } = self;
-        let &mut Constants { leaders, policy: PolicyConstants { layers, widths, parameters }, .. } = constants;
+        let Network { weights, hidden, leaders, constants, .. } = self;
+        let (leaders, &mut PolicyConstants { layers, widths, parameters }) = (*leaders, constants);
         let mut first = 0;
         let [mut to, mut from] = hidden.each_mut().map(|units| &mut units[..]);
         for (layer, widths) in widths[..=layers as usize].windows(2).enumerate() {
             let [rows, columns] = [widths[0] as usize, widths[1] as usize];
             let inputs = if layer == 0 { inputs.as_flattened() } else { &*from };
-            let units = &mut to[..leaders as usize * columns];
-            let weights = (0..leaders as usize).map(|leader| &weights[leader * parameters as usize + first..]);
+            let units = &mut to[..leaders * columns];
+            let weights = (0..leaders).map(|leader| &weights[leader * parameters as usize + first..]);
             match (rows, columns) {
                 // The paper's network, with constant sizes.
                 (INPUTS, 10) => affine_layer::<S, INPUTS, 10>(inputs, units, weights),
@@ -123,7 +137,7 @@ impl<S: Simd> Network<S> {
             std::mem::swap(&mut from, &mut to);
         }
         if widths[layers as usize] as usize == OUTPUTS {
-            return outputs.copy_from_slice(&from.as_chunks::<OUTPUTS>().0[..leaders as usize]);
+            return outputs.copy_from_slice(&from.as_chunks::<OUTPUTS>().0[..leaders]);
         }
         for ((answer, inputs), wanted) in outputs.iter_mut().zip(inputs).zip(from.as_chunks().0) {
             *answer = policy::choose::<S>(inputs, wanted);

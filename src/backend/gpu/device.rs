@@ -2,17 +2,21 @@
 //!
 //! [`super::open`] also tests a device.
 
+use std::borrow::Cow;
+use std::collections::HashMap;
 use std::fmt;
 use std::ops::Range;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Duration;
 
 use bytemuck::Pod;
 use futures_channel::oneshot;
 use wgpu::util::DeviceExt;
 
+use super::absent;
 use super::exact::{self, Pass, ShaderError};
+use super::faults::Faults;
 use crate::escape;
 use crate::host::{self, Instant};
 
@@ -102,10 +106,10 @@ impl From<&wgpu::AdapterInfo> for AdapterInfo {
 #[derive(Debug, thiserror::Error)]
 pub enum DeviceError {
     /// There is no adapter.
-    #[error("no GPU adapter found (is a Vulkan, Metal or DirectX 12 driver installed?)")]
+    #[error("no GPU adapter found: {}", absent::reasons())]
     NoAdapter,
     /// There are only software renderers, which are opened only by name or number.
-    #[error("no GPU among the adapters, only {}", list(.found))]
+    #[error("no GPU among the adapters, only {}{}", list(.found), absent::hints())]
     NoRealAdapter {
         /// The adapters.
         found: Vec<AdapterInfo>,
@@ -208,7 +212,8 @@ fn inexact(failures: &[(Pass, String)]) -> String {
 
 /// Returns all adapters that can compute, the preferred ones first.
 ///
-/// `WGPU_BACKEND` limits the backends (`vulkan`, `metal`, `dx12`). The Vulkan loader has its own `VK_DRIVER_FILES`.
+/// `WGPU_BACKEND` limits the backends (`vulkan`, `metal`, `dx12`). wgpu's other variables have their effect, too, such as
+/// `WGPU_DX12_COMPILER`. The Vulkan loader has its own `VK_DRIVER_FILES`.
 pub fn adapters() -> Vec<AdapterInfo> {
     found().into_iter().map(|(_, info)| info).collect()
 }
@@ -219,6 +224,7 @@ fn found() -> Vec<(wgpu::Adapter, AdapterInfo)> {
     let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
         backends,
         flags: wgpu::InstanceFlags::empty().with_env(),
+        backend_options: wgpu::BackendOptions::from_env_or_default(),
         ..wgpu::InstanceDescriptor::new_without_display_handle()
     });
     let mut adapters: Vec<_> = host::wait(instance.enumerate_adapters(backends))
@@ -235,6 +241,20 @@ fn found() -> Vec<(wgpu::Adapter, AdapterInfo)> {
     let first = |index: usize| !infos[..index].iter().any(|earlier| same(earlier, &infos[index]));
     let kept = adapters.into_iter().enumerate().filter(|(index, _)| first(*index));
     kept.map(|(_, (info, adapter))| (adapter, AdapterInfo::from(&info))).collect()
+}
+
+/// Describes the compiler that a backend ("vulkan", "metal", "dx12") passes shaders to.
+pub fn compiler(backend: &str) -> String {
+    match backend {
+        "metal" => "Metal's compiler with fast math, which wgpu does not let us turn off".into(),
+        "dx12" => match wgpu::Dx12Compiler::from_env().unwrap_or_default() {
+            wgpu::Dx12Compiler::Fxc => "FXC, by WGPU_DX12_COMPILER".into(),
+            wgpu::Dx12Compiler::DynamicDxc { dxc_path } => format!("DXC ({dxc_path})"),
+            wgpu::Dx12Compiler::StaticDxc => "DXC, built in".into(),
+            wgpu::Dx12Compiler::Auto => "DXC if dxcompiler.dll is on the path, else FXC".into(),
+        },
+        _ => "the driver's compiler".into(),
+    }
 }
 
 /// Selects the adapter to open.
@@ -292,6 +312,43 @@ pub struct Gpu {
     errors: Arc<Mutex<DeviceErrors>>,
     /// Bytes to and from the device.
     traffic: Arc<[AtomicU64; 2]>,
+    /// The next nonce, see [`Gpu::nonces`].
+    nonce: Arc<AtomicU32>,
+    patience: Patience,
+    /// Pipelines that the device's tests have compiled, and whether more are kept.
+    kept: Arc<Mutex<HashMap<Compiled, wgpu::ComputePipeline>>>,
+    keeps: bool,
+    /// Faults that tests inject.
+    faults: Option<Arc<dyn Faults>>,
+}
+
+/// Everything that a pipeline depends on: the text and entry point of its shader, and the pass.
+type Compiled = (String, String, Pass);
+
+/// How long to wait for a device that makes no progress.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Patience {
+    /// The time of one wait. After the first, the second, the fourth and so on, the device is reported as slow.
+    pub wait: Duration,
+    /// Waits without progress after which the device counts as lost.
+    pub waits: u32,
+}
+
+impl Patience {
+    /// The patience with a GPU: a message after 10 s, and an error after 2 minutes. No submission takes longer than a
+    /// second.
+    pub const WITH_GPUS: Patience = Patience { wait: Duration::from_secs(10), waits: 12 };
+    /// The patience with a software renderer, which waits for the processor as any other program does: an hour.
+    pub const WITH_SOFTWARE: Patience = Patience { wait: Duration::from_secs(10), waits: 360 };
+}
+
+/// Reports a device without progress to people, see [`report_stalls`].
+static REPORT: OnceLock<fn(&str)> = OnceLock::new();
+
+/// Sets the function that reports to people, in a sentence, that a device makes no progress. Only the first call has an
+/// effect.
+pub fn report_stalls(report: fn(&str)) {
+    let _ = REPORT.set(report);
 }
 
 /// Bytes between host and device.
@@ -412,7 +469,95 @@ impl Gpu {
             contents: &[0; 16],
             usage: wgpu::BufferUsages::UNIFORM,
         });
-        Ok(Gpu { adapter: info, limits, pass, checked, device, queue, guard, errors, traffic: Arc::default() })
+        // Another value in each process, because memory may keep nonces of a process before.
+        let nonce = Arc::new(AtomicU32::new(host::since_1970().as_nanos() as u32));
+        let patience = if info.kind == Kind::Software { Patience::WITH_SOFTWARE } else { Patience::WITH_GPUS };
+        Ok(Gpu {
+            adapter: info,
+            limits,
+            pass,
+            checked,
+            device,
+            queue,
+            guard,
+            errors,
+            traffic: Arc::default(),
+            nonce,
+            patience,
+            kept: Arc::default(),
+            keeps: false,
+            faults: None,
+        })
+    }
+
+    /// Sets how long to wait for a device that makes no progress.
+    pub fn waiting(self, patience: Patience) -> Gpu {
+        Gpu { patience, ..self }
+    }
+
+    /// Returns the device such that the crate's own pipelines that it compiles are reused by its other clones.
+    pub(super) fn keeping_pipelines(&self) -> Gpu {
+        Gpu { keeps: true, ..self.clone() }
+    }
+
+    /// Injects faults, so that tests can show that each is noticed.
+    ///
+    /// # Safety
+    /// Shaders are compiled without bounds checks. An edited shader must keep its indices in bounds and its loops finite,
+    /// see [`Gpu::pipeline`].
+    #[doc(hidden)]
+    #[expect(unsafe_code, reason = "edited shaders are compiled without bounds checks")]
+    pub unsafe fn failing(self, faults: Arc<dyn Faults>) -> Gpu {
+        Gpu { faults: Some(faults), ..self }
+    }
+
+    /// Takes `count` consecutive numbers that no other work of this device has, and returns the first.
+    ///
+    /// Work writes its nonce beside its results, so that results of earlier work are never taken for its own: some
+    /// drivers report work as done that a watchdog ended, and leave the old bytes.
+    pub(super) fn nonces(&self, count: u32) -> u32 {
+        self.nonce.fetch_add(count, Relaxed)
+    }
+
+    /// Records that the device was lost, so that every later call fails, and returns that error.
+    pub(super) fn lose(&self, reason: &str) -> DeviceError {
+        let mut errors = self.errors.lock().unwrap_or_else(PoisonError::into_inner);
+        let reason = errors.lost.get_or_insert_with(|| reason.into()).clone();
+        DeviceError::Lost { adapter: self.adapter.to_string(), reason }
+    }
+
+    /// Records that a result lacks its nonce, and returns the error.
+    pub(super) fn lose_undone(&self, what: &str) -> DeviceError {
+        self.lose(&format!(
+            "the driver reports {what} as done, but the device did not do it; a watchdog may have ended it"
+        ))
+    }
+
+    /// Submits commands. `turns` is their estimated work.
+    pub(super) fn submit_commands(
+        &self,
+        what: &str,
+        turns: u64,
+        encoder: wgpu::CommandEncoder,
+    ) -> wgpu::SubmissionIndex {
+        let commands = encoder.finish();
+        match &self.faults {
+            Some(faults) if faults.drops(what, turns) => self.queue.submit([]),
+            _ => self.queue.submit([commands]),
+        }
+    }
+
+    /// Returns how long work took, or seems to take under injected faults.
+    pub(super) fn taken(&self, turns: u64, elapsed: Duration) -> Duration {
+        self.faults.as_ref().and_then(|faults| faults.takes(turns)).unwrap_or(elapsed)
+    }
+
+    /// Returns the text of a shader, edited under injected faults.
+    fn text<'a>(&self, text: &'a str) -> Cow<'a, str> {
+        match &self.faults {
+            Some(faults) => faults.edits(text.into()).into(),
+            None => text.into(),
+        }
     }
 
     /// Returns an error if the device was lost, or if anything failed outside the calls below. To be called after every
@@ -471,6 +616,9 @@ impl Gpu {
         if bytes > allowed {
             return Err(DeviceError::TooLarge { adapter: self.adapter.to_string(), what: what.into(), bytes, allowed });
         }
+        if self.faults.as_ref().is_some_and(|faults| faults.lacks_memory(what)) {
+            return Err(DeviceError::OutOfMemory { adapter: self.adapter.to_string(), what: what.into() });
+        }
         let descriptor = wgpu::BufferDescriptor { label: Some(what), size: bytes, usage, mapped_at_creation: false };
         self.scoped(what, || self.device.create_buffer(&descriptor))
     }
@@ -503,28 +651,25 @@ impl Gpu {
         Traffic { up, down }
     }
 
-    /// Waits for all work, and reads a range of a buffer (in bytes, multiples of 4; usage `COPY_SRC`).
+    /// Waits for all work, and reads ranges of buffers, one after another (in bytes, multiples of 4; usage `COPY_SRC`).
     ///
     /// # Errors
     /// The device was lost, or has too little memory for the copy.
-    pub fn read<T: Pod>(&self, buffer: &wgpu::Buffer, bytes: Range<u64>) -> Result<Vec<T>, DeviceError> {
-        let size = bytes.end - bytes.start;
-        self.traffic[1].fetch_add(size, Relaxed);
+    pub fn read<T: Pod>(&self, ranges: &[(&wgpu::Buffer, Range<u64>)]) -> Result<Vec<T>, DeviceError> {
+        let size = ranges.iter().map(|(_, bytes)| bytes.end - bytes.start).sum();
         let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ;
         let landing = self.buffer("reading back", size, usage)?;
-        let (send, receive) = oneshot::channel();
         self.scoped("reading back", || {
             let mut encoder = self.device.create_command_encoder(&Default::default());
-            encoder.copy_buffer_to_buffer(buffer, bytes.start, &landing, 0, size);
-            self.queue.submit([encoder.finish()]);
-            // The receiver is dropped only after an error.
-            landing.map_async(wgpu::MapMode::Read, .., move |result| drop(send.send(result)));
+            let mut to = 0;
+            for (buffer, bytes) in ranges {
+                encoder.copy_buffer_to_buffer(buffer, bytes.start, &landing, to, bytes.end - bytes.start);
+                to += bytes.end - bytes.start;
+            }
+            self.submit_commands("reading back", 0, encoder);
         })?;
         self.wait()?;
-        let mapped = host::wait(receive).map_err(|error| self.failed("reading back", error))?;
-        mapped.map_err(|error| self.failed("reading back", error))?;
-        let view = landing.get_mapped_range(..).map_err(|error| self.failed("reading back", error))?;
-        Ok(bytemuck::pod_collect_to_vec(&view[..]))
+        self.mapped(&landing, 0..size, bytemuck::pod_collect_to_vec)
     }
 
     /// Calls `show` with a range of a buffer (in bytes, multiples of 4; usage `MAP_READ`). All work that writes it must
@@ -551,7 +696,8 @@ impl Gpu {
         let mapped = host::wait(receive).map_err(|error| self.failed("reading back", error))?;
         mapped.map_err(|error| self.failed("reading back", error))?;
         let view = buffer.get_mapped_range(bytes).map_err(|error| self.failed("reading back", error))?;
-        let shown = show(&view);
+        let instead = self.faults.as_ref().and_then(|faults| faults.reads(buffer, &view));
+        let shown = show(instead.as_deref().unwrap_or(&view));
         drop(view);
         buffer.unmap();
         Ok(shown)
@@ -578,9 +724,29 @@ impl Gpu {
             let _ = host::wait(done);
             return self.check();
         }
-        let waited = self.device.poll(wgpu::PollType::Wait { submission_index, timeout: None });
-        self.check()?;
-        waited.map(drop).map_err(|error| self.failed("waiting", error))
+        let Patience { wait, waits } = self.patience;
+        for waited in 1..=waits {
+            let wanted = wgpu::PollType::Wait { submission_index: submission_index.clone(), timeout: Some(wait) };
+            let polled = match self.faults.as_ref().is_some_and(|faults| faults.stalls()) {
+                true => Err(wgpu::PollError::Timeout),
+                false => self.device.poll(wanted),
+            };
+            self.check()?;
+            match polled {
+                Ok(_) => return Ok(()),
+                Err(wgpu::PollError::Timeout) => {
+                    let (seconds, most) = ((wait * waited).as_secs_f64(), (wait * waits).as_secs_f64());
+                    REPORT.get().filter(|_| waited.is_power_of_two()).inspect(|report| {
+                        report(&format!(
+                            "{}: no progress for {seconds:.0} s; it counts as lost after {most:.0} s",
+                            self.adapter
+                        ));
+                    });
+                }
+                Err(error) => return Err(self.failed("waiting", error)),
+            }
+        }
+        Err(self.lose(&format!("no progress for {:.0} s", (wait * waits).as_secs_f64())))
     }
 
     /// Returns the layout of a pipeline that uses these buffers as bindings 1, 2, … of group 0.
@@ -642,12 +808,19 @@ impl Gpu {
         entry: &str,
         layout: &Bindings,
     ) -> Result<wgpu::ComputePipeline, DeviceError> {
+        let key = (self.text(wgsl).into_owned(), entry.to_owned(), self.pass);
+        let kept = |key: &Compiled| self.kept.lock().unwrap_or_else(PoisonError::into_inner).get(key).cloned();
+        if let Some(pipeline) = kept(&key) {
+            return Ok(pipeline);
+        }
         // SAFETY: the loops of the crate's own shaders end, their bindings are those of their layouts, and their
         // indices are in bounds for groups and plans that were checked, as the checked builds in the tests show.
         #[expect(unsafe_code, reason = "shaders of the crate's own are compiled without bounds checks")]
-        unsafe {
-            self.pipeline(label, wgsl, entry, layout)
+        let pipeline = unsafe { self.pipeline(label, &key.0, entry, layout) }?;
+        if self.keeps {
+            self.kept.lock().unwrap_or_else(PoisonError::into_inner).insert(key, pipeline.clone());
         }
+        Ok(pipeline)
     }
 
     /// Compiles an entry point under the device's pass. Workgroup memory starts undefined unless `checked`.
@@ -744,12 +917,17 @@ impl Gpu {
         }
     }
 
+    /// Reports whether the device has a clock.
+    pub fn has_clock(&self) -> bool {
+        self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY)
+    }
+
     /// Returns a stopwatch, if the device has a clock.
     ///
     /// # Errors
     /// There is too little memory.
     pub fn stopwatch(&self) -> Result<Option<Stopwatch>, DeviceError> {
-        if !self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY) {
+        if !self.has_clock() {
             return Ok(None);
         }
         let bytes = 2 * u64::from(wgpu::QUERY_SIZE);

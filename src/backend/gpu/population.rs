@@ -31,6 +31,8 @@ gpu_struct! {
         pub slots: u32,
         /// Weights per policy.
         pub parameters: u32,
+        /// The leader, in `0..leaders`.
+        pub leader: u32,
         /// The offset of the leader's parents in the plan.
         pub parents: u32,
         /// A weight mutates if its random word is below this threshold.
@@ -88,18 +90,18 @@ impl fmt::Debug for Kernels {
 }
 
 impl Kernels {
-    /// Compiles the kernels. `edit` may change the shader's text.
+    /// Compiles the kernels.
     ///
     /// # Errors
     /// The device does not support them.
-    pub(super) fn new(gpu: Gpu, edit: fn(String) -> String) -> Result<Kernels, DeviceError> {
+    pub(super) fn new(gpu: Gpu) -> Result<Kernels, DeviceError> {
         use Binding::{Read, Write};
-        let text = edit(source());
+        let text = source();
         let pipeline = |entry, buffers: &[Binding]| -> Result<_, DeviceError> {
             let layout = gpu.layout(entry, buffers)?;
             Ok((gpu.own_pipeline(entry, &text, entry, &layout)?, layout))
         };
-        let breed = pipeline("breed", &[Read, Read, Read, Write])?;
+        let breed = pipeline("breed", &[Read, Read, Read, Write, Write])?;
         let gather = pipeline("gather", &[Read, Read, Read, Write, Read, Read, Read])?;
         Ok(Kernels { breed, gather, gpu })
     }
@@ -122,17 +124,23 @@ impl Kernels {
         let input = Usage::STORAGE | Usage::COPY_DST;
         let broods = gpu.buffer("broods", (leaders * BINDING_ALIGNMENT) as u64, input)?;
         let plan = gpu.buffer("the parents", (leaders * slots * size_of::<u32>()) as u64, input)?;
-        for (buffer, weights) in buffers.iter().zip(weights.chunks_exact(size)) {
-            for (index, piece) in weights.chunks(PIECE / size_of::<f32>()).enumerate() {
-                let bytes = bytemuck::cast_slice(piece);
-                gpu.scoped("a population", || {
-                    gpu.write(buffer, (index * PIECE) as u64, bytes);
-                    gpu.queue.submit([]);
-                })?;
-                gpu.wait()?;
-            }
+        let pieces = weights.chunks_exact(size).zip(&buffers).flat_map(|(weights, buffer)| {
+            weights.chunks(PIECE / size_of::<f32>()).enumerate().map(move |(index, piece)| (buffer, index, piece))
+        });
+        let mut done = vec![0; leaders];
+        let words = leaders + leaders * size.div_ceil(PIECE / size_of::<f32>());
+        let status = gpu.buffer("the status of a population", (words * size_of::<u32>()) as u64, usage)?;
+        for (buffer, index, piece) in pieces {
+            let nonce = gpu.nonces(1);
+            gpu.scoped("a population", || {
+                gpu.write(buffer, (index * PIECE) as u64, bytemuck::cast_slice(piece));
+                gpu.write(&status, (done.len() * size_of::<u32>()) as u64, &nonce.to_ne_bytes());
+                gpu.queue.submit([]);
+            })?;
+            gpu.wait()?;
+            done.push(nonce);
         }
-        Ok(Population { kernels: self.clone(), buffers, broods, plan, leaders, slots, parameters })
+        Ok(Population { kernels: self.clone(), buffers, broods, plan, status, done, leaders, slots, parameters })
     }
 
     /// Returns the dispatch that gathers the policies of a job. The job is an aligned element of a buffer, `(buffer,
@@ -185,6 +193,10 @@ pub(super) struct Population {
     buffers: Vec<wgpu::Buffer>,
     broods: wgpu::Buffer,
     plan: wgpu::Buffer,
+    /// Per leader the number of workgroups that have bred, then the nonces of the pieces that were copied to the device.
+    status: wgpu::Buffer,
+    /// The content of `status` if everything was done that was submitted.
+    done: Vec<u32>,
     leaders: usize,
     slots: usize,
     parameters: usize,
@@ -196,14 +208,19 @@ impl Population {
         Arc::ptr_eq(&self.kernels, kernels)
     }
 
-    /// Checks that teams of these sizes, `[leaders, slots, parameters]`, can choose from it.
+    /// Checks that it has these sizes, `[populations, slots, parameters]`.
     ///
     /// # Errors
     /// The sizes differ.
     pub(super) fn check(&self, sizes: [usize; 3]) -> Result<(), BackendError> {
-        let own = [if self.leaders == 1 { sizes[0] } else { self.leaders }, self.slots, self.parameters];
-        let text = || format!("populations of {own:?} leaders, policies and weights stand for some of {sizes:?}");
+        let own = [self.leaders, self.slots, self.parameters];
+        let text = || format!("populations of sizes {own:?} (populations, policies, weights) instead of {sizes:?}");
         if own == sizes { Ok(()) } else { Err(BackendError::InvalidInput(text())) }
+    }
+
+    /// Returns the buffer of status words, and their values if everything was done that was submitted.
+    pub(super) fn status(&self) -> (&wgpu::Buffer, &[u32]) {
+        (&self.status, &self.done)
     }
 
     /// Returns the byte ranges in which one leader's policies are transferred.
@@ -224,6 +241,7 @@ impl DevicePopulation for Population {
                 key: key.of_population(generation, leader),
                 slots: self.slots as u32,
                 parameters: self.parameters as u32,
+                leader: leader as u32,
                 parents: (leader * self.slots) as u32,
                 threshold: threshold.unwrap_or_default(),
                 all: u32::from(threshold.is_none()),
@@ -242,6 +260,7 @@ impl DevicePopulation for Population {
                 self.plan.as_entire_buffer_binding(),
                 policies.as_entire_buffer_binding(),
                 children.as_entire_buffer_binding(),
+                self.status.as_entire_buffer_binding(),
             ];
             groups.push(gpu.bind("breed", layout, &buffers)?);
         }
@@ -256,9 +275,10 @@ impl DevicePopulation for Population {
                 pass.dispatch_workgroups(x, y, z);
             }
             drop(pass);
-            gpu.queue.submit([encoder.finish()]);
+            gpu.submit_commands("breeding", 0, encoder);
         })?;
         self.buffers.rotate_right(1);
+        self.done[..self.leaders].iter_mut().for_each(|workgroups| *workgroups = workgroups.wrapping_add(x * y * z));
         Ok(())
     }
 
@@ -266,8 +286,15 @@ impl DevicePopulation for Population {
         let policies = weights.chunks_exact_mut(self.slots * self.parameters);
         for (buffer, policies) in self.buffers.iter().zip(policies) {
             for bytes in self.pieces() {
-                let piece = self.kernels.gpu.read::<f32>(buffer, bytes.start as u64..bytes.end as u64)?;
-                policies[bytes.start / size_of::<f32>()..][..piece.len()].copy_from_slice(&piece);
+                let gpu = &self.kernels.gpu;
+                let ranges = [(buffer, bytes.start as u64..bytes.end as u64), (&self.status, 0..self.status.size())];
+                // The status comes with each piece, so that neither the breeding nor the copy can be missing.
+                let words = gpu.read::<u32>(&ranges)?;
+                let (piece, status) = words.split_at(bytes.len() / size_of::<f32>());
+                if status != self.done {
+                    return Err(gpu.lose_undone("breeding").into());
+                }
+                policies[bytes.start / size_of::<f32>()..][..piece.len()].copy_from_slice(bytemuck::cast_slice(piece));
             }
         }
         Ok(())

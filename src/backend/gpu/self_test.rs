@@ -1,19 +1,22 @@
 //! The self-test of a device: small computations whose bits must equal the CPU's.
 
 use std::borrow::Cow;
+use std::collections::BTreeSet;
 use std::fmt;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
+use glam::Vec2;
 use wgpu::BufferUsages;
 
 use super::device::{self, Binding, DeviceError, Gpu, Kind, Request};
-use super::episode::{GpuBackend, Kernel};
+use super::episode::{GpuBackend, Kernel, Records, ResidencyPolicy};
 use super::exact::Pass;
 use super::population::Kernels;
 use crate::backend::compare::first_mismatch;
 use crate::backend::cpu::Cpu;
-use crate::backend::{Backend, BackendError, DevicePopulation, Group, RecordRequest};
-use crate::config::{Config, Learning};
+use crate::backend::{Backend, BackendError, DevicePopulation, Group, Weights};
+use crate::config::{Config, Fitness, Learning, Sharing};
+use crate::credit::{Episode, Seen};
 use crate::evolve::{Breeding, Key, Purpose};
 use crate::sample;
 use crate::world::World;
@@ -52,7 +55,7 @@ pub type Probe = fn(&Gpu) -> Result<Option<Deviation>, DeviceError>;
 /// All probes that a pass must survive, the quickest first.
 ///
 /// A new probe is a function here. It compiles its shader with `gpu.own_pipeline`, which applies the pass under test.
-pub const ALL: &[Probe] = &[arithmetic, episode, breeding];
+pub const ALL: &[Probe] = &[arithmetic, episode, breeding, training];
 
 /// Opens an adapter, and finds the first pass under which every probe gives the CPU's bits: no contraction on Vulkan,
 /// else guarded.
@@ -75,17 +78,27 @@ pub fn open(request: impl Into<Request>) -> Result<Gpu, DeviceError> {
         None => vec![Pass::Guarded],
     };
     let limits = if request.default_limits { wgpu::Limits::defaults() } else { adapter.limits() };
-    let mut gpu = Gpu::new(&adapter, info, candidates[0], limits, features, request.checked)?;
+    let gpu = Gpu::new(&adapter, info, candidates[0], limits, features, request.checked)?;
+    find_exact(gpu, &candidates)
+}
+
+/// Returns a device under the first of some passes that survives every probe. [`Pass::Plain`] is not tested.
+///
+/// # Errors
+/// None does, or the device failed.
+#[doc(hidden)]
+pub fn find_exact(mut gpu: Gpu, candidates: &[Pass]) -> Result<Gpu, DeviceError> {
     let mut failures = Vec::new();
-    for pass in candidates {
+    for &pass in candidates {
         gpu.pass = pass;
         if pass == Pass::Plain {
             return Ok(gpu);
         }
-        match self_test(&gpu) {
+        match self_test(&gpu.keeping_pipelines()) {
             Ok(None) => return Ok(gpu),
             Ok(Some(mismatch)) => failures.push((pass, mismatch.to_string())),
-            Err(lost @ DeviceError::Lost { .. }) => return Err(lost),
+            // These say nothing about the arithmetic.
+            Err(error @ (DeviceError::Lost { .. } | DeviceError::OutOfMemory { .. })) => return Err(error),
             Err(error) => failures.push((pass, error.to_string())),
         }
     }
@@ -97,12 +110,7 @@ pub fn open(request: impl Into<Request>) -> Result<Gpu, DeviceError> {
 /// # Errors
 /// The device failed.
 pub fn self_test(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
-    for probe in ALL {
-        if let Some(mismatch) = probe(gpu)? {
-            return Ok(Some(mismatch));
-        }
-    }
-    Ok(None)
+    ALL.iter().find_map(|probe| probe(gpu).transpose()).transpose()
 }
 
 /// The computations of [`arithmetic`], in the order of `shaders/probe.wgsl`.
@@ -163,7 +171,7 @@ fn arithmetic(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     let pipeline = gpu.own_pipeline("probe", SHADER, "probe", &layout)?;
     let buffers = gpu.bind("probe", &layout, &[from.as_entire_buffer_binding(), to.as_entire_buffer_binding()])?;
     gpu.dispatch("probe", &pipeline, &buffers, [ITEMS.div_ceil(WORKGROUP) as u32, 1, 1])?;
-    let words: Vec<u32> = gpu.read(&to, 0..bytes)?;
+    let words: Vec<u32> = gpu.read(&[(&to, 0..bytes)])?;
     Ok((0..ITEMS).zip(words.chunks_exact(NAMES.len())).find_map(|(item, words)| {
         let expected = expected(&values, item);
         let differs = (0..NAMES.len()).find(|&probe| words[probe] != expected[probe])?;
@@ -185,7 +193,8 @@ fn episode(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
         weights: weights[..].into(),
         policies: TEAMS,
         teams: &teams,
-        need: RecordRequest::Record,
+        sharing: Sharing::PerLeader,
+        fitnesses: &[],
     };
     let traced = |error| refused(gpu, error);
     let expected = Cpu::default().trace(&group).map_err(traced)?;
@@ -213,7 +222,7 @@ fn breeding(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     let learning = Learning { mutation_probability: 0.5, ..config.learning };
     let key = Key::new(0, 0, Purpose::Mutation);
     let breeding = Breeding { parents: &parents, key, generation: 0, learning: &learning };
-    let mut held = Arc::new(Kernels::new(gpu.clone(), |text| text)?).hold(weights, sizes)?;
+    let mut held = Arc::new(Kernels::new(gpu.clone())?).hold(weights, sizes)?;
     let mut found = vec![0.0; weights.len()];
     held.breed(&breeding).and_then(|()| held.fetch(&mut found)).map_err(|error| refused(gpu, error))?;
     let expected = breeding.on_host(sizes, weights).map_err(|error| refused(gpu, error.into()))?;
@@ -224,6 +233,89 @@ fn breeding(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
         cpu: expected[index].to_bits(),
         gpu: found[index].to_bits(),
     }))
+}
+
+/// Tests what a generation of training uses: populations on the device, from which 64 teams are gathered, both kernels,
+/// and packed records.
+fn training(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
+    const TEAMS: usize = 64;
+    let config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
+    let world = World::new(&config);
+    let (leaders, parameters) = (world.leaders(), world.parameters());
+    let weights = sample::weights(&world, TEAMS, 1);
+    let place = |place: usize| ((place / leaders * (2 * (place % leaders) + 1) + place % leaders) % TEAMS) as u32;
+    let teams: Vec<u32> = (0..TEAMS * leaders).map(place).collect();
+    // Leaders start at POIs, alone, and followers out of sight, so that small sets and followers without a leader matter.
+    let start = |agent: usize| match agent.checked_sub(leaders) {
+        None => world.pois[agent % world.pois.len()],
+        Some(follower) => world.pois[follower % world.pois.len()] + Vec2::new(0.0, 11.0 + 3.5 * follower as f32 / 2.0),
+    };
+    let starts: Vec<Vec2> = (0..world.agents()).map(start).collect();
+    let group = Group {
+        world: &world,
+        starts: &starts,
+        weights: weights[..].into(),
+        policies: TEAMS,
+        sharing: Sharing::PerLeader,
+        teams: &teams,
+        fitnesses: &[Fitness::D, Fitness::Df, Fitness::Dpp],
+    };
+    let failed = |error| refused(gpu, error);
+    let trace = Cpu::default().trace(&group).map_err(failed)?;
+    let expected: Vec<_> = (0..TEAMS).map(|team| what_scores_depend_on(&world, &trace.episode(&world, team))).collect();
+    // Software renderers play by the generic kernel, see [`GpuBackend::playing`].
+    let kernels = [Kernel::Generic, Kernel::Specialised];
+    let kernels = if gpu.adapter.kind == Kind::Software { &kernels[..1] } else { &kernels };
+    for &kernel in kernels {
+        let backend = GpuBackend::new(gpu.clone())?.playing(kernel);
+        let mut backend = backend.holding(ResidencyPolicy::Always).bringing(Records::Packed);
+        let held = backend.hold(&weights, [leaders, TEAMS, parameters]).map_err(failed)?;
+        let held = held.expect("the device holds all populations");
+        let group = Group { weights: Weights::OnDevice(&*held), ..group };
+        let found = Mutex::new(vec![Vec::new(); TEAMS]);
+        let note = |_, team: usize, episode: &Episode<'_>| {
+            let words = what_scores_depend_on(&world, episode);
+            found.lock().unwrap_or_else(PoisonError::into_inner)[team] = words;
+        };
+        backend.visit(&[group], &note).map_err(failed)?;
+        let found = found.into_inner().unwrap_or_else(PoisonError::into_inner);
+        if let Some(team) = (0..TEAMS).find(|&team| expected[team] != found[team]) {
+            let word = |words: &[u32]| words.iter().fold(0u32, |sum, word| sum.rotate_left(5) ^ word);
+            return Ok(Some(Deviation {
+                probe: format!("a rollout as in training by the {kernel} kernel, team {team}").into(),
+                values: Vec::new(),
+                cpu: word(&expected[team]),
+                gpu: word(&found[team]),
+            }));
+        }
+    }
+    Ok(None)
+}
+
+/// Returns what the scores of a team depend on, in a form that packing does not change: per POI the sets that no other
+/// set contains, and the leader that each follower saw most. Sets are of one word.
+fn what_scores_depend_on(world: &World, episode: &Episode<'_>) -> Vec<u32> {
+    let (pois, leaders, followers) = (world.pois.len(), world.leaders(), world.followers());
+    let mut words = Vec::new();
+    for poi in 0..pois {
+        let sets: BTreeSet<u32> = episode.sets.iter().skip(poi).step_by(pois).filter(|&set| set != 0).collect();
+        let contained = |set: u32| sets.iter().any(|&other| other != set && other & set == set);
+        words.extend(sets.iter().filter(|&&set| !contained(set)));
+        // Where the sets of one POI end.
+        words.push(0);
+    }
+    match episode.seen {
+        Seen::Counts(counts) => words.extend((0..followers).map(|follower| {
+            let steps = |leader: &usize| counts.get(follower * leaders + leader);
+            // The first leader wins ties.
+            let most = (0..leaders).rev().max_by_key(steps).filter(|leader| steps(leader) > 0);
+            most.map_or(u32::from(u8::MAX), |leader| leader as u32)
+        })),
+        Seen::Owners(owners) => {
+            words.extend((0..followers).map(|follower| owners.get(follower / 4) >> (8 * (follower % 4)) & 0xff));
+        }
+    }
+    words
 }
 
 fn refused(gpu: &Gpu, error: BackendError) -> DeviceError {

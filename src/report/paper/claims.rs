@@ -1,8 +1,12 @@
 //! Every measurable sentence of the paper about these experiments, tested as it is worded.
 //!
-//! Each claim has one measure and, for each source of policies, a verdict. It is *yes* if the 95 % interval lies within
-//! what the words allow, *no* if it lies outside, and *not decided* if it contains the threshold. If the paper gives no
+//! Each claim has one measure and, for each source of policies, a verdict. It is *yes* if the interval lies within what
+//! the words allow, *no* if it lies outside, and *not decided* if it contains the threshold. If the paper gives no
 //! number, [`SMALL`] and [`FEW`] replace its words.
+//!
+//! All measures are of champions, unless a claim is about random teams. The paper's curves are averages over trials, so
+//! claims about curves are judged by averages. The verdicts on evolved teams are corrected for each other using Holm's
+//! method: the p-value of a verdict is the smallest alpha at which the interval of confidence 1 - alpha decides it.
 
 use serde::Serialize;
 
@@ -12,8 +16,7 @@ use crate::statistics::{self, Estimate};
 
 /// Maximum difference, as a share of the POIs, that counts as "about similar", "comparable" or "slight".
 pub const SMALL: f64 = 0.1;
-/// Maximum share of trials that counts as "almost never". A larger share is "some of the time". "All" requires a share
-/// of at least 1 - [`FEW`], with no counterexample.
+/// Maximum share of trials that counts as "almost never". A larger share is "some of the time".
 pub const FEW: f64 = 0.1;
 /// The generation at which the paper judges results: "After 100 generations".
 pub const END: usize = 100;
@@ -54,16 +57,19 @@ pub struct Finding {
     pub column: usize,
     /// The measured source, or the two sources of a comparison ("Df − G").
     pub of: String,
-    /// Whether the claim holds.
+    /// Whether the claim holds. For evolved teams, corrected for the number of verdicts.
     pub verdict: Verdict,
-    /// The measurement as text: "3.58 [3.43, 3.73]".
+    /// The measurement as text, with its 95 % interval: "3.58 [3.43, 3.73]".
     pub measured: String,
     /// The measured number with its interval, if there is one.
     #[serde(flatten)]
     pub estimate: Option<Estimate>,
-    /// Two-sided p-value of a test of difference.
+    /// The smallest alpha at which the interval decides. None if chance plays no part, or for baselines.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub p: Option<f64>,
+    /// [`p`](Finding::p) with Holm's correction for all verdicts on evolved teams.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub p_holm: Option<f64>,
 }
 
 /// One claim of the paper.
@@ -77,11 +83,25 @@ pub struct Claim {
     pub words: &'static str,
     /// The measure that represents the words.
     pub measure: &'static str,
+    /// Whether the experiment is ours: the paper states the claim, but describes no such experiment.
+    pub exploratory: bool,
     /// The findings, one per source.
     pub findings: Vec<Finding>,
 }
 
 impl Claim {
+    /// Returns the verdict over all fitnesses. The paper's "they all" are its reward functions: the claim holds if it
+    /// holds for each of them, and not if it fails for one.
+    pub fn verdict(&self) -> Verdict {
+        let worst = |found: &Finding| {
+            [Verdict::Yes, Verdict::Undecided, Verdict::Open, Verdict::No]
+                .into_iter()
+                .position(|verdict| verdict == found.verdict)
+                .map(|rank| (rank, found.verdict))
+        };
+        self.on_evolution().filter_map(worst).max_by_key(|&(rank, _)| rank).map_or(Verdict::Open, |(_, worst)| worst)
+    }
+
     /// Returns the findings on evolved teams. The paper's claims are about no other teams.
     pub fn on_evolution(&self) -> impl Iterator<Item = &Finding> {
         self.findings.iter().filter(|found| matches!(SOURCES[found.column], Source::Evolved(_)))
@@ -93,6 +113,8 @@ type Band = [f64; 2];
 const ABOVE_0: Band = [f64::MIN_POSITIVE, f64::INFINITY];
 const BELOW_0: Band = [f64::NEG_INFINITY, 0.0];
 const MOST: Band = [0.5 + f64::EPSILON, f64::INFINITY];
+/// The level of significance of all verdicts, after correction.
+const ALPHA: f64 = 1.0 - statistics::CONFIDENCE;
 
 /// The measured values, and the values that the words allow.
 enum Criterion {
@@ -103,62 +125,54 @@ enum Criterion {
     /// Differences per pair of trials, in shares of the POIs. The smallest step is 0.25, because layouts have at most
     /// four POIs.
     Shares(Vec<f64>, Band),
-    /// The same as [`Criterion::Difference`], with the p-value of its test.
-    Tested(Vec<f64>, Band),
+    /// Differences per pair of trials, in generations.
+    Generations(Vec<f64>, Band),
     /// The number of trials or pairs that meet the criterion, and the number of all.
     Share(usize, usize, Band),
-    /// The same numbers as [`Criterion::Share`]. All trials should meet the criterion.
-    All(usize, usize),
 }
 
 impl Criterion {
     /// Tests the criterion for teams that can observe `pois` POIs.
     fn find(self, column: usize, of: String, certain: bool, pois: f64) -> Option<Finding> {
-        let estimate = |values: &[f64], least: f64| match certain {
-            true => values.first().copied().map(Estimate::exact),
-            false => Some(statistics::mean(values, 1.0)?.within(least, pois)),
+        let last = END as f64;
+        // Values are whole POIs or generations. Layouts have at most four POIs, so shares have steps of at least 0.25.
+        let (values, step, [least, most], allowed, signed) = match &self {
+            Criterion::Mean(values, allowed) => (values, 1.0, [0.0, pois], *allowed, false),
+            Criterion::Difference(values, allowed) => (values, 1.0, [-pois, pois], *allowed, true),
+            Criterion::Shares(values, allowed) => (values, 0.25, [-1.0, 1.0], *allowed, true),
+            Criterion::Generations(values, allowed) => (values, 1.0, [-last - 1.0, last + 1.0], *allowed, true),
+            Criterion::Share(_, _, allowed) => (&vec![], 0.0, [0.0, 1.0], *allowed, false),
         };
-        let share = |count: usize, of: usize| match certain {
-            true => (of > 0).then(|| Estimate::exact((count > 0).into())),
-            false => statistics::share(count, of),
+        let estimate = |confidence: f64| match (&self, certain) {
+            (&Criterion::Share(count, of, _), true) => (of > 0).then(|| Estimate::exact((count > 0).into())),
+            (&Criterion::Share(count, of, _), false) => statistics::share_at(confidence, count, of),
+            (_, true) => values.first().copied().map(Estimate::exact),
+            (_, false) => Some(statistics::mean_at(confidence, values, step)?.within(least, most)),
         };
-        let (estimate, verdict, measured) = match &self {
-            Criterion::Mean(values, allowed) => {
-                let estimate = estimate(values, 0.0)?;
-                (estimate, judge(estimate, *allowed), format!("{:.2}", estimate.value))
-            }
-            Criterion::Difference(values, allowed) | Criterion::Tested(values, allowed) => {
-                let estimate = estimate(values, -pois)?;
-                (estimate, judge(estimate, *allowed), format!("{:+.2}", estimate.value))
-            }
-            Criterion::Shares(values, allowed) => {
-                let estimate = match certain {
-                    true => Estimate::exact(*values.first()?),
-                    false => statistics::mean(values, 0.25)?.within(-1.0, 1.0),
-                };
-                (estimate, judge(estimate, *allowed), format!("{:+.2}", estimate.value))
-            }
-            &Criterion::Share(count, of, allowed) => {
-                let estimate = share(count, of)?;
-                (estimate, judge(estimate, allowed), format!("{count} of {of}"))
-            }
-            &Criterion::All(count, of) => {
-                let estimate = share(count, of)?;
-                // One counterexample refutes the claim. To confirm it, the interval of the share must start at 1 - FEW
-                // or above.
-                let verdict = if count < of { Verdict::No } else { judge(estimate, [1.0 - FEW, f64::INFINITY]) };
-                (estimate, verdict, format!("{count} of {of}"))
-            }
+        let at = estimate(statistics::CONFIDENCE)?;
+        let measured = match &self {
+            Criterion::Share(count, of, _) => format!("{count} of {of}"),
+            Criterion::Generations(..) => format!("{:+.1}", at.value),
+            _ if signed => format!("{:+.2}", at.value),
+            _ => format!("{:.2}", at.value),
         };
-        let p = match &self {
-            Criterion::Tested(values, _) if !certain => statistics::p_value(values),
-            _ => None,
+        let interval = match (&self, certain) {
+            (_, true) => String::new(),
+            (Criterion::Generations(..), _) => format!(" [{:.1}, {:.1}]", at.low, at.high),
+            _ => format!(" [{:.2}, {:.2}]", at.low, at.high),
         };
-        let interval = if certain { String::new() } else { format!(" [{:.2}, {:.2}]", estimate.low, estimate.high) };
-        let test = p.map_or(String::new(), |p| if p < 0.001 { ", p < 0.001".into() } else { format!(", p = {p:.3}") });
+        let decided = |verdict: Verdict| {
+            statistics::smallest_alpha(|confidence| {
+                estimate(confidence).is_some_and(|estimate| judge(estimate, allowed) == verdict)
+            })
+        };
+        let p = match certain {
+            true => None,
+            false => Some(decided(Verdict::Yes).or_else(|| decided(Verdict::No)).unwrap_or(1.0)),
+        };
         // Typographic minus signs.
-        let measured = format!("{measured}{interval}{test}").replace("-", "−");
-        Some(Finding { column, of, verdict, measured, estimate: Some(estimate), p })
+        let measured = format!("{measured}{interval}").replace('-', "−");
+        Some(Finding { column, of, verdict: judge(at, allowed), measured, estimate: Some(at), p, p_holm: None })
     }
 }
 
@@ -225,19 +239,19 @@ fn less(values: &[f64], others: &[f64]) -> Vec<f64> {
 }
 
 impl Course<'_> {
-    /// Returns the first generation at which each trial's best team observes every POI. None within a trial means never
+    /// Returns the first generation at which each trial's champion observes every POI. None within a trial means never
     /// up to `last`.
     fn solved(&self, last: usize) -> Option<Vec<Option<usize>>> {
-        self.best.iter().map(|trial| Some(trial.get(..=last)?.iter().position(|&g| g >= 1.0))).collect()
+        self.champion.iter().map(|trial| Some(trial.get(..=last)?.iter().position(|&g| g >= 1.0))).collect()
     }
 
-    /// Returns the number of trials whose best team observes every POI at or before `last`.
+    /// Returns the number of trials whose champion observes every POI at or before `last`.
     fn count_solved(&self, last: usize) -> Option<usize> {
         Some(self.solved(last)?.iter().flatten().count())
     }
 
     fn trials(&self) -> usize {
-        self.best.len()
+        self.champion.len()
     }
 }
 
@@ -247,6 +261,8 @@ struct Test {
     layout: usize,
     words: &'static str,
     measure: &'static str,
+    /// Whether the experiment is ours.
+    exploratory: bool,
     /// The last generation that the claim needs.
     needs: usize,
     sources: &'static [Source],
@@ -254,11 +270,11 @@ struct Test {
 }
 
 /// The sources for claims about all-leaders teams. Df is omitted because it equals D without followers.
-const ALONE: &[Source] = SOURCES.split_at(4).0;
-const EVOLVED: &[Source] = SOURCES.split_at(2).1;
-const G: Source = SOURCES[2];
-const D: Source = SOURCES[3];
-const DF: Source = SOURCES[4];
+const ALONE: &[Source] = SOURCES.split_at(5).0;
+const EVOLVED: &[Source] = SOURCES.split_at(3).1;
+const G: Source = SOURCES[3];
+const D: Source = SOURCES[4];
+const DF: Source = SOURCES[5];
 
 /// Sources for comparisons with all-leaders teams that choose among behaviours, each with the same fitness. The order
 /// must differ from [`EVOLVED`], because [`Test::finding`] treats that slice as comparisons between fitnesses.
@@ -272,23 +288,28 @@ const EIGHT: usize = 3;
 const MORE_OPTIMAL: &str = "“a more optimal joint policy” led than alone";
 const MORE_POIS: &str = "POIs at generation 100, leader-follower less all-leaders, by pair: above 0";
 const MUCH_FASTER: &str = "“much faster” led than alone";
-const HALF_THE_TIME: &str =
-    "pairs in which leader-follower first observes all POIs in half of all-leaders' generations or fewer: over half";
+const HALF_THE_TIME: &str = "generations until all POIs are observed (at most 101), half of all-leaders' less \
+                             leader-follower's, by pair, 0 if neither observes all: above 0. Where a side observes all \
+                             in fewer than half of its trials: pairs in which leader-follower needs at most half as \
+                             many, of those that are no ties: over half";
+const SOONER: &str = "generations until all POIs are observed (at most 101), all-leaders' less leader-follower's, by \
+                      pair, 0 if neither observes all: above 0. Where a side observes all in fewer than half of its \
+                      trials: pairs in which leader-follower is sooner, of those that are no ties: over half";
 const MORE_RELIABLY: &str = "“more reliably” led than alone";
 const ODD_PAIRS: &str =
     "of the pairs in which only one observes all POIs at generation 100, leader-follower does in: over half";
+
+/// Returns the values that "all POIs" allows for an average: at least a share of 1 - [`SMALL`].
+fn nearly_all(view: Lookup<'_>) -> Band {
+    [view.pois(1.0 - SMALL), f64::INFINITY]
+}
 
 fn more_optimal(view: Lookup<'_>) -> Option<Criterion> {
     Some(Criterion::Difference(view.lead()?, ABOVE_0))
 }
 
 fn much_faster(view: Lookup<'_>) -> Option<Criterion> {
-    let (led, all) = (view.led()?.solved(END)?, view.all()?.solved(END)?);
-    // A trial that never succeeds counts as succeeding after the end.
-    let sooner = |(led, all): &(&Option<usize>, &Option<usize>)| {
-        led.is_some_and(|led| 2 * led <= all.unwrap_or(END + 1) && Some(led) != **all)
-    };
-    Some(Criterion::Share(led.iter().zip(&all).filter(sooner).count(), led.len(), MOST))
+    sooner(view.led()?, view.all()?, 2)
 }
 
 fn more_reliably(view: Lookup<'_>) -> Option<Criterion> {
@@ -305,6 +326,7 @@ const MORE_THAN_SELECTING: Test = Test {
     layout: GENERAL,
     words: "led, “a more optimal solution” than “those learning to select between policies”",
     measure: "POIs at generation 100, leader-follower less all-leaders who choose among behaviours, by pair: above 0",
+    exploratory: true,
     needs: END,
     sources: AGAINST_SELECTING,
     find: |view| {
@@ -314,18 +336,31 @@ const MORE_THAN_SELECTING: Test = Test {
 };
 const FASTER_THAN_SELECTING: Test = Test {
     words: "led, “faster” than “those learning to select between policies”",
-    measure: "pairs in which leader-follower observes all POIs before all-leaders who choose among behaviours do: over half",
-    find: |view| sooner(view.led()?, view.selecting()?),
+    measure: SOONER,
+    find: |view| sooner(view.led()?, view.selecting()?, 1),
     ..MORE_THAN_SELECTING
 };
 
-/// Counts the pairs in which the first observes all POIs before the second does, or the second never does.
-fn sooner(one: Course<'_>, other: Course<'_>) -> Option<Criterion> {
+/// Compares the generations until all POIs are observed: those of the second, divided by a factor, less those of the
+/// first. A trial that never observes all counts as [`END`] + 1, and a pair in which neither does is a tie.
+///
+/// If a side observes all in fewer than half of its trials, most of its times are censored. The sign test then replaces
+/// the mean.
+fn sooner(one: Course<'_>, other: Course<'_>, factor: usize) -> Option<Criterion> {
     let (one, other) = (one.solved(END)?, other.solved(END)?);
-    let pairs = one.iter().zip(&other);
-    let sooner =
-        |(one, other): &(&Option<usize>, &Option<usize>)| one.is_some_and(|one| other.is_none_or(|other| one < other));
-    Some(Criterion::Share(pairs.filter(sooner).count(), one.len(), MOST))
+    let censored = |times: &[Option<usize>]| 2 * times.iter().flatten().count() < times.len();
+    let time = |solved: Option<usize>| solved.unwrap_or(END + 1);
+    let pairs = || one.iter().copied().zip(other.iter().copied());
+    if censored(&one) || censored(&other) {
+        let untied = pairs().filter(|(one, other)| one != other);
+        let sooner = untied.clone().filter(|&(one, other)| one.is_some() && factor * time(one) <= time(other));
+        return Some(Criterion::Share(sooner.count(), untied.count(), MOST));
+    }
+    let less = |(one, other): (Option<usize>, Option<usize>)| match one.or(other) {
+        None => 0.0,
+        Some(_) => time(other) as f64 / factor as f64 - time(one) as f64,
+    };
+    Some(Criterion::Generations(pairs().map(less).collect(), ABOVE_0))
 }
 
 /// Returns the fitness that a fitness is compared with, so that every pair of fitnesses occurs once.
@@ -344,6 +379,7 @@ const TESTS: &[Test] = &[
         layout: GENERAL,
         words: MORE_OPTIMAL,
         measure: MORE_POIS,
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
         find: more_optimal,
@@ -353,6 +389,7 @@ const TESTS: &[Test] = &[
         layout: GENERAL,
         words: MUCH_FASTER,
         measure: HALF_THE_TIME,
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
         find: much_faster,
@@ -362,6 +399,7 @@ const TESTS: &[Test] = &[
         layout: GENERAL,
         words: MORE_RELIABLY,
         measure: ODD_PAIRS,
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
         find: more_reliably,
@@ -371,6 +409,7 @@ const TESTS: &[Test] = &[
         layout: GENERAL,
         words: "alone, “they struggle to learn to observe all 4 POIs”",
         measure: "all-leaders, trials that ever observe all 4 up to generation 100: under half",
+        exploratory: false,
         needs: END,
         sources: ALONE,
         find: |view| Some(Criterion::Share(view.all()?.count_solved(END)?, view.all()?.trials(), [0.0, 0.5])),
@@ -380,6 +419,7 @@ const TESTS: &[Test] = &[
         layout: GENERAL,
         words: "alone, “after 100 generations, they average observing less than a single POI”",
         measure: "all-leaders, POIs at generation 100: under 1",
+        exploratory: false,
         needs: END,
         sources: ALONE,
         find: |view| Some(Criterion::Mean(view.all()?.observed(END)?, [f64::NEG_INFINITY, 1.0])),
@@ -389,6 +429,7 @@ const TESTS: &[Test] = &[
         layout: GENERAL,
         words: "led, “in fewer than 20 generations, they all observe at least 3, on average”",
         measure: "leader-follower, POIs at generation 19: at least 3",
+        exploratory: false,
         needs: 19,
         sources: &SOURCES,
         find: |view| Some(Criterion::Mean(view.led()?.observed(19)?, [3.0, f64::INFINITY])),
@@ -397,22 +438,24 @@ const TESTS: &[Test] = &[
         place: "§5.1, Fig. 4",
         layout: GENERAL,
         words: "led, “quickly able to learn to observe all of the POIs”",
-        measure: "leader-follower, trials that ever observe all 4 up to generation 40: all",
+        measure: "leader-follower, POIs at generation 40: at least 3.6",
+        exploratory: false,
         needs: 40,
         sources: &SOURCES,
-        find: |view| Some(Criterion::All(view.led()?.count_solved(40)?, view.led()?.trials())),
+        find: |view| Some(Criterion::Mean(view.led()?.observed(40)?, nearly_all(view))),
     },
     Test {
         place: "§5.1",
         layout: GENERAL,
         words: "led, “they all consistently observe all 4 POIs within 40 generations”",
-        measure: "leader-follower, trials that observe all 4 at every generation from 40 to 100: all",
+        measure: "leader-follower, POIs in the mean over generations 40 to 100: at least 3.6",
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
         find: |view| {
             let led = view.led()?;
-            let always = |trial: &&Vec<f64>| trial[40..=END].iter().all(|&g| g >= 1.0);
-            Some(Criterion::All(led.best.iter().filter(always).count(), led.trials()))
+            let mean = |trial: &Vec<f64>| trial[40..=END].iter().sum::<f64>() / (END - 39) as f64 * led.pois as f64;
+            Some(Criterion::Mean(led.champion.iter().map(mean).collect(), nearly_all(view)))
         },
     },
     Test {
@@ -420,6 +463,7 @@ const TESTS: &[Test] = &[
         layout: STRICT,
         words: MORE_OPTIMAL,
         measure: MORE_POIS,
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
         find: more_optimal,
@@ -429,6 +473,7 @@ const TESTS: &[Test] = &[
         layout: STRICT,
         words: MUCH_FASTER,
         measure: HALF_THE_TIME,
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
         find: much_faster,
@@ -438,6 +483,7 @@ const TESTS: &[Test] = &[
         layout: STRICT,
         words: MORE_RELIABLY,
         measure: ODD_PAIRS,
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
         find: more_reliably,
@@ -447,6 +493,7 @@ const TESTS: &[Test] = &[
         layout: STRICT,
         words: "alone, “almost never able to learn to obtain any reward using any of the reward functions”",
         measure: "all-leaders, trials that ever observe a POI up to generation 100: under 1 in 10",
+        exploratory: false,
         needs: END,
         sources: ALONE,
         find: |view| {
@@ -460,6 +507,7 @@ const TESTS: &[Test] = &[
         layout: STRICT,
         words: "alone, failing “is more drastic than in the previous configuration”",
         measure: "all-leaders, share of the POIs at generation 100, less that in generally forward, by pair: below 0",
+        exploratory: false,
         needs: END,
         sources: ALONE,
         find: |view| {
@@ -475,6 +523,7 @@ const TESTS: &[Test] = &[
         layout: STRICT,
         words: "led, “learning to observe 3 of the 4 POIs on average withing 30 generations”",
         measure: "leader-follower, POIs at generation 30: at least 1.5 of the 2 that this layout has",
+        exploratory: false,
         needs: 30,
         sources: &SOURCES,
         find: |view| Some(Criterion::Mean(view.led()?.observed(30)?, [view.pois(0.75), f64::INFINITY])),
@@ -483,10 +532,11 @@ const TESTS: &[Test] = &[
         place: "§5.2",
         layout: STRICT,
         words: "led, “able to use any of the reward functions to successfully solve the task”",
-        measure: "leader-follower, trials that ever observe both POIs up to generation 100: all",
+        measure: "leader-follower, POIs at generation 100: at least 1.8",
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
-        find: |view| Some(Criterion::All(view.led()?.count_solved(END)?, view.led()?.trials())),
+        find: |view| Some(Criterion::Mean(view.led()?.observed(END)?, nearly_all(view))),
     },
     Test {
         place: "§5.2",
@@ -495,6 +545,7 @@ const TESTS: &[Test] = &[
                 average reward”",
         measure: "leader-follower, POIs at generation 100 under one fitness less those under another, by pair: less \
                   than 0.2 apart",
+        exploratory: false,
         needs: END,
         sources: EVOLVED,
         find: |view| {
@@ -509,15 +560,17 @@ const TESTS: &[Test] = &[
         words: "led, under Df “the variance of the performance of the system was significantly higher”",
         measure: "leader-follower, distance of a trial's POIs at generation 100 from the median trial's, Df less the \
                   other, by pair (Brown-Forsythe): above 0",
+        exploratory: false,
         needs: END,
         sources: &[G, D],
-        find: |view| Some(Criterion::Tested(view.between(DF, view.source, statistics::distances)?, ABOVE_0)),
+        find: |view| Some(Criterion::Difference(view.between(DF, view.source, statistics::distances)?, ABOVE_0)),
     },
     Test {
         place: "§5",
         layout: CHAOTIC,
         words: MORE_OPTIMAL,
         measure: MORE_POIS,
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
         find: more_optimal,
@@ -527,6 +580,7 @@ const TESTS: &[Test] = &[
         layout: CHAOTIC,
         words: MUCH_FASTER,
         measure: HALF_THE_TIME,
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
         find: much_faster,
@@ -536,6 +590,7 @@ const TESTS: &[Test] = &[
         layout: CHAOTIC,
         words: MORE_RELIABLY,
         measure: ODD_PAIRS,
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
         find: more_reliably,
@@ -545,12 +600,17 @@ const TESTS: &[Test] = &[
         layout: CHAOTIC,
         words: "alone, “a high likelihood of random actions successfully causing the agents to observe the POI”",
         measure: "all-leaders, trials in which one of generation 0's random teams observes a POI: over half",
+        exploratory: false,
         needs: 0,
         // Before any selection, fitness has no effect.
-        sources: &[Source::Random, G],
+        sources: &[Source::Actions, Source::Random, G],
         find: |view| {
             let all = view.all()?;
-            Some(Criterion::Share(all.observed(0)?.iter().filter(|&&pois| pois > 0.0).count(), all.trials(), MOST))
+            Some(Criterion::Share(
+                all.observed_by_best(0)?.iter().filter(|&&pois| pois > 0.0).count(),
+                all.trials(),
+                MOST,
+            ))
         },
     },
     Test {
@@ -558,6 +618,7 @@ const TESTS: &[Test] = &[
         layout: CHAOTIC,
         words: "alone, “able to solve the problem some of the time”",
         measure: "all-leaders, trials that ever observe all 4 up to generation 100: 1 in 10 to 9 in 10",
+        exploratory: false,
         needs: END,
         sources: ALONE,
         find: |view| Some(Criterion::Share(view.all()?.count_solved(END)?, view.all()?.trials(), [FEW, 1.0 - FEW])),
@@ -568,6 +629,7 @@ const TESTS: &[Test] = &[
         words: "alone, “a rather large variance in the average policy performance”",
         measure: "all-leaders, mean distance of a trial's POIs at generation 100 from the median trial's: at least 0.5, \
                   as if every second trial were a POI off",
+        exploratory: false,
         needs: END,
         sources: ALONE,
         find: |view| Some(Criterion::Mean(statistics::distances(&view.all()?.observed(END)?), [0.5, f64::INFINITY])),
@@ -577,6 +639,7 @@ const TESTS: &[Test] = &[
         layout: CHAOTIC,
         words: "led, “the agents learn about a similar policy”",
         measure: "POIs at generation 100, leader-follower less all-leaders, by pair: less than 0.4 apart",
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
         find: |view| {
@@ -589,6 +652,7 @@ const TESTS: &[Test] = &[
         layout: CHAOTIC,
         words: "led, “at least a comparable policy”",
         measure: "POIs at generation 100, leader-follower less all-leaders, by pair: above −0.4",
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
         find: |view| Some(Criterion::Difference(view.lead()?, [-view.pois(SMALL), f64::INFINITY])),
@@ -599,11 +663,12 @@ const TESTS: &[Test] = &[
         words: "led, “more consistently” than alone",
         measure: "distance of a trial's POIs at generation 100 from the median trial's, leader-follower less \
                   all-leaders, by pair (Brown-Forsythe): below 0",
+        exploratory: false,
         needs: END,
         sources: &SOURCES,
         find: |view| {
             let distances = |course: Course<'_>| Some(statistics::distances(&course.observed(END)?));
-            Some(Criterion::Tested(less(&distances(view.led()?)?, &distances(view.all()?)?), BELOW_0))
+            Some(Criterion::Difference(less(&distances(view.led()?)?, &distances(view.all()?)?), BELOW_0))
         },
     },
     Test {
@@ -611,6 +676,7 @@ const TESTS: &[Test] = &[
         layout: CHAOTIC,
         words: "led, “a slight benefit of using the leader-follower trajectory assignment” over the global reward",
         measure: "leader-follower, POIs at generation 100 under Df less those under G, by pair: above 0, under 0.4",
+        exploratory: false,
         needs: END,
         sources: &[G],
         find: |view| {
@@ -622,10 +688,11 @@ const TESTS: &[Test] = &[
         place: "§5.3",
         layout: CHAOTIC,
         words: "led, the global reward is “enough of a learning signal to direct agent to solve the task”",
-        measure: "leader-follower, trials that ever observe all 4 up to generation 100: all",
+        measure: "leader-follower, POIs at generation 100: at least 3.6",
+        exploratory: false,
         needs: END,
-        sources: &[Source::Straight, Source::Random, G],
-        find: |view| Some(Criterion::All(view.led()?.count_solved(END)?, view.led()?.trials())),
+        sources: &[SOURCES[0], SOURCES[1], SOURCES[2], G],
+        find: |view| Some(Criterion::Mean(view.led()?.observed(END)?, nearly_all(view))),
     },
     MORE_THAN_SELECTING.within(GENERAL),
     FASTER_THAN_SELECTING.within(GENERAL),
@@ -638,6 +705,7 @@ const TESTS: &[Test] = &[
         layout: EIGHT,
         words: "led, “a similarly performant policy”, “even as this ratio of followers to leaders is increased”",
         measure: "POIs at generation 100, leader-follower less all-leaders, by pair: less than 0.2 apart",
+        exploratory: true,
         needs: END,
         sources: &SOURCES,
         find: |view| {
@@ -649,16 +717,31 @@ const TESTS: &[Test] = &[
         place: "§6",
         layout: EIGHT,
         words: "led, “faster than when using all learners”, “even as this ratio of followers to leaders is increased”",
-        measure: "pairs in which leader-follower observes all POIs before all-leaders do: over half",
+        measure: SOONER,
+        exploratory: true,
         needs: END,
         sources: &SOURCES,
-        find: |view| sooner(view.led()?, view.all()?),
+        find: |view| sooner(view.led()?, view.all()?, 1),
     },
 ];
 
 /// Tests every claim of the paper on these results.
 pub fn claims(results: Evidence<'_>) -> Vec<Claim> {
-    TESTS.iter().map(|test| test.claim(results)).collect()
+    let mut claims: Vec<Claim> = TESTS.iter().map(|test| test.claim(results)).collect();
+    let mut tested: Vec<&mut Finding> = claims
+        .iter_mut()
+        .flat_map(|claim| &mut claim.findings)
+        .filter(|found| found.p.is_some() && matches!(SOURCES[found.column], Source::Evolved(_)))
+        .collect();
+    let p: Vec<f64> = tested.iter().filter_map(|found| found.p).collect();
+    for (found, p) in tested.iter_mut().zip(statistics::holm(&p)) {
+        found.p_holm = Some(p);
+        if p > ALPHA {
+            found.verdict = Verdict::Undecided;
+        }
+        found.measured += &if p < 0.001 { ", p < 0.001".into() } else { format!(", p = {p:.3}") };
+    }
+    claims
 }
 
 impl Test {
@@ -669,8 +752,8 @@ impl Test {
 
     fn claim(&self, results: Evidence<'_>) -> Claim {
         let findings = self.sources.iter().filter_map(|&source| self.finding(results, source)).collect();
-        let Test { place, layout, words, measure, .. } = *self;
-        Claim { place, layout: LAYOUTS[layout].name, words, measure, findings }
+        let Test { place, layout, words, measure, exploratory, .. } = *self;
+        Claim { place, layout: LAYOUTS[layout].name, words, measure, exploratory, findings }
     }
 
     fn finding(&self, results: Evidence<'_>, source: Source) -> Option<Finding> {
@@ -683,9 +766,9 @@ impl Test {
             _ => source.to_string(),
         };
         let without = |verdict, measured: String| {
-            Some(Finding { column, of: of.clone(), verdict, measured, estimate: None, p: None })
+            Some(Finding { column, of: of.clone(), verdict, measured, estimate: None, p: None, p_holm: None })
         };
-        if course.best.iter().any(|trial| trial.len() <= self.needs) {
+        if course.champion.iter().any(|trial| trial.len() <= self.needs) {
             return without(Verdict::Open, format!("takes {} generations", self.needs));
         }
         if course.trials() < 2 && !course.certain {

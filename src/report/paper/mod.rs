@@ -8,7 +8,7 @@
 
 use serde::Serialize;
 
-use super::curves::{Curve, Figure, Panel};
+use super::curves::{Band, Curve, Figure, Panel};
 use crate::baseline::Baseline;
 use crate::config::{Config, ConfigError, Fitness, Override, Paradigm};
 use crate::model::policy::Actions;
@@ -65,6 +65,8 @@ pub struct Experiment {
     pub fitness: Fitness,
     /// The whole config.
     pub config: Config,
+    /// G of the champion, the team of every population's best policy, `[trials][generations + 1]`.
+    pub champion: Vec<Vec<f64>>,
     /// G of the best team, `[trials][generations + 1]`.
     pub best: Vec<Vec<f64>>,
 }
@@ -90,8 +92,8 @@ pub fn arms(overrides: &[Override]) -> Result<Vec<Experiment>, ConfigError> {
             if selects {
                 config.policy.actions = Actions::Behaviours;
             }
-            let best = vec![Vec::with_capacity(config.learning.generations + 1); config.learning.trials];
-            arms.push(Experiment { layout, paradigm, selects, fitness, config, best });
+            let none = vec![Vec::with_capacity(config.learning.generations + 1); config.learning.trials];
+            arms.push(Experiment { layout, paradigm, selects, fitness, config, champion: none.clone(), best: none });
         }
     }
     Ok(arms)
@@ -118,6 +120,7 @@ pub fn trained(arms: &[Experiment]) -> (Vec<Config>, Vec<usize>) {
 impl Experiment {
     /// Adds a row. The rows of a trial must come in order of generations.
     pub fn add(&mut self, row: &Row) {
+        self.champion[row.trial].push(row.champion_g);
         self.best[row.trial].push(row.best_g);
     }
 
@@ -151,17 +154,20 @@ pub struct Evidence<'a> {
 /// The source of a team's policies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Source {
-    /// The zero policy: straight ahead at half speed.
-    Straight,
-    /// The best so far of as many random teams as evolution evaluated.
+    /// The best constant speed, straight ahead.
+    Constant,
+    /// The best so far of as many random constant actions as evolution evaluated teams.
+    Actions,
+    /// The best so far of as many random networks as evolution evaluated teams.
     Random,
-    /// The best team of a generation that evolved with this fitness.
+    /// Teams that evolved with this fitness.
     Evolved(Fitness),
 }
 
 /// All sources, those without learning first.
-pub const SOURCES: [Source; 5] = [
-    Source::Straight,
+pub const SOURCES: [Source; 6] = [
+    Source::Constant,
+    Source::Actions,
     Source::Random,
     Source::Evolved(FITNESSES[0]),
     Source::Evolved(FITNESSES[1]),
@@ -171,8 +177,9 @@ pub const SOURCES: [Source; 5] = [
 impl std::fmt::Display for Source {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
-            Source::Straight => f.write_str("straight ahead"),
-            Source::Random => f.write_str("random teams"),
+            Source::Constant => f.write_str("constant speed"),
+            Source::Actions => f.write_str("constant actions"),
+            Source::Random => f.write_str("random networks"),
             Source::Evolved(fitness) => fitness.fmt(f),
         }
     }
@@ -181,6 +188,8 @@ impl std::fmt::Display for Source {
 /// The results of one source for one layout and paradigm.
 #[derive(Clone, Copy, Debug)]
 pub struct Course<'a> {
+    /// G of the champion, `[trials][generations + 1]`. For baselines, the same as `best`.
+    pub champion: &'a [Vec<f64>],
     /// G of the best team, `[trials][generations + 1]`.
     pub best: &'a [Vec<f64>],
     /// Number of POIs of the layout.
@@ -197,40 +206,53 @@ impl Evidence<'_> {
         let mut here = self.arms.iter().filter(is_here);
         let pois = here.clone().next()?.pois();
         let ground = PARADIGMS.len() * layout + PARADIGMS.iter().position(|&other| other == paradigm)?;
-        let best = match source {
-            Source::Straight => &self.baselines.get(ground)?.straight,
-            Source::Random => &self.baselines.get(ground)?.random,
-            Source::Evolved(fitness) => &here.find(|arm| arm.fitness == fitness)?.best,
+        let baseline = self.baselines.get(ground);
+        let (champion, best) = match source {
+            Source::Constant => (&baseline?.constant, &baseline?.constant),
+            Source::Actions => (&baseline?.actions, &baseline?.actions),
+            Source::Random => (&baseline?.random, &baseline?.random),
+            Source::Evolved(fitness) => {
+                here.find(|arm| arm.fitness == fitness).map(|arm| (&arm.champion, &arm.best))?
+            }
         };
         // The paper's starts are fixed. If starts or POIs move, results depend on the trial.
-        let certain = source == Source::Straight && best.windows(2).all(|pair| pair[0] == pair[1]);
-        Some(Course { best, pois, certain })
+        let certain = source == Source::Constant && best.windows(2).all(|pair| pair[0] == pair[1]);
+        Some(Course { champion, best, pois, certain })
     }
 
     /// Returns the results of all-leaders teams on one of [`LAYOUTS`] that choose among known behaviours.
     pub fn selecting(&self, layout: usize, fitness: Fitness) -> Option<Course<'_>> {
         let name = LAYOUTS.get(layout)?.name;
         let arm = self.arms.iter().find(|arm| (arm.layout.name, arm.selects, arm.fitness) == (name, true, fitness))?;
-        Some(Course { best: &arm.best, pois: arm.pois(), certain: false })
+        Some(Course { champion: &arm.champion, best: &arm.best, pois: arm.pois(), certain: false })
     }
 }
 
 impl Course<'_> {
-    /// Returns the POIs that the best team observed, per trial. None if the run is shorter.
+    /// Returns the POIs that the champion observed, per trial. None if the run is shorter.
     pub fn observed(&self, generation: usize) -> Option<Vec<f64>> {
+        self.champion.iter().map(|trial| Some(trial.get(generation)? * self.pois as f64)).collect()
+    }
+
+    /// Returns the POIs that the best team of a generation observed, per trial. None if the run is shorter.
+    pub fn observed_by_best(&self, generation: usize) -> Option<Vec<f64>> {
         self.best.iter().map(|trial| Some(trial.get(generation)? * self.pois as f64)).collect()
     }
 
-    /// Returns the POIs that the best team so far observed, per trial. None if the run is shorter.
+    /// Returns the most POIs that champions observed so far, per trial. None if the run is shorter.
     pub fn observed_by(&self, generation: usize) -> Option<Vec<f64>> {
-        let most = |trial: &Vec<f64>| Some(trial.get(..=generation)?.iter().copied().fold(0.0, f64::max));
-        self.best.iter().map(|trial| Some(most(trial)? * self.pois as f64)).collect()
+        most_so_far(self.champion, generation, self.pois)
     }
 
-    /// Averages the POIs over trials, per generation.
+    /// Returns the most POIs that any team observed so far, per trial. None if the run is shorter.
+    pub fn observed_by_any(&self, generation: usize) -> Option<Vec<f64>> {
+        most_so_far(self.best, generation, self.pois)
+    }
+
+    /// Averages the champion's POIs over trials, per generation.
     fn tallies(&self) -> Vec<Average> {
-        let mut tallies = vec![Average::default(); self.best.iter().map(Vec::len).max().unwrap_or(0)];
-        for trial in self.best {
+        let mut tallies = vec![Average::default(); self.champion.iter().map(Vec::len).max().unwrap_or(0)];
+        for trial in self.champion {
             tallies.iter_mut().zip(trial).for_each(|(tally, best)| tally.add(best * self.pois as f64));
         }
         tallies
@@ -241,11 +263,17 @@ impl Course<'_> {
     }
 }
 
+/// Returns the largest of the first values of each trial, in POIs.
+fn most_so_far(trials: &[Vec<f64>], generation: usize, pois: usize) -> Option<Vec<f64>> {
+    let most = |trial: &Vec<f64>| Some(trial.get(..=generation)?.iter().copied().fold(0.0, f64::max));
+    trials.iter().map(|trial| Some(most(trial)? * pois as f64)).collect()
+}
+
 /// Returns a figure of the paper: one panel per paradigm, one curve per fitness, and the baselines without learning in
 /// grey.
 pub fn figure(results: Evidence<'_>, layout: usize) -> Figure {
-    let [straight, random, evolved @ ..] = SOURCES;
-    let sources = [evolved.as_slice(), &[straight, random]].concat();
+    let [constant, _, random, evolved @ ..] = SOURCES;
+    let sources = [evolved.as_slice(), &[constant, random]].concat();
     let panel = |(letter, paradigm): (&str, Paradigm)| Panel {
         title: format!("({letter}) {}", title(paradigm)),
         curves: sources
@@ -260,10 +288,11 @@ pub fn figure(results: Evidence<'_>, layout: usize) -> Figure {
     Figure {
         panels: ["a", "b"].into_iter().zip(PARADIGMS).map(panel).collect(),
         legend: evolved.map(|source| source.to_string()).to_vec(),
-        references: vec!["straight ahead".into(), "best of as many random teams".into()],
-        y_label: "POIs observed".into(),
+        references: vec!["best constant speed".into(), "best of as many random networks".into()],
+        y_label: "POIs observed by the champion".into(),
         y_max: PARADIGMS.into_iter().map(pois).fold(1.0, f64::max),
         shares: false,
+        band: Band::Error,
         source: None,
         warning: None,
     }
@@ -281,8 +310,10 @@ fn title(paradigm: Paradigm) -> &'static str {
 pub struct Summary<'a> {
     /// Version of the program.
     pub version: &'static str,
-    /// The backend that played the episodes.
+    /// The backend that played the episodes, "cpu" or "gpu".
     pub backend: String,
+    /// Description of the backend.
+    pub description: String,
     /// Duration of the whole experiment, in seconds.
     pub seconds: f64,
     /// Random seed of every experiment.
@@ -298,14 +329,14 @@ pub struct Summary<'a> {
     pub claims: &'a [claims::Claim],
 }
 
-/// One curve: the POIs observed by the best team of each generation. For random teams, by the best team so far.
+/// One curve: the POIs observed by the champion of each generation. For baselines, by the best team so far.
 #[derive(Serialize)]
 pub struct Trajectory {
     /// Name of the layout.
     pub layout: &'static str,
     /// The paradigm.
     pub paradigm: Paradigm,
-    /// `straight ahead`, `random teams`, or the fitness.
+    /// `constant speed`, `constant actions`, `random networks`, or the fitness.
     pub source: String,
     /// The fitness, for evolved teams only.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -320,6 +351,8 @@ pub struct Trajectory {
     pub curve: Curve,
     /// Standard deviations over trials, per generation.
     pub deviation: Vec<f64>,
+    /// Means of the POIs observed by the best of all teams of a generation.
+    pub best_mean: Vec<f64>,
 }
 
 impl Trajectory {
@@ -338,6 +371,7 @@ impl Trajectory {
                 pois: course.pois,
                 curve: course.curve(),
                 deviation: course.tallies().iter().map(Average::deviation).collect(),
+                best_mean: Course { champion: course.best, ..course }.tallies().iter().map(Average::mean).collect(),
             });
         };
         for layout in 0..LAYOUTS.len() {

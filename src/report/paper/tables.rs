@@ -4,21 +4,23 @@ use super::claims::{Claim, END, Verdict};
 use super::{Evidence, LAYOUTS, PARADIGMS, SOURCES, Source};
 use crate::config::Learning;
 use crate::report::table::markdown;
-use crate::statistics;
+use crate::statistics::{self, Average};
 
 /// Returns tables of the baselines without learning, next to evolution. They also show whether evolution beats random
 /// search.
 pub fn without_learning(results: Evidence<'_>) -> String {
     let last = results.arms.first().map_or(0, |arm| arm.config.learning.generations).min(END);
-    let teams = results.arms.first().map_or(0, |arm| arm.config.learning.population) * (last + 1);
+    let population = results.arms.first().map_or(0, |arm| arm.config.learning.population);
+    let teams = population * (last + 1);
     let mut sources = vec!["POIs at generation ".to_string() + &last.to_string(), "of".into()];
     sources.extend(SOURCES.map(|source| match source {
-        Source::Random => format!("best of {teams} random teams"),
-        _ => source.to_string(),
+        Source::Constant => "best constant speed".into(),
+        Source::Actions | Source::Random => format!("best of {teams} {source}"),
+        Source::Evolved(_) => format!("{source}: champion (best of {population} teams)"),
     }));
     let mut rows = vec![sources];
     let mut races =
-        vec![vec!["Best team so far, evolution less random".to_string(), "G".into(), "D".into(), "Df".into()]];
+        vec![vec!["Best team so far, evolution less random networks".to_string(), "G".into(), "D".into(), "Df".into()]];
     let mut solved = Vec::new();
     for (layout, name) in LAYOUTS.iter().enumerate() {
         for paradigm in PARADIGMS {
@@ -30,16 +32,19 @@ pub fn without_learning(results: Evidence<'_>) -> String {
                 let Some((course, observed)) = course(source).and_then(|c| Some((c, c.observed(last)?))) else {
                     return String::new();
                 };
-                match statistics::mean(&observed, 1.0).map(|mean| mean.within(0.0, pois as f64)) {
+                let best = course.observed_by_best(last).filter(|_| matches!(source, Source::Evolved(_)));
+                let best = best.map(|best| format!(" ({:.2})", best.iter().collect::<Average>().mean()));
+                let champion = match statistics::mean(&observed, 1.0).map(|mean| mean.within(0.0, pois as f64)) {
                     Some(mean) if !course.certain => format!("{:.2} [{:.2}, {:.2}]", mean.value, mean.low, mean.high),
                     _ => observed.first().map_or(String::new(), |pois| format!("{pois:.2}")),
-                }
+                };
+                champion + &best.unwrap_or_default()
             }));
             rows.push(row);
-            let random = course(Source::Random).and_then(|course| course.observed_by(last)).unwrap_or_default();
+            let random = course(Source::Random).and_then(|course| course.observed_by_any(last)).unwrap_or_default();
             let mut race = vec![name.clone()];
-            race.extend(SOURCES[2..].iter().map(|&source| {
-                let evolved = course(source).and_then(|course| course.observed_by(last)).unwrap_or_default();
+            race.extend(SOURCES[3..].iter().map(|&source| {
+                let evolved = course(source).and_then(|course| course.observed_by_any(last)).unwrap_or_default();
                 let lead: Vec<f64> = evolved.iter().zip(&random).map(|(evolved, random)| evolved - random).collect();
                 let within = |mean: statistics::Estimate| mean.within(-(pois as f64), pois as f64);
                 let Some(mean) = statistics::mean(&lead, 1.0).map(within) else { return "open: takes 2 trials".into() };
@@ -51,19 +56,18 @@ pub fn without_learning(results: Evidence<'_>) -> String {
                 format!("{word}: {:+.2} [{:.2}, {:.2}]", mean.value, mean.low, mean.high).replace('-', "−")
             }));
             races.push(race);
-            let straight = course(Source::Straight).and_then(|course| course.observed(last)).unwrap_or_default();
-            if !straight.is_empty() && straight.iter().all(|&observed| observed >= pois as f64) {
+            let constant = course(Source::Constant).and_then(|course| course.observed(last)).unwrap_or_default();
+            if !constant.is_empty() && constant.iter().all(|&observed| observed >= pois as f64) {
                 solved.push(name);
             }
         }
     }
     let meaning = if solved.is_empty() {
-        "A team whose weights are all zero goes straight ahead at half speed; nowhere does it observe every POI.".into()
+        "No constant speed, straight ahead, observes every POI anywhere.".into()
     } else {
         format!(
-            "A team whose weights are all zero goes straight ahead at half speed. Untrained, it observes every POI in: {}. \
-             There the layout gives the task away, and that evolved teams observe every POI is no evidence of how well they \
-             learn.",
+            "A constant speed, straight ahead, observes every POI in: {}. Such a team senses nothing, so teams that observe \
+             every POI there need not have learned to sense.",
             solved.join("; ")
         )
     };
@@ -72,10 +76,11 @@ pub fn without_learning(results: Evidence<'_>) -> String {
 
 /// Returns the verdicts on all claims without figures, for a terminal and the first page.
 pub fn verdicts(claims: &[Claim]) -> String {
-    let mut rows = vec![[vec!["Layout".to_string(), "The paper says".into()], sources()].concat()];
+    let mut rows =
+        vec![[vec!["Layout".to_string(), "The paper says".into(), "all fitnesses".into()], sources()].concat()];
     for claim in claims {
         let cells = cells(claim, |verdict, _| verdict.to_string());
-        rows.push([vec![claim.layout.to_string(), claim.words.to_string()], cells].concat());
+        rows.push([vec![layout(claim), claim.words.to_string(), claim.verdict().to_string()], cells].concat());
     }
     markdown(&rows)
 }
@@ -85,11 +90,16 @@ pub fn full(claims: &[Claim]) -> String {
     let head = ["Layout", "Where", "The paper says", "Measured here"].map(String::from).to_vec();
     let mut rows = vec![[head, sources()].concat()];
     for claim in claims {
-        let Claim { layout, place, words, measure, .. } = *claim;
+        let Claim { place, words, measure, .. } = *claim;
         let cells = cells(claim, |verdict, measured| format!("{verdict}: {measured}"));
-        rows.push([[layout, place, words, measure].map(String::from).to_vec(), cells].concat());
+        rows.push([vec![layout(claim)], [place, words, measure].map(String::from).to_vec(), cells].concat());
     }
     markdown(&rows)
+}
+
+/// Returns a claim's layout, marked if the experiment is ours.
+fn layout(claim: &Claim) -> String {
+    claim.layout.to_string() + if claim.exploratory { " †" } else { "" }
 }
 
 fn sources() -> Vec<String> {
@@ -106,14 +116,18 @@ fn cells(claim: &Claim, say: impl Fn(Verdict, &str) -> String) -> Vec<String> {
     SOURCES.into_iter().enumerate().map(cell).collect()
 }
 
-/// Counts the verdicts by kind.
+/// Counts the claims by verdict, those of the paper's own experiments first.
 pub fn count(claims: &[Claim]) -> String {
-    let all: Vec<Verdict> = claims.iter().flat_map(Claim::on_evolution).map(|found| found.verdict).collect();
-    let count = |verdict| all.iter().filter(|&&other| other == verdict).count();
-    let [yes, no, undecided, open] = [Verdict::Yes, Verdict::No, Verdict::Undecided, Verdict::Open].map(count);
-    let open = if open > 0 { format!(", {open} open (too few generations or trials)") } else { String::new() };
-    let (claims, verdicts) = (claims.len(), all.len());
-    format!("{verdicts} verdicts on {claims} claims: {yes} yes, {no} no, {undecided} not decided{open}.")
+    let of = |exploratory: bool| {
+        let all: Vec<Verdict> =
+            claims.iter().filter(|claim| claim.exploratory == exploratory).map(Claim::verdict).collect();
+        let count = |verdict| all.iter().filter(|&&other| other == verdict).count();
+        let [yes, no, undecided, open] = [Verdict::Yes, Verdict::No, Verdict::Undecided, Verdict::Open].map(count);
+        let open = if open > 0 { format!(", {open} open (too few generations or trials)") } else { String::new() };
+        (all.len(), format!("{yes} yes, {no} no, {undecided} not decided{open}"))
+    };
+    let ((paper, verdicts), (ours, exploratory)) = (of(false), of(true));
+    format!("{paper} claims on the paper's experiments: {verdicts}. {ours} exploratory claims (†): {exploratory}.")
 }
 
 /// Returns the heading: number of trials, generations and seed.
@@ -132,18 +146,20 @@ pub fn page(without_learning: &str, heading: &str, full: &str) -> String {
 
 /// Explains the table of baselines.
 pub const RACE: &str = "\
-Means over trials of each generation's best team, in POIs, with 95 % intervals. Random teams are as many as evolution
-evaluated, drawn as its first generation is, and their best so far is kept; in the second table evolution's best so far
-is kept too, since it would not be a fair race otherwise. Trials with one seed are pairs, whatever the arm: the same
-starts, the same luck in every draw, and, where the sizes agree, the same first populations; differences are of pairs.";
+Means over trials in POIs, with 95 % intervals. The champion is the team of every population's best policy. In parentheses
+is the best of a generation's teams, a maximum that grows with their number. Random constant actions and random networks
+are as many as evolution evaluates, and their best so far is kept. The second table keeps evolution's best so far, too.
+Trials with one seed are pairs: they have the same starts and, where the sizes agree, the same first populations.
+Differences are over pairs.";
 
 /// Explains the table of claims.
 pub const LEGEND: &str = "\
-*yes*: the 95 % interval, in brackets, lies within what the words allow; *no*: it lies outside; *not decided*: it holds
-the threshold, and more trials might tell; *open*: too few generations or trials. Means and differences by Student's t,
-over pairs where arms are compared; shares by Clopper and Pearson. Where the paper gives no number: *almost never* is
-under 1 trial in 10, *some of the time* 1 in 10 to 9 in 10; *all* is refuted by one trial that does not, and holds where
-the interval of those that do starts at 9 in 10; *similar*, *comparable* and *slight* are differences under a tenth of
-the POIs. The columns *straight ahead* and *random teams* hold the same measure for what needs no learning, and are not
-counted: a *yes* there says that the claim speaks of the task rather than of what was learned. Alone, Df is D. Every
-interval stands for itself: of so many, a few miss what they estimate by chance.";
+*yes*: the interval lies within what the words allow. *no*: it lies outside. *not decided*: it contains the threshold.
+*open*: too few generations or trials. Brackets are 95 % intervals: Student's for means and differences over pairs, Clopper
+and Pearson's for shares. p is the smallest alpha at which the interval decides, corrected by Holm's method for all verdicts
+on evolved teams at once; a verdict needs p of at most 0.05. A claim holds if it holds under every fitness, and fails if it
+fails under one. Curves are judged by averages over trials, since the paper's curves are averages. If the paper gives no
+number, *almost never* is under 1 trial in 10 and *some of the time* is 1 in 10 to 9 in 10. *All POIs* is an average of at
+least nine tenths of them, and *similar*, *comparable* and *slight* are differences under a tenth. The baselines' columns
+have the same measures, uncorrected and not counted. A *yes* there says that the claim is about the task rather than about
+learning. Without followers, Df is D. † marks experiments of ours for sentences that describe none.";

@@ -1,19 +1,20 @@
 //! Work in flight: the device's buffers of one batch, and how a batch is submitted.
 
 use std::any::Any;
+use std::ops::Range;
 
 use super::planner::{BatchPlan, PACKED_HEAD, PlannedTask, State, Task, gather};
 use super::shape::Shape;
 use super::{GpuBackend, Records};
-use crate::backend::gpu::device::{BINDING_ALIGNMENT, DeviceError, Gpu, Stopwatch, grid, timed};
-use crate::backend::gpu::population::{GatherJob, Population, TOGETHER, parts};
+use crate::backend::gpu::device::{BINDING_ALIGNMENT, DeviceError, Gpu, Stopwatch, timed};
+use crate::backend::gpu::population::{Dispatch, GatherJob, Population, TOGETHER, parts};
 use crate::backend::{BackendError, FOUR, Group, Moment, Weights};
 use crate::host::Instant;
 use crate::parallel::*;
 
-/// Alignment of each kernel's first task, in tasks, so that a binding may start there. The size of a task is no power
-/// of two.
-const TASK_ALIGNMENT: usize = BINDING_ALIGNMENT / 4;
+/// Alignment of each kernel's first task, in tasks, so that a binding may start there.
+const TASK_ALIGNMENT: usize = BINDING_ALIGNMENT / size_of::<Task>();
+const _: () = assert!(BINDING_ALIGNMENT.is_multiple_of(size_of::<Task>()));
 /// Initial share of all sets that a packed record has room for.
 pub(super) const KEPT: f64 = 1.0 / 16.0;
 /// Words of a packed record beyond that share.
@@ -42,9 +43,20 @@ pub(super) struct Buffers {
     /// The packed record, if any, and whether the whole record is copied to the host too.
     pub(super) sent: Option<PackedReadback>,
     pub(super) whole: bool,
-    pub(super) watch: Option<Stopwatch>,
-    /// The submission to wait for.
+    /// Stopwatches of the submissions, if they are timed by the device's clock.
+    pub(super) watches: Vec<Stopwatch>,
+    /// The number of submissions, the time before the first, unless some were waited for, and their work.
+    pub(super) submissions: usize,
+    pub(super) started: Option<Instant>,
+    pub(super) turns: u64,
+    /// The last submission.
     pub(super) submitted: Option<wgpu::SubmissionIndex>,
+    /// The nonce of the batch.
+    pub(super) nonce: u32,
+    /// The status words of the populations that it plays, on their way to the host, and their values if everything
+    /// was done.
+    pub(super) populations_back: Option<wgpu::Buffer>,
+    pub(super) populations: Vec<u32>,
 }
 
 /// A packed record that is copied to the host.
@@ -65,7 +77,7 @@ impl Buffers {
         let submitted = gpu.scoped("record, read back", || {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             encoder.copy_buffer_to_buffer(record, 0, back, 0, bytes);
-            gpu.queue.submit([encoder.finish()])
+            gpu.submit_commands("reading back", 0, encoder)
         })?;
         gpu.wait_for(Some(submitted))
     }
@@ -90,6 +102,56 @@ fn grown<'a>(
     Ok(buffer.as_ref().expect("just made"))
 }
 
+/// Tasks of one shape and round.
+struct Run {
+    shape: Shape,
+    round: usize,
+    tasks: Range<usize>,
+    /// The estimated work of a task.
+    turns: u64,
+}
+
+/// The dispatches of a batch on their way to the device, in submissions that no watchdog ends.
+struct Submission<'a> {
+    gpu: &'a Gpu,
+    /// Whether submissions are timed by the device's clock.
+    clock: bool,
+    watches: &'a mut Vec<Stopwatch>,
+    /// The number of submissions.
+    count: usize,
+    /// Dispatches of the next submission, their estimated time in seconds and their estimated work.
+    dispatches: Vec<Dispatch<'a>>,
+    load: f64,
+    turns: u64,
+}
+
+impl Submission<'_> {
+    /// Submits the dispatches, and whatever `copy` adds.
+    fn submit(&mut self, copy: impl FnOnce(&mut wgpu::CommandEncoder)) -> Result<wgpu::SubmissionIndex, DeviceError> {
+        let Submission { gpu, clock, watches, count, dispatches, turns, .. } = self;
+        if *clock && watches.len() == *count {
+            watches.extend(gpu.stopwatch()?);
+        }
+        let watch = watches.get(*count);
+        let submitted = gpu.scoped("episodes", || {
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            let mut pass = encoder.begin_compute_pass(&timed(watch));
+            for (pipeline, group, [x, y, z]) in dispatches.iter() {
+                pass.set_pipeline(pipeline);
+                pass.set_bind_group(0, group, &[]);
+                pass.dispatch_workgroups(*x, *y, *z);
+            }
+            drop(pass);
+            watch.inspect(|watch| watch.stop(&mut encoder));
+            copy(&mut encoder);
+            gpu.submit_commands("episodes", *turns, encoder)
+        })?;
+        dispatches.clear();
+        (self.count, self.load, self.turns) = (self.count + 1, 0.0, 0);
+        Ok(submitted)
+    }
+}
+
 impl GpuBackend {
     /// Submits one batch.
     pub(super) fn submit(
@@ -102,33 +164,27 @@ impl GpuBackend {
         use wgpu::BufferUsages as Usage;
         let start = Instant::now();
         let (jobs, choices) = self.jobs(groups, work)?;
+        let rounds = work.shares.iter().map(PlannedTask::rounds).max().unwrap_or(0);
+        let nonce = self.gpu.nonces(rounds as u32);
         self.fill_staging(groups, work);
         let gathered = Instant::now();
         self.stages.gather += gathered - start;
         // In each round the tasks of a shape are consecutive. The first is at an offset where a binding may start.
         let mut tasks: Vec<Task> = Vec::new();
-        let mut dispatches: Vec<(Shape, usize, [u32; 3])> = Vec::new();
-        // The dispatches of the first round, which cover every task once.
-        let mut first_round = 0;
+        let mut runs: Vec<Run> = Vec::new();
         let shapes = &work.shapes;
-        let new = shapes.iter().filter(|shape| !self.pipelines.contains_key(shape)).count();
-        if self.pipelines.len() + new > self.kept_kernels {
-            self.pipelines.retain(|shape, _| shapes.contains(shape));
-        }
-        let rounds = work.shares.iter().map(|share| (share.task.end as usize).div_ceil(share.steps_a_dispatch)).max();
-        for (round, &shape) in (0..rounds.unwrap_or(0)).flat_map(|round| shapes.iter().map(move |shape| (round, shape)))
-        {
+        self.prepare_pipelines(shapes)?;
+        for (round, &shape) in (0..rounds).flat_map(|round| shapes.iter().map(move |shape| (round, shape))) {
             tasks.resize(tasks.len().next_multiple_of(TASK_ALIGNMENT), Task::default());
-            let first = tasks.len();
-            tasks
-                .extend(work.shares.iter().filter(|share| share.shape == shape).filter_map(|share| share.round(round)));
+            let (first, mut turns) = (tasks.len(), 1);
+            for share in work.shares.iter().filter(|share| share.shape == shape) {
+                if let Some(task) = share.round(round, nonce) {
+                    turns = turns.max(share.turns(&task));
+                    tasks.push(task);
+                }
+            }
             if tasks.len() > first {
-                let grid = grid(tasks.len() - first, &self.gpu.limits);
-                // The last row of the grid may be longer than the tasks. Its additional workgroups play no team.
-                tasks.resize(first + (grid[0] * grid[1]) as usize, Task::default());
-                dispatches.push((shape, first, grid));
-                self.prepare_pipeline(shape)?;
-                first_round += usize::from(round == 0);
+                runs.push(Run { shape, round, tasks: first..tasks.len(), turns });
             }
         }
         if work.head.is_some() {
@@ -209,49 +265,87 @@ impl GpuBackend {
             _ => None,
         };
 
-        let (mut bound, mut packs) = (Vec::with_capacity(dispatches.len()), Vec::new());
-        for (index, (shape, first, grid)) in dispatches.into_iter().enumerate() {
-            let tasks = wgpu::BufferBinding {
-                buffer: &all_tasks,
-                offset: (first * size_of::<Task>()) as u64,
-                size: wgpu::BufferSize::new(u64::from(grid[0] * grid[1]) * size_of::<Task>() as u64),
-            };
-            let [worlds, places, weights, record, moments, states] =
-                [&worlds, &places, &weights, record, moments, states].map(|buffer| buffer.as_entire_buffer_binding());
-            if let Some(((pipeline, layout), least, packed, ..)) = packing.as_ref().filter(|_| index < first_round) {
-                let [least, packed] = [least, *packed].map(|buffer| buffer.as_entire_buffer_binding());
-                let group =
-                    gpu.bind("pack", layout, &[worlds.clone(), tasks.clone(), least, packed, record.clone()])?;
-                packs.push((pipeline, group, grid));
+        let population_bytes = 4 * jobs.iter().map(|(_, population)| population.status().1.len() as u64).sum::<u64>();
+        let populations_back = match jobs.is_empty() {
+            false => Some(grown(gpu, &mut buffers.populations_back, "status, read back", population_bytes, back)?),
+            true => None,
+        };
+        buffers.populations.clear();
+        buffers.populations.extend(jobs.iter().flat_map(|(_, population)| population.status().1));
+
+        let most = gpu.limits.max_compute_workgroups_per_dimension as usize / TASK_ALIGNMENT * TASK_ALIGNMENT;
+        let (clock, watches) = (self.clock, &mut buffers.watches);
+        let mut submission = Submission { gpu, clock, watches, count: 0, dispatches: gathers, load: 0.0, turns: 0 };
+        let (mut packs, mut started, mut turns_in_all) = (Vec::new(), Some(Instant::now()), 0);
+        for Run { shape, round, mut tasks, turns } in runs {
+            while !tasks.is_empty() {
+                let pace = self.paces.entry(shape).or_default();
+                let allowed = pace.tasks(turns, submission.load) / TASK_ALIGNMENT * TASK_ALIGNMENT;
+                if allowed == 0 && submission.turns > 0 {
+                    submission.submit(|_| ())?;
+                    continue;
+                }
+                let part = tasks.start..tasks.end.min(tasks.start + allowed.clamp(TASK_ALIGNMENT, most));
+                tasks.start = part.end;
+                let (grid, part_turns) = ([part.len() as u32, 1, 1], part.len() as u64 * turns);
+                let bound_tasks = wgpu::BufferBinding {
+                    buffer: &all_tasks,
+                    offset: (part.start * size_of::<Task>()) as u64,
+                    size: wgpu::BufferSize::new((part.len() * size_of::<Task>()) as u64),
+                };
+                let [worlds, places, weights, record, moments, states] =
+                    [&worlds, &places, &weights, record, moments, states]
+                        .map(|buffer| buffer.as_entire_buffer_binding());
+                if let Some(((pipeline, layout), least, packed, ..)) = packing.as_ref().filter(|_| round == 0) {
+                    let [least, packed] = [least, *packed].map(|buffer| buffer.as_entire_buffer_binding());
+                    let inputs = [worlds.clone(), bound_tasks.clone(), least, packed, record.clone()];
+                    packs.push((pipeline, gpu.bind("pack", layout, &inputs)?, grid));
+                }
+                let inputs = [worlds, bound_tasks, places, weights, record, moments, states];
+                let group = gpu.bind("episode", &self.layout, &inputs)?;
+                submission.dispatches.push((&self.pipelines[&shape].pipeline, group, grid));
+                turns_in_all += part_turns;
+                submission.turns += part_turns;
+                submission.load += pace.seconds(part_turns);
+                if !tasks.is_empty() && !pace.is_known() {
+                    // The rest is cut by how long this part takes.
+                    gpu.wait()?;
+                    let start = Instant::now();
+                    gpu.wait_for(Some(submission.submit(|_| ())?))?;
+                    let elapsed = gpu.taken(part_turns, start.elapsed());
+                    pace.try_out(part_turns, elapsed);
+                    self.stages.longest = self.stages.longest.max(elapsed);
+                    started = None;
+                }
             }
-            let group =
-                gpu.bind("episode", &self.layout, &[worlds, tasks, places, weights, record, moments, states])?;
-            bound.push((&self.pipelines[&shape].pipeline, group, grid));
         }
-        let watch = buffers.watch.as_ref();
-        let submitted = gpu.scoped("episodes", || {
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            let mut pass = encoder.begin_compute_pass(&timed(watch));
-            for (pipeline, group, [x, y, z]) in gathers.iter().chain(&bound).chain(&packs) {
-                pass.set_pipeline(pipeline);
-                pass.set_bind_group(0, group, &[]);
-                pass.dispatch_workgroups(*x, *y, *z);
+        if submission.count > 0 && !packs.is_empty() {
+            submission.submit(|_| ())?;
+        }
+        submission.dispatches.extend(packs);
+        let submitted = submission.submit(|encoder| {
+            // The record comes last, because its status words stand for everything before it.
+            if let Some(moments_back) = moments_back {
+                encoder.copy_buffer_to_buffer(moments, 0, moments_back, 0, moment_bytes);
             }
-            drop(pass);
-            watch.inspect(|watch| watch.stop(&mut encoder));
-            if let Some(record_back) = record_back {
-                encoder.copy_buffer_to_buffer(record, 0, record_back, 0, record_bytes);
+            let mut to = 0;
+            for (_, population) in &jobs {
+                let (status, words) = population.status();
+                let bytes = size_of_val(words) as u64;
+                populations_back.inspect(|back| encoder.copy_buffer_to_buffer(status, 0, back, to, bytes));
+                to += bytes;
             }
             if let Some((.., packed, back, bytes)) = packing {
                 encoder.copy_buffer_to_buffer(packed, 0, back, 0, bytes);
             }
-            if let Some(moments_back) = moments_back {
-                encoder.copy_buffer_to_buffer(moments, 0, moments_back, 0, moment_bytes);
+            if let Some(record_back) = record_back {
+                encoder.copy_buffer_to_buffer(record, 0, record_back, 0, record_bytes);
             }
-            gpu.queue.submit([encoder.finish()])
         })?;
+        buffers.submissions = submission.count;
         buffers.submitted = Some(submitted);
-        (buffers.sent, buffers.whole) = (sent, whole);
+        (buffers.sent, buffers.whole, buffers.nonce) = (sent, whole, nonce);
+        (buffers.started, buffers.turns) = (started, turns_in_all);
         self.stages.upload += gathered.elapsed();
         Ok(())
     }
@@ -265,7 +359,7 @@ impl GpuBackend {
             let ours = |population: &&Population| self.kernels.as_ref().is_some_and(|k| population.is_of(k));
             let population = (held as &dyn Any).downcast_ref().filter(ours).ok_or(BackendError::HeldElsewhere)?;
             let leaders = group.world.leaders();
-            population.check([leaders, group.policies, group.world.parameters()])?;
+            population.check([group.populations(), group.policies, group.world.parameters()])?;
             let teams: u32 = shares.iter().map(|share| share.task.teams).sum();
             for first in (0..leaders).step_by(TOGETHER) {
                 let job = GatherJob {

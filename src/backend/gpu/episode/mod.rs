@@ -5,7 +5,9 @@
 //! | `shape` | kernels: what they are compiled for, and how teams fill their workgroups |
 //! | `planner` | teams cut into tasks, and tasks into batches |
 //! | `source` | the text of the shaders |
+//! | `packing` | which packing is faster on a device |
 //! | `pipelines` | compiled kernels |
+//! | `pace` | how long submissions take, so that none is too long |
 //! | `flight` | buffers, and submitting a batch |
 //! | `readback` | waiting for a batch, and reading its record |
 //!
@@ -22,14 +24,19 @@ use std::time::Duration;
 use bytemuck::Zeroable;
 
 use super::device::{Binding, Bindings, DeviceError, Gpu, Kind, Traffic};
+use super::faults::Faults;
 use super::population::Kernels;
+use crate::backend::scores::ScoreTable;
 use crate::backend::{
-    BATCH_BYTES, Backend, BackendError, DevicePopulation, Episode, FOUR, Group, HELD_FROM, Moment, PACKED_FROM, Seen,
-    Strided, Trace, Visit,
+    BATCH_BYTES, Backend, BackendError, DevicePopulation, FOUR, Group, GroupScores, HELD_FROM, Moment, PACKED_FROM,
+    Trace,
 };
+use crate::credit::{Episode, Seen, Strided};
 use crate::host::Instant;
 
 mod flight;
+mod pace;
+mod packing;
 mod pipelines;
 mod planner;
 mod readback;
@@ -42,10 +49,11 @@ pub use shape::Kernel;
 pub use source::{Workgroup, shader_of, shaders, workgroup_of};
 
 use flight::{Buffers, KEPT};
+use pace::Pace;
 use pipelines::{Compiled, IDLE_PLAYS, KEPT_KERNELS};
 use planner::{NOWHERE, owner_words, plan};
 use readback::{Done, Readback};
-use shape::Shape;
+use shape::{Shape, TEAMS};
 
 /// Selects the populations that a device holds between generations. Results do not depend on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -86,8 +94,16 @@ pub struct GpuBackend {
     gpu: Gpu,
     layout: Bindings,
     kernel: Kernel,
+    /// Maximum teams per workgroup of a specialised kernel. `None` until it is measured.
+    packing: Option<usize>,
     pipelines: HashMap<Shape, Compiled>,
-    /// The number of calls of `play`.
+    /// How fast the device plays each shape.
+    paces: HashMap<Shape, Pace>,
+    /// When the last batch was done.
+    done_at: Option<Instant>,
+    /// Whether rollouts are timed by the device's clock.
+    clock: bool,
+    /// The number of calls of `play_tasks`.
     plays: u64,
     holding: ResidencyPolicy,
     records: Records,
@@ -105,8 +121,6 @@ pub struct GpuBackend {
     batch_bytes: u64,
     kept_kernels: usize,
     idle_plays: u64,
-    /// Changes the text of shaders, so that tests can show that a change is detected.
-    edit: fn(String) -> String,
     stages: Stages,
 }
 
@@ -125,6 +139,8 @@ pub struct Stages {
     pub score: Duration,
     /// Playing, by the GPU's clock. 0 if that was not requested or there is none.
     pub gpu: Duration,
+    /// The longest submission: by the GPU's clock if that was requested, else as the host saw it.
+    pub longest: Duration,
     /// Bytes copied to and from the device.
     pub traffic: Traffic,
 }
@@ -142,7 +158,12 @@ impl GpuBackend {
             gpu,
             layout,
             kernel: if software { Kernel::Generic } else { Kernel::Best },
+            // Software renderers have no warps to fill.
+            packing: software.then_some(TEAMS[0]),
             pipelines: HashMap::new(),
+            paces: HashMap::new(),
+            done_at: None,
+            clock: false,
             plays: 0,
             holding: if software { ResidencyPolicy::Never } else { ResidencyPolicy::From(HELD_FROM) },
             records: if software { Records::Whole } else { Records::PackedFrom(PACKED_FROM) },
@@ -154,7 +175,6 @@ impl GpuBackend {
             batch_bytes: BATCH_BYTES,
             kept_kernels: KEPT_KERNELS,
             idle_plays: IDLE_PLAYS,
-            edit: |text| text,
             stages: Stages::default(),
         })
     }
@@ -168,6 +188,12 @@ impl GpuBackend {
     /// take about a second for each specialised kernel.
     pub fn playing(self, kernel: Kernel) -> GpuBackend {
         GpuBackend { kernel, ..self }
+    }
+
+    /// Sets the maximum teams per workgroup of specialised kernels: 32, 16 or 8. By default the faster one of 32 and 16
+    /// is measured on the first large rollout, except on software renderers. Results do not depend on it.
+    pub fn packing(self, teams: usize) -> GpuBackend {
+        GpuBackend { packing: Some(teams), ..self }
     }
 
     /// Sets the maximum number of kernels per batch and kept between batches, at least one, and the number of rollouts
@@ -200,18 +226,19 @@ impl GpuBackend {
     #[doc(hidden)]
     #[expect(unsafe_code, reason = "edited shaders are compiled without bounds checks")]
     pub unsafe fn edited(self, edit: fn(String) -> String) -> GpuBackend {
-        GpuBackend { edit, ..self }
+        struct Edit(fn(String) -> String);
+        impl Faults for Edit {
+            fn edits(&self, text: String) -> String {
+                (self.0)(text)
+            }
+        }
+        // SAFETY: see the function's own contract.
+        GpuBackend { gpu: unsafe { self.gpu.failing(Arc::new(Edit(edit))) }, ..self }
     }
 
     /// Starts to time rollouts by the GPU's clock, if it has one.
-    ///
-    /// # Errors
-    /// The device failed.
-    pub fn use_clock(&mut self) -> Result<(), DeviceError> {
-        for flight in &mut self.flights {
-            flight.watch = self.gpu.stopwatch()?;
-        }
-        Ok(())
+    pub fn use_clock(&mut self) {
+        self.clock = self.gpu.has_clock();
     }
 
     /// Returns and resets the times of rollouts.
@@ -225,7 +252,7 @@ impl GpuBackend {
     }
 
     /// Plays all tasks, and calls `done` for each with the record and the moments of its batch.
-    fn play(&mut self, groups: &[Group<'_>], trace: bool, done: &Done<'_>) -> Result<(), BackendError> {
+    fn play_tasks(&mut self, groups: &[Group<'_>], trace: bool, done: &Done<'_>) -> Result<(), BackendError> {
         let (start, before) = (Instant::now(), self.gpu.traffic());
         self.plays += 1;
         let (plays, most) = (self.plays, self.idle_plays);
@@ -243,26 +270,28 @@ impl GpuBackend {
         self.stages.traffic += self.gpu.traffic() - before;
         Ok(())
     }
-}
 
-impl Backend for GpuBackend {
-    fn rollout(&mut self, groups: &[Group<'_>], visit: &Visit<'_>) -> Result<(), BackendError> {
-        groups.iter().try_for_each(Group::check)?;
-        self.play(groups, false, &|share, readback, _| {
-            let Group { world, need, .. } = groups[share.group];
+    /// Plays all groups, and calls `visit` with each team's group, its index there, and its record, from several threads.
+    pub(crate) fn visit(
+        &mut self,
+        groups: &[Group<'_>],
+        visit: &(dyn Fn(usize, usize, &Episode<'_>) + Sync),
+    ) -> Result<(), BackendError> {
+        self.play_tasks(groups, false, &|share, readback, _| {
+            let world = groups[share.group].world;
             let Task { sets, seen, table, owners, .. } = share.task;
             let stride = share.task.teams as usize;
             let (group, first) = (share.group, share.first_team);
             match readback {
                 Readback::Whole(record) => {
                     let sets = &record[sets as usize..][..world.set_words() * stride];
-                    let sight_words = if need.sights() { world.sight_words() } else { 0 };
+                    let sight_words = if groups[group].records().sights() { world.sight_words() } else { 0 };
                     let (seen, sights) = record[seen as usize..].split_at(world.leaders() * world.followers() * stride);
                     let sights = &sights[..sight_words * stride];
                     for offset in 0..stride {
                         let strided = |words| Strided { words, stride, offset };
                         let (sets, seen, sights) = (strided(sets), Seen::Counts(strided(seen)), strided(sights));
-                        visit(Episode { group, team: first + offset, sets, seen, sights });
+                        visit(group, first + offset, &Episode { sets, seen, sights });
                     }
                 }
                 Readback::Packed(words) => {
@@ -275,11 +304,21 @@ impl Backend for GpuBackend {
                         let words = &words[ends[0] as usize..ends[1] as usize];
                         let sets = Strided { words, stride: 1, offset: 0 };
                         let seen = Seen::Owners(Strided { words: owners, stride, offset });
-                        visit(Episode { group, team: first + offset, sets, seen, sights: Strided::NONE });
+                        visit(group, first + offset, &Episode { sets, seen, sights: Strided::NONE });
                     }
                 }
             }
         })
+    }
+}
+
+impl Backend for GpuBackend {
+    fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
+        groups.iter().try_for_each(Group::check)?;
+        self.measure_packing(groups)?;
+        let scores = ScoreTable::new(groups);
+        self.visit(groups, &|group, team, episode| scores.score(group, team, episode))?;
+        Ok(scores.finish())
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
@@ -287,7 +326,7 @@ impl Backend for GpuBackend {
         let world = group.world;
         let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
         let (set_words, seen_words) = (world.set_words(), world.leaders() * world.followers());
-        let sight_words = if group.need.sights() { world.sight_words() } else { 0 };
+        let sight_words = if group.records().sights() { world.sight_words() } else { 0 };
         let trace = std::sync::Mutex::new(Trace {
             teams,
             agents,
@@ -296,7 +335,7 @@ impl Backend for GpuBackend {
             seen: vec![0; teams * seen_words],
             sights: vec![0; teams * sight_words],
         });
-        self.play(std::slice::from_ref(group), true, &|share, readback, moments| {
+        self.play_tasks(std::slice::from_ref(group), true, &|share, readback, moments| {
             let Readback::Whole(record) = readback else { unreachable!("no trace is packed") };
             let mut trace = trace.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
             let task = share.task;
@@ -346,7 +385,7 @@ impl Backend for GpuBackend {
         }
         let kernels = match &self.kernels {
             Some(kernels) => kernels,
-            None => self.kernels.insert(Arc::new(Kernels::new(self.gpu.clone(), self.edit)?)),
+            None => self.kernels.insert(Arc::new(Kernels::new(self.gpu.clone())?)),
         };
         match kernels.hold(weights, sizes) {
             Ok(population) => Ok(Some(Box::new(population))),

@@ -1,14 +1,14 @@
 //! Compiled kernels: which worlds get one of their own, and how long each is kept.
 
 use std::cmp::Reverse;
-use std::collections::hash_map::Entry;
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 
 use super::GpuBackend;
-use super::shape::{Capacity, Kept, Kernel, MAX_OFFSET, Packing, Shape};
+use super::shape::{Capacity, Kept, Kernel, MAX_OFFSET, Packing, Shape, TEAMS};
 use super::source::{packing, source};
 use crate::backend::Group;
 use crate::backend::gpu::device::{Binding, DeviceError};
+use crate::parallel::*;
 
 /// Maximum number of specialised kernels under [`Kernel::Best`]: each takes a fraction of a second to compile.
 const MAX_SPECIALISED: usize = 16;
@@ -41,6 +41,7 @@ impl GpuBackend {
         Capacity {
             batch: self.batch_bytes,
             kernels: self.kept_kernels,
+            teams: self.packing.unwrap_or(TEAMS[0]),
             buffer: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(MAX_OFFSET),
             workgroup: limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x) as usize,
             workgroup_bytes: limits.max_compute_workgroup_storage_size as usize,
@@ -70,20 +71,28 @@ impl GpuBackend {
         use Binding::{Read, Write};
         if self.pack.is_none() {
             let layout = self.gpu.layout("pack", &[Read, Read, Read, Write, Write])?;
-            let pipeline = self.gpu.own_pipeline("pack", &(self.edit)(packing()), "pack", &layout)?;
+            let pipeline = self.gpu.own_pipeline("pack", &packing(), "pack", &layout)?;
             self.pack = Some((pipeline, layout));
         }
         Ok(())
     }
 
-    pub(super) fn prepare_pipeline(&mut self, shape: Shape) -> Result<(), DeviceError> {
-        match self.pipelines.entry(shape) {
-            Entry::Occupied(mut entry) => entry.get_mut().played = self.plays,
-            Entry::Vacant(entry) => {
-                let pipeline =
-                    self.gpu.own_pipeline("episode", &(self.edit)(source(shape)), "episode", &self.layout)?;
-                entry.insert(Compiled { pipeline, played: self.plays });
-            }
+    /// Compiles the kernels of a batch that are new, side by side. Evicts others if there are too many.
+    pub(super) fn prepare_pipelines(&mut self, shapes: &BTreeSet<Shape>) -> Result<(), DeviceError> {
+        let new: Vec<Shape> = shapes.iter().filter(|shape| !self.pipelines.contains_key(shape)).copied().collect();
+        if self.pipelines.len() + new.len() > self.kept_kernels {
+            self.pipelines.retain(|shape, _| shapes.contains(shape));
+        }
+        let (gpu, layout, played) = (&self.gpu, &self.layout, self.plays);
+        let compile = |shape: Shape| {
+            let pipeline = gpu.own_pipeline("episode", &source(shape), "episode", layout)?;
+            Ok((shape, Compiled { pipeline, played }))
+        };
+        let compiled: Vec<_> = new.into_par_iter().map(compile).collect::<Result<_, DeviceError>>()?;
+        self.pipelines.extend(compiled);
+        self.paces.retain(|shape, _| self.pipelines.contains_key(shape));
+        for shape in shapes {
+            self.pipelines.get_mut(shape).expect("compiled just now").played = played;
         }
         Ok(())
     }

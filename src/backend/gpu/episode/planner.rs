@@ -6,7 +6,8 @@ use glam::Vec2;
 
 use super::Records;
 use super::shape::{Capacity, Kept, MAX_THREADS, Packing, Shape, WORKGROUPS};
-use crate::backend::{BackendError, FOUR, Group, Moment, RecordRequest, fours, owner_bits, record_words};
+use crate::backend::{BackendError, FOUR, Group, Moment, fours, record_words};
+use crate::credit::{RecordRequest, owner_bits};
 use crate::gpu_struct::gpu_struct;
 use crate::model::Constants;
 use crate::model::policy::PolicyConstants;
@@ -19,6 +20,8 @@ const TURNS: usize = 60_000;
 pub(super) const PACK_WORKGROUP: usize = 64;
 /// Words before the others in a packed record (`struct Packed` in the shader): words used, and words available.
 pub(super) const PACKED_HEAD: usize = 2;
+/// Words after a task's record.
+const STATUS: usize = 1;
 /// Sentinel: no offset.
 pub(super) const NOWHERE: u32 = u32::MAX;
 
@@ -54,6 +57,10 @@ gpu_struct! {
         pub table: u32,
         /// The offset of the leaders that followers saw most, which packing writes, or all ones for nowhere.
         pub owners: u32,
+        /// The offset of the status word in the record. The first dispatch writes the nonce there; each later one adds 1.
+        pub status: u32,
+        /// A number that no earlier work of the device had.
+        pub nonce: u32,
     }
 
     /// The state of an agent between two dispatches.
@@ -71,8 +78,8 @@ gpu_struct! {
     }
 }
 
-/// Returns the maximum steps per dispatch, see [`TURNS`].
-fn steps_a_dispatch(world: &World, packing: Packing, records: Kept) -> usize {
+/// Returns the estimated loop iterations per thread and step, over all loops.
+fn turns_a_step(world: &World, packing: Packing, records: Kept) -> usize {
     let Constants { words, policy: PolicyConstants { widths, .. }, .. } = world.constants;
     let network: u32 = widths.windows(2).map(|w| (w[0] + 2) * w[1]).sum();
     // A leader iterates over all agents, and again over those in reach.
@@ -80,12 +87,17 @@ fn steps_a_dispatch(world: &World, packing: Packing, records: Kept) -> usize {
     let sights = if records.sights { world.followers() * world.leader_words() } else { 0 };
     let items = |rows: usize| (rows * packing.teams).div_ceil(packing.workgroup);
     let items = items(world.pois.len() * words as usize) + items(sights);
-    (TURNS / (packing.slots * agent + items * 33)).max(1)
+    packing.slots * agent + items * 33
+}
+
+/// Returns the maximum steps per dispatch, see [`TURNS`].
+fn steps_a_dispatch(world: &World, packing: Packing, records: Kept) -> usize {
+    (TURNS / turns_a_step(world, packing, records)).max(1)
 }
 
 /// Returns the bytes of a team's states between two dispatches, 0 if one dispatch plays the whole episode. An adapter that
 /// allows larger workgroups than every WebGPU device does may need none where this counts some.
-pub(crate) fn state_bytes(world: &World, request: RecordRequest) -> u64 {
+pub(crate) fn state_bytes(world: &World, request: RecordRequest<'_>) -> u64 {
     let kept = Kept { trace: false, sights: request.sights() && world.followers() > 0 };
     let generic = Packing::generic(world, WORKGROUPS[2]);
     let specialised = Packing::specialised(world, Capacity::of_workgroups(MAX_THREADS));
@@ -102,19 +114,41 @@ pub(super) struct PlannedTask {
     /// The task, with all steps of the episode.
     pub(super) task: Task,
     pub(super) steps_a_dispatch: usize,
+    /// The estimated work of a step: loop iterations over all threads.
+    pub(super) turns_a_step: usize,
 }
 
 impl PlannedTask {
+    /// Returns the estimated work of a round: loop iterations over all threads.
+    pub(super) fn turns(&self, round: &Task) -> u64 {
+        u64::from(round.end - round.first) * self.turns_a_step as u64
+    }
+
     /// Returns the number of weights of its teams, in fours.
     pub(super) fn fours(&self, groups: &[Group<'_>]) -> usize {
         self.task.teams as usize * fours(groups[self.group].world)
     }
 
+    /// Returns the number of rounds of dispatches.
+    pub(super) fn rounds(&self) -> usize {
+        (self.task.end as usize).div_ceil(self.steps_a_dispatch)
+    }
+
     /// Returns the task with the steps of one round of dispatches, or `None` after its last round.
-    pub(super) fn round(&self, round: usize) -> Option<Task> {
+    pub(super) fn round(&self, round: usize, nonce: u32) -> Option<Task> {
         let first = (round * self.steps_a_dispatch) as u32;
         let end = self.task.end.min(first + self.steps_a_dispatch as u32);
-        (first < end).then_some(Task { first, end, ..self.task })
+        (first < end).then_some(Task { first, end, nonce, ..self.task })
+    }
+
+    /// Returns the offset of the status word in a packed record. It follows the table.
+    pub(super) fn packed_status(&self) -> usize {
+        (self.task.table + self.task.teams) as usize + 1
+    }
+
+    /// Returns the value of the status word after the last round.
+    pub(super) fn final_status(&self, nonce: u32) -> u32 {
+        nonce.wrapping_add(self.rounds() as u32 - 1)
     }
 }
 
@@ -143,7 +177,7 @@ impl BatchPlan {
     /// would take too long for one dispatch, or it would save nothing.
     fn pack(&mut self, groups: &[Group<'_>], records: Records) {
         let packs = |share: &PlannedTask| {
-            let Group { world, need, .. } = groups[share.group];
+            let (world, need) = (groups[share.group].world, groups[share.group].records());
             need.least(1).is_some() && !world.rule.is_timed() && pack_turns(groups, share) <= TURNS
         };
         if !records.packs((self.record * size_of::<u32>()) as u64) || !self.shares.iter().all(packs) {
@@ -151,13 +185,13 @@ impl BatchPlan {
         }
         let mut head = 0;
         for shares in self.shares.chunk_by_mut(|a, b| a.group == b.group) {
-            let Group { world, need, .. } = groups[shares[0].group];
+            let (world, need) = (groups[shares[0].group].world, groups[shares[0].group].records());
             let least = self.least.len() as u32;
             self.least.extend(world.coupling.iter().filter_map(|&coupling| need.least(coupling)));
             for PlannedTask { task, .. } in shares {
                 let teams = task.teams as usize;
                 (task.least, task.table, task.owners) = (least, head as u32, NOWHERE);
-                head += teams + 1;
+                head += teams + 2;
                 if need.owners() && world.followers() > 0 {
                     task.owners = head as u32;
                     head += owner_words(world) * teams;
@@ -206,11 +240,12 @@ pub(super) fn plan(
             let packing = Packing::generic(world, room.workgroup);
             (packing, Shape::generic(world, packing, kept))
         });
-        let steps_a_dispatch = steps_a_dispatch(world, packing, kept);
+        let (steps_a_dispatch, turns_a_step) =
+            (steps_a_dispatch(world, packing, kept), turns_a_step(world, packing, kept));
         let states_a_team = if world.steps() > steps_a_dispatch { world.agents() } else { 0 };
         // Every buffer that grows with the teams is one of these, or smaller than one of them.
         let bytes_a_team = [
-            record_words(world, group.need) * size_of::<u32>(),
+            (record_words(world, group.records()) + STATUS) * size_of::<u32>(),
             fours(world) * size_of::<[f32; FOUR]>(),
             moments_a_team * size_of::<Moment>(),
             states_a_team * size_of::<State>(),
@@ -263,15 +298,17 @@ pub(super) fn plan(
                 states: work.states as u32,
                 teams: teams as u32,
                 end: world.constants.steps,
+                status: (work.record + record_words(world, group.records()) * teams) as u32,
                 ..base
             };
             work.weights += fours(world) * teams;
-            work.record += record_words(world, group.need) * teams;
+            work.record += record_words(world, group.records()) * teams + STATUS;
             work.sets += world.set_words() * teams;
             work.moments += moments_a_team * teams;
             work.states += states_a_team * teams;
             work.shapes.insert(shape);
-            work.shares.push(PlannedTask { group: index, first_team, shape, task, steps_a_dispatch });
+            let turns_a_step = turns_a_step * packing.workgroup;
+            work.shares.push(PlannedTask { group: index, first_team, shape, task, steps_a_dispatch, turns_a_step });
         }
     }
     batches.retain(|work| !work.shares.is_empty());
@@ -288,7 +325,7 @@ pub(super) fn gather(group: &Group<'_>, weights: &[f32], first_team: usize, team
     let policies = &group.teams[first_team * leaders..(first_team + teams) * leaders];
     for (place, &policy) in policies.iter().enumerate() {
         let (team, leader) = (place / leaders, place % leaders);
-        let from = group.place(weights, leader, policy as usize);
+        let from = group.place(leader, policy as usize);
         let column = to[leader * teams + team..].iter_mut().step_by(leaders * teams);
         for (four, weights) in column.zip(weights[from..from + parameters].chunks(FOUR)) {
             four[..weights.len()].copy_from_slice(weights);
@@ -315,7 +352,8 @@ mod tests {
             weights: Weights::OnHost(&policies),
             policies: 1,
             teams: &vec![0; population],
-            need: RecordRequest::Score(crate::config::Fitness::Df),
+            sharing: crate::config::Sharing::PerLeader,
+            fitnesses: &[crate::config::Fitness::Df],
         };
         for buffer in [128 << 20, 1 << 20, 1 << 14] {
             let room = Capacity { batch: BATCH_BYTES, buffer, ..Capacity::of_workgroups(256) };
@@ -328,6 +366,6 @@ mod tests {
             let teams: u32 = batches.iter().flat_map(|work| &work.shares).map(|share| share.task.teams).sum();
             assert_eq!(teams as usize, population);
         }
-        assert_eq!(state_bytes(&world, group.need), 256 * 20);
+        assert_eq!(state_bytes(&world, group.records()), 256 * 20);
     }
 }

@@ -68,7 +68,7 @@ pub(super) struct Kept {
 
 impl Kept {
     pub(super) fn of(group: &Group<'_>, trace: bool) -> Kept {
-        Kept { trace, sights: group.need.sights() && group.world.followers() > 0 }
+        Kept { trace, sights: group.records().sights() && group.world.followers() > 0 }
     }
 }
 
@@ -130,8 +130,11 @@ impl Packing {
     pub(super) fn specialised(world: &World, room: Capacity) -> Option<Packing> {
         let threads = |teams: usize| seats(world, teams).next_multiple_of(ROLE);
         let bytes = |teams: usize| 2 * teams * world.agents() * size_of::<Vec2>();
-        let fits =
-            |&teams: &usize| threads(teams) <= room.workgroup.min(MAX_THREADS) && bytes(teams) <= room.workgroup_bytes;
+        let fits = |&teams: &usize| {
+            teams <= room.teams
+                && threads(teams) <= room.workgroup.min(MAX_THREADS)
+                && bytes(teams) <= room.workgroup_bytes
+        };
         let teams = TEAMS.into_iter().find(fits).filter(|_| world.parameters() <= MAX_STRAIGHT_WEIGHTS)?;
         Some(Packing { workgroup: threads(teams), slots: 1, teams })
     }
@@ -160,6 +163,8 @@ pub(super) struct Capacity {
     pub(super) buffer: u64,
     /// Maximum kernels per batch.
     pub(super) kernels: usize,
+    /// Maximum teams per workgroup of a specialised kernel.
+    pub(super) teams: usize,
     /// Maximum threads per workgroup, and bytes of workgroup memory.
     pub(super) workgroup: usize,
     pub(super) workgroup_bytes: usize,
@@ -169,6 +174,7 @@ impl Capacity {
     /// Returns the limits of a device with this maximum of threads per workgroup, and no limit on batches.
     pub(super) fn of_workgroups(threads: usize) -> Capacity {
         let bytes = MAX_OFFSET;
-        Capacity { batch: bytes, buffer: bytes, kernels: 1, workgroup: threads, workgroup_bytes: 16 << 10 }
+        let (kernels, teams, workgroup_bytes) = (1, TEAMS[0], 16 << 10);
+        Capacity { batch: bytes, buffer: bytes, kernels, teams, workgroup: threads, workgroup_bytes }
     }
 }

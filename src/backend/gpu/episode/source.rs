@@ -4,7 +4,7 @@ use std::collections::HashSet;
 use std::fmt::Write;
 
 use crate::backend::gpu::exact;
-use crate::backend::{BackendError, FOUR, Group, Moment, Weights, fours, record_words};
+use crate::backend::{BackendError, FOUR, Group, Moment, Weights, fours};
 use crate::config::MAX_AGENTS;
 use crate::gpu_struct::GpuStruct;
 use crate::model::policy::Actions;
@@ -192,7 +192,7 @@ pub fn workgroup_of(group: &Group<'_>, kernel: Kernel, threads: usize) -> Result
             words(bytemuck::bytes_of(&task)),
             words(bytemuck::cast_slice(&work.places)),
             words(bytemuck::cast_slice(&weights)),
-            vec![0; record_words(group.world, group.need) * task.teams as usize],
+            vec![0; task.status as usize + 1],
             Vec::new(),
             vec![0; agents * size_of::<State>() / 4],
         ],

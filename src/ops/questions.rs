@@ -1,32 +1,59 @@
-//! `flotilla paper --questions`: trains experiments for the questions that the paper leaves open.
+//! Trains experiments for the questions that the paper leaves open.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering::Relaxed;
 
-use serde_json::json;
+use serde::Serialize;
 
-use super::paper::Args;
-use super::recovery::{self, Signals};
+use super::paper::Request;
 use super::sweep::{claim, free_memory, same_sweep};
-use super::{Error, backend, print, print_json, say};
+use super::{Context, Error, Event, Player, check_memory, said};
 use crate::config::Config;
 use crate::escape::PathExt;
-use crate::memory::Peaks;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, SWEEP};
 use crate::record::{RecordError, ownership, policies};
-use crate::report::comparison;
+use crate::report::comparison::{self, Comparison};
 use crate::report::curves::PRINT;
-use crate::report::progress::Meter;
 use crate::report::scene::Format;
-use crate::run::{Ended, Options, RunError, Session};
+use crate::run::{Ended, Session};
 use crate::sweep::questions::{self, Answer, OpenQuestion, QUESTIONS, Study};
 use crate::sweep::results::point_folder;
-use crate::sweep::run::{self, SweepOptions};
+use crate::sweep::run::SweepProgress;
 use crate::sweep::{Sweep, shard};
 
 /// The page with the results.
 const PAGE: &str = "questions.md";
+
+/// Results of one question.
+#[derive(Clone, Debug, Serialize)]
+#[non_exhaustive]
+pub struct QuestionOutcome {
+    /// The question's letter.
+    pub letter: char,
+    /// The question.
+    pub title: &'static str,
+    /// The comparisons of all its parts.
+    pub comparisons: Vec<Comparison>,
+}
+
+/// Results of all questions.
+#[derive(Clone, Debug, Serialize)]
+#[non_exhaustive]
+pub struct Outcome {
+    /// The folder.
+    pub folder: String,
+    /// The random seed of all experiments.
+    pub seed: u64,
+    /// The number of trials of each.
+    pub trials: usize,
+    /// The questions.
+    pub questions: Vec<QuestionOutcome>,
+    /// The path of the page with the results.
+    pub page: String,
+    /// The page.
+    #[serde(skip)]
+    pub text: String,
+}
 
 /// Returns all parts of all questions.
 fn all_parts() -> impl Iterator<Item = &'static Study> {
@@ -40,44 +67,43 @@ fn files() -> impl Iterator<Item = String> {
 }
 
 /// Trains every part of the questions, each as a sweep in a folder of its own, and writes the results.
-pub fn run(args: &Args) -> Result<(), Error> {
-    let (out, start) = (&args.out, args.start());
-    let parts: Vec<(&Study, Sweep)> = questions::parts(&args.questions)
+///
+/// # Errors
+/// The folder or a config cannot be used, training fails or is stopped, or files cannot be written.
+pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> Result<Outcome, Error> {
+    let (out, start) = (&request.out, request.start);
+    let parts: Vec<(&Study, Sweep)> = questions::parts(&request.questions)
         .into_iter()
-        .map(|part| Ok((part, part.sweep(&args.overrides())?)))
+        .map(|part| Ok((part, part.sweep(&request.set)?)))
         .collect::<Result<_, Error>>()?;
     if let Some((_, sweep)) = parts.iter().find(|(_, sweep)| sweep.points[0].config.learning.trials < 2) {
         let trials = sweep.points[0].config.learning.trials;
-        return Err(Error::Usage(format!("--trials {trials}: intervals and tests take two trials or more")));
+        return Err(Error::Usage(format!("--trials {trials}: intervals and tests take two trials or more").into()));
     }
     if let Some(what) = folder::collection(out) {
-        return Err(Error::Refused(format!("{} holds {what}; choose another --out", out.escaped())));
+        return Err(Error::Refused(said(format!("{} holds {what}", out.escaped()), "choose another --out")));
     }
     if folder::holds_run(out)? {
-        return Err(Error::Refused(format!("{} holds a run; choose another --out", out.escaped())));
+        return Err(Error::Refused(said(format!("{} holds a run", out.escaped()), "choose another --out")));
     }
     parts.iter().try_for_each(|(part, sweep)| same_sweep(sweep, &out.join(part.name)))?;
     if !all_parts().any(|part| out.join(part.name).join(SWEEP).exists())
         && let Some(theirs) = files().chain([PAGE.into()]).find(|name| out.join(name).exists())
     {
-        return Err(Error::Refused(format!(
-            "{} holds {theirs}, but none of the questions' sweeps; choose another --out",
-            out.escaped()
+        return Err(Error::Refused(said(
+            format!("{} holds {theirs}, but none of the questions' sweeps", out.escaped()),
+            "choose another --out",
         )));
     }
-    let mut player = backend::open(&args.run)?;
-    for config in parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config) {
-        Peaks::of([config], rayon::current_num_threads()).check(player.1.backend == "gpu").map_err(RunError::from)?;
-    }
+    let player = player.open()?;
+    check_memory(parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config), player)?;
     let disk = Disk::default();
     disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
-    let disk = ownership::enter(&disk, out, args.is_out_named())?;
+    let disk = ownership::enter(&disk, out, request.is_out_named())?;
     let _lock = folder::lock(&disk, out)?;
     ownership::check(&disk, files().chain([PAGE.into()]).map(|name| out.join(name)))?;
-    if !args.quiet {
-        let points: usize = parts.iter().map(|(_, sweep)| sweep.points.len()).sum();
-        say(format_args!("training {points} experiments on {}, into {}", player.0.describe(), out.escaped()));
-    }
+    let points: usize = parts.iter().map(|(_, sweep)| sweep.points.len()).sum();
+    context.message(format_args!("training {points} experiments on {}, into {}", player.0.describe(), out.escaped()));
 
     let warm: Vec<_> = parts.iter().map(|(part, sweep)| part.warm(sweep, out)).collect();
     // All folders are checked before training, so that no part is trained only to fail at another part's folder.
@@ -88,9 +114,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
     let folders: Vec<(PathBuf, &Config)> = points.chain(warm_runs).collect();
     folder::check(&disk, folders.iter().map(|(path, config)| (&**path, *config)), start)?;
 
-    let signals = Signals::listen()?;
-    let mut meter = Meter::new(args.quiet);
-    let stopped = || Error::Stopped(format!("with everything saved; go on with\n  {}", args.command_to_resume()));
+    let stopped = || Error::Stopped("with everything saved".into());
     let cost = |sweep: &Sweep| sweep.points.iter().map(shard::cost).sum::<u128>() as f64;
     // Each warm start costs as much as an average point of its sweep.
     let times = |at: usize| 1.0 + warm[at].len() as f64 / parts[at].1.points.len() as f64;
@@ -100,32 +124,14 @@ pub fn run(args: &Args) -> Result<(), Error> {
         let folder = out.join(part.name);
         claim(&disk, sweep, &folder)?;
         let points: Vec<_> = sweep.points.iter().collect();
-        let mut manner = SweepOptions {
-            start,
-            disk: &disk,
-            memory: free_memory(),
-            runs: Options {
-                command: &recovery::typed(),
-                stop: &signals.stop,
-                save: &signals.save,
-                instead: &mut |error| args.loss.instead(error),
-                setback: &mut recovery::setback,
-                watch: &mut |_| {},
-            },
-            watch: &mut |now| {
-                let share = now.played as f64 / now.total.max(1) as f64;
-                meter.show((before + share * cost(sweep)) / whole, || {
-                    format!("{}: {}/{} experiments done", part.name, now.done, now.points)
-                });
-            },
-            note: &mut |point, note| {
-                if note.is_damage() {
-                    say(format_args!("{}: {note}", sweep.describe(point)));
-                }
-            },
+        let share = |now: &SweepProgress| {
+            let share = now.played as f64 / now.total.max(1) as f64;
+            let text = format!("{}: {}/{} experiments done", part.name, now.done, now.points);
+            (context.tell)(Event::Share((before + share * cost(sweep)) / whole, text));
         };
-        if run::run(&points, &folder, &mut player, &mut manner)? == Ended::Stopped {
-            meter.clear();
+        let ended =
+            super::sweep::train_points(context, sweep, &points, &folder, start, &disk, free_memory(), player, &share)?;
+        if ended == Ended::Stopped {
             return Err(stopped());
         }
         before += cost(sweep);
@@ -136,32 +142,26 @@ pub fn run(args: &Args) -> Result<(), Error> {
             Ok((run.config.clone(), run.folder.clone(), Some(policies::read_init(&run.policies, &run.config)?)))
         });
         let (mut session, _) = Session::open_from(runs.collect::<Result<_, RecordError>>()?, start, &disk)?;
-        let mut options = Options {
-            command: &recovery::typed(),
-            stop: &signals.stop,
-            save: &signals.save,
-            instead: &mut |error| args.loss.instead(error),
-            setback: &mut recovery::setback,
-            watch: &mut |_| meter.show(before / whole, || format!("{}: warm starts", part.name)),
+        let mut watch = |_: &crate::run::Progress<'_>| {
+            (context.tell)(Event::Share(before / whole, format!("{}: warm starts", part.name)));
         };
-        if !session.is_done() && session.train(&mut player, &mut options)? == Ended::Stopped {
-            meter.clear();
+        if !session.is_done() && context.train(&mut watch, |options| session.train(player, options))? == Ended::Stopped
+        {
             return Err(stopped());
         }
         before += cost(sweep) * (times(at) - 1.0);
     }
 
     let mut answers: Vec<(OpenQuestion, Vec<Answer>)> = Vec::new();
-    for question in QUESTIONS.iter().filter(|question| args.questions.contains(&question.letter)) {
+    for question in QUESTIONS.iter().filter(|question| request.questions.contains(&question.letter)) {
         let mut of_parts = Vec::new();
         for part in question.parts {
-            if signals.stop.load(Relaxed) {
-                meter.clear();
+            if context.is_stopped() {
                 return Err(stopped());
             }
             let sweep = parts.iter().find(|(other, _)| other.name == part.name).map(|(_, sweep)| sweep);
             let Some(sweep) = sweep else { continue };
-            meter.show(1.0, || format!("comparing {}", part.name));
+            (context.tell)(Event::Share(1.0, format!("comparing {}", part.name)));
             let answer = part.answer(sweep, out, &mut *player.0)?;
             for kind in Format::ALL {
                 let path = out.join(format!("{}.{}", part.name, kind.extension()));
@@ -176,7 +176,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
         }
         answers.push((*question, of_parts));
     }
-    meter.clear();
+    (context.tell)(Event::Pause);
     let first = &parts[0].1.points[0].config.learning;
     let heading = format!(
         "Means over {} trials of seed {} with 95 % bootstrap intervals; p by Mann and Whitney's test, two-sided, by Holm's\n\
@@ -185,25 +185,19 @@ pub fn run(args: &Args) -> Result<(), Error> {
     );
     let page = questions::page(&answers, &heading);
     write(&disk, &out.join(PAGE), Ok(page.clone().into_bytes()))?;
-    if args.json {
-        let all = answers.iter().map(|(question, answers)| {
-            let comparisons: Vec<_> = answers.iter().flat_map(Answer::comparisons).collect();
-            json!({ "letter": question.letter, "title": question.title, "comparisons": comparisons })
-        });
-        let told = json!({
-            "folder": out.escaped().to_string(),
-            "seed": first.seed,
-            "trials": first.trials,
-            "questions": all.collect::<Vec<_>>(),
-            "page": out.join(PAGE).escaped().to_string(),
-        });
-        return print_json(&told);
-    }
-    print(&format!(
-        "{page}\nFiles in {}: {PAGE}, for each table its figure (.svg, .png, .pdf) and every comparison (.csv), and the sweep \
-         that it is of, in a folder\n",
-        out.escaped()
-    ))
+    let of = |(question, answers): &(OpenQuestion, Vec<Answer>)| QuestionOutcome {
+        letter: question.letter,
+        title: question.title,
+        comparisons: answers.iter().flat_map(Answer::comparisons).cloned().collect(),
+    };
+    Ok(Outcome {
+        folder: out.escaped().to_string(),
+        seed: first.seed,
+        trials: first.trials,
+        questions: answers.iter().map(of).collect(),
+        page: out.join(PAGE).escaped().to_string(),
+        text: page,
+    })
 }
 
 fn write(disk: &Disk, path: &Path, bytes: std::io::Result<Vec<u8>>) -> Result<(), Error> {

@@ -1,21 +1,54 @@
 //! The record of one team's episode: who was at which POI, and which leaders followers saw.
 
+use crate::config::Fitness;
+
 /// The record of one team's episode. Credit is computed from it.
 #[derive(Clone, Copy, Debug)]
 pub struct Episode<'a> {
-    /// The index of its group in the batch.
-    pub group: usize,
-    /// The index of the team in the group.
-    pub team: usize,
-    /// The agents at each POI after each step, one bit per agent, `[steps][pois][words]`. If only scores were
-    /// [requested](super::RecordRequest), there may be fewer steps, down to none, whose sets give the same scores; see
-    /// [`crate::credit`].
+    /// The agents at each POI after each step, one bit per agent, `[steps][pois][words]`. There may be fewer steps, down
+    /// to none, whose sets give the same scores; see [`RecordRequest`].
     pub sets: Strided<'a>,
     /// The leaders that the followers saw.
     pub seen: Seen<'a>,
     /// The leaders that each follower saw before the move of each step, one bit per leader, `[steps][followers][words
-    /// of leaders]`. Empty unless [requested](super::RecordRequest::sights).
+    /// of leaders]`. Empty unless [needed](RecordRequest::sights).
     pub sights: Strided<'a>,
+}
+
+impl<'a> Episode<'a> {
+    /// Returns the whole record of a team that nothing else is interleaved with.
+    pub fn whole(sets: &'a [u32], counts: &'a [u32], sights: &'a [u32]) -> Episode<'a> {
+        let [sets, counts, sights] = [sets, counts, sights].map(|words| Strided { words, stride: 1, offset: 0 });
+        Episode { sets, seen: Seen::Counts(counts), sights }
+    }
+}
+
+/// The part of a record that some fitnesses and the number of observed POIs are computed from. A record may have more.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RecordRequest<'a>(pub &'a [Fitness]);
+
+impl RecordRequest<'_> {
+    /// Returns the minimum number of agents in a set that can affect a score, at a POI of this coupling. `None` if the
+    /// sets of all steps are needed.
+    pub fn least(self, coupling: u32) -> Option<u32> {
+        match self {
+            // Dt depends on when sets occur.
+            _ if self.sights() => None,
+            // D++ depends on how many agents are missing.
+            RecordRequest(fitnesses) if fitnesses.contains(&Fitness::Dpp) => Some(1),
+            _ => Some(coupling),
+        }
+    }
+
+    /// Reports whether the leader that each follower saw most is needed.
+    pub fn owners(self) -> bool {
+        self.0.contains(&Fitness::Df)
+    }
+
+    /// Reports whether the leaders that each follower saw at each step are needed.
+    pub fn sights(self) -> bool {
+        self.0.contains(&Fitness::Dt)
+    }
 }
 
 /// The leaders that the followers of one team saw.
@@ -23,9 +56,8 @@ pub struct Episode<'a> {
 pub enum Seen<'a> {
     /// The number of steps at which each follower saw each leader, `[followers][leaders]`.
     Counts(Strided<'a>),
-    /// The leader that each follower saw at most steps, see [`crate::credit::assign`]: [`owner_bits`] bits per
-    /// follower, from the lowest of a word, all ones for nobody. Empty unless
-    /// [requested](super::RecordRequest::owners).
+    /// The leader that each follower saw at most steps, see [`assign`](super::assign): [`owner_bits`] bits per follower,
+    /// from the lowest of a word, all ones for nobody. Empty unless [needed](RecordRequest::owners).
     Owners(Strided<'a>),
 }
 

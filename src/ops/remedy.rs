@@ -21,6 +21,12 @@ use crate::shell;
 
 /// `EMFILE`. It has this number on every Unix, and no name in Rust.
 const TOO_MANY_FILES: i32 = 24;
+/// `EIO`, likewise.
+const INPUT_OUTPUT: i32 = 5;
+
+/// Advice on a comparison without a GPU.
+pub const NONE_TO_VERIFY: &str =
+    "; --report FILE without --adapter compares the instruction sets of the processor alone";
 
 /// Returns advice on a device that could not be opened, or that failed.
 pub fn device(error: &DeviceError) -> &'static str {
@@ -80,10 +86,11 @@ pub fn record(error: &RecordError, again: &str) -> String {
                 format!("; the system allows no larger file here (see `ulimit -f`): raise that, then {again}")
             }
             PermissionDenied | ReadOnlyFilesystem => "; choose a place you may write to".into(),
+            _ if cfg!(unix) && error.raw_os_error() == Some(INPUT_OUTPUT) => format!("; check the disk, then {again}"),
             _ => String::new(),
         },
         RecordError::Exists { .. } => {
-            "; go on with it by --resume, write over it by --force, or choose another --out".into()
+            "; pass --resume to continue it or --force to overwrite it, or choose another --out".into()
         }
         RecordError::NotOurs { .. } => "; move it away, or choose another --out".into(),
         RecordError::OfAnotherUser { .. } => "; to write there all the same, name it with --out".into(),
@@ -129,16 +136,16 @@ pub fn record(error: &RecordError, again: &str) -> String {
 /// Returns advice on a run that could not continue.
 pub fn run(error: &RunError) -> String {
     match error {
-        RunError::Record(error) => record(error, "go on with --resume"),
+        RunError::Record(error) => record(error, "continue with --resume"),
         RunError::TooLittle(_) => {
             " (flotilla check shows what a config needs; `ulimit -v` and limits of a job or container count)".into()
         }
         RunError::Backend { saved: Ok(()), .. } => {
-            ": go on with --resume, with --on-device-loss cpu to change to the CPU".into()
+            ": continue with --resume, with --on-device-loss cpu to change to the CPU".into()
         }
         RunError::Backend { saved: Err(error), .. } => run(error),
-        RunError::Held(BackendError::Gone) => "; --resume goes on from the last checkpoint or the start".into(),
-        RunError::Held(error) => backend(error).into(),
+        RunError::Fetch(BackendError::Gone) => "; --resume continues from the last checkpoint or the start".into(),
+        RunError::Fetch(error) => backend(error).into(),
         RunError::Memory { .. } | RunError::Config(_) => String::new(),
     }
 }

@@ -1,0 +1,181 @@
+"""Training by ask and tell: the caller decides what policies are worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flotilla import _native
+from flotilla._arrays import Floats, backend_name, floats
+from flotilla._config import Config
+from flotilla._run import Generation, Run, first_policies
+
+
+class Asked(NamedTuple):
+    """What a generation plays, see :class:`Coevolution`."""
+
+    policies: Floats
+    """``[trials, leaders, policies + 1, parameters]``, or ``[trials, 1, ...]`` if leaders share a policy. The last is the
+    champion of the previous generation."""
+    teams: NDArray[np.uint32]
+    """The policy of each leader in each team, ``[trials, teams, leaders]``."""
+    starts: Floats
+    """Start positions of agents, leaders first, ``[trials, episodes, agents, 2]``; if POIs move, their positions follow."""
+
+
+class Played(NamedTuple):
+    """The scores of a generation's teams, as means over episodes, see :class:`Coevolution`."""
+
+    g: NDArray[np.float64]
+    """G, ``[trials, teams]``."""
+    fitness: Floats
+    """The config's fitness of each leader, ``[trials, teams, leaders]``."""
+
+
+class Coevolution:
+    """Training by ask and tell: you decide what each leader of each team was worth.
+
+    Told the config's own fitness, the result has the digest of :func:`train`. It can be pickled between generations.
+
+    Args:
+        config: what to train.
+        seed: replaces the config's ``learning.seed``.
+        init: initial policies, see :func:`train`; arrays only.
+        backend: where to play, see :func:`train`.
+
+    Raises:
+        ConfigError: the config or the seed is wrong.
+        ValueError: ``init`` has another shape.
+        MemoryError: there is not enough memory for the populations.
+
+    Example:
+        >>> config = flotilla.Config.paper().replace(learning={"trials": 2, "generations": 5})
+        >>> coevolution = flotilla.Coevolution(config, seed=7)
+        >>> while not coevolution.done:
+        ...     played = coevolution.play()
+        ...     _ = coevolution.tell(played.fitness)
+        >>> coevolution.run.digest == flotilla.train(config, seed=7).digest
+        True
+
+        Your own reward is one line: what a leader was worth, plus a share of its team's G.
+
+        >>> coevolution = flotilla.Coevolution(config, seed=7)
+        >>> for _ in range(3):
+        ...     played = coevolution.play()
+        ...     _ = coevolution.tell(played.fitness + 0.1 * played.g[..., None])
+        >>> coevolution.generation, coevolution.best.shape
+        (3, (2, 4, 112))
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        seed: int | None = None,
+        *,
+        init: ArrayLike | Sequence[ArrayLike] | None = None,
+        backend: str | int = "auto",
+    ) -> None:
+        if not isinstance(config, Config):
+            raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config")
+        self.config = config if seed is None else config.replace(learning={"seed": seed})
+        self._backend = backend_name(backend)
+        self._native = _native.Coevolution(self.config._native)
+        if init is not None:
+            self._native.start_from(first_policies(init))
+
+    @property
+    def generation(self) -> int:
+        """The generation that plays next; 0 is the initial one."""
+        return self._native.generation
+
+    @property
+    def done(self) -> bool:
+        """Whether all generations were told."""
+        return self._native.done
+
+    def ask(self) -> Asked:
+        """Returns the generation's policies, teams and starts. Asking again returns the same.
+
+        Example:
+            >>> asked = flotilla.Coevolution(flotilla.Config.paper()).ask()
+            >>> asked.policies.shape, asked.teams.shape, asked.starts.shape
+            ((5, 4, 51, 112), (5, 50, 4), (5, 1, 12, 2))
+        """
+        return Asked(*self._native.ask())
+
+    def play(self) -> Played:
+        """Plays the generation's teams, and returns their G and the config's fitness."""
+        return Played(*self._native.play(self._backend))
+
+    def tell(self, fitness: ArrayLike) -> list[Generation]:
+        """Breeds the next generation.
+
+        The generation is also played for its G, unless :meth:`play` did so. After the last generation its champions play.
+
+        Args:
+            fitness: what each leader of each team was worth, ``[trials, teams, leaders]``.
+
+        Returns:
+            the generations that became complete: usually the one before, because champions play one generation later.
+
+        Raises:
+            ValueError: the fitness has another shape or is not finite, or all generations were told.
+        """
+        values = floats("fitness", fitness, 3)
+        learning = self.config["learning"]
+        shape = (learning["trials"], learning["population"], self.config.num_learners)
+        if values.shape != shape:
+            raise ValueError(f"fitness has the shape {values.shape}, allowed is [trials, teams, leaders] = {shape}")
+        return self._native.tell(values, self._backend)
+
+    @property
+    def best(self) -> Floats:
+        """The champion of the generation that was told last, ``[trials, leaders, parameters]``, or ``[trials, 1,
+        parameters]`` if leaders share a policy.
+
+        Raises:
+            ValueError: no generation was told.
+        """
+        if self.generation == 0:
+            raise ValueError("there is no best policy before a generation was told")
+        return self._native.best()
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """The state between two generations, as NumPy arrays and numbers. Setting it continues from there.
+
+        Raises:
+            ValueError: a state that is set is of another config.
+        """
+        names = ("generation", "policies", "fitness", "pending", "rows")
+        return dict(zip(names, self._native.state()))
+
+    @state.setter
+    def state(self, state: dict[str, Any]) -> None:
+        names = ("generation", "policies", "fitness", "pending", "rows")
+        self._native.restore(tuple(state[name] for name in names))
+
+    @property
+    def run(self) -> Run:
+        """The results, once all generations were told.
+
+        Raises:
+            ValueError: generations are left.
+        """
+        if not self.done:
+            raise ValueError(f"generation {self.generation} is to be told; a run has results once all were")
+        return Run(self._native.finish(), ("cpu", "ask and tell", None), None, None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"config": self.config, "backend": self._backend, "state": self.state}
+
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        Coevolution.__init__(self, saved["config"], backend=saved["backend"])
+        self.state = saved["state"]
+
+    def __repr__(self) -> str:
+        last = self.config["learning.generations"]
+        return f"<flotilla.Coevolution: generation {min(self.generation, last)} of {last}{', done' if self.done else ''}>"

@@ -1,0 +1,156 @@
+import gc
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+from conftest import random_config, random_policies
+
+import flotilla
+from flotilla import Coevolution, Config, rollout, train
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_told_its_own_fitness_it_gives_the_bits_of_train(seed):
+    config = random_config(seed)
+    coevolution = Coevolution(config)
+    while not coevolution.done:
+        coevolution.tell(coevolution.play().fitness)
+    run = train(config)
+    assert coevolution.run.digest == run.digest
+    assert np.array_equal(coevolution.run.metrics["mean_g"], run.metrics["mean_g"])
+
+
+def test_what_is_asked_is_what_is_played(config):
+    coevolution = Coevolution(config, seed=3)
+    asked, played = coevolution.ask(), coevolution.play()
+    for trial in range(2):
+        teams = np.stack([asked.policies[trial, leader, asked.teams[trial, :, leader]] for leader in range(4)])
+        scores = rollout(config, teams)
+        assert np.array_equal(scores.g, played.g[trial]) and np.array_equal(scores["Df"], played.fitness[trial])
+    # So a fitness that is computed from rollouts gives the run of train, too.
+    while not coevolution.done:
+        asked = coevolution.ask()
+        told = [
+            rollout(config, np.stack([policies[leader][teams[:, leader]] for leader in range(4)]))["Df"]
+            for policies, teams in zip(asked.policies, asked.teams)
+        ]
+        coevolution.tell(np.stack(told))
+    assert coevolution.run.digest == train(config, seed=3).digest
+
+
+def test_another_fitness_gives_another_run(config):
+    coevolution = Coevolution(config, seed=3)
+    while not coevolution.done:
+        coevolution.tell(np.random.default_rng(0).random(coevolution.play().fitness.shape))
+    assert coevolution.run.digest != train(config, seed=3).digest
+
+
+def test_it_continues_after_pickling_and_from_its_state(config):
+    whole, expected = Coevolution(config, seed=1), train(config, seed=1).digest
+    states = []
+    while not whole.done:
+        states.append(whole.state)
+        whole = pickle.loads(pickle.dumps(whole))
+        whole.tell(whole.play().fitness)
+    states.append(whole.state)
+    assert pickle.loads(pickle.dumps(whole)).run.digest == expected
+    for state in states:
+        other = Coevolution(config, seed=1)
+        other.state = state
+        while not other.done:
+            other.tell(other.play().fitness)
+        assert other.run.digest == expected
+    with pytest.raises(ValueError, match="state is of another config"):
+        Coevolution(config.replace(learning={"trials": 3})).state = states[2]
+    with pytest.raises(ValueError, match="state is of another config"):
+        Coevolution(config).state = {**states[2], "policies": states[2]["policies"] * np.nan}
+
+
+def test_wrong_fitness_changes_nothing(config):
+    coevolution = Coevolution(config)
+    right = coevolution.play().fitness
+    for wrong in (right[:1], right[..., :2], right * np.nan, np.full_like(right, np.inf)):
+        with pytest.raises(ValueError, match="fitness"):
+            coevolution.tell(wrong)
+    with pytest.raises(TypeError):
+        coevolution.tell(right > 0)
+    assert coevolution.generation == 0
+    with pytest.raises(ValueError, match="before a generation"):
+        coevolution.best
+    with pytest.raises(ValueError, match="is to be told"):
+        coevolution.run
+    while not coevolution.done:
+        coevolution.tell(coevolution.play().fitness)
+    with pytest.raises(ValueError, match="all generations"):
+        coevolution.tell(right)
+
+
+def test_it_starts_from_arrays_as_train_does(config):
+    first = random_policies(config, 12)
+    coevolution = Coevolution(config, init=first)
+    assert np.array_equal(coevolution.ask().policies[1][:, :12], first)
+    while not coevolution.done:
+        coevolution.tell(coevolution.play().fitness)
+    run = train(config, init=first)
+    assert coevolution.run.digest == run.digest
+    kept = train(config, init=[first, first], out="kept")
+    assert kept.digest == run.digest
+    assert train(config, init=kept).digest != run.digest
+    for wrong in (first[:3], first[:, :1], [first] * 3, first[..., 1:]):
+        with pytest.raises(ValueError, match="init"):
+            train(config, init=wrong)
+    for wrong in (7, object(), [1, 2], first > 0):
+        with pytest.raises((TypeError, ValueError), match="init"):
+            train(config, init=wrong)
+    run.save("saved")
+    saved = flotilla.Run.open("saved")
+    assert saved.digest == run.digest
+    assert saved.replay(generation=0).episodes[0].observed == run.replay(generation=0).episodes[0].observed
+
+
+def test_callbacks_get_champions(config):
+    seen, also = [], []
+    run = train(config, callback=[seen.append, also.append], champions=True)
+    assert run.digest == train(config).digest and seen == also
+    assert [generation.generation for generation in seen] == list(range(7))
+    assert np.array_equal(seen[-1].champions, np.stack([policies[:, 0] for policies in run.policies]))
+    for generation in seen:
+        for trial, champion in enumerate(generation.champions):
+            assert rollout(config, champion[:, None]).g[0] == generation.champion_g[trial]
+    seen.clear()
+    stopped = train(config, callback=[lambda g: g.generation == 2, seen.append], champions=True)
+    assert stopped.digest == train(config.replace(learning={"generations": 4})).digest == train(
+        config, callback=[lambda generation: generation.generation == 2, seen.append]
+    ).digest
+    train(config, callback=seen.append)
+    assert seen[-1].champions is None
+    with pytest.raises(TypeError, match="callback"):
+        train(config, callback=[7])
+
+
+def test_loggers_close_when_training_stops_early(config):
+    closed = []
+    logger = flotilla.loggers.Logger(lambda generation: None, lambda: closed.append(1))
+    train(config, callback=[logger, lambda generation: True])
+    assert closed == [1]
+
+    def fails(generation):
+        raise RuntimeError("no more")
+
+    other = flotilla.loggers.Logger(fails, lambda: closed.append(2))
+    with pytest.raises(RuntimeError, match="no more"):
+        train(config, callback=other)
+    assert closed == [1, 2]
+
+
+def test_no_resource_warning(config):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run = train(config)
+        folder = run.folder
+        del run
+        gc.collect()
+    import os
+
+    assert not os.path.exists(folder)

@@ -1,0 +1,77 @@
+//! The answers of policies to given inputs, with the arithmetic of episodes.
+
+use fearless_simd::{Level, Simd, dispatch, prelude::*};
+
+use super::network::Network;
+use super::transpose::transpose_rows;
+use crate::kernels::splat;
+use crate::model::policy::PolicyConstants;
+use crate::parallel::*;
+use crate::world::{INPUTS, OUTPUTS};
+
+/// Computes what policies answer to given inputs, to the bit as in an episode.
+///
+/// `weights` are `[policies][parameters]`, each 0 or of size 2^-30 to 2^20. `inputs` are `[rows][8]`. Row `i` is answered
+/// by policy `of(i)`. Writes `outputs`, `[rows][2]`.
+///
+/// # Panics
+/// An array has the wrong length, or a policy does not exist.
+pub fn forward(
+    policy: &PolicyConstants,
+    weights: &[f32],
+    inputs: &[f32],
+    of: &(impl Fn(usize) -> usize + Sync),
+    outputs: &mut [f32],
+) {
+    assert_eq!(inputs.len() / INPUTS, outputs.len() / OUTPUTS);
+    dispatch!(Level::new(), simd => forward_rows(simd, policy, weights, inputs, of, outputs));
+}
+
+/// Rows per task.
+const ROWS: usize = 1024;
+
+fn forward_rows<S: Simd>(
+    simd: S,
+    policy: &PolicyConstants,
+    weights: &[f32],
+    inputs: &[f32],
+    of: &(impl Fn(usize) -> usize + Sync),
+    outputs: &mut [f32],
+) {
+    outputs.par_chunks_mut(ROWS * OUTPUTS).enumerate().for_each(|(part, outputs)| {
+        let (width, parameters) = (S::f32s::LEN, policy.parameters as usize);
+        let mut network = Network::new(simd, policy, 1);
+        let mut loaded = None;
+        let zero = splat(simd, 0.0);
+        for (chunk, outputs) in outputs.chunks_mut(width * OUTPUTS).enumerate() {
+            let (first, rows) = (part * ROWS + chunk * width, outputs.len() / OUTPUTS);
+            let row = |lane: usize| first + if lane < rows { lane } else { 0 };
+            let mut sensed = [[zero; INPUTS]];
+            let mut answers = [[zero; OUTPUTS]];
+            simd.vectorize(
+                #[inline(always)]
+                || {
+                    for quad in (0..width).step_by(4) {
+                        let rows = [0, 1, 2, 3].map(|lane| &inputs[row(quad + lane) * INPUTS..][..INPUTS]);
+                        transpose_rows(
+                            simd,
+                            rows,
+                            #[inline(always)]
+                            |column, lanes| sensed[0][column].as_mut_slice()[quad..quad + 4].copy_from_slice(lanes),
+                        );
+                    }
+                    let one = of(first);
+                    let same = (0..width).all(|lane| of(row(lane)) == one);
+                    if !(same && loaded == Some(one)) {
+                        network.load_policies(|_, lane| &weights[of(row(lane)) * parameters..][..parameters]);
+                    }
+                    loaded = same.then_some(one);
+                    network.decide(&sensed, &mut answers);
+                },
+            );
+            for (lane, answer) in outputs.chunks_exact_mut(OUTPUTS).enumerate() {
+                answer.iter_mut().zip(&answers[0]).for_each(|(to, answer)| *to = answer[lane]);
+            }
+        }
+    });
+}

@@ -1,0 +1,57 @@
+//! Scores of a batch, computed by the threads that play it.
+
+use std::cell::RefCell;
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
+use super::{Group, GroupScores};
+use crate::config::Fitness;
+use crate::credit::{Credit, Episode};
+
+/// The scores of the groups of a batch. Several threads may write at a time; each team is scored once.
+pub(crate) struct ScoreTable<'a> {
+    groups: &'a [Group<'a>],
+    /// POIs observed, `[teams]` per group.
+    observed: Vec<Vec<AtomicU32>>,
+    /// Scores, f32 as bits, `[teams][fitnesses][leaders]` per group.
+    scores: Vec<Vec<AtomicU32>>,
+}
+
+impl<'a> ScoreTable<'a> {
+    /// Returns a table of zeros.
+    pub(crate) fn new(groups: &'a [Group<'a>]) -> ScoreTable<'a> {
+        let zeros = |count: usize| std::iter::repeat_with(AtomicU32::default).take(count).collect();
+        ScoreTable {
+            groups,
+            observed: groups.iter().map(|group| zeros(group.team_count())).collect(),
+            scores: groups.iter().map(|group| zeros(group.teams.len() * group.fitnesses.len())).collect(),
+        }
+    }
+
+    /// Scores a team of a group from the record of its episode.
+    pub(crate) fn score(&self, group: usize, team: usize, episode: &Episode<'_>) {
+        thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
+        let Group { world, fitnesses, .. } = self.groups[group];
+        let leaders = world.leaders();
+        CREDIT.with_borrow_mut(|(credit, scores)| {
+            scores.resize(leaders, 0.0);
+            let table = self.scores[group][team * fitnesses.len() * leaders..].chunks_exact(leaders);
+            let mut observed = None;
+            for (&fitness, row) in fitnesses.iter().zip(table) {
+                observed = Some(credit.score(episode, world, fitness, scores));
+                row.iter().zip(&*scores).for_each(|(to, score)| to.store(score.to_bits(), Relaxed));
+            }
+            let observed = observed.unwrap_or_else(|| credit.score(episode, world, Fitness::G, scores));
+            self.observed[group][team].store(observed, Relaxed);
+        });
+    }
+
+    /// Returns the scores of each group.
+    pub(crate) fn finish(self) -> Vec<GroupScores> {
+        let groups = self.observed.into_iter().zip(self.scores);
+        let scores = |(observed, scores): (Vec<AtomicU32>, Vec<AtomicU32>)| GroupScores {
+            observed: observed.into_iter().map(AtomicU32::into_inner).collect(),
+            scores: scores.into_iter().map(|score| f32::from_bits(score.into_inner())).collect(),
+        };
+        groups.map(scores).collect()
+    }
+}

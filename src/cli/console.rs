@@ -1,0 +1,116 @@
+//! Runs use cases in a terminal: opens the backend, listens for signals, and shows what happens.
+
+use std::cell::RefCell;
+use std::sync::atomic::AtomicBool;
+
+use super::recovery::{self, Loss, Signals};
+use super::{Error, RunOptions, backend, say};
+use crate::backend::OpenBackend;
+use crate::ops::{Context, Event, Player};
+use crate::report::progress::{Board, Meter};
+
+/// The flags of a command that concern every use case.
+pub struct Console<'a> {
+    machine: Machine<'a>,
+    loss: Loss,
+    quiet: bool,
+}
+
+/// The backend that the flags choose, opened when it is needed.
+struct Machine<'a> {
+    options: &'a RunOptions,
+    open: Option<OpenBackend>,
+}
+
+impl Player for Machine<'_> {
+    fn open(&mut self) -> Result<&mut OpenBackend, Error> {
+        match &mut self.open {
+            Some(open) => Ok(open),
+            closed => Ok(closed.insert(backend::open(self.options)?)),
+        }
+    }
+}
+
+impl<'a> Console<'a> {
+    /// Returns a console with a command's flags.
+    pub fn new(options: &'a RunOptions, loss: Loss, quiet: bool) -> Console<'a> {
+        Console { machine: Machine { options, open: None }, loss, quiet }
+    }
+
+    /// Runs a use case that signals stop.
+    ///
+    /// # Errors
+    /// The use case fails, or the system does not allow signal handlers.
+    pub fn run<R>(&mut self, work: impl FnOnce(&mut dyn Player, Context<'_>) -> Result<R, Error>) -> Result<R, Error> {
+        let (signals, command) = (Signals::listen()?, recovery::typed());
+        let show = Display::new(self.quiet);
+        let context = Context {
+            tell: &|event| show.event(event),
+            stop: &signals.stop,
+            save: &signals.save,
+            command: &command,
+            falls_back: self.loss.falls_back(),
+        };
+        let done = work(&mut self.machine, context);
+        show.event(Event::Pause);
+        done
+    }
+}
+
+/// Runs a use case that needs no backend. A signal ends the process.
+///
+/// # Errors
+/// The use case fails.
+pub fn tell<R>(quiet: bool, work: impl FnOnce(Context<'_>) -> Result<R, Error>) -> Result<R, Error> {
+    let (show, never) = (Display::new(quiet), AtomicBool::new(false));
+    let context =
+        Context { tell: &|event| show.event(event), stop: &never, save: &never, command: "", falls_back: false };
+    let done = work(context);
+    show.event(Event::Pause);
+    done
+}
+
+/// Shows events on standard error.
+struct Display {
+    quiet: bool,
+    shown: RefCell<Shown>,
+}
+
+enum Shown {
+    Nothing,
+    Curves(Board),
+    Share(Meter),
+}
+
+impl Display {
+    fn new(quiet: bool) -> Display {
+        Display { quiet, shown: RefCell::new(Shown::Nothing) }
+    }
+
+    fn event(&self, event: Event<'_>) {
+        let shown = &mut *self.shown.borrow_mut();
+        match (event, &mut *shown) {
+            (Event::Warning(text), _) => say(text),
+            (Event::Message(text), _) if !self.quiet => say(text),
+            (Event::Begin(names, from, last), shown) => {
+                *shown = Shown::Curves(Board::new(names, from, last, self.quiet));
+            }
+            (Event::Rows(next, rows), Shown::Curves(board)) => board.show(next, rows),
+            (Event::Share(part, text), Shown::Share(meter)) => meter.show(part, || text),
+            (Event::Share(part, text), shown) => {
+                let mut meter = Meter::new(self.quiet);
+                meter.show(part, || text);
+                *shown = Shown::Share(meter);
+            }
+            (Event::Pause, shown) => {
+                match shown {
+                    Shown::Nothing => {}
+                    Shown::Curves(board) => board.clear(),
+                    Shown::Share(meter) => meter.clear(),
+                }
+                *shown = Shown::Nothing;
+            }
+            (Event::Message(_) | Event::Rows(..), _) => {}
+        }
+    }
+}

@@ -1,0 +1,236 @@
+//! Training in which the caller decides what policies are worth.
+
+use super::{Failure, Generation, Trained, start_from, trainer_of};
+use crate::backend::Backend;
+use crate::config::Config;
+use crate::trainer::{Asked, Ending, Row, Snapshot, Trainer};
+use crate::world::World;
+
+/// Training by ask and tell: the caller decides what each leader of each team was worth.
+///
+/// ```
+/// use flotilla::{Config, front::{self, Coevolution}};
+///
+/// let mut config = Config::parse(include_str!("../../configs/generally_forward.toml"), "generally_forward.toml")?;
+/// (config.learning.trials, config.learning.generations) = (2, 3);
+/// let (mut backend, _) = front::cpu();
+/// let mut coevolution = Coevolution::new(&config)?;
+/// while !coevolution.is_done() {
+///     let (g, fitness) = coevolution.play(&mut *backend)?;
+///     // What each leader was worth, [trials][teams][leaders]. Here it is the config's fitness.
+///     println!("the best team observes {}", g.iter().fold(0.0_f64, |best, g| best.max(*g)));
+///     coevolution.tell(&mut *backend, Some(&fitness))?;
+/// }
+/// assert_eq!(coevolution.finish()?.digest(), front::train(&config, &mut *backend, |_| std::ops::ControlFlow::Continue(()))?.digest());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub struct Coevolution {
+    config: Config,
+    trainer: Trainer,
+    rows: Vec<Row>,
+    /// Whether the present generation was played.
+    played: bool,
+}
+
+/// The state of a [`Coevolution`] between two generations: the trainer's, and all complete rows.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Progress {
+    /// The populations about to play.
+    pub snapshot: Snapshot,
+    /// All complete rows.
+    pub rows: Vec<Row>,
+}
+
+impl Coevolution {
+    /// Creates random populations for every trial.
+    ///
+    /// # Errors
+    /// The config is invalid, or its memory does not fit this machine.
+    pub fn new(config: &Config) -> Result<Coevolution, Failure> {
+        let valid = config.validate()?;
+        let config = Config::clone(&valid);
+        Ok(Coevolution { config, trainer: trainer_of(valid)?, rows: Vec::new(), played: false })
+    }
+
+    /// Replaces the random populations by given ones, see [`super::train_from`].
+    ///
+    /// # Errors
+    /// The policies do not fit the config, or a generation was played.
+    pub fn start_from(&mut self, policies: usize, first: &[Vec<f32>]) -> Result<(), Failure> {
+        if self.generation() > 0 {
+            return Err(Failure::State);
+        }
+        start_from(&mut self.trainer, &self.config, policies, first)
+    }
+
+    /// Returns the config.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// Returns the generation that is about to play.
+    pub fn generation(&self) -> usize {
+        self.trainer.generation(0)
+    }
+
+    /// Reports whether all generations were played.
+    pub fn is_done(&self) -> bool {
+        self.trainer.is_done()
+    }
+
+    /// Returns the rows that are complete: all generations before the last one told.
+    pub fn rows(&self) -> &[Row] {
+        &self.rows
+    }
+
+    /// Returns the generation's policies, teams and starts, one entry per trial, and its world.
+    ///
+    /// # Errors
+    /// All generations were played.
+    pub fn ask(&mut self) -> Result<Vec<Asked<'_>>, Failure> {
+        if self.is_done() { Err(Failure::Done) } else { Ok(self.trainer.ask(0)) }
+    }
+
+    /// Returns the world of the generation, and its teams per trial, without the champions'.
+    pub fn world(&self) -> (&World, usize) {
+        self.trainer.asked_world(0)
+    }
+
+    /// Plays the generation. Returns G, `[trials][teams]`, and the config's fitness of each leader,
+    /// `[trials][teams][leaders]`, as means over episodes.
+    ///
+    /// # Errors
+    /// The backend failed, or all generations were played.
+    pub fn play(&mut self, backend: &mut dyn Backend) -> Result<(Vec<f64>, Vec<f32>), Failure> {
+        if self.is_done() {
+            return Err(Failure::Done);
+        }
+        if !self.played {
+            self.trainer.play_asked(0, backend)?;
+            self.played = true;
+        }
+        Ok(self.trainer.played(0))
+    }
+
+    /// Breeds the next generation from what each leader of each team was worth, `[trials][teams][leaders]`, or `None` for
+    /// the config's fitness. Plays the generation unless [`Coevolution::play`] did, because its rows need G. After the
+    /// last generation its champions play, too.
+    ///
+    /// Returns the rows that became complete.
+    ///
+    /// # Errors
+    /// The fitness has the wrong length or is not finite, the backend failed, or all generations were played. Nothing has
+    /// changed then.
+    pub fn tell(&mut self, backend: &mut dyn Backend, fitness: Option<&[f32]>) -> Result<Generation<'_>, Failure> {
+        if self.is_done() {
+            return Err(Failure::Done);
+        }
+        let (world, teams) = self.world();
+        let expected = self.config.learning.trials * teams * world.leaders();
+        if let Some(told) = fitness {
+            if told.len() != expected {
+                let text = format!("{} numbers, but [trials][teams][leaders] are {expected}", told.len());
+                return Err(Failure::Fitness(text));
+            }
+            if let Some(place) = told.iter().position(|value| !value.is_finite()) {
+                return Err(Failure::Fitness(format!("number {place} is {}, allowed are finite ones", told[place])));
+            }
+        }
+        if !self.played {
+            self.trainer.play_asked(0, backend)?;
+        }
+        let first = self.rows.len();
+        self.rows.extend(self.trainer.tell(0, fitness));
+        self.played = false;
+        if self.generation() > self.config.learning.generations && !self.is_done() {
+            self.end(backend)?;
+        }
+        let rows = &self.rows[first..];
+        let generation = rows.last().map_or(0, |row| row.generation);
+        Ok(Generation { generation, last: self.config.learning.generations, rows })
+    }
+
+    /// Makes the generation that plays next the last.
+    pub fn stop(&mut self) {
+        let Config { learning, stages, .. } = &mut self.config;
+        learning.generations = self.trainer.end(0);
+        stages.retain(|stage| stage.from <= learning.generations);
+    }
+
+    /// Plays the champions of the last generation, which completes its rows.
+    fn end(&mut self, backend: &mut dyn Backend) -> Result<(), Failure> {
+        self.trainer.play_asked(0, backend)?;
+        self.rows.extend(self.trainer.tell(0, None));
+        Ok(())
+    }
+
+    /// Returns the champions of the generation that was told last, `[trials][populations][parameters]`.
+    ///
+    /// # Errors
+    /// No generation was told.
+    pub fn best(&mut self) -> Result<Vec<f32>, Failure> {
+        if self.generation() == 0 {
+            return Err(Failure::State);
+        }
+        let slot = (self.config.learning.population + 1) * self.config.parameters();
+        let mut best = Vec::new();
+        for trial in 0..self.config.learning.trials {
+            for population in self.trainer.weights(0, trial)?.chunks_exact(slot) {
+                best.extend_from_slice(&population[slot - self.config.parameters()..]);
+            }
+        }
+        Ok(best)
+    }
+
+    /// Returns the state, for [`Coevolution::restore`].
+    ///
+    /// # Errors
+    /// There is too little memory.
+    pub fn state(&mut self) -> Result<Progress, Failure> {
+        let bytes = self.config.policy_bytes().into();
+        let snapshot =
+            self.trainer.snapshot(0).map_err(|_| Failure::Memory { what: "a copy of all policies", bytes })?;
+        Ok(Progress { snapshot, rows: self.rows.clone() })
+    }
+
+    /// Continues from a state of the same config.
+    ///
+    /// # Errors
+    /// The state does not fit the config. Nothing has changed then.
+    pub fn restore(&mut self, state: Progress) -> Result<(), Failure> {
+        let trials = self.config.learning.trials;
+        let whole = |numbers: &[f32]| numbers.iter().all(|number| number.is_finite());
+        let Snapshot { generation, last, weights, fitness, pending } = &state.snapshot;
+        let in_turn = state
+            .rows
+            .iter()
+            .enumerate()
+            .all(|(place, row)| (row.generation, row.trial) == (place / trials, place % trials));
+        let complete = generation.saturating_sub(1) * trials;
+        let fits = *last == self.config.learning.generations
+            && *generation <= last + 2
+            && in_turn
+            && state.rows.len() == complete
+            && weights.iter().flatten().all(|&weight| crate::evolve::is_weight(weight))
+            && fitness.iter().all(|fitness| whole(fitness))
+            && pending.iter().all(|row| row.is_some() == (*generation > 0));
+        if !fits || !self.trainer.restore(0, state.snapshot) {
+            return Err(Failure::State);
+        }
+        (self.rows, self.played) = (state.rows, false);
+        Ok(())
+    }
+
+    /// Returns the results.
+    ///
+    /// # Errors
+    /// Generations are left.
+    pub fn finish(&mut self) -> Result<Trained, Failure> {
+        if !self.is_done() {
+            return Err(Failure::State);
+        }
+        let policies = self.trainer.policies(0);
+        let ending = self.trainer.ends(&[0]).first().map(|(_, end)| Ending::of(end));
+        Ok(Trained::new(self.config.clone(), &self.rows, policies, ending))
+    }
+}

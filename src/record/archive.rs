@@ -1,0 +1,107 @@
+//! Runs in zip files, as the browser page saves them.
+
+use std::fs::File;
+use std::io::{self, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use tempfile::TempDir;
+use zip::ZipArchive;
+
+use super::RecordError;
+use super::disk::Disk;
+use super::folder::{CHECKPOINTS, CONFIG, METRICS, POLICIES, RUN};
+use crate::file;
+
+/// Maximum number of bytes that are unpacked from one zip file.
+const MAX_BYTES: u64 = 16 << 30;
+/// Every zip file that is not empty starts with these bytes.
+const MAGIC: [u8; 4] = *b"PK\x03\x04";
+
+/// The folder of a run: the named one, or a temporary one with what a zip file holds, which is removed at the end.
+#[derive(Debug)]
+pub struct RunFolder {
+    path: PathBuf,
+    unpacked: Option<TempDir>,
+}
+
+impl RunFolder {
+    /// Opens a run. A zip file is unpacked; any other path is taken as it is.
+    ///
+    /// # Errors
+    /// The zip file cannot be read or unpacked, or does not hold exactly one run.
+    pub fn open(path: &Path) -> Result<RunFolder, RecordError> {
+        // Only regular files are opened: opening a pipe would wait for its writer.
+        let is_file = path.metadata().is_ok_and(|metadata| metadata.is_file());
+        let plain = || RunFolder { path: path.into(), unpacked: None };
+        if !is_file {
+            return Ok(plain());
+        }
+        let mut file = file::open(path).map_err(RecordError::read(path))?;
+        let mut start = [0; MAGIC.len()];
+        if file.read_exact(&mut start).is_err() || start != MAGIC {
+            return Ok(plain());
+        }
+        file.seek(SeekFrom::Start(0)).map_err(RecordError::read(path))?;
+        let temporary = TempDir::new().map_err(RecordError::write(&std::env::temp_dir()))?;
+        // Pictures and messages show the folder's name.
+        let folder = temporary.path().join(file::stem(path, "run"));
+        unpack(path, file, &folder)?;
+        Ok(RunFolder { path: folder, unpacked: Some(temporary) })
+    }
+
+    /// Returns the path of the folder. It exists until this value is dropped.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Returns whether the run came from a zip file, so that nothing may be written into its folder.
+    pub fn is_unpacked(&self) -> bool {
+        self.unpacked.is_some()
+    }
+}
+
+/// Unpacks the files of a run. Other files of the archive are ignored, so no name in it leads out of the folder.
+fn unpack(path: &Path, file: File, folder: &Path) -> Result<(), RecordError> {
+    let damaged = |error: zip::result::ZipError| RecordError::damaged(path, error);
+    let mut archive = ZipArchive::new(file).map_err(damaged)?;
+    let names: Vec<String> = archive.file_names().flatten().map(Into::into).collect();
+    let runs: Vec<&str> = names.iter().filter_map(|name| inside(name, CONFIG)).collect();
+    let &[top] = &runs[..] else {
+        let reason = match runs.len() {
+            0 => format!("it is no run's archive: it has no {CONFIG}"),
+            count => format!("it holds {count} runs; unpack it and name the folder of one"),
+        };
+        return Err(RecordError::damaged(path, reason));
+    };
+    let disk = Disk::default();
+    disk.create_folder(&folder.join(CHECKPOINTS)).map_err(RecordError::write(folder))?;
+    let mut room = MAX_BYTES;
+    for name in &names {
+        let Some(own) = name.strip_prefix(top) else { continue };
+        let checkpoint = own.strip_prefix(CHECKPOINTS).and_then(|rest| rest.strip_prefix('/'));
+        let is_checkpoint = checkpoint.is_some_and(|rest| {
+            rest.ends_with(".safetensors")
+                && rest.bytes().all(|byte| byte.is_ascii_alphanumeric() || b".-_".contains(&byte))
+        });
+        if !is_checkpoint && ![CONFIG, METRICS, POLICIES, RUN].contains(&own) {
+            continue;
+        }
+        let target = folder.join(own);
+        let mut content = archive.by_name(name).map_err(damaged)?.take(room);
+        let written = disk.replace(&target, |output| {
+            room -= io::copy(&mut content, output)?;
+            Ok(())
+        });
+        written.map_err(RecordError::write(&target))?;
+        if room == 0 {
+            return Err(RecordError::damaged(path, format!("it holds more than {} GiB", MAX_BYTES >> 30)));
+        }
+    }
+    Ok(())
+}
+
+/// Returns the folder of a file in the archive, empty or ending in `/`, if that is the file's name.
+fn inside<'a>(path: &'a str, name: &str) -> Option<&'a str> {
+    let folder = path.strip_suffix(name)?;
+    (folder.is_empty() || folder.ends_with('/')).then_some(folder)
+}

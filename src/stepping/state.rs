@@ -1,0 +1,142 @@
+//! The state of all teams as bytes, so that environments can be saved, copied and sent to other processes.
+
+use glam::Vec2;
+
+use super::{StepError, Stepper};
+use crate::world::World;
+
+/// The first word of a saved state, which names the format and its version.
+const MAGIC: u32 = 0x3173_6c66;
+/// Words before the arrays: the format, and the sizes that have to match.
+const HEADER: usize = 6;
+
+/// The part of a saved state that the vectors of teams hold, of all teams.
+pub(super) struct Saved<'a> {
+    /// `[teams][agents][2]`.
+    pub positions: &'a [f32],
+    /// `[teams][agents][2]`.
+    pub headings: &'a [f32],
+    /// `[teams][agents]`.
+    pub speeds: &'a [f32],
+    /// `[teams][followers][leaders]`; empty unless recorded, as are the next two.
+    pub counts: &'a [u32],
+    /// `[teams][steps][pois][words]`.
+    pub record: &'a [u32],
+    /// `[teams][steps][followers][words of leaders]`.
+    pub sights: &'a [u32],
+}
+
+/// Takes the arrays of a saved state one after the other.
+struct Words<'a>(&'a [u32]);
+
+impl<'a> Words<'a> {
+    fn take(&mut self, count: usize) -> &'a [u32] {
+        let (taken, rest) = self.0.split_at(count);
+        self.0 = rest;
+        taken
+    }
+
+    fn numbers(&mut self, count: usize) -> &'a [f32] {
+        bytemuck::cast_slice(self.take(count))
+    }
+}
+
+impl Stepper {
+    /// Returns the state of all teams, for [`Stepper::restore`]. It is the same on every instruction set.
+    pub fn save(&mut self) -> Vec<u8> {
+        self.vectors.states(&self.world, &mut self.observations);
+        let (header, observations) = (self.header(self.moved.len() / self.teams()), &self.observations);
+        let mut words = header.to_vec();
+        for numbers in [&observations.positions, &observations.headings, &observations.speeds] {
+            words.extend_from_slice(bytemuck::cast_slice(numbers));
+        }
+        words.extend_from_slice(&observations.near);
+        for flags in [&observations.newly, &observations.observed] {
+            words.extend(flags.iter().map(|&flag| u32::from(flag)));
+        }
+        words.extend_from_slice(&observations.steps);
+        words.extend_from_slice(bytemuck::cast_slice(&self.moved));
+        let (mut seen, mut sets, mut sights) = (Vec::new(), Vec::new(), Vec::new());
+        for team in 0..self.teams() {
+            if let Some(episode) = self.vectors.episode(team, &self.world, &mut seen) {
+                words.extend(episode.seen.words().iter());
+                sets.extend(episode.sets.iter());
+                sights.extend(episode.sights.iter());
+            }
+        }
+        words.extend_from_slice(&sets);
+        words.extend_from_slice(&sights);
+        words.iter_mut().for_each(|word| *word = word.to_le());
+        bytemuck::cast_slice(&words).to_vec()
+    }
+
+    /// Puts all teams into a state that [`Stepper::save`] returned for the same world and number of teams, and the same
+    /// kind of record. They continue with the same bits.
+    ///
+    /// # Errors
+    /// The state is of another world or kind of stepper, or it is damaged. No team has changed then.
+    pub fn restore(&mut self, state: &[u8]) -> Result<(), StepError> {
+        let words: Vec<u32> = state.as_chunks::<4>().0.iter().map(|&bytes| u32::from_le_bytes(bytes)).collect();
+        let (world, teams) = (&self.world, self.teams());
+        let (agents, pois) = (world.agents(), world.pois.len());
+        let moved = if words.get(HEADER - 1) == Some(&0) { 0 } else { pois };
+        let header = self.header(moved);
+        let [_, _, _, record, sights, _] = header.map(|size| size as usize);
+        let counts = if record > 0 { world.followers() * world.leaders() } else { 0 };
+        let sets = pois * world.constants.words as usize;
+        let of_team = agents * 5 + sets + pois * 2 + 1 + moved * 2 + counts + record + sights;
+        if words.get(..HEADER) != Some(&header) || state.len() != (HEADER + teams * of_team) * 4 {
+            return Err(StepError::State("it is of another world, number of teams or kind of record"));
+        }
+        let mut words = Words(&words[HEADER..]);
+        let [positions, headings] = [(); 2].map(|()| words.numbers(teams * agents * 2));
+        let speeds = words.numbers(teams * agents);
+        let near = words.take(teams * sets);
+        let [newly, observed] = [(); 2].map(|()| words.take(teams * pois));
+        let steps = words.take(teams);
+        let moved: &[Vec2] = bytemuck::cast_slice(words.numbers(teams * moved * 2));
+        let saved = Saved {
+            positions,
+            headings,
+            speeds,
+            counts: words.take(teams * counts),
+            record: words.take(teams * record),
+            sights: words.take(teams * sights),
+        };
+        check(world, &saved, moved)?;
+        if newly.iter().chain(observed).any(|&flag| flag > 1) || steps.iter().any(|&step| step > world.constants.steps)
+        {
+            return Err(StepError::State("a step or flag is out of range"));
+        }
+        self.moved = moved.to_vec();
+        self.observations.near.copy_from_slice(near);
+        self.observations.newly.iter_mut().zip(newly).for_each(|(to, &flag)| *to = flag == 1);
+        self.observations.observed.iter_mut().zip(observed).for_each(|(to, &flag)| *to = flag == 1);
+        self.observations.steps.copy_from_slice(steps);
+        self.vectors.restore(&self.world, &saved, &self.moved, &mut self.observations);
+        Ok(())
+    }
+
+    /// Returns the format, and the sizes that a saved state has to match: teams, agents, and each team's words of
+    /// record, sightings and moved POIs.
+    fn header(&self, moved: usize) -> [u32; HEADER] {
+        let mut seen = Vec::new();
+        let episode = self.vectors.episode(0, &self.world, &mut seen);
+        let [record, sights] = episode.map_or([0, 0], |episode| [episode.sets.len(), episode.sights.len()]);
+        [MAGIC, self.teams() as u32, self.world.agents() as u32, record as u32, sights as u32, moved as u32]
+    }
+}
+
+/// Checks that all numbers are in the range of a state that was played.
+fn check(world: &World, saved: &Saved<'_>, moved: &[Vec2]) -> Result<(), StepError> {
+    let map = world.map();
+    let on_map = |place: &[f32]| (0.0..=map.x).contains(&place[0]) && (0.0..=map.y).contains(&place[1]);
+    let unit = |heading: &[f32]| (libm::hypotf(heading[0], heading[1]) - 1.0).abs() < 0.01;
+    if !saved.positions.chunks_exact(2).all(on_map) || !moved.iter().all(|place| on_map(&place.to_array())) {
+        return Err(StepError::State("a position is off the map"));
+    }
+    if !saved.headings.chunks_exact(2).all(unit) || !saved.speeds.iter().all(|speed| speed.is_finite()) {
+        return Err(StepError::State("a heading or speed is out of range"));
+    }
+    Ok(())
+}

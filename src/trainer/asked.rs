@@ -1,0 +1,106 @@
+//! Ask and tell: the caller decides what the policies of a generation are worth.
+//!
+//! The populations stay on the host. Told the scores that the backend's episodes give, the results are those of
+//! [`Trainer::advance`].
+
+use glam::Vec2;
+
+use super::experiment::Experiment;
+use super::results::{self, mean_score};
+use super::{Row, Trainer};
+use crate::backend::{Backend, BackendError};
+use crate::parallel::*;
+use crate::world::World;
+
+/// Teams that one trial plays in a generation.
+#[derive(Clone, Copy, Debug)]
+pub struct Asked<'a> {
+    /// The populations, `[populations][policies + 1][parameters]`. A population's last slot holds the champion of the
+    /// previous generation.
+    pub weights: &'a [f32],
+    /// The policy of each leader in each team, `[policies + 1][leaders]`. The last team is the champions'.
+    pub teams: &'a [u32],
+    /// Start positions of every episode, followed by POI positions if POIs move, `[episodes][agents + pois]`.
+    pub starts: &'a [Vec<Vec2>],
+}
+
+impl Trainer {
+    /// Forms the teams of the generation that an experiment plays next, and returns them, one entry per trial.
+    pub fn ask(&mut self, experiment: usize) -> Vec<Asked<'_>> {
+        let experiment = &mut self.experiments[experiment];
+        experiment.prepare(self.level);
+        let pairs = experiment.trials.iter().zip(&experiment.schedules);
+        let asked = pairs.map(|(trial, schedule)| Asked {
+            weights: &trial.weights,
+            teams: &schedule.teams,
+            starts: &schedule.starts,
+        });
+        asked.collect()
+    }
+
+    /// Plays the teams that [`Trainer::ask`] returns, and keeps their scores.
+    ///
+    /// # Errors
+    /// The backend failed.
+    pub fn play_asked(&mut self, experiment: usize, backend: &mut dyn Backend) -> Result<(), BackendError> {
+        let level = self.level;
+        scope(|_| {
+            let experiment = &mut self.experiments[experiment];
+            experiment.prepare(level);
+            let mut playing = [(0, experiment)];
+            let scores = results::play(backend, &playing)?;
+            results::keep(scores, &mut playing);
+            Ok(())
+        })
+    }
+
+    /// Returns the world that the teams of [`Trainer::ask`] play in, the number of teams without the champions', and of
+    /// the champions of a finished experiment 0.
+    pub fn asked_world(&self, experiment: usize) -> (&World, usize) {
+        let experiment = &self.experiments[experiment];
+        let stage = experiment.stage();
+        (&stage.world, if experiment.is_over() { 0 } else { stage.config.learning.population })
+    }
+
+    /// Returns G, `[trials][policies]`, and the config's fitness of each leader, `[trials][policies][leaders]`, of the
+    /// teams that [`Trainer::play_asked`] played, as means over episodes.
+    pub fn played(&self, experiment: usize) -> (Vec<f64>, Vec<f32>) {
+        let experiment = &self.experiments[experiment];
+        let stage = experiment.stage();
+        let (population, leaders) = (stage.config.learning.population, stage.world.leaders());
+        let (mut g, mut scores) = (Vec::new(), Vec::new());
+        for trial in &experiment.trials {
+            let all = (stage.world.pois.len() * trial.scores.len()) as f64;
+            let observed =
+                |team: usize| trial.scores.iter().map(|episode| u64::from(episode.observed[team])).sum::<u64>();
+            g.extend((0..population).map(|team| observed(team) as f64 / all));
+            scores.extend((0..population * leaders).map(|place| mean_score(&trial.scores, place)));
+        }
+        (g, scores)
+    }
+
+    /// Breeds the next generation of an experiment whose teams were played. `fitness` is what each leader of each team
+    /// was worth, `[trials][policies][leaders]`; `None` takes the config's fitness.
+    ///
+    /// Returns the rows that became complete: a generation's champions play with the next generation, and alone after
+    /// the last.
+    ///
+    /// # Panics
+    /// `fitness` has the wrong length.
+    pub fn tell(&mut self, index: usize, fitness: Option<&[f32]>) -> Vec<Row> {
+        let level = self.level;
+        scope(|_| {
+            let experiment: &mut Experiment = &mut self.experiments[index];
+            let mut rows = if experiment.is_over() {
+                experiment.collect_last_rows()
+            } else {
+                let rows = experiment.collect_results(index, fitness);
+                experiment.breed_on_host(level);
+                rows
+            };
+            experiment.generation += 1;
+            rows.sort_by_key(|row| (row.experiment, row.trial, row.generation));
+            rows
+        })
+    }
+}

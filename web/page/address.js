@@ -1,0 +1,96 @@
+// @ts-check
+// The experiment in the address.
+import { comparison, read, write } from "./compare.js";
+import { configs } from "./config.js";
+import { $, trouble } from "./dom.js";
+import { edited, take } from "./experiment.js";
+import { KEYS, NAMES, quote, state } from "./state.js";
+import { train } from "./train.js";
+import { seek } from "./views.js";
+
+let remembered = 0;
+export async function remember() {
+  const turn = ++remembered, words = new URLSearchParams(), layout = $("layout").value;
+  if (layout === "own") {
+    // If the browser cannot compress, there is no link. The rest of the page works.
+    try { words.set("config", await configs.pack(state.text)); } catch { return; }
+  } else {
+    words.set("layout", layout);
+    for (const id of Object.keys(KEYS).filter(id => id !== "coupling")) words.set(id, $(id).value);
+  }
+  const compared = state.compared, both = compared && compared.key === "learning.paradigm";
+  words.set("learners", both ? "both" : state.config.learning.paradigm);
+  if (compared && !both) words.set("compare", write(compared));
+  if ($("on").value !== "auto") words.set("on", $("on").value);
+  if ($("pace").value !== "watch") words.set("pace", $("pace").value);
+  if (turn === remembered) history.replaceState(null, "", `#${words}`);
+}
+
+// Opens the experiment in the address. Reports the parts that cannot be read, and then leaves the address unchanged.
+export async function recall() {
+  const words = new URLSearchParams(location.hash.slice(1)), unknown = [];
+  for (const id of ["on", "pace"]) {
+    const value = words.get(id);
+    if ([...$(id).options].some(option => option.value === value)) $(id).value = value;
+    else if (value !== null) unknown.push(`${id}=${value}`);
+  }
+  const layout = words.get("layout");
+  if (layout !== null && !configs.LAYOUTS.includes(layout)) unknown.push(`layout=${layout}`);
+  let text = configs.layout(configs.LAYOUTS.find(name => name === layout) || "generally_forward");
+  if (words.has("config")) {
+    try { text = await configs.unpack(words.get("config")); } catch { unknown.push("config"); }
+  } else {
+    text = await edited(text, Object.entries(KEYS).filter(([id]) => words.has(id)).map(([id, key]) => [key, quote(id)(words.get(id))]));
+  }
+  const learners = words.get("learners"), known = learners !== null && Object.hasOwn(NAMES, learners);
+  if (learners !== null && learners !== "both" && !known) unknown.push(`learners=${learners}`);
+  state.compared = known ? null : comparison("paradigm", 0);
+  if (words.has("compare")) {
+    state.compared = read(words.get("compare"));
+    if (!state.compared) unknown.push("compare");
+  }
+  if (known) text = await edited(text, [["learning.paradigm", `"${learners}"`]]);
+  const whole = key => words.has(key) && /^\d{1,7}$/.test(words.get(key)) ? Number(words.get(key)) : null;
+  for (const key of ["generation", "trial", "play"]) if (words.has(key) && whole(key) === null) unknown.push(`${key}=${words.get(key)}`);
+  wanted = whole("play") === 1 ? { generation: whole("generation") ?? Infinity, trial: whole("trial") ?? 0 } : null;
+  const damage = unknown.length ? `This link is damaged: ${unknown.join(", ")} cannot be read. Ask for a new link; what you see is not what it was made for.` : "";
+  const taken = await take(text, { address: !damage });
+  if (!taken && !state.config) {
+    // Show a map even if the config in the link is invalid.
+    await take(configs.layout("generally_forward"), { address: false });
+    await take(text);
+  }
+  if (damage) trouble(damage);
+  const version = words.get("version");
+  $("version").textContent = version !== null && version !== state.version ? `This link is from version ${version}, and this page is version ${state.version}: results may differ.` : "";
+}
+
+// Returns a link to what is on show: the address, and if there is a training its generation and trial. Whoever opens it
+// trains at once. Digests depend on the version.
+export function link() {
+  const words = new URLSearchParams(location.hash.slice(1));
+  if (state.training) {
+    const { generation, trial } = state;
+    for (const [key, value] of Object.entries({ generation, trial, play: 1 })) words.set(key, String(value));
+  }
+  words.set("version", state.version);
+  return `${location.href.split("#")[0]}#${words}`;
+}
+
+// What the opened link asks to show after training, or null.
+let wanted = null;
+
+// Trains if the opened link asks for that, and shows its generation and trial.
+export async function autoplay() {
+  if (!wanted || !state.valid) return;
+  const { generation, trial } = wanted;
+  wanted = null;
+  const pace = $("pace").value;
+  $("pace").value = "full";
+  await train();
+  $("pace").value = pace;
+  if (!state.training || state.training.state !== "done") return;
+  state.trial = Math.min(trial, state.training.arms[0].trials.length - 1);
+  $("trial").value = String(state.trial);
+  seek(generation);
+}

@@ -1,0 +1,127 @@
+// @ts-check
+// Steering a leader.
+import { $, count, find, make, number, trouble } from "./dom.js";
+import { edited } from "./experiment.js";
+import { reach, start_scene } from "./scene.js";
+import { state } from "./state.js";
+import { clear, draw, show, view } from "./views.js";
+
+const drive = { on: false, timer: null, wish: [0, 0], pointer: null, keys: new Set() };
+
+export function options() {
+  if (!state.config) return;
+  const many = state.config.world.leaders.length, chosen = $("leader").value;
+  $("leader").replaceChildren(...Array.from({ length: many }, (_, leader) => make("option", String(leader))));
+  if (Number(chosen) < many && chosen !== "") $("leader").value = chosen;
+}
+
+export function drive_view() {
+  clear();
+  const only = view("leader-follower");
+  $("views").classList.add("one");
+  only.title.textContent = "In your hands";
+  find(".key", only.card).hidden = true;
+  only.crop = reach(state.config);
+  only.canvas.classList.add("steer");
+  only.canvas.tabIndex = 0;
+  only.canvas.setAttribute("role", "application");
+  only.tell = (step, observed, said) => {
+    only.said.textContent = `step ${step} of ${state.config.world.steps} · ${observed} of ${state.config.world.pois.length} POIs`;
+    only.canvas.setAttribute("aria-label", `You steer leader ${$("leader").value}: step ${step}, ${said}`);
+  };
+  show(only, start_scene(state.config), false);
+  only.chosen = ["leaders", Number($("leader").value) || 0];
+  draw(only);
+  const at = event => {
+    const { scale } = stage.place_on(only.canvas, only.crop);
+    drive.pointer = [only.crop[0] + event.offsetX / scale, only.crop[3] - event.offsetY / scale];
+  };
+  only.canvas.addEventListener("pointermove", at);
+  only.canvas.addEventListener("pointerdown", event => { at(event); only.canvas.focus(); if (!drive.on) drive_on(); });
+  // Lifting a finger also fires `pointerleave`. The leader then keeps going to the last place touched.
+  only.canvas.addEventListener("pointerleave", event => { if (event.pointerType !== "touch") drive.pointer = null; });
+  const key = event => {
+    if (!/^Arrow/.test(event.key)) return;
+    if (event.type === "keydown") { drive.keys.add(event.key); drive.pointer = null; if (!drive.on) drive_on(); } else drive.keys.delete(event.key);
+    event.preventDefault();
+    event.stopPropagation();
+  };
+  only.canvas.addEventListener("keydown", key);
+  only.canvas.addEventListener("keyup", key);
+  return only;
+}
+
+// Returns the wanted turn, in half turns to the left, and speed, each in -1..1. Returns null without input.
+function wish(positions, headings, leader) {
+  const [x, y] = positions.slice(2 * leader, 2 * leader + 2), [cos, sin] = headings.slice(2 * leader, 2 * leader + 2);
+  if (drive.pointer) {
+    const [dx, dy] = [drive.pointer[0] - x, drive.pointer[1] - y], away = Math.hypot(dx, dy);
+    if (away < 0.3) return [0, -1];
+    const angle = Math.atan2(cos * dy - sin * dx, cos * dx + sin * dy);
+    return [Math.max(-1, Math.min(1, angle / Math.PI)), Math.max(-1, Math.min(1, away / 2 - 1))];
+  }
+  if (!drive.keys.size) return null;
+  const turn = (drive.keys.has("ArrowLeft") ? 0.4 : 0) - (drive.keys.has("ArrowRight") ? 0.4 : 0);
+  return [turn, drive.keys.has("ArrowUp") ? 1 : drive.keys.has("ArrowDown") ? -1 : 0.2];
+}
+
+export async function drive_on() {
+  drive_off();
+  const only = drive_view(), leader = Number($("leader").value) || 0;
+  only.canvas.focus({ preventScroll: true });
+  only.chosen = null;
+  drive.on = true;
+  $("again").textContent = "Start over";
+  const player = state.clerk, toml = await edited(state.toml, [["learning.paradigm", '"leader-follower"']]);
+  const { each, weights } = state.policies || { each: 0 };
+  let told;
+  try {
+    told = (await player.ask({ ask: "drive", text: toml, leader, policies: each }, weights)).words;
+    $("driven").textContent = told.learned ? "The other leaders do what they learned." : state.policies ? "The other leaders go straight ahead: what was learned is not for these teams." : "The other leaders go straight ahead: train first, and they do what they learned.";
+  } catch (error) {
+    drive_off();
+    return trouble(error.message);
+  }
+  const data = start_scene(state.config), [episode] = data.episodes;
+  const track = { positions: [], headings: [], near: [] };
+  const take = words => {
+    track.positions.push(...words.positions);
+    track.headings.push(...words.headings);
+    track.near.push(...words.near);
+    Object.assign(episode, {
+      positions: Float32Array.from(track.positions), headings: Float32Array.from(track.headings), near: Uint16Array.from(track.near),
+      shown: Array.from({ length: words.step + 1 }, (_, step) => step), observed: words.observed,
+    });
+  };
+  take(told);
+  show(only, data, false);
+  const turn = drive.turn = {};
+  const pace = Math.max(60, data.dt * 1000 * 0.75);
+  const step = async () => {
+    if (drive.turn !== turn || state.mode !== "drive") return;
+    const from = performance.now(), wanted = wish(told.positions, told.headings, leader);
+    if (!wanted) return void (drive.timer = setTimeout(step, 30));
+    const [angle, speed] = wanted;
+    try { told = (await player.ask({ ask: "step", turn: angle, speed })).words; } catch (error) { return trouble(error.message); }
+    if (drive.turn !== turn) return;
+    take(told);
+    Object.assign(only, { place: told.step });
+    draw(only);
+    if (told.scores) {
+      drive_off();
+      const { g, d, df } = told.scores, pois = state.config.world.pois.length;
+      $("driven").textContent = `The team observed ${Math.round(g * pois)} of ${count(pois, "POI")} (G = ${number(g)}). Yours: D = ${number(d[leader])}, Df = ${number(df[leader])}.`;
+      return;
+    }
+    drive.timer = setTimeout(step, Math.max(0, pace - (performance.now() - from)));
+  };
+  step();
+}
+
+export function drive_off() {
+  clearTimeout(drive.timer);
+  drive.turn = null;
+  drive.on = false;
+  drive.keys.clear();
+  $("again").textContent = "Start";
+}

@@ -1,0 +1,184 @@
+// @ts-check
+// The experiment: its text, its controls, and its editor.
+import { remember } from "./address.js";
+import { show_start } from "./arrange.js";
+import { choice_of } from "./compare.js";
+import { configs } from "./config.js";
+import { curves } from "./curves.js";
+import { $, count, find, make, trouble } from "./dom.js";
+import { options } from "./drive.js";
+import { mode } from "./modes.js";
+import { state } from "./state.js";
+import { forget } from "./train.js";
+
+// Makes a text the config. If it is invalid, shows its problems and returns false.
+let newest = 0;
+export async function take(text, { edited = false, address = true, views = true } = {}) {
+  const turn = ++newest;
+  state.text = text;
+  if (!edited) $("text").value = text;
+  let resolved;
+  try {
+    resolved = (await state.clerk.ask({ ask: "resolve", text, name: "config.toml", changes: [] })).words;
+  } catch (error) {
+    if (turn === newest) { mark(error.problems, error.message); $("train").disabled = true; state.valid = false; }
+    return false;
+  }
+  if (turn !== newest) return false;
+  mark([]);
+  Object.assign(state, { config: resolved.config, toml: resolved.toml, pois: resolved.pois, valid: true });
+  $("train").disabled = false;
+  fill(views);
+  if (address) remember();
+  stale();
+  return true;
+}
+
+// Sets keys of the config, and keeps its comments if possible. Changes run one after the other.
+/** @type {Promise<any>} */
+let changing = Promise.resolve();
+export const change = changes => (changing = changing.catch(() => {}).then(() => change_now(changes)));
+async function change_now(changes) {
+  keep();
+  return take(await edited(state.text, changes));
+}
+
+// Returns a text with keys set to TOML values. A text that is not TOML is returned as it is: reading it shows why.
+export async function edited(text, changes) {
+  try { return (await state.clerk.ask({ ask: "edit", text, changes })).words.text; } catch { return text; }
+}
+
+// Replaces the experiment: a text, and what is compared. Results of the former one are discarded.
+export async function settings(text, compared) {
+  keep();
+  forget();
+  Object.assign(state, { file: null, compared });
+  mode("watch");
+  return take(text);
+}
+
+// Compares other values, or nothing.
+export function compare(compared) {
+  keep();
+  state.compared = compared;
+  fill(false);
+  remember();
+  stale();
+}
+
+// Returns whether an earlier experiment is the present one.
+const is_now = past => past && past.text === state.text && JSON.stringify(past.compared) === JSON.stringify(state.compared);
+
+// Saves the current experiment for undo.
+export function keep() {
+  if (!is_now(state.past.at(-1))) state.past.push({ text: state.text, file: state.file, compared: state.compared });
+  if (state.past.length > 100) state.past.shift();
+  $("undo").disabled = false;
+}
+
+export async function undo() {
+  let last;
+  do last = state.past.pop(); while (is_now(last));
+  $("undo").disabled = state.past.length === 0;
+  if (!last) return;
+  state.file = last.file;
+  state.compared = last.compared;
+  await take(last.text);
+}
+
+// Shows a note if the results were trained with settings that differ from those in the form.
+export function stale() {
+  const { training } = state, differs = training && training.source && (training.source.text !== state.text || JSON.stringify(training.source.compared) !== JSON.stringify(state.compared));
+  $("stale").hidden = !differs;
+  if (!differs) return;
+  const { fitness, seed, population, generations } = training.arms[0].config.learning;
+  $("stale").textContent = `The results below were trained with other settings: fitness ${fitness}, seed ${seed}, population ${population}, ${generations} generations. Train again to see the present ones.`;
+}
+
+// Edits are applied after a delay. `entered` applies pending ones at once, so that what follows uses them.
+let typed = null;
+const type = () => { typed = null; return take($("text").value, { edited: true }); };
+export function typing() {
+  clearTimeout(typed);
+  typed = setTimeout(type, 250);
+}
+export async function entered() {
+  if (typed !== null) { clearTimeout(typed); await type(); }
+  await changing;
+}
+
+// Sets the controls to the values of the config.
+export function fill(views = true) {
+  const { learning, world } = state.config;
+  for (const id of ["seed", "generations", "trials", "population"]) $(id).value = learning[id];
+  $("fitness").value = learning.fitness;
+  const each = Array.isArray(world.coupling);
+  $("coupling").value = each ? "" : world.coupling;
+  $("coupling").placeholder = each ? "each" : "";
+  const choice = choice_of(state.compared, learning.population), own = find("[value=own]", $("compare"));
+  own.hidden = choice !== "own";
+  own.textContent = choice === "own" ? `${state.compared.key.split(".")[1].replaceAll("_", " ")} ${state.compared.values.join(", ")}` : "";
+  $("compare").value = choice;
+  $("paradigm").value = learning.paradigm;
+  const layout = configs.LAYOUTS.find(name => same_world(name));
+  $("layout").querySelector("[value=own]").hidden = Boolean(layout);
+  $("layout").value = layout || "own";
+  if (views && (!state.training || state.mode === "arrange")) show_start();
+  else curves();
+  options();
+}
+
+// Returns whether a config differs from a layout at most in keys that have a command-line flag.
+const same_world = name => rest_of(state.config) === rest_of(state.layouts[name]);
+const rest_of = config => {
+  const { paradigm, fitness, seed, trials, generations, population, ...learning } = config.learning;
+  return JSON.stringify({ ...config, learning });
+};
+
+function mark(problems, message = "") {
+  $("marks").replaceChildren();
+  $("problems").replaceChildren();
+  $("text").setAttribute("aria-invalid", problems.length > 0);
+  for (const { line, key, message } of problems) {
+    const item = make("li", "", $("problems")), words = `${key ? key + ": " : ""}${message}`;
+    const button = make("button", line ? `Line ${line}: ${words}` : words, item, { type: "button" });
+    button.addEventListener("click", () => go_to(line || 1));
+    if (line) {
+      const place = make("div", "", $("marks"), { className: "mark" });
+      place.dataset.line = line;
+      make("span", words, place);
+    }
+  }
+  trouble(problems.length ? `The config cannot be used: ${count(problems.length, "problem")}, beside its lines below.` : message);
+  if (problems.length || message) $("config").open = true;
+  lines();
+}
+
+function go_to(line) {
+  const from = $("text").value.split("\n").slice(0, line - 1).join("\n").length + (line > 1 ? 1 : 0);
+  $("text").focus();
+  $("text").setSelectionRange(from, from);
+  $("text").scrollTop = Math.max(0, (line - 6) * 20);
+  lines();
+}
+
+export function lines() {
+  const many = $("text").value.split("\n").length;
+  $("lines").textContent = Array.from({ length: many }, (_, line) => line + 1).join("\n");
+  $("lines").scrollTop = $("text").scrollTop;
+  for (const place of $("marks").children) place.style.top = `${8 + (place.dataset.line - 1) * 20 - $("text").scrollTop}px`;
+}
+
+export const name_of = () => state.file || ($("layout").value === "own" ? "config" : $("layout").value);
+
+// Returns the command that gives the same results.
+export function command({ learning }, given = []) {
+  const layout = $("layout").value, flagged = ["fitness", "seed", "generations", "trials", "population"];
+  const written = ([key, value]) => flagged.includes(key.split(".")[1]) ? ` --${key.split(".")[1]} ${value}` : ` --set ${key}=${value}`;
+  const extra = given.filter(([key]) => layout === "own" || !flagged.includes(key.split(".")[1])).map(written).join("");
+  if (layout === "own") return `flotilla train ${name_of()}.toml --paradigm ${learning.paradigm}${extra}`;
+  const flags = ["paradigm", "fitness", "seed"].map(key => `--${key} ${learning[key]}`);
+  const base = state.layouts[layout].learning;
+  for (const key of ["generations", "trials", "population"]) if (base[key] !== learning[key]) flags.push(`--${key} ${learning[key]}`);
+  return `flotilla train configs/${layout}.toml ${flags.join(" ")}${extra}`;
+}

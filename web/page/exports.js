@@ -1,0 +1,107 @@
+// @ts-check
+// Pictures, films and tables of what is on show.
+import { slug } from "./compare.js";
+import { $, save, trouble } from "./dom.js";
+import { name_of } from "./experiment.js";
+import { state } from "./state.js";
+import { csv } from "./table.js";
+import { draw } from "./views.js";
+
+// Most frames of a film, and its width in pixels per view.
+const FRAMES = 80, WIDTH = 420;
+
+const shown = () => state.views.filter(view => view.data);
+
+// Draws all views side by side, each with its title and state, onto a canvas.
+function compose(canvas, wide) {
+  const views = shown(), pen = canvas.getContext("2d", { willReadFrequently: true }), style = getComputedStyle(document.documentElement);
+  const tall = Math.max(...views.map(view => wide * view.canvas.height / view.canvas.width));
+  const size = [Math.round(views.length * wide), Math.round(tall + 52)];
+  if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
+  pen.fillStyle = style.getPropertyValue("--card").trim();
+  pen.fillRect(0, 0, ...size);
+  views.forEach((view, index) => {
+    const left = index * wide;
+    pen.fillStyle = style.getPropertyValue("--ink").trim();
+    pen.font = `600 ${Math.round(wide / 28)}px system-ui, sans-serif`;
+    pen.fillText(view.title.textContent, left + 6, 20, wide - 12);
+    pen.font = `${Math.round(wide / 32)}px system-ui, sans-serif`;
+    pen.fillText(view.said.textContent, left + 6, 40, wide - 12);
+    pen.drawImage(view.canvas, left, 50, wide, wide * view.canvas.height / view.canvas.width);
+  });
+}
+
+const base = () => slug(`${name_of()}${state.training ? `-generation-${state.generation}-trial-${state.trial}` : ""}`);
+
+export async function save_png() {
+  if (!shown().length) return;
+  const canvas = document.createElement("canvas");
+  compose(canvas, shown()[0].canvas.width);
+  const blob = await new Promise(done => canvas.toBlob(done, "image/png"));
+  save(`${base()}.png`, blob, "image/png");
+}
+
+// Calls `each` with the composed picture of every frame of the film, and then shows what was shown before.
+async function film(canvas, each) {
+  const views = shown(), before = views.map(({ place, playing }) => ({ place, playing }));
+  views.forEach(view => { view.playing = false; });
+  const last = Math.max(...views.map(view => view.data.episodes[0].shown.length - 1)), many = Math.max(1, Math.min(FRAMES, 2 * last));
+  for (let frame = 0; frame <= many; frame++) {
+    for (const view of views) {
+      const end = view.data.episodes[0].shown.length - 1;
+      view.place = Math.min(end, frame / many * last);
+      draw(view);
+    }
+    compose(canvas, WIDTH);
+    await each(frame, many);
+  }
+  views.forEach((view, index) => { Object.assign(view, before[index]); draw(view); });
+  return last;
+}
+
+// Simulated time per frame, in seconds, at least 1/25 s.
+const pause_of = many => {
+  const [view] = shown(), whole = view.data.steps * view.data.dt;
+  return Math.max(0.04, Math.min(whole, 8) / many);
+};
+
+let busy = false;
+async function one_at_a_time(act) {
+  if (busy || !shown().some(view => view.data.episodes[0].shown.length > 1)) return;
+  busy = true;
+  try { await act(); } catch (error) { trouble(`The film could not be made: ${error.message}`); } finally { busy = false; }
+}
+
+export const save_gif = () => one_at_a_time(async () => {
+  $("said").textContent = "Making the GIF…";
+  const canvas = document.createElement("canvas"), pictures = [];
+  let many = 1;
+  await film(canvas, async (_, frames) => {
+    many = frames;
+    pictures.push(new Uint8Array(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.buffer));
+  });
+  const delay = Math.round(100 * pause_of(many));
+  const { bytes } = await state.clerk.ask({ ask: "gif", width: canvas.width, height: canvas.height, delay }, pictures, {}, pictures.map(picture => picture.buffer));
+  save(`${base()}.gif`, bytes, "image/gif");
+});
+
+export const save_webm = () => one_at_a_time(async () => {
+  if (typeof MediaRecorder !== "function") throw new Error("this browser cannot record a canvas");
+  $("said").textContent = "Recording the film…";
+  const canvas = document.createElement("canvas");
+  compose(canvas, WIDTH);
+  const recorder = new MediaRecorder(canvas.captureStream(25), { mimeType: "video/webm" }), parts = [];
+  recorder.ondataavailable = ({ data }) => parts.push(data);
+  const stopped = new Promise(done => { recorder.onstop = done; });
+  recorder.start();
+  await film(canvas, (_, many) => new Promise(done => setTimeout(done, 1000 * pause_of(many))));
+  await new Promise(done => setTimeout(done, 400));
+  recorder.stop();
+  await stopped;
+  save(`${base()}.webm`, new Blob(parts, { type: "video/webm" }), "video/webm");
+});
+
+export function save_csv() {
+  if (state.training) save(`${slug(name_of())}-curves.csv`, csv(state.training.arms), "text/csv");
+  else $("said").textContent = "There are no curves yet. Train first.";
+}

@@ -1,0 +1,53 @@
+// @ts-check
+// Experiments to start from. Each has a config in web/gallery and what it compares.
+import { $, make } from "./dom.js";
+import { settings } from "./experiment.js";
+import { train } from "./train.js";
+
+/** @typedef {{ name: string, title: string, says: string, compare: import("./compare.js").Comparison }} Exhibit */
+
+/** @type {Exhibit[]} */
+export const GALLERY = [
+  {
+    name: "two_groups", title: "Two groups must meet", compare: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] },
+    says: "Six agents at one POI at once. With followers, teams learn it; where all twelve agents learn, nobody does.",
+  },
+  {
+    name: "population", title: "Few policies or many", compare: { key: "learning.population", values: ["50", "500", "2500"] },
+    says: "All six agents learn. With 50 policies each they hardly observe anything; with 2500, nearly everything.",
+  },
+  {
+    name: "blind", title: "Blind leaders", compare: { key: "learning.start_jitter", values: ["0.0", "2.0", "4.0"] },
+    says: "Leaders that sense no POI learn the way by heart. Scatter the starts, and they lose half of the POIs.",
+  },
+  {
+    name: "eight_followers", title: "Eight followers per leader", compare: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] },
+    says: "Two policies steer eighteen agents. Eighteen policies hardly can.",
+  },
+  {
+    name: "relay", title: "A relay", compare: { key: "learning.fitness", values: ["D", "Df", "Dt"] },
+    says: "A leader has to hand its followers over. Only followers count, so D, which removes a leader alone, sees no credit.",
+  },
+  {
+    name: "places", title: "POIs that move", compare: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] },
+    says: "POIs lie elsewhere in every generation: no way can be learned by heart, and teams of both kinds learn to sense.",
+  },
+];
+
+export const text_of = name => $(`gallery-${name}`).textContent;
+
+// Opens an experiment of the gallery, and trains it if asked.
+export async function exhibit(name, { trains = false } = {}) {
+  const found = GALLERY.find(exhibit => exhibit.name === name);
+  if (await settings(text_of(name), found.compare) && trains) await train();
+}
+
+export function gallery() {
+  for (const { name, title, says } of GALLERY) {
+    const button = make("button", "", make("li", "", $("gallery")), { type: "button" });
+    make("b", title, button);
+    make("span", says, button);
+    button.dataset.exhibit = name;
+    button.addEventListener("click", () => exhibit(name, { trains: true }));
+  }
+}

@@ -1,0 +1,42 @@
+// @ts-check
+// The workers, and the backend that trains.
+import { $, count } from "./dom.js";
+import { pool } from "./pool.js";
+import { state } from "./state.js";
+
+// Opens the chosen backend, or the CPU if no GPU is exact. `auto` also ignores software renderers.
+export async function settle() {
+  const wanted = $("on").value, { gpu } = state;
+  if (state.settled === wanted) return;
+  let why = "";
+  if (wanted === "gpu" || wanted === "auto" && gpu.name && !gpu.software) {
+    try {
+      if (!gpu.name) throw new Error(gpu.reason);
+      $("machine").textContent = `Testing ${gpu.name} for exactness…`;
+      state.machine = (await state.players[0].ask({ ask: "open", gpu: true, pass: null })).words;
+      state.machine.adapter = gpu.name;
+      state.machine.description = `${gpu.name} by WebGPU${gpu.software ? ", a software renderer" : ""}, proved exact`;
+      state.settled = wanted;
+      return told();
+    } catch (error) { why = error.message; }
+  } else if (wanted === "auto") why = gpu.software ? `this browser's GPU is a software renderer, ${gpu.name}` : gpu.reason;
+  state.machine = (await state.players[0].ask({ ask: "open", gpu: false, pass: null })).words;
+  state.machine.threads = state.players.length;
+  state.machine.why = why;
+  state.settled = wanted;
+  told();
+}
+
+export function told() {
+  const { training, machine } = state, workers = machine.backend === "cpu" ? `${machine.description.replace(/, \d+ threads?/, "")} in ${count(state.players.length, "worker")}` : machine.description;
+  const speed = training && training.teams ? ` · ${Math.round(training.rate).toLocaleString("en")} teams a second` : "";
+  $("machine").textContent = `Runs on ${workers}${speed}${machine.why ? ` (${machine.why})` : ""}`;
+}
+
+// Replaces the players, for example after they stopped responding.
+export async function renew() {
+  const many = Math.max(1, Math.min(16, navigator.hardwareConcurrency || 2)), old = state.players;
+  [state.clerk, ...state.players] = await Promise.all([state.clerk || pool.open(), ...Array.from({ length: many }, () => pool.open())]);
+  state.settled = null;
+  old.forEach(player => player.stop());
+}

@@ -1,0 +1,146 @@
+// @ts-check
+// Starts, shows and ends trainings.
+import { constants, randoms } from "./baselines.js";
+import { label, slug, toml } from "./compare.js";
+import { curves } from "./curves.js";
+import { $, copy, make, save, trouble } from "./dom.js";
+import { command, entered, name_of, stale } from "./experiment.js";
+import { renew, settle, told } from "./machine.js";
+import { mode } from "./modes.js";
+import { state } from "./state.js";
+import { Training } from "./training.js";
+import { build, clear, controls, follow, following } from "./views.js";
+
+let starting = false;
+export async function train() {
+  if (starting) return;
+  starting = true;
+  const busy = state.training && ["starting", "training"].includes(state.training.state);
+  if (state.training) state.training.stop();
+  trouble("");
+  mode("watch");
+  $("digests").replaceChildren();
+  $("announced").textContent = "";
+  let training;
+  try {
+    // A worker that still plays a long generation would delay the new training.
+    if (busy) await renew();
+    await entered();
+    if (!state.valid) return;
+    await settle();
+    const compared = effective();
+    const arms = await Promise.all(compared.values.map(async value => {
+      const { key } = compared, changes = [[key, toml(value)]];
+      const { words } = await state.clerk.ask({ ask: "resolve", text: state.text, name: "config.toml", changes });
+      return {
+        bytes: words.bytes, label: label(compared, value), toml: words.toml, config: words.config, pois: words.pois, parameters: words.parameters,
+        command: command(words.config, key === "learning.paradigm" ? [] : [[key, value]]), name: slug(name_of()), constant: null, random: [],
+      };
+    }));
+    const bytes = arms.reduce((sum, arm) => sum + arm.bytes, 0);
+    if (bytes > 3 * 2 ** 30) throw new Error(`This takes ${(bytes / 2 ** 30).toFixed(1)} GiB, and a tab has at most 4. Choose a smaller population, fewer trials or fewer arms, or use the command line.`);
+    training = state.training = new Training(arms, state.machine);
+    training.source = { text: state.text, compared: state.compared };
+    Object.assign(state, { generation: 0, trial: 0, policies: null });
+    following(true);
+    build(training);
+    await training.start(state.players);
+  } catch (error) {
+    if (error.fatal) await renew();
+    trouble(error.message);
+    return;
+  } finally { starting = false; }
+  stale();
+  controls();
+  constants(training).catch(() => {});
+  // For watching, the pace is limited to `last / 8` generations per second, but at least 1. Pauses do not count.
+  let shown = 0, clock = performance.now(), dirty = true, news = clock;
+  const allowed = () => {
+    const now = performance.now(), each = training.last / 8;
+    if (!training.paused) shown += (now - clock) / 1000 * Math.max(1, each);
+    clock = now;
+    return $("pace").value === "full" ? Infinity : shown + 1;
+  };
+  const paint = () => {
+    if (state.training !== training) return;
+    // Ten charts a second are enough, and leave the main thread free.
+    if (dirty && performance.now() - news > 100) { dirty = false; news = performance.now(); curves(); follow(); }
+    const silent = (performance.now() - news) / 1000;
+    if (silent > 2 && !training.paused && training.state === "training" && training.reached < training.last) {
+      $("generation").textContent = `generation ${training.reached + 1} of ${training.last}: ${Math.round(silent)} s so far`;
+    }
+    if (training.state === "training" || training.state === "starting") requestAnimationFrame(paint);
+  };
+  requestAnimationFrame(paint);
+  try {
+    await training.play(allowed, () => { dirty = true; });
+  } catch (error) {
+    if (!error.stopped && state.training === training) {
+      training.stop();
+      if (error.fatal || state.machine.backend === "gpu") await renew();
+      trouble(`${error.message}\nTraining stopped there. ${state.machine.backend === "gpu" ? "Train again, on the CPU if need be: it comes to the same." : "Train again: it comes to the same."}`);
+    }
+  }
+  if (state.training !== training) return;
+  controls();
+  curves();
+  follow();
+  told();
+  if (training.state === "done") {
+    digests();
+    randoms(training).catch(() => {});
+    const found = training.arms.map(arm => {
+      const last = arm.trials.map(trial => trial.at(-1).best), mean = last.reduce((sum, best) => sum + best, 0) / last.length;
+      return `${arm.label} observes ${(mean * (arm.pois ?? 1)).toFixed(2)} ${arm.pois === null ? "of its POIs (a share)" : `of ${arm.pois} POIs`}`;
+    });
+    $("announced").textContent = `Training is finished. On average over trials, the best team of ${found.join("; ")}.`;
+  }
+}
+
+// Returns what the arms differ in. Without followers, there is only one paradigm. One value makes one arm.
+function effective() {
+  const { compared, config } = state;
+  if (compared && (compared.key !== "learning.paradigm" || config.world.followers.length)) return compared;
+  return { key: "learning.paradigm", values: [config.learning.paradigm] };
+}
+
+// Stops a training. The generations played so far can still be watched.
+export function stop() {
+  const { training } = state;
+  if (!training || training.state !== "training") return;
+  training.stop();
+  controls();
+  $("announced").textContent = `Stopped after generation ${Math.max(0, training.reached)}.`;
+}
+
+// Discards a training and its results.
+export function forget() {
+  if (state.training) state.training.stop();
+  Object.assign(state, { training: null, policies: null });
+  $("digests").replaceChildren();
+  $("scrub").value = 0;
+  $("generation").textContent = "";
+  $("announced").textContent = "";
+  $("trial").replaceChildren();
+  clear();
+  controls();
+  stale();
+}
+
+export function digests() {
+  $("digests").replaceChildren();
+  for (const arm of state.training.arms) {
+    const place = make("div", "", $("digests"), { className: "digest" });
+    const head = make("div", "", place, { className: "row" });
+    make("b", `${arm.label}:`, head);
+    make("code", arm.digest, head, { className: "sha" });
+    if (arm.command) make("code", arm.command, place);
+    const acts = make("div", "", place, { className: "row" });
+    if (arm.zip) make("button", `Save the ${arm.label} run (.zip)`, acts, { type: "button", className: "home" }).addEventListener("click", () => save(`${arm.name}-${slug(arm.label)}.zip`, arm.zip, "application/zip"));
+    const { source } = state.training;
+    if (source && arm.command && !arm.command.includes(" configs/")) {
+      make("button", `Save ${arm.name}.toml`, acts, { type: "button" }).addEventListener("click", () => save(`${arm.name}.toml`, source.text, "text/plain"));
+    }
+    if (arm.command) make("button", "Copy the command", acts, { type: "button" }).addEventListener("click", () => copy(arm.command, "The command is copied: it comes to the same digest."));
+  }
+}

@@ -1,0 +1,62 @@
+//! Baselines without learning, for the chart.
+
+use flotilla::backend::cpu::Cpu;
+use flotilla::baseline::{self, Baselines};
+use flotilla::config::Config;
+use flotilla::host::Instant;
+use serde_json::{Value, json};
+
+use crate::ask::{Refusal, refuse};
+
+/// Episodes from which G of a constant action is averaged if starts or POIs move.
+const EPISODES: u32 = 20;
+
+/// Returns G of the best constant action, as a mean over trials, and what that action is.
+///
+/// # Errors
+/// The backend fails.
+pub fn constant(mut config: Config) -> Result<Value, Refusal> {
+    let learning = &mut config.learning;
+    // Constant actions need no population. Without jitter, all generations and trials are alike.
+    learning.population = 2;
+    if learning.start_jitter == 0.0 && learning.poi_jitter == 0.0 {
+        (learning.generations, learning.trials) = (0, 1);
+    }
+    let (actions, trials) = (config.policy.actions, config.learning.trials as f64);
+    let (mut baselines, mut cpu) = (Baselines::new(vec![config]), Cpu::default());
+    while !baselines.is_done() {
+        baselines.advance(&mut cpu).map_err(refuse)?;
+    }
+    let outcomes = baselines.outcomes(&mut cpu, EPISODES).map_err(refuse)?.remove(0);
+    let g = outcomes.iter().map(|outcome| outcome.constants[outcome.best_constant]).sum::<f64>() / trials;
+    let constant = outcomes.first().map(|outcome| baseline::constants(actions).swap_remove(outcome.best_constant));
+    Ok(json!({ "g": g, "outputs": constant }))
+}
+
+/// The best of as many random networks as training evaluates.
+pub struct Random(Baselines);
+
+impl Random {
+    pub fn new(config: Config) -> Random {
+        Random(Baselines::new(vec![config]))
+    }
+
+    /// Plays generations for `time` milliseconds, at least one. Returns G of the best so far per generation, as means
+    /// over trials.
+    ///
+    /// # Errors
+    /// The backend fails.
+    pub fn advance(&mut self, time: f64) -> Result<Value, Refusal> {
+        let (start, mut cpu) = (Instant::now(), Cpu::default());
+        while !self.0.is_done() {
+            self.0.advance(&mut cpu).map_err(refuse)?;
+            if start.elapsed().as_secs_f64() * 1000.0 >= time {
+                break;
+            }
+        }
+        let trials = self.0.so_far().next().map_or(&[][..], |found| &found.random);
+        let mean = |generation: usize| trials.iter().map(|g| g[generation]).sum::<f64>() / trials.len() as f64;
+        let g: Vec<f64> = (0..self.0.generation()).map(mean).collect();
+        Ok(json!({ "done": self.0.is_done(), "g": g }))
+    }
+}
