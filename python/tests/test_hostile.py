@@ -58,6 +58,8 @@ FUNCTIONS = {
     "rollout starts": lambda *a: flotilla.rollout(SMALL, RUN.policies[0], episodes=a[0], seed=a[1], jitter=a[2]) if not isinstance(a[0], int) or a[0] < 100 else None,
     "rollout backend": lambda *a: flotilla.rollout(SMALL, RUN.policies[0], backend=a[0]),
     "forward": lambda *a: flotilla.forward(*a[:3]),
+    "collect": lambda *a: flotilla.collect(SMALL, RUN.policies[0], a[0], a[1], jitter=a[2]),
+    "collect anything": lambda *a: flotilla.collect(*a[:4]),
     "train seed": lambda *a: flotilla.train(SMALL, a[0], callback=lambda generation: a[1]),
     "train anything": lambda *a: flotilla.train(a[0]),
     "train backend": lambda *a: flotilla.train(SMALL, backend=a[0]),
