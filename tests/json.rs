@@ -78,6 +78,9 @@ fn commands_that_train_nothing_print_json() {
     let cpu = ["--backend", "cpu"];
     assert!(good(&place, &["check", "x.toml"])["cost"].is_object());
     assert!(good(&place, &["devices"])["cpu"].is_string());
+    let flags = ["--generations", "1", "--population", "8", "--paradigm", "all-leaders"];
+    let flags = good(&place, &[&["baseline", "x.toml", "--seeds", "2"], &flags[..], &cpu].concat());
+    assert_eq!(flags["teams"], 16);
     let baseline = ["baseline", "x.toml", "--seeds", "2", "--set", "learning.generations=1"];
     let baseline = good(&place, &[&baseline[..], &cpu].concat());
     // A generation after the random one: two generations of 8 random teams.

@@ -10,6 +10,7 @@ goes out, the program takes. Nothing complains, the page never stutters, and it 
 PAGE is the index.html that web/build makes. Python's standard library and a Chromium are all that is needed.
 """
 
+import difflib
 import itertools
 import json
 import pathlib
@@ -530,11 +531,12 @@ def main():
         # A link brings all of it to another tab.
         tab.evaluate("document.querySelector('#said').textContent = ''")
         tab.click("#share")
-        tab.wait("document.querySelector('#said').textContent !== ''")
+        tab.wait("/copied|not let a page copy/.test(document.querySelector('#said').textContent)")
         link, text = tab.evaluate("location.href"), tab.evaluate("page.state.text")
         tab.open(link)
         tab.wait(READY)
-        assert tab.evaluate("page.state.text") == text
+        opened = tab.evaluate("page.state.text")
+        assert opened == text, "\n".join(difflib.unified_diff(text.splitlines(), opened.splitlines(), lineterm=""))
         print("a link holds the experiment")
 
         # Take a leader: followers follow, and the POIs ahead are observed.

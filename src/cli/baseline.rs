@@ -24,10 +24,10 @@ pub struct Args {
     episodes: u32,
     /// Draw as many random teams as a training with this many generations plays [default: the config's]
     #[arg(long, value_name = "N", value_parser = number)]
-    generations: Option<toml::Value>,
+    generations: Option<String>,
     /// Draw as many random teams as a training with this population plays [default: the config's]
     #[arg(long, value_name = "N", value_parser = number)]
-    population: Option<toml::Value>,
+    population: Option<String>,
     /// Who learns [default: the config's]
     #[arg(long, value_name = "NAME", value_parser = Words::new(Paradigm::names()))]
     paradigm: Option<String>,
@@ -45,13 +45,13 @@ pub struct Args {
 
 /// Plays the baselines of a config, one repetition after the other.
 pub fn run(args: Args) -> Result<(), Error> {
-    let set = |key: &str, value: Option<toml::Value>| {
-        Some(Override::new(format!("learning.{key}"), value?, format!("--{key}")))
+    let set = |key: &str, value: Option<String>| {
+        Some(Override::of_text(format!("learning.{key}"), value?, format!("--{key}")))
     };
     let overrides = [
         set("generations", args.generations.clone()),
         set("population", args.population.clone()),
-        set("paradigm", args.paradigm.clone().map(toml::Value::from)),
+        set("paradigm", args.paradigm.clone().map(|name| toml::Value::from(name).to_string())),
     ];
     let config =
         args.config.load(&overrides.into_iter().flatten().chain(args.set.set.iter().cloned()).collect::<Vec<_>>())?;
