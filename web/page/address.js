@@ -8,9 +8,10 @@ import { KEYS, NAMES, quote, state } from "./state.js";
 import { train } from "./train.js";
 import { seek } from "./views.js";
 
-let remembered = 0;
+// Packing a config takes a moment. An older experiment never replaces a newer one in the address.
+let asked = 0, written = 0;
 export async function remember() {
-  const turn = ++remembered, words = new URLSearchParams(), layout = $("layout").value;
+  const turn = ++asked, words = new URLSearchParams(), layout = $("layout").value;
   if (layout === "own") {
     // If the browser cannot compress, there is no link. The rest of the page works.
     try { words.set("config", await configs.pack(state.text)); } catch { return; }
@@ -23,7 +24,9 @@ export async function remember() {
   if (compared && !both) words.set("compare", write(compared));
   if ($("on").value !== "auto") words.set("on", $("on").value);
   if ($("pace").value !== "watch") words.set("pace", $("pace").value);
-  if (turn === remembered) history.replaceState(null, "", `#${words}`);
+  if (turn < written) return;
+  written = turn;
+  history.replaceState(null, "", `#${words}`);
 }
 
 // Opens the experiment in the address. Reports the parts that cannot be read, and then leaves the address unchanged.
