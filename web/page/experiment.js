@@ -38,8 +38,6 @@ export async function take(text, { edited = false, address = true, views = true 
 /** @type {Promise<any>} */
 let changing = Promise.resolve();
 export const change = changes => (changing = changing.catch(() => {}).then(() => change_now(changes)));
-// Waits until all changes so far are part of the config. Actions that take the config out of the page start with this.
-export const changed = () => changing.catch(() => {});
 async function change_now(changes) {
   keep();
   return take(await edited(state.text, changes));

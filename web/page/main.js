@@ -8,7 +8,7 @@ import { credits } from "./credit.js";
 import { curves, drawn_chart } from "./curves.js";
 import { $, all, copy, save, trouble } from "./dom.js";
 import { drive_off, drive_on, drive_view } from "./drive.js";
-import { change, changed, compare, edited, fill, keep, lines, take, typing, undo } from "./experiment.js";
+import { change, compare, edited, entered, fill, keep, lines, take, typing, undo } from "./experiment.js";
 import { save_csv, save_gif, save_png, save_webm } from "./exports.js";
 import { take_file } from "./files.js";
 import { gallery, text_of } from "./gallery.js";
@@ -82,7 +82,7 @@ function listen() {
   $("curves").addEventListener("click", event => { if (drawn_chart && state.training) { if (state.mode !== "watch") mode("watch"); seek(drawn_chart.generation(event.offsetX)); } });
   $("verify").addEventListener("click", verify);
   $("share").addEventListener("click", async () => {
-    await changed();
+    await entered();
     if (!state.valid) return void ($("said").textContent = "No link was copied: the config has problems. Correct them first.");
     await remember();
     copy(link(), `The link is copied: whoever opens it ${state.training ? "sees the same generation of the same training" : "trains the same"}.`);
@@ -90,7 +90,7 @@ function listen() {
   for (const [id, act] of Object.entries({ png: save_png, gif: save_gif, webm: save_webm, csv: save_csv })) $(id).addEventListener("click", act);
   $("open").addEventListener("click", () => $("file").click());
   $("file").addEventListener("change", () => { if ($("file").files[0]) take_file($("file").files[0]); $("file").value = ""; });
-  $("save").addEventListener("click", async () => { await changed(); save("config.toml", state.text, "text/plain"); });
+  $("save").addEventListener("click", async () => { await entered(); save("config.toml", state.text, "text/plain"); });
   $("text").addEventListener("input", () => {
     lines();
     typing();
