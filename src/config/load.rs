@@ -22,7 +22,7 @@ impl Config {
 
 /// Returns whether a path is `-`, which means standard input.
 pub fn is_standard_input(path: &Path) -> bool {
-    path == "-"
+    path.as_os_str() == "-"
 }
 
 /// Returns the name of a config or sweep file in errors.
