@@ -376,6 +376,38 @@ fn a_zipped_run_is_read_like_its_folder() {
 }
 
 #[test]
+fn a_zipped_run_is_resumed_after_it_is_unpacked_as_the_message_says() {
+    let run = Run::new(CONFIG, &[]);
+    let here = run.folder.path().join("here");
+    for (index, top) in ["", "saved/", "deep/er/"].into_iter().enumerate() {
+        let unpacked = if top.is_empty() { format!("run{index}") } else { top.trim_end_matches('/').into() };
+        let _ = fs::remove_dir_all(&here);
+        fs::create_dir(&here).unwrap();
+        let (name, config) = (format!("run{index}.zip"), format!("{unpacked}/config.toml"));
+        zip(&run.path(), top, &here.join(&name));
+        let flotilla = |words: &[&str]| support::flotilla().current_dir(&here).args(words).output().unwrap();
+        for words in [vec!["train", &name, "--resume"], vec!["train", &config, "--resume", "--out", &name]] {
+            let output = flotilla(&words);
+            let told = String::from_utf8_lossy(&output.stderr).into_owned();
+            assert_eq!(output.status.code(), Some(2), "{told}");
+            let target = if top.is_empty() { format!(" -d {unpacked}") } else { String::new() };
+            for expected in [
+                format!("{name} is a run in a zip file"),
+                format!("unzip {name}{target}\n"),
+                format!("flotilla train {config} --out {unpacked} --resume"),
+            ] {
+                assert!(told.contains(&expected), "{expected}: {told}");
+            }
+        }
+        // Both commands of the message, the first of them done here.
+        let mut archive = zip::ZipArchive::new(fs::File::open(here.join(&name)).unwrap()).unwrap();
+        archive.extract(if top.is_empty() { here.join(&unpacked) } else { here.clone() }).unwrap();
+        let output = flotilla(&["train", &config, "--out", &unpacked, "--resume", "--generations", "9"]);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+}
+
+#[test]
 fn a_zip_file_that_is_no_run_is_refused() {
     let run = Run::new(CONFIG, &[]);
     let at = |name: &str| run.folder.path().join(name).to_str().unwrap().to_string();

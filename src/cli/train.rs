@@ -17,6 +17,7 @@ use crate::host::Instant;
 use crate::memory::Peaks;
 use crate::ops::{Context, Event};
 use crate::record::RecordError;
+use crate::record::archive;
 use crate::record::digests::Verification;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, METRICS, POLICIES, Start};
@@ -99,7 +100,24 @@ impl Args {
     }
 }
 
+/// Refuses a run in a zip file, because its folder would be removed at the end. The message says how to unpack and resume it.
+fn refuse_zip(path: &Path) -> Result<(), Error> {
+    let Some(top) = archive::top(path) else { return Ok(()) };
+    let inner = if top.is_empty() { file::stem(path, "run") } else { top.clone() };
+    let mut unpack = vec!["unzip".into(), shell::argument(path)];
+    if top.is_empty() {
+        unpack.extend(["-d".into(), inner.clone().into()]);
+    }
+    let [config, folder] = [Path::new(&inner).join(folder::CONFIG), inner.into()].map(|path| shell::argument(&path));
+    let resume = ["flotilla".into(), "train".into(), config, "--out".into(), folder, "--resume".into()];
+    Err(Error::Usage(said(
+        format!("{} is a run in a zip file, and a run resumes in a folder", path.escaped()),
+        format!("unpack it, and resume it there:\n  {}\n  {}", shell::command(unpack), shell::command(resume)),
+    )))
+}
+
 pub fn run(args: Args) -> Result<(), Error> {
+    [&args.config.file.path].into_iter().chain(&args.out).try_for_each(|path| refuse_zip(path))?;
     let (config, notes_on_config) = args.config.load(args.checkpoints.list())?;
     let (mut player, runs_on) = backend::open_for(&args.run, Work::of([&config]))?;
     Peaks::of([&config], rayon::current_num_threads()).check(player.1.backend == "gpu").map_err(RunError::from)?;

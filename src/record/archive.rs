@@ -30,18 +30,7 @@ impl RunFolder {
     /// # Errors
     /// The zip file cannot be read or unpacked, or does not hold exactly one run.
     pub fn open(path: &Path) -> Result<RunFolder, RecordError> {
-        // Only regular files are opened: opening a pipe would wait for its writer.
-        let is_file = path.metadata().is_ok_and(|metadata| metadata.is_file());
-        let plain = || RunFolder { path: path.into(), unpacked: None };
-        if !is_file {
-            return Ok(plain());
-        }
-        let mut file = file::open(path).map_err(RecordError::read(path))?;
-        let mut start = [0; MAGIC.len()];
-        if file.read_exact(&mut start).is_err() || start != MAGIC {
-            return Ok(plain());
-        }
-        file.seek(SeekFrom::Start(0)).map_err(RecordError::read(path))?;
+        let Some(file) = zip_file(path)? else { return Ok(RunFolder { path: path.into(), unpacked: None }) };
         let temporary = TempDir::new().map_err(RecordError::write(&std::env::temp_dir()))?;
         // Pictures and messages show the folder's name.
         let folder = temporary.path().join(file::stem(path, "run"));
@@ -58,6 +47,28 @@ impl RunFolder {
     pub fn is_unpacked(&self) -> bool {
         self.unpacked.is_some()
     }
+}
+
+/// Opens a zip file. Returns none if the path is anything else.
+fn zip_file(path: &Path) -> Result<Option<File>, RecordError> {
+    // Only regular files are opened: opening a pipe would wait for its writer.
+    if !path.metadata().is_ok_and(|metadata| metadata.is_file()) {
+        return Ok(None);
+    }
+    let mut file = file::open(path).map_err(RecordError::read(path))?;
+    let mut start = [0; MAGIC.len()];
+    if file.read_exact(&mut start).is_err() || start != MAGIC {
+        return Ok(None);
+    }
+    file.seek(SeekFrom::Start(0)).map_err(RecordError::read(path))?;
+    Ok(Some(file))
+}
+
+/// Returns the folder that holds the run in a zip file, empty if there is none. Returns none if the path is no zip file of a run.
+pub fn top(path: &Path) -> Option<String> {
+    let archive = ZipArchive::new(zip_file(path).ok()??).ok()?;
+    let names: Vec<String> = archive.file_names().flatten().map(Into::into).collect();
+    Some(names.iter().find_map(|name| inside(name, CONFIG))?.trim_end_matches('/').into())
 }
 
 /// Unpacks the files of a run. Other files of the archive are ignored, so no name in it leads out of the folder.
