@@ -13,6 +13,7 @@ PAGE is the index.html that web/build makes. Python's standard library and a Chr
 import difflib
 import itertools
 import json
+import os
 import pathlib
 import subprocess
 import sys
@@ -41,7 +42,8 @@ trials = 2
 from = 3
 set = { world.pois = [[40, 30]], world.coupling = 1, learning.poi_jitter = 1.0 }
 """
-DONE = "page.state.training && page.state.training.state === 'done' && document.querySelectorAll('.sha').length > 0"
+# The comparison of arms comes last, and moves what is below it.
+DONE = "page.state.training && page.state.training.state === 'done' && document.querySelectorAll('.sha').length > 0 && page.state.training.found"
 
 
 class Tab(Browser):
@@ -69,9 +71,12 @@ class Tab(Browser):
         super().click(selector)
 
     def drop(self, name, content):
+        self.drop_all({name: content})
+
+    def drop_all(self, files):
         self.evaluate(
-            f"(() => {{ const data = new DataTransfer(); const bytes = Uint8Array.from(atob('{content}'), c => c.charCodeAt(0));"
-            f" data.items.add(new File([bytes], {json.dumps(name)}));"
+            f"(() => {{ const data = new DataTransfer(); for (const [name, content] of Object.entries({json.dumps(files)}))"
+            " data.items.add(new File([Uint8Array.from(atob(content), c => c.charCodeAt(0))], name));"
             " dispatchEvent(new DragEvent('drop', { dataTransfer: data, bubbles: true, cancelable: true })); })()"
         )
 
@@ -218,6 +223,204 @@ def visitors(tab, page):
     tab.window(1280, 900, dark=False)
     print("links, phones, keyboards and reduced motion are served")
 
+
+def several(tab, page, flotilla, folder):
+    """Runs that are opened together are arms of one chart."""
+    folder.mkdir(exist_ok=True)
+
+    def run(name, layout, *flags):
+        words = [flotilla, "train", CONFIGS / f"{layout}.toml", "--seed", "7", "--population", "20", *flags]
+        subprocess.run([*map(str, words), "--out", str(folder / name), "--quiet", "--backend", "cpu"], check=True)
+        archive = folder / f"{name}.zip"
+        with zipfile.ZipFile(archive, "w") as to:
+            for file in ["config.toml", "metrics.csv", "policies.safetensors", "run.json"]:
+                to.write(folder / name / file, f"{name}/{file}")
+        return base64(archive.read_bytes())
+
+    def cells(selector):
+        rows = "tr => [...tr.cells].map(cell => cell.textContent)"
+        return tab.evaluate(f"[...document.querySelectorAll('{selector} tr')].map({rows})")
+
+    def opened(names):
+        """Opens runs, and compares the page's tables with those of the program."""
+        tab.drop_all({f"{name}.zip": files[name] for name in names})
+        tab.wait(f"document.querySelector('#said').textContent.startsWith('{len(names)} runs are compared')")
+        digests = [json.loads((folder / name / "run.json").read_text())["digest"] for name in names]
+        assert tab.evaluate("[...document.querySelectorAll('.sha')].map(code => code.textContent)") == digests
+        words = [flotilla, "compare", *(folder / name for name in names)]
+        told = subprocess.run([*map(str, words)], check=True, capture_output=True, text=True).stdout
+        tables, rows = [[]], [line.strip("|").split("|") for line in told.splitlines() if line.startswith("|")]
+        for row in ([cell.strip() for cell in row] for row in rows):
+            if row[0] == "measure":
+                tables.append([])
+            if row[0].strip("-"):
+                tables[-1].append(row)
+        assert cells("#means") == tables[0] and cells("#pairs") == tables[1], (told, cells("#means"), cells("#pairs"))
+
+    files = {
+        "of-g": run("of-g", "strictly_forward", "--fitness", "G", "--generations", "6", "--trials", "3"),
+        "of-df": run("of-df", "strictly_forward", "--fitness", "Df", "--generations", "6", "--trials", "3"),
+        "longer": run("longer", "generally_forward", "--generations", "9", "--trials", "2"),
+    }
+    tab.load(page)
+    opened(["of-g", "of-df"])
+    assert tab.evaluate("page.state.training.arms.map(arm => arm.label)") == ["fitness G", "fitness Df"]
+    assert "95 % interval" in tab.text("#legend") and "of 2" in tab.text("#legend"), tab.text("#legend")
+    # The bands are on the chart.
+    drawn = "(() => { dispatchEvent(new Event('resize')); return document.querySelector('#curves').toDataURL(); })()"
+    banded = tab.evaluate(drawn)
+    assert tab.evaluate("page.state.training.found.curves.some(curve => curve.band)")
+    tab.evaluate("window.bands = page.state.training.found.curves.map(curve => curve.band); page.state.training.found.curves.forEach(curve => { curve.band = null; }); 0")
+    assert tab.evaluate(drawn) != banded, "no band is drawn"
+    tab.evaluate("page.state.training.found.curves.forEach((curve, run) => { curve.band = bands[run]; }); 0")
+    assert tab.evaluate(drawn) == banded
+    tab.wait("page.state.views.length === 2 && page.state.views.every(view => view.data && view.data.episodes[0].generation === 6)")
+    tab.calm()
+    # Of runs of different lengths, the shorter ones stay at their end. Trials are those that all have.
+    opened(["of-g", "of-df", "longer"])
+    generations = "page.state.views.map(view => view.data && view.data.episodes[0].generation).join()"
+    tab.wait(f"{generations} === '6,6,9'")
+    tab.set("#scrub", 8)
+    tab.wait(f"{generations} === '6,6,8'")
+    assert tab.evaluate("document.querySelector('#trial').length") == 2
+    assert "share of POIs" in tab.text("#legend"), tab.text("#legend")
+    tab.calm()
+    # What cannot be opened together leaves all as it is.
+    broken = base64(b"PK\x03\x04" + bytes(40))
+    for group, told in [
+        ({"of-g.zip": files["of-g"], "mine.toml": base64(b"")}, "mine.toml: it is no run"),
+        ({"of-g.zip": files["of-g"], "broken.zip": broken}, "broken.zip: no archive"),
+        ({f"{index}.zip": files["of-g"] for index in range(7)}, "open 6 runs at most"),
+    ]:
+        tab.drop_all(group)
+        tab.wait(f"document.querySelector('#trouble').textContent.includes({json.dumps(told)})")
+        tab.evaluate("document.querySelector('#trouble').textContent = ''")
+        assert tab.evaluate("page.state.training.arms.length") == 3
+    assert not list(tab.complaints())
+    print("several runs are arms of one chart, with the intervals and tests of the program")
+
+
+
+# Leaders that meet at a POI, beside other POIs.
+CROWDED = """
+[world]
+leaders = [[20, 20], [20.3, 20], [20.6, 20], [20, 20.3], [20.3, 20.3], [20.6, 20.3], [20, 20.6], [20.3, 20.6], [20.6, 20.6], [21, 21]]
+pois = [[20, 20.5], [24, 21], [20, 25], [21, 25.4]]
+coupling = 3
+"""
+# Keeps the labels that views draw: text and box.
+KEEP_LABELS = """(() => {
+  const { fillText } = CanvasRenderingContext2D.prototype;
+  window.labels = [];
+  CanvasRenderingContext2D.prototype.fillText = function (text, x, y, ...rest) {
+    if (this.canvas.closest('#views')) { const half = this.measureText(text).width / 2; labels.push([text, x - half, y - 9, x + half, y]); }
+    fillText.call(this, text, x, y, ...rest);
+  };
+})()"""
+OVERPRINTED = """labels.flatMap((a, index) => labels.slice(0, index).filter(b => a[1] < b[3] && b[1] < a[3] && a[2] < b[4] && b[2] < a[4])
+  .map(b => [a[0], b[0]]))"""
+
+
+def defects(tab, page, call, downloads, folder):
+    """Other defects that visitors have met."""
+    # No number is printed over another, in motion or where leaders meet.
+    tab.load(page)
+    tab.evaluate(KEEP_LABELS)
+    steps = int(tab.evaluate("document.querySelector('#step').max"))
+    drawn = 0
+    for step in range(steps + 1):
+        tab.evaluate("labels.length = 0")
+        tab.set("#step", step)
+        found = tab.evaluate(OVERPRINTED)
+        assert found == [], (step, found)
+        drawn += tab.evaluate("labels.length")
+    assert drawn > 5 * steps, "hardly any label is drawn"
+    tab.evaluate("labels.length = 0")
+    tab.drop("crowded.toml", base64(CROWDED.encode()))
+    tab.wait("page.state.config.world.leaders.length === 10 && labels.length > 0")
+    tab.evaluate("labels.length = 0; dispatchEvent(new Event('resize')); 0")
+    assert tab.evaluate(OVERPRINTED) == []
+    tab.calm()
+    # The map shows the generation of the slider whenever training pauses, goes on, stops or is looked back at.
+    tab.load(page, layout="generally_forward", on="cpu")
+    same = "page.state.views.every(view => view.data && view.data.episodes[0].generation === Number(document.querySelector('#scrub').value))"
+    tab.click("#train")
+    tab.wait("page.state.training && page.state.training.reached >= 8")
+    tab.click("#pause")
+    tab.wait(same, 20)
+    assert tab.evaluate("Number(document.querySelector('#scrub').value)") >= 8
+    tab.click("[data-mode=arrange]")
+    tab.click("[data-mode=watch]")
+    tab.wait(same, 20)
+    tab.click("#pause")
+    tab.wait("page.state.training.reached >= 20")
+    tab.click("#stop")
+    tab.wait("page.state.training.state === 'stopped'")
+    tab.wait(same, 20)
+    assert tab.evaluate("Number(document.querySelector('#scrub').value)") >= 20
+    tab.calm()
+    # Results stand as those of other settings once another link is pasted.
+    assert tab.evaluate("document.querySelector('#stale').hidden")
+    tab.evaluate("location.hash = '#layout=chaotic&seed=5'; 0")
+    tab.wait("page.state.config.learning.seed === '5' && !document.querySelector('#stale').hidden")
+    # A slow generation says for how long it has been playing.
+    tab.load(page, layout="generally_forward", on="cpu", trials=1, generations=3, population=60000, learners="all-leaders")
+    tab.click("#train")
+    tab.wait("/ s so far$/.test(document.querySelector('#generation').textContent)", 60)
+    # The memory guard counts all arms.
+    tab.load(page, layout="generally_forward", on="cpu", population=20000, compare="learning.fitness:G,D,Df,D%2B%2B,Dt")
+    tab.click("#train")
+    tab.wait("document.querySelector('#trouble').textContent.startsWith('This takes ')")
+    takes = float(tab.text("#trouble").split()[2])
+    assert 3 < takes < 15, takes
+    assert not tab.evaluate("Boolean(page.state.training)")
+    # Without CompressionStream there is no link to an own map, and no wrong one either. The rest works.
+    script = tab.call("Page.addScriptToEvaluateOnNewDocument", source="delete window.CompressionStream")["identifier"]
+    tab.load(page, layout="chaotic", seed=9)
+    tab.evaluate("navigator.clipboard.writeText = text => { window.copied = text; return Promise.resolve(); }; 0")
+    tab.click("[data-mode=arrange]")
+    tab.click("[data-add=pois]")
+    tab.wait("document.querySelector('#layout').value === 'own'")
+    tab.click("#share")
+    tab.wait("document.querySelector('#said').textContent.startsWith('No link was copied: this browser')")
+    assert not tab.evaluate("Boolean(window.copied)")
+    assert "chaotic" not in tab.evaluate("location.hash"), "the address is of another experiment"
+    tab.set("#layout", "strictly_forward")
+    tab.wait("location.hash.includes('strictly_forward')")
+    tab.click("#share")
+    tab.wait("window.copied && window.copied.includes('strictly_forward')")
+    tab.calm()
+    tab.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
+    # What was trained is saved, not what was changed since, and the command names the saved file.
+    text = "[world]\nleaders = [[5, 5]]\nfollowers = [[4, 4], [6, 4]]\npois = [[5, 12]]\n[learning]\npopulation = 10\ngenerations = 3\ntrials = 2\n"
+    tab.load(page)
+    tab.drop("my first map.toml", base64(text.encode()))
+    tab.wait(f"page.state.text === {json.dumps(text)} && page.state.valid")
+    tab.train()
+    command, digest = tab.evaluate("(({ command, digest }) => [command, digest])(page.state.training.arms[0])")
+    tab.set("#seed", "99")
+    tab.wait("page.state.config.learning.seed === '99'")
+    name = command.split()[2]
+    tab.evaluate(f"[...document.querySelectorAll('.digest button')].find(button => button.textContent === 'Save {name}').click()")
+    saved, deadline = downloads / name, time.monotonic() + 60
+    while not saved.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert saved.read_text() == text
+    call("train", saved, *command.split()[3:], "--out", folder / "first", "--quiet", "--backend", "cpu")
+    assert json.loads((folder / "first" / "run.json").read_text())["digest"] == digest
+    tab.calm()
+    # Without a compiler for the web, the build says what to install.
+    bare = folder / "bare"
+    bare.mkdir()
+    (bare / "rustc").write_text(f"#!/bin/sh\necho {bare}\n")
+    (bare / "rustc").chmod(0o755)
+    build = pathlib.Path(__file__).parent.parent / "web" / "build"
+    path = {**os.environ, "PATH": f"{bare}:{os.environ['PATH']}", "RUSTC_WEB": str(bare / "none")}
+    refused = subprocess.run([build, folder / "built"], env=path, capture_output=True, text=True, timeout=20)
+    assert refused.returncode == 1 and "run 'rustup target add wasm32-unknown-unknown'" in refused.stderr, refused
+    print("numbers, generations, links, files and memory are right, and the build says what it lacks")
+
+
 # TOML that is valid, but not written as the layouts are.
 WRITTEN = [
     "[ world ]\n# mine\nleaders = [[5, 5]]\nfollowers = [[4, 4], [6, 4]]\npois = [[5, 12]]\ncoupling = 2\n[ learning ] # also mine\nseed = 3 # a\n",
@@ -269,6 +472,7 @@ def strangers(tab, page, call, downloads):
         assert len(arms) == len(set(arms)) >= 2, (name, arms)
         tab.calm()
         tab.click("#stop")
+        tab.wait("page.state.training.found")
     print("six experiments open")
 
     # Where a constant action does as well, that is said; it is the baseline of the program.
@@ -636,8 +840,10 @@ def main():
         assert not list(tab.complaints())
         print("a broken config tells its problems beside their lines")
 
+        several(tab, page, flotilla, folder / "several")
         visitors(tab, page)
         strangers(tab, page, call, downloads)
+        defects(tab, page, call, downloads, folder)
 
         # 4096 teams, and the page stays responsive. Its observer goes by the clock, and so tells of other programs, too, that had
         # the processor: what the page itself did in a task is told by its thread's time.

@@ -66,7 +66,7 @@ impl Heading {
 }
 
 /// The index of the nearest of some places; the first of those equally near.
-fn nearest(from: &[f64; 2], places: &[[f64; 2]]) -> usize {
+pub fn nearest(from: &[f64; 2], places: &[[f64; 2]]) -> usize {
     let distance2 = |at: &[f64; 2]| (at[0] - from[0]).powi(2) + (at[1] - from[1]).powi(2);
     (0..places.len()).min_by(|&a, &b| distance2(&places[a]).total_cmp(&distance2(&places[b]))).unwrap_or(0)
 }

@@ -372,7 +372,7 @@ fn measured(measure: Measure, values: &[Vec<f64>], paired: bool) -> Measured {
 
 impl Comparison {
     /// Returns a table with one row per arm and one column per measure.
-    fn means(&self) -> Vec<Vec<String>> {
+    pub fn means(&self) -> Vec<Vec<String>> {
         let mut head = vec!["arm".to_string(), "trials".into()];
         head.extend(self.measures.iter().map(|measured| measured.measure.to_string()));
         let rows = self.arms.iter().enumerate().map(|(at, arm)| {
@@ -386,7 +386,7 @@ impl Comparison {
     }
 
     /// Returns a table with one row per measure and pair.
-    fn pairs(&self) -> Vec<Vec<String>> {
+    pub fn pairs(&self) -> Vec<Vec<String>> {
         let head = ["measure", "pair", "difference", "A", "p", "p (Holm)"].map(String::from).to_vec();
         let row = |measure: Measure, pair: &Versus| {
             let names = pair.arms.map(|arm| &*self.arms[arm].name);
@@ -419,7 +419,7 @@ pub fn probability(p: f64) -> String {
 }
 
 /// Explains how to read the tables.
-fn legend(all: &[Comparison], options: &Question) -> String {
+pub fn legend(all: &[Comparison], options: &Question) -> String {
     let (test, a) = match options.paired {
         true => ("Wilcoxon's signed ranks", "a pair's first trial"),
         false => ("Mann and Whitney's test", "a trial of the first arm"),

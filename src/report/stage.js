@@ -132,13 +132,11 @@ const stage = (() => {
     const group = agent => led[agent].length === 0 ? color("--faint") : colors[led[agent][0] % colors.length];
     const draw = canvas.getContext("2d");
     const taken = [];
-    // Writes text with a pale outline. A `spare` label is omitted if it would hide another one.
-    const label = (text, x, y, align, spare) => {
+    // Writes text with a pale outline.
+    const label = (text, x, y, align) => {
       draw.font = "600 12px system-ui, sans-serif";
       const half = draw.measureText(text).width / 2, middle = align === "left" ? x + half : x;
-      const area = [middle - half - 1, y - 11, middle + half + 1, y + 3];
-      if (spare && taken.some(other => overlap(area, other))) return;
-      taken.push(area);
+      taken.push([middle - half - 1, y - 11, middle + half + 1, y + 3]);
       draw.textAlign = "center";
       draw.lineWidth = 3;
       draw.strokeStyle = color("--sea");
@@ -277,7 +275,7 @@ const stage = (() => {
       const words = `POI ${look.over}: ${text}${when(data, look.over)}`, half = Math.max(40, draw.measureText(words).width / 2 + 4);
       label(words, Math.max(half, Math.min(wide - half, x)), Math.max(12, y));
     }
-    // A leader's number is placed at the first corner of its arrow where it hides no other label.
+    // A leader's number is placed at the first corner of its arrow where it hides no other label, and omitted if there is none.
     const corners = [[1.5, 1.6], [1.5, -0.9], [-2.5, 1.6], [-2.5, -0.9]];
     for (let agent = 0; agent < episode.leaders; agent++) {
       const [x, y] = now[agent], text = String(agent), wide = draw.measureText(text).width;
@@ -285,8 +283,8 @@ const stage = (() => {
         const left = X(x) + size * across, base = Y(y) + size * down;
         return taken.some(other => overlap([left - 1, base - 11, left + wide + 1, base + 3], other));
       };
-      const [across, down] = corners.find(corner => !hides(corner)) || corners[0];
-      label(text, X(x) + size * across, Y(y) + size * down, "left", episode.leaders > 12);
+      const corner = corners.find(corner => !hides(corner));
+      if (corner) label(text, X(x) + size * corner[0], Y(y) + size * corner[1], "left");
     }
     return { step, near, led, positions: now.map(([x, y]) => [x, y]) };
   }

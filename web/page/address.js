@@ -8,13 +8,18 @@ import { KEYS, NAMES, quote, state } from "./state.js";
 import { train } from "./train.js";
 import { seek } from "./views.js";
 
-// Packing a config takes a moment. An older experiment never replaces a newer one in the address.
 let asked = 0, written = 0;
+/**
+ * Writes the experiment into the address. Returns false if this browser cannot: then the address is none, because the former one is of
+ * another experiment. Packing a config takes a moment, and an older experiment never replaces a newer one.
+ */
 export async function remember() {
   const turn = ++asked, words = new URLSearchParams(), layout = $("layout").value;
   if (layout === "own") {
-    // If the browser cannot compress, there is no link. The rest of the page works.
-    try { words.set("config", await configs.pack(state.text)); } catch { return; }
+    try { words.set("config", await configs.pack(state.text)); } catch {
+      history.replaceState(null, "", "#");
+      return false;
+    }
   } else {
     words.set("layout", layout);
     for (const id of Object.keys(KEYS).filter(id => id !== "coupling")) words.set(id, $(id).value);
@@ -24,14 +29,15 @@ export async function remember() {
   if (compared && !both) words.set("compare", write(compared));
   if ($("on").value !== "auto") words.set("on", $("on").value);
   if ($("pace").value !== "watch") words.set("pace", $("pace").value);
-  if (turn < written) return;
+  if (turn < written) return true;
   written = turn;
   history.replaceState(null, "", `#${words}`);
+  return true;
 }
 
 // Opens the experiment in the address. Reports the parts that cannot be read, and then leaves the address unchanged.
 export async function recall() {
-  const words = new URLSearchParams(location.hash.slice(1)), unknown = [];
+  const words = new URLSearchParams(location.hash.slice(1)), unknown = [], word = (/** @type {string} */ key) => words.get(key) ?? "";
   for (const id of ["on", "pace"]) {
     const value = words.get(id);
     if ([...$(id).options].some(option => option.value === value)) $(id).value = value;
@@ -41,19 +47,19 @@ export async function recall() {
   if (layout !== null && !configs.LAYOUTS.includes(layout)) unknown.push(`layout=${layout}`);
   let text = configs.layout(configs.LAYOUTS.find(name => name === layout) || "generally_forward");
   if (words.has("config")) {
-    try { text = await configs.unpack(words.get("config")); } catch { unknown.push("config"); }
+    try { text = await configs.unpack(word("config")); } catch { unknown.push("config"); }
   } else {
-    text = await edited(text, Object.entries(KEYS).filter(([id]) => words.has(id)).map(([id, key]) => [key, quote(id)(words.get(id))]));
+    text = await edited(text, Object.entries(KEYS).filter(([id]) => words.has(id)).map(([id, key]) => [key, quote(id)(word(id))]));
   }
   const learners = words.get("learners"), known = learners !== null && Object.hasOwn(NAMES, learners);
   if (learners !== null && learners !== "both" && !known) unknown.push(`learners=${learners}`);
   state.compared = known ? null : comparison("paradigm", 0);
   if (words.has("compare")) {
-    state.compared = read(words.get("compare"));
+    state.compared = read(word("compare"));
     if (!state.compared) unknown.push("compare");
   }
   if (known) text = await edited(text, [["learning.paradigm", `"${learners}"`]]);
-  const whole = key => words.has(key) && /^\d{1,7}$/.test(words.get(key)) ? Number(words.get(key)) : null;
+  const whole = (/** @type {string} */ key) => /^\d{1,7}$/.test(word(key)) ? Number(word(key)) : null;
   for (const key of ["generation", "trial", "play"]) if (words.has(key) && whole(key) === null) unknown.push(`${key}=${words.get(key)}`);
   wanted = whole("play") === 1 ? { generation: whole("generation") ?? Infinity, trial: whole("trial") ?? 0 } : null;
   const damage = unknown.length ? `This link is damaged: ${unknown.join(", ")} cannot be read. Ask for a new link; what you see is not what it was made for.` : "";
@@ -80,7 +86,7 @@ export function link() {
   return `${location.href.split("#")[0]}#${words}`;
 }
 
-// What the opened link asks to show after training, or null.
+/** What the opened link asks to show after training, or null. @type {{ generation: number, trial: number } | null} */
 let wanted = null;
 
 // Trains if the opened link asks for that, and shows its generation and trial.

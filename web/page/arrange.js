@@ -2,7 +2,7 @@
 // Rearranging the map by pointer and keys.
 import { configs } from "./config.js";
 import { curves } from "./curves.js";
-import { $, count, find, number } from "./dom.js";
+import { $, count, find, number, pen_of } from "./dom.js";
 import { change } from "./experiment.js";
 import { reach, start_scene } from "./scene.js";
 import { state } from "./state.js";
@@ -39,44 +39,54 @@ export function show_start() {
   if (!state.training) curves();
 }
 
-const name_chosen = ([list, index]) => `${{ leaders: "leader", followers: "follower", pois: "POI" }[list]} ${index} at ${state.config.world[list][index].map(number).join(", ")}`;
+const KINDS = { leaders: "leader", followers: "follower", pois: "POI" };
+const name_chosen = (/** @type {Chosen} */ [list, index]) => `${KINDS[list]} ${index} at ${state.config.world[list][index].map(number).join(", ")}`;
 
+/** Draws a ring around what is chosen in a view. @param {View} view */
 export function ring(view) {
+  if (!view.chosen) return;
   const [list, index] = view.chosen, place = state.config.world[list][index];
   if (!place) return;
-  const { X, Y } = stage.place_on(view.canvas, view.crop), pen = view.canvas.getContext("2d");
+  const { X, Y } = stage.place_on(view.canvas, view.crop), pen = pen_of(view.canvas);
   pen.strokeStyle = getComputedStyle(document.documentElement).getPropertyValue("--accent").trim();
   pen.lineWidth = 2.5;
   pen.beginPath(); pen.arc(X(place[0]), Y(place[1]), 17, 0, 2 * Math.PI); pen.stroke();
 }
 
-const items = ({ world }) => ["leaders", "followers", "pois"].flatMap(list => world[list].map((place, index) => [list, index, place]));
+/** Returns everything on the map: its list, its index and its place. @type {(config: any) => [List, number, Place][]} */
+const items = ({ world }) => /** @type {List[]} */ (["leaders", "followers", "pois"]).flatMap(list => world[list].map((/** @type {Place} */ place, /** @type {number} */ index) => [list, index, place]));
 
+/** @param {View} view @param {Chosen | null} chosen */
 function choose(view, chosen) {
   view.chosen = chosen;
   $("chosen").textContent = chosen ? `Chosen: ${name_chosen(chosen)}` : "";
   draw(view);
 }
 
-// Lets the pointer and the keys move agents and POIs.
+// Positions are rounded to a tenth, and stay on the map.
+const tenth = (/** @type {number} */ value, /** @type {number} */ most) => Math.round(Math.max(0, Math.min(most, value)) * 10) / 10;
+/** @type {Record<string, number[]>} */
+const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+
+/** Lets the pointer and the keys move agents and POIs. @param {View} view */
 export function hands(view) {
   if (view.canvas.classList.contains("hands")) return;
   view.canvas.classList.add("hands");
   view.canvas.tabIndex = 0;
   view.canvas.setAttribute("role", "application");
+  /** @type {Chosen | null} */
   let held = null;
-  const place = event => {
+  const place = (/** @type {PointerEvent} */ event) => {
     const { scale } = stage.place_on(view.canvas, view.crop), [width, height] = state.config.world.map;
-    const tenth = (value, most) => Math.round(Math.max(0, Math.min(most, value)) * 10) / 10;
     return [tenth(view.crop[0] + event.offsetX / scale, width), tenth(view.crop[3] - event.offsetY / scale, height)];
   };
   view.canvas.addEventListener("pointerdown", event => {
     const { scale } = stage.place_on(view.canvas, view.crop), at = place(event);
     // Agents are drawn above POIs, so they take precedence.
-    const away = ([list, , [x, y]]) => Math.hypot(x - at[0], y - at[1]) + (list === "pois" ? 1 : 0);
+    const away = (/** @type {[List, number, Place]} */ [list, , [x, y]]) => Math.hypot(x - at[0], y - at[1]) + (list === "pois" ? 1 : 0);
     const near = items(state.config).sort((a, b) => away(a) - away(b))[0];
     if (!near || away(near) > Math.max(18 / scale, state.config.world.observation_radius * 0.6)) return choose(view, null);
-    held = near.slice(0, 2);
+    held = [near[0], near[1]];
     choose(view, held);
     view.canvas.setPointerCapture(event.pointerId);
     view.canvas.focus();
@@ -94,15 +104,16 @@ export function hands(view) {
   view.canvas.addEventListener("pointerup", release);
   view.canvas.addEventListener("pointercancel", release);
   view.canvas.addEventListener("keydown", event => {
-    const all = items(state.config), index = view.chosen ? all.findIndex(([list, at]) => list === view.chosen[0] && at === view.chosen[1]) : -1;
-    const by = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    const all = items(state.config), { chosen } = view;
+    const index = chosen ? all.findIndex(([list, at]) => list === chosen[0] && at === chosen[1]) : -1;
+    const by = ARROWS[event.key];
     if (event.key === "]" || event.key === "[") {
       const next = (index + (event.key === "]" ? 1 : -1) + all.length + (index < 0 && event.key === "[" ? 1 : 0)) % all.length;
-      choose(view, all[next].slice(0, 2));
+      choose(view, [all[next][0], all[next][1]]);
     } else if (by && view.chosen) {
       const [list, at] = view.chosen, [width, height] = state.config.world.map, size = event.shiftKey ? 0.1 : 1;
-      const [x, y] = state.config.world[list][at], fix = (value, most) => Math.round(Math.max(0, Math.min(most, value)) * 10) / 10;
-      state.config.world[list][at] = [fix(x + by[0] * size, width), fix(y + by[1] * size, height)];
+      const [x, y] = state.config.world[list][at];
+      state.config.world[list][at] = [tenth(x + by[0] * size, width), tenth(y + by[1] * size, height)];
       moved(list);
       choose(view, view.chosen);
     } else if (event.key === "Delete" && view.chosen) remove();
@@ -112,11 +123,13 @@ export function hands(view) {
   });
 }
 
+/** @param {List} list */
 function moved(list) {
   state.file = null;
   return change([[`world.${list}`, configs.positions(state.config.world[list])]]);
 }
 
+/** Adds an agent or a POI. @param {List} list */
 export function add(list) {
   const { world } = state.config, [width, height] = world.map, [first] = state.views;
   const taken = items(state.config).map(([, , place]) => place);

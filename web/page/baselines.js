@@ -3,7 +3,7 @@
 import { curves } from "./curves.js";
 import { state } from "./state.js";
 
-// Plays the baselines of a training's arms on the clerk, in slices, so that it still answers other requests.
+/** Plays the constant actions of a training's arms. @param {Training} training */
 export async function constants(training) {
   for (const arm of training.arms) {
     if (state.training !== training) return;
@@ -12,7 +12,11 @@ export async function constants(training) {
   }
 }
 
-// Random teams cost as much as the training. They are played after it.
+/**
+ * Plays as many random teams as the training evaluated, in slices, so that the clerk still answers other requests. They cost as much as
+ * the training, and are played after it.
+ * @param {Training} training
+ */
 export async function randoms(training) {
   for (const arm of training.arms) {
     await state.clerk.ask({ ask: "random", text: arm.toml });

@@ -1,24 +1,34 @@
 // @ts-check
 // Draws learning curves: POIs observed by the best team, per arm the mean over trials, with each trial as a thin line.
+import { pen_of } from "./dom.js";
+
+/**
+ * An arm of the chart. Each trial is a list of POIs, one value per `every` generations. `mean` and the outline `band` of its interval are
+ * lists of [generation, POIs], or null: then the mean is drawn without an interval. `constant` is what the best constant action
+ * observes, or null, and `random` the best random team, per generation.
+ * @typedef {{ tone: string, trials: number[][], constant: number | null, random: number[], mean: Place[] | null, band: Place[] | null }} Drawn
+ */
 
 export const chart = (() => {
   const DASHES = [[], [7, 3], [12, 4], [3, 3], [10, 3, 3, 3], [16, 3]];
-  // `arms` are { tone, trials, constant, random }. Each trial is an array of POIs, one value per `every` generations.
-  // `constant` is what the best constant action observes, or null, and `random` the best random team, per generation. `cursor` is the
-  // generation to mark, or null.
+  /**
+   * `cursor` is the generation to mark, or null.
+   * @param {HTMLCanvasElement} canvas @param {Drawn[]} arms @param {number} every @param {number} last @param {number} pois
+   * @param {number | null} cursor
+   */
   function paint(canvas, arms, every, last, pois, cursor) {
     const wide = canvas.clientWidth, tall = canvas.clientHeight, dots = window.devicePixelRatio || 1;
     if (canvas.width !== Math.round(wide * dots) || canvas.height !== Math.round(tall * dots)) {
       canvas.width = Math.round(wide * dots);
       canvas.height = Math.round(tall * dots);
     }
-    const style = getComputedStyle(document.documentElement), color = name => style.getPropertyValue(name).trim();
-    const draw = canvas.getContext("2d");
+    const style = getComputedStyle(document.documentElement), color = (/** @type {string} */ name) => style.getPropertyValue(name).trim();
+    const draw = pen_of(canvas);
     draw.setTransform(dots, 0, 0, dots, 0, 0);
     draw.clearRect(0, 0, wide, tall);
     const [left, right, above, below] = [30, 14, 12, 36];
-    const X = generation => left + (wide - left - right) * (last > 0 ? generation / last : 0);
-    const Y = value => tall - below - (tall - above - below) * (pois > 0 ? value / pois : 0);
+    const X = (/** @type {number} */ generation) => left + (wide - left - right) * (last > 0 ? generation / last : 0);
+    const Y = (/** @type {number} */ value) => tall - below - (tall - above - below) * (pois > 0 ? value / pois : 0);
     draw.font = "12px system-ui, sans-serif";
     draw.lineWidth = 1;
     draw.textBaseline = "middle";
@@ -32,7 +42,7 @@ export const chart = (() => {
     }
     draw.textAlign = "center";
     const rough = Math.max(1, last) / Math.max(2, Math.min(10, Math.floor(wide / 90)));
-    const size = 10 ** Math.floor(Math.log10(rough)), apart = Math.max(1, [1, 2, 5, 10].find(n => n * size >= rough) * size);
+    const size = 10 ** Math.floor(Math.log10(rough)), apart = Math.max(1, ([1, 2, 5].find(n => n * size >= rough) ?? 10) * size);
     for (let generation = 0; generation <= last; generation += apart) draw.fillText(String(Math.round(generation)), X(generation), tall - below + 13);
     draw.fillText("generation", (left + wide - right) / 2, tall - 7);
     if (cursor !== null) {
@@ -42,6 +52,15 @@ export const chart = (() => {
       draw.setLineDash([]);
     }
     draw.lineJoin = "round";
+    for (const { tone, band } of arms) {
+      if (!band) continue;
+      draw.fillStyle = color(tone);
+      draw.globalAlpha = 0.16;
+      draw.beginPath();
+      for (const [generation, value] of band) draw.lineTo(X(generation), Y(value));
+      draw.fill();
+      draw.globalAlpha = 1;
+    }
     for (const { tone, trials } of arms) {
       draw.strokeStyle = color(tone);
       draw.lineWidth = 1;
@@ -59,29 +78,33 @@ export const chart = (() => {
       if (random.length) line(draw, random, 1, X, Y);
       draw.setLineDash([]);
     }
-    arms.forEach(({ tone, trials }, index) => {
-      const means = mean(trials);
+    arms.forEach(({ tone, trials, mean: found }, index) => {
+      const means = found || averages(trials).map((value, at) => /** @type {Place} */ ([at * every, value]));
       if (!means.length) return;
       draw.strokeStyle = color(tone);
       draw.lineWidth = 2.5;
       draw.setLineDash(DASHES[index % DASHES.length]);
-      line(draw, means, every, X, Y);
+      draw.beginPath();
+      for (const [generation, value] of means) draw.lineTo(X(generation), Y(value));
+      draw.stroke();
       draw.setLineDash([]);
-      const end = means.length - 1;
+      const [generation, value] = means[means.length - 1];
       draw.fillStyle = color(tone);
-      draw.beginPath(); draw.arc(X(end * every), Y(means[end]), 4, 0, 2 * Math.PI); draw.fill();
+      draw.beginPath(); draw.arc(X(generation), Y(value), 4, 0, 2 * Math.PI); draw.fill();
     });
-    return { generation: x => Math.round(Math.max(0, Math.min(1, (x - left) / (wide - left - right))) * last) };
+    return { generation: (/** @type {number} */ x) => Math.round(Math.max(0, Math.min(1, (x - left) / (wide - left - right))) * last) };
   }
 
+  /** @typedef {(value: number) => number} Scale */
+  /** @param {CanvasRenderingContext2D} draw @param {number[]} values @param {number} every @param {Scale} X @param {Scale} Y */
   function line(draw, values, every, X, Y) {
     draw.beginPath();
     values.forEach((value, index) => draw.lineTo(X(index * every), Y(value)));
     draw.stroke();
   }
 
-  // Returns the mean over trials, up to the last generation that all trials have reached.
-  function mean(trials) {
+  /** Returns the mean over trials, up to the last generation that all trials have reached. @param {number[][]} trials */
+  function averages(trials) {
     const length = trials.length ? Math.min(...trials.map(trial => trial.length)) : 0;
     return Array.from({ length }, (_, generation) => trials.reduce((sum, trial) => sum + trial[generation], 0) / trials.length);
   }

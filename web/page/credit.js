@@ -4,8 +4,6 @@ import { $, count, make, number } from "./dom.js";
 import { state } from "./state.js";
 import { draw } from "./views.js";
 
-/** @typedef {import("./state.js").View} View */
-
 // Most leaders with a column each.
 const COLUMNS = 32;
 
@@ -24,12 +22,15 @@ export function credits() {
   table(view);
 }
 
+/** What the table was drawn of. @type {any[] | null} */
 let drawn = null;
+
+/** @param {View} view */
 function table(view) {
   const { data } = view, [episode] = data.episodes;
   // The table changes with the episode, but not with its steps.
-  const key = [view, data, view.removed, view.selected];
-  if (drawn && key.every((part, index) => part === drawn[index])) return;
+  const key = [view, data, view.removed, view.selected], before = drawn;
+  if (before && key.every((part, index) => part === before[index])) return;
   drawn = key;
   const { leaders } = episode, columns = Math.min(leaders, COLUMNS), followers = episode.agents > leaders;
   const rows = [["D", episode.d], ["Df", episode.df], ["D++", episode.dpp], ["Dt", episode.dt]].filter(([, values]) => values && values.length);
@@ -87,7 +88,7 @@ export function select(view, leader) {
 export function dark(view) {
   if (!view.removed) return [];
   const [episode] = view.data.episodes, without = episode.without[view.removed.leader][view.removed.group ? "group" : "alone"];
-  return episode.observed.flatMap((at, poi) => at !== null && without.observed[poi] === null ? [poi] : []);
+  return episode.observed.flatMap((/** @type {number | null} */ at, /** @type {number} */ poi) => at !== null && without.observed[poi] === null ? [poi] : []);
 }
 
 /** Says what the removal costs. @param {View} view */

@@ -3,6 +3,7 @@
 
 /** @type {(id: string) => any} */
 export const $ = id => document.getElementById(id);
+/** Makes an element, in a parent if given. @type {(name: string, text?: string, parent?: Element | null, more?: Record<string, any>) => any} */
 export const make = (name, text = "", parent = null, more = {}) => {
   const element = Object.assign(document.createElement(name), more);
   if (text !== "") element.textContent = text;
@@ -13,15 +14,21 @@ export const make = (name, text = "", parent = null, more = {}) => {
 export const find = (selector, within = document) => within.querySelector(selector);
 /** @type {(selector: string) => any[]} */
 export const all = selector => [...document.querySelectorAll(selector)];
+/** Returns what draws on a canvas. @param {HTMLCanvasElement} canvas */
+export const pen_of = canvas => /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
 export const still = matchMedia("(prefers-reduced-motion: reduce)");
+/** @param {number} value */
 export const number = value => String(Number(value.toFixed(3)));
+/** @param {number} many @param {string} what */
 export const count = (many, what) => `${many} ${what}${many === 1 ? "" : "s"}`;
 
+/** Shows an error, or none. @param {string} message */
 export function trouble(message) {
   $("trouble").textContent = message;
   $("trouble").hidden = !message;
 }
 
+/** Saves a file. @param {string} name @param {BlobPart} content @param {string} type */
 export function save(name, content, type) {
   const link = make("a", "", document.body, { href: URL.createObjectURL(new Blob([content], { type })), download: name });
   link.click();
@@ -30,6 +37,7 @@ export function save(name, content, type) {
   $("said").textContent = `${name} is saved.`;
 }
 
+/** Copies a text, and then says so. @param {string} text @param {string} said */
 export async function copy(text, said) {
   try {
     await navigator.clipboard.writeText(text);

@@ -6,7 +6,8 @@ import { reach, start_scene } from "./scene.js";
 import { state } from "./state.js";
 import { clear, draw, show, view } from "./views.js";
 
-const drive = { on: false, timer: null, wish: [0, 0], pointer: null, keys: new Set() };
+/** What steers. `turn` identifies the drive in progress. @type {{ on: boolean, timer: number, pointer: number[] | null, keys: Set<string>, turn: object | null }} */
+const drive = { on: false, timer: 0, pointer: null, keys: new Set(), turn: null };
 
 export function options() {
   if (!state.config) return;
@@ -32,7 +33,7 @@ export function drive_view() {
   show(only, start_scene(state.config), false);
   only.chosen = ["leaders", Number($("leader").value) || 0];
   draw(only);
-  const at = event => {
+  const at = (/** @type {PointerEvent} */ event) => {
     const { scale } = stage.place_on(only.canvas, only.crop);
     drive.pointer = [only.crop[0] + event.offsetX / scale, only.crop[3] - event.offsetY / scale];
   };
@@ -40,7 +41,7 @@ export function drive_view() {
   only.canvas.addEventListener("pointerdown", event => { at(event); only.canvas.focus(); if (!drive.on) drive_on(); });
   // Lifting a finger also fires `pointerleave`. The leader then keeps going to the last place touched.
   only.canvas.addEventListener("pointerleave", event => { if (event.pointerType !== "touch") drive.pointer = null; });
-  const key = event => {
+  const key = (/** @type {KeyboardEvent} */ event) => {
     if (!/^Arrow/.test(event.key)) return;
     if (event.type === "keydown") { drive.keys.add(event.key); drive.pointer = null; if (!drive.on) drive_on(); } else drive.keys.delete(event.key);
     event.preventDefault();
@@ -51,7 +52,10 @@ export function drive_view() {
   return only;
 }
 
-// Returns the wanted turn, in half turns to the left, and speed, each in -1..1. Returns null without input.
+/**
+ * Returns the wanted turn, in half turns to the left, and speed, each in -1..1. Returns null without input.
+ * @param {number[]} positions @param {number[]} headings @param {number} leader
+ */
 function wish(positions, headings, leader) {
   const [x, y] = positions.slice(2 * leader, 2 * leader + 2), [cos, sin] = headings.slice(2 * leader, 2 * leader + 2);
   if (drive.pointer) {
@@ -72,19 +76,21 @@ export async function drive_on() {
   only.chosen = null;
   drive.on = true;
   $("again").textContent = "Start over";
-  const player = state.clerk, toml = await edited(state.toml, [["learning.paradigm", '"leader-follower"']]);
+  const player = state.clerk, toml = await edited(state.toml ?? "", [["learning.paradigm", '"leader-follower"']]);
   const { each, weights } = state.policies || { each: 0 };
+  /** @type {any} */
   let told;
   try {
     told = (await player.ask({ ask: "drive", text: toml, leader, policies: each }, weights)).words;
     $("driven").textContent = told.learned ? "The other leaders do what they learned." : state.policies ? "The other leaders go straight ahead: what was learned is not for these teams." : "The other leaders go straight ahead: train first, and they do what they learned.";
-  } catch (error) {
+  } catch (/** @type {any} */ error) {
     drive_off();
     return trouble(error.message);
   }
   const data = start_scene(state.config), [episode] = data.episodes;
+  /** @type {Record<"positions" | "headings" | "near", number[]>} */
   const track = { positions: [], headings: [], near: [] };
-  const take = words => {
+  const take = (/** @type {any} */ words) => {
     track.positions.push(...words.positions);
     track.headings.push(...words.headings);
     track.near.push(...words.near);
@@ -102,7 +108,7 @@ export async function drive_on() {
     const from = performance.now(), wanted = wish(told.positions, told.headings, leader);
     if (!wanted) return void (drive.timer = setTimeout(step, 30));
     const [angle, speed] = wanted;
-    try { told = (await player.ask({ ask: "step", turn: angle, speed })).words; } catch (error) { return trouble(error.message); }
+    try { told = (await player.ask({ ask: "step", turn: angle, speed })).words; } catch (/** @type {any} */ error) { return trouble(error.message); }
     if (drive.turn !== turn) return;
     take(told);
     Object.assign(only, { place: told.step });

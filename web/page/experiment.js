@@ -2,7 +2,7 @@
 // The experiment: its text, its controls, and its editor.
 import { remember } from "./address.js";
 import { show_start } from "./arrange.js";
-import { choice_of } from "./compare.js";
+import { choice_of, slug } from "./compare.js";
 import { configs } from "./config.js";
 import { curves } from "./curves.js";
 import { $, count, find, make, trouble } from "./dom.js";
@@ -11,8 +11,8 @@ import { mode } from "./modes.js";
 import { state } from "./state.js";
 import { forget } from "./train.js";
 
-// Makes a text the config. If it is invalid, shows its problems and returns false.
 let newest = 0;
+/** Makes a text the config. If it is invalid, shows its problems and returns false. @param {string} text */
 export async function take(text, { edited = false, address = true, views = true } = {}) {
   const turn = ++newest;
   state.text = text;
@@ -20,13 +20,13 @@ export async function take(text, { edited = false, address = true, views = true 
   let resolved;
   try {
     resolved = (await state.clerk.ask({ ask: "resolve", text, name: "config.toml", changes: [] })).words;
-  } catch (error) {
+  } catch (/** @type {any} */ error) {
     if (turn === newest) { mark(error.problems, error.message); $("train").disabled = true; state.valid = false; }
     return false;
   }
   if (turn !== newest) return false;
   mark([]);
-  Object.assign(state, { config: resolved.config, toml: resolved.toml, pois: resolved.pois, valid: true });
+  Object.assign(state, { config: resolved.config, toml: resolved.toml, pois: resolved.pois, start: resolved.start, valid: true });
   $("train").disabled = false;
   fill(views);
   if (address) remember();
@@ -34,21 +34,30 @@ export async function take(text, { edited = false, address = true, views = true 
   return true;
 }
 
-// Sets keys of the config, and keeps its comments if possible. Changes run one after the other.
+/** Keys of the config and their new values as TOML. @typedef {[string, string][]} Changes */
+
 /** @type {Promise<any>} */
 let changing = Promise.resolve();
+/** Sets keys of the config, and keeps its comments if possible. Changes run one after the other. @param {Changes} changes */
 export const change = changes => (changing = changing.catch(() => {}).then(() => change_now(changes)));
+/** @param {Changes} changes */
 async function change_now(changes) {
   keep();
   return take(await edited(state.text, changes));
 }
 
-// Returns a text with keys set to TOML values. A text that is not TOML is returned as it is: reading it shows why.
+/**
+ * Returns a text with keys set to TOML values. A text that is not TOML is returned as it is: reading it shows why.
+ * @param {string} text @param {Changes} changes
+ */
 export async function edited(text, changes) {
   try { return (await state.clerk.ask({ ask: "edit", text, changes })).words.text; } catch { return text; }
 }
 
-// Replaces the experiment: a text, and what is compared. Results of the former one are discarded.
+/**
+ * Replaces the experiment: a text, and what is compared. Results of the former one are discarded.
+ * @param {string} text @param {Comparison | null} compared
+ */
 export async function settings(text, compared) {
   keep();
   forget();
@@ -57,7 +66,7 @@ export async function settings(text, compared) {
   return take(text);
 }
 
-// Compares other values, or nothing.
+/** Compares other values, or nothing. @param {Comparison | null} compared */
 export function compare(compared) {
   keep();
   state.compared = compared;
@@ -66,7 +75,7 @@ export function compare(compared) {
   stale();
 }
 
-// Returns whether an earlier experiment is the present one.
+/** Returns whether an earlier experiment is the present one. @param {(typeof state.past)[0] | undefined} past */
 const is_now = past => past && past.text === state.text && JSON.stringify(past.compared) === JSON.stringify(state.compared);
 
 // Saves the current experiment for undo.
@@ -96,14 +105,15 @@ export function stale() {
 }
 
 // Edits are applied after a delay. `entered` applies pending ones at once, so that what follows uses them.
-let typed = null;
-const type = () => { typed = null; return take($("text").value, { edited: true }); };
+/** @type {number | undefined} */
+let typed;
+const type = () => { typed = undefined; return take($("text").value, { edited: true }); };
 export function typing() {
   clearTimeout(typed);
   typed = setTimeout(type, 250);
 }
 export async function entered() {
-  if (typed !== null) { clearTimeout(typed); await type(); }
+  if (typed !== undefined) { clearTimeout(typed); await type(); }
   await changing;
 }
 
@@ -117,7 +127,7 @@ export function fill(views = true) {
   $("coupling").placeholder = each ? "each" : "";
   const choice = choice_of(state.compared, learning.population), own = find("[value=own]", $("compare"));
   own.hidden = choice !== "own";
-  own.textContent = choice === "own" ? `${state.compared.key.split(".")[1].replaceAll("_", " ")} ${state.compared.values.join(", ")}` : "";
+  own.textContent = state.compared && choice === "own" ? `${state.compared.key.split(".")[1].replaceAll("_", " ")} ${state.compared.values.join(", ")}` : "";
   $("compare").value = choice;
   $("paradigm").value = learning.paradigm;
   const layout = configs.LAYOUTS.find(name => same_world(name));
@@ -129,12 +139,13 @@ export function fill(views = true) {
 }
 
 // Returns whether a config differs from a layout at most in keys that have a command-line flag.
-const same_world = name => rest_of(state.config) === rest_of(state.layouts[name]);
-const rest_of = config => {
+const same_world = (/** @type {string} */ name) => rest_of(state.config) === rest_of(state.layouts[name]);
+const rest_of = (/** @type {any} */ config) => {
   const { paradigm, fitness, seed, trials, generations, population, ...learning } = config.learning;
   return JSON.stringify({ ...config, learning });
 };
 
+/** @param {{ line?: number, key?: string, message: string }[]} problems */
 function mark(problems, message = "") {
   $("marks").replaceChildren();
   $("problems").replaceChildren();
@@ -145,7 +156,7 @@ function mark(problems, message = "") {
     button.addEventListener("click", () => go_to(line || 1));
     if (line) {
       const place = make("div", "", $("marks"), { className: "mark" });
-      place.dataset.line = line;
+      place.dataset.line = String(line);
       make("span", words, place);
     }
   }
@@ -154,6 +165,7 @@ function mark(problems, message = "") {
   lines();
 }
 
+/** @param {number} line */
 function go_to(line) {
   const from = $("text").value.split("\n").slice(0, line - 1).join("\n").length + (line > 1 ? 1 : 0);
   $("text").focus();
@@ -171,12 +183,12 @@ export function lines() {
 
 export const name_of = () => state.file || ($("layout").value === "own" ? "config" : $("layout").value);
 
-// Returns the command that gives the same results.
+/** Returns the command that gives the same results. @param {any} config @param {Changes} given */
 export function command({ learning }, given = []) {
   const layout = $("layout").value, flagged = ["fitness", "seed", "generations", "trials", "population"];
-  const written = ([key, value]) => flagged.includes(key.split(".")[1]) ? ` --${key.split(".")[1]} ${value}` : ` --set ${key}=${value}`;
+  const written = (/** @type {Changes[0]} */ [key, value]) => flagged.includes(key.split(".")[1]) ? ` --${key.split(".")[1]} ${value}` : ` --set ${key}=${value}`;
   const extra = given.filter(([key]) => layout === "own" || !flagged.includes(key.split(".")[1])).map(written).join("");
-  if (layout === "own") return `flotilla train ${name_of()}.toml --paradigm ${learning.paradigm}${extra}`;
+  if (layout === "own") return `flotilla train ${slug(name_of())}.toml --paradigm ${learning.paradigm}${extra}`;
   const flags = ["paradigm", "fitness", "seed"].map(key => `--${key} ${learning[key]}`);
   const base = state.layouts[layout].learning;
   for (const key of ["generations", "trials", "population"]) if (base[key] !== learning[key]) flags.push(`--${key} ${learning[key]}`);

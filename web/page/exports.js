@@ -10,16 +10,18 @@ import { draw } from "./views.js";
 // Most frames of a film, and its width in pixels per view.
 const FRAMES = 80, WIDTH = 420;
 
+const readable = (/** @type {HTMLCanvasElement} */ canvas) => /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d", { willReadFrequently: true }));
 const shown = () => state.views.filter(view => view.data);
 
 // Draws all views side by side, each with its title and state, onto a canvas.
+/** @param {HTMLCanvasElement} canvas @param {number} wide */
 function compose(canvas, wide) {
-  const views = shown(), pen = canvas.getContext("2d", { willReadFrequently: true }), style = getComputedStyle(document.documentElement);
+  const views = shown(), pen = readable(canvas), style = getComputedStyle(document.documentElement);
   const tall = Math.max(...views.map(view => wide * view.canvas.height / view.canvas.width));
   const size = [Math.round(views.length * wide), Math.round(tall + 52)];
   if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
   pen.fillStyle = style.getPropertyValue("--card").trim();
-  pen.fillRect(0, 0, ...size);
+  pen.fillRect(0, 0, size[0], size[1]);
   views.forEach((view, index) => {
     const left = index * wide;
     pen.fillStyle = style.getPropertyValue("--ink").trim();
@@ -37,11 +39,13 @@ export async function save_png() {
   if (!shown().length) return;
   const canvas = document.createElement("canvas");
   compose(canvas, shown()[0].canvas.width);
+  /** @type {Blob | null} */
   const blob = await new Promise(done => canvas.toBlob(done, "image/png"));
-  save(`${base()}.png`, blob, "image/png");
+  if (blob) save(`${base()}.png`, blob, "image/png");
 }
 
 // Calls `each` with the composed picture of every frame of the film, and then shows what was shown before.
+/** @param {HTMLCanvasElement} canvas @param {(frame: number, many: number) => Promise<void>} each */
 async function film(canvas, each) {
   const views = shown(), before = views.map(({ place, playing }) => ({ place, playing }));
   views.forEach(view => { view.playing = false; });
@@ -60,25 +64,26 @@ async function film(canvas, each) {
 }
 
 // Simulated time per frame, in seconds, at least 1/25 s.
-const pause_of = many => {
+const pause_of = (/** @type {number} */ many) => {
   const [view] = shown(), whole = view.data.steps * view.data.dt;
   return Math.max(0.04, Math.min(whole, 8) / many);
 };
 
 let busy = false;
+/** @param {() => Promise<void>} act */
 async function one_at_a_time(act) {
   if (busy || !shown().some(view => view.data.episodes[0].shown.length > 1)) return;
   busy = true;
-  try { await act(); } catch (error) { trouble(`The film could not be made: ${error.message}`); } finally { busy = false; }
+  try { await act(); } catch (/** @type {any} */ error) { trouble(`The film could not be made: ${error.message}`); } finally { busy = false; }
 }
 
 export const save_gif = () => one_at_a_time(async () => {
   $("said").textContent = "Making the GIF…";
-  const canvas = document.createElement("canvas"), pictures = [];
+  const canvas = document.createElement("canvas"), pictures = /** @type {Uint8Array[]} */ ([]);
   let many = 1;
   await film(canvas, async (_, frames) => {
     many = frames;
-    pictures.push(new Uint8Array(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.buffer));
+    pictures.push(new Uint8Array(readable(canvas).getImageData(0, 0, canvas.width, canvas.height).data.buffer));
   });
   const delay = Math.round(100 * pause_of(many));
   const { bytes } = await state.clerk.ask({ ask: "gif", width: canvas.width, height: canvas.height, delay }, pictures, {}, pictures.map(picture => picture.buffer));
@@ -90,7 +95,7 @@ export const save_webm = () => one_at_a_time(async () => {
   $("said").textContent = "Recording the film…";
   const canvas = document.createElement("canvas");
   compose(canvas, WIDTH);
-  const recorder = new MediaRecorder(canvas.captureStream(25), { mimeType: "video/webm" }), parts = [];
+  const recorder = new MediaRecorder(canvas.captureStream(25), { mimeType: "video/webm" }), parts = /** @type {Blob[]} */ ([]);
   recorder.ondataavailable = ({ data }) => parts.push(data);
   const stopped = new Promise(done => { recorder.onstop = done; });
   recorder.start();

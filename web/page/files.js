@@ -6,63 +6,98 @@ import { $, count, trouble } from "./dom.js";
 import { keep, take } from "./experiment.js";
 import { settle } from "./machine.js";
 import { mode } from "./modes.js";
+import { intervals } from "./intervals.js";
 import { reach } from "./scene.js";
-import { state } from "./state.js";
+import { TONES, state } from "./state.js";
 import { digests, forget } from "./train.js";
 import { Training } from "./training.js";
 import { build, clear, controls, following, seek, show, unpack, view } from "./views.js";
 
-export async function take_file(file) {
+/** Most runs that are opened together: each has a colour. */
+const MOST_RUNS = TONES.length;
+
+/** @typedef {{ file: File, bytes: Bytes }} Read */
+
+/** Opens files: several runs as arms of one chart, or a single file of any kind. @param {File[]} files */
+export async function take_files(files) {
   trouble("");
   $("said").textContent = "";
+  let now = files[0];
   try {
-    const bytes = new Uint8Array(await file.arrayBuffer());
-    if (/\.zip$/i.test(file.name) || bytes[0] === 0x50 && bytes[1] === 0x4b) {
-      const found = await state.players[0].ask({ ask: "read", text: null }, bytes, {}, [bytes.buffer]);
-      await settle();
-      const training = await Training.read(state.players[0], state.machine, file.name, found);
-      if (state.training) state.training.stop();
-      state.training = training;
-      keep();
-      Object.assign(state, { compared: null, trial: 0, generation: training.last, policies: null });
-      following(false);
-      training.source = { text: found.words.toml, compared: null };
-      mode("watch");
-      await take(found.words.toml);
-      build(training);
-      controls();
-      curves();
-      digests();
-      seek(training.last);
-      $("said").textContent = `${file.name}: the run is whole, its digest is right.`;
-    } else if (/\.safetensors$/i.test(file.name)) {
-      const { words, bytes: weights } = await state.clerk.ask({ ask: "read", text: state.toml }, bytes);
-      forget();
-      state.policies = { each: words.policies, weights };
-      const { words: data } = await state.clerk.ask({ ask: "play", text: state.toml, policies: words.policies }, weights);
-      mode("watch");
-      clear();
-      const only = view(state.config.learning.paradigm);
-      only.crop = reach(state.config);
-      only.title.textContent = `The champion of ${file.name}`;
-      only.tell = (step, observed) => {
-        only.said.textContent = `${observed} of ${data.pois.length} POIs by step ${step}`;
-        only.canvas.setAttribute("aria-label", `${only.title.textContent}, step ${step}: ${only.said.textContent}`);
-      };
-      $("views").classList.add("one");
-      show(only, unpack(data));
-      $("said").textContent = `${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} a leader. Take a leader to play with them.`;
-    } else {
-      if (!/\.toml$/i.test(file.name)) throw new Error("it is no config (.toml), no run (.zip) and no policies (.safetensors)");
-      const text = new TextDecoder("utf-8", { fatal: true }).decode(bytes);
-      keep();
-      state.file = file.name.replace(/\.toml$/i, "");
-      state.compared = null;
-      forget();
-      mode("watch");
-      show_start();
-      const taken = await take(text);
-      $("said").textContent = taken ? `${file.name} is the config now.` : `${file.name} has problems; they stand beside its lines.`;
+    /** @type {Read[]} */
+    const read = [];
+    for (const file of files) {
+      now = file;
+      const bytes = new Uint8Array(await file.arrayBuffer()), is_run = /\.zip$/i.test(file.name) || bytes[0] === 0x50 && bytes[1] === 0x4b;
+      if (files.length > 1 && !is_run) throw new Error("it is no run (.zip); only runs can be opened together");
+      if (files.length > MOST_RUNS) throw new Error(`these are ${files.length} files; open ${MOST_RUNS} runs at most together`);
+      read.push({ file, bytes });
+      if (is_run && read.length === files.length) return await take_runs(read, file => { now = file; });
     }
-  } catch (error) { trouble(`${file.name}: ${error.message}`); }
+    if (read.length) await take_other(read[0]);
+  } catch (/** @type {any} */ error) { trouble(`${now.name}: ${error.message}`); }
+}
+
+/** Opens runs as arms of one chart. @param {Read[]} read @param {(file: File) => void} reading */
+async function take_runs(read, reading) {
+  const found = [];
+  for (const { file, bytes } of read) {
+    reading(file);
+    const { words, bytes: numbers } = await state.players[0].ask({ ask: "read", text: null }, bytes, {}, [bytes.buffer]);
+    found.push({ name: file.name, label: words.config.learning.paradigm, words, bytes: numbers });
+  }
+  if (found.length > 1) {
+    const { words } = await state.clerk.ask({ ask: "labels", texts: found.map(({ words }) => words.toml), names: found.map(({ name }) => name) });
+    found.forEach((run, index) => { run.label = words.labels[index]; });
+  }
+  await settle();
+  const training = await Training.read(state.players[0], state.machine, found), [{ words }] = found;
+  if (state.training) state.training.stop();
+  state.training = training;
+  keep();
+  Object.assign(state, { compared: null, trial: 0, generation: training.last, policies: null });
+  following(false);
+  training.source = { text: words.toml, compared: null };
+  mode("watch");
+  await take(words.toml);
+  build(training);
+  controls();
+  curves();
+  digests();
+  seek(training.last);
+  await intervals(training);
+  $("said").textContent = found.length > 1 ? `${found.length} runs are compared. Each is whole: its digest is right. The settings are those of ${found[0].name}.` : `${found[0].name}: the run is whole, its digest is right.`;
+}
+
+/** Opens policies or a config. @param {Read} read */
+async function take_other({ file, bytes }) {
+  if (/\.safetensors$/i.test(file.name)) {
+    const { words, bytes: weights } = await state.clerk.ask({ ask: "read", text: state.toml }, bytes);
+    forget();
+    state.policies = { each: words.policies, weights };
+    const { words: data } = await state.clerk.ask({ ask: "play", text: state.toml, policies: words.policies }, weights);
+    mode("watch");
+    clear();
+    const only = view(state.config.learning.paradigm);
+    only.crop = reach(state.config);
+    only.title.textContent = `The champion of ${file.name}`;
+    only.tell = (step, observed) => {
+      only.said.textContent = `${observed} of ${data.pois.length} POIs by step ${step}`;
+      only.canvas.setAttribute("aria-label", `${only.title.textContent}, step ${step}: ${only.said.textContent}`);
+    };
+    $("views").classList.add("one");
+    show(only, unpack(data));
+    $("said").textContent = `${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} a leader. Take a leader to play with them.`;
+  } else {
+    if (!/\.toml$/i.test(file.name)) throw new Error("it is no config (.toml), no run (.zip) and no policies (.safetensors)");
+    const text = new TextDecoder("utf-8", { fatal: true }).decode(bytes);
+    keep();
+    state.file = file.name.replace(/\.toml$/i, "");
+    state.compared = null;
+    forget();
+    mode("watch");
+    show_start();
+    const taken = await take(text);
+    $("said").textContent = taken ? `${file.name} is the config now.` : `${file.name} has problems; they stand beside its lines.`;
+  }
 }

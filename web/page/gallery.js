@@ -34,12 +34,13 @@ export const GALLERY = [
   },
 ];
 
+/** Returns the config of an experiment. @param {string} name @returns {string} */
 export const text_of = name => $(`gallery-${name}`).textContent;
 
-// Opens an experiment of the gallery, and trains it if asked.
+/** Opens an experiment of the gallery, and trains it if asked. @param {string} name */
 export async function exhibit(name, { trains = false } = {}) {
   const found = GALLERY.find(exhibit => exhibit.name === name);
-  if (await settings(text_of(name), found.compare) && trains) await train();
+  if (found && await settings(text_of(name), found.compare) && trains) await train();
 }
 
 export function gallery() {

@@ -18,7 +18,7 @@ export async function settle() {
       state.machine.description = `${gpu.name} by WebGPU${gpu.software ? ", a software renderer" : ""}, proved exact`;
       state.settled = wanted;
       return told();
-    } catch (error) { why = error.message; }
+    } catch (/** @type {any} */ error) { why = error.message; }
   } else if (wanted === "auto") why = gpu.software ? `this browser's GPU is a software renderer, ${gpu.name}` : gpu.reason;
   state.machine = (await state.players[0].ask({ ask: "open", gpu: false, pass: null })).words;
   state.machine.threads = state.players.length;

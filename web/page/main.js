@@ -10,7 +10,7 @@ import { $, all, copy, save, trouble } from "./dom.js";
 import { drive_off, drive_on, drive_view } from "./drive.js";
 import { change, compare, edited, entered, fill, keep, lines, take, typing, undo } from "./experiment.js";
 import { save_csv, save_gif, save_png, save_webm } from "./exports.js";
-import { take_file } from "./files.js";
+import { take_files } from "./files.js";
 import { gallery, text_of } from "./gallery.js";
 import { guide, leave_guide } from "./guide.js";
 import { renew, settle } from "./machine.js";
@@ -23,7 +23,7 @@ import { verify } from "./verify.js";
 import { ask, draw, follow, following, pause, replay, seek, step_to, wake_up } from "./views.js";
 
 function listen() {
-  $("setup").addEventListener("submit", event => { event.preventDefault(); train(); });
+  $("setup").addEventListener("submit", (/** @type {Event} */ event) => { event.preventDefault(); train(); });
   $("layout").addEventListener("change", async () => {
     const { fitness, seed } = state.config ? state.config.learning : {};
     let text = configs.layout($("layout").value);
@@ -48,7 +48,7 @@ function listen() {
   }
   for (const id of ["on", "pace"]) $(id).addEventListener("change", remember);
   // A training in progress keeps its backend. The next one uses the new choice.
-  $("on").addEventListener("change", () => { if (!state.training || state.training.state === "done" || state.training.state === "stopped") settle().catch(error => trouble(error.message)); });
+  $("on").addEventListener("change", () => { if (!state.training || state.training.state === "done" || state.training.state === "stopped") settle().catch((/** @type {Error} */ error) => trouble(error.message)); });
   for (const button of all("[data-mode]")) button.addEventListener("click", () => mode(button.dataset.mode));
   for (const button of all("[data-add]")) button.addEventListener("click", () => add(button.dataset.add));
   $("remove").addEventListener("click", remove);
@@ -79,17 +79,17 @@ function listen() {
   $("loop").addEventListener("change", () => { if ($("loop").checked) wake_up(); });
   $("credited").addEventListener("change", credits);
   for (const id of ["trails", "radii", "heat"]) $(id).addEventListener("change", () => state.views.forEach(draw));
-  $("curves").addEventListener("click", event => { if (drawn_chart && state.training) { if (state.mode !== "watch") mode("watch"); seek(drawn_chart.generation(event.offsetX)); } });
+  $("curves").addEventListener("click", (/** @type {MouseEvent} */ event) => { if (drawn_chart && state.training) { if (state.mode !== "watch") mode("watch"); seek(drawn_chart.generation(event.offsetX)); } });
   $("verify").addEventListener("click", verify);
   $("share").addEventListener("click", async () => {
     await entered();
     if (!state.valid) return void ($("said").textContent = "No link was copied: the config has problems. Correct them first.");
-    await remember();
+    if (!await remember()) return void ($("said").textContent = "No link was copied: this browser cannot compress a config. Save config.toml instead.");
     copy(link(), `The link is copied: whoever opens it ${state.training ? "sees the same generation of the same training" : "trains the same"}.`);
   });
   for (const [id, act] of Object.entries({ png: save_png, gif: save_gif, webm: save_webm, csv: save_csv })) $(id).addEventListener("click", act);
   $("open").addEventListener("click", () => $("file").click());
-  $("file").addEventListener("change", () => { if ($("file").files[0]) take_file($("file").files[0]); $("file").value = ""; });
+  $("file").addEventListener("change", () => { take_files([...$("file").files]); $("file").value = ""; });
   $("save").addEventListener("click", async () => { await entered(); save("config.toml", state.text, "text/plain"); });
   $("text").addEventListener("input", () => {
     lines();
@@ -102,7 +102,7 @@ function listen() {
   addEventListener("drop", event => {
     event.preventDefault();
     document.body.classList.remove("dropping");
-    if (event.dataTransfer.files[0]) take_file(event.dataTransfer.files[0]);
+    if (event.dataTransfer) take_files([...event.dataTransfer.files]);
   });
   addEventListener("keydown", event => {
     if (event.key !== " " || /** @type {Element} */ (event.target).closest("button, input, select, textarea, summary, a")) return;
@@ -122,7 +122,7 @@ async function start() {
   if (opens) show_opening();
   try {
     [state.gpu] = await Promise.all([pool.gpu(), renew()]);
-  } catch (error) {
+  } catch (/** @type {any} */ error) {
     $("machine").textContent = "";
     return trouble(`This browser cannot run it: ${error.message}. It takes WebAssembly with SIMD, as browsers have had since 2023.`);
   }
@@ -147,4 +147,4 @@ async function start() {
 
 start();
 
-window.page = { state, seek, take_file, configs, stage };
+window.page = { state, seek, take_files, configs, stage };

@@ -6,11 +6,13 @@ import { drive_off, drive_view, options } from "./drive.js";
 import { state } from "./state.js";
 import { ask, build, clear, controls, follow, position } from "./views.js";
 
+/** @type {Record<string, string>} */
 const HINTS = {
   watch: "", arrange: "Drag leaders, followers and POIs, then train again.",
   drive: "Point where your leader shall go, or use the arrow keys; time waits for you.",
 };
 
+/** @param {"watch" | "arrange" | "drive"} wanted */
 export function mode(wanted) {
   if (state.mode === wanted) return;
   drive_off();

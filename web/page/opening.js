@@ -8,6 +8,7 @@ import { clear, show, unpack, view } from "./views.js";
 /** Name of the experiment in the gallery. */
 export const OPENING = "two_groups";
 
+/** @type {any} */
 let parsed = null;
 export function show_opening() {
   parsed ??= JSON.parse($("opening").textContent);

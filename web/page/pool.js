@@ -1,14 +1,17 @@
 // @ts-check
 // Workers that run flotilla, and the detection of a GPU.
+import { $ } from "./dom.js";
 
 export const pool = (() => {
-  const text = id => document.getElementById(id).textContent;
-  let compiled = null, script = null;
+  /** @type {Promise<WebAssembly.Module> | null} */
+  let compiled = null;
+  /** @type {string | null} */
+  let script = null;
 
   // The page contains the WebAssembly module, compressed. It is compiled once for all workers.
   async function compile() {
-    const packed = await fetch(`data:application/octet-stream;base64,${text("wasm")}`);
-    const plain = packed.body.pipeThrough(new DecompressionStream("deflate"));
+    const packed = await fetch(`data:application/octet-stream;base64,${$("wasm").textContent}`);
+    const plain = /** @type {ReadableStream} */ (packed.body).pipeThrough(new DecompressionStream("deflate"));
     return WebAssembly.compile(await new Response(plain).arrayBuffer());
   }
 
@@ -19,7 +22,7 @@ export const pool = (() => {
       this.suspends = false;
       /** @type {(told: any) => void} */
       this.told = () => {};
-      script ??= URL.createObjectURL(new Blob([text("worker")], { type: "text/javascript" }));
+      script ??= URL.createObjectURL(new Blob([$("worker").textContent], { type: "text/javascript" }));
       this.worker = new Worker(script);
       this.worker.onerror = event => this.fail(event.message || "the worker could not be started");
       this.worker.onmessage = ({ data }) => {
@@ -32,12 +35,17 @@ export const pool = (() => {
         } else asked.resolve(data);
       };
     }
+    /** @param {string} reason */
     fail(reason) {
       for (const { reject } of this.asked.values()) reject(Object.assign(new Error(reason), { problems: [], fatal: true }));
       this.asked.clear();
       this.failed = true;
     }
-    // Buffers in `transferred` move to the worker, and cannot be used here afterwards.
+    /**
+     * Buffers in `transferred` move to the worker, and cannot be used here afterwards.
+     * @param {any} words @param {Bytes | Bytes[]} [bytes] @param {object} [more] @param {Transferable[]} [transferred]
+     * @returns {Promise<{ words: any, bytes: Bytes }>}
+     */
     ask(words, bytes, more = {}, transferred = []) {
       if (this.failed) return Promise.reject(Object.assign(new Error("the worker has failed; load the page again"), { problems: [], fatal: true }));
       const id = this.count++;

@@ -5,6 +5,7 @@ import { label, slug, toml } from "./compare.js";
 import { curves } from "./curves.js";
 import { $, copy, make, save, trouble } from "./dom.js";
 import { command, entered, name_of, stale } from "./experiment.js";
+import { intervals, tables } from "./intervals.js";
 import { renew, settle, told } from "./machine.js";
 import { mode } from "./modes.js";
 import { state } from "./state.js";
@@ -21,6 +22,7 @@ export async function train() {
   mode("watch");
   $("digests").replaceChildren();
   $("announced").textContent = "";
+  /** @type {Training} */
   let training;
   try {
     // A worker that still plays a long generation would delay the new training.
@@ -43,9 +45,10 @@ export async function train() {
     training.source = { text: state.text, compared: state.compared };
     Object.assign(state, { generation: 0, trial: 0, policies: null });
     following(true);
+    tables();
     build(training);
     await training.start(state.players);
-  } catch (error) {
+  } catch (/** @type {any} */ error) {
     if (error.fatal) await renew();
     trouble(error.message);
     return;
@@ -74,7 +77,7 @@ export async function train() {
   requestAnimationFrame(paint);
   try {
     await training.play(allowed, () => { dirty = true; });
-  } catch (error) {
+  } catch (/** @type {any} */ error) {
     if (!error.stopped && state.training === training) {
       training.stop();
       if (error.fatal || state.machine.backend === "gpu") await renew();
@@ -86,11 +89,12 @@ export async function train() {
   curves();
   follow();
   told();
+  intervals(training).catch(() => {});
   if (training.state === "done") {
     digests();
     randoms(training).catch(() => {});
     const found = training.arms.map(arm => {
-      const last = arm.trials.map(trial => trial.at(-1).best), mean = last.reduce((sum, best) => sum + best, 0) / last.length;
+      const last = arm.trials.map(trial => trial[trial.length - 1].best), mean = last.reduce((sum, best) => sum + best, 0) / last.length;
       return `${arm.label} observes ${(mean * (arm.pois ?? 1)).toFixed(2)} ${arm.pois === null ? "of its POIs (a share)" : `of ${arm.pois} POIs`}`;
     });
     $("announced").textContent = `Training is finished. On average over trials, the best team of ${found.join("; ")}.`;
@@ -122,25 +126,27 @@ export function forget() {
   $("generation").textContent = "";
   $("announced").textContent = "";
   $("trial").replaceChildren();
+  tables();
   clear();
   controls();
   stale();
 }
 
 export function digests() {
+  const { training } = state;
   $("digests").replaceChildren();
-  for (const arm of state.training.arms) {
+  for (const arm of training ? training.arms : []) {
     const place = make("div", "", $("digests"), { className: "digest" });
     const head = make("div", "", place, { className: "row" });
     make("b", `${arm.label}:`, head);
     make("code", arm.digest, head, { className: "sha" });
     if (arm.command) make("code", arm.command, place);
+    const { command, zip } = arm, source = training && training.source;
     const acts = make("div", "", place, { className: "row" });
-    if (arm.zip) make("button", `Save the ${arm.label} run (.zip)`, acts, { type: "button", className: "home" }).addEventListener("click", () => save(`${arm.name}-${slug(arm.label)}.zip`, arm.zip, "application/zip"));
-    const { source } = state.training;
-    if (source && arm.command && !arm.command.includes(" configs/")) {
+    if (zip) make("button", `Save the ${arm.label} run (.zip)`, acts, { type: "button", className: "home" }).addEventListener("click", () => save(`${arm.name}-${slug(arm.label)}.zip`, zip, "application/zip"));
+    if (source && command && !command.includes(" configs/")) {
       make("button", `Save ${arm.name}.toml`, acts, { type: "button" }).addEventListener("click", () => save(`${arm.name}.toml`, source.text, "text/plain"));
     }
-    if (arm.command) make("button", "Copy the command", acts, { type: "button" }).addEventListener("click", () => copy(arm.command, "The command is copied: it comes to the same digest."));
+    if (command) make("button", "Copy the command", acts, { type: "button" }).addEventListener("click", () => copy(command, "The command is copied: it comes to the same digest."));
   }
 }

@@ -1,28 +1,42 @@
 // @ts-check
-// A training of one or two arms. On the GPU, one worker trains everything as one batch. On the CPU, the trials are
+// A training of some arms, or runs that were opened. On the GPU, one worker trains everything as one batch. On the CPU, the trials are
 // divided among the workers. The division does not change the results.
 
 export class Training {
+  /** @param {Planned[]} arms @param {any} machine */
   constructor(arms, machine) {
-    /** The text and the paradigms that were trained. @type {any} */
+    /** The text and the comparison that were trained. @type {{ text: string, compared: Comparison | null } | null} */
     this.source = null;
+    /** The comparison of the arms, once it is made. @type {Found | null} */
+    this.found = null;
+    /** @type {Arm[]} */
     this.arms = arms.map(arm => ({ ...arm, trials: Array.from({ length: arm.config.learning.trials }, () => []), ended: [] }));
     this.machine = machine;
+    /** @type {Player[]} */
     this.players = [];
+    /** The player of each trial. @type {Map<string, Player>} */
     this.owners = new Map();
     this.paused = false;
     this.state = "starting";
     this.teams = 0;
+    /** Seconds that each player has worked. @type {number[]} */
     this.busy = [];
     this.started = new Date().toISOString().replace(/\.\d+Z$/, "Z");
   }
 
-  get last() { return Math.max(...this.arms.map(arm => arm.config.learning.generations)); }
+  get last() { return Math.max(...this.arms.map(last_of)); }
   // Returns the last generation that all trials have finished, or -1.
-  get reached() { return Math.min(...this.arms.flatMap(arm => arm.trials.map(trial => trial.length))) - 1; }
+  get reached() {
+    return Math.min(...this.arms.map(arm => {
+      const reached = Math.min(...arm.trials.map(trial => trial.length)) - 1;
+      return reached >= last_of(arm) ? this.last : reached;
+    }));
+  }
+  // Returns the number of POIs if it is the same in all arms and stages, otherwise null.
+  get pois() { return this.arms.every(arm => arm.pois === this.arms[0].pois) ? this.arms[0].pois : null; }
   get rate() { return this.teams / Math.max(1e-9, Math.max(0, ...this.busy)); }
 
-  // Divides the trials among players, and starts the training.
+  /** Divides the trials among players, and starts the training. @param {Player[]} players */
   async start(players) {
     const tasks = this.arms.flatMap((arm, run) => arm.trials.map((_, trial) => [run, trial]));
     const whole = this.machine.backend === "gpu";
@@ -30,19 +44,22 @@ export class Training {
     await Promise.all(this.players.map((player, index) => {
       const own = tasks.filter((_, task) => whole || task % this.players.length === index);
       for (const [run, trial] of own) this.owners.set(`${run}/${trial}`, player);
-      const trials = run => whole ? null : own.filter(([of]) => of === run).map(([, trial]) => trial);
+      const trials = (/** @type {number} */ run) => whole ? null : own.filter(([of]) => of === run).map(([, trial]) => trial);
       return player.ask({ ask: "train", runs: this.arms.map((arm, run) => ({ text: arm.toml, trials: trials(run) })) });
     }));
     this.busy = this.players.map(() => 0);
     this.state = "training";
   }
 
-  // Trains until everything is finished or `stop` is called. `allowed` returns how many generations may be played so
-  // far. `changed` is called when there are new results.
+  /**
+   * Trains until everything is finished or `stop` is called. `allowed` returns how many generations may be played so far. `changed` is
+   * called when there are new results.
+   * @param {() => number} allowed @param {() => void} changed
+   */
   async play(allowed, changed) {
     const from = performance.now();
     let idle = 0;
-    const work = async (player, index) => {
+    const work = async (/** @type {Player} */ player, /** @type {number} */ index) => {
       for (let next = 0; this.state === "training";) {
         const most = Math.floor(allowed()) - next;
         if (this.paused || most <= 0) {
@@ -76,7 +93,7 @@ export class Training {
       const answers = await Promise.all(this.players.map(player => player.ask({ ask: "ends", run })));
       const trials = answers.flatMap(({ words, bytes }) => {
         let at = 0;
-        return words.map(({ trial, policies, fitness, pending }) => {
+        return words.map((/** @type {{ trial: number, policies: number, fitness: number, pending: Place | null }} */ { trial, policies, fitness, pending }) => {
           const part = bytes.subarray(at, at += 4 * (policies + fitness));
           return { trial, part, pending, champions: champions(arm, part, policies) };
         });
@@ -87,6 +104,10 @@ export class Training {
     this.state = "done";
   }
 
+  /**
+   * Makes the archive and the digest of a run.
+   * @param {Arm} arm @param {{ part: Bytes, pending: Place | null }[]} ended @param {ArrayBuffer[]} buffers
+   */
   async record(arm, ended, buffers) {
     const { trials, toml: text, command } = arm, last = arm.config.learning.generations;
     const rows = new Float64Array((last + 1) * trials.length * 7);
@@ -107,30 +128,38 @@ export class Training {
     Object.assign(arm, { digest: words.digest, zip });
   }
 
-  // Makes a finished training from a run's archive.
-  static async read(player, machine, name, { words, bytes }) {
-    const arm = { name, label: words.config.learning.paradigm, toml: words.toml, config: words.config, pois: words.pois, parameters: words.parameters, digest: words.digest };
-    const training = new Training([arm], machine), [own] = training.arms;
-    const numbers = new Float64Array(bytes.buffer, bytes.byteOffset, words.rows * 7);
-    for (let at = 0; at < numbers.length; at += 7) {
-      const [, trial, generation, best, mean, champion, seconds] = numbers.subarray(at, at + 7);
-      own.trials[trial][generation] = { best, mean, champion, seconds };
-    }
-    const start = words.rows * 56, size = (bytes.byteLength - start) / own.trials.length;
-    own.trials.forEach((_, trial) => {
-      own.ended[trial] = champions(own, bytes.subarray(start + trial * size, start + (trial + 1) * size), size / 4);
-      training.owners.set(`0/${trial}`, player);
+  /** Makes a finished training of opened runs, each as an arm. @param {Player} player @param {any} machine @param {Opened[]} opened */
+  static async read(player, machine, opened) {
+    const training = new Training(opened.map(({ name, label, words }) => {
+      const { toml, config, pois, parameters, digest } = words;
+      return { name, label, toml, config, pois, parameters, digest, constant: null, random: [] };
+    }), machine);
+    opened.forEach(({ words, bytes }, run) => {
+      const own = training.arms[run], numbers = new Float64Array(bytes.buffer, bytes.byteOffset, words.rows * 7);
+      for (let at = 0; at < numbers.length; at += 7) {
+        const [, trial, generation, best, mean, champion, seconds] = numbers.subarray(at, at + 7);
+        own.trials[trial][generation] = { best, mean, champion, seconds };
+      }
+      const start = words.rows * 56, size = (bytes.byteLength - start) / own.trials.length;
+      own.trials.forEach((_, trial) => {
+        own.ended[trial] = champions(own, bytes.subarray(start + trial * size, start + (trial + 1) * size), size / 4);
+        training.owners.set(`${run}/${trial}`, player);
+      });
     });
     training.players = [player];
-    await player.ask({ ask: "train", runs: [{ text: words.toml, trials: [] }] });
+    await player.ask({ ask: "train", runs: opened.map(({ words }) => ({ text: words.toml, trials: [] })) });
     training.state = "done";
     return training;
   }
 
-  // Returns the episode of the best team of a generation of a trial, for display. Without `generation`, the worker's
-  // current one is used.
+  /**
+   * Returns the episode of the best team of a generation of a trial, for display. A run that ended before that generation gives its last.
+   * @param {number} run @param {number} trial @param {number} generation
+   */
   async best(run, trial, generation) {
-    const { words } = await this.owners.get(`${run}/${trial}`).ask({ ask: "best", run, trial, generation });
+    const player = this.owners.get(`${run}/${trial}`);
+    if (!player) throw new Error(`there is no trial ${trial}`);
+    const { words } = await player.ask({ ask: "best", run, trial, generation });
     // Training here starts from random policies. A run from a file may have started from given ones, or be from another
     // version.
     const [episode] = words.episodes, told = this.arms[run].trials[trial][episode.generation];
@@ -141,7 +170,13 @@ export class Training {
   stop() { if (this.state !== "done") this.state = "stopped"; }
 }
 
-// Returns the first policy of each population. `bytes` start with `numbers` f32, `[populations][policies][parameters]`.
+/** Returns the last generation of an arm. @param {{ config: any }} arm */
+export const last_of = ({ config }) => config.learning.generations;
+
+/**
+ * Returns the first policy of each population. `bytes` start with `numbers` f32, `[populations][policies][parameters]`.
+ * @param {Arm} arm @param {Uint8Array} bytes @param {number} numbers
+ */
 function champions({ config, parameters }, bytes, numbers) {
   const each = 4 * config.learning.population * parameters, many = numbers * 4 / each, own = new Uint8Array(many * 4 * parameters);
   for (let at = 0; at < many; at++) own.set(bytes.subarray(at * each, at * each + 4 * parameters), at * 4 * parameters);

@@ -16,7 +16,7 @@ export async function verify() {
     const { words } = await player.ask({ ask: "verify", worlds, teams, seed: 0, pass });
     output.className = words.mismatch ? "bad" : "good";
     output.textContent = words.mismatch ? `DIFFERENT: ${words.mismatch}` : `Equal: this browser's GPU and CPU agree on every bit of ${words.agent_steps.toLocaleString("en")} agent-steps in ${words.worlds} random worlds.`;
-  } catch (error) {
+  } catch (/** @type {any} */ error) {
     output.className = "bad";
     output.textContent = error.message;
   }

@@ -3,11 +3,13 @@
 import { ring } from "./arrange.js";
 import { credits, dark, select } from "./credit.js";
 import { curves } from "./curves.js";
-import { $, make, number, still, trouble } from "./dom.js";
+import { $, make, number, pen_of, still, trouble } from "./dom.js";
 import { reach } from "./scene.js";
 import { angles, moment, words } from "./senses.js";
 import { NAMES, TONES, state } from "./state.js";
+import { last_of } from "./training.js";
 
+/** Adds a view. @param {string} label */
 export function view(label) {
   const card = make("section", "", $("views"), { className: "card" });
   const head = make("h2", "", card);
@@ -18,27 +20,30 @@ export function view(label) {
   said.setAttribute("aria-live", "off");
   const canvas = make("canvas", "", card);
   canvas.setAttribute("role", "img");
+  /** @type {View} */
   const made = { label, card, title, said, canvas, data: null, place: 0, playing: false, over: null, wanted: null, asking: false, crop: [0, 0, 1, 1], removed: null, selected: null };
-  canvas.addEventListener("pointermove", event => pointed(made, event));
-  canvas.addEventListener("click", event => picked(made, event));
+  canvas.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => pointed(made, event));
+  canvas.addEventListener("click", (/** @type {MouseEvent} */ event) => picked(made, event));
   canvas.addEventListener("pointerleave", () => { made.over = null; draw(made); });
   state.views.push(made);
   return made;
 }
 
+/** Makes a view for each arm. @param {Training} training */
 export function build(training) {
   clear();
   $("loop").checked = false;
-  for (const arm of training.arms) Object.assign(view(arm.label), { crop: reach(arm.config) });
+  for (const arm of training.arms) view(arm.label).crop = reach(arm.config);
   $("views").classList.toggle("one", training.arms.length === 1);
   $("views").classList.toggle("many", training.arms.length > 2);
-  const [arm] = training.arms;
-  $("trial").replaceChildren(...arm.trials.map((_, trial) => make("option", String(trial))));
+  // Trials that all arms have.
+  const trials = Math.min(...training.arms.map(arm => arm.trials.length));
+  $("trial").replaceChildren(...Array.from({ length: trials }, (_, trial) => make("option", String(trial))));
   $("scrub").max = training.last;
   $("scrub").value = 0;
 }
 
-// Decodes an episode and its details, in place.
+/** Decodes an episode and its details, in place. @param {any} data */
 export function unpack(data) {
   stage.unpack(data);
   for (const episode of data.episodes) {
@@ -54,6 +59,7 @@ export function clear() {
   $("credit").hidden = true;
 }
 
+/** Draws a view at its place in the episode. @param {View} view */
 export function draw(view) {
   if (!view.data) return;
   const { data } = view, [own] = data.episodes;
@@ -78,9 +84,9 @@ export function draw(view) {
   if (view === state.views[0]) playing();
 }
 
-// Draws what the selected leader senses: a sector per quadrant, outside for POIs and inside for agents.
+/** Draws what the selected leader senses: a sector per quadrant, outside for POIs and inside for agents. @param {View} view @param {any} episode */
 function senses(view, episode) {
-  const leader = view.selected, shows = leader !== null && episode.senses && leader < episode.leaders;
+  const leader = view.selected ?? -1, shows = leader >= 0 && episode.senses && leader < episode.leaders;
   view.sensed ??= make("p", "", view.card, { className: "sensed" });
   view.sensed.hidden = !shows;
   if (!shows) return;
@@ -89,7 +95,7 @@ function senses(view, episode) {
   view.sensed.textContent = frame === 0 ? `Leader ${leader} has not sensed anything yet.` : `Leader ${leader} ${words(now)}`;
   if (frame === 0) return;
   const [x, y, cos, sin] = stage.moment(view.data, episode, frame - 1, leader), ahead = Math.atan2(sin, cos);
-  const pen = view.canvas.getContext("2d"), style = getComputedStyle(document.documentElement);
+  const pen = pen_of(view.canvas), style = getComputedStyle(document.documentElement);
   for (const { values, tone, size } of [{ values: now.pois, tone: "--poi", size: 46 }, { values: now.agents, tone: "--accent", size: 26 }]) {
     const most = Math.max(...values, 1e-9);
     values.forEach((value, quadrant) => {
@@ -110,7 +116,7 @@ function senses(view, episode) {
   pen.globalAlpha = 1;
 }
 
-// A click selects the leader under it, or none.
+/** Selects the leader under a click, or none. @param {View} view @param {MouseEvent} event */
 function picked(view, event) {
   if (state.mode !== "watch" || !view.data || !view.drawn || !view.data.episodes[0].senses) return;
   const { X, Y } = stage.place_on(view.canvas, view.crop), { leaders } = view.data.episodes[0];
@@ -119,23 +125,25 @@ function picked(view, event) {
   if (away[nearest] <= 18) select(view, nearest);
 }
 
-// Plays an episode from its start, or shows its end if `moving` is false. Visitors who prefer reduced motion also see
-// the end, unless they asked to play it.
-export function show(view, data, moving = true, asked = false) {
+/**
+ * Plays an episode from its start, or shows its end if `moving` is false. Visitors who prefer reduced motion also see the end.
+ * @param {View} view @param {any} data
+ */
+export function show(view, data, moving = true) {
   const last = data.episodes[0].shown.length - 1;
-  const plays = moving && (asked || !still.matches), [left, below, right, above] = view.crop;
+  const plays = moving && !still.matches, [left, below, right, above] = view.crop;
   // Stages and jitter may move POIs out of the view.
-  if (data.pois.some(([x, y]) => x < left || x > right || y < below || y > above)) view.crop = stage.whole(data);
+  if (data.pois.some((/** @type {Place} */ [x, y]) => x < left || x > right || y < below || y > above)) view.crop = stage.whole(data);
   // A removed leader stays removed while the episode is the same.
   if (data !== view.data) view.removed = null;
-  if (view.selected !== null && view.selected >= data.episodes[0].leaders) view.selected = null;
+  if (view.selected && view.selected >= data.episodes[0].leaders) view.selected = null;
   Object.assign(view, { data, place: plays ? 0 : last, playing: plays, ended: plays ? null : performance.now() });
   draw(view);
   credits();
   wake_up();
 }
 
-// Sets the step slider to the first view's step.
+/** Sets the step slider to the first view's step. @param {View} view */
 export function steps(view) {
   const last = view.data.episodes[0].shown.length - 1;
   $("step").disabled = last === 0;
@@ -144,7 +152,7 @@ export function steps(view) {
   $("step").setAttribute("aria-valuetext", `step ${view.data.episodes[0].shown[Math.floor(view.place)]} of ${view.data.steps}`);
 }
 
-// Shows all views at a step, and pauses them.
+/** Shows all views at a step, and pauses them. @param {number} place */
 export function step_to(place) {
   $("loop").checked = false;
   for (const view of state.views.filter(view => view.data)) {
@@ -153,7 +161,7 @@ export function step_to(place) {
   }
 }
 
-export // Sets the button of the player.
+// Sets the button of the player.
 function playing() {
   const plays = state.views.some(view => view.playing);
   if ($("replay").textContent !== (plays ? "Pause the episode" : "Play")) $("replay").textContent = plays ? "Pause the episode" : "Play";
@@ -172,7 +180,9 @@ export function replay() {
   wake_up();
 }
 
-let clock = null, running = false, has_moved = false;
+/** When the last frame was drawn, or null. @type {number | null} */
+let clock = null;
+let running = false, has_moved = false;
 export function wake_up() {
   if (running) return;
   running = true;
@@ -180,6 +190,7 @@ export function wake_up() {
   requestAnimationFrame(tick);
 }
 
+/** @param {number} time */
 function tick(time) {
   const seconds = clock === null ? 0 : Math.min((time - clock) / 1000, 0.25);
   clock = time;
@@ -200,7 +211,7 @@ function tick(time) {
   // Repeats together, a second after the last view has ended.
   const views = state.views.filter(view => view.data && view.data.episodes[0].shown.length > 1);
   const waits = $("loop").checked && !live && state.mode === "watch" && views.length > 0 && views.every(view => !view.playing && view.ended);
-  if (waits && views.every(view => time - view.ended > 1000)) views.forEach(view => Object.assign(view, { place: 0, playing: true, ended: null }));
+  if (waits && views.every(view => time - (view.ended ?? time) > 1000)) views.forEach(view => Object.assign(view, { place: 0, playing: true, ended: null }));
   if (state.follow) follow();
   running = waits || state.views.some(view => view.playing);
   if (running) requestAnimationFrame(tick);
@@ -215,19 +226,21 @@ export function follow() {
   state.views.forEach((view, run) => {
     const at = view.data ? view.data.episodes[0].generation : -1;
     const rest = still.matches ? 700 : 250;
-    if (view.playing || view.asking || at >= training.last || at === state.generation && training.state !== "done") return;
+    if (view.playing || view.asking || at >= last_of(training.arms[run]) || at === state.generation && training.state !== "done") return;
     if (view.ended && performance.now() - view.ended < rest) return void setTimeout(follow, rest);
     ask(view, run, training.state === "done" ? training.last : state.generation);
   });
 }
 
+/** Requests an episode for a view, and shows it. @param {View} view @param {number} run @param {number} generation */
 export async function ask(view, run, generation) {
   const { training, trial } = state;
+  if (!training) return;
   view.asking = true;
   try {
     const data = unpack(await training.best(run, trial, generation));
     if (state.training === training && state.views[run] === view && state.mode === "watch") show(view, data);
-  } catch (error) {
+  } catch (/** @type {any} */ error) {
     if (!error.stopped && state.training === training && !/worker/.test(error.message)) trouble(error.message);
   }
   view.asking = false;
@@ -238,7 +251,7 @@ export async function ask(view, run, generation) {
   }
 }
 
-// Shows a generation of all arms.
+/** Shows a generation of all arms. @param {number} generation */
 export function seek(generation) {
   const { training } = state;
   if (!training || training.state === "starting") return;
@@ -252,22 +265,25 @@ export function seek(generation) {
   });
 }
 
+/** Follows the training, or not. @param {boolean} follow */
 export function following(follow) {
   state.follow = follow;
   $("following").checked = follow;
 }
 
 export function position() {
-  const { training, generation } = state, ahead = state.follow && training.state === "training";
+  const { training, generation } = state;
+  if (!training) return;
+  const ahead = state.follow && training.state === "training";
   $("scrub").value = generation;
   $("generation").textContent = `${ahead ? "trained to generation" : "generation"} ${generation} of ${training.last}`;
   $("scrub").setAttribute("aria-valuetext", $("generation").textContent);
 }
 
 export function controls() {
-  const { training } = state, going = training && training.state === "training";
+  const { training } = state, going = Boolean(training && training.state === "training");
   $("pause").disabled = $("stop").disabled = $("following").disabled = !going;
-  $("pause").textContent = going && training.paused ? "Continue" : "Pause";
+  $("pause").textContent = going && training && training.paused ? "Continue" : "Pause";
   $("scrub").disabled = !training || training.state === "starting";
 }
 
@@ -280,6 +296,7 @@ export function pause() {
   follow();
 }
 
+/** Marks the POI under the pointer. @param {View} view @param {PointerEvent} event */
 function pointed(view, event) {
   if (state.mode !== "watch" || !view.data) return;
   const over = stage.poi_at(view.data, view.canvas, view.crop, event.offsetX, event.offsetY);

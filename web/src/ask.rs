@@ -1,6 +1,7 @@
 //! The requests of a page, and their dispatch.
 
 use std::fmt::Display;
+use std::path::PathBuf;
 
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::device::{Gpu, Request, Wanted};
@@ -9,12 +10,14 @@ use flotilla::backend::gpu::{self, exact::Pass};
 use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::{Config, ConfigError, Override};
 use flotilla::front;
-use flotilla::report::replay;
+use flotilla::model::start;
+use flotilla::report::{replay, runs};
 use flotilla::verify::{self, Plan};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
 use crate::archive::{self, Recorded};
+use crate::arms;
 use crate::baseline::{self, Random};
 use crate::drive::Drive;
 use crate::edit;
@@ -59,6 +62,10 @@ enum Ask {
     Edit { text: String, changes: Vec<(String, String)> },
     /// Returns G of the best constant action.
     Constant { text: String },
+    /// Returns learning curves with their intervals, and the comparison of arms. The numbers are G, see [`arms::compare`].
+    Compare { arms: Vec<arms::Arm> },
+    /// Names runs by what differs between their configs, or by their files.
+    Labels { texts: Vec<String>, names: Vec<String> },
     /// Starts the baseline of random networks.
     Random { text: String },
     /// Plays generations of that baseline, and returns G of the best network so far.
@@ -128,6 +135,12 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
         Ask::Resolve { text, name, changes } => words(resolve(&text, &name, changes)?),
         Ask::Edit { text, changes } => words(json!({ "text": edit::set(&text, &changes).map_err(refuse)? })),
         Ask::Constant { text } => words(baseline::constant(parse(&text)?)?),
+        Ask::Compare { arms } => words(arms::compare(arms, bytes)?),
+        Ask::Labels { texts, names } => {
+            let configs = texts.iter().map(|text| parse(text)).collect::<Result<Vec<_>, _>>()?;
+            let names: Vec<PathBuf> = names.into_iter().map(PathBuf::from).collect();
+            words(json!({ "labels": runs::labels(&names, &configs) }))
+        }
         Ask::Random { text } => {
             session.random = Some(Random::new(parse(&text)?));
             words(json!({}))
@@ -185,13 +198,27 @@ fn resolve(text: &str, name: &str, changes: Vec<(String, String)>) -> Result<Val
     Ok(words)
 }
 
-/// Returns a config as TOML and as JSON, with its number of POIs (null if stages differ) and parameters per policy.
+/// Returns a config as TOML and as JSON, with its number of POIs (null if stages differ), parameters per policy, and
+/// start.
 pub fn described(config: &Config) -> Value {
     let (toml, pois, parameters) = (config.to_toml(), config.pois(), config.parameters());
     let mut words = json!({ "toml": toml, "config": config, "pois": pois, "parameters": parameters });
     // JavaScript numbers cannot represent every 64-bit seed.
     words["config"]["learning"]["seed"] = config.learning.seed.to_string().into();
+    words["start"] = start_of(config);
     words
+}
+
+/// Returns each POI's coupling, each agent's heading, and the leader that each agent would follow first (-1 for none).
+fn start_of(config: &Config) -> Value {
+    let world = &config.world;
+    let first = |follower: &[f64; 2]| {
+        let leader = start::nearest(follower, &world.leaders);
+        let [dx, dy] = [0, 1].map(|axis| world.leaders[leader][axis] - follower[axis]);
+        if dx.hypot(dy) <= config.follow.attraction_radius { leader as i64 } else { -1 }
+    };
+    let owner: Vec<i64> = (0..world.leaders.len() as i64).chain(world.followers.iter().map(first)).collect();
+    json!({ "owner": owner, "coupling": world.coupling.of_each(world.pois.len()), "headings": world.headings() })
 }
 
 fn machine((backend, machine): &OpenBackend) -> Value {

@@ -33,7 +33,7 @@ mod page {
     use wasm_bindgen_cli_support::Bindgen;
 
     /// Modules of the page, in the order in which they are joined to one script.
-    const MODULES: &str = "dom pool config chart training compare table senses state experiment address machine curves scene \
+    const MODULES: &str = "dom pool config chart training compare table senses state experiment address machine curves intervals scene \
         views credit baselines train arrange drive modes files verify exports gallery guide opening main";
     /// Experiments of the gallery.
     const GALLERY: [&str; 6] = ["two_groups", "population", "blind", "eight_followers", "relay", "places"];

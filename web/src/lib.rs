@@ -15,6 +15,7 @@ use serde_json::{Value, json};
 use wasm_bindgen::prelude::*;
 
 mod archive;
+mod arms;
 mod ask;
 mod baseline;
 mod drive;

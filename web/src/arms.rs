@@ -1,0 +1,61 @@
+//! Compares arms: what was trained, or runs that were opened.
+
+use std::path::PathBuf;
+
+use flotilla::config::Config;
+use flotilla::report::comparison::{self, At, Cohort, Question, Trial};
+use flotilla::report::curves::{Band, Curve};
+use flotilla::statistics::Average;
+use serde::Deserialize;
+use serde_json::{Value, json};
+
+use crate::ask::{Refusal, refuse};
+
+/// G whose first generation is compared, as in `flotilla compare`.
+const REACH: f64 = 0.75;
+
+/// An arm of a comparison.
+#[derive(Deserialize)]
+pub struct Arm {
+    name: String,
+    text: String,
+    /// The number of generations that each trial has played, including generation 0.
+    lengths: Vec<usize>,
+}
+
+/// Returns the curves of the best teams with their 95 % intervals, and the tables of `flotilla compare`.
+///
+/// `bytes` are G of the best team and of the champion as f64, `[arms][trials][generations][2]`. If the arms cannot be
+/// compared, `refused` says why, and there are no tables.
+pub fn compare(arms: Vec<Arm>, bytes: &[u8]) -> Result<Value, Refusal> {
+    let numbers: Vec<f64> = bytemuck::pod_collect_to_vec(&bytes[..bytes.len() / 8 * 8]);
+    let mut pairs = numbers.as_chunks::<2>().0;
+    let (mut cohorts, mut curves) = (Vec::new(), Vec::new());
+    for Arm { name, text, lengths } in arms {
+        let config = Config::parse(&text, "the config")?;
+        // A training that was stopped may have played some trials further than others.
+        let shared = lengths.iter().copied().min().unwrap_or(0);
+        let (mut trials, mut best) = (Vec::new(), vec![Average::default(); shared]);
+        for (trial, length) in lengths.into_iter().enumerate() {
+            let (course, rest) = pairs.split_at_checked(length).ok_or_else(|| refuse("the rows are incomplete"))?;
+            pairs = rest;
+            best.iter_mut().zip(course).for_each(|(best, [g, _])| best.add(*g));
+            let key = (config.learning.seed, trial);
+            trials.push(Trial { key, course: course.to_vec(), from: config.last_from() });
+        }
+        let (curve, _) = Curve::new(&best).thinned();
+        let band = curve.outline(Band::Interval, 1.0);
+        curves.push(json!({ "generation": curve.generation, "mean": curve.mean, "band": band }));
+        let folders = vec![PathBuf::from(&name)];
+        cohorts.push(Cohort { name, folders, planned: config.learning.generations, trials });
+    }
+    let question = Question { at: vec![At::Last], reach: REACH, paired: false };
+    Ok(match comparison::compare("", &cohorts, &question) {
+        Ok(found) => {
+            let pairs = if cohorts.len() > 1 { found.pairs() } else { vec![] };
+            let legend = comparison::legend(std::slice::from_ref(&found), &question);
+            json!({ "curves": curves, "means": found.means(), "pairs": pairs, "legend": legend, "notes": found.notes })
+        }
+        Err(error) => json!({ "curves": curves, "refused": error.to_string() }),
+    })
+}
