@@ -4,8 +4,10 @@ import { $, count, make, number } from "./dom.js";
 import { state } from "./state.js";
 import { draw } from "./views.js";
 
-// Most leaders with a column each.
-const COLUMNS = 32;
+// Most leaders in the table.
+const SHOWN = 32;
+const narrow = matchMedia("(max-width: 640px)");
+narrow.addEventListener("change", () => credits());
 
 // Shows the credits of the view that is chosen in the list.
 export function credits() {
@@ -29,45 +31,58 @@ let drawn = null;
 function table(view) {
   const { data } = view, [episode] = data.episodes;
   // The table changes with the episode, but not with its steps.
-  const key = [view, data, view.removed, view.selected], before = drawn;
+  const key = [view, data, view.removed, view.selected, narrow.matches], before = drawn;
   if (before && key.every((part, index) => part === before[index])) return;
   drawn = key;
-  const { leaders } = episode, columns = Math.min(leaders, COLUMNS), followers = episode.agents > leaders;
-  const rows = [["D", episode.d], ["Df", episode.df], ["D++", episode.dpp], ["Dt", episode.dt]].filter(([, values]) => values && values.length);
-  const body = make("table"), head = make("tr", "", make("thead", "", body));
+  const leaders = Array.from({ length: Math.min(episode.leaders, SHOWN) }, (_, leader) => leader);
+  const scores = [["D", episode.d], ["Df", episode.df], ["D++", episode.dpp], ["Dt", episode.dt]].filter(([, values]) => values && values.length);
+  /** A list per measure and action: its name, and then a cell per leader. @type {(string | HTMLElement)[][]} */
+  const lists = [
+    ["Leader", ...leaders.map(leader => sense_button(view, leader))],
+    ...scores.map(([name, values]) => [name === data.fitness ? `${name} (selects)` : name, ...leaders.map(leader => number(values[leader]))]),
+    ["Remove it", ...leaders.map(leader => remove_button(view, { leader, group: false }))],
+  ];
+  if (episode.agents > episode.leaders) lists.push(["Remove it and its followers", ...leaders.map(leader => remove_button(view, { leader, group: true }))]);
+  const selects = 1 + scores.findIndex(([name]) => name === data.fitness);
   const focused = document.activeElement && /** @type {HTMLElement} */ (document.activeElement).dataset.credit;
-  make("th", "Leader", head, { scope: "col" });
-  for (let leader = 0; leader < columns; leader++) {
-    const cell = make("th", "", head, { scope: "col" }), colors = stage.palette(data);
-    const button = make("button", String(leader), cell, { type: "button", title: "Show what it senses" });
-    button.setAttribute("aria-label", `Leader ${leader}: show what it senses`);
-    button.setAttribute("aria-pressed", String(view.selected === leader));
-    button.dataset.credit = `sense ${leader}`;
-    button.style.borderBottom = `4px solid ${colors[leader % colors.length]}`;
-    button.addEventListener("click", () => select(view, leader));
-  }
-  const places = make("tbody", "", body);
-  for (const [name, values] of rows) {
-    const row = make("tr", "", places, { className: name === data.fitness ? "selects" : "" });
-    make("th", name === data.fitness ? `${name} (selects)` : name, row, { scope: "row" });
-    for (let leader = 0; leader < columns; leader++) make("td", number(values[leader]), row);
-  }
-  for (const group of followers ? [false, true] : [false]) {
-    const row = make("tr", "", places);
-    make("th", group ? "Remove it and its followers" : "Remove it", row, { scope: "row" });
-    for (let leader = 0; leader < columns; leader++) {
-      const is = view.removed && view.removed.leader === leader && view.removed.group === group;
-      const button = make("button", is ? "Put back" : "Remove", make("td", "", row), { type: "button" });
-      button.setAttribute("aria-label", `${is ? "Put back" : "Remove"} leader ${leader}${group ? " and its followers" : ""}`);
-      button.setAttribute("aria-pressed", String(Boolean(is)));
-      button.dataset.credit = `${group} ${leader}`;
-      button.addEventListener("click", () => remove_leader(view, is ? null : { leader, group }));
+  const body = make("table"), head = make("thead", "", body), rest = make("tbody", "", body);
+  // Each list is a row. In a narrow window it is a column, because leaders are often more than measures.
+  const [high, wide] = narrow.matches ? [leaders.length + 1, lists.length] : [lists.length, leaders.length + 1];
+  for (let row = 0; row < high; row++) {
+    const line = make("tr", "", row === 0 ? head : rest);
+    for (let column = 0; column < wide; column++) {
+      const [list, place] = narrow.matches ? [column, row] : [row, column];
+      const cell = make(row === 0 || column === 0 ? "th" : "td", "", line, { className: list > 0 && list === selects ? "selects" : "" });
+      if (row === 0 || column === 0) cell.scope = row === 0 ? "col" : "row";
+      cell.append(lists[list][place]);
     }
   }
   $("credits").replaceChildren(body);
-  if (leaders > columns) make("p", `and ${count(leaders - columns, "more leader")}`, $("credits"));
+  if (episode.leaders > SHOWN) make("p", `and ${count(episode.leaders - SHOWN, "more leader")}`, $("credits"));
   if (focused) [...$("credits").querySelectorAll("button")].find(button => button.dataset.credit === focused)?.focus();
   $("lost").textContent = lost(view);
+}
+
+/** Makes the button that shows what a leader senses. @param {View} view @param {number} leader */
+function sense_button(view, leader) {
+  const colors = stage.palette(view.data), button = make("button", String(leader), null, { type: "button", title: "Show what it senses" });
+  button.setAttribute("aria-label", `Leader ${leader}: show what it senses`);
+  button.setAttribute("aria-pressed", String(view.selected === leader));
+  button.dataset.credit = `sense ${leader}`;
+  button.style.borderBottom = `4px solid ${colors[leader % colors.length]}`;
+  button.addEventListener("click", () => select(view, leader));
+  return button;
+}
+
+/** Makes the button that removes a leader, or puts it back. @param {View} view @param {{ leader: number, group: boolean }} removal */
+function remove_button(view, { leader, group }) {
+  const is = view.removed && view.removed.leader === leader && view.removed.group === group;
+  const button = make("button", is ? "Put back" : "Remove", null, { type: "button" });
+  button.setAttribute("aria-label", `${is ? "Put back" : "Remove"} leader ${leader}${group ? " and its followers" : ""}`);
+  button.setAttribute("aria-pressed", String(Boolean(is)));
+  button.dataset.credit = `${group} ${leader}`;
+  button.addEventListener("click", () => remove_leader(view, is ? null : { leader, group }));
+  return button;
 }
 
 /** Removes a leader from a view's episode, or puts it back. @param {View} view @param {View["removed"]} removed */
