@@ -72,8 +72,8 @@ export class Training {
         for (let at = 0; at < numbers.length; at += 6) {
           const [run, trial, generation, best, mean, champion] = numbers.subarray(at, at + 6);
           this.arms[run].trials[trial][generation] = { best, mean, champion, seconds };
-          const { population, episodes_per_team } = this.arms[run].config.learning;
-          this.teams += (population + 1) * episodes_per_team;
+          const { population, partners, episodes_per_team } = this.arms[run].config.learning;
+          this.teams += (population * (partners ?? 1) + 1) * episodes_per_team;
         }
         this.busy[index] += words.seconds;
         next = words.next;
