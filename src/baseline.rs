@@ -32,9 +32,9 @@ const SATURATING: f32 = 20.0;
 pub struct Baseline {
     /// The best constant (see [`constants`]) in each generation.
     pub constant: Vec<Vec<f64>>,
-    /// The best random constant action so far, with as many drawn in each generation as the population has policies.
+    /// The best random constant action so far, with as many drawn in each generation as training plays teams.
     pub actions: Vec<Vec<f64>>,
-    /// The best random network so far, with as many drawn in each generation as the population has policies.
+    /// The best random network so far, with as many drawn in each generation as training plays teams.
     pub random: Vec<Vec<f64>>,
 }
 
@@ -251,14 +251,14 @@ impl Setting {
     fn new(config: Config, trials: std::ops::Range<usize>) -> Setting {
         let world = World::new(&config);
         let constants = constants(config.policy.actions);
-        let Learning { population, episodes_per_team, generations, .. } = config.learning;
+        let Learning { episodes_per_team, generations, .. } = config.learning;
         let none = || vec![Vec::with_capacity(generations + 1); trials.len()];
         let found = Baseline { constant: none(), actions: none(), random: none() };
         let trial = |index| Trial {
             index,
             weights: vec![],
             starts: vec![vec![]; episodes_per_team],
-            observed: Vec::with_capacity(constants.len() + 2 * population),
+            observed: Vec::with_capacity(constants.len() + 2 * config.learning.teams()),
             constants: vec![0; constants.len()],
             finalists: [vec![], vec![]],
         };
@@ -267,7 +267,7 @@ impl Setting {
 
     /// Returns the number of teams per generation of a trial.
     fn teams(&self) -> usize {
-        self.constants.len() + 2 * self.config.learning.population
+        self.constants.len() + 2 * self.config.learning.teams()
     }
 
     /// Returns the round of a trial's teams whose policies are written.
@@ -278,11 +278,11 @@ impl Setting {
 
     /// Returns the team at a place among a generation's teams.
     fn team(&self, generation: usize, place: usize) -> Team {
-        let (constants, population) = (self.constants.len(), self.config.learning.population);
+        let (constants, teams) = (self.constants.len(), self.config.learning.teams());
         match place.checked_sub(constants) {
             None => Team::Constant(place),
-            Some(slot) if slot < population => Team::Action(generation, slot),
-            Some(slot) => Team::Network(generation, slot - population),
+            Some(slot) if slot < teams => Team::Action(generation, slot),
+            Some(slot) => Team::Network(generation, slot - teams),
         }
     }
 
@@ -335,14 +335,14 @@ impl Setting {
 
     /// Adds the results of a generation.
     fn collect_results(&mut self, generation: usize) {
-        let Learning { population, episodes_per_team, .. } = self.config.learning;
+        let episodes_per_team = self.config.learning.episodes_per_team;
         let whole = (self.world.pois.len() * episodes_per_team) as f64;
         for (place, trial) in self.trials.iter_mut().enumerate() {
             let (constants, random) = trial.observed.split_at(self.constants.len());
             trial.constants.iter_mut().zip(constants).for_each(|(sum, &observed)| *sum += u64::from(observed));
             let most = constants.iter().copied().max().unwrap_or(0);
             self.found.constant[place].push(f64::from(most) / whole);
-            let (actions, networks) = random.split_at(population);
+            let (actions, networks) = random.split_at(self.config.learning.teams());
             let kinds = [
                 (actions, &mut self.found.actions[place], Team::Action as MakeTeam),
                 (networks, &mut self.found.random[place], Team::Network),

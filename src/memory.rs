@@ -69,7 +69,9 @@ impl Peaks {
                 staged.iter().map(|(config, world)| size(config, world)).max().unwrap_or(0)
             };
             let (trials, policies) = (config.learning.trials as u64, config.learning.population);
-            let teams = |config: &Config| trials * config.learning.episodes_per_team as u64 * (policies as u64 + 1);
+            let teams = |config: &Config| {
+                trials * config.learning.episodes_per_team as u64 * (config.learning.teams() as u64 + 1)
+            };
             training += trainer::bytes(config);
             next += trainer::next_bytes(config);
             checkpoint += checkpoint_bytes(config);

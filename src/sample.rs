@@ -255,6 +255,8 @@ fn plain_world(seed: u64) -> Config {
             sharing: if later.random_bool(0.2) { Sharing::Shared } else { Sharing::PerLeader },
             fitness: word(rng),
             population: rng.random_range(2..=20),
+            partners: 1,
+            leniency: Leniency::Mean,
             generations: 3,
             trials: 1,
             elites: Elites::Count(1),

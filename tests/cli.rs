@@ -214,6 +214,18 @@ fn every_wrong_value_is_named_with_line_and_range() {
             "parents = \"elites\"\nelites = 0",
             "learning.parents: found \"elites\" with learning.elites = 0, allowed with 1 or more",
         ),
+        (23, "partners = 17", "learning.partners: found 17, allowed 1 to 16"),
+        (
+            23,
+            "partners = 3\nsharing = \"all\"",
+            "learning.partners: found 3 with learning.sharing = \"all\", allowed 1: a team has a single policy",
+        ),
+        (
+            23,
+            "partners = 2\npopulation = 600000",
+            "learning.partners: found 2, which makes 1200000 teams per generation, allowed 1048576",
+        ),
+        (23, "leniency = \"min\"", "learning.leniency: found \"min\", allowed \"mean\" or \"max\""),
         (23, "generations = -1", "learning.generations: found -1, allowed 0 to 1000000"),
         (23, "trials = 0", "learning.trials: found 0, allowed 1 to 4096"),
         (23, "episodes_per_team = 0", "learning.episodes_per_team: found 0, allowed 1 to 1000"),
@@ -281,7 +293,7 @@ x.toml:13: motion.max_sped: unknown key, did you mean `motion.max_speed`?
 x.toml:21: policy.hidden[0]: found 65, allowed 1 to 64
 x.toml:24: learning.trials: found 0, allowed 1 to 4096
 x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, fitness, generations, led_by, \
-         led_within, mutation, mutation_probability, mutation_sigma, paradigm, parents, poi_jitter, population, seed, sharing, start_jitter, trials
+         led_within, leniency, mutation, mutation_probability, mutation_sigma, paradigm, parents, partners, poi_jitter, population, seed, sharing, start_jitter, trials
 --population: found 1, allowed 2 to 1048576"
     );
 }

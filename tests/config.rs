@@ -4,8 +4,9 @@ use std::path::Path;
 
 use flotilla::config::{
     Actions, CheckpointConfig, Config, ConfigError, Coupling, Density, Elites, Fitness, Follow, Heading, Learning,
-    LedBy, MAX_EPISODES, MAX_GENERATIONS, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS,
-    Motion, Mutation, Observers, Override, Paradigm, Parents, Policy, Problem, Sense, Sharing, WorldConfig,
+    LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_PARTNERS, MAX_POPULATION,
+    MAX_STEPS, MAX_TRIALS, Motion, Mutation, Observers, Override, Paradigm, Parents, Policy, Problem, Sense, Sharing,
+    WorldConfig,
 };
 use flotilla::reader::Document;
 use proptest::collection::vec;
@@ -60,6 +61,8 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             sharing: Sharing::PerLeader,
             fitness: Fitness::Df,
             population: 50,
+            partners: 1,
+            leniency: Leniency::Mean,
             generations: 100,
             trials: 5,
             elites: Elites::Count(1),
@@ -288,7 +291,8 @@ fn configs() -> impl Strategy<Value = Config> {
     let policy = (vec(1..=MAX_HIDDEN_UNITS, 0..=MAX_HIDDEN_LAYERS), word())
         .prop_map(|(hidden, actions)| Policy { hidden, actions });
     let elites = prop_oneof![(0.0..=1.0f64).prop_map(Ok), size(1e-3, 100.0).prop_map(Err)];
-    let sizes = (2..=5000usize, 0..=MAX_GENERATIONS, 1..=9usize, (elites, word()), 1..=MAX_EPISODES);
+    let teams = (2..=5000usize, 1..=MAX_PARTNERS, word());
+    let sizes = (teams, 0..=MAX_GENERATIONS, 1..=9usize, (elites, word()), 1..=MAX_EPISODES);
     let mutation = (word(), size_or_zero(1e-6, 1.0), size_or_zero(1e-6, 100.0));
     let mutation = (mutation, 0..=MAX_STEPS, word());
     let jitters = (size_or_zero(1e-6, 1e4), size_or_zero(1e-6, 1e4));
@@ -296,7 +300,7 @@ fn configs() -> impl Strategy<Value = Config> {
         |(
             (paradigm, sharing),
             fitness,
-            (population, generations, trials, (part, parents), episodes_per_team),
+            ((population, partners, leniency), generations, trials, (part, parents), episodes_per_team),
             mutation,
             (start_jitter, poi_jitter),
             seed,
@@ -307,6 +311,8 @@ fn configs() -> impl Strategy<Value = Config> {
                 sharing,
                 fitness,
                 population,
+                partners: if sharing == Sharing::Shared { 1 } else { partners },
+                leniency,
                 generations,
                 trials,
                 elites: match part {

@@ -9,7 +9,9 @@ use std::collections::HashSet;
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group};
-use flotilla::config::{Actions, Config, Elites, Fitness, Learning, Mutation, Paradigm, Parents, Sharing, ValidConfig};
+use flotilla::config::{
+    Actions, Config, Elites, Fitness, Learning, Leniency, Mutation, Paradigm, Parents, Sharing, ValidConfig,
+};
 use flotilla::credit::Credit;
 use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, UNCHANGED};
 use flotilla::trainer::{Row, Trainer};
@@ -81,9 +83,11 @@ fn bits(weights: &[f32]) -> Vec<u32> {
 
 proptest! {
     #[test]
-    fn every_policy_is_on_one_team(seed: u64, generation in 0usize..200, leaders in 1usize..30, population in 1usize..300) {
+    fn every_policy_is_on_one_team_of_a_round(
+        seed: u64, generation in 0usize..200, round in 0usize..16, leaders in 1usize..30, population in 1usize..300,
+    ) {
         let mut teams = vec![u32::MAX; population * leaders];
-        evolve::form_teams(Key::new(seed, 3, Purpose::Teams), generation, leaders, &mut teams);
+        evolve::form_teams(Key::new(seed, 3, Purpose::Teams), generation, round, leaders, &mut teams);
         for leader in 0..leaders {
             let mut policies: Vec<u32> = teams.iter().skip(leader).step_by(leaders).copied().collect();
             policies.sort_unstable();
@@ -133,7 +137,7 @@ fn every_way_to_form_teams_is_as_likely() {
     let mut together = vec![0; population * population * population];
     let mut orders = vec![0; 256];
     for generation in 0..12_000 {
-        evolve::form_teams(Key::new(5, 0, Purpose::Teams), generation, leaders, &mut teams);
+        evolve::form_teams(Key::new(5, 0, Purpose::Teams), generation, 0, leaders, &mut teams);
         let team = |leader: usize| (0..population).position(|team| teams[team * leaders + leader] == 0).unwrap();
         together[(team(0) * population + team(1)) * population + team(2)] += 1;
         let order = (0..population).fold(0, |order, team| order * 4 + teams[team * leaders] as usize);
@@ -193,6 +197,19 @@ fn a_tournament_is_between_any_two_policies() {
     chi_square("pairs", &counts, |_| 1.0 / 190.0);
     let mut duels = (0..100).map(|slot| evolve::tournament(tournaments.at(0, 0, slot), &[0.0, 1.0]));
     assert!(duels.all(|winner| winner == 1), "of two policies, both play");
+}
+
+#[test]
+fn a_policy_has_other_partners_in_every_round() {
+    let learning = config(CHAOTIC, |config| (config.learning.partners, config.learning.population) = (3, 20)).learning;
+    let one = Learning { partners: 1, ..learning.clone() };
+    let (all, first) = (evolve::teams_of(&learning, 1, 5, 4), evolve::teams_of(&one, 1, 5, 4));
+    assert_eq!((all.len(), learning.teams()), (3 * 20 * 4, 60));
+    assert_eq!(all[..20 * 4], first, "the first round is that of a single partner");
+    let mut teams: Vec<&[u32]> = all.chunks(4).collect();
+    teams.sort_unstable();
+    teams.dedup();
+    assert_eq!(teams.len(), 60, "no team plays twice");
 }
 
 #[test]
@@ -506,6 +523,16 @@ fn arms() -> Vec<Config> {
             config.sense.gain = 8.0;
         }),
         config(GENERALLY_FORWARD, |config| {
+            small(config, 10, 4, 2);
+            (config.learning.partners, config.learning.fitness) = (3, Fitness::D);
+            config.world.coupling = flotilla::config::Coupling::Same(2);
+        }),
+        config(CHAOTIC, |config| {
+            small(config, 8, 3, 1);
+            (config.learning.partners, config.learning.leniency) = (2, Leniency::Max);
+            (config.learning.start_jitter, config.learning.episodes_per_team) = (0.5, 2);
+        }),
+        config(GENERALLY_FORWARD, |config| {
             small(config, 11, 4, 2);
             (config.learning.sharing, config.learning.fitness) = (Sharing::Shared, Fitness::D);
             (config.learning.start_jitter, config.learning.episodes_per_team) = (0.5, 2);
@@ -533,6 +560,27 @@ set = { 'world.pois' = [[10, 12], [40, 20]], 'learning.fitness' = 'D++', 'learni
 [[stages]]
 from = 6
 set = { 'learning.poi_jitter' = 2.0, 'learning.episodes_per_team' = 2 }
+",
+        ),
+        // Leniency ends early, as in Panait, Luke and Wiegand (2006), and partners come and go.
+        staged(
+            STRICTLY_FORWARD,
+            "[learning]
+population = 10
+generations = 6
+trials = 2
+fitness = 'G'
+partners = 2
+leniency = 'max'
+[[stages]]
+from = 2
+set = { 'learning.partners' = 4 }
+[[stages]]
+from = 3
+set = { 'learning.partners' = 1, 'world.coupling' = 2 }
+[[stages]]
+from = 5
+set = { 'learning.partners' = 3, 'learning.leniency' = 'mean', 'learning.fitness' = 'D' }
 ",
         ),
         // Its first stage begins at once, its last is its last generation.
@@ -648,10 +696,14 @@ impl Plain<'_> {
         let mut rows = Vec::new();
         for generation in 0..=generations {
             let stage = self.config.at(generation);
-            let mut teams = vec![0; population * leaders];
-            evolve::form_teams(self.key(Purpose::Teams), generation, leaders, &mut teams);
+            let Learning { partners, leniency, .. } = stage.learning;
+            let mut teams = vec![0; partners * population * leaders];
+            for (round, teams) in teams.chunks_mut(population * leaders).enumerate() {
+                evolve::form_teams(self.key(Purpose::Teams), generation, round, leaders, teams);
+            }
             let shared = self.config.learning.sharing == Sharing::Shared;
             let (mut observed, mut fitness) = (Vec::new(), vec![vec![0.0; population]; self.policies.len()]);
+            let mut scored = vec![vec![Vec::new(); population]; self.policies.len()];
             for (index, team) in teams.chunks(leaders).enumerate() {
                 let team: Vec<usize> =
                     team.iter().map(|&policy| if shared { index } else { policy as usize }).collect();
@@ -665,7 +717,16 @@ impl Plain<'_> {
                 team.iter()
                     .zip(scores)
                     .enumerate()
-                    .for_each(|(leader, (&policy, score))| fitness[leader][policy] = score);
+                    .for_each(|(leader, (&policy, score))| scored[leader][policy].push(score));
+            }
+            for (fitness, scores) in fitness.iter_mut().flatten().zip(scored.iter().flatten()).filter(|_| !shared) {
+                assert_eq!(scores.len(), partners);
+                *fitness = match leniency {
+                    Leniency::Mean => {
+                        (scores.iter().map(|&score| f64::from(score)).sum::<f64>() / partners as f64) as f32
+                    }
+                    Leniency::Max => scores.iter().copied().reduce(f32::max).unwrap(),
+                };
             }
             let ranked: Vec<Vec<usize>> = (fitness.iter())
                 .map(|scores| {

@@ -38,7 +38,7 @@ coupling = 4
 type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Together these cases cover every choice that a config has, and sizes on both sides of every special case.
-const CASES: [Case; 27] = [
+const CASES: [Case; 29] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -186,6 +186,25 @@ const CASES: [Case; 27] = [
         "a fifth of each population are elites, and only they become parents",
         GENERALLY_FORWARD,
         &[("learning.elites", "'20%'"), ("learning.parents", "'elites'"), ("world.coupling", "2")],
+    ),
+    (
+        "partners",
+        "the mean of three teams a policy, D",
+        GENERALLY_FORWARD,
+        &[("learning.partners", "3"), ("learning.fitness", "'D'"), ("world.coupling", "2")],
+    ),
+    (
+        "lenient",
+        "the best of two teams a policy, all-leaders, two episodes from jittered starts",
+        CHAOTIC,
+        &[
+            ("learning.partners", "2"),
+            ("learning.leniency", "'max'"),
+            ("learning.paradigm", "'all-leaders'"),
+            ("learning.start_jitter", "0.5"),
+            ("learning.episodes_per_team", "2"),
+            ("world.coupling", "3"),
+        ],
     ),
     (
         "sense-gain",

@@ -16,7 +16,7 @@ use flotilla::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
 use flotilla::backend::{Backend, BackendError, DevicePopulation, Group, GroupScores, HELD_FROM, Trace, Weights};
 use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::{
-    Config, Coupling, Elites, Fitness, Learning, Mutation, Paradigm, Parents, Sharing, ValidConfig,
+    Config, Coupling, Elites, Fitness, Learning, Leniency, Mutation, Paradigm, Parents, Sharing, ValidConfig,
 };
 use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use flotilla::record::disk::Disk;
@@ -112,7 +112,12 @@ fn arms() -> Vec<Config> {
     (fifth.learning.trials, fifth.learning.generations, fifth.learning.population) = (2, 4, 30);
     (fifth.learning.elites, fifth.learning.parents) = (Elites::Percentage(20.0), Parents::Elites);
     fifth.sense.gain = 3.0;
-    vec![first, second, third, fourth, fifth]
+    // Every policy plays in three teams, and is worth the best of them.
+    let mut sixth = support::layout("strictly_forward");
+    (sixth.learning.trials, sixth.learning.generations, sixth.learning.population) = (2, 4, 14);
+    (sixth.learning.partners, sixth.learning.leniency) = (3, Leniency::Max);
+    (sixth.learning.start_jitter, sixth.learning.episodes_per_team) = (0.5, 2);
+    vec![first, second, third, fourth, fifth, sixth]
 }
 
 /// The result of a trainer of [`arms`], and its snapshot before each generation.

@@ -202,6 +202,8 @@ fn keys_at_their_defaults_leave_a_configs_digest_as_it_was() {
         ("learning.led_by", "'any-seen'"),
         ("sense.gain", "2.0"),
         ("learning.parents", "'elites'"),
+        ("learning.partners", "2"),
+        ("learning.leniency", "'max'"),
     ] {
         let coupling = Override { key: "world.coupling".into(), text: "1".into(), name: "coupling".into() };
         let change = Override { key: key.into(), text: value.into(), name: key.into() };
@@ -209,5 +211,5 @@ fn keys_at_their_defaults_leave_a_configs_digest_as_it_was() {
     }
     digests.sort();
     digests.dedup();
-    assert_eq!(digests.len(), 8, "each key has a say");
+    assert_eq!(digests.len(), 10, "each key has a say");
 }

@@ -204,6 +204,37 @@ fn a_run_goes_on_through_its_stages() {
     assert!(error.contains("stages[1]: { from = 4") && error.contains("{ from = 5"), "{error}");
 }
 
+/// A killed run of policies with several partners, whose number stages change, goes on to the same bits.
+#[test]
+fn a_run_with_several_partners_goes_on() {
+    let place = tempfile::tempdir().unwrap();
+    let text = SMALL.replace("population = 8", "population = 8\npartners = 3\nleniency = 'max'");
+    let stages = "[[stages]]\nfrom = 3\nset = { learning.partners = 1 }\n\
+                  [[stages]]\nfrom = 5\nset = { learning.partners = 2, learning.leniency = 'mean' }\n";
+    let config = config(&[&text, stages].concat());
+    let whole = place.path().join("whole");
+    let expected = train(&config, &whole, None, Start::Fresh, 99).unwrap().unwrap();
+    for until in 1..=7 {
+        let path = place.path().join(format!("stopped-{until}"));
+        assert_eq!(train(&config, &path, None, Start::Fresh, until).unwrap(), None, "{until}");
+        assert_eq!(train(&config, &path, None, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
+        assert_eq!((rows(&path), bytes(&path)), (rows(&whole), bytes(&whole)), "{until}");
+    }
+    // Of each generation, the best of all teams and the champions are played again.
+    for which in [Which::Best, Which::Champion] {
+        let again =
+            replay(&whole, 1, &[0, 2, 3, 5, 6], which, Verification::Required, &mut Cpu::default(), &mut |_| true);
+        assert_eq!(again.unwrap_or_else(|error| panic!("{which:?}: {error}")).len(), 5);
+    }
+    // Team 23 is the last of three rounds of 8 policies, and generation 3 has a single round.
+    let team = |generation| {
+        let mut backend = Cpu::default();
+        let generations = [generation];
+        replay(&whole, 0, &generations, Which::Number(23), Verification::Required, &mut backend, &mut |_| true)
+    };
+    assert!(team(2).is_ok() && team(3).is_err());
+}
+
 /// The populations after the last generation are bred as its stage says.
 #[test]
 fn a_finished_run_is_extended_from_the_stage_that_it_ended_in() {

@@ -125,9 +125,8 @@ class Coevolution:
             ValueError: the fitness has another shape or is not finite, or all generations were told.
         """
         values = floats("fitness", fitness, 3)
-        learning = self.config["learning"]
-        shape = (learning["trials"], learning["population"], self.config.num_learners)
-        if values.shape != shape:
+        shape = (self.config["learning.trials"], self._native.teams, self.config.num_learners)
+        if not self.done and values.shape != shape:
             raise ValueError(f"fitness has the shape {values.shape}, allowed is [trials, teams, leaders] = {shape}")
         return self._native.tell(values, self._backend)
 

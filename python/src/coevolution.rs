@@ -71,6 +71,12 @@ impl Coevolution {
         Ok(self.lock()?.generation())
     }
 
+    /// Teams of the generation per trial, without the champions'.
+    #[getter]
+    fn teams(&self) -> PyResult<usize> {
+        Ok(self.lock()?.world().1)
+    }
+
     #[getter]
     fn done(&self) -> PyResult<bool> {
         Ok(self.lock()?.is_done())
@@ -78,7 +84,8 @@ impl Coevolution {
 
     fn ask<'py>(&self, py: Python<'py>) -> PyResult<Asked<'py>> {
         let mut inner = self.lock()?;
-        let (config, leaders) = (inner.config().clone(), inner.world().0.leaders());
+        let config = inner.config().clone();
+        let (leaders, count) = (inner.world().0.leaders(), inner.world().1);
         let (populations, slots) = (config.populations(), config.learning.population + 1);
         let asked = inner.ask().raise()?;
         let trials = asked.len();
@@ -86,13 +93,13 @@ impl Coevolution {
         weights.reserve_exact(trials * populations * slots * config.parameters());
         for trial in &asked {
             weights.extend_from_slice(trial.weights);
-            teams.extend_from_slice(&trial.teams[..(slots - 1) * leaders]);
+            teams.extend_from_slice(&trial.teams[..count * leaders]);
             starts.extend(trial.starts.iter().flatten().flat_map(|place| place.to_array()));
         }
         let (episodes, places) = (asked[0].starts.len(), asked[0].starts[0].len());
         Ok((
             PyArray1::from_vec(py, weights).reshape([trials, populations, slots, config.parameters()])?,
-            PyArray1::from_vec(py, teams).reshape([trials, slots - 1, leaders])?,
+            PyArray1::from_vec(py, teams).reshape([trials, count, leaders])?,
             PyArray1::from_vec(py, starts).reshape([trials, episodes, places, 2])?,
         ))
     }

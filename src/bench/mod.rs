@@ -187,7 +187,7 @@ pub fn measure(config: &Config, player: &mut Subject, generations: Generations) 
         }
     };
     Ok(Timing {
-        teams: config.learning.population,
+        teams: config.learning.teams(),
         leaders: world.leaders(),
         followers: world.followers(),
         pois: world.pois.len(),
@@ -254,7 +254,7 @@ fn rollout(
         Ok(())
     };
     let times = time(play, ceiling)?;
-    let mean_g = f64::from(observed) / (population * world.pois.len()) as f64;
+    let mean_g = f64::from(observed) / (config.learning.teams() * world.pois.len()) as f64;
     let pairs = world.steps() * world.agents() * world.agents();
     let traced = (TRACED_PAIRS / pairs).clamp(1, TRACED_TEAMS).min(population);
     // The CPU traces, because every backend's trace is the same.

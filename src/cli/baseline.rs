@@ -92,7 +92,7 @@ struct Found<'a> {
 impl Found<'_> {
     /// Returns the number of random teams of each kind per seed.
     fn teams(&self) -> usize {
-        self.config.learning.population * (self.config.learning.generations + 1)
+        self.config.learning.teams() * (self.config.learning.generations + 1)
     }
 
     fn pois(&self) -> usize {

@@ -60,7 +60,7 @@ impl Cost {
             let (world, learning) = (World::new(&share), &share.learning);
             let played = wide(learning.trials)
                 * wide(learning.generations + 1)
-                * wide(learning.population + 1)
+                * wide(learning.teams() + 1)
                 * wide(learning.episodes_per_team);
             teams += played;
             team_steps += played * wide(world.steps());

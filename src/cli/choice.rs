@@ -63,7 +63,7 @@ impl Work {
 
 /// Returns the agent-steps of one trial's generation.
 fn generation(config: &Config) -> f64 {
-    ((config.learning.population + 1) * config.learning.episodes_per_team) as f64 * team(config)
+    ((config.learning.teams() + 1) * config.learning.episodes_per_team) as f64 * team(config)
 }
 
 /// Returns the agent-steps of one team's episode.

@@ -283,7 +283,7 @@ impl Told<'_> {
             false => format!(
                 "Trained {} of {} teams, {}, in {} ({:.1} generations/s) on {}",
                 counted(learning.trials, "trial"),
-                learning.population,
+                learning.teams(),
                 counted(learning.generations, "generation"),
                 time(seconds),
                 generations as f64 / seconds.max(1e-9),

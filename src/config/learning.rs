@@ -9,6 +9,8 @@ use crate::reader::{NumberOrPercentage, Reader, between, section};
 
 /// Maximum number of teams in one generation, and of policies in a population.
 pub const MAX_POPULATION: usize = 1 << 20;
+/// Maximum number of teams that a policy plays in per generation.
+pub const MAX_PARTNERS: usize = 16;
 /// Maximum number of generations after the random start.
 pub const MAX_GENERATIONS: usize = 1_000_000;
 /// Maximum number of trials in one run.
@@ -27,8 +29,12 @@ section! {
         /// followers, D++ with copies of a leader, or Dt without a leader and, at each step, the followers that it
         /// leads then
         fitness: Fitness = "", "3.2, Eq. 1; 4.2, Eq. 5; 2.2",
-        /// k: policies of each learner, and teams of a generation
+        /// k: policies of each learner; a generation has k·m teams
         population: usize = "policies", "4.3",
+        /// m: teams that each policy plays in per generation, each with other random partners; 1 if leaders share a policy
+        partners: usize = "teams", "",
+        /// what a policy's fitness is: the mean score of its teams, or the largest, which is lenient with bad partners
+        leniency: Leniency = "", "",
         /// how many follow the random start
         generations: usize = "generations", "4.3, Alg. 1",
         /// independent repetitions
@@ -95,6 +101,16 @@ config_enum! {
         Dpp = "D++",
         /// Difference evaluation without the leader and, at each step, the followers that it leads then.
         Dt = "Dt",
+    }
+}
+
+config_enum! {
+    /// How the scores of the teams that a policy plays in make its fitness.
+    Leniency {
+        /// Their mean.
+        Mean = "mean",
+        /// The largest.
+        Max = "max",
     }
 }
 
@@ -172,8 +188,24 @@ impl Paradigm {
 }
 
 impl Learning {
+    /// Returns the number of teams per generation of a trial, without the champions' team.
+    pub fn teams(&self) -> usize {
+        self.population * self.partners
+    }
+
     pub(super) fn read(r: &mut Reader<'_>, paradigm: Paradigm) -> Learning {
         let population = Learning::population(r).number(between(2, MAX_POPULATION), 50);
+        let sharing = Learning::sharing(r).choice(Sharing::PerLeader);
+        let partners = Learning::partners(r).number(between(1, MAX_PARTNERS), 1);
+        if partners > 1 && sharing == Sharing::Shared {
+            let text =
+                format!("found {partners} with learning.sharing = \"all\", allowed 1: a team has a single policy");
+            r.report_key("learning.partners", text);
+        } else if population * partners > MAX_POPULATION {
+            let teams = population * partners;
+            let text = format!("found {partners}, which makes {teams} teams per generation, allowed {MAX_POPULATION}");
+            r.report_key("learning.partners", text);
+        }
         let elites = Learning::elites(r).number_or_percentage(between(0, population).because("learning.population"), 1);
         let elites = match elites {
             NumberOrPercentage::Number(count) => Elites::Count(count),
@@ -188,9 +220,11 @@ impl Learning {
         }
         Learning {
             paradigm,
-            sharing: Learning::sharing(r).choice(Sharing::PerLeader),
+            sharing,
             fitness: Learning::fitness(r).choice(Fitness::Df),
             population,
+            partners,
+            leniency: Learning::leniency(r).choice(Leniency::Mean),
             generations: Learning::generations(r).number(between(0, MAX_GENERATIONS), 100),
             trials: Learning::trials(r).number(between(1, MAX_TRIALS), 5),
             elites,

@@ -7,23 +7,29 @@ use super::random::{Key, Purpose, pick};
 use crate::config::{Learning, Sharing};
 use crate::world::{World, on_grid};
 
-/// Forms the teams of one generation: a random permutation per population puts each policy on exactly one team.
+/// Forms the teams of one round of a generation: a random permutation per population puts each policy on exactly one
+/// team.
 ///
 /// Writes the policy of each leader, `[teams][leaders]`. `key` is of [`Purpose::Teams`].
-pub fn form_teams(key: Key, generation: usize, leaders: usize, teams: &mut [u32]) {
+pub fn form_teams(key: Key, generation: usize, round: usize, leaders: usize, teams: &mut [u32]) {
     let mut order = vec![0; teams.len() / leaders];
     for leader in 0..leaders {
-        shuffle(Level::new(), key, generation, leader, &mut order);
+        shuffle(Level::new(), key, generation, round, leader, &mut order);
         teams.iter_mut().skip(leader).step_by(leaders).zip(&order).for_each(|(policy, &shuffled)| *policy = shuffled);
     }
 }
 
-/// Returns the teams of one generation of a trial, `[teams][leaders]`. With a shared population, team `t` is policy
-/// `t`; otherwise see [`form_teams`].
+/// Returns the teams of one generation of a trial, `[teams][leaders]`, round by round. With a shared population, team `t`
+/// is policy `t`; otherwise see [`form_teams`].
 pub fn teams_of(learning: &Learning, trial: usize, generation: usize, leaders: usize) -> Vec<u32> {
     let mut teams = one_policy_a_team(learning.population, leaders);
     if learning.sharing == Sharing::PerLeader {
-        form_teams(Key::new(learning.seed, trial, Purpose::Teams), generation, leaders, &mut teams);
+        let key = Key::new(learning.seed, trial, Purpose::Teams);
+        let of_round = teams.len();
+        teams.resize(learning.partners * of_round, 0);
+        for (round, teams) in teams.chunks_exact_mut(of_round).enumerate() {
+            form_teams(key, generation, round, leaders, teams);
+        }
     }
     teams
 }
@@ -33,9 +39,9 @@ pub fn one_policy_a_team(teams: usize, leaders: usize) -> Vec<u32> {
     (0..teams as u32).flat_map(|policy| std::iter::repeat_n(policy, leaders)).collect()
 }
 
-/// Writes one population's policy in each team, see [`form_teams`].
-pub fn shuffle(level: Level, key: Key, generation: usize, population: usize, order: &mut [u32]) {
-    let key = key.at(generation, population, 0);
+/// Writes one population's policy in each team of a round, see [`form_teams`].
+pub fn shuffle(level: Level, key: Key, generation: usize, round: usize, population: usize, order: &mut [u32]) {
+    let key = key.at(generation, population, round);
     dispatch!(level, simd => shuffle_lanes(simd, key, order));
 }
 

@@ -223,7 +223,7 @@ fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
 
 /// Keys of later versions with their default values. A config's digest omits these lines, so that runs of earlier
 /// versions can be resumed.
-const LATER: [&str; 10] = [
+const LATER: [&str; 12] = [
     "observers = \"all\"\n",
     "windows = []\n",
     "after = []\n",
@@ -234,6 +234,8 @@ const LATER: [&str; 10] = [
     "poi_jitter = 0.0\n",
     "gain = 1.0\n",
     "parents = \"all\"\n",
+    "partners = 1\n",
+    "leniency = \"mean\"\n",
 ];
 
 /// Returns the SHA-256 of the part of a config that affects results.

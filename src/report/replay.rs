@@ -281,7 +281,7 @@ pub fn replay(
     if trial >= trials {
         return Err(ReplayError::NoTrial { folder: name(), trial, trials });
     }
-    let teams = config.learning.population;
+    let teams = generations.iter().map(|&generation| config.at(generation).learning.teams()).min().unwrap_or(0);
     if let Which::Number(team) = which
         && team >= teams
     {

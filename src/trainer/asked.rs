@@ -18,7 +18,7 @@ pub struct Asked<'a> {
     /// The populations, `[populations][policies + 1][parameters]`. A population's last slot holds the champion of the
     /// previous generation.
     pub weights: &'a [f32],
-    /// The policy of each leader in each team, `[policies + 1][leaders]`. The last team is the champions'.
+    /// The policy of each leader in each team, `[teams + 1][leaders]`. The last team is the champions'.
     pub teams: &'a [u32],
     /// Start positions of every episode, followed by POI positions if POIs move, `[episodes][agents + pois]`.
     pub starts: &'a [Vec<Vec2>],
@@ -59,28 +59,28 @@ impl Trainer {
     pub fn asked_world(&self, experiment: usize) -> (&World, usize) {
         let experiment = &self.experiments[experiment];
         let stage = experiment.stage();
-        (&stage.world, if experiment.is_over() { 0 } else { stage.config.learning.population })
+        (&stage.world, if experiment.is_over() { 0 } else { stage.config.learning.teams() })
     }
 
-    /// Returns G, `[trials][policies]`, and the config's fitness of each leader, `[trials][policies][leaders]`, of the
-    /// teams that [`Trainer::play_asked`] played, as means over episodes.
+    /// Returns G, `[trials][teams]`, and the config's fitness of each leader, `[trials][teams][leaders]`, of the teams
+    /// that [`Trainer::play_asked`] played, as means over episodes.
     pub fn played(&self, experiment: usize) -> (Vec<f64>, Vec<f32>) {
         let experiment = &self.experiments[experiment];
         let stage = experiment.stage();
-        let (population, leaders) = (stage.config.learning.population, stage.world.leaders());
+        let (teams, leaders) = (stage.config.learning.teams(), stage.world.leaders());
         let (mut g, mut scores) = (Vec::new(), Vec::new());
         for trial in &experiment.trials {
             let all = (stage.world.pois.len() * trial.scores.len()) as f64;
             let observed =
                 |team: usize| trial.scores.iter().map(|episode| u64::from(episode.observed[team])).sum::<u64>();
-            g.extend((0..population).map(|team| observed(team) as f64 / all));
-            scores.extend((0..population * leaders).map(|place| mean_score(&trial.scores, place)));
+            g.extend((0..teams).map(|team| observed(team) as f64 / all));
+            scores.extend((0..teams * leaders).map(|place| mean_score(&trial.scores, place)));
         }
         (g, scores)
     }
 
     /// Breeds the next generation of an experiment whose teams were played. `fitness` is what each leader of each team
-    /// was worth, `[trials][policies][leaders]`; `None` takes the config's fitness.
+    /// was worth, `[trials][teams][leaders]`; `None` takes the config's fitness.
     ///
     /// Returns the rows that became complete: a generation's champions play with the next generation, and alone after
     /// the last.

@@ -9,7 +9,7 @@ use super::experiment::{Experiment, TrialState};
 use super::schedule::{MIN_POLICIES_PER_TASK, TeamSchedule, min_populations_per_task};
 use super::stages::Stage;
 use crate::backend::{Backend, BackendError, Group, GroupScores, Weights};
-use crate::config::Sharing;
+use crate::config::{Learning, Leniency, Sharing};
 use crate::parallel::*;
 
 /// Plays the teams of every trial of some experiments as one batch. Returns their scores, for [`keep`]. An experiment
@@ -21,7 +21,7 @@ pub(super) fn play<'a>(
     let mut groups = Vec::new();
     for (_, experiment) in experiments {
         let (stage, range) = (experiment.stage(), experiment.playing());
-        let (population, leaders) = (stage.config.learning.population, stage.world.leaders());
+        let (teams, leaders) = (stage.config.learning.teams(), stage.world.leaders());
         let previous = experiment.stages.ending_before(experiment.residency.generation());
         let on_device = experiment.residency.on_device();
         for (index, (trial, schedule)) in experiment.trials.iter().zip(&experiment.schedules).enumerate() {
@@ -32,17 +32,17 @@ pub(super) fn play<'a>(
                     world: &stage.world,
                     starts,
                     weights,
-                    policies: population + 1,
+                    policies: learning.population + 1,
                     sharing: learning.sharing,
                     teams: &schedule.teams[range.start * leaders..range.end * leaders],
                     fitnesses: std::slice::from_ref(&learning.fitness),
                 }));
             };
             // Champions play in the stage that they come from.
-            let end = if previous.is_some() { population } else { range.end };
+            let end = if previous.is_some() { teams } else { range.end };
             add(stage, &schedule.starts, range.start..end);
             if let Some(previous) = previous {
-                add(previous, &schedule.previous_stage_starts, population..population + 1);
+                add(previous, &schedule.previous_stage_starts, teams..teams + 1);
             }
         }
     }
@@ -64,23 +64,23 @@ impl Experiment {
     /// The teams that play, by index. The last is the champion's: the first generation has no champion before it, and
     /// after the last generation champions play alone.
     fn playing(&self) -> Range<usize> {
-        let population = self.stage().config.learning.population;
-        let first = if self.is_over() { population } else { 0 };
-        first..population + usize::from(self.residency.generation() > 0)
+        let teams = self.stage().config.learning.teams();
+        let first = if self.is_over() { teams } else { 0 };
+        first..teams + usize::from(self.residency.generation() > 0)
     }
 
     /// Turns a generation's scores into fitness, and returns the rows that its champions complete. `index` is the
-    /// experiment's in its trainer. `told` replaces the scores, `[trials][policies][leaders]`, one team per policy.
+    /// experiment's in its trainer. `told` replaces the scores, `[trials][teams][leaders]`.
     pub fn collect_results(&mut self, index: usize, told: Option<&[f32]>) -> Vec<Row> {
         let generation = self.residency.generation();
         let Experiment { stages, trials, schedules, .. } = self;
         let Stage { config, world, .. } = stages.of(generation);
-        let population = config.learning.population;
+        let teams = config.learning.teams();
         let pois_before = stages.ending_before(generation).map_or(world.pois.len(), |stage| stage.world.pois.len());
         let mut rows = Vec::with_capacity(trials.len());
         for (number, (trial, schedule)) in trials.iter_mut().zip(schedules).enumerate() {
-            let size = population * world.leaders();
-            let [best_g, mean_g] = team_g(&trial.scores, world.pois.len(), population);
+            let size = teams * world.leaders();
+            let [best_g, mean_g] = team_g(&trial.scores, world.pois.len(), teams);
             rows.extend(trial.pending.map(|row| Row { champion_g: trial.champion_g(pois_before), ..row }));
             trial.pending =
                 Some(Row { experiment: index, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
@@ -89,7 +89,7 @@ impl Experiment {
                 None => mean_score(&trial.scores, place),
             };
             match config.learning.sharing {
-                Sharing::PerLeader => assign_fitness(score, schedule, population, &mut trial.fitness),
+                Sharing::PerLeader => assign_fitness(score, schedule, &config.learning, &mut trial.fitness),
                 Sharing::Shared => assign_shared_fitness(score, world.leaders(), &mut trial.fitness),
             }
             trial.forget_scores();
@@ -128,28 +128,46 @@ impl TrialState {
 }
 
 /// Returns G of the best team, and the mean over teams. `episodes` are the scores of each episode.
-fn team_g(episodes: &[GroupScores], pois: usize, population: usize) -> [f64; 2] {
+fn team_g(episodes: &[GroupScores], pois: usize, teams: usize) -> [f64; 2] {
     let observed = |team: usize| episodes.iter().map(|episode| u64::from(episode.observed[team])).sum();
     let whole = (pois * episodes.len()) as f64;
-    let best: u64 = (0..population).map(observed).max().unwrap_or(0);
-    let total: u64 = (0..population).map(observed).sum();
-    [best as f64 / whole, total as f64 / (whole * population as f64)]
+    let best: u64 = (0..teams).map(observed).max().unwrap_or(0);
+    let total: u64 = (0..teams).map(observed).sum();
+    [best as f64 / whole, total as f64 / (whole * teams as f64)]
 }
 
-/// Assigns each policy its leader's score in its team. `score` takes a place of `[teams][leaders]`, `fitness` is
-/// `[leaders][policies]`.
+/// Assigns each policy its leader's score in its team, or with several partners the mean or the largest of its scores.
+/// `score` takes a place of `[teams][leaders]`, `fitness` is `[leaders][policies]`.
+///
+/// The mean adds scores in 64 bits, in the order of the rounds, and rounds to 32 bits once.
 fn assign_fitness(
     score: impl Fn(usize) -> f32 + Sync,
     schedule: &TeamSchedule,
-    population: usize,
+    learning: &Learning,
     fitness: &mut [f32],
 ) {
+    let Learning { population, partners, leniency, .. } = *learning;
     let leaders = fitness.len() / population;
     let populations = fitness.par_chunks_exact_mut(population).with_min_len(min_populations_per_task(population));
     populations.enumerate().for_each(|(leader, fitness)| {
-        let policies = schedule.teams[leader..population * leaders].iter().step_by(leaders);
-        for (place, &policy) in (leader..).step_by(leaders).zip(policies) {
-            fitness[policy as usize] = score(place);
+        let policies = schedule.teams[leader..partners * population * leaders].iter().step_by(leaders);
+        let scores = (leader..).step_by(leaders).zip(policies).map(|(place, &policy)| (policy as usize, score(place)));
+        match leniency {
+            _ if partners == 1 => scores.for_each(|(policy, score)| fitness[policy] = score),
+            Leniency::Max => {
+                fitness.fill(f32::NEG_INFINITY);
+                // Not `f32::max`, which may return either of two zeros.
+                scores.for_each(|(policy, score)| {
+                    if score > fitness[policy] {
+                        fitness[policy] = score;
+                    }
+                });
+            }
+            Leniency::Mean => {
+                let mut totals = vec![0.0; population];
+                scores.for_each(|(policy, score)| totals[policy] += f64::from(score));
+                fitness.iter_mut().zip(totals).for_each(|(mean, total)| *mean = (total / partners as f64) as f32);
+            }
         }
     });
 }

@@ -22,9 +22,9 @@ pub(super) fn min_populations_per_task(population: usize) -> usize {
 pub(super) struct TeamSchedule {
     /// The generation and the index of its stage. `None` before the first draw. Ending a run early can change the stage.
     drawn_for: Option<(usize, usize)>,
-    /// Scratch memory: each population's policies in the order of their teams, `[populations][policies]`.
+    /// Scratch memory: each population's policies in the order of their teams, `[rounds][populations][policies]`.
     orders: Vec<u32>,
-    /// The policy of each leader, `[policies + 1][leaders]`. The last team is the champion's.
+    /// The policy of each leader, `[teams + 1][leaders]`, round by round. The last team is the champion's.
     pub teams: Vec<u32>,
     /// Start positions, followed by POI positions if POIs move, `[episodes][agents + pois]`.
     pub starts: Vec<Vec<Vec2>>,
@@ -57,7 +57,7 @@ impl TeamSchedule {
         }
         self.drawn_for = Some((generation, stages.index_of(generation)));
         let stage = stages.of(generation);
-        self.form_teams(level, &stage.config.learning, trial, generation);
+        self.form_teams(level, &stage.config.learning, stage.world.leaders(), trial, generation);
         draw_starts(stage, trial, generation, &mut self.starts);
         match stages.ending_before(generation) {
             Some(stage) => draw_starts(stage, trial, generation, &mut self.previous_stage_starts),
@@ -66,26 +66,29 @@ impl TeamSchedule {
     }
 
     /// Writes `teams`.
-    fn form_teams(&mut self, level: Level, learning: &Learning, trial: usize, generation: usize) {
+    fn form_teams(&mut self, level: Level, learning: &Learning, leaders: usize, trial: usize, generation: usize) {
         // With a shared population, team t always plays policy t.
         if learning.sharing == Sharing::Shared {
             return;
         }
         let population = learning.population;
+        let of_round = population * leaders;
+        self.orders.resize(learning.partners * of_round, 0);
+        self.teams.resize(learning.partners * of_round, 0);
         let key = Key::new(learning.seed, trial, Purpose::Teams);
         let orders = self.orders.par_chunks_exact_mut(population);
-        orders
-            .with_min_len(min_populations_per_task(population))
-            .enumerate()
-            .for_each(|(leader, order)| evolve::shuffle(level, key, generation, leader, order));
-        let (orders, leaders) = (&self.orders, self.orders.len() / population);
-        let teams =
-            self.teams[..population * leaders].par_chunks_exact_mut(leaders).with_min_len(MIN_POLICIES_PER_TASK);
-        teams.enumerate().for_each(|(team, policies)| {
-            for (policy, order) in policies.iter_mut().zip(orders.chunks_exact(population)) {
-                *policy = order[team];
-            }
+        orders.with_min_len(min_populations_per_task(population)).enumerate().for_each(|(index, order)| {
+            evolve::shuffle(level, key, generation, index / leaders, index % leaders, order);
         });
+        for (teams, orders) in self.teams.chunks_exact_mut(of_round).zip(self.orders.chunks_exact(of_round)) {
+            let teams = teams.par_chunks_exact_mut(leaders).with_min_len(MIN_POLICIES_PER_TASK);
+            teams.enumerate().for_each(|(team, policies)| {
+                for (policy, order) in policies.iter_mut().zip(orders.chunks_exact(population)) {
+                    *policy = order[team];
+                }
+            });
+        }
+        self.teams.extend(std::iter::repeat_n(population as u32, leaders));
     }
 }
 
