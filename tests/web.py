@@ -278,7 +278,14 @@ def several(tab, page, flotilla, folder):
         "longer": run("longer", "generally_forward", "--generations", "9", "--trials", "2"),
     }
     tab.load(page)
+    assert not tab.evaluate("document.querySelector('#guide').hidden")
     opened(["of-g", "of-df"])
+    assert tab.evaluate("document.querySelector('#guide').hidden"), "the guide speaks of another team"
+    # A link cannot hold runs, and does not pretend to.
+    tab.evaluate("navigator.clipboard.writeText = text => { window.copied = text; return Promise.resolve(); }; 0")
+    tab.click("#share")
+    tab.wait("window.copied && document.querySelector('#said').textContent.includes('not the runs')")
+    assert "play=" not in tab.evaluate("window.copied") and "fitness=G" in tab.evaluate("window.copied")
     assert tab.evaluate("page.state.training.arms.map(arm => arm.label)") == ["fitness G", "fitness Df"]
     assert "95 % interval" in tab.text("#legend") and "of 2" in tab.text("#legend"), tab.text("#legend")
     # The bands are on the chart.

@@ -74,11 +74,14 @@ export async function recall() {
   $("version").textContent = version !== null && version !== state.version ? `This link is from version ${version}, and this page is version ${state.version}: results may differ.` : "";
 }
 
+/** Returns whether several opened runs are on show. No link holds them. */
+export const shows_runs = () => Boolean(state.training && state.training.arms.length > 1 && state.training.source && !state.training.source.compared);
+
 // Returns a link to what is on show: the address, and if there is a training its generation and trial. Whoever opens it
 // trains at once. Digests depend on the version.
 export function link() {
   const words = new URLSearchParams(location.hash.slice(1));
-  if (state.training) {
+  if (state.training && !shows_runs()) {
     const { generation, trial } = state;
     for (const [key, value] of Object.entries({ generation, trial, play: 1 })) words.set(key, String(value));
   }

@@ -4,6 +4,7 @@ import { show_start } from "./arrange.js";
 import { curves } from "./curves.js";
 import { $, count, trouble } from "./dom.js";
 import { keep, take } from "./experiment.js";
+import { leave_guide } from "./guide.js";
 import { settle } from "./machine.js";
 import { mode } from "./modes.js";
 import { intervals } from "./intervals.js";
@@ -54,6 +55,7 @@ async function take_runs(read, reading) {
   const training = await Training.read(state.players[0], state.machine, found), [{ words }] = found;
   if (state.training) state.training.stop();
   state.training = training;
+  leave_guide();
   keep();
   Object.assign(state, { compared: null, trial: 0, generation: training.last, policies: null });
   following(false);
@@ -74,6 +76,7 @@ async function take_other({ file, bytes }) {
   if (/\.safetensors$/i.test(file.name)) {
     const { words, bytes: weights } = await state.clerk.ask({ ask: "read", text: state.toml }, bytes);
     forget();
+    leave_guide();
     state.policies = { each: words.policies, weights };
     const { words: data } = await state.clerk.ask({ ask: "play", text: state.toml, policies: words.policies }, weights);
     mode("watch");
@@ -95,6 +98,7 @@ async function take_other({ file, bytes }) {
     state.file = file.name.replace(/\.toml$/i, "");
     state.compared = null;
     forget();
+    leave_guide();
     mode("watch");
     show_start();
     const taken = await take(text);

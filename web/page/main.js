@@ -1,6 +1,6 @@
 // @ts-check
 // The page's event listeners and its start.
-import { autoplay, link, recall, remember } from "./address.js";
+import { autoplay, link, recall, remember, shows_runs } from "./address.js";
 import { add, remove } from "./arrange.js";
 import { comparison } from "./compare.js";
 import { configs } from "./config.js";
@@ -85,6 +85,7 @@ function listen() {
     await entered();
     if (!state.valid) return void ($("said").textContent = "No link was copied: the config has problems. Correct them first.");
     if (!await remember()) return void ($("said").textContent = "No link was copied: this browser cannot compress a config. Save config.toml instead.");
+    if (shows_runs()) return void copy(link(), "The link is copied: it has the settings of the first run, but not the runs.");
     copy(link(), `The link is copied: whoever opens it ${state.training ? "sees the same generation of the same training" : "trains the same"}.`);
   });
   for (const [id, act] of Object.entries({ png: save_png, gif: save_gif, webm: save_webm, csv: save_csv })) $(id).addEventListener("click", act);
