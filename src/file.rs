@@ -4,6 +4,8 @@ use std::fs::{self, File};
 use std::io::{self, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
+use crate::escape::PathExt;
+
 /// Opens a regular file for reading. Opening a pipe without a writer would block, so other kinds are refused, except files
 /// that the parent process opened: `/dev/stdin`, or `<(…)` in a shell.
 ///
@@ -68,6 +70,11 @@ pub fn exists(path: &Path) -> io::Result<bool> {
         Err(error) if error.kind() == ErrorKind::NotADirectory => Ok(false),
         result => result,
     }
+}
+
+/// Returns the error for a file whose folder does not exist.
+pub fn no_folder(path: &Path) -> io::Error {
+    io::Error::new(ErrorKind::NotFound, format!("the folder {} does not exist; make it first", folder(path).escaped()))
 }
 
 /// Returns the folder that contains a path: the current one for a bare name.

@@ -48,6 +48,13 @@ pub enum Why {
     },
 }
 
+impl Unreachable {
+    /// Returns whether a message gives the same reason for another POI, after rounding.
+    pub(crate) fn same_reason(&self, other: &Unreachable) -> bool {
+        self.to_string() == Unreachable { poi: self.poi, why: other.why.clone() }.to_string()
+    }
+}
+
 impl Display for Unreachable {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let poi = self.poi;

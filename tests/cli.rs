@@ -84,16 +84,27 @@ fn a_good_config_is_printed_as_resolved_and_prints_itself_again() {
         "agent_range = 5.0",
         "fitness = \"Df\"",
         "# A run of this plays 25755 teams, champions included:", // 5 trials × 101 generations × 51 teams
-        "#   agents a team         6, of which 2 learn",
-        "#   team-steps            643875",
-        "#   agent-steps           3863250",
-        "#   parameters a policy   112",          // 9·10 + 11·2
-        "#   policies, all trials  224000 bytes", // 5 × 2 × 50 × 112 × 4
-        "#   record of a team      232 bytes",    // (25 × 2 + 4 × 2) × 4
+        "#   agents per team         6, of which 2 learn",
+        "#   team-steps              643875",
+        "#   agent-steps             3863250",
+        "#   parameters per policy   112",          // 9·10 + 11·2
+        "#   policies of all trials  224000 bytes", // 5 × 2 × 50 × 112 × 4
+        "#   record of one team      232 bytes",    // (25 × 2 + 4 × 2) × 4
     ] {
         assert!(text.lines().any(|found| found == line), "no {line:?} in\n{text}");
     }
     assert_eq!(String::from_utf8(check(&text, &[]).stdout).unwrap(), text);
+}
+
+#[test]
+fn a_heading_in_degrees_is_noted() {
+    let told = |text: &str| String::from_utf8(check(text, &[]).stderr).unwrap();
+    let note =
+        "world.heading has 90, which is more than a full turn: headings are in radians, and 90 degrees would be 1.5708";
+    let text = GOOD.replacen("heading = 1.5\n", "heading = 90\n", 1);
+    assert!(told(&text).contains(note), "{}", told(&text));
+    let text = GOOD.replacen("heading = 1.5\n", "heading = 1.5708\n", 1);
+    assert!(!told(&text).contains("full turn"), "{}", told(&text));
 }
 
 #[test]

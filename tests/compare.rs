@@ -82,7 +82,7 @@ fn two_arms_are_told_with_intervals_and_a_test() {
         "(1 of 5)",
         "| best team's G, generation 1 | fitness Df, seed 0 − fitness G, seed 1 | +0.450 [",
         "| 0.98 | 0.016 | 0.016    |",
-        "A trial that does not reach G 0.75 counts as one that does a generation after the last.",
+        "A trial that never reaches G 0.75 counts as if it reached it one generation after the last.",
     ] {
         assert!(text.contains(words), "{words:?} is not in\n{text}");
     }
@@ -136,7 +136,7 @@ fn pairs_are_told_of_and_compared_as_pairs_where_that_is_asked_for() {
     let (_, told) = place.good("compare df g");
     assert!(told.contains("note: these arms have the same seeds") && told.contains("--paired"), "{told}");
     let (text, told) = place.good("compare df g --paired");
-    assert!(told.is_empty() && text.contains("Wilcoxon's signed ranks"), "{told}{text}");
+    assert!(told.is_empty() && text.contains("Wilcoxon's signed-rank test"), "{told}{text}");
     let told = json(&place, "compare df g --paired");
     let pair = &told["comparisons"][0]["measures"][0]["pairs"][0];
     // Every pair a quarter apart: the least p of five.
@@ -167,7 +167,7 @@ fn arms_that_are_alike_do_not_differ() {
     // Nothing sets them apart but where they are.
     let (text, _) = place.good("compare a b_50% --latex");
     assert!(
-        text.starts_with("% Means over trials")
+        text.starts_with("% Values are means over trials")
             && text.contains(r"best team's G, generation 1 & a $-$ b\_50\% & +0.000")
     );
     for (open, close) in [(r"\begin{tabular}", r"\end{tabular}"), ("{", "}")] {

@@ -194,7 +194,7 @@ fn pois_out_of_reach_are_told_before_and_after_training() {
                   away, and an agent travels at most 14.4 units in 25 steps";
     let (text, told) = place.good("check far.toml");
     assert!(told.contains(warned) && told.contains("set world.steps to at least 4"), "{told}");
-    assert!(text.contains("#   an agent travels      at most 14.4 units in an episode\n"), "{text}");
+    assert!(text.contains("#   distance per episode    at most 14.4 units per agent\n"), "{text}");
     let cost = json(&place, "check near.toml --json")["cost"].clone();
     assert!((17.4..17.5).contains(&cost["travel"].as_f64().unwrap()), "{cost}");
     assert_eq!(place.good("check near.toml").1, "");

@@ -205,7 +205,7 @@ fn a_config_to_start_from_trains_and_writes_over_nothing() {
     let again = place.run("init chaotic --out my.toml");
     let told = String::from_utf8(again.stderr).unwrap();
     assert_eq!(
-        (again.status.code(), told.contains("it is there already; choose another --out, or --force")),
+        (again.status.code(), told.contains("the file exists; choose another --out, or overwrite it with --force")),
         (Some(1), true),
         "{told}"
     );
@@ -275,6 +275,47 @@ fn a_sweep_from_standard_input_is_gone_on_with_from_its_folder() {
     assert!(all.starts_with("2 of 2 points are done."), "{all}");
     let (script, _) = fed(&place, "sweep - --slurm", &sweep);
     assert!(script.contains("/runs/sweep/sweep.toml"), "{script}");
+}
+
+#[test]
+fn a_job_array_says_if_its_size_fits_badly() {
+    let place = Place::new(&[]);
+    let sweep = SMALL.to_string() + "[grid]\n'learning.seed' = [1, 2]\n";
+    let (_, one) = fed(&place, "sweep - --slurm", &sweep);
+    assert!(one.contains("note: the job array has one task, which trains all points"), "{one}");
+    let (_, many) = fed(&place, "sweep - --slurm --shards 5", &sweep);
+    assert!(many.contains("note: 3 of the 5 tasks get nothing to train, because the sweep has 2 points"), "{many}");
+    let (_, two) = fed(&place, "sweep - --slurm --shards 2", &sweep);
+    assert!(!two.contains("note:"), "{two}");
+}
+
+#[test]
+fn mistakes_with_places_are_told_with_the_right_place() {
+    let place = Place::new(&[]);
+    let refusal = |line: &str, input: &str| {
+        let output = place.command().args(line.split_whitespace()).write_stdin(input).output().unwrap();
+        assert_ne!(output.status.code(), Some(0), "{line}");
+        String::from_utf8(output.stderr).unwrap()
+    };
+    // An axis of the grid in no section.
+    let told = refusal("sweep -", &format!("groups = [2, 4]\n{SMALL}[grid]\n'learning.seed' = [1]\n"));
+    assert!(told.contains("groups: this key belongs in the section [grid]: groups = [2, 4]"), "{told}");
+    // A run is named without the folder that `train` chose for it.
+    fed(&place, "train - --backend cpu -q -o runs/first", SMALL);
+    let told = refusal("replay first", "");
+    assert!(told.contains("; did you mean runs/first?"), "{told}");
+    // A picture in a folder that is not there.
+    let told = refusal("plot runs/first -o pictures/curves.svg", "");
+    assert!(told.contains("the folder pictures does not exist; make it first"), "{told}");
+}
+
+#[test]
+fn pois_out_of_reach_for_one_reason_share_a_warning() {
+    let place = Place::new(&[]);
+    let far = SMALL.replace("pois = [[10, 9]]", "pois = [[50, 9], [50, 9], [10, 50]]");
+    let (_, told) = fed(&place, "check -", &far);
+    assert_eq!(told.matches("cannot be reached by").count(), 2, "{told}");
+    assert!(told.contains("; POI 1 likewise\n"), "{told}");
 }
 
 #[test]

@@ -183,13 +183,16 @@ impl Found<'_> {
                 _ => {}
             }
         }
-        let what = match self.config.policy.actions {
-            Actions::Direct => "constant speed (shares of motion.max_speed)",
-            Actions::Behaviours => "constant behaviour (by number)",
-        };
-        match ranges.is_empty() {
-            true => format!("No {what} observes every POI."),
-            false => format!("Observe every POI by a {what}: {}.", ranges.join(", ")),
+        let ranges = ranges.join(", ");
+        match (self.config.policy.actions, ranges.is_empty()) {
+            (Actions::Direct, true) => "No constant speed observes every POI.".into(),
+            (Actions::Direct, false) => {
+                format!("A team that drives straight ahead at {ranges} of motion.max_speed observes every POI.")
+            }
+            (Actions::Behaviours, true) => "No constant behaviour observes every POI.".into(),
+            (Actions::Behaviours, false) => {
+                format!("A team that always chooses the behaviour {ranges} observes every POI.")
+            }
         }
     }
 

@@ -118,15 +118,15 @@ pub fn run(args: Args) -> Result<(), Error> {
     print(&format!(
         "{}
 # A run of this plays {teams} teams, champions included:
-#   agents a team         {agents}, of which {learners} learn
-#   an agent travels      at most {travel:.1} units in an episode
-#   team-steps            {team_steps}
-#   agent-steps           {agent_steps}
-#   parameters a policy   {parameters}
-#   policies, all trials  {policy_bytes} bytes
-#   record of a team      {record_bytes} bytes
-#   memory at the peak    {host_bytes} bytes on the CPU, {checkpoint_bytes} of them only while a checkpoint is written
-#     with a GPU          {gpu_host_bytes} bytes, and {adapter_bytes} of the adapter's
+#   agents per team         {agents}, of which {learners} learn
+#   distance per episode    at most {travel:.1} units per agent
+#   team-steps              {team_steps}
+#   agent-steps             {agent_steps}
+#   parameters per policy   {parameters}
+#   policies of all trials  {policy_bytes} bytes
+#   record of one team      {record_bytes} bytes
+#   peak memory, CPU        {host_bytes} bytes; {checkpoint_bytes} of them only while a checkpoint is written
+#   peak memory, GPU        {adapter_bytes} bytes on the GPU, {gpu_host_bytes} bytes of main memory
 ",
         config.to_toml()
     ))

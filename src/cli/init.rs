@@ -88,7 +88,9 @@ fn template(args: &Args) -> Result<String, Error> {
 /// Writes a file that must not exist yet.
 fn write_new(path: &Path, text: &str) -> io::Result<()> {
     let mut file = OpenOptions::new().write(true).create_new(true).open(path).map_err(|error| match error.kind() {
-        io::ErrorKind::AlreadyExists => io::Error::other("it is there already; choose another --out, or --force"),
+        io::ErrorKind::AlreadyExists => {
+            io::Error::other("the file exists; choose another --out, or overwrite it with --force")
+        }
         _ => error,
     })?;
     file.write_all(text.as_bytes()).inspect_err(|_| {

@@ -115,7 +115,7 @@ commands! {
     }
 }
 
-/// Trains cooperative teams by coevolution on any GPU, with the same bits on a CPU.
+/// Trains cooperative teams by coevolution on a CPU or a GPU, with the same bits on both.
 #[derive(Parser)]
 #[command(name = "flotilla", version, long_version = VERSION.as_str(), arg_required_else_help = true)]
 struct Cli {

@@ -81,6 +81,10 @@ pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), 
         }
         // This fails now, because the file may only be written after hours of computation.
         if let Err(error) = fs::metadata(file::folder(path)) {
+            let error = match error.kind() {
+                io::ErrorKind::NotFound => file::no_folder(path),
+                _ => error,
+            };
             return Err(RecordError::Write { path: path.into(), error }.into());
         }
         if path.is_dir() {

@@ -142,7 +142,7 @@ impl Args {
     }
 
     fn out(&self, sweep: &Sweep) -> PathBuf {
-        self.out.clone().unwrap_or_else(|| Path::new("runs").join(&sweep.name))
+        self.out.clone().unwrap_or_else(|| Path::new(ops::RUNS).join(&sweep.name))
     }
 
     /// Returns the arguments that run this sweep again, without those that differ between processes.
@@ -274,17 +274,28 @@ fn list(sweep: &Sweep, shards: usize) -> Result<(), Error> {
     let (least, most) = (loads.iter().min().copied().unwrap_or(0), loads.iter().max().copied().unwrap_or(0));
     let _ = writeln!(
         text,
-        "{} points, {} left out; shards cost {:.2} to {:.2} % each",
+        "{} points, {} left out; {}",
         sweep.points.len(),
         sweep.skipped,
-        part(least),
-        part(most)
+        match shards {
+            1 => "one shard trains them all".into(),
+            _ => format!("each of {shards} shards trains {:.2} to {:.2} % of the work", part(least), part(most)),
+        }
     );
     print(&text)
 }
 
 fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> Result<(), Error> {
     output::check(&[("--slurm", file)], &[&args.sweep])?;
+    match (args.shards, sweep.points.len()) {
+        (1, 2..) => say("note: the job array has one task, which trains all points; --shards N makes it N tasks"),
+        (shards, points) if shards > points => say(format_args!(
+            "note: {} of the {shards} tasks get nothing to train, because the sweep has {points} points; --shards \
+             {points} is enough",
+            shards - points
+        )),
+        _ => {}
+    }
     let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.into());
     let out = absolute(out);
     let cpu = args.run.backend == super::BackendChoice::Cpu;

@@ -15,7 +15,7 @@ use crate::escape::PathExt;
 use crate::file;
 use crate::host::Instant;
 use crate::memory::Peaks;
-use crate::ops::{Context, Event};
+use crate::ops::{Context, Event, RUNS};
 use crate::record::RecordError;
 use crate::record::archive;
 use crate::record::digests::Verification;
@@ -33,8 +33,6 @@ use crate::run::{Ended, Progress, Results, RunError, Session};
 use crate::shell;
 use crate::trainer::Row;
 
-/// The folder of runs without `--out`.
-const RUNS: &str = "runs";
 /// The folder of event files for TensorBoard, in a run's folder.
 const TENSORBOARD: &str = "tensorboard";
 
@@ -402,7 +400,10 @@ fn report(config: &Config, folder: &Path, results: &Results, trained: &str) -> S
     let best = story.last.iter().reduce(|a, b| if b.champion_g > a.champion_g { b } else { a });
     let (best, observed) = best.map_or((0, 0.0), |row| (row.trial, row.champion_g * pois as f64));
     let what = counted.map_or("share of POIs".into(), |pois| format!("of {pois} POIs"));
-    let _ = write!(text, "\nThe best champion is that of trial {best}: {observed:.2} {what}.\n");
+    let _ = match observed > 0.0 {
+        true => write!(text, "\nThe best champion is that of trial {best}: {observed:.2} {what}.\n"),
+        false => write!(text, "\nNo champion observed any POI. The film below shows what that of trial {best} does.\n"),
+    };
     let _ = write!(
         text,
         "

@@ -160,7 +160,10 @@ impl Config {
     /// Returns a note for each setting that is valid but likely a mistake.
     pub fn notes(&self) -> Vec<String> {
         let too_short = |config: &Config| config.motion.too_short(config.world.dt, config.world.map);
-        let mut notes: Vec<String> = self.staged().iter().filter_map(|(_, config)| too_short(config)).collect();
+        let degrees = |config: &Config| config.world.heading.likely_degrees();
+        let staged = self.staged();
+        let mut notes: Vec<String> =
+            staged.iter().flat_map(|(_, config)| [too_short(config), degrees(config)]).flatten().collect();
         notes.dedup();
         notes
     }

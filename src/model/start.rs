@@ -1,6 +1,6 @@
 //! Start headings of agents. The key is in `[world]`.
 
-use std::f64::consts::FRAC_PI_2;
+use std::f64::consts::{FRAC_PI_2, TAU};
 
 use serde::Serialize;
 
@@ -50,6 +50,20 @@ impl Heading {
                 Heading::Each(headings)
             }
         }
+    }
+
+    /// Returns a note if a heading is larger than a full turn: it was likely meant in degrees.
+    pub(crate) fn likely_degrees(&self) -> Option<String> {
+        let headings = match self {
+            Heading::Same(heading) => std::slice::from_ref(heading),
+            Heading::Each(headings) => headings,
+        };
+        let large = headings.iter().find(|heading| heading.abs() > TAU)?;
+        Some(format!(
+            "world.heading has {large}, which is more than a full turn: headings are in radians, and {large} degrees \
+             would be {:.4}",
+            large.to_radians()
+        ))
     }
 
     /// The heading of each agent, leaders first, given where all start.

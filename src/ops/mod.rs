@@ -34,7 +34,7 @@ pub mod verify;
 
 pub use error::{Error, Said, said};
 #[cfg(feature = "cli")]
-pub(crate) use remedy::device as advice_on_device;
+pub(crate) use remedy::{RUNS, device as advice_on_device};
 
 /// An event while a use case runs.
 #[non_exhaustive]

@@ -6,6 +6,7 @@ use std::io;
 use std::io::ErrorKind::{
     FileTooLarge, NotADirectory, NotFound, PermissionDenied, QuotaExceeded, ReadOnlyFilesystem, StorageFull,
 };
+use std::path::Path;
 
 use crate::backend::BackendError;
 use crate::backend::gpu::device::DeviceError;
@@ -150,9 +151,15 @@ pub fn run(error: &RunError) -> String {
     }
 }
 
+/// The folder for runs whose folder is not named.
+pub(crate) const RUNS: &str = "runs";
+
 /// Returns advice on a run that could not be shown.
 pub fn shown(error: &runs::ReadError) -> String {
     match error {
+        runs::ReadError::Missing(folder) if Path::new(RUNS).join(folder).is_dir() => {
+            format!("; did you mean {}?", Path::new(RUNS).join(folder).escaped())
+        }
         runs::ReadError::Missing(folder) => {
             let words = ["flotilla", "train", "CONFIG", "--out"].map(OsString::from);
             let command = shell::command(words.into_iter().chain([shell::argument(folder)]));

@@ -14,7 +14,7 @@ use crate::config::{self, Config, ConfigError, Override, Problem};
 use crate::escape::PathExt;
 use crate::file;
 use crate::memory;
-use crate::reach;
+use crate::reach::{self, Unreachable};
 use crate::record::RecordError;
 use crate::record::digests::{self, UNVERIFIED, Verification};
 use crate::record::disk::Disk;
@@ -402,8 +402,17 @@ pub(crate) fn unreachable(config: &Config) -> Vec<String> {
     for (index, (_, config)) in staged.iter().enumerate() {
         let place = if staged.len() > 1 { format!("stage {index}: ") } else { String::new() };
         let found = reach::unreachable(config);
-        lines.extend(found.iter().take(MOST_POIS).map(|found| format!("{place}{found}")));
-        if let more @ 1.. = found.len().saturating_sub(MOST_POIS) {
+        let mut reasons: Vec<(&Unreachable, Vec<usize>)> = vec![];
+        for unreachable in &found {
+            match reasons.iter_mut().find(|(first, _)| first.same_reason(unreachable)) {
+                Some((_, others)) => others.push(unreachable.poi),
+                None => reasons.push((unreachable, vec![])),
+            }
+        }
+        lines.extend(
+            reasons.iter().take(MOST_POIS).map(|(first, others)| format!("{place}{first}{}", likewise(others))),
+        );
+        if let more @ 1.. = reasons.iter().skip(MOST_POIS).map(|(_, others)| 1 + others.len()).sum::<usize>() {
             lines.push(format!("{place}{more} more POIs cannot be observed"));
         }
         if let Some(steps) = reach::fewest_steps(config, &found) {
@@ -414,6 +423,18 @@ pub(crate) fn unreachable(config: &Config) -> Vec<String> {
         }
     }
     lines
+}
+
+/// Names more POIs to which a warning applies: "; POIs 1, 2 and 3 likewise".
+fn likewise(pois: &[usize]) -> String {
+    match pois {
+        [] => String::new(),
+        [poi] => format!("; POI {poi} likewise"),
+        [pois @ .., last] => {
+            let pois: Vec<String> = pois.iter().map(ToString::to_string).collect();
+            format!("; POIs {} and {last} likewise", pois.join(", "))
+        }
+    }
 }
 
 /// Returns half of the memory that is free now in bytes, or 2 GiB if the system does not report it.
@@ -442,7 +463,7 @@ pub fn collect(request: &Request, sweep: &Sweep, axes: &[usize], context: Contex
     let rows = if every == 1 { "generation by generation".into() } else { format!("every {every} generations") };
     let _ = write!(
         text,
-        "\nFiles in {}:\n  points/      the runs themselves\n  results.csv  every point and trial, {rows}\n  points.csv   what each point came to\n",
+        "\nFiles in {}:\n  points/      the runs themselves\n  results.csv  every point and trial, {rows}\n  points.csv   the result of each point\n",
         out.escaped(),
     );
     if pictures.is_empty() {

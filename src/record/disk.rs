@@ -250,7 +250,7 @@ impl Disk {
         }
         let path = &file::resolved(path);
         if !file::folder(path).is_dir() {
-            return Err(io::Error::new(io::ErrorKind::NotFound, "there is no such folder; make it first"));
+            return Err(file::no_folder(path));
         }
         self.pass(Operation::Create, path)?;
         // A random name, because the folder may contain any files of the user.

@@ -421,12 +421,14 @@ pub fn probability(p: f64) -> String {
 /// Explains how to read the tables.
 pub fn legend(all: &[Comparison], options: &Question) -> String {
     let (test, a) = match options.paired {
-        true => ("Wilcoxon's signed ranks", "a pair's first trial"),
-        false => ("Mann and Whitney's test", "a trial of the first arm"),
+        true => ("Wilcoxon's signed-rank test", "the first arm's trial of a pair"),
+        false => ("the Mann-Whitney test", "a random trial of the first arm"),
     };
     let mut text = format!(
-        "Means over trials with 95 % bootstrap intervals. Of a pair, the first arm less the second; A: how likely {a} has\n\
-         the larger value, 0.5 if neither; p: two-sided, by {test}; Holm: corrected for the number of pairs.\n"
+        "Values are means over trials, with 95 % bootstrap intervals.\n\
+         Differences are the first arm minus the second.\n\
+         A is the probability that {a} has the larger value; 0.5 means no difference.\n\
+         p is two-sided, by {test}. Holm's correction is for the number of pairs.\n"
     );
     let never = |measured: &Measured, all: &Comparison| {
         measured.arms.iter().zip(&all.arms).any(|(mean, arm)| mean.reached.is_some_and(|reached| reached < arm.trials))
@@ -434,7 +436,7 @@ pub fn legend(all: &[Comparison], options: &Question) -> String {
     if all.iter().any(|all| all.measures.iter().any(|measured| never(measured, all))) {
         let _ = writeln!(
             text,
-            "A trial that does not reach G {} counts as one that does a generation after the last.",
+            "A trial that never reaches G {} counts as if it reached it one generation after the last.",
             options.reach
         );
     }

@@ -146,6 +146,12 @@ impl Sweep {
             })
             .collect();
         problems.extend(layout::conflicts(&grid, &base));
+        problems.extend(
+            layout::AXES
+                .into_iter()
+                .filter(|key| base.contains_key(*key))
+                .map(|key| problem(None, key, format!("this key belongs in the section [grid]: {key} = [2, 4]"))),
+        );
         let mut counts: Vec<_> = grid.of_grid().map(|axis| axis.values.len()).collect();
         counts.extend(Some(grid.variations()).filter(|&variations| variations > 1));
         let total = counts.iter().try_fold(1, |total: usize, &count| total.checked_mul(count));
