@@ -465,6 +465,64 @@ def defects(tab, page, call, downloads, folder):
     print("numbers, generations, links, files and memory are right, and the build says what it lacks")
 
 
+# Pairs of elements that differ in a state or an arm, and the property that shows it.
+STATES = [
+    ("#modes button[aria-pressed=true]", "#modes button[aria-pressed=false]", "backgroundColor"),
+    ('#credits button[data-credit="true 0"]', '#credits button[data-credit="true 1"]', "backgroundColor"),
+    ("#train", "#undo", "backgroundColor"),
+    ("#legend > :nth-child(1) .key", "#legend > :nth-child(2) .key", "borderTopColor"),
+    ('#credits [data-credit="sense 0"]', '#credits [data-credit="sense 1"]', "borderBottomColor"),
+]
+
+
+def legible(tab, dark, forced=False):
+    """Every text, border and mark of the page has enough contrast with what lies under it."""
+    colours = tab.evaluate(COLOURS.replace("replay.data.colors[scheme]", "page.stage.palette(page.state.views[0].data)"))
+    # A palette of the system shows by faint text that a control is disabled.
+    disabled = tab.evaluate("[...document.querySelectorAll(':disabled')].map(e => e.textContent.trim())") if forced else []
+    for least, what, ink, ground in colours:
+        if what.removeprefix("border of ") not in disabled:
+            assert contrast(ink, ground) >= least, (what, ink, ground, contrast(ink, ground), dark)
+
+
+def settings_of_the_system(tab, page, pictures):
+    """Shows the page in forced colours, at 200 % zoom, and in a window of 1024 x 768."""
+    def look(name, width, height, scale=1, dark=False, forced=False):
+        tab.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=False)
+        features = {"prefers-color-scheme": "dark" if dark else "light", "forced-colors": "active" if forced else ""}
+        tab.call("Emulation.setEmulatedMedia", features=[{"name": key, "value": value} for key, value in features.items()])
+        tab.load(page, layout="generally_forward", on="cpu", pace="full", **SMALL)
+        tab.train()
+        tab.set("#scrub", 6)
+        tab.wait("page.state.views.every(view => view.data && view.data.episodes[0].generation === 6 && !view.playing)")
+        tab.click('#credits button[data-credit="true 0"]')
+        tab.evaluate("for (const part of document.querySelectorAll('details')) part.open = true; document.activeElement.blur(); 0")
+        assert tab.evaluate("document.documentElement.scrollWidth") <= width, (name, "the page is wider than the window")
+        # The editor scrolls long lines.
+        assert set(tab.evaluate(CUT)) <= {"text"}, (name, tab.evaluate(CUT))
+        outside = f"[...document.querySelectorAll('main *')].filter(e => e.checkVisibility() && e.getBoundingClientRect().width && e.getBoundingClientRect().right > {width} + 0.5 && !e.closest('.stacks thead')).map(e => e.id || e.textContent.slice(0, 30))"
+        assert tab.evaluate(outside) == [], (name, tab.evaluate(outside))
+        legible(tab, dark, forced)
+        tab.screenshot(pictures / f"web-{name}.png")
+        tab.calm()
+
+    for dark in [False, True]:
+        look(f"forced-{'dark' if dark else 'light'}", 1280, 900, dark=dark, forced=True)
+        assert tab.evaluate("matchMedia('(forced-colors: active)').matches")
+        for one, other, shown in STATES:
+            values = [tab.evaluate(f"getComputedStyle(document.querySelector({json.dumps(element)})).{shown}") for element in (one, other)]
+            assert values[0] != values[1], (one, other, values)
+        # Colours on a canvas are chosen for their own ground, and must not lie on one of the system.
+        for canvas, ground in [("#views canvas", "--sea"), ("#curves", "--card")]:
+            under = tab.evaluate(f"(() => {{ const made = document.createElement('i'); made.style.cssText = 'forced-color-adjust: none; color: var({ground})'; document.body.append(made); const color = getComputedStyle(made).color; made.remove(); return [color, getComputedStyle(document.querySelector('{canvas}')).backgroundColor]; }})()")
+            assert under[0] == under[1], (canvas, under)
+    look("zoomed", 640, 450, scale=2)
+    look("zoomed-forced", 640, 450, scale=2, forced=True)
+    look("1024", 1024, 768)
+    tab.window(1280, 900, dark=False)
+    print("forced colours, 200 % zoom and a window of 1024 x 768 are served")
+
+
 # TOML that is valid, but not written as the layouts are.
 WRITTEN = [
     "[ world ]\n# mine\nleaders = [[5, 5]]\nfollowers = [[4, 4], [6, 4]]\npois = [[5, 12]]\ncoupling = 2\n[ learning ] # also mine\nseed = 3 # a\n",
@@ -881,6 +939,8 @@ def main():
         strangers(tab, page, call, downloads)
         defects(tab, page, call, downloads, folder)
 
+        settings_of_the_system(tab, page, pictures)
+
         # 4096 teams, and the page stays responsive. Its observer goes by the clock, and so tells of other programs, too, that had
         # the processor: what the page itself did in a task is told by its thread's time.
         tab.load(page, layout="generally_forward", on="cpu", pace="full", trials=1, generations=6, population=4096)
@@ -903,9 +963,7 @@ def main():
             tab.wait("page.state.views.every(view => view.data.episodes[0].generation === 100 && !view.playing)")
             assert tab.evaluate("document.documentElement.scrollWidth") <= width, "the page is wider than the window"
             assert not tab.evaluate(CUT), f"cut off at {width}: {tab.evaluate(CUT)}"
-            colours = tab.evaluate(COLOURS.replace("replay.data.colors[scheme]", "page.stage.palette(page.state.views[0].data)"))
-            for least, what, ink, ground in colours:
-                assert contrast(ink, ground) >= least, (what, ink, ground, contrast(ink, ground), dark)
+            legible(tab, dark)
             unnamed = tab.evaluate(
                 "[...document.querySelectorAll('button, select, input, canvas, textarea')].filter(e => e.checkVisibility() &&"
                 " !(e.textContent.trim() || e.getAttribute('aria-label') || (e.labels && e.labels.length))).map(e => e.outerHTML)"
