@@ -48,6 +48,7 @@ pub enum Why {
     },
 }
 
+#[cfg(all(feature = "gpu", feature = "report"))]
 impl Unreachable {
     /// Returns whether a message gives the same reason for another POI, after rounding.
     pub(crate) fn same_reason(&self, other: &Unreachable) -> bool {
