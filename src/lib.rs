@@ -94,6 +94,7 @@
 //! | [`report`] | `report` | pictures, films, pages; the paper's claims |
 //! | [`sweep`] | `report` | many runs of a parameter grid |
 //! | [`front`] | | the functions that most programs need |
+//! | [`choice`] | `gpu` and `record` | the processor that is expected to be done first |
 //! | [`ops`] | `gpu` and `report` | the use cases of the program, and their errors |
 //! | [`mod@bench`] | `cli` | a backend's speed, and the machine's arithmetic ceiling |
 //! | [`cli`] | `cli` | the command line |
@@ -128,6 +129,8 @@ pub mod backend;
 pub mod baseline;
 #[cfg(feature = "cli")]
 pub mod bench;
+#[cfg(all(feature = "gpu", feature = "record"))]
+pub mod choice;
 #[cfg(feature = "cli")]
 pub mod cli;
 pub mod config;

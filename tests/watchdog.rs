@@ -1,5 +1,5 @@
 //! Faults injected into a device: dropped submissions, old bytes, watchdogs, waits without end, missing memory, wrong
-//! kernels. None of them may give wrong bits unnoticed.
+//! kernels, other speeds. None of them may give wrong bits unnoticed.
 
 #![cfg(feature = "gpu")]
 
@@ -7,18 +7,21 @@ mod support;
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering::SeqCst};
-use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::sync::{Arc, Mutex, mpsc};
+use std::thread;
+use std::time::Duration;
 
-use flotilla::backend::BackendError;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::device::{DeviceError, Gpu, Patience, Request, report_stalls};
 use flotilla::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy};
 use flotilla::backend::gpu::exact::Pass;
 use flotilla::backend::gpu::faults::Faults;
 use flotilla::backend::gpu::{self, self_test};
-use flotilla::config::{Config, Fitness};
+use flotilla::backend::{Backend, BackendError, Group};
+use flotilla::config::{Config, Fitness, Sharing};
+use flotilla::sample;
 use flotilla::trainer::{Row, Trainer};
+use flotilla::world::World;
 
 fn config() -> Config {
     let mut config = Config::parse(support::SMALL, "small.toml").unwrap();
@@ -215,16 +218,31 @@ impl Faults for Stalled {
 
 static REPORTED: Mutex<Vec<String>> = Mutex::new(Vec::new());
 
+/// Runs a test in a thread of its own, and fails if it takes longer than `most`. A thread that hangs ends with the process.
+fn within(most: Duration, test: impl FnOnce() + Send + 'static) {
+    let (send, done) = mpsc::channel();
+    let running = thread::spawn(move || {
+        test();
+        let _ = send.send(());
+    });
+    if done.recv_timeout(most) == Err(mpsc::RecvTimeoutError::Timeout) {
+        panic!("still waiting for the device after {most:?}");
+    }
+    running.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+}
+
 #[test]
 fn a_device_without_progress_is_reported_and_lost() {
+    within(Duration::from_secs(120), stall);
+}
+
+fn stall() {
     report_stalls(|text| REPORTED.lock().unwrap().push(text.into()));
     let (rows, policies) = expected();
     for (request, info) in support::adapters("a_device_without_progress_is_reported_and_lost") {
         let faults = Arc::new(Stalled(AtomicUsize::new(0)));
         let patience = Patience { wait: Duration::from_millis(20), waits: 3 };
-        let start = Instant::now();
         let found = train(backend(failing(&opened(&request), &faults).waiting(patience), WAYS[0]));
-        assert!(start.elapsed() < Duration::from_secs(60));
         assert_eq!((found.0, found.1, found.2), (rows.clone(), policies.clone(), 1), "{info}");
         assert_eq!(faults.0.load(SeqCst), 3);
         let reported = REPORTED.lock().unwrap().split_off(0);
@@ -279,6 +297,50 @@ fn opening_tests_everything_that_trains() {
         for (what, edit) in edits {
             let found = self_test::find_exact(failing(&gpu, &Arc::new(Edited(edit))), &[gpu.pass]);
             assert!(matches!(found, Err(DeviceError::Inexact { .. })), "{info}: a wrong {what} is taken: {found:?}");
+        }
+    }
+}
+
+/// Plays faster with so many teams per workgroup.
+struct Favours(usize);
+
+impl Faults for Favours {
+    fn rollout_takes(&self, teams: usize) -> Option<Duration> {
+        Some(Duration::from_millis(if teams == self.0 { 1 } else { 2 }))
+    }
+}
+
+#[test]
+fn the_faster_packing_is_kept_and_each_gives_the_same_records() {
+    const TEAMS: usize = 1024;
+    let world = World::new(&config());
+    let weights = sample::weights(&world, 9, 0);
+    let teams: Vec<u32> = (0..TEAMS * world.leaders()).map(|place| (place * 7 % 9) as u32).collect();
+    let group = Group {
+        world: &world,
+        starts: &world.starts,
+        weights: weights[..].into(),
+        policies: 9,
+        sharing: Sharing::PerLeader,
+        teams: &teams,
+        fitnesses: &[Fitness::Df, Fitness::Dpp],
+    };
+    let few = Group { teams: &teams[..100 * world.leaders()], ..group };
+    let (scores, trace) = (Cpu::default().play(&[group]).unwrap(), Cpu::default().trace(&few).unwrap());
+    for (request, info) in support::adapters("the_faster_packing_is_kept_and_each_gives_the_same_records") {
+        let gpu = opened(&request);
+        for (favoured, records) in
+            [(32, Records::Whole), (16, Records::Whole), (32, Records::Packed), (16, Records::Packed)]
+        {
+            let case = format!("{info}, {favoured} teams per workgroup, {records:?}");
+            let device = GpuBackend::new(failing(&gpu, &Arc::new(Favours(favoured)))).unwrap();
+            let mut device = device.playing(Kernel::Specialised).bringing(records).packing(None);
+            // Too few teams to tell.
+            assert_eq!(device.trace(&few).unwrap(), trace, "{case}");
+            assert_eq!(device.packed(), None, "{case}");
+            assert_eq!(device.play(&[group]).unwrap(), scores, "{case}");
+            assert_eq!(device.packed(), Some(favoured), "{case}");
+            assert_eq!(device.trace(&few).unwrap(), trace, "{case}");
         }
     }
 }

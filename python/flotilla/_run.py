@@ -281,8 +281,8 @@ def train(
             ``[leaders, policies, parameters]``, one for each trial or one for all. Trial i starts from trial i of a run or
             file. Larger populations are filled with random policies. A run that starts from policies is kept in ``out``,
             or else in a temporary folder that is removed with the :class:`Run`.
-        backend: what to play on, to the same bits: ``"auto"`` (a GPU where there is one), ``"cpu"``, ``"gpu"``, or an
-            adapter's number or name.
+        backend: what to play on, to the same bits: ``"auto"`` (a GPU if it is expected to finish first), ``"cpu"``,
+            ``"gpu"``, or an adapter's number or name.
         callback: called with every :class:`Generation` once it has played, or several such functions. The training stops
             if one returns True. The results are then those of a config with so many generations. A callback with a method
             ``close`` is closed at the end, however the training ends.

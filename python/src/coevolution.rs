@@ -2,6 +2,7 @@
 
 use std::sync::Mutex;
 
+use flotilla::choice::Work;
 use flotilla::front;
 use flotilla::trainer::{Row, Snapshot};
 use numpy::{PyArray1, PyArray2, PyArray3, PyArray4, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray3};
@@ -111,7 +112,8 @@ impl Coevolution {
         py: Python<'py>,
         backend: &str,
     ) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray3<f32>>)> {
-        let (trials, teams, leaders, (g, fitness)) = workers::play(py, backend, |(backend, _)| {
+        let work = Work::of_generation(self.lock()?.config());
+        let (trials, teams, leaders, (g, fitness)) = workers::play(py, backend, work, |(backend, _)| {
             let mut inner = self.lock()?;
             let played = inner.play(&mut **backend).raise()?;
             let (world, teams) = inner.world();
@@ -126,7 +128,7 @@ impl Coevolution {
     /// Breeds the next generation, and returns the generations that became complete.
     fn tell(&self, py: Python<'_>, fitness: PyReadonlyArray3<'_, f32>, backend: &str) -> PyResult<Vec<Generation>> {
         let fitness = fitness.as_slice().map_err(|_| PyValueError::new_err("fitness is not C-contiguous"))?;
-        workers::play(py, backend, |(backend, _)| {
+        workers::play(py, backend, Work::default(), |(backend, _)| {
             let mut inner = self.lock()?;
             let told = inner.tell(&mut **backend, Some(fitness)).raise()?;
             Ok(Generation::of_rows(told.rows, told.last))

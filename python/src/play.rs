@@ -4,6 +4,7 @@ use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::{self, StepArrays};
+use flotilla::choice::Work;
 use flotilla::config::{Fitness, MAX_HIDDEN_UNITS};
 use flotilla::evaluate::{Batch, Spread, Starts};
 use flotilla::evolve::{self, MAX_WEIGHT};
@@ -80,7 +81,8 @@ pub fn rollout<'py>(
         return Err(Failure::Memory { what: "the scores of all episodes", bytes }).raise();
     }
     let (mut interrupted, mut asked) = (None, Instant::now());
-    let evaluation = workers::play(py, backend, |(backend, _)| {
+    let work = Work::of_teams(&config.0, teams.saturating_mul(episodes));
+    let evaluation = workers::play(py, backend, work, |(backend, _)| {
         let watch = &mut |batch: Batch<'_>| {
             if spread {
                 each.extend_from_slice(batch.observed);

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use flotilla::backend::OpenBackend;
 use flotilla::backend::gpu::device;
+use flotilla::choice::Work;
 use flotilla::cli;
 use flotilla::ops::{self, Context, Event, Player, Request};
 use pyo3::exceptions::{PyRuntimeWarning, PyValueError};
@@ -79,15 +80,15 @@ fn warn(py: Python<'_>, text: &str) -> PyResult<()> {
 /// A backend by name, opened when it is needed.
 struct Lazy<'a> {
     name: &'a str,
-    open: Option<Lent<'a>>,
+    open: Option<Lent>,
     /// Why it could not be opened.
     error: Option<PyErr>,
 }
 
 impl Player for Lazy<'_> {
-    fn open(&mut self) -> Result<&mut OpenBackend, ops::Error> {
+    fn open(&mut self, work: Work) -> Result<(&mut OpenBackend, String), ops::Error> {
         if self.open.is_none() {
-            match Lent::open(self.name) {
+            match Lent::open(self.name, work) {
                 Ok(open) => self.open = Some(open),
                 Err(error) => {
                     let message = error.to_string();
@@ -96,6 +97,7 @@ impl Player for Lazy<'_> {
                 }
             }
         }
-        Ok(&mut self.open.as_mut().expect("it was opened above").player)
+        let Lent { player, description, .. } = self.open.as_mut().expect("it was opened above");
+        Ok((player, description.clone()))
     }
 }

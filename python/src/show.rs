@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+use flotilla::choice::Work;
 use flotilla::record::digests::Verification;
 use flotilla::report::curves::{Band, PRINT};
 use flotilla::report::replay::{self as again, Film, ReplayError, Replayed, Which};
@@ -35,7 +36,9 @@ pub fn replay(
 ) -> PyResult<Replay> {
     let verification = Verification::unless(unverified);
     let (mut interrupted, mut asked) = (None, Instant::now());
-    let played = workers::play(py, backend, |(backend, _)| {
+    let config = runs::config(&folder, verification).raise()?;
+    let work = Work::of_teams(&config, generations.len());
+    let played = workers::play(py, backend, work, |(backend, _)| {
         let mut watch = |_| {
             if asked.elapsed() > Duration::from_millis(50) {
                 interrupted = Python::attach(|py| py.check_signals()).err();
@@ -52,7 +55,7 @@ pub fn replay(
         return Err(error);
     }
     let name = folder.file_name().map_or("run".into(), |name| name.to_string_lossy().into_owned());
-    Ok(Replay { name, config: runs::config(&folder, verification).raise()?, played })
+    Ok(Replay { name, config, played })
 }
 
 #[pymethods]

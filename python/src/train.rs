@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use flotilla::backend::{Backend, OpenBackend};
+use flotilla::choice::Work;
 use flotilla::front::{self, Coevolution, Trained};
 use flotilla::memory::Peaks;
 use flotilla::record::digests::Verification;
@@ -195,7 +196,7 @@ pub fn train<'py>(
     champions: bool,
 ) -> PyResult<(Outcomes<'py>, Played, Vec<f64>)> {
     let mut watcher = Watcher::new(callback.as_ref());
-    let (trained, digest, played) = workers::play(py, backend, |player| {
+    let (trained, digest, played) = workers::play(py, backend, Work::of([&config.0]), |player| {
         let played = named(player);
         if champions {
             let trained = with_champions(&config.0, &mut *player.0, &mut watcher)?;
@@ -296,7 +297,7 @@ pub fn train_into(
         return Err(failed(format!("{} holds {what}, not a run; choose another folder", out.display())));
     }
     let mut watcher = Watcher::new(callback.as_ref());
-    let mut notes: Vec<String> = workers::play(py, backend, |player| {
+    let mut notes: Vec<String> = workers::play(py, backend, Work::of([&config.0]), |player| {
         Peaks::of([&config.0], rayon::current_num_threads())
             .check(player.1.backend == "gpu")
             .map_err(RunError::from)

@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
 
 use flotilla::backend::OpenBackend;
+use flotilla::choice::{self, Chosen, Ledger, Work};
 use flotilla::front::{self, Processor};
 use flotilla::parallel;
 use pyo3::exceptions::PyRuntimeWarning;
@@ -13,6 +14,8 @@ use crate::errors::Raise;
 
 /// Open backends that are not in use, by requested name. Opening a GPU takes longer than many rollouts.
 static IDLE: Mutex<Vec<(String, OpenBackend)>> = Mutex::new(Vec::new());
+/// The work that "auto" was asked to play in this process.
+static WORK: Mutex<Ledger> = Mutex::new(Ledger::new());
 /// Maximum number of idle backends.
 const MOST: usize = 4;
 /// Whether this process was forked. Threads of its parent do not exist in it.
@@ -71,34 +74,63 @@ pub fn aside<R: Send>(py: Python<'_>, work: impl FnOnce() -> R + Send) -> R {
     py.detach(|| with_threads(work))
 }
 
-/// Runs `work` on a backend, without the interpreter's lock.
+/// Plays `work` on a backend, without the interpreter's lock.
 ///
-/// `backend` is "auto", "cpu", "gpu", or an adapter's number or part of its name.
+/// `backend` is "auto", "cpu", "gpu", or an adapter's number or part of its name. With "auto", the work decides.
 pub fn play<R: Send>(
     py: Python<'_>,
     backend: &str,
-    work: impl FnOnce(&mut OpenBackend) -> PyResult<R> + Send,
+    work: Work,
+    play: impl FnOnce(&mut OpenBackend) -> PyResult<R> + Send,
 ) -> PyResult<R> {
     aside(py, || {
-        let mut lent = Lent::open(backend)?;
-        let done = work(&mut lent.player)?;
+        let mut lent = Lent::open(backend, work)?;
+        let done = play(&mut lent.player)?;
         lent.give_back();
         Ok(done)
     })
 }
 
 /// A backend in use.
-pub struct Lent<'a> {
-    name: &'a str,
+pub struct Lent {
+    name: String,
     /// The open backend.
     pub player: OpenBackend,
+    /// The backend for people, with the reason if nobody asked for it.
+    pub description: String,
 }
 
-impl Lent<'_> {
+impl Lent {
     /// Takes an idle backend, or opens one.
-    pub fn open(name: &str) -> PyResult<Lent<'_>> {
-        let player = take(name).map_or_else(|| open(name), Ok)?;
-        Ok(Lent { name, player })
+    pub fn open(name: &str, work: Work) -> PyResult<Lent> {
+        if name == "auto" {
+            return Lent::choose(work);
+        }
+        let player = match take(name) {
+            Some(player) => player,
+            None => find(name, None)?.0.unwrap_or_else(front::cpu),
+        };
+        Ok(Lent::of(name, player, None))
+    }
+
+    fn of(name: &str, player: OpenBackend, reason: Option<String>) -> Lent {
+        let reason = reason.map_or(String::new(), |reason| format!(" [auto: {reason}]"));
+        let description = format!("{}{reason}", player.0.describe());
+        Lent { name: name.into(), player, description }
+    }
+
+    /// Takes or opens the backend that is expected to finish first. An idle backend "auto" is a GPU.
+    fn choose(work: Work) -> PyResult<Lent> {
+        let work = WORK.lock().unwrap_or_else(PoisonError::into_inner).add(work);
+        if let Some(player) = take("auto") {
+            return Ok(Lent::of("auto", player, None));
+        }
+        let cpu = || take("cpu").unwrap_or_else(front::cpu);
+        let Some(work) = work else { return Ok(Lent::of("cpu", cpu(), None)) };
+        Ok(match find("auto", Some(work))? {
+            (Some(player), reason) => Lent::of("auto", player, reason),
+            (None, reason) => Lent::of("cpu", cpu(), reason),
+        })
     }
 
     /// Keeps the backend for the next call. Call this only if the backend did not fail.
@@ -106,7 +138,7 @@ impl Lent<'_> {
         if let Ok(mut idle) = IDLE.try_lock()
             && idle.len() < MOST
         {
-            idle.push((self.name.into(), self.player));
+            idle.push((self.name, self.player));
         }
     }
 }
@@ -117,18 +149,18 @@ fn take(backend: &str) -> Option<OpenBackend> {
     Some(idle.swap_remove(place).1)
 }
 
-fn open(backend: &str) -> PyResult<OpenBackend> {
+/// Opens the GPU that a name stands for, if any, and returns why it was chosen or not. Some work decides about "auto".
+fn find(backend: &str, work: Option<Work>) -> PyResult<(Option<OpenBackend>, Option<String>)> {
     let processor = match backend {
         "auto" => Processor::Auto,
         "cpu" => Processor::Cpu,
         "gpu" => Processor::Gpu,
         name => Processor::Adapter(name.into()),
     };
-    let (player, passed_over) = front::open(&processor).raise()?;
-    if let Some(error) = passed_over {
-        let text = format!("no GPU is used: {error}").replace('\0', " ");
-        let text = std::ffi::CString::new(text).unwrap_or_default();
+    let Chosen { gpu, reason, passed_over, forgotten } = choice::find(&processor, None, work).raise()?;
+    for text in passed_over.map(|error| format!("no GPU is used: {error}")).into_iter().chain(forgotten) {
+        let text = std::ffi::CString::new(text.replace('\0', " ")).unwrap_or_default();
         Python::attach(|py| PyErr::warn(py, &py.get_type::<PyRuntimeWarning>(), &text, 2))?;
     }
-    Ok(player)
+    Ok((gpu.map(front::on_gpu), reason))
 }

@@ -2,9 +2,9 @@
 
 use serde_json::json;
 
-use super::choice::Work;
 use super::{ConfigFile, Error, Processor, RunOptions, SetKeys, backend, between, number, print, print_json, say};
 use crate::baseline::{self, Baselines, Outcome, SPEEDS};
+use crate::choice::Work;
 use crate::config::{Actions, Choice, Config, Override, Paradigm};
 use crate::evaluate::MAX_EPISODES;
 use crate::report::progress::Meter;

@@ -160,7 +160,7 @@ fn open(args: &Args) -> Result<(Subject, Machine), Error> {
     Ok(match backend::open_gpu(&args.run, None)?.0 {
         Some(gpu) => {
             let gpu = match args.packing.as_deref().and_then(|teams| teams.parse().ok()) {
-                Some(teams) => gpu.packing(teams),
+                Some(teams) => gpu.packing(Some(teams)),
                 None => gpu,
             };
             let machine = Machine::of_gpu(&gpu);

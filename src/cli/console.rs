@@ -6,6 +6,7 @@ use std::sync::atomic::AtomicBool;
 use super::recovery::{self, Loss, Signals};
 use super::{Error, RunOptions, backend, say};
 use crate::backend::OpenBackend;
+use crate::choice::Work;
 use crate::ops::{Context, Event, Player};
 use crate::report::progress::{Board, Meter};
 
@@ -19,15 +20,16 @@ pub struct Console<'a> {
 /// The backend that the flags choose, opened when it is needed.
 struct Machine<'a> {
     options: &'a RunOptions,
-    open: Option<OpenBackend>,
+    open: Option<(OpenBackend, String)>,
 }
 
 impl Player for Machine<'_> {
-    fn open(&mut self) -> Result<&mut OpenBackend, Error> {
-        match &mut self.open {
-            Some(open) => Ok(open),
-            closed => Ok(closed.insert(backend::open(self.options)?)),
-        }
+    fn open(&mut self, work: Work) -> Result<(&mut OpenBackend, String), Error> {
+        let (open, description) = match &mut self.open {
+            Some(open) => open,
+            closed => closed.insert(backend::open_for(self.options, work)?),
+        };
+        Ok((open, description.clone()))
     }
 }
 

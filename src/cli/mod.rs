@@ -28,7 +28,6 @@ mod backend;
 mod baseline;
 mod bench;
 mod check;
-mod choice;
 mod compare;
 mod completions;
 mod console;

@@ -5,10 +5,10 @@ use std::sync::atomic::Ordering::Relaxed;
 
 use serde_json::json;
 
-use super::choice::Work;
 use super::output::Destination;
 use super::recovery::Signals;
 use super::{Error, RunOptions, backend, between, points, print, print_json, said, say, whole, words};
+use crate::choice::Work;
 use crate::config::{Config, Learning};
 use crate::escape::PathExt;
 use crate::record::RecordError;

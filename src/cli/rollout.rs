@@ -6,12 +6,12 @@ use std::path::{Path, PathBuf};
 use clap::builder::PossibleValuesParser as Words;
 use serde_json::json;
 
-use super::choice::Work;
 use super::{
     ConfigFile, Error, Processor, RunOptions, SetKeys, backend, between, canonical, output, points, print, print_json,
     real, said, say, whole,
 };
 use crate::backend::{Backend, Group, Moment};
+use crate::choice::Work;
 use crate::config::{Choice, Config, Override, Paradigm, Sharing};
 use crate::escape::PathExt;
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Spread, Starts};

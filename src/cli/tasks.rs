@@ -9,6 +9,7 @@ use super::recovery::{self, Loss, Signals};
 use super::{Error, RunOptions, backend, between, print, say};
 use crate::backend::Backend;
 use crate::baseline::{Baselines, Outcome};
+use crate::choice::Work;
 use crate::config::{self, Config, Fitness, Override};
 use crate::evaluate::Starts;
 use crate::memory::Peaks;
@@ -101,7 +102,12 @@ pub fn run(args: Args) -> Result<(), Error> {
         };
         tasks.push((name, path.clone(), [Some(small), large]));
     }
-    let mut player = backend::open(&args.run)?;
+    let mut work = Work::default();
+    for config in tasks.iter().flat_map(|(.., configs)| configs.iter().flatten()) {
+        // One training after the other.
+        FITNESSES.iter().for_each(|_| work += Work::of([config]));
+    }
+    let (mut player, on) = backend::open_for(&args.run, work)?;
     let start = match (args.resume, args.force) {
         (true, _) => Start::Resume,
         (_, true) => Start::Force,
@@ -116,7 +122,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let mut refused = Vec::new();
     for (name, path, configs) in &tasks {
         if !args.quiet {
-            say(format_args!("{name}: playing baselines and training on {}", player.0.describe()));
+            say(format_args!("{name}: playing baselines and training on {on}"));
         }
         let small = configs[0].as_ref().expect("small populations are always trained");
         let baselines = baselines(small, &mut *player.0)?;

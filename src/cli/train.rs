@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 
 use serde_json::json;
 
-use super::choice::Work;
 use super::recovery::{self, Checkpoints, Loss, Signals, quoted};
 use super::{ConfigArgs, Error, Processor, RunOptions, backend, print, print_json, said, say, warnings};
+use crate::choice::Work;
 use crate::config::Config;
 use crate::escape::PathExt;
 use crate::file;

@@ -17,6 +17,7 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use serde::{Deserialize, Serialize};
 
 use crate::backend::{BackendError, Machine, OpenBackend};
+use crate::choice::Work;
 use crate::front;
 use crate::memory::Peaks;
 use crate::parallel;
@@ -111,16 +112,17 @@ impl Context<'_> {
 
 /// Opens the backend when it is needed, so that requests are checked first.
 pub trait Player {
-    /// Returns the open backend.
+    /// Returns the backend that plays some work, and its description for people.
     ///
     /// # Errors
     /// It cannot be opened.
-    fn open(&mut self) -> Result<&mut OpenBackend, Error>;
+    fn open(&mut self, work: Work) -> Result<(&mut OpenBackend, String), Error>;
 }
 
 impl Player for &mut OpenBackend {
-    fn open(&mut self) -> Result<&mut OpenBackend, Error> {
-        Ok(self)
+    fn open(&mut self, _: Work) -> Result<(&mut OpenBackend, String), Error> {
+        let description = self.0.describe();
+        Ok((self, description))
     }
 }
 

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Context, Error, Event, Player, Processor, said};
 use crate::baseline::Baselines;
+use crate::choice::Work;
 use crate::config::{self, Actions, Fitness, Override, Paradigm};
 use crate::escape::PathExt;
 use crate::memory;
@@ -127,8 +128,8 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
     let mut arms = paper::arms(&request.set)?;
     let marks = Marks::of(&arms[0].config.learning);
     marks.compare(out, start)?;
-    let player = player.open()?;
     let (configs, places) = paper::trained(&arms);
+    let (player, on) = player.open(Work::of(&configs))?;
     let plan = memory::Peaks::of(&configs, current_num_threads());
     plan.check(player.1.backend == "gpu").map_err(RunError::from)?;
     let disk = Disk::default();
@@ -161,8 +162,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
     if !session.is_done() {
         let (count, different, trials) = (arms.len(), configs.len(), learning.trials);
         context.message(format_args!(
-            "training {count} experiments, {different} of them different, of {trials} trials each on {}, into {}",
-            player.0.describe(),
+            "training {count} experiments, {different} of them different, of {trials} trials each on {on}, into {}",
             out.escaped()
         ));
         let names = arms.iter().map(|arm| (arm.name(), Some(arm.pois()))).collect();

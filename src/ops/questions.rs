@@ -7,6 +7,7 @@ use serde::Serialize;
 use super::paper::Request;
 use super::sweep::{claim, free_memory, same_sweep};
 use super::{Context, Error, Event, Player, check_memory, said};
+use crate::choice::Work;
 use crate::config::Config;
 use crate::escape::PathExt;
 use crate::record::disk::Disk;
@@ -95,15 +96,16 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
             "choose another --out",
         )));
     }
-    let player = player.open()?;
-    check_memory(parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config), player)?;
+    let configs = || parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config);
+    let (player, on) = player.open(Work::of(configs()))?;
+    check_memory(configs(), player)?;
     let disk = Disk::default();
     disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
     let disk = ownership::enter(&disk, out, request.is_out_named())?;
     let _lock = folder::lock(&disk, out)?;
     ownership::check(&disk, files().chain([PAGE.into()]).map(|name| out.join(name)))?;
     let points: usize = parts.iter().map(|(_, sweep)| sweep.points.len()).sum();
-    context.message(format_args!("training {points} experiments on {}, into {}", player.0.describe(), out.escaped()));
+    context.message(format_args!("training {points} experiments on {on}, into {}", out.escaped()));
 
     let warm: Vec<_> = parts.iter().map(|(part, sweep)| part.warm(sweep, out)).collect();
     // All folders are checked before training, so that no part is trained only to fail at another part's folder.

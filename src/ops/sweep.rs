@@ -10,6 +10,7 @@ use serde_json::Value;
 
 use super::{Context, Error, Event, Player, check_memory};
 use crate::backend::OpenBackend;
+use crate::choice::Work;
 use crate::config::{self, Config, ConfigError, Override, Problem};
 use crate::escape::PathExt;
 use crate::file;
@@ -312,7 +313,7 @@ pub fn train(request: &Request, sweep: &Sweep, player: &mut dyn Player, context:
     let shard = shard.map_err(|error| Error::Usage(error.into()))?;
     same_sweep(sweep, out)?;
     let points = shard.take(&sweep.points);
-    let player = player.open()?;
+    let (player, on) = player.open(Work::of(points.iter().map(|point| &point.config)))?;
     check_memory(points.iter().map(|point| &point.config), player)?;
     warn_of_unreachable(sweep, &points, context);
     claim(&Disk::default(), sweep, out)?;
@@ -325,7 +326,7 @@ pub fn train(request: &Request, sweep: &Sweep, player: &mut dyn Player, context:
     let (all, taken) = (sweep.points.len(), points.len());
     let part =
         if shard.count > 1 { format!("shard {shard}: {taken} of {all} points") } else { format!("{all} points") };
-    context.message(format_args!("{part}{skipped}{batches}, on {}, into {}", player.0.describe(), out.escaped()));
+    context.message(format_args!("{part}{skipped}{batches}, on {on}, into {}", out.escaped()));
     let share = |progress: &SweepProgress| {
         let SweepProgress { done, points, batch, generation, last, played, total } = *progress;
         let text =

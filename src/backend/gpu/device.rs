@@ -552,6 +552,11 @@ impl Gpu {
         self.faults.as_ref().and_then(|faults| faults.takes(turns)).unwrap_or(elapsed)
     }
 
+    /// Returns how long a rollout took, or seems to take under injected faults.
+    pub(super) fn rollout_taken(&self, teams: usize, elapsed: Duration) -> Duration {
+        self.faults.as_ref().and_then(|faults| faults.rollout_takes(teams)).unwrap_or(elapsed)
+    }
+
     /// Returns the text of a shader, edited under injected faults.
     fn text<'a>(&self, text: &'a str) -> Cow<'a, str> {
         match &self.faults {

@@ -190,10 +190,16 @@ impl GpuBackend {
         GpuBackend { kernel, ..self }
     }
 
-    /// Sets the maximum teams per workgroup of specialised kernels: 32, 16 or 8. By default the faster one of 32 and 16
-    /// is measured on the first large rollout, except on software renderers. Results do not depend on it.
-    pub fn packing(self, teams: usize) -> GpuBackend {
-        GpuBackend { packing: Some(teams), ..self }
+    /// Sets the maximum teams per workgroup of specialised kernels: 32, 16 or 8. With `None`, the faster one of 32 and 16
+    /// is measured on the first large rollout. This is the default, except on software renderers. Results do not depend
+    /// on it.
+    pub fn packing(self, teams: Option<usize>) -> GpuBackend {
+        GpuBackend { packing: teams, ..self }
+    }
+
+    /// Returns the maximum teams per workgroup of specialised kernels, or `None` if it is yet to be measured.
+    pub fn packed(&self) -> Option<usize> {
+        self.packing
     }
 
     /// Sets the maximum number of kernels per batch and kept between batches, at least one, and the number of rollouts

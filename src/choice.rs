@@ -1,24 +1,27 @@
-//! `--backend auto`: chooses the processor that is expected to be done first. Results do not depend on it.
+//! Chooses the processor that is expected to be done first, where none is asked for. Results do not depend on it.
 //!
 //! Opening a GPU and compiling for it takes seconds, and short runs are over before. Long runs pay for a measurement of
 //! both processors. It is kept in a file per device, in the user's cache.
 
 use std::fs;
+use std::io;
+use std::ops::AddAssign;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::{Error, say};
 use crate::VERSION;
-use crate::backend::Backend;
 use crate::backend::cpu::Cpu;
-use crate::backend::gpu::device::AdapterInfo;
-use crate::backend::gpu::episode::GpuBackend;
+use crate::backend::gpu::device::{self, AdapterInfo, DeviceError, Wanted};
+use crate::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
+use crate::backend::{Backend, BackendError};
 use crate::config::Config;
 use crate::escape::PathExt;
+use crate::front::{self, Found, Processor};
 use crate::host::Instant;
+use crate::parallel::current_num_threads;
 use crate::trainer::Trainer;
 use crate::world::World;
 
@@ -33,9 +36,9 @@ const ON_CPU: usize = 2048;
 /// Timed generations, of which the shortest counts.
 const REPEATS: usize = 3;
 /// The layout that is timed.
-const CONFIG: &str = include_str!("../../configs/generally_forward.toml");
+const CONFIG: &str = include_str!("../configs/generally_forward.toml");
 
-/// The episodes of a command.
+/// Episodes to play.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Work {
     generations: f64,
@@ -55,10 +58,119 @@ impl Work {
         })
     }
 
+    /// Returns the work of one generation of a config.
+    pub fn of_generation(config: &Config) -> Work {
+        Work { generations: 1.0, agent_steps: config.learning.trials as f64 * generation(config) }
+    }
+
     /// Returns the work of playing this many teams of a config.
     pub fn of_teams(config: &Config, teams: usize) -> Work {
         Work { generations: 1.0, agent_steps: teams as f64 * team(config) }
     }
+}
+
+impl AddAssign for Work {
+    fn add_assign(&mut self, other: Work) {
+        self.generations += other.generations;
+        self.agent_steps += other.agent_steps;
+    }
+}
+
+/// The work of a process that plays one piece after the other. Many short pieces are worth a GPU as one long one is.
+#[derive(Debug, Default)]
+pub struct Ledger {
+    /// All work so far.
+    all: Work,
+    /// All work when a GPU was last looked for.
+    looked: Work,
+}
+
+impl Ledger {
+    /// Returns an empty ledger.
+    pub const fn new() -> Ledger {
+        const NONE: Work = Work { generations: 0.0, agent_steps: 0.0 };
+        Ledger { all: NONE, looked: NONE }
+    }
+
+    /// Adds some work. Returns all work so far if [`find`] should decide by that: when it is no longer short, and each
+    /// time that it has doubled. Otherwise the decision stays.
+    pub fn add(&mut self, work: Work) -> Option<Work> {
+        self.add_for(work, current_num_threads())
+    }
+
+    fn add_for(&mut self, work: Work, threads: usize) -> Option<Work> {
+        self.all += work;
+        let is_due = self.all.agent_steps >= 2.0 * self.looked.agent_steps;
+        if !is_due || choose(self.all, threads, None).is_some() {
+            return None;
+        }
+        self.looked = self.all;
+        Some(self.all)
+    }
+}
+
+/// A search for the processor that plays some work.
+#[derive(Default)]
+pub struct Chosen {
+    /// The opened GPU, if one plays. Otherwise the CPU does.
+    pub gpu: Option<GpuBackend>,
+    /// Why it was chosen, for people, if nobody asked for it.
+    pub reason: Option<String>,
+    /// The reason why an existing GPU cannot be used.
+    pub passed_over: Option<DeviceError>,
+    /// Why a measurement could not be kept, for people.
+    pub forgotten: Option<String>,
+}
+
+impl Chosen {
+    fn cpu(reason: String) -> Chosen {
+        Chosen { reason: Some(reason), ..Chosen::default() }
+    }
+}
+
+/// Opens the GPU that a processor asks for, if any, see [`front::find_gpu`]. With [`Processor::Auto`], `work` decides.
+/// Without it, any usable GPU is taken.
+///
+/// # Errors
+/// The requested GPU does not exist, cannot be used, or fails.
+pub fn find(
+    processor: &Processor,
+    holding: Option<ResidencyPolicy>,
+    work: Option<Work>,
+) -> Result<Chosen, BackendError> {
+    let threads = current_num_threads();
+    let work = work.filter(|_| *processor == Processor::Auto && holding != Some(ResidencyPolicy::Always));
+    let mut measured = None;
+    if let Some(work) = work {
+        if let Some(choice) = choose(work, threads, None) {
+            return Ok(Chosen::cpu(choice.reason));
+        }
+        let found = device::adapters();
+        measured = device::position(&Wanted::Real, &found).ok().and_then(|index| recall(&found[index]));
+        let choice = measured.and_then(|measured| choose(work, threads, Some(measured)));
+        if let Some(choice) = choice.filter(|choice| !choice.gpu) {
+            return Ok(Chosen::cpu(choice.reason));
+        }
+    }
+    let start = Instant::now();
+    let Found { mut gpu, passed_over } = front::find_gpu(processor, holding)?;
+    let Some(work) = work else { return Ok(Chosen { gpu, passed_over, ..Chosen::default() }) };
+    let Some(opened) = &mut gpu else {
+        let reason = passed_over.is_none().then(|| "no GPU found".into());
+        return Ok(Chosen { passed_over, reason, ..Chosen::default() });
+    };
+    let mut forgotten = None;
+    let measured = match measured {
+        Some(measured) => measured,
+        None => {
+            let measured = measure(opened, start.elapsed().as_secs_f64(), threads)?;
+            forgotten = remember(&opened.gpu().adapter, &measured).err();
+            measured
+        }
+    };
+    let choice = choose(work, threads, Some(measured));
+    let gpu = gpu.filter(|_| choice.as_ref().is_none_or(|choice| choice.gpu));
+    Ok(Chosen { gpu, reason: choice.map(|choice| choice.reason), passed_over, forgotten })
 }
 
 /// Returns the agent-steps of one trial's generation.
@@ -74,7 +186,7 @@ fn team(config: &Config) -> f64 {
 
 /// Measurements of a GPU and of the CPU beside it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Measured {
+struct Measured {
     /// Seconds to open the GPU.
     open_s: f64,
     /// Seconds per generation of a small population.
@@ -87,13 +199,13 @@ pub struct Measured {
 
 /// A choice, and the reason for people.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Choice {
-    pub gpu: bool,
-    pub reason: String,
+struct Choice {
+    gpu: bool,
+    reason: String,
 }
 
 /// Chooses by the work, the CPU's threads and what was measured. `None` if a measurement is worth its time.
-pub fn choose(work: Work, threads: usize, measured: Option<Measured>) -> Option<Choice> {
+fn choose(work: Work, threads: usize, measured: Option<Measured>) -> Option<Choice> {
     let rate = measured.map_or(CPU_RATE, |measured| measured.cpu_agent_steps_per_s);
     let on_cpu = work.agent_steps / (rate * threads.max(1) as f64);
     match measured {
@@ -122,10 +234,7 @@ fn time(seconds: f64) -> String {
 }
 
 /// Times generations on a GPU that took `open_s` seconds to open, and on the CPU.
-///
-/// # Errors
-/// The GPU failed.
-pub fn measure(gpu: &mut GpuBackend, open_s: f64, threads: usize) -> Result<Measured, Error> {
+fn measure(gpu: &mut GpuBackend, open_s: f64, threads: usize) -> Result<Measured, BackendError> {
     let (small, _) = seconds(gpu, SMALL)?;
     let (large, steps) = seconds(gpu, LARGE)?;
     let (cpu, cpu_steps) = seconds(&mut Cpu::default(), ON_CPU)?;
@@ -138,7 +247,7 @@ pub fn measure(gpu: &mut GpuBackend, open_s: f64, threads: usize) -> Result<Meas
 }
 
 /// Returns seconds per generation of so many teams, and its agent-steps.
-fn seconds(backend: &mut dyn Backend, teams: usize) -> Result<(f64, f64), Error> {
+fn seconds(backend: &mut dyn Backend, teams: usize) -> Result<(f64, f64), BackendError> {
     let mut config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
     (config.learning.trials, config.learning.population) = (1, teams);
     let world = World::new(&config);
@@ -173,7 +282,7 @@ fn file(adapter: &AdapterInfo) -> Option<PathBuf> {
 }
 
 /// Returns what was measured of a device before. A damaged file counts as none.
-pub fn recall(adapter: &AdapterInfo) -> Option<Measured> {
+fn recall(adapter: &AdapterInfo) -> Option<Measured> {
     let text = fs::read(file(adapter)?).ok()?;
     let measured: Measured = serde_json::from_slice(&text).ok()?;
     let Measured { open_s, generation_s, agent_steps_per_s, cpu_agent_steps_per_s } = measured;
@@ -181,17 +290,18 @@ pub fn recall(adapter: &AdapterInfo) -> Option<Measured> {
     sound.then_some(measured)
 }
 
-/// Keeps what was measured. Says so if that fails, because each run measures again.
-pub fn remember(adapter: &AdapterInfo, measured: &Measured) {
-    let Some(path) = file(adapter) else { return };
+/// Keeps what was measured. Returns a message if that fails, because each run measures again.
+fn remember(adapter: &AdapterInfo, measured: &Measured) -> Result<(), String> {
+    let Some(path) = file(adapter) else { return Ok(()) };
     let text = serde_json::to_vec_pretty(measured).expect("numbers have a JSON form");
     let folder = path.parent().map_or(Ok(()), fs::create_dir_all);
     // Whoever reads it meanwhile gets the old file or the new one.
     let new = path.with_extension(format!("{}", std::process::id()));
-    if let Err(error) = folder.and_then(|()| fs::write(&new, text)).and_then(|()| fs::rename(&new, &path)) {
+    let written = folder.and_then(|()| fs::write(&new, text)).and_then(|()| fs::rename(&new, &path));
+    written.map_err(|error: io::Error| {
         let _ = fs::remove_file(&new);
-        say(format_args!("note: {}: the GPU's speed cannot be kept: {error}; set FLOTILLA_CACHE", path.escaped()));
-    }
+        format!("{}: the GPU's speed cannot be kept: {error}; set FLOTILLA_CACHE", path.escaped())
+    })
 }
 
 #[cfg(test)]
@@ -223,6 +333,19 @@ mod tests {
         // Many short generations.
         let often = Measured { generation_s: 1.0, ..FAST };
         assert!(!choose(work(1000, 2000, 10), 2, Some(often)).unwrap().gpu);
+    }
+
+    #[test]
+    fn many_short_calls_are_worth_a_look_for_a_gpu() {
+        let (mut ledger, short) = (Ledger::new(), work(4096, 20, 1));
+        let looked: Vec<usize> = (1..=64 * 64).filter(|_| ledger.add_for(short, 2).is_some()).collect();
+        // Not at first, and ever more rarely.
+        let first = looked[0];
+        assert!(first > 1 && looked.len() > 3, "{looked:?}");
+        assert!(looked.windows(2).all(|pair| pair[1] == 2 * pair[0]), "{looked:?}");
+        // Work that takes no time is no reason.
+        assert_eq!(ledger.add_for(Work::default(), 2), None);
+        assert!(Ledger::new().add_for(work(1 << 20, 200, 1), 2).is_some());
     }
 
     #[test]
