@@ -11,7 +11,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 GENERATED = {"docs/reference/config.md", "docs/reference/python.md", "docs/develop/evidence.md", "docs/results/claims-measured.md",
-             "docs/results/questions-tables.md"}
+             "docs/results/questions-tables.md", "benches/static-figures.md"}
+LOGS = ["benches/README.md", "benches/peers/README.md", "benches/static-figures.md"]
 
 
 def parts(text):
@@ -46,7 +47,8 @@ def sentences(paragraphs):
 
 def main():
     given = [Path(name).resolve() for name in sys.argv[1:]]
-    pages = given or [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    pages = given or [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")),
+                      *(ROOT / log for log in LOGS)]
     total = 0
     print(f"{'prose':>6} {'table':>6} {'mean':>5} {'max':>4}  page")
     for page in filter(Path.exists, pages):

@@ -7,7 +7,7 @@
 //!
 //! With `FLOTILLA_EVIDENCE=FOLDER` what was read is noted there, as a row of `docs/develop/evidence.md`.
 //!
-//! `cargo test --test nvidia -- table --ignored --nocapture` makes the table of `benches/README.md`.
+//! `cargo test --test nvidia -- table --ignored --nocapture` makes the table of `benches/static-figures.md`.
 
 #![cfg(feature = "gpu")]
 
@@ -312,7 +312,7 @@ fn without_a_pass_nvidias_compiler_fuses() {
     assert!(found > 50, "{name}: only {found} instructions are fused");
 }
 
-/// Prints the table by chip of `benches/README.md`.
+/// Prints the table by chip of `benches/static-figures.md`.
 #[test]
 #[ignore = "prints a table"]
 fn table() {

@@ -377,7 +377,13 @@ fn broken_links(page: &Path) -> Vec<String> {
 #[test]
 fn every_link_of_the_pages_leads_somewhere() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let others = ["CHANGELOG.md", "python/README.md", "benches/README.md", "benches/peers/README.md"];
+    let others = [
+        "CHANGELOG.md",
+        "python/README.md",
+        "benches/README.md",
+        "benches/static-figures.md",
+        "benches/peers/README.md",
+    ];
     let pages = pages().into_iter().chain(others.map(|other| root.join(other)));
     let broken: Vec<_> = pages.filter(|page| page.exists()).flat_map(|page| broken_links(&page)).collect();
     assert!(broken.is_empty(), "{broken:#?}");

@@ -8,7 +8,7 @@
 //!
 //! With `FLOTILLA_EVIDENCE=FOLDER` what was read is noted there, as a row of `docs/develop/evidence.md`.
 //!
-//! `cargo test --test radv -- table --ignored --nocapture` makes the tables of `benches/README.md`.
+//! `cargo test --test radv -- table --ignored --nocapture` makes the tables of `benches/static-figures.md`.
 
 #![cfg(feature = "cli")]
 
@@ -371,7 +371,7 @@ fn guards_are_not_cancelled() {
     }
 }
 
-/// Prints the table by chip of `benches/README.md`.
+/// Prints the table by chip of `benches/static-figures.md`.
 #[test]
 #[ignore = "prints a table"]
 fn table() {
