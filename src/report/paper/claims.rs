@@ -285,9 +285,9 @@ const STRICT: usize = 1;
 const CHAOTIC: usize = 2;
 const EIGHT: usize = 3;
 
-const MORE_OPTIMAL: &str = "“a more optimal joint policy” led than alone";
+const MORE_OPTIMAL: &str = "“a more optimal joint policy”, leader-follower than all-leaders";
 const MORE_POIS: &str = "POIs at generation 100, leader-follower less all-leaders, by pair: above 0";
-const MUCH_FASTER: &str = "“much faster” led than alone";
+const MUCH_FASTER: &str = "“much faster”, leader-follower than all-leaders";
 const HALF_THE_TIME: &str = "generations until all POIs are observed (at most 101), half of all-leaders' less \
                              leader-follower's, by pair, 0 if neither observes all: above 0. Where a side observes all \
                              in fewer than half of its trials: pairs in which leader-follower needs at most half as \
@@ -295,7 +295,7 @@ const HALF_THE_TIME: &str = "generations until all POIs are observed (at most 10
 const SOONER: &str = "generations until all POIs are observed (at most 101), all-leaders' less leader-follower's, by \
                       pair, 0 if neither observes all: above 0. Where a side observes all in fewer than half of its \
                       trials: pairs in which leader-follower is sooner, of those that are no ties: over half";
-const MORE_RELIABLY: &str = "“more reliably” led than alone";
+const MORE_RELIABLY: &str = "“more reliably”, leader-follower than all-leaders";
 const ODD_PAIRS: &str =
     "of the pairs in which only one observes all POIs at generation 100, leader-follower does in: over half";
 
@@ -324,7 +324,7 @@ fn more_reliably(view: Lookup<'_>) -> Option<Criterion> {
 const MORE_THAN_SELECTING: Test = Test {
     place: "§1",
     layout: GENERAL,
-    words: "led, “a more optimal solution” than “those learning to select between policies”",
+    words: "leader-follower: “a more optimal solution” than “those learning to select between policies”",
     measure: "POIs at generation 100, leader-follower less all-leaders who choose among behaviours, by pair: above 0",
     exploratory: true,
     needs: END,
@@ -335,7 +335,7 @@ const MORE_THAN_SELECTING: Test = Test {
     },
 };
 const FASTER_THAN_SELECTING: Test = Test {
-    words: "led, “faster” than “those learning to select between policies”",
+    words: "leader-follower: “faster” than “those learning to select between policies”",
     measure: SOONER,
     find: |view| sooner(view.led()?, view.selecting()?, 1),
     ..MORE_THAN_SELECTING
@@ -407,7 +407,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.1",
         layout: GENERAL,
-        words: "alone, “they struggle to learn to observe all 4 POIs”",
+        words: "all-leaders: “they struggle to learn to observe all 4 POIs”",
         measure: "all-leaders, trials that ever observe all 4 up to generation 100: under half",
         exploratory: false,
         needs: END,
@@ -417,7 +417,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.1, Fig. 4",
         layout: GENERAL,
-        words: "alone, “after 100 generations, they average observing less than a single POI”",
+        words: "all-leaders: “after 100 generations, they average observing less than a single POI”",
         measure: "all-leaders, POIs at generation 100: under 1",
         exploratory: false,
         needs: END,
@@ -427,7 +427,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.1",
         layout: GENERAL,
-        words: "led, “in fewer than 20 generations, they all observe at least 3, on average”",
+        words: "leader-follower: “in fewer than 20 generations, they all observe at least 3, on average”",
         measure: "leader-follower, POIs at generation 19: at least 3",
         exploratory: false,
         needs: 19,
@@ -437,7 +437,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.1, Fig. 4",
         layout: GENERAL,
-        words: "led, “quickly able to learn to observe all of the POIs”",
+        words: "leader-follower: “quickly able to learn to observe all of the POIs”",
         measure: "leader-follower, POIs at generation 40: at least 3.6",
         exploratory: false,
         needs: 40,
@@ -447,7 +447,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.1",
         layout: GENERAL,
-        words: "led, “they all consistently observe all 4 POIs within 40 generations”",
+        words: "leader-follower: “they all consistently observe all 4 POIs within 40 generations”",
         measure: "leader-follower, POIs in the mean over generations 40 to 100: at least 3.6",
         exploratory: false,
         needs: END,
@@ -491,7 +491,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.2",
         layout: STRICT,
-        words: "alone, “almost never able to learn to obtain any reward using any of the reward functions”",
+        words: "all-leaders: “almost never able to learn to obtain any reward using any of the reward functions”",
         measure: "all-leaders, trials that ever observe a POI up to generation 100: under 1 in 10",
         exploratory: false,
         needs: END,
@@ -505,7 +505,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "Fig. 5",
         layout: STRICT,
-        words: "alone, failing “is more drastic than in the previous configuration”",
+        words: "all-leaders: failing “is more drastic than in the previous configuration”",
         measure: "all-leaders, share of the POIs at generation 100, less that in generally forward, by pair: below 0",
         exploratory: false,
         needs: END,
@@ -521,7 +521,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "Fig. 5",
         layout: STRICT,
-        words: "led, “learning to observe 3 of the 4 POIs on average withing 30 generations”",
+        words: "leader-follower: “learning to observe 3 of the 4 POIs on average withing 30 generations”",
         measure: "leader-follower, POIs at generation 30: at least 1.5 of the 2 that this layout has",
         exploratory: false,
         needs: 30,
@@ -531,7 +531,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.2",
         layout: STRICT,
-        words: "led, “able to use any of the reward functions to successfully solve the task”",
+        words: "leader-follower: “able to use any of the reward functions to successfully solve the task”",
         measure: "leader-follower, POIs at generation 100: at least 1.8",
         exploratory: false,
         needs: END,
@@ -541,8 +541,8 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.2",
         layout: STRICT,
-        words: "led, “the impact of the various reward structures is not as readily apparent based solely on the \
-                average reward”",
+        words: "leader-follower: “the impact of the various reward structures is not as readily apparent based solely on \
+                the average reward”",
         measure: "leader-follower, POIs at generation 100 under one fitness less those under another, by pair: less \
                   than 0.2 apart",
         exploratory: false,
@@ -557,7 +557,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.2",
         layout: STRICT,
-        words: "led, under Df “the variance of the performance of the system was significantly higher”",
+        words: "leader-follower: under Df “the variance of the performance of the system was significantly higher”",
         measure: "leader-follower, distance of a trial's POIs at generation 100 from the median trial's, Df less the \
                   other, by pair (Brown-Forsythe): above 0",
         exploratory: false,
@@ -598,7 +598,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.3",
         layout: CHAOTIC,
-        words: "alone, “a high likelihood of random actions successfully causing the agents to observe the POI”",
+        words: "all-leaders: “a high likelihood of random actions successfully causing the agents to observe the POI”",
         measure: "all-leaders, trials in which one of generation 0's random teams observes a POI: over half",
         exploratory: false,
         needs: 0,
@@ -616,7 +616,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "Fig. 6",
         layout: CHAOTIC,
-        words: "alone, “able to solve the problem some of the time”",
+        words: "all-leaders: “able to solve the problem some of the time”",
         measure: "all-leaders, trials that ever observe all 4 up to generation 100: 1 in 10 to 9 in 10",
         exploratory: false,
         needs: END,
@@ -626,7 +626,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.3",
         layout: CHAOTIC,
-        words: "alone, “a rather large variance in the average policy performance”",
+        words: "all-leaders: “a rather large variance in the average policy performance”",
         measure: "all-leaders, mean distance of a trial's POIs at generation 100 from the median trial's: at least 0.5, \
                   as if every second trial were a POI off",
         exploratory: false,
@@ -637,7 +637,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.3",
         layout: CHAOTIC,
-        words: "led, “the agents learn about a similar policy”",
+        words: "leader-follower: “the agents learn about a similar policy”",
         measure: "POIs at generation 100, leader-follower less all-leaders, by pair: less than 0.4 apart",
         exploratory: false,
         needs: END,
@@ -650,7 +650,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "Fig. 6",
         layout: CHAOTIC,
-        words: "led, “at least a comparable policy”",
+        words: "leader-follower: “at least a comparable policy”",
         measure: "POIs at generation 100, leader-follower less all-leaders, by pair: above −0.4",
         exploratory: false,
         needs: END,
@@ -660,7 +660,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.3, Fig. 6",
         layout: CHAOTIC,
-        words: "led, “more consistently” than alone",
+        words: "leader-follower: “more consistently” than all-leaders",
         measure: "distance of a trial's POIs at generation 100 from the median trial's, leader-follower less \
                   all-leaders, by pair (Brown-Forsythe): below 0",
         exploratory: false,
@@ -674,7 +674,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.3",
         layout: CHAOTIC,
-        words: "led, “a slight benefit of using the leader-follower trajectory assignment” over the global reward",
+        words: "leader-follower: “a slight benefit of using the leader-follower trajectory assignment” over the global reward",
         measure: "leader-follower, POIs at generation 100 under Df less those under G, by pair: above 0, under 0.4",
         exploratory: false,
         needs: END,
@@ -687,7 +687,7 @@ const TESTS: &[Test] = &[
     Test {
         place: "§5.3",
         layout: CHAOTIC,
-        words: "led, the global reward is “enough of a learning signal to direct agent to solve the task”",
+        words: "leader-follower: the global reward is “enough of a learning signal to direct agent to solve the task”",
         measure: "leader-follower, POIs at generation 100: at least 3.6",
         exploratory: false,
         needs: END,
@@ -703,7 +703,8 @@ const TESTS: &[Test] = &[
     Test {
         place: "§6",
         layout: EIGHT,
-        words: "led, “a similarly performant policy”, “even as this ratio of followers to leaders is increased”",
+        words: "leader-follower: “a similarly performant policy”, “even as this ratio of followers to leaders is \
+                increased”",
         measure: "POIs at generation 100, leader-follower less all-leaders, by pair: less than 0.2 apart",
         exploratory: true,
         needs: END,
@@ -716,7 +717,8 @@ const TESTS: &[Test] = &[
     Test {
         place: "§6",
         layout: EIGHT,
-        words: "led, “faster than when using all learners”, “even as this ratio of followers to leaders is increased”",
+        words: "leader-follower: “faster than when using all learners”, “even as this ratio of followers to leaders is \
+                increased”",
         measure: SOONER,
         exploratory: true,
         needs: END,
