@@ -36,9 +36,9 @@ class Played(NamedTuple):
 
 
 class Coevolution:
-    """Training by ask and tell: you decide what each leader of each team was worth.
+    """Training by ask and tell, with a fitness of your own for each leader of each team.
 
-    Told the config's own fitness, the result has the digest of :func:`train`. It can be pickled between generations.
+    With the config's own fitness, the result has the digest of :func:`train`. It can be pickled between generations.
 
     Args:
         config: what to train.
@@ -60,7 +60,7 @@ class Coevolution:
         >>> coevolution.run.digest == flotilla.train(config, seed=7).digest
         True
 
-        Your own reward is one line: what a leader was worth, plus a share of its team's G.
+        A reward of your own takes one line: a leader's fitness plus a share of its team's G.
 
         >>> coevolution = flotilla.Coevolution(config, seed=7)
         >>> for _ in range(3):
@@ -93,7 +93,7 @@ class Coevolution:
 
     @property
     def done(self) -> bool:
-        """Whether all generations were told."""
+        """Whether all generations have a fitness."""
         return self._native.done
 
     def ask(self) -> Asked:
@@ -122,7 +122,7 @@ class Coevolution:
             the generations that became complete: usually the one before, because champions play one generation later.
 
         Raises:
-            ValueError: the fitness has another shape or is not finite, or all generations were told.
+            ValueError: the fitness has another shape or is not finite, or all generations have one.
         """
         values = floats("fitness", fitness, 3)
         shape = (self.config["learning.trials"], self._native.teams, self.config.num_learners)
@@ -132,11 +132,11 @@ class Coevolution:
 
     @property
     def best(self) -> Floats:
-        """The champion of the generation that was told last, ``[trials, leaders, parameters]``, or ``[trials, 1,
+        """The champion of the last generation with a fitness, ``[trials, leaders, parameters]``, or ``[trials, 1,
         parameters]`` if leaders share a policy.
 
         Raises:
-            ValueError: no generation was told.
+            ValueError: no generation has a fitness yet.
         """
         if self.generation == 0:
             raise ValueError("there is no best policy before a generation was told")
@@ -159,7 +159,7 @@ class Coevolution:
 
     @property
     def run(self) -> Run:
-        """The results, once all generations were told.
+        """The results, once all generations have a fitness.
 
         Raises:
             ValueError: generations are left.

@@ -99,7 +99,7 @@ class Config(Mapping[str, Any]):
 
     @classmethod
     def parse(cls, text: str, name: str = "the config") -> Config:
-        """Reads a config from its text (TOML); ``name`` is what errors call it.
+        """Reads a config from its text (TOML). Errors use ``name`` for it.
 
         Raises:
             ConfigError: everything that is wrong with the text, by line.
@@ -137,7 +137,7 @@ class Config(Mapping[str, Any]):
     keys = _Keys()  # pyright: ignore[reportAssignmentType]
 
     def replace(self, **sections: Mapping[str, Any] | Sequence[Any]) -> Config:
-        """This config with some keys changed; those of a section that are not named stay.
+        """Returns this config with some keys changed. All other keys stay.
 
         Raises:
             ConfigError: everything that is wrong with the keys.
@@ -150,7 +150,7 @@ class Config(Mapping[str, Any]):
         return Config._of(self._native.replace(_flat(sections)))
 
     def to_toml(self) -> str:
-        """The config file that says this, every key written out.
+        """The text of a config file with every key written out.
 
         Example:
             >>> config = flotilla.Config.paper()

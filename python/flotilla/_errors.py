@@ -22,7 +22,7 @@ class Problem(NamedTuple):
 
 
 class Error(RuntimeError):
-    """What was asked for was right, but could not be done: a file cannot be read, a GPU fails, a run is not finished.
+    """The arguments were right, but the work failed: a file cannot be read, a GPU fails, a run is not finished.
 
     Example:
         >>> try:

@@ -199,7 +199,7 @@ def rollout(
         ValueError: the policies have another shape, or hold a NaN, an infinity or a size above 1e6; or another argument is
             not allowed.
         TypeError: the policies are no numbers.
-        MemoryError: there is not enough memory for so many.
+        MemoryError: there is not enough memory for that many teams.
         Error: the backend fails.
 
     Example:
@@ -330,7 +330,7 @@ def collect(
 
     Raises:
         ValueError: an argument is not allowed.
-        MemoryError: there is not enough memory for so many.
+        MemoryError: there is not enough memory for that many teams.
 
     Example:
         >>> config = flotilla.Config.paper()
@@ -391,7 +391,7 @@ def _layers(config: Config | None, parameters: int) -> list[int]:
 
 
 def forward(policies: ArrayLike, inputs: ArrayLike, config: Config | None = None) -> Floats:
-    """Returns what policies answer to inputs, to the bit as in an episode.
+    """Returns the outputs of policies, with the bits of an episode.
 
     A policy is a fully connected network with a bias and tanh in every layer. If a config says that policies choose among
     behaviours, the answer is the turn and speed of the chosen one.
@@ -434,8 +434,8 @@ def forward(policies: ArrayLike, inputs: ArrayLike, config: Config | None = None
 def to_onnx(policy: ArrayLike, path: str | os.PathLike[str], config: Config | None = None) -> None:
     """Writes one policy's network as an ONNX model with an input ``inputs [n, 8]`` and an output ``outputs [n, 2]``.
 
-    Needs the package ``onnx`` (``pip install flotilla-teams[onnx]``). Where a config says that policies choose among
-    behaviours, the output is ``[n, 5]``: how much each is wanted.
+    Needs the package ``onnx`` (``pip install flotilla-teams[onnx]``). If a config says that policies choose among
+    behaviours, the output is ``[n, 5]``, one value per behaviour.
 
     Args:
         policy: ``[parameters]``.

@@ -23,19 +23,19 @@ def program(use_case: str, backend: str = "auto", **request: Any) -> dict[str, A
 def compare(
     runs: Sequence[Run | str | os.PathLike[str]], *, at: str | int | Sequence[str | int] = "last", paired: bool = False
 ) -> dict[str, Any]:
-    """Runs side by side: means, 95 % intervals, and a test of every pair, as ``flotilla compare`` tells them.
+    """Runs side by side: means, 95 % intervals, and a test of every pair, as ``flotilla compare`` prints them.
 
     Args:
-        runs: two at least, or their folders; or the folder of one sweep.
+        runs: at least two runs or their directories, or the directory of one sweep.
         at: generations to compare at: ``[0, 50, "last"]``.
         paired: compare pair by pair: trials with one seed and number are pairs.
 
     Returns:
-        what ``docs/reference/json.md`` says of ``flotilla compare RUN RUN --json``.
+        the object that ``docs/reference/json.md`` describes for ``flotilla compare RUN RUN --json``.
 
     Raises:
         ValueError: there is nothing to compare.
-        Error: a run cannot be read, or has one trial alone.
+        Error: a run cannot be read, or has only one trial.
 
     Example:
         >>> config = flotilla.Config.paper().replace(learning={"generations": 3})
@@ -63,23 +63,23 @@ def paper(
     force: bool = False,
     backend: str | int = "auto",
 ) -> dict[str, Any]:
-    """The paper's Figures 4 to 6, its claims checked one by one, and a run for each of its arms, in a folder.
+    """Trains the paper's experiments into a directory: Figures 4 to 6, a verdict on each claim, and one run per experiment.
 
     Args:
-        out: the folder.
+        out: the directory.
         trials: 5 if left out.
         generations: 100 if left out.
         seed: 0 if left out.
-        resume: go on with the paper in the folder.
-        force: write over it.
+        resume: continue the paper in the directory.
+        force: overwrite it.
         backend: as of :func:`train`.
 
     Returns:
-        what ``docs/reference/json.md`` says of ``flotilla paper --json``.
+        the object that ``docs/reference/json.md`` describes for ``flotilla paper --json``.
 
     Raises:
         ValueError: a number is not allowed.
-        Error: the folder holds one already, or cannot be written.
+        Error: the directory already holds one, or cannot be written.
 
     Example:
         >>> found = flotilla.paper("short", trials=2, generations=2)
@@ -87,7 +87,7 @@ def paper(
         (33, 2)
     """
     if resume and force:
-        raise ValueError("resume goes on with a paper and force writes over it, leave out one of the two")
+        raise ValueError("resume continues a paper and force overwrites it: leave out one of the two")
     start = "resume" if resume else "force" if force else "fresh"
     keys = {"trials": trials, "generations": generations, "seed": seed}
     given = {key: whole(key, value, 0, 2**63 - 1) for key, value in keys.items() if value is not None}
@@ -100,9 +100,9 @@ def verify(*, worlds: int | None = None, teams: int | None = None, adapter: str 
     """Compares every GPU with the CPU, bit for bit, over random worlds.
 
     Args:
-        worlds: how many, instead of the program's default.
-        teams: of each world, likewise.
-        adapter: only the one of this number or name.
+        worlds: number of worlds; None takes the command line's default.
+        teams: number of teams per world; None takes the default.
+        adapter: compare only the adapter with this number or name.
 
     Returns:
         ``equal``, and ``comparisons``: for every adapter, pass and kernel what was compared and what differs.
@@ -116,7 +116,7 @@ def verify(*, worlds: int | None = None, teams: int | None = None, adapter: str 
 
 
 def devices() -> list[dict[str, str | int]]:
-    """The GPUs that a driver offers, each by the number that ``backend`` takes; the CPU is always there beside them.
+    """The GPUs that drivers offer, each with the number that ``backend`` takes. The CPU is always available and not listed.
 
     Example:
         >>> all({"index", "name", "driver", "api", "kind"} == set(device) for device in flotilla.devices())

@@ -31,18 +31,18 @@ METRICS = ("best_g", "mean_g", "champion_g")
 
 
 class Run:
-    """What a training came to. :func:`train` and :meth:`Run.open` make one.
+    """The results of training. :func:`train` and :meth:`Run.open` return one.
 
     Attributes:
-        config: what was trained; where a callback stopped it, of fewer generations.
+        config: the config that was trained. If a callback stopped training, it has fewer generations.
         metrics: ``best_g``, ``mean_g`` and ``champion_g``, each float64 ``[trials, generations + 1]``, the random start
             first: the share of POIs observed, 0 to 1, by each generation's best and mean team, and by the team of every
             population's best policy.
-        policies: one float32 ``[leaders, policies, parameters]`` a trial, or ``[1, policies, parameters]`` where leaders
-            share a policy (``learning.sharing``); best policy first, so that team 0 of a rollout is the champion. These
-            arrays and those of ``metrics`` are read-only: copy them to change them.
-        digest: of all of these: the same as the program's for this config and seed.
-        backend: what it was trained on, in words.
+        policies: one float32 array ``[leaders, policies, parameters]`` per trial, or ``[1, policies, parameters]`` if leaders
+            share a policy (``learning.sharing``). The best policy is first, so that team 0 of a rollout is the champion.
+            These arrays and those of ``metrics`` are read-only: copy them to change them.
+        digest: a checksum of the results, equal to the command line's for this config and seed.
+        backend: the processor that trained it, in words.
         unverified: True if its files were not compared with their digests.
 
     Example:
@@ -75,10 +75,10 @@ class Run:
 
     @classmethod
     def open(cls, folder: str | os.PathLike[str], unverified: bool = False) -> Run:
-        """Reads a run that is done, whoever trained it.
+        """Reads a finished run of the command line or of Python.
 
         Args:
-            folder: what ``flotilla train``, a sweep or :func:`train` wrote.
+            folder: a run directory that ``flotilla train``, a sweep or :func:`train` wrote.
             unverified: read files that differ from their digests in ``run.json``, too.
 
         Raises:
@@ -117,8 +117,8 @@ class Run:
         """Writes the run as ``flotilla train`` does, so that the program reads it, too.
 
         Args:
-            folder: where to; it is made.
-            force: write over a run that is there.
+            folder: the directory to create.
+            force: overwrite an existing run.
 
         Raises:
             FileExistsError: there is a run, and ``force`` was not given.
@@ -142,7 +142,7 @@ class Run:
         _native.save(*arguments)
 
     def to_pandas(self) -> pandas.DataFrame:
-        """The metrics as ``metrics.csv`` has them: a row a trial and generation.
+        """The metrics as ``metrics.csv`` has them: one row per trial and generation.
 
         Needs pandas (``pip install flotilla-teams[pandas]``).
 
@@ -272,23 +272,23 @@ def train(
 
     Args:
         config: what to train.
-        seed: instead of the config's ``learning.seed``.
-        out: a folder to keep the run in as it trains, as ``flotilla train CONFIG --out DIR`` does: whatever happens, it can be gone on
-            with. None trains in memory; :meth:`Run.save` still writes it.
-        resume: go on with the run in ``out``, or start it where there is none.
-        force: write over the run in ``out``.
+        seed: replaces the config's ``learning.seed``.
+        out: a directory that keeps the run while it trains, as ``flotilla train CONFIG --out DIR`` does, so that it can be
+            resumed. None trains in memory; :meth:`Run.save` writes it later.
+        resume: continue the run in ``out``, or start it if there is none.
+        force: overwrite the run in ``out``.
         init: initial policies in place of random ones: a :class:`Run`, a ``policies.safetensors``, or arrays
             ``[leaders, policies, parameters]``, one for each trial or one for all. Trial i starts from trial i of a run or
             file. Larger populations are filled with random policies. A run that starts from policies is kept in ``out``,
             or else in a temporary folder that is removed with the :class:`Run`.
-        backend: what to play on, to the same bits: ``"auto"`` (a GPU if it is expected to finish first), ``"cpu"``,
+        backend: where to play, with the same bits: ``"auto"`` (a GPU if it is expected to finish first), ``"cpu"``,
             ``"gpu"``, or an adapter's number or name.
         callback: called with every :class:`Generation` once it has played, or several such functions. The training stops
-            if one returns True. The results are then those of a config with so many generations. A callback with a method
+            if one returns True. The results are then those of a config with that many generations. A callback with a method
             ``close`` is closed at the end, however the training ends.
         champions: give every generation its ``champions``. The populations then stay in the host's memory, and the run is
             trained in memory.
-        progress: draw a bar by tqdm; None does so in notebooks and terminals, where tqdm is installed.
+        progress: draw a progress bar with tqdm. None does so in notebooks and terminals if tqdm is installed.
 
     Returns:
         the :class:`Run`.
@@ -296,9 +296,9 @@ def train(
     Raises:
         ConfigError: the config or the seed is wrong.
         FileExistsError: ``out`` holds a run, and neither ``resume`` nor ``force`` was given.
-        MemoryError: there is not enough for the populations.
+        MemoryError: there is not enough memory for the populations.
         Error: a folder or ``init`` cannot be used, or the backend fails.
-        KeyboardInterrupt: Ctrl-C; a run in a folder is saved then, to be gone on with by ``resume``.
+        KeyboardInterrupt: Ctrl-C. A run in a directory is saved first, and ``resume`` continues it.
 
     Example:
         >>> config = flotilla.Config.paper().replace(learning={"trials": 2, "generations": 50})
@@ -316,7 +316,7 @@ def train(
     if champions and (out is not None or init is not None):
         raise ValueError("champions are given for training in memory from random policies; leave out out= and init=")
     if resume and force:
-        raise ValueError("resume goes on with a run and force writes over it, leave out one of the two")
+        raise ValueError("resume continues a run and force overwrites it: leave out one of the two")
     if seed is not None:
         config = config.replace(learning={"seed": seed})
     name = backend_name(backend)

@@ -28,7 +28,7 @@ def _write(path: str | os.PathLike[str], content: bytes) -> None:
 
 
 class Figure:
-    """A picture: it shows itself in a notebook.
+    """A picture. In a notebook it is shown.
 
     Example:
         >>> run = flotilla.train(flotilla.Config.paper().replace(learning={"generations": 2}))
@@ -50,7 +50,7 @@ class Figure:
 
         Args:
             path: a file that ends in .svg, .pdf or .png.
-            width: pixels across, 100 to 8192, of a .png; None is 300 an inch.
+            width: pixels across, 100 to 8192, of a .png; None gives 300 pixels per inch.
 
         Raises:
             ValueError: the name ends in something else.
@@ -77,7 +77,7 @@ class Episode(NamedTuple):
 
 
 class Replay:
-    """The very episodes that generations' best teams were scored on: they show themselves in a notebook, to be played.
+    """The episodes on which the best teams of generations were scored. In a notebook they are shown with a player.
 
     Example:
         >>> run = flotilla.train(flotilla.Config.paper().replace(learning={"generations": 5}))
@@ -117,7 +117,7 @@ class Replay:
             path: a file that ends in .html (to be played), .gif (moving), .svg, .pdf or .png (still).
             step: of a still: None is the last.
             width: pixels across, 100 to 8192, of a .gif or .png.
-            fps: pictures a second of a .gif, 1 to 50.
+            fps: pictures per second of a .gif, 1 to 50.
 
         Raises:
             ValueError: the name ends in something else, or there is no such step.

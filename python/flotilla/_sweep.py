@@ -57,7 +57,7 @@ class Sweep:
         return iter(self.points)
 
     def metric(self, name: str = "best_g") -> NDArray[np.float64]:
-        """A metric of the last generation, float64 ``[points, trials]``; of points with fewer trials, NaN."""
+        """A metric of the last generation, float64 ``[points, trials]``, NaN for missing trials."""
         rows = [point.run.metrics[name][:, -1] for point in self.points]
         table = np.full((len(rows), max(map(len, rows), default=0)), np.nan)
         for row, values in zip(table, rows):
@@ -65,7 +65,7 @@ class Sweep:
         return table
 
     def to_pandas(self) -> pandas.DataFrame:
-        """A row a point and trial: the axes' values, and the last generation's metrics."""
+        """One row per point and trial: the values of the axes, and the last generation's metrics."""
         import pandas
 
         rows = []
@@ -99,13 +99,13 @@ def sweep(
     Args:
         sweep: a :class:`Config`, with a grid; or a sweep file, or its text: a config with a section ``[grid]``.
         grid: lists of values by dotted keys, for a config: ``{"world.coupling": [1, 3]}``.
-        executor: who plays the points: any ``concurrent.futures.Executor``, of processes or of Dask's, MPI's or Slurm's
-            (submitit) workers. Points travel as configs, and results come back as arrays. Where a worker is lost, its
-            points are played again, to the same bits. None trains them here, side by side.
-        out: a folder to keep the sweep in, as ``flotilla sweep SWEEP --out DIR`` does; without ``executor`` alone.
+        executor: trains the points: any ``concurrent.futures.Executor``, with processes or with workers of Dask, MPI or
+            Slurm (submitit). Points are sent as configs, and results return as arrays. If a worker is lost, its points
+            are trained again, to the same bits. None trains them in this process, side by side.
+        out: a directory that keeps the sweep, as ``flotilla sweep SWEEP --out DIR`` does. Not with ``executor``.
         skip_impossible: leave out points that cannot run.
         backend: as of :func:`train`.
-        progress: told how many points of how many are done.
+        progress: called with the number of finished points and of all points.
 
     Raises:
         ConfigError: everything that is wrong with the sweep and any of its points.

@@ -164,7 +164,7 @@ class VectorEnv(Base):
 
     Raises:
         ValueError: a number or word is not allowed.
-        MemoryError: there is not enough memory for so many teams.
+        MemoryError: there is not enough memory for that many teams.
 
     Example:
         >>> env = flotilla.VectorEnv(flotilla.Config.paper(), num_envs=64)

@@ -43,7 +43,7 @@ def scalars(generation: Generation) -> dict[str, float]:
 
 
 def tensorboard(folder: str | os.PathLike[str]) -> Logger:
-    """Event files in a folder, by tensorboardX (``pip install flotilla-teams[tensorboard]``)."""
+    """Event files in a directory, written with tensorboardX (``pip install flotilla-teams[tensorboard]``)."""
     from tensorboardX import SummaryWriter
 
     # The writer has its own thread. `flush` does not wait for queued rows, but `close` does.
@@ -57,7 +57,7 @@ def tensorboard(folder: str | os.PathLike[str]) -> Logger:
 
 
 def wandb(config: Config, **options: Any) -> Logger:
-    """A run of Weights & Biases; ``options`` are those of ``wandb.init``, as ``mode="offline"``."""
+    """A run of Weights & Biases; ``options`` are those of ``wandb.init``, such as ``mode="offline"``."""
     import wandb as client
 
     run = client.init(config=config.to_dict(), **options)
@@ -69,7 +69,7 @@ def wandb(config: Config, **options: Any) -> Logger:
 
 
 def mlflow(config: Config, **options: Any) -> Logger:
-    """A run of MLflow where ``mlflow.set_tracking_uri`` says; ``options`` are those of ``mlflow.start_run``."""
+    """A run of MLflow at ``mlflow.set_tracking_uri``; ``options`` are those of ``mlflow.start_run``."""
     import mlflow as client
 
     run = client.start_run(**options)

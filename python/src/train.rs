@@ -34,14 +34,14 @@ use crate::workers;
 /// Minimum time between checks for Ctrl-C if there is no callback.
 const PATIENCE: Duration = Duration::from_millis(50);
 
-/// A generation that has been played, as a callback of :func:`train` is told of it.
+/// One generation, as callbacks of :func:`train` receive it.
 ///
 /// Attributes:
 ///     generation: its number; 0 is the random start.
-///     last: the number of the last that there will be.
+///     last: the number of the last generation.
 ///     best_g: G of its best team, float64 ``[trials]``.
-///     mean_g: of its mean team, likewise.
-///     champion_g: G of the champion, the team of every population's best policy, likewise.
+///     mean_g: mean G of its teams, of the same shape.
+///     champion_g: G of the champion, the team of every population's best policy, of the same shape.
 ///     champions: the policies of the champion, float32 ``[trials, leaders, parameters]``, or
 ///         ``[trials, 1, parameters]`` if leaders share a policy. None unless :func:`train` was asked for ``champions``.
 ///
