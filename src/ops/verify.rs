@@ -87,7 +87,7 @@ impl Outcome {
         (failed > 0).then(|| {
             Error::Different(said(
                 format!("{failed} of {} comparisons found other bits than the CPU's", self.comparisons.len()),
-                "until that is mended, use --backend cpu",
+                "until this is fixed, use --backend cpu",
             ))
         })
     }

@@ -403,7 +403,7 @@ fn table() {
     versions.dedup();
     let tables = [
         "% of the f32 rate",
-        "Lane slots a team-step, cycles of the slowest wave a step",
+        "Lane slots per team-step, cycles of the slowest wave per step",
         "Vector registers and instructions",
     ];
     for (table, title) in tables.into_iter().enumerate() {
