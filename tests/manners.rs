@@ -315,7 +315,7 @@ fn pois_out_of_reach_for_one_reason_share_a_warning() {
     let far = SMALL.replace("pois = [[10, 9]]", "pois = [[50, 9], [50, 9], [10, 50]]");
     let (_, told) = fed(&place, "check -", &far);
     assert_eq!(told.matches("cannot be reached by").count(), 2, "{told}");
-    assert!(told.contains("; POI 1 likewise\n"), "{told}");
+    assert!(told.contains("; the same holds for POI 1\n"), "{told}");
 }
 
 #[test]

@@ -22,8 +22,8 @@ section! {
     Learning = "learning" {
         /// who learns: the leaders, or every agent
         paradigm: Paradigm = "", "4.1, 4.4",
-        /// whose policy is the same: nobody's, or all leaders': then there is one population, whose policies are
-        /// selected by the mean of their leaders' scores
+        /// leaders that share a policy: none, or all; then there is one population, whose policies are selected by the
+        /// mean of their leaders' scores
         sharing: Sharing = "", "2.1",
         /// what policies are selected by: the team's score G, D without a leader, Df without a leader and its
         /// followers, D++ with copies of a leader, or Dt without a leader and, at each step, the followers that it
@@ -35,7 +35,7 @@ section! {
         partners: usize = "teams", "",
         /// what a policy's fitness is: the mean score of its teams, or the largest, which is lenient with bad partners
         leniency: Leniency = "", "",
-        /// how many follow the random start
+        /// number of generations after the random start
         generations: usize = "generations", "4.3, Alg. 1",
         /// independent repetitions
         trials: usize = "trials", "5",
@@ -47,23 +47,23 @@ section! {
         parents: Parents = "", "4.3, Alg. 1",
         /// what a mutated weight w gains: w·N(0, σ) if scaled, N(0, σ) if additive
         mutation: Mutation = "", "2.4, 4.3",
-        /// of each weight of a new policy, to mutate
+        /// probability that a weight of a new policy mutates
         mutation_probability: f64 = "", "2.4, 4.3",
         /// σ: standard deviation of a mutation
         mutation_sigma: f64 = "", "2.4, 4.3",
-        /// for Dt: how many of the last steps tell who leads a follower, the present one among them; 0 is all since the
-        /// start
+        /// for Dt: number of last steps, the present one included, that decide who leads a follower; 0 means all steps
+        /// so far
         led_within: usize = "steps", "",
-        /// for Dt: the leader that a follower saw at most of these steps leads it, or any that it saw
+        /// for Dt: a follower is led by the leader that it saw in most of these steps, or by every leader that it saw
         led_by: LedBy = "", "4.2, 5",
-        /// over which a team's scores are averaged
+        /// number of episodes over which a team's scores are averaged
         episodes_per_team: usize = "episodes", "",
         /// j: in every episode each agent's start is moved by a uniform offset in −j to j on both axes, the same for
         /// all teams of a generation
         start_jitter: f64 = "units", "",
-        /// likewise, of each POI
+        /// the same for POIs: largest offset of each POI on both axes in every episode
         poi_jitter: f64 = "units", "",
-        /// start of all randomness: config and seed decide every bit
+        /// random seed: config and seed decide every bit of a run
         seed: u64 = "", "",
     }
 }
@@ -245,9 +245,9 @@ impl Learning {
 section! {
     /// `[checkpoint]`: how often a run saves what it needs to go on, without a say in its results; 0 is never.
     CheckpointConfig = "checkpoint" {
-        /// between checkpoints, which change no result; 0 is never
+        /// generations between checkpoints, which do not affect results; 0 means never
         generations: usize = "generations", "",
-        /// between checkpoints, which change no result; 0 is never
+        /// seconds between checkpoints, which do not affect results; 0 means never
         seconds: f64 = "s", "",
     }
 }

@@ -28,7 +28,7 @@ section! {
         map: [f64; 2] = "units", "3.1",
         /// start positions of the leaders, which are agents 0 to L − 1
         leaders: Vec<[f64; 2]> = "units", "4.1, Fig. 3",
-        /// start positions of the followers, agents L to N − 1; in the all-leaders paradigm leaders stand there
+        /// start positions of the followers, agents L to N − 1; in the all-leaders paradigm, of more leaders
         followers: Vec<[f64; 2]> = "units", "4.1, Fig. 3",
         /// positions of the P points of interest, which do not move while teams play
         pois: Vec<[f64; 2]> = "units", "3.1, Fig. 3",
@@ -44,11 +44,11 @@ section! {
         after: Vec<Vec<usize>>,
         /// T: length of an episode
         steps: usize = "steps", "3.2, Eq. 2",
-        /// time that a step takes
+        /// duration of a step
         dt: f64 = "s", "",
         /// Agents' headings at the start, in radians from the x axis towards the y axis.
         heading: Heading,
-        /// every agent's speed at the start
+        /// speed of every agent at the start
         speed: f64 = "units/s", "3.1",
     }
 }

@@ -12,7 +12,7 @@ pub const WGSL: &str = include_str!("../../shaders/couple.wgsl");
 
 /// Reads the observation radius.
 pub(crate) fn observation_radius(r: &mut Reader<'_>) -> f64 {
-    r.key("world.observation_radius", "units", "σ₀: an agent this near to a POI is at it", "3.2, Eq. 3")
+    r.key("world.observation_radius", "units", "σ₀: distance up to which an agent observes a POI", "3.2, Eq. 3")
         .number(between(0.01, LONGEST), 5.0)
 }
 

@@ -21,9 +21,9 @@ const MAX_GAIN: f64 = 1e3;
 section! {
     /// `[follow]`: the followers' preset behaviour.
     Follow = "follow" {
-        /// within it a follower sees others: it is drawn to them, and counts the leaders among them for Df and Dt
+        /// a follower sees other agents within this distance: they attract it, and the leaders among them count for Df and Dt
         attraction_radius: f64 = "units", "4.1, 4.2",
-        /// within it others, and walls, push a follower away
+        /// agents and walls within this distance repel a follower
         repulsion_radius: f64 = "units", "4.1",
         /// pull of others at the attraction radius
         attraction_gain: f64 = "units/s", "4.1, Fig. 2b",

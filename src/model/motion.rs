@@ -21,7 +21,7 @@ section! {
     Motion = "motion" {
         /// smallest speed of any agent: above 0, nobody can stop
         min_speed: f64 = "units/s", "3.1",
-        /// largest speed of any agent, and a leader's wanted speed at most
+        /// largest speed of any agent, and largest wanted speed of a leader
         max_speed: f64 = "units/s", "3.1",
         /// an agent's speed changes by at most this times dt
         max_acceleration: f64 = "units/s²", "3.1",

@@ -24,7 +24,7 @@ impl Coupling {
             .key(
                 "world.coupling",
                 "agents",
-                "C: how many must be at a POI at the same step for it to be observed; one number for all POIs, or one \
+                "C: number of agents that a POI needs at the same step to be observed; one number for all POIs, or one \
                  per POI",
                 "3.2, Eq. 2",
             )
@@ -59,7 +59,7 @@ config_enum! {
 impl Observers {
     /// Reads the key.
     pub(crate) fn read(r: &mut Reader<'_>) -> Observers {
-        r.key("world.observers", "", "whose presence at a POI counts; the coupling is at most their number", "5")
+        r.key("world.observers", "", "agents that count at a POI; the coupling is at most their number", "5")
             .choice(Observers::All)
     }
 
@@ -104,8 +104,8 @@ pub(crate) fn after(r: &mut Reader<'_>, pois: Option<usize>) -> Vec<Vec<usize>> 
     let asked = r.key(
         "world.after",
         "POIs",
-        "the POIs, by their places in world.pois from 0 on, that must have been observed at an earlier step before this \
-         one can be",
+        "for each POI, the POIs (indices into world.pois, from 0) that must have been observed at an earlier step before \
+         it can be",
         "5",
     );
     let most = pois.map_or(usize::MAX, |pois| pois - 1);

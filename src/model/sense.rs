@@ -34,9 +34,9 @@ section! {
     /// `[sense]`: what a leader senses. An infinite range is unlimited; a config file says so with `inf`. With a range
     /// of 0 nothing is sensed, not even what is at the leader's own place.
     Sense = "sense" {
-        /// how far leaders sense POIs; at 0 they sense none
+        /// distance up to which leaders sense POIs; with 0 they sense none
         poi_range: f64 = "units", "3.1",
-        /// how far leaders sense other agents; at 0 they sense none
+        /// distance up to which leaders sense other agents; with 0 they sense none
         agent_range: f64 = "units", "3.1",
         /// what something at distance d adds to its quadrant's density: 1 − d/(√2·max(map)) if linear, 1/max(d, 1) if
         /// inverse

@@ -411,7 +411,7 @@ pub(crate) fn unreachable(config: &Config) -> Vec<String> {
             }
         }
         lines.extend(
-            reasons.iter().take(MOST_POIS).map(|(first, others)| format!("{place}{first}{}", likewise(others))),
+            reasons.iter().take(MOST_POIS).map(|(first, others)| format!("{place}{first}{}", same_holds_for(others))),
         );
         if let more @ 1.. = reasons.iter().skip(MOST_POIS).map(|(_, others)| 1 + others.len()).sum::<usize>() {
             lines.push(format!("{place}{more} more POIs cannot be observed"));
@@ -426,14 +426,14 @@ pub(crate) fn unreachable(config: &Config) -> Vec<String> {
     lines
 }
 
-/// Names more POIs to which a warning applies: "; POIs 1, 2 and 3 likewise".
-fn likewise(pois: &[usize]) -> String {
+/// Names more POIs to which a warning applies: "; the same holds for POIs 1, 2 and 3".
+fn same_holds_for(pois: &[usize]) -> String {
     match pois {
         [] => String::new(),
-        [poi] => format!("; POI {poi} likewise"),
+        [poi] => format!("; the same holds for POI {poi}"),
         [pois @ .., last] => {
             let pois: Vec<String> = pois.iter().map(ToString::to_string).collect();
-            format!("; POIs {} and {last} likewise", pois.join(", "))
+            format!("; the same holds for POIs {} and {last}", pois.join(", "))
         }
     }
 }
