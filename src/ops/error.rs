@@ -62,12 +62,9 @@ pub enum Error {
     /// A config that cannot be read or is invalid.
     #[error("{}{}", .0, remedy::config(.0))]
     Config(#[from] ConfigError),
-    /// Episodes that could not be played.
+    /// A GPU that could not be opened, or episodes that could not be played.
     #[error("{}{}", .0, remedy::backend(.0))]
     Backend(#[from] BackendError),
-    /// A GPU that could not be opened, or that failed.
-    #[error("{}{}", .0, remedy::device(.0))]
-    Device(#[from] DeviceError),
     /// There is no GPU to compare with the CPU.
     #[error("{}{}", .0, remedy::NONE_TO_VERIFY)]
     NoneToVerify(DeviceError),
@@ -123,7 +120,6 @@ impl Error {
             Error::Run(RunError::TooLittle(_) | RunError::Memory { .. }) => "memory",
             Error::Run(RunError::Config(_)) => "config_invalid",
             Error::Backend(_)
-            | Error::Device(_)
             | Error::Run(RunError::Backend { .. } | RunError::Fetch(_))
             | Error::Replayed(ReplayError::Backend(_))
             | Error::Unanswered(Unanswered::Backend(_)) => "backend",
@@ -146,7 +142,7 @@ impl Error {
         match self {
             Error::Config(error) => error.to_string(),
             Error::Backend(error) => error.to_string(),
-            Error::Device(error) | Error::NoneToVerify(error) => error.to_string(),
+            Error::NoneToVerify(error) => error.to_string(),
             Error::Record(error) => error.to_string(),
             Error::Run(error) => error.to_string(),
             Error::Shown(error) => error.to_string(),
@@ -196,7 +192,7 @@ impl Error {
     pub fn is_usage(&self) -> bool {
         match self {
             Error::Usage(_)
-            | Error::Device(DeviceError::UnknownAdapter { .. })
+            | Error::Backend(BackendError::Gpu(DeviceError::UnknownAdapter { .. }))
             | Error::NoneToVerify(DeviceError::UnknownAdapter { .. })
             | Error::Record(RecordError::NoTrial { .. })
             | Error::Replayed(
@@ -205,6 +201,12 @@ impl Error {
             Error::Config(error) => error.is_usage(),
             _ => false,
         }
+    }
+}
+
+impl From<DeviceError> for Error {
+    fn from(error: DeviceError) -> Error {
+        Error::Backend(error.into())
     }
 }
 
