@@ -14,6 +14,8 @@ const stage = (() => {
       episode.headings = data.exact ? new Float32Array(bytes(episode.headings)) : new Uint8Array(bytes(episode.headings));
       episode.near = new Uint16Array(bytes(episode.near));
       episode.led = new Uint32Array(bytes(episode.led));
+      if (episode.senses) episode.senses = new Float32Array(bytes(episode.senses));
+      for (const { alone, group } of episode.without || []) for (const part of [alone, group]) part.near = new Uint16Array(bytes(part.near));
     }
     return data;
   }

@@ -1,18 +1,18 @@
 // @ts-check
 // Files that are dropped or opened.
 import { show_start } from "./arrange.js";
-import { curves } from "./curves.js";
-import { $, count, trouble } from "./dom.js";
+import { $, count, failure, trouble } from "./dom.js";
 import { keep, take } from "./experiment.js";
 import { leave_guide } from "./guide.js";
 import { settle } from "./machine.js";
 import { mode } from "./modes.js";
 import { intervals } from "./intervals.js";
+import { clerk } from "./pool.js";
 import { reach } from "./scene.js";
 import { TONES, state } from "./state.js";
 import { digests, forget } from "./train.js";
 import { Training } from "./training.js";
-import { build, clear, controls, following, seek, show, unpack, view } from "./views.js";
+import { build, controls, following, only_view, seek, show } from "./views.js";
 
 /** Most runs that are opened together: each has a colour. */
 const MOST_RUNS = TONES.length;
@@ -36,11 +36,12 @@ export async function take_files(files) {
       if (is_run && read.length === files.length) return await take_runs(read, file => { now = file; });
     }
     if (read.length) await take_other(read[0]);
-  } catch (/** @type {any} */ error) { trouble(`${now.name}: ${error.message}`); }
+  } catch (thrown) { trouble(`${now.name}: ${failure(thrown).message}`); }
 }
 
 /** Opens runs as arms of one chart. @param {Read[]} read @param {(file: File) => void} reading */
 async function take_runs(read, reading) {
+  /** @type {Opened[]} */
   const found = [];
   for (const { file, bytes } of read) {
     reading(file);
@@ -48,7 +49,7 @@ async function take_runs(read, reading) {
     found.push({ name: file.name, label: words.config.learning.paradigm, words, bytes: numbers });
   }
   if (found.length > 1) {
-    const { words } = await state.clerk.ask({ ask: "labels", texts: found.map(({ words }) => words.toml), names: found.map(({ name }) => name) });
+    const { words } = await clerk.ask({ ask: "labels", texts: found.map(({ words }) => words.toml), names: found.map(({ name }) => name) });
     found.forEach((run, index) => { run.label = words.labels[index]; });
   }
   await settle();
@@ -64,7 +65,6 @@ async function take_runs(read, reading) {
   await take(words.toml);
   build(training);
   controls();
-  curves();
   digests();
   seek(training.last);
   await intervals(training);
@@ -74,22 +74,18 @@ async function take_runs(read, reading) {
 /** Opens policies or a config. @param {Read} read */
 async function take_other({ file, bytes }) {
   if (/\.safetensors$/i.test(file.name)) {
-    const { words, bytes: weights } = await state.clerk.ask({ ask: "read", text: state.toml }, bytes);
+    const { words, bytes: weights } = await clerk.ask({ ask: "read", text: state.toml }, bytes);
     forget();
     leave_guide();
     state.policies = { each: words.policies, weights };
-    const { words: data } = await state.clerk.ask({ ask: "play", text: state.toml, policies: words.policies }, weights);
+    const data = stage.unpack((await clerk.ask({ ask: "play", text: state.toml, policies: words.policies }, weights)).words);
     mode("watch");
-    clear();
-    const only = view(state.config.learning.paradigm);
-    only.crop = reach(state.config);
-    only.title.textContent = `The champion of ${file.name}`;
+    const only = only_view(`The champion of ${file.name}`, reach(state.config));
     only.tell = (step, observed) => {
       only.said.textContent = `${observed} of ${data.pois.length} POIs by step ${step}`;
-      only.canvas.setAttribute("aria-label", `${only.title.textContent}, step ${step}: ${only.said.textContent}`);
+      only.canvas.ariaLabel = `${only.title.textContent}, step ${step}: ${only.said.textContent}`;
     };
-    $("views").classList.add("one");
-    show(only, unpack(data));
+    show(only, data);
     $("said").textContent = `${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} a leader. Take a leader to play with them.`;
   } else {
     if (!/\.toml$/i.test(file.name)) throw new Error("it is no config (.toml), no run (.zip) and no policies (.safetensors)");
@@ -102,6 +98,6 @@ async function take_other({ file, bytes }) {
     mode("watch");
     show_start();
     const taken = await take(text);
-    $("said").textContent = taken ? `${file.name} is the config now.` : `${file.name} has problems; they stand beside its lines.`;
+    $("said").textContent = taken ? `${file.name} is the config now.` : `${file.name} has problems; they are shown beside its lines.`;
   }
 }

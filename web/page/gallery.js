@@ -1,10 +1,12 @@
 // @ts-check
 // Experiments to start from. Each has a config in web/gallery and what it compares.
 import { $, make } from "./dom.js";
-import { settings } from "./experiment.js";
-import { train } from "./train.js";
+import { keep, take } from "./experiment.js";
+import { mode } from "./modes.js";
+import { state } from "./state.js";
+import { forget, train } from "./train.js";
 
-/** @typedef {{ name: string, title: string, says: string, compare: import("./compare.js").Comparison }} Exhibit */
+/** @typedef {{ name: string, title: string, says: string, compare: Comparison }} Exhibit */
 
 /** @type {Exhibit[]} */
 export const GALLERY = [
@@ -34,13 +36,18 @@ export const GALLERY = [
   },
 ];
 
-/** Returns the config of an experiment. @param {string} name @returns {string} */
-export const text_of = name => $(`gallery-${name}`).textContent;
+/** Returns the config of an experiment. @param {string} name */
+export const text_of = name => $(`gallery-${name}`).textContent ?? "";
 
-/** Opens an experiment of the gallery, and trains it if asked. @param {string} name */
+/** Replaces the experiment by one of the gallery, and trains it if asked. @param {string} name */
 export async function exhibit(name, { trains = false } = {}) {
   const found = GALLERY.find(exhibit => exhibit.name === name);
-  if (found && await settings(text_of(name), found.compare) && trains) await train();
+  if (!found) return;
+  keep();
+  forget();
+  Object.assign(state, { file: null, compared: found.compare });
+  mode("watch");
+  if (await take(text_of(name)) && trains) await train();
 }
 
 export function gallery() {

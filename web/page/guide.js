@@ -3,11 +3,11 @@
 import { remove_leader } from "./credit.js";
 import { $ } from "./dom.js";
 import { exhibit } from "./gallery.js";
-import { state } from "./state.js";
+import { shown } from "./state.js";
 import { train } from "./train.js";
 import { replay } from "./views.js";
 
-const best = () => state.views.find(view => view.data && view.data.episodes[0].without);
+const best = () => shown().find(({ data }) => data.episodes[0].without);
 const STEPS = [
   {
     says: "These twelve agents are a trained team: four leaders learned, eight followers follow. A point of interest (POI) counts once six agents are near it at the same time, so groups have to meet.",
@@ -15,9 +15,9 @@ const STEPS = [
     act() {
       const view = best();
       if (!view) return;
-      const { df } = view.data.episodes[0];
+      const { df = [] } = view.data.episodes[0];
       remove_leader(view, { leader: df.indexOf(Math.max(...df)), group: true });
-      if (!state.views.some(view => view.playing)) replay();
+      if (!view.playing) replay();
     },
   },
   {

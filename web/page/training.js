@@ -3,7 +3,7 @@
 // divided among the workers. The division does not change the results.
 
 export class Training {
-  /** @param {Planned[]} arms @param {any} machine */
+  /** @param {Planned[]} arms @param {Machine} machine */
   constructor(arms, machine) {
     /** The text and the comparison that were trained. @type {{ text: string, compared: Comparison | null } | null} */
     this.source = null;
@@ -93,7 +93,7 @@ export class Training {
       const answers = await Promise.all(this.players.map(player => player.ask({ ask: "ends", run })));
       const trials = answers.flatMap(({ words, bytes }) => {
         let at = 0;
-        return words.map((/** @type {{ trial: number, policies: number, fitness: number, pending: Place | null }} */ { trial, policies, fitness, pending }) => {
+        return words.map(({ trial, policies, fitness, pending }) => {
           const part = bytes.subarray(at, at += 4 * (policies + fitness));
           return { trial, part, pending, champions: champions(arm, part, policies) };
         });
@@ -128,7 +128,7 @@ export class Training {
     Object.assign(arm, { digest: words.digest, zip });
   }
 
-  /** Makes a finished training of opened runs, each as an arm. @param {Player} player @param {any} machine @param {Opened[]} opened */
+  /** Makes a finished training of opened runs, each as an arm. @param {Player} player @param {Machine} machine @param {Opened[]} opened */
   static async read(player, machine, opened) {
     const training = new Training(opened.map(({ name, label, words }) => {
       const { toml, config, pois, parameters, digest } = words;
@@ -170,7 +170,7 @@ export class Training {
   stop() { if (this.state !== "done") this.state = "stopped"; }
 }
 
-/** Returns the last generation of an arm. @param {{ config: any }} arm */
+/** Returns the last generation of an arm. @param {{ config: Config }} arm */
 export const last_of = ({ config }) => config.learning.generations;
 
 /**

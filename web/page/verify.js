@@ -1,6 +1,6 @@
 // @ts-check
 // Compares the browser's GPU with its CPU.
-import { $ } from "./dom.js";
+import { $, failure } from "./dom.js";
 import { pool } from "./pool.js";
 
 export async function verify() {
@@ -16,9 +16,9 @@ export async function verify() {
     const { words } = await player.ask({ ask: "verify", worlds, teams, seed: 0, pass });
     output.className = words.mismatch ? "bad" : "good";
     output.textContent = words.mismatch ? `DIFFERENT: ${words.mismatch}` : `Equal: this browser's GPU and CPU agree on every bit of ${words.agent_steps.toLocaleString("en")} agent-steps in ${words.worlds} random worlds.`;
-  } catch (/** @type {any} */ error) {
+  } catch (thrown) {
     output.className = "bad";
-    output.textContent = error.message;
+    output.textContent = failure(thrown).message;
   }
   if (player) player.stop();
   $("verify").disabled = false;

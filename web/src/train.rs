@@ -11,7 +11,7 @@ use flotilla::trainer::{Row, Snapshot, Trainer};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
-use crate::ask::{Answer, Refusal, refuse};
+use crate::answer::{Answer, Refusal, refuse};
 
 /// A config, and the trials of it that this worker trains. `None` means all trials.
 #[derive(Deserialize)]
