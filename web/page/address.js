@@ -1,4 +1,3 @@
-// @ts-check
 // The experiment in the address.
 import { comparison, read, write } from "./compare.js";
 import { configs } from "./config.js";

@@ -1,4 +1,3 @@
-// @ts-check
 // Rearranging the map by pointer and keys.
 import { configs } from "./config.js";
 import { $, count, number } from "./dom.js";
@@ -13,7 +12,7 @@ export function show_start() {
   const { config, views } = state, { world } = config;
   if (!start_view || !views.includes(start_view)) {
     start_view = only_view("Where everyone starts", reach(config));
-    start_view.tell = tell_start;
+    start_view.describe = describe_start;
   }
   if (start_view.chosen && !world[start_view.chosen[0]][start_view.chosen[1]]) start_view.chosen = null;
   start_view.crop = reach(config);
@@ -28,11 +27,11 @@ export function show_start() {
   show(start_view, start_scene(config), false);
 }
 
-function tell_start() {
+function describe_start() {
   const { world } = state.config;
   if (!start_view) return;
-  start_view.said.textContent = `${count(world.leaders.length, "leader")}, ${count(world.followers.length, "follower")}, ${count(world.pois.length, "POI")} · ${world.steps} steps`;
-  start_view.canvas.ariaLabel = `Map of the start: ${start_view.said.textContent}${start_view.chosen ? `; chosen: ${name_chosen(start_view.chosen)}` : ""}`;
+  start_view.status.textContent = `${count(world.leaders.length, "leader")}, ${count(world.followers.length, "follower")}, ${count(world.pois.length, "POI")} · ${world.steps} steps`;
+  start_view.canvas.ariaLabel = `Map of the start: ${start_view.status.textContent}${start_view.chosen ? `; chosen: ${name_chosen(start_view.chosen)}` : ""}`;
 }
 
 const KINDS = { leaders: "leader", followers: "follower", pois: "POI" };

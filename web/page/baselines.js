@@ -1,4 +1,3 @@
-// @ts-check
 // Baselines without learning: the best constant action, and the best of as many random teams as training evaluates.
 import { curves } from "./curves.js";
 import { clerk } from "./pool.js";

@@ -1,4 +1,3 @@
-// @ts-check
 // What a training compares: the values of one key of the config, each of which is an arm.
 
 /** @typedef {{ key: string, values: string[] }} Comparison */

@@ -1,4 +1,3 @@
-// @ts-check
 // Configs as text: the paper's layouts, and encoding for links.
 import { $ } from "./dom.js";
 

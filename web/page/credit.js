@@ -1,4 +1,3 @@
-// @ts-check
 // Credit of each leader, and the episode without a leader: the POIs that go dark are its credit.
 import { $, all, count, make, number } from "./dom.js";
 import { shown, state } from "./state.js";
@@ -39,7 +38,7 @@ function table(view) {
   /** A list per measure and action: its name, and then a cell per leader. @type {(string | HTMLElement)[][]} */
   const lists = [
     ["Leader", ...leaders.map(leader => sense_button(view, leader))],
-    ...scores.map(({ name, values }) => [name === data.fitness ? `${name} (selects)` : name, ...leaders.map(leader => number(values[leader]))]),
+    ...scores.map(({ name, values }) => [name === data.fitness ? `${name} (fitness)` : name, ...leaders.map(leader => number(values[leader]))]),
     ["Remove it", ...leaders.map(leader => remove_button(view, { leader, group: false }))],
   ];
   if (episode.agents > episode.leaders) lists.push(["Remove it and its followers", ...leaders.map(leader => remove_button(view, { leader, group: true }))]);
@@ -94,7 +93,7 @@ export function remove_leader(view, removed) {
 
 /** Says what the removal costs. @param {Shown} view */
 function lost(view) {
-  if (!view.removed) return "Remove a leader: the POIs that go dark are its credit. D counts it alone, Df with the followers that it led.";
+  if (!view.removed) return "Remove a leader: the POIs that go dark are its credit. D removes the leader alone, Df the leader and its followers.";
   const { leader, group } = view.removed, gone = dark(view.data, view.removed), pois = view.data.pois.length;
   const who = `Without leader ${leader}${group ? " and its followers" : ""}`;
   const which = gone.length ? `POI${gone.length > 1 ? "s" : ""} ${gone.join(", ")} ${gone.length > 1 ? "go" : "goes"} dark` : "no POI goes dark";

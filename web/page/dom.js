@@ -1,4 +1,3 @@
-// @ts-check
 // Elements of the page, and short helpers.
 
 /** Returns the element with an id. @template {keyof Elements} K @param {K} id */
@@ -55,13 +54,13 @@ export function save(name, content, type) {
   link.click();
   link.remove();
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
-  $("said").textContent = `${name} is saved.`;
+  $("message").textContent = `${name} is saved.`;
 }
 
-/** Copies a text, and then says so. @param {string} text @param {string} said */
-export async function copy(text, said) {
+/** Copies a text, and reports it. @param {string} text @param {string} message */
+export async function copy(text, message) {
   try {
     await navigator.clipboard.writeText(text);
-    $("said").textContent = said;
-  } catch { $("said").textContent = `This browser does not let a page copy. Here it is: ${text}`; }
+    $("message").textContent = message;
+  } catch { $("message").textContent = `This browser does not let a page copy. Here it is: ${text}`; }
 }

@@ -1,4 +1,3 @@
-// @ts-check
 // Steering a leader.
 import { $, count, failure, make, number, trouble } from "./dom.js";
 import { edited } from "./experiment.js";
@@ -21,9 +20,9 @@ export function drive_view() {
   only.canvas.classList.add("steer");
   only.canvas.tabIndex = 0;
   only.canvas.setAttribute("role", "application");
-  only.tell = (step, observed, said) => {
-    only.said.textContent = `step ${step} of ${state.config.world.steps} · ${observed} of ${state.config.world.pois.length} POIs`;
-    only.canvas.ariaLabel = `You steer leader ${$("leader").value}: step ${step}, ${said}`;
+  only.describe = (step, observed, text) => {
+    only.status.textContent = `step ${step} of ${state.config.world.steps} · ${observed} of ${state.config.world.pois.length} POIs`;
+    only.canvas.ariaLabel = `You steer leader ${$("leader").value}: step ${step}, ${text}`;
   };
   show(only, start_scene(state.config), false);
   only.chosen = ["leaders", Number($("leader").value) || 0];
@@ -74,10 +73,10 @@ export async function drive_on() {
   const toml = await edited(state.toml ?? "", [["learning.paradigm", '"leader-follower"']]);
   const { each, weights } = state.policies || { each: 0 };
   /** @type {Driven} */
-  let told;
+  let now;
   try {
-    told = (await clerk.ask({ ask: "drive", text: toml, leader, policies: each }, weights)).words;
-    $("driven").textContent = told.learned ? "The other leaders do what they learned." : state.policies ? "The other leaders go straight ahead: what was learned is not for these teams." : "The other leaders go straight ahead: train first, and they do what they learned.";
+    now = (await clerk.ask({ ask: "drive", text: toml, leader, policies: each }, weights)).words;
+    $("driven").textContent = now.learned ? "The other leaders do what they learned." : state.policies ? "The other leaders go straight ahead: what was learned is not for these teams." : "The other leaders go straight ahead: train first, and they do what they learned.";
   } catch (thrown) {
     drive_off();
     return trouble(failure(thrown).message);
@@ -94,23 +93,23 @@ export async function drive_on() {
       shown: Array.from({ length: words.step + 1 }, (_, step) => step), observed: words.observed,
     });
   };
-  take(told);
+  take(now);
   show(only, data, false);
   const turn = drive.turn = {};
   const pace = Math.max(60, data.dt * 1000 * 0.75);
   const step = async () => {
     if (drive.turn !== turn || state.mode !== "drive") return;
-    const from = performance.now(), wanted = wish(told.positions, told.headings, leader);
+    const from = performance.now(), wanted = wish(now.positions, now.headings, leader);
     if (!wanted) return void (drive.timer = setTimeout(step, 30));
     const [angle, speed] = wanted;
-    try { told = (await clerk.ask({ ask: "step", turn: angle, speed })).words; } catch (thrown) { return trouble(failure(thrown).message); }
+    try { now = (await clerk.ask({ ask: "step", turn: angle, speed })).words; } catch (thrown) { return trouble(failure(thrown).message); }
     if (drive.turn !== turn) return;
-    take(told);
-    Object.assign(only, { place: told.step });
+    take(now);
+    Object.assign(only, { place: now.step });
     draw(only);
-    if (told.scores) {
+    if (now.scores) {
       drive_off();
-      const { g, d, df } = told.scores, pois = state.config.world.pois.length;
+      const { g, d, df } = now.scores, pois = state.config.world.pois.length;
       $("driven").textContent = `The team observed ${Math.round(g * pois)} of ${count(pois, "POI")} (G = ${number(g)}). Yours: D = ${number(d[leader])}, Df = ${number(df[leader])}.`;
       return;
     }

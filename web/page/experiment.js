@@ -1,4 +1,3 @@
-// @ts-check
 // The experiment: its text, its controls, and its editor.
 import { choice_of, slug } from "./compare.js";
 import { configs } from "./config.js";

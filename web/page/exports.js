@@ -1,4 +1,3 @@
-// @ts-check
 // Pictures, films and tables of what is on show.
 import { slug } from "./compare.js";
 import { $, failure, pen_of, save, trouble } from "./dom.js";
@@ -28,7 +27,7 @@ function compose(canvas, wide) {
     pen.font = `600 ${Math.round(wide / 28)}px system-ui, sans-serif`;
     pen.fillText(view.title.textContent ?? "", left + 6, 20, wide - 12);
     pen.font = `${Math.round(wide / 32)}px system-ui, sans-serif`;
-    pen.fillText(view.said.textContent ?? "", left + 6, 40, wide - 12);
+    pen.fillText(view.status.textContent ?? "", left + 6, 40, wide - 12);
     pen.drawImage(view.canvas, left, 50, wide, wide * view.canvas.height / view.canvas.width);
   });
 }
@@ -77,7 +76,7 @@ async function one_at_a_time(act) {
 }
 
 export const save_gif = () => one_at_a_time(async () => {
-  $("said").textContent = "Making the GIF…";
+  $("message").textContent = "Making the GIF…";
   const canvas = document.createElement("canvas"), pictures = /** @type {Bytes[]} */ ([]);
   let many = 1;
   await film(canvas, async (_, frames) => {
@@ -91,7 +90,7 @@ export const save_gif = () => one_at_a_time(async () => {
 
 export const save_webm = () => one_at_a_time(async () => {
   if (typeof MediaRecorder !== "function") throw new Error("this browser cannot record a canvas");
-  $("said").textContent = "Recording the film…";
+  $("message").textContent = "Recording the film…";
   const canvas = document.createElement("canvas");
   compose(canvas, WIDTH);
   const recorder = new MediaRecorder(canvas.captureStream(25), { mimeType: "video/webm" }), parts = /** @type {Blob[]} */ ([]);
@@ -107,5 +106,5 @@ export const save_webm = () => one_at_a_time(async () => {
 
 export function save_csv() {
   if (state.training) save(`${slug(name_of())}-curves.csv`, csv(state.training.arms), "text/csv");
-  else $("said").textContent = "There are no curves yet. Train first.";
+  else $("message").textContent = "There are no curves yet. Train first.";
 }

@@ -1,4 +1,3 @@
-// @ts-check
 // Files that are dropped or opened.
 import { show_start } from "./arrange.js";
 import { $, count, failure, trouble } from "./dom.js";
@@ -22,7 +21,7 @@ const MOST_RUNS = TONES.length;
 /** Opens files: several runs as arms of one chart, or a single file of any kind. @param {File[]} files */
 export async function take_files(files) {
   trouble("");
-  $("said").textContent = "";
+  $("message").textContent = "";
   let now = files[0];
   try {
     /** @type {Read[]} */
@@ -30,7 +29,7 @@ export async function take_files(files) {
     for (const file of files) {
       now = file;
       const bytes = new Uint8Array(await file.arrayBuffer()), is_run = /\.zip$/i.test(file.name) || bytes[0] === 0x50 && bytes[1] === 0x4b;
-      if (files.length > 1 && !is_run) throw new Error("it is no run (.zip); only runs can be opened together");
+      if (files.length > 1 && !is_run) throw new Error("not a run (.zip); only runs can be opened together");
       if (files.length > MOST_RUNS) throw new Error(`these are ${files.length} files; open ${MOST_RUNS} runs at most together`);
       read.push({ file, bytes });
       if (is_run && read.length === files.length) return await take_runs(read, file => { now = file; });
@@ -68,7 +67,7 @@ async function take_runs(read, reading) {
   digests();
   seek(training.last);
   await intervals(training);
-  $("said").textContent = found.length > 1 ? `${found.length} runs are compared. Each is whole: its digest is right. The settings are those of ${found[0].name}.` : `${found[0].name}: the run is whole, its digest is right.`;
+  $("message").textContent = found.length > 1 ? `${found.length} runs are compared. Each is whole: its digest is right. The settings are those of ${found[0].name}.` : `${found[0].name}: the run is whole, its digest is right.`;
 }
 
 /** Opens policies or a config. @param {Read} read */
@@ -81,14 +80,14 @@ async function take_other({ file, bytes }) {
     const data = stage.unpack((await clerk.ask({ ask: "play", text: state.toml, policies: words.policies }, weights)).words);
     mode("watch");
     const only = only_view(`The champion of ${file.name}`, reach(state.config));
-    only.tell = (step, observed) => {
-      only.said.textContent = `${observed} of ${data.pois.length} POIs by step ${step}`;
-      only.canvas.ariaLabel = `${only.title.textContent}, step ${step}: ${only.said.textContent}`;
+    only.describe = (step, observed) => {
+      only.status.textContent = `${observed} of ${data.pois.length} POIs by step ${step}`;
+      only.canvas.ariaLabel = `${only.title.textContent}, step ${step}: ${only.status.textContent}`;
     };
     show(only, data);
-    $("said").textContent = `${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} a leader. Take a leader to play with them.`;
+    $("message").textContent = `${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} a leader. Take a leader to play with them.`;
   } else {
-    if (!/\.toml$/i.test(file.name)) throw new Error("it is no config (.toml), no run (.zip) and no policies (.safetensors)");
+    if (!/\.toml$/i.test(file.name)) throw new Error("not a config (.toml), a run (.zip) or policies (.safetensors)");
     const text = new TextDecoder("utf-8", { fatal: true }).decode(bytes);
     keep();
     state.file = file.name.replace(/\.toml$/i, "");
@@ -98,6 +97,6 @@ async function take_other({ file, bytes }) {
     mode("watch");
     show_start();
     const taken = await take(text);
-    $("said").textContent = taken ? `${file.name} is the config now.` : `${file.name} has problems; they are shown beside its lines.`;
+    $("message").textContent = taken ? `${file.name} is the config now.` : `${file.name} has problems; they are shown beside its lines.`;
   }
 }

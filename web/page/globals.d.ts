@@ -68,12 +68,12 @@ declare const stage: {
   later(data: Scene, episode: Episode, place: number, seconds: number): number,
 };
 
-/** One canvas: its arm, its episode, and the place in it. `tell` writes the text of a view that shows no training. */
+/** One canvas: its arm, its episode, and the place in it. `describe` writes the text of a view that shows no training. */
 interface View {
-  label: string, card: HTMLElement, title: HTMLElement, key: HTMLElement, said: HTMLElement, sensed: HTMLElement, canvas: HTMLCanvasElement,
+  label: string, card: HTMLElement, title: HTMLElement, key: HTMLElement, status: HTMLElement, sensed: HTMLElement, canvas: HTMLCanvasElement,
   data: Scene | null, place: number, playing: boolean, ended: number | null, over: number | null, wanted: number | null, asking: boolean,
   crop: Crop, chosen: Chosen | null, removed: Removed | null, selected: number | null, drawn: Place[],
-  tell: ((step: number, observed: number, said: string) => void) | null,
+  describe: ((step: number, observed: number, text: string) => void) | null,
 }
 /** A view that shows an episode. */
 type Shown = View & { data: Scene };
@@ -153,7 +153,7 @@ type Elements =
   & Record<"png" | "gif" | "webm" | "csv" | "guide-next" | "guide-end", HTMLButtonElement>
   & Record<"text", HTMLTextAreaElement> & Record<"curves", HTMLCanvasElement> & Record<"config", HTMLDetailsElement>
   & Record<"setup" | "guide" | "guide-step" | "guide-says" | "hint" | "arrange" | "drive" | "modes" | "views" | "plain-label", HTMLElement>
-  & Record<"credit" | "team" | "credits" | "lost" | "compared" | "compared-says" | "means" | "pairs" | "tests" | "gallery" | "digests", HTMLElement>
+  & Record<"credit" | "play" | "team" | "credits" | "lost" | "compared" | "compared-says" | "means" | "pairs" | "tests" | "gallery" | "digests", HTMLElement>
   & Record<"trouble" | "stale" | "announced" | "machine" | "version" | "legend" | "needless" | "problems" | "lines" | "marks", HTMLElement>
-  & Record<"chosen" | "driven" | "generation" | "said" | "verified", HTMLElement>
+  & Record<"chosen" | "driven" | "generation" | "message" | "verified", HTMLElement>
   & Record<"wasm" | "worker" | "opening" | `layout-${string}` | `gallery-${string}`, HTMLElement>;

@@ -1,4 +1,3 @@
-// @ts-check
 // Intervals over trials, and the comparison of arms. The module computes them as `flotilla compare` does.
 import { curves } from "./curves.js";
 import { $, make } from "./dom.js";

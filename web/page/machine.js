@@ -1,4 +1,3 @@
-// @ts-check
 // The workers, and the backend that trains.
 import { $, count, failure, write_text } from "./dom.js";
 import { pool } from "./pool.js";
@@ -17,17 +16,17 @@ export async function settle() {
       state.machine.adapter = gpu.name;
       state.machine.description = `${gpu.name} by WebGPU${gpu.software ? ", a software renderer" : ""}, proved exact`;
       state.settled = wanted;
-      return told();
+      return show_machine();
     } catch (thrown) { why = failure(thrown).message; }
   } else if (wanted === "auto") why = gpu.software ? `this browser's GPU is a software renderer, ${gpu.name}` : gpu.reason ?? "";
   state.machine = (await state.players[0].ask({ ask: "open", gpu: false, pass: null })).words;
   state.machine.threads = state.players.length;
   state.machine.why = why;
   state.settled = wanted;
-  told();
+  show_machine();
 }
 
-export function told() {
+export function show_machine() {
   const { training, machine } = state, workers = machine.backend === "cpu" ? `${machine.description.replace(/, \d+ threads?/, "")} in ${count(state.players.length, "worker")}` : machine.description;
   const speed = training && training.teams ? ` · ${Math.round(training.rate).toLocaleString("en")} teams a second` : "";
   write_text($("machine"), `Runs on ${workers}${speed}${machine.why ? ` (${machine.why})` : ""}`);

@@ -1,4 +1,3 @@
-// @ts-check
 // The page's event listeners and its start.
 import { autoplay, link, recall, remember, shows_runs } from "./address.js";
 import { add, remove, show_start } from "./arrange.js";
@@ -90,8 +89,8 @@ function listen() {
   $("verify").addEventListener("click", verify);
   $("share").addEventListener("click", async () => {
     await entered();
-    if (!state.valid) return void ($("said").textContent = "No link was copied: the config has problems. Correct them first.");
-    if (!await remember()) return void ($("said").textContent = "No link was copied: this browser cannot compress a config. Save config.toml instead.");
+    if (!state.valid) return void ($("message").textContent = "No link was copied: the config has problems. Correct them first.");
+    if (!await remember()) return void ($("message").textContent = "No link was copied: this browser cannot compress a config. Save config.toml instead.");
     if (shows_runs()) return void copy(link(), "The link is copied: it has the settings of the first run, but not the runs.");
     copy(link(), `The link is copied: whoever opens it ${state.training ? "sees the same generation of the same training" : "trains the same"}.`);
   });
@@ -130,7 +129,10 @@ function listen() {
 const opens = location.hash.length <= 1;
 
 async function start() {
-  if (opens) show_opening();
+  if (opens) {
+    show_opening();
+    guide();
+  }
   try {
     [state.gpu] = await Promise.all([pool.gpu(), renew()]);
   } catch (thrown) {
@@ -145,12 +147,11 @@ async function start() {
   option($("on"), "gpu").disabled = !state.gpu.name;
   listen();
   gallery();
-  if (opens) {
-    guide();
-    // The settings become those of the opening. Its episode goes on.
-    await take(text_of(OPENING), { address: false, views: false });
-  } else await recall();
+  // The settings become those of the opening. Its episode goes on.
+  if (opens) await take(text_of(OPENING), { address: false, views: false });
+  else await recall();
   await settle();
+  $("guide-next").disabled = false;
   document.body.dataset.ready = "";
   await autoplay();
 }

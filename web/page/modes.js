@@ -1,4 +1,3 @@
-// @ts-check
 // What to do with the map: watch, rearrange, or take a leader.
 import { show_start } from "./arrange.js";
 import { $, all } from "./dom.js";

@@ -1,4 +1,3 @@
-// @ts-check
 // Workers that run flotilla, and the detection of a GPU.
 import { $, Failure } from "./dom.js";
 
@@ -21,13 +20,13 @@ export const pool = (() => {
       this.asked = new Map();
       this.count = 0;
       this.failed = false;
-      /** @type {(told: { verified: number }) => void} */
-      this.told = () => {};
+      /** @type {(progress: { verified: number }) => void} */
+      this.progress = () => {};
       script ??= URL.createObjectURL(new Blob([$("worker").textContent], { type: "text/javascript" }));
       this.worker = new Worker(script);
       this.worker.onerror = event => this.fail(event.message || "the worker could not be started");
       this.worker.onmessage = ({ data }) => {
-        if (data.told) return data.told.panic ? this.fail(data.told.panic) : this.told(data.told);
+        if (data.told) return data.told.panic ? this.fail(data.told.panic) : this.progress(data.told);
         const asked = this.asked.get(data.id);
         this.asked.delete(data.id);
         if (!asked) return;

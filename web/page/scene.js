@@ -1,4 +1,3 @@
-// @ts-check
 // The part of the map to show, and the start as an episode without steps.
 import { opening, state } from "./state.js";
 

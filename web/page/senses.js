@@ -1,4 +1,3 @@
-// @ts-check
 // What a leader senses: the densities of POIs and agents in four quadrants, and its answer.
 
 /** Names of the quadrants, in the order of a policy's inputs. */

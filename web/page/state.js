@@ -1,4 +1,3 @@
-// @ts-check
 // The state of the page, and the names that it shows.
 import { $ } from "./dom.js";
 

@@ -1,4 +1,3 @@
-// @ts-check
 // Starts, shows and ends trainings.
 import { constants, randoms } from "./baselines.js";
 import { label, slug, toml } from "./compare.js";
@@ -6,7 +5,7 @@ import { curves } from "./curves.js";
 import { $, copy, failure, make, save, trouble, write_text } from "./dom.js";
 import { command, entered, name_of, stale } from "./experiment.js";
 import { intervals, tables } from "./intervals.js";
-import { renew, settle, told } from "./machine.js";
+import { renew, settle, show_machine } from "./machine.js";
 import { mode } from "./modes.js";
 import { clerk } from "./pool.js";
 import { state } from "./state.js";
@@ -82,7 +81,7 @@ export async function train() {
     if (!stopped && state.training === training) {
       training.stop();
       if (fatal || state.machine.backend === "gpu") await renew();
-      trouble(`${message}\nTraining stopped there. ${state.machine.backend === "gpu" ? "Train again, on the CPU if need be: it comes to the same." : "Train again: it comes to the same."}`);
+      trouble(`${message}\nTraining stopped there. ${state.machine.backend === "gpu" ? "Train again, if necessary on the CPU: the result is the same." : "Train again: the result is the same."}`);
     }
   }
   clearInterval(painting);
@@ -90,16 +89,16 @@ export async function train() {
   controls();
   curves();
   follow();
-  told();
+  show_machine();
   intervals(training).catch(() => {});
   if (training.state === "done") {
     digests();
     randoms(training).catch(() => {});
     const found = training.arms.map(arm => {
       const last = arm.trials.map(trial => trial[trial.length - 1].best), mean = last.reduce((sum, best) => sum + best, 0) / last.length;
-      return `${arm.label} observes ${(mean * (arm.pois ?? 1)).toFixed(2)} ${arm.pois === null ? "of its POIs (a share)" : `of ${arm.pois} POIs`}`;
+      return `${arm.label} ${(mean * (arm.pois ?? 1)).toFixed(2)} of ${arm.pois ?? 1}`;
     });
-    $("announced").textContent = `Training is finished. On average over trials, the best team of ${found.join("; ")}.`;
+    $("announced").textContent = `Training is finished. ${training.pois === null ? "The share of POIs" : "POIs"} that the best team observes, on average over trials: ${found.join("; ")}.`;
   }
 }
 
@@ -149,6 +148,6 @@ export function digests() {
     if (source && command && !command.includes(" configs/")) {
       make("button", `Save ${arm.name}.toml`, acts, { type: "button" }).addEventListener("click", () => save(`${arm.name}.toml`, source.text, "text/plain"));
     }
-    if (command) make("button", "Copy the command", acts, { type: "button" }).addEventListener("click", () => copy(command, "The command is copied: it comes to the same digest."));
+    if (command) make("button", "Copy the command", acts, { type: "button" }).addEventListener("click", () => copy(command, "The command is copied. It gives the same digest."));
   }
 }

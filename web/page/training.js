@@ -1,4 +1,3 @@
-// @ts-check
 // A training of some arms, or runs that were opened. On the GPU, one worker trains everything as one batch. On the CPU, the trials are
 // divided among the workers. The division does not change the results.
 
@@ -162,8 +161,8 @@ export class Training {
     const { words } = await player.ask({ ask: "best", run, trial, generation });
     // Training here starts from random policies. A run from a file may have started from given ones, or be from another
     // version.
-    const [episode] = words.episodes, told = this.arms[run].trials[trial][episode.generation];
-    if (told && told.best !== episode.best_g) throw new Error(`Trained again, generation ${episode.generation} comes to G = ${episode.best_g}, where the run says ${told.best}: it started from given policies, or another version made it.`);
+    const [episode] = words.episodes, recorded = this.arms[run].trials[trial][episode.generation];
+    if (recorded && recorded.best !== episode.best_g) throw new Error(`Generation ${episode.generation} cannot be replayed: it gives G = ${episode.best_g} here, and the run has ${recorded.best}. The run started from given policies, or another version made it.`);
     return words;
   }
 

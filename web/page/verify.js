@@ -1,4 +1,3 @@
-// @ts-check
 // Compares the browser's GPU with its CPU.
 import { $, failure } from "./dom.js";
 import { pool } from "./pool.js";
@@ -11,7 +10,7 @@ export async function verify() {
   let player;
   try {
     player = await pool.open();
-    player.told = ({ verified }) => { output.textContent = `${verified} of ${worlds} worlds`; };
+    player.progress = ({ verified }) => { output.textContent = `${verified} of ${worlds} worlds`; };
     const pass = $("plain").checked ? "plain" : null;
     const { words } = await player.ask({ ask: "verify", worlds, teams, seed: 0, pass });
     output.className = words.mismatch ? "bad" : "good";

@@ -1,4 +1,3 @@
-// @ts-check
 // Views of episodes: one canvas per arm.
 import { curves } from "./curves.js";
 import { $, failure, make, number, pen_of, still, trouble, write_text } from "./dom.js";
@@ -14,13 +13,13 @@ function add_view(label, crop) {
   const key = make("span", "", head, { className: `key${state.views.length ? " dashed" : ""}` });
   key.style.color = `var(${TONES[state.views.length]})`;
   const title = make("span", NAMES[label] || label, head);
-  const said = make("p", "", card, { role: "status", ariaLive: "off" });
+  const status = make("p", "", card, { role: "status", ariaLive: "off" });
   const canvas = make("canvas", "", card, { role: "img" });
   const sensed = make("p", "", card, { className: "sensed", hidden: true });
   /** @type {View} */
   const view = {
-    label, card, key, title, said, canvas, sensed, crop, data: null, place: 0, playing: false, ended: null, over: null, wanted: null,
-    asking: false, chosen: null, removed: null, selected: null, drawn: [], tell: null,
+    label, card, key, title, status, canvas, sensed, crop, data: null, place: 0, playing: false, ended: null, over: null, wanted: null,
+    asking: false, chosen: null, removed: null, selected: null, drawn: [], describe: null,
   };
   canvas.addEventListener("pointermove", event => pointed(view, event));
   canvas.addEventListener("click", event => picked(view, event));
@@ -36,16 +35,18 @@ export function only_view(title, crop) {
   view.title.textContent = title;
   view.key.hidden = true;
   $("views").classList.add("one");
+  $("views").after($("credit"));
   return view;
 }
 
-/** Makes a view for each arm. @param {Training} training */
+/** Makes a view for each arm. The chart comes before the table of credit then: it is what changes. @param {Training} training */
 export function build(training) {
   clear();
   $("loop").checked = false;
   for (const arm of training.arms) add_view(arm.label, reach(arm.config));
   $("views").classList.toggle("one", training.arms.length === 1);
   $("views").classList.toggle("many", training.arms.length > 2);
+  $("play").after($("credit"));
   // Trials that all arms have.
   const trials = Math.min(...training.arms.map(arm => arm.trials.length));
   $("trial").replaceChildren(...Array.from({ length: trials }, (_, trial) => make("option", String(trial))));
@@ -71,12 +72,12 @@ export function draw(view) {
   const { step, positions } = stage.paint(data, episode, view.canvas, view.place, look);
   view.drawn = positions;
   if (view === state.views[0]) steps(data, view.place);
-  const [observed, said] = stage.say(episode, step);
-  if (view.tell) view.tell(step, observed, said);
+  const [observed, text] = stage.say(episode, step);
+  if (view.describe) view.describe(step, observed, text);
   else {
     const end = number(episode.g * data.pois.length);
-    write_text(view.said, `generation ${episode.generation}, trial ${episode.trial} · ${observed} of ${data.pois.length} POIs by step ${step} · ends at ${end}`);
-    view.canvas.ariaLabel = `${NAMES[view.label] || view.label}: the best team of generation ${episode.generation}, step ${step}: ${said}`;
+    write_text(view.status, `generation ${episode.generation}, trial ${episode.trial} · ${observed} of ${data.pois.length} POIs by step ${step} · ends at ${end}`);
+    view.canvas.ariaLabel = `${NAMES[view.label] || view.label}: the best team of generation ${episode.generation}, step ${step}: ${text}`;
   }
   if (view.chosen) ring(view, view.chosen);
   senses(view, data);

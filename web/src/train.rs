@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use flotilla::backend::Backend;
 use flotilla::backend::cpu::Cpu;
-use flotilla::config::{Config, ValidConfig};
+use flotilla::config::{Config, Fitness, ValidConfig};
 use flotilla::host::Instant;
 use flotilla::report::replay;
 use flotilla::trainer::{Row, Snapshot, Trainer};
@@ -153,7 +153,14 @@ impl Training {
             trainer.advance(&mut cpu).map_err(refuse)?;
         }
         let config = config.at(generation);
-        let played = replay::best(&config, &mut trainer, trial, &mut cpu).map_err(refuse)?;
+        // Under Dt, what Dt needs is recorded, and every other credit, too.
+        let mut timed = config.clone();
+        timed.learning.fitness = Fitness::Dt;
+        let mut played = replay::best(&timed, &mut trainer, trial, &mut cpu).map_err(refuse)?;
+        if config.learning.fitness != Fitness::Dt {
+            // Then followers are drawn with the leader that they saw most.
+            played.led.clear();
+        }
         Ok(replay::detailed("", &config, &[played]))
     }
 
