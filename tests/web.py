@@ -562,12 +562,11 @@ def strangers(tab, page, call, downloads):
     tab.set("#seed", "8")
     tab.wait("page.state.config.learning.seed === '8'")
     tab.wait(f"{title} === 'Where everyone starts'")
-    # A leader is taken on the map of the settings, too.
+    # A leader is steered on the map of the settings as they are now.
     tab.click("[data-mode=drive]")
-    tab.set("#layout", "strictly_forward")
-    tab.wait("page.state.views[0].data.pois.length === 2")
-    assert tab.evaluate("document.querySelector('#leader').length") == 2
-    assert tab.evaluate("page.state.mode === 'watch' || page.state.views[0].canvas.classList.contains('steer')")
+    tab.set("#coupling", "2")
+    tab.wait("page.state.views[0].data.episodes[0].coupling[0] === 2")
+    assert tab.evaluate("page.state.views[0].canvas.classList.contains('steer')")
     tab.load(page)
     # The guide removes the leader of the largest Df. The POIs that go dark are its Df.
     episode = "page.state.views[0].data.episodes[0]"
@@ -586,7 +585,7 @@ def strangers(tab, page, call, downloads):
     assert tab.evaluate("page.state.training.arms.map(arm => arm.constant)") == [0, 0]
     best = tab.evaluate("page.state.training.arms.map(arm => arm.trials.map(trial => trial.at(-1).best))")
     tab.wait("document.querySelector('#guide-says').textContent.includes('Training is finished.')")
-    assert f"leader-follower {sum(best[0]):.2f} of 4; all-leaders 0.00 of 4" in tab.text("#guide-says"), tab.text("#guide-says")
+    assert f"{sum(best[0]):.2f} of 4 (leader-follower), 0.00 of 4 (all-leaders)" in tab.text("#guide-says"), tab.text("#guide-says")
     assert min(best[0]) >= 0.75 and max(best[1]) == 0, best
     assert not tab.text("#needless")
     random = tab.evaluate("page.state.training.arms[0].random")

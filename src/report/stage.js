@@ -127,7 +127,8 @@ const stage = (() => {
       canvas.width = Math.round(wide * dots);
       canvas.height = Math.round(tall * dots);
     }
-    const style = getComputedStyle(document.documentElement), color = name => style.getPropertyValue(name).trim();
+    const style = getComputedStyle(document.documentElement), tones = {};
+    const color = name => tones[name] ??= style.getPropertyValue(name).trim();
     const colors = palette(data);
     const led = Array.from({ length: episode.agents }, (_, agent) => leaders_of(episode, Math.floor(place), agent));
     const dashes = agent => DASHES[Math.floor((led[agent][0] || 0) / colors.length) % DASHES.length];

@@ -17,11 +17,7 @@ export function show_start() {
   if (start_view.chosen && !world[start_view.chosen[0]][start_view.chosen[1]]) start_view.chosen = null;
   start_view.crop = reach(config);
   if (state.mode === "arrange") {
-    // Show the whole map, as high as the window allows below the row of modes.
-    const [width, height] = world.map;
-    start_view.crop = [0, 0, width, height];
-    start_view.canvas.style.maxWidth = `${Math.max(280, (innerHeight - 250) * width / height)}px`;
-    start_view.canvas.style.marginInline = "auto";
+    start_view.crop = [0, 0, ...world.map];
     hands(start_view);
   }
   show(start_view, start_scene(config), false);
@@ -54,7 +50,7 @@ const tenth = (/** @type {number} */ value, /** @type {number} */ most) => Math.
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
 /** Lets the pointer and the keys move agents and POIs. @param {View} view */
-export function hands(view) {
+function hands(view) {
   if (view.canvas.classList.contains("hands")) return;
   view.canvas.classList.add("hands");
   view.canvas.tabIndex = 0;

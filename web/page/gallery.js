@@ -8,7 +8,7 @@ import { forget, train } from "./train.js";
 /** @typedef {{ name: string, title: string, says: string, compare: Comparison }} Exhibit */
 
 /** @type {Exhibit[]} */
-export const GALLERY = [
+const GALLERY = [
   {
     name: "two_groups", title: "Two groups must meet", compare: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] },
     says: "Six agents must be at one POI at once. Leader-follower teams learn it; teams in which all twelve agents learn do not.",

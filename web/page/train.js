@@ -96,9 +96,9 @@ export async function train() {
     randoms(training).catch(() => {});
     const found = training.arms.map(arm => {
       const last = arm.trials.map(trial => trial[trial.length - 1].best), mean = last.reduce((sum, best) => sum + best, 0) / last.length;
-      return `${arm.label} ${(mean * (arm.pois ?? 1)).toFixed(2)} of ${arm.pois ?? 1}`;
+      return `${(mean * (arm.pois ?? 1)).toFixed(2)} of ${arm.pois ?? 1} (${arm.label})`;
     });
-    $("announced").textContent = `Training is finished. ${training.pois === null ? "The share of POIs" : "POIs"} that the best team observes, on average over trials: ${found.join("; ")}.`;
+    $("announced").textContent = `Training is finished. ${training.pois === null ? "Share of POIs" : "POIs"} that the best team observes, on average over trials: ${found.join(", ")}.`;
   }
 }
 

@@ -85,7 +85,7 @@ export function draw(view) {
 }
 
 /** Returns what an episode observes without a leader. @param {Episode} episode @param {Removed | null} removed */
-export const without = (episode, removed) => removed && episode.without ? episode.without[removed.leader][removed.group ? "group" : "alone"] : null;
+const without = (episode, removed) => removed && episode.without ? episode.without[removed.leader][removed.group ? "group" : "alone"] : null;
 
 /** Returns the POIs that only the removed agents' presence observed. @param {Scene} data @param {Removed | null} removed */
 export function dark(data, removed) {
@@ -158,6 +158,7 @@ export function show(view, data, moves = true) {
   const last = data.episodes[0].shown.length - 1, plays = moves && !still.matches, [left, below, right, above] = view.crop;
   // Stages and jitter may move POIs out of the view.
   if (data.pois.some(([x, y]) => x < left || x > right || y < below || y > above)) view.crop = stage.whole(data);
+  view.canvas.style.setProperty("--wide", String((view.crop[2] - view.crop[0]) / (view.crop[3] - view.crop[1])));
   // A removed leader stays removed while the episode is the same.
   if (data !== view.data) view.removed = null;
   if (view.selected && view.selected >= data.episodes[0].leaders) view.selected = null;
