@@ -1,6 +1,7 @@
 // Tests the pure modules of the page in Node: node --test web/units.mjs
 
 import assert from "node:assert/strict";
+import { readFileSync } from "node:fs";
 import { test } from "node:test";
 import { choice_of, comparison, label, read, slug, toml, write } from "./page/compare.js";
 import { angles, moment, words } from "./page/senses.js";
@@ -44,4 +45,17 @@ test("senses are those of the leader and frame, with quadrants around the headin
   // Front left lies between the heading and 90 degrees counterclockwise.
   assert.deepEqual(angles(2), [0, Math.PI / 2]);
   assert.match(words({ pois: [0, 0, 1, 0], agents: [0, 0, 0, 0], turn: 0.5, speed: 1 }), /front left 1\.00.* 90° to the left, at 100 %/);
+});
+
+test("elements are of the types that are declared", () => {
+  const [html, types] = ["index.html", "globals.d.ts"].map(name => readFileSync(new URL(`page/${name}`, import.meta.url), "utf8"));
+  const tags = new Map([...html.matchAll(/<(\w+)[^>]* id="([a-z-]+)"/g)].map(([, tag, id]) => [id, tag]));
+  for (const [, names, type] of types.matchAll(/Record<([^>]*), (HTML\w*Element)>/g)) {
+    for (const [, id] of names.matchAll(/"([a-z-]+)"/g)) {
+      // The build adds these.
+      if (["wasm", "worker", "opening"].includes(id)) continue;
+      assert.ok(tags.has(id), `no element is called ${id}`);
+      assert.ok(type === "HTMLElement" || type.toLowerCase() === `html${tags.get(id)}element`, `${id} is a ${tags.get(id)}, not a ${type}`);
+    }
+  }
 });

@@ -751,7 +751,7 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
 }
 
 /// Returns the colours of leaders and their followers for light and dark backgrounds.
-pub fn colors() -> serde_json::Value {
+fn colors() -> serde_json::Value {
     json!({ "light": hex(&map::GROUPS), "dark": hex(&map::GROUPS_DARK) })
 }
 

@@ -14,6 +14,8 @@ const stage = (() => {
       episode.headings = data.exact ? new Float32Array(bytes(episode.headings)) : new Uint8Array(bytes(episode.headings));
       episode.near = new Uint16Array(bytes(episode.near));
       episode.led = new Uint32Array(bytes(episode.led));
+      if (episode.senses) episode.senses = new Float32Array(bytes(episode.senses));
+      for (const { alone, group } of episode.without || []) for (const part of [alone, group]) part.near = new Uint16Array(bytes(part.near));
     }
     return data;
   }
@@ -125,7 +127,8 @@ const stage = (() => {
       canvas.width = Math.round(wide * dots);
       canvas.height = Math.round(tall * dots);
     }
-    const style = getComputedStyle(document.documentElement), color = name => style.getPropertyValue(name).trim();
+    const style = getComputedStyle(document.documentElement), tones = {};
+    const color = name => tones[name] ??= style.getPropertyValue(name).trim();
     const colors = palette(data);
     const led = Array.from({ length: episode.agents }, (_, agent) => leaders_of(episode, Math.floor(place), agent));
     const dashes = agent => DASHES[Math.floor((led[agent][0] || 0) / colors.length) % DASHES.length];

@@ -1,10 +1,9 @@
-// @ts-check
 // The experiment in the address.
 import { comparison, read, write } from "./compare.js";
 import { configs } from "./config.js";
 import { $, trouble } from "./dom.js";
 import { edited, take } from "./experiment.js";
-import { KEYS, NAMES, quote, state } from "./state.js";
+import { KEYS, KEY_IDS, NAMES, quote, state } from "./state.js";
 import { train } from "./train.js";
 import { seek } from "./views.js";
 
@@ -22,7 +21,7 @@ export async function remember() {
     }
   } else {
     words.set("layout", layout);
-    for (const id of Object.keys(KEYS).filter(id => id !== "coupling")) words.set(id, $(id).value);
+    for (const id of KEY_IDS) if (id !== "coupling") words.set(id, $(id).value);
   }
   const compared = state.compared, both = compared && compared.key === "learning.paradigm";
   words.set("learners", both ? "both" : state.config.learning.paradigm);
@@ -38,10 +37,11 @@ export async function remember() {
 // Opens the experiment in the address. Reports the parts that cannot be read, and then leaves the address unchanged.
 export async function recall() {
   const words = new URLSearchParams(location.hash.slice(1)), unknown = [], word = (/** @type {string} */ key) => words.get(key) ?? "";
-  for (const id of ["on", "pace"]) {
+  for (const id of /** @type {const} */ (["on", "pace"])) {
     const value = words.get(id);
+    if (value === null) continue;
     if ([...$(id).options].some(option => option.value === value)) $(id).value = value;
-    else if (value !== null) unknown.push(`${id}=${value}`);
+    else unknown.push(`${id}=${value}`);
   }
   const layout = words.get("layout");
   if (layout !== null && !configs.LAYOUTS.includes(layout)) unknown.push(`layout=${layout}`);
@@ -49,7 +49,7 @@ export async function recall() {
   if (words.has("config")) {
     try { text = await configs.unpack(word("config")); } catch { unknown.push("config"); }
   } else {
-    text = await edited(text, Object.entries(KEYS).filter(([id]) => words.has(id)).map(([id, key]) => [key, quote(id)(word(id))]));
+    text = await edited(text, KEY_IDS.filter(id => words.has(id)).map(id => [KEYS[id], quote(id)(word(id))]));
   }
   const learners = words.get("learners"), known = learners !== null && Object.hasOwn(NAMES, learners);
   if (learners !== null && learners !== "both" && !known) unknown.push(`learners=${learners}`);
@@ -64,7 +64,7 @@ export async function recall() {
   wanted = whole("play") === 1 ? { generation: whole("generation") ?? Infinity, trial: whole("trial") ?? 0 } : null;
   const damage = unknown.length ? `This link is damaged: ${unknown.join(", ")} cannot be read. Ask for a new link; what you see is not what it was made for.` : "";
   const taken = await take(text, { address: !damage });
-  if (!taken && !state.config) {
+  if (!taken && !state.views.length) {
     // Show a map even if the config in the link is invalid.
     await take(configs.layout("generally_forward"), { address: false });
     await take(text);

@@ -1,60 +1,41 @@
-// @ts-check
 // Rearranging the map by pointer and keys.
 import { configs } from "./config.js";
-import { curves } from "./curves.js";
-import { $, count, find, number, pen_of } from "./dom.js";
+import { $, count, number } from "./dom.js";
 import { change } from "./experiment.js";
 import { reach, start_scene } from "./scene.js";
 import { state } from "./state.js";
-import { clear, draw, show, view } from "./views.js";
+import { draw, only_view, show } from "./views.js";
 
+/** The view of the start. @type {View | null} */
+let start_view = null;
 export function show_start() {
-  const { config } = state;
-  if (!state.views.length || state.training || state.mode === "arrange") {
-    if (state.mode !== "arrange" || state.views.length !== 1) {
-      clear();
-      view("leader-follower");
-      $("views").classList.add("one");
-    }
-    const [only] = state.views;
-    only.tell = (step, observed, said) => {
-      const { world } = config;
-      only.said.textContent = `${count(world.leaders.length, "leader")}, ${count(world.followers.length, "follower")}, ${count(world.pois.length, "POI")} · ${world.steps} steps`;
-      only.canvas.setAttribute("aria-label", `Map of the start: ${only.said.textContent}${only.chosen ? `; chosen: ${name_chosen(only.chosen)}` : ""}`);
-    };
-    only.title.textContent = "Where everyone starts";
-    find(".key", only.card).hidden = true;
+  const { config, views } = state, { world } = config;
+  if (!start_view || !views.includes(start_view)) {
+    start_view = only_view("Where everyone starts", reach(config));
+    start_view.describe = describe_start;
   }
-  const [only] = state.views;
-  only.crop = state.mode === "arrange" ? [0, 0, ...config.world.map] : reach(config);
-  if (only.chosen && !config.world[only.chosen[0]][only.chosen[1]]) only.chosen = null;
+  if (start_view.chosen && !world[start_view.chosen[0]][start_view.chosen[1]]) start_view.chosen = null;
+  start_view.crop = reach(config);
   if (state.mode === "arrange") {
-    // Show the whole map, as high as the window allows below the row of modes.
-    const [width, height] = config.world.map;
-    only.canvas.style.maxWidth = `${Math.max(280, (innerHeight - 250) * width / height)}px`;
-    only.canvas.style.marginInline = "auto";
-    hands(only);
+    start_view.crop = [0, 0, ...world.map];
+    hands(start_view);
   }
-  show(only, start_scene(config), false);
-  if (!state.training) curves();
+  show(start_view, start_scene(config), false);
+}
+
+function describe_start() {
+  const { world } = state.config;
+  if (!start_view) return;
+  start_view.status.textContent = `${count(world.leaders.length, "leader")}, ${count(world.followers.length, "follower")}, ${count(world.pois.length, "POI")} · ${world.steps} steps`;
+  start_view.canvas.ariaLabel = `Map of the start: ${start_view.status.textContent}${start_view.chosen ? `; chosen: ${name_chosen(start_view.chosen)}` : ""}`;
 }
 
 const KINDS = { leaders: "leader", followers: "follower", pois: "POI" };
 const name_chosen = (/** @type {Chosen} */ [list, index]) => `${KINDS[list]} ${index} at ${state.config.world[list][index].map(number).join(", ")}`;
 
-/** Draws a ring around what is chosen in a view. @param {View} view */
-export function ring(view) {
-  if (!view.chosen) return;
-  const [list, index] = view.chosen, place = state.config.world[list][index];
-  if (!place) return;
-  const { X, Y } = stage.place_on(view.canvas, view.crop), pen = pen_of(view.canvas);
-  pen.strokeStyle = getComputedStyle(document.documentElement).getPropertyValue("--accent").trim();
-  pen.lineWidth = 2.5;
-  pen.beginPath(); pen.arc(X(place[0]), Y(place[1]), 17, 0, 2 * Math.PI); pen.stroke();
-}
-
-/** Returns everything on the map: its list, its index and its place. @type {(config: any) => [List, number, Place][]} */
-const items = ({ world }) => /** @type {List[]} */ (["leaders", "followers", "pois"]).flatMap(list => world[list].map((/** @type {Place} */ place, /** @type {number} */ index) => [list, index, place]));
+const LISTS = /** @type {List[]} */ (["leaders", "followers", "pois"]);
+/** Returns everything on the map: its list, its index and its place. @type {(config: Config) => [List, number, Place][]} */
+const items = ({ world }) => LISTS.flatMap(list => world[list].map((place, index) => /** @type {[List, number, Place]} */ ([list, index, place])));
 
 /** @param {View} view @param {Chosen | null} chosen */
 function choose(view, chosen) {
@@ -69,14 +50,15 @@ const tenth = (/** @type {number} */ value, /** @type {number} */ most) => Math.
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
 /** Lets the pointer and the keys move agents and POIs. @param {View} view */
-export function hands(view) {
+function hands(view) {
   if (view.canvas.classList.contains("hands")) return;
   view.canvas.classList.add("hands");
   view.canvas.tabIndex = 0;
   view.canvas.setAttribute("role", "application");
   /** @type {Chosen | null} */
   let held = null;
-  const place = (/** @type {PointerEvent} */ event) => {
+  /** @type {(event: PointerEvent) => Place} */
+  const place = event => {
     const { scale } = stage.place_on(view.canvas, view.crop), [width, height] = state.config.world.map;
     return [tenth(view.crop[0] + event.offsetX / scale, width), tenth(view.crop[3] - event.offsetY / scale, height)];
   };
@@ -134,9 +116,11 @@ export function add(list) {
   const { world } = state.config, [width, height] = world.map, [first] = state.views;
   const taken = items(state.config).map(([, , place]) => place);
   // Search for a free place, on a spiral from the middle of the map.
+  /** @type {Place} */
   let place = [width / 2, height / 2];
   for (let ring = 0; taken.some(([x, y]) => Math.hypot(x - place[0], y - place[1]) < 2) && ring < 200; ring++) {
-    place = [width / 2 + 1.5 * Math.sqrt(ring) * Math.cos(2.4 * ring), height / 2 + 1.5 * Math.sqrt(ring) * Math.sin(2.4 * ring)].map(at => Math.round(at * 10) / 10);
+    const away = 1.5 * Math.sqrt(ring), angle = 2.4 * ring;
+    place = [tenth(width / 2 + away * Math.cos(angle), width), tenth(height / 2 + away * Math.sin(angle), height)];
   }
   world[list].push(place);
   moved(list);

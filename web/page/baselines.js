@@ -1,13 +1,13 @@
-// @ts-check
 // Baselines without learning: the best constant action, and the best of as many random teams as training evaluates.
 import { curves } from "./curves.js";
+import { clerk } from "./pool.js";
 import { state } from "./state.js";
 
 /** Plays the constant actions of a training's arms. @param {Training} training */
 export async function constants(training) {
   for (const arm of training.arms) {
     if (state.training !== training) return;
-    arm.constant = (await state.clerk.ask({ ask: "constant", text: arm.toml })).words.g;
+    arm.constant = (await clerk.ask({ ask: "constant", text: arm.toml })).words.g;
     curves();
   }
 }
@@ -19,10 +19,10 @@ export async function constants(training) {
  */
 export async function randoms(training) {
   for (const arm of training.arms) {
-    await state.clerk.ask({ ask: "random", text: arm.toml });
+    await clerk.ask({ ask: "random", text: arm.toml });
     for (let done = false; !done;) {
       if (state.training !== training) return;
-      const { words } = await state.clerk.ask({ ask: "more_random", milliseconds: 60 });
+      const { words } = await clerk.ask({ ask: "more_random", milliseconds: 60 });
       arm.random = words.g;
       done = words.done;
       curves();

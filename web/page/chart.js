@@ -1,4 +1,3 @@
-// @ts-check
 // Draws learning curves: POIs observed by the best team, per arm the mean over trials, with each trial as a thin line.
 import { pen_of } from "./dom.js";
 

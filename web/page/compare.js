@@ -1,12 +1,11 @@
-// @ts-check
 // What a training compares: the values of one key of the config, each of which is an arm.
 
 /** @typedef {{ key: string, values: string[] }} Comparison */
 
-export const FITNESSES = ["G", "D", "Df", "D++", "Dt"];
+const FITNESSES = ["G", "D", "Df", "D++", "Dt"];
 const PARADIGMS = ["leader-follower", "all-leaders"];
 /** Most arms of one training. */
-export const MOST_ARMS = 6;
+const MOST_ARMS = 6;
 
 /**
  * Returns the comparison that a choice stands for: of paradigms, of fitnesses, or of populations a tenth and ten times as large.

@@ -1,10 +1,9 @@
-// @ts-check
 // Configs as text: the paper's layouts, and encoding for links.
 import { $ } from "./dom.js";
 
 export const configs = (() => {
   const LAYOUTS = ["generally_forward", "strictly_forward", "chaotic"];
-  const layout = (/** @type {string} */ name) => $(`layout-${name}`).textContent;
+  const layout = (/** @type {string} */ name) => $(`layout-${name}`).textContent ?? "";
 
   const positions = (/** @type {number[][]} */ list) => `[${list.map(([x, y]) => `[${decimal(x)}, ${decimal(y)}]`).join(", ")}]`;
   const decimal = (/** @type {number} */ value) => Number.isInteger(value) ? value.toFixed(1) : String(value);

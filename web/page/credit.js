@@ -1,8 +1,7 @@
-// @ts-check
 // Credit of each leader, and the episode without a leader: the POIs that go dark are its credit.
-import { $, count, make, number } from "./dom.js";
-import { state } from "./state.js";
-import { draw } from "./views.js";
+import { $, all, count, make, number } from "./dom.js";
+import { shown, state } from "./state.js";
+import { dark, draw, select } from "./views.js";
 
 // Most leaders in the table.
 const SHOWN = 32;
@@ -11,23 +10,23 @@ narrow.addEventListener("change", () => credits());
 
 // Shows the credits of the view that is chosen in the list.
 export function credits() {
-  const shown = state.views.filter(view => view.data && view.data.episodes[0].without && view.data.episodes[0].shown.length > 1);
-  $("credit").hidden = shown.length === 0 || state.mode !== "watch";
+  const views = shown().filter(({ data: { episodes: [episode] } }) => episode.without && episode.shown.length > 1);
+  $("credit").hidden = views.length === 0 || state.mode !== "watch";
   if ($("credit").hidden) return;
-  const picked = Math.min(Number($("credited").value) || 0, shown.length - 1), view = shown[picked];
-  const names = shown.map(view => view.title.textContent);
+  const picked = Math.min(Number($("credited").value) || 0, views.length - 1), view = views[picked];
+  const names = views.map(view => view.title.textContent);
   if ([...$("credited").options].map(option => option.textContent).join("\n") !== names.join("\n")) {
-    $("credited").replaceChildren(...names.map((name, index) => make("option", name, null, { value: String(index) })));
+    $("credited").replaceChildren(...names.map((name, index) => new Option(name ?? "", String(index))));
   }
   $("credited").value = String(picked);
-  $("credited").parentElement.hidden = shown.length === 1;
+  $("team").hidden = views.length === 1;
   table(view);
 }
 
-/** What the table was drawn of. @type {any[] | null} */
+/** What the table was drawn of. @type {unknown[] | null} */
 let drawn = null;
 
-/** @param {View} view */
+/** @param {Shown} view */
 function table(view) {
   const { data } = view, [episode] = data.episodes;
   // The table changes with the episode, but not with its steps.
@@ -35,16 +34,16 @@ function table(view) {
   if (before && key.every((part, index) => part === before[index])) return;
   drawn = key;
   const leaders = Array.from({ length: Math.min(episode.leaders, SHOWN) }, (_, leader) => leader);
-  const scores = [["D", episode.d], ["Df", episode.df], ["D++", episode.dpp], ["Dt", episode.dt]].filter(([, values]) => values && values.length);
+  const scores = Object.entries({ D: episode.d, Df: episode.df, "D++": episode.dpp, Dt: episode.dt }).flatMap(([name, values]) => values && values.length ? [{ name, values }] : []);
   /** A list per measure and action: its name, and then a cell per leader. @type {(string | HTMLElement)[][]} */
   const lists = [
     ["Leader", ...leaders.map(leader => sense_button(view, leader))],
-    ...scores.map(([name, values]) => [name === data.fitness ? `${name} (selects)` : name, ...leaders.map(leader => number(values[leader]))]),
+    ...scores.map(({ name, values }) => [name === data.fitness ? `${name} (fitness)` : name, ...leaders.map(leader => number(values[leader]))]),
     ["Remove it", ...leaders.map(leader => remove_button(view, { leader, group: false }))],
   ];
   if (episode.agents > episode.leaders) lists.push(["Remove it and its followers", ...leaders.map(leader => remove_button(view, { leader, group: true }))]);
-  const selects = 1 + scores.findIndex(([name]) => name === data.fitness);
-  const focused = document.activeElement && /** @type {HTMLElement} */ (document.activeElement).dataset.credit;
+  const selects = 1 + scores.findIndex(({ name }) => name === data.fitness);
+  const focused = document.activeElement instanceof HTMLElement && document.activeElement.dataset.credit;
   const body = make("table"), head = make("thead", "", body), rest = make("tbody", "", body);
   // Each list is a row. In a narrow window it is a column, because leaders are often more than measures.
   const [high, wide] = narrow.matches ? [leaders.length + 1, lists.length] : [lists.length, leaders.length + 1];
@@ -59,11 +58,11 @@ function table(view) {
   }
   $("credits").replaceChildren(body);
   if (episode.leaders > SHOWN) make("p", `and ${count(episode.leaders - SHOWN, "more leader")}`, $("credits"));
-  if (focused) [...$("credits").querySelectorAll("button")].find(button => button.dataset.credit === focused)?.focus();
+  if (focused) all("button", $("credits")).find(button => button.dataset.credit === focused)?.focus();
   $("lost").textContent = lost(view);
 }
 
-/** Makes the button that shows what a leader senses. @param {View} view @param {number} leader */
+/** Makes the button that shows what a leader senses. @param {Shown} view @param {number} leader */
 function sense_button(view, leader) {
   const colors = stage.palette(view.data), button = make("button", String(leader), null, { type: "button", title: "Show what it senses" });
   button.setAttribute("aria-label", `Leader ${leader}: show what it senses`);
@@ -74,7 +73,7 @@ function sense_button(view, leader) {
   return button;
 }
 
-/** Makes the button that removes a leader, or puts it back. @param {View} view @param {{ leader: number, group: boolean }} removal */
+/** Makes the button that removes a leader, or puts it back. @param {View} view @param {Removed} removal */
 function remove_button(view, { leader, group }) {
   const is = view.removed && view.removed.leader === leader && view.removed.group === group;
   const button = make("button", is ? "Put back" : "Remove", null, { type: "button" });
@@ -85,31 +84,17 @@ function remove_button(view, { leader, group }) {
   return button;
 }
 
-/** Removes a leader from a view's episode, or puts it back. @param {View} view @param {View["removed"]} removed */
+/** Removes a leader from a view's episode, or puts it back. @param {View} view @param {Removed | null} removed */
 export function remove_leader(view, removed) {
   view.removed = removed;
   draw(view);
   credits();
 }
 
-/** Selects the leader whose senses are shown. Selecting it again ends that. @param {View} view @param {number} leader */
-export function select(view, leader) {
-  view.selected = view.selected === leader ? null : leader;
-  draw(view);
-  credits();
-}
-
-/** Returns the POIs that only the removed agents' presence observed. @param {View} view */
-export function dark(view) {
-  if (!view.removed) return [];
-  const [episode] = view.data.episodes, without = episode.without[view.removed.leader][view.removed.group ? "group" : "alone"];
-  return episode.observed.flatMap((/** @type {number | null} */ at, /** @type {number} */ poi) => at !== null && without.observed[poi] === null ? [poi] : []);
-}
-
-/** Says what the removal costs. @param {View} view */
+/** Says what the removal costs. @param {Shown} view */
 function lost(view) {
-  if (!view.removed) return "Remove a leader: the POIs that go dark are its credit. D counts it alone, Df with the followers that it led.";
-  const { leader, group } = view.removed, gone = dark(view), pois = view.data.pois.length;
+  if (!view.removed) return "Remove a leader: the POIs that go dark are its credit. D removes the leader alone, Df the leader and its followers.";
+  const { leader, group } = view.removed, gone = dark(view.data, view.removed), pois = view.data.pois.length;
   const who = `Without leader ${leader}${group ? " and its followers" : ""}`;
   const which = gone.length ? `POI${gone.length > 1 ? "s" : ""} ${gone.join(", ")} ${gone.length > 1 ? "go" : "goes"} dark` : "no POI goes dark";
   return `${who}, ${which}: its ${group ? view.data.fitness === "Dt" ? "Dt" : "Df" : "D"} is ${gone.length} of ${pois}, ${number(gone.length / pois)}.`;

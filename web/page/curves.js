@@ -1,8 +1,7 @@
-// @ts-check
 // The learning curves below the map.
 import { chart } from "./chart.js";
 import { $, make } from "./dom.js";
-import { told } from "./machine.js";
+import { show_machine } from "./machine.js";
 import { TONES, state } from "./state.js";
 
 /** The chart, once it is drawn. @type {ReturnType<typeof chart.paint> | null} */
@@ -42,7 +41,7 @@ export function curves() {
   make("span", `${many} observed by the best team, mean over trials${arms.some(arm => arm.band) ? " with its 95 % interval" : ""}; thin: each trial${arms.some(arm => arm.constant !== null) ? "; dotted: the best constant action, and the best of as many random teams" : ""}`, $("legend"));
   $("curves").setAttribute("aria-label", `Learning curves, best team, mean over trials: ${words.join("; ") || "nothing trained yet"}`);
   $("needless").textContent = needless(training);
-  if (training) told();
+  if (training) show_machine();
 }
 
 /** Says if a constant action observes as much as what was trained, because then nothing had to be learned. @param {Training | null} training */

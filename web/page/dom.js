@@ -1,26 +1,46 @@
-// @ts-check
 // Elements of the page, and short helpers.
 
-/** @type {(id: string) => any} */
-export const $ = id => document.getElementById(id);
-/** Makes an element, in a parent if given. @type {(name: string, text?: string, parent?: Element | null, more?: Record<string, any>) => any} */
-export const make = (name, text = "", parent = null, more = {}) => {
+/** Returns the element with an id. @template {keyof Elements} K @param {K} id */
+export const $ = id => /** @type {Elements[K]} */ (/** @type {unknown} */ (document.getElementById(id)));
+/**
+ * Makes an element, in a parent if given.
+ * @template {keyof HTMLElementTagNameMap} K
+ * @param {K} name @param {string} [text] @param {Element | null} [parent] @param {Partial<HTMLElementTagNameMap[K]>} [more]
+ */
+export function make(name, text = "", parent = null, more = {}) {
   const element = Object.assign(document.createElement(name), more);
   if (text !== "") element.textContent = text;
   if (parent) parent.append(element);
   return element;
-};
-/** @type {(selector: string, within?: ParentNode) => any} */
-export const find = (selector, within = document) => within.querySelector(selector);
-/** @type {(selector: string) => any[]} */
-export const all = selector => [...document.querySelectorAll(selector)];
-/** Returns what draws on a canvas. @param {HTMLCanvasElement} canvas */
-export const pen_of = canvas => /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
+}
+/** Returns all elements that a selector matches. @type {(selector: string, within?: ParentNode) => HTMLElement[]} */
+export const all = (selector, within = document) => [...within.querySelectorAll(selector)].filter(element => element instanceof HTMLElement);
+/** Returns an option of a list. @param {HTMLSelectElement} list @param {string} value */
+export const option = (list, value) => [...list.options].find(({ value: own }) => own === value) ?? new Option();
+/** Returns what draws on a canvas. @param {HTMLCanvasElement} canvas @param {CanvasRenderingContext2DSettings} [settings] */
+export const pen_of = (canvas, settings) => /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d", settings));
 export const still = matchMedia("(prefers-reduced-motion: reduce)");
 /** @param {number} value */
 export const number = value => String(Number(value.toFixed(3)));
 /** @param {number} many @param {string} what */
 export const count = (many, what) => `${many} ${what}${many === 1 ? "" : "s"}`;
+/** Why a worker did not answer: problems of the config, or the worker is lost (`fatal`) or was stopped. */
+export class Failure extends Error {
+  /** @param {string} message @param {{ problems?: Problem[], fatal?: boolean, stopped?: boolean }} [more] */
+  constructor(message, { problems = [], fatal = false, stopped = false } = {}) {
+    super(message);
+    this.problems = problems;
+    this.fatal = fatal;
+    this.stopped = stopped;
+  }
+}
+/** Returns what was thrown as a failure. @param {unknown} thrown */
+export const failure = thrown => thrown instanceof Failure ? thrown : new Failure(thrown instanceof Error ? thrown.message : String(thrown));
+
+/** Writes a text if it differs. Even the same text would cost a layout. @param {HTMLElement} element @param {string} text */
+export function write_text(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
 
 /** Shows an error, or none. @param {string} message */
 export function trouble(message) {
@@ -34,13 +54,13 @@ export function save(name, content, type) {
   link.click();
   link.remove();
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
-  $("said").textContent = `${name} is saved.`;
+  $("message").textContent = `${name} is saved.`;
 }
 
-/** Copies a text, and then says so. @param {string} text @param {string} said */
-export async function copy(text, said) {
+/** Copies a text, and reports it. @param {string} text @param {string} message */
+export async function copy(text, message) {
   try {
     await navigator.clipboard.writeText(text);
-    $("said").textContent = said;
-  } catch { $("said").textContent = `This browser does not let a page copy. Here it is: ${text}`; }
+    $("message").textContent = message;
+  } catch { $("message").textContent = `This browser does not let a page copy. Here it is: ${text}`; }
 }

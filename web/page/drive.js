@@ -1,34 +1,28 @@
-// @ts-check
 // Steering a leader.
-import { $, count, find, make, number, trouble } from "./dom.js";
+import { $, count, failure, make, number, trouble } from "./dom.js";
 import { edited } from "./experiment.js";
+import { clerk } from "./pool.js";
 import { reach, start_scene } from "./scene.js";
 import { state } from "./state.js";
-import { clear, draw, show, view } from "./views.js";
+import { draw, only_view, show } from "./views.js";
 
-/** What steers. `turn` identifies the drive in progress. @type {{ on: boolean, timer: number, pointer: number[] | null, keys: Set<string>, turn: object | null }} */
+/** What steers. `turn` identifies the drive in progress. @type {{ on: boolean, timer: number, pointer: Place | null, keys: Set<string>, turn: object | null }} */
 const drive = { on: false, timer: 0, pointer: null, keys: new Set(), turn: null };
 
 export function options() {
-  if (!state.config) return;
   const many = state.config.world.leaders.length, chosen = $("leader").value;
   $("leader").replaceChildren(...Array.from({ length: many }, (_, leader) => make("option", String(leader))));
   if (Number(chosen) < many && chosen !== "") $("leader").value = chosen;
 }
 
 export function drive_view() {
-  clear();
-  const only = view("leader-follower");
-  $("views").classList.add("one");
-  only.title.textContent = "In your hands";
-  find(".key", only.card).hidden = true;
-  only.crop = reach(state.config);
+  const only = only_view("In your hands", reach(state.config));
   only.canvas.classList.add("steer");
   only.canvas.tabIndex = 0;
   only.canvas.setAttribute("role", "application");
-  only.tell = (step, observed, said) => {
-    only.said.textContent = `step ${step} of ${state.config.world.steps} · ${observed} of ${state.config.world.pois.length} POIs`;
-    only.canvas.setAttribute("aria-label", `You steer leader ${$("leader").value}: step ${step}, ${said}`);
+  only.describe = (step, observed, text) => {
+    only.status.textContent = `step ${step} of ${state.config.world.steps} · ${observed} of ${state.config.world.pois.length} POIs`;
+    only.canvas.ariaLabel = `You steer leader ${$("leader").value}: step ${step}, ${text}`;
   };
   show(only, start_scene(state.config), false);
   only.chosen = ["leaders", Number($("leader").value) || 0];
@@ -76,21 +70,21 @@ export async function drive_on() {
   only.chosen = null;
   drive.on = true;
   $("again").textContent = "Start over";
-  const player = state.clerk, toml = await edited(state.toml ?? "", [["learning.paradigm", '"leader-follower"']]);
+  const toml = await edited(state.toml ?? "", [["learning.paradigm", '"leader-follower"']]);
   const { each, weights } = state.policies || { each: 0 };
-  /** @type {any} */
-  let told;
+  /** @type {Driven} */
+  let now;
   try {
-    told = (await player.ask({ ask: "drive", text: toml, leader, policies: each }, weights)).words;
-    $("driven").textContent = told.learned ? "The other leaders do what they learned." : state.policies ? "The other leaders go straight ahead: what was learned is not for these teams." : "The other leaders go straight ahead: train first, and they do what they learned.";
-  } catch (/** @type {any} */ error) {
+    now = (await clerk.ask({ ask: "drive", text: toml, leader, policies: each }, weights)).words;
+    $("driven").textContent = now.learned ? "The other leaders do what they learned." : state.policies ? "The other leaders go straight ahead: what was learned is not for these teams." : "The other leaders go straight ahead: train first, and they do what they learned.";
+  } catch (thrown) {
     drive_off();
-    return trouble(error.message);
+    return trouble(failure(thrown).message);
   }
   const data = start_scene(state.config), [episode] = data.episodes;
   /** @type {Record<"positions" | "headings" | "near", number[]>} */
   const track = { positions: [], headings: [], near: [] };
-  const take = (/** @type {any} */ words) => {
+  const take = (/** @type {Driven} */ words) => {
     track.positions.push(...words.positions);
     track.headings.push(...words.headings);
     track.near.push(...words.near);
@@ -99,23 +93,23 @@ export async function drive_on() {
       shown: Array.from({ length: words.step + 1 }, (_, step) => step), observed: words.observed,
     });
   };
-  take(told);
+  take(now);
   show(only, data, false);
   const turn = drive.turn = {};
   const pace = Math.max(60, data.dt * 1000 * 0.75);
   const step = async () => {
     if (drive.turn !== turn || state.mode !== "drive") return;
-    const from = performance.now(), wanted = wish(told.positions, told.headings, leader);
+    const from = performance.now(), wanted = wish(now.positions, now.headings, leader);
     if (!wanted) return void (drive.timer = setTimeout(step, 30));
     const [angle, speed] = wanted;
-    try { told = (await player.ask({ ask: "step", turn: angle, speed })).words; } catch (/** @type {any} */ error) { return trouble(error.message); }
+    try { now = (await clerk.ask({ ask: "step", turn: angle, speed })).words; } catch (thrown) { return trouble(failure(thrown).message); }
     if (drive.turn !== turn) return;
-    take(told);
-    Object.assign(only, { place: told.step });
+    take(now);
+    Object.assign(only, { place: now.step });
     draw(only);
-    if (told.scores) {
+    if (now.scores) {
       drive_off();
-      const { g, d, df } = told.scores, pois = state.config.world.pois.length;
+      const { g, d, df } = now.scores, pois = state.config.world.pois.length;
       $("driven").textContent = `The team observed ${Math.round(g * pois)} of ${count(pois, "POI")} (G = ${number(g)}). Yours: D = ${number(d[leader])}, Df = ${number(df[leader])}.`;
       return;
     }

@@ -1,15 +1,9 @@
-// @ts-check
 // The experiment: its text, its controls, and its editor.
-import { remember } from "./address.js";
-import { show_start } from "./arrange.js";
 import { choice_of, slug } from "./compare.js";
 import { configs } from "./config.js";
-import { curves } from "./curves.js";
-import { $, count, find, make, trouble } from "./dom.js";
-import { options } from "./drive.js";
-import { mode } from "./modes.js";
-import { state } from "./state.js";
-import { forget } from "./train.js";
+import { $, all, count, failure, make, option, trouble } from "./dom.js";
+import { clerk } from "./pool.js";
+import { after, state } from "./state.js";
 
 let newest = 0;
 /** Makes a text the config. If it is invalid, shows its problems and returns false. @param {string} text */
@@ -19,24 +13,25 @@ export async function take(text, { edited = false, address = true, views = true 
   if (!edited) $("text").value = text;
   let resolved;
   try {
-    resolved = (await state.clerk.ask({ ask: "resolve", text, name: "config.toml", changes: [] })).words;
-  } catch (/** @type {any} */ error) {
-    if (turn === newest) { mark(error.problems, error.message); $("train").disabled = true; state.valid = false; }
+    resolved = (await clerk.ask({ ask: "resolve", text, name: "config.toml", changes: [] })).words;
+  } catch (thrown) {
+    const { problems, message } = failure(thrown);
+    if (turn === newest) { mark(problems, message); $("train").disabled = true; state.valid = false; }
     return false;
   }
   if (turn !== newest) return false;
   mark([]);
   Object.assign(state, { config: resolved.config, toml: resolved.toml, pois: resolved.pois, start: resolved.start, valid: true });
   $("train").disabled = false;
-  fill(views);
-  if (address) remember();
+  fill();
+  after.config({ views, address });
   stale();
   return true;
 }
 
 /** Keys of the config and their new values as TOML. @typedef {[string, string][]} Changes */
 
-/** @type {Promise<any>} */
+/** @type {Promise<unknown>} */
 let changing = Promise.resolve();
 /** Sets keys of the config, and keeps its comments if possible. Changes run one after the other. @param {Changes} changes */
 export const change = changes => (changing = changing.catch(() => {}).then(() => change_now(changes)));
@@ -51,31 +46,19 @@ async function change_now(changes) {
  * @param {string} text @param {Changes} changes
  */
 export async function edited(text, changes) {
-  try { return (await state.clerk.ask({ ask: "edit", text, changes })).words.text; } catch { return text; }
-}
-
-/**
- * Replaces the experiment: a text, and what is compared. Results of the former one are discarded.
- * @param {string} text @param {Comparison | null} compared
- */
-export async function settings(text, compared) {
-  keep();
-  forget();
-  Object.assign(state, { file: null, compared });
-  mode("watch");
-  return take(text);
+  try { return (await clerk.ask({ ask: "edit", text, changes })).words.text; } catch { return text; }
 }
 
 /** Compares other values, or nothing. @param {Comparison | null} compared */
 export function compare(compared) {
   keep();
   state.compared = compared;
-  fill(false);
-  remember();
+  fill();
+  after.config({ views: false, address: true });
   stale();
 }
 
-/** Returns whether an earlier experiment is the present one. @param {(typeof state.past)[0] | undefined} past */
+/** Returns whether an earlier experiment is the present one. @param {Past | undefined} past */
 const is_now = past => past && past.text === state.text && JSON.stringify(past.compared) === JSON.stringify(state.compared);
 
 // Saves the current experiment for undo.
@@ -118,38 +101,36 @@ export async function entered() {
 }
 
 // Sets the controls to the values of the config.
-export function fill(views = true) {
+export function fill() {
   const { learning, world } = state.config;
-  for (const id of ["seed", "generations", "trials", "population"]) $(id).value = learning[id];
+  for (const id of /** @type {const} */ (["seed", "generations", "trials", "population"])) $(id).value = String(learning[id]);
   $("fitness").value = learning.fitness;
-  const each = Array.isArray(world.coupling);
-  $("coupling").value = each ? "" : world.coupling;
+  const each = typeof world.coupling !== "number";
+  $("coupling").value = each ? "" : String(world.coupling);
   $("coupling").placeholder = each ? "each" : "";
-  const choice = choice_of(state.compared, learning.population), own = find("[value=own]", $("compare"));
+  const choice = choice_of(state.compared, learning.population), own = option($("compare"), "own");
   own.hidden = choice !== "own";
   own.textContent = state.compared && choice === "own" ? `${state.compared.key.split(".")[1].replaceAll("_", " ")} ${state.compared.values.join(", ")}` : "";
   $("compare").value = choice;
   $("paradigm").value = learning.paradigm;
   const layout = configs.LAYOUTS.find(name => same_world(name));
-  $("layout").querySelector("[value=own]").hidden = Boolean(layout);
+  option($("layout"), "own").hidden = Boolean(layout);
   $("layout").value = layout || "own";
-  if (views && (!state.training || state.mode === "arrange")) show_start();
-  else curves();
-  options();
 }
 
 // Returns whether a config differs from a layout at most in keys that have a command-line flag.
 const same_world = (/** @type {string} */ name) => rest_of(state.config) === rest_of(state.layouts[name]);
-const rest_of = (/** @type {any} */ config) => {
+const rest_of = (/** @type {Config | undefined} */ config) => {
+  if (!config) return "";
   const { paradigm, fitness, seed, trials, generations, population, ...learning } = config.learning;
   return JSON.stringify({ ...config, learning });
 };
 
-/** @param {{ line?: number, key?: string, message: string }[]} problems */
+/** @param {Problem[]} problems */
 function mark(problems, message = "") {
   $("marks").replaceChildren();
   $("problems").replaceChildren();
-  $("text").setAttribute("aria-invalid", problems.length > 0);
+  $("text").ariaInvalid = String(problems.length > 0);
   for (const { line, key, message } of problems) {
     const item = make("li", "", $("problems")), words = `${key ? key + ": " : ""}${message}`;
     const button = make("button", line ? `Line ${line}: ${words}` : words, item, { type: "button" });
@@ -178,19 +159,19 @@ export function lines() {
   const many = $("text").value.split("\n").length;
   $("lines").textContent = Array.from({ length: many }, (_, line) => line + 1).join("\n");
   $("lines").scrollTop = $("text").scrollTop;
-  for (const place of $("marks").children) place.style.top = `${8 + (place.dataset.line - 1) * 20 - $("text").scrollTop}px`;
+  for (const place of all(".mark")) place.style.top = `${8 + (Number(place.dataset.line) - 1) * 20 - $("text").scrollTop}px`;
 }
 
 export const name_of = () => state.file || ($("layout").value === "own" ? "config" : $("layout").value);
 
-/** Returns the command that gives the same results. @param {any} config @param {Changes} given */
+/** Returns the command that gives the same results. @param {Config} config @param {Changes} given */
 export function command({ learning }, given = []) {
   const layout = $("layout").value, flagged = ["fitness", "seed", "generations", "trials", "population"];
   const written = (/** @type {Changes[0]} */ [key, value]) => flagged.includes(key.split(".")[1]) ? ` --${key.split(".")[1]} ${value}` : ` --set ${key}=${value}`;
   const extra = given.filter(([key]) => layout === "own" || !flagged.includes(key.split(".")[1])).map(written).join("");
   if (layout === "own") return `flotilla train ${slug(name_of())}.toml --paradigm ${learning.paradigm}${extra}`;
-  const flags = ["paradigm", "fitness", "seed"].map(key => `--${key} ${learning[key]}`);
+  const flags = /** @type {const} */ (["paradigm", "fitness", "seed"]).map(key => `--${key} ${learning[key]}`);
   const base = state.layouts[layout].learning;
-  for (const key of ["generations", "trials", "population"]) if (base[key] !== learning[key]) flags.push(`--${key} ${learning[key]}`);
+  for (const key of /** @type {const} */ (["generations", "trials", "population"])) if (base[key] !== learning[key]) flags.push(`--${key} ${learning[key]}`);
   return `flotilla train configs/${layout}.toml ${flags.join(" ")}${extra}`;
 }

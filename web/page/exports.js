@@ -1,17 +1,16 @@
-// @ts-check
 // Pictures, films and tables of what is on show.
 import { slug } from "./compare.js";
-import { $, save, trouble } from "./dom.js";
+import { $, failure, pen_of, save, trouble } from "./dom.js";
 import { name_of } from "./experiment.js";
-import { state } from "./state.js";
+import { clerk } from "./pool.js";
+import { shown, state } from "./state.js";
 import { csv } from "./table.js";
-import { draw } from "./views.js";
+import { draw, end_of, moving } from "./views.js";
 
 // Most frames of a film, and its width in pixels per view.
 const FRAMES = 80, WIDTH = 420;
 
-const readable = (/** @type {HTMLCanvasElement} */ canvas) => /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d", { willReadFrequently: true }));
-const shown = () => state.views.filter(view => view.data);
+const readable = (/** @type {HTMLCanvasElement} */ canvas) => pen_of(canvas, { willReadFrequently: true });
 
 // Draws all views side by side, each with its title and state, onto a canvas.
 /** @param {HTMLCanvasElement} canvas @param {number} wide */
@@ -26,9 +25,9 @@ function compose(canvas, wide) {
     const left = index * wide;
     pen.fillStyle = style.getPropertyValue("--ink").trim();
     pen.font = `600 ${Math.round(wide / 28)}px system-ui, sans-serif`;
-    pen.fillText(view.title.textContent, left + 6, 20, wide - 12);
+    pen.fillText(view.title.textContent ?? "", left + 6, 20, wide - 12);
     pen.font = `${Math.round(wide / 32)}px system-ui, sans-serif`;
-    pen.fillText(view.said.textContent, left + 6, 40, wide - 12);
+    pen.fillText(view.status.textContent ?? "", left + 6, 40, wide - 12);
     pen.drawImage(view.canvas, left, 50, wide, wide * view.canvas.height / view.canvas.width);
   });
 }
@@ -49,11 +48,10 @@ export async function save_png() {
 async function film(canvas, each) {
   const views = shown(), before = views.map(({ place, playing }) => ({ place, playing }));
   views.forEach(view => { view.playing = false; });
-  const last = Math.max(...views.map(view => view.data.episodes[0].shown.length - 1)), many = Math.max(1, Math.min(FRAMES, 2 * last));
+  const last = Math.max(...views.map(end_of)), many = Math.max(1, Math.min(FRAMES, 2 * last));
   for (let frame = 0; frame <= many; frame++) {
     for (const view of views) {
-      const end = view.data.episodes[0].shown.length - 1;
-      view.place = Math.min(end, frame / many * last);
+      view.place = Math.min(end_of(view), frame / many * last);
       draw(view);
     }
     compose(canvas, WIDTH);
@@ -72,27 +70,27 @@ const pause_of = (/** @type {number} */ many) => {
 let busy = false;
 /** @param {() => Promise<void>} act */
 async function one_at_a_time(act) {
-  if (busy || !shown().some(view => view.data.episodes[0].shown.length > 1)) return;
+  if (busy || !moving().length) return;
   busy = true;
-  try { await act(); } catch (/** @type {any} */ error) { trouble(`The film could not be made: ${error.message}`); } finally { busy = false; }
+  try { await act(); } catch (thrown) { trouble(`The film could not be made: ${failure(thrown).message}`); } finally { busy = false; }
 }
 
 export const save_gif = () => one_at_a_time(async () => {
-  $("said").textContent = "Making the GIF…";
-  const canvas = document.createElement("canvas"), pictures = /** @type {Uint8Array[]} */ ([]);
+  $("message").textContent = "Making the GIF…";
+  const canvas = document.createElement("canvas"), pictures = /** @type {Bytes[]} */ ([]);
   let many = 1;
   await film(canvas, async (_, frames) => {
     many = frames;
     pictures.push(new Uint8Array(readable(canvas).getImageData(0, 0, canvas.width, canvas.height).data.buffer));
   });
   const delay = Math.round(100 * pause_of(many));
-  const { bytes } = await state.clerk.ask({ ask: "gif", width: canvas.width, height: canvas.height, delay }, pictures, {}, pictures.map(picture => picture.buffer));
+  const { bytes } = await clerk.ask({ ask: "gif", width: canvas.width, height: canvas.height, delay }, pictures, pictures.map(picture => picture.buffer));
   save(`${base()}.gif`, bytes, "image/gif");
 });
 
 export const save_webm = () => one_at_a_time(async () => {
   if (typeof MediaRecorder !== "function") throw new Error("this browser cannot record a canvas");
-  $("said").textContent = "Recording the film…";
+  $("message").textContent = "Recording the film…";
   const canvas = document.createElement("canvas");
   compose(canvas, WIDTH);
   const recorder = new MediaRecorder(canvas.captureStream(25), { mimeType: "video/webm" }), parts = /** @type {Blob[]} */ ([]);
@@ -108,5 +106,5 @@ export const save_webm = () => one_at_a_time(async () => {
 
 export function save_csv() {
   if (state.training) save(`${slug(name_of())}-curves.csv`, csv(state.training.arms), "text/csv");
-  else $("said").textContent = "There are no curves yet. Train first.";
+  else $("message").textContent = "There are no curves yet. Train first.";
 }

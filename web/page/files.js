@@ -1,18 +1,17 @@
-// @ts-check
 // Files that are dropped or opened.
 import { show_start } from "./arrange.js";
-import { curves } from "./curves.js";
-import { $, count, trouble } from "./dom.js";
+import { $, count, failure, trouble } from "./dom.js";
 import { keep, take } from "./experiment.js";
 import { leave_guide } from "./guide.js";
 import { settle } from "./machine.js";
 import { mode } from "./modes.js";
 import { intervals } from "./intervals.js";
+import { clerk } from "./pool.js";
 import { reach } from "./scene.js";
 import { TONES, state } from "./state.js";
 import { digests, forget } from "./train.js";
 import { Training } from "./training.js";
-import { build, clear, controls, following, seek, show, unpack, view } from "./views.js";
+import { build, controls, following, only_view, seek, show } from "./views.js";
 
 /** Most runs that are opened together: each has a colour. */
 const MOST_RUNS = TONES.length;
@@ -22,7 +21,7 @@ const MOST_RUNS = TONES.length;
 /** Opens files: several runs as arms of one chart, or a single file of any kind. @param {File[]} files */
 export async function take_files(files) {
   trouble("");
-  $("said").textContent = "";
+  $("message").textContent = "";
   let now = files[0];
   try {
     /** @type {Read[]} */
@@ -30,17 +29,18 @@ export async function take_files(files) {
     for (const file of files) {
       now = file;
       const bytes = new Uint8Array(await file.arrayBuffer()), is_run = /\.zip$/i.test(file.name) || bytes[0] === 0x50 && bytes[1] === 0x4b;
-      if (files.length > 1 && !is_run) throw new Error("it is no run (.zip); only runs can be opened together");
+      if (files.length > 1 && !is_run) throw new Error("not a run (.zip); only runs can be opened together");
       if (files.length > MOST_RUNS) throw new Error(`these are ${files.length} files; open ${MOST_RUNS} runs at most together`);
       read.push({ file, bytes });
       if (is_run && read.length === files.length) return await take_runs(read, file => { now = file; });
     }
     if (read.length) await take_other(read[0]);
-  } catch (/** @type {any} */ error) { trouble(`${now.name}: ${error.message}`); }
+  } catch (thrown) { trouble(`${now.name}: ${failure(thrown).message}`); }
 }
 
 /** Opens runs as arms of one chart. @param {Read[]} read @param {(file: File) => void} reading */
 async function take_runs(read, reading) {
+  /** @type {Opened[]} */
   const found = [];
   for (const { file, bytes } of read) {
     reading(file);
@@ -48,7 +48,7 @@ async function take_runs(read, reading) {
     found.push({ name: file.name, label: words.config.learning.paradigm, words, bytes: numbers });
   }
   if (found.length > 1) {
-    const { words } = await state.clerk.ask({ ask: "labels", texts: found.map(({ words }) => words.toml), names: found.map(({ name }) => name) });
+    const { words } = await clerk.ask({ ask: "labels", texts: found.map(({ words }) => words.toml), names: found.map(({ name }) => name) });
     found.forEach((run, index) => { run.label = words.labels[index]; });
   }
   await settle();
@@ -64,35 +64,30 @@ async function take_runs(read, reading) {
   await take(words.toml);
   build(training);
   controls();
-  curves();
   digests();
   seek(training.last);
   await intervals(training);
-  $("said").textContent = found.length > 1 ? `${found.length} runs are compared. Each is whole: its digest is right. The settings are those of ${found[0].name}.` : `${found[0].name}: the run is whole, its digest is right.`;
+  $("message").textContent = found.length > 1 ? `${found.length} runs are compared. Each is whole: its digest is right. The settings are those of ${found[0].name}.` : `${found[0].name}: the run is whole, its digest is right.`;
 }
 
 /** Opens policies or a config. @param {Read} read */
 async function take_other({ file, bytes }) {
   if (/\.safetensors$/i.test(file.name)) {
-    const { words, bytes: weights } = await state.clerk.ask({ ask: "read", text: state.toml }, bytes);
+    const { words, bytes: weights } = await clerk.ask({ ask: "read", text: state.toml }, bytes);
     forget();
     leave_guide();
     state.policies = { each: words.policies, weights };
-    const { words: data } = await state.clerk.ask({ ask: "play", text: state.toml, policies: words.policies }, weights);
+    const data = stage.unpack((await clerk.ask({ ask: "play", text: state.toml, policies: words.policies }, weights)).words);
     mode("watch");
-    clear();
-    const only = view(state.config.learning.paradigm);
-    only.crop = reach(state.config);
-    only.title.textContent = `The champion of ${file.name}`;
-    only.tell = (step, observed) => {
-      only.said.textContent = `${observed} of ${data.pois.length} POIs by step ${step}`;
-      only.canvas.setAttribute("aria-label", `${only.title.textContent}, step ${step}: ${only.said.textContent}`);
+    const only = only_view(`The champion of ${file.name}`, reach(state.config));
+    only.describe = (step, observed) => {
+      only.status.textContent = `${observed} of ${data.pois.length} POIs by step ${step}`;
+      only.canvas.ariaLabel = `${only.title.textContent}, step ${step}: ${only.status.textContent}`;
     };
-    $("views").classList.add("one");
-    show(only, unpack(data));
-    $("said").textContent = `${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} a leader. Take a leader to play with them.`;
+    show(only, data);
+    $("message").textContent = `${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} a leader. Take a leader to play with them.`;
   } else {
-    if (!/\.toml$/i.test(file.name)) throw new Error("it is no config (.toml), no run (.zip) and no policies (.safetensors)");
+    if (!/\.toml$/i.test(file.name)) throw new Error("not a config (.toml), a run (.zip) or policies (.safetensors)");
     const text = new TextDecoder("utf-8", { fatal: true }).decode(bytes);
     keep();
     state.file = file.name.replace(/\.toml$/i, "");
@@ -102,6 +97,6 @@ async function take_other({ file, bytes }) {
     mode("watch");
     show_start();
     const taken = await take(text);
-    $("said").textContent = taken ? `${file.name} is the config now.` : `${file.name} has problems; they stand beside its lines.`;
+    $("message").textContent = taken ? `${file.name} is the config now.` : `${file.name} has problems; they are shown beside its lines.`;
   }
 }

@@ -1,46 +1,52 @@
-// @ts-check
 // Experiments to start from. Each has a config in web/gallery and what it compares.
 import { $, make } from "./dom.js";
-import { settings } from "./experiment.js";
-import { train } from "./train.js";
+import { keep, take } from "./experiment.js";
+import { mode } from "./modes.js";
+import { state } from "./state.js";
+import { forget, train } from "./train.js";
 
-/** @typedef {{ name: string, title: string, says: string, compare: import("./compare.js").Comparison }} Exhibit */
+/** @typedef {{ name: string, title: string, says: string, compare: Comparison }} Exhibit */
 
 /** @type {Exhibit[]} */
-export const GALLERY = [
+const GALLERY = [
   {
     name: "two_groups", title: "Two groups must meet", compare: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] },
-    says: "Six agents at one POI at once. With followers, teams learn it; where all twelve agents learn, nobody does.",
+    says: "Six agents must be at one POI at once. Leader-follower teams learn it; teams in which all twelve agents learn do not.",
   },
   {
     name: "population", title: "Few policies or many", compare: { key: "learning.population", values: ["50", "500", "2500"] },
-    says: "All six agents learn. With 50 policies each they hardly observe anything; with 2500, nearly everything.",
+    says: "All six agents learn. With 50 policies each they observe hardly anything; with 2500, nearly everything.",
   },
   {
     name: "blind", title: "Blind leaders", compare: { key: "learning.start_jitter", values: ["0.0", "2.0", "4.0"] },
-    says: "Leaders that sense no POI learn the way by heart. Scatter the starts, and they lose half of the POIs.",
+    says: "Leaders that sense no POI learn the way by heart. If the starts are scattered, they lose half of the POIs.",
   },
   {
     name: "eight_followers", title: "Eight followers per leader", compare: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] },
-    says: "Two policies steer eighteen agents. Eighteen policies hardly can.",
+    says: "Two policies are enough to steer eighteen agents. Eighteen policies, one per agent, hardly learn it.",
   },
   {
     name: "relay", title: "A relay", compare: { key: "learning.fitness", values: ["D", "Df", "Dt"] },
-    says: "A leader has to hand its followers over. Only followers count, so D, which removes a leader alone, sees no credit.",
+    says: "A leader has to hand its followers over to another. Only followers count at POIs, so D, which removes a leader alone, is always 0.",
   },
   {
     name: "places", title: "POIs that move", compare: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] },
-    says: "POIs lie elsewhere in every generation: no way can be learned by heart, and teams of both kinds learn to sense.",
+    says: "POIs are elsewhere in every generation. No way can be learned by heart, and teams of both kinds learn to sense.",
   },
 ];
 
-/** Returns the config of an experiment. @param {string} name @returns {string} */
-export const text_of = name => $(`gallery-${name}`).textContent;
+/** Returns the config of an experiment. @param {string} name */
+export const text_of = name => $(`gallery-${name}`).textContent ?? "";
 
-/** Opens an experiment of the gallery, and trains it if asked. @param {string} name */
+/** Replaces the experiment by one of the gallery, and trains it if asked. @param {string} name */
 export async function exhibit(name, { trains = false } = {}) {
   const found = GALLERY.find(exhibit => exhibit.name === name);
-  if (found && await settings(text_of(name), found.compare) && trains) await train();
+  if (!found) return;
+  keep();
+  forget();
+  Object.assign(state, { file: null, compared: found.compare });
+  mode("watch");
+  if (await take(text_of(name)) && trains) await train();
 }
 
 export function gallery() {

@@ -1,33 +1,159 @@
-// What the build puts before the modules: src/report/stage.js, which every page that shows episodes shares.
-declare const stage: any;
-interface Window { page: any }
-// Browsers that can suspend WebAssembly have these.
-declare namespace WebAssembly { const Suspending: any, promising: any }
-interface Navigator { gpu: any }
+// Types that several modules use: what the worker sends, what the page is made of, and what stage.js draws.
 
-// Types that several modules use. `any` is what the module sends: configs and episodes.
+interface Window { page: object }
+// Browsers that can suspend WebAssembly have this.
+declare namespace WebAssembly { const Suspending: Function | undefined }
+
 type Training = import("./training.js").Training;
-type View = import("./state.js").View;
 type Comparison = import("./compare.js").Comparison;
 type Player = Awaited<ReturnType<typeof import("./pool.js").pool.open>>;
 type Bytes = Uint8Array<ArrayBuffer>;
+type Place = [number, number];
+/** A part of the map: left, below, right and above. */
+type Crop = [number, number, number, number];
 /** Lists of the config that hold what lies on the map, and an index into one. */
 type List = "leaders" | "followers" | "pois";
 type Chosen = [List, number];
-type Place = [number, number];
+type Kind = "leader-follower" | "all-leaders";
+
+/** The keys of a config that the page reads. The seed is text, because numbers cannot represent every seed. */
+interface Config {
+  world: Record<List, Place[]> & Rule & { map: Place, coupling: number | number[], observation_radius: number, steps: number, dt: number };
+  motion: { max_speed: number };
+  follow: { attraction_radius: number };
+  learning: {
+    paradigm: Kind, fitness: string, seed: string, generations: number, trials: number, population: number, partners?: number,
+    episodes_per_team: number,
+  };
+}
+/** Which agents count at POIs, when, and after which others. */
+interface Rule { observers: "all" | "leaders" | "followers", windows: Place[], after: number[][] }
+interface Start { owner: number[], coupling: number[], headings: number[] }
+interface Described { toml: string, config: Config, pois: number | null, parameters: number, start: Start }
+interface Palettes { light: string[], dark: string[] }
+
+/** At which steps POIs were observed, and how many agents were near them, `[shown][pois]`. */
+interface Seen { observed: (number | null)[], near: Uint16Array }
+/** An episode. Starts and steered episodes have no scores. Very long ones have neither `senses` nor `without`. */
+interface Episode extends Seen {
+  leaders: number, agents: number, coupling: number[], shown: number[], g: number, generation: number, trial: number, owner: number[],
+  led: Uint32Array, positions: Float32Array, headings: Float32Array, best_g?: number, d?: number[], df?: number[], dpp?: number[], dt?: number[],
+  senses?: Float32Array, without?: { alone: Seen, group: Seen }[],
+}
+interface Scene extends Rule {
+  map: Place, pois: Place[], observation_radius: number, attraction_radius: number, dt: number, steps: number, exact: boolean,
+  colors: Palettes, fitness?: string, episodes: Episode[],
+}
+/** A scene as it is sent: arrays are base64 until `stage.unpack`. */
+interface Packed { colors: Palettes, episodes: { generation: number, best_g: number }[] }
+
+/** What to show of an episode. */
+interface Look {
+  crop: Crop, trails: boolean, radii: boolean, groups: boolean, over: number | null, heat: boolean, removed: Removed | null, dark: number[],
+}
+interface Removed { leader: number, group: boolean }
+interface OnCanvas { wide: number, tall: number, scale: number, X: (x: number) => number, Y: (y: number) => number }
+/** The build puts this before the modules: src/report/stage.js, which every page that shows episodes shares. */
+declare const stage: {
+  night: MediaQueryList,
+  unpack(data: Packed): Scene,
+  moment(data: Scene, episode: Episode, frame: number, agent: number): [number, number, number, number],
+  busy(data: Scene): Crop,
+  whole(data: Scene): Crop,
+  place_on(canvas: HTMLCanvasElement, crop: Crop): OnCanvas,
+  palette(data: Scene): string[],
+  paint(data: Scene, episode: Episode, canvas: HTMLCanvasElement, place: number, look: Look): { step: number, positions: Place[] },
+  say(episode: Episode, step: number): [number, string],
+  poi_at(data: Scene, canvas: HTMLCanvasElement, crop: Crop, x: number, y: number): number | null,
+  later(data: Scene, episode: Episode, place: number, seconds: number): number,
+};
+
+/** One canvas: its arm, its episode, and the place in it. `describe` writes the text of a view that shows no training. */
+interface View {
+  label: string, card: HTMLElement, title: HTMLElement, key: HTMLElement, status: HTMLElement, sensed: HTMLElement, canvas: HTMLCanvasElement,
+  data: Scene | null, place: number, playing: boolean, ended: number | null, over: number | null, wanted: number | null, asking: boolean,
+  crop: Crop, chosen: Chosen | null, removed: Removed | null, selected: number | null, drawn: Place[],
+  describe: ((step: number, observed: number, text: string) => void) | null,
+}
+/** A view that shows an episode. */
+type Shown = View & { data: Scene };
+
+/**
+ * The state of the page. `mode` is what the map is for, and `follow` whether the views follow the training. `training` has the results on
+ * show. `valid` tells whether the text is a valid config, and `config`, `toml`, `pois` and `start` are those of the last valid text. `past`
+ * has earlier texts, for undo. `layouts` has the config of each layout. `settled` is the choice that `machine` was opened for.
+ */
+interface State extends Past {
+  valid: boolean, config: Config, toml: string | null, pois: number | null, start: Start, past: Past[], mode: "watch" | "arrange" | "drive",
+  training: Training | null, follow: boolean, generation: number, trial: number, views: View[], gpu: Gpu, machine: Machine, settled: string | null,
+  players: Player[], policies: { each: number, weights: Bytes } | null, layouts: Record<string, Config>, version: string,
+}
+interface Past { text: string, file: string | null, compared: Comparison | null }
+/** The browser's GPU, or the reason why none can be used. */
+interface Gpu { name?: string, software?: boolean, reason?: string }
+
 /** G of a generation of a trial: of the best team, the mean, and of the champion. */
 interface Row { best: number, mean: number, champion: number, seconds: number }
 /** What an arm is made of. `constant` and `random` are G of baselines. */
 interface Planned {
-  name: string, label: string, toml: string, config: any, pois: number | null, parameters: number, command?: string, digest?: string,
+  name: string, label: string, toml: string, config: Config, pois: number | null, parameters: number, command?: string, digest?: string,
   zip?: Bytes, bytes?: number, constant: number | null, random: number[],
 }
 /** An arm of a training. `ended` has the champions of each trial. */
 interface Arm extends Planned { trials: Row[][], ended: Bytes[] }
 /** A run from a file. */
-interface Opened { name: string, label: string, words: any, bytes: Bytes }
+interface Opened { name: string, label: string, words: Answers["read"], bytes: Bytes }
 /** The comparison of arms: curves with intervals, and tables. */
 interface Found {
   curves: { generation: number[], mean: number[], band: Place[] | null }[],
   means?: string[][], pairs?: string[][], refused?: string, legend?: string, notes?: string[],
 }
+
+/** The backend that trains. `why` says why it is not a GPU. */
+interface Machine { description: string, backend: string, adapter: string | null, driver: string | null, threads: number, why?: string }
+/** Results of a trial that ended: the counts of its numbers. */
+interface Ended { trial: number, policies: number, fitness: number, pending: Place | null }
+interface Driven {
+  step: number, learned: boolean, positions: number[], headings: number[], near: number[], observed: (number | null)[],
+  scores: { g: number, d: number[], df: number[] } | null,
+}
+interface Problem { line?: number, key?: string, message: string }
+
+/** The JSON that a worker answers, by what was asked. */
+interface Answers {
+  start: { suspends: boolean };
+  about: { version: string };
+  resolve: Described & { bytes: number };
+  edit: { text: string };
+  labels: { labels: string[] };
+  compare: Found;
+  constant: { g: number };
+  random: {};
+  more_random: { g: number[], done: boolean };
+  gif: {};
+  open: Machine;
+  train: {};
+  advance: { next: number, played: number, done: boolean, seconds: number };
+  best: Packed;
+  play: Packed;
+  ends: Ended[];
+  record: { digest: string };
+  read: Described & { rows: number, digest: string, policies: number };
+  verify: { worlds: number, agent_steps: number, mismatch: string | null };
+  drive: Driven;
+  step: Driven;
+}
+
+/** Elements with an id, by what they are. */
+type Elements =
+  & Record<"layout" | "compare" | "fitness" | "paradigm" | "pace" | "on" | "trial" | "speed" | "leader" | "credited", HTMLSelectElement>
+  & Record<"coupling" | "seed" | "generations" | "trials" | "population" | "scrub" | "step" | "file", HTMLInputElement>
+  & Record<"following" | "loop" | "trails" | "radii" | "heat" | "plain", HTMLInputElement>
+  & Record<"train" | "stop" | "pause" | "replay" | "undo" | "again" | "remove" | "verify" | "share" | "open" | "save", HTMLButtonElement>
+  & Record<"png" | "gif" | "webm" | "csv" | "guide-next" | "guide-end", HTMLButtonElement>
+  & Record<"text", HTMLTextAreaElement> & Record<"curves", HTMLCanvasElement> & Record<"config", HTMLDetailsElement>
+  & Record<"setup" | "guide" | "guide-step" | "guide-says" | "hint" | "arrange" | "drive" | "modes" | "views" | "plain-label", HTMLElement>
+  & Record<"credit" | "play" | "team" | "credits" | "lost" | "compared" | "compared-says" | "means" | "pairs" | "tests" | "gallery" | "digests", HTMLElement>
+  & Record<"trouble" | "stale" | "announced" | "machine" | "version" | "legend" | "needless" | "problems" | "lines" | "marks", HTMLElement>
+  & Record<"chosen" | "driven" | "generation" | "message" | "verified", HTMLElement>
+  & Record<"wasm" | "worker" | "opening" | `layout-${string}` | `gallery-${string}`, HTMLElement>;

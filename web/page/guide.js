@@ -1,41 +1,50 @@
-// @ts-check
-// The guided start: one sentence and one button per step.
+// The guided start: one sentence and one button per step. Until it ends, the map is above the settings.
 import { remove_leader } from "./credit.js";
 import { $ } from "./dom.js";
 import { exhibit } from "./gallery.js";
-import { state } from "./state.js";
+import { shown, state } from "./state.js";
 import { train } from "./train.js";
 import { replay } from "./views.js";
 
-const best = () => state.views.find(view => view.data && view.data.episodes[0].without);
+/** Returns the view in which leaders can be removed. */
+const removable = () => shown().find(({ data }) => data.episodes[0].without);
+/** Returns the leader with the largest Df, and what the team loses without it. @param {Episode} episode */
+function dearest({ df = [], observed }) {
+  const most = Math.max(...df);
+  return { leader: df.indexOf(most), lost: Math.round(most * observed.length), pois: observed.length };
+}
+
+/** @type {{ says: () => string, button: string, act: () => Promise<void> | void }[]} */
 const STEPS = [
   {
-    says: "These twelve agents are a trained team: four leaders learned, eight followers follow. A point of interest (POI) counts once six agents are near it at the same time, so groups have to meet.",
-    button: "Whose credit is it?",
+    says: () => "This team was trained: its four leaders (filled arrows) learned where to go, and eight followers (hollow arrows) follow them. A point of interest (POI, a circle) is observed once six agents are inside it at the same time, so groups have to meet.",
+    button: "What is one leader worth?",
     act() {
-      const view = best();
+      const view = removable();
       if (!view) return;
-      const { df } = view.data.episodes[0];
-      remove_leader(view, { leader: df.indexOf(Math.max(...df)), group: true });
-      if (!state.views.some(view => view.playing)) replay();
+      remove_leader(view, { leader: dearest(view.data.episodes[0]).leader, group: true });
+      if (!view.playing) replay();
     },
   },
   {
-    says: "Now one leader is gone, with the followers that it led. The POIs that go dark are its Df: Df rewards a leader for what the team loses without it and its followers.",
+    says() {
+      const view = removable(), { leader, lost, pois } = view ? dearest(view.data.episodes[0]) : { leader: 0, lost: 0, pois: 1 };
+      return `Leader ${leader} and its followers (pale) no longer count, and ${lost} of ${pois} POIs are lost (dark). This loss, ${lost / pois}, is the leader's Df. Training with Df keeps the leaders without which the team would lose most.`;
+    },
     button: "Train such teams",
     act() {
-      const view = best();
+      const view = removable();
       if (view) remove_leader(view, null);
-      train();
+      return train();
     },
   },
   {
-    says: "Two kinds of team learn side by side: leaders with followers, and teams in which all twelve agents learn. Dotted lines are what a constant action and random teams observe, without any learning.",
+    says: () => "Two kinds of team learn this task from nothing: leaders with followers, and teams in which all twelve agents learn. The chart shows how many POIs their best teams observe, generation by generation.",
     button: "What does a larger population change?",
-    act() { exhibit("population", { trains: true }); },
+    act: () => exhibit("population", { trains: true }),
   },
   {
-    says: "The same task with 50, 500 and 2500 policies per agent, all of which learn: a larger population finds what a small one misses. Choose another experiment below, or change anything.",
+    says: () => "A smaller task: six agents, all of which learn, and two POIs that need three agents each. Each agent's policy is chosen from a population of 50, 500 or 2500 policies. Compare the three lines of the chart.",
     button: "Done",
     act() {},
   },
@@ -43,21 +52,27 @@ const STEPS = [
 
 let at = 0;
 
-function show_step() {
-  $("guide").hidden = at >= STEPS.length;
-  if ($("guide").hidden) return;
+function show_step(result = "") {
+  const goes_on = at < STEPS.length;
+  $("guide").hidden = !goes_on;
+  $(goes_on ? "play" : "guide").after($("setup"), $("modes"));
+  if (!goes_on) return;
   $("guide-step").textContent = `${at + 1} of ${STEPS.length}`;
-  $("guide-says").textContent = STEPS[at].says;
+  $("guide-says").textContent = `${STEPS[at].says()}${result}`;
   $("guide-next").textContent = STEPS[at].button;
 }
 
 export function guide() {
   show_step();
-  $("guide-next").addEventListener("click", () => {
-    const step = STEPS[at];
+  $("guide-next").addEventListener("click", async () => {
+    const { act } = STEPS[at];
     at += 1;
+    const now = at, trained = act();
     show_step();
-    step.act();
+    if (!trained) return;
+    // A step that trains ends with the result.
+    await trained;
+    if (at === now && state.training && state.training.state === "done") show_step(` ${$("announced").textContent}`);
   });
   $("guide-end").addEventListener("click", leave_guide);
 }

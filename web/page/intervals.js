@@ -1,14 +1,14 @@
-// @ts-check
 // Intervals over trials, and the comparison of arms. The module computes them as `flotilla compare` does.
 import { curves } from "./curves.js";
 import { $, make } from "./dom.js";
+import { clerk } from "./pool.js";
 import { state } from "./state.js";
 
 /** Shows the intervals and tests of a training that has ended, or of opened runs. @param {Training} training */
 export async function intervals(training) {
   const arms = training.arms.map(({ label, toml, trials }) => ({ name: label, text: toml, lengths: trials.map(trial => trial.length) }));
   const numbers = Float64Array.from(training.arms.flatMap(({ trials }) => trials.flatMap(rows => rows.flatMap(({ best, champion }) => [best, champion]))));
-  const { words } = await state.clerk.ask({ ask: "compare", arms }, new Uint8Array(numbers.buffer));
+  const { words } = await clerk.ask({ ask: "compare", arms }, new Uint8Array(numbers.buffer));
   if (state.training !== training) return;
   training.found = words;
   tables();

@@ -1,6 +1,5 @@
-// @ts-check
 // The workers, and the backend that trains.
-import { $, count } from "./dom.js";
+import { $, count, failure, write_text } from "./dom.js";
 import { pool } from "./pool.js";
 import { state } from "./state.js";
 
@@ -17,26 +16,26 @@ export async function settle() {
       state.machine.adapter = gpu.name;
       state.machine.description = `${gpu.name} by WebGPU${gpu.software ? ", a software renderer" : ""}, proved exact`;
       state.settled = wanted;
-      return told();
-    } catch (/** @type {any} */ error) { why = error.message; }
-  } else if (wanted === "auto") why = gpu.software ? `this browser's GPU is a software renderer, ${gpu.name}` : gpu.reason;
+      return show_machine();
+    } catch (thrown) { why = failure(thrown).message; }
+  } else if (wanted === "auto") why = gpu.software ? `this browser's GPU is a software renderer, ${gpu.name}` : gpu.reason ?? "";
   state.machine = (await state.players[0].ask({ ask: "open", gpu: false, pass: null })).words;
   state.machine.threads = state.players.length;
   state.machine.why = why;
   state.settled = wanted;
-  told();
+  show_machine();
 }
 
-export function told() {
+export function show_machine() {
   const { training, machine } = state, workers = machine.backend === "cpu" ? `${machine.description.replace(/, \d+ threads?/, "")} in ${count(state.players.length, "worker")}` : machine.description;
   const speed = training && training.teams ? ` · ${Math.round(training.rate).toLocaleString("en")} teams a second` : "";
-  $("machine").textContent = `Runs on ${workers}${speed}${machine.why ? ` (${machine.why})` : ""}`;
+  write_text($("machine"), `Runs on ${workers}${speed}${machine.why ? ` (${machine.why})` : ""}`);
 }
 
 // Replaces the players, for example after they stopped responding.
 export async function renew() {
   const many = Math.max(1, Math.min(16, navigator.hardwareConcurrency || 2)), old = state.players;
-  [state.clerk, ...state.players] = await Promise.all([state.clerk || pool.open(), ...Array.from({ length: many }, () => pool.open())]);
+  state.players = await Promise.all(Array.from({ length: many }, () => pool.open()));
   state.settled = null;
   old.forEach(player => player.stop());
 }

@@ -1,13 +1,12 @@
-// @ts-check
 // The page's event listeners and its start.
 import { autoplay, link, recall, remember, shows_runs } from "./address.js";
-import { add, remove } from "./arrange.js";
+import { add, remove, show_start } from "./arrange.js";
 import { comparison } from "./compare.js";
 import { configs } from "./config.js";
 import { credits } from "./credit.js";
 import { curves, drawn_chart } from "./curves.js";
-import { $, all, copy, save, trouble } from "./dom.js";
-import { drive_off, drive_on, drive_view } from "./drive.js";
+import { $, all, copy, failure, option, save, trouble } from "./dom.js";
+import { drive_off, drive_on, drive_view, options } from "./drive.js";
 import { change, compare, edited, entered, fill, keep, lines, take, typing, undo } from "./experiment.js";
 import { save_csv, save_gif, save_png, save_webm } from "./exports.js";
 import { take_files } from "./files.js";
@@ -16,18 +15,25 @@ import { guide, leave_guide } from "./guide.js";
 import { renew, settle } from "./machine.js";
 import { mode } from "./modes.js";
 import { OPENING, show_opening } from "./opening.js";
-import { pool } from "./pool.js";
-import { KEYS, quote, state } from "./state.js";
+import { clerk, pool } from "./pool.js";
+import { KEYS, KEY_IDS, after, quote, state } from "./state.js";
 import { forget, stop, train } from "./train.js";
 import { verify } from "./verify.js";
 import { ask, draw, follow, following, pause, replay, seek, step_to, wake_up } from "./views.js";
 
+after.episode = credits;
+after.config = ({ views, address }) => {
+  options();
+  if (state.mode === "drive") { drive_off(); drive_view(); } else if (views && (!state.training || state.mode === "arrange")) show_start();
+  curves();
+  if (address) remember();
+};
+
 function listen() {
-  $("setup").addEventListener("submit", (/** @type {Event} */ event) => { event.preventDefault(); train(); });
+  $("setup").addEventListener("submit", event => { event.preventDefault(); train(); });
   $("layout").addEventListener("change", async () => {
-    const { fitness, seed } = state.config ? state.config.learning : {};
-    let text = configs.layout($("layout").value);
-    if (fitness) text = await edited(text, [["learning.fitness", `"${fitness}"`], ["learning.seed", String(seed)]]);
+    const { fitness, seed } = state.config.learning;
+    const text = await edited(configs.layout($("layout").value), [["learning.fitness", `"${fitness}"`], ["learning.seed", seed]]);
     keep();
     forget();
     state.file = null;
@@ -40,17 +46,17 @@ function listen() {
     change([["learning.paradigm", `"${$("paradigm").value}"`]]);
   });
   $("compare").addEventListener("change", () => {
-    if (state.config && $("compare").value !== "own") compare(comparison($("compare").value, state.config.learning.population));
+    if ($("compare").value !== "own") compare(comparison($("compare").value, state.config.learning.population));
   });
-  for (const [id, key] of Object.entries(KEYS)) {
+  for (const id of KEY_IDS) {
     // An empty field is reset to the config's value.
-    $(id).addEventListener("change", () => { if ($(id).value !== "") change([[key, quote(id)($(id).value)]]); else if (state.config) fill(); });
+    $(id).addEventListener("change", () => { if ($(id).value !== "") change([[KEYS[id], quote(id)($(id).value)]]); else fill(); });
   }
-  for (const id of ["on", "pace"]) $(id).addEventListener("change", remember);
+  for (const id of /** @type {const} */ (["on", "pace"])) $(id).addEventListener("change", remember);
   // A training in progress keeps its backend. The next one uses the new choice.
-  $("on").addEventListener("change", () => { if (!state.training || state.training.state === "done" || state.training.state === "stopped") settle().catch((/** @type {Error} */ error) => trouble(error.message)); });
-  for (const button of all("[data-mode]")) button.addEventListener("click", () => mode(button.dataset.mode));
-  for (const button of all("[data-add]")) button.addEventListener("click", () => add(button.dataset.add));
+  $("on").addEventListener("change", () => { if (!state.training || state.training.state === "done" || state.training.state === "stopped") settle().catch(thrown => trouble(failure(thrown).message)); });
+  for (const button of all("[data-mode]")) button.addEventListener("click", () => mode(/** @type {typeof state.mode} */ (button.dataset.mode)));
+  for (const button of all("[data-add]")) button.addEventListener("click", () => add(/** @type {List} */ (button.dataset.add)));
   $("remove").addEventListener("click", remove);
   $("again").addEventListener("click", drive_on);
   $("leader").addEventListener("change", () => { if (state.mode === "drive") { drive_off(); drive_view(); } });
@@ -78,19 +84,22 @@ function listen() {
   });
   $("loop").addEventListener("change", () => { if ($("loop").checked) wake_up(); });
   $("credited").addEventListener("change", credits);
-  for (const id of ["trails", "radii", "heat"]) $(id).addEventListener("change", () => state.views.forEach(draw));
-  $("curves").addEventListener("click", (/** @type {MouseEvent} */ event) => { if (drawn_chart && state.training) { if (state.mode !== "watch") mode("watch"); seek(drawn_chart.generation(event.offsetX)); } });
+  for (const id of /** @type {const} */ (["trails", "radii", "heat"])) $(id).addEventListener("change", () => state.views.forEach(draw));
+  $("curves").addEventListener("click", event => { if (drawn_chart && state.training) { if (state.mode !== "watch") mode("watch"); seek(drawn_chart.generation(event.offsetX)); } });
   $("verify").addEventListener("click", verify);
   $("share").addEventListener("click", async () => {
     await entered();
-    if (!state.valid) return void ($("said").textContent = "No link was copied: the config has problems. Correct them first.");
-    if (!await remember()) return void ($("said").textContent = "No link was copied: this browser cannot compress a config. Save config.toml instead.");
+    if (!state.valid) return void ($("message").textContent = "No link was copied: the config has problems. Correct them first.");
+    if (!await remember()) return void ($("message").textContent = "No link was copied: this browser cannot compress a config. Save config.toml instead.");
     if (shows_runs()) return void copy(link(), "The link is copied: it has the settings of the first run, but not the runs.");
     copy(link(), `The link is copied: whoever opens it ${state.training ? "sees the same generation of the same training" : "trains the same"}.`);
   });
-  for (const [id, act] of Object.entries({ png: save_png, gif: save_gif, webm: save_webm, csv: save_csv })) $(id).addEventListener("click", act);
+  $("png").addEventListener("click", save_png);
+  $("gif").addEventListener("click", save_gif);
+  $("webm").addEventListener("click", save_webm);
+  $("csv").addEventListener("click", save_csv);
   $("open").addEventListener("click", () => $("file").click());
-  $("file").addEventListener("change", () => { take_files([...$("file").files]); $("file").value = ""; });
+  $("file").addEventListener("change", () => { take_files([...$("file").files ?? []]); $("file").value = ""; });
   $("save").addEventListener("click", async () => { await entered(); save("config.toml", state.text, "text/plain"); });
   $("text").addEventListener("input", () => {
     lines();
@@ -110,7 +119,7 @@ function listen() {
     event.preventDefault();
     pause();
   });
-  const again = () => { state.views.forEach(draw); if (state.config) curves(); };
+  const again = () => { state.views.forEach(draw); curves(); };
   addEventListener("resize", again);
   stage.night.addEventListener("change", again);
   addEventListener("hashchange", async () => { leave_guide(); await recall(); });
@@ -120,28 +129,29 @@ function listen() {
 const opens = location.hash.length <= 1;
 
 async function start() {
-  if (opens) show_opening();
+  if (opens) {
+    show_opening();
+    guide();
+  }
   try {
     [state.gpu] = await Promise.all([pool.gpu(), renew()]);
-  } catch (/** @type {any} */ error) {
+  } catch (thrown) {
     $("machine").textContent = "";
-    return trouble(`This browser cannot run it: ${error.message}. It takes WebAssembly with SIMD, as browsers have had since 2023.`);
+    return trouble(`This browser cannot run it: ${failure(thrown).message}. It takes WebAssembly with SIMD, as browsers have had since 2023.`);
   }
-  for (const name of configs.LAYOUTS) state.layouts[name] = (await state.clerk.ask({ ask: "resolve", text: configs.layout(name), name, changes: [] })).words.config;
-  const { version, colors } = (await state.clerk.ask({ ask: "about" })).words;
-  Object.assign(state, { version, palettes: colors });
+  for (const name of configs.LAYOUTS) state.layouts[name] = (await clerk.ask({ ask: "resolve", text: configs.layout(name), name, changes: [] })).words.config;
+  state.version = (await clerk.ask({ ask: "about" })).words.version;
   $("verify").disabled = !state.gpu.name;
   $("plain-label").hidden = !state.gpu.name;
   $("verified").textContent = state.gpu.name ? "Compares this browser's GPU with its CPU, bit for bit." : `There is no GPU to verify: ${state.gpu.reason}.`;
-  $("on").querySelector("[value=gpu]").disabled = !state.gpu.name;
+  option($("on"), "gpu").disabled = !state.gpu.name;
   listen();
   gallery();
-  if (opens) {
-    guide();
-    // The settings become those of the opening. Its episode goes on.
-    await take(text_of(OPENING), { address: false, views: false });
-  } else await recall();
+  // The settings become those of the opening. Its episode goes on.
+  if (opens) await take(text_of(OPENING), { address: false, views: false });
+  else await recall();
   await settle();
+  $("guide-next").disabled = false;
   document.body.dataset.ready = "";
   await autoplay();
 }

@@ -1,4 +1,3 @@
-// @ts-check
 // What to do with the map: watch, rearrange, or take a leader.
 import { show_start } from "./arrange.js";
 import { $, all } from "./dom.js";
@@ -17,18 +16,16 @@ export function mode(wanted) {
   if (state.mode === wanted) return;
   drive_off();
   state.mode = wanted;
-  for (const button of all("[data-mode]")) button.setAttribute("aria-pressed", button.dataset.mode === wanted);
+  for (const button of all("[data-mode]")) button.ariaPressed = String(button.dataset.mode === wanted);
   $("hint").textContent = HINTS[wanted];
   $("arrange").hidden = wanted !== "arrange";
   $("drive").hidden = wanted !== "drive";
   const { training } = state;
+  if (wanted !== "watch" && training && training.state === "training") { training.paused = true; controls(); }
   if (wanted === "arrange") {
-    if (training && training.state === "training") { training.paused = true; controls(); }
-    clear();
     show_start();
     $("modes").scrollIntoView({ block: "start" });
   } else if (wanted === "drive") {
-    if (training && training.state === "training") { training.paused = true; controls(); }
     const led = training && training.arms.find(arm => arm.label === "leader-follower" && arm.ended.length);
     if (led) state.policies = { each: 1, weights: led.ended[Math.min(state.trial, led.ended.length - 1)] };
     if (led && led.toml !== state.toml && led.config.world.leaders.length !== state.config.world.leaders.length) state.policies = null;
@@ -40,7 +37,7 @@ export function mode(wanted) {
     const { generation, trial } = state;
     build(training);
     position();
-    $("trial").value = trial;
+    $("trial").value = String(trial);
     if (training.state === "done" || !state.follow) {
       state.views.forEach((view, run) => ask(view, run, state.follow ? training.last : generation));
     } else follow();

@@ -1,6 +1,5 @@
-// @ts-check
 // Workers that run flotilla, and the detection of a GPU.
-import { $ } from "./dom.js";
+import { $, Failure } from "./dom.js";
 
 export const pool = (() => {
   /** @type {Promise<WebAssembly.Module> | null} */
@@ -17,47 +16,49 @@ export const pool = (() => {
 
   class Player {
     constructor() {
+      /** @type {Map<number, { resolve(data: unknown): void, reject(failure: Failure): void }>} */
       this.asked = new Map();
       this.count = 0;
-      this.suspends = false;
-      /** @type {(told: any) => void} */
-      this.told = () => {};
+      this.failed = false;
+      /** @type {(progress: { verified: number }) => void} */
+      this.progress = () => {};
       script ??= URL.createObjectURL(new Blob([$("worker").textContent], { type: "text/javascript" }));
       this.worker = new Worker(script);
       this.worker.onerror = event => this.fail(event.message || "the worker could not be started");
       this.worker.onmessage = ({ data }) => {
-        if (data.told) return data.told.panic ? this.fail(data.told.panic) : this.told(data.told);
+        if (data.told) return data.told.panic ? this.fail(data.told.panic) : this.progress(data.told);
         const asked = this.asked.get(data.id);
         this.asked.delete(data.id);
         if (!asked) return;
-        if (data.words && data.words.error) {
-          asked.reject(Object.assign(new Error(data.words.error), { problems: data.words.problems || [], fatal: data.words.fatal }));
-        } else asked.resolve(data);
+        if (data.words && data.words.error) asked.reject(new Failure(data.words.error, data.words));
+        else asked.resolve(data);
       };
     }
     /** @param {string} reason */
-    fail(reason) {
-      for (const { reject } of this.asked.values()) reject(Object.assign(new Error(reason), { problems: [], fatal: true }));
-      this.asked.clear();
+    fail(reason) { this.end(new Failure(reason, { fatal: true })); }
+    /** Fails all requests, and those to come. @param {Failure} failure */
+    end(failure) {
       this.failed = true;
+      for (const { reject } of this.asked.values()) reject(failure);
+      this.asked.clear();
     }
     /**
      * Buffers in `transferred` move to the worker, and cannot be used here afterwards.
-     * @param {any} words @param {Bytes | Bytes[]} [bytes] @param {object} [more] @param {Transferable[]} [transferred]
-     * @returns {Promise<{ words: any, bytes: Bytes }>}
+     * @template {keyof Answers} K
+     * @param {{ ask: K, [key: string]: unknown }} words @param {Bytes | Bytes[]} [bytes] @param {object} [more] @param {Transferable[]} [transferred]
+     * @returns {Promise<{ words: Answers[K], bytes: Bytes }>}
      */
     ask(words, bytes, more = {}, transferred = []) {
-      if (this.failed) return Promise.reject(Object.assign(new Error("the worker has failed; load the page again"), { problems: [], fatal: true }));
+      if (this.failed) return Promise.reject(new Failure("the worker has failed; load the page again", { fatal: true }));
       const id = this.count++;
-      const answered = new Promise((resolve, reject) => this.asked.set(id, { resolve, reject }));
-      this.worker.postMessage({ id, words, bytes, ...more }, transferred);
-      return answered;
+      return new Promise((resolve, reject) => {
+        this.asked.set(id, { resolve, reject });
+        this.worker.postMessage({ id, words, bytes, ...more }, transferred);
+      });
     }
     stop() {
       this.worker.terminate();
-      this.failed = true;
-      for (const { reject } of this.asked.values()) reject(Object.assign(new Error("stopped"), { problems: [], stopped: true }));
-      this.asked.clear();
+      this.end(new Failure("stopped", { stopped: true }));
     }
   }
 
@@ -65,21 +66,32 @@ export const pool = (() => {
   async function open() {
     compiled ??= compile();
     const player = new Player();
-    const { words } = await player.ask({}, undefined, { module: await compiled });
-    player.suspends = words.suspends;
+    await player.ask({ ask: "start" }, undefined, { module: await compiled });
     return player;
   }
 
   // Returns the name of the browser's GPU and whether it is a software renderer, or the reason why none can be used.
+  /** @returns {Promise<Gpu>} */
   async function gpu() {
     if (!navigator.gpu) return { reason: "this browser has no WebGPU, or keeps it to pages of https and localhost" };
     if (typeof WebAssembly.Suspending !== "function") return { reason: "this browser cannot suspend WebAssembly, which waiting for a GPU takes" };
     const adapter = await navigator.gpu.requestAdapter().catch(() => null);
     if (!adapter) return { reason: "this browser offers no GPU" };
-    const { vendor = "", architecture = "", device = "", description = "", isFallbackAdapter = adapter.isFallbackAdapter } = adapter.info || {};
+    const { vendor, architecture, device, description, isFallbackAdapter } = adapter.info;
     const name = description || [vendor, architecture, device].filter(Boolean).join(" ") || "GPU";
-    return { name, software: Boolean(isFallbackAdapter) || /swiftshader|llvmpipe|software/i.test(`${architecture} ${description}`) };
+    return { name, software: isFallbackAdapter || /swiftshader|llvmpipe|software/i.test(`${architecture} ${description}`) };
   }
 
   return { open, gpu };
 })();
+
+/** The worker that answers requests while the players train. @type {Promise<Player> | null} */
+let opened = null;
+export const clerk = {
+  /**
+   * Asks as a player does.
+   * @template {keyof Answers} K
+   * @param {{ ask: K, [key: string]: unknown }} words @param {Bytes | Bytes[]} [bytes] @param {Transferable[]} [transferred]
+   */
+  ask: async (words, bytes, transferred) => (await (opened ??= pool.open())).ask(words, bytes, {}, transferred),
+};

@@ -1,14 +1,12 @@
-// @ts-check
 // The part of the map to show, and the start as an episode without steps.
-import { state } from "./state.js";
+import { opening, state } from "./state.js";
 
 // Returns the part of the map that contains all POIs and every place that agents can reach in an episode.
-/** @param {any} config */
+/** @param {Config} config @returns {Crop} */
 export function reach({ world, motion }) {
   const far = world.steps * world.dt * motion.max_speed + 2, [width, height] = world.map;
-  /** @type {number[][]} */
   const starts = [...world.leaders, ...world.followers].map(place => [...place, far]);
-  const all = [...starts, ...world.pois.map((/** @type {number[]} */ place) => [...place, world.observation_radius + 1])];
+  const all = [...starts, ...world.pois.map(place => [...place, world.observation_radius + 1])];
   const side = (/** @type {number} */ axis, /** @type {number} */ sign) => all.map(place => place[axis] + sign * place[2]);
   // A margin beyond the walls, so that agents at a wall are drawn whole.
   const low = (/** @type {number} */ axis) => Math.max(-1.5, Math.min(...side(axis, -1))), high = (/** @type {number} */ axis, /** @type {number} */ end) => Math.min(end + 1.5, Math.max(...side(axis, 1)));
@@ -20,7 +18,7 @@ export function reach({ world, motion }) {
 
 /**
  * Returns the start as an episode without steps. Places are those of the config, which may have moved since the module resolved it.
- * @param {any} config
+ * @param {Config} config @returns {Scene}
  */
 export function start_scene(config) {
   const { world, follow } = config, agents = [...world.leaders, ...world.followers], { coupling, headings } = state.start;
@@ -28,7 +26,7 @@ export function start_scene(config) {
   const owner = agents.map((_, agent) => state.start.owner[agent] < world.leaders.length ? state.start.owner[agent] : -1);
   return {
     map: world.map, pois: world.pois, observation_radius: world.observation_radius, attraction_radius: follow.attraction_radius,
-    dt: world.dt, steps: world.steps, exact: true, colors: state.palettes,
+    dt: world.dt, steps: world.steps, exact: true, colors: opening.data.colors,
     observers: world.observers, windows: world.windows, after: world.after,
     episodes: [{
       leaders: world.leaders.length, agents: agents.length, coupling, shown: [0], g: 0, generation: 0, trial: 0, owner,

@@ -1,8 +1,7 @@
-// @ts-check
 // What a leader senses: the densities of POIs and agents in four quadrants, and its answer.
 
 /** Names of the quadrants, in the order of a policy's inputs. */
-export const QUADRANTS = ["back right", "front right", "front left", "back left"];
+const QUADRANTS = ["back right", "front right", "front left", "back left"];
 
 /** Returns the angles at which a quadrant starts and ends, from the heading and counterclockwise. @param {number} quadrant */
 export const angles = quadrant => [(quadrant - 2) * Math.PI / 2, (quadrant - 1) * Math.PI / 2];

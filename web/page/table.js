@@ -1,4 +1,3 @@
-// @ts-check
 // Learning curves as CSV.
 
 /**

@@ -1,13 +1,13 @@
-// @ts-check
 // Starts, shows and ends trainings.
 import { constants, randoms } from "./baselines.js";
 import { label, slug, toml } from "./compare.js";
 import { curves } from "./curves.js";
-import { $, copy, make, save, trouble } from "./dom.js";
+import { $, copy, failure, make, save, trouble, write_text } from "./dom.js";
 import { command, entered, name_of, stale } from "./experiment.js";
 import { intervals, tables } from "./intervals.js";
-import { renew, settle, told } from "./machine.js";
+import { renew, settle, show_machine } from "./machine.js";
 import { mode } from "./modes.js";
+import { clerk } from "./pool.js";
 import { state } from "./state.js";
 import { Training } from "./training.js";
 import { build, clear, controls, follow, following } from "./views.js";
@@ -33,7 +33,7 @@ export async function train() {
     const compared = effective();
     const arms = await Promise.all(compared.values.map(async value => {
       const { key } = compared, changes = [[key, toml(value)]];
-      const { words } = await state.clerk.ask({ ask: "resolve", text: state.text, name: "config.toml", changes });
+      const { words } = await clerk.ask({ ask: "resolve", text: state.text, name: "config.toml", changes });
       return {
         bytes: words.bytes, label: label(compared, value), toml: words.toml, config: words.config, pois: words.pois, parameters: words.parameters,
         command: command(words.config, key === "learning.paradigm" ? [] : [[key, value]]), name: slug(name_of()), constant: null, random: [],
@@ -48,56 +48,57 @@ export async function train() {
     tables();
     build(training);
     await training.start(state.players);
-  } catch (/** @type {any} */ error) {
-    if (error.fatal) await renew();
-    trouble(error.message);
+  } catch (thrown) {
+    const { message, fatal } = failure(thrown);
+    if (fatal) await renew();
+    trouble(message);
     return;
   } finally { starting = false; }
   stale();
   controls();
   constants(training).catch(() => {});
   // For watching, the pace is limited to `last / 8` generations per second, but at least 1. Pauses do not count.
-  let shown = 0, clock = performance.now(), dirty = true, news = clock;
+  let played = 0, clock = performance.now(), dirty = true, news = clock;
   const allowed = () => {
     const now = performance.now(), each = training.last / 8;
-    if (!training.paused) shown += (now - clock) / 1000 * Math.max(1, each);
+    if (!training.paused) played += (now - clock) / 1000 * Math.max(1, each);
     clock = now;
-    return $("pace").value === "full" ? Infinity : shown + 1;
+    return $("pace").value === "full" ? Infinity : played + 1;
   };
-  const paint = () => {
-    if (state.training !== training) return;
-    // Ten charts a second are enough, and leave the main thread free.
-    if (dirty && performance.now() - news > 100) { dirty = false; news = performance.now(); curves(); follow(); }
+  // Four charts a second are enough, and leave the main thread free.
+  const painting = setInterval(() => {
+    if (state.training !== training || document.hidden) return;
+    if (dirty) { dirty = false; news = performance.now(); curves(); follow(); }
     const silent = (performance.now() - news) / 1000;
-    if (silent > 2 && !training.paused && training.state === "training" && training.reached < training.last) {
-      $("generation").textContent = `generation ${training.reached + 1} of ${training.last}: ${Math.round(silent)} s so far`;
+    if (silent > 2 && !training.paused && training.reached < training.last) {
+      write_text($("generation"), `generation ${training.reached + 1} of ${training.last}: ${Math.round(silent)} s so far`);
     }
-    if (training.state === "training" || training.state === "starting") requestAnimationFrame(paint);
-  };
-  requestAnimationFrame(paint);
+  }, 250);
   try {
     await training.play(allowed, () => { dirty = true; });
-  } catch (/** @type {any} */ error) {
-    if (!error.stopped && state.training === training) {
+  } catch (thrown) {
+    const { message, stopped, fatal } = failure(thrown);
+    if (!stopped && state.training === training) {
       training.stop();
-      if (error.fatal || state.machine.backend === "gpu") await renew();
-      trouble(`${error.message}\nTraining stopped there. ${state.machine.backend === "gpu" ? "Train again, on the CPU if need be: it comes to the same." : "Train again: it comes to the same."}`);
+      if (fatal || state.machine.backend === "gpu") await renew();
+      trouble(`${message}\nTraining stopped there. ${state.machine.backend === "gpu" ? "Train again, if necessary on the CPU: the result is the same." : "Train again: the result is the same."}`);
     }
   }
+  clearInterval(painting);
   if (state.training !== training) return;
   controls();
   curves();
   follow();
-  told();
+  show_machine();
   intervals(training).catch(() => {});
   if (training.state === "done") {
     digests();
     randoms(training).catch(() => {});
     const found = training.arms.map(arm => {
       const last = arm.trials.map(trial => trial[trial.length - 1].best), mean = last.reduce((sum, best) => sum + best, 0) / last.length;
-      return `${arm.label} observes ${(mean * (arm.pois ?? 1)).toFixed(2)} ${arm.pois === null ? "of its POIs (a share)" : `of ${arm.pois} POIs`}`;
+      return `${(mean * (arm.pois ?? 1)).toFixed(2)} of ${arm.pois ?? 1} (${arm.label})`;
     });
-    $("announced").textContent = `Training is finished. On average over trials, the best team of ${found.join("; ")}.`;
+    $("announced").textContent = `Training is finished. ${training.pois === null ? "Share of POIs" : "POIs"} that the best team observes, on average over trials: ${found.join(", ")}.`;
   }
 }
 
@@ -122,7 +123,7 @@ export function forget() {
   if (state.training) state.training.stop();
   Object.assign(state, { training: null, policies: null });
   $("digests").replaceChildren();
-  $("scrub").value = 0;
+  $("scrub").value = "0";
   $("generation").textContent = "";
   $("announced").textContent = "";
   $("trial").replaceChildren();
@@ -147,6 +148,6 @@ export function digests() {
     if (source && command && !command.includes(" configs/")) {
       make("button", `Save ${arm.name}.toml`, acts, { type: "button" }).addEventListener("click", () => save(`${arm.name}.toml`, source.text, "text/plain"));
     }
-    if (command) make("button", "Copy the command", acts, { type: "button" }).addEventListener("click", () => copy(command, "The command is copied: it comes to the same digest."));
+    if (command) make("button", "Copy the command", acts, { type: "button" }).addEventListener("click", () => copy(command, "The command is copied. It gives the same digest."));
   }
 }

@@ -1,9 +1,8 @@
-// @ts-check
 // A training of some arms, or runs that were opened. On the GPU, one worker trains everything as one batch. On the CPU, the trials are
 // divided among the workers. The division does not change the results.
 
 export class Training {
-  /** @param {Planned[]} arms @param {any} machine */
+  /** @param {Planned[]} arms @param {Machine} machine */
   constructor(arms, machine) {
     /** The text and the comparison that were trained. @type {{ text: string, compared: Comparison | null } | null} */
     this.source = null;
@@ -93,7 +92,7 @@ export class Training {
       const answers = await Promise.all(this.players.map(player => player.ask({ ask: "ends", run })));
       const trials = answers.flatMap(({ words, bytes }) => {
         let at = 0;
-        return words.map((/** @type {{ trial: number, policies: number, fitness: number, pending: Place | null }} */ { trial, policies, fitness, pending }) => {
+        return words.map(({ trial, policies, fitness, pending }) => {
           const part = bytes.subarray(at, at += 4 * (policies + fitness));
           return { trial, part, pending, champions: champions(arm, part, policies) };
         });
@@ -128,7 +127,7 @@ export class Training {
     Object.assign(arm, { digest: words.digest, zip });
   }
 
-  /** Makes a finished training of opened runs, each as an arm. @param {Player} player @param {any} machine @param {Opened[]} opened */
+  /** Makes a finished training of opened runs, each as an arm. @param {Player} player @param {Machine} machine @param {Opened[]} opened */
   static async read(player, machine, opened) {
     const training = new Training(opened.map(({ name, label, words }) => {
       const { toml, config, pois, parameters, digest } = words;
@@ -162,15 +161,15 @@ export class Training {
     const { words } = await player.ask({ ask: "best", run, trial, generation });
     // Training here starts from random policies. A run from a file may have started from given ones, or be from another
     // version.
-    const [episode] = words.episodes, told = this.arms[run].trials[trial][episode.generation];
-    if (told && told.best !== episode.best_g) throw new Error(`Trained again, generation ${episode.generation} comes to G = ${episode.best_g}, where the run says ${told.best}: it started from given policies, or another version made it.`);
+    const [episode] = words.episodes, recorded = this.arms[run].trials[trial][episode.generation];
+    if (recorded && recorded.best !== episode.best_g) throw new Error(`Generation ${episode.generation} cannot be replayed: it gives G = ${episode.best_g} here, and the run has ${recorded.best}. The run started from given policies, or another version made it.`);
     return words;
   }
 
   stop() { if (this.state !== "done") this.state = "stopped"; }
 }
 
-/** Returns the last generation of an arm. @param {{ config: any }} arm */
+/** Returns the last generation of an arm. @param {{ config: Config }} arm */
 export const last_of = ({ config }) => config.learning.generations;
 
 /**

@@ -1,56 +1,57 @@
-// @ts-check
 // Views of episodes: one canvas per arm.
-import { ring } from "./arrange.js";
-import { credits, dark, select } from "./credit.js";
 import { curves } from "./curves.js";
-import { $, make, number, pen_of, still, trouble } from "./dom.js";
+import { $, failure, make, number, pen_of, still, trouble, write_text } from "./dom.js";
 import { reach } from "./scene.js";
 import { angles, moment, words } from "./senses.js";
-import { NAMES, TONES, state } from "./state.js";
+import { NAMES, TONES, after, shown, state } from "./state.js";
 import { last_of } from "./training.js";
 
-/** Adds a view. @param {string} label */
-export function view(label) {
+/** Adds a view. @param {string} label @param {Crop} crop */
+function add_view(label, crop) {
   const card = make("section", "", $("views"), { className: "card" });
   const head = make("h2", "", card);
-  const dash = make("span", "", head, { className: `key${state.views.length ? " dashed" : ""}` });
-  dash.style.color = `var(${TONES[state.views.length]})`;
+  const key = make("span", "", head, { className: `key${state.views.length ? " dashed" : ""}` });
+  key.style.color = `var(${TONES[state.views.length]})`;
   const title = make("span", NAMES[label] || label, head);
-  const said = make("p", "", card, { role: "status" });
-  said.setAttribute("aria-live", "off");
-  const canvas = make("canvas", "", card);
-  canvas.setAttribute("role", "img");
+  const status = make("p", "", card, { role: "status", ariaLive: "off" });
+  const canvas = make("canvas", "", card, { role: "img" });
+  const sensed = make("p", "", card, { className: "sensed", hidden: true });
   /** @type {View} */
-  const made = { label, card, title, said, canvas, data: null, place: 0, playing: false, over: null, wanted: null, asking: false, crop: [0, 0, 1, 1], removed: null, selected: null };
-  canvas.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => pointed(made, event));
-  canvas.addEventListener("click", (/** @type {MouseEvent} */ event) => picked(made, event));
-  canvas.addEventListener("pointerleave", () => { made.over = null; draw(made); });
-  state.views.push(made);
-  return made;
+  const view = {
+    label, card, key, title, status, canvas, sensed, crop, data: null, place: 0, playing: false, ended: null, over: null, wanted: null,
+    asking: false, chosen: null, removed: null, selected: null, drawn: [], describe: null,
+  };
+  canvas.addEventListener("pointermove", event => pointed(view, event));
+  canvas.addEventListener("click", event => picked(view, event));
+  canvas.addEventListener("pointerleave", () => { view.over = null; draw(view); });
+  state.views.push(view);
+  return view;
 }
 
-/** Makes a view for each arm. @param {Training} training */
+/** Shows a single view that belongs to no arm. @param {string} title @param {Crop} crop */
+export function only_view(title, crop) {
+  clear();
+  const view = add_view("leader-follower", crop);
+  view.title.textContent = title;
+  view.key.hidden = true;
+  $("views").classList.add("one");
+  $("views").after($("credit"));
+  return view;
+}
+
+/** Makes a view for each arm. The chart comes before the table of credit then: it is what changes. @param {Training} training */
 export function build(training) {
   clear();
   $("loop").checked = false;
-  for (const arm of training.arms) view(arm.label).crop = reach(arm.config);
+  for (const arm of training.arms) add_view(arm.label, reach(arm.config));
   $("views").classList.toggle("one", training.arms.length === 1);
   $("views").classList.toggle("many", training.arms.length > 2);
+  $("play").after($("credit"));
   // Trials that all arms have.
   const trials = Math.min(...training.arms.map(arm => arm.trials.length));
   $("trial").replaceChildren(...Array.from({ length: trials }, (_, trial) => make("option", String(trial))));
-  $("scrub").max = training.last;
-  $("scrub").value = 0;
-}
-
-/** Decodes an episode and its details, in place. @param {any} data */
-export function unpack(data) {
-  stage.unpack(data);
-  for (const episode of data.episodes) {
-    if (episode.senses) episode.senses = new Float32Array(stage.bytes(episode.senses));
-    for (const { alone, group } of episode.without || []) for (const part of [alone, group]) part.near = new Uint16Array(stage.bytes(part.near));
-  }
-  return data;
+  $("scrub").max = String(training.last);
+  $("scrub").value = "0";
 }
 
 export function clear() {
@@ -61,40 +62,57 @@ export function clear() {
 
 /** Draws a view at its place in the episode. @param {View} view */
 export function draw(view) {
-  if (!view.data) return;
-  const { data } = view, [own] = data.episodes;
-  const { removed } = view, gone = removed && own.without && own.without[removed.leader][removed.group ? "group" : "alone"];
-  const episode = gone ? { ...own, ...gone } : own;
+  const { data, removed } = view;
+  if (!data) return;
+  const [own] = data.episodes, gone = without(own, removed), episode = gone ? { ...own, ...gone } : own;
   const look = {
     crop: view.crop, trails: $("trails").checked, radii: $("radii").checked, groups: true, over: view.over,
-    heat: $("heat").checked, removed: gone ? removed : null, dark: dark(view),
+    heat: $("heat").checked, removed: gone ? removed : null, dark: dark(data, removed),
   };
   const { step, positions } = stage.paint(data, episode, view.canvas, view.place, look);
   view.drawn = positions;
-  if (view === state.views[0]) steps(view);
-  const [observed, said] = stage.say(episode, step);
-  if (view.tell) view.tell(step, observed, said);
+  if (view === state.views[0]) steps(data, view.place);
+  const [observed, text] = stage.say(episode, step);
+  if (view.describe) view.describe(step, observed, text);
   else {
     const end = number(episode.g * data.pois.length);
-    view.said.textContent = `generation ${episode.generation}, trial ${episode.trial} · ${observed} of ${data.pois.length} POIs by step ${step} · ends at ${end}`;
-    view.canvas.setAttribute("aria-label", `${NAMES[view.label] || view.label}: the best team of generation ${episode.generation}, step ${step}: ${said}`);
+    write_text(view.status, `generation ${episode.generation}, trial ${episode.trial} · ${observed} of ${data.pois.length} POIs by step ${step} · ends at ${end}`);
+    view.canvas.ariaLabel = `${NAMES[view.label] || view.label}: the best team of generation ${episode.generation}, step ${step}: ${text}`;
   }
-  if (view.chosen) ring(view);
-  senses(view, own);
+  if (view.chosen) ring(view, view.chosen);
+  senses(view, data);
   if (view === state.views[0]) playing();
 }
 
-/** Draws what the selected leader senses: a sector per quadrant, outside for POIs and inside for agents. @param {View} view @param {any} episode */
-function senses(view, episode) {
-  const leader = view.selected ?? -1, shows = leader >= 0 && episode.senses && leader < episode.leaders;
-  view.sensed ??= make("p", "", view.card, { className: "sensed" });
-  view.sensed.hidden = !shows;
-  if (!shows) return;
+/** Returns what an episode observes without a leader. @param {Episode} episode @param {Removed | null} removed */
+const without = (episode, removed) => removed && episode.without ? episode.without[removed.leader][removed.group ? "group" : "alone"] : null;
+
+/** Returns the POIs that only the removed agents' presence observed. @param {Scene} data @param {Removed | null} removed */
+export function dark(data, removed) {
+  const [episode] = data.episodes, gone = without(episode, removed);
+  return gone ? episode.observed.flatMap((at, poi) => at !== null && gone.observed[poi] === null ? [poi] : []) : [];
+}
+
+/** Draws a ring around what is chosen in a view. @param {View} view @param {Chosen} chosen */
+function ring(view, [list, index]) {
+  const place = state.config.world[list][index];
+  if (!place) return;
+  const { X, Y } = stage.place_on(view.canvas, view.crop), pen = pen_of(view.canvas);
+  pen.strokeStyle = getComputedStyle(document.documentElement).getPropertyValue("--accent").trim();
+  pen.lineWidth = 2.5;
+  pen.beginPath(); pen.arc(X(place[0]), Y(place[1]), 17, 0, 2 * Math.PI); pen.stroke();
+}
+
+/** Draws what the selected leader senses: a sector per quadrant, outside for POIs and inside for agents. @param {View} view @param {Scene} data */
+function senses(view, data) {
+  const [episode] = data.episodes, leader = view.selected;
+  view.sensed.hidden = leader === null || !episode.senses;
+  if (leader === null || !episode.senses) return;
   const frame = Math.min(Math.floor(view.place), episode.shown.length - 1);
   const now = moment(episode.senses, episode.leaders, frame, leader), { X, Y } = stage.place_on(view.canvas, view.crop);
   view.sensed.textContent = frame === 0 ? `Leader ${leader} has not sensed anything yet.` : `Leader ${leader} ${words(now)}`;
   if (frame === 0) return;
-  const [x, y, cos, sin] = stage.moment(view.data, episode, frame - 1, leader), ahead = Math.atan2(sin, cos);
+  const [x, y, cos, sin] = stage.moment(data, episode, frame - 1, leader), ahead = Math.atan2(sin, cos);
   const pen = pen_of(view.canvas), style = getComputedStyle(document.documentElement);
   for (const { values, tone, size } of [{ values: now.pois, tone: "--poi", size: 46 }, { values: now.agents, tone: "--accent", size: 26 }]) {
     const most = Math.max(...values, 1e-9);
@@ -118,59 +136,70 @@ function senses(view, episode) {
 
 /** Selects the leader under a click, or none. @param {View} view @param {MouseEvent} event */
 function picked(view, event) {
-  if (state.mode !== "watch" || !view.data || !view.drawn || !view.data.episodes[0].senses) return;
+  if (state.mode !== "watch" || !view.data || !view.data.episodes[0].senses) return;
   const { X, Y } = stage.place_on(view.canvas, view.crop), { leaders } = view.data.episodes[0];
   const away = view.drawn.slice(0, leaders).map(([x, y]) => Math.hypot(X(x) - event.offsetX, Y(y) - event.offsetY));
   const nearest = away.indexOf(Math.min(...away));
   if (away[nearest] <= 18) select(view, nearest);
 }
 
+/** Selects the leader whose senses are shown. Selecting it again ends that. @param {View} view @param {number} leader */
+export function select(view, leader) {
+  view.selected = view.selected === leader ? null : leader;
+  draw(view);
+  after.episode();
+}
+
 /**
- * Plays an episode from its start, or shows its end if `moving` is false. Visitors who prefer reduced motion also see the end.
- * @param {View} view @param {any} data
+ * Plays an episode from its start, or shows its end if `moves` is false. Visitors who prefer reduced motion also see the end.
+ * @param {View} view @param {Scene} data
  */
-export function show(view, data, moving = true) {
-  const last = data.episodes[0].shown.length - 1;
-  const plays = moving && !still.matches, [left, below, right, above] = view.crop;
+export function show(view, data, moves = true) {
+  const last = data.episodes[0].shown.length - 1, plays = moves && !still.matches, [left, below, right, above] = view.crop;
   // Stages and jitter may move POIs out of the view.
-  if (data.pois.some((/** @type {Place} */ [x, y]) => x < left || x > right || y < below || y > above)) view.crop = stage.whole(data);
+  if (data.pois.some(([x, y]) => x < left || x > right || y < below || y > above)) view.crop = stage.whole(data);
+  view.canvas.style.setProperty("--wide", String((view.crop[2] - view.crop[0]) / (view.crop[3] - view.crop[1])));
   // A removed leader stays removed while the episode is the same.
   if (data !== view.data) view.removed = null;
   if (view.selected && view.selected >= data.episodes[0].leaders) view.selected = null;
   Object.assign(view, { data, place: plays ? 0 : last, playing: plays, ended: plays ? null : performance.now() });
   draw(view);
-  credits();
+  after.episode();
   wake_up();
 }
 
-/** Sets the step slider to the first view's step. @param {View} view */
-export function steps(view) {
-  const last = view.data.episodes[0].shown.length - 1;
-  $("step").disabled = last === 0;
-  $("step").max = last;
-  $("step").value = Math.floor(view.place);
-  $("step").setAttribute("aria-valuetext", `step ${view.data.episodes[0].shown[Math.floor(view.place)]} of ${view.data.steps}`);
+/** Sets the step slider to a place in an episode. @param {Scene} data @param {number} place */
+function steps({ episodes: [{ shown }], steps }, place) {
+  const slider = $("step"), step = String(Math.floor(place));
+  if (slider.max === String(shown.length - 1) && slider.value === step && slider.ariaValueText) return;
+  slider.disabled = shown.length === 1;
+  slider.max = String(shown.length - 1);
+  slider.value = step;
+  slider.ariaValueText = `step ${shown[Number(step)]} of ${steps}`;
 }
+
+/** Returns the last frame of a view's episode. @param {Shown} view */
+export const end_of = view => view.data.episodes[0].shown.length - 1;
+/** Returns the views whose episodes have steps. */
+export const moving = () => shown().filter(view => end_of(view) > 0);
 
 /** Shows all views at a step, and pauses them. @param {number} place */
 export function step_to(place) {
   $("loop").checked = false;
-  for (const view of state.views.filter(view => view.data)) {
-    Object.assign(view, { playing: false, place: Math.min(place, view.data.episodes[0].shown.length - 1), ended: performance.now() });
+  for (const view of shown()) {
+    Object.assign(view, { playing: false, place: Math.min(place, end_of(view)), ended: performance.now() });
     draw(view);
   }
 }
 
 // Sets the button of the player.
 function playing() {
-  const plays = state.views.some(view => view.playing);
-  if ($("replay").textContent !== (plays ? "Pause the episode" : "Play")) $("replay").textContent = plays ? "Pause the episode" : "Play";
+  write_text($("replay"), state.views.some(view => view.playing) ? "Pause the episode" : "Play");
 }
 
 // Plays the episodes, from their start if they have ended, or pauses them.
 export function replay() {
-  const views = state.views.filter(view => view.data && view.data.episodes[0].shown.length > 1), plays = views.some(view => view.playing);
-  const ended = views.every(view => view.place >= view.data.episodes[0].shown.length - 1);
+  const views = moving(), plays = views.some(view => view.playing), ended = views.every(view => view.place >= end_of(view));
   if (plays) $("loop").checked = false;
   for (const view of views) {
     if (plays) Object.assign(view, { playing: false, ended: performance.now() });
@@ -195,26 +224,28 @@ function tick(time) {
   const seconds = clock === null ? 0 : Math.min((time - clock) / 1000, 0.25);
   clock = time;
   const { training } = state, live = training && training.state === "training" && state.follow;
-  for (const view of state.views.filter(view => view.playing)) {
-    const [episode] = view.data.episodes, last = episode.shown.length - 1;
+  for (const view of shown().filter(view => view.playing)) {
+    const [episode] = view.data.episodes;
     // An episode takes 1.6 s during training. Afterwards it plays in simulated time, but for at most 4 s.
     const whole = view.data.steps * view.data.dt, times = whole / (live ? 1.6 : Math.min(whole, 4)) * Number($("speed").value);
     // The time of the first motion, for measurements.
     if (!has_moved && seconds > 0) { has_moved = true; performance.mark("motion"); }
     view.place = stage.later(view.data, episode, view.place, seconds * times);
-    if (view.place >= last) {
+    if (view.place >= end_of(view)) {
       view.playing = false;
       view.ended = time;
     }
     draw(view);
   }
   // Repeats together, a second after the last view has ended.
-  const views = state.views.filter(view => view.data && view.data.episodes[0].shown.length > 1);
+  const views = moving();
   const waits = $("loop").checked && !live && state.mode === "watch" && views.length > 0 && views.every(view => !view.playing && view.ended);
   if (waits && views.every(view => time - (view.ended ?? time) > 1000)) views.forEach(view => Object.assign(view, { place: 0, playing: true, ended: null }));
   if (state.follow) follow();
   running = waits || state.views.some(view => view.playing);
-  if (running) requestAnimationFrame(tick);
+  // During training, about 20 pictures a second are enough, and leave the main thread free.
+  if (running && live) setTimeout(requestAnimationFrame, 32, tick);
+  else if (running) requestAnimationFrame(tick);
 }
 
 // Requests the current best team for every view that has finished its episode.
@@ -238,10 +269,11 @@ export async function ask(view, run, generation) {
   if (!training) return;
   view.asking = true;
   try {
-    const data = unpack(await training.best(run, trial, generation));
+    const data = stage.unpack(await training.best(run, trial, generation));
     if (state.training === training && state.views[run] === view && state.mode === "watch") show(view, data);
-  } catch (/** @type {any} */ error) {
-    if (!error.stopped && state.training === training && !/worker/.test(error.message)) trouble(error.message);
+  } catch (thrown) {
+    const { message, stopped, fatal } = failure(thrown);
+    if (!stopped && !fatal && state.training === training) trouble(message);
   }
   view.asking = false;
   if (view.wanted !== null) {
@@ -275,9 +307,9 @@ export function position() {
   const { training, generation } = state;
   if (!training) return;
   const ahead = state.follow && training.state === "training";
-  $("scrub").value = generation;
+  $("scrub").value = String(generation);
   $("generation").textContent = `${ahead ? "trained to generation" : "generation"} ${generation} of ${training.last}`;
-  $("scrub").setAttribute("aria-valuetext", $("generation").textContent);
+  $("scrub").ariaValueText = $("generation").textContent;
 }
 
 export function controls() {

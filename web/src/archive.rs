@@ -16,7 +16,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use zip::{ZipArchive, ZipWriter, write::SimpleFileOptions};
 
-use crate::ask::{Answer, Refusal, described, floats, refuse};
+use crate::answer::{Answer, Refusal, described, floats, refuse};
 
 /// Maximum bytes read from one file of an archive.
 const MOST: u64 = 1 << 30;

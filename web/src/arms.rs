@@ -9,7 +9,7 @@ use flotilla::statistics::Average;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
-use crate::ask::{Refusal, refuse};
+use crate::answer::{Refusal, refuse};
 
 /// G whose first generation is compared, as in `flotilla compare`.
 const REACH: f64 = 0.75;

@@ -1,6 +1,5 @@
 //! The requests of a page, and their dispatch.
 
-use std::fmt::Display;
 use std::path::PathBuf;
 
 use flotilla::backend::cpu::Cpu;
@@ -8,49 +7,20 @@ use flotilla::backend::gpu::device::{Gpu, Request, Wanted};
 use flotilla::backend::gpu::episode::{GpuBackend, Records, ResidencyPolicy};
 use flotilla::backend::gpu::{self, exact::Pass};
 use flotilla::backend::{Machine, OpenBackend};
-use flotilla::config::{Config, ConfigError, Override};
+use flotilla::config::{Config, Override};
 use flotilla::front;
-use flotilla::model::start;
 use flotilla::report::{replay, runs};
 use flotilla::verify::{self, Plan};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
+use crate::answer::{Answer, Refusal, described, floats, refuse};
 use crate::archive::{self, Recorded};
 use crate::arms;
 use crate::baseline::{self, Random};
 use crate::drive::Drive;
 use crate::edit;
 use crate::train::{Chosen, Training};
-
-/// JSON and little-endian numbers.
-pub type Answer = (Value, Vec<u8>);
-
-/// An error as JSON: a message, and for an invalid config its problems by line.
-pub struct Refusal(Value);
-
-impl From<Refusal> for Value {
-    fn from(refusal: Refusal) -> Value {
-        refusal.0
-    }
-}
-
-impl From<ConfigError> for Refusal {
-    fn from(error: ConfigError) -> Refusal {
-        let mut words = json!({ "error": error.to_string() });
-        if let ConfigError::Invalid { problems, unlisted, .. } = error {
-            let problem = |problem: flotilla::config::Problem| json!({ "line": problem.line, "key": problem.key, "message": problem.message });
-            words["problems"] = problems.into_iter().map(problem).collect();
-            words["unlisted"] = unlisted.into();
-        }
-        Refusal(words)
-    }
-}
-
-/// Wraps any error that has only a message.
-pub fn refuse(error: impl Display) -> Refusal {
-    Refusal(json!({ "error": error.to_string() }))
-}
 
 /// A request of the page.
 #[derive(Deserialize)]
@@ -72,7 +42,7 @@ enum Ask {
     MoreRandom { milliseconds: f64 },
     /// Joins pictures to a GIF. The numbers are RGBA `[pictures][height][width][4]`. `delay` is in hundredths of a second.
     Gif { width: u16, height: u16, delay: u16 },
-    /// Returns the version, and the colours of leaders and their followers.
+    /// Returns the version.
     About,
     /// Chooses the backend: the CPU, or the browser's GPU. Without `pass`, the first exact pass is used.
     Open { gpu: bool, pass: Option<String> },
@@ -124,11 +94,6 @@ fn parse(text: &str) -> Result<Config, Refusal> {
     Ok(Config::parse(text, "the config")?)
 }
 
-/// Copies bytes of any alignment to f32 numbers. Incomplete trailing bytes are ignored.
-pub fn floats(bytes: &[u8]) -> Vec<f32> {
-    bytemuck::pod_collect_to_vec(&bytes[..bytes.len() / 4 * 4])
-}
-
 pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer, Refusal> {
     let words = |words: Value| Ok((words, vec![]));
     match serde_json::from_str(text).map_err(refuse)? {
@@ -158,7 +123,7 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
             let pictures = bytes.chunks_exact(size).map(<[u8]>::to_vec).zip(delays);
             Ok((json!({}), replay::animate([width, height], last, pictures).map_err(refuse)?))
         }
-        Ask::About => words(json!({ "version": flotilla::VERSION, "colors": replay::colors() })),
+        Ask::About => words(json!({ "version": flotilla::VERSION })),
         Ask::Open { gpu, pass } => {
             session.player = if gpu { front::on_gpu(episodes(open_gpu(pass.as_deref())?)?) } else { front::cpu() };
             words(machine(&session.player))
@@ -196,29 +161,6 @@ fn resolve(text: &str, name: &str, changes: Vec<(String, String)>) -> Result<Val
     // Besides training itself, snapshots are kept, and packing the archive copies all policies.
     words["bytes"] = (flotilla::memory::Peaks::of([&config], 1).host + 5 * config.policy_bytes()).into();
     Ok(words)
-}
-
-/// Returns a config as TOML and as JSON, with its number of POIs (null if stages differ), parameters per policy, and
-/// start.
-pub fn described(config: &Config) -> Value {
-    let (toml, pois, parameters) = (config.to_toml(), config.pois(), config.parameters());
-    let mut words = json!({ "toml": toml, "config": config, "pois": pois, "parameters": parameters });
-    // JavaScript numbers cannot represent every 64-bit seed.
-    words["config"]["learning"]["seed"] = config.learning.seed.to_string().into();
-    words["start"] = start_of(config);
-    words
-}
-
-/// Returns each POI's coupling, each agent's heading, and the leader that each agent would follow first (-1 for none).
-fn start_of(config: &Config) -> Value {
-    let world = &config.world;
-    let first = |follower: &[f64; 2]| {
-        let leader = start::nearest(follower, &world.leaders);
-        let [dx, dy] = [0, 1].map(|axis| world.leaders[leader][axis] - follower[axis]);
-        if dx.hypot(dy) <= config.follow.attraction_radius { leader as i64 } else { -1 }
-    };
-    let owner: Vec<i64> = (0..world.leaders.len() as i64).chain(world.followers.iter().map(first)).collect();
-    json!({ "owner": owner, "coupling": world.coupling.of_each(world.pois.len()), "headings": world.headings() })
 }
 
 fn machine((backend, machine): &OpenBackend) -> Value {

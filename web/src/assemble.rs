@@ -32,9 +32,6 @@ mod page {
     use miniz_oxide::deflate::compress_to_vec_zlib;
     use wasm_bindgen_cli_support::Bindgen;
 
-    /// Modules of the page, in the order in which they are joined to one script.
-    const MODULES: &str = "dom pool config chart training compare table senses state experiment address machine curves intervals scene \
-        views credit baselines train arrange drive modes files verify exports gallery guide opening main";
     /// Experiments of the gallery.
     const GALLERY: [&str; 6] = ["two_groups", "population", "blind", "eight_followers", "relay", "places"];
     const LAYOUTS: [&str; 3] = ["generally_forward", "strictly_forward", "chaotic"];
@@ -44,11 +41,39 @@ mod page {
         fs::read_to_string(&path).map_err(|error| format!("{}: cannot be read: {error}", path.display()).into())
     }
 
-    /// Returns a module without its imports and exports. Names are unique among modules; the browser reports any that
-    /// are not.
-    fn joined(module: &str) -> String {
-        let lines = module.lines().filter(|line| !line.starts_with("import "));
-        lines.map(|line| format!("{}\n", line.strip_prefix("export ").unwrap_or(line))).collect()
+    /// The page's script: each module once, after those that it imports.
+    #[derive(Default)]
+    struct Script {
+        text: String,
+        joined: Vec<String>,
+        /// The modules whose imports are being joined, each imported by the one before it.
+        importing: Vec<String>,
+    }
+
+    impl Script {
+        /// Joins a module, without its imports and exports. Names are unique among modules; the browser reports any that
+        /// are not.
+        fn join(&mut self, module: &str) -> Result<(), Box<dyn Error>> {
+            if self.joined.iter().any(|joined| joined == module) {
+                return Ok(());
+            }
+            if let Some(first) = self.importing.iter().position(|importing| importing == module) {
+                let circle = self.importing[first..].join(", ");
+                return Err(format!("web/page: these modules import each other in a circle: {circle}").into());
+            }
+            self.importing.push(module.into());
+            let text = source(&format!("page/{module}.js"))?;
+            let (imports, rest): (Vec<_>, Vec<_>) = text.lines().partition(|line| line.starts_with("import "));
+            for import in imports {
+                let file = import.split('"').nth(1).and_then(|file| file.strip_prefix("./")?.strip_suffix(".js"));
+                self.join(file.ok_or_else(|| format!("{module}.js: imports no module of the page: {import}"))?)?;
+            }
+            for line in rest {
+                self.text += &format!("{}\n", line.strip_prefix("export ").unwrap_or(line));
+            }
+            self.joined.extend(self.importing.pop());
+            Ok(())
+        }
     }
 
     pub fn make(wasm: &Path, folder: &Path) -> Result<(), Box<dyn Error>> {
@@ -71,12 +96,10 @@ mod page {
             texts.push((format!("gallery-{name}"), source(&format!("gallery/{name}.toml"))?));
         }
         texts.push(("opening".into(), source("page/opening.json")?));
-        let mut scripts = source("../src/report/stage.js")?;
-        for module in MODULES.split_whitespace() {
-            scripts += &joined(&source(&format!("page/{module}.js"))?);
-        }
+        let mut script = Script { text: source("../src/report/stage.js")?, ..Script::default() };
+        script.join("main")?;
         let mut page = source("page/index.html")?;
-        page = page.replacen("/* STYLE */", &source("page/style.css")?, 1).replacen("/* SCRIPTS */", &scripts, 1);
+        page = page.replacen("/* STYLE */", &source("page/style.css")?, 1).replacen("/* SCRIPTS */", &script.text, 1);
         let mut inert = String::new();
         for (name, text) in texts {
             if text.contains("</") && text.to_lowercase().contains("</script") {

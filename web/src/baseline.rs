@@ -6,7 +6,7 @@ use flotilla::config::Config;
 use flotilla::host::Instant;
 use serde_json::{Value, json};
 
-use crate::ask::{Refusal, refuse};
+use crate::answer::{Refusal, refuse};
 
 /// Episodes from which G of a constant action is averaged if starts or POIs move.
 const EPISODES: u32 = 20;

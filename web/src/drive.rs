@@ -6,7 +6,7 @@ use flotilla::stepping::Stepper;
 use flotilla::world::{INPUTS, OUTPUTS};
 use serde_json::{Value, json};
 
-use crate::ask::{Refusal, refuse};
+use crate::answer::{Refusal, refuse};
 
 pub struct Drive {
     stepper: Stepper,

@@ -14,6 +14,7 @@ use flotilla::host::{self, Host};
 use serde_json::{Value, json};
 use wasm_bindgen::prelude::*;
 
+mod answer;
 mod archive;
 mod arms;
 mod ask;
@@ -22,7 +23,8 @@ mod drive;
 mod edit;
 mod train;
 
-use ask::{Answer, Session};
+use answer::Answer;
+use ask::Session;
 
 #[wasm_bindgen]
 extern "C" {

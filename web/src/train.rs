@@ -4,14 +4,14 @@ use std::collections::BTreeMap;
 
 use flotilla::backend::Backend;
 use flotilla::backend::cpu::Cpu;
-use flotilla::config::{Config, ValidConfig};
+use flotilla::config::{Config, Fitness, ValidConfig};
 use flotilla::host::Instant;
 use flotilla::report::replay;
 use flotilla::trainer::{Row, Snapshot, Trainer};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
-use crate::ask::{Answer, Refusal, refuse};
+use crate::answer::{Answer, Refusal, refuse};
 
 /// A config, and the trials of it that this worker trains. `None` means all trials.
 #[derive(Deserialize)]
@@ -153,7 +153,14 @@ impl Training {
             trainer.advance(&mut cpu).map_err(refuse)?;
         }
         let config = config.at(generation);
-        let played = replay::best(&config, &mut trainer, trial, &mut cpu).map_err(refuse)?;
+        // Under Dt, what Dt needs is recorded, and every other credit, too.
+        let mut timed = config.clone();
+        timed.learning.fitness = Fitness::Dt;
+        let mut played = replay::best(&timed, &mut trainer, trial, &mut cpu).map_err(refuse)?;
+        if config.learning.fitness != Fitness::Dt {
+            // Then followers are drawn with the leader that they saw most.
+            played.led.clear();
+        }
         Ok(replay::detailed("", &config, &[played]))
     }
 

@@ -1,0 +1,65 @@
+//! Answers to the page's requests: JSON and numbers, errors, and the description of a config.
+
+use std::fmt::Display;
+
+use flotilla::config::{Config, ConfigError, Problem};
+use flotilla::model::start;
+use serde_json::{Value, json};
+
+/// JSON and little-endian numbers.
+pub type Answer = (Value, Vec<u8>);
+
+/// An error as JSON: a message, and for an invalid config its problems by line.
+pub struct Refusal(Value);
+
+impl From<Refusal> for Value {
+    fn from(refusal: Refusal) -> Value {
+        refusal.0
+    }
+}
+
+impl From<ConfigError> for Refusal {
+    fn from(error: ConfigError) -> Refusal {
+        let mut words = json!({ "error": error.to_string() });
+        if let ConfigError::Invalid { problems, unlisted, .. } = error {
+            let problem =
+                |problem: Problem| json!({ "line": problem.line, "key": problem.key, "message": problem.message });
+            words["problems"] = problems.into_iter().map(problem).collect();
+            words["unlisted"] = unlisted.into();
+        }
+        Refusal(words)
+    }
+}
+
+/// Wraps any error that has only a message.
+pub fn refuse(error: impl Display) -> Refusal {
+    Refusal(json!({ "error": error.to_string() }))
+}
+
+/// Copies bytes of any alignment to f32 numbers. Incomplete trailing bytes are ignored.
+pub fn floats(bytes: &[u8]) -> Vec<f32> {
+    bytemuck::pod_collect_to_vec(&bytes[..bytes.len() / 4 * 4])
+}
+
+/// Returns a config as TOML and as JSON, with its number of POIs (null if stages differ), parameters per policy, and
+/// start.
+pub fn described(config: &Config) -> Value {
+    let (toml, pois, parameters) = (config.to_toml(), config.pois(), config.parameters());
+    let mut words = json!({ "toml": toml, "config": config, "pois": pois, "parameters": parameters });
+    // JavaScript numbers cannot represent every 64-bit seed.
+    words["config"]["learning"]["seed"] = config.learning.seed.to_string().into();
+    words["start"] = start_of(config);
+    words
+}
+
+/// Returns each POI's coupling, each agent's heading, and the leader that each agent would follow first (-1 for none).
+fn start_of(config: &Config) -> Value {
+    let world = &config.world;
+    let first = |follower: &[f64; 2]| {
+        let leader = start::nearest(follower, &world.leaders);
+        let [dx, dy] = [0, 1].map(|axis| world.leaders[leader][axis] - follower[axis]);
+        if dx.hypot(dy) <= config.follow.attraction_radius { leader as i64 } else { -1 }
+    };
+    let owner: Vec<i64> = (0..world.leaders.len() as i64).chain(world.followers.iter().map(first)).collect();
+    json!({ "owner": owner, "coupling": world.coupling.of_each(world.pois.len()), "headings": world.headings() })
+}
