@@ -105,8 +105,7 @@ fn commented(from: &str, config: &Config) -> String {
     let values: Table = config.to_toml().parse().expect("it was just written");
     let opening: String =
         from.lines().take_while(|line| line.starts_with('#')).map(|line| format!("{line}\n")).collect();
-    let mut text =
-        opening + "#\n# Every key follows, with its meaning and (unit; allowed values; default).\n";
+    let mut text = opening + "#\n# Every key follows, with its meaning and (unit; allowed values; default).\n";
     let mut section = "";
     for key in config::keys() {
         let (of, leaf) = key.name.split_once('.').expect("keys are dotted");
