@@ -56,7 +56,7 @@ pub enum Failure {
     #[error(transparent)]
     TooLittle(#[from] TooLittle),
     /// The system cannot allocate the memory.
-    #[error("there is no memory for {what}, {bytes} bytes")]
+    #[error("not enough memory for {what}, {bytes} bytes")]
     Memory {
         /// The purpose of the memory.
         what: &'static str,

@@ -179,8 +179,13 @@ pub fn read_document<T>(
     for error in first_errors(errors, lines) {
         let span = error.span().unwrap_or(0..0);
         let at = text.get(span.clone()).filter(|at| !at.trim().is_empty());
-        let at = at.map_or(String::new(), |at| format!(" (at `{}`)", shorten(at)));
-        let message = error.message().trim().replace('\n', ", ") + &at;
+        // A missing comma is the usual mistake in a list of positions. The parser takes it for a word without quotes.
+        let numbers = |at: &str| at.contains(' ') && at.split(' ').all(|word| word.parse::<f64>().is_ok());
+        let message = match at {
+            Some(at) if numbers(at) => format!("found `{}`, allowed numbers with a comma between them", shorten(at)),
+            Some(at) => format!("{} (at `{}`)", error.message().trim().replace('\n', ", "), shorten(at)),
+            None => error.message().trim().replace('\n', ", "),
+        };
         reader.report(Place::Offset(span.start), "", message);
     }
     if reader.problems.is_empty() {

@@ -46,7 +46,7 @@ pub enum RunError {
     },
     /// An allocation failed.
     #[error(
-        "there is no memory for {what}, {bytes} bytes; choose a smaller population, fewer trials or another machine"
+        "not enough memory for {what}, {bytes} bytes; choose a smaller population, fewer trials or another machine"
     )]
     Memory {
         /// Purpose of the memory.

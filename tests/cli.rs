@@ -158,6 +158,7 @@ fn every_wrong_value_is_named_with_line_and_range() {
         (8, "dt = 1979-05-27", "world.dt: found 1979-05-27, allowed a number, 0.0001 to 10"),
         (7, "steps = 2.5", "world.steps: found 2.5, allowed a whole number, 1 to 10000"),
         (2, "map = 50", "world.map: found 50, allowed a list of 2 numbers"),
+        (2, "map = [50 60]", "found `50 60`, allowed numbers with a comma between them"),
         (2, "map = [50]", "world.map: found a list of 1, allowed a list of 2 numbers"),
         (3, "leaders = [[1, 2], 3]", "world.leaders[1]: found 3, allowed a list of 2 numbers"),
         (3, "leaders = [[1, 2, 3]]", "world.leaders[0]: found a list of 3, allowed a list of 2 numbers"),

@@ -152,7 +152,7 @@ fn bench_refuses_a_clock_that_stands_still() {
     let script = "ulimit -t 60; LD_PRELOAD=$PWD/preload.so exec flotilla bench --backend cpu --threads 1 --teams 2";
     let output = place.shell(script);
     let text = told(&output);
-    assert!(output.status.code() == Some(1) && text.contains("clock stands still"), "{:?} {text}", output.status);
+    assert!(output.status.code() == Some(1) && text.contains("clock does not advance"), "{:?} {text}", output.status);
 }
 
 #[test]

@@ -225,8 +225,8 @@ fn unfinished_runs_are_compared_as_far_as_they_are_and_that_is_told() {
     let metrics = place.path("part/metrics.csv");
     fs::write(&metrics, fs::read_to_string(&metrics).unwrap() + "2,3,1,0.").unwrap();
     let (text, told) = place.good("compare whole part");
-    assert!(told.contains("note: fitness G has come to generation 2 of 10\n"), "{told}");
-    assert!(told.contains("note: arms are compared up to generation 2, which all have come to\n"), "{told}");
+    assert!(told.contains("note: fitness G has reached generation 2 of 10\n"), "{told}");
+    assert!(told.contains("note: arms are compared up to generation 2, which all have reached\n"), "{told}");
     assert!(text.contains("best team's G, generation 2"), "{text}");
     let told = json(&place, "compare whole part");
     let reach = &told["comparisons"][0]["measures"][2];
@@ -240,7 +240,7 @@ fn unfinished_runs_are_compared_as_far_as_they_are_and_that_is_told() {
     let (_, told) = place.good("compare whole short");
     assert_eq!(
         told.lines().next(),
-        Some("note: arms are compared up to generation 1, which all have come to"),
+        Some("note: arms are compared up to generation 1, which all have reached"),
         "{told}"
     );
 
@@ -260,7 +260,7 @@ fn what_cannot_be_compared_is_refused_in_a_line() {
     bad(&place, "compare a", 2, &["a is one run", "another"]);
     bad(&place, "compare a b ./a", 2, &["./a is named twice"]);
     bad(&place, "compare a one", 1, &["one trial", "--trials"]);
-    bad(&place, "compare a torn", 1, &["no generation that every trial has come to"]);
+    bad(&place, "compare a torn", 1, &["no generation that every trial has reached"]);
     bad(&place, "compare a none", 1, &["none: no such folder", "flotilla train"]);
     bad(&place, "compare none", 1, &["none: no such folder"]);
     bad(&place, "compare paper a", 1, &["paper holds a paper", "arms/"]);

@@ -484,11 +484,11 @@ fn rules_that_cannot_be_are_refused_where_they_stand() {
         ("observers = 'nobody'", "5: world.observers: found 'nobody', allowed \"all\" or \"leaders\" or \"followers\""),
         (
             "observers = 'followers'\ncoupling = 2",
-            "6: world.coupling: found 2, allowed 1 (the number of followers, who alone are observers)",
+            "6: world.coupling: found 2, allowed 1 (the number of followers, because only they observe)",
         ),
         (
             "observers = 'leaders'\ncoupling = [1, 2, 3]",
-            "6: world.coupling[2]: found 3, allowed 1 to 2 (the number of leaders, who alone are observers)",
+            "6: world.coupling[2]: found 3, allowed 1 to 2 (the number of leaders, because only they observe)",
         ),
         (
             "observers = 'followers'\n[learning]\nparadigm = 'all-leaders'",

@@ -143,7 +143,7 @@ fn what_is_no_file_is_not_waited_for() {
     }
     for command in ["train small.toml", "sweep grid.toml", "paper --trials 1 --generations 1"] {
         let told = place.refused(1, &format!("{command} --backend cpu --out pipe"));
-        assert!(told.ends_with("a file stands where a folder is needed; choose another name\n"), "{told}");
+        assert!(told.ends_with("a file is where a folder is needed; choose another name\n"), "{told}");
     }
     for name in ["config.toml", "metrics.csv", ".lock"] {
         let place = with_run();

@@ -289,7 +289,7 @@ fn varied_keys_change_one_at_a_time() {
 fn wrong_varied_keys_are_told_with_their_lines() {
     let with = |keys: &str| refusal(&varied().replace("world.coupling = [1, 7]", keys));
     for (keys, wanted) in [
-        ("\"learning.fitness\" = [\"D\"]", "x.toml:17: vary.\"learning.fitness\": it stands in [grid] too"),
+        ("\"learning.fitness\" = [\"D\"]", "x.toml:17: vary.\"learning.fitness\": it is also in [grid]"),
         (
             "\"world.coupling\" = [1, 3]",
             "x.toml:17: vary.\"world.coupling\"[1]: found 3, which is the file's own value",
@@ -812,7 +812,7 @@ fn damaged_points_are_missing_not_wrong() {
     let error = failed(flotilla(&sweep, &out, &["--collect"]), 1);
     for wanted in [
         "4 of 8 points are missing",
-        "point 0001 (world.coupling = 1, world.steps = 8, learning.generations = 12): it has come to generation 2 of 12",
+        "point 0001 (world.coupling = 1, world.steps = 8, learning.generations = 12): it has reached generation 2 of 12",
         "point 0002",
         "metrics.csv: line 2 is not",
         "it was not run",

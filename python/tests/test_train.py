@@ -126,7 +126,7 @@ def test_a_training_starts_from_what_another_came_to(config, program):
     # Without the checkpoint it would start over.
     warm.save("bare")
     shutil.rmtree("bare/checkpoints")
-    with pytest.raises(flotilla.Error, match="starts over from these alone"):
+    with pytest.raises(flotilla.Error, match="can only start again from these"):
         train(longer, out="bare", resume=True)
     stopped = train(second, out="stopped", init=first, callback=lambda generation: generation.generation == 2)
     assert stopped.replay(compare=0).episodes[0].generation == 0

@@ -61,7 +61,7 @@ pub struct Args {
 /// Prints a table or JSON objects, with one row per combination of teams, steps and agents.
 pub fn run(args: Args) -> Result<(), Error> {
     if !bench::has_clock() {
-        let message = "the system's monotonic clock stands still, so nothing can be timed; run bench where it advances";
+        let message = "the system's monotonic clock does not advance, so nothing can be timed; run bench where it does";
         return Err(Error::Refused(message.into()));
     }
     let (name, text) = match &args.config {

@@ -177,9 +177,9 @@ impl StartLayout {
         let StartLayout { groups, followers, pois, .. } = *self;
         let count = |number: usize, what: &str| format!("{number} {what}{}", if number == 1 { "" } else { "s" });
         let (name, looks) = match self.shape {
-            Pattern::Ring => ("Ring", "stand around the centre of the map and look outwards"),
-            Pattern::Row => ("Row", "stand side by side and look up"),
-            Pattern::Grid => ("Grid", "stand side by side and look up"),
+            Pattern::Ring => ("Ring", "start around the centre of the map and face outwards"),
+            Pattern::Row => ("Row", "start side by side and face up"),
+            Pattern::Grid => ("Grid", "start side by side and face up"),
         };
         let place = match self.shape {
             Pattern::Ring => "on a ring around them",
@@ -187,8 +187,8 @@ impl StartLayout {
             Pattern::Grid => "in rows ahead of them",
         };
         format!(
-            "# {name}: {}, each a leader with {}.\n#\n# The groups {looks}. The {} {} {place}. A POI counts once {} {} \
-             near it at the\n# same step.\n",
+            "# {name}: {}, each a leader with {}.\n#\n# The groups {looks}. The {} {} {place}. A POI is observed when \
+             {} {} within its\n# radius in the same step.\n",
             count(groups, "group"),
             count(followers, "follower"),
             count(pois, "POI"),

@@ -76,8 +76,8 @@ impl Observers {
     pub(crate) fn counted(self) -> &'static str {
         match self {
             Observers::All => "the number of agents",
-            Observers::Leaders => "the number of leaders, who alone are observers",
-            Observers::Followers => "the number of followers, who alone are observers",
+            Observers::Leaders => "the number of leaders, because only they observe",
+            Observers::Followers => "the number of followers, because only they observe",
         }
     }
 }

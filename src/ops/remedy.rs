@@ -26,14 +26,13 @@ const TOO_MANY_FILES: i32 = 24;
 const INPUT_OUTPUT: i32 = 5;
 
 /// Advice on a comparison without a GPU.
-pub const NONE_TO_VERIFY: &str =
-    "; --report FILE without --adapter compares the instruction sets of the processor alone";
+pub const NONE_TO_VERIFY: &str = "; --report FILE without --adapter compares only the processor's instruction sets";
 
 /// Returns advice on a device that could not be opened, or that failed.
 pub fn device(error: &DeviceError) -> &'static str {
     match error {
         DeviceError::NoRealAdapter { .. } => {
-            "; what may be a software renderer is taken by --adapter alone (--adapter 0); --backend cpu is faster than one"
+            "; an adapter that may be a software renderer is used only with --adapter (--adapter 0); --backend cpu is faster"
         }
         DeviceError::Refused { .. } | DeviceError::Inexact { .. } => {
             "; choose another with --adapter, or use --backend cpu"

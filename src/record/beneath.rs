@@ -94,7 +94,7 @@ impl Root {
     /// Splits a path below this folder into the folders on the way and the last name.
     fn names<'a>(&self, path: &'a Path) -> io::Result<(Vec<&'a OsStr>, &'a OsStr)> {
         let elsewhere = || {
-            let text = format!("it is not in {}, where alone this is written", self.path.display());
+            let text = format!("it is outside {}, and this is written only inside", self.path.display());
             io::Error::new(ErrorKind::InvalidInput, text)
         };
         let here = self.path == Path::new(".") && path.is_relative();
@@ -212,7 +212,7 @@ fn not_a_folder(kind: Option<FileKind>, path: &Path, error: io::Error) -> io::Er
     match kind {
         Some(FileKind::Link) => is_link(path),
         Some(FileKind::File | FileKind::Other) => {
-            io::Error::new(ErrorKind::NotADirectory, "a file stands where a folder is needed; choose another name")
+            io::Error::new(ErrorKind::NotADirectory, "a file is where a folder is needed; choose another name")
         }
         Some(FileKind::Folder) | None => error,
     }

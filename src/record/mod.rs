@@ -127,7 +127,7 @@ pub enum RecordError {
         here: String,
     },
     /// The run has no usable checkpoint, so it needs the policies that it started from.
-    #[error("{path} {}, and has no checkpoint yet: it starts over from these alone", started(&Some(there.clone())), path = path.escaped())]
+    #[error("{path} {}, and has no checkpoint yet: it can only start again from these", started(&Some(there.clone())), path = path.escaped())]
     InitNeeded {
         /// Path of the folder.
         path: PathBuf,

@@ -220,7 +220,7 @@ impl<R: Read + Seek> TensorFile<R> {
         self.source.seek(SeekFrom::Start(self.start + start as u64)).map_err(told)?;
         let part = |_| {
             let mut values = Vec::new();
-            let refused = |_| format!("there is no memory for the {} bytes of {name}", end - start);
+            let refused = |_| format!("not enough memory for the {} bytes of {name}", end - start);
             values.try_reserve_exact(count).map_err(refused)?;
             values.resize(count, T::zeroed());
             self.source.read_exact(bytemuck::cast_slice_mut(&mut values)).map_err(told)?;

@@ -112,10 +112,10 @@ pub enum ComparisonError {
     #[error("{0} has one trial, of which no interval can be had; that takes two or more")]
     OneTrial(String),
     /// The trials of an arm, by its name, have no generation in common.
-    #[error("{0} has no generation that every trial has come to")]
+    #[error("{0} has no generation that every trial has reached")]
     TooShort(String),
     /// Some arms have not reached a requested generation.
-    #[error("the arms have come to generation {last}")]
+    #[error("the arms have reached generation {last}")]
     Beyond {
         /// The requested generation.
         at: usize,
@@ -316,10 +316,10 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
     let mut notes: Vec<String> = arms
         .iter()
         .filter_map(|arm| Some((arm, arm.last().filter(|&come| come < arm.planned)?)))
-        .map(|(arm, come)| format!("{} has come to generation {come} of {}", arm.name, arm.planned))
+        .map(|(arm, come)| format!("{} has reached generation {come} of {}", arm.name, arm.planned))
         .collect();
     if arms.iter().any(|arm| arm.planned > last) {
-        notes.push(format!("arms are compared up to generation {last}, which all have come to"));
+        notes.push(format!("arms are compared up to generation {last}, which all have reached"));
     }
     let named = |arm: &Cohort| Named {
         name: arm.name.clone(),

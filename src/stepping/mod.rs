@@ -66,7 +66,7 @@ pub enum StepError {
     #[error("the world's {0} do not fit its numbers of agents and POIs")]
     World(&'static str),
     /// The system has too little memory.
-    #[error("there is no memory for {teams} teams, {bytes} bytes")]
+    #[error("not enough memory for {teams} teams, {bytes} bytes")]
     Memory {
         /// The number of teams.
         teams: usize,

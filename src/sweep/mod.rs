@@ -284,7 +284,7 @@ impl Grid {
                 report("it lays out whole teams, of which the file has none of its own; allowed in [grid]".into());
             }
             _ if varied && self.axes.iter().any(|(other, _)| other.key == key) => {
-                report("it stands in [grid] too; leave one of them out".into());
+                report("it is also in [grid]; leave one of them out".into());
             }
             Value::Array(values) if values.is_empty() => {
                 report("found no values, allowed a list of at least one; or leave the key out".into());

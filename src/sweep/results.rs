@@ -85,7 +85,7 @@ pub enum Missing {
     #[error("it was not run")]
     NotRun,
     /// The point's run has reached the first of these generations. The second is its last.
-    #[error("it has come to generation {0} of {1}")]
+    #[error("it has reached generation {0} of {1}")]
     Unfinished(usize, usize),
     /// The point's files cannot be used.
     #[error("{0}")]

@@ -65,10 +65,13 @@ pub fn without_learning(results: Evidence<'_>) -> String {
     let meaning = if solved.is_empty() {
         "No constant speed, straight ahead, observes every POI anywhere.".into()
     } else {
+        let there = match solved.len() == LAYOUTS.len() * PARADIGMS.len() {
+            true => "of every layout in both paradigms".into(),
+            false => format!("in: {}", solved.join("; ")),
+        };
         format!(
-            "A constant speed, straight ahead, observes every POI in: {}. Such a team senses nothing, so teams that observe \
-             every POI there need not have learned to sense.",
-            solved.join("; ")
+            "A constant speed, straight ahead, observes every POI {there}. Such a team senses nothing, so teams that observe \
+             every POI there need not have learned to sense."
         )
     };
     format!("{meaning}\n\n{}\n{}", markdown(&rows), markdown(&races))
