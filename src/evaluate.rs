@@ -92,13 +92,15 @@ pub struct Tally {
 }
 
 /// The mean of a [`Tally`], its spread over episodes, and its confidence interval.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Spread {
     /// Mean over episodes.
     pub mean: f64,
     /// Sample standard deviation over episodes. None for one episode.
+    #[serde(rename = "standard_deviation")]
     pub deviation: Option<f64>,
     /// The 95 % interval of the mean, see [`statistics::mean`]. None for one episode.
+    #[serde(rename = "interval_95")]
     pub interval: Option<[f64; 2]>,
 }
 

@@ -9,7 +9,7 @@
 use std::borrow::Cow;
 use std::cell::RefCell;
 use std::ops::{ControlFlow, Range};
-#[cfg(feature = "report")]
+#[cfg(feature = "record")]
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
@@ -28,16 +28,13 @@ use crate::evolve::{self, Key, MAX_WEIGHT, Purpose};
 use crate::memory::{self, Peaks, TooLittle};
 use crate::parallel::current_num_threads;
 #[cfg(feature = "record")]
-use crate::record::{RecordError, hex, metrics};
-#[cfg(feature = "report")]
 use crate::record::{
+    RecordError,
     digests::{Digests, Verification},
     finished,
     folder::POLICIES,
-    policies,
+    hex, metrics, policies, runs,
 };
-#[cfg(feature = "report")]
-use crate::report::runs;
 use crate::stepping::{StepError, Stepper};
 use crate::trainer::{Ending, Row, Trainer};
 use crate::world::{INPUTS, OUTPUTS, World};
@@ -48,6 +45,7 @@ pub use coevolution::{Coevolution, Progress};
 
 /// The error of a function in this module. A failed call changes nothing.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum Failure {
     /// All problems of a config.
     #[error(transparent)]
@@ -137,7 +135,7 @@ pub enum Failure {
     #[error(transparent)]
     Step(#[from] StepError),
     /// A run's directory could not be read.
-    #[cfg(feature = "report")]
+    #[cfg(feature = "record")]
     #[error(transparent)]
     Run(#[from] runs::ReadError),
     /// A run's files could not be read or written.
@@ -149,6 +147,7 @@ pub enum Failure {
 /// The processor that plays episodes.
 #[cfg(feature = "gpu")]
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Processor {
     /// A usable GPU if there is one, else the CPU. Software renderers are ignored.
     #[default]
@@ -164,6 +163,7 @@ pub enum Processor {
 
 /// The result of the search for a GPU.
 #[cfg(feature = "gpu")]
+#[non_exhaustive]
 pub struct Found {
     /// The opened GPU, if one is used.
     pub gpu: Option<GpuBackend>,
@@ -226,6 +226,7 @@ pub fn on_gpu(backend: GpuBackend) -> OpenBackend {
 
 /// One generation of all trials, reported after its teams and champions have played.
 #[derive(Clone, Copy, Debug)]
+#[non_exhaustive]
 pub struct Generation<'a> {
     /// Index of the generation. Generation 0 plays the initial policies.
     pub generation: usize,
@@ -237,6 +238,7 @@ pub struct Generation<'a> {
 
 /// The results of a training.
 #[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
 pub struct Trained {
     /// The config that was trained. If the training was stopped early, it has fewer generations.
     pub config: Config,
@@ -275,7 +277,7 @@ impl Trained {
     ///
     /// # Errors
     /// The directory has no finished run, or its files are damaged or were changed after the run.
-    #[cfg(feature = "report")]
+    #[cfg(feature = "record")]
     pub fn read(folder: &Path, verification: Verification) -> Result<Trained, Failure> {
         let config = runs::config(folder, verification)?;
         let (mut rows, mut turns) = (Vec::new(), vec![0; config.learning.trials]);
@@ -409,6 +411,7 @@ fn start_from(trainer: &mut Trainer, config: &Config, policies: usize, first: &[
 
 /// The scores of teams, averaged over episodes.
 #[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
 pub struct Played {
     /// Number of POIs observed, `[teams]`.
     pub observed: Vec<f64>,
@@ -493,6 +496,7 @@ pub struct ActionNoise<'a> {
 
 /// The results of [`record`], of each episode's teams.
 #[derive(Clone, Debug, Default, PartialEq)]
+#[non_exhaustive]
 pub struct Recorded {
     /// Number of POIs observed, `[episodes][teams]`.
     pub observed: Vec<u32>,
@@ -556,6 +560,7 @@ pub fn record(
 
 /// The states, inputs, outputs and observations of every step of one episode.
 #[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
 pub struct Traced {
     /// Positions in units, `[teams][steps + 1][agents][2]`. Step 0 is the start. Leaders come first.
     pub positions: Vec<f32>,

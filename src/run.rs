@@ -256,6 +256,11 @@ impl Session {
         &self.members[run].folder.disk
     }
 
+    /// Returns the config of a run. It is shorter than the config that the run was opened with after [`Session::end`].
+    pub fn config(&self, run: usize) -> &Config {
+        &self.members[run].config
+    }
+
     /// Returns the content of `run.json` of a run.
     pub fn run(&self, run: usize) -> &Run {
         &self.members[run].run

@@ -118,6 +118,9 @@ fn failures_are_one_object() {
     assert_eq!(on_cpu(&["replay", "run", "--trial", "9"]), "usage");
     assert_eq!(on_cpu(&["rollout", "x.toml"]), "usage");
     assert_eq!(on_cpu(&["sweep", "none.toml"]), "config_unreadable");
+    assert_eq!(on_cpu(&["tasks", "none.toml"]), "config_unreadable");
+    assert_eq!(on_cpu(&["tasks", "x.toml", "--set", "world.steps=0"]), "usage");
+    assert_eq!(on_cpu(&["tasks", "x.toml", "./x.toml"]), "usage");
     assert_eq!(on_cpu(&["sweep", "x.toml", "--collect"]), "config_invalid");
     assert_eq!(on_cpu(&["bench", "x.toml", "--teams", "0"]), "usage");
     assert_eq!(on_cpu(&["baseline", "none.toml"]), "config_unreadable");
@@ -137,6 +140,22 @@ fn failures_are_one_object() {
         let (code, message) = failed(&place, &["check", name]);
         assert!(code == "config_unreadable" && message.contains(name), "{message}");
     }
+}
+
+#[test]
+fn every_command_with_json_fails_in_json() {
+    let place = Place::new(&[]);
+    let mut count = 0;
+    for command in flotilla::cli::command().get_subcommands() {
+        if command.get_arguments().any(|arg| arg.get_long() == Some("json")) {
+            let name = command.get_name();
+            for word in ["--no-such-flag", "--a\"b", "--\\", "--\u{2028}", "--red\u{1b}[31m", "--left\u{202e}right\n"] {
+                assert_eq!(failed(&place, &[name, word]).0, "usage", "{name} {word:?}");
+            }
+            count += 1;
+        }
+    }
+    assert!(count > 10, "{count} commands have --json");
 }
 
 #[test]

@@ -165,3 +165,50 @@ fn imports_are_found_however_they_are_written() {
     assert_eq!(imports(code, "crate"), ["a", "c", "d", "g", "h"]);
     assert_eq!(listed("//! | [`a`], [`mod@b`] | `c` | d |\n//! | x | [`y`] |\n"), ["a", "b"]);
 }
+
+/// The public items of a module, one a line, each method below its type.
+fn face(path: &Path) -> Vec<String> {
+    let (mut found, mut item, mut of) = (vec![format!("# {}", path.display())], String::new(), String::new());
+    for line in code(path).lines() {
+        let (text, indent) = (line.trim(), line.len() - line.trim_start().len());
+        let variant = of.starts_with("pub enum") && indent == 4 && text.starts_with(char::is_uppercase);
+        let method = of.starts_with("pub trait") && indent == 4 && text.starts_with("fn ");
+        match item.is_empty() {
+            true if indent == 0 && text.starts_with("impl") => of = text.trim_end_matches(" {").into(),
+            true if text.starts_with("pub ") || variant || method => item = text.into(),
+            true => continue,
+            false => item = format!("{item} {text}"),
+        }
+        let count = |bracket: [char; 2]| bracket.map(|one| item.matches(one).count());
+        let [[opened, closed], [from, to]] = [count(['(', ')']), count(['[', ']'])];
+        if opened == closed && from == to && item.ends_with(['{', ';', ',', '}']) {
+            if indent == 0 && item.starts_with("pub ") && item.ends_with('{') {
+                of = item.trim_end_matches(" {").into();
+            }
+            let within = if indent > 0 && of.starts_with("impl") { format!("{of}: ") } else { String::new() };
+            let shown = item.split(" = ").next().unwrap_or_default().trim_end_matches([' ', '{', ';', ',', '}']);
+            found.push(format!("{}{within}{shown}", " ".repeat(indent)));
+            item.clear();
+        }
+    }
+    found
+}
+
+#[test]
+fn the_public_face_is_as_listed() {
+    let modules = ["src/front", "src/ops"].map(PathBuf::from);
+    let paths = [PathBuf::from("src/front.rs")].into_iter().chain(modules.iter().flat_map(|module| files(module)));
+    let face = paths.flat_map(|path| face(&path)).collect::<Vec<_>>().join("\n") + "\n";
+    let path = "tests/face.txt";
+    if std::env::var("FLOTILLA_WRITE").as_deref() == Ok("1") {
+        fs::write(path, &face).unwrap();
+    }
+    let listed = fs::read_to_string(path).unwrap_or_default();
+    let differs = face.lines().find(|line| !listed.lines().any(|other| other == *line));
+    let gone = listed.lines().find(|line| !face.lines().any(|other| other == *line));
+    assert!(
+        listed == face,
+        "the public interface has changed: {differs:?} is new, {gone:?} is gone. If programs that are built on it still \
+         build, or this is a new minor version: FLOTILLA_WRITE=1 cargo test --test structure"
+    );
+}

@@ -7,7 +7,6 @@ import shlex
 import shutil
 import sys
 import tempfile
-import warnings
 import weakref
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -331,8 +330,7 @@ def train(
         start = "resume" if resume else "force" if force else "fresh"
         with tempfile.TemporaryDirectory(prefix="flotilla-") as aside:
             first = None if init is None else _init_file(init, config, aside)
-            for note in _native.train_into(config._native, where, start, first, name, _command(), told):
-                warnings.warn(f"{where}: {note}", RuntimeWarning, stacklevel=2)
+            _native.train_into(config._native, where, start, first, name, _command(), told)
         run = Run.open(where)
         if temporary:
             run._temporary = True

@@ -14,19 +14,6 @@ if TYPE_CHECKING:
     from flotilla._run import Run
 
 
-def _write(path: str | os.PathLike[str], content: bytes) -> None:
-    """Writes a file atomically, through a temporary file beside it."""
-    place = os.fspath(path)
-    beside = f"{place}.{os.getpid()}.part"
-    try:
-        with open(beside, "wb") as file:
-            file.write(content)
-        os.replace(beside, place)
-    finally:
-        if os.path.exists(beside):
-            os.remove(beside)
-
-
 class Figure:
     """A picture. In a notebook it is shown.
 
@@ -57,7 +44,7 @@ class Figure:
             OSError: the file cannot be written.
         """
         pixels = None if width is None else whole("width", width, 100, 8192)
-        _write(path, self._native.file(os.fspath(path), pixels))
+        _native.write(os.fspath(path), self._native.file(os.fspath(path), pixels))
 
     def __repr__(self) -> str:
         return "<flotilla.Figure: .save(path) writes it as .svg, .pdf or .png>"
@@ -125,10 +112,10 @@ class Replay:
         """
         kind = os.path.splitext(os.fspath(path))[1].lower()
         if kind == ".html":
-            _write(path, self.page().encode())
+            _native.write(os.fspath(path), self.page().encode())
         elif kind == ".gif":
             pixels = None if width is None else whole("width", width, 100, 8192)
-            _write(path, self._native.gif(pixels, whole("fps", fps, 1, 50)))
+            _native.write(os.fspath(path), self._native.gif(pixels, whole("fps", fps, 1, 50)))
         elif kind in (".svg", ".pdf", ".png"):
             self.still(step).save(path, width)
         else:

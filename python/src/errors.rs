@@ -116,7 +116,8 @@ impl Raised for runs::ReadError {
 
 impl Raised for ops::Error {
     fn raised(self) -> PyErr {
-        let text = self.to_string();
+        // Advice is about flags of the program.
+        let text = self.message();
         match self {
             ops::Error::Config(error) => error.raised(),
             ops::Error::Stopped(_) => PyKeyboardInterrupt::new_err(text),

@@ -29,7 +29,7 @@ mod _native {
     #[pymodule_export]
     use crate::program::{adapters, answer, main};
     #[pymodule_export]
-    use crate::show::{Figure, Replay, figure, replay};
+    use crate::show::{Figure, Replay, figure, replay, write};
     #[pymodule_export]
     use crate::step::Stepper;
     #[pymodule_export]

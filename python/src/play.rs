@@ -156,7 +156,7 @@ pub fn record<'py>(
     let recorded = workers::aside(py, || {
         front::record(&config.0, teams, weights, &starts, episodes.0..episodes.1, noise, arrays).raise()
     })?;
-    let front::Recorded { observed, credits, observed_at } = recorded;
+    let front::Recorded { observed, credits, observed_at, .. } = recorded;
     let shape = [observed.len(), config.0.learners()];
     let scores = |index: usize| PyArray1::from_iter(py, credits.iter().map(|credits| credits[index])).reshape(shape);
     let timed = config.0.learning.fitness == Fitness::Dt;

@@ -1,6 +1,6 @@
 //! The command-line program, its use cases, and the adapters it can use.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::ffi::{CString, OsString};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
@@ -10,6 +10,7 @@ use flotilla::backend::gpu::device;
 use flotilla::choice::Work;
 use flotilla::cli;
 use flotilla::ops::{self, Context, Event, Player, Request};
+use flotilla::trainer::Row;
 use pyo3::exceptions::{PyRuntimeWarning, PyValueError};
 use pyo3::prelude::*;
 
@@ -37,39 +38,74 @@ const PATIENCE: Duration = Duration::from_millis(50);
 #[pyfunction]
 pub fn answer(py: Python<'_>, request: &str, backend: &str, command: &str) -> PyResult<String> {
     let request: Request = serde_json::from_str(request).map_err(|error| PyValueError::new_err(error.to_string()))?;
+    perform(py, backend, command, &mut |_, _| Ok(false), |player, context| ops::answer(&request, player, context))
+        .map(|outcome| outcome.to_string())
+}
+
+/// Receives the rows of a generation and the number of the last one. Returns whether to end the training there.
+type Watch<'a> = &'a mut (dyn FnMut(&[Row], usize) -> PyResult<bool> + Send);
+
+/// Runs a use case, shows its warnings, and checks for Ctrl-C.
+pub fn perform<R: Send>(
+    py: Python<'_>,
+    backend: &str,
+    command: &str,
+    watch: Watch<'_>,
+    work: impl FnOnce(&mut dyn Player, Context<'_>) -> Result<R, ops::Error> + Send,
+) -> PyResult<R> {
     let mut player = Lazy { name: backend, open: None, error: None };
     let (outcome, interrupted) = workers::aside(py, || {
-        let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
-        let (asked, interrupted) = (RefCell::new(Instant::now()), RefCell::new(None));
-        let check = |event: Event<'_>| {
-            let is_due = asked.borrow().elapsed() >= PATIENCE;
-            let found = Python::attach(|py| match event {
-                Event::Warning(text) if !text.starts_with("note: ") => warn(py, text.trim_start_matches("warning: ")),
-                _ if is_due => py.check_signals(),
-                _ => Ok(()),
-            });
-            if is_due {
-                asked.replace(Instant::now());
-            }
-            if let Err(error) = found {
+        let [stop, end] = [false; 2].map(AtomicBool::new);
+        let (asked, interrupted) = (Cell::new(Instant::now()), Cell::new(None));
+        let (watch, last, ended) = (RefCell::new(watch), Cell::new(0), Cell::new(false));
+        let tell = |event: Event<'_>| {
+            let is_due = asked.get().elapsed() >= PATIENCE;
+            let generation = |a: &Row, b: &Row| a.generation == b.generation;
+            let found = match event {
+                Event::Warning(text) => {
+                    Python::attach(|py| warn(py, text.trim_start_matches("warning: "))).map(|()| false)
+                }
+                Event::Begin(_, _, to) => {
+                    last.set(to);
+                    Ok(false)
+                }
+                Event::Rows(_, rows) if !ended.get() => {
+                    let mut told = rows.chunk_by(generation).map(|rows| watch.borrow_mut()(rows, last.get()));
+                    told.find(|told| !matches!(told, Ok(false))).unwrap_or(Ok(false))
+                }
+                _ => Ok(false),
+            };
+            let found = match found {
+                Ok(false) if is_due => {
+                    asked.set(Instant::now());
+                    Python::attach(|py| py.check_signals()).map(|()| false)
+                }
+                found => found,
+            };
+            let ends = found.unwrap_or_else(|error| {
+                interrupted.set(Some(error));
                 stop.store(true, Relaxed);
-                interrupted.replace(Some(error));
+                false
+            });
+            if ends {
+                ended.set(true);
+                end.store(true, Relaxed);
+                stop.store(true, Relaxed);
             }
         };
-        let context = Context { tell: &check, stop: &stop, save: &save, command, falls_back: false };
-        let outcome = ops::answer(&request, &mut player, context);
+        let mut context = Context::new(&tell);
+        (context.stop, context.end, context.command) = (&stop, &end, command);
+        let outcome = work(&mut player, context);
         (outcome, interrupted.into_inner())
     });
-    match (interrupted, player.error) {
-        (Some(error), _) | (None, Some(error)) => Err(error),
-        (None, None) => {
-            let outcome = outcome.raise()?;
-            if let Some(lent) = player.open {
-                lent.give_back();
-            }
-            Ok(outcome.to_string())
-        }
+    if let Some(error) = interrupted.or(player.error) {
+        return Err(error);
     }
+    let outcome = outcome.raise()?;
+    if let Some(lent) = player.open {
+        lent.give_back();
+    }
+    Ok(outcome)
 }
 
 fn warn(py: Python<'_>, text: &str) -> PyResult<()> {

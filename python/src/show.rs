@@ -4,6 +4,8 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use flotilla::choice::Work;
+use flotilla::ops::{self, output};
+use flotilla::record::RecordError;
 use flotilla::record::digests::Verification;
 use flotilla::report::curves::{Band, PRINT};
 use flotilla::report::replay::{self as again, Film, ReplayError, Replayed, Which};
@@ -13,7 +15,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
-use crate::errors::Raise;
+use crate::errors::{Raise, Raised};
 use crate::workers;
 
 /// Replayed episodes.
@@ -101,6 +103,17 @@ pub fn figure(py: Python<'_>, folders: Vec<PathBuf>, unverified: bool) -> PyResu
         runs::figure(&folders, None, Band::Interval, verification).map(|figure| Figure(figure.scene()))
     })
     .raise()
+}
+
+/// Writes a file that the user named, whole or not at all.
+#[pyfunction]
+pub fn write(py: Python<'_>, path: PathBuf, content: &[u8]) -> PyResult<()> {
+    py.detach(|| output::check(&[("path", Some(&*path))], &[]).and_then(|()| output::write(&path, content))).map_err(
+        |error| match error {
+            ops::Error::Record(RecordError::Write { error, .. }) => error.into(),
+            error => error.raised(),
+        },
+    )
 }
 
 #[pymethods]

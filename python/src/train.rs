@@ -2,22 +2,17 @@
 
 use std::ops::ControlFlow;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use flotilla::backend::{Backend, OpenBackend};
 use flotilla::choice::Work;
 use flotilla::front::{self, Coevolution, Trained};
-use flotilla::memory::Peaks;
+use flotilla::ops::{self, ConfigText, train::Request};
 use flotilla::record::digests::Verification;
 use flotilla::record::disk::Disk;
 use flotilla::record::finished::Finished;
-use flotilla::record::folder::{self, Folder, METRICS, Start, StartFrom};
-use flotilla::record::ownership::{self, CURVES};
+use flotilla::record::folder::{self, METRICS, Start};
 use flotilla::record::{RecordError, metrics, policies};
-use flotilla::report::curves::Band;
-use flotilla::report::runs;
-use flotilla::run::{Ended, Options, RunError, Session};
 use flotilla::trainer::{Ending, Row};
 use numpy::{
     PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
@@ -28,7 +23,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyBool;
 
 use crate::config::Config;
-use crate::errors::{Raise, failed};
+use crate::errors::Raise;
+use crate::program::perform;
 use crate::workers;
 
 /// Minimum time between checks for Ctrl-C if there is no callback.
@@ -275,7 +271,7 @@ pub fn write_policies(config: &Config, policies: Vec<PyReadonlyArray3<'_, f32>>,
     Ok(())
 }
 
-/// Trains in a run directory, as `flotilla train` does, and returns warnings. [`open`] reads the results.
+/// Trains in a run directory, as `flotilla train` does. [`open`] reads the results.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "these are all that a run is")]
 pub fn train_into(
@@ -287,69 +283,20 @@ pub fn train_into(
     backend: &str,
     command: &str,
     callback: Option<Py<PyAny>>,
-) -> PyResult<Vec<String>> {
+) -> PyResult<()> {
     let start = match start {
         "resume" => Start::Resume,
         "force" => Start::Force,
         _ => Start::Fresh,
     };
-    if let Some(what) = folder::collection(&out) {
-        return Err(failed(format!("{} holds {what}, not a run; choose another folder", out.display())));
-    }
+    let config = ConfigText { text: config.0.to_toml(), name: "config".into(), set: vec![] };
+    let request = Request { config, name: "run".into(), out: Some(out), start, init, tensorboard: false };
     let mut watcher = Watcher::new(callback.as_ref());
-    let mut notes: Vec<String> = workers::play(py, backend, Work::of([&config.0]), |player| {
-        Peaks::of([&config.0], rayon::current_num_threads())
-            .check(player.1.backend == "gpu")
-            .map_err(RunError::from)
-            .raise()?;
-        let init = init.map(|path| policies::read_init(&path, &config.0)).transpose().raise()?;
-        let runs = vec![(config.0.clone(), out.clone(), init)];
-        let (mut session, notes) = Session::open_from(runs, start, &Disk::default()).raise()?;
-        let (stop, save, mut last) = (AtomicBool::new(false), AtomicBool::new(false), config.0.learning.generations);
-        while !session.is_done() {
-            let mut watch = |progress: &flotilla::run::Progress<'_>| {
-                for rows in progress.rows.chunk_by(|a, b| a.generation == b.generation) {
-                    if !stop.load(Relaxed) {
-                        stop.store(watcher.tell(rows, last, None), Relaxed);
-                    }
-                }
-            };
-            let mut options = Options {
-                command,
-                stop: &stop,
-                save: &save,
-                instead: &mut |_| None,
-                setback: &mut |_| (),
-                watch: &mut watch,
-            };
-            let outcome = session.train(player, &mut options).raise()?;
-            if watcher.error.is_some() {
-                break;
-            }
-            if outcome == Ended::Stopped {
-                // The callback stopped the training. The generation that plays next becomes the run's last one.
-                last = session.end().raise()?;
-                watcher.callback = None;
-                stop.store(false, Relaxed);
-            }
-        }
-        Ok(notes.into_iter().filter(|(_, note)| note.is_damage()).map(|(_, note)| note.to_string()).collect())
-    })?;
-    if let Some(error) = watcher.error {
-        return Err(error);
-    }
-    // The run is complete without its picture, so a failure here is only a warning.
-    let failed = workers::aside(py, || draw(&out)).err();
-    notes.extend(failed.map(|error| format!("curves.svg was not written: {error}")));
-    Ok(notes)
-}
-
-/// Writes a run's learning curves to its directory, as the program does.
-fn draw(folder: &PathBuf) -> PyResult<()> {
-    let svg =
-        runs::figure(std::slice::from_ref(folder), None, Band::Interval, Verification::Required).raise()?.scene().svg();
-    let disk = ownership::enter(&Disk::default(), folder, true).raise()?;
-    ownership::publish(&disk, &folder.join(CURVES), |output| output.write_all(svg.as_bytes())).raise()
+    let mut watch = |rows: &[Row], last| {
+        let stop = watcher.tell(rows, last, None);
+        watcher.error.take().map_or(Ok(stop), Err)
+    };
+    perform(py, backend, command, &mut watch, |player, context| ops::train::run(&request, player, context)).map(drop)
 }
 
 /// Reads a finished run.
@@ -415,9 +362,6 @@ pub fn save(
     };
     let rows: Vec<(Row, f64)> = rows.map(row).collect();
     workers::aside(py, || {
-        let disk = Disk::default();
-        let start = if force { Start::Force } else { Start::Fresh };
-        let (mut kept, _) = Folder::open(&folder, start, config, StartFrom::Random, disk).raise()?;
         let (backend, description, init) = played;
         let run = folder::Run {
             version: env!("CARGO_PKG_VERSION").into(),
@@ -432,8 +376,6 @@ pub fn save(
             ..folder::Run::new(config)
         };
         let finished = Finished { config, rows: &rows, policies: &weights, ending, run };
-        let digest = finished.write(&mut kept).raise()?;
-        draw(&folder)?;
-        Ok(digest)
+        ops::train::save(finished, &folder, if force { Start::Force } else { Start::Fresh }).raise()
     })
 }

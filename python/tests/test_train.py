@@ -78,6 +78,47 @@ def test_the_program_goes_on_with_what_was_trained_here(config, program):
     assert os.path.exists("memory/replay.html")
 
 
+def files_of(folder):
+    """The files of a run by name, without times, paths and who wrote them."""
+
+    def content(path):
+        data = path.read_bytes()
+        if path.name == "metrics.csv":
+            return [line.rsplit(b",", 1)[0] for line in data.splitlines()]
+        if path.name == "run.json":
+            who = ("started", "updated", "seconds", "command", "commit")
+            return {key: value for key, value in json.loads(data).items() if key not in who}
+        if path.parent.name == "checkpoints":
+            length = int.from_bytes(data[:8], "little")
+            header = json.loads(data[8 : 8 + length])
+            for key in ("seconds", "metrics_bytes", "metrics_sha256", "sha256"):
+                header["__metadata__"].pop(key, None)
+            return header, data[8 + length :]
+        return data
+
+    return {str(path.relative_to(folder)): content(path) for path in pathlib.Path(folder).rglob("*") if path.is_file()}
+
+
+def test_a_run_has_the_same_files_however_it_was_trained(config, program, tmp_path):
+    (tmp_path / "config.toml").write_text(config.to_toml())
+    program("train", "config.toml", "--out", "theirs", "--backend", "cpu", "--quiet")
+    train(config, out="ours", backend="cpu")
+    train(config, backend="cpu").save("saved")
+    expected = files_of("theirs")
+    assert {"config.toml", "curves.svg", "metrics.csv", "policies.safetensors", "run.json"} < set(expected)
+    longer = train(config.replace(learning={"generations": 16}), backend="cpu").digest
+    for folder in ("ours", "saved"):
+        found = files_of(folder)
+        assert found.keys() == expected.keys(), folder
+        for name, content in expected.items():
+            assert found[name] == content, (folder, name)
+    for folder in ("theirs", "ours", "saved"):
+        extended = program("train", f"{folder}/config.toml", "--out", folder, "--resume", "--generations", "16", "--json", "--backend", "cpu")
+        extended = json.loads(extended)
+        # Nothing that was trained before is trained again.
+        assert (extended["digest"], extended["trained_generations"]) == (longer, 10), folder
+
+
 def test_a_folder_is_gone_on_with_or_written_over(config):
     first = train(config, out="run")
     with pytest.raises(FileExistsError, match="run"):

@@ -1,7 +1,7 @@
 //! Runs use cases in a terminal: opens the backend, listens for signals, and shows what happens.
 
 use std::cell::RefCell;
-use std::sync::atomic::AtomicBool;
+use std::ffi::OsString;
 
 use super::recovery::{self, Loss, Signals};
 use super::{Error, RunOptions, backend, say};
@@ -44,18 +44,24 @@ impl<'a> Console<'a> {
     /// # Errors
     /// The use case fails, or the system does not allow signal handlers.
     pub fn run<R>(&mut self, work: impl FnOnce(&mut dyn Player, Context<'_>) -> Result<R, Error>) -> Result<R, Error> {
-        let (signals, command) = (Signals::listen()?, recovery::typed());
-        let show = Display::new(self.quiet);
-        let context = Context {
-            tell: &|event| show.event(event),
-            stop: &signals.stop,
-            save: &signals.save,
-            command: &command,
-            falls_back: self.loss.falls_back(),
-        };
-        let done = work(&mut self.machine, context);
-        show.event(Event::Pause);
-        done
+        self.with(&Signals::listen()?, work)
+    }
+
+    /// Runs a use case that signals end at once, because it leaves nothing to save.
+    ///
+    /// # Errors
+    /// The use case fails.
+    pub fn play<R>(&mut self, work: impl FnOnce(&mut dyn Player, Context<'_>) -> Result<R, Error>) -> Result<R, Error> {
+        self.with(&Signals::default(), work)
+    }
+
+    fn with<R>(
+        &mut self,
+        signals: &Signals,
+        work: impl FnOnce(&mut dyn Player, Context<'_>) -> Result<R, Error>,
+    ) -> Result<R, Error> {
+        let flags = recovery::words_of_machine(self.machine.options, self.loss);
+        told(self.quiet, signals, &flags, self.loss.falls_back(), |context| work(&mut self.machine, context))
     }
 }
 
@@ -64,10 +70,19 @@ impl<'a> Console<'a> {
 /// # Errors
 /// The use case fails.
 pub fn tell<R>(quiet: bool, work: impl FnOnce(Context<'_>) -> Result<R, Error>) -> Result<R, Error> {
-    let (show, never) = (Display::new(quiet), AtomicBool::new(false));
-    let context =
-        Context { tell: &|event| show.event(event), stop: &never, save: &never, command: "", falls_back: false };
-    let done = work(context);
+    told(quiet, &Signals::default(), &[], false, work)
+}
+
+fn told<R>(
+    quiet: bool,
+    signals: &Signals,
+    flags: &[OsString],
+    falls_back: bool,
+    work: impl FnOnce(Context<'_>) -> Result<R, Error>,
+) -> Result<R, Error> {
+    let (show, command) = (Display::new(quiet), recovery::typed());
+    let (Signals { stop, save }, tell) = (signals, |event: Event<'_>| show.event(event));
+    let done = work(Context { stop, save, command: &command, flags, falls_back, ..Context::new(&tell) });
     show.event(Event::Pause);
     done
 }
@@ -92,7 +107,7 @@ impl Display {
     fn event(&self, event: Event<'_>) {
         let shown = &mut *self.shown.borrow_mut();
         match (event, &mut *shown) {
-            (Event::Warning(text), _) => say(text),
+            (Event::Warning(text) | Event::Note(text), _) => say(text),
             (Event::Message(text), _) if !self.quiet => say(text),
             (Event::Begin(names, from, last), shown) => {
                 *shown = Shown::Curves(Board::new(names, from, last, self.quiet));

@@ -1,17 +1,15 @@
 //! `flotilla init`: writes a config to start from, with a comment about every key.
 
-use std::fs::OpenOptions;
-use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::builder::{PossibleValue, PossibleValuesParser};
 use toml::{Table, Value};
 
 use super::layout::{SHAPES, StartLayout};
-use super::{Error, output, print, said, whole};
+use super::{Error, print, said, whole};
 use crate::config::{self, Config, Definition};
 use crate::escape::PathExt;
-use crate::record::RecordError;
+use crate::ops::output;
 
 /// The paper's layouts. Each has the name of the argument, the name of the config file, and the file's text.
 const LAYOUTS: [([&str; 2], &str); 3] = [
@@ -56,8 +54,8 @@ pub fn run(args: Args) -> Result<(), Error> {
     let Some(path) = args.out else { return print(&text) };
     output::check(&[("--out", Some(&path))], &[])?;
     match args.force {
-        true => output::write(&path, |output| output.write_all(text.as_bytes()))?,
-        false => write_new(&path, &text).map_err(|error| RecordError::Write { path: path.clone(), error })?,
+        true => output::write(&path, text.as_bytes())?,
+        false => output::write_new(&path, text.as_bytes())?,
     }
     print(&format!("{}\n", path.escaped()))
 }
@@ -83,20 +81,6 @@ fn template(args: &Args) -> Result<String, Error> {
         Some(problem) => Err(Error::Usage(problem.into())),
         None => Ok(layout.text()?),
     }
-}
-
-/// Writes a file that must not exist yet.
-fn write_new(path: &Path, text: &str) -> io::Result<()> {
-    let mut file = OpenOptions::new().write(true).create_new(true).open(path).map_err(|error| match error.kind() {
-        io::ErrorKind::AlreadyExists => {
-            io::Error::other("the file exists; choose another --out, or overwrite it with --force")
-        }
-        _ => error,
-    })?;
-    file.write_all(text.as_bytes()).inspect_err(|_| {
-        // An incomplete config is worse than none.
-        let _ = std::fs::remove_file(path);
-    })
 }
 
 /// Returns `config` as a config file, after the opening comment of the text `from`. Each key has a comment with its

@@ -18,11 +18,12 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use serde::Serialize;
 
-use crate::config::{self, Choice, Config, Fitness, Override, Paradigm};
+use crate::config::{self, Choice, Fitness, Override, Paradigm};
 use crate::escape;
 use crate::file;
+use crate::ops::ConfigText;
 pub use crate::ops::{Error, Processor, said};
-use crate::reader::Document;
+use crate::record::folder::Start;
 
 mod backend;
 mod baseline;
@@ -35,10 +36,8 @@ mod devices;
 mod init;
 mod layout;
 mod man;
-mod output;
 mod paper;
 mod plot;
-mod points;
 mod process;
 mod recovery;
 mod replay;
@@ -47,7 +46,6 @@ mod sweep;
 mod tasks;
 mod train;
 mod verify;
-mod warnings;
 
 /// Declares the commands, each with its file, and runs the one that was typed. Help lists them by group.
 macro_rules! commands {
@@ -383,18 +381,12 @@ pub struct ConfigFile {
 }
 
 impl ConfigFile {
-    /// Loads the config, with the keys that a command's own flags set.
+    /// Reads the file, for a request that sets some keys.
     ///
     /// # Errors
-    /// Fails if the file cannot be read, or if it or a flag is invalid. The error lists the problems.
-    pub fn load(&self, overrides: &[Override]) -> Result<Config, Error> {
-        Ok(self.load_noted(overrides)?.0)
-    }
-
-    /// Loads the config as [`ConfigFile::load`] does, and returns notes for its author.
-    fn load_noted(&self, overrides: &[Override]) -> Result<(Config, Vec<String>), Error> {
-        let text = config::read_file(&self.path)?;
-        Ok(Config::read_noted(&Document::parse(&text), &config::name(&self.path), &[], overrides)?)
+    /// The file cannot be read.
+    pub fn text(&self, set: Vec<Override>) -> Result<ConfigText, Error> {
+        Ok(ConfigText { text: config::read_file(&self.path)?, name: config::name(&self.path), set })
     }
 }
 
@@ -418,15 +410,63 @@ impl ConfigArgs {
         }
     }
 
-    /// Loads the config, with the keys that the flags and `more` set. Prints the notes for its author, and returns them
-    /// as well.
+    /// Reads the file, for a request that sets the keys of the flags and `more`.
     ///
     /// # Errors
-    /// Fails if the file cannot be read, or if it or a flag is invalid. The error lists the problems.
-    pub fn load(&self, more: Vec<Override>) -> Result<(Config, Vec<String>), Error> {
-        let (config, notes) = self.file.load_noted(&[self.overrides.list(), more].concat())?;
-        notes.iter().for_each(|note| say(format_args!("note: {note}")));
-        Ok((config, notes))
+    /// The file cannot be read.
+    pub fn text(&self, more: Vec<Override>) -> Result<ConfigText, Error> {
+        self.file.text([self.overrides.list(), more].concat())
+    }
+}
+
+/// The flags that say what a command prints.
+#[derive(clap::Args, Clone, Copy)]
+pub struct Printed {
+    /// Print no progress, and no summary of a training or an episode; --json still prints its object
+    #[arg(long, short)]
+    pub quiet: bool,
+    /// Print the results as one JSON object (docs/reference/json.md)
+    #[arg(long)]
+    pub json: bool,
+}
+
+impl Printed {
+    /// Prints an outcome as JSON or, by `text`, for people.
+    ///
+    /// # Errors
+    /// Standard output cannot be written.
+    pub fn outcome<T: Serialize>(self, outcome: &T, text: impl FnOnce(&T) -> String) -> Result<(), Error> {
+        if self.json { print_json(outcome) } else { print(&text(outcome)) }
+    }
+
+    /// Prints an outcome that people may not want to see.
+    ///
+    /// # Errors
+    /// Standard output cannot be written.
+    pub fn summary<T: Serialize>(self, outcome: &T, text: impl FnOnce(&T) -> String) -> Result<(), Error> {
+        if self.quiet && !self.json { Ok(()) } else { self.outcome(outcome, text) }
+    }
+}
+
+/// The flags for results that are in the output directory.
+#[derive(clap::Args, Clone, Copy)]
+pub struct There {
+    /// Resume what is in the directory, and start what is missing
+    #[arg(long, conflicts_with = "force")]
+    resume: bool,
+    /// Overwrite what is in the directory
+    #[arg(long)]
+    force: bool,
+}
+
+impl There {
+    /// Returns what happens to the results.
+    pub fn start(self) -> Start {
+        match (self.resume, self.force) {
+            (true, _) => Start::Resume,
+            (_, true) => Start::Force,
+            _ => Start::Fresh,
+        }
     }
 }
 

@@ -5,12 +5,12 @@ use std::path::PathBuf;
 
 use super::console::Console;
 use super::recovery::{self, Checkpoints, Loss};
-use super::{Error, Overrides, RunOptions, number, print, print_json};
+use super::{Error, Overrides, Printed, RunOptions, There, number};
 use crate::config::Override;
 use crate::escape::PathExt;
 use crate::ops;
 use crate::ops::paper::{OUT, Request};
-use crate::record::folder::{ARMS, Start};
+use crate::record::folder::ARMS;
 use crate::shell;
 use crate::sweep::questions::letter;
 
@@ -32,18 +32,10 @@ pub struct Args {
     /// Random seed [default: 0]
     #[arg(long, value_name = "N", value_parser = number)]
     seed: Option<String>,
-    /// Resume the paper in the directory, or start it; for a finished one, draw figures and claims again
-    #[arg(long, conflicts_with = "force")]
-    resume: bool,
-    /// Overwrite the paper in the directory
-    #[arg(long)]
-    force: bool,
-    /// Print no progress
-    #[arg(long, short)]
-    quiet: bool,
-    /// Print the results as one JSON object (docs/reference/json.md)
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    there: There,
+    #[command(flatten)]
+    printed: Printed,
     #[command(flatten)]
     checkpoints: Checkpoints,
     #[command(flatten)]
@@ -60,19 +52,6 @@ impl Args {
         [overrides.list(), self.checkpoints.list()].concat()
     }
 
-    /// Returns what to do with a paper that is in the folder.
-    fn start(&self) -> Start {
-        match (self.resume, self.force) {
-            (true, _) => Start::Resume,
-            (_, true) => Start::Force,
-            _ => Start::Fresh,
-        }
-    }
-
-    fn request(&self) -> Request {
-        Request { out: self.out.clone(), start: self.start(), set: self.overrides(), questions: self.questions.clone() }
-    }
-
     /// Returns the command that resumes the paper.
     fn command_to_resume(&self) -> String {
         let (overrides, out) = (self.overrides(), shell::argument(&self.out));
@@ -86,29 +65,27 @@ impl Args {
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let mut console = Console::new(&args.run, args.loss, args.quiet);
+    let mut console = Console::new(&args.run, args.loss, args.printed.quiet);
+    let (set, start) = (args.overrides(), args.there.start());
+    let request = Request { out: args.out.clone(), start, set, questions: args.questions.clone() };
     let resume = |error: Error| error.or_advise(|| format!("continue with\n  {}", args.command_to_resume()));
     let out = args.out.escaped();
     if !args.questions.is_empty() {
-        let request = args.request();
         let found = console.run(|player, context| ops::questions::run(&request, player, context)).map_err(resume)?;
-        return match args.json {
-            true => print_json(&found),
-            false => print(&format!(
+        return args.printed.outcome(&found, |found| {
+            format!(
                 "{}\nFiles in {out}: questions.md, for each table its figure (.svg, .png, .pdf) and every comparison (.csv), and \
                  the sweep that it is of, in a folder\n",
                 found.text
-            )),
-        };
+            )
+        });
     }
-    let request = args.request();
     let found = console.run(|player, context| ops::paper::run(&request, player, context)).map_err(resume)?;
-    match args.json {
-        true => print_json(&found),
-        false => print(&format!(
+    args.printed.outcome(&found, |found| {
+        format!(
             "{}Trained in {:.1} s. Files in {out}: figure4, figure5, figure6 (.svg, .png, .pdf), claims.md (with every \
              figure), summary.json, and a run each in {ARMS}/\n",
             found.text, found.seconds
-        )),
-    }
+        )
+    })
 }

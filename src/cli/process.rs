@@ -1,6 +1,7 @@
 //! Sets up the process before its command, for the program and for the command in the Python package.
 
-use super::Error;
+use super::{Error, say};
+use crate::ops::output;
 
 /// Sets the process up: silences drivers, and turns the system's limits into errors that can be reported.
 ///
@@ -8,6 +9,7 @@ use super::Error;
 /// Fails if the system does not allow signal handlers.
 pub fn set_up() -> Result<(), Error> {
     suppress_driver_noise();
+    output::report_waiting(|text| say(text));
     #[cfg(unix)]
     {
         allow_many_files();

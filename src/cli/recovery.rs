@@ -13,16 +13,17 @@ use crate::config::Override;
 use crate::shell;
 
 /// The reaction to a failing device.
-#[derive(clap::Args, Clone, Copy)]
+#[derive(clap::Args, Clone, Copy, Default)]
 pub struct Loss {
     /// Reaction to a device that fails during a run
     #[arg(long, value_enum, value_name = "WHAT", default_value_t = OnLoss::Stop)]
     on_device_loss: OnLoss,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum OnLoss {
     /// Save, and stop with an error
+    #[default]
     Stop,
     /// Continue on the CPU, with the same results
     Cpu,
@@ -104,6 +105,7 @@ pub fn typed() -> String {
 }
 
 /// Flags that signals set.
+#[derive(Default)]
 pub struct Signals {
     /// Set if the run should save and stop.
     pub stop: Arc<AtomicBool>,

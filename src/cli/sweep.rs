@@ -8,13 +8,13 @@ use serde_json::json;
 
 use super::console::{self, Console};
 use super::recovery::{self, Loss};
-use super::{Error, Overrides, RunOptions, between, output, print, print_json, say, whole};
+use super::{Error, Overrides, RunOptions, There, between, print, print_json, say, whole};
 use crate::config;
 use crate::escape::PathExt;
-use crate::ops;
 use crate::ops::sweep::{Request, Results, claim};
+use crate::ops::{self, output};
 use crate::record::disk::Disk;
-use crate::record::folder::{SWEEP, Start};
+use crate::record::folder::SWEEP;
 use crate::report::curves::Band;
 use crate::report::runs::TeamKind;
 use crate::shell;
@@ -36,12 +36,8 @@ pub struct Args {
     /// Output directory, the same for all shards [default: runs/NAME of the sweep]
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Resume the points in the directory, and start the missing ones
-    #[arg(long, conflicts_with = "force")]
-    resume: bool,
-    /// Overwrite this sweep's points in the directory
-    #[arg(long)]
-    force: bool,
+    #[command(flatten)]
+    there: There,
     /// Leave out impossible points, for example a coupling above the number of agents
     #[arg(long)]
     skip_impossible: bool,
@@ -165,11 +161,7 @@ impl Args {
             skip_impossible: self.skip_impossible,
             out: out.into(),
             named: self.out.is_some(),
-            start: match (self.resume, self.force) {
-                (true, _) => Start::Resume,
-                (_, true) => Start::Force,
-                _ => Start::Fresh,
-            },
+            start: self.there.start(),
             shard: shard.map(|shard| (shard.index, shard.count)),
             memory: self.memory.map(|gib| (gib * f64::from(1 << 30)) as usize),
             results: Results {
@@ -317,7 +309,7 @@ fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> 
     match file {
         None => print(&script),
         Some(path) => {
-            output::write(path, |output| output.write_all(script.as_bytes()))?;
+            output::write(path, script.as_bytes())?;
             say(format_args!("submit it with: sbatch {}", path.escaped()));
             Ok(())
         }

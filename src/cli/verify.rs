@@ -2,10 +2,10 @@
 
 use std::path::PathBuf;
 
-use super::{Error, SetKeys, backend, between, console, output, print, print_json};
+use super::{Error, Printed, SetKeys, backend, between, console};
 use crate::config;
-use crate::ops;
 use crate::ops::verify::{Request, TEAMS};
+use crate::ops::{self, output};
 use crate::record::evidence::Compared;
 
 #[derive(clap::Args)]
@@ -41,12 +41,8 @@ pub struct Args {
     /// A remark about the machine, for the report
     #[arg(long, value_name = "TEXT", requires = "report")]
     note: Option<String>,
-    /// Print one JSON object
-    #[arg(long)]
-    json: bool,
-    /// Print no progress
-    #[arg(long, short)]
-    quiet: bool,
+    #[command(flatten)]
+    printed: Printed,
 }
 
 /// Shown below the help.
@@ -59,17 +55,14 @@ pub fn run(args: Args) -> Result<(), Error> {
     let config = args.config.as_deref().filter(|path| !config::is_standard_input(path));
     output::check(&[("--report", args.report.as_deref())], config.as_slice())?;
     let read = |path: PathBuf| Ok::<_, Error>((config::name(&path), config::read_file(&path)?));
-    let Args { config, set, teams, worlds, seed, adapter, pass, kernel, report, note, json, quiet } = args;
+    let Args { config, set, teams, worlds, seed, adapter, pass, kernel, report, note, printed } = args;
     let (config, set, evidence) = (config.map(read).transpose()?, set.set, report.is_some());
     let request = Request { config, set, teams, worlds, seed, adapter, pass, kernel, evidence, note };
-    let found = console::tell(quiet, |context| ops::verify::run(&request, context))?;
+    let found = console::tell(printed.quiet, |context| ops::verify::run(&request, context))?;
     if let (Some(path), Some(evidence)) = (&report, &found.evidence) {
-        output::write(path, |file| file.write_all(evidence.to_json().as_bytes()))?;
+        output::write(path, evidence.to_json().as_bytes())?;
     }
-    match json {
-        true => print_json(&found)?,
-        false => print(&in_words(&found.comparisons))?,
-    }
+    printed.outcome(&found, |found| in_words(&found.comparisons))?;
     found.difference().map_or(Ok(()), Err)
 }
 

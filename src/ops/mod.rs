@@ -3,34 +3,80 @@
 //! Each takes a request that can be serialised, tells a [`Context`] what happens on the way, and returns an outcome that
 //! can be serialised, or an [`Error`] with a stable code. [`answer`] takes any request as data.
 //!
+//! # Example
+//!
+//! ```
+//! use flotilla::ops::{self, ConfigText, Context, check};
+//!
+//! let text = include_str!("../../configs/chaotic.toml").into();
+//! let config = ConfigText { text, name: "chaotic.toml".into(), set: vec![] };
+//! let request = check::Request { config, name: "chaotic".into(), out: None };
+//! let found = check::run(&request, Context::new(&|_| ()))?;
+//! println!("{} teams play {} steps", found.cost.teams, found.cost.team_steps);
+//! # Ok::<(), ops::Error>(())
+//! ```
+//!
+//! The same as data, from any source, with a processor:
+//!
+//! ```
+//! use flotilla::ops::{self, Context};
+//!
+//! let request = r#"{"use_case": "check", "name": "mine", "config": {"text": "[world]", "name": "mine.toml"}}"#;
+//! let error = ops::answer(&serde_json::from_str(request)?, &mut &mut flotilla::front::cpu(), Context::new(&|_| ()));
+//! assert_eq!(error.unwrap_err().code(), "config_invalid");
+//! # Ok::<(), serde_json::Error>(())
+//! ```
+//!
 //! | module | use case |
 //! |---|---|
 //! | [`error`] | the error of all of them |
+//! | [`output`] | which files may be written |
+//! | [`train`] | training of one config |
+//! | [`check`] | the values and the cost of a config |
+//! | [`rollout`] | scores of trained or given policies |
+//! | [`replay`] | a page, a film or a picture of an episode |
+//! | [`plot`] | learning curves |
+//! | [`baseline`] | teams that do not learn |
+//! | [`tasks`] | which tasks need learning |
 //! | [`sweep`] | training of a grid of runs, and collection of its results |
 //! | [`questions`] | training for the open questions of the paper |
 //! | [`paper`] | training of the paper's experiments, and a check of its claims |
 //! | [`compare`] | comparison of runs |
 //! | [`verify`] | comparison of GPUs with the CPU |
 
+use std::ffi::OsString;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
 use serde::{Deserialize, Serialize};
 
 use crate::backend::{BackendError, Machine, OpenBackend};
 use crate::choice::Work;
+use crate::config::{Config, Override};
+use crate::escape::PathExt;
 use crate::front;
 use crate::memory::Peaks;
 use crate::parallel;
+use crate::reader::Document;
 use crate::record::folder::Run;
 use crate::run::{Options, Progress, RunError};
 use crate::trainer::Row;
 
+pub mod baseline;
+pub mod check;
 pub mod compare;
 pub mod error;
+pub mod output;
 pub mod paper;
+pub mod plot;
+mod points;
 pub mod questions;
 mod remedy;
+pub mod replay;
+pub mod rollout;
 pub mod sweep;
+pub mod tasks;
+pub mod train;
 pub mod verify;
 
 pub use error::{Error, Said, said};
@@ -42,6 +88,8 @@ pub(crate) use remedy::{RUNS, device as advice_on_device};
 pub enum Event<'a> {
     /// Progress, for people.
     Message(String),
+    /// A remark, shown also to people who want no progress.
+    Note(String),
     /// A warning, shown also to people who want no progress.
     Warning(String),
     /// Training of these experiments begins: their names and numbers of POIs, the next and the last generation.
@@ -56,6 +104,7 @@ pub enum Event<'a> {
 
 /// How a use case reports to its caller, and how the caller stops it.
 #[derive(Clone, Copy)]
+#[non_exhaustive]
 pub struct Context<'a> {
     /// Receives events.
     pub tell: &'a dyn Fn(Event<'_>),
@@ -63,15 +112,47 @@ pub struct Context<'a> {
     pub stop: &'a AtomicBool,
     /// Set by the caller to save and continue.
     pub save: &'a AtomicBool,
+    /// Set by the caller together with `stop` to make the generation that plays next the last. See [`Session::end`].
+    ///
+    /// [`Session::end`]: crate::run::Session::end
+    pub end: &'a AtomicBool,
     /// Command that is recorded in `run.json`.
     pub command: &'a str,
+    /// Flags that choose the processor, for commands in advice.
+    pub flags: &'a [OsString],
     /// Whether the CPU continues if a device fails during a run.
     pub falls_back: bool,
+}
+
+impl<'a> Context<'a> {
+    /// Returns a context that reports to `tell`, and never stops.
+    pub fn new(tell: &'a dyn Fn(Event<'_>)) -> Context<'a> {
+        static NEVER: AtomicBool = AtomicBool::new(false);
+        Context { tell, stop: &NEVER, save: &NEVER, end: &NEVER, command: "", flags: &[], falls_back: false }
+    }
 }
 
 impl Context<'_> {
     pub(crate) fn message(&self, text: impl ToString) {
         (self.tell)(Event::Message(text.to_string()));
+    }
+
+    pub(crate) fn note(&self, text: impl ToString) {
+        (self.tell)(Event::Note(text.to_string()));
+    }
+
+    /// Reports the share of the work that is done.
+    pub(crate) fn share(&self, part: f64, text: impl ToString) {
+        (self.tell)(Event::Share(part, text.to_string()));
+    }
+
+    pub(crate) fn pause(&self) {
+        (self.tell)(Event::Pause);
+    }
+
+    /// Warns about every POI of a config that no team can observe.
+    pub(crate) fn warn_of_unreachable(&self, config: &Config) {
+        sweep::unreachable(config).iter().for_each(|line| self.warn(format_args!("warning: {line}")));
     }
 
     /// Reports a warning.
@@ -81,6 +162,19 @@ impl Context<'_> {
 
     fn is_stopped(&self) -> bool {
         self.stop.load(Relaxed)
+    }
+
+    /// Fails if the caller asked to stop work that leaves nothing to resume.
+    fn go_on(&self) -> Result<(), Error> {
+        let stopped = || Error::Stopped(said("before everything was played", "nothing was written"));
+        if self.is_stopped() { Err(stopped()) } else { Ok(()) }
+    }
+
+    /// Returns whether a stopped training ends with the generation that plays next. If so, it continues until then.
+    fn ends(&self) -> bool {
+        let ends = self.end.swap(false, Relaxed);
+        self.stop.fetch_and(!ends, Relaxed);
+        ends
     }
 
     /// Returns the CPU backend to continue with after another backend failed, if that is allowed.
@@ -126,6 +220,41 @@ impl Player for &mut OpenBackend {
     }
 }
 
+/// A config as a request carries it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ConfigText {
+    /// The text of the file.
+    pub text: String,
+    /// The file's name in errors.
+    pub name: String,
+    /// Config keys to set.
+    #[serde(default)]
+    pub set: Vec<Override>,
+}
+
+impl ConfigText {
+    /// Reads the config.
+    ///
+    /// # Errors
+    /// The text or a key is invalid. The error lists the problems.
+    pub fn read(&self) -> Result<Config, Error> {
+        Ok(Config::read(&self.text, &self.name, &[], &self.set)?)
+    }
+
+    /// Reads the config. Reports notes for its author, and returns them, too.
+    fn read_noted(&self, context: Context<'_>) -> Result<(Config, Vec<String>), Error> {
+        let (config, notes) = Config::read_noted(&Document::parse(&self.text), &self.name, &[], &self.set)?;
+        notes.iter().for_each(|note| context.note(format_args!("note: {note}")));
+        Ok((config, notes))
+    }
+}
+
+/// Serialises a path as in messages, with control characters escaped.
+fn escaped<S: serde::Serializer>(path: &PathBuf, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(&path.escaped())
+}
+
 /// Refuses configs that need more memory than there is, each alone.
 fn check_memory<'a>(
     configs: impl IntoIterator<Item = &'a crate::config::Config>,
@@ -168,7 +297,8 @@ impl Processor {
     }
 
     /// Adds the fields to a JSON object.
-    pub fn add_to(&self, object: &mut serde_json::Value) {
+    #[cfg(feature = "cli")]
+    pub(crate) fn add_to(&self, object: &mut serde_json::Value) {
         let fields = serde_json::to_value(self).expect("texts and numbers are JSON");
         for (name, value) in fields.as_object().into_iter().flatten() {
             object[name] = value.clone();
@@ -191,6 +321,20 @@ pub enum Request {
     Compare(compare::Request),
     /// See [`verify`].
     Verify(verify::Request),
+    /// See [`train`].
+    Train(train::Request),
+    /// See [`check`].
+    Check(check::Request),
+    /// See [`rollout`].
+    Rollout(rollout::Request),
+    /// See [`replay`].
+    Replay(replay::Request),
+    /// See [`plot`].
+    Plot(plot::Request),
+    /// See [`baseline`].
+    Baseline(baseline::Request),
+    /// See [`tasks`].
+    Tasks(tasks::Request),
 }
 
 /// Runs any use case, and returns its outcome as data.
@@ -205,6 +349,13 @@ pub fn answer(request: &Request, player: &mut dyn Player, context: Context<'_>) 
         Request::Sweep(request) => serde_json::to_value(sweep::run(request, player, context)?),
         Request::Compare(request) => serde_json::to_value(compare::run(request, context)?),
         Request::Verify(request) => serde_json::to_value(verify::run(request, context)?),
+        Request::Train(request) => serde_json::to_value(train::run(request, player, context)?),
+        Request::Check(request) => serde_json::to_value(check::run(request, context)?),
+        Request::Rollout(request) => serde_json::to_value(rollout::run(request, player, context)?),
+        Request::Replay(request) => serde_json::to_value(replay::run(request, player, context)?),
+        Request::Plot(request) => serde_json::to_value(plot::run(request, context)?),
+        Request::Baseline(request) => serde_json::to_value(baseline::run(request, player, context)?),
+        Request::Tasks(request) => serde_json::to_value(tasks::run(request, player, context)?),
     };
     Ok(outcome.expect("outcomes are JSON"))
 }

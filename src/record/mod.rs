@@ -11,6 +11,7 @@
 //! | [`checkpoint`] | `checkpoints/`, written during training |
 //! | [`folder`] | the folder of a run, its lock and `run.json` |
 //! | [`digests`] | comparison of files with the digests in `run.json` |
+//! | [`runs`] | configs and metrics of runs |
 //! | [`archive`] | runs in zip files |
 //! | [`finished`] | a finished run that was trained in memory |
 //! | [`evidence`] | results of checks on a machine, for `docs/develop/evidence.md` |
@@ -39,6 +40,7 @@ pub mod folder;
 pub mod metrics;
 pub mod ownership;
 pub mod policies;
+pub mod runs;
 pub mod tensors;
 
 /// Reason why the files of a run could not be written, read or used.
@@ -199,11 +201,11 @@ fn brief(digest: &str) -> String {
 }
 
 impl RecordError {
-    fn write(path: &Path) -> impl FnOnce(io::Error) -> RecordError {
+    pub(crate) fn write(path: &Path) -> impl FnOnce(io::Error) -> RecordError {
         move |error| RecordError::Write { path: path.into(), error }
     }
 
-    fn read(path: &Path) -> impl FnOnce(io::Error) -> RecordError {
+    pub(crate) fn read(path: &Path) -> impl FnOnce(io::Error) -> RecordError {
         move |error| RecordError::Read { path: path.into(), error }
     }
 

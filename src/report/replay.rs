@@ -122,7 +122,8 @@ fn places(count: usize) -> String {
 }
 
 /// The team of a generation to replay.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Which {
     /// The team with the largest G; the first one if several are equal.
     #[default]

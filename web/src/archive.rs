@@ -1,16 +1,15 @@
 //! Exports and imports runs as zip archives of a run directory, in the format of `flotilla train`.
 
-use std::io::{Cursor, Read, Write};
+use std::io::{self, Cursor, Read};
 
 use flotilla::backend::{Group, cpu::Cpu};
 use flotilla::config::{Config, Sharing};
 use flotilla::evolve;
-use flotilla::record::checkpoint::{self, Checkpoint};
-use flotilla::record::folder::{self, FileSums, Origin, Run, Status};
-use flotilla::record::metrics::{self, Extent, Lines};
-use flotilla::record::{config_digest, hex, policies};
+use flotilla::record::finished::{Content, Finished, Storage};
+use flotilla::record::folder::{self, Origin, Run};
+use flotilla::record::{RecordError, hex, metrics, policies};
 use flotilla::report::replay;
-use flotilla::trainer::{Row, Snapshot};
+use flotilla::trainer::{Ending, Row};
 use flotilla::world::World;
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -72,37 +71,11 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
     };
     let (policies, fitness): (Vec<_>, Vec<_>) =
         rest.chunks_exact((policies + fitness) * size_of::<f32>()).map(trial).unzip();
-    let digest = hex(&metrics::digest(rows.iter().map(|&(row, _)| row), &policies));
-    let metrics = hex(&metrics::digest(rows.iter().map(|&(row, _)| row), &[] as &[&[f32]]));
-
-    let lines = Lines::of(&config);
-    let mut text = lines.header();
-    // A longer run would resume before the rows of the last generation.
-    let mut ending = None;
-    for (row, seconds) in &rows {
-        if row.generation == last && ending.is_none() {
-            ending = Some(Extent::after(&text));
-        }
-        text += &lines.line(row, *seconds);
-    }
-    let seconds = rows.last().map_or(0.0, |&(_, seconds)| seconds);
-    let pending = recorded.pending.iter().enumerate().map(|(trial, pending)| {
-        let [best_g, mean_g] = (*pending)?;
-        Some(Row { experiment: 0, trial, generation: last, best_g, mean_g, champion_g: 0.0 })
-    });
-    let end = Checkpoint {
-        config: config_digest(&config),
-        init: None,
-        seconds,
-        metrics: ending.unwrap_or_else(|| Extent::after(&text)),
-        snapshot: Snapshot { generation: last + 1, last, weights: vec![], fitness, pending: pending.collect() },
-    };
-    let (mut weights, mut checkpoint) = (Vec::new(), Vec::new());
-    let checksum = policies::put(&mut weights, &config, &policies).map_err(refuse)?;
+    let policies: Vec<&[f32]> = policies.iter().map(|policies| &policies[..]).collect();
+    let ending = Some(Ending { fitness, pending: recorded.pending.clone() });
     let run = Run {
         version: flotilla::VERSION.into(),
         commit: flotilla::COMMIT.map(String::from),
-        state: Status::Done,
         description: recorded.description.clone(),
         backend: recorded.backend.clone(),
         adapter: recorded.adapter.clone(),
@@ -111,28 +84,29 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
         command: recorded.command.clone(),
         started: recorded.started.clone(),
         updated: folder::now(),
-        seconds,
         sessions: 1,
-        generations: last + 1,
-        digest: Some(digest.clone()),
-        files: Some(FileSums { metrics, policies: checksum }),
         ..Run::new(&config)
     };
-    end.put(&mut checkpoint, &config).map_err(refuse)?;
-    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
-    let path = checkpoint::path(folder::CHECKPOINTS.as_ref(), last + 1);
-    for (name, content) in [
-        (folder::CONFIG, config.to_toml().as_bytes()),
-        (folder::METRICS, text.as_bytes()),
-        (folder::POLICIES, &weights[..]),
-        (folder::RUN, run.to_json().as_bytes()),
-        (path.to_str().unwrap_or_default(), &checkpoint[..]),
-    ] {
-        zip.start_file(format!("{}/{name}", recorded.name), SimpleFileOptions::default()).map_err(refuse)?;
-        zip.write_all(content).map_err(refuse)?;
-    }
-    let archive = zip.finish().map_err(refuse)?.into_inner();
+    let mut zip = Zip { folder: recorded.name.clone(), writer: ZipWriter::new(Cursor::new(Vec::new())) };
+    let finished = Finished { config: &config, rows: &rows, policies: &policies, ending, run };
+    let digest = finished.write(&mut zip).map_err(refuse)?;
+    let archive = zip.writer.finish().map_err(refuse)?.into_inner();
     Ok((json!({ "digest": digest }), archive))
+}
+
+/// An archive that holds a run's folder.
+struct Zip {
+    folder: String,
+    writer: ZipWriter<Cursor<Vec<u8>>>,
+}
+
+impl Storage for Zip {
+    fn put(&mut self, name: &str, content: Content<'_>) -> Result<(), RecordError> {
+        let path = format!("{}/{name}", self.folder);
+        let started = self.writer.start_file(&path, SimpleFileOptions::default()).map_err(io::Error::from);
+        let written = started.and_then(|()| content(&mut self.writer));
+        written.map_err(|error| RecordError::Write { path: path.into(), error })
+    }
 }
 
 /// Reads a file that was dropped on the page.

@@ -18,7 +18,7 @@ const MOST: usize = 40;
 ///
 /// # Errors
 /// Fails if the folder is not a run directory, or if its config is damaged.
-pub(super) fn config(folder: &Path, verification: Verification) -> Result<Config, Error> {
+pub fn config(folder: &Path, verification: Verification) -> Result<Config, Error> {
     runs::config(folder, verification).map_err(|error| match error {
         ReadError::Collection { what: "a sweep", .. } => match Sweep::load(&folder.join(SWEEP), &[], false) {
             Ok(sweep) => Error::Refused(list(&sweep, folder).into()),

@@ -1,13 +1,14 @@
-//! Checks and writes the output files of commands.
+//! Decides which files may be written, and writes them: the one owner of paths for everything that is not part of a
+//! run's own files.
 
-use std::fs;
+use std::fs::{self, OpenOptions};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::sync::mpsc;
+use std::sync::{OnceLock, mpsc};
 use std::thread;
 use std::time::Duration;
 
-use super::{Error, said, say};
+use super::{Error, said};
 use crate::escape::PathExt;
 use crate::file;
 use crate::record::disk::Disk;
@@ -48,14 +49,14 @@ impl Destination {
     ///
     /// # Errors
     /// Fails if the file cannot be written, or for the reasons of [`Destination::check`].
-    pub fn write(&self, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Error> {
+    pub fn write(&self, content: &[u8]) -> Result<(), Error> {
         self.check()?;
+        let put = |output: &mut dyn Write| output.write_all(content);
         match self {
-            Destination::Named(path) => write(path, content),
-            Destination::OfRun(path) => Ok(ownership::publish(&self.disk()?, path, content)?),
+            Destination::Named(path) => write_with(path, put),
+            Destination::OfRun(path) => Ok(ownership::publish(&self.disk()?, path, put)?),
             Destination::Here(path) => {
-                let written = self.disk()?.replace_shared(path, content, || Ok(()));
-                Ok(written.map_err(|error| RecordError::Write { path: path.clone(), error })?)
+                Ok(self.disk()?.replace_shared(path, put, || Ok(())).map_err(RecordError::write(path))?)
             }
         }
     }
@@ -85,13 +86,12 @@ pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), 
                 io::ErrorKind::NotFound => file::no_folder(path),
                 _ => error,
             };
-            return Err(RecordError::Write { path: path.into(), error }.into());
+            return Err(RecordError::write(path)(error).into());
         }
         if path.is_dir() {
-            let error = io::ErrorKind::IsADirectory.into();
-            return Err(RecordError::Write { path: path.into(), error }.into());
+            return Err(RecordError::write(path)(io::ErrorKind::IsADirectory.into()).into());
         }
-        disk(path).map_err(|error| RecordError::Write { path: path.into(), error })?;
+        disk(path).map_err(RecordError::write(path))?;
         let resolved = file::resolved(path);
         let refused = |why: &str| {
             Err(Error::Usage(said(format!("{flag} {}: this file {why}", path.escaped()), "name another to write")))
@@ -107,19 +107,47 @@ pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), 
     Ok(())
 }
 
+/// Writes a file as [`write_with`] does.
+///
+/// # Errors
+/// Fails if the file cannot be written.
+pub fn write(path: &Path, content: &[u8]) -> Result<(), Error> {
+    write_with(path, |output| output.write_all(content))
+}
+
 /// Writes a file completely or not at all. A pipe blocks until a reader opens it. In the folder of a run, sweep or paper
 /// no link is followed, because other users may write there.
 ///
 /// # Errors
 /// Fails if the file cannot be written.
-pub fn write(path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Error> {
+pub fn write_with(path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Error> {
     let opened = tell_of_waiting(path);
     let content = |output: &mut dyn Write| {
         drop(opened);
         content(output)
     };
     let written = disk(path).and_then(|disk| disk.deliver(path, content));
-    Ok(written.map_err(|error| RecordError::Write { path: path.into(), error })?)
+    Ok(written.map_err(RecordError::write(path))?)
+}
+
+/// Writes a file that must not exist yet.
+///
+/// # Errors
+/// Fails if the file exists or cannot be written.
+pub fn write_new(path: &Path, content: &[u8]) -> Result<(), Error> {
+    let created = OpenOptions::new().write(true).create_new(true).open(path);
+    let written = match created {
+        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+            Err(io::Error::other("the file exists; choose another --out, or overwrite it with --force"))
+        }
+        created => created.and_then(|mut file| {
+            file.write_all(content).inspect_err(|_| {
+                // An incomplete file is worse than none.
+                let _ = fs::remove_file(path);
+            })
+        }),
+    };
+    Ok(written.map_err(RecordError::write(path))?)
 }
 
 /// Returns the disk for a file that the user named, which is not a link in one of flotilla's folders.
@@ -138,11 +166,21 @@ fn tell_of_waiting(path: &Path) -> mpsc::Sender<()> {
         // If no thread can be started, only the message is missing.
         let _ = thread::Builder::new().spawn(move || {
             if waiting.recv_timeout(PATIENCE) == Err(mpsc::RecvTimeoutError::Timeout) {
-                say(format_args!("waiting for somebody to read from {}", path.escaped()));
+                if let Some(report) = REPORT.get() {
+                    report(&format!("waiting for somebody to read from {}", path.escaped()));
+                }
             }
         });
     }
     opened
+}
+
+/// Reports a pipe without a reader to people, see [`report_waiting`].
+static REPORT: OnceLock<fn(&str)> = OnceLock::new();
+
+/// Sets the function that reports to people that a pipe has no reader yet. Only the first call has an effect.
+pub fn report_waiting(report: fn(&str)) {
+    let _ = REPORT.set(report);
 }
 
 /// Time until a pipe without a reader is reported.

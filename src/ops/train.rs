@@ -1,0 +1,354 @@
+//! Trains the teams of a config in a run's folder.
+
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::{ConfigText, Context, Error, Event, Player, Processor, RUNS, check_memory, escaped, said};
+use crate::choice::Work;
+use crate::escape::PathExt;
+use crate::file;
+use crate::host::Instant;
+use crate::record::RecordError;
+use crate::record::archive;
+use crate::record::digests::Verification;
+use crate::record::disk::Disk;
+use crate::record::finished::Finished;
+use crate::record::folder::{self, CONFIG, Folder, METRICS, POLICIES, RUN, Start, StartFrom, Story};
+use crate::record::ownership::{self, CURVES};
+use crate::record::policies;
+use crate::report::curves::Band;
+use crate::report::replay::History;
+use crate::report::runs;
+use crate::report::scene::Scene;
+use crate::report::tensorboard::Events;
+use crate::run::{Ended, Progress, RunError, Session};
+use crate::shell;
+use crate::trainer::Row;
+
+/// The folder of event files for TensorBoard, in a run's folder.
+const TENSORBOARD: &str = "tensorboard";
+
+/// The files of a run by their content.
+const FILES: [(&str, &str); 5] =
+    [("config", CONFIG), ("run", RUN), ("metrics", METRICS), ("policies", POLICIES), ("curves", CURVES)];
+
+/// Request of a training.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Request {
+    /// The config.
+    pub config: ConfigText,
+    /// The name of the run. Its folder has this name by default.
+    pub name: String,
+    /// The folder. `runs/NAME`, or the next that is free, by default.
+    #[serde(default)]
+    pub out: Option<PathBuf>,
+    /// Treatment of a run that is in the folder.
+    pub start: Start,
+    /// A file with the policies to start from.
+    #[serde(default)]
+    pub init: Option<PathBuf>,
+    /// Whether event files for TensorBoard are written.
+    #[serde(default)]
+    pub tensorboard: bool,
+}
+
+/// Results of a run.
+#[derive(Clone, Debug, Serialize)]
+#[non_exhaustive]
+pub struct Outcome {
+    /// The run's folder.
+    #[serde(serialize_with = "escaped")]
+    pub folder: PathBuf,
+    /// The run's name.
+    pub config: String,
+    /// The run's digest.
+    pub digest: String,
+    /// Random seed.
+    pub seed: u64,
+    /// Number of trials.
+    pub trials: usize,
+    /// Policies per population.
+    pub population: usize,
+    /// Generations after the random start.
+    pub generations: usize,
+    /// Number of POIs, if it is the same in all stages.
+    pub pois: Option<usize>,
+    /// Generations that were trained now.
+    pub trained_generations: usize,
+    /// Seconds that this took.
+    pub seconds: f64,
+    /// Notes for the config's author.
+    pub notes: Vec<String>,
+    /// Scores of the random start.
+    pub first: Course,
+    /// Scores of the last generation.
+    pub last: Course,
+    /// The files by their content.
+    pub files: BTreeMap<&'static str, String>,
+    /// The processor of the run's last session.
+    #[serde(flatten)]
+    pub processor: Processor,
+    /// The rows of the random start and of the last generation.
+    #[serde(skip)]
+    pub story: Story,
+    /// Number of teams per generation.
+    #[serde(skip)]
+    pub teams: usize,
+    /// The processor in words, or `None` if the run was finished before.
+    #[serde(skip)]
+    pub trained_on: Option<String>,
+}
+
+/// Scores of a generation, over trials.
+#[derive(Clone, Copy, Debug, Serialize)]
+#[non_exhaustive]
+pub struct Course {
+    /// G of the best team.
+    pub best_g: Extremes,
+    /// G of the mean team.
+    pub mean_g: Extremes,
+    /// G of the champion.
+    pub champion_g: Extremes,
+}
+
+impl Course {
+    fn of(rows: &[Row]) -> Course {
+        let of = |share: fn(&Row) -> f64| Extremes::of(rows.iter().map(share));
+        Course { best_g: of(|row| row.best_g), mean_g: of(|row| row.mean_g), champion_g: of(|row| row.champion_g) }
+    }
+}
+
+/// The mean, lowest and highest value over trials.
+#[derive(Clone, Copy, Debug, Serialize)]
+#[non_exhaustive]
+pub struct Extremes {
+    /// The mean.
+    pub mean: f64,
+    /// The lowest value.
+    pub lowest: f64,
+    /// The highest value.
+    pub highest: f64,
+}
+
+impl Extremes {
+    /// Returns the extremes of shares, which are at least 0.
+    pub(crate) fn of(shares: impl Iterator<Item = f64>) -> Extremes {
+        let (mut count, mut spread) = (0.0, Extremes { mean: 0.0, lowest: f64::INFINITY, highest: 0.0 });
+        for share in shares {
+            count += 1.0;
+            spread.mean += share;
+            spread.lowest = spread.lowest.min(share);
+            spread.highest = spread.highest.max(share);
+        }
+        Extremes { mean: spread.mean / count, ..spread }
+    }
+}
+
+impl Request {
+    /// Returns the command that resumes the run.
+    fn command_to_resume(&self, folder: &Path, context: Context<'_>) -> String {
+        let words: [OsString; 3] = ["flotilla".into(), "train".into(), shell::argument(&folder.join(CONFIG))];
+        let out = ["--out".into(), shell::argument(folder), "--resume".into()];
+        let events = self.tensorboard.then(|| "--tensorboard".into());
+        shell::command(words.into_iter().chain(out).chain(events).chain(context.flags.iter().cloned()))
+    }
+
+    /// Returns the run's folder.
+    fn folder(&self) -> Result<PathBuf, Error> {
+        let runs = Path::new(RUNS);
+        Ok(match (&self.out, self.start) {
+            (Some(out), _) => out.clone(),
+            (None, Start::Resume) => folder::latest(runs, &self.name),
+            (None, Start::Force) => runs.join(&self.name),
+            (None, Start::Fresh) => folder::next_free(runs, &self.name)?,
+        })
+    }
+}
+
+/// Refuses a run in a zip file, because its folder would be removed at the end. The message says how to unpack and resume it.
+pub(crate) fn refuse_zip(path: &Path) -> Result<(), Error> {
+    let Some(top) = archive::top(path) else { return Ok(()) };
+    let inner = if top.is_empty() { file::stem(path, "run") } else { top.clone() };
+    let mut unpack = vec!["unzip".into(), shell::argument(path)];
+    if top.is_empty() {
+        unpack.extend(["-d".into(), inner.clone().into()]);
+    }
+    let [config, folder] = [Path::new(&inner).join(CONFIG), inner.into()].map(|path| shell::argument(&path));
+    let resume = ["flotilla".into(), "train".into(), config, "--out".into(), folder, "--resume".into()];
+    Err(Error::Usage(said(
+        format!("{} is a run in a zip file, and a run resumes in a folder", path.escaped()),
+        format!("unpack it, and resume it there:\n  {}\n  {}", shell::command(unpack), shell::command(resume)),
+    )))
+}
+
+/// Starts or resumes a run, trains it to its end, and draws its curves.
+///
+/// # Errors
+/// The config is invalid, the folder cannot be used, or training fails or is stopped.
+pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> Result<Outcome, Error> {
+    request.out.iter().try_for_each(|path| refuse_zip(path))?;
+    let (config, notes) = request.config.read_noted(context)?;
+    let (player, on) = player.open(Work::of([&config]))?;
+    check_memory([&config], player)?;
+    context.warn_of_unreachable(&config);
+    let (init, start) = (request.init.as_deref(), request.start);
+    let first = init.map(|path| policies::read_init(path, &config)).transpose()?;
+    let folder = request.folder()?;
+    if let Some(what) = folder::collection(&folder) {
+        let text = format!("{} holds {what}, not a run", folder.escaped());
+        return Err(Error::Refused(said(text, "choose another --out")));
+    }
+    if let Some(path) = init.filter(|path| file::resolved(path) == file::resolved(&folder.join(POLICIES))) {
+        let text = format!("--init {}: this run would be written over it", path.escaped());
+        return Err(Error::Usage(said(text, "choose another --out")));
+    }
+    let disk = Disk::default();
+    if folder.is_dir() {
+        let disk = ownership::enter(&disk, &folder, request.out.is_some())?;
+        // A foreign picture must not prevent a run from being resumed.
+        if start != Start::Resume {
+            ownership::check(&disk, [folder.join(CURVES)])?;
+        }
+    }
+    let opened = Session::open_from(vec![(config.clone(), folder.clone(), first)], start, &disk);
+    let (mut session, found) = opened.map_err(|error| match error {
+        RunError::Record(RecordError::Exists { .. }) if request.tensorboard => Error::Refused(said(
+            format!("{error}\nfor event files of the run that is there:"),
+            format!("  {}", request.command_to_resume(&folder, context)),
+        )),
+        // This avoids the advice to use `--resume`. Until the run's origin is recorded, a resumed run would start from
+        // random policies.
+        RunError::Record(error) if init.is_some() => error.into(),
+        error => error.into(),
+    })?;
+    for (_, note) in found {
+        if note.is_damage() { context.warn(note) } else { context.note(note) }
+    }
+    let disk = session.disk(0).clone();
+    let mut events = EventFiles::open(request, &folder, config.learning.trials, &disk, context);
+    let (since, from) = (Instant::now(), session.generations()[0]);
+    let (was_done, mut last) = (session.is_done(), config.learning.generations);
+    if !was_done {
+        context.message(format_args!("training on {on}, into {}", folder.escaped()));
+        (context.tell)(Event::Begin(vec![(String::new(), config.pois())], from, last));
+    }
+    while !session.is_done() {
+        let mut watch = |progress: &Progress<'_>| {
+            (context.tell)(Event::Rows(progress.generations[0], progress.rows));
+            events.add(progress.rows);
+        };
+        let ended = context.train(&mut watch, |options| session.train(player, options));
+        context.pause();
+        events.flush();
+        if ended? == Ended::Done {
+            break;
+        }
+        if !context.ends() {
+            let next = session.generations()[0];
+            return Err(Error::Stopped(said(
+                format!("before generation {next} of {last}, with everything saved"),
+                format!("continue with\n  {}", request.command_to_resume(&folder, context)),
+            )));
+        }
+        last = session.end()?;
+    }
+    let (config, results) = (session.config(0), session.results(0).expect("the run is done"));
+    // A session that ended after the run but before its picture left an older picture, or none.
+    let is_drawn = || fs::read_to_string(folder.join(CURVES)).is_ok_and(|svg| Scene::shows(&svg, &results.digest));
+    if let Some(error) = (!was_done || !is_drawn()).then(|| draw(&disk, &folder).err()).flatten() {
+        // Everything that was learned is already saved.
+        context.warn(format_args!("{}: not drawn: {}", folder.join(CURVES).escaped(), error.message()));
+    }
+    let ever = |all: Vec<History>| all.iter().any(|history| history.most() > 0.0);
+    if !History::all(&folder, config, Verification::Required).is_ok_and(ever) {
+        context.warn(format_args!(
+            "warning: no team observed any POI in any generation, so there was nothing to learn from; try more \
+             world.steps, a smaller world.coupling, POIs nearer to the starts, or a larger learning.population; \
+             `flotilla replay {}` shows what teams do",
+            shell::quoted(shell::argument(&folder))
+        ));
+    }
+    let learning = &config.learning;
+    Ok(Outcome {
+        config: request.name.clone(),
+        digest: results.digest.clone(),
+        seed: learning.seed,
+        trials: learning.trials,
+        population: learning.population,
+        generations: learning.generations,
+        pois: config.pois(),
+        trained_generations: if was_done { 0 } else { (last + 1).saturating_sub(from) },
+        seconds: if was_done { 0.0 } else { since.elapsed().as_secs_f64() },
+        notes,
+        first: Course::of(&results.story.first),
+        last: Course::of(&results.story.last),
+        files: FILES.into_iter().map(|(name, file)| (name, folder.join(file).escaped().to_string())).collect(),
+        processor: Processor::of_run(session.run(0)),
+        story: results.story.clone(),
+        teams: learning.teams(),
+        trained_on: (!was_done).then_some(on),
+        folder,
+    })
+}
+
+/// Writes a finished run that was trained in memory to a folder, as [`run`] does. Returns its digest.
+///
+/// # Errors
+/// The folder cannot be used or written.
+pub fn save(finished: Finished<'_>, folder: &Path, start: Start) -> Result<String, Error> {
+    let (mut kept, _) = Folder::open(folder, start, finished.config, StartFrom::Random, Disk::default())?;
+    let digest = finished.write(&mut kept)?;
+    draw(&kept.disk, folder)?;
+    Ok(digest)
+}
+
+/// Draws the run's curves.
+fn draw(disk: &Disk, folder: &Path) -> Result<(), Error> {
+    let runs = [folder.to_path_buf()];
+    let svg = runs::figure(&runs, None, Band::Interval, Verification::Required)?.scene().svg();
+    Ok(ownership::publish(disk, &folder.join(CURVES), |output| output.write_all(svg.as_bytes()))?)
+}
+
+/// The event files of a run, if they are wanted and can be written. A failure is only reported.
+struct EventFiles<'a> {
+    open: Option<Events>,
+    path: PathBuf,
+    context: Context<'a>,
+}
+
+impl<'a> EventFiles<'a> {
+    fn open(request: &Request, folder: &Path, trials: usize, disk: &Disk, context: Context<'a>) -> EventFiles<'a> {
+        let mut files = EventFiles { open: None, path: folder.join(TENSORBOARD), context };
+        if request.tensorboard {
+            let opened = Events::create(disk, &files.path, trials, &folder.join(METRICS));
+            files.open = opened.map_err(|error| files.failed(&error)).ok();
+        } else if request.start == Start::Force {
+            // The event files belong to the run that was overwritten.
+            Events::clear(disk, &files.path).unwrap_or_else(|error| files.failed(&error));
+        }
+        files
+    }
+
+    fn add(&mut self, rows: &[Row]) {
+        if let Some(Err(error)) = self.open.as_mut().map(|events| events.add(rows)) {
+            self.failed(&error);
+            self.open = None;
+        }
+    }
+
+    fn flush(&mut self) {
+        if let Some(Err(error)) = self.open.as_mut().map(Events::flush) {
+            self.failed(&error);
+        }
+    }
+
+    fn failed(&self, error: &std::io::Error) {
+        self.context
+            .warn(format_args!("{}: cannot be written: {error}; there are no event files", self.path.escaped()));
+    }
+}

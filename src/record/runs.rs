@@ -1,0 +1,135 @@
+//! Reads the configs and metrics of finished and unfinished runs.
+
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+use super::RecordError;
+use super::digests::{Digests, Verification};
+use super::folder::{self, CONFIG, METRICS};
+use super::metrics::{self, RowsError};
+use crate::config::{Config, ConfigError};
+use crate::escape::PathExt;
+use crate::file;
+use crate::trainer::Row;
+
+/// The reason why a run cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadError {
+    /// The path does not exist.
+    #[error("{}: no such folder", .0.escaped())]
+    Missing(PathBuf),
+    /// The path is a file instead of a directory.
+    #[error("{} is a file; name the folder of a run", .0.escaped())]
+    NoFolder(PathBuf),
+    /// The directory is not a run.
+    #[error("{folder} is no run's folder: it has no {name}", folder = folder.escaped())]
+    Foreign {
+        /// The given directory.
+        folder: PathBuf,
+        /// The missing file that every run has.
+        name: &'static str,
+    },
+    /// The run's config is invalid.
+    #[error("{folder}: {error}", folder = folder.escaped())]
+    Config {
+        /// The given directory.
+        folder: PathBuf,
+        /// The error in the config.
+        error: ConfigError,
+    },
+    /// The directory contains several runs.
+    #[error("{folder} holds {what}; name one of the runs in it, as {folder}/{example}", folder = folder.escaped())]
+    Collection {
+        /// The given directory.
+        folder: PathBuf,
+        /// The kind of its contents, such as "a sweep".
+        what: &'static str,
+        /// The path of a run in it.
+        example: &'static str,
+    },
+    /// The run lacks the requested data.
+    #[error("{folder}: {reason}", folder = folder.escaped())]
+    Unfinished {
+        /// The given directory.
+        folder: PathBuf,
+        /// The missing data.
+        reason: String,
+    },
+    /// The run's files cannot be read.
+    #[error(transparent)]
+    Record(#[from] RecordError),
+}
+
+/// Reads a run's config.
+///
+/// # Errors
+/// The directory does not exist, is not a run, or its config is damaged or was changed after the run.
+pub fn config(folder: &Path, verification: Verification) -> Result<Config, ReadError> {
+    let kind = std::fs::metadata(folder).map_err(|error| match error.kind() {
+        ErrorKind::NotFound => ReadError::Missing(folder.into()),
+        _ => ReadError::Record(RecordError::Read { path: folder.into(), error }),
+    })?;
+    if !kind.is_dir() {
+        return Err(ReadError::NoFolder(folder.into()));
+    }
+    let path = folder.join(CONFIG);
+    if !seen(&path)? {
+        if let Some(what) = folder::collection(folder) {
+            let example = if what == "a sweep" { "points/0000" } else { "arms/chaotic-leader-follower-Df" };
+            return Err(ReadError::Collection { folder: folder.into(), what, example });
+        }
+        return Err(ReadError::Foreign { folder: folder.into(), name: CONFIG });
+    }
+    let config = Config::load(&path).map_err(|error| ReadError::Config { folder: folder.into(), error })?;
+    Digests::read(folder, verification)?.compare_config(&path, &config)?;
+    Ok(config)
+}
+
+/// Reports whether a file exists.
+fn seen(path: &Path) -> Result<bool, RecordError> {
+    file::exists(path).map_err(|error| RecordError::Read { path: path.into(), error })
+}
+
+/// Calls `each` with every complete row of a run's metrics. A partial last line is ignored, because it is still being
+/// written.
+///
+/// # Errors
+/// The metrics are missing, belong to another run, or were changed after the run. The last error may appear only after
+/// all rows.
+pub fn metrics(
+    folder: &Path,
+    config: &Config,
+    verification: Verification,
+    mut each: impl FnMut(&Row),
+) -> Result<(), ReadError> {
+    let path = folder.join(METRICS);
+    // The digests are read before the metrics, because the run may finish in between.
+    let digests = Digests::read(folder, verification)?;
+    let unfinished = |reason: String| ReadError::Unfinished { folder: folder.into(), reason };
+    if !seen(&path)? {
+        return Err(unfinished(format!("it has no {METRICS} yet")));
+    }
+    let damaged = |reason: String| ReadError::Record(RecordError::Damaged { path: path.clone(), reason });
+    let mut count = 0;
+    let mut rows = metrics::open(&path)?;
+    for row in &mut rows {
+        let row = match row {
+            Ok((row, _)) => row,
+            // A partial last line belongs to a run that is still training or was killed.
+            Err(RowsError::CutShort(_)) => break,
+            Err(error) => return Err(damaged(error.to_string())),
+        };
+        let (trials, generations) = (config.learning.trials, config.learning.generations);
+        if row.trial >= trials || row.generation > generations {
+            let (trial, generation) = (row.trial, row.generation);
+            return Err(damaged(format!(
+                "line {} is trial {trial}, generation {generation}, which the run's {CONFIG} does not have",
+                count + 2
+            )));
+        }
+        each(&row);
+        count += 1;
+    }
+    digests.compare_metrics(&path, rows.digest())?;
+    if count == 0 { Err(unfinished(format!("its {METRICS} has no rows yet"))) } else { Ok(()) }
+}
