@@ -102,6 +102,11 @@
 //! Only `backend::gpu` and the GPU's ceiling in [`mod@bench`] use wgpu. The model does not depend on threads or GPUs.
 //! Only [`host`] reads the clock.
 //!
+//! # Stability
+//!
+//! Programs build on [`front`], [`ops`], [`Config`] and the types that these use. A minor version may change them, and the
+//! changelog says so. The other modules are public for this crate's tests and tools, and may change in any version.
+//!
 //! # Features
 //!
 //! | feature | adds | total crates, approximately |
@@ -134,20 +139,26 @@ pub mod choice;
 #[cfg(feature = "cli")]
 pub mod cli;
 pub mod config;
+#[doc(hidden)]
 pub mod config_enum;
 pub mod credit;
+#[doc(hidden)]
 pub mod escape;
 pub mod evaluate;
 pub mod evolve;
 pub mod file;
 pub mod front;
+#[doc(hidden)]
 pub mod gpu_struct;
+#[doc(hidden)]
 pub mod host;
+#[doc(hidden)]
 pub mod kernels;
 pub mod memory;
 pub mod model;
 #[cfg(all(feature = "gpu", feature = "report"))]
 pub mod ops;
+#[doc(hidden)]
 pub mod parallel;
 pub mod reach;
 pub mod reader;
@@ -157,7 +168,9 @@ pub mod record;
 pub mod report;
 #[cfg(feature = "record")]
 pub mod run;
+#[doc(hidden)]
 pub mod sample;
+#[doc(hidden)]
 pub mod shell;
 pub mod statistics;
 pub mod stepping;

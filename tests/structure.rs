@@ -186,7 +186,8 @@ fn face(path: &Path) -> Vec<String> {
                 of = item.trim_end_matches(" {").into();
             }
             let within = if indent > 0 && of.starts_with("impl") { format!("{of}: ") } else { String::new() };
-            let shown = item.split(" = ").next().unwrap_or_default().trim_end_matches([' ', '{', ';', ',', '}']);
+            let shown =
+                item.split(" = ").next().unwrap_or_default().trim_end_matches([';', ',']).trim_end_matches(" {");
             found.push(format!("{}{within}{shown}", " ".repeat(indent)));
             item.clear();
         }

@@ -11,7 +11,7 @@ use flotilla::ops::{self, ConfigText, train::Request};
 use flotilla::record::digests::Verification;
 use flotilla::record::disk::Disk;
 use flotilla::record::finished::Finished;
-use flotilla::record::folder::{self, METRICS, Start};
+use flotilla::record::folder::{self, Folder, METRICS, Start, StartFrom};
 use flotilla::record::{RecordError, metrics, policies};
 use flotilla::trainer::{Ending, Row};
 use numpy::{
@@ -376,6 +376,8 @@ pub fn save(
             ..folder::Run::new(config)
         };
         let finished = Finished { config, rows: &rows, policies: &weights, ending, run };
-        ops::train::save(finished, &folder, if force { Start::Force } else { Start::Fresh }).raise()
+        let start = if force { Start::Force } else { Start::Fresh };
+        let (mut kept, _) = Folder::open(&folder, start, config, StartFrom::Random, Disk::default()).raise()?;
+        ops::train::save(finished, &mut kept).raise()
     })
 }

@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{ConfigText, Context, Error, Event, Player, Processor, RUNS, check_memory, escaped, said};
+use super::remedy::RUNS;
+use super::{ConfigText, Context, Error, Event, Player, Processor, check_memory, escaped, said};
 use crate::choice::Work;
 use crate::escape::PathExt;
 use crate::file;
@@ -16,8 +17,8 @@ use crate::record::RecordError;
 use crate::record::archive;
 use crate::record::digests::Verification;
 use crate::record::disk::Disk;
-use crate::record::finished::Finished;
-use crate::record::folder::{self, CONFIG, Folder, METRICS, POLICIES, RUN, Start, StartFrom, Story};
+use crate::record::finished::{Finished, Storage};
+use crate::record::folder::{self, CONFIG, METRICS, POLICIES, RUN, Start, Story};
 use crate::record::ownership::{self, CURVES};
 use crate::record::policies;
 use crate::report::curves::Band;
@@ -296,14 +297,15 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
     })
 }
 
-/// Writes a finished run that was trained in memory to a folder, as [`run`] does. Returns its digest.
+/// Writes a finished run that was trained in memory, with the files of [`run`]. Returns its digest.
 ///
 /// # Errors
-/// The folder cannot be used or written.
-pub fn save(finished: Finished<'_>, folder: &Path, start: Start) -> Result<String, Error> {
-    let (mut kept, _) = Folder::open(folder, start, finished.config, StartFrom::Random, Disk::default())?;
-    let digest = finished.write(&mut kept)?;
-    draw(&kept.disk, folder)?;
+/// A file cannot be written.
+pub fn save(finished: Finished<'_>, storage: &mut dyn Storage) -> Result<String, RecordError> {
+    let (config, rows) = (finished.config, finished.rows);
+    let digest = finished.write(storage)?;
+    let figure = runs::figure_of(config, rows.iter().map(|(row, _)| row), &digest);
+    storage.publish(CURVES, figure.scene().svg().as_bytes())?;
     Ok(digest)
 }
 

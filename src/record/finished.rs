@@ -3,10 +3,12 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use sha2::{Digest, Sha256};
+
 use super::checkpoint::{self, Checkpoint};
 use super::folder::{CHECKPOINTS, CONFIG, FileSums, Folder, METRICS, POLICIES, RUN, Run, Status};
 use super::metrics::{self, Extent, Lines};
-use super::{RecordError, config_digest, hex, policies};
+use super::{RecordError, config_digest, hex, ownership, policies};
 use crate::config::Config;
 use crate::trainer::{Ending, Row, Snapshot};
 
@@ -17,6 +19,16 @@ pub trait Storage {
     /// # Errors
     /// The file cannot be written.
     fn put(&mut self, name: &str, content: Content<'_>) -> Result<(), RecordError>;
+
+    /// Writes a picture of the run, and lists it as made by flotilla.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    fn publish(&mut self, name: &str, content: &[u8]) -> Result<(), RecordError> {
+        self.put(name, &mut |output| output.write_all(content))?;
+        let line = ownership::line(&hex(&Sha256::digest(content)), Path::new(name));
+        self.put(ownership::LIST, &mut |output| output.write_all(line.as_bytes()))
+    }
 }
 
 /// Writes the content of a file.
@@ -26,6 +38,10 @@ impl Storage for Folder {
     fn put(&mut self, name: &str, content: Content<'_>) -> Result<(), RecordError> {
         let path = self.file(name);
         self.disk.replace(&path, |output| content(output)).map_err(RecordError::write(&path))
+    }
+
+    fn publish(&mut self, name: &str, content: &[u8]) -> Result<(), RecordError> {
+        ownership::publish(&self.disk, &self.file(name), |output| output.write_all(content))
     }
 }
 

@@ -219,7 +219,7 @@ pub fn is_drawing(path: &Path) -> bool {
 const SOFTWARE: &[u8] = b"tEXtSoftware\0flotilla";
 
 /// Returns the line of a file in [`LIST`].
-fn line(digest: &str, path: &Path) -> String {
+pub(super) fn line(digest: &str, path: &Path) -> String {
     format!("{digest}  {}\n", path.file_name().unwrap_or_default().to_string_lossy())
 }
 

@@ -106,19 +106,19 @@ impl Courses {
     /// See [`metrics()`].
     pub fn read(folder: &Path, config: &Config, verification: Verification) -> Result<Courses, ReadError> {
         let mut courses = Courses::default();
-        metrics(folder, config, verification, |row| {
-            for (course, g) in [
-                (&mut courses.best, row.best_g),
-                (&mut courses.mean, row.mean_g),
-                (&mut courses.champion, row.champion_g),
-            ] {
-                if course.len() <= row.generation {
-                    course.resize(row.generation + 1, Average::default());
-                }
-                course[row.generation].add(g);
-            }
-        })?;
+        metrics(folder, config, verification, |row| courses.add(row))?;
         Ok(courses)
+    }
+
+    fn add(&mut self, row: &Row) {
+        let courses =
+            [(&mut self.best, row.best_g), (&mut self.mean, row.mean_g), (&mut self.champion, row.champion_g)];
+        for (course, g) in courses {
+            if course.len() <= row.generation {
+                course.resize(row.generation + 1, Average::default());
+            }
+            course[row.generation].add(g);
+        }
     }
 }
 
@@ -158,14 +158,40 @@ pub fn figure(
     let configs = folders.iter().map(|folder| config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
     let all = folders.iter().zip(&configs).map(|(folder, config)| Courses::read(folder, config, verification));
     let all = all.collect::<Result<Vec<_>, _>>()?;
-    let (legend, curves): (Vec<String>, Vec<Curve>) = match (&*all, measure) {
+    let shown = Figure {
+        band,
+        source: match folders {
+            [folder] => Digests::read(folder, verification)?.run,
+            _ => None,
+        },
+        warning: verification.is_skipped().then(|| UNVERIFIED.into()),
+        ..of_courses(&all, &configs, || labels(folders, &configs), measure)
+    };
+    Ok(shown)
+}
+
+/// Returns the learning curves of one run as [`figure`] does, from its rows and its digest.
+pub fn figure_of<'a>(config: &Config, rows: impl Iterator<Item = &'a Row>, digest: &str) -> Figure {
+    let mut courses = Courses::default();
+    rows.for_each(|row| courses.add(row));
+    let figure = of_courses(&[courses], std::slice::from_ref(config), Vec::new, None);
+    Figure { source: Some(digest.into()), ..figure }
+}
+
+fn of_courses(
+    all: &[Courses],
+    configs: &[Config],
+    labels: impl FnOnce() -> Vec<String>,
+    measure: Option<TeamKind>,
+) -> Figure {
+    let (legend, curves): (Vec<String>, Vec<Curve>) = match (all, measure) {
         ([courses], None) => {
             TeamKind::ALL.into_iter().map(|kind| (kind.name().to_string(), Curve::new(courses.of(kind)))).unzip()
         }
         ([courses], Some(kind)) => (vec![kind.name().to_string()], vec![Curve::new(courses.of(kind))]),
         (all, kind) => {
             let curves = all.iter().map(|courses| Curve::new(courses.of(kind.unwrap_or_default())));
-            labels(folders, &configs).into_iter().zip(curves).unzip()
+            labels().into_iter().zip(curves).unzip()
         }
     };
     let y_label = match (all.len(), measure) {
@@ -181,20 +207,17 @@ pub fn figure(
     let mut staged: Vec<Vec<usize>> = configs.iter().map(begun).collect();
     staged.dedup();
     let stages = if staged.len() == 1 { staged.remove(0) } else { vec![] };
-    Ok(Figure {
+    Figure {
         panels: vec![Panel { title: String::new(), curves: curves.into_iter().enumerate().collect(), stages }],
         legend,
         references: vec![],
         y_label,
         y_max: 1.0,
         shares: true,
-        band,
-        source: match folders {
-            [folder] => Digests::read(folder, verification)?.run,
-            _ => None,
-        },
-        warning: verification.is_skipped().then(|| UNVERIFIED.into()),
-    })
+        band: Band::Interval,
+        source: None,
+        warning: None,
+    }
 }
 
 /// Reports whether trials of several runs form pairs, because all runs have the same seed.

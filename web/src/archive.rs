@@ -5,6 +5,7 @@ use std::io::{self, Cursor, Read};
 use flotilla::backend::{Group, cpu::Cpu};
 use flotilla::config::{Config, Sharing};
 use flotilla::evolve;
+use flotilla::ops;
 use flotilla::record::finished::{Content, Finished, Storage};
 use flotilla::record::folder::{self, Origin, Run};
 use flotilla::record::{RecordError, hex, metrics, policies};
@@ -89,7 +90,7 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
     };
     let mut zip = Zip { folder: recorded.name.clone(), writer: ZipWriter::new(Cursor::new(Vec::new())) };
     let finished = Finished { config: &config, rows: &rows, policies: &policies, ending, run };
-    let digest = finished.write(&mut zip).map_err(refuse)?;
+    let digest = ops::train::save(finished, &mut zip).map_err(refuse)?;
     let archive = zip.writer.finish().map_err(refuse)?.into_inner();
     Ok((json!({ "digest": digest }), archive))
 }
