@@ -45,7 +45,7 @@
 //! | [`verify`] | comparison of GPUs with the CPU |
 
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
 use serde::{Deserialize, Serialize};
@@ -251,7 +251,7 @@ impl ConfigText {
 }
 
 /// Serialises a path as in messages, with control characters escaped.
-fn escaped<S: serde::Serializer>(path: &PathBuf, serializer: S) -> Result<S::Ok, S::Error> {
+fn escaped<S: serde::Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_str(&path.escaped())
 }
 

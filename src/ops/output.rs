@@ -165,10 +165,9 @@ fn tell_of_waiting(path: &Path) -> mpsc::Sender<()> {
         let path = path.to_path_buf();
         // If no thread can be started, only the message is missing.
         let _ = thread::Builder::new().spawn(move || {
-            if waiting.recv_timeout(PATIENCE) == Err(mpsc::RecvTimeoutError::Timeout) {
-                if let Some(report) = REPORT.get() {
-                    report(&format!("waiting for somebody to read from {}", path.escaped()));
-                }
+            let silent = waiting.recv_timeout(PATIENCE) == Err(mpsc::RecvTimeoutError::Timeout);
+            if silent && let Some(report) = REPORT.get() {
+                report(&format!("waiting for somebody to read from {}", path.escaped()));
             }
         });
     }
