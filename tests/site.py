@@ -80,7 +80,7 @@ def main():
     site = pathlib.Path(sys.argv[1]).resolve()
     broken = list(broken_links(site))
     assert not broken, "links lead nowhere:\n" + "\n".join(broken)
-    with tempfile.TemporaryDirectory() as profile:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         browser = Browser(profile)
         browser.window(1280, 900, dark=False)
         wrong = []

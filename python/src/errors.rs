@@ -92,7 +92,9 @@ impl Raised for RunError {
 impl Raised for RecordError {
     fn raised(self) -> PyErr {
         match self {
-            RecordError::Exists { .. } => PyFileExistsError::new_err(self.to_string()),
+            RecordError::Exists { .. } => {
+                PyFileExistsError::new_err(format!("{self}; choose another folder, or pass force=True"))
+            }
             _ => failed(self),
         }
     }
@@ -123,7 +125,7 @@ impl Raised for ops::Error {
             ops::Error::Stopped(_) => PyKeyboardInterrupt::new_err(text),
             error if error.is_usage() => PyValueError::new_err(text),
             error => match error.code() {
-                "exists" => PyFileExistsError::new_err(text),
+                "exists" => PyFileExistsError::new_err(format!("{text}; choose another folder, or pass force=True")),
                 "memory" => PyMemoryError::new_err(text),
                 _ => failed(text),
             },
