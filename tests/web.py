@@ -591,6 +591,15 @@ def strangers(tab, page, call, downloads):
     random = tab.evaluate("page.state.training.arms[0].random")
     assert random == sorted(random) and random[-1] < min(best[0]), random
     tab.calm()
+    # A larger population of the same leaders observes more, and no constant action observes anything.
+    tab.click("#guide-next")
+    tab.wait("page.state.training.arms.length === 3 && " + DONE, 400)
+    tab.wait("page.state.training.arms.every(arm => arm.constant === 0)", 60)
+    best = tab.evaluate("page.state.training.arms.map(arm => arm.trials.reduce((sum, trial) => sum + trial.at(-1).best, 0))")
+    assert best[0] < best[1] < best[2], best
+    tab.wait(f"document.querySelector('#guide-says').textContent.includes('{best[2]:.2f} of 4 (population 500)')")
+    assert not tab.text("#needless")
+    tab.calm()
     print("a stranger meets a trained team, its credit, and baselines; first motion after %d ms" % first)
 
     # Every experiment of the gallery opens, with its arms.

@@ -50,5 +50,5 @@ function needless(training) {
   const final = (/** @type {Arm} */ { trials }) => trials.reduce((sum, trial) => sum + trial[trial.length - 1].best, 0) / trials.length;
   const alike = training.arms.filter(arm => arm.constant !== null && arm.constant > 0 && arm.constant >= final(arm) - 1e-9);
   if (!alike.length) return "";
-  return `A constant action observes as much as ${alike.map(arm => arm.label).join(" and ")}: that needs no learning. In "Two groups must meet" a constant action observes nothing.`;
+  return `A constant action observes as much as ${alike.map(arm => arm.label).join(", ")}. No learning is needed for that. In "Two groups must meet", a constant action observes nothing.`;
 }

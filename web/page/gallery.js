@@ -5,7 +5,7 @@ import { mode } from "./modes.js";
 import { state } from "./state.js";
 import { forget, train } from "./train.js";
 
-/** @typedef {{ name: string, title: string, says: string, compare: Comparison }} Exhibit */
+/** `config` names the config, if it is that of another experiment. @typedef {{ name: string, title: string, says: string, compare: Comparison, config?: string }} Exhibit */
 
 /** @type {Exhibit[]} */
 const GALLERY = [
@@ -14,8 +14,8 @@ const GALLERY = [
     says: "Six agents must be at one POI at once. Leader-follower teams learn it; teams in which all twelve agents learn do not.",
   },
   {
-    name: "population", title: "Few policies or many", compare: { key: "learning.population", values: ["50", "500", "2500"] },
-    says: "All six agents learn. With 50 policies each they observe hardly anything; with 2500, nearly everything.",
+    name: "population", config: "two_groups", title: "Few policies or many", compare: { key: "learning.population", values: ["20", "100", "500"] },
+    says: "The same task. With 20 policies per leader, the best teams observe at most one of the four POIs; with 500, three or four.",
   },
   {
     name: "blind", title: "Blind leaders", compare: { key: "learning.start_jitter", values: ["0.0", "2.0", "4.0"] },
@@ -46,7 +46,7 @@ export async function exhibit(name, { trains = false } = {}) {
   forget();
   Object.assign(state, { file: null, compared: found.compare });
   mode("watch");
-  if (await take(text_of(name)) && trains) await train();
+  if (await take(text_of(found.config ?? name)) && trains) await train();
 }
 
 export function gallery() {

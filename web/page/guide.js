@@ -44,7 +44,7 @@ const STEPS = [
     act: () => exhibit("population", { trains: true }),
   },
   {
-    says: () => "A smaller task: six agents, all of which learn, and two POIs that need three agents each. Each agent's policy is chosen from a population of 50, 500 or 2500 policies. Compare the three lines of the chart.",
+    says: () => "The same task, with followers. This time each leader's policy is chosen from a population of 20, 100 or 500 policies. Compare the three lines of the chart.",
     button: "Done",
     act() {},
   },
@@ -52,14 +52,16 @@ const STEPS = [
 
 let at = 0;
 
+/** Shows a step, or its result once there is one. */
 function show_step(result = "") {
   const goes_on = at < STEPS.length;
   $("guide").hidden = !goes_on;
   $(goes_on ? "play" : "guide").after($("setup"), $("modes"));
   if (!goes_on) return;
   $("guide-step").textContent = `${at + 1} of ${STEPS.length}`;
-  $("guide-says").textContent = `${STEPS[at].says()}${result}`;
+  $("guide-says").textContent = result || STEPS[at].says();
   $("guide-next").textContent = STEPS[at].button;
+  $("guide-end").hidden = at === STEPS.length - 1;
 }
 
 export function guide() {
@@ -72,7 +74,7 @@ export function guide() {
     if (!trained) return;
     // A step that trains ends with the result.
     await trained;
-    if (at === now && state.training && state.training.state === "done") show_step(` ${$("announced").textContent}`);
+    if (at === now && state.training && state.training.state === "done") show_step($("announced").textContent ?? "");
   });
   $("guide-end").addEventListener("click", leave_guide);
 }

@@ -1,6 +1,9 @@
 // A training of some arms, or runs that were opened. On the GPU, one worker trains everything as one batch. On the CPU, the trials are
 // divided among the workers. The division does not change the results.
 
+/** Milliseconds after which a player that waits asks again whether it may play. */
+const REST = 40;
+
 export class Training {
   /** @param {Planned[]} arms @param {Machine} machine */
   constructor(arms, machine) {
@@ -62,8 +65,8 @@ export class Training {
       for (let next = 0; this.state === "training";) {
         const most = Math.floor(allowed()) - next;
         if (this.paused || most <= 0) {
-          await new Promise(done => setTimeout(done, 15));
-          idle += 15 / this.players.length;
+          await new Promise(done => setTimeout(done, REST));
+          idle += REST / this.players.length;
           continue;
         }
         const { words, bytes } = await player.ask({ ask: "advance", generations: Math.min(most, 1000), milliseconds: 40 });

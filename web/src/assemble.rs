@@ -33,7 +33,7 @@ mod page {
     use wasm_bindgen_cli_support::Bindgen;
 
     /// Experiments of the gallery.
-    const GALLERY: [&str; 6] = ["two_groups", "population", "blind", "eight_followers", "relay", "places"];
+    const GALLERY: [&str; 5] = ["two_groups", "blind", "eight_followers", "relay", "places"];
     const LAYOUTS: [&str; 3] = ["generally_forward", "strictly_forward", "chaotic"];
 
     fn source(name: &str) -> Result<String, Box<dyn Error>> {
