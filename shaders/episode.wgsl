@@ -112,7 +112,7 @@ fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
             near &= near - 1u;
         }
     }
-    let inputs = weigh_in(of_pois, of_agents);
+    let inputs = scale_inputs(of_pois, of_agents);
     let start = task.weights + leader * task.teams + (*me).team;
     let outputs = decide(start, shape.leaders * task.teams, inputs);
     if TRACE {

@@ -29,7 +29,7 @@ fn sense(density: f32, dx: f32, dy: f32, hx: f32, hy: f32, sums: ptr<function, v
 }
 
 // Returns the policy's inputs: the sums of both kinds, each multiplied by its constant.
-fn weigh_in(of_pois: vec4<f32>, of_agents: vec4<f32>) -> array<f32, INPUTS> {
+fn scale_inputs(of_pois: vec4<f32>, of_agents: vec4<f32>) -> array<f32, INPUTS> {
     let p = of_pois * world.poi_share;
     let a = of_agents * world.agent_share;
     return array(p.x, p.y, p.z, p.w, a.x, a.y, a.z, a.w);

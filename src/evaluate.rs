@@ -16,17 +16,17 @@ use crate::world::World;
 pub use crate::evolve::one_policy_a_team;
 
 /// The fitnesses of an evaluation, besides G.
-pub const SCORES: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp];
+pub(crate) const SCORES: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp];
 /// [`SCORES`] and Dt, which needs a record of who was seen at every step.
 pub const SCORES_AND_DT: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp, Fitness::Dt];
 
 /// Returns what an evaluation computes beside a fitness: Dt only if that is asked for.
-pub fn scores_beside(fitness: Fitness) -> &'static [Fitness] {
+pub(crate) fn scores_beside(fitness: Fitness) -> &'static [Fitness] {
     if fitness == Fitness::Dt { SCORES_AND_DT } else { SCORES }
 }
 
 /// Maximum number of episodes per evaluation.
-pub const MAX_EPISODES: u32 = 1_000_000;
+pub(crate) const MAX_EPISODES: u32 = 1_000_000;
 /// Limits per batch: bytes of scores that wait to be summed, and number of episodes.
 const BATCH_BYTES: usize = 1 << 26;
 const BATCH_EPISODES: usize = 256;
@@ -214,10 +214,7 @@ pub struct Batch<'a> {
 
 /// [`evaluate`], which calls `each` several times per second, from this thread and in the order of episodes. If that
 /// breaks, the evaluation ends after the episodes reported so far.
-///
-/// # Errors
-/// The backend fails.
-pub fn evaluate_until(
+pub(crate) fn evaluate_until(
     backend: &mut dyn Backend,
     group: &Group<'_>,
     starts: &Starts,

@@ -125,7 +125,7 @@ mod threads {
 
     impl Threads {
         /// Whether there are fewer threads than were asked for.
-        pub fn is_short(&self) -> bool {
+        pub(crate) fn is_short(&self) -> bool {
             self.started < self.wanted
         }
     }

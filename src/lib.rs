@@ -60,8 +60,13 @@
 //! | to | change |
 //! |---|---|
 //! | add a density | `model/sense.rs` and its shader `shaders/sense.wgsl`, `bench/operations.rs` |
-//! | add a fitness | `config/learning.rs`, `credit/` (`mod.rs`, `fast.rs` or `replay.rs`), `backend/batch.rs` (what to record) |
-//! | add a place that holds populations | `trainer/residency.rs`, `trainer/populations.rs`, `backend/batch.rs` |
+//! | add a fitness | `config/learning.rs`, `credit/` (`mod.rs`, `replay.rs`; `record.rs` for what it needs, `fast.rs` for speed) |
+//! | show a fitness beside the others | `evaluate.rs`, `cli/rollout.rs`, `report/replay/page.rs` |
+//! | add a place that holds populations | `trainer/residency.rs`, `trainer/populations.rs`, `trainer/results.rs`, `backend/batch.rs` |
+//! | add a claim of the paper | `report/paper/claims/list.rs` |
+//! | add an open question | `sweep/questions/list.rs`, `configs/questions/` |
+//! | add a kind of value in configs | `reader/request.rs`, `reader/allowed.rs` |
+//! | change where a run resumes | `record/folder/resume.rs`, `record/checkpoint.rs` |
 //!
 //! # Modules
 //!
@@ -120,6 +125,11 @@
 //! | `cli` (default) | the program; includes all of the above except `scalar` | 145 |
 
 #![deny(missing_docs)]
+#![cfg_attr(
+    not(feature = "cli"),
+    allow(dead_code, unused_imports, reason = "the callers may be in features that are left out")
+)]
+#![allow(rustdoc::private_intra_doc_links, reason = "tables of modules name the internal ones, too")]
 
 /// The commit that this build was made from, if it is known. Debug builds do not know it.
 pub const COMMIT: Option<&str> = {
@@ -139,14 +149,12 @@ pub mod choice;
 #[cfg(feature = "cli")]
 pub mod cli;
 pub mod config;
-#[doc(hidden)]
-pub mod config_enum;
+pub(crate) mod config_enum;
 pub mod credit;
-#[doc(hidden)]
-pub mod escape;
+pub(crate) mod escape;
 pub mod evaluate;
 pub mod evolve;
-pub mod file;
+pub(crate) mod file;
 pub mod front;
 #[doc(hidden)]
 pub mod gpu_struct;
@@ -170,8 +178,7 @@ pub mod report;
 pub mod run;
 #[doc(hidden)]
 pub mod sample;
-#[doc(hidden)]
-pub mod shell;
+pub(crate) mod shell;
 pub mod statistics;
 pub mod stepping;
 #[cfg(feature = "report")]

@@ -31,7 +31,7 @@ pub fn command(words: impl IntoIterator<Item = impl AsRef<OsStr>>) -> String {
 }
 
 /// Returns a path as an argument. A name that starts with a hyphen would be read as a flag, so `./` precedes it.
-pub fn argument(path: &Path) -> OsString {
+pub(crate) fn argument(path: &Path) -> OsString {
     match path.as_os_str().as_encoded_bytes().first() {
         Some(b'-') => Path::new(".").join(path).into_os_string(),
         _ => path.as_os_str().into(),

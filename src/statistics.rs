@@ -1,7 +1,7 @@
 //! Estimates from trials with their confidence intervals, and tests of differences.
 //!
 //! Trials of two arms with the same seed are pairs. They share their starts and, if sizes agree, their first
-//! populations. The differences of pairs are one sample: [`mean`] gives its interval and [`p_value`] its test.
+//! populations. The differences of pairs are one sample: [`mean`] gives its interval.
 //!
 //! [`Average`] gives mean, deviation and standard error of any other values.
 //!
@@ -16,11 +16,11 @@ use serde::Serialize;
 use statrs::distribution::{Beta, ContinuousCDF, Normal, StudentsT};
 
 /// Confidence level of all intervals.
-pub const CONFIDENCE: f64 = 0.95;
+pub(crate) const CONFIDENCE: f64 = 0.95;
 /// Number of samples that [`bootstrap`] draws.
-pub const RESAMPLES: usize = 9999;
+pub(crate) const RESAMPLES: usize = 9999;
 /// Maximum number of values, counting both samples, for exact p-values. Larger samples use the normal distribution.
-pub const EXACT: usize = 100;
+pub(crate) const EXACT: usize = 100;
 
 /// A number with its 95 % interval. Both ends are included.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -125,7 +125,7 @@ fn interval_at(confidence: f64, value: f64, error: f64, count: usize, step: f64)
 }
 
 /// Returns the half-width of the 95 % interval of a mean of `count` values, in standard errors. 0 for fewer than two.
-pub fn half_width(count: usize) -> f64 {
+pub(crate) fn half_width(count: usize) -> f64 {
     half_width_at(CONFIDENCE, count)
 }
 
@@ -139,7 +139,7 @@ pub fn share(count: usize, of: usize) -> Option<Estimate> {
 }
 
 /// Returns the same as [`share`], with an interval of any confidence level.
-pub fn share_at(confidence: f64, count: usize, of: usize) -> Option<Estimate> {
+pub(crate) fn share_at(confidence: f64, count: usize, of: usize) -> Option<Estimate> {
     let (some, others) = (count as f64, of.checked_sub(count)? as f64);
     let bound = |a: f64, b: f64, at: f64| Some(Beta::new(a, b).ok()?.inverse_cdf(at));
     let tail = (1.0 - confidence) / 2.0;
@@ -168,18 +168,6 @@ pub fn smallest_alpha(holds: impl Fn(f64) -> bool) -> Option<f64> {
         *if holds(1.0 - alpha(middle)) { &mut meets } else { &mut fails } = middle;
     }
     Some(alpha(meets))
-}
-
-/// Returns the two-sided p-value of Student's test that the mean of a sample of differences is 0.
-///
-/// If all differences are equal, Student's test is undefined, and the sign test is used.
-pub fn p_value(differences: &[f64]) -> Option<f64> {
-    let (mean, error) = moments(differences)?;
-    Some(match error {
-        0.0 if mean == 0.0 => 1.0,
-        0.0 => 0.5f64.powi(differences.len() as i32 - 1),
-        _ => 2.0 * student(differences.len()).cdf(-(mean / error).abs()),
-    })
 }
 
 /// Returns the distance of each value from the median of all values.

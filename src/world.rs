@@ -12,7 +12,7 @@ use crate::model::rule::Rule;
 use crate::model::sense::{Density, SenseConstants};
 
 pub use crate::model::motion::GRID;
-pub use crate::model::policy::{BEHAVIOURS, OUTPUTS};
+pub use crate::model::policy::OUTPUTS;
 pub use crate::model::sense::INPUTS;
 pub use crate::model::{Constants, Variant};
 
@@ -153,7 +153,7 @@ impl World {
     }
 
     /// Returns the words of a set of leaders, one bit per leader.
-    pub fn leader_words(&self) -> usize {
+    pub(crate) fn leader_words(&self) -> usize {
         self.leaders().div_ceil(32)
     }
 

@@ -743,7 +743,7 @@ fn a_killed_run_goes_on_to_the_same_results() {
             } else {
                 assert!(recorded == 0 || !told.contains("generation"), "{recorded} recorded: {told}");
             }
-            assert!(!told.contains("set aside") && !told.contains("anew"), "{told}");
+            assert!(!told.contains("set aside") && !told.contains("rewritten"), "{told}");
             match over {
                 None => {
                     killed += 1;
@@ -787,7 +787,7 @@ fn finish_under_kills(file: &Path, out: &Path, flags: &[&str], kills: usize) -> 
             }
         };
         let told = read_all(child.stderr.take());
-        assert!(!told.contains("set aside") && !told.contains("anew"), "{told}");
+        assert!(!told.contains("set aside") && !told.contains("rewritten"), "{told}");
         match over {
             None => killed += 1,
             Some(status) => {

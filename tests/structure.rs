@@ -73,7 +73,10 @@ fn imports(code: &str, root: &str) -> Vec<String> {
 fn check(doc: &Path, folder: &Path, root: &str) -> usize {
     let text = fs::read_to_string(doc).unwrap();
     let modules = listed(&text);
-    let declared = text.lines().filter_map(|line| line.strip_prefix("pub mod ")?.strip_suffix(';'));
+    let declared = text.lines().filter_map(|line| {
+        let name = line.strip_prefix("pub mod ").or(line.strip_prefix("pub(crate) mod "));
+        name?.strip_suffix(';')
+    });
     let (mut declared, mut sorted) = (declared.map(String::from).collect::<Vec<_>>(), modules.clone());
     declared.sort();
     sorted.sort();

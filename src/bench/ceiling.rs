@@ -21,7 +21,7 @@ const LINKS: usize = 20_000;
 const LEAST: Duration = Duration::from_millis(20);
 
 /// Returns lane operations per second, of all threads of the current rayon pool.
-pub fn measure(level: Level) -> f64 {
+pub(crate) fn measure(level: Level) -> f64 {
     rayon::broadcast(|_| dispatch!(level, simd => thread(simd))).into_iter().sum()
 }
 

@@ -17,7 +17,7 @@ const MAX_ITERATIONS: u32 = 4096;
 const MIN_TIME: Duration = Duration::from_millis(20);
 
 /// Measures the arithmetic ceiling of a device under its pass.
-pub struct Ceiling {
+pub(crate) struct Ceiling {
     gpu: Gpu,
     pipeline: wgpu::ComputePipeline,
     buffers: wgpu::BindGroup,
@@ -72,7 +72,7 @@ impl Ceiling {
     ///
     /// # Errors
     /// The device failed.
-    pub fn measure(&self) -> Result<f64, DeviceError> {
+    pub(crate) fn measure(&self) -> Result<f64, DeviceError> {
         let time = self.gpu.time("ceiling", &self.pipeline, &self.buffers, [self.workgroups, 1, 1])?;
         Ok(self.operations / time.as_secs_f64())
     }

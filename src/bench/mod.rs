@@ -125,12 +125,12 @@ impl Timing {
     }
 
     /// Returns the steps of all teams together.
-    pub fn team_steps(&self) -> f64 {
+    pub(crate) fn team_steps(&self) -> f64 {
         (self.teams * self.steps) as f64
     }
 
     /// Returns the share of the arithmetic ceiling that rollouts reach.
-    pub fn ceiling_share(&self) -> f64 {
+    pub(crate) fn ceiling_share(&self) -> f64 {
         self.operations * self.team_steps() / self.rollout / self.ceiling
     }
 }
@@ -171,7 +171,7 @@ pub fn with_agents(config: &Config, agents: usize) -> Result<Config, String> {
 ///
 /// # Errors
 /// The backend failed.
-pub fn measure(config: &Config, player: &mut Subject, generations: Generations) -> Result<Timing, BackendError> {
+pub(crate) fn measure(config: &Config, player: &mut Subject, generations: Generations) -> Result<Timing, BackendError> {
     let world = World::new(config);
     let ceiling = &mut player.ceiling()?;
     let ([rollout, ceiling], mean_g, reach) = rollout(config, &world, player.backend(), ceiling)?;
@@ -264,7 +264,7 @@ fn rollout(
 }
 
 /// Returns whether the system's clock advances. No measurement would end without that.
-pub fn has_clock() -> bool {
+pub(crate) fn has_clock() -> bool {
     advances(Instant::now)
 }
 

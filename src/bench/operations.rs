@@ -70,23 +70,23 @@ impl Reach {
 /// Lane operations of [`kernels`](crate::kernels): an f32 or integer operation, a comparison or a selection is one.
 mod kernel {
     /// [`rsqrt`](crate::kernels::math::rsqrt).
-    pub const RSQRT: u32 = 12;
+    pub(crate) const RSQRT: u32 = 12;
     /// [`exact_sqrt`](crate::kernels::math::exact_sqrt).
-    pub const SQRT: u32 = 12;
+    pub(crate) const SQRT: u32 = 12;
     /// [`recip`](crate::kernels::math::recip).
-    pub const RECIP: u32 = 8;
+    pub(crate) const RECIP: u32 = 8;
     /// A clamp, a square, 5 and 3 for numerator and denominator; their squares' sum, its rough reciprocal (4) and 6 more.
-    pub const TANH: u32 = CLAMP + 1 + 5 + 3 + 3 + 4 + 6;
+    pub(crate) const TANH: u32 = CLAMP + 1 + 5 + 3 + 3 + 4 + 6;
     /// [`sin_cos`](crate::kernels::math::sin_cos).
-    pub const SIN_COS: u32 = 26;
+    pub(crate) const SIN_COS: u32 = 26;
     /// [`flush`](crate::kernels::math::flush).
-    pub const FLUSH: u32 = 3;
+    pub(crate) const FLUSH: u32 = 3;
     /// Minimum and maximum.
-    pub const CLAMP: u32 = 2;
+    pub(crate) const CLAMP: u32 = 2;
     /// An offset and its squared length: 2 differences, 2 products, a sum.
-    pub const SQUARED_DISTANCE: u32 = 5;
+    pub(crate) const SQUARED_DISTANCE: u32 = 5;
     /// A rotation, or an offset relative to a heading: 4 products, 2 sums.
-    pub const ROTATE: u32 = 6;
+    pub(crate) const ROTATE: u32 = 6;
 }
 use kernel::*;
 

@@ -8,7 +8,7 @@ use crate::escape::PathExt;
 use crate::file;
 
 /// Maximum size of a config file, in bytes.
-pub const MAX_FILE_BYTES: u64 = 1 << 20;
+pub(crate) const MAX_FILE_BYTES: u64 = 1 << 20;
 
 impl Config {
     /// Reads a config file.
@@ -21,7 +21,7 @@ impl Config {
 }
 
 /// Returns whether a path is `-`, which means standard input.
-pub fn is_standard_input(path: &Path) -> bool {
+pub(crate) fn is_standard_input(path: &Path) -> bool {
     path.as_os_str() == "-"
 }
 
@@ -34,7 +34,7 @@ pub fn name(path: &Path) -> String {
 ///
 /// # Errors
 /// Fails if the file cannot be read, is a directory, is larger than [`MAX_FILE_BYTES`] or is not UTF-8.
-pub fn read_file(path: &Path) -> Result<String, ConfigError> {
+pub(crate) fn read_file(path: &Path) -> Result<String, ConfigError> {
     let fail = |reason: String| ConfigError::Unreadable { name: name(path), reason, is_missing: false };
     let missing = |error: std::io::Error| ConfigError::Unreadable {
         name: name(path),

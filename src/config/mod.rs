@@ -24,8 +24,10 @@ pub use learning::{
     CheckpointConfig, Elites, Fitness, Learning, LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_PARTNERS,
     MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm, Parents, Sharing,
 };
-pub use load::{MAX_FILE_BYTES, is_standard_input, name, read_file};
-pub use stages::{GENERATIONS, MAX_STAGES, STAGES, Stage};
+pub use load::name;
+pub(crate) use load::{is_standard_input, read_file};
+pub(crate) use stages::MAX_STAGES;
+pub use stages::{GENERATIONS, STAGES, Stage};
 pub use valid::ValidConfig;
 pub use world::{MAX_AGENTS, MAX_POIS, MAX_STEPS, WorldConfig};
 
@@ -36,11 +38,11 @@ mod valid;
 mod world;
 
 /// Maximum size of the policies of all trials of a run, in bytes.
-pub const MAX_POLICY_BYTES: u64 = 1 << 38;
+pub(crate) const MAX_POLICY_BYTES: u64 = 1 << 38;
 /// The section that makes a config a sweep: lists of values to combine.
 pub const GRID: &str = "grid";
 /// The section of a sweep with values to try one at a time.
-pub const VARY: &str = "vary";
+pub(crate) const VARY: &str = "vary";
 
 /// Returns every key of a config, in the order of [`Config::to_toml`].
 pub fn keys() -> Vec<Definition> {
@@ -103,7 +105,7 @@ impl Config {
     ///
     /// # Errors
     /// Fails if the text or an override is invalid. The error lists their problems.
-    pub fn read_document(
+    pub(crate) fn read_document(
         document: &Document<'_>,
         name: &str,
         foreign: &[&str],
@@ -179,7 +181,7 @@ impl Config {
             refused: if foreign.contains(&GRID) { &[] } else { &[GRID, VARY] },
             message: "this makes the file a sweep, of many configs; use `flotilla sweep`",
         };
-        reader::read_document(document, others, overrides, Config::ask)
+        reader::read(document, others, overrides, Config::ask)
     }
 
     /// Returns this config with some keys changed.

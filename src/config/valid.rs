@@ -51,7 +51,7 @@ impl ValidConfig {
     }
 
     /// Returns the config with at most this number of generations. Stages that begin later are never played.
-    pub fn ending_at(mut self, generation: usize) -> ValidConfig {
+    pub(crate) fn ending_at(mut self, generation: usize) -> ValidConfig {
         self.config.learning.generations = self.config.learning.generations.min(generation);
         self
     }

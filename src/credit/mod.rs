@@ -15,7 +15,8 @@ mod fast;
 mod record;
 mod replay;
 
-pub use assignment::{NOBODY, assign, lead, leads};
+pub(crate) use assignment::{NOBODY, assign};
+pub use assignment::{lead, leads};
 pub use record::{Episode, RecordRequest, Seen, Strided, owner_bits};
 pub use replay::observed_at;
 

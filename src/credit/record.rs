@@ -46,7 +46,7 @@ impl RecordRequest<'_> {
     }
 
     /// Reports whether the leaders that each follower saw at each step are needed.
-    pub fn sights(self) -> bool {
+    pub(crate) fn sights(self) -> bool {
         self.0.contains(&Fitness::Dt)
     }
 }

@@ -132,20 +132,20 @@ pub fn normal<S: Simd>(a: S::u32s, b: S::u32s) -> S::f32s {
 
 /// [`normal`], from its radius and cosine.
 #[inline(always)]
-pub fn normal_of<S: Simd>(radius: S::f32s, cosine: S::f32s) -> S::f32s {
+pub(crate) fn normal_of<S: Simd>(radius: S::f32s, cosine: S::f32s) -> S::f32s {
     flush::<S>(radius * cosine, 9.094947e-13)
 }
 
 /// The radius of [`normal`]: the top 24 bits of `a` are a uniform number in (0, 1].
 #[inline(always)]
-pub fn normal_radius<S: Simd>(a: S::u32s) -> S::f32s {
+pub(crate) fn normal_radius<S: Simd>(a: S::u32s) -> S::f32s {
     let u = ((a >> 8) + 1).to_float::<S::f32s>() * 5.9604645e-8;
     exact_sqrt::<S>(ln::<S>(u) * -2.0)
 }
 
 /// The cosine of [`normal`]: the top 24 bits of `b` are an angle in [-π, π).
 #[inline(always)]
-pub fn normal_cosine<S: Simd>(b: S::u32s) -> S::f32s {
+pub(crate) fn normal_cosine<S: Simd>(b: S::u32s) -> S::f32s {
     let angle = ((b >> 8).to_float::<S::f32s>() - 8388608.0) * 3.7450704e-7;
     let (_, cosine) = sin_cos::<S>(angle);
     cosine

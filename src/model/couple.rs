@@ -8,7 +8,7 @@ use crate::kernels::math::within;
 use crate::reader::{Reader, between};
 
 /// The shader of this part.
-pub const WGSL: &str = include_str!("../../shaders/couple.wgsl");
+pub(crate) const WGSL: &str = include_str!("../../shaders/couple.wgsl");
 
 /// Reads the observation radius.
 pub(crate) fn observation_radius(r: &mut Reader<'_>) -> f64 {

@@ -13,7 +13,7 @@ use crate::kernels::{
 use crate::reader::{Reader, between, section};
 
 /// The shader of this part.
-pub const WGSL: &str = include_str!("../../shaders/follow.wgsl");
+pub(crate) const WGSL: &str = include_str!("../../shaders/follow.wgsl");
 
 /// Maximum gain of a force.
 const MAX_GAIN: f64 = 1e3;
@@ -84,7 +84,7 @@ impl FollowConstants {
 }
 
 /// Forces smaller than this (2^-30) are flushed to 0.
-pub const TINY: f32 = 1.0 / 1_073_741_824.0;
+pub(crate) const TINY: f32 = 1.0 / 1_073_741_824.0;
 
 /// Sums and counts of the offsets to agents within a follower's radii.
 #[derive(Clone, Copy)]
@@ -114,13 +114,13 @@ impl<S: Simd> Sums<S> {
 
 /// Returns the lanes in which a follower sees the agent at offset (`dx`, `dy`): it is within the attraction radius.
 #[inline(always)]
-pub fn sees<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::mask32s {
+pub(crate) fn sees<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::mask32s {
     within::<S>(dx, dy, world.follow.attraction_radius2)
 }
 
 /// Adds the agent at offset (`dx`, `dy`), and returns the lanes in which the follower sees it.
 #[inline(always)]
-pub fn influence<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s, sums: &mut Sums<S>) -> S::mask32s {
+pub(crate) fn influence<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s, sums: &mut Sums<S>) -> S::mask32s {
     let near = within::<S>(dx, dy, world.follow.repulsion_radius2);
     let seen = within::<S>(dx, dy, world.follow.attraction_radius2);
     let far = seen & !near;
@@ -187,7 +187,7 @@ pub fn sizes<S: Simd>(pull: &SteeringForce<S>) -> (S::f32s, S::f32s) {
 /// A cosine near 1 cannot resolve small angles, and a sine near 1 cannot resolve large ones. So `BY_SINE` is set if the
 /// maximum turn is small.
 #[inline(always)]
-pub fn steer<S: Simd, const BY_SINE: bool>(
+pub(crate) fn steer<S: Simd, const BY_SINE: bool>(
     world: &Lanes<S>,
     pull: &SteeringForce<S>,
     (force2, inverse): (S::f32s, S::f32s),

@@ -67,7 +67,7 @@ gpu_struct! {
 
 impl Variant {
     /// Returns the density.
-    pub fn density(&self) -> Density {
+    pub(crate) fn density(&self) -> Density {
         Density::of(self.density)
     }
 }
@@ -102,10 +102,10 @@ impl<S: Simd> Lanes<S> {
 }
 
 /// Returns the WGSL of the structs and constants that the parts' shaders use.
-pub fn declarations() -> String {
+pub(crate) fn declarations() -> String {
     let inputs = format!("const INPUTS: u32 = {}u;\n", sense::INPUTS);
     [Constants::wgsl(), Variant::wgsl(), Density::wgsl(), inputs].concat()
 }
 
 /// The parts' shaders, in the order of a step.
-pub const WGSL: [&str; 5] = [sense::WGSL, policy::WGSL, follow::WGSL, motion::WGSL, couple::WGSL];
+pub(crate) const WGSL: [&str; 5] = [sense::WGSL, policy::WGSL, follow::WGSL, motion::WGSL, couple::WGSL];

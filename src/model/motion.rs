@@ -14,7 +14,7 @@ use crate::kernels::{
 use crate::reader::{Allowed, Reader, between, section};
 
 /// The shader of this part.
-pub const WGSL: &str = include_str!("../../shaders/motion.wgsl");
+pub(crate) const WGSL: &str = include_str!("../../shaders/motion.wgsl");
 
 section! {
     /// `[motion]`: the limits of every agent's movement.
@@ -70,7 +70,7 @@ impl Motion {
 const SHORTEST: f64 = 256.0;
 
 /// Returns the largest distance between neighbouring positions on a map: the grid's, or where f32 is coarser, f32's.
-pub fn resolution(map: [f64; 2]) -> f64 {
+pub(crate) fn resolution(map: [f64; 2]) -> f64 {
     let side = map[0].max(map[1]) as f32;
     f64::from((side - side.next_down()).max(1.0 / GRID))
 }
@@ -118,7 +118,7 @@ impl MotionConstants {
     }
 
     /// Reports whether the maximum turn is so small that angles are compared by their sines instead of their cosines.
-    pub fn by_sine(&self) -> bool {
+    pub(crate) fn by_sine(&self) -> bool {
         self.max_turn_cos > 0.7
     }
 }
@@ -128,11 +128,11 @@ impl MotionConstants {
 pub const GRID: f32 = 262_144.0;
 
 /// Components of a heading smaller than this (2^-30) are flushed to 0.
-pub const TINY: f32 = 1.0 / 1_073_741_824.0;
+pub(crate) const TINY: f32 = 1.0 / 1_073_741_824.0;
 
 /// Rotates a heading to the left, by the angle of this cosine and sine.
 #[inline(always)]
-pub fn rotate<S: Simd>(hx: S::f32s, hy: S::f32s, cosine: S::f32s, sine: S::f32s) -> (S::f32s, S::f32s) {
+pub(crate) fn rotate<S: Simd>(hx: S::f32s, hy: S::f32s, cosine: S::f32s, sine: S::f32s) -> (S::f32s, S::f32s) {
     (hx * cosine - hy * sine, hx * sine + hy * cosine)
 }
 
@@ -146,14 +146,14 @@ pub fn turn<S: Simd>(world: &Lanes<S>, hx: S::f32s, hy: S::f32s, wanted: S::f32s
 
 /// Scales a heading back to length 1 by one Newton step, because each turn adds a rounding error.
 #[inline(always)]
-pub fn renormalize<S: Simd>(hx: S::f32s, hy: S::f32s) -> (S::f32s, S::f32s) {
+pub(crate) fn renormalize<S: Simd>(hx: S::f32s, hy: S::f32s) -> (S::f32s, S::f32s) {
     let scale = splat(hx.token(), 1.5) - (hx * hx + hy * hy) * 0.5;
     (flush::<S>(hx * scale, TINY), flush::<S>(hy * scale, TINY))
 }
 
 /// Changes the speed towards the wanted one, within the limits.
 #[inline(always)]
-pub fn accelerate<S: Simd>(world: &Lanes<S>, speed: S::f32s, wanted: S::f32s) -> S::f32s {
+pub(crate) fn accelerate<S: Simd>(world: &Lanes<S>, speed: S::f32s, wanted: S::f32s) -> S::f32s {
     let limit = world.motion.max_speed_change;
     let change = clamp_to::<S>(wanted - speed, -limit, limit);
     clamp_to::<S>(speed + change, world.motion.min_speed, world.motion.max_speed)
@@ -167,6 +167,6 @@ pub fn advance<S: Simd>(at: S::f32s, step: S::f32s, heading: S::f32s, size: S::f
 
 /// Rounds a coordinate to the grid.
 #[inline(always)]
-pub fn snap<S: Simd>(at: S::f32s) -> S::f32s {
+pub(crate) fn snap<S: Simd>(at: S::f32s) -> S::f32s {
     (at * GRID + 0.5).floor() * (1.0 / GRID)
 }

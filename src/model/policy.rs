@@ -10,12 +10,12 @@ use crate::kernels::{math, select, splat};
 use crate::reader::{Reader, between, section};
 
 /// The shader of this part.
-pub const WGSL: &str = include_str!("../../shaders/policy.wgsl");
+pub(crate) const WGSL: &str = include_str!("../../shaders/policy.wgsl");
 
 /// Actions of a leader: a wanted turn and a wanted speed.
 pub const OUTPUTS: usize = 2;
 /// Behaviours to choose among: hold, towards or away from POIs, towards or away from agents.
-pub const BEHAVIOURS: usize = 5;
+pub(crate) const BEHAVIOURS: usize = 5;
 /// Maximum number of hidden layers.
 pub const MAX_HIDDEN_LAYERS: usize = 3;
 /// Maximum units per hidden layer.
@@ -102,7 +102,7 @@ impl PolicyConstants {
     }
 
     /// Returns the widest layer, inputs included.
-    pub fn widest(&self) -> usize {
+    pub(crate) fn widest(&self) -> usize {
         self.widths.into_iter().max().unwrap_or(0) as usize
     }
 
@@ -116,7 +116,7 @@ impl PolicyConstants {
 ///
 /// `weights` has one row of `UNITS` per input, then the biases.
 #[inline(always)]
-pub fn affine<S: Simd, const UNITS: usize>(inputs: &[S::f32s], weights: &[S::f32s]) -> [S::f32s; UNITS] {
+pub(crate) fn affine<S: Simd, const UNITS: usize>(inputs: &[S::f32s], weights: &[S::f32s]) -> [S::f32s; UNITS] {
     let (rows, _) = weights.as_chunks::<UNITS>();
     let mut sums = rows[inputs.len()];
     for (&input, row) in inputs.iter().zip(rows) {
@@ -129,12 +129,12 @@ pub fn affine<S: Simd, const UNITS: usize>(inputs: &[S::f32s], weights: &[S::f32
 
 /// Clamps a sum to the range of tanh. Small sums are flushed to 0, so that the next layer has no denormals.
 #[inline(always)]
-pub fn clamp_preactivation<S: Simd>(sum: S::f32s) -> S::f32s {
+pub(crate) fn clamp_preactivation<S: Simd>(sum: S::f32s) -> S::f32s {
     math::limit_tanh::<S>(math::flush::<S>(sum, TINY))
 }
 
 /// Sums smaller than this (2^-30) are flushed to 0.
-pub const TINY: f32 = 1.0 / 1_073_741_824.0;
+pub(crate) const TINY: f32 = 1.0 / 1_073_741_824.0;
 
 /// Returns the actions of the most wanted behaviour: the first of the largest `wanted`, each in -1..1.
 ///
@@ -171,12 +171,12 @@ pub fn choose<S: Simd>(inputs: &[S::f32s; INPUTS], wanted: &[S::f32s; BEHAVIOURS
 
 /// Converts the first output, in -1..1, to a wanted turn in radians to the left.
 #[inline(always)]
-pub fn wanted_turn<S: Simd>(output: S::f32s) -> S::f32s {
+pub(crate) fn wanted_turn<S: Simd>(output: S::f32s) -> S::f32s {
     output * std::f32::consts::PI
 }
 
 /// Converts the second output, in -1..1, to a wanted speed.
 #[inline(always)]
-pub fn wanted_speed<S: Simd>(world: &Lanes<S>, output: S::f32s) -> S::f32s {
+pub(crate) fn wanted_speed<S: Simd>(world: &Lanes<S>, output: S::f32s) -> S::f32s {
     (output + 1.0) * 0.5 * world.motion.max_speed
 }

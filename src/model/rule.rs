@@ -175,7 +175,7 @@ pub struct Rule {
 }
 
 /// The step of an event that never happens.
-pub const NEVER: u32 = u32::MAX;
+pub(crate) const NEVER: u32 = u32::MAX;
 
 impl Rule {
     /// Creates a rule from the observers, of `agents`, the windows, `[pois]`, and the POIs that each comes after,
@@ -204,7 +204,7 @@ impl Rule {
     }
 
     /// Reports whether this is the default rule.
-    pub fn is_plain(&self) -> bool {
+    pub(crate) fn is_plain(&self) -> bool {
         self.counted.is_empty() && !self.is_timed()
     }
 
@@ -220,7 +220,7 @@ impl Rule {
 
     /// Masks a word of a set to the observers.
     #[inline]
-    pub fn counted(&self, word: usize, agents: u32) -> u32 {
+    pub(crate) fn counted(&self, word: usize, agents: u32) -> u32 {
         agents & self.counted.get(word).copied().unwrap_or(u32::MAX)
     }
 
@@ -231,7 +231,7 @@ impl Rule {
     }
 
     /// Returns the first and last step of a POI's window, if it has one.
-    pub fn window(&self, poi: usize) -> Option<[u32; 2]> {
+    pub(crate) fn window(&self, poi: usize) -> Option<[u32; 2]> {
         self.windows.get(poi).copied()
     }
 

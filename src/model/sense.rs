@@ -12,12 +12,12 @@ use crate::kernels::{
 use crate::reader::{Reader, between, section};
 
 /// The shader of this part.
-pub const WGSL: &str = include_str!("../../shaders/sense.wgsl");
+pub(crate) const WGSL: &str = include_str!("../../shaders/sense.wgsl");
 
 /// Inputs of a policy: POI and agent density in four quadrants each.
 pub const INPUTS: usize = 8;
 /// The inputs' names, in order.
-pub const NAMES: [&str; INPUTS] = [
+pub(crate) const NAMES: [&str; INPUTS] = [
     "POIs back right",
     "POIs front right",
     "POIs front left",
@@ -102,7 +102,7 @@ impl SenseConstants {
 
 /// Returns the density of an entity at offset (`dx`, `dy`), if it is in range.
 #[inline(always)]
-pub fn density<S: Simd, const DENSITY: u32>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::f32s {
+pub(crate) fn density<S: Simd, const DENSITY: u32>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::f32s {
     let one = splat(dx.token(), 1.0);
     let d2 = dx * dx + dy * dy;
     match const { Density::of(DENSITY) } {
@@ -133,7 +133,11 @@ pub fn sense<S: Simd>(density: S::f32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, h
 
 /// Returns the policy's inputs: the sums of both kinds, each multiplied by its constant.
 #[inline(always)]
-pub fn weigh_in<S: Simd>(world: &Lanes<S>, of_pois: [S::f32s; 4], of_agents: [S::f32s; 4]) -> [S::f32s; INPUTS] {
+pub(crate) fn scale_inputs<S: Simd>(
+    world: &Lanes<S>,
+    of_pois: [S::f32s; 4],
+    of_agents: [S::f32s; 4],
+) -> [S::f32s; INPUTS] {
     let [p, a] = [world.sense.poi_share, world.sense.agent_share];
     let ([p0, p1, p2, p3], [a0, a1, a2, a3]) = (of_pois, of_agents);
     [p0 * p, p1 * p, p2 * p, p3 * p, a0 * a, a1 * a, a2 * a, a3 * a]

@@ -19,7 +19,7 @@ const MAGIC: [u8; 4] = *b"PK\x03\x04";
 
 /// The folder of a run: the named one, or a temporary one with what a zip file holds, which is removed at the end.
 #[derive(Debug)]
-pub struct RunFolder {
+pub(crate) struct RunFolder {
     path: PathBuf,
     unpacked: Option<TempDir>,
 }
@@ -44,7 +44,7 @@ impl RunFolder {
     }
 
     /// Returns whether the run came from a zip file, so that nothing may be written into its folder.
-    pub fn is_unpacked(&self) -> bool {
+    pub(crate) fn is_unpacked(&self) -> bool {
         self.unpacked.is_some()
     }
 }
@@ -65,7 +65,7 @@ fn zip_file(path: &Path) -> Result<Option<File>, RecordError> {
 }
 
 /// Returns the folder that holds the run in a zip file, empty if there is none. Returns none if the path is no zip file of a run.
-pub fn top(path: &Path) -> Option<String> {
+pub(crate) fn top(path: &Path) -> Option<String> {
     let archive = ZipArchive::new(zip_file(path).ok()??).ok()?;
     let names: Vec<String> = archive.file_names().flatten().map(Into::into).collect();
     Some(names.iter().find_map(|name| inside(name, CONFIG))?.trim_end_matches('/').into())

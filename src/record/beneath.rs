@@ -28,7 +28,7 @@ pub enum FileKind {
 }
 
 /// A name in an open folder. No file needs to exist under that name.
-pub struct FolderEntry {
+pub(crate) struct FolderEntry {
     parent: Handle,
     name: OsString,
     path: PathBuf,
@@ -36,9 +36,6 @@ pub struct FolderEntry {
 
 impl Root {
     /// Opens a folder. Links in its path are followed.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn open(path: &Path) -> io::Result<Root> {
         Ok(Root { path: path.into(), handle: system::open(path)? })
     }
@@ -49,9 +46,6 @@ impl Root {
     }
 
     /// Returns the user ids `[owner, current user]`, or `None` on systems without user ids.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn owners(&self) -> io::Result<Option<[u32; 2]>> {
         system::owners(&self.handle)
     }
@@ -60,7 +54,7 @@ impl Root {
     ///
     /// # Errors
     /// A folder on the way is a link or is missing, or the path is not below this folder.
-    pub fn entry(&self, path: &Path) -> io::Result<FolderEntry> {
+    pub(crate) fn entry(&self, path: &Path) -> io::Result<FolderEntry> {
         let (folders, name) = self.names(path)?;
         let mut parent = system::copy(&self.handle)?;
         let mut at = self.path.clone();
@@ -75,7 +69,7 @@ impl Root {
     ///
     /// # Errors
     /// Another file or a link has one of the names, or the system returns an error.
-    pub fn create_folder(&self, path: &Path) -> io::Result<()> {
+    pub(crate) fn create_folder(&self, path: &Path) -> io::Result<()> {
         if path == self.path {
             return Ok(());
         }
@@ -109,9 +103,6 @@ impl Root {
 
 impl FolderEntry {
     /// Returns the type of the entry, or `None` if it does not exist.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn kind(&self) -> io::Result<Option<FileKind>> {
         system::kind(&self.parent, &self.name, &self.path)
     }
@@ -120,25 +111,20 @@ impl FolderEntry {
     ///
     /// # Errors
     /// The entry is not a plain file, or the system returns an error.
-    pub fn only_file(&self) -> io::Result<Option<()>> {
+    pub(crate) fn only_file(&self) -> io::Result<Option<()>> {
         match self.kind()? {
             None => Ok(None),
             Some(FileKind::File) => Ok(Some(())),
             Some(FileKind::Link) => Err(is_link(&self.path)),
-            Some(FileKind::Folder) => {
-                Err(io::Error::new(ErrorKind::IsADirectory, "it is a folder, where a file is needed"))
-            }
+            Some(FileKind::Folder) => Err(io::Error::new(ErrorKind::IsADirectory, "it is a folder, not a file")),
             Some(FileKind::Other) => {
-                Err(io::Error::new(ErrorKind::InvalidInput, "it is a pipe or a device, where a file is needed"))
+                Err(io::Error::new(ErrorKind::InvalidInput, "it is a pipe or a device, not a file"))
             }
         }
     }
 
     /// Creates a file. Fails if the name is taken.
-    ///
-    /// # Errors
-    /// Returns the system's error.
-    pub fn create_new(&self) -> io::Result<File> {
+    pub(crate) fn create_new(&self) -> io::Result<File> {
         system::create_new(&self.parent, &self.name, &self.path)
     }
 
@@ -182,16 +168,13 @@ impl FolderEntry {
     ///
     /// # Errors
     /// The new name belongs to something other than a plain file, or the system returns an error.
-    pub fn rename(&self, to: &FolderEntry) -> io::Result<()> {
+    pub(crate) fn rename(&self, to: &FolderEntry) -> io::Result<()> {
         to.only_file()?;
         system::rename((&self.parent, &self.name, &self.path), (&to.parent, &to.name, &to.path))
     }
 
     /// Flushes the names in the parent folder to the disk, if the system can.
-    ///
-    /// # Errors
-    /// Returns the system's error.
-    pub fn sync_folder(&self) -> io::Result<()> {
+    pub(crate) fn sync_folder(&self) -> io::Result<()> {
         match system::sync(&self.parent) {
             // Some network file systems cannot flush a folder.
             Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
@@ -201,7 +184,7 @@ impl FolderEntry {
 }
 
 /// Returns the error for writing through a link.
-pub fn is_link(path: &Path) -> io::Error {
+pub(crate) fn is_link(path: &Path) -> io::Error {
     let text =
         format!("{} is a symbolic link, and nothing is written through one here; remove the link", path.display());
     io::Error::new(ErrorKind::InvalidInput, text)
@@ -256,7 +239,7 @@ mod system {
         opened.map(Handle).map_err(|error| not_a_folder(kind(parent, name, path).ok().flatten(), path, error.into()))
     }
 
-    pub fn create_folder(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<()> {
+    pub(crate) fn create_folder(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<()> {
         Ok(fs::mkdirat(&parent.0, name, FOLDER_MODE)?)
     }
 
@@ -273,7 +256,7 @@ mod system {
         }
     }
 
-    pub fn create_new(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<File> {
+    pub(crate) fn create_new(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<File> {
         let flags = FILE | OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL;
         Ok(fs::openat(&parent.0, name, flags, FILE_MODE)?.into())
     }
@@ -295,7 +278,7 @@ mod system {
         Ok(fs::unlinkat(&parent.0, name, AtFlags::empty())?)
     }
 
-    pub fn rename(from: (&Handle, &OsStr, &Path), to: (&Handle, &OsStr, &Path)) -> io::Result<()> {
+    pub(crate) fn rename(from: (&Handle, &OsStr, &Path), to: (&Handle, &OsStr, &Path)) -> io::Result<()> {
         Ok(fs::renameat(&from.0.0, from.1, &to.0.0, to.1)?)
     }
 
@@ -335,7 +318,7 @@ mod system {
         }
     }
 
-    pub fn create_folder(_: &Handle, _: &OsStr, path: &Path) -> io::Result<()> {
+    pub(crate) fn create_folder(_: &Handle, _: &OsStr, path: &Path) -> io::Result<()> {
         fs::create_dir(path)
     }
 
@@ -350,7 +333,7 @@ mod system {
         }
     }
 
-    pub fn create_new(_: &Handle, _: &OsStr, path: &Path) -> io::Result<File> {
+    pub(crate) fn create_new(_: &Handle, _: &OsStr, path: &Path) -> io::Result<File> {
         OpenOptions::new().write(true).create_new(true).open(path)
     }
 
@@ -370,7 +353,7 @@ mod system {
         fs::remove_file(path)
     }
 
-    pub fn rename(from: (&Handle, &OsStr, &Path), to: (&Handle, &OsStr, &Path)) -> io::Result<()> {
+    pub(crate) fn rename(from: (&Handle, &OsStr, &Path), to: (&Handle, &OsStr, &Path)) -> io::Result<()> {
         fs::rename(from.2, to.2)
     }
 

@@ -71,7 +71,7 @@ impl<N> Checkpoint<N> {
 }
 
 /// Returns the config with `last` generations. Stages that begin after that generation are removed.
-pub fn of_length(config: &Config, last: usize) -> Config {
+pub(crate) fn of_length(config: &Config, last: usize) -> Config {
     let mut config = config.clone();
     config.learning.generations = last;
     config.stages.retain(|stage| stage.from <= last);
@@ -134,10 +134,9 @@ impl Checkpoint {
         if file.kind() != Some(KIND) {
             return Err(format!("it holds {:?}, not {KIND:?}", file.kind().unwrap_or("something else")));
         }
-        let text = |key: &str| file.metadata(key).map(String::from).ok_or_else(|| format!("it does not say its {key}"));
-        let number = |key: &str| {
-            text(key)?.parse::<u64>().map_err(|error| format!("its {key} is no number that can be: {error}"))
-        };
+        let text = |key: &str| file.metadata(key).map(String::from).ok_or_else(|| format!("it has no {key}"));
+        let number =
+            |key: &str| text(key)?.parse::<u64>().map_err(|error| format!("its {key} is not a valid number: {error}"));
         let config = text("config")?;
         // A longer time would make lines of `metrics.csv` too long for its readers. It has no influence on results.
         let seconds: Option<f64> = text("seconds")?.parse().ok();
@@ -156,7 +155,7 @@ impl Checkpoint {
         let mut floats = |name: &str, shape: &[usize]| -> Result<Vec<Vec<f32>>, String> {
             let mut trials: Vec<Vec<f32>> = file.read(name, Dtype::F32, shape, shape[0])?;
             match trials.iter_mut().any(|numbers| evolve::admit(numbers).is_some()) {
-                true => Err(format!("{name} has numbers that cannot be")),
+                true => Err(format!("{name} has numbers out of range")),
                 false => Ok(trials),
             }
         };
@@ -168,7 +167,7 @@ impl Checkpoint {
             _ => file.read(PENDING, Dtype::F64, &[learning.trials, 2], 1)?.pop().unwrap_or_default(),
         };
         if pending.iter().flatten().any(|share| !(0.0..=1.0).contains(share)) {
-            return Err(format!("{PENDING} has numbers that cannot be"));
+            return Err(format!("{PENDING} has numbers out of range"));
         }
         let row = |trial: usize| {
             let &[best_g, mean_g] = pending.get(trial)?;
@@ -386,7 +385,7 @@ impl Keeper {
     ///
     /// # Errors
     /// A checkpoint could not be read or written.
-    pub fn shorten(&mut self, config: &Config) -> Result<(), RecordError> {
+    pub(crate) fn shorten(&mut self, config: &Config) -> Result<(), RecordError> {
         self.wait()?;
         for &generation in &self.kept {
             let path = path(&self.folder, generation);
@@ -405,7 +404,7 @@ impl Keeper {
     ///
     /// # Errors
     /// The last checkpoint could not be written.
-    pub fn poll(&mut self) -> Result<(), RecordError> {
+    pub(crate) fn poll(&mut self) -> Result<(), RecordError> {
         if self.writing.as_ref().is_some_and(Aside::is_finished) { self.wait() } else { Ok(()) }
     }
 
@@ -428,7 +427,7 @@ impl Drop for Keeper {
 ///
 /// # Errors
 /// The folder cannot be read or written.
-pub fn tidy(disk: &Disk, folder: &Path) -> Result<Vec<usize>, RecordError> {
+pub(crate) fn tidy(disk: &Disk, folder: &Path) -> Result<Vec<usize>, RecordError> {
     let generations = list(folder)?;
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
         let path = entry.path();

@@ -16,7 +16,7 @@ use super::{RecordError, hex};
 use crate::config::Config;
 
 /// Warning for output made from files that were not compared.
-pub const UNVERIFIED: &str = "Unverified: files were not compared with the digests in run.json";
+pub(crate) const UNVERIFIED: &str = "Unverified: files were not compared with the digests in run.json";
 
 /// Whether the files of a run are compared with their digests.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -35,7 +35,7 @@ impl Verification {
     }
 
     /// Returns whether no file is compared.
-    pub fn is_skipped(self) -> bool {
+    pub(crate) fn is_skipped(self) -> bool {
         self == Verification::Skipped
     }
 }
@@ -70,7 +70,7 @@ impl Digests {
     ///
     /// # Errors
     /// The config differs.
-    pub fn compare_config(&self, path: &Path, config: &Config) -> Result<(), RecordError> {
+    pub(crate) fn compare_config(&self, path: &Path, config: &Config) -> Result<(), RecordError> {
         same(path, self.origin.as_ref().is_none_or(|origin| *origin == Origin::of(config)))
     }
 
@@ -78,7 +78,7 @@ impl Digests {
     ///
     /// # Errors
     /// The metrics differ.
-    pub fn compare_metrics(&self, path: &Path, found: Sha256) -> Result<(), RecordError> {
+    pub(crate) fn compare_metrics(&self, path: &Path, found: Sha256) -> Result<(), RecordError> {
         same(path, self.files.as_ref().is_none_or(|files| files.metrics == hex(&found.finalize())))
     }
 
@@ -86,7 +86,7 @@ impl Digests {
     ///
     /// # Errors
     /// The checksum differs.
-    pub fn compare_policies(&self, path: &Path, checksum: Option<&str>) -> Result<(), RecordError> {
+    pub(crate) fn compare_policies(&self, path: &Path, checksum: Option<&str>) -> Result<(), RecordError> {
         same(path, self.files.as_ref().is_none_or(|files| Some(&*files.policies) == checksum))
     }
 }

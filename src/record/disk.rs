@@ -30,7 +30,7 @@ pub enum Operation {
 }
 
 /// Called before each operation. If it returns an error, the operation fails with that error.
-pub type Gate = dyn Fn(Operation, &Path) -> io::Result<()> + Send + Sync;
+pub(crate) type Gate = dyn Fn(Operation, &Path) -> io::Result<()> + Send + Sync;
 
 /// The file system, optionally limited to one folder. Tests can add a gate that makes operations fail.
 #[derive(Clone, Default)]
@@ -100,15 +100,12 @@ impl Disk {
     ///
     /// # Errors
     /// It is one, or the system returns an error.
-    pub fn refuse_link(&self, path: &Path) -> io::Result<()> {
+    pub(crate) fn refuse_link(&self, path: &Path) -> io::Result<()> {
         if self.kind(path)? == Some(FileKind::Link) { Err(is_link(path)) } else { Ok(()) }
     }
 
     /// Creates a folder and its missing parents.
-    ///
-    /// # Errors
-    /// Returns the system's error.
-    pub fn create_folder(&self, path: &Path) -> io::Result<()> {
+    pub(crate) fn create_folder(&self, path: &Path) -> io::Result<()> {
         self.pass(Operation::CreateFolder, path)?;
         if let Some(root) = &self.root {
             return root.create_folder(path);
@@ -131,10 +128,7 @@ impl Disk {
     }
 
     /// Creates a file. Fails if the name is taken.
-    ///
-    /// # Errors
-    /// Returns the system's error.
-    pub fn create_new(&self, path: &Path) -> io::Result<Output> {
+    pub(crate) fn create_new(&self, path: &Path) -> io::Result<Output> {
         self.pass(Operation::Create, path)?;
         let file = self.entry(path)?.create_new()?;
         Ok(Output { disk: self.clone(), path: path.into(), file })
@@ -180,7 +174,7 @@ impl Disk {
     ///
     /// # Errors
     /// Returns the error of the system or of `before`.
-    pub fn replace_shared(
+    pub(crate) fn replace_shared(
         &self,
         path: &Path,
         content: impl FnOnce(&mut dyn Write) -> io::Result<()>,
@@ -227,10 +221,11 @@ impl Disk {
 
     /// Writes a file that the user named, whole or not at all. A link to a file is followed, except on a disk that is
     /// limited to a folder. A device or a pipe, such as `/dev/stdout`, is written to directly.
-    ///
-    /// # Errors
-    /// Returns the system's error.
-    pub fn deliver(&self, path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
+    pub(crate) fn deliver(
+        &self,
+        path: &Path,
+        content: impl FnOnce(&mut dyn Write) -> io::Result<()>,
+    ) -> io::Result<()> {
         if self.root.is_some() && self.kind(path)? != Some(FileKind::Other) {
             if self.kind(path)?.is_some() {
                 // A link must not be replaced, nor a file without write permission.
@@ -274,7 +269,7 @@ impl Disk {
     ///
     /// # Errors
     /// Returns the system's error.
-    pub fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+    pub(crate) fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
         self.pass(Operation::Rename, to)?;
         let target = self.entry(to)?;
         self.entry(from)?.rename(&target)?;
@@ -306,7 +301,7 @@ impl Disk {
     ///
     /// # Errors
     /// The entry is not a plain file, or the system returns an error.
-    pub fn open_lock(&self, path: &Path) -> io::Result<File> {
+    pub(crate) fn open_lock(&self, path: &Path) -> io::Result<File> {
         self.entry(path)?.extend()
     }
 
@@ -318,7 +313,7 @@ impl Disk {
 }
 
 /// Removes the path of a temporary file from an error, because the user does not know that file.
-pub fn without_path(error: io::Error) -> io::Error {
+pub(crate) fn without_path(error: io::Error) -> io::Error {
     if error.get_ref().is_some() { error.kind().into() } else { error }
 }
 
@@ -326,14 +321,14 @@ pub fn without_path(error: io::Error) -> io::Error {
 const PREFIX: &str = ".flotilla-";
 
 /// Returns the path of the temporary file in which the new content of a file is written.
-pub fn temporary(path: &Path) -> PathBuf {
+pub(crate) fn temporary(path: &Path) -> PathBuf {
     let name = path.file_name().unwrap_or_default();
     let name = [PREFIX.as_ref(), name, ".tmp".as_ref()].into_iter().collect::<std::ffi::OsString>();
     path.with_file_name(name)
 }
 
 /// Returns the name of the file to which a [`temporary`] path belongs, or `None` for other paths.
-pub fn of_temporary(path: &Path) -> Option<&str> {
+pub(crate) fn of_temporary(path: &Path) -> Option<&str> {
     path.file_name()?.to_str()?.strip_prefix(PREFIX)?.strip_suffix(".tmp")
 }
 

@@ -112,10 +112,11 @@ impl MachineReport {
     /// # Errors
     /// Returns a description of the problem.
     pub fn parse(text: &str) -> Result<MachineReport, String> {
-        let found: MachineReport = serde_json::from_str(text).map_err(|error| format!("it is no evidence: {error}"))?;
+        let found: MachineReport =
+            serde_json::from_str(text).map_err(|error| format!("not a machine report: {error}"))?;
         match found.schema {
             SCHEMA => Ok(found),
-            other => Err(format!("it has schema {other}, known is {SCHEMA}")),
+            other => Err(format!("schema {other} is unknown; this version reads {SCHEMA}")),
         }
     }
 

@@ -32,7 +32,7 @@ pub trait Storage {
 }
 
 /// Writes the content of a file.
-pub type Content<'a> = &'a mut dyn FnMut(&mut dyn Write) -> io::Result<()>;
+pub(crate) type Content<'a> = &'a mut dyn FnMut(&mut dyn Write) -> io::Result<()>;
 
 impl Storage for Folder {
     fn put(&mut self, name: &str, content: Content<'_>) -> Result<(), RecordError> {
@@ -104,7 +104,7 @@ impl Finished<'_> {
 
 /// Returns the checkpoint that a finished run leaves, from which it can be extended. `metrics` ends before the rows of
 /// the last generation. The weights are those of the policies' file.
-pub fn last_checkpoint(
+pub(crate) fn last_checkpoint(
     config: &Config,
     init: Option<String>,
     seconds: f64,
@@ -123,7 +123,7 @@ pub fn last_checkpoint(
 
 /// Reads the scores behind the order of a finished run's policies. Returns `None` if its last checkpoint is missing or
 /// cannot be used.
-pub fn read_ending(folder: &Path, config: &Config) -> Option<Ending> {
+pub(crate) fn read_ending(folder: &Path, config: &Config) -> Option<Ending> {
     let path = checkpoint::path(&folder.join(CHECKPOINTS), config.learning.generations + 1);
     let found = Checkpoint::read(crate::file::open(&path).ok()?, config).ok()?;
     let Snapshot { generation, last, weights, fitness, pending } = &found.snapshot;

@@ -21,7 +21,7 @@ use crate::trainer::Row;
 /// Header of the file.
 pub const HEADER: &str = "trial,generation,best_g,mean_g,champion_g,seconds";
 /// Header of the file if the config has stages.
-pub const STAGED: &str = "trial,generation,best_g,mean_g,champion_g,seconds,stage";
+pub(crate) const STAGED: &str = "trial,generation,best_g,mean_g,champion_g,seconds,stage";
 /// Maximum number of bytes per line.
 const MAX_LINE: u64 = 256;
 
@@ -162,7 +162,7 @@ fn shared(row: &Row) -> String {
 ///
 /// # Errors
 /// Returns the system's error.
-pub fn begins(path: &Path) -> io::Result<bool> {
+pub(crate) fn begins(path: &Path) -> io::Result<bool> {
     let mut start = Vec::new();
     file::open(path)?.take("trial,generation,".len() as u64).read_to_end(&mut start)?;
     Ok(HEADER.as_bytes().starts_with(&start))

@@ -30,7 +30,7 @@ use crate::escape::{self, PathExt};
 use crate::file::{self, TextError};
 
 pub mod archive;
-pub mod beneath;
+pub(crate) mod beneath;
 pub mod checkpoint;
 pub mod digests;
 pub mod disk;
@@ -149,7 +149,7 @@ pub enum RecordError {
         path: PathBuf,
     },
     /// The file has changed since the run wrote it.
-    #[error("{path}: it is not as the run left it (run.json has another digest)")]
+    #[error("{path}: it has changed since the run wrote it (run.json has another digest)")]
     Differs {
         /// Path of the file.
         path: PathBuf,
@@ -248,7 +248,7 @@ pub fn config_digest(config: &Config) -> String {
 }
 
 /// Returns the config with the default `[checkpoint]`, because that section may differ between sessions of a run.
-pub fn without_checkpoint(config: &Config) -> Config {
+pub(crate) fn without_checkpoint(config: &Config) -> Config {
     Config { checkpoint: config::CheckpointConfig::default(), ..config.clone() }
 }
 

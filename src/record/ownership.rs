@@ -33,19 +33,19 @@ pub const POLICIES: &str = "policies.safetensors";
 /// Folder of the [`super::checkpoint`]s.
 pub const CHECKPOINTS: &str = "checkpoints";
 /// File that marks a folder as the folder of a paper.
-pub const PAPER: &str = "paper.toml";
+pub(crate) const PAPER: &str = "paper.toml";
 /// Folder of the runs of a paper.
-pub const ARMS: &str = "arms";
+pub(crate) const ARMS: &str = "arms";
 /// The sweep as it was run. This file marks a folder as the folder of a sweep.
 pub const SWEEP: &str = "sweep.toml";
 /// Results of a sweep, one line per trial.
-pub const RESULTS: &str = "results.csv";
+pub(crate) const RESULTS: &str = "results.csv";
 /// Points of a sweep, one per line.
-pub const POINTS: &str = "points.csv";
+pub(crate) const POINTS: &str = "points.csv";
 /// Training curves in the folder of a run.
 pub const CURVES: &str = "curves.svg";
 /// Replay page in the folder of a run.
-pub const REPLAY: &str = "replay.html";
+pub(crate) const REPLAY: &str = "replay.html";
 /// List of the files made from runs. Each line has SHA-256 and name, in the format of `sha256sum`.
 pub const LIST: &str = ".flotilla.sha256";
 /// Maximum size of `run.json` in bytes.
@@ -87,7 +87,7 @@ struct RunMark {
 ///
 /// # Errors
 /// The folder has a file that a run would replace but holds no run, or it cannot be read.
-pub fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordError> {
+pub(crate) fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordError> {
     let there = |name: &str| {
         let path = folder.join(name);
         let there = file::exists(&path).map_err(RecordError::read(&path))?;
@@ -139,7 +139,7 @@ pub fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordError> {
 ///
 /// # Errors
 /// A file of the run is a link, or the folder cannot be read.
-pub fn refuse_links(disk: &Disk, folder: &Path) -> Result<(), RecordError> {
+pub(crate) fn refuse_links(disk: &Disk, folder: &Path) -> Result<(), RecordError> {
     for path in [RUN, CONFIG, METRICS, POLICIES, CHECKPOINTS].map(|name| folder.join(name)) {
         disk.refuse_link(&path).map_err(RecordError::write(&path))?;
     }
@@ -197,7 +197,7 @@ pub fn publish(
 ///
 /// # Errors
 /// The file cannot be read or deleted.
-pub fn withdraw(disk: &Disk, path: &Path) -> Result<(), RecordError> {
+pub(crate) fn withdraw(disk: &Disk, path: &Path) -> Result<(), RecordError> {
     match check(disk, [path]) {
         Ok(()) => disk.remove(path).map_err(RecordError::write(path)),
         Err(RecordError::NotOurs { .. }) => Ok(()),
@@ -206,7 +206,7 @@ pub fn withdraw(disk: &Disk, path: &Path) -> Result<(), RecordError> {
 }
 
 /// Returns whether the content of a file is an SVG or PNG that flotilla drew.
-pub fn is_drawing(path: &Path) -> bool {
+pub(crate) fn is_drawing(path: &Path) -> bool {
     let mut start = Vec::new();
     let read = file::open(path).and_then(|file| file.take(1 << 12).read_to_end(&mut start));
     let holds = |piece: &[u8]| start.windows(piece.len()).any(|window| window == piece);

@@ -59,7 +59,7 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
 }
 
 /// Returns whether a file can be read and belongs to a run of this config.
-pub fn are_of(path: &Path, config: &Config) -> bool {
+pub(crate) fn are_of(path: &Path, config: &Config) -> bool {
     mark(path).0 == Some(super::config_digest(config))
 }
 
@@ -171,7 +171,7 @@ pub fn from_source(source: impl Read + Seek, config: &Config, trial: Option<usiz
 ///
 /// # Errors
 /// Returns a description of the problem.
-pub fn from_file(
+pub(crate) fn from_file(
     file: &mut TensorFile<impl Read + Seek>,
     config: &Config,
     populations: &[usize],

@@ -22,7 +22,7 @@ pub enum ReadError {
     #[error("{} is a file; name the folder of a run", .0.escaped())]
     NoFolder(PathBuf),
     /// The directory is not a run.
-    #[error("{folder} is no run's folder: it has no {name}", folder = folder.escaped())]
+    #[error("{folder}: not a run directory (it has no {name})", folder = folder.escaped())]
     Foreign {
         /// The given directory.
         folder: PathBuf,

@@ -15,7 +15,6 @@ use safetensors::tensor::{Dtype, Metadata, TensorInfo};
 use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha256};
 
-use super::disk::Disk;
 use super::{RecordError, hex};
 use crate::file;
 
@@ -49,21 +48,7 @@ impl<'a> Tensor<'a> {
     }
 }
 
-/// Writes a file of a kind (such as "policies 1"), whole or not at all.
-///
-/// # Errors
-/// Returns the system's error. Nothing else was changed in that case.
-pub fn write(
-    disk: &Disk,
-    path: &Path,
-    kind: &str,
-    metadata: &BTreeMap<String, String>,
-    tensors: &[Tensor<'_>],
-) -> io::Result<()> {
-    disk.replace(path, |output| put(output, kind, metadata, tensors).map(drop))
-}
-
-/// Writes the content of such a file to a stream. Returns its checksum.
+/// Writes the content of a file of a kind (such as "policies 1") to a stream. Returns its checksum.
 ///
 /// # Errors
 /// Returns the stream's error.
@@ -117,13 +102,13 @@ impl<R: Read + Seek> TensorFile<R> {
     /// Returns a description of the problem.
     pub fn open(source: R) -> Result<TensorFile<R>, String> {
         let mut source = BufReader::with_capacity(1 << 16, source);
-        let told = |error: io::Error| match error.kind() {
+        let describe = |error: io::Error| match error.kind() {
             io::ErrorKind::UnexpectedEof => "it is cut short".to_string(),
             _ => format!("cannot be read: {error}"),
         };
-        let size = source.seek(SeekFrom::End(0)).and_then(|size| source.rewind().map(|()| size)).map_err(told)?;
+        let size = source.seek(SeekFrom::End(0)).and_then(|size| source.rewind().map(|()| size)).map_err(describe)?;
         let mut length = [0; 8];
-        source.read_exact(&mut length).map_err(told)?;
+        source.read_exact(&mut length).map_err(describe)?;
         let header_bytes = u64::from_le_bytes(length);
         if header_bytes > MAX_HEADER_BYTES {
             let most = MAX_HEADER_BYTES;
@@ -137,7 +122,7 @@ impl<R: Read + Seek> TensorFile<R> {
             return Err("it is cut short".into());
         }
         let mut text = vec![0; header_bytes as usize];
-        source.read_exact(&mut text).map_err(told)?;
+        source.read_exact(&mut text).map_err(describe)?;
         let header: Metadata =
             serde_json::from_slice(&text).map_err(|error| format!("its safetensors header is damaged: {error}"))?;
         if (header.data_len() as u64).checked_add(start) != Some(size) {
@@ -185,7 +170,7 @@ impl<R: Read + Seek> TensorFile<R> {
     }
 
     /// Returns the metadata value of a key.
-    pub fn metadata(&self, key: &str) -> Option<&str> {
+    pub(crate) fn metadata(&self, key: &str) -> Option<&str> {
         self.header.metadata().as_ref()?.get(key).map(String::as_str)
     }
 
@@ -216,14 +201,14 @@ impl<R: Read + Seek> TensorFile<R> {
         }
         let (start, end) = info.data_offsets;
         let count = (end - start) / size_of::<T>() / parts;
-        let told = |error: io::Error| format!("cannot be read: {error}");
-        self.source.seek(SeekFrom::Start(self.start + start as u64)).map_err(told)?;
+        let describe = |error: io::Error| format!("cannot be read: {error}");
+        self.source.seek(SeekFrom::Start(self.start + start as u64)).map_err(describe)?;
         let part = |_| {
             let mut values = Vec::new();
             let refused = |_| format!("not enough memory for the {} bytes of {name}", end - start);
             values.try_reserve_exact(count).map_err(refused)?;
             values.resize(count, T::zeroed());
-            self.source.read_exact(bytemuck::cast_slice_mut(&mut values)).map_err(told)?;
+            self.source.read_exact(bytemuck::cast_slice_mut(&mut values)).map_err(describe)?;
             Ok(values)
         };
         (0..parts).map(part).collect()
@@ -232,7 +217,7 @@ impl<R: Read + Seek> TensorFile<R> {
 
 /// Checks whether a file has a newer format than this program writes. If so, returns the version that wrote it, or
 /// `Some(None)` if the file does not contain it. A file that cannot be read gives `None`.
-pub fn newer(path: &Path) -> Option<Option<String>> {
+pub(crate) fn newer(path: &Path) -> Option<Option<String>> {
     let mut file = file::open(path).ok()?;
     let mut length = [0; 8];
     file.read_exact(&mut length).ok()?;

@@ -58,7 +58,7 @@ impl Cohort {
     }
 
     /// Returns the arm's name and its directories, for messages.
-    fn told(&self) -> String {
+    fn described(&self) -> String {
         const MOST: usize = 3;
         let folders: Vec<String> = self.folders.iter().map(|folder| folder.escaped().to_string()).collect();
         match folders.len().checked_sub(MOST) {
@@ -109,7 +109,7 @@ pub struct Question {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ComparisonError {
     /// An arm, by its name, has a single trial.
-    #[error("{0} has one trial, of which no interval can be had; that takes two or more")]
+    #[error("{0} has one trial; an interval needs two or more")]
     OneTrial(String),
     /// The trials of an arm, by its name, have no generation in common.
     #[error("{0} has no generation that every trial has reached")]
@@ -123,7 +123,7 @@ pub enum ComparisonError {
         last: usize,
     },
     /// Two arms, by their names, cannot be compared pair by pair.
-    #[error("{0} and {1} have not the same seeds and numbers of trials, so their trials are no pairs")]
+    #[error("{0} and {1} have different seeds or numbers of trials, so their trials are no pairs")]
     NoPairs(String, String),
 }
 
@@ -186,7 +186,7 @@ impl Measure {
     }
 
     /// Returns the number of decimals to print.
-    pub fn digits(self) -> usize {
+    pub(crate) fn digits(self) -> usize {
         if let Measure::GenerationsToReach { .. } = self { 1 } else { 3 }
     }
 
@@ -287,12 +287,12 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
     let mut last = usize::MAX;
     for arm in arms {
         if arm.trials.len() < 2 {
-            return Err(ComparisonError::OneTrial(arm.told()));
+            return Err(ComparisonError::OneTrial(arm.described()));
         }
-        last = last.min(arm.last().ok_or_else(|| ComparisonError::TooShort(arm.told()))?);
+        last = last.min(arm.last().ok_or_else(|| ComparisonError::TooShort(arm.described()))?);
     }
     if let Some(other) = arms.iter().find(|arm| options.paired && arm.keys() != arms[0].keys()) {
-        return Err(ComparisonError::NoPairs(arms[0].told(), other.told()));
+        return Err(ComparisonError::NoPairs(arms[0].described(), other.described()));
     }
     let mut generations = Vec::new();
     for &at in &options.at {
@@ -333,7 +333,7 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
 ///
 /// # Errors
 /// An arm has fewer than two trials.
-pub fn of_values(
+pub(crate) fn of_values(
     place: &str,
     generation: usize,
     arms: Vec<Named>,
@@ -414,7 +414,7 @@ pub fn estimate(Estimate { value, low, high }: Estimate, digits: usize, signed: 
 }
 
 /// Formats a probability as "0.042" or "< 0.001".
-pub fn probability(p: f64) -> String {
+pub(crate) fn probability(p: f64) -> String {
     if p < 0.001 { "< 0.001".into() } else { format!("{p:.3}") }
 }
 
@@ -456,7 +456,7 @@ pub fn text(all: &[Comparison], options: &Question) -> String {
 }
 
 /// Returns two LaTeX tables per comparison, with the legend as comments.
-pub fn latex(all: &[Comparison], options: &Question) -> String {
+pub(crate) fn latex(all: &[Comparison], options: &Question) -> String {
     let comment = |text: &str| text.lines().map(|line| format!("% {line}\n")).collect::<String>();
     let mut text = comment(&legend(all, options));
     for comparison in all {

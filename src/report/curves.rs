@@ -2,25 +2,26 @@
 
 use std::collections::BTreeSet;
 
-use serde::Serialize;
+use serde::de::IntoDeserializer;
+use serde::{Deserialize, Serialize};
 
 use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
 use crate::statistics::{self, Average};
 
 /// Width of a column of a two-column paper, in millimetres.
-pub const COLUMN: f64 = 85.0;
+pub(crate) const COLUMN: f64 = 85.0;
 /// Pixels per millimetre of a PNG: 300 pixels per inch.
 pub const PRINT: f64 = 300.0 / 25.4;
 /// Maximum number of points of a drawn curve.
 const MAX_POINTS: usize = 300;
 /// Font size of 7 points, in millimetres. The next one is 8 points.
-pub const SMALL: f64 = 2.47;
-const NORMAL: f64 = 2.82;
+pub(crate) const SMALL: f64 = 2.47;
+pub(super) const NORMAL: f64 = 2.82;
 const REFERENCES: [&[f64]; 2] = [&[2.6, 1.0], &[0.7, 0.7]];
 const DASHES: [&[f64]; 5] = [&[], &[1.6, 0.7], &[1.8, 0.6, 0.4, 0.6], &[0.5, 0.5], &[3.0, 0.8]];
 
 /// The meaning of the band around a mean.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Band {
     /// The 95 % interval of the mean, by Student's t.
@@ -34,11 +35,7 @@ pub enum Band {
 
 impl std::fmt::Display for Band {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            Band::Interval => "interval",
-            Band::Error => "error",
-            Band::None => "none",
-        })
+        self.serialize(f)
     }
 }
 
@@ -46,12 +43,8 @@ impl std::str::FromStr for Band {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Band, String> {
-        match text {
-            "interval" => Ok(Band::Interval),
-            "error" => Ok(Band::Error),
-            "none" => Ok(Band::None),
-            _ => Err("allowed interval, error or none".into()),
-        }
+        let read = Band::deserialize(text.into_deserializer());
+        read.map_err(|_: serde::de::value::Error| "allowed interval, error or none".into())
     }
 }
 
@@ -309,7 +302,7 @@ impl Figure {
 }
 
 /// Returns the caption of the bands, if any curve has one.
-pub fn band_caption<'a>(band: Band, curves: impl Iterator<Item = &'a Curve>) -> Option<String> {
+pub(crate) fn band_caption<'a>(band: Band, curves: impl Iterator<Item = &'a Curve>) -> Option<String> {
     let curves: Vec<&Curve> = curves.collect();
     curves.iter().any(|curve| curve.outline(band, f64::INFINITY).is_some()).then_some(())?;
     let trials: BTreeSet<u32> = curves.iter().map(|curve| curve.trials).collect();
@@ -319,7 +312,7 @@ pub fn band_caption<'a>(band: Band, curves: impl Iterator<Item = &'a Curve>) -> 
 }
 
 /// Draws the caption of the bands from a place on the baseline.
-pub fn draw_caption(scene: &mut Scene, [x, y]: [f64; 2], caption: &str) {
+pub(crate) fn draw_caption(scene: &mut Scene, [x, y]: [f64; 2], caption: &str) {
     scene.rectangle([x, y - 1.9, 6.0, 2.2], Some(Fill { color: GREY, opacity: 0.3 }), None);
     scene.line(vec![[x, y - 0.8], [x + 6.0, y - 0.8]], Pen::new(GREY, 0.4));
     scene.text([x + 7.0, y], caption, SMALL, Anchor::Start, BLACK);
@@ -454,7 +447,7 @@ impl Look {
 }
 
 /// Returns the smallest round number (1, 2 or 5 times a power of ten) that is at least `least`.
-pub fn round_step(least: f64) -> f64 {
+pub(crate) fn round_step(least: f64) -> f64 {
     let power = libm::pow(10.0, libm::log10(least).floor());
     [1.0, 2.0, 5.0].into_iter().map(|step| step * power).find(|&step| step >= least * 0.999).unwrap_or(10.0 * power)
 }

@@ -1,13 +1,11 @@
 //! Figures of a sweep: heat maps over two axes, curves by the values of an axis, and dots for keys that are varied one
 //! at a time.
 
-use super::curves::{Band, Curve, band_caption, distinct, draw_caption};
+use super::curves::{Band, Curve, NORMAL, SMALL, band_caption, distinct, draw_caption};
 use super::scene::{Anchor, BLACK, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
 
 /// Maximum width of a figure in millimetres. Further panels go to the next row.
 const WIDEST: f64 = 180.0;
-const SMALL: f64 = 2.47;
-const NORMAL: f64 = 2.82;
 const GAP: f64 = 5.0;
 
 /// A sequential palette of decreasing lightness (ColorBrewer's YlGnBu). It keeps its order for colour-blind readers and
@@ -25,7 +23,7 @@ const PALETTE: [Color; 9] = [
 ];
 
 /// Returns the colour of a value in 0..1.
-pub fn shade(value: f64) -> Color {
+pub(crate) fn shade(value: f64) -> Color {
     let place = value.clamp(0.0, 1.0) * (PALETTE.len() - 1) as f64;
     let low = (place as usize).min(PALETTE.len() - 2);
     let part = place - low as f64;
@@ -41,7 +39,7 @@ fn ink(on: Color) -> Color {
 
 /// One axis of a sweep.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Scale {
+pub(crate) struct Scale {
     /// The axis's key.
     pub label: String,
     /// The axis's values, as text.
@@ -50,7 +48,7 @@ pub struct Scale {
 
 /// Content of one cell of a heat map.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub enum Cell {
+pub(crate) enum Cell {
     /// Nothing ran here.
     #[default]
     Empty,
@@ -62,7 +60,7 @@ pub enum Cell {
 
 /// A heat map over two axes, with one panel per combination of the other axes' values.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct HeatMap {
+pub(crate) struct HeatMap {
     /// Title above all panels.
     pub title: String,
     /// The horizontal axis.
@@ -176,14 +174,18 @@ impl HeatMap {
             for (row, cells) in cells.chunks(columns.max(1)).enumerate() {
                 let row = self.y.values.get(row).map(|value| format!("{y} {value}"));
                 let place: Vec<_> = [title.clone()].into_iter().filter(|title| !title.is_empty()).chain(row).collect();
-                let said = |(value, cell): (&String, &Cell)| match cell {
+                let described = |(value, cell): (&String, &Cell)| match cell {
                     Cell::Empty => format!("{value}: none"),
                     Cell::Value(_, word, note) if !note.is_empty() => format!("{value}: {word} ({note})"),
                     Cell::Value(_, word, _) | Cell::Word(word) => format!("{value}: {word}"),
                 };
-                let said: Vec<_> = self.x.values.iter().zip(cells).map(said).collect();
-                text +=
-                    &format!(" {}{}{}.", place.join(", "), if place.is_empty() { "" } else { ": " }, said.join(", "));
+                let described: Vec<_> = self.x.values.iter().zip(cells).map(described).collect();
+                text += &format!(
+                    " {}{}{}.",
+                    place.join(", "),
+                    if place.is_empty() { "" } else { ": " },
+                    described.join(", ")
+                );
             }
         }
         text
@@ -192,7 +194,7 @@ impl HeatMap {
 
 /// Curves of G in 0..1 by generation: one curve per value of an axis, one panel per combination of the others.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Curves {
+pub(crate) struct Curves {
     /// Title above all panels.
     pub title: String,
     /// Label of the y axis: whose G is shown.
@@ -328,7 +330,7 @@ pub type Interval = [f64; 3];
 /// A figure of means with intervals for keys that are varied one at a time, next to the unvaried result. Each panel
 /// shows one setting.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Dots {
+pub(crate) struct Dots {
     /// Title above all panels.
     pub title: String,
     /// Label of the x axis.
@@ -342,13 +344,16 @@ pub struct Dots {
 impl Dots {
     /// Describes each panel, row by row.
     fn description(&self) -> String {
-        let told = |spread: &Option<Interval>| spread.map_or("missing".into(), |[mean, ..]| format!("{mean:.2}"));
+        let described = |spread: &Option<Interval>| spread.map_or("missing".into(), |[mean, ..]| format!("{mean:.2}"));
         let headed = |name: &str| if name.is_empty() { String::new() } else { format!("{name}: ") };
         let panel = |(title, base, found): &(String, Option<Interval>, Vec<Option<Interval>>)| {
             let mut found = found.iter();
             let group = |(name, values): &(String, Vec<String>)| {
-                let values: Vec<_> =
-                    values.iter().zip(&mut found).map(|(value, spread)| format!("{value} {}", told(spread))).collect();
+                let values: Vec<_> = values
+                    .iter()
+                    .zip(&mut found)
+                    .map(|(value, spread)| format!("{value} {}", described(spread)))
+                    .collect();
                 format!("{}{}", headed(name), values.join(", "))
             };
             let groups: Vec<_> = self.groups.iter().map(group).collect();

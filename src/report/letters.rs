@@ -7,17 +7,17 @@ use tiny_skia::PathBuilder;
 use ttf_parser::{Face, OutlineBuilder};
 
 /// The font file.
-pub const FILE: &[u8] = include_bytes!("font/dejavu-sans.ttf");
+pub(crate) const FILE: &[u8] = include_bytes!("font/dejavu-sans.ttf");
 
 static FONT: LazyLock<Face<'static>> = LazyLock::new(|| Face::parse(FILE, 0).expect("the embedded font is whole"));
 
 /// Returns the parsed font.
-pub fn font() -> &'static Face<'static> {
+pub(crate) fn font() -> &'static Face<'static> {
     &FONT
 }
 
 /// Returns the number of font units per em.
-pub fn units_per_em() -> f64 {
+pub(crate) fn units_per_em() -> f64 {
     f64::from(FONT.units_per_em())
 }
 

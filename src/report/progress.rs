@@ -60,7 +60,7 @@ fn line(to: &mut dyn Write, text: &str) {
 }
 
 /// Shows the progress of one task on standard error.
-pub struct Meter {
+pub(crate) struct Meter {
     pace: Pace,
     bar: Option<ProgressBar>,
     lines: Box<dyn Write + Send>,
@@ -78,26 +78,26 @@ impl Meter {
         Meter { pace, bar, lines: Box::new(io::stderr()) }
     }
 
-    /// Shows the completed fraction, 0 to 1. `told` describes the current work and is called only if it is shown.
-    pub fn show(&mut self, part: f64, told: impl FnOnce() -> String) {
+    /// Shows the completed fraction, 0 to 1. `describe` describes the current work and is called only if it is shown.
+    pub fn show(&mut self, part: f64, describe: impl FnOnce() -> String) {
         if !self.pace.is_due() {
             return;
         }
         match &self.bar {
             Some(bar) => {
-                bar.set_message(told());
+                bar.set_message(describe());
                 bar.set_position((part * PARTS as f64) as u64);
             }
             None => {
                 let left = self.pace.seconds() * (1.0 - part) / part.max(1e-9);
                 let left = if part > 0.0 { format!(", {left:.0} s left") } else { String::new() };
-                line(&mut self.lines, &format!("{}, {:.0} %{left}", told(), part * 100.0));
+                line(&mut self.lines, &format!("{}, {:.0} %{left}", describe(), part * 100.0));
             }
         }
     }
 
     /// Clears the bar, so that other output can follow.
-    pub fn clear(&self) {
+    pub(crate) fn clear(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
@@ -105,7 +105,7 @@ impl Meter {
 }
 
 /// Shows the training progress of several arms on standard error.
-pub struct Board {
+pub(crate) struct Board {
     arms: Vec<Growing>,
     last: usize,
     /// The generation at which this session started.
@@ -224,7 +224,7 @@ impl Board {
     }
 
     /// Clears the curves, so that other output can follow.
-    pub fn clear(&self) {
+    pub(crate) fn clear(&self) {
         if let Some(Terminal { all, .. }) = &self.terminal {
             let _ = all.clear();
         }

@@ -2,6 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
+use serde::de::IntoDeserializer;
+use serde::{Deserialize, Serialize};
+
 use super::curves::{Band, Curve, Figure, Panel};
 use crate::config::Config;
 use crate::escape::PathExt;
@@ -13,10 +16,10 @@ use crate::statistics::Average;
 use crate::trainer::Row;
 
 /// Maximum number of runs in one figure.
-pub const MAX_RUNS: usize = 24;
+pub(crate) const MAX_RUNS: usize = 24;
 
 /// The team of a generation whose G a picture shows.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TeamKind {
     /// The team with the largest G.
@@ -58,11 +61,7 @@ impl TeamKind {
 
 impl std::fmt::Display for TeamKind {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            TeamKind::Best => "best",
-            TeamKind::Champion => "champion",
-            TeamKind::Mean => "mean",
-        })
+        self.serialize(f)
     }
 }
 
@@ -70,18 +69,14 @@ impl std::str::FromStr for TeamKind {
     type Err = String;
 
     fn from_str(text: &str) -> Result<TeamKind, String> {
-        match text {
-            "best" => Ok(TeamKind::Best),
-            "champion" => Ok(TeamKind::Champion),
-            "mean" => Ok(TeamKind::Mean),
-            _ => Err("allowed best, champion or mean".into()),
-        }
+        let read = TeamKind::deserialize(text.into_deserializer());
+        read.map_err(|_: serde::de::value::Error| "allowed best, champion or mean".into())
     }
 }
 
 /// A run's metrics by generation, as shares of the POIs averaged over trials.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Courses {
+pub(crate) struct Courses {
     /// G of the best team.
     pub best: Vec<Average>,
     /// G of the mean team.

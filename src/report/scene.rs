@@ -24,17 +24,17 @@ const MAX_PIXELS: f64 = 8192.0;
 pub type Color = [u8; 3];
 
 /// Text.
-pub const BLACK: Color = [0, 0, 0];
+pub(crate) const BLACK: Color = [0, 0, 0];
 /// Background.
-pub const WHITE: Color = [255, 255, 255];
+pub(crate) const WHITE: Color = [255, 255, 255];
 /// Secondary elements.
-pub const GREY: Color = [120, 120, 120];
+pub(crate) const GREY: Color = [120, 120, 120];
 /// Grid lines.
-pub const LIGHT: Color = [222, 222, 222];
+pub(crate) const LIGHT: Color = [222, 222, 222];
 
 /// Colours that colour-blind readers can distinguish, after Okabe and Ito. The first ones are also distinct in
 /// greyscale.
-pub const COLORS: [Color; 7] =
+pub(crate) const COLORS: [Color; 7] =
     [[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [140, 109, 0], [0, 0, 0]];
 
 /// The style of a line.
@@ -189,12 +189,12 @@ impl Scene {
     }
 
     /// Draws a polygon that is filled, outlined or both.
-    pub fn polygon(&mut self, points: Vec<[f64; 2]>, fill: Option<Fill>, pen: Option<Pen>) {
+    pub(crate) fn polygon(&mut self, points: Vec<[f64; 2]>, fill: Option<Fill>, pen: Option<Pen>) {
         self.marks.push(Mark::Shape { points, closed: true, fill, pen });
     }
 
     /// Draws an upright rectangle, given by its corner and sides.
-    pub fn rectangle(&mut self, [x, y, width, height]: [f64; 4], fill: Option<Fill>, pen: Option<Pen>) {
+    pub(crate) fn rectangle(&mut self, [x, y, width, height]: [f64; 4], fill: Option<Fill>, pen: Option<Pen>) {
         self.polygon(vec![[x, y], [x + width, y], [x + width, y + height], [x, y + height]], fill, pen);
     }
 
@@ -209,12 +209,12 @@ impl Scene {
     }
 
     /// Writes bold text. `place` is on its baseline.
-    pub fn bold(&mut self, place: [f64; 2], text: impl Into<String>, size: f64, anchor: Anchor, color: Color) {
+    pub(crate) fn bold(&mut self, place: [f64; 2], text: impl Into<String>, size: f64, anchor: Anchor, color: Color) {
         self.write(Mark::Text { place, text: text.into(), size, anchor, color, upright: false, bold: true });
     }
 
     /// Writes text that reads upwards, centred on `place`.
-    pub fn upright(&mut self, place: [f64; 2], text: impl Into<String>, size: f64, color: Color) {
+    pub(crate) fn upright(&mut self, place: [f64; 2], text: impl Into<String>, size: f64, color: Color) {
         let text = text.into();
         self.write(Mark::Text { place, text, size, anchor: Anchor::Middle, color, upright: true, bold: false });
     }
@@ -226,7 +226,7 @@ impl Scene {
     }
 
     /// Clips everything that `draw` draws to `[x, y, width, height]`.
-    pub fn clipped(&mut self, area: [f64; 4], draw: impl FnOnce(&mut Scene)) {
+    pub(crate) fn clipped(&mut self, area: [f64; 4], draw: impl FnOnce(&mut Scene)) {
         self.marks.push(Mark::Clip(Some(area)));
         draw(self);
         self.marks.push(Mark::Clip(None));
@@ -471,7 +471,8 @@ fn paint_svg(svg: &mut String, fill: Option<&Fill>, pen: Option<&Pen>) -> std::f
     Ok(())
 }
 
-fn hex([r, g, b]: Color) -> String {
+/// Returns a colour as "#rrggbb".
+pub(super) fn hex([r, g, b]: Color) -> String {
     format!("#{r:02x}{g:02x}{b:02x}")
 }
 

@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 /// Returns a Markdown table with aligned columns. The first row is the head. A `|` in a cell is escaped.
-pub fn markdown(rows: &[Vec<String>]) -> String {
+pub(crate) fn markdown(rows: &[Vec<String>]) -> String {
     let escaped = |row: &Vec<String>| row.iter().map(|cell| cell.replace('|', r"\|")).collect();
     let rows: Vec<Vec<String>> = rows.iter().map(escaped).collect();
     let columns = rows[0].len();
@@ -19,7 +19,7 @@ pub fn markdown(rows: &[Vec<String>]) -> String {
 }
 
 /// Returns a LaTeX `tabular` that needs no package. The first row is the head. Columns of numbers are right-aligned.
-pub fn latex(rows: &[Vec<String>]) -> String {
+pub(crate) fn latex(rows: &[Vec<String>]) -> String {
     let is_number = |cell: &String| cell.starts_with(|c: char| c.is_ascii_digit() || "+−<".contains(c));
     let place = |column: usize| if rows[1..].iter().all(|row| is_number(&row[column])) { 'r' } else { 'l' };
     let places: String = (0..rows[0].len()).map(place).collect();
@@ -32,7 +32,7 @@ pub fn latex(rows: &[Vec<String>]) -> String {
 }
 
 /// Escapes a text for LaTeX, so that nothing in it is a command.
-pub fn tex(text: &str) -> String {
+pub(crate) fn tex(text: &str) -> String {
     let escaped = |c: char| match c {
         '\\' => "\\textbackslash{}".into(),
         '~' => "\\textasciitilde{}".into(),

@@ -8,6 +8,8 @@ use std::io::{self, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use crc::{CRC_32_ISCSI, Crc};
+
 use crate::host::{self, Instant};
 use crate::record::beneath::FileKind;
 use crate::record::disk::Disk;
@@ -22,9 +24,11 @@ const FLUSH: Duration = Duration::from_secs(2);
 const MARK: &str = "tfevents";
 /// The suffix of files that this module writes.
 const OURS: &str = ".flotilla";
+/// The checksum of TFRecords.
+static CHECKSUM: Crc<u32> = Crc::<u32>::new(&CRC_32_ISCSI);
 
 /// The event files of one run.
-pub struct Events {
+pub(crate) struct Events {
     disk: Disk,
     /// One file per trial.
     files: Vec<PathBuf>,
@@ -68,7 +72,7 @@ impl Events {
     ///
     /// # Errors
     /// A file cannot be removed.
-    pub fn clear(disk: &Disk, folder: &Path) -> io::Result<()> {
+    pub(crate) fn clear(disk: &Disk, folder: &Path) -> io::Result<()> {
         for trial in names(folder)?.into_iter().filter(|trial| named(trial, "trial-", "")) {
             // Links are skipped, so that nothing outside the run is removed.
             if !fs::symlink_metadata(&trial)?.is_dir() {
@@ -236,41 +240,5 @@ fn record(content: &[u8]) -> Vec<u8> {
 
 /// Returns a CRC-32C that is rotated and shifted, as TFRecord requires, so that checksums of checksums stay strong.
 fn masked_checksum(bytes: &[u8]) -> [u8; 4] {
-    crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8).to_le_bytes()
-}
-
-/// Computes a CRC-32C byte by byte.
-fn crc32c(bytes: &[u8]) -> u32 {
-    const TABLE: [u32; 256] = {
-        let mut table = [0; 256];
-        let mut index = 0;
-        while index < 256 {
-            let mut word = index as u32;
-            let mut bit = 0;
-            while bit < 8 {
-                word = if word & 1 == 1 { word >> 1 ^ 0x82f6_3b78 } else { word >> 1 };
-                bit += 1;
-            }
-            table[index] = word;
-            index += 1;
-        }
-        table
-    };
-    !bytes.iter().fold(u32::MAX, |crc, &byte| crc >> 8 ^ TABLE[((crc ^ u32::from(byte)) & 0xff) as usize])
-}
-
-#[cfg(test)]
-mod tests {
-    use super::crc32c;
-
-    /// The expected values are those of RFC 3720, appendix B.4.
-    #[test]
-    fn crc32c_has_its_published_values() {
-        let ascending: Vec<u8> = (0..32).collect();
-        let descending: Vec<u8> = (0..32).rev().collect();
-        assert_eq!(crc32c(&[0; 32]), 0x8a91_36aa);
-        assert_eq!(crc32c(&[0xff; 32]), 0x62a8_ab43);
-        assert_eq!(crc32c(&ascending), 0x46dd_794e);
-        assert_eq!(crc32c(&descending), 0x113f_db5c);
-    }
+    CHECKSUM.checksum(bytes).rotate_right(15).wrapping_add(0xa282_ead8).to_le_bytes()
 }

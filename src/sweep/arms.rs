@@ -25,7 +25,7 @@ impl Sweep {
 
     /// Groups the points by the values of an axis, for each combination of the other axes with at least two values.
     pub fn arms(&self, by: usize) -> Vec<Series<'_>> {
-        let told =
+        let describe =
             |axis: &Axis, value: usize| escape::line(&format!("{} {}", axis.leaf(), axis.label(value))).to_string();
         let mut groups: BTreeMap<Vec<usize>, BTreeMap<usize, Vec<&Point>>> = BTreeMap::new();
         for point in &self.points {
@@ -39,8 +39,8 @@ impl Sweep {
             let others = self.axes.iter().zip(place).enumerate();
             let others =
                 others.filter(|(at, (axis, value))| *at != by && axis.key != SEED && (!axis.varied || *value > 0));
-            let place: Vec<_> = others.map(|(_, (axis, value))| told(axis, value)).collect();
-            let arms = arms.into_iter().map(|(value, points)| (told(&self.axes[by], value), points));
+            let place: Vec<_> = others.map(|(_, (axis, value))| describe(axis, value)).collect();
+            let arms = arms.into_iter().map(|(value, points)| (describe(&self.axes[by], value), points));
             let place = if many && place.is_empty() { "as in the file".into() } else { place.join(", ") };
             Series { place, arms: arms.collect() }
         });

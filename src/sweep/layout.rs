@@ -14,17 +14,17 @@ use super::{Grid, problem};
 use crate::config::{Override, Problem};
 
 /// The key for followers per leader (0 to 64; 2 if only the other axis is given).
-pub const FOLLOWERS: &str = "followers_per_leader";
+pub(crate) const FOLLOWERS: &str = "followers_per_leader";
 /// The key for leaders, each with followers and a POI (1 to 256; 4 if only the other axis is given).
 pub const GROUPS: &str = "groups";
 /// Both keys.
-pub const AXES: [&str; 2] = [FOLLOWERS, GROUPS];
+pub(crate) const AXES: [&str; 2] = [FOLLOWERS, GROUPS];
 const DEFAULT_FOLLOWERS: usize = 2;
 const DEFAULT_GROUPS: usize = 4;
 /// Maximum number of followers per leader.
 pub const MAX_FOLLOWERS: usize = 64;
 /// Maximum number of groups, one per POI.
-pub const MAX_GROUPS: usize = crate::config::MAX_POIS;
+pub(crate) const MAX_GROUPS: usize = crate::config::MAX_POIS;
 /// The distance between neighbouring groups, and between a leader and its POI.
 const SPACING: i32 = 10;
 const LEADER_Y: i32 = 5;

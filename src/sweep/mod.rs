@@ -42,7 +42,7 @@ pub mod slurm;
 /// The key of `[grid]` that is not an axis.
 const SKIP: &str = "skip_impossible";
 /// Maximum number of points of a sweep.
-pub const MAX_POINTS: usize = 1 << 16;
+pub(crate) const MAX_POINTS: usize = 1 << 16;
 /// Maximum number of problems listed per sweep.
 const MAX_LISTED: usize = 50;
 
@@ -93,7 +93,7 @@ impl Axis {
     }
 
     /// Returns the key without its section.
-    pub fn leaf(&self) -> &str {
+    pub(crate) fn leaf(&self) -> &str {
         self.key.rsplit('.').next().unwrap_or_default()
     }
 }
@@ -200,8 +200,8 @@ struct Tried {
 }
 
 fn describe<'a>(axes: impl Iterator<Item = &'a Axis>, values: &[usize]) -> String {
-    let told = axes.zip(values).filter(|(axis, value)| !axis.varied || **value > 0);
-    let pairs: Vec<_> = told.map(|(axis, &value)| format!("{} = {}", axis.key, axis.label(value))).collect();
+    let shown = axes.zip(values).filter(|(axis, value)| !axis.varied || **value > 0);
+    let pairs: Vec<_> = shown.map(|(axis, &value)| format!("{} = {}", axis.key, axis.label(value))).collect();
     if pairs.is_empty() { "as in the file".into() } else { escape::line(&pairs.join(", ")).into() }
 }
 

@@ -65,7 +65,7 @@ impl Outcome {
 
     /// Returns the median over trials of the first generation that reaches G. Trials that never reach it count as
     /// infinite. None if the median is infinite.
-    pub fn median_reached(&self) -> Option<f64> {
+    pub(crate) fn median_reached(&self) -> Option<f64> {
         let mut reached: Vec<usize> = self.reached.iter().map(|reached| reached.unwrap_or(usize::MAX)).collect();
         reached.sort_unstable();
         let middle = [reached[(reached.len() - 1) / 2], reached[reached.len() / 2]];
@@ -74,7 +74,7 @@ impl Outcome {
 }
 
 /// Returns the folder of a point's run.
-pub fn point_folder(out: &Path, point: &Point) -> PathBuf {
+pub(crate) fn point_folder(out: &Path, point: &Point) -> PathBuf {
     out.join("points").join(format!("{:04}", point.index))
 }
 

@@ -10,7 +10,7 @@ use crate::config::Config;
 use crate::world::World;
 
 /// Maximum number of shards of a sweep.
-pub const MAX_SHARDS: usize = 1 << 16;
+pub(crate) const MAX_SHARDS: usize = 1 << 16;
 
 /// Shard `index` (from 1) of `count`; written `1/4` to `4/4`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -23,7 +23,7 @@ pub struct Shard {
 
 impl Shard {
     /// The only shard.
-    pub const WHOLE: Shard = Shard { index: 1, count: 1 };
+    pub(crate) const WHOLE: Shard = Shard { index: 1, count: 1 };
 
     /// Returns a shard.
     ///
@@ -86,7 +86,7 @@ impl Shard {
 }
 
 /// Assigns each point to one of `count` shards, from 1: in order of decreasing cost, each to the least loaded shard.
-pub fn deal(points: &[Point], count: usize) -> Vec<usize> {
+pub(crate) fn deal(points: &[Point], count: usize) -> Vec<usize> {
     let mut order: Vec<(u128, usize)> = points.iter().map(cost).zip(0..).collect();
     order.sort_by_key(|&(cost, at)| (Reverse(cost), points[at].index));
     let mut loads: BinaryHeap<_> = (1..=count).map(|shard| Reverse((0, shard))).collect();

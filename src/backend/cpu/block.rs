@@ -193,7 +193,7 @@ impl<S: Simd> Block<S> {
                     sense::sense::<S>(density, dx, dy, hx, hy, &mut of_agents);
                 },
             );
-            *inputs = sense::weigh_in::<S>(world, of_pois, of_agents);
+            *inputs = sense::scale_inputs::<S>(world, of_pois, of_agents);
         }
     }
 

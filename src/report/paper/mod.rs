@@ -48,7 +48,7 @@ pub const LAYOUTS: [Layout; 4] = [
     },
 ];
 /// The paradigms, one panel per figure: (a) and (b).
-pub const PARADIGMS: [Paradigm; 2] = [Paradigm::AllLeaders, Paradigm::LeaderFollower];
+pub(crate) const PARADIGMS: [Paradigm; 2] = [Paradigm::AllLeaders, Paradigm::LeaderFollower];
 /// The fitnesses, one curve per panel.
 pub const FITNESSES: [Fitness; 3] = [Fitness::G, Fitness::D, Fitness::Df];
 
@@ -221,7 +221,7 @@ impl Evidence<'_> {
     }
 
     /// Returns the results of all-leaders teams on one of [`LAYOUTS`] that choose among known behaviours.
-    pub fn selecting(&self, layout: usize, fitness: Fitness) -> Option<Course<'_>> {
+    pub(crate) fn selecting(&self, layout: usize, fitness: Fitness) -> Option<Course<'_>> {
         let name = LAYOUTS.get(layout)?.name;
         let arm = self.arms.iter().find(|arm| (arm.layout.name, arm.selects, arm.fitness) == (name, true, fitness))?;
         Some(Course { champion: &arm.champion, best: &arm.best, pois: arm.pois(), certain: false })
@@ -235,17 +235,17 @@ impl Course<'_> {
     }
 
     /// Returns the POIs that the best team of a generation observed, per trial. None if the run is shorter.
-    pub fn observed_by_best(&self, generation: usize) -> Option<Vec<f64>> {
+    pub(crate) fn observed_by_best(&self, generation: usize) -> Option<Vec<f64>> {
         self.best.iter().map(|trial| Some(trial.get(generation)? * self.pois as f64)).collect()
     }
 
     /// Returns the most POIs that champions observed so far, per trial. None if the run is shorter.
-    pub fn observed_by(&self, generation: usize) -> Option<Vec<f64>> {
+    pub(crate) fn observed_by(&self, generation: usize) -> Option<Vec<f64>> {
         most_so_far(self.champion, generation, self.pois)
     }
 
     /// Returns the most POIs that any team observed so far, per trial. None if the run is shorter.
-    pub fn observed_by_any(&self, generation: usize) -> Option<Vec<f64>> {
+    pub(crate) fn observed_by_any(&self, generation: usize) -> Option<Vec<f64>> {
         most_so_far(self.best, generation, self.pois)
     }
 
@@ -307,7 +307,7 @@ fn title(paradigm: Paradigm) -> &'static str {
 
 /// All measurements, for `summary.json`.
 #[derive(Serialize)]
-pub struct Summary<'a> {
+pub(crate) struct Summary<'a> {
     /// Version of the program.
     pub version: &'static str,
     /// The backend that played the episodes, "cpu" or "gpu".
@@ -331,7 +331,7 @@ pub struct Summary<'a> {
 
 /// One curve: the POIs observed by the champion of each generation. For baselines, by the best team so far.
 #[derive(Serialize)]
-pub struct Trajectory {
+pub(crate) struct Trajectory {
     /// Name of the layout.
     pub layout: &'static str,
     /// The paradigm.

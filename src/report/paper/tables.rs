@@ -113,8 +113,8 @@ fn sources() -> Vec<String> {
 fn cells(claim: &Claim, say: impl Fn(Verdict, &str) -> String) -> Vec<String> {
     let cell = |(column, source): (usize, Source)| {
         let Some(found) = claim.findings.iter().find(|found| found.column == column) else { return "·".into() };
-        let said = say(found.verdict, &found.measured);
-        if found.of == source.to_string() { said } else { format!("({}) {said}", found.of) }
+        let text = say(found.verdict, &found.measured);
+        if found.of == source.to_string() { text } else { format!("({}) {text}", found.of) }
     };
     SOURCES.into_iter().enumerate().map(cell).collect()
 }
@@ -148,7 +148,7 @@ pub fn page(without_learning: &str, heading: &str, full: &str) -> String {
 }
 
 /// Explains the table of baselines.
-pub const RACE: &str = "\
+pub(crate) const RACE: &str = "\
 Means over trials in POIs, with 95 % intervals. The champion is the team of every population's best policy. In parentheses
 is the best of a generation's teams, a maximum that grows with their number. Random constant actions and random networks
 are as many as evolution evaluates, and their best so far is kept. The second table keeps evolution's best so far, too.
@@ -156,7 +156,7 @@ Trials with one seed are pairs: they have the same starts and, where the sizes a
 Differences are over pairs.";
 
 /// Explains the table of claims.
-pub const LEGEND: &str = "\
+pub(crate) const LEGEND: &str = "\
 *yes*: the interval lies within what the words allow. *no*: it lies outside. *not decided*: it contains the threshold.
 *open*: too few generations or trials. Brackets are 95 % intervals: Student's for means and differences over pairs, Clopper
 and Pearson's for shares. p is the smallest alpha at which the interval decides, corrected by Holm's method for all verdicts

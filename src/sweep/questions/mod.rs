@@ -1,6 +1,6 @@
 //! The open questions of the paper, as sweeps in `configs/questions/`, and their results.
 //!
-//! A [`Study`] is one sweep. Its arms are compared along one axis, as in [`comparison`]. Each combination of the other
+//! [`QUESTIONS`] lists them. A [`Study`] is one sweep. Its arms are compared along one axis, as in [`comparison`]. Each combination of the other
 //! axes is a row of its results.
 //!
 //! This module adds two experiments that a sweep cannot express. Some runs start from the policies of other runs, and
@@ -8,8 +8,6 @@
 
 use std::path::{Path, PathBuf};
 
-use super::results::point_folder;
-use super::{Axis, Point, Sweep};
 use crate::backend::{Backend, BackendError, Group};
 use crate::baseline::{self, Baselines};
 use crate::config::{Config, ConfigError, Override, Sharing};
@@ -24,7 +22,13 @@ use crate::report::grid::{Dots, Interval};
 use crate::report::runs::ReadError;
 use crate::report::scene::Scene;
 use crate::report::table;
+use crate::sweep::results::point_folder;
+use crate::sweep::{Axis, Point, Sweep};
 use crate::world::World;
+
+mod list;
+
+pub use list::QUESTIONS;
 
 /// Number of episodes that champions play with moved POIs.
 pub const EPISODES: u32 = 200;
@@ -72,168 +76,6 @@ pub struct Study {
     moved: Option<f64>,
 }
 
-const PLAIN: Study = Study {
-    name: "",
-    config: "",
-    title: "",
-    by: "",
-    panels: None,
-    words: &[],
-    pairs: &[[0, 1]],
-    at: &[],
-    reach: None,
-    champion: false,
-    warm_from: None,
-    moved: None,
-};
-
-macro_rules! part {
-    ($name:literal, $($field:ident: $value:expr),* $(,)?) => {
-        Study {
-            name: $name,
-            config: include_str!(concat!("../../configs/questions/", $name, ".toml")),
-            $($field: $value,)*
-            ..PLAIN
-        }
-    };
-}
-
-const SHARING: (&str, &[&str]) = ("sharing", &["own policies", "one policy"]);
-/// The pairs G − Df, G − Dt and Df − Dt by their index among G, D, Df and Dt.
-const OF_CREDIT: &[[usize; 2]] = &[[0, 2], [0, 3], [2, 3]];
-
-/// All questions.
-pub const QUESTIONS: &[OpenQuestion] = &[
-    OpenQuestion {
-        letter: 'a',
-        title: "One policy or many, as groups and asymmetry grow",
-        parts: &[
-            part!(
-                "groups",
-                title: "One policy or many: groups with their POIs straight ahead",
-                by: "sharing",
-                panels: Some("paradigm"),
-                words: &[SHARING],
-                reach: Some(0.75),
-            ),
-            part!(
-                "asymmetry",
-                title: "One policy or many: four groups with less and less in common",
-                by: "sharing",
-                panels: Some("paradigm"),
-                words: &[SHARING, ("pois", &["ahead", "to either side", "ahead and behind", "each another way"])],
-                reach: Some(0.75),
-            ),
-        ],
-    },
-    OpenQuestion {
-        letter: 'b',
-        title: "Known behaviours against direct control",
-        parts: &[part!(
-            "behaviours",
-            title: "Known behaviours or direct control",
-            by: "actions",
-            panels: Some("paradigm"),
-            words: &[("pois", &["ahead", "each another way"])],
-            reach: Some(0.75),
-        )],
-    },
-    OpenQuestion {
-        letter: 'c',
-        title: "Relays: the same followers, led by different leaders in turn",
-        parts: &[
-            part!(
-                "relay",
-                title: "A relay of two leaders, by how long its last POIs can be observed",
-                by: "fitness",
-                words: &[("windows", &[
-                    "1 step",
-                    "5 steps",
-                    "10 steps",
-                    "20 steps",
-                    "30 steps",
-                    "no windows",
-                ])],
-                pairs: OF_CREDIT,
-                reach: Some(0.75),
-                champion: true,
-            ),
-            part!(
-                "relay_forced",
-                title: "A relay whose hand-over is forced",
-                by: "fitness",
-                words: &[("windows", &["1 step", "10 steps", "20 steps", "30 steps"])],
-                pairs: OF_CREDIT,
-                reach: Some(0.75),
-            ),
-            part!(
-                "relay_order",
-                title: "The relay's world with its POIs in order instead of in windows",
-                by: "fitness",
-                words: &[("after", &["any order", "in order"])],
-                pairs: OF_CREDIT,
-            ),
-            part!(
-                "relay_twice",
-                title: "Two relays side by side",
-                by: "fitness",
-                pairs: OF_CREDIT,
-                reach: Some(0.75),
-                champion: true,
-            ),
-            part!(
-                "relay_led",
-                title: "The relay by Dt, who leads a follower told in other ways",
-                by: "led_within",
-                words: &[("led_within", &["all steps", "the present step", "the last 10 steps"])],
-                pairs: &[[0, 1], [0, 2]],
-            ),
-        ],
-    },
-    OpenQuestion {
-        letter: 'd',
-        title: "Followers as the only observers",
-        parts: &[
-            part!("observers", title: "Only followers count, by followers of each leader", by: "fitness", pairs: OF_CREDIT),
-        ],
-    },
-    OpenQuestion {
-        letter: 'e',
-        title: "Curricula over coupling",
-        parts: &[part!(
-            "curricula",
-            title: "Coupling at once, or step by step",
-            by: "stages",
-            panels: Some("paradigm"),
-            words: &[("stages", &["at once", "step by step"])],
-        )],
-    },
-    OpenQuestion {
-        letter: 'f',
-        title: "Warm starts from one layout to another",
-        parts: &[part!(
-            "warm",
-            title: "POIs each another way, from random policies or from those of other layouts",
-            pairs: &[[0, 1], [0, 2], [0, 3]],
-            at: &[0, 10, 100],
-            // These points are leader-follower teams in which each leader has its own policy.
-            warm_from: Some(("asymmetry", &[(0, "from ahead"), (2, "from either side"), (4, "from ahead and behind")])),
-        )],
-    },
-    OpenQuestion {
-        letter: 'g',
-        title: "Learned on fixed POIs, played on moved ones, and the other way round",
-        parts: &[part!(
-            "places",
-            title: "Champions where POIs stand and where they are moved",
-            by: "poi_jitter",
-            words: &[("poi_jitter", &["learned on fixed POIs", "learned on moved POIs"])],
-            pairs: &[[0, 1], [0, 2], [1, 2]],
-            moved: Some(5.0),
-        )],
-    },
-];
-
 /// The reason why a question has no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum Unanswered {
@@ -267,7 +109,7 @@ pub struct Warm {
 ///
 /// # Errors
 /// There is no such question.
-pub fn letter(text: &str) -> Result<char, String> {
+pub(crate) fn letter(text: &str) -> Result<char, String> {
     let is = |question: &&OpenQuestion| text == question.letter.to_string();
     let letters = || QUESTIONS.iter().map(|question| question.letter.to_string()).collect::<Vec<_>>().join(", ");
     QUESTIONS.iter().find(is).map(|question| question.letter).ok_or_else(|| format!("allowed {}", letters()))
@@ -302,7 +144,7 @@ impl Study {
     }
 
     /// Returns the runs that start from other runs' policies. `out` has the folders of all studies.
-    pub fn warm(&self, sweep: &Sweep, out: &Path) -> Vec<Warm> {
+    pub(crate) fn warm(&self, sweep: &Sweep, out: &Path) -> Vec<Warm> {
         sweep.points.iter().flat_map(|point| self.warm_of(point, out)).collect()
     }
 
@@ -480,25 +322,25 @@ struct OfPlace {
 
 impl Answer {
     /// Returns all comparisons.
-    pub fn comparisons(&self) -> impl Iterator<Item = &Comparison> {
+    pub(crate) fn comparisons(&self) -> impl Iterator<Item = &Comparison> {
         self.rows.iter().map(|row| &row.comparison)
     }
 
     /// Returns the measures to report, with their index among all.
-    fn told(&self) -> Vec<(usize, Measure)> {
+    fn reported(&self) -> Vec<(usize, Measure)> {
         let measures = self.rows.first().map_or(&[][..], |row| &row.comparison.measures);
-        let is_told = |measure: &Measure| match measure {
+        let is_reported = |measure: &Measure| match measure {
             Measure::BestG { .. } | Measure::Played { .. } => true,
             Measure::GenerationsToReach { .. } => self.part.reach.is_some(),
             Measure::ChampionG { .. } => self.part.champion,
         };
         let measures = measures.iter().map(|measured| measured.measure).enumerate();
-        measures.filter(|(_, measure)| is_told(measure)).collect()
+        measures.filter(|(_, measure)| is_reported(measure)).collect()
     }
 
     /// Returns one table per measure for a page, with means and differences.
     pub fn tables(&self) -> String {
-        let tables = self.told().into_iter().map(|(at, measure)| {
+        let tables = self.reported().into_iter().map(|(at, measure)| {
             let arms = self.rows.first().map_or(&[][..], |row| &row.comparison.arms);
             let mut head = vec![measure.to_string()];
             head.extend(arms.iter().map(|arm| arm.name.clone()));
@@ -530,13 +372,13 @@ impl Answer {
     }
 
     /// Returns the tables between their marks in a page.
-    pub fn block(&self) -> String {
+    pub(crate) fn block(&self) -> String {
         format!("{}\n\n{}\n{END}\n", mark(self.part.name), self.tables())
     }
 
     /// Draws the means with their intervals.
     pub fn scene(&self) -> Scene {
-        let told: Vec<_> = self.told().into_iter().filter(|(_, measure)| measure.digits() > 1).collect();
+        let reported: Vec<_> = self.reported().into_iter().filter(|(_, measure)| measure.digits() > 1).collect();
         let mut groups: Vec<(String, Vec<String>)> = Vec::new();
         for OfPlace { name, comparison, .. } in &self.rows {
             if !groups.iter().any(|(other, _)| other == name) {
@@ -550,8 +392,8 @@ impl Answer {
         };
         let mut panels: Vec<Option<String>> = self.rows.iter().map(|row| row.panel.clone()).collect();
         panels.dedup();
-        let several = told.len() > 1;
-        let titled = told.iter().flat_map(|(at, measure)| {
+        let several = reported.len() > 1;
+        let titled = reported.iter().flat_map(|(at, measure)| {
             panels.iter().map(move |panel| {
                 let measure = Some(measure.to_string()).filter(|_| several);
                 let title: Vec<_> = measure.into_iter().chain(panel.clone()).collect();
@@ -559,7 +401,7 @@ impl Answer {
             })
         });
         let panels = titled.map(|(title, panel, at)| (title, None, of(panel, at))).collect();
-        let x_label = match &told[..] {
+        let x_label = match &reported[..] {
             [(_, measure)] => format!("{measure}: mean and 95 % interval"),
             _ => "G: mean and 95 % interval".into(),
         };

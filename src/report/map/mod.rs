@@ -1,12 +1,19 @@
 //! A team on its map at one moment: agents with trails and numbers, and POIs with their couplings.
+//!
+//! [`Legend`] is below the map. [`layout()`] draws a config before training.
 
 use glam::DVec2;
 
 use super::curves::round_step;
 use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
-use crate::config::{Config, Observers};
+use crate::config::Config;
 use crate::model::rule::Rule;
-use crate::world::World;
+
+mod layout;
+mod legend;
+
+pub use layout::layout;
+pub(crate) use legend::Legend;
 
 /// Colours of leaders and their followers on white. Green is reserved for observed POIs and grey for agents without a
 /// group.
@@ -61,7 +68,7 @@ const LABEL: f64 = 2.4;
 const LEAST: f64 = 1.9;
 const PALE: Color = [250, 250, 250];
 /// Colour of secondary text.
-pub const FAINT: Color = [95, 95, 95];
+pub(crate) const FAINT: Color = [95, 95, 95];
 
 /// An agent to draw.
 pub struct Marker {
@@ -107,7 +114,7 @@ pub fn poi_label(rule: &Rule, poi: usize, needs: String) -> String {
 }
 
 /// Returns an observed POI's label: the step at which it was observed.
-pub fn observed_label(rule: &Rule, poi: usize, step: usize) -> String {
+pub(crate) fn observed_label(rule: &Rule, poi: usize, step: usize) -> String {
     if rule.is_timed() { format!("{poi}: at step {step}") } else { format!("at step {step}") }
 }
 
@@ -145,7 +152,7 @@ impl Viewport {
     }
 
     /// Returns the same view with another upper left corner, in millimetres.
-    pub fn moved_to(self, [left, above]: [f64; 2]) -> Viewport {
+    pub(crate) fn moved_to(self, [left, above]: [f64; 2]) -> Viewport {
         Viewport { left, above, ..self }
     }
 
@@ -332,228 +339,6 @@ impl Viewport {
         scene.text([left + width / 2.0, below + 6.6], "x, map units", LABEL, Anchor::Middle, BLACK);
         scene.upright([left - 7.2, above + height / 2.0], "y, map units", LABEL, BLACK);
     }
-
-    /// Returns the legend of the symbols that occur on the maps of these teams.
-    pub fn legend(&self, teams: &[Team], counts: &str) -> Legend {
-        let mut entries: Vec<LegendEntry> = Vec::new();
-        let Some(team) = teams.first() else { return Legend::default() };
-        let mut pois = teams.iter().flat_map(|team| &team.pois);
-        let up = DVec2::Y;
-        let numbered = if team.leaders > 1 { "leader, by number" } else { "leader" };
-        entries.push((
-            3.0,
-            numbered.into(),
-            Box::new(move |scene, [x, y]| arrow(scene, [x + 1.2, y - 0.8], up, 1.6, Some(0), true)),
-        ));
-        let followers = &team.agents[team.leaders..];
-        if !followers.is_empty() {
-            let owned = followers.iter().any(|agent| agent.group.is_some());
-            let group = owned.then_some(0);
-            let what = if owned { "its follower" } else { "follower" };
-            entries.push((
-                3.0,
-                what.into(),
-                Box::new(move |scene, [x, y]| arrow(scene, [x + 1.2, y - 0.8], up, 1.4, group, false)),
-            ));
-        }
-        if pois.clone().any(|poi| poi.observed) {
-            let (fill, pen) = (Fill { color: COLORS[2], opacity: 0.22 }, Pen::new(COLORS[2], 0.25));
-            entries.push((
-                3.0,
-                "observed POI, with its step".into(),
-                Box::new(move |scene, [x, y]| scene.circle([x + 1.2, y - 0.8], 1.2, Some(fill), Some(pen.clone()))),
-            ));
-        }
-        if team.agents.iter().any(|agent| !agent.counts) {
-            let (leads, up) = (!team.agents[0].counts, DVec2::Y);
-            entries.push((
-                3.4,
-                "does not observe".into(),
-                Box::new(move |scene, [x, y]| {
-                    arrow(scene, [x + 1.4, y - 0.8], up, 1.5, None, leads);
-                    strike(scene, [x + 1.4, y - 0.8], up, 1.5);
-                }),
-            ));
-        }
-        if pois.clone().any(|poi| !poi.observed && !poi.open) {
-            let pen = Pen { dash: CLOSED, ..Pen::new(GREY, 0.25) };
-            entries.push((
-                3.0,
-                "POI that cannot be observed now".into(),
-                Box::new(move |scene, [x, y]| scene.circle([x + 1.2, y - 0.8], 1.2, None, Some(pen.clone()))),
-            ));
-        }
-        if pois.any(|poi| !poi.observed && poi.open) {
-            let pen = Pen { dash: &[0.7, 0.5], ..Pen::new(GREY, 0.25) };
-            entries.push((
-                3.0,
-                "POI".into(),
-                Box::new(move |scene, [x, y]| scene.circle([x + 1.2, y - 0.8], 1.2, None, Some(pen.clone()))),
-            ));
-        }
-        if !counts.is_empty() {
-            let text = match self.poi_labels(team) {
-                Some(_) => counts.to_string(),
-                None => "ring: share of the agents needed that is near".into(),
-            };
-            entries.push((0.0, text, Box::new(|_, _| ())));
-        }
-        let units = round_step(8.0 / self.scale);
-        let length = units * self.scale;
-        entries.push((
-            length + 1.0,
-            format!("{units} map units"),
-            Box::new(move |scene, [x, y]| {
-                scene.line(vec![[x, y - 1.5], [x, y - 0.1]], Pen::new(BLACK, 0.3));
-                scene.line(vec![[x, y - 0.8], [x + length, y - 0.8]], Pen::new(BLACK, 0.3));
-                scene.line(vec![[x + length, y - 1.5], [x + length, y - 0.1]], Pen::new(BLACK, 0.3));
-            }),
-        ));
-        Legend { entries }
-    }
-}
-
-type LegendEntry = (f64, String, Box<dyn Fn(&mut Scene, [f64; 2])>);
-
-/// The legend below a map.
-#[derive(Default)]
-pub struct Legend {
-    /// Width of each symbol, its text, and a function that draws it from a place on the baseline.
-    entries: Vec<LegendEntry>,
-}
-
-impl Legend {
-    const ROW: f64 = 4.2;
-
-    /// Adds a remark without a symbol.
-    pub fn note(&mut self, text: impl Into<String>) {
-        self.entries.push((0.0, text.into(), Box::new(|_, _| ())));
-    }
-
-    /// Returns the position of each entry in rows of a given width, and the height of all rows, in millimetres.
-    fn places(&self, width: f64) -> (Vec<[f64; 2]>, f64) {
-        let (mut x, mut y) = (0.0, 0.0);
-        let mut places = Vec::new();
-        for (sign, text, _) in &self.entries {
-            let length = sign + text_width(text, LABEL);
-            if x > 0.0 && x + length > width {
-                (x, y) = (0.0, y + Self::ROW);
-            }
-            places.push([x, y]);
-            x += length + 3.5;
-        }
-        (places, y + Self::ROW)
-    }
-
-    /// Returns the height of the legend below a map of this width, in millimetres.
-    pub fn height(&self, width: f64) -> f64 {
-        self.places(width).1
-    }
-
-    /// Draws the legend from a place on the first row's baseline.
-    pub fn draw(&self, scene: &mut Scene, [left, first]: [f64; 2], width: f64) {
-        for ((sign, text, draw), [x, y]) in self.entries.iter().zip(self.places(width).0) {
-            draw(scene, [left + x, first + y]);
-            let color = if *sign > 0.0 { BLACK } else { FAINT };
-            scene.text([left + x + sign, first + y], &**text, LABEL, Anchor::Start, color);
-        }
-    }
-}
-
-/// Draws the layout of a config before training: start positions, headings and the coupling of each POI.
-pub fn layout(name: &str, config: &Config) -> Scene {
-    const LEFT: f64 = 11.0;
-    const EDGE: f64 = 3.0;
-    const HEAD: f64 = 6.5;
-    let world = World::new(config);
-    let leaders = world.leaders();
-    let agent = |(index, start): (usize, &glam::Vec2)| Marker {
-        place: start.as_dvec2(),
-        heading: world.headings[index].as_dvec2(),
-        group: (index < leaders).then_some(index),
-        counts: world.rule.counts(index),
-        trail: vec![],
-    };
-    let none = vec![false; world.pois.len()];
-    let poi = |(poi, (&place, needed)): (usize, (&[f64; 2], &u32))| Poi {
-        place: place.into(),
-        label: poi_label(&world.rule, poi, needed.to_string()),
-        share: None,
-        observed: false,
-        open: world.rule.is_open(poi, 1, &none),
-    };
-    let team = Team {
-        leaders,
-        agents: world.starts.iter().enumerate().map(agent).collect(),
-        pois: config.world.pois.iter().zip(&world.coupling).enumerate().map(poi).collect(),
-    };
-    let map = DVec2::from(config.world.map);
-    let view = Viewport::new(config, [DVec2::ZERO, map], 80.0).moved_to([LEFT, HEAD]);
-    let [width, height] = view.size();
-    let radius = config.world.observation_radius;
-    let mut legend = view.legend(std::slice::from_ref(&team), "");
-    let alike = world.coupling.windows(2).all(|pair| pair[0] == pair[1]);
-    let needs = match (world.coupling.first(), view.poi_labels(&team)) {
-        (_, Some(_)) if world.rule.is_timed() => {
-            format!("at a POI: its number, agents it needs within {radius} of it, and when")
-        }
-        (_, Some(_)) => format!("number at a POI: agents it needs, within {radius} of it"),
-        (Some(&needed), None) if alike => {
-            format!("each POI needs {} within {radius} of it", count(needed as usize, "agent"))
-        }
-        _ => format!("what each POI needs has no room here; it counts within {radius} of it"),
-    };
-    legend.note(needs);
-    if config.learning.start_jitter > 0.0 {
-        legend.note(format!("starts move by up to {} on each axis", config.learning.start_jitter));
-    }
-    if config.learning.poi_jitter > 0.0 {
-        legend.note(format!("POIs move by up to {} on each axis", config.learning.poi_jitter));
-    }
-    let whole = LEFT + width.max(50.0) + EDGE;
-    let room = whole - 2.0 * EDGE;
-    let mut scene = Scene::new(whole, HEAD + height + 9.5 + legend.height(room) + 0.5);
-    let followers = world.followers();
-    let said =
-        format!("{}, {}, {}", count(leaders, "leader"), count(followers, "follower"), count(team.pois.len(), "POI"));
-    scene.bold([EDGE, 4.2], said.clone(), 3.0, Anchor::Start, BLACK);
-    view.draw(&mut scene, &team);
-    view.rule(&mut scene);
-    legend.draw(&mut scene, [EDGE, HEAD + height + 11.8], room);
-    scene.title = format!("The layout of {name}: {said}");
-    let couplings = match (world.coupling.iter().min(), world.coupling.iter().max()) {
-        (Some(least), Some(most)) if least == most => {
-            format!("Each POI needs {} near at once", count(*least as usize, "agent"))
-        }
-        (Some(least), Some(most)) => format!("A POI needs {least} to {most} agents near at once"),
-        _ => String::new(),
-    };
-    let places = |what: &str, places: &[DVec2]| {
-        let list: Vec<_> = places.iter().take(12).map(|place| format!("({}, {})", place.x, place.y)).collect();
-        let more = if places.len() > 12 { ", …" } else { "" };
-        format!("{what} at {}{more}. ", list.join(", "))
-    };
-    let who = match config.world.observers {
-        Observers::All => String::new(),
-        observers => format!(" Only {observers} observe."),
-    };
-    let timed = if world.rule.is_timed() { pois_in_words(&world.rule, world.pois.len()) } else { String::new() };
-    let starts: Vec<DVec2> = team.agents[..leaders].iter().map(|agent| agent.place).collect();
-    let pois: Vec<DVec2> = team.pois.iter().map(|poi| poi.place).collect();
-    scene.description = format!(
-        "A map of {} by {} units before any training. {}{}{couplings}, within {radius} of it.{who}{timed}",
-        map.x,
-        map.y,
-        places("Leaders", &starts),
-        places("POIs", &pois),
-    );
-    scene
-}
-
-/// Describes when POIs can be observed, for at most 12 of them.
-fn pois_in_words(rule: &Rule, pois: usize) -> String {
-    let list: Vec<_> = (0..pois.min(12)).map(|poi| poi_label(rule, poi, "any time".into())).collect();
-    format!(" POIs can be observed: {}{}.", list.join("; "), if pois > 12 { "; …" } else { "" })
 }
 
 /// Formats a count as "1 leader" or "2 leaders".

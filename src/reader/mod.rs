@@ -2,19 +2,24 @@
 //! of the text with their lines.
 //!
 //! The requests also define the table of keys, see [`keys`]. The keys themselves are defined elsewhere.
+//!
+//! A module reads a key with a [`KeyRequest`], which states its [`Allowed`] values.
 
 use std::collections::{BTreeMap, HashSet};
-use std::fmt::{self, Display};
 use std::ops::RangeInclusive;
 
-use serde::Serialize;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue, Error};
 
-use crate::config_enum::Choice;
+mod allowed;
+mod request;
+
+pub(crate) use allowed::Allowed;
+pub use allowed::{Number, between};
+pub(crate) use request::{KeyRequest, NumberOrPercentage, OneOrList};
 
 /// Maximum number of problems listed per text.
-pub const MAX_LISTED: usize = 50;
+pub(crate) const MAX_LISTED: usize = 50;
 /// Maximum number of unknown keys for which similar keys are searched. A text with more is not a config.
 const MAX_HINTS: usize = 256;
 
@@ -55,7 +60,7 @@ impl Override {
     }
 
     /// Sets `key` to what a text says in TOML; errors call it `name`.
-    pub fn of_text(key: impl Into<String>, text: impl Into<String>, name: impl Into<String>) -> Override {
+    pub(crate) fn of_text(key: impl Into<String>, text: impl Into<String>, name: impl Into<String>) -> Override {
         Override { key: key.into(), text: text.into(), name: name.into() }
     }
 }
@@ -150,25 +155,12 @@ impl LineNumbers {
     }
 }
 
-/// Reads a text, with some keys set by overrides: `ask` requests every key. Also returns a note
-/// about each key that was left out and whose default other keys leave no room for.
+/// Reads a text, with some keys set by overrides: `ask` requests every key. Also returns a note about each key that was
+/// left out and whose default other keys leave no room for.
 ///
 /// # Errors
 /// All problems of the text and the overrides.
-pub fn read<T>(
-    text: &str,
-    others: Others<'_>,
-    overrides: &[Override],
-    ask: impl FnOnce(&mut Reader<'_>) -> T,
-) -> Result<(T, Vec<String>), Problems> {
-    read_document(&Document::parse(text), others, overrides, ask)
-}
-
-/// Reads a parsed text, as [`read`] does.
-///
-/// # Errors
-/// All problems of the text and the overrides.
-pub fn read_document<T>(
+pub(crate) fn read<T>(
     document: &Document<'_>,
     others: Others<'_>,
     overrides: &[Override],
@@ -226,150 +218,6 @@ fn first_errors<'e>(errors: &'e [Error], lines: &'e LineNumbers) -> impl Iterato
         is_new
     })
 }
-
-/// The allowed values of a number.
-#[derive(Clone, Copy, Debug)]
-pub struct Allowed<T> {
-    low: T,
-    high: T,
-    zero: bool,
-    unlimited: bool,
-    /// The keys that set the bounds.
-    because: &'static str,
-}
-
-/// Returns the range from `low` to `high`, both included.
-pub fn between<T>(low: T, high: T) -> Allowed<T> {
-    Allowed { low, high, zero: false, unlimited: false, because: "" }
-}
-
-impl<T: Number> Allowed<T> {
-    /// Also allows 0, below the minimum.
-    pub fn or_zero(self) -> Self {
-        Allowed { zero: true, ..self }
-    }
-
-    /// Also allows infinity.
-    pub fn or_unlimited(self) -> Self {
-        Allowed { unlimited: true, ..self }
-    }
-
-    /// Names the keys that set the bounds.
-    pub fn because(self, because: &'static str) -> Self {
-        Allowed { because, ..self }
-    }
-
-    fn holds(&self, value: T) -> bool {
-        (self.low..=self.high).contains(&value)
-            || self.zero && value == T::ZERO
-            || self.unlimited && value.is_infinite()
-    }
-
-    /// Returns whether the value is above 0 and below the smallest allowed number other than 0.
-    fn is_too_small(&self, value: T) -> bool {
-        self.zero && T::ZERO < value && value < self.low
-    }
-
-    /// Returns the default, or the bound next to it if other keys exclude it.
-    fn nearest(&self, default: T) -> T {
-        match default {
-            _ if self.holds(default) => default,
-            _ if default < self.low => self.low,
-            _ => self.high,
-        }
-    }
-}
-
-impl<T: Number> Allowed<T> {
-    /// Returns the range for any config: a bound that depends on other keys is their names.
-    fn in_general(&self) -> String {
-        match self.because {
-            "" => self.in_detail(),
-            both if both.contains(" to ") => both.into(),
-            most => format!("{}{} to {most}", if self.zero { "0 or " } else { "" }, self.low),
-        }
-    }
-
-    /// The range with its gap between 0 and the least other number, if it has one.
-    fn in_detail(&self) -> String {
-        match (self.zero, self.low < self.high) {
-            (true, true) => format!("0 or {}", Allowed { zero: false, ..*self }),
-            _ => self.to_string(),
-        }
-    }
-}
-
-/// The plain range: the gap above 0 is only worth a word to who wrote a number within it.
-impl<T: Number> Display for Allowed<T> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Allowed { low, high, .. } = self;
-        match (self.zero, low.partial_cmp(high)) {
-            (true, Some(std::cmp::Ordering::Less)) => write!(f, "0 to {high}")?,
-            (true, _) => write!(f, "0")?,
-            (false, Some(std::cmp::Ordering::Less)) => write!(f, "{low} to {high}")?,
-            (false, _) => write!(f, "{high}")?,
-        }
-        if self.unlimited {
-            write!(f, " or inf (unlimited)")?;
-        }
-        if !self.because.is_empty() {
-            write!(f, " ({})", self.because)?;
-        }
-        Ok(())
-    }
-}
-
-/// A type of numbers in a config.
-pub trait Number: Copy + PartialOrd + Display + Serialize {
-    /// The number 0.
-    const ZERO: Self;
-    /// The name of the type with its article: "a number".
-    const KIND: &'static str;
-
-    /// Returns the number of a value: `None` for another kind of value, `Some(None)` for a number outside the type.
-    fn read(value: &DeValue<'_>) -> Option<Option<Self>>;
-
-    /// Returns whether the number is infinity.
-    fn is_infinite(self) -> bool {
-        false
-    }
-}
-
-impl Number for f64 {
-    const ZERO: f64 = 0.0;
-    const KIND: &'static str = "a number";
-
-    fn read(value: &DeValue<'_>) -> Option<Option<f64>> {
-        match value {
-            DeValue::Integer(_) => Some(i64::read(value)?.map(|integer| integer as f64)),
-            DeValue::Float(float) => {
-                let value: Option<f64> = float.as_str().parse().ok();
-                let written = |value: &f64| value.is_finite() || float.as_str().contains("inf");
-                // Adding 0 turns -0 into 0.
-                Some(value.filter(written).map(|value| value + 0.0))
-            }
-            _ => None,
-        }
-    }
-
-    fn is_infinite(self) -> bool {
-        self == f64::INFINITY
-    }
-}
-
-macro_rules! whole_number {
-    ($($type:ty)*) => {$(
-        impl Number for $type {
-            const ZERO: $type = 0;
-            const KIND: &'static str = "a whole number";
-
-            fn read(value: &DeValue<'_>) -> Option<Option<$type>> {
-                value.as_integer().map(|integer| <$type>::from_str_radix(integer.as_str(), integer.radix()).ok())
-            }
-        }
-    )*};
-}
-whole_number!(i64 u64 usize);
 
 /// The place of a value. The order of the variants is the order of problems.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -468,15 +316,6 @@ macro_rules! section {
 }
 pub(crate) use section;
 
-/// A requested key, before its allowed values and its default are given.
-pub struct KeyRequest<'r, 'a> {
-    reader: &'r mut Reader<'a>,
-    name: &'static str,
-    unit: &'static str,
-    meaning: &'static str,
-    paper: &'static str,
-}
-
 impl<'a> Reader<'a> {
     fn fill(&mut self, document: DeTable<'a>, text: &'a str, foreign: &[&str], overrides: &'a [Override]) {
         for (section, value) in document {
@@ -516,7 +355,7 @@ impl<'a> Reader<'a> {
     }
 
     /// Returns the number of problems found so far.
-    pub fn error_count(&self) -> usize {
+    pub(crate) fn error_count(&self) -> usize {
         self.problems.len()
     }
 
@@ -594,7 +433,7 @@ impl<'a> Reader<'a> {
     }
 
     /// Reports a problem with a requested key; if the key is missing, at the start of its section.
-    pub fn report_key(&mut self, key: &'static str, message: String) {
+    pub(crate) fn report_key(&mut self, key: &'static str, message: String) {
         let section = || self.sections.get(section_of(key)).copied().unwrap_or(0);
         let known = self.known.get(key).cloned().flatten();
         let (place, name) = known.unwrap_or_else(|| (Place::Offset(section()), key.to_string()));
@@ -646,170 +485,6 @@ impl<'a> Reader<'a> {
         });
         Problems { listed: listed.collect(), unlisted }
     }
-}
-
-impl<'a> KeyRequest<'_, 'a> {
-    /// Takes the value from the config. `about` returns kind, range and default for [`keys`].
-    fn take(&mut self, about: impl FnOnce() -> (String, String, Option<String>)) -> Option<Entry<'a>> {
-        if let Some(table) = &mut self.reader.table {
-            let KeyRequest { name, unit, meaning, paper, .. } = *self;
-            let (kind, range, default) = about();
-            table.push(Definition { name, unit, kind, range, default, meaning, paper });
-        }
-        self.reader.take(self.name)
-    }
-
-    /// Returns a number, or the default without the key.
-    pub fn number<T: Number>(mut self, allowed: Allowed<T>, default: T) -> T {
-        let entry = self.take(|| (kind::<T>().into(), allowed.in_general(), Some(written(&default))));
-        self.reader.number(self.name, entry, allowed, default)
-    }
-
-    /// Returns a number, or a percentage of the number that bounds it, written as a word such as `"10%"`.
-    pub fn number_or_percentage<T: Number>(mut self, allowed: Allowed<T>, default: T) -> NumberOrPercentage<T> {
-        const PERCENTAGES: &str = "above \"0%\", up to \"100%\"";
-        let kind = || format!("{}, or a percentage such as \"10%\"", kind::<T>());
-        let range = || format!("{}, or {PERCENTAGES}", allowed.in_general());
-        let entry = self.take(|| (kind(), range(), Some(written(&default))));
-        let Some((entry, word)) = entry.as_ref().and_then(|entry| Some((entry, entry.value.get_ref().as_str()?)))
-        else {
-            return NumberOrPercentage::Number(self.reader.number(self.name, entry, allowed, default));
-        };
-        let percentage = word.strip_suffix('%').and_then(|number| number.parse().ok());
-        match percentage.filter(|&percentage: &f64| 0.0 < percentage && percentage <= 100.0) {
-            Some(percentage) => NumberOrPercentage::Percentage(percentage),
-            None => {
-                let message = format!("found {}, allowed {allowed}, or {PERCENTAGES}", entry.found());
-                self.reader.report(entry.place(), &entry.name, message);
-                NumberOrPercentage::Number(allowed.nearest(default))
-            }
-        }
-    }
-
-    /// Returns the value of a word, or the default without the key.
-    pub fn choice<T: Choice>(mut self, default: T) -> T {
-        let words = || T::names().map(|word| format!("{word:?}")).collect::<Vec<_>>().join(" or ");
-        let Some(entry) = self.take(|| ("word".into(), words(), Some(written(&default)))) else { return default };
-        let word = entry.value.get_ref().as_str();
-        T::ALL.iter().find(|choice| Some(choice.0) == word).map_or_else(
-            || {
-                let message = format!("found {}, allowed {}", entry.found(), words());
-                self.reader.report(entry.place(), &entry.name, message);
-                default
-            },
-            |choice| choice.1,
-        )
-    }
-
-    /// Returns two numbers, or the default without the key.
-    pub fn pair(mut self, allowed: Allowed<f64>, default: [f64; 2]) -> [f64; 2] {
-        let about = || ("two numbers".into(), format!("each {}", allowed.in_general()), Some(written(&default)));
-        let Some(entry) = self.take(about) else { return default };
-        self.reader.two(entry, [allowed; 2])
-    }
-
-    /// Returns positions within these sides, or `None` if the required key is missing or not such a list.
-    pub fn positions(
-        mut self,
-        counts: RangeInclusive<usize>,
-        sides: [Allowed<f64>; 2],
-        default: Option<Vec<[f64; 2]>>,
-    ) -> Option<Vec<[f64; 2]>> {
-        const WHAT: &str = "positions [x, y]";
-        let (fewest, most) = (*counts.start(), *counts.end());
-        let range = || format!("{} of them, on {}", between(fewest, most), sides[0].because);
-        let Some(entry) = self.take(|| (format!("list of {WHAT}"), range(), default.as_ref().map(written))) else {
-            if default.is_none() {
-                let message = format!("missing, allowed a list of {} {WHAT}", between(fewest, most));
-                self.reader.report_key(self.name, message);
-            }
-            return default;
-        };
-        let items = self.reader.items(entry, counts, WHAT)?;
-        Some(items.into_iter().map(|item| self.reader.two(item, sides)).collect())
-    }
-
-    /// Returns a list of numbers, or the default without the key.
-    pub fn numbers<T: Number>(mut self, counts: RangeInclusive<usize>, allowed: Allowed<T>, default: Vec<T>) -> Vec<T> {
-        let range = || format!("{} of them, each {}", between(*counts.start(), *counts.end()), allowed.in_general());
-        let about = || (format!("list of {}s", kind::<T>()), range(), Some(written(&default)));
-        match self.take(about) {
-            Some(entry) => self.reader.numbers(entry, counts, allowed),
-            None => default,
-        }
-    }
-
-    /// Returns a list of lists of numbers, by default an empty one. Otherwise it has as many lists as the key `of` has
-    /// items, or any number if that is unknown. `check` returns further problems, each with the index of its list.
-    pub fn lists<T: Number>(
-        mut self,
-        what: &str,
-        (of, count): (&str, Option<usize>),
-        lengths: RangeInclusive<usize>,
-        allowed: Allowed<T>,
-        check: impl FnOnce(&[Vec<T>]) -> Vec<(usize, String)>,
-    ) -> Vec<Vec<T>> {
-        let range = || format!("none, or as many as {of}, of numbers each {}", allowed.in_general());
-        let Some(entry) = self.take(|| (format!("list of {what}"), range(), Some("[]".into()))) else { return vec![] };
-        if entry.value.get_ref().as_array().is_some_and(|items| items.is_empty()) {
-            return vec![];
-        }
-        let reader = self.reader;
-        let errors = reader.error_count();
-        let counts = count.map_or(1..=usize::MAX, |count| count..=count);
-        let items = reader.items(entry, counts, &format!("{what}, or none")).unwrap_or_default();
-        let places: Vec<_> = items.iter().map(|item| (item.place(), item.name.clone())).collect();
-        let lists: Vec<_> = items.into_iter().map(|item| reader.numbers(item, lengths.clone(), allowed)).collect();
-        if reader.error_count() == errors {
-            for (list, message) in check(&lists) {
-                let (place, name) = &places[list];
-                reader.report(*place, name, message);
-            }
-        }
-        if reader.error_count() == errors { lists } else { vec![] }
-    }
-
-    /// Returns one number or a list of numbers. The default is one number.
-    pub fn one_or_list<T: Number>(
-        mut self,
-        allowed: Allowed<T>,
-        counts: RangeInclusive<usize>,
-        default: T,
-    ) -> OneOrList<T> {
-        let kind = || format!("{}, or a list of them", kind::<T>());
-        match self.take(|| (kind(), allowed.in_general(), Some(written(&default)))) {
-            Some(entry) if entry.value.get_ref().is_array() => {
-                OneOrList::List(self.reader.numbers(entry, counts, allowed))
-            }
-            entry => OneOrList::One(self.reader.number(self.name, entry, allowed, default)),
-        }
-    }
-}
-
-/// The value of a key that takes a number or a percentage.
-pub enum NumberOrPercentage<T> {
-    /// A number.
-    Number(T),
-    /// A percentage, above 0 and up to 100.
-    Percentage(f64),
-}
-
-/// The value of a key that allows a number or a list.
-pub enum OneOrList<T> {
-    /// One value for all.
-    One(T),
-    /// One value for each.
-    List(Vec<T>),
-}
-
-/// Returns the name of a type without its article.
-fn kind<T: Number>() -> &'static str {
-    T::KIND.trim_start_matches("a ")
-}
-
-/// Writes a value as TOML.
-fn written<T: Serialize>(value: &T) -> String {
-    toml::Value::try_from(value).expect("numbers, words and lists of them are TOML").to_string()
 }
 
 /// Returns the section of a dotted key.

@@ -1,0 +1,150 @@
+//! The allowed values of a number.
+
+use std::fmt::{self, Display};
+
+use serde::Serialize;
+use toml::de::DeValue;
+
+/// The allowed values of a number.
+#[derive(Clone, Copy, Debug)]
+pub struct Allowed<T> {
+    low: T,
+    pub(super) high: T,
+    zero: bool,
+    unlimited: bool,
+    /// The keys that set the bounds.
+    pub(super) because: &'static str,
+}
+
+/// Returns the range from `low` to `high`, both included.
+pub fn between<T>(low: T, high: T) -> Allowed<T> {
+    Allowed { low, high, zero: false, unlimited: false, because: "" }
+}
+
+impl<T: Number> Allowed<T> {
+    /// Also allows 0, below the minimum.
+    pub(crate) fn or_zero(self) -> Self {
+        Allowed { zero: true, ..self }
+    }
+
+    /// Also allows infinity.
+    pub(crate) fn or_unlimited(self) -> Self {
+        Allowed { unlimited: true, ..self }
+    }
+
+    /// Names the keys that set the bounds.
+    pub fn because(self, because: &'static str) -> Self {
+        Allowed { because, ..self }
+    }
+
+    pub(super) fn holds(&self, value: T) -> bool {
+        (self.low..=self.high).contains(&value)
+            || self.zero && value == T::ZERO
+            || self.unlimited && value.is_infinite()
+    }
+
+    /// Returns whether the value is above 0 and below the smallest allowed number other than 0.
+    pub(super) fn is_too_small(&self, value: T) -> bool {
+        self.zero && T::ZERO < value && value < self.low
+    }
+
+    /// Returns the default, or the bound next to it if other keys exclude it.
+    pub(super) fn nearest(&self, default: T) -> T {
+        match default {
+            _ if self.holds(default) => default,
+            _ if default < self.low => self.low,
+            _ => self.high,
+        }
+    }
+}
+
+impl<T: Number> Allowed<T> {
+    /// Returns the range for any config: a bound that depends on other keys is their names.
+    pub(super) fn in_general(&self) -> String {
+        match self.because {
+            "" => self.in_detail(),
+            both if both.contains(" to ") => both.into(),
+            most => format!("{}{} to {most}", if self.zero { "0 or " } else { "" }, self.low),
+        }
+    }
+
+    /// The range with its gap between 0 and the least other number, if it has one.
+    pub(super) fn in_detail(&self) -> String {
+        match (self.zero, self.low < self.high) {
+            (true, true) => format!("0 or {}", Allowed { zero: false, ..*self }),
+            _ => self.to_string(),
+        }
+    }
+}
+
+/// The plain range: the gap above 0 is only worth a word to who wrote a number within it.
+impl<T: Number> Display for Allowed<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Allowed { low, high, .. } = self;
+        match (self.zero, low.partial_cmp(high)) {
+            (true, Some(std::cmp::Ordering::Less)) => write!(f, "0 to {high}")?,
+            (true, _) => write!(f, "0")?,
+            (false, Some(std::cmp::Ordering::Less)) => write!(f, "{low} to {high}")?,
+            (false, _) => write!(f, "{high}")?,
+        }
+        if self.unlimited {
+            write!(f, " or inf (unlimited)")?;
+        }
+        if !self.because.is_empty() {
+            write!(f, " ({})", self.because)?;
+        }
+        Ok(())
+    }
+}
+
+/// A type of numbers in a config.
+pub trait Number: Copy + PartialOrd + Display + Serialize {
+    /// The number 0.
+    const ZERO: Self;
+    /// The name of the type with its article: "a number".
+    const KIND: &'static str;
+
+    /// Returns the number of a value: `None` for another kind of value, `Some(None)` for a number outside the type.
+    fn read(value: &DeValue<'_>) -> Option<Option<Self>>;
+
+    /// Returns whether the number is infinity.
+    fn is_infinite(self) -> bool {
+        false
+    }
+}
+
+impl Number for f64 {
+    const ZERO: f64 = 0.0;
+    const KIND: &'static str = "a number";
+
+    fn read(value: &DeValue<'_>) -> Option<Option<f64>> {
+        match value {
+            DeValue::Integer(_) => Some(i64::read(value)?.map(|integer| integer as f64)),
+            DeValue::Float(float) => {
+                let value: Option<f64> = float.as_str().parse().ok();
+                let written = |value: &f64| value.is_finite() || float.as_str().contains("inf");
+                // Adding 0 turns -0 into 0.
+                Some(value.filter(written).map(|value| value + 0.0))
+            }
+            _ => None,
+        }
+    }
+
+    fn is_infinite(self) -> bool {
+        self == f64::INFINITY
+    }
+}
+
+macro_rules! whole_number {
+    ($($type:ty)*) => {$(
+        impl Number for $type {
+            const ZERO: $type = 0;
+            const KIND: &'static str = "a whole number";
+
+            fn read(value: &DeValue<'_>) -> Option<Option<$type>> {
+                value.as_integer().map(|integer| <$type>::from_str_radix(integer.as_str(), integer.radix()).ok())
+            }
+        }
+    )*};
+}
+whole_number!(i64 u64 usize);

@@ -1,0 +1,181 @@
+//! Requests for keys, one method per kind of value.
+
+use std::ops::RangeInclusive;
+
+use serde::Serialize;
+
+use super::{Allowed, Definition, Entry, Number, Reader, between};
+use crate::config_enum::Choice;
+
+/// A requested key, before its allowed values and its default are given.
+pub struct KeyRequest<'r, 'a> {
+    pub(super) reader: &'r mut Reader<'a>,
+    pub(super) name: &'static str,
+    pub(super) unit: &'static str,
+    pub(super) meaning: &'static str,
+    pub(super) paper: &'static str,
+}
+
+impl<'a> KeyRequest<'_, 'a> {
+    /// Takes the value from the config. `about` returns kind, range and default for [`keys`].
+    fn take(&mut self, about: impl FnOnce() -> (String, String, Option<String>)) -> Option<Entry<'a>> {
+        if let Some(table) = &mut self.reader.table {
+            let KeyRequest { name, unit, meaning, paper, .. } = *self;
+            let (kind, range, default) = about();
+            table.push(Definition { name, unit, kind, range, default, meaning, paper });
+        }
+        self.reader.take(self.name)
+    }
+
+    /// Returns a number, or the default without the key.
+    pub fn number<T: Number>(mut self, allowed: Allowed<T>, default: T) -> T {
+        let entry = self.take(|| (kind::<T>().into(), allowed.in_general(), Some(written(&default))));
+        self.reader.number(self.name, entry, allowed, default)
+    }
+
+    /// Returns a number, or a percentage of the number that bounds it, written as a word such as `"10%"`.
+    pub(crate) fn number_or_percentage<T: Number>(mut self, allowed: Allowed<T>, default: T) -> NumberOrPercentage<T> {
+        const PERCENTAGES: &str = "above \"0%\", up to \"100%\"";
+        let kind = || format!("{}, or a percentage such as \"10%\"", kind::<T>());
+        let range = || format!("{}, or {PERCENTAGES}", allowed.in_general());
+        let entry = self.take(|| (kind(), range(), Some(written(&default))));
+        let Some((entry, word)) = entry.as_ref().and_then(|entry| Some((entry, entry.value.get_ref().as_str()?)))
+        else {
+            return NumberOrPercentage::Number(self.reader.number(self.name, entry, allowed, default));
+        };
+        let percentage = word.strip_suffix('%').and_then(|number| number.parse().ok());
+        match percentage.filter(|&percentage: &f64| 0.0 < percentage && percentage <= 100.0) {
+            Some(percentage) => NumberOrPercentage::Percentage(percentage),
+            None => {
+                let message = format!("found {}, allowed {allowed}, or {PERCENTAGES}", entry.found());
+                self.reader.report(entry.place(), &entry.name, message);
+                NumberOrPercentage::Number(allowed.nearest(default))
+            }
+        }
+    }
+
+    /// Returns the value of a word, or the default without the key.
+    pub fn choice<T: Choice>(mut self, default: T) -> T {
+        let words = || T::names().map(|word| format!("{word:?}")).collect::<Vec<_>>().join(" or ");
+        let Some(entry) = self.take(|| ("word".into(), words(), Some(written(&default)))) else { return default };
+        let word = entry.value.get_ref().as_str();
+        T::ALL.iter().find(|choice| Some(choice.0) == word).map_or_else(
+            || {
+                let message = format!("found {}, allowed {}", entry.found(), words());
+                self.reader.report(entry.place(), &entry.name, message);
+                default
+            },
+            |choice| choice.1,
+        )
+    }
+
+    /// Returns two numbers, or the default without the key.
+    pub(crate) fn pair(mut self, allowed: Allowed<f64>, default: [f64; 2]) -> [f64; 2] {
+        let about = || ("two numbers".into(), format!("each {}", allowed.in_general()), Some(written(&default)));
+        let Some(entry) = self.take(about) else { return default };
+        self.reader.two(entry, [allowed; 2])
+    }
+
+    /// Returns positions within these sides, or `None` if the required key is missing or not such a list.
+    pub fn positions(
+        mut self,
+        counts: RangeInclusive<usize>,
+        sides: [Allowed<f64>; 2],
+        default: Option<Vec<[f64; 2]>>,
+    ) -> Option<Vec<[f64; 2]>> {
+        const WHAT: &str = "positions [x, y]";
+        let (fewest, most) = (*counts.start(), *counts.end());
+        let range = || format!("{} of them, on {}", between(fewest, most), sides[0].because);
+        let Some(entry) = self.take(|| (format!("list of {WHAT}"), range(), default.as_ref().map(written))) else {
+            if default.is_none() {
+                let message = format!("missing, allowed a list of {} {WHAT}", between(fewest, most));
+                self.reader.report_key(self.name, message);
+            }
+            return default;
+        };
+        let items = self.reader.items(entry, counts, WHAT)?;
+        Some(items.into_iter().map(|item| self.reader.two(item, sides)).collect())
+    }
+
+    /// Returns a list of numbers, or the default without the key.
+    pub fn numbers<T: Number>(mut self, counts: RangeInclusive<usize>, allowed: Allowed<T>, default: Vec<T>) -> Vec<T> {
+        let range = || format!("{} of them, each {}", between(*counts.start(), *counts.end()), allowed.in_general());
+        let about = || (format!("list of {}s", kind::<T>()), range(), Some(written(&default)));
+        match self.take(about) {
+            Some(entry) => self.reader.numbers(entry, counts, allowed),
+            None => default,
+        }
+    }
+
+    /// Returns a list of lists of numbers, by default an empty one. Otherwise it has as many lists as the key `of` has
+    /// items, or any number if that is unknown. `check` returns further problems, each with the index of its list.
+    pub fn lists<T: Number>(
+        mut self,
+        what: &str,
+        (of, count): (&str, Option<usize>),
+        lengths: RangeInclusive<usize>,
+        allowed: Allowed<T>,
+        check: impl FnOnce(&[Vec<T>]) -> Vec<(usize, String)>,
+    ) -> Vec<Vec<T>> {
+        let range = || format!("none, or as many as {of}, of numbers each {}", allowed.in_general());
+        let Some(entry) = self.take(|| (format!("list of {what}"), range(), Some("[]".into()))) else { return vec![] };
+        if entry.value.get_ref().as_array().is_some_and(|items| items.is_empty()) {
+            return vec![];
+        }
+        let reader = self.reader;
+        let errors = reader.error_count();
+        let counts = count.map_or(1..=usize::MAX, |count| count..=count);
+        let items = reader.items(entry, counts, &format!("{what}, or none")).unwrap_or_default();
+        let places: Vec<_> = items.iter().map(|item| (item.place(), item.name.clone())).collect();
+        let lists: Vec<_> = items.into_iter().map(|item| reader.numbers(item, lengths.clone(), allowed)).collect();
+        if reader.error_count() == errors {
+            for (list, message) in check(&lists) {
+                let (place, name) = &places[list];
+                reader.report(*place, name, message);
+            }
+        }
+        if reader.error_count() == errors { lists } else { vec![] }
+    }
+
+    /// Returns one number or a list of numbers. The default is one number.
+    pub(crate) fn one_or_list<T: Number>(
+        mut self,
+        allowed: Allowed<T>,
+        counts: RangeInclusive<usize>,
+        default: T,
+    ) -> OneOrList<T> {
+        let kind = || format!("{}, or a list of them", kind::<T>());
+        match self.take(|| (kind(), allowed.in_general(), Some(written(&default)))) {
+            Some(entry) if entry.value.get_ref().is_array() => {
+                OneOrList::List(self.reader.numbers(entry, counts, allowed))
+            }
+            entry => OneOrList::One(self.reader.number(self.name, entry, allowed, default)),
+        }
+    }
+}
+
+/// The value of a key that takes a number or a percentage.
+pub(crate) enum NumberOrPercentage<T> {
+    /// A number.
+    Number(T),
+    /// A percentage, above 0 and up to 100.
+    Percentage(f64),
+}
+
+/// The value of a key that allows a number or a list.
+pub(crate) enum OneOrList<T> {
+    /// One value for all.
+    One(T),
+    /// One value for each.
+    List(Vec<T>),
+}
+
+/// Returns the name of a type without its article.
+fn kind<T: Number>() -> &'static str {
+    T::KIND.trim_start_matches("a ")
+}
+
+/// Writes a value as TOML.
+fn written<T: Serialize>(value: &T) -> String {
+    toml::Value::try_from(value).expect("numbers, words and lists of them are TOML").to_string()
+}

@@ -1,0 +1,134 @@
+//! The legend below a map.
+
+use glam::DVec2;
+
+use super::{CLOSED, FAINT, LABEL, Team, Viewport, arrow, strike};
+use crate::report::curves::round_step;
+use crate::report::scene::{Anchor, BLACK, COLORS, Fill, GREY, Pen, Scene, text_width};
+
+/// The symbol of an entry, drawn from a place on the baseline.
+enum Symbol {
+    None,
+    /// An agent's arrow of a size, its group, whether it leads, and whether it observes.
+    Agent(f64, Option<usize>, bool, bool),
+    /// A POI's circle.
+    Poi(Option<Fill>, Pen),
+    /// A scale of a length in millimetres.
+    Scale(f64),
+}
+
+impl Symbol {
+    /// Returns the width in millimetres, with the gap before the text.
+    fn width(&self) -> f64 {
+        match self {
+            Symbol::None => 0.0,
+            Symbol::Agent(_, _, _, false) => 3.4,
+            Symbol::Agent(..) | Symbol::Poi(..) => 3.0,
+            Symbol::Scale(length) => length + 1.0,
+        }
+    }
+
+    fn draw(&self, scene: &mut Scene, [x, y]: [f64; 2]) {
+        match *self {
+            Symbol::None => {}
+            Symbol::Agent(size, group, leads, observes) => {
+                let place = [x + if observes { 1.2 } else { 1.4 }, y - 0.8];
+                arrow(scene, place, DVec2::Y, size, group, leads);
+                if !observes {
+                    strike(scene, place, DVec2::Y, size);
+                }
+            }
+            Symbol::Poi(fill, ref pen) => scene.circle([x + 1.2, y - 0.8], 1.2, fill, Some(pen.clone())),
+            Symbol::Scale(length) => {
+                for line in [
+                    [[x, y - 1.5], [x, y - 0.1]],
+                    [[x, y - 0.8], [x + length, y - 0.8]],
+                    [[x + length, y - 1.5], [x + length, y - 0.1]],
+                ] {
+                    scene.line(line.to_vec(), Pen::new(BLACK, 0.3));
+                }
+            }
+        }
+    }
+}
+
+/// The legend below a map: symbols with their texts.
+#[derive(Default)]
+pub(crate) struct Legend {
+    entries: Vec<(Symbol, String)>,
+}
+
+impl Legend {
+    const ROW: f64 = 4.2;
+
+    /// Returns the legend of the symbols that occur on the maps of these teams.
+    pub fn new(view: &Viewport, teams: &[Team], counts: &str) -> Legend {
+        let mut entries = Vec::new();
+        let mut add = |symbol: Symbol, text: &str| entries.push((symbol, text.to_string()));
+        let Some(team) = teams.first() else { return Legend::default() };
+        let mut pois = teams.iter().flat_map(|team| &team.pois);
+        let leader = if team.leaders > 1 { "leader, by number" } else { "leader" };
+        add(Symbol::Agent(1.6, Some(0), true, true), leader);
+        let followers = &team.agents[team.leaders..];
+        if followers.iter().any(|agent| agent.group.is_some()) {
+            add(Symbol::Agent(1.4, Some(0), false, true), "its follower");
+        } else if !followers.is_empty() {
+            add(Symbol::Agent(1.4, None, false, true), "follower");
+        }
+        if pois.clone().any(|poi| poi.observed) {
+            let fill = Fill { color: COLORS[2], opacity: 0.22 };
+            add(Symbol::Poi(Some(fill), Pen::new(COLORS[2], 0.25)), "observed POI, with its step");
+        }
+        if team.agents.iter().any(|agent| !agent.counts) {
+            add(Symbol::Agent(1.5, None, !team.agents[0].counts, false), "does not observe");
+        }
+        let unobserved = |dash| Symbol::Poi(None, Pen { dash, ..Pen::new(GREY, 0.25) });
+        if pois.clone().any(|poi| !poi.observed && !poi.open) {
+            add(unobserved(CLOSED), "POI that cannot be observed now");
+        }
+        if pois.any(|poi| !poi.observed && poi.open) {
+            add(unobserved(&[0.7, 0.5]), "POI");
+        }
+        if !counts.is_empty() {
+            let has_room = view.poi_labels(team).is_some();
+            add(Symbol::None, if has_room { counts } else { "ring: share of the agents needed that is near" });
+        }
+        let units = round_step(8.0 / view.scale);
+        add(Symbol::Scale(units * view.scale), &format!("{units} map units"));
+        Legend { entries }
+    }
+
+    /// Adds a remark without a symbol.
+    pub fn note(&mut self, text: impl Into<String>) {
+        self.entries.push((Symbol::None, text.into()));
+    }
+
+    /// Returns the position of each entry in rows of a given width, and the height of all rows, in millimetres.
+    fn places(&self, width: f64) -> (Vec<[f64; 2]>, f64) {
+        let (mut x, mut y) = (0.0, 0.0);
+        let mut places = Vec::new();
+        for (symbol, text) in &self.entries {
+            let length = symbol.width() + text_width(text, LABEL);
+            if x > 0.0 && x + length > width {
+                (x, y) = (0.0, y + Self::ROW);
+            }
+            places.push([x, y]);
+            x += length + 3.5;
+        }
+        (places, y + Self::ROW)
+    }
+
+    /// Returns the height of the legend below a map of this width, in millimetres.
+    pub fn height(&self, width: f64) -> f64 {
+        self.places(width).1
+    }
+
+    /// Draws the legend from a place on the first row's baseline.
+    pub fn draw(&self, scene: &mut Scene, [left, first]: [f64; 2], width: f64) {
+        for ((symbol, text), [x, y]) in self.entries.iter().zip(self.places(width).0) {
+            symbol.draw(scene, [left + x, first + y]);
+            let color = if symbol.width() > 0.0 { BLACK } else { FAINT };
+            scene.text([left + x + symbol.width(), first + y], &**text, LABEL, Anchor::Start, color);
+        }
+    }
+}
