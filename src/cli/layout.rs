@@ -187,8 +187,8 @@ impl StartLayout {
             Pattern::Grid => "in rows ahead of them",
         };
         format!(
-            "# {name}: {}, each a leader with {}.\n#\n# The groups {looks}. The {} {} {place}. A POI is observed when \
-             {} {} within its\n# radius in the same step.\n",
+            "# {name}: {}, each a leader with {}.\n#\n# The groups {looks}. The {} {} {place}.\n# A POI is \
+             observed when {} {} within its radius in the same step.\n",
             count(groups, "group"),
             count(followers, "follower"),
             count(pois, "POI"),
