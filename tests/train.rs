@@ -4,11 +4,18 @@
 
 mod support;
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fs;
-use std::path::PathBuf;
+use std::ops::ControlFlow::Continue;
+use std::path::{Path, PathBuf};
 
+use flotilla::record::RecordError;
+use flotilla::record::disk::Disk;
+use flotilla::record::finished::{Content, Finished, Storage};
+use flotilla::record::folder::{Folder, Run, Start, StartFrom};
 use flotilla::record::hex;
+use flotilla::trainer::Row;
+use flotilla::{Config, front, ops};
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use sha2::{Digest, Sha256};
@@ -718,4 +725,122 @@ fn json_is_json_whatever_stands_in_it() {
     let told = json(&["sweep", "sweep.toml", "--out", "a \"sweep\"", "--collect", "--json"], 1);
     let missing = told["points"][1]["missing"].as_str().unwrap();
     assert!(missing.contains("x\u{202e}"), "{missing:?}");
+}
+
+/// Files in memory, as the page keeps them for its archive.
+#[derive(Default)]
+struct Files(BTreeMap<String, Vec<u8>>);
+
+impl Storage for Files {
+    fn put(&mut self, name: &str, content: Content<'_>) -> Result<(), RecordError> {
+        let mut bytes = Vec::new();
+        content(&mut bytes).unwrap();
+        self.0.insert(name.into(), bytes);
+        Ok(())
+    }
+}
+
+/// The files of a run by name, without times, paths and who wrote them.
+fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    fn without(text: &[u8], names: &[&str]) -> Vec<u8> {
+        let mut value: serde_json::Value = serde_json::from_slice(text).unwrap();
+        for object in [&["__metadata__"][..], &[]] {
+            let object = object.iter().fold(Some(&mut value), |value, name| value?.get_mut(name));
+            let object = object.and_then(serde_json::Value::as_object_mut);
+            object.into_iter().for_each(|object| object.retain(|name, _| !names.contains(&&**name)));
+        }
+        value.to_string().into_bytes()
+    }
+    let mut found = BTreeMap::new();
+    let mut folders = vec![folder.to_path_buf()];
+    while let Some(next) = folders.pop() {
+        for path in fs::read_dir(next).unwrap().map(|entry| entry.unwrap().path()) {
+            if path.is_dir() {
+                folders.push(path);
+                continue;
+            }
+            let bytes = fs::read(&path).unwrap();
+            let content = match path.file_name().unwrap().to_str().unwrap() {
+                "metrics.csv" => {
+                    let text = String::from_utf8(bytes).unwrap();
+                    text.lines().map(|line| line.rsplit_once(',').unwrap().0).collect::<Vec<_>>().join("\n").into()
+                }
+                "run.json" => without(&bytes, &["started", "updated", "seconds", "command"]),
+                name if name.ends_with(".safetensors") && name != "policies.safetensors" => {
+                    let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+                    let times = ["seconds", "metrics_bytes", "metrics_sha256", "checksum", "sha256"];
+                    [without(&bytes[8..8 + length], &times), bytes[8 + length..].to_vec()].concat()
+                }
+                _ => bytes,
+            };
+            found.insert(path.strip_prefix(folder).unwrap().to_path_buf(), content);
+        }
+    }
+    found
+}
+
+#[test]
+fn a_run_has_the_same_files_however_it_was_trained_and_stored() {
+    let place = place();
+    place.good("train small.toml --out theirs --quiet");
+    let config = Config::parse(SMALL, "small.toml").unwrap();
+    let mut player = front::cpu();
+    let trained = front::train(&config, &mut *player.0, |_| Continue(())).unwrap();
+    let columns = config.learning.generations + 1;
+    let row = |(generation, trial): (usize, usize)| {
+        let at = trial * columns + generation;
+        let (best_g, mean_g, champion_g) = (trained.best_g[at], trained.mean_g[at], trained.champion_g[at]);
+        (Row { experiment: 0, trial, generation, best_g, mean_g, champion_g }, generation as f64)
+    };
+    let rows: Vec<(Row, f64)> =
+        (0..columns).flat_map(|generation| (0..3).map(move |trial| (generation, trial))).map(row).collect();
+    let policies: Vec<&[f32]> = trained.policies.iter().map(|policies| &policies[..]).collect();
+    let finished = || Finished {
+        config: &config,
+        rows: &rows,
+        policies: &policies,
+        ending: trained.ending.clone(),
+        run: Run {
+            version: flotilla::VERSION.into(),
+            commit: flotilla::COMMIT.map(String::from),
+            backend: player.1.backend.clone(),
+            description: player.0.describe(),
+            threads: player.1.threads,
+            sessions: 1,
+            ..Run::new(&config)
+        },
+    };
+    let saved = place.path("saved");
+    let (mut folder, _) = Folder::open(&saved, Start::Fresh, &config, StartFrom::Random, Disk::default()).unwrap();
+    ops::train::save(finished(), &mut folder).unwrap();
+    drop(folder);
+    let mut archive = Files::default();
+    ops::train::save(finished(), &mut archive).unwrap();
+    for (name, content) in archive.0 {
+        let path = place.path("archived").join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, content).unwrap();
+    }
+    let expected = files(&place.path("theirs"));
+    for name in ["config.toml", "curves.svg", ".flotilla.sha256", "metrics.csv", "policies.safetensors", "run.json"] {
+        assert!(expected.contains_key(Path::new(name)), "{name} is missing in {:?}", expected.keys());
+    }
+    for folder in ["saved", "archived"] {
+        let mut found = files(&place.path(folder));
+        // Only a folder that a run was written into has a lock.
+        for (name, content) in expected.iter().filter(|(name, _)| folder == "saved" || !name.ends_with(".lock")) {
+            let found = found.remove(name).unwrap_or_else(|| panic!("{folder}: no {}", name.display()));
+            assert!(found == *content, "{folder}/{}: {}", name.display(), String::from_utf8_lossy(&found));
+        }
+        assert!(found.is_empty(), "{folder}: {:?}", found.keys());
+    }
+    let straight = place.good("train small.toml --out straight --generations 16 --json").0;
+    let straight: serde_json::Value = serde_json::from_str(&straight).unwrap();
+    for folder in ["theirs", "saved", "archived"] {
+        let told =
+            place.good(&*format!("train {folder}/config.toml --out {folder} --resume --generations 16 --json")).0;
+        let told: serde_json::Value = serde_json::from_str(&told).unwrap();
+        // Nothing that was trained before is trained again.
+        assert_eq!((&told["digest"], &told["trained_generations"]), (&straight["digest"], &10.into()), "{folder}");
+    }
 }
