@@ -46,17 +46,17 @@ fn an_edited_metric_is_noticed_by_every_reader() {
     edit_metrics(&place, "swept/points/0001/metrics.csv");
     for command in ["plot run", "plot run other", "compare run other"] {
         let told = run(&place, 1, command);
-        assert!(told.contains("run/metrics.csv: it is not as the run left it"), "{command}: {told}");
+        assert!(told.contains("run/metrics.csv: it has changed since the run wrote it"), "{command}: {told}");
         assert!(told.contains("--resume` ") || told.contains("--resume`,"), "{command}: {told}");
         assert!(told.contains("--unverified"), "{command}: {told}");
     }
     let told = place.refused(1, "replay run");
-    assert!(told.contains("run/metrics.csv: it is not as the run left it"), "{told}");
+    assert!(told.contains("run/metrics.csv: it has changed since the run wrote it"), "{told}");
     let told = run(&place, 1, "compare swept");
-    assert!(told.contains("swept/points/0001/metrics.csv: it is not as the run left it"), "{told}");
+    assert!(told.contains("swept/points/0001/metrics.csv: it has changed since the run wrote it"), "{told}");
     let told = run(&place, 1, "sweep grid.toml --out swept --collect");
     assert!(told.contains("1 of 2 points are missing"), "{told}");
-    assert!(told.contains("points/0001/metrics.csv: it is not as the run left it"), "{told}");
+    assert!(told.contains("points/0001/metrics.csv: it has changed since the run wrote it"), "{told}");
 
     // Whoever wants them gets them, marked.
     let mark = "Unverified: files were not compared with the digests in run.json";
@@ -101,7 +101,7 @@ fn an_edited_config_is_noticed_by_whoever_plays() {
     edit(&place, "run/config.toml", &[("coupling = 2", "coupling = 1"), ("coupling = [2, 2]", "coupling = [1, 1]")]);
     for command in ["replay run", ROLLOUT] {
         let told = place.refused(1, command);
-        assert!(told.contains("run/config.toml: it is not as the run left it"), "{command}: {told}");
+        assert!(told.contains("run/config.toml: it has changed since the run wrote it"), "{command}: {told}");
     }
     let told = place.good(&format!("{ROLLOUT} --unverified")).0;
     assert!(told.contains("Unverified"), "{told}");
@@ -138,7 +138,7 @@ fn policies_of_another_run_are_noticed() {
     place.good("train small.toml --out other --seed 3");
     fs::copy(place.path("other/policies.safetensors"), place.path("run/policies.safetensors")).unwrap();
     let told = place.refused(1, ROLLOUT);
-    assert!(told.contains("run/policies.safetensors: it is not as the run left it"), "{told}");
+    assert!(told.contains("run/policies.safetensors: it has changed since the run wrote it"), "{told}");
     place.good(&format!("{ROLLOUT} --unverified"));
     // Somebody's own config and copies of policies are compared with nothing.
     fs::copy(place.path("other/policies.safetensors"), place.path("mine.safetensors")).unwrap();

@@ -70,7 +70,7 @@ impl Folder {
                             found.checkpoint = Some((checkpoint, metrics));
                             break;
                         }
-                        None => format!("{}: {} is not as this left it", path.escaped(), metrics.escaped()),
+                        None => format!("{}: {} has changed since this was written", path.escaped(), metrics.escaped()),
                     }
                 }
                 Ok(Some(_)) if edited.is_some() => break,
