@@ -27,7 +27,7 @@ ORDER = [
     ("Your own fitness", ["Coevolution", "Asked", "Played"]),
     ("Looking", ["Replay", "Episode", "Figure", "plot", "compare"]),
     ("Evaluating", ["rollout", "Rollout", "Trace", "forward", "collect", "Collected", "to_onnx"]),
-    ("Environments", ["VectorEnv", "parallel_env"]),
+    ("Environments", ["VectorEnv", "team_env", "parallel_env"]),
     ("Many runs", ["sweep", "Sweep", "Point", "paper"]),
     ("The machine", ["devices", "verify"]),
 ]

@@ -7,11 +7,9 @@
 //! resumed, is in [`crate::run`].
 
 use std::borrow::Cow;
-use std::cell::RefCell;
 use std::ops::{ControlFlow, Range};
 #[cfg(feature = "record")]
 use std::path::Path;
-use std::sync::{Mutex, PoisonError};
 
 use crate::backend::cpu::{Cpu, Noise, StepArrays};
 #[cfg(feature = "gpu")]
@@ -20,9 +18,8 @@ use crate::backend::gpu::{
     device::{DeviceError, Wanted},
     episode::{GpuBackend, ResidencyPolicy},
 };
-use crate::backend::{Backend, BackendError, Group, Machine, OpenBackend};
+use crate::backend::{Backend, BackendError, Group, GroupScores, Machine, OpenBackend};
 use crate::config::{Config, ConfigError, Fitness, MAX_POPULATION, Sharing, ValidConfig};
-use crate::credit::{self, Credit};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
 use crate::evolve::{self, Key, MAX_WEIGHT, Purpose};
 use crate::memory::{self, Peaks, TooLittle};
@@ -494,20 +491,9 @@ pub struct ActionNoise<'a> {
     pub deviations: &'a [[f32; OUTPUTS]],
 }
 
-/// The results of [`record`], of each episode's teams.
-#[derive(Clone, Debug, Default, PartialEq)]
-#[non_exhaustive]
-pub struct Recorded {
-    /// Number of POIs observed, `[episodes][teams]`.
-    pub observed: Vec<u32>,
-    /// D, Df, D++ and Dt, `[episodes][teams][leaders]`. Dt is 0 unless it is the config's fitness.
-    pub credits: Vec<[f32; 4]>,
-    /// The step, from 1, at which each POI was observed, or 0, `[episodes][teams][pois]`.
-    pub observed_at: Vec<u32>,
-}
-
-/// Plays some episodes of given policies on the CPU, writes the steps of all teams, and scores them. The teams of an
-/// episode follow those of the one before. See [`play`] for the other arguments.
+/// Plays some episodes of given policies on the CPU, writes the steps of all teams, and returns the scores of each
+/// episode, by the fitnesses of [`evaluate::scores_beside`]. In the arrays, the teams of an episode follow those of the
+/// one before. See [`play`] for the other arguments.
 ///
 /// Without noise, the states and scores are those of [`trace`] and [`play`].
 ///
@@ -521,41 +507,20 @@ pub fn record(
     episodes: Range<usize>,
     noise: Option<ActionNoise<'_>>,
     arrays: StepArrays<'_>,
-) -> Result<Recorded, Failure> {
-    thread_local! { static CREDIT: RefCell<Credit> = RefCell::default(); }
+) -> Result<Vec<GroupScores>, Failure> {
     let cast = Cast::new(config, teams, weights, starts)?;
     if episodes.end > starts.episodes() || episodes.is_empty() {
         return Err(Failure::NoEpisode { episode: episodes.end, episodes: starts.episodes() });
     }
-    let (world, leaders, pois) = (&cast.world, cast.world.leaders(), cast.world.pois.len());
-    let drawn: Vec<Vec<glam::Vec2>> = episodes.clone().map(|episode| starts.of(episode, world)).collect();
+    let drawn: Vec<Vec<glam::Vec2>> = episodes.clone().map(|episode| starts.of(episode, &cast.world)).collect();
     let fitnesses = scores_of(config);
     let groups: Vec<Group<'_>> = drawn.iter().map(|starts| Group { fitnesses, ..cast.group(starts) }).collect();
-    let all = teams * drawn.len();
-    let recorded = Mutex::new(Recorded {
-        observed: vec![0; all],
-        credits: vec![[0.0; 4]; all * leaders],
-        observed_at: vec![0; all * pois],
-    });
     let noise = noise.map(|ActionNoise { seed, deviations }| Noise {
         key: Key::new(seed, 0, Purpose::Exploration),
         deviations,
         first: (episodes.start * teams) as u32,
     });
-    Cpu::default().record(&groups, noise, arrays, &|group, team, episode| {
-        let scores = CREDIT.with_borrow_mut(|credit| credit.all(episode, world));
-        let at = credit::observed_at(episode.sets, world);
-        let place = group * teams + team;
-        let mut recorded = recorded.lock().unwrap_or_else(PoisonError::into_inner);
-        recorded.observed[place] = scores.observed;
-        for (leader, to) in recorded.credits[place * leaders..][..leaders].iter_mut().enumerate() {
-            let dt = scores.dt.get(leader).copied().unwrap_or(0.0);
-            *to = [scores.d[leader], scores.df[leader], scores.dpp[leader], dt];
-        }
-        let to = recorded.observed_at[place * pois..].iter_mut();
-        to.zip(at).for_each(|(to, step)| *to = step.unwrap_or(0) as u32);
-    })?;
-    Ok(recorded.into_inner().unwrap_or_else(PoisonError::into_inner))
+    Ok(Cpu::default().record(&groups, noise, arrays)?)
 }
 
 /// The states, inputs, outputs and observations of every step of one episode.

@@ -10,7 +10,7 @@ Example:
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from flotilla import _native, loggers
 from flotilla._coevolution import Asked, Coevolution, Played
@@ -18,13 +18,14 @@ from flotilla._config import Config, Key
 from flotilla._errors import ConfigError, Error, Problem
 from flotilla._play import Collected, Rollout, Trace, collect, forward, rollout, to_onnx
 from flotilla._program import compare, devices, paper, verify
-from flotilla._run import Generation, Run, train
-from flotilla._show import Episode, Figure, Replay, plot
+from flotilla._run import Generation, Run, plot, train
+from flotilla._show import Episode, Figure, Replay
 from flotilla._sweep import Point, Sweep, sweep
 from flotilla._vector import VectorEnv
 
 if TYPE_CHECKING:
     from flotilla._parallel import TeamEnv
+    from flotilla._single import SingleEnv
 
 __version__: str = _native.__version__
 
@@ -58,6 +59,7 @@ __all__ = [
     "plot",
     "rollout",
     "sweep",
+    "team_env",
     "to_onnx",
     "train",
     "verify",
@@ -71,16 +73,16 @@ def parallel_env(
     jitter: float | None = None,
     poi_jitter: float | None = None,
 ) -> TeamEnv:
-    """One team as a PettingZoo ``ParallelEnv``: agents ``leader_0``, ``leader_1``, …
+    """One team as a PettingZoo `ParallelEnv`: agents `leader_0`, `leader_1`, …
 
-    Needs PettingZoo (``pip install flotilla-teams[pettingzoo]``). Observations are float32 ``[8]``, actions float32 ``[2]``
-    in -1..1, ``state()`` is float32 ``[agents * 5 + pois]``: everyone's x, y, heading and speed, and which POIs have been
-    observed. An episode takes ``world.steps`` steps, and is *truncated* then.
+    Needs PettingZoo (`pip install flotilla-teams[pettingzoo]`). Observations are float32 `[8]`, actions float32 `[2]`
+    in -1..1, `state()` is float32 `[agents * 5 + pois]`: everyone's x, y, heading and speed, and which POIs have been
+    observed. An episode takes `world.steps` steps, and is *truncated* then.
 
     Args:
         config: the world.
-        render_mode: None or ``"rgb_array"``.
-        reward: see :class:`VectorEnv`, as for the next two.
+        render_mode: None or `"rgb_array"`.
+        reward: see `VectorEnv`, as for the next two.
         jitter: largest offset of a start on each axis, in map units.
         poi_jitter: the same for POIs.
 
@@ -97,6 +99,34 @@ def parallel_env(
     from flotilla._parallel import TeamEnv
 
     return TeamEnv(config, render_mode, reward, jitter, poi_jitter)
+
+
+def team_env(config: Config, render_mode: str | None = None, reward: str = "G", **options: Any) -> SingleEnv:
+    """One team as a `gymnasium.Env`, whose learner controls all leaders at once.
+
+    Needs gymnasium (`pip install flotilla-teams[gymnasium]`). Observations are float32 `[leaders, 8]`, actions float32
+    `[leaders, 2]` in -1..1. The reward is the mean over the leaders. The last step's info has `g`.
+
+    Args:
+        config: the world.
+        render_mode: None or `"rgb_array"`.
+        reward: see `VectorEnv`.
+        options: `copy`, `horizon`, `time_input`, `jitter` and `poi_jitter` of `VectorEnv`.
+
+    Raises:
+        ImportError: gymnasium is not installed.
+        ValueError: a word is not allowed.
+
+    Example:
+        >>> env = flotilla.team_env(flotilla.Config.paper(), jitter=1.0)
+        >>> observation, info = env.reset(seed=1)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> observation.shape, reward
+        ((4, 8), 0.0)
+    """
+    from flotilla._single import SingleEnv
+
+    return SingleEnv(config, render_mode, reward, **options)
 
 
 if hasattr(os, "register_at_fork"):

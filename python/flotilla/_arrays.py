@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 import operator
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-if TYPE_CHECKING:
-    from flotilla._config import Config
 
 Floats = NDArray[np.float32]
 
@@ -30,6 +27,8 @@ def aligned(shape: tuple[int, ...]) -> Floats:
 
 def floats(what: str, values: ArrayLike, axes: int) -> Floats:
     """Converts values to a float32 array with the given number of axes, without a copy if they are one already."""
+    if type(values) is np.ndarray and values.dtype == np.float32 and values.ndim == axes and values.flags.carray:
+        return values
     try:
         array = np.asarray(values)
     except ValueError as error:
@@ -78,20 +77,6 @@ def backend_name(value: Any) -> str:
     if isinstance(value, int) and not isinstance(value, bool):
         return str(value)
     return text("backend", value)
-
-
-def jitters(config: Config, jitter: float | None, poi_jitter: float | None) -> tuple[float, float]:
-    """Returns the jitter of starts and of POIs: as given, or else the config's."""
-    learning = config["learning"]
-    given = learning["start_jitter"] if jitter is None else jitter
-    of_pois = learning["poi_jitter"] if poi_jitter is None else poi_jitter
-    return number("jitter", given, 0, 1e9), number("poi_jitter", of_pois, 0, 1e9)
-
-
-def as_bools(words: NDArray[np.uint32], agents: int) -> NDArray[np.bool_]:
-    """Converts bit sets `[..., words]` to bools `[..., agents]`. The first agent has the lowest bit."""
-    bits = np.unpackbits(words.astype("<u4", copy=False).view(np.uint8), axis=-1, count=agents, bitorder="little")
-    return bits.view(np.bool_)
 
 
 def renamed(old: str, new: str) -> None:

@@ -15,40 +15,40 @@ from flotilla._run import Generation, Run, first_policies
 
 
 class Asked(NamedTuple):
-    """What a generation plays, see :class:`Coevolution`."""
+    """What a generation plays, see `Coevolution`."""
 
     policies: Floats
-    """``[trials, leaders, policies + 1, parameters]``, or ``[trials, 1, ...]`` if leaders share a policy. The last is the
+    """`[trials, leaders, policies + 1, parameters]`, or `[trials, 1, ...]` if leaders share a policy. The last is the
     champion of the previous generation."""
     teams: NDArray[np.uint32]
-    """The policy of each leader in each team, ``[trials, teams, leaders]``."""
+    """The policy of each leader in each team, `[trials, teams, leaders]`."""
     starts: Floats
-    """Start positions of agents, leaders first, ``[trials, episodes, agents, 2]``; if POIs move, their positions follow."""
+    """Start positions of agents, leaders first, `[trials, episodes, agents, 2]`; if POIs move, their positions follow."""
 
 
 class Played(NamedTuple):
-    """The scores of a generation's teams, as means over episodes, see :class:`Coevolution`."""
+    """The scores of a generation's teams, as means over episodes, see `Coevolution`."""
 
     g: NDArray[np.float64]
-    """G, ``[trials, teams]``."""
+    """G, `[trials, teams]`."""
     fitness: Floats
-    """The config's fitness of each leader, ``[trials, teams, leaders]``."""
+    """The config's fitness of each leader, `[trials, teams, leaders]`."""
 
 
 class Coevolution:
     """Training by ask and tell, with a fitness of your own for each leader of each team.
 
-    With the config's own fitness, the result has the digest of :func:`train`. It can be pickled between generations.
+    With the config's own fitness, the result has the digest of `train`. It can be pickled between generations.
 
     Args:
         config: what to train.
-        seed: replaces the config's ``learning.seed``.
-        init: initial policies, see :func:`train`; arrays only.
-        backend: where to play, see :func:`train`.
+        seed: replaces the config's `learning.seed`.
+        init: initial policies, see `train`; arrays only.
+        backend: where to play, see `train`.
 
     Raises:
         ConfigError: the config or the seed is wrong.
-        ValueError: ``init`` has another shape.
+        ValueError: `init` has another shape.
         MemoryError: there is not enough memory for the populations.
 
     Example:
@@ -83,6 +83,7 @@ class Coevolution:
         self.config = config if seed is None else config.replace(learning={"seed": seed})
         self._backend = backend_name(backend)
         self._native = _native.Coevolution(self.config._native)
+        self._trials = int(self.config["learning.trials"])
         if init is not None:
             self._native.start_from(first_policies(init))
 
@@ -113,10 +114,10 @@ class Coevolution:
     def tell(self, fitness: ArrayLike) -> list[Generation]:
         """Breeds the next generation.
 
-        The generation is also played for its G, unless :meth:`play` did so. After the last generation its champions play.
+        The generation is also played for its G, unless `play` did so. After the last generation its champions play.
 
         Args:
-            fitness: what each leader of each team was worth, ``[trials, teams, leaders]``.
+            fitness: what each leader of each team was worth, `[trials, teams, leaders]`.
 
         Returns:
             the generations that became complete: usually the one before, because champions play one generation later.
@@ -125,15 +126,15 @@ class Coevolution:
             ValueError: the fitness has another shape or is not finite, or all generations have one.
         """
         values = floats("fitness", fitness, 3)
-        shape = (self.config["learning.trials"], self._native.teams, self.config.num_learners)
+        shape = (self._trials, self._native.teams, self.config.num_learners)
         if not self.done and values.shape != shape:
             raise ValueError(f"fitness has the shape {values.shape}, allowed is [trials, teams, leaders] = {shape}")
         return self._native.tell(values, self._backend)
 
     @property
     def best(self) -> Floats:
-        """The champion of the last generation with a fitness, ``[trials, leaders, parameters]``, or ``[trials, 1,
-        parameters]`` if leaders share a policy.
+        """The champion of the last generation with a fitness, `[trials, leaders, parameters]`, or `[trials, 1,
+        parameters]` if leaders share a policy.
 
         Raises:
             ValueError: no generation has a fitness yet.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, KeysView, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from flotilla import _native as native
-from flotilla._arrays import renamed
+from flotilla._arrays import number, renamed
 
 
 class Key(NamedTuple):
@@ -19,7 +19,7 @@ class Key(NamedTuple):
     """
 
     name: str
-    """Dotted: ``world.steps``."""
+    """Dotted: `world.steps`."""
     unit: str
     kind: str
     """What its value is: a whole number, a list, one of some words."""
@@ -53,14 +53,14 @@ class _Keys:
 
 
 class Config(Mapping[str, Any]):
-    """One experiment: its world, its agents, its learning. A config cannot be changed; :meth:`replace` makes another.
+    """One experiment: its world, its agents, its learning. A config cannot be changed; `replace` makes another.
 
-    Keys that are not given have the defaults of ``docs/reference/config.md``. A config can be compared, hashed, copied and
-    pickled. It is a mapping of sections: ``"world.steps" in config``, ``dict(config)``.
+    Keys that are not given have the defaults of `docs/reference/config.md`. A config can be compared, hashed, copied and
+    pickled. It is a mapping of sections: `"world.steps" in config`, `dict(config)`.
 
     Args:
-        sections: a mapping for every section of a config file: ``world={"leaders": [[5, 5]], "pois": [[5, 15]]}``, and a
-            list for ``stages``. Positions may be lists or NumPy arrays ``[n, 2]``, in map units.
+        sections: a mapping for every section of a config file: `world={"leaders": [[5, 5]], "pois": [[5, 15]]}`, and a
+            list for `stages`. Positions may be lists or NumPy arrays `[n, 2]`, in map units.
 
     Raises:
         ConfigError: everything that is wrong, at once.
@@ -99,7 +99,7 @@ class Config(Mapping[str, Any]):
 
     @classmethod
     def parse(cls, text: str, name: str = "the config") -> Config:
-        """Reads a config from its text (TOML). Errors use ``name`` for it.
+        """Reads a config from its text (TOML). Errors use `name` for it.
 
         Raises:
             ConfigError: everything that is wrong with the text, by line.
@@ -112,7 +112,7 @@ class Config(Mapping[str, Any]):
 
     @classmethod
     def paper(cls, layout: str = "generally_forward", fitness: str = "Df", paradigm: str = "leader-follower") -> Config:
-        """One of the paper's experiments: ``"generally_forward"``, ``"strictly_forward"`` or ``"chaotic"``.
+        """One of the paper's experiments: `"generally_forward"`, `"strictly_forward"` or `"chaotic"`.
 
         Raises:
             ValueError: there is no such layout, fitness or paradigm.
@@ -170,7 +170,7 @@ class Config(Mapping[str, Any]):
         return sections
 
     def __getitem__(self, key: str) -> Any:
-        """A key's value by its dotted name, or a section: ``config["world.steps"]``, ``config["world"]``."""
+        """A key's value by its dotted name, or a section: `config["world.steps"]`, `config["world"]`."""
         found: Any = self.to_dict()
         for part in str(key).split("."):
             if not isinstance(found, dict) or part not in found:
@@ -191,7 +191,7 @@ class Config(Mapping[str, Any]):
 
     @property
     def leaders(self) -> int:
-        """The former name of ``num_learners``."""
+        """The former name of `num_learners`."""
         renamed("Config.leaders", "Config.num_learners")
         return self.num_learners
 
@@ -228,3 +228,11 @@ class Config(Mapping[str, Any]):
             f"{count(learning['population'], 'team')}, {count(learning['generations'], 'generation')}, "
             f"{count(learning['trials'], 'trial')}, seed {learning['seed']}>"
         )
+
+
+def jitters(config: Config, jitter: float | None, poi_jitter: float | None) -> tuple[float, float]:
+    """Returns the jitter of starts and of POIs: as given, or else the config's."""
+    learning = config["learning"]
+    given = learning["start_jitter"] if jitter is None else jitter
+    of_pois = learning["poi_jitter"] if poi_jitter is None else poi_jitter
+    return number("jitter", given, 0, 1e9), number("poi_jitter", of_pois, 0, 1e9)

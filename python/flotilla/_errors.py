@@ -37,7 +37,7 @@ class ConfigError(ValueError):
     """Everything that is wrong with a config.
 
     Attributes:
-        problems: a list of :class:`Problem`, by line.
+        problems: a list of `Problem`, by line.
 
     Example:
         >>> try:

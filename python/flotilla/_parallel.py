@@ -19,7 +19,7 @@ Space = spaces.Space[Array]
 
 
 class TeamEnv(ParallelEnv[str, Array, Array]):  # type: ignore[misc, unused-ignore]
-    """See :func:`flotilla.parallel_env`."""
+    """See `flotilla.parallel_env`."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class TeamEnv(ParallelEnv[str, Array, Array]):  # type: ignore[misc, unused-igno
         wanted = spaces.Box(-1, 1, (_native.OUTPUTS,), np.float32)
         self.observation_spaces = {agent: sensed for agent in self.possible_agents}
         self.action_spaces = {agent: spaces.Box(-1, 1, wanted.shape, np.float32) for agent in self.possible_agents}
-        size = self._teams.agents * 5 + len(config["world.pois"])
+        size = self._teams.agents * 5 + self._teams.pois
         self.state_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
     def observation_space(self, agent: str) -> Space:

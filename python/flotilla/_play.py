@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
-from flotilla._arrays import Floats, as_bools, backend_name, floats, jitters, renamed, whole
-from flotilla._config import Config
+from flotilla._arrays import Floats, backend_name, floats, renamed, whole
+from flotilla._config import Config, jitters
 
 MAX_EPISODES = 1_000_000
 
@@ -24,15 +24,15 @@ class Trace:
     """What teams did at every step of one episode. Fields that were not recorded are None.
 
     Attributes:
-        positions: positions from the start on, ``[teams, steps + 1, agents, 2]``, leaders first, in map units.
+        positions: positions from the start on, `[teams, steps + 1, agents, 2]`, leaders first, in map units.
         headings: unit vectors, of the same shape.
-        speeds: ``[teams, steps + 1, agents]``, in units per second.
-        inputs: what leaders sense, ``[teams, steps, leaders, 8]``: the density of POIs, then of agents, in four quadrants
+        speeds: `[teams, steps + 1, agents]`, in units per second.
+        inputs: what leaders sense, `[teams, steps, leaders, 8]`: the density of POIs, then of agents, in four quadrants
             around their heading: back right, front right, front left, back left.
-        outputs: the answers of their policies, ``[teams, steps, leaders, 2]`` in -1..1, which lead to the next step's
+        outputs: the answers of their policies, `[teams, steps, leaders, 2]` in -1..1, which lead to the next step's
             states.
         agents_at_poi: which agents are within the observation radius of each POI after each step,
-            ``[teams, steps, pois, agents]``, bool.
+            `[teams, steps, pois, agents]`, bool.
 
     Example:
         >>> config = flotilla.Config.paper()
@@ -51,26 +51,26 @@ class Trace:
 
     @property
     def near(self) -> Any:
-        """The former name of ``agents_at_poi``."""
+        """The former name of `agents_at_poi`."""
         renamed("Trace.near", "Trace.agents_at_poi")
         return self.agents_at_poi
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """The scores of teams; means over episodes. ``rollout["Df"]`` is a score by the name of the fitness.
+    """The scores of teams; means over episodes. `rollout["Df"]` is a score by the name of the fitness.
 
     Attributes:
-        observed: POIs observed, ``[teams]``.
-        g: the share of POIs observed, float64 ``[teams]``, as in a run's metrics.
-        d: what the team would have lost without each leader, ``[teams, leaders]``, as the next three.
+        observed: POIs observed, `[teams]`.
+        g: the share of POIs observed, float64 `[teams]`, as in a run's metrics.
+        d: what the team would have lost without each leader, `[teams, leaders]`, as the next three.
         df: without the leader and the followers that it led.
         dpp: what copies of the leader would have gained, if that is more.
         dt: without the leader and, at each step, the followers that it led then; None unless the config's fitness is Dt.
         trace: what the teams did, if that was asked for.
-        deviation: the standard deviation of G over episodes, ``[teams]``, if ``spread`` was asked for, as the next two.
-        interval: the 95 % interval of the mean G, ``[teams, 2]``, as ``flotilla rollout`` computes it.
-        episodes: G of each episode, ``[episodes, teams]``.
+        deviation: the standard deviation of G over episodes, `[teams]`, if `spread` was asked for, as the next two.
+        interval: the 95 % interval of the mean G, `[teams, 2]`, as `flotilla rollout` computes it.
+        episodes: G of each episode, `[episodes, teams]`.
 
     Example:
         >>> config = flotilla.Config.paper()
@@ -91,7 +91,7 @@ class Rollout:
     episodes: NDArray[np.float64] | None = None
 
     def __getitem__(self, fitness: str) -> NDArray[Any]:
-        """Returns a score by the name of the fitness: ``"G"``, ``"D"``, ``"Df"``, ``"D++"`` or ``"Dt"``."""
+        """Returns a score by the name of the fitness: `"G"`, `"D"`, `"Df"`, `"D++"` or `"Dt"`."""
         scores: dict[str, NDArray[Any] | None] = {"G": self.g, "D": self.d, "Df": self.df, "D++": self.dpp, "Dt": self.dt}
         found = scores.get(fitness)
         if found is None:
@@ -106,6 +106,8 @@ class Rollout:
 FIELDS = ("positions", "headings", "speeds", "inputs", "outputs", "agents_at_poi")
 # Seconds that a block of episodes should take, so that Ctrl-C is answered soon.
 BLOCK_SECONDS = 0.2
+# Steps of agents in the first block, before it is known how long they take.
+FIRST_BLOCK = 4_000_000
 
 
 def _checked(config: Any, policies: ArrayLike) -> Floats:
@@ -116,9 +118,8 @@ def _checked(config: Any, policies: ArrayLike) -> Floats:
 
 
 def _shapes(config: Config, teams: int) -> dict[str, tuple[int, ...]]:
-    """Returns the shape of every array of steps, that of `agents_at_poi` in words of 32 agents."""
-    agents, steps = len(config["world.leaders"]) + len(config["world.followers"]), int(config["world.steps"])
-    leaders, pois = config.num_learners, len(config["world.pois"])
+    """Returns the shape of every array of steps."""
+    (agents, pois, steps), leaders = config._native.sizes, config.num_learners
     return {
         "positions": (teams, steps + 1, agents, 2),
         "headings": (teams, steps + 1, agents, 2),
@@ -126,7 +127,7 @@ def _shapes(config: Config, teams: int) -> dict[str, tuple[int, ...]]:
         "inputs": (teams, steps, leaders, _native.INPUTS),
         "outputs": (teams, steps, leaders, _native.OUTPUTS),
         "actions": (teams, steps, leaders, _native.OUTPUTS),
-        "agents_at_poi": (teams, steps, pois, -(-agents // 32)),
+        "agents_at_poi": (teams, steps, pois, agents),
     }
 
 
@@ -136,30 +137,30 @@ def _record(
     starts: tuple[int, int, float, float] | None,
     noise: tuple[int, Floats] | None,
     arrays: dict[str, Any],
-) -> tuple[list[Any], NDArray[np.uint32]]:
-    """Plays in blocks and fills the arrays. Returns scores, and the step at which each POI was observed, or 0.
+) -> list[Any]:
+    """Plays in blocks and fills the arrays. Returns scores.
 
     Blocks are episodes of all teams, or if there is one episode, some teams of it.
     """
     teams, episodes = policies.shape[1], 1 if starts is None else starts[0]
     whole_teams = episodes > 1 or noise is not None
-    total, block, first = (episodes if whole_teams else teams), 1 if whole_teams else 256, 0
+    agents, _, steps = config._native.sizes
+    cost = agents * steps * (teams if whole_teams else 1)
+    total, block, first = (episodes if whole_teams else teams), max(FIRST_BLOCK // cost, 1), 0
     parts: list[tuple[Any, ...]] = []
     while first < total:
         count = min(block, total - first)
         chosen = policies if count == teams or whole_teams else np.ascontiguousarray(policies[:, first : first + count])
         begin, end = (first * teams, (first + count) * teams) if whole_teams else (first, first + count)
-        of_block = [arrays[name][begin:end] if name in arrays else None for name in (*FIELDS[:5], "actions")]
-        near = arrays["agents_at_poi"][begin:end] if "agents_at_poi" in arrays else None
+        of_block = {name: array[begin:end] for name, array in arrays.items()}
+        states, others = [of_block.get(name) for name in (*FIELDS[:5], "actions")], ("agents_at_poi", "observed_at")
         span = (first, first + count) if whole_teams else (0, 1)
         began = time.perf_counter()
-        scores, at = _native.record(config._native, chosen, starts, span, noise, of_block, near)
+        parts.append(_native.record(config._native, chosen, starts, span, noise, states, *map(of_block.get, others)))
         took = time.perf_counter() - began
-        parts.append((*scores, at))
         first += count
         block = block * 2 if took < BLOCK_SECONDS / 2 else max(block // 2, 1) if took > BLOCK_SECONDS * 2 else block
-    joined: list[Any] = [None if part[0] is None else np.concatenate(part) for part in zip(*parts)]
-    return joined[:-1], joined[-1]
+    return [None if part[0] is None else np.concatenate(part) for part in zip(*parts)]
 
 
 def rollout(
@@ -180,20 +181,20 @@ def rollout(
 
     Args:
         config: the world, and the policies' network.
-        policies: float32 ``[leaders, teams, parameters]``: team ``t`` is made of every leader's policy ``t``; or
-            ``[1, teams, parameters]`` if the leaders of a team share one. C-contiguous float32 arrays are not copied.
-            A policy's parameters are its layers in order, each as weights ``W[in, out]`` (row-major), then biases ``b[out]``.
+        policies: float32 `[leaders, teams, parameters]`: team `t` is made of every leader's policy `t`; or
+            `[1, teams, parameters]` if the leaders of a team share one. C-contiguous float32 arrays are not copied.
+            A policy's parameters are its layers in order, each as weights `W[in, out]` (row-major), then biases `b[out]`.
         episodes: number of held-out starts that every team plays from. None plays once, from the config's own start.
         seed: seed of these starts, which are the same for all policies.
-        jitter: largest offset of a start on each axis, in map units; None takes the config's ``learning.start_jitter``.
-        poi_jitter: the same for POIs; None takes the config's ``learning.poi_jitter``.
+        jitter: largest offset of a start on each axis, in map units; None takes the config's `learning.start_jitter`.
+        poi_jitter: the same for POIs; None takes the config's `learning.poi_jitter`.
         spread: also return G of each episode, its standard deviation and its interval.
-        trace: also return all fields of a :class:`Trace`, of the first episode.
-        record: the fields of the trace to return, if not all: ``("positions",)``. Steps are recorded on the CPU, to the
+        trace: also return all fields of a `Trace`, of the first episode.
+        record: the fields of the trace to return, if not all: `("positions",)`. Steps are recorded on the CPU, to the
             same bits as on any GPU.
         out: C-contiguous arrays for fields of the trace, by name, which are then not allocated: float32, and bool for
-            ``agents_at_poi``.
-        backend: where to play, with the same bits: ``"auto"``, ``"cpu"``, ``"gpu"``, or an adapter's number or name.
+            `agents_at_poi`.
+        backend: where to play, with the same bits: `"auto"`, `"cpu"`, `"gpu"`, or an adapter's number or name.
 
     Raises:
         ValueError: the policies have another shape, or hold a NaN, an infinity or a size above 1e6; or another argument is
@@ -223,13 +224,13 @@ def rollout(
             warnings.warn(text, UserWarning, stacklevel=2)
     elif jitter is not None or poi_jitter is not None:
         raise ValueError("a jitter applies to drawn starts; pass episodes= with their number")
-    pois = len(config["world.pois"])
+    _, pois, _ = config._native.sizes
     traced = None
     if fields:
         first = None if starts is None else (1, *starts[1:])
         arrays = _allocate(_shapes(config, array.shape[1]), fields, out)
-        (observed, d, df, dpp, dt), _ = _record(config, array, first, None, arrays)
-        traced = _traced(config, arrays, out)
+        observed, d, df, dpp, dt = _record(config, array, first, None, arrays)
+        traced = Trace(**arrays)
         if starts is None and not spread:
             return Rollout(observed, observed / pois, d, df, dpp, dt, traced)
     (observed, d, df, dpp, dt), spreads = _native.rollout(config._native, array, starts, name, bool(spread))
@@ -256,31 +257,17 @@ def _allocate(
     """Returns the arrays to record fields in: those of `out`, or new ones."""
     arrays: dict[str, Any] = {}
     for field in fields:
-        given = None if out is None or field == "agents_at_poi" else out.get(field)
+        kind = np.dtype(np.bool_ if field == "agents_at_poi" else np.float32)
+        given = None if out is None else out.get(field)
         if given is None:
-            arrays[field] = np.empty(shapes[field], np.uint32 if field == "agents_at_poi" else np.float32)
+            arrays[field] = np.empty(shapes[field], kind)
             continue
-        right = isinstance(given, np.ndarray) and given.dtype == np.float32 and given.shape == shapes[field]
+        right = isinstance(given, np.ndarray) and given.dtype == kind and given.shape == shapes[field]
         if not right or not given.flags.c_contiguous or not given.flags.writeable:
-            text = f"out[{field!r}] must be a writable C-contiguous float32 array of shape {shapes[field]}"
+            text = f"out[{field!r}] must be a writable C-contiguous {kind} array of shape {shapes[field]}"
             raise ValueError(text)
         arrays[field] = given
     return arrays
-
-
-def _traced(config: Config, arrays: dict[str, Any], out: Mapping[str, NDArray[Any]] | None) -> Trace:
-    """Returns a trace of recorded arrays."""
-    if "agents_at_poi" in arrays:
-        agents = len(config["world.leaders"]) + len(config["world.followers"])
-        found = as_bools(arrays["agents_at_poi"], agents)
-        given = None if out is None else out.get("agents_at_poi")
-        if given is not None:
-            if given.dtype != np.bool_ or given.shape != found.shape:
-                raise ValueError(f"out['agents_at_poi'] must be a bool array of shape {found.shape}")
-            given[...] = found
-            found = given
-        arrays = {**arrays, "agents_at_poi": found}
-    return Trace(**arrays)
 
 
 @dataclass(frozen=True)
@@ -288,13 +275,13 @@ class Collected:
     """Episodes with noise on the actions, for trainers such as PPO. Episodes of a team follow each other by teams.
 
     Attributes:
-        observations: what leaders sense, ``[episodes * teams, steps, leaders, 8]``.
+        observations: what leaders sense, `[episodes * teams, steps, leaders, 8]`.
         actions: what they did before it was clamped to -1..1: their policy's answer plus noise,
-            ``[episodes * teams, steps, leaders, 2]``.
+            `[episodes * teams, steps, leaders, 2]`.
         means: the answers of their policies, of the same shape.
-        rewards: ``[episodes * teams, steps, leaders]``, as of :class:`VectorEnv`.
-        masks: False at the last step of an episode, else True, ``[episodes * teams, steps]``.
-        g: G, ``[episodes * teams]``.
+        rewards: `[episodes * teams, steps, leaders]`, as of `VectorEnv`.
+        masks: False at the last step of an episode, else True, `[episodes * teams, steps]`.
+        g: G, `[episodes * teams]`.
     """
 
     observations: Floats
@@ -320,13 +307,13 @@ def collect(
 
     Args:
         config: the world, and the policies' network.
-        policies: see :func:`rollout`.
-        noise: the standard deviation of the noise: one number, ``[2]`` for turn and speed, or ``[leaders, 2]``.
+        policies: see `rollout`.
+        noise: the standard deviation of the noise: one number, `[2]` for turn and speed, or `[leaders, 2]`.
         seed: seed of the noise and of the starts.
         episodes: number of episodes per team.
-        jitter: see :func:`rollout`; here, too, None takes the config's.
+        jitter: see `rollout`; here, too, None takes the config's.
         poi_jitter: the same for POIs.
-        reward: see :class:`VectorEnv`.
+        reward: see `VectorEnv`.
 
     Raises:
         ValueError: an argument is not allowed.
@@ -354,14 +341,16 @@ def collect(
     total = starts[0] * array.shape[1]
     shapes = _shapes(config, total)
     arrays = {name: np.empty(shapes[name], np.float32) for name in ("inputs", "outputs", "actions")}
-    (observed, d, df, dpp, dt), at = _record(scored, array, starts, (number, deviations), arrays)
-    steps, pois = int(config["world.steps"]), len(config["world.pois"])
+    _, pois, steps = config._native.sizes
+    at = np.empty((total, pois), np.uint32)
+    if reward == "G":
+        arrays["observed_at"] = at
+    observed, d, df, dpp, dt = _record(scored, array, starts, (number, deviations), arrays)
     rewards = np.zeros((total, steps, config.num_learners), np.float32)
     if reward == "G":
         team, poi = np.nonzero(at)
-        counts = np.zeros((total, steps), np.float32)
-        np.add.at(counts, (team, at[team, poi].astype(np.int64) - 1), 1)
-        rewards[...] = (counts / np.float32(pois))[..., None]
+        counts = np.bincount(team * steps + at[team, poi] - 1, minlength=total * steps)
+        rewards[...] = counts.reshape(total, steps, 1).astype(np.float32) / np.float32(pois)
     else:
         rewards[:, -1] = {"D": d, "Df": df, "D++": dpp, "Dt": dt}[reward]
     masks = np.ones((total, steps), np.bool_)
@@ -397,12 +386,12 @@ def forward(policies: ArrayLike, inputs: ArrayLike, config: Config | None = None
     behaviours, the answer is the turn and speed of the chosen one.
 
     Args:
-        policies: ``[..., parameters]``, see :func:`rollout`.
-        inputs: ``[..., 8]``; the axes before the last are broadcast against those of the policies.
+        policies: `[..., parameters]`, see `rollout`.
+        inputs: `[..., 8]`; the axes before the last are broadcast against those of the policies.
         config: the config of the policies; None if they have at most one hidden layer, and answer directly.
 
     Returns:
-        float32 ``[..., 2]`` in -1..1: the turn, as a fraction of a half turn to the left, and the speed, from standing still
+        float32 `[..., 2]` in -1..1: the turn, as a fraction of a half turn to the left, and the speed, from standing still
         to the largest.
 
     Raises:
@@ -432,15 +421,15 @@ def forward(policies: ArrayLike, inputs: ArrayLike, config: Config | None = None
 
 
 def to_onnx(policy: ArrayLike, path: str | os.PathLike[str], config: Config | None = None) -> None:
-    """Writes one policy's network as an ONNX model with an input ``inputs [n, 8]`` and an output ``outputs [n, 2]``.
+    """Writes one policy's network as an ONNX model with an input `inputs [n, 8]` and an output `outputs [n, 2]`.
 
-    Needs the package ``onnx`` (``pip install flotilla-teams[onnx]``). If a config says that policies choose among
-    behaviours, the output is ``[n, 5]``, one value per behaviour.
+    Needs the package `onnx` (`pip install flotilla-teams[onnx]`). If a config says that policies choose among
+    behaviours, the output is `[n, 5]`, one value per behaviour.
 
     Args:
-        policy: ``[parameters]``.
+        policy: `[parameters]`.
         path: file to write.
-        config: as of :func:`forward`.
+        config: as of `forward`.
 
     Raises:
         ValueError: the shape does not fit.

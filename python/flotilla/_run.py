@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from flotilla import _native
 from flotilla._arrays import Floats, backend_name, floats, whole
 from flotilla._config import Config
-from flotilla._show import Figure, Replay, plot
+from flotilla._show import Figure, Replay
 
 if TYPE_CHECKING:
     import pandas
@@ -213,6 +213,24 @@ class Run:
             f"<flotilla.Run: {len(best)} trials, {last} generations, best G {best.mean():.3f} "
             f"({best.min():.3f} to {best.max():.3f}){where}, digest {self.digest[:12]}…>"
         )
+
+
+def plot(runs: Sequence[Run]) -> Figure:
+    """The learning curves of one run, or the best teams of several side by side.
+
+    Raises:
+        Error: a run cannot be read.
+
+    Example:
+        >>> config = flotilla.Config.paper().replace(learning={"generations": 3})
+        >>> runs = [flotilla.train(config.replace(learning={"fitness": fitness})) for fitness in ("G", "Df")]
+        >>> flotilla.plot(runs).svg()[:4]
+        '<svg'
+    """
+    folders = [run.folder for run in runs]
+    if not 1 <= len(folders) <= 24:
+        raise ValueError(f"{len(folders)} runs, allowed are 1 to 24")
+    return Figure(_native.figure(folders, any(run.unverified for run in runs)))
 
 
 def _command() -> str:

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import html
 import os
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from flotilla import _native
 from flotilla._arrays import whole
-
-if TYPE_CHECKING:
-    from flotilla._run import Run
 
 
 class Figure:
@@ -124,21 +120,3 @@ class Replay:
     def __repr__(self) -> str:
         told = ", ".join(f"trial {e.trial} generation {e.generation} (G {e.best_g:.2f})" for e in self.episodes)
         return f"<flotilla.Replay: {told}>"
-
-
-def plot(runs: Sequence[Run]) -> Figure:
-    """The learning curves of one run, or the best teams of several side by side.
-
-    Raises:
-        Error: a run cannot be read.
-
-    Example:
-        >>> config = flotilla.Config.paper().replace(learning={"generations": 3})
-        >>> runs = [flotilla.train(config.replace(learning={"fitness": fitness})) for fitness in ("G", "Df")]
-        >>> flotilla.plot(runs).svg()[:4]
-        '<svg'
-    """
-    folders = [run.folder for run in runs]
-    if not 1 <= len(folders) <= 24:
-        raise ValueError(f"{len(folders)} runs, allowed are 1 to 24")
-    return Figure(_native.figure(folders, any(run.unverified for run in runs)))

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
-from flotilla._arrays import Floats, aligned, as_bools, floats, jitters, renamed, whole
-from flotilla._config import Config
+from flotilla._arrays import Floats, aligned, floats, renamed, whole
+from flotilla._config import Config, jitters
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -57,9 +57,7 @@ class TeamBatch:
         self.config, self.reward, self.render_mode = config, reward, render_mode
         self.count = whole("the number of teams", teams, 1, MAX_TEAMS)
         self.stepper = self._make_stepper()
-        self.leaders, self.length = config.num_learners, int(config["world.steps"])
-        self.agents = len(config["world.leaders"]) + len(config["world.followers"])
-        self.pois = len(config["world.pois"])
+        self.leaders, (self.agents, self.pois, self.length) = config.num_learners, config._native.sizes
         self.jitters = jitters(config, jitter, poi_jitter)
         self.seed: int | None = None
         self.drawn = 0
@@ -80,16 +78,16 @@ class TeamBatch:
 
     @property
     def steps(self) -> NDArray[np.uint32]:
-        """Steps that each team has played in its episode, ``[teams]``."""
+        """Steps that each team has played in its episode, `[teams]`."""
         return self.stepper.steps
 
     @property
     def observed(self) -> NDArray[np.bool_]:
-        """POIs that each team has observed in its episode, ``[teams, pois]``."""
+        """POIs that each team has observed in its episode, `[teams, pois]`."""
         return self.stepper.observed
 
     def inputs(self, out: Floats | None = None) -> Floats:
-        """Returns what every leader senses, ``[teams, leaders, 8]``, in a new array or in `out`."""
+        """Returns what every leader senses, `[teams, leaders, 8]`, in a new array or in `out`."""
         if out is None:
             out = aligned((self.count, self.leaders, _native.INPUTS))
         self.stepper.read_inputs(out)
@@ -123,7 +121,7 @@ class TeamBatch:
         return finished
 
     def state(self) -> Floats:
-        """Returns the full state of each team, ``[teams, agents * 5 + pois]``."""
+        """Returns the full state of each team, `[teams, agents * 5 + pois]`."""
         positions, headings, speeds = self.stepper.states()
         parts = (positions, headings, speeds[..., None])
         moving = np.concatenate(parts, axis=-1).reshape(self.count, -1)
@@ -131,10 +129,10 @@ class TeamBatch:
 
 
 class VectorEnv(Base):
-    """Many teams of one world that step together: a ``gymnasium.vector.VectorEnv`` if gymnasium is installed.
+    """Many teams of one world that step together: a `gymnasium.vector.VectorEnv` if gymnasium is installed.
 
-    An episode takes ``world.steps`` steps. With a jitter, every team of every episode starts from a place of its own,
-    drawn from the seed of :meth:`reset`; otherwise all teams start where the config says. With a POI jitter, the same
+    An episode takes `world.steps` steps. With a jitter, every team of every episode starts from a place of its own,
+    drawn from the seed of `reset`; otherwise all teams start where the config says. With a POI jitter, the same
     holds for the POIs. An environment can be pickled and deep-copied: the copy continues with the same bits.
 
     A leader's observation is the density of POIs, then of agents, in four quadrants around its heading: back right,
@@ -144,23 +142,23 @@ class VectorEnv(Base):
     Args:
         config: the world. Of its learning section, only the paradigm and the jitter of starts matter here.
         num_envs: number of teams.
-        reward: ``"G"`` gives the newly observed share of POIs at each step, the same to all leaders, which adds up to G;
-            ``"D"``, ``"Df"``, ``"D++"`` and ``"Dt"`` give each leader that fitness at the last step, and 0 before.
-        layout: shape of rewards and environments. ``"leaders"``: one environment per team and one reward per leader,
-            ``[num_envs, leaders]``. ``"team"``: one environment per team and one reward, ``[num_envs]``, the mean over its
-            leaders, as gymnasium's wrappers expect. ``"flat"``: one environment per leader, ``num_envs * leaders`` in all,
+        reward: `"G"` gives the newly observed share of POIs at each step, the same to all leaders, which adds up to G;
+            `"D"`, `"Df"`, `"D++"` and `"Dt"` give each leader that fitness at the last step, and 0 before.
+        layout: shape of rewards and environments. `"leaders"`: one environment per team and one reward per leader,
+            `[num_envs, leaders]`. `"team"`: one environment per team and one reward, `[num_envs]`, the mean over its
+            leaders, as gymnasium's wrappers expect. `"flat"`: one environment per leader, `num_envs * leaders` in all,
             teams one after the other, as trainers with shared parameters expect.
-        autoreset: what happens to a finished team, in gymnasium's terms (``metadata["autoreset_mode"]``):
-            ``"next_step"`` resets it at the next step and ignores that step's action; ``"same_step"`` resets it at
-            once and returns its last observation in ``infos["final_obs"]``; ``"disabled"`` leaves it until ``reset`` with
-            ``options={"reset_mask": mask}``.
+        autoreset: what happens to a finished team, in gymnasium's terms (`metadata["autoreset_mode"]`):
+            `"next_step"` resets it at the next step and ignores that step's action; `"same_step"` resets it at
+            once and returns its last observation in `infos["final_obs"]`; `"disabled"` leaves it until `reset` with
+            `options={"reset_mask": mask}`.
         copy: return new arrays at every step. If False, observations and rewards are the same arrays at every step,
             with new values: faster, but wrong in a replay buffer that keeps references.
-        horizon: how the end of an episode is reported, ``"truncated"`` or ``"terminated"``.
+        horizon: how the end of an episode is reported, `"truncated"` or `"terminated"`.
         time_input: append the played share of the episode to each leader's observation, which then has 9 numbers.
-        render_mode: None or ``"rgb_array"``.
-        jitter: largest offset of a start on each axis, in map units; None takes the config's ``learning.start_jitter``.
-        poi_jitter: the same for POIs; None takes the config's ``learning.poi_jitter``.
+        render_mode: None or `"rgb_array"`.
+        jitter: largest offset of a start on each axis, in map units; None takes the config's `learning.start_jitter`.
+        poi_jitter: the same for POIs; None takes the config's `learning.poi_jitter`.
 
     Raises:
         ValueError: a number or word is not allowed.
@@ -202,7 +200,8 @@ class VectorEnv(Base):
         self.config, self.render_mode = config, render_mode
         self.num_learners, self.layout, self.autoreset = self._teams.leaders, layout, autoreset
         self.copy, self.horizon, self.time_input = bool(copy), horizon, bool(time_input)
-        self.num_envs = self._teams.count * (self.num_learners if layout == "flat" else 1)
+        self.num_teams = self._teams.count
+        self.num_envs = self.num_teams * (self.num_learners if layout == "flat" else 1)
         self.metadata: dict[str, Any] = {
             "render_modes": list(RENDER_MODES),
             "autoreset_mode": _autoreset_mode(autoreset),
@@ -254,7 +253,7 @@ class VectorEnv(Base):
         return self
 
     def _observe(self, copy: bool) -> Floats:
-        """Returns the observations of all environments, ``[num_envs, ...]``."""
+        """Returns the observations of all environments, `[num_envs, ...]`."""
         if not self.time_input:
             found = self._teams.inputs(None if copy else self._inputs)
         else:
@@ -284,11 +283,11 @@ class VectorEnv(Base):
         Args:
             seed: seed of the drawn starts. None continues with the seed before; the first time it takes one from the
                 operating system, so that workers differ.
-            options: ``{"reset_mask": mask}`` resets only the teams that a bool array ``[teams]`` marks. In the layout
-                ``"flat"`` the mask is ``[num_envs]``, and a team is reset if all its leaders are marked.
+            options: `{"reset_mask": mask}` resets only the teams that a bool array `[teams]` marks. In the layout
+                `"flat"` the mask is `[num_envs]`, and a team is reset if all its leaders are marked.
 
         Returns:
-            observations, float32 ``[num_envs, leaders, 8]`` (``[num_envs, 8]`` in the layout ``"flat"``), and an empty
+            observations, float32 `[num_envs, leaders, 8]` (`[num_envs, 8]` in the layout `"flat"`), and an empty
             dictionary.
 
         Raises:
@@ -316,13 +315,13 @@ class VectorEnv(Base):
         """Plays one step of every team.
 
         Args:
-            actions: ``[num_envs, leaders, 2]`` (``[num_envs, 2]`` in the layout ``"flat"``). Numbers beyond -1..1 are
+            actions: `[num_envs, leaders, 2]` (`[num_envs, 2]` in the layout `"flat"`). Numbers beyond -1..1 are
                 clipped. C-contiguous float32 arrays are not copied.
 
         Returns:
-            observations, rewards, terminated, truncated and infos, see :class:`VectorEnv` for their shapes. With
-            ``autoreset="same_step"``, infos of a step that finished teams hold ``final_obs`` and ``final_info``: ``g``,
-            ``observed`` (``[num_envs, pois]``) and ``state``; names with an underscore in front mark the finished ones.
+            observations, rewards, terminated, truncated and infos, see `VectorEnv` for their shapes. With
+            `autoreset="same_step"`, infos of a step that finished teams hold `final_obs` and `final_info`: `g`,
+            `observed` (`[num_envs, pois]`) and `state`; names with an underscore in front mark the finished ones.
 
         Raises:
             ValueError: the actions have another shape or are not all finite, or another thread is stepping this
@@ -371,7 +370,7 @@ class VectorEnv(Base):
         return found
 
     def states(self) -> tuple[Floats, Floats, Floats]:
-        """Positions and headings ``[teams, agents, 2]`` and speeds ``[teams, agents]``, leaders first.
+        """Positions and headings `[teams, agents, 2]` and speeds `[teams, agents]`, leaders first.
 
         Example:
             >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).states()[0].shape
@@ -380,38 +379,45 @@ class VectorEnv(Base):
         return self._teams.stepper.states()
 
     def agents_at_poi(self) -> NDArray[np.bool_]:
-        """Agents within the observation radius of each POI after the last step, ``[teams, pois, agents]``.
+        """Agents within the observation radius of each POI after the last step, `[teams, pois, agents]`.
 
         Example:
             >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).agents_at_poi().shape
             (2, 4, 12)
         """
-        return as_bools(self._teams.stepper.near, self._teams.agents)
+        return self._teams.stepper.near
 
     def near(self) -> NDArray[np.bool_]:
-        """The former name of :meth:`agents_at_poi`."""
+        """The former name of `agents_at_poi`."""
         renamed("VectorEnv.near", "VectorEnv.agents_at_poi")
         return self.agents_at_poi()
 
     @property
     def leaders(self) -> int:
-        """The former name of ``num_learners``."""
+        """The former name of `num_learners`."""
         renamed("VectorEnv.leaders", "VectorEnv.num_learners")
         return self.num_learners
 
     @property
     def observed(self) -> NDArray[np.bool_]:
-        """POIs observed since the start of each team's episode, ``[teams, pois]``."""
+        """POIs observed since the start of each team's episode, `[teams, pois]`."""
         return self._teams.observed
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """The first team as a picture, uint8 ``[height, width, 3]``, if the render mode is ``"rgb_array"``.
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Pictures of all environments, uint8 `[height, width, 3]`, if the render mode is `"rgb_array"`.
+
+        In the layout `"flat"`, a team's leaders have the same picture.
 
         Example:
-            >>> flotilla.VectorEnv(flotilla.Config.paper(), 2, render_mode="rgb_array").render().shape
-            (480, 480, 3)
+            >>> pictures = flotilla.VectorEnv(flotilla.Config.paper(), 2, render_mode="rgb_array").render()
+            >>> len(pictures), pictures[0].shape
+            (2, (480, 480, 3))
         """
-        return self._teams.stepper.render(0, PIXELS) if self.render_mode == "rgb_array" else None
+        if self.render_mode != "rgb_array":
+            return None
+        pictures = [self._teams.stepper.render(team, PIXELS) for team in range(self.num_teams)]
+        copies = self.num_envs // self.num_teams
+        return tuple(picture for picture in pictures for _ in range(copies))
 
     def close(self, **_: Any) -> None:
         """Marks the environment as closed. It holds nothing that has to be freed."""

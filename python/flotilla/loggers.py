@@ -1,4 +1,4 @@
-"""Callbacks for :func:`flotilla.train` that log every generation elsewhere, each some ten lines to start from."""
+"""Callbacks for `flotilla.train` that log every generation elsewhere, each some ten lines to start from."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from flotilla._config import Config
 from flotilla._run import Generation
 
 class Logger:
-    """A callback that logs elsewhere. :func:`flotilla.train` closes it at the end, also if it stops early or fails."""
+    """A callback that logs elsewhere. `flotilla.train` closes it at the end, also if it stops early or fails."""
 
     def __init__(self, log: Callable[[Generation], Any], close: Callable[[], Any]) -> None:
         self._log, self._close, self.closed = log, close, False
@@ -43,7 +43,7 @@ def scalars(generation: Generation) -> dict[str, float]:
 
 
 def tensorboard(folder: str | os.PathLike[str]) -> Logger:
-    """Event files in a directory, written with tensorboardX (``pip install flotilla-teams[tensorboard]``)."""
+    """Event files in a directory, written with tensorboardX (`pip install flotilla-teams[tensorboard]`)."""
     from tensorboardX import SummaryWriter
 
     # The writer has its own thread. `flush` does not wait for queued rows, but `close` does.
@@ -57,7 +57,7 @@ def tensorboard(folder: str | os.PathLike[str]) -> Logger:
 
 
 def wandb(config: Config, **options: Any) -> Logger:
-    """A run of Weights & Biases; ``options`` are those of ``wandb.init``, such as ``mode="offline"``."""
+    """A run of Weights & Biases; `options` are those of `wandb.init`, such as `mode="offline"`."""
     import wandb as client
 
     run = client.init(config=config.to_dict(), **options)
@@ -69,7 +69,7 @@ def wandb(config: Config, **options: Any) -> Logger:
 
 
 def mlflow(config: Config, **options: Any) -> Logger:
-    """A run of MLflow at ``mlflow.set_tracking_uri``; ``options`` are those of ``mlflow.start_run``."""
+    """A run of MLflow at `mlflow.set_tracking_uri`; `options` are those of `mlflow.start_run`."""
     import mlflow as client
 
     run = client.start_run(**options)

@@ -1,4 +1,4 @@
-"""An adapter for Stable-Baselines3 (``pip install flotilla-teams[sb3]``)."""
+"""An adapter for Stable-Baselines3 (`pip install flotilla-teams[sb3]`)."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ class LeaderVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]
 
     Args:
         config: the world.
-        num_teams: number of teams; there are ``num_teams * leaders`` environments, teams one after the other.
-        options: further arguments of :class:`flotilla.VectorEnv`, such as ``reward`` and ``time_input``. With
-            ``layout="team"`` an environment is a whole team, whose actions and observations are those of all leaders.
+        num_teams: number of teams; there are `num_teams * leaders` environments, teams one after the other.
+        options: further arguments of `flotilla.VectorEnv`, such as `reward` and `time_input`. With
+            `layout="team"` an environment is a whole team, whose actions and observations are those of all leaders.
 
     Example:
         >>> from stable_baselines3 import PPO
-        >>> model = PPO("MlpPolicy", LeaderVecEnv(flotilla.Config.paper(), 64, reward="Df"))
-        >>> model.learn(100_000)
+        >>> env = LeaderVecEnv(flotilla.Config.paper(), 16, reward="Df")
+        >>> model = PPO("MlpPolicy", env, n_steps=25, batch_size=400, device="cpu").learn(3200)
+        >>> model.predict(env.reset())[0].shape
+        (64, 2)
     """
 
     def __init__(self, config: Config, num_teams: int, **options: Any) -> None:
@@ -61,7 +63,8 @@ class LeaderVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]
         self.teams.close()
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        return [self.teams.render()]
+        # One per team, because the pictures of its leaders are the same.
+        return (self.teams.render() or ())[:: self.num_envs // self.teams.num_teams]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         return [getattr(self.teams, attr_name)] * len(list(self._get_indices(indices)))

@@ -36,8 +36,12 @@ impl Config {
         let name = |arm: &Experiment| arm.layout.name.replace(' ', "_");
         let found = arms.iter().find(|arm| name(arm) == layout.replace([' ', '-'], "_"));
         found.map(|arm| Config(arm.config.clone())).ok_or_else(|| {
-            let mut names: Vec<_> = arms.iter().map(name).collect();
-            names.dedup();
+            let mut names: Vec<_> = Vec::new();
+            for name in arms.iter().map(name) {
+                if !names.contains(&name) {
+                    names.push(name);
+                }
+            }
             PyValueError::new_err(format!("layout {layout:?}, allowed are {}", names.join(", ")))
         })
     }
@@ -65,6 +69,13 @@ impl Config {
     #[getter]
     fn learners(&self) -> usize {
         self.0.learners()
+    }
+
+    /// Numbers of agents, POIs and steps.
+    #[getter]
+    fn sizes(&self) -> (usize, usize, usize) {
+        let world = &self.0.world;
+        (world.leaders.len() + world.followers.len(), world.pois.len(), world.steps)
     }
 
     /// Widths of a policy's layers, inputs and outputs included.

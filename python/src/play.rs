@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::{self, StepArrays};
 use flotilla::choice::Work;
-use flotilla::config::{Fitness, MAX_HIDDEN_UNITS};
-use flotilla::evaluate::{Batch, Spread, Starts};
+use flotilla::config::MAX_HIDDEN_UNITS;
+use flotilla::evaluate::{self, Batch, Spread, Starts};
 use flotilla::evolve::{self, MAX_WEIGHT};
 use flotilla::front::{self, ActionNoise, Failure, Played};
 use flotilla::model::policy::{MAX_HIDDEN_LAYERS, PolicyConstants};
@@ -17,6 +17,7 @@ use numpy::{
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+use rayon::prelude::*;
 
 use crate::config::Config;
 use crate::errors::Raise;
@@ -116,15 +117,14 @@ pub fn rollout<'py>(
     Ok(((PyArray1::from_vec(py, observed), rows(d)?, rows(df)?, rows(dpp)?, dt), spreads.transpose()?))
 }
 
-/// The scores of each episode's teams, and the step at which each POI was observed, or 0, `[episodes, teams, pois]`.
-type Recorded<'py> = (Scores<'py>, Bound<'py, PyArray2<u32>>);
-
-/// Plays some episodes on the CPU, and writes every step of all teams to the arrays that are given.
+/// Plays some episodes on the CPU, and writes every step of all teams to the arrays that are given. Returns the scores of
+/// each episode's teams.
 ///
 /// The arrays are positions and headings `[teams, steps + 1, agents, 2]`, speeds `[teams, steps + 1, agents]`, inputs
 /// `[teams, steps, leaders, 8]`, outputs and actions `[teams, steps, leaders, 2]`, all float32, and near
-/// `[teams, steps, pois, words]`, uint32, with one bit per agent within the observation radius of each POI. The teams of
-/// all episodes follow each other. `noise` is a seed and the standard deviations `[leaders, 2]`.
+/// `[teams, steps, pois, agents]`, bool, whether each agent is within the observation radius of each POI. `observed_at`,
+/// `[teams, pois]`, uint32, is the step at which each POI was observed, from 1, or 0. The teams of all episodes follow each
+/// other. `noise` is a seed and the standard deviations `[leaders, 2]`.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "these are all that an episode is")]
 pub fn record<'py>(
@@ -135,35 +135,68 @@ pub fn record<'py>(
     episodes: (usize, usize),
     noise: Option<(u64, PyReadonlyArray2<'py, f32>)>,
     arrays: [Option<PyReadwriteArrayDyn<'py, f32>>; 6],
-    near: Option<PyReadwriteArrayDyn<'py, u32>>,
-) -> PyResult<Recorded<'py>> {
+    near: Option<PyReadwriteArrayDyn<'py, bool>>,
+    observed_at: Option<PyReadwriteArrayDyn<'py, u32>>,
+) -> PyResult<Scores<'py>> {
     let (teams, weights) = weights(config, &policies)?;
     let starts = drawn(starts);
-    let (mut arrays, mut near) = (arrays, near);
+    let (mut arrays, mut near, mut observed_at) = (arrays, near, observed_at);
     let mut slices = [(); 6].map(|()| Default::default());
     for (slice, array) in slices.iter_mut().zip(&mut arrays) {
         *slice = contiguous(array)?;
     }
     let [positions, headings, speeds, inputs, outputs, actions] = slices;
-    let near = contiguous(&mut near)?;
+    let (near, observed_at) = (contiguous(&mut near)?, contiguous(&mut observed_at)?);
+    let world = World::new(&config.0);
+    let sets = if near.is_empty() { 0 } else { near.len() / world.agents() * world.constants.words as usize };
     let deviations: Option<Vec<[f32; OUTPUTS]>> = noise.as_ref().map(|(_, deviations)| {
         let deviations = deviations.as_array();
         deviations.rows().into_iter().map(|row| std::array::from_fn(|output| row[output])).collect()
     });
     let noise = noise.as_ref().zip(deviations.as_deref());
     let noise = noise.map(|(&(seed, _), deviations)| ActionNoise { seed, deviations });
-    let arrays = StepArrays { positions, headings, speeds, inputs, outputs, actions, near };
-    let recorded = workers::aside(py, || {
-        front::record(&config.0, teams, weights, &starts, episodes.0..episodes.1, noise, arrays).raise()
+    let scores = workers::aside(py, || {
+        let mut sets = vec![0; sets];
+        let near_sets = &mut sets[..];
+        let arrays = StepArrays { positions, headings, speeds, inputs, outputs, actions, near: near_sets, observed_at };
+        let scores = front::record(&config.0, teams, weights, &starts, episodes.0..episodes.1, noise, arrays);
+        write_members(&sets, world.agents(), near);
+        scores.raise()
     })?;
-    let front::Recorded { observed, credits, observed_at, .. } = recorded;
-    let shape = [observed.len(), config.0.learners()];
-    let scores = |index: usize| PyArray1::from_iter(py, credits.iter().map(|credits| credits[index])).reshape(shape);
-    let timed = config.0.learning.fitness == Fitness::Dt;
-    let dt = timed.then(|| scores(3)).transpose()?;
-    let counts = PyArray1::from_iter(py, observed.iter().map(|&observed| f64::from(observed)));
-    let at = PyArray1::from_vec(py, observed_at).reshape([observed.len(), config.0.world.pois.len()])?;
-    Ok(((counts, scores(0)?, scores(1)?, scores(2)?, dt), at))
+    let (leaders, fitnesses) = (world.leaders(), evaluate::scores_beside(config.0.learning.fitness));
+    let rows = |index: usize| {
+        let teams = scores.iter().flat_map(|episode| episode.scores.chunks_exact(fitnesses.len() * leaders));
+        let rows: Vec<f32> = teams.flat_map(|scores| &scores[index * leaders..][..leaders]).copied().collect();
+        let shape = [rows.len() / leaders, leaders];
+        PyArray1::from_vec(py, rows).reshape(shape)
+    };
+    let observed: Vec<f64> =
+        scores.iter().flat_map(|episode| &episode.observed).map(|&observed| observed.into()).collect();
+    let dt = (fitnesses.len() > 3).then(|| rows(3)).transpose()?;
+    Ok((PyArray1::from_vec(py, observed), rows(0)?, rows(1)?, rows(2)?, dt))
+}
+
+/// The bits of each byte, lowest first.
+const BITS: [[bool; 8]; 256] = {
+    let (mut table, mut place) = ([[false; 8]; 256], 0);
+    while place < 256 * 8 {
+        table[place / 8][place % 8] = (place / 8) >> (place % 8) & 1 == 1;
+        place += 1;
+    }
+    table
+};
+
+/// Writes sets of agents, one bit per agent in whole words, as one bool per agent.
+pub fn write_members(sets: &[u32], agents: usize, members: &mut [bool]) {
+    /// Minimum number of sets per task.
+    const LEAST: usize = 4096;
+    let sets = sets.par_chunks(agents.div_ceil(32)).with_min_len(LEAST);
+    members.par_chunks_mut(agents).zip(sets).for_each(|(members, set)| {
+        let bytes = set.iter().flat_map(|word| word.to_le_bytes());
+        for (members, byte) in members.chunks_mut(8).zip(bytes) {
+            members.copy_from_slice(&BITS[usize::from(byte)][..members.len()]);
+        }
+    });
 }
 
 /// Returns the elements of an array, or none.

@@ -19,6 +19,7 @@ use pyo3::types::PyBytes;
 
 use crate::config::Config;
 use crate::errors::Raise;
+use crate::play::write_members;
 use crate::workers;
 
 type States<'py> = (Bound<'py, PyArray3<f32>>, Bound<'py, PyArray3<f32>>, Bound<'py, PyArray2<f32>>);
@@ -156,12 +157,17 @@ impl Stepper {
         Ok(())
     }
 
-    /// Agents within the observation radius of each POI, one bit per agent, `[teams, pois, words]`.
+    /// Whether each agent is within the observation radius of each POI, `[teams, pois, agents]`.
     #[getter]
-    fn near<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<u32>>> {
-        let stepper = self.stepper()?;
-        let words = stepper.world().constants.words as usize;
-        copied(py, stepper.near(), &[stepper.teams(), stepper.world().pois.len(), words])
+    fn near<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<bool>>> {
+        let (shape, members) = workers::aside(py, || {
+            let stepper = self.stepper()?;
+            let shape = [stepper.teams(), stepper.world().pois.len(), stepper.world().agents()];
+            let mut members = vec![false; shape.iter().product()];
+            write_members(stepper.near(), shape[2], &mut members);
+            PyResult::Ok((shape, members))
+        })?;
+        PyArray1::from_vec(py, members).reshape(&shape[..])
     }
 
     /// POIs observed since the start, `[teams, pois]`.

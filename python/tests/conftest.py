@@ -76,5 +76,8 @@ def random_config(seed: int) -> flotilla.Config:
     hidden = [int(units) for units in rng.integers(1, 12, rng.integers(0, 3))]
     policy = {"hidden": hidden, "actions": str(rng.choice(["direct", "behaviours"]))}
     first = min(2, learning["generations"])
+    if learning["sharing"] == "none":
+        learning["partners"] = int(rng.integers(1, 4))
+        learning["leniency"] = str(rng.choice(["mean", "max"]))
     stages = [{"from": first, "set": {"world.coupling": 1}}] if rng.random() < 0.3 else []
     return flotilla.Config(world=world, learning=learning, policy=policy, stages=stages)

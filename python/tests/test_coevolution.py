@@ -39,6 +39,35 @@ def test_what_is_asked_is_what_is_played(config):
     assert coevolution.run.digest == train(config, seed=3).digest
 
 
+@pytest.mark.parametrize("episodes", [1, 2])
+@pytest.mark.parametrize("leniency", ["mean", "max"])
+def test_policies_play_with_several_partners(config, leniency, episodes):
+    learning = {"partners": 3, "leniency": leniency, "episodes_per_team": episodes, "start_jitter": 1.0, "fitness": "D++"}
+    config = config.replace(learning=learning)
+    coevolution = Coevolution(config, seed=3)
+    asked, played = coevolution.ask(), coevolution.play()
+    # Each policy plays once per round, with others every time.
+    rounds = asked.teams.reshape(2, 3, 20, 4)
+    assert np.array_equal(np.sort(rounds, axis=2), np.broadcast_to(np.arange(20)[:, None], rounds.shape))
+    assert not np.array_equal(rounds[:, 0], rounds[:, 1]) and not np.array_equal(rounds[:, 1], rounds[:, 2])
+    assert played.g.shape == (2, 60) and played.fitness.shape == (2, 60, 4)
+    # The champion has the best mean or the best single score.
+    told = np.random.default_rng(1).random(played.fitness.shape).astype(np.float32)
+    other = pickle.loads(pickle.dumps(coevolution))
+    other.tell(told)
+    for trial in range(2):
+        for leader in range(4):
+            scores = np.empty((3, 20))
+            for number, teams in enumerate(rounds[trial]):
+                scores[number, teams[:, leader]] = told[trial].reshape(3, 20, 4)[number, :, leader]
+            worth = scores.mean(0) if leniency == "mean" else scores.max(0)
+            assert np.array_equal(other.best[trial, leader], asked.policies[trial, leader, worth.argmax()])
+    while not coevolution.done:
+        coevolution.tell(coevolution.play().fitness)
+        coevolution = pickle.loads(pickle.dumps(coevolution))
+    assert coevolution.run.digest == train(config, seed=3).digest
+
+
 def test_another_fitness_gives_another_run(config):
     coevolution = Coevolution(config, seed=3)
     while not coevolution.done:

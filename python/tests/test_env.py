@@ -1,4 +1,5 @@
 import copy
+import os
 import pickle
 import threading
 import warnings
@@ -178,37 +179,108 @@ def test_without_a_seed_workers_differ():
     assert not np.array_equal(VectorEnv(config, 4).reset()[0], VectorEnv(config, 4).reset()[0])
 
 
-WRAPPERS = [
-    ("ClipReward", {"min_reward": 0.0, "max_reward": 0.5}),
-    ("TransformReward", {"func": lambda reward: reward * 2}),
-    ("NormalizeReward", {}),
-    ("NormalizeObservation", {}),
-    ("FlattenObservation", {}),
-    ("RescaleAction", {"min_action": 0.0, "max_action": 1.0}),
-    ("ClipAction", {}),
-    ("TransformAction", {"func": lambda action: action}),
-    ("TransformObservation", {"func": lambda observation: observation}),
-    ("DtypeObservation", {"dtype": np.float64}),
-    ("RecordEpisodeStatistics", {}),
-    ("DictInfoToList", {}),
-]
+def identity(value):
+    return value
+
+
+WRAPPERS = {
+    "ClipReward": {"min_reward": 0.0, "max_reward": 0.5},
+    "TransformReward": {"func": lambda reward: reward * 2},
+    "VectorizeTransformReward": {"wrapper": "TransformReward", "func": identity},
+    "NormalizeReward": {},
+    "NormalizeObservation": {},
+    "FlattenObservation": {},
+    "ReshapeObservation": {},
+    "RescaleAction": {"min_action": 0.0, "max_action": 1.0},
+    "ClipAction": {},
+    "TransformAction": {"func": identity},
+    "VectorizeTransformAction": {"wrapper": "ClipAction"},
+    "TransformObservation": {"func": identity},
+    "VectorizeTransformObservation": {"wrapper": "FlattenObservation"},
+    "DtypeObservation": {"dtype": np.float64},
+    "RecordEpisodeStatistics": {},
+    "DictInfoToList": {},
+    "ArrayConversion": {},
+    "NumpyToTorch": {},
+    "RecordVideo": {"video_folder": "films", "video_length": 5, "disable_logger": True},
+    "HumanRendering": {},
+}
+# What else a wrapper needs, which only the long form of the tests installs.
+NEEDS = {"NumpyToTorch": "torch", "RecordVideo": "moviepy", "HumanRendering": "pygame"}
+# Wrappers for spaces that these environments do not have.
+OTHERS = {
+    "FilterObservation": "observations are dictionaries",
+    "GrayscaleObservation": "observations are pictures",
+    "ResizeObservation": "observations are pictures",
+    "RescaleObservation": "observations are bounded",
+    "JaxToNumpy": "the environment returns JAX arrays",
+    "JaxToTorch": "the environment returns JAX arrays",
+}
+
+
+def test_no_vector_wrapper_is_left_out():
+    wrappers = pytest.importorskip("gymnasium.wrappers.vector", reason="gymnasium is not installed")
+    assert set(wrappers.__all__) <= {*WRAPPERS, *OTHERS}
 
 
 @pytest.mark.parametrize("layout", ["team", "flat"])
-@pytest.mark.parametrize("name, words", WRAPPERS, ids=[name for name, _ in WRAPPERS])
-def test_gymnasium_s_vector_wrappers_take_it(layout, name, words):
+@pytest.mark.parametrize("name", WRAPPERS)
+def test_gymnasium_s_vector_wrappers_take_it(layout, name, monkeypatch):
     gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed")
-    inner = VectorEnv(Config.paper(), 5, layout=layout, autoreset="next_step")
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name], reason="by request: FLOTILLA_LONG=1")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    words = dict(WRAPPERS[name])
+    if "wrapper" in words:
+        words["wrapper"] = getattr(gymnasium.wrappers, words["wrapper"])
+    if name == "ReshapeObservation":
+        words["shape"] = (8, 4) if layout == "team" else (2, 4)
+    if name == "ArrayConversion":
+        pytest.importorskip("array_api_compat", reason="array-api-compat is not installed")
+        words = {"env_xp": np, "target_xp": pytest.importorskip("jax.numpy", reason="jax is not installed")}
+    pictured = "rgb_array" if name in ("RecordVideo", "HumanRendering") else None
+    inner = VectorEnv(Config.paper(), 5, layout=layout, autoreset="next_step", render_mode=pictured)
     assert isinstance(inner, gymnasium.vector.VectorEnv)
     env = getattr(gymnasium.wrappers.vector, name)(inner, **words)
     observations, _ = env.reset(seed=1)
     for _ in range(30):
-        observations, rewards, terminated, truncated, infos = env.step(env.action_space.sample())
+        actions = env.action_space.sample()
+        if name == "NumpyToTorch":
+            actions = pytest.importorskip("torch").from_numpy(actions)
+        observations, rewards, terminated, truncated, infos = env.step(actions)
         assert len(observations) == env.num_envs
         assert rewards.shape == terminated.shape == truncated.shape == (env.num_envs,)
         if name == "RecordEpisodeStatistics" and truncated.all():
             assert (infos["episode"]["l"] == 25).all() and (infos["episode"]["r"] <= 1).all()
+    if name == "RecordVideo":
+        assert [film.endswith(".mp4") for film in os.listdir("films")] == [True]
     env.close()
+
+
+@pytest.mark.filterwarnings("error", "ignore:.*maximum value is infinity")
+@pytest.mark.parametrize("words", [{}, {"horizon": "terminated"}, {"jitter": 2.0, "reward": "Df", "time_input": True}])
+def test_gymnasium_s_checker_finds_nothing(words):
+    checker = pytest.importorskip("gymnasium.utils.env_checker", reason="gymnasium is not installed")
+    # A picture is asked for before the first reset, too.
+    checker.check_env(flotilla.team_env(Config.paper(), render_mode="rgb_array", **words), skip_render_check=True)
+
+
+@pytest.mark.parametrize("reward", ["G", "Df"])
+def test_one_team_is_the_first_of_many_for_gymnasium(reward):
+    pytest.importorskip("gymnasium", reason="gymnasium is not installed")
+    words = {"reward": reward, "jitter": 2.0, "horizon": "terminated", "time_input": True}
+    one = flotilla.team_env(Config.paper(), **words)
+    many = VectorEnv(Config.paper(), 1, layout="team", autoreset="disabled", **words)
+    rng = np.random.default_rng(1)
+    for seed in (3, None):
+        assert np.array_equal(one.reset(seed=seed)[0], many.reset(seed=seed)[0][0])
+        ended = False
+        while not ended:
+            action = rng.uniform(-1, 1, (4, 2)).astype(np.float32)
+            seen, reward, ended, truncated, infos = one.step(action)
+            expected = many.step(action[None])
+            assert np.array_equal(seen, expected[0][0]) and (reward, ended, truncated) == tuple(e[0] for e in expected[1:4])
+            assert infos == ({"g": many.observed.mean()} if ended else {})
 
 
 def test_what_is_handed_out_may_be_written_to():
@@ -370,9 +442,12 @@ def test_metadata_and_spaces_are_gymnasium_s():
 def test_a_picture_is_drawn():
     env = VectorEnv(Config.paper(), 2, render_mode="rgb_array")
     env.reset()
-    first = env.render()
+    first, _ = env.render()
     env.step(np.ones((2, 4, 2), np.float32))
-    second = env.render()
+    second, other = env.render()
+    assert np.array_equal(second, other)
+    flat = VectorEnv(Config.paper(), 2, layout="flat", render_mode="rgb_array")
+    assert [picture.shape for picture in flat.render()] == [(480, 480, 3)] * 8
     assert first.shape == (480, 480, 3) and first.dtype == np.uint8
     assert (first != second).any() and first.std() > 5
     assert VectorEnv(Config.paper(), 2).render() is None
@@ -384,6 +459,10 @@ def test_pettingzoo_s_own_tests_pass():
     jittered = Config.paper().replace(learning={"start_jitter": 2.0})
     for config in (Config.paper(), jittered):
         tests.parallel_seed_test(lambda: flotilla.parallel_env(config))
+        # As one agent after the other.
+        convert = pytest.importorskip("pettingzoo.utils.conversions").parallel_to_aec
+        tests.api_test(convert(flotilla.parallel_env(config)), num_cycles=200)
+        tests.seed_test(lambda: convert(flotilla.parallel_env(config)), num_cycles=100)
     # Renders as it says.
     env = flotilla.parallel_env(Config.paper(), render_mode="rgb_array")
     env.reset(seed=1)

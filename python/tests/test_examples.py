@@ -32,7 +32,6 @@ def test_there_are_notebooks():
     "name, needs",
     [
         ("leaders_by_es", "numpy"),
-        ("cma_shared", "cma"),
         # These bring hundreds of megabytes: by request.
         pytest.param("leaders_by_evosax", "evosax", marks=long),
         pytest.param("ppo", "torch", marks=long),
@@ -43,11 +42,3 @@ def test_examples_run(name, needs):
     words = [sys.executable, ROOT / f"python/examples/{name}.py", "2"]
     said = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     assert re.search(r"^(generation|iteration)   1: G", said, re.M), said
-
-
-def test_sb3_s_ppo_learns():
-    pytest.importorskip("stable_baselines3", reason="by request: FLOTILLA_LONG=1")
-    words = [sys.executable, ROOT / "python/examples/ppo_sb3.py", "400"]
-    said = subprocess.run(words, capture_output=True, text=True, check=True, timeout=900).stdout
-    before, after = map(float, re.findall(r"G (\d\.\d+) before, (\d\.\d+) after", said)[0])
-    assert after > before, said

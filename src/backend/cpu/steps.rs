@@ -5,8 +5,8 @@ use fearless_simd::{Simd, dispatch, f32x4, prelude::*};
 use super::batch::{WorldBatch, world_batches};
 use super::episode::EpisodeBlock;
 use super::transpose::transpose4;
-use super::{BackendError, Cpu, Group};
-use crate::credit::Episode;
+use super::{BackendError, Cpu, Group, GroupScores, ScoreTable};
+use crate::credit;
 use crate::evolve::{self, Key};
 use crate::kernels::{clamp_to, splat};
 use crate::parallel::*;
@@ -32,14 +32,17 @@ pub struct StepArrays<'a> {
     pub actions: &'a mut [f32],
     /// The agents within the observation radius of each POI, one bit per agent, `[teams][steps][pois][words]`.
     pub near: &'a mut [u32],
+    /// The step, from 1, at which each POI was observed, or 0, `[teams][pois]`.
+    pub observed_at: &'a mut [u32],
 }
 
 /// Numbers that one team has in each of [`StepArrays`], in their order.
-pub fn step_sizes(world: &World) -> [usize; 7] {
+pub fn step_sizes(world: &World) -> [usize; 8] {
     let (agents, steps) = (world.agents(), world.steps());
     let leaders = steps * world.leaders();
     let states = (steps + 1) * agents;
-    [states * 2, states * 2, states, leaders * INPUTS, leaders * OUTPUTS, leaders * OUTPUTS, world.set_words()]
+    let (inputs, outputs) = (leaders * INPUTS, leaders * OUTPUTS);
+    [states * 2, states * 2, states, inputs, outputs, outputs, world.set_words(), world.pois.len()]
 }
 
 /// Normal noise on the actions of leaders.
@@ -55,22 +58,22 @@ pub struct Noise<'a> {
 
 impl<'a> StepArrays<'a> {
     /// Returns the index of the first array that is neither empty nor as long as needed.
-    fn misfit(&self, sizes: [usize; 7], teams: usize) -> Option<usize> {
-        let StepArrays { positions, headings, speeds, inputs, outputs, actions, near } = self;
+    fn misfit(&self, sizes: [usize; 8], teams: usize) -> Option<usize> {
+        let StepArrays { positions, headings, speeds, inputs, outputs, actions, near, observed_at } = self;
         let found = [positions, headings, speeds, inputs, outputs, actions].map(|array| array.len());
-        let found = found.into_iter().chain([near.len()]);
+        let found = found.into_iter().chain([near.len(), observed_at.len()]);
         found.zip(sizes).position(|(found, size)| found != 0 && found != size * teams)
     }
 
     /// Splits off the first teams.
-    fn split(&mut self, sizes: [usize; 7], teams: usize) -> StepArrays<'a> {
+    fn split(&mut self, sizes: [usize; 8], teams: usize) -> StepArrays<'a> {
         fn take<'a, T>(slice: &mut &'a mut [T], count: usize) -> &'a mut [T] {
             let count = count.min(slice.len());
             let (taken, rest) = std::mem::take(slice).split_at_mut(count);
             *slice = rest;
             taken
         }
-        let [positions, headings, speeds, inputs, outputs, actions, near] = sizes.map(|size| size * teams);
+        let [positions, headings, speeds, inputs, outputs, actions, near, observed_at] = sizes.map(|size| size * teams);
         StepArrays {
             positions: take(&mut self.positions, positions),
             headings: take(&mut self.headings, headings),
@@ -79,15 +82,13 @@ impl<'a> StepArrays<'a> {
             outputs: take(&mut self.outputs, outputs),
             actions: take(&mut self.actions, actions),
             near: take(&mut self.near, near),
+            observed_at: take(&mut self.observed_at, observed_at),
         }
     }
 }
 
-/// Called once for each team with its group, its index there, and its record; from any thread, in any order.
-pub type Visit<'a> = dyn Fn(usize, usize, &Episode<'_>) + Sync + 'a;
-
 impl Cpu {
-    /// Plays every team of some groups of one world, writes their steps, and calls `visit` for every team.
+    /// Plays every team of some groups of one world, writes their steps, and scores them.
     ///
     /// Without noise, the states are those of [`Backend::trace`](crate::backend::Backend::trace).
     ///
@@ -98,8 +99,7 @@ impl Cpu {
         groups: &[Group<'_>],
         noise: Option<Noise<'_>>,
         arrays: StepArrays<'_>,
-        visit: &Visit<'_>,
-    ) -> Result<(), BackendError> {
+    ) -> Result<Vec<GroupScores>, BackendError> {
         groups.iter().try_for_each(|group| group.check().and(group.weights.on_host().map(drop)))?;
         let batches = world_batches(groups);
         let [run] = &batches[..] else {
@@ -111,9 +111,9 @@ impl Cpu {
         if noise.is_some_and(|noise| noise.deviations.len() != run.world.leaders()) {
             return Err(BackendError::InvalidInput("noise is of every leader".into()));
         }
-        let level = self.level;
-        dispatch!(level, simd => record(simd, run, noise, arrays, visit));
-        Ok(())
+        let (level, scores) = (self.level, ScoreTable::new(groups));
+        dispatch!(level, simd => record(simd, run, noise, arrays, &scores));
+        Ok(scores.finish())
     }
 }
 
@@ -122,7 +122,7 @@ fn record<S: Simd>(
     run: &WorldBatch<'_>,
     noise: Option<Noise<'_>>,
     mut arrays: StepArrays<'_>,
-    visit: &Visit<'_>,
+    scores: &ScoreTable<'_>,
 ) {
     let (width, sizes) = (S::f32s::LEN, step_sizes(run.world));
     let part = |first: usize| {
@@ -138,9 +138,14 @@ fn record<S: Simd>(
                 #[inline(always)]
                 || play(simd, &mut whole, run, noise, *first, *teams, arrays),
             );
+            let mut observed_at = arrays.observed_at.chunks_exact_mut(run.world.pois.len());
             for lane in 0..*teams {
-                let (group, team) = run.locate(*first + lane);
-                visit(run.first + group, team, &whole.episode(lane));
+                let ((group, team), episode) = (run.locate(*first + lane), whole.episode(lane));
+                scores.score(run.first + group, team, &episode);
+                if let Some(to) = observed_at.next() {
+                    let steps = credit::observed_at(episode.sets, run.world);
+                    to.iter_mut().zip(steps).for_each(|(to, step)| *to = step.unwrap_or(0) as u32);
+                }
             }
         }
     });
