@@ -32,7 +32,7 @@ pub trait Storage {
 }
 
 /// Writes the content of a file.
-pub(crate) type Content<'a> = &'a mut dyn FnMut(&mut dyn Write) -> io::Result<()>;
+pub type Content<'a> = &'a mut dyn FnMut(&mut dyn Write) -> io::Result<()>;
 
 impl Storage for Folder {
     fn put(&mut self, name: &str, content: Content<'_>) -> Result<(), RecordError> {
