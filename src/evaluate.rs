@@ -21,7 +21,7 @@ pub(crate) const SCORES: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp];
 pub const SCORES_AND_DT: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp, Fitness::Dt];
 
 /// Returns what an evaluation computes beside a fitness: Dt only if that is asked for.
-pub(crate) fn scores_beside(fitness: Fitness) -> &'static [Fitness] {
+pub fn scores_beside(fitness: Fitness) -> &'static [Fitness] {
     if fitness == Fitness::Dt { SCORES_AND_DT } else { SCORES }
 }
 

@@ -744,11 +744,11 @@ impl Storage for Files {
 fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     fn without(text: &[u8], names: &[&str]) -> Vec<u8> {
         let mut value: serde_json::Value = serde_json::from_slice(text).unwrap();
-        for object in [&["__metadata__"][..], &[]] {
-            let object = object.iter().fold(Some(&mut value), |value, name| value?.get_mut(name));
-            let object = object.and_then(serde_json::Value::as_object_mut);
-            object.into_iter().for_each(|object| object.retain(|name, _| !names.contains(&&**name)));
-        }
+        let drop = |value: &mut serde_json::Value| {
+            value.as_object_mut().into_iter().for_each(|object| object.retain(|name, _| !names.contains(&&**name)));
+        };
+        drop(&mut value);
+        value.get_mut("__metadata__").into_iter().for_each(drop);
         value.to_string().into_bytes()
     }
     let mut found = BTreeMap::new();
