@@ -593,7 +593,7 @@ def strangers(tab, page, call, downloads):
     tab.calm()
     # A larger population of the same leaders observes more, and no constant action observes anything.
     tab.click("#guide-next")
-    tab.wait("page.state.training.arms.length === 3 && " + DONE, 400)
+    tab.wait(DONE + " && page.state.training.arms.length === 3", 400)
     tab.wait("page.state.training.arms.every(arm => arm.constant === 0)", 60)
     best = tab.evaluate("page.state.training.arms.map(arm => arm.trials.reduce((sum, trial) => sum + trial.at(-1).best, 0))")
     assert best[0] < best[1] < best[2], best
