@@ -79,7 +79,7 @@ class Coevolution:
         backend: str | int = "auto",
     ) -> None:
         if not isinstance(config, Config):
-            raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config")
+            raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config, see Config.load and Config.paper")
         self.config = config if seed is None else config.replace(learning={"seed": seed})
         self._backend = backend_name(backend)
         self._native = _native.Coevolution(self.config._native)
