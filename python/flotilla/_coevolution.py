@@ -79,7 +79,7 @@ class Coevolution:
         backend: str | int = "auto",
     ) -> None:
         if not isinstance(config, Config):
-            raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config")
+            raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config, see Config.load and Config.paper")
         self.config = config if seed is None else config.replace(learning={"seed": seed})
         self._backend = backend_name(backend)
         self._native = _native.Coevolution(self.config._native)
@@ -140,7 +140,7 @@ class Coevolution:
             ValueError: no generation has a fitness yet.
         """
         if self.generation == 0:
-            raise ValueError("there is no best policy before a generation was told")
+            raise ValueError("no generation has a fitness yet, so there is no best policy")
         return self._native.best()
 
     @property
@@ -166,7 +166,7 @@ class Coevolution:
             ValueError: generations are left.
         """
         if not self.done:
-            raise ValueError(f"generation {self.generation} is to be told; a run has results once all were")
+            raise ValueError(f"generation {self.generation} has no fitness yet; a run has results once all generations have one")
         return Run(self._native.finish(), ("cpu", "ask and tell", None), None, None)
 
     def __getstate__(self) -> dict[str, Any]:

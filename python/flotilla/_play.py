@@ -95,7 +95,7 @@ class Rollout:
         scores: dict[str, NDArray[Any] | None] = {"G": self.g, "D": self.d, "Df": self.df, "D++": self.dpp, "Dt": self.dt}
         found = scores.get(fitness)
         if found is None:
-            raise KeyError(fitness)
+            raise KeyError(f"{fitness}: the scores are {', '.join(name for name in scores if scores[name] is not None)}")
         return found
 
     def __repr__(self) -> str:
@@ -113,7 +113,7 @@ FIRST_BLOCK = 4_000_000
 def _checked(config: Any, policies: ArrayLike) -> Floats:
     """Returns policies as an array `[leaders, teams, parameters]`."""
     if not isinstance(config, Config):
-        raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config")
+        raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config, see Config.load and Config.paper")
     return floats("policies", policies, 3)
 
 
@@ -364,7 +364,7 @@ def _layers(config: Config | None, parameters: int) -> list[int]:
     Without a config, the policy has at most one hidden layer, whose width follows from the number of parameters.
     """
     if config is not None and not isinstance(config, Config):
-        raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config")
+        raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config, see Config.load and Config.paper")
     if config is None:
         ins, outs = _native.INPUTS, _native.OUTPUTS
         units = (parameters - outs) // (ins + 1 + outs)

@@ -326,7 +326,7 @@ def train(
         True
     """
     if not isinstance(config, Config):
-        raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config")
+        raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config, see Config.load and Config.paper")
     called = _together(callback)
     if out is None and (resume or force):
         raise ValueError("resume and force are of a run in a folder, say which by out")

@@ -107,7 +107,7 @@ def test_wrong_fitness_changes_nothing(config):
     assert coevolution.generation == 0
     with pytest.raises(ValueError, match="before a generation"):
         coevolution.best
-    with pytest.raises(ValueError, match="is to be told"):
+    with pytest.raises(ValueError, match="has no fitness yet"):
         coevolution.run
     while not coevolution.done:
         coevolution.tell(coevolution.play().fitness)

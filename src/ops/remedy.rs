@@ -165,7 +165,7 @@ pub fn shown(error: &runs::ReadError) -> String {
             format!("; `{command}` makes a run there")
         }
         runs::ReadError::NoFolder(_) => ", which `flotilla train` makes".into(),
-        runs::ReadError::Foreign { .. } => "; `flotilla train CONFIG --out DIR` makes one that has".into(),
+        runs::ReadError::Foreign { .. } => "; `flotilla train CONFIG --out DIR` makes one".into(),
         runs::ReadError::Config { .. } => {
             "\nfind a config that is whole, and repeat the run with `flotilla train CONFIG --out DIR`".into()
         }
