@@ -1,4 +1,4 @@
-"""Use cases of the program as functions. Each returns what the command prints with ``--json``."""
+"""Use cases of the program as functions. Each returns what the command prints with `--json`."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ def program(use_case: str, backend: str = "auto", **request: Any) -> dict[str, A
 def compare(
     runs: Sequence[Run | str | os.PathLike[str]], *, at: str | int | Sequence[str | int] = "last", paired: bool = False
 ) -> dict[str, Any]:
-    """Runs side by side: means, 95 % intervals, and a test of every pair, as ``flotilla compare`` prints them.
+    """Runs side by side: means, 95 % intervals, and a test of every pair, as `flotilla compare` prints them.
 
     Args:
         runs: at least two runs or their directories, or the directory of one sweep.
-        at: generations to compare at: ``[0, 50, "last"]``.
+        at: generations to compare at: `[0, 50, "last"]`.
         paired: compare pair by pair: trials with one seed and number are pairs.
 
     Returns:
-        the object that ``docs/reference/json.md`` describes for ``flotilla compare RUN RUN --json``.
+        the object that `docs/reference/json.md` describes for `flotilla compare RUN RUN --json`.
 
     Raises:
         ValueError: there is nothing to compare.
@@ -72,10 +72,10 @@ def paper(
         seed: 0 if left out.
         resume: continue the paper in the directory.
         force: overwrite it.
-        backend: as of :func:`train`.
+        backend: as of `train`.
 
     Returns:
-        the object that ``docs/reference/json.md`` describes for ``flotilla paper --json``.
+        the object that `docs/reference/json.md` describes for `flotilla paper --json`.
 
     Raises:
         ValueError: a number is not allowed.
@@ -105,7 +105,7 @@ def verify(*, worlds: int | None = None, teams: int | None = None, adapter: str 
         adapter: compare only the adapter with this number or name.
 
     Returns:
-        ``equal``, and ``comparisons``: for every adapter, pass and kernel what was compared and what differs.
+        `equal`, and `comparisons`: for every adapter, pass and kernel what was compared and what differs.
 
     Raises:
         Error: there is no GPU at all.
@@ -116,7 +116,7 @@ def verify(*, worlds: int | None = None, teams: int | None = None, adapter: str 
 
 
 def devices() -> list[dict[str, str | int]]:
-    """The GPUs that drivers offer, each with the number that ``backend`` takes. The CPU is always available and not listed.
+    """The GPUs that drivers offer, each with the number that `backend` takes. The CPU is always available and not listed.
 
     Example:
         >>> all({"index", "name", "driver", "api", "kind"} == set(device) for device in flotilla.devices())

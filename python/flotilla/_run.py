@@ -30,16 +30,16 @@ METRICS = ("best_g", "mean_g", "champion_g")
 
 
 class Run:
-    """The results of training. :func:`train` and :meth:`Run.open` return one.
+    """The results of training. `train` and `Run.open` return one.
 
     Attributes:
         config: the config that was trained. If a callback stopped training, it has fewer generations.
-        metrics: ``best_g``, ``mean_g`` and ``champion_g``, each float64 ``[trials, generations + 1]``, the random start
+        metrics: `best_g`, `mean_g` and `champion_g`, each float64 `[trials, generations + 1]`, the random start
             first: the share of POIs observed, 0 to 1, by each generation's best and mean team, and by the team of every
             population's best policy.
-        policies: one float32 array ``[leaders, policies, parameters]`` per trial, or ``[1, policies, parameters]`` if leaders
-            share a policy (``learning.sharing``). The best policy is first, so that team 0 of a rollout is the champion.
-            These arrays and those of ``metrics`` are read-only: copy them to change them.
+        policies: one float32 array `[leaders, policies, parameters]` per trial, or `[1, policies, parameters]` if leaders
+            share a policy (`learning.sharing`). The best policy is first, so that team 0 of a rollout is the champion.
+            These arrays and those of `metrics` are read-only: copy them to change them.
         digest: a checksum of the results, equal to the command line's for this config and seed.
         backend: the processor that trained it, in words.
         unverified: True if its files were not compared with their digests.
@@ -77,8 +77,8 @@ class Run:
         """Reads a finished run of the command line or of Python.
 
         Args:
-            folder: a run directory that ``flotilla train``, a sweep or :func:`train` wrote.
-            unverified: read files that differ from their digests in ``run.json``, too.
+            folder: a run directory that `flotilla train`, a sweep or `train` wrote.
+            unverified: read files that differ from their digests in `run.json`, too.
 
         Raises:
             Error: the folder holds no run, or one that is not finished, or its files are damaged or not as the run left
@@ -113,14 +113,14 @@ class Run:
         return folder
 
     def save(self, folder: str | os.PathLike[str], force: bool = False) -> None:
-        """Writes the run as ``flotilla train`` does, so that the program reads it, too.
+        """Writes the run as `flotilla train` does, so that the program reads it, too.
 
         Args:
             folder: the directory to create.
             force: overwrite an existing run.
 
         Raises:
-            FileExistsError: there is a run, and ``force`` was not given.
+            FileExistsError: there is a run, and `force` was not given.
             Error: the files cannot be written.
 
         Example:
@@ -141,9 +141,9 @@ class Run:
         _native.save(*arguments)
 
     def to_pandas(self) -> pandas.DataFrame:
-        """The metrics as ``metrics.csv`` has them: one row per trial and generation.
+        """The metrics as `metrics.csv` has them: one row per trial and generation.
 
-        Needs pandas (``pip install flotilla-teams[pandas]``).
+        Needs pandas (`pip install flotilla-teams[pandas]`).
 
         Example:
             >>> run = flotilla.train(flotilla.Config.paper().replace(learning={"generations": 2}))
@@ -166,7 +166,7 @@ class Run:
             trial: from 0.
             generation: None is the last.
             compare: another generation, side by side.
-            backend: as of :func:`train`.
+            backend: as of `train`.
 
         Raises:
             ValueError: there is no such trial or generation.
@@ -289,33 +289,33 @@ def train(
 
     Args:
         config: what to train.
-        seed: replaces the config's ``learning.seed``.
-        out: a directory that keeps the run while it trains, as ``flotilla train CONFIG --out DIR`` does, so that it can be
-            resumed. None trains in memory; :meth:`Run.save` writes it later.
-        resume: continue the run in ``out``, or start it if there is none.
-        force: overwrite the run in ``out``.
-        init: initial policies in place of random ones: a :class:`Run`, a ``policies.safetensors``, or arrays
-            ``[leaders, policies, parameters]``, one for each trial or one for all. Trial i starts from trial i of a run or
-            file. Larger populations are filled with random policies. A run that starts from policies is kept in ``out``,
-            or else in a temporary folder that is removed with the :class:`Run`.
-        backend: where to play, with the same bits: ``"auto"`` (a GPU if it is expected to finish first), ``"cpu"``,
-            ``"gpu"``, or an adapter's number or name.
-        callback: called with every :class:`Generation` once it has played, or several such functions. The training stops
+        seed: replaces the config's `learning.seed`.
+        out: a directory that keeps the run while it trains, as `flotilla train CONFIG --out DIR` does, so that it can be
+            resumed. None trains in memory; `Run.save` writes it later.
+        resume: continue the run in `out`, or start it if there is none.
+        force: overwrite the run in `out`.
+        init: initial policies in place of random ones: a `Run`, a `policies.safetensors`, or arrays
+            `[leaders, policies, parameters]`, one for each trial or one for all. Trial i starts from trial i of a run or
+            file. Larger populations are filled with random policies. A run that starts from policies is kept in `out`,
+            or else in a temporary folder that is removed with the `Run`.
+        backend: where to play, with the same bits: `"auto"` (a GPU if it is expected to finish first), `"cpu"`,
+            `"gpu"`, or an adapter's number or name.
+        callback: called with every `Generation` once it has played, or several such functions. The training stops
             if one returns True. The results are then those of a config with that many generations. A callback with a method
-            ``close`` is closed at the end, however the training ends.
-        champions: give every generation its ``champions``. The populations then stay in the host's memory, and the run is
+            `close` is closed at the end, however the training ends.
+        champions: give every generation its `champions`. The populations then stay in the host's memory, and the run is
             trained in memory.
         progress: draw a progress bar with tqdm. None does so in notebooks and terminals if tqdm is installed.
 
     Returns:
-        the :class:`Run`.
+        the `Run`.
 
     Raises:
         ConfigError: the config or the seed is wrong.
-        FileExistsError: ``out`` holds a run, and neither ``resume`` nor ``force`` was given.
+        FileExistsError: `out` holds a run, and neither `resume` nor `force` was given.
         MemoryError: there is not enough memory for the populations.
-        Error: a folder or ``init`` cannot be used, or the backend fails.
-        KeyboardInterrupt: Ctrl-C. A run in a directory is saved first, and ``resume`` continues it.
+        Error: a folder or `init` cannot be used, or the backend fails.
+        KeyboardInterrupt: Ctrl-C. A run in a directory is saved first, and `resume` continues it.
 
     Example:
         >>> config = flotilla.Config.paper().replace(learning={"trials": 2, "generations": 50})

@@ -37,11 +37,11 @@ class Point(NamedTuple):
 
 
 class Sweep:
-    """The results of a sweep; ``len()``, iteration and ``sweep[0]`` are over its points.
+    """The results of a sweep; `len()`, iteration and `sweep[0]` are over its points.
 
     Attributes:
         axes: the keys that vary.
-        points: every :class:`Point`, in the order of the grid.
+        points: every `Point`, in the order of the grid.
     """
 
     def __init__(self, axes: list[str], points: list[Point]) -> None:
@@ -57,7 +57,7 @@ class Sweep:
         return iter(self.points)
 
     def metric(self, name: str = "best_g") -> NDArray[np.float64]:
-        """A metric of the last generation, float64 ``[points, trials]``, NaN for missing trials."""
+        """A metric of the last generation, float64 `[points, trials]`, NaN for missing trials."""
         rows = [point.run.metrics[name][:, -1] for point in self.points]
         table = np.full((len(rows), max(map(len, rows), default=0)), np.nan)
         for row, values in zip(table, rows):
@@ -97,14 +97,14 @@ def sweep(
     """Trains every point of a grid.
 
     Args:
-        sweep: a :class:`Config`, with a grid; or a sweep file, or its text: a config with a section ``[grid]``.
-        grid: lists of values by dotted keys, for a config: ``{"world.coupling": [1, 3]}``.
-        executor: trains the points: any ``concurrent.futures.Executor``, with processes or with workers of Dask, MPI or
+        sweep: a `Config`, with a grid; or a sweep file, or its text: a config with a section `[grid]`.
+        grid: lists of values by dotted keys, for a config: `{"world.coupling": [1, 3]}`.
+        executor: trains the points: any `concurrent.futures.Executor`, with processes or with workers of Dask, MPI or
             Slurm (submitit). Points are sent as configs, and results return as arrays. If a worker is lost, its points
             are trained again, to the same bits. None trains them in this process, side by side.
-        out: a directory that keeps the sweep, as ``flotilla sweep SWEEP --out DIR`` does. Not with ``executor``.
+        out: a directory that keeps the sweep, as `flotilla sweep SWEEP --out DIR` does. Not with `executor`.
         skip_impossible: leave out points that cannot run.
-        backend: as of :func:`train`.
+        backend: as of `train`.
         progress: called with the number of finished points and of all points.
 
     Raises:

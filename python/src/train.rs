@@ -30,16 +30,16 @@ use crate::workers;
 /// Minimum time between checks for Ctrl-C if there is no callback.
 const PATIENCE: Duration = Duration::from_millis(50);
 
-/// One generation, as callbacks of :func:`train` receive it.
+/// One generation, as callbacks of `train` receive it.
 ///
 /// Attributes:
 ///     generation: its number; 0 is the random start.
 ///     last: the number of the last generation.
-///     best_g: G of its best team, float64 ``[trials]``.
+///     best_g: G of its best team, float64 `[trials]`.
 ///     mean_g: mean G of its teams, of the same shape.
 ///     champion_g: G of the champion, the team of every population's best policy, of the same shape.
-///     champions: the policies of the champion, float32 ``[trials, leaders, parameters]``, or
-///         ``[trials, 1, parameters]`` if leaders share a policy. None unless :func:`train` was asked for ``champions``.
+///     champions: the policies of the champion, float32 `[trials, leaders, parameters]`, or
+///         `[trials, 1, parameters]` if leaders share a policy. None unless `train` was asked for `champions`.
 ///
 /// Example:
 ///     >>> seen = []
