@@ -50,7 +50,7 @@ impl Folder {
                 true => RecordError::Shorter { path, there, here },
                 false if before.is_some() => RecordError::Edited { path: self.file(CONFIG) },
                 false => {
-                    let differences = vec![format!("  {} says so, without saying what", self.file(RUN).display())];
+                    let differences = vec![format!("  {} has another digest", self.file(RUN).display())];
                     RecordError::ConfigDiffers { path, differences }
                 }
             })
@@ -76,7 +76,7 @@ impl Folder {
                 Ok(Some(_)) if edited.is_some() => break,
                 Ok(Some(_)) if before.is_some() => format!("{}: it is of another run", path.escaped()),
                 Ok(Some(_)) => {
-                    let differences = vec![format!("  {} says so, without saying what", path.escaped())];
+                    let differences = vec![format!("  {} has another digest", path.escaped())];
                     return Err(RecordError::ConfigDiffers { path: self.path.clone(), differences });
                 }
                 Ok(None) => {

@@ -157,7 +157,7 @@ impl Run {
     /// # Errors
     /// Returns a description of the problem.
     pub fn parse(text: &str) -> Result<Run, String> {
-        serde_json::from_str(text).map_err(|error| format!("it is no record of a run: {error}"))
+        serde_json::from_str(text).map_err(|error| format!("not the record of a run: {error}"))
     }
 
     /// Returns the text of `run.json`.
