@@ -41,7 +41,8 @@ pub struct Args {
 
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { config, run, out, there, init, tensorboard, printed, checkpoints, loss } = args;
-    train::refuse_zip(&config.file.path)?;
+    // Before the config is read: the message names it where it will be.
+    [Some(&config.file.path), out.as_ref()].into_iter().flatten().try_for_each(|path| train::refuse_zip(path))?;
     let (name, start) = (config.name(), there.start());
     let request = Request { config: config.text(checkpoints.list())?, name, out, start, init, tensorboard };
     let mut console = Console::new(&run, loss, printed.quiet);
