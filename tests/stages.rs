@@ -240,30 +240,37 @@ fn a_run_with_several_partners_goes_on() {
 #[test]
 fn evolution_strategies_go_on() {
     let place = tempfile::tempdir().unwrap();
-    let stage = "[[stages]]\nfrom = 3\nset = { learning.search_step = 2.0, world.coupling = 3 }\n";
+    const FAR: &str = "pois = [[10, 12], [20, 13]]\ncoupling = 1\nsteps = 20";
+    let stage = "[[stages]]\nfrom = 3\nset = { learning.search_step = 2.0, world.coupling = 2 }\n";
     for method in ["openai-es", "snes"] {
         let method = format!("population = 9\nmethod = '{method}'\nfitness = 'G'");
-        let config = config(&[&SMALL.replace("population = 8", &method), stage].concat());
+        // Far enough for policies to differ in what they reach.
+        let small = SMALL.replace("pois = [[10, 9], [20, 9]]\ncoupling = 2\nsteps = 9", FAR);
+        let config = config(&[&small.replace("population = 8", &method), stage].concat());
         let whole = place.path().join("whole");
         let expected = train(&config, &whole, None, Start::Force, 99).unwrap().unwrap();
+        let varied = rows(&whole)[1..].iter().filter(|row| row[2] != row[3]).count();
+        assert!(varied > 10, "{method}: all teams tied in all but {varied} rows, so that the mean stayed");
         for until in 1..=7 {
             let path = place.path().join("stopped");
             assert_eq!(train(&config, &path, None, Start::Force, until).unwrap(), None, "{until}");
             assert_eq!(train(&config, &path, None, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
             assert_eq!((rows(&path), bytes(&path)), (rows(&whole), bytes(&whole)), "{until}");
         }
+        let plain = Config { stages: vec![], ..config.clone() };
+        let longer = place.path().join("longer");
+        let expected = train(&plain, &longer, None, Start::Force, 99).unwrap().unwrap();
         for generations in [0, 1, 3, 5] {
             let extended = place.path().join("extended");
-            let mut short = config.clone();
+            let mut short = plain.clone();
             short.learning.generations = generations;
-            short.stages.retain(|stage| stage.from <= generations);
             assert!(train(&short, &extended, None, Start::Force, 99).unwrap().is_some());
             let (mut session, _) =
-                Session::open(vec![(config.clone(), extended.clone())], Start::Resume, &Disk::default()).unwrap();
+                Session::open(vec![(plain.clone(), extended.clone())], Start::Resume, &Disk::default()).unwrap();
             assert_eq!(session.generations(), [generations + 1], "it does not begin again");
             assert!(go_on(&mut session, |_| false).unwrap() == Ended::Done);
             assert_eq!(session.results(0), Some(&expected), "from {generations} on");
-            assert_eq!((rows(&extended), bytes(&extended)), (rows(&whole), bytes(&whole)), "from {generations} on");
+            assert_eq!((rows(&extended), bytes(&extended)), (rows(&longer), bytes(&longer)), "from {generations} on");
         }
         for which in [Which::Best, Which::Champion] {
             let again =
