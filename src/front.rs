@@ -369,7 +369,7 @@ pub fn train_from(
         rows.extend(played);
     }
     let policies = trainer.policies(0);
-    let ending = trainer.ends(&[0]).first().map(|(_, end)| Ending::of(end));
+    let ending = trainer.ends(&[0]).first().and_then(|(_, end)| Ending::of(end));
     Ok(Trained::new(config, &rows, policies, ending))
 }
 

@@ -10,7 +10,7 @@ use std::fs;
 use std::path::Path;
 
 use crate::backend::{self, BATCH_BYTES, PACKED_FROM, cpu};
-use crate::config::Config;
+use crate::config::{Config, Method};
 use crate::trainer;
 use crate::world::World;
 
@@ -77,9 +77,14 @@ impl Peaks {
             checkpoint += checkpoint_bytes(config);
             queue += most(&|config, _| teams(config).div_ceil(lanes) * 16);
             block = block.max(most(&|config, world| cpu::block_bytes(world, config.learning.fitness)));
-            order = order.max((policies * size_of::<usize>()) as u64);
+            // With an evolution strategy, utilities come beside the order.
+            let strategy = config.learning.method != Method::Tournament;
+            let ranked = size_of::<usize>() + if strategy { size_of::<f64>() } else { 0 };
+            order = order.max((policies * ranked) as u64);
             populations += trials * config.populations() as u64;
-            held += trials * backend::held_bytes([config.populations(), policies + 1, config.parameters()]);
+            if !strategy {
+                held += trials * backend::held_bytes([config.populations(), policies + 1, config.parameters()]);
+            }
             weights = weights.saturating_add(most(&|config, world| teams(config) * backend::weight_bytes(world)));
             record = record.saturating_add(most(&|config, world| {
                 teams(config).saturating_mul(backend::record_bytes(world, config.learning.fitness))

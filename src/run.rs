@@ -566,8 +566,18 @@ impl Member {
         let (mark, output) = metrics.mark().map_err(failed)?;
         let (init, in_all) = (self.run.init.clone(), self.before + seconds);
         let metrics = ending.take().unwrap_or(mark);
-        let last = finished::last_checkpoint(&self.config, init, in_all, metrics, Ending::of(&end));
-        keeper.save(last, output, since)?;
+        let next = end.generation;
+        match Ending::of(&end) {
+            Some(ending) => {
+                let last = finished::last_checkpoint(&self.config, init, in_all, metrics, ending);
+                keeper.save(last, output, since)?;
+            }
+            None => {
+                let config = config_digest(&self.config);
+                let last = Checkpoint { config, init, seconds: in_all, metrics, snapshot: end };
+                keeper.save_now(&last, &output, since)?;
+            }
+        }
         let path = self.folder.file(POLICIES);
         if path.exists() {
             // The old checkpoints of an extended run need the old policies. The new checkpoint must be complete before
@@ -578,7 +588,7 @@ impl Member {
         let (story, RunSums { run: digest, metrics }) = self.folder.digest(&self.config, policies)?;
         keeper.wait()?;
         self.run.files = Some(FileSums { metrics, policies: checksum });
-        self.write_run(Status::Done, end.generation, seconds, Some(digest.clone()))?;
+        self.write_run(Status::Done, next, seconds, Some(digest.clone()))?;
         self.results = Some(Results { story, digest });
         self.going = None;
         Ok(())

@@ -67,6 +67,9 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             trials: 5,
             elites: Elites::Count(1),
             parents: Parents::All,
+            method: Method::Tournament,
+            search_sigma: 0.3,
+            search_step: 1.0,
             mutation: Mutation::Scaled,
             mutation_probability: 0.15,
             mutation_sigma: 0.1,
@@ -295,13 +298,14 @@ fn configs() -> impl Strategy<Value = Config> {
     let sizes = (teams, 0..=MAX_GENERATIONS, 1..=9usize, (elites, word()), 1..=MAX_EPISODES);
     let mutation = (word(), size_or_zero(1e-6, 1.0), size_or_zero(1e-6, 100.0));
     let mutation = (mutation, 0..=MAX_STEPS, word());
+    let search = (word(), size(1e-6, 100.0), size(1e-6, 100.0));
     let jitters = (size_or_zero(1e-6, 1e4), size_or_zero(1e-6, 1e4));
-    let learning = ((word(), word()), word(), sizes, mutation, jitters, 0..=i64::MAX as u64).prop_map(
+    let learning = ((word(), word()), word(), sizes, (mutation, search), jitters, 0..=i64::MAX as u64).prop_map(
         |(
             (paradigm, sharing),
             fitness,
             ((population, partners, leniency), generations, trials, (part, parents), episodes_per_team),
-            mutation,
+            (mutation, (method, search_sigma, search_step)),
             (start_jitter, poi_jitter),
             seed,
         )| {
@@ -320,6 +324,9 @@ fn configs() -> impl Strategy<Value = Config> {
                     Err(percentage) => Elites::Percentage(percentage),
                 },
                 parents,
+                method,
+                search_sigma,
+                search_step,
                 mutation,
                 mutation_probability,
                 mutation_sigma,

@@ -10,7 +10,7 @@ use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group};
 use flotilla::config::{
-    Actions, Config, Elites, Fitness, Learning, Leniency, Mutation, Paradigm, Parents, Sharing, ValidConfig,
+    Actions, Config, Elites, Fitness, Learning, Leniency, Method, Mutation, Paradigm, Parents, Sharing, ValidConfig,
 };
 use flotilla::credit::Credit;
 use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, UNCHANGED};
@@ -19,7 +19,7 @@ use flotilla::world::{GRID, World};
 use glam::Vec2;
 use proptest::prelude::*;
 
-const PURPOSES: [Purpose; 10] = [
+const PURPOSES: [Purpose; 11] = [
     Purpose::Weights,
     Purpose::Teams,
     Purpose::Starts,
@@ -30,6 +30,7 @@ const PURPOSES: [Purpose; 10] = [
     Purpose::Pois,
     Purpose::HeldOutPois,
     Purpose::ConstantActions,
+    Purpose::Search,
 ];
 const GENERALLY_FORWARD: &str = "generally_forward";
 const STRICTLY_FORWARD: &str = "strictly_forward";
@@ -544,6 +545,21 @@ fn arms() -> Vec<Config> {
             (config.learning.poi_jitter, config.learning.episodes_per_team) = (3.0, 3);
             config.world.coupling = flotilla::config::Coupling::Same(2);
         }),
+        config(GENERALLY_FORWARD, |config| {
+            small(config, 9, 5, 2);
+            (config.learning.method, config.learning.fitness) = (Method::OpenAiEs, Fitness::D);
+            config.world.coupling = flotilla::config::Coupling::Same(2);
+        }),
+        config(CHAOTIC, |config| {
+            small(config, 12, 4, 2);
+            (config.learning.method, config.learning.search_sigma) = (Method::Snes, 0.6);
+            (config.learning.partners, config.learning.episodes_per_team) = (2, 2);
+            (config.learning.start_jitter, config.world.coupling) = (0.5, flotilla::config::Coupling::Same(2));
+        }),
+        config(STRICTLY_FORWARD, |config| {
+            small(config, 10, 0, 1);
+            (config.learning.method, config.learning.sharing) = (Method::Snes, Sharing::Shared);
+        }),
         staged(
             GENERALLY_FORWARD,
             "[learning]
@@ -688,6 +704,8 @@ impl Plain<'_> {
     /// Rows, then the policies best first.
     fn train(mut self) -> (Vec<Row>, Vec<f32>) {
         let Learning { population, generations, elites, parents, .. } = self.config.learning;
+        let parameters = self.world.parameters();
+        let mut search = vec![vec![0.0; 2 * parameters]; self.policies.len()];
         let elites = match elites {
             Elites::Count(count) => count,
             Elites::Percentage(percentage) => ((population as f64 * percentage / 100.0).round() as usize).max(1),
@@ -735,6 +753,18 @@ impl Plain<'_> {
                     order
                 })
                 .collect();
+            // With an evolution strategy the champion is the mean, which joins the policies for an episode.
+            let strategy = evolve::Strategy::of(Level::baseline(), &stage.learning, parameters);
+            let mut ranked = ranked;
+            for (leader, search) in search.iter_mut().enumerate() {
+                if let Some(strategy) = &strategy {
+                    let mut whole = [self.policies[leader].concat(), search.clone()].concat();
+                    strategy.update(Level::baseline(), generation, &fitness[leader], &mut whole);
+                    *search = whole.split_off(population * parameters);
+                    self.policies[leader].push(search[..parameters].to_vec());
+                    ranked[leader].insert(0, population);
+                }
+            }
             // The champion plays along with the next generation, so from the starts of that.
             let champion: Vec<usize> = (0..leaders).map(|leader| ranked[if shared { 0 } else { leader }][0]).collect();
             let (champion, _) = self.play(generation + 1, &stage, &champion);
@@ -747,8 +777,26 @@ impl Plain<'_> {
                 champion_g: champion,
             });
             for (leader, (policies, order)) in self.policies.clone().iter().zip(&ranked).enumerate() {
-                let sorted = order.iter().map(|&policy| policies[policy].clone());
+                let sorted = order.iter().take(population).map(|&policy| policies[policy].clone());
                 self.policies[leader] = sorted.collect();
+                if let Some(strategy) = &strategy {
+                    if generation < generations {
+                        let (mean, sigmas) = search[leader].split_at(parameters);
+                        let (key, mut children) = (self.key(Purpose::Search), vec![0.0; population * parameters]);
+                        let samples = evolve::Samples {
+                            key,
+                            generation,
+                            population: leader,
+                            policies: population,
+                            first: 0,
+                            mean,
+                            sigmas,
+                        };
+                        strategy.sample(Level::baseline(), samples, &mut children, &mut vec![]);
+                        self.policies[leader] = children.chunks(parameters).map(<[f32]>::to_vec).collect();
+                    }
+                    continue;
+                }
                 for slot in if generation < generations { elites..population } else { 0..0 } {
                     let key = self.key(Purpose::Tournament).at(generation, leader, slot);
                     let parent = match parents {

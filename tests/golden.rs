@@ -38,7 +38,7 @@ coupling = 4
 type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Together these cases cover every choice that a config has, and sizes on both sides of every special case.
-const CASES: [Case; 29] = [
+const CASES: [Case; 32] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -216,6 +216,42 @@ const CASES: [Case; 29] = [
             ("world.coupling", "3"),
             ("learning.paradigm", "'all-leaders'"),
             ("learning.fitness", "'D++'"),
+        ],
+    ),
+    (
+        "openai-es",
+        "evolution strategy of OpenAI, an odd population",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.method", "'openai-es'"),
+            ("learning.search_step", "0.3"),
+            ("learning.population", "21"),
+            ("world.coupling", "2"),
+        ],
+    ),
+    (
+        "snes",
+        "separable natural evolution strategies, D++, two partners",
+        CHAOTIC,
+        &[
+            ("learning.method", "'snes'"),
+            ("learning.search_sigma", "0.5"),
+            ("learning.partners", "2"),
+            ("learning.fitness", "'D++'"),
+            ("world.coupling", "3"),
+        ],
+    ),
+    (
+        "shared-openai-es",
+        "evolution strategy of OpenAI, all leaders share a policy, more of the gradient from generation 4 on",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.method", "'openai-es'"),
+            ("learning.search_step", "0.3"),
+            ("learning.sharing", "'all'"),
+            ("learning.fitness", "'G'"),
+            ("world.coupling", "2"),
+            ("stages", "[{from = 4, set = {'learning.search_step' = 1.5}}]"),
         ],
     ),
 ];

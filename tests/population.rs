@@ -16,7 +16,7 @@ use flotilla::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
 use flotilla::backend::{Backend, BackendError, DevicePopulation, Group, GroupScores, HELD_FROM, Trace, Weights};
 use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::{
-    Config, Coupling, Elites, Fitness, Learning, Leniency, Mutation, Paradigm, Parents, Sharing, ValidConfig,
+    Config, Coupling, Elites, Fitness, Learning, Leniency, Method, Mutation, Paradigm, Parents, Sharing, ValidConfig,
 };
 use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use flotilla::record::disk::Disk;
@@ -117,7 +117,15 @@ fn arms() -> Vec<Config> {
     (sixth.learning.trials, sixth.learning.generations, sixth.learning.population) = (2, 4, 14);
     (sixth.learning.partners, sixth.learning.leniency) = (3, Leniency::Max);
     (sixth.learning.start_jitter, sixth.learning.episodes_per_team) = (0.5, 2);
-    vec![first, second, third, fourth, fifth, sixth]
+    // Evolution strategies sample on the host.
+    let mut seventh = support::layout("generally_forward");
+    (seventh.learning.trials, seventh.learning.generations, seventh.learning.population) = (2, 5, 15);
+    (seventh.learning.method, seventh.world.coupling) = (Method::OpenAiEs, Coupling::Same(1));
+    let mut eighth = support::layout("strictly_forward");
+    (eighth.learning.trials, eighth.learning.generations, eighth.learning.population) = (1, 4, 12);
+    (eighth.learning.method, eighth.learning.sharing) = (Method::Snes, Sharing::Shared);
+    eighth.world.coupling = Coupling::Same(1);
+    vec![first, second, third, fourth, fifth, sixth, seventh, eighth]
 }
 
 /// The result of a trainer of [`arms`], and its snapshot before each generation.

@@ -204,6 +204,9 @@ fn keys_at_their_defaults_leave_a_configs_digest_as_it_was() {
         ("learning.parents", "'elites'"),
         ("learning.partners", "2"),
         ("learning.leniency", "'max'"),
+        ("learning.method", "'snes'"),
+        ("learning.search_sigma", "0.5"),
+        ("learning.search_step", "0.5"),
     ] {
         let coupling = Override { key: "world.coupling".into(), text: "1".into(), name: "coupling".into() };
         let change = Override { key: key.into(), text: value.into(), name: key.into() };
@@ -211,5 +214,5 @@ fn keys_at_their_defaults_leave_a_configs_digest_as_it_was() {
     }
     digests.sort();
     digests.dedup();
-    assert_eq!(digests.len(), 10, "each key has a say");
+    assert_eq!(digests.len(), 13, "each key has a say");
 }

@@ -235,6 +235,61 @@ fn a_run_with_several_partners_goes_on() {
     assert!(team(2).is_ok() && team(3).is_err());
 }
 
+/// An evolution strategy resumes from its mean and standard deviations to the same bits, also beyond the end of a shorter
+/// run, and through stages that change its step.
+#[test]
+fn evolution_strategies_go_on() {
+    let place = tempfile::tempdir().unwrap();
+    const FAR: &str = "pois = [[10, 12], [20, 13]]\ncoupling = 1\nsteps = 20";
+    let stage = "[[stages]]\nfrom = 3\nset = { learning.search_step = 2.0, world.coupling = 2 }\n";
+    for method in ["openai-es", "snes"] {
+        let method = format!("population = 9\nmethod = '{method}'\nfitness = 'G'");
+        // Far enough for policies to differ in what they reach.
+        let small = SMALL.replace("pois = [[10, 9], [20, 9]]\ncoupling = 2\nsteps = 9", FAR);
+        let config = config(&[&small.replace("population = 8", &method), stage].concat());
+        let whole = place.path().join("whole");
+        let expected = train(&config, &whole, None, Start::Force, 99).unwrap().unwrap();
+        let varied = rows(&whole)[1..].iter().filter(|row| row[2] != row[3]).count();
+        assert!(varied > 10, "{method}: all teams tied in all but {varied} rows, so that the mean stayed");
+        for until in 1..=7 {
+            let path = place.path().join("stopped");
+            assert_eq!(train(&config, &path, None, Start::Force, until).unwrap(), None, "{until}");
+            assert_eq!(train(&config, &path, None, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
+            assert_eq!((rows(&path), bytes(&path)), (rows(&whole), bytes(&whole)), "{until}");
+        }
+        let plain = Config { stages: vec![], ..config.clone() };
+        let longer = place.path().join("longer");
+        let expected = train(&plain, &longer, None, Start::Force, 99).unwrap().unwrap();
+        for generations in [0, 1, 3, 5] {
+            let extended = place.path().join("extended");
+            let mut short = plain.clone();
+            short.learning.generations = generations;
+            assert!(train(&short, &extended, None, Start::Force, 99).unwrap().is_some());
+            let (mut session, _) =
+                Session::open(vec![(plain.clone(), extended.clone())], Start::Resume, &Disk::default()).unwrap();
+            assert_eq!(session.generations(), [generations + 1], "it does not begin again");
+            assert!(go_on(&mut session, |_| false).unwrap() == Ended::Done);
+            assert_eq!(session.results(0), Some(&expected), "from {generations} on");
+            assert_eq!((rows(&extended), bytes(&extended)), (rows(&longer), bytes(&longer)), "from {generations} on");
+        }
+        for which in [Which::Best, Which::Champion] {
+            let again =
+                replay(&whole, 1, &[0, 2, 3, 6], which, Verification::Required, &mut Cpu::default(), &mut |_| true);
+            assert_eq!(again.unwrap_or_else(|error| panic!("{which:?}: {error}")).len(), 4);
+        }
+        // What the search starts from is the best of the given policies.
+        let init = || Some(read_init(&whole.join(POLICIES), &config).unwrap());
+        let [warm, again] = ["warm", "again"].map(|name| place.path().join(name));
+        train(&config, &warm, init(), Start::Force, 99).unwrap();
+        train(&config, &again, init(), Start::Force, 2).unwrap();
+        train(&config, &again, init(), Start::Resume, 99).unwrap();
+        assert_eq!((rows(&again), bytes(&again)), (rows(&warm), bytes(&warm)));
+        assert!(bytes(&warm) != bytes(&whole));
+        fs::remove_dir_all(place.path()).unwrap();
+        fs::create_dir(place.path()).unwrap();
+    }
+}
+
 /// The populations after the last generation are bred as its stage says.
 #[test]
 fn a_finished_run_is_extended_from_the_stage_that_it_ended_in() {

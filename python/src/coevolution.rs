@@ -87,7 +87,7 @@ impl Coevolution {
         let mut inner = self.lock()?;
         let config = inner.config().clone();
         let (leaders, count) = (inner.world().0.leaders(), inner.world().1);
-        let (populations, slots) = (config.populations(), config.learning.population + 1);
+        let (populations, slots) = (config.populations(), config.learning.slots());
         let asked = inner.ask().raise()?;
         let trials = asked.len();
         let (mut weights, mut teams, mut starts) = (Vec::new(), Vec::new(), Vec::new());

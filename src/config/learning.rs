@@ -45,6 +45,13 @@ section! {
         /// which policies the parents of a generation are drawn from: by binary tournaments of the whole population, or
         /// uniformly from its elites (truncation selection)
         parents: Parents = "", "4.3, Alg. 1",
+        /// how a generation follows from the one before: by elites, tournaments and mutation, or by an evolution strategy,
+        /// which samples policies around a mean policy: that of OpenAI, or separable natural evolution strategies
+        method: Method = "", "4.3, Alg. 1",
+        /// for evolution strategies: standard deviation of the samples around the mean; "snes" adapts it from there
+        search_sigma: f64 = "", "",
+        /// for "openai-es": α, how far the mean moves along the estimated gradient
+        search_step: f64 = "", "",
         /// what a mutated weight w gains: w·N(0, σ) if scaled, N(0, σ) if additive
         mutation: Mutation = "", "2.4, 4.3",
         /// probability that a weight of a new policy mutates
@@ -124,6 +131,18 @@ config_enum! {
     }
 }
 
+config_enum! {
+    /// How a generation follows from the one before.
+    Method {
+        /// Elites survive, and the others are mutated winners of tournaments, see [`Parents`].
+        Tournament = "tournament",
+        /// The evolution strategy of OpenAI: mirrored samples, centred ranks, one standard deviation.
+        OpenAiEs = "openai-es",
+        /// Separable natural evolution strategies: a standard deviation per weight, which adapts.
+        Snes = "snes",
+    }
+}
+
 /// The number of policies in a population that survive unchanged.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Elites {
@@ -188,6 +207,12 @@ impl Paradigm {
 }
 
 impl Learning {
+    /// Returns the number of policies' places in a population's memory: its policies, the champion of the previous
+    /// generation, which is the mean of an evolution strategy, and for such a strategy its standard deviations.
+    pub fn slots(&self) -> usize {
+        self.population + 1 + usize::from(self.method != Method::Tournament)
+    }
+
     /// Returns the number of teams per generation of a trial, without the champions' team.
     pub fn teams(&self) -> usize {
         self.population * self.partners
@@ -229,6 +254,9 @@ impl Learning {
             trials: Learning::trials(r).number(between(1, MAX_TRIALS), 5),
             elites,
             parents,
+            method: Learning::method(r).choice(Method::Tournament),
+            search_sigma: Learning::search_sigma(r).number(between(LEAST, 100.0), 0.3),
+            search_step: Learning::search_step(r).number(between(LEAST, 100.0), 1.0),
             mutation: Learning::mutation(r).choice(Mutation::Scaled),
             mutation_probability: Learning::mutation_probability(r).number(between(LEAST, 1.0).or_zero(), 0.15),
             mutation_sigma: Learning::mutation_sigma(r).number(between(LEAST, 100.0).or_zero(), 0.1),

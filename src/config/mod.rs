@@ -22,7 +22,7 @@ pub use crate::model::start::Heading;
 pub use crate::reader::{Definition, Override, Problem};
 pub use learning::{
     CheckpointConfig, Elites, Fitness, Learning, LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_PARTNERS,
-    MAX_POPULATION, MAX_TRIALS, Mutation, Paradigm, Parents, Sharing,
+    MAX_POPULATION, MAX_TRIALS, Method, Mutation, Paradigm, Parents, Sharing,
 };
 pub use load::name;
 pub(crate) use load::{is_standard_input, read_file};

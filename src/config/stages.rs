@@ -19,7 +19,7 @@ pub(crate) const MAX_STAGES: usize = 256;
 /// The key with the length of a run.
 pub const GENERATIONS: &str = "learning.generations";
 /// Keys that stages cannot change. A name that ends with a dot is a whole section.
-const FIXED: [&str; 10] = [
+const FIXED: [&str; 12] = [
     "policy.",
     "checkpoint.",
     "learning.paradigm",
@@ -27,6 +27,8 @@ const FIXED: [&str; 10] = [
     "learning.population",
     "learning.elites",
     "learning.parents",
+    "learning.method",
+    "learning.search_sigma",
     GENERATIONS,
     "learning.trials",
     "learning.seed",

@@ -30,6 +30,8 @@ pub enum Purpose {
     ConstantActions = 10,
     /// Noise on the actions of leaders, see [`noise`].
     Exploration = 11,
+    /// The samples of an evolution strategy, see [`Strategy::sample`](super::Strategy::sample).
+    Search = 12,
 }
 
 /// A key of the counter-based random number generator. [`Key::draw`] returns the words of a counter.

@@ -2,7 +2,7 @@
 
 use super::{Failure, Generation, Trained, start_from, trainer_of};
 use crate::backend::Backend;
-use crate::config::Config;
+use crate::config::{Config, Learning};
 use crate::trainer::{Asked, Ending, Row, Snapshot, Trainer};
 use crate::world::World;
 
@@ -172,11 +172,14 @@ impl Coevolution {
         if self.generation() == 0 {
             return Err(Failure::State);
         }
-        let slot = (self.config.learning.population + 1) * self.config.parameters();
+        let Learning { population, .. } = self.config.learning;
+        let parameters = self.config.parameters();
+        let champion = population * parameters..(population + 1) * parameters;
         let mut best = Vec::new();
         for trial in 0..self.config.learning.trials {
-            for population in self.trainer.weights(0, trial)?.chunks_exact(slot) {
-                best.extend_from_slice(&population[slot - self.config.parameters()..]);
+            let stride = self.config.learning.slots() * parameters;
+            for population in self.trainer.weights(0, trial)?.chunks_exact(stride) {
+                best.extend_from_slice(&population[champion.clone()]);
             }
         }
         Ok(best)
@@ -230,7 +233,7 @@ impl Coevolution {
             return Err(Failure::State);
         }
         let policies = self.trainer.policies(0);
-        let ending = self.trainer.ends(&[0]).first().map(|(_, end)| Ending::of(end));
+        let ending = self.trainer.ends(&[0]).first().and_then(|(_, end)| Ending::of(end));
         Ok(Trained::new(self.config.clone(), &self.rows, policies, ending))
     }
 }

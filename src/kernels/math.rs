@@ -146,9 +146,22 @@ pub(crate) fn normal_radius<S: Simd>(a: S::u32s) -> S::f32s {
 /// The cosine of [`normal`]: the top 24 bits of `b` are an angle in [-π, π).
 #[inline(always)]
 pub(crate) fn normal_cosine<S: Simd>(b: S::u32s) -> S::f32s {
-    let angle = ((b >> 8).to_float::<S::f32s>() - 8388608.0) * 3.7450704e-7;
-    let (_, cosine) = sin_cos::<S>(angle);
+    let (_, cosine) = sin_cos::<S>(normal_angle::<S>(b));
     cosine
+}
+
+/// Two independent standard normal deviates from two uniform words, the first as by [`normal`]. 65 operations.
+#[inline(always)]
+pub(crate) fn normal_pair<S: Simd>(a: S::u32s, b: S::u32s) -> [S::f32s; 2] {
+    let radius = normal_radius::<S>(a);
+    let (sine, cosine) = sin_cos::<S>(normal_angle::<S>(b));
+    [normal_of::<S>(radius, cosine), normal_of::<S>(radius, sine)]
+}
+
+/// The angle of [`normal_cosine`].
+#[inline(always)]
+fn normal_angle<S: Simd>(b: S::u32s) -> S::f32s {
+    ((b >> 8).to_float::<S::f32s>() - 8388608.0) * 3.7450704e-7
 }
 
 /// Whether the length of an offset is at most a radius, given squared. 4 operations.

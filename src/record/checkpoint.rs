@@ -5,7 +5,8 @@
 //! checksum of [`super::tensors`] protects it.
 //!
 //! A finished run leaves one more checkpoint, so that the run can be extended. Its weights are those of
-//! `policies.safetensors`, put back into the order given by their fitness.
+//! `policies.safetensors`, put back into the order given by their fitness. With an evolution strategy it has weights of
+//! its own, because the search distribution is more than the policies.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -21,7 +22,7 @@ use super::metrics::Extent;
 use super::policies;
 use super::tensors::{self, Tensor, TensorFile};
 use super::{RecordError, config_digest};
-use crate::config::Config;
+use crate::config::{Config, Method};
 use crate::evolve;
 use crate::file;
 use crate::host::Instant;
@@ -180,11 +181,12 @@ impl Checkpoint {
     }
 
     /// Adds the missing weights from `policies.safetensors`. Returns false if that file does not belong to the same
-    /// run.
+    /// run, or the run needs more than its policies.
     #[must_use]
     fn complete(&mut self, mut file: TensorFile<impl Read + Seek>, of: &Config) -> bool {
         // A file without a kind has no checksum either: another program wrote it.
-        if file.kind().is_none() || file.metadata(policies::CONFIG) != Some(&self.config) {
+        let is_of_run = file.kind().is_some() && file.metadata(policies::CONFIG) == Some(&self.config);
+        if !is_of_run || of.learning.method != Method::Tournament {
             return false;
         }
         let (population, parameters) = (of.learning.population, of.parameters());
@@ -224,7 +226,7 @@ impl Shapes {
         let (trials, populations, policies) =
             (config.learning.trials, config.populations(), config.learning.population);
         Shapes {
-            weights: [trials, populations, policies + 1, config.parameters()],
+            weights: [trials, populations, config.learning.slots(), config.parameters()],
             fitness: [trials, populations, policies],
         }
     }

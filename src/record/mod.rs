@@ -225,7 +225,7 @@ fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
 
 /// Keys of later versions with their default values. A config's digest omits these lines, so that runs of earlier
 /// versions can be resumed.
-const LATER: [&str; 12] = [
+const LATER: [&str; 15] = [
     "observers = \"all\"\n",
     "windows = []\n",
     "after = []\n",
@@ -238,6 +238,9 @@ const LATER: [&str; 12] = [
     "parents = \"all\"\n",
     "partners = 1\n",
     "leniency = \"mean\"\n",
+    "method = \"tournament\"\n",
+    "search_sigma = 0.3\n",
+    "search_step = 1.0\n",
 ];
 
 /// Returns the SHA-256 of the part of a config that affects results.

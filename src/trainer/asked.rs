@@ -15,8 +15,7 @@ use crate::world::World;
 /// Teams that one trial plays in a generation.
 #[derive(Clone, Copy, Debug)]
 pub struct Asked<'a> {
-    /// The populations, `[populations][policies + 1][parameters]`. A population's last slot holds the champion of the
-    /// previous generation.
+    /// The populations, `[populations][slots][parameters]`, see [`Learning::slots`](crate::config::Learning::slots).
     pub weights: &'a [f32],
     /// The policy of each leader in each team, `[teams + 1][leaders]`. The last team is the champions'.
     pub teams: &'a [u32],

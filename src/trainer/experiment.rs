@@ -29,12 +29,12 @@ pub(super) struct Experiment {
 
 /// One trial's populations, and scratch memory for its generations.
 ///
-/// A population has one slot more than policies. The last slot holds the champion of the previous generation, which
-/// plays along as one more team.
+/// A population has more slots than policies, see [`Learning::slots`]. The one after the policies holds the champion of
+/// the previous generation, which plays along as one more team.
 pub(super) struct TrialState {
     /// The trial's number within its config.
     pub index: usize,
-    /// This generation, `[populations][policies + 1][parameters]`, and memory for the next.
+    /// This generation, `[populations][slots][parameters]`, and memory for the next.
     pub weights: Vec<f32>,
     pub children: Vec<f32>,
     /// The scores of the generation that played, `[episodes]`. The last team is the champion's, if it played there.
@@ -148,7 +148,7 @@ impl Experiment {
         if generation == last + 1 && last < self.last() {
             // The shorter run kept its last policies. This run breeds a next generation from them.
             self.residency = Residency::on_host(last);
-            self.breed_on_host(level);
+            self.breed_beyond_the_last(level);
         }
         true
     }
@@ -160,9 +160,10 @@ impl TrialState {
         let Stage { config, world, .. } = stages.of(0);
         let Learning { seed, population, .. } = config.learning;
         let (populations, parameters) = (config.populations(), world.parameters());
+        let stride = config.learning.slots() * parameters;
         let key = Key::new(seed, index, Purpose::Weights);
-        let mut weights = vec![0.0; populations * (population + 1) * parameters];
-        weights.par_chunks_exact_mut((population + 1) * parameters).enumerate().for_each(|(leader, policies)| {
+        let mut weights = vec![0.0; populations * stride];
+        weights.par_chunks_exact_mut(stride).enumerate().for_each(|(leader, policies)| {
             policies[..population * parameters]
                 .par_chunks_exact_mut(parameters)
                 .with_min_len(64)

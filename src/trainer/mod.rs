@@ -18,7 +18,7 @@ use std::time::Duration;
 use fearless_simd::Level;
 
 use crate::backend::{Backend, BackendError};
-use crate::config::ValidConfig;
+use crate::config::{Method, ValidConfig};
 use crate::host::Instant;
 use crate::parallel::*;
 use crate::world::World;
@@ -72,8 +72,9 @@ pub struct Snapshot<N = Vec<f32>> {
     pub generation: usize,
     /// The run's last generation, after which policies stay as they are.
     pub last: usize,
-    /// A trial's weights, `[populations][policies + 1][parameters]`, see
-    /// [`Config::populations`](crate::config::Config::populations).
+    /// A trial's weights, `[populations][slots][parameters]`, see
+    /// [`Config::populations`](crate::config::Config::populations) and
+    /// [`Learning::slots`](crate::config::Learning::slots).
     pub weights: Vec<N>,
     /// A trial's scores of the previous generation, `[populations][policies]`.
     pub fitness: Vec<N>,
@@ -91,10 +92,14 @@ pub struct Ending {
 }
 
 impl Ending {
-    /// Copies what is needed of a snapshot after the last generation.
-    pub fn of(snapshot: &Snapshot<&[f32]>) -> Ending {
+    /// Copies what is needed of a snapshot after the last generation. `None` if the policies are not enough: with an
+    /// evolution strategy, the snapshot has the weights.
+    pub fn of(snapshot: &Snapshot<&[f32]>) -> Option<Ending> {
+        if !snapshot.weights.is_empty() {
+            return None;
+        }
         let pending = snapshot.pending.iter().map(|row| row.map(|row| [row.best_g, row.mean_g])).collect();
-        Ending { fitness: snapshot.fitness.iter().map(|scores| scores.to_vec()).collect(), pending }
+        Some(Ending { fitness: snapshot.fitness.iter().map(|scores| scores.to_vec()).collect(), pending })
     }
 }
 
@@ -111,7 +116,7 @@ pub struct Times {
     pub breed: Duration,
 }
 
-/// The outcome of an experiment: the sorted policies of each trial, and a snapshot without weights.
+/// The outcome of an experiment: the sorted policies of each trial, and the snapshot after the last generation.
 pub type End<'a> = (Vec<&'a [f32]>, Snapshot<&'a [f32]>);
 
 /// Why there is no snapshot.
@@ -273,7 +278,8 @@ impl Trainer {
     }
 
     /// Returns the outcomes of experiments that are done: [`Trainer::policies`], in the next generation's memory, and
-    /// the snapshot after the last generation. Its weights are empty, because they are the policies in another order.
+    /// the snapshot after the last generation. After tournaments its weights are empty, because they are the policies in
+    /// another order.
     pub fn ends(&mut self, experiments: &[usize]) -> Vec<End<'_>> {
         for &experiment in experiments {
             let experiment = &mut self.experiments[experiment];
@@ -289,13 +295,17 @@ impl Trainer {
             let experiment = &self.experiments[experiment];
             let len = experiment.policy_len();
             let sorted = experiment.trials.iter().map(|trial| &trial.children[..len]).collect();
-            (sorted, Snapshot { generation: experiment.last() + 1, weights: vec![], ..experiment.snapshot() })
+            let mut snapshot = Snapshot { generation: experiment.last() + 1, ..experiment.snapshot() };
+            if experiment.stage().config.learning.method == Method::Tournament {
+                snapshot.weights.clear();
+            }
+            (sorted, snapshot)
         };
         experiments.iter().map(end).collect()
     }
 
-    /// Returns the populations of a trial that are about to play, `[populations][policies + 1][parameters]`. A
-    /// population's last slot holds the champion of the previous generation.
+    /// Returns the populations of a trial that are about to play, `[populations][slots][parameters]`, see
+    /// [`Learning::slots`](crate::config::Learning::slots).
     ///
     /// # Errors
     /// The backend that holds them failed to return them.
@@ -346,14 +356,14 @@ impl Trainer {
         let experiment = &mut self.experiments[experiment];
         let stage = experiment.stage();
         let (populations, parameters) = (stage.config.populations(), stage.world.parameters());
-        let population = stage.config.learning.population;
+        let (population, slots) = (stage.config.learning.population, stage.config.learning.slots());
         let fresh = experiment.generation == 0 && experiment.residency.is_undecided();
         let Some(trial) = experiment.trials.get_mut(trial) else { return false };
         if !fresh || policies == 0 || weights.len() != populations * policies * parameters {
             return false;
         }
         let taken = policies.min(population) * parameters;
-        let slots = trial.weights.chunks_exact_mut((population + 1) * parameters);
+        let slots = trial.weights.chunks_exact_mut(slots * parameters);
         for (slots, policies) in slots.zip(weights.chunks_exact(policies * parameters)) {
             slots[..taken].copy_from_slice(&policies[..taken]);
         }

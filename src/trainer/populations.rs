@@ -8,8 +8,8 @@ use super::experiment::{Experiment, TrialState};
 use super::residency::Residency;
 use super::stages::Stage;
 use crate::backend::{Backend, BackendError};
-use crate::config::Learning;
-use crate::evolve::{self, Breeding, Key, Purpose, Selection};
+use crate::config::{Learning, Method};
+use crate::evolve::{self, Breeding, Key, Purpose, Samples, Selection, Strategy};
 use crate::parallel::*;
 
 /// Slots that one thread fills at a time.
@@ -23,7 +23,11 @@ impl Experiment {
         }
         self.residency.decline();
         let Stage { config, world, .. } = self.stage();
-        let sizes = [config.populations(), config.learning.population + 1, world.parameters()];
+        // Devices mutate, but do not sample.
+        if config.learning.method != Method::Tournament {
+            return Ok(());
+        }
+        let sizes = [config.populations(), config.learning.slots(), world.parameters()];
         let held: Option<Vec<_>> =
             self.trials.iter().map(|trial| backend.hold(&trial.weights, sizes).transpose()).collect();
         if let Some(held) = held {
@@ -106,6 +110,77 @@ impl Experiment {
 
     /// Breeds populations that the host has, which cannot fail.
     pub fn breed_on_host(&mut self, level: Level) {
+        match self.strategy(level) {
+            None => self.select(level),
+            Some(strategy) => {
+                self.update_search(level, &strategy);
+                if self.residency.generation() < self.last() {
+                    self.sample(level, &strategy);
+                }
+            }
+        }
+        self.residency.bred();
+    }
+
+    /// Breeds on from the last generation of a shorter run, whose champions are known.
+    pub fn breed_beyond_the_last(&mut self, level: Level) {
+        match self.strategy(level) {
+            None => self.select(level),
+            Some(strategy) => self.sample(level, &strategy),
+        }
+        self.residency.bred();
+    }
+
+    /// Returns the evolution strategy of the present stage. `None` stands for tournaments.
+    fn strategy(&self, level: Level) -> Option<Strategy> {
+        let Stage { config, world, .. } = self.stage();
+        Strategy::of(level, &config.learning, world.parameters())
+    }
+
+    /// Moves the means of all populations.
+    fn update_search(&mut self, level: Level, strategy: &Strategy) {
+        let generation = self.residency.generation();
+        let (population, stride) = (self.stage().config.learning.population, self.stride());
+        self.trials.par_iter_mut().for_each(|TrialState { weights, fitness, .. }| {
+            let populations = weights.par_chunks_exact_mut(stride).zip(fitness.par_chunks_exact(population));
+            populations.for_each(|(weights, fitness)| strategy.update(level, generation, fitness, weights));
+        });
+    }
+
+    /// Samples the next generation around the means.
+    fn sample(&mut self, level: Level, strategy: &Strategy) {
+        thread_local! { static NOISE: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) }; }
+        let (generation, stride) = (self.residency.generation(), self.stride());
+        let Stage { config, world, .. } = self.stage();
+        let (&Learning { seed, population: policies, .. }, parameters) = (&config.learning, world.parameters());
+        self.trials.par_iter_mut().for_each(|trial| {
+            let key = Key::new(seed, trial.index, Purpose::Search);
+            let TrialState { weights, children, .. } = trial;
+            let populations = weights.par_chunks_exact(stride).zip(children.par_chunks_exact_mut(stride));
+            populations.enumerate().for_each(|(population, (weights, children))| {
+                let search = &weights[policies * parameters..];
+                let (mean, sigmas) = search.split_at(parameters);
+                let (children, kept) = children.split_at_mut(policies * parameters);
+                kept.copy_from_slice(search);
+                let broods = children.par_chunks_mut(BROOD * parameters).with_max_len(4);
+                broods.enumerate().for_each(|(index, children)| {
+                    let first = index * BROOD;
+                    let samples = Samples { key, generation, population, policies, first, mean, sigmas };
+                    NOISE.with_borrow_mut(|noise| strategy.sample(level, samples, children, noise));
+                });
+            });
+            std::mem::swap(weights, &mut trial.children);
+        });
+    }
+
+    /// Numbers in a population.
+    fn stride(&self) -> usize {
+        let Stage { config, world, .. } = self.stage();
+        config.learning.slots() * world.parameters()
+    }
+
+    /// Selects parents and mutates them.
+    fn select(&mut self, level: Level) {
         thread_local! { static SCRATCH: RefCell<Vec<u32>> = const { RefCell::new(Vec::new()) }; }
         let generation = self.residency.generation();
         let Experiment { stages, trials, .. } = self;
@@ -132,18 +207,19 @@ impl Experiment {
             });
             std::mem::swap(weights, &mut trial.children);
         });
-        self.residency.bred();
     }
 
-    /// Copies policies, without the champions' slots, best first in each population.
+    /// Copies policies, without the champions' slots, best first in each population. With an evolution strategy the mean
+    /// comes first, in place of the worst policy.
     pub fn sort(&self, weights: &[f32], fitness: &[f32], policies: &mut [f32]) {
         let Stage { config, world, .. } = self.stage();
         let (population, parameters) = (config.learning.population, world.parameters());
-        let populations = weights.par_chunks_exact((population + 1) * parameters);
+        let mean = (config.learning.method != Method::Tournament).then_some(population);
+        let populations = weights.par_chunks_exact(self.stride());
         let sorted = policies.par_chunks_exact_mut(population * parameters);
         populations.zip(fitness.par_chunks_exact(population)).zip(sorted).for_each(|((weights, fitness), sorted)| {
             let best = evolve::best(fitness, population);
-            for (policy, index) in sorted.chunks_exact_mut(parameters).zip(best) {
+            for (policy, index) in sorted.chunks_exact_mut(parameters).zip(mean.into_iter().chain(best)) {
                 policy.copy_from_slice(&weights[index * parameters..(index + 1) * parameters]);
             }
         });

@@ -32,7 +32,7 @@ pub(super) fn play<'a>(
                     world: &stage.world,
                     starts,
                     weights,
-                    policies: learning.population + 1,
+                    policies: learning.slots(),
                     sharing: learning.sharing,
                     teams: &schedule.teams[range.start * leaders..range.end * leaders],
                     fitnesses: std::slice::from_ref(&learning.fitness),

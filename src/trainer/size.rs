@@ -17,8 +17,8 @@ pub fn next_bytes(config: &Config) -> u64 {
 
 /// Returns the bytes of the numbers in a [`Snapshot`](super::Snapshot) of a valid config's experiment.
 pub fn snapshot_bytes(config: &Config) -> u64 {
-    let [trials, populations, policies, parameters] = sizes(config);
-    4 * trials * populations * ((policies + 1) * parameters + policies)
+    let ([trials, populations, policies, parameters], slots) = (sizes(config), config.learning.slots() as u64);
+    4 * trials * populations * (slots * parameters + policies)
 }
 
 fn max_over_stages(config: &Config, bytes: fn(&Config) -> u64) -> u64 {
@@ -27,10 +27,10 @@ fn max_over_stages(config: &Config, bytes: fn(&Config) -> u64) -> u64 {
 
 fn bytes_of_stage(config: &Config) -> u64 {
     let ([trials, populations, policies, parameters], leaders) = (sizes(config), config.learners() as u64);
-    let (slots, episodes) = (policies + 1, config.learning.episodes_per_team as u64);
+    let (slots, episodes) = (config.learning.slots() as u64, config.learning.episodes_per_team as u64);
     let teams = config.learning.teams() as u64 + 1;
     let weights = 2 * populations * slots * parameters;
-    let fitness_and_parents = populations * (policies + slots);
+    let fitness_and_parents = populations * (2 * policies + 1);
     let observed_and_scores = episodes * teams * (1 + leaders);
     // Scores are added up in 64 bits.
     let totals = if config.learning.partners > 1 { 2 * populations * policies } else { 0 };

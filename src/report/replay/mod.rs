@@ -437,7 +437,7 @@ impl<'a> Episodes<'a> {
             world: self.world,
             starts: &self.starts[episode],
             weights: self.weights.into(),
-            policies: learning.population + 1,
+            policies: learning.slots(),
             sharing: learning.sharing,
             teams,
             fitnesses: std::slice::from_ref(&learning.fitness),
