@@ -33,7 +33,12 @@ def case(name: str):
             return None
         actions = rng.uniform(-1, 1, (teams, 4, 2)).astype(np.float32)
         env.reset()
-        return lambda: [env.step(actions) for _ in range(25)], 25
+
+        def episode():
+            for _ in range(25):
+                env.step(actions)
+
+        return episode, 25
     if kind in ("train", "own", "asked"):
         config = config.replace(learning={"generations": 50})
         if kind == "train":
