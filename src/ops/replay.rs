@@ -59,10 +59,10 @@ pub struct Request {
 #[derive(Clone, Debug, Serialize)]
 #[non_exhaustive]
 pub struct Outcome {
-    /// What was written.
+    /// The written files.
     #[serde(flatten)]
     pub written: Written,
-    /// What was played.
+    /// The played episodes.
     pub episodes: Vec<Episode>,
     /// Whether files were read that differ from their digests.
     pub unverified: bool,
@@ -78,7 +78,7 @@ pub enum Written {
         /// The file.
         #[serde(serialize_with = "escaped")]
         out: PathBuf,
-        /// Its size.
+        /// Size of the file.
         bytes: usize,
     },
     /// Numbered pictures.

@@ -94,7 +94,7 @@ pub struct Outcome {
 #[derive(Clone, Copy, Debug, Serialize)]
 #[non_exhaustive]
 pub struct Best {
-    /// Its number.
+    /// Number of the team.
     pub team: usize,
     /// POIs that it observes.
     #[serde(flatten)]
