@@ -366,3 +366,48 @@ fn compiling() {
         }
     }
 }
+
+/// The CPU's part of a generation: its phases on a device that plays only the first steps of each episode. By default of
+/// 2^20 teams, more or fewer by `FLOTILLA_TEAMS`, with as many threads as `RAYON_NUM_THREADS` says.
+#[test]
+#[ignore = "prints a table"]
+fn the_cpus_part_of_a_generation() {
+    const GENERATIONS: u32 = 6;
+    fn short(text: String) -> String {
+        text.replace("step < task.end; step++", "step < min(task.end, task.first + 2u); step++")
+    }
+    let mut config = support::layout("generally_forward");
+    let teams = std::env::var("FLOTILLA_TEAMS").map_or(1 << 20, |teams| teams.parse().unwrap());
+    (config.learning.trials, config.learning.population, config.learning.generations) = (1, teams, 60);
+    config.learning.fitness = Fitness::Df;
+    for (request, info) in support::adapters("the_cpus_part_of_a_generation") {
+        let backend = open(&request, Records::PackedFrom(0)).holding(ResidencyPolicy::Always);
+        // SAFETY: the edit only shortens a loop.
+        #[expect(unsafe_code, reason = "edited shaders are compiled without bounds checks")]
+        let mut backend = unsafe { backend.edited(short) };
+        let mut trainer = Trainer::new([config.validate().unwrap()]);
+        // Room for packed records is found by the first generations.
+        for _ in 0..3 {
+            trainer.advance(&mut backend).unwrap();
+        }
+        (_, _) = (trainer.take_times(), backend.take_stages());
+        for _ in 0..GENERATIONS {
+            trainer.advance(&mut backend).unwrap();
+        }
+        let (times, stages) = (trainer.take_times(), backend.take_stages());
+        println!("{info}, {teams} teams, {} threads, ms per generation:", rayon::current_num_threads());
+        for (name, time) in [
+            ("prepare", times.prepare),
+            ("play", times.play),
+            ("  gather", stages.gather),
+            ("  upload", stages.upload),
+            ("  wait", stages.wait),
+            ("  read back", stages.read_back),
+            ("  score", stages.score),
+            ("collect", times.collect),
+            ("breed", times.breed),
+        ] {
+            println!("{name:>12} {:9.2}", 1e3 * time.as_secs_f64() / f64::from(GENERATIONS));
+        }
+    }
+}

@@ -29,12 +29,12 @@ pub struct Group<'a> {
 
 impl<'a> Group<'a> {
     /// Returns the number of teams.
-    pub fn team_count(&self) -> usize {
+    pub(crate) fn team_count(&self) -> usize {
         self.teams.len() / self.world.leaders()
     }
 
     /// Returns the POI positions, if they are not the world's.
-    pub fn moved_pois(&self) -> Option<&'a [Vec2]> {
+    pub(crate) fn moved_pois(&self) -> Option<&'a [Vec2]> {
         Some(&self.starts[self.world.agents()..]).filter(|pois| !pois.is_empty())
     }
 
@@ -82,6 +82,10 @@ impl<'a> Group<'a> {
         {
             let found = weights.len();
             return invalid(format!("{found} weights, but {populations} populations of {policies} have {numbers}"));
+        }
+        // The largest number is found by vectors.
+        if teams.iter().copied().max().is_none_or(|policy| (policy as usize) < policies) {
+            return Ok(());
         }
         match teams.iter().position(|&policy| policy as usize >= policies) {
             None => Ok(()),

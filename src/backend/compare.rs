@@ -69,7 +69,7 @@ impl fmt::Display for Mismatch {
 }
 
 /// Returns the first difference of two traces of the same group: by step, then stage, then team.
-pub fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mismatch> {
+pub(crate) fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mismatch> {
     if expected == found && bits(expected) == bits(found) {
         return None;
     }

@@ -94,13 +94,13 @@ pub struct Machine {
 
 impl Machine {
     /// Describes the CPU, with the threads of the current pool.
-    pub fn of_cpu() -> Machine {
+    pub(crate) fn of_cpu() -> Machine {
         Machine { backend: "cpu".into(), threads: current_num_threads(), ..Machine::default() }
     }
 
     /// Describes the GPU of a backend.
     #[cfg(feature = "gpu")]
-    pub fn of_gpu(backend: &gpu::episode::GpuBackend) -> Machine {
+    pub(crate) fn of_gpu(backend: &gpu::episode::GpuBackend) -> Machine {
         let adapter = &backend.gpu().adapter;
         Machine {
             backend: "gpu".into(),
@@ -120,7 +120,7 @@ pub const HELD_FROM: u64 = 1 << 20;
 
 /// Default minimum bytes of a batch's records to be packed on a GPU: about what the bus transfers in the time of one
 /// more dispatch. An estimate, not a measurement. Software renderers pack none.
-pub const PACKED_FROM: u64 = 1 << 20;
+pub(crate) const PACKED_FROM: u64 = 1 << 20;
 
 /// Target bytes of one buffer of a batch on a GPU: enough to fill the device, small enough to overlap batches.
 pub const BATCH_BYTES: u64 = 256 << 20;
@@ -144,12 +144,12 @@ fn fours(world: &World) -> usize {
 }
 
 /// Returns the bytes of a team's weights as an episode on a GPU loads them.
-pub fn weight_bytes(world: &World) -> u64 {
+pub(crate) fn weight_bytes(world: &World) -> u64 {
     (fours(world) * size_of::<[f32; FOUR]>()) as u64
 }
 
 /// Returns the bytes of a team's states that a GPU keeps between dispatches, 0 if one dispatch plays the whole episode.
-pub fn state_bytes(world: &World, fitness: Fitness) -> u64 {
+pub(crate) fn state_bytes(world: &World, fitness: Fitness) -> u64 {
     #[cfg(feature = "gpu")]
     let bytes = gpu::episode::state_bytes(world, RecordRequest(&[fitness]));
     #[cfg(not(feature = "gpu"))]
@@ -162,7 +162,7 @@ pub fn state_bytes(world: &World, fitness: Fitness) -> u64 {
 
 /// Returns the bytes of a trial's populations, `[populations, slots, parameters]`, on a GPU that holds them: one buffer
 /// per population, one more, and every slot's parent. 0 if they are too small to be held by default.
-pub fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {
+pub(crate) fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {
     let [populations, population, parents] =
         [populations, 4 * slots * parameters, 4 * populations * slots].map(|count| count as u64);
     if populations * population < HELD_FROM { 0 } else { (populations + 1) * population + parents }

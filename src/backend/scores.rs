@@ -6,6 +6,10 @@ use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use super::{Group, GroupScores};
 use crate::config::Fitness;
 use crate::credit::{Credit, Episode};
+use crate::parallel::*;
+
+/// Scores that one thread sets to zero, at least.
+const ZEROED_TOGETHER: usize = 1 << 16;
 
 /// The scores of the groups of a batch. Several threads may write at a time; each team is scored once.
 pub(crate) struct ScoreTable<'a> {
@@ -19,7 +23,10 @@ pub(crate) struct ScoreTable<'a> {
 impl<'a> ScoreTable<'a> {
     /// Returns a table of zeros.
     pub(crate) fn new(groups: &'a [Group<'a>]) -> ScoreTable<'a> {
-        let zeros = |count: usize| std::iter::repeat_with(AtomicU32::default).take(count).collect();
+        // Threads share the memory's first use, which takes longer than the zeros.
+        let zeros = |count: usize| {
+            (0..count).into_par_iter().with_min_len(ZEROED_TOGETHER).map(|_| AtomicU32::default()).collect()
+        };
         ScoreTable {
             groups,
             observed: groups.iter().map(|group| zeros(group.team_count())).collect(),

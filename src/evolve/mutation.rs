@@ -55,6 +55,11 @@ impl Breeding<'_> {
         if self.parents.len() != leaders * slots {
             return invalid(format!("{} parents for {leaders} populations of {slots}", self.parents.len()));
         }
+        // The largest number is found by vectors.
+        if self.parents.iter().map(|planned| planned & !UNCHANGED).max().is_none_or(|parent| (parent as usize) < slots)
+        {
+            return Ok(());
+        }
         match self.parents.iter().position(|&planned| (planned & !UNCHANGED) as usize >= slots) {
             None => Ok(()),
             Some(place) => invalid(format!(

@@ -9,11 +9,9 @@ use crate::parallel::*;
 
 /// Returns the indices of the `count` best scores, best first. Ties go to the lower index.
 pub fn best(scores: &[f32], count: usize) -> Vec<usize> {
-    let better = |a: &usize, b: &usize| scores[*b].total_cmp(&scores[*a]).then(a.cmp(b));
-    let mut order: Vec<usize>;
     if count <= FEW {
         // The best so far, in order. Few scores are inserted, so that this is faster than sorting.
-        order = Vec::with_capacity(count + 1);
+        let mut order: Vec<usize> = Vec::with_capacity(count + 1);
         for (index, score) in scores.iter().enumerate() {
             if order.len() < count || order.last().is_some_and(|&last| score.total_cmp(&scores[last]).is_gt()) {
                 order.insert(order.partition_point(|&other| scores[other].total_cmp(score).is_ge()), index);
@@ -22,13 +20,19 @@ pub fn best(scores: &[f32], count: usize) -> Vec<usize> {
         }
         return order;
     }
-    order = (0..scores.len()).collect();
+    // Numbers in the order of the scores, each followed by its index, sort faster than indices by what they refer to.
+    let key = |(index, score): (u64, &f32)| {
+        let bits = score.to_bits();
+        let ascending = bits ^ if bits >> 31 == 0 { 1 << 31 } else { u32::MAX };
+        u64::from(!ascending) << 32 | index
+    };
+    let mut order: Vec<u64> = (0..).zip(scores).map(key).collect();
     if count < order.len() {
-        order.select_nth_unstable_by(count - 1, better);
+        order.select_nth_unstable(count - 1);
+        order.truncate(count);
     }
-    order.truncate(count);
-    order.sort_unstable_by(better);
-    order
+    order.sort_unstable();
+    order.into_iter().map(|key| key as u32 as usize).collect()
 }
 
 /// Up to this count, [`best`] searches without sorting.
@@ -128,6 +132,22 @@ fn draw_parents_lanes<S: Simd>(
         let [firsts, seconds, ..] = math::pcg4d::<S>(x, y, z, w);
         for ((parent, &first), &second) in parents.iter_mut().zip(firsts.as_slice()).zip(seconds.as_slice()) {
             *parent = choose(first, second) as u32;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_best_are_those_of_a_stable_sort() {
+        let special = [0.0, -0.0, f32::NAN, -f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MIN_POSITIVE, -1.5, 1.5];
+        let scores: Vec<f32> = (0..90).map(|index| special[index * index % 23 % special.len()]).collect();
+        let mut expected: Vec<usize> = (0..scores.len()).collect();
+        expected.sort_by(|a, b| scores[*b].total_cmp(&scores[*a]));
+        for count in 0..=scores.len() {
+            assert_eq!(best(&scores, count), expected[..count], "{count} of {}", scores.len());
         }
     }
 }

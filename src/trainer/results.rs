@@ -131,8 +131,7 @@ impl TrialState {
 fn team_g(episodes: &[GroupScores], pois: usize, teams: usize) -> [f64; 2] {
     let observed = |team: usize| episodes.iter().map(|episode| u64::from(episode.observed[team])).sum();
     let whole = (pois * episodes.len()) as f64;
-    let best: u64 = (0..teams).map(observed).max().unwrap_or(0);
-    let total: u64 = (0..teams).map(observed).sum();
+    let (best, total) = (0..teams).map(observed).fold((0, 0), |(best, total): (u64, u64), g| (best.max(g), total + g));
     [best as f64 / whole, total as f64 / (whole * teams as f64)]
 }
 

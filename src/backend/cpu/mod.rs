@@ -27,7 +27,7 @@ mod transpose;
 
 pub(crate) use agent::Agent;
 pub use forward::forward;
-pub use steps::{Noise, StepArrays, step_sizes};
+pub use steps::{Noise, StepArrays};
 
 pub(crate) use block::{Block, BlockState};
 pub(crate) use transpose::{transpose_rows, transpose4};
@@ -199,7 +199,7 @@ pub fn lanes() -> u64 {
 }
 
 /// Returns the bytes of one vector of teams that are scored by a fitness.
-pub fn block_bytes(world: &World, fitness: Fitness) -> u64 {
+pub(crate) fn block_bytes(world: &World, fitness: Fitness) -> u64 {
     let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
     let record = world.set_words() + followers * leaders + sight_words(world, fitness == Fitness::Dt);
     let words = 8 * agents + leaders * world.constants.policy.words() + 3 * followers + record;

@@ -37,7 +37,7 @@ pub struct StepArrays<'a> {
 }
 
 /// Numbers that one team has in each of [`StepArrays`], in their order.
-pub fn step_sizes(world: &World) -> [usize; 8] {
+fn step_sizes(world: &World) -> [usize; 8] {
     let (agents, steps) = (world.agents(), world.steps());
     let leaders = steps * world.leaders();
     let states = (steps + 1) * agents;

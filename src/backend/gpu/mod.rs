@@ -24,7 +24,7 @@ pub mod self_test;
 pub use self_test::{open, self_test};
 
 /// The shader that measures a device's arithmetic ceiling.
-pub const CEILING: &str = include_str!("../../../shaders/ceiling.wgsl");
+pub(crate) const CEILING: &str = include_str!("../../../shaders/ceiling.wgsl");
 
 /// The whole text of every shader, with a name for each: what the lints and the exactness tests walk over.
 pub fn shaders() -> Vec<(&'static str, String)> {

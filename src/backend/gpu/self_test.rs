@@ -47,15 +47,15 @@ impl fmt::Display for Deviation {
 }
 
 /// The shader of the arithmetic probe.
-pub const SHADER: &str = include_str!("../../../shaders/probe.wgsl");
+pub(super) const SHADER: &str = include_str!("../../../shaders/probe.wgsl");
 
 /// One probe. Returns the first mismatch under the device's current pass, if any.
-pub type Probe = fn(&Gpu) -> Result<Option<Deviation>, DeviceError>;
+type Probe = fn(&Gpu) -> Result<Option<Deviation>, DeviceError>;
 
 /// All probes that a pass must survive, the quickest first.
 ///
 /// A new probe is a function here. It compiles its shader with `gpu.own_pipeline`, which applies the pass under test.
-pub const ALL: &[Probe] = &[arithmetic, episode, breeding, training];
+const ALL: &[Probe] = &[arithmetic, episode, breeding, training];
 
 /// Opens an adapter, and finds the first pass under which every probe gives the CPU's bits: no contraction on Vulkan,
 /// else guarded.

@@ -49,7 +49,7 @@ impl GpuBackend {
                 };
                 status == share.final_status(nonce)
             };
-            if !work.shares.iter().all(done_by_device) {
+            if !work.shares.par_iter().all(done_by_device) {
                 return Err(self.gpu.lose_undone("an episode"));
             }
             let start = Instant::now();

@@ -1,0 +1,121 @@
+//! Why a GPU could not be opened, or failed.
+
+use super::adapter::{AdapterInfo, is_index};
+use crate::backend::gpu::absent;
+use crate::backend::gpu::exact::{Pass, ShaderError};
+
+/// Why a GPU could not be opened, or failed.
+#[derive(Debug, thiserror::Error)]
+pub enum DeviceError {
+    /// There is no adapter.
+    #[error("no GPU adapter found: {}", absent::reasons())]
+    NoAdapter,
+    /// There are only software renderers, which are opened only by name or number.
+    #[error("no GPU among the adapters, only {}{}", list(.found), absent::hints())]
+    NoRealAdapter {
+        /// The adapters.
+        found: Vec<AdapterInfo>,
+    },
+    /// No adapter has this name or number.
+    #[error("no adapter {} \"{name}\"; {}", if is_index(name) { "has the number" } else { "matches" }, there_are(.found))]
+    UnknownAdapter {
+        /// The name or number.
+        name: String,
+        /// The adapters.
+        found: Vec<AdapterInfo>,
+    },
+    /// The driver refuses to open it.
+    #[error("{adapter}: cannot be opened: {reason}")]
+    Refused {
+        /// The adapter, with its driver.
+        adapter: String,
+        /// The driver's message.
+        reason: String,
+    },
+    /// The device's arithmetic differs from the CPU's under every pass.
+    #[error("{adapter}: not bit-exact, so it cannot be used: {}", inexact(.failures))]
+    Inexact {
+        /// The adapter, with its driver.
+        adapter: String,
+        /// Per pass, the first difference.
+        failures: Vec<(Pass, String)>,
+    },
+    /// The driver lost the device, and everything on it.
+    #[error("{adapter}: the device was lost ({reason})")]
+    Lost {
+        /// The adapter, with its driver.
+        adapter: String,
+        /// The driver's message.
+        reason: String,
+    },
+    /// The device has too little memory for a buffer.
+    #[error("{adapter}: out of memory for {what}; use a smaller batch")]
+    OutOfMemory {
+        /// The adapter, with its driver.
+        adapter: String,
+        /// The use of the buffer.
+        what: String,
+    },
+    /// A buffer or binding exceeds the device's limit.
+    #[error("{adapter}: {what} needs {bytes} bytes, the device allows {allowed}; use a smaller batch")]
+    TooLarge {
+        /// The adapter, with its driver.
+        adapter: String,
+        /// The use of the buffer.
+        what: String,
+        /// Bytes needed.
+        bytes: u64,
+        /// Bytes allowed.
+        allowed: u64,
+    },
+    /// A shader does not compile for the device.
+    #[error("shader {label} {source}")]
+    Shader {
+        /// The shader's name.
+        label: String,
+        /// The error.
+        source: ShaderError,
+    },
+    /// Any other error of wgpu.
+    #[error("{adapter}: {what} failed: {reason}")]
+    Failed {
+        /// The adapter, with its driver.
+        adapter: String,
+        /// The operation.
+        what: String,
+        /// The driver's message.
+        reason: String,
+    },
+}
+
+fn list(found: &[AdapterInfo]) -> String {
+    found.iter().enumerate().map(|(index, info)| format!("{index}: {info}")).collect::<Vec<_>>().join(", ")
+}
+
+fn there_are(found: &[AdapterInfo]) -> String {
+    let one = |(index, info): (usize, &AdapterInfo)| format!("{index} ({info})");
+    let all: Vec<_> = found.iter().enumerate().map(one).collect();
+    match all.len() {
+        0 => "there is none at all".into(),
+        1 => format!("the only adapter is {}", all[0]),
+        _ => format!("the adapters are {}", all.join(", ")),
+    }
+}
+
+fn inexact(failures: &[(Pass, String)]) -> String {
+    failures.iter().map(|(pass, failure)| format!("under the {pass} pass, {failure}")).collect::<Vec<_>>().join("; ")
+}
+
+/// Formats an error with all its causes.
+pub(super) fn chain(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        let inner = error.to_string();
+        if !text.contains(&inner) {
+            text += &format!(": {inner}");
+        }
+        cause = error.source();
+    }
+    text
+}

@@ -1,0 +1,232 @@
+//! Finding, opening and using a GPU.
+//!
+//! [`super::open`] also tests a device.
+//!
+//! | file | holds |
+//! |---|---|
+//! | `adapter` | adapters: finding them, describing them, choosing one |
+//! | `error` | why a GPU could not be opened, or failed |
+//! | `buffers` | buffers, and bytes to and from the device |
+//! | `compute` | pipelines and dispatches |
+//! | `waiting` | waiting for a device, which may never answer |
+
+use std::collections::HashMap;
+use std::fmt;
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use wgpu::util::DeviceExt;
+
+use super::exact::Pass;
+use super::faults::Faults;
+use crate::host;
+
+mod adapter;
+mod buffers;
+mod compute;
+mod error;
+mod waiting;
+
+pub(super) use adapter::choose;
+pub use adapter::{AdapterInfo, Kind, Request, Wanted, adapters, compiler, position};
+pub use buffers::Traffic;
+pub(super) use compute::{BINDING_ALIGNMENT, Stopwatch, grid, timed};
+pub use compute::{Binding, Bindings};
+pub use error::DeviceError;
+pub use waiting::{Patience, report_stalls};
+
+use error::chain;
+
+/// Errors since the device was opened, from wgpu's callbacks.
+#[derive(Default)]
+struct DeviceErrors {
+    lost: Option<String>,
+    error: Option<String>,
+}
+
+/// An opened device whose arithmetic was tested under `pass`. Clones share the device.
+#[derive(Clone)]
+pub struct Gpu {
+    /// The adapter.
+    pub adapter: AdapterInfo,
+    /// The device's limits.
+    pub limits: wgpu::Limits,
+    /// The compile pass of its shaders.
+    pub pass: Pass,
+    /// Whether shaders keep their checks, see [`Request::checked`].
+    pub checked: bool,
+    /// The wgpu device.
+    pub device: wgpu::Device,
+    /// The only queue.
+    pub queue: wgpu::Queue,
+    /// A buffer of zeros that guarded arithmetic uses: binding 0 of every bind group.
+    guard: wgpu::Buffer,
+    errors: Arc<Mutex<DeviceErrors>>,
+    /// Bytes to and from the device.
+    traffic: Arc<[AtomicU64; 2]>,
+    /// The next nonce, see [`Gpu::nonces`].
+    nonce: Arc<AtomicU32>,
+    patience: Patience,
+    /// Pipelines that the device's tests have compiled, and whether more are kept.
+    kept: Arc<Mutex<HashMap<Compiled, wgpu::ComputePipeline>>>,
+    keeps: bool,
+    /// Faults that tests inject.
+    faults: Option<Arc<dyn Faults>>,
+}
+
+/// Everything that a pipeline depends on: the text and entry point of its shader, and the pass.
+type Compiled = (String, String, Pass);
+
+impl fmt::Debug for Gpu {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Gpu").field("adapter", &self.adapter).field("pass", &self.pass).finish_non_exhaustive()
+    }
+}
+
+impl Gpu {
+    /// Opens an adapter, without testing it.
+    pub(super) fn new(
+        adapter: &wgpu::Adapter,
+        info: AdapterInfo,
+        pass: Pass,
+        limits: wgpu::Limits,
+        features: wgpu::Features,
+        checked: bool,
+    ) -> Result<Gpu, DeviceError> {
+        let descriptor = wgpu::DeviceDescriptor {
+            label: Some("flotilla"),
+            required_features: features,
+            required_limits: limits.clone(),
+            ..Default::default()
+        };
+        let refused = |error: wgpu::RequestDeviceError| DeviceError::Refused {
+            adapter: info.to_string(),
+            reason: error.to_string(),
+        };
+        let (device, queue) = host::wait(adapter.request_device(&descriptor)).map_err(refused)?;
+        let errors = Arc::new(Mutex::new(DeviceErrors::default()));
+        let noted = errors.clone();
+        device.set_device_lost_callback(move |reason, message| {
+            let reason = if message.is_empty() { format!("{reason:?}") } else { message };
+            noted.lock().unwrap_or_else(PoisonError::into_inner).lost.get_or_insert(reason);
+        });
+        let noted = errors.clone();
+        device.on_uncaptured_error(Arc::new(move |error| {
+            noted.lock().unwrap_or_else(PoisonError::into_inner).error.get_or_insert(chain(&error));
+        }));
+        let guard = device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+            label: Some("guard"),
+            contents: &[0; 16],
+            usage: wgpu::BufferUsages::UNIFORM,
+        });
+        // Another value in each process, because memory may keep nonces of a process before.
+        let nonce = Arc::new(AtomicU32::new(host::since_1970().as_nanos() as u32));
+        let patience = if info.kind == Kind::Software { Patience::WITH_SOFTWARE } else { Patience::WITH_GPUS };
+        Ok(Gpu {
+            adapter: info,
+            limits,
+            pass,
+            checked,
+            device,
+            queue,
+            guard,
+            errors,
+            traffic: Arc::default(),
+            nonce,
+            patience,
+            kept: Arc::default(),
+            keeps: false,
+            faults: None,
+        })
+    }
+
+    /// Returns the device such that the crate's own pipelines that it compiles are reused by its other clones.
+    pub(super) fn keeping_pipelines(&self) -> Gpu {
+        Gpu { keeps: true, ..self.clone() }
+    }
+
+    /// Injects faults, so that tests can show that each is noticed.
+    ///
+    /// # Safety
+    /// Shaders are compiled without bounds checks. An edited shader must keep its indices in bounds and its loops finite,
+    /// see [`Gpu::pipeline`].
+    #[doc(hidden)]
+    #[expect(unsafe_code, reason = "edited shaders are compiled without bounds checks")]
+    pub unsafe fn failing(self, faults: Arc<dyn Faults>) -> Gpu {
+        Gpu { faults: Some(faults), ..self }
+    }
+
+    /// Takes `count` consecutive numbers that no other work of this device has, and returns the first.
+    ///
+    /// Work writes its nonce beside its results, so that results of earlier work are never taken for its own: some
+    /// drivers report work as done that a watchdog ended, and leave the old bytes.
+    pub(super) fn nonces(&self, count: u32) -> u32 {
+        self.nonce.fetch_add(count, Relaxed)
+    }
+
+    /// Records that the device was lost, so that every later call fails, and returns that error.
+    pub(super) fn lose(&self, reason: &str) -> DeviceError {
+        let mut errors = self.errors.lock().unwrap_or_else(PoisonError::into_inner);
+        let reason = errors.lost.get_or_insert_with(|| reason.into()).clone();
+        DeviceError::Lost { adapter: self.adapter.to_string(), reason }
+    }
+
+    /// Records that a result lacks its nonce, and returns the error.
+    pub(super) fn lose_undone(&self, what: &str) -> DeviceError {
+        self.lose(&format!(
+            "the driver reports {what} as done, but the device did not do it; a watchdog may have ended it"
+        ))
+    }
+
+    /// Returns how long work took, or seems to take under injected faults.
+    pub(super) fn taken(&self, turns: u64, elapsed: Duration) -> Duration {
+        self.faults.as_ref().and_then(|faults| faults.takes(turns)).unwrap_or(elapsed)
+    }
+
+    /// Returns how long a rollout took, or seems to take under injected faults.
+    pub(super) fn rollout_taken(&self, teams: usize, elapsed: Duration) -> Duration {
+        self.faults.as_ref().and_then(|faults| faults.rollout_takes(teams)).unwrap_or(elapsed)
+    }
+
+    /// Returns an error if the device was lost, or if anything failed outside the calls below. To be called after every
+    /// wait.
+    ///
+    /// # Errors
+    /// The device was lost, or a command failed.
+    pub fn check(&self) -> Result<(), DeviceError> {
+        let mut errors = self.errors.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(reason) = &errors.lost {
+            return Err(DeviceError::Lost { adapter: self.adapter.to_string(), reason: reason.clone() });
+        }
+        match errors.error.take() {
+            Some(reason) => Err(self.failed("a command", reason)),
+            None => Ok(()),
+        }
+    }
+
+    fn failed(&self, what: &str, reason: impl ToString) -> DeviceError {
+        DeviceError::Failed { adapter: self.adapter.to_string(), what: what.into(), reason: reason.to_string() }
+    }
+
+    /// Runs `make`, and returns any error of wgpu as an error about `what`.
+    ///
+    /// # Errors
+    /// wgpu reported an error, or the device was lost.
+    pub(crate) fn scoped<T>(&self, what: &str, make: impl FnOnce() -> T) -> Result<T, DeviceError> {
+        use wgpu::ErrorFilter::{Internal, OutOfMemory, Validation};
+        let [memory, validation, internal] =
+            [OutOfMemory, Validation, Internal].map(|f| self.device.push_error_scope(f));
+        let made = make();
+        // Scopes have to be popped innermost first.
+        let errors = [host::wait(internal.pop()), host::wait(validation.pop()), host::wait(memory.pop())];
+        self.check()?;
+        match errors.into_iter().flatten().next() {
+            None => Ok(made),
+            Some(wgpu::Error::OutOfMemory { .. }) => {
+                Err(DeviceError::OutOfMemory { adapter: self.adapter.to_string(), what: what.into() })
+            }
+            Some(error) => Err(self.failed(what, chain(&error))),
+        }
+    }
+}
