@@ -4,7 +4,7 @@
 //! up to the generation, from a checkpoint if possible. It then plays the generation's teams again and traces one
 //! team's episode. G of the best team or champion is compared with the run's `metrics.csv`.
 //!
-//! [`page()`] makes a page of the episodes, [`still`] a picture and [`gif`] a film.
+//! [`page()`] makes a page of the episodes, [`still`] a picture and [`gif()`] a film.
 
 use std::path::Path;
 
