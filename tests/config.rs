@@ -5,8 +5,8 @@ use std::path::Path;
 use flotilla::config::{
     Actions, CheckpointConfig, Config, ConfigError, Coupling, Density, Elites, Fitness, Follow, Heading, Learning,
     LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_PARTNERS, MAX_POPULATION,
-    MAX_STEPS, MAX_TRIALS, Motion, Mutation, Observers, Override, Paradigm, Parents, Policy, Problem, Sense, Sharing,
-    WorldConfig,
+    MAX_STEPS, MAX_TRIALS, Method, Motion, Mutation, Observers, Override, Paradigm, Parents, Policy, Problem, Sense,
+    Sharing, WorldConfig,
 };
 use flotilla::reader::Document;
 use proptest::collection::vec;
