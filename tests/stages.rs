@@ -239,8 +239,8 @@ fn a_run_with_several_partners_goes_on() {
 /// run, and through stages that change its step.
 #[test]
 fn evolution_strategies_go_on() {
-    let place = tempfile::tempdir().unwrap();
     const FAR: &str = "pois = [[10, 12], [20, 13]]\ncoupling = 1\nsteps = 20";
+    let place = tempfile::tempdir().unwrap();
     let stage = "[[stages]]\nfrom = 3\nset = { learning.search_step = 2.0, world.coupling = 2 }\n";
     for method in ["openai-es", "snes"] {
         let method = format!("population = 9\nmethod = '{method}'\nfitness = 'G'");
