@@ -205,7 +205,7 @@ fn constants_of_a_definition_are_that_to_the_bit() {
         ("rsqrt", 0, 1.5 * third),
         ("exact_sqrt", 0, 1.5 * third),
         ("ln", 9, LN_2),
-        ("normal_cosine", 1, TAU / f64::from(1 << 24)),
+        ("normal_angle", 1, TAU / f64::from(1 << 24)),
         ("normal_radius", 0, 1.0 / f64::from(1 << 24)),
         ("normal_of", 0, 1.0 / f64::from(1 << 20) / f64::from(1 << 20)),
     ] {
