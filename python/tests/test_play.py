@@ -153,6 +153,18 @@ def test_a_trace_is_played_once_with_the_scores_of_a_rollout(seed):
         assert getattr(given, name) is out and np.array_equal(out, whole)
 
 
+def test_blocks_change_nothing(config, monkeypatch):
+    policies = random_policies(config, 70)
+    whole, batch = rollout(config, policies, trace=True), flotilla.collect(config, policies, episodes=5, jitter=1.0)
+    monkeypatch.setattr(flotilla._play, "FIRST_BLOCK", 1)
+    parts, other = rollout(config, policies, trace=True), flotilla.collect(config, policies, episodes=5, jitter=1.0)
+    for name, value in vars(whole.trace).items():
+        assert np.array_equal(value, getattr(parts.trace, name)), name
+    assert np.array_equal(whole.g, parts.g) and np.array_equal(whole.df, parts.df)
+    for name, value in vars(batch).items():
+        assert np.array_equal(value, getattr(other, name)), name
+
+
 def test_wrong_records_are_told(config):
     policies = random_policies(config, 5)
     with pytest.raises(ValueError, match="record 'place'"):
