@@ -29,7 +29,7 @@ def test_cma_es_learns_a_task_of_the_suite():
 
 def test_sb3_s_ppo_learns():
     pytest.importorskip("stable_baselines3", reason="by request: FLOTILLA_LONG=1")
-    said = example("ppo_sb3", "400")
+    said = example("ppo_sb3", "200")
     before, after = map(float, re.findall(r"G (\d\.\d+) before, (\d\.\d+) after", said)[0])
     assert after > before + 0.1, said
 
