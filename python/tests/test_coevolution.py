@@ -105,7 +105,7 @@ def test_wrong_fitness_changes_nothing(config):
     with pytest.raises(TypeError):
         coevolution.tell(right > 0)
     assert coevolution.generation == 0
-    with pytest.raises(ValueError, match="before a generation"):
+    with pytest.raises(ValueError, match="no generation has a fitness yet"):
         coevolution.best
     with pytest.raises(ValueError, match="has no fitness yet"):
         coevolution.run
