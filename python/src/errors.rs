@@ -73,7 +73,7 @@ impl Raised for Failure {
             Failure::Run(error) => error.raised(),
             Failure::Record(error) => error.raised(),
             Failure::TooLittle(_) | Failure::Memory { .. } => PyMemoryError::new_err(text),
-            Failure::Backend(_) => failed(text),
+            Failure::Backend(error) => error.raised(),
             _ => PyValueError::new_err(text),
         }
     }
@@ -135,16 +135,16 @@ impl Raised for ops::Error {
 
 impl Raised for BackendError {
     fn raised(self) -> PyErr {
-        failed(self)
+        match self {
+            BackendError::Gpu(DeviceError::UnknownAdapter { .. }) => PyValueError::new_err(self.to_string()),
+            _ => failed(self),
+        }
     }
 }
 
 impl Raised for DeviceError {
     fn raised(self) -> PyErr {
-        match self {
-            DeviceError::UnknownAdapter { .. } => PyValueError::new_err(self.to_string()),
-            _ => failed(self),
-        }
+        BackendError::from(self).raised()
     }
 }
 

@@ -138,8 +138,12 @@ def test_a_folder_is_gone_on_with_or_written_over(config):
 
 def test_a_run_is_whole_without_its_picture(config):
     os.makedirs("run/curves.svg/full")
+    with pytest.raises(flotilla.Error, match="curves.svg"):
+        train(config, out="run")
+    assert os.listdir("run") == ["curves.svg"]
+    # A run that resumes is not held up by a picture.
     with pytest.warns(RuntimeWarning, match="curves.svg"):
-        run = train(config, out="run")
+        run = train(config, out="run", resume=True)
     assert Run.open("run").digest == run.digest
 
 
