@@ -417,7 +417,8 @@ def defects(tab, page, call, downloads, folder):
     assert columns == ["Leader", "D", "Df", "D++", "Dt (fitness)", "Remove it", "Remove it and its followers"], columns
     assert not tab.evaluate(CUT), tab.evaluate(CUT)
     tab.window(1280, 900, dark=False)
-    assert tab.evaluate("document.querySelectorAll('#credits thead th').length") == 5, "the table does not turn with the window"
+    # The table turns with the window.
+    tab.wait("document.querySelectorAll('#credits thead th').length === 5", 20)
     # A slow generation says for how long it has been playing.
     tab.load(page, layout="generally_forward", on="cpu", trials=1, generations=3, population=60000, learners="all-leaders")
     tab.click("#train")

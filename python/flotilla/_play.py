@@ -340,7 +340,7 @@ def collect(
     starts = (whole("episodes", episodes, 1, MAX_EPISODES), number, *jitters(config, jitter, poi_jitter))
     total = starts[0] * array.shape[1]
     shapes = _shapes(config, total)
-    arrays = {name: np.empty(shapes[name], np.float32) for name in ("inputs", "outputs", "actions")}
+    arrays: dict[str, NDArray[Any]] = {name: np.empty(shapes[name], np.float32) for name in ("inputs", "outputs", "actions")}
     _, pois, steps = config._native.sizes
     at = np.empty((total, pois), np.uint32)
     if reward == "G":
