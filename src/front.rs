@@ -33,7 +33,7 @@ use crate::record::{
     hex, metrics, policies, runs,
 };
 use crate::stepping::{StepError, Stepper};
-use crate::trainer::{Ending, Row, Trainer};
+use crate::trainer::{Ending, Row, Snapshot, Trainer};
 use crate::world::{INPUTS, OUTPUTS, World};
 
 mod coevolution;
@@ -231,6 +231,8 @@ pub struct Generation<'a> {
     pub last: usize,
     /// The results, one row per trial.
     pub rows: &'a [Row],
+    /// The best policy of each population, `[trials][populations][parameters]`, if [`train_with_champions`] trains.
+    pub champions: Option<&'a [f32]>,
 }
 
 /// The results of a training.
@@ -247,8 +249,7 @@ pub struct Trained {
     pub champion_g: Vec<f64>,
     /// The last generation's policies, best first in each population: `[trials]` of `[leaders][policies][parameters]`.
     pub policies: Vec<Vec<f32>>,
-    /// State that a longer run continues from, beside the policies. `None` if the run was read from a directory without its
-    /// last checkpoint.
+    /// State that a longer run continues from. `None` if the run was read from a directory without its last checkpoint.
     pub ending: Option<Ending>,
 }
 
@@ -268,6 +269,16 @@ impl Trained {
             (trained.best_g[at], trained.mean_g[at], trained.champion_g[at]) = (row.best_g, row.mean_g, row.champion_g);
         }
         trained
+    }
+
+    /// Returns the results of a trainer's only experiment, which is done.
+    fn of(trainer: &mut Trainer, config: Config, rows: &[Row]) -> Result<Trained, Failure> {
+        let bytes = config.policy_bytes().into();
+        let (policies, end) = trainer.ends(&[0]).remove(0);
+        let policies = policies.into_iter().map(<[f32]>::to_vec).collect();
+        let memory = |_| Failure::Memory { what: "the last generation", bytes };
+        let Snapshot { weights, fitness, .. } = end.copy().map_err(memory)?;
+        Ok(Trained::new(config, rows, policies, Some(Ending { weights, fitness })))
     }
 
     /// Reads the results of a finished run from its directory.
@@ -350,6 +361,29 @@ pub fn train_from(
     backend: &mut dyn Backend,
     policies: usize,
     first: &[Vec<f32>],
+    watch: impl FnMut(Generation<'_>) -> ControlFlow<()>,
+) -> Result<Trained, Failure> {
+    train_by(config, backend, (policies, first), false, watch)
+}
+
+/// Trains as [`train`] does, and gives `watch` the champions of every generation. A device that holds populations returns
+/// them after every generation.
+///
+/// # Errors
+/// As for [`train`].
+pub fn train_with_champions(
+    config: &Config,
+    backend: &mut dyn Backend,
+    watch: impl FnMut(Generation<'_>) -> ControlFlow<()>,
+) -> Result<Trained, Failure> {
+    train_by(config, backend, (0, &[]), true, watch)
+}
+
+fn train_by(
+    config: &Config,
+    backend: &mut dyn Backend,
+    (policies, first): (usize, &[Vec<f32>]),
+    with_champions: bool,
     mut watch: impl FnMut(Generation<'_>) -> ControlFlow<()>,
 ) -> Result<Trained, Failure> {
     let valid = config.validate()?;
@@ -357,10 +391,13 @@ pub fn train_from(
     let (mut trainer, mut rows, mut stopped) = (trainer_of(valid)?, Vec::new(), false);
     start_from(&mut trainer, &config, policies, first)?;
     while !trainer.is_done() {
+        // These play beside the next generation, and complete the rows of their own.
+        let best = with_champions.then(|| champions(&mut trainer, &config)).transpose()?;
         let played = trainer.advance(backend)?;
         if let Some(&Row { generation, .. }) = played.first().filter(|_| !stopped) {
             let last = config.learning.generations;
-            stopped = watch(Generation { generation, last, rows: &played }).is_break();
+            let champions = best.as_deref();
+            stopped = watch(Generation { generation, last, rows: &played, champions }).is_break();
             if stopped {
                 config.learning.generations = trainer.end(0);
                 config.stages.retain(|stage| stage.from <= config.learning.generations);
@@ -368,9 +405,20 @@ pub fn train_from(
         }
         rows.extend(played);
     }
-    let policies = trainer.policies(0);
-    let ending = trainer.ends(&[0]).first().and_then(|(_, end)| Ending::of(end));
-    Ok(Trained::new(config, &rows, policies, ending))
+    Trained::of(&mut trainer, config, &rows)
+}
+
+/// Returns the champions of the previous generation, `[trials][populations][parameters]`.
+fn champions(trainer: &mut Trainer, config: &Config) -> Result<Vec<f32>, BackendError> {
+    let (parameters, population) = (config.parameters(), config.learning.population);
+    let champion = population * parameters..(population + 1) * parameters;
+    let mut best = Vec::new();
+    for trial in 0..config.learning.trials {
+        for policies in trainer.weights(0, trial)?.chunks_exact(config.learning.slots() * parameters) {
+            best.extend_from_slice(&policies[champion.clone()]);
+        }
+    }
+    Ok(best)
 }
 
 /// Checks that a training fits this machine's memory, and returns its trainer.

@@ -12,14 +12,13 @@ use crate::host::Instant;
 use crate::memory::{self, TooLittle};
 use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule};
 use crate::record::disk::Disk;
-use crate::record::finished;
 use crate::record::folder::{
     self, FileSums, Folder, METRICS, Note, Origin, POLICIES, Run, RunSums, Start, StartFrom, Status, Story,
 };
 use crate::record::metrics::{self, Extent};
 use crate::record::policies::{self, Init, Policies};
 use crate::record::{RecordError, config_digest};
-use crate::trainer::{Ending, Row, Snapshot, SnapshotError, Trainer};
+use crate::trainer::{Row, Snapshot, SnapshotError, Trainer};
 
 /// Interval at which runs pass their metrics to the system.
 const FLUSH: Duration = Duration::from_secs(1);
@@ -567,16 +566,17 @@ impl Member {
         let (init, in_all) = (self.run.init.clone(), self.before + seconds);
         let metrics = ending.take().unwrap_or(mark);
         let next = end.generation;
-        match Ending::of(&end) {
-            Some(ending) => {
-                let last = finished::last_checkpoint(&self.config, init, in_all, metrics, ending);
-                keeper.save(last, output, since)?;
-            }
-            None => {
-                let config = config_digest(&self.config);
-                let last = Checkpoint { config, init, seconds: in_all, metrics, snapshot: end };
-                keeper.save_now(&last, &output, since)?;
-            }
+        let last = Checkpoint { config: config_digest(&self.config), init, seconds: in_all, metrics, snapshot: end };
+        if last.snapshot.weights.is_empty() {
+            let bytes = self.config.policy_bytes();
+            let snapshot = last
+                .snapshot
+                .copy()
+                .map_err(|error| RunError::of_snapshot(error.into(), "the scores of the last generation", bytes))?;
+            let Checkpoint { config, init, seconds, metrics, .. } = last;
+            keeper.save(Checkpoint { config, init, seconds, metrics, snapshot }, output, since)?;
+        } else {
+            keeper.save_now(&last, &output, since)?;
         }
         let path = self.folder.file(POLICIES);
         if path.exists() {

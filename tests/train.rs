@@ -781,9 +781,18 @@ fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 
 #[test]
 fn a_run_has_the_same_files_however_it_was_trained_and_stored() {
+    for method in ["tournament", "snes"] {
+        has_the_same_files(method);
+    }
+}
+
+fn has_the_same_files(method: &str) {
     let place = place();
-    place.good("train small.toml --out theirs --quiet");
-    let config = Config::parse(SMALL, "small.toml").unwrap();
+    let set = format!("--set learning.method=\"{method}\"");
+    place.good(&*format!("train small.toml --out theirs --quiet {set}"));
+    let text = SMALL.replacen("[learning]", &format!("[learning]\nmethod = \"{method}\""), 1);
+    let config = Config::parse(&text, "small.toml").unwrap();
+    assert!(config.to_toml().contains(&format!("method = \"{method}\"")));
     let mut player = front::cpu();
     let trained = front::train(&config, &mut *player.0, |_| Continue(())).unwrap();
     let columns = config.learning.generations + 1;
@@ -834,7 +843,7 @@ fn a_run_has_the_same_files_however_it_was_trained_and_stored() {
         }
         assert!(found.is_empty(), "{folder}: {:?}", found.keys());
     }
-    let straight = place.good("train small.toml --out straight --generations 16 --json").0;
+    let straight = place.good(&*format!("train small.toml --out straight --generations 16 --json {set}")).0;
     let straight: serde_json::Value = serde_json::from_str(&straight).unwrap();
     for folder in ["theirs", "saved", "archived"] {
         let told =

@@ -167,7 +167,7 @@ class Coevolution:
         """
         if not self.done:
             raise ValueError(f"generation {self.generation} has no fitness yet; a run has results once all generations have one")
-        return Run(self._native.finish(), ("cpu", "ask and tell", None), None, None)
+        return Run(self._native.finish(), ("cpu", "ask and tell", None, None, _native.threads(), None), None, None)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"config": self.config, "backend": self._backend, "state": self.state}

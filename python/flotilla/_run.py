@@ -130,7 +130,7 @@ class Run:
             ['metrics.csv', 'policies.safetensors', 'run.json']
         """
         self._write(os.fspath(folder), force)
-        if self._temporary and self._folder is not None and self._played[2] is not None:
+        if self._temporary and self._folder is not None and self._played[-1] is not None:
             # Only its checkpoints have the policies that it started from.
             shutil.copytree(self._folder, folder, dirs_exist_ok=True)
 

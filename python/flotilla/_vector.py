@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
-from flotilla._arrays import Floats, aligned, floats, renamed, whole
+from flotilla._arrays import ArraySupply, Floats, aligned, floats, renamed, whole
 from flotilla._config import Config, jitters
 
 if TYPE_CHECKING:
@@ -62,6 +62,7 @@ class TeamBatch:
         self.seed: int | None = None
         self.drawn = 0
         self.rewards = np.zeros((self.count, self.leaders), np.float32)
+        self.new_inputs = ArraySupply((self.count, self.leaders, _native.INPUTS))
 
     def _make_stepper(self) -> _native.Stepper:
         # The fitness decides what the stepper records.
@@ -89,7 +90,7 @@ class TeamBatch:
     def inputs(self, out: Floats | None = None) -> Floats:
         """Returns what every leader senses, `[teams, leaders, 8]`, in a new array or in `out`."""
         if out is None:
-            out = aligned((self.count, self.leaders, _native.INPUTS))
+            out = self.new_inputs()
         self.stepper.read_inputs(out)
         return out
 
@@ -221,9 +222,10 @@ class VectorEnv(Base):
         self._inputs = aligned((teams, leaders, _native.INPUTS))
         self._observations = aligned((teams, leaders, self._single[-1])) if self.time_input else self._inputs
         self._rewards = aligned((self.num_envs,) + ((leaders,) if self.layout == "leaders" else ()))
+        self._new_observations, self._new_rewards = (ArraySupply(own.shape) for own in (self._observations, self._rewards))
 
     def __getstate__(self) -> dict[str, Any]:
-        scratch = ("_inputs", "_observations", "_rewards")
+        scratch = ("_inputs", "_observations", "_rewards", "_new_observations", "_new_rewards")
         return {name: value for name, value in self.__dict__.items() if name not in scratch}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -257,7 +259,7 @@ class VectorEnv(Base):
         if not self.time_input:
             found = self._teams.inputs(None if copy else self._inputs)
         else:
-            found = aligned(self._observations.shape) if copy else self._observations
+            found = self._new_observations() if copy else self._observations
             found[..., :-1] = self._teams.inputs(self._inputs)
             found[..., -1] = (self._teams.steps / np.float32(self._teams.length))[:, None]
         return found.reshape(self.num_envs, *self._single)
@@ -268,7 +270,7 @@ class VectorEnv(Base):
 
     def _reward(self) -> Floats:
         """Returns rewards in the layout's shape, in a new array if `copy` is set, else in the reused one."""
-        out = aligned(self._rewards.shape) if self.copy else self._rewards
+        out = self._new_rewards() if self.copy else self._rewards
         if self.layout == "team":
             np.mean(self._teams.rewards, axis=1, out=out)
         else:

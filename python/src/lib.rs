@@ -35,7 +35,7 @@ mod _native {
     #[pymodule_export]
     use crate::train::{Generation, open, save, train, train_into, write_policies};
     #[pymodule_export]
-    use crate::workers::forked;
+    use crate::workers::{forked, threads};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

@@ -1,6 +1,6 @@
 //! The command-line program, its use cases, and the adapters it can use.
 
-use std::cell::{Cell, RefCell};
+use std::cell::Cell;
 use std::ffi::{CString, OsString};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
@@ -38,12 +38,13 @@ const PATIENCE: Duration = Duration::from_millis(50);
 #[pyfunction]
 pub fn answer(py: Python<'_>, request: &str, backend: &str, command: &str) -> PyResult<String> {
     let request: Request = serde_json::from_str(request).map_err(|error| PyValueError::new_err(error.to_string()))?;
-    perform(py, backend, command, &mut |_, _| Ok(false), |player, context| ops::answer(&request, player, context))
+    perform(py, backend, command, &|_, _, _| Ok(false), |player, context| ops::answer(&request, player, context))
         .map(|outcome| outcome.to_string())
 }
 
-/// Receives the rows of a generation and the number of the last one. Returns whether to end the training there.
-type Watch<'a> = &'a mut (dyn FnMut(&[Row], usize) -> PyResult<bool> + Send);
+/// Receives the rows of a generation, the number of the last one, and champions if they were asked for. Returns whether to end the
+/// training there.
+type Watch<'a> = &'a (dyn Fn(&[Row], usize, Option<&[f32]>) -> PyResult<bool> + Sync);
 
 /// Runs a use case, shows its warnings, and checks for Ctrl-C.
 pub fn perform<R: Send>(
@@ -57,7 +58,7 @@ pub fn perform<R: Send>(
     let (outcome, interrupted) = workers::aside(py, || {
         let [stop, end] = [false; 2].map(AtomicBool::new);
         let (asked, interrupted) = (Cell::new(Instant::now()), Cell::new(None));
-        let (watch, last, ended) = (RefCell::new(watch), Cell::new(0), Cell::new(false));
+        let (last, ended) = (Cell::new(0), Cell::new(false));
         let tell = |event: Event<'_>| {
             let is_due = asked.get().elapsed() >= PATIENCE;
             let generation = |a: &Row, b: &Row| a.generation == b.generation;
@@ -69,8 +70,8 @@ pub fn perform<R: Send>(
                     last.set(to);
                     Ok(false)
                 }
-                Event::Rows(_, rows) if !ended.get() => {
-                    let mut told = rows.chunk_by(generation).map(|rows| watch.borrow_mut()(rows, last.get()));
+                Event::Rows { rows, champions, .. } if !ended.get() => {
+                    let mut told = rows.chunk_by(generation).map(|rows| watch(rows, last.get(), champions));
                     told.find(|told| !matches!(told, Ok(false))).unwrap_or(Ok(false))
                 }
                 _ => Ok(false),

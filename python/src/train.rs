@@ -1,13 +1,10 @@
 //! Trains in memory, or in a run directory as the program does.
 
-use std::ops::ControlFlow;
 use std::path::PathBuf;
-use std::time::{Duration, Instant};
 
-use flotilla::backend::{Backend, OpenBackend};
-use flotilla::choice::Work;
-use flotilla::front::{self, Coevolution, Trained};
-use flotilla::ops::{self, ConfigText, train::Request};
+use flotilla::front::Trained;
+use flotilla::ops::train::{InMemory, Request};
+use flotilla::ops::{self, ConfigText, Processor};
 use flotilla::record::digests::Verification;
 use flotilla::record::disk::Disk;
 use flotilla::record::finished::Finished;
@@ -26,9 +23,6 @@ use crate::config::Config;
 use crate::errors::Raise;
 use crate::program::perform;
 use crate::workers;
-
-/// Minimum time between checks for Ctrl-C if there is no callback.
-const PATIENCE: Duration = Duration::from_millis(50);
 
 /// One generation, as callbacks of `train` receive it.
 ///
@@ -102,36 +96,20 @@ impl Generation {
     }
 }
 
-/// Calls the callback after every generation, and checks for Ctrl-C.
+/// The callback, and what it is told.
 struct Watcher<'a> {
     callback: Option<&'a Py<PyAny>>,
-    asked: Instant,
-    error: Option<PyErr>,
-    /// Seconds since the start of training at which each generation was complete.
-    times: Vec<f64>,
-    since: Instant,
+    populations: usize,
 }
 
-impl<'a> Watcher<'a> {
-    fn new(callback: Option<&'a Py<PyAny>>) -> Watcher<'a> {
-        Watcher { callback, asked: Instant::now(), error: None, times: vec![], since: Instant::now() }
-    }
-
+impl Watcher<'_> {
     /// Reports a generation to the callback. Returns whether to stop.
-    fn tell(&mut self, rows: &[Row], last: usize, champions: Option<(Vec<f32>, usize)>) -> bool {
-        self.times.push(self.since.elapsed().as_secs_f64());
-        if self.callback.is_none() && self.asked.elapsed() < PATIENCE {
-            return false;
-        }
-        let told = Python::attach(|py| {
-            py.check_signals()?;
-            let (Some(callback), Some(row)) = (self.callback, rows.first()) else { return Ok(false) };
-            let answer = callback.bind(py).call1((Generation {
-                generation: row.generation,
-                last,
-                rows: rows.into(),
-                champions,
-            },))?;
+    fn tell(&self, rows: &[Row], last: usize, champions: Option<&[f32]>) -> PyResult<bool> {
+        let (Some(callback), Some(row)) = (self.callback, rows.first()) else { return Ok(false) };
+        Python::attach(|py| {
+            let champions = champions.map(|champions| (champions.to_vec(), self.populations));
+            let generation = Generation { generation: row.generation, last, rows: rows.into(), champions };
+            let answer = callback.bind(py).call1((generation,))?;
             if answer.is_none() {
                 return Ok(false);
             }
@@ -141,11 +119,6 @@ impl<'a> Watcher<'a> {
             }
             let text = format!("the callback gave {answer:.60}, allowed are True to stop, False and None");
             Err(PyTypeError::new_err(text))
-        });
-        self.asked = Instant::now();
-        told.unwrap_or_else(|error| {
-            self.error = Some(error);
-            true
         })
     }
 }
@@ -165,21 +138,20 @@ pub fn outcomes(py: Python<'_>, trained: Trained, digest: String) -> PyResult<Ou
     let policies = policies.into_iter().map(|trial| PyArray1::from_vec(py, trial).reshape(shape));
     let metrics = [table(best_g)?, table(mean_g)?, table(champion_g)?];
     let policies = policies.collect::<PyResult<_>>()?;
-    let end = ending.map(|Ending { fitness, pending }| {
-        (fitness.into_iter().map(|scores| PyArray1::from_vec(py, scores)).collect(), pending)
-    });
+    let arrays = |trials: Vec<Vec<f32>>| trials.into_iter().map(|trial| PyArray1::from_vec(py, trial)).collect();
+    let end = ending.map(|Ending { weights, fitness }| (arrays(weights), arrays(fitness)));
     Ok((Config(config), metrics, policies, digest, end))
 }
 
-/// State that a longer run continues from: each trial's scores, `[leaders or 1][policies]`, and the best and mean G of the last
-/// generation.
-type End<T> = Option<(Vec<T>, Vec<Option<[f64; 2]>>)>;
+/// State that a longer run continues from: of each trial the weights, if they are needed, and the scores.
+type End<T> = Option<(Vec<T>, Vec<T>)>;
 
-/// The backend, "cpu" or "gpu", its description, and the digest of the initial policies if they were given.
-type Played = (String, String, Option<String>);
+/// The processor: the fields of [`Processor`]. The last is the digest of the initial policies if they were given.
+type Played = (String, String, Option<String>, Option<String>, usize, Option<String>);
 
-fn named((backend, machine): &OpenBackend) -> Played {
-    (machine.backend.clone(), backend.describe(), None)
+fn played(processor: Processor, init: Option<String>) -> Played {
+    let Processor { backend, description, adapter, driver, threads, .. } = processor;
+    (backend, description, adapter, driver, threads, init)
 }
 
 /// Trains in memory. Also returns the backend, and the seconds at which each generation was complete.
@@ -191,58 +163,14 @@ pub fn train<'py>(
     callback: Option<Py<PyAny>>,
     champions: bool,
 ) -> PyResult<(Outcomes<'py>, Played, Vec<f64>)> {
-    let mut watcher = Watcher::new(callback.as_ref());
-    let (trained, digest, played) = workers::play(py, backend, Work::of([&config.0]), |player| {
-        let played = named(player);
-        if champions {
-            let trained = with_champions(&config.0, &mut *player.0, &mut watcher)?;
-            let digest = trained.digest();
-            return Ok((trained, digest, played));
-        }
-        let trained = front::train(&config.0, &mut *player.0, |generation| {
-            let stop = watcher.error.is_none() && watcher.tell(generation.rows, generation.last, None);
-            if stop { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-        });
-        let trained = trained.raise()?;
-        let digest = trained.digest();
-        Ok((trained, digest, played))
-    })?;
-    if let Some(error) = watcher.error {
-        return Err(error);
-    }
-    // After a stop, one more generation is played, which the watcher has not seen.
-    watcher.times.resize(trained.config.learning.generations + 1, watcher.since.elapsed().as_secs_f64());
-    Ok((outcomes(py, trained, digest)?, played, watcher.times))
-}
-
-/// Trains with the champions of every generation for the callback. The populations stay on the host.
-fn with_champions(
-    config: &flotilla::Config,
-    backend: &mut dyn Backend,
-    watcher: &mut Watcher<'_>,
-) -> PyResult<Trained> {
-    let mut coevolution = Coevolution::new(config).raise()?;
-    let (mut champions, mut stopped) = (Vec::new(), false);
-    while !coevolution.is_done() {
-        let told = coevolution.tell(backend, None).raise()?;
-        let (rows, last) = (told.rows.to_vec(), told.last);
-        let next = coevolution.best().raise()?;
-        // A generation is complete when its champions have played with the next one.
-        for (place, rows) in rows.chunk_by(|a, b| a.generation == b.generation).enumerate() {
-            let own = if place == 0 && !champions.is_empty() { &champions } else { &next };
-            if !stopped
-                && watcher.error.is_none()
-                && watcher.tell(rows, last, Some((own.clone(), config.populations())))
-            {
-                stopped = true;
-                if !coevolution.is_done() {
-                    coevolution.stop();
-                }
-            }
-        }
-        champions = next;
-    }
-    coevolution.finish().raise()
+    let watcher = Watcher { callback: callback.as_ref(), populations: config.0.populations() };
+    let (InMemory { trained, seconds, processor, .. }, digest) =
+        perform(py, backend, "", &|rows, last, champions| watcher.tell(rows, last, champions), |player, context| {
+            let done = ops::train::in_memory(&config.0, champions, player, context)?;
+            let digest = done.trained.digest();
+            Ok((done, digest))
+        })?;
+    Ok((outcomes(py, trained, digest)?, played(processor, None), seconds))
 }
 
 /// Returns the number of policies, and the given policies, `[populations][policies][parameters]`, of each trial.
@@ -291,12 +219,9 @@ pub fn train_into(
     };
     let config = ConfigText { text: config.0.to_toml(), name: "config".into(), set: vec![] };
     let request = Request { config, name: "run".into(), out: Some(out), start, init, tensorboard: false };
-    let mut watcher = Watcher::new(callback.as_ref());
-    let mut watch = |rows: &[Row], last| {
-        let stop = watcher.tell(rows, last, None);
-        watcher.error.take().map_or(Ok(stop), Err)
-    };
-    perform(py, backend, command, &mut watch, |player, context| ops::train::run(&request, player, context)).map(drop)
+    let watcher = Watcher { callback: callback.as_ref(), populations: 0 };
+    let watch = |rows: &[Row], last, _: Option<&[f32]>| watcher.tell(rows, last, None);
+    perform(py, backend, command, &watch, |player, context| ops::train::run(&request, player, context)).map(drop)
 }
 
 /// Reads a finished run.
@@ -313,7 +238,7 @@ pub fn open(py: Python<'_>, folder: PathBuf, unverified: bool) -> PyResult<(Outc
         });
         Ok::<_, PyErr>((trained, digest, run, times.collect::<Result<_, _>>().raise()?))
     })?;
-    Ok((outcomes(py, trained, digest)?, (run.backend, run.description, run.init), times))
+    Ok((outcomes(py, trained, digest)?, played(Processor::of_run(&run), run.init), times))
 }
 
 /// Writes the results of a training in memory as a run directory, and returns the digest.
@@ -338,9 +263,12 @@ pub fn save(
         && policies.len() == trials
         && policies.iter().all(|policies| policies.shape() == shape)
         && times.len() == columns
-        && end.iter().all(|(fitness, pending)| {
+        && end.iter().all(|(weights, fitness)| {
+            let slots = config.populations() * learning.slots() * config.parameters();
             let scores = config.populations() * learning.population;
-            fitness.len() == trials && pending.len() == trials && fitness.iter().all(|trial| trial.len() == scores)
+            let of =
+                |all: &[PyReadonlyArray1<'_, f32>], len| all.len() == trials && all.iter().all(|one| one.len() == len);
+            (weights.is_empty() || of(weights, slots)) && of(fitness, scores)
         });
     let slices = |fits: bool| {
         let metrics = metrics.iter().map(|metrics| metrics.as_slice().ok()).collect::<Option<Vec<_>>>()?;
@@ -350,10 +278,10 @@ pub fn save(
     let Some((scores, weights)) = slices(fits) else {
         return Err(PyValueError::new_err("the run's arrays no longer have the shapes that its config gives them"));
     };
-    let ending = end.map(|(fitness, pending)| {
-        let fitness = fitness.iter().map(|trial| trial.as_array().iter().copied().collect()).collect();
-        Ending { fitness, pending }
-    });
+    let copies = |trials: Vec<PyReadonlyArray1<'_, f32>>| {
+        trials.iter().map(|trial| trial.as_array().iter().copied().collect()).collect()
+    };
+    let ending = end.map(|(weights, fitness)| Ending { weights: copies(weights), fitness: copies(fitness) });
     let rows = (0..columns).flat_map(|generation| (0..trials).map(move |trial| (generation, trial)));
     let row = |(generation, trial): (usize, usize)| {
         let of = |score: &[f64]| score[trial * columns + generation];
@@ -362,12 +290,14 @@ pub fn save(
     };
     let rows: Vec<(Row, f64)> = rows.map(row).collect();
     workers::aside(py, || {
-        let (backend, description, init) = played;
+        let (backend, description, adapter, driver, threads, init) = played;
         let run = folder::Run {
             version: env!("CARGO_PKG_VERSION").into(),
             backend,
             description,
-            threads: rayon::current_num_threads(),
+            adapter,
+            driver,
+            threads,
             updated: folder::now(),
             sessions: 1,
             command: command.into(),

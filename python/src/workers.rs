@@ -69,6 +69,12 @@ fn wanted_threads(otherwise: usize) -> usize {
     wanted.filter(|&threads: &usize| threads > 0).map_or(otherwise, |threads| threads.max(2))
 }
 
+/// Returns the number of threads that play.
+#[pyfunction]
+pub fn threads(py: Python<'_>) -> usize {
+    aside(py, rayon::current_num_threads)
+}
+
 /// Runs `work` without the interpreter's lock.
 pub fn aside<R: Send>(py: Python<'_>, work: impl FnOnce() -> R + Send) -> R {
     py.detach(|| with_threads(work))

@@ -86,18 +86,19 @@ def test_observations_outlive_the_environment():
 
 
 @pytest.mark.parametrize("library", ["torch", "jax"])
-def test_other_libraries_take_every_row_without_a_copy_of_ours(library):
+@pytest.mark.parametrize("teams", [1, 70])
+def test_other_libraries_take_every_row_without_a_copy_of_ours(library, teams):
     # PyTorch takes gigabytes: only the long form of the tests installs it.
     why = "by request: FLOTILLA_LONG=1" if library == "torch" else "jax is not installed"
     module = pytest.importorskip(library, reason=why)
     convert = module.from_numpy if library == "torch" else module.device_put
-    env, other = VectorEnv(Config.paper(), 70), VectorEnv(Config.paper(), 70)
+    env, other = VectorEnv(Config.paper(), teams), VectorEnv(Config.paper(), teams)
     env.reset(), other.reset()
     rng, kept, expected = np.random.default_rng(1), [], []
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for _ in range(1000):
-            actions = rng.uniform(-1, 1, (70, 4, 2)).astype(np.float32)
+            actions = rng.uniform(-1, 1, (teams, 4, 2)).astype(np.float32)
             kept.append(convert(env.step(actions)[0]))
             expected.append(other.step(actions)[0])
     for found, copied in zip(kept, expected):

@@ -99,20 +99,25 @@ def files_of(folder):
     return {str(path.relative_to(folder)): content(path) for path in pathlib.Path(folder).rglob("*") if path.is_file()}
 
 
-def test_a_run_has_the_same_files_however_it_was_trained(config, program, tmp_path):
+@pytest.mark.parametrize("method", ["tournament", "openai-es"])
+def test_a_run_has_the_same_files_however_it_was_trained(config, program, tmp_path, method):
+    config = config.replace(learning={"method": method})
     (tmp_path / "config.toml").write_text(config.to_toml())
     program("train", "config.toml", "--out", "theirs", "--backend", "cpu", "--quiet")
     train(config, out="ours", backend="cpu")
     train(config, backend="cpu").save("saved")
+    Run.open("theirs").save("copy")
+    pickle.loads(pickle.dumps(train(config, backend="cpu"))).save("pickled")
+    copies = ("ours", "saved", "copy", "pickled")
     expected = files_of("theirs")
     assert {"config.toml", "curves.svg", "metrics.csv", "policies.safetensors", "run.json"} < set(expected)
     longer = train(config.replace(learning={"generations": 16}), backend="cpu").digest
-    for folder in ("ours", "saved"):
+    for folder in copies:
         found = files_of(folder)
         assert found.keys() == expected.keys(), folder
         for name, content in expected.items():
             assert found[name] == content, (folder, name)
-    for folder in ("theirs", "ours", "saved"):
+    for folder in ("theirs", *copies):
         extended = program("train", f"{folder}/config.toml", "--out", folder, "--resume", "--generations", "16", "--json", "--backend", "cpu")
         extended = json.loads(extended)
         # Nothing that was trained before is trained again.
@@ -363,45 +368,3 @@ def test_the_recorded_command_is_one_that_a_shell_reads(tmp_path):
     subprocess.run([sys.executable, *words], check=True, cwd=tmp_path)
     command = json.loads((tmp_path / "kept/run.json").read_text())["command"]
     assert shlex.split(command)[1:] == words
-
-
-def _files(folder):
-    """Returns what a run's folder holds, without times and without who wrote it."""
-    found = {}
-    for path in sorted(pathlib.Path(folder).rglob("*")):
-        name = str(path.relative_to(folder))
-        if not path.is_file() or name in (".lock", ".flotilla.sha256"):
-            continue
-        content = path.read_bytes()
-        if name == "metrics.csv":
-            content = [line.rsplit(",", 1)[0] for line in path.read_text().splitlines()]
-        elif name == "run.json":
-            content = json.loads(content)
-            for key in ("started", "updated", "seconds", "sessions", "command", "commit", "threads", "adapter", "driver"):
-                content.pop(key, None)
-        elif name.startswith("checkpoints"):
-            header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-            tensors = {key: value for key, value in header.items() if key != "__metadata__"}
-            kept = {key: header["__metadata__"][key] for key in ("config", "generation", "generations")}
-            content = tensors, kept, content[8 + int.from_bytes(content[:8], "little") :]
-        found[name] = content
-    return found
-
-
-def test_a_run_is_the_same_whoever_trains_it_and_is_extended_without_training_again(config, program, tmp_path):
-    (tmp_path / "c.toml").write_text(config.to_toml())
-    program("train", "c.toml", "--out", "program", "--quiet", "--backend", "cpu", cwd=tmp_path)
-    train(config, out=tmp_path / "python", backend="cpu")
-    train(config, backend="cpu").save(tmp_path / "memory")
-    Run.open(tmp_path / "program").save(tmp_path / "copy")
-    whole = ["--generations", str(config["learning.generations"] + 10), "--backend", "cpu", "--json", "--quiet"]
-    straight = json.loads(program("train", "c.toml", "--out", "straight", *whole, cwd=tmp_path))
-    first = _files(tmp_path / "program")
-    assert any(name.startswith("checkpoints") for name in first)
-    for name in ("python", "memory", "copy"):
-        assert _files(tmp_path / name) == first
-    for name in ("program", "python", "memory", "copy"):
-        extended = json.loads(program("train", f"{name}/config.toml", "--out", name, "--resume", *whole, cwd=tmp_path))
-        assert extended["digest"] == straight["digest"]
-        # The last generation is played again, because the champions of a longer run play with the next generation.
-        assert extended["trained_generations"] <= 11, name

@@ -112,9 +112,9 @@ impl Display {
             (Event::Begin(names, from, last), shown) => {
                 *shown = Shown::Curves(Board::new(names, from, last, self.quiet));
             }
-            (Event::Rows(next, rows), Shown::Curves(board)) => board.show(next, rows),
-            (Event::Share(part, text), Shown::Share(meter)) => meter.show(part, || text),
-            (Event::Share(part, text), shown) => {
+            (Event::Rows { next, rows, .. }, Shown::Curves(board)) => board.show(next, rows),
+            (Event::Fraction(part, text), Shown::Share(meter)) => meter.show(part, || text),
+            (Event::Fraction(part, text), shown) => {
                 let mut meter = Meter::new(self.quiet);
                 meter.show(part, || text);
                 *shown = Shown::Share(meter);
@@ -127,7 +127,7 @@ impl Display {
                 }
                 *shown = Shown::Nothing;
             }
-            (Event::Message(_) | Event::Rows(..), _) => {}
+            (Event::Message(_) | Event::Rows { .. }, _) => {}
         }
     }
 }

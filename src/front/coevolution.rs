@@ -1,9 +1,9 @@
 //! Training in which the caller decides what policies are worth.
 
-use super::{Failure, Generation, Trained, start_from, trainer_of};
+use super::{Failure, Generation, Trained, champions, start_from, trainer_of};
 use crate::backend::Backend;
-use crate::config::{Config, Learning};
-use crate::trainer::{Asked, Ending, Row, Snapshot, Trainer};
+use crate::config::Config;
+use crate::trainer::{Asked, Row, Snapshot, Trainer};
 use crate::world::World;
 
 /// Training by ask and tell: the caller decides what each leader of each team was worth.
@@ -147,14 +147,7 @@ impl Coevolution {
         }
         let rows = &self.rows[first..];
         let generation = rows.last().map_or(0, |row| row.generation);
-        Ok(Generation { generation, last: self.config.learning.generations, rows })
-    }
-
-    /// Makes the generation that plays next the last.
-    pub fn stop(&mut self) {
-        let Config { learning, stages, .. } = &mut self.config;
-        learning.generations = self.trainer.end(0);
-        stages.retain(|stage| stage.from <= learning.generations);
+        Ok(Generation { generation, last: self.config.learning.generations, rows, champions: None })
     }
 
     /// Plays the champions of the last generation, which completes its rows.
@@ -172,17 +165,7 @@ impl Coevolution {
         if self.generation() == 0 {
             return Err(Failure::State);
         }
-        let Learning { population, .. } = self.config.learning;
-        let parameters = self.config.parameters();
-        let champion = population * parameters..(population + 1) * parameters;
-        let mut best = Vec::new();
-        for trial in 0..self.config.learning.trials {
-            let stride = self.config.learning.slots() * parameters;
-            for population in self.trainer.weights(0, trial)?.chunks_exact(stride) {
-                best.extend_from_slice(&population[champion.clone()]);
-            }
-        }
-        Ok(best)
+        Ok(champions(&mut self.trainer, &self.config)?)
     }
 
     /// Returns the state, for [`Coevolution::restore`].
@@ -232,8 +215,6 @@ impl Coevolution {
         if !self.is_done() {
             return Err(Failure::State);
         }
-        let policies = self.trainer.policies(0);
-        let ending = self.trainer.ends(&[0]).first().and_then(|(_, end)| Ending::of(end));
-        Ok(Trained::new(self.config.clone(), &self.rows, policies, ending))
+        Trained::of(&mut self.trainer, self.config.clone(), &self.rows)
     }
 }

@@ -9,6 +9,7 @@ use super::remedy;
 use crate::backend::BackendError;
 use crate::backend::gpu::device::DeviceError;
 use crate::config::ConfigError;
+use crate::front::Failure;
 use crate::record::RecordError;
 use crate::report::replay::ReplayError;
 use crate::report::runs::ReadError;
@@ -107,6 +108,19 @@ pub enum Error {
 }
 
 impl Error {
+    /// Converts the error of a training in memory.
+    pub(crate) fn of_training(error: Failure) -> Error {
+        match error {
+            Failure::Config(error) => error.into(),
+            Failure::Backend(error) => error.into(),
+            Failure::TooLittle(error) => Error::Run(error.into()),
+            Failure::Memory { what, bytes } => {
+                Error::Run(RunError::Memory { what, bytes: bytes.try_into().unwrap_or(u64::MAX) })
+            }
+            error => Error::Refused(error.to_string().into()),
+        }
+    }
+
     /// Returns the kind of the error as a word that stays the same from version to version.
     pub fn code(&self) -> &'static str {
         match self {

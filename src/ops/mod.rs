@@ -94,10 +94,17 @@ pub enum Event<'a> {
     Warning(String),
     /// Training of these experiments begins: their names and numbers of POIs, the next and the last generation.
     Begin(Vec<(String, Option<usize>)>, usize, usize),
-    /// Experiments have played: the next generation, and the rows that became complete.
-    Rows(usize, &'a [Row]),
-    /// The share of the work that is done, 0 to 1, and what is done now.
-    Share(f64, String),
+    /// Experiments have played.
+    Rows {
+        /// The next generation.
+        next: usize,
+        /// The rows that became complete.
+        rows: &'a [Row],
+        /// The best policy of each population of that generation, `[trials][populations][parameters]`, if they were asked for.
+        champions: Option<&'a [f32]>,
+    },
+    /// The fraction of the work that is done, 0 to 1, and what is done now.
+    Fraction(f64, String),
     /// No more progress is reported for now.
     Pause,
 }
@@ -141,9 +148,14 @@ impl Context<'_> {
         (self.tell)(Event::Note(text.to_string()));
     }
 
-    /// Reports the share of the work that is done.
+    /// Reports rows that became complete.
+    fn rows(&self, next: usize, rows: &[Row]) {
+        (self.tell)(Event::Rows { next, rows, champions: None });
+    }
+
+    /// Reports the fraction of the work that is done.
     pub(crate) fn share(&self, part: f64, text: impl ToString) {
-        (self.tell)(Event::Share(part, text.to_string()));
+        (self.tell)(Event::Fraction(part, text.to_string()));
     }
 
     pub(crate) fn pause(&self) {

@@ -176,7 +176,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
         };
         let mut watch = |now: &run::Progress<'_>| {
             let rows: Vec<Row> = now.rows.iter().flat_map(of_arms).collect();
-            (context.tell)(Event::Rows(next(now.generations), &rows));
+            context.rows(next(now.generations), &rows);
         };
         let ended = context.train(&mut watch, |options| session.train(player, options));
         (context.tell)(Event::Pause);
@@ -213,7 +213,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
         }
         let (generation, last) = (baselines.generation(), learning.generations);
         let part = generation as f64 / (last + 1) as f64;
-        (context.tell)(Event::Share(part, format!("playing random teams: generation {generation} of {last}")));
+        (context.tell)(Event::Fraction(part, format!("playing random teams: generation {generation} of {last}")));
     }
     (context.tell)(Event::Pause);
     let baselines = baselines.found();

@@ -129,7 +129,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
         let share = |now: &SweepProgress| {
             let share = now.played as f64 / now.total.max(1) as f64;
             let text = format!("{}: {}/{} experiments done", part.name, now.done, now.points);
-            (context.tell)(Event::Share((before + share * cost(sweep)) / whole, text));
+            (context.tell)(Event::Fraction((before + share * cost(sweep)) / whole, text));
         };
         let ended =
             super::sweep::train_points(context, sweep, &points, &folder, start, &disk, free_memory(), player, &share)?;
@@ -145,7 +145,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
         });
         let (mut session, _) = Session::open_from(runs.collect::<Result<_, RecordError>>()?, start, &disk)?;
         let mut watch = |_: &crate::run::Progress<'_>| {
-            (context.tell)(Event::Share(before / whole, format!("{}: warm starts", part.name)));
+            (context.tell)(Event::Fraction(before / whole, format!("{}: warm starts", part.name)));
         };
         if !session.is_done() && context.train(&mut watch, |options| session.train(player, options))? == Ended::Stopped
         {
@@ -163,7 +163,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
             }
             let sweep = parts.iter().find(|(other, _)| other.name == part.name).map(|(_, sweep)| sweep);
             let Some(sweep) = sweep else { continue };
-            (context.tell)(Event::Share(1.0, format!("comparing {}", part.name)));
+            (context.tell)(Event::Fraction(1.0, format!("comparing {}", part.name)));
             let answer = part.answer(sweep, out, &mut *player.0)?;
             for kind in Format::ALL {
                 let path = out.join(format!("{}.{}", part.name, kind.extension()));

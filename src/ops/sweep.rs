@@ -331,7 +331,7 @@ pub fn train(request: &Request, sweep: &Sweep, player: &mut dyn Player, context:
         let SweepProgress { done, points, batch, generation, last, played, total } = *progress;
         let text =
             format!("{done}/{points} points done, {batch} side by side at generation {}/{last}", generation.min(last));
-        (context.tell)(Event::Share(played as f64 / total.max(1) as f64, text));
+        (context.tell)(Event::Fraction(played as f64 / total.max(1) as f64, text));
     };
     match train_points(context, sweep, &points, out, request.start, &disk, memory, player, &share)? {
         Ended::Done => Ok(()),

@@ -211,7 +211,7 @@ fn train(
     let title = format!("{task}, {} policies, {}", learning.population, learning.fitness);
     let names = vec![(title, Some(config.world.pois.len()))];
     (context.tell)(Event::Begin(names, session.generations()[0], learning.generations));
-    let mut watch = |now: &Progress<'_>| (context.tell)(Event::Rows(now.generations[0], now.rows));
+    let mut watch = |now: &Progress<'_>| context.rows(now.generations[0], now.rows);
     let ended = context.train(&mut watch, |options| session.train(player, options));
     context.pause();
     match ended? {

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::fs;
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -10,8 +11,10 @@ use serde::{Deserialize, Serialize};
 use super::remedy::RUNS;
 use super::{ConfigText, Context, Error, Event, Player, Processor, check_memory, escaped, said};
 use crate::choice::Work;
+use crate::config::Config;
 use crate::escape::PathExt;
 use crate::file;
+use crate::front::{self, Generation, Trained};
 use crate::host::Instant;
 use crate::record::RecordError;
 use crate::record::archive;
@@ -240,7 +243,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
     }
     while !session.is_done() {
         let mut watch = |progress: &Progress<'_>| {
-            (context.tell)(Event::Rows(progress.generations[0], progress.rows));
+            context.rows(progress.generations[0], progress.rows);
             events.add(progress.rows);
         };
         let ended = context.train(&mut watch, |options| session.train(player, options));
@@ -295,6 +298,53 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
         trained_on: (!was_done).then_some(on),
         folder,
     })
+}
+
+/// The results of a training in memory.
+#[non_exhaustive]
+pub struct InMemory {
+    /// The results. If the caller ended the training early, their config has fewer generations.
+    pub trained: Trained,
+    /// Seconds since the start at which each generation was complete.
+    pub seconds: Vec<f64>,
+    /// The processor that trained.
+    pub processor: Processor,
+}
+
+/// Trains without a folder. [`save`] writes the results later. `champions` asks for the champions of every generation.
+///
+/// # Errors
+/// The config is invalid, memory is too small, training fails, or it is stopped.
+pub fn in_memory(
+    config: &Config,
+    champions: bool,
+    player: &mut dyn Player,
+    context: Context<'_>,
+) -> Result<InMemory, Error> {
+    let (player, on) = player.open(Work::of([config]))?;
+    (context.tell)(Event::Begin(vec![(String::new(), config.pois())], 0, config.learning.generations));
+    let (since, mut seconds, mut stopped) = (Instant::now(), Vec::new(), false);
+    let watch = |generation: Generation<'_>| {
+        seconds.push(since.elapsed().as_secs_f64());
+        let Generation { generation: number, rows, champions, .. } = generation;
+        (context.tell)(Event::Rows { next: number + 1, rows, champions });
+        if !context.is_stopped() {
+            return ControlFlow::Continue(());
+        }
+        stopped = !context.ends();
+        ControlFlow::Break(())
+    };
+    let trained = match champions {
+        true => front::train_with_champions(config, &mut *player.0, watch),
+        false => front::train(config, &mut *player.0, watch),
+    };
+    let trained = trained.map_err(Error::of_training)?;
+    if stopped {
+        return Err(Error::Stopped(said("before the last generation", "nothing was saved")));
+    }
+    // After an early end, one more generation is played, of which nobody is told.
+    seconds.resize(trained.config.learning.generations + 1, since.elapsed().as_secs_f64());
+    Ok(InMemory { trained, seconds, processor: Processor::of(&player.1, &on) })
 }
 
 /// Writes a finished run that was trained in memory, with the files of [`run`]. Returns its digest.

@@ -16,7 +16,7 @@ use crate::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy}
 use crate::backend::gpu::exact::Pass;
 use crate::config::{Config, Override};
 use crate::escape;
-use crate::front::{self, Failure};
+use crate::front;
 use crate::host::Instant;
 use crate::record::evidence::{Compared, MachineReport, ShortTraining, Tier};
 use crate::verify::{Agreement, Plan, compare, short_trainings};
@@ -127,7 +127,7 @@ pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
             let Combination { info, pass, kernel, .. } = combination;
             let of = if budget.is_some() { String::new() } else { format!(" of {}", plan.worlds.len()) };
             let text = format!("{}, {pass} pass, {kernel} kernel: {}{of} worlds", info.name, outcome.worlds);
-            (context.tell)(Event::Share((place as f64 + done) / combinations.len() as f64, text));
+            (context.tell)(Event::Fraction((place as f64 + done) / combinations.len() as f64, text));
         };
         let result = verify(&plan, budget.map(|all| all / combinations.len() as u32), combination, &mut shown);
         lines.push(Compared {
@@ -217,7 +217,7 @@ fn instruction_sets(plan: &Plan, context: Context<'_>) -> Vec<Compared> {
         let compared = compare(plan, &mut reference, &mut wider, |outcome| {
             let (done, all) = (outcome.worlds, plan.worlds.len());
             let text = format!("{}: {done} of {all} worlds", level_name(level));
-            (context.tell)(Event::Share(done as f64 / all as f64, text));
+            (context.tell)(Event::Fraction(done as f64 / all as f64, text));
         });
         (context.tell)(Event::Pause);
         line(wider.describe(), &reference, compared.map_err(Error::from))
@@ -230,11 +230,8 @@ fn evidence(lines: &[Compared], note: Option<String>, context: Context<'_>) -> R
     let mut trained = Vec::new();
     let trainings = short_trainings();
     for (index, (name, config)) in trainings.iter().enumerate() {
-        (context.tell)(Event::Share(index as f64 / trainings.len() as f64, format!("training {name}")));
-        let came = front::train(config, &mut Cpu::default(), |_| Continue(())).map_err(|error| match error {
-            Failure::Backend(error) => Error::Backend(error),
-            other => Error::Refused(other.to_string().into()),
-        })?;
+        (context.tell)(Event::Fraction(index as f64 / trainings.len() as f64, format!("training {name}")));
+        let came = front::train(config, &mut Cpu::default(), |_| Continue(())).map_err(Error::of_training)?;
         trained.push(ShortTraining { config: name.clone(), digest: came.digest() });
     }
     (context.tell)(Event::Pause);

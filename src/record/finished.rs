@@ -9,7 +9,7 @@ use super::checkpoint::{self, Checkpoint};
 use super::folder::{CHECKPOINTS, CONFIG, FileSums, Folder, METRICS, POLICIES, RUN, Run, Status};
 use super::metrics::{self, Extent, Lines};
 use super::{RecordError, config_digest, hex, ownership, policies};
-use crate::config::Config;
+use crate::config::{Config, Method};
 use crate::trainer::{Ending, Row, Snapshot};
 
 /// The place that the files of a run are written to: a folder or an archive.
@@ -53,7 +53,7 @@ pub struct Finished<'a> {
     pub rows: &'a [(Row, f64)],
     /// The policies of each trial, best first.
     pub policies: &'a [&'a [f32]],
-    /// The scores behind the order of the policies. Without them, an extended run trains again from generation 0.
+    /// The state after the last generation. Without it, an extended run trains again from generation 0.
     pub ending: Option<Ending>,
     /// The machine and the origin of the run.
     pub run: Run,
@@ -83,9 +83,12 @@ impl Finished<'_> {
         storage.put(CONFIG, &mut |output| output.write_all(config.to_toml().as_bytes()))?;
         storage.put(METRICS, &mut |output| output.write_all(text.as_bytes()))?;
         storage.put(POLICIES, &mut |output| policies::put(output, config, policies).map(|sum| checksum = sum))?;
-        if let Some(ending) = ending {
-            let extent = extent.unwrap_or_else(|| Extent::after(&text));
-            let checkpoint = last_checkpoint(config, run.init.clone(), seconds, extent, ending);
+        if let Some(Ending { weights, fitness }) = ending {
+            let pending = rows.iter().filter(|(row, _)| row.generation == last).map(|&(row, _)| Some(row)).collect();
+            let snapshot = Snapshot { generation: last + 1, last, weights, fitness, pending };
+            let metrics = extent.unwrap_or_else(|| Extent::after(&text));
+            let (config_digest, init) = (config_digest(config), run.init.clone());
+            let checkpoint = Checkpoint { config: config_digest, init, seconds, metrics, snapshot };
             let path = checkpoint::path(Path::new(CHECKPOINTS), last + 1).to_string_lossy().replace('\\', "/");
             storage.put(&path, &mut |output| checkpoint.put(output, config))?;
         }
@@ -102,32 +105,14 @@ impl Finished<'_> {
     }
 }
 
-/// Returns the checkpoint that a finished run leaves, from which it can be extended. `metrics` ends before the rows of
-/// the last generation. The weights are those of the policies' file.
-pub(crate) fn last_checkpoint(
-    config: &Config,
-    init: Option<String>,
-    seconds: f64,
-    metrics: Extent,
-    Ending { fitness, pending }: Ending,
-) -> Checkpoint {
-    let last = config.learning.generations;
-    let row = |(trial, pending): (usize, Option<[f64; 2]>)| {
-        let [best_g, mean_g] = pending?;
-        Some(Row { experiment: 0, trial, generation: last, best_g, mean_g, champion_g: 0.0 })
-    };
-    let pending = pending.into_iter().enumerate().map(row).collect();
-    let snapshot = Snapshot { generation: last + 1, last, weights: vec![], fitness, pending };
-    Checkpoint { config: config_digest(config), init, seconds, metrics, snapshot }
-}
-
-/// Reads the scores behind the order of a finished run's policies. Returns `None` if its last checkpoint is missing or
-/// cannot be used.
+/// Reads the state of a finished run after its last generation. Returns `None` if its last checkpoint is missing or cannot be
+/// used.
 pub(crate) fn read_ending(folder: &Path, config: &Config) -> Option<Ending> {
     let path = checkpoint::path(&folder.join(CHECKPOINTS), config.learning.generations + 1);
     let found = Checkpoint::read(crate::file::open(&path).ok()?, config).ok()?;
-    let Snapshot { generation, last, weights, fitness, pending } = &found.snapshot;
-    let fits = found.is_of(config) && weights.is_empty() && *last + 1 == *generation;
-    let pending = pending.iter().map(|row| row.map(|row| [row.best_g, row.mean_g])).collect();
-    (fits && *last == config.learning.generations).then(|| Ending { fitness: fitness.clone(), pending })
+    let is_of = found.is_of(config);
+    let Snapshot { generation, last, weights, fitness, .. } = found.snapshot;
+    let whole = weights.is_empty() == (config.learning.method == Method::Tournament);
+    let fits = is_of && whole && last + 1 == generation && last == config.learning.generations;
+    fits.then_some(Ending { weights, fitness })
 }

@@ -82,24 +82,31 @@ pub struct Snapshot<N = Vec<f32>> {
     pub pending: Vec<Option<Row>>,
 }
 
-/// State that a finished experiment needs, beside its policies, to be extended.
+/// What a finished experiment continues from if it is extended, beside its rows and policies.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Ending {
+    /// With an evolution strategy, a trial's weights after the last generation, as in [`Snapshot`]. Empty after
+    /// tournaments, because the policies and their fitness are enough.
+    pub weights: Vec<Vec<f32>>,
     /// A trial's scores of the last generation, `[populations][policies]`.
     pub fitness: Vec<Vec<f32>>,
-    /// Best and mean G of the last generation's teams, by trial.
-    pub pending: Vec<Option<[f64; 2]>>,
 }
 
-impl Ending {
-    /// Copies what is needed of a snapshot after the last generation. `None` if the policies are not enough: with an
-    /// evolution strategy, the snapshot has the weights.
-    pub fn of(snapshot: &Snapshot<&[f32]>) -> Option<Ending> {
-        if !snapshot.weights.is_empty() {
-            return None;
-        }
-        let pending = snapshot.pending.iter().map(|row| row.map(|row| [row.best_g, row.mean_g])).collect();
-        Some(Ending { fitness: snapshot.fitness.iter().map(|scores| scores.to_vec()).collect(), pending })
+impl Snapshot<&[f32]> {
+    /// Copies the weights and scores.
+    ///
+    /// # Errors
+    /// There is too little memory.
+    pub fn copy(self) -> Result<Snapshot, TryReserveError> {
+        let copy = |numbers: &[f32]| {
+            let mut copy = Vec::new();
+            copy.try_reserve_exact(numbers.len())?;
+            copy.extend_from_slice(numbers);
+            Ok(copy)
+        };
+        let each = |trials: Vec<&[f32]>| -> Result<Vec<_>, TryReserveError> { trials.into_iter().map(copy).collect() };
+        let Snapshot { generation, last, weights, fitness, pending } = self;
+        Ok(Snapshot { generation, last, weights: each(weights)?, fitness: each(fitness)?, pending })
     }
 }
 
@@ -116,7 +123,8 @@ pub struct Times {
     pub breed: Duration,
 }
 
-/// The outcome of an experiment: the sorted policies of each trial, and the snapshot after the last generation.
+/// The outcome of an experiment: the sorted policies of each trial, and the snapshot after the last generation. The snapshot has
+/// no weights if the sorted policies and their fitness are enough to continue from.
 pub type End<'a> = (Vec<&'a [f32]>, Snapshot<&'a [f32]>);
 
 /// Why there is no snapshot.
@@ -336,15 +344,7 @@ impl Trainer {
     /// # Errors
     /// There is too little memory, or the backend that holds the populations failed to return them.
     pub fn snapshot(&mut self, experiment: usize) -> Result<Snapshot, SnapshotError> {
-        let copy = |numbers: &[f32]| {
-            let mut copy = Vec::new();
-            copy.try_reserve_exact(numbers.len())?;
-            copy.extend_from_slice(numbers);
-            Ok(copy)
-        };
-        let each = |trials: Vec<&[f32]>| -> Result<Vec<_>, TryReserveError> { trials.into_iter().map(copy).collect() };
-        let Snapshot { generation, last, weights, fitness, pending } = self.view(experiment)?;
-        Ok(Snapshot { generation, last, weights: each(weights)?, fitness: each(fitness)?, pending })
+        Ok(self.view(experiment)?.copy()?)
     }
 
     /// Puts given policies, `[populations][policies][parameters]`, into the first slots of a trial's populations, in

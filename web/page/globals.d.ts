@@ -112,7 +112,7 @@ interface Found {
 /** The backend that trains. `why` says why it is not a GPU. */
 interface Machine { description: string, backend: string, adapter: string | null, driver: string | null, threads: number, why?: string }
 /** Results of a trial that ended: the counts of its numbers. */
-interface Ended { trial: number, policies: number, fitness: number, pending: Place | null }
+interface Ended { trial: number, policies: number, numbers: number }
 interface Driven {
   step: number, learned: boolean, positions: number[], headings: number[], near: number[], observed: (number | null)[],
   scores: { g: number, d: number[], df: number[] } | null,

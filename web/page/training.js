@@ -95,9 +95,9 @@ export class Training {
       const answers = await Promise.all(this.players.map(player => player.ask({ ask: "ends", run })));
       const trials = answers.flatMap(({ words, bytes }) => {
         let at = 0;
-        return words.map(({ trial, policies, fitness, pending }) => {
-          const part = bytes.subarray(at, at += 4 * (policies + fitness));
-          return { trial, part, pending, champions: champions(arm, part, policies) };
+        return words.map(({ trial, policies, numbers }) => {
+          const part = bytes.subarray(at, at += 4 * numbers);
+          return { trial, part, champions: champions(arm, part, policies) };
         });
       }).sort((a, b) => a.trial - b.trial);
       arm.ended = trials.map(({ champions }) => champions);
@@ -108,7 +108,7 @@ export class Training {
 
   /**
    * Makes the archive and the digest of a run.
-   * @param {Arm} arm @param {{ part: Bytes, pending: Place | null }[]} ended @param {ArrayBuffer[]} buffers
+   * @param {Arm} arm @param {{ part: Bytes }[]} ended @param {ArrayBuffer[]} buffers
    */
   async record(arm, ended, buffers) {
     const { trials, toml: text, command } = arm, last = arm.config.learning.generations;
@@ -125,7 +125,7 @@ export class Training {
     const { description, backend, adapter, driver, threads } = this.machine;
     const { words, bytes: zip } = await this.players[0].ask({
       ask: "record", name: `${arm.name}-${arm.label}`.replaceAll("++", "pp").replace(/[^\w.-]+/g, "-"), text, command, description, backend, adapter, driver, threads,
-      started: this.started, rows: rows.length / 7, pending: ended.map(({ pending }) => pending),
+      started: this.started, rows: rows.length / 7,
     }, [new Uint8Array(rows.buffer), ...ended.map(({ part }) => part)], {}, [rows.buffer, ...buffers]);
     Object.assign(arm, { digest: words.digest, zip });
   }

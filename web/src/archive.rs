@@ -1,9 +1,10 @@
 //! Exports and imports runs as zip archives of a run directory, in the format of `flotilla train`.
 
 use std::io::{self, Cursor, Read};
+use std::ops::Range;
 
 use flotilla::backend::{Group, cpu::Cpu};
-use flotilla::config::{Config, Sharing};
+use flotilla::config::{Config, Method, Sharing};
 use flotilla::evolve;
 use flotilla::ops;
 use flotilla::record::finished::{Content, Finished, Storage};
@@ -24,7 +25,8 @@ const MOST: u64 = 1 << 30;
 /// Describes a finished run to export.
 ///
 /// The numbers start with the rows, `[rows][7]` f64, in the order of `metrics.csv`. A row is run, trial, generation,
-/// best, mean and champion G, seconds. After the rows follow each trial's policies and fitness, as f32.
+/// best, mean and champion G, seconds. After the rows follow each trial's policies and fitness, as f32, and with an
+/// evolution strategy the weights after the last generation.
 #[derive(Deserialize)]
 pub struct Recorded {
     /// The folder in the archive that holds the run.
@@ -38,8 +40,6 @@ pub struct Recorded {
     threads: usize,
     started: String,
     rows: usize,
-    /// Best and mean G of the last generation, per trial.
-    pending: Vec<Option<[f64; 2]>>,
 }
 
 /// Returns the digest of a finished run, and its directory as a zip archive.
@@ -48,11 +48,10 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
     let (trials, last) = (config.learning.trials, config.learning.generations);
     let fitness = config.populations() * config.learning.population;
     let policies = fitness * config.parameters();
-    let numbers = recorded.rows * 7 * size_of::<f64>();
-    if bytes.len() != numbers + trials * (policies + fitness) * size_of::<f32>()
-        || recorded.rows != trials * (last + 1)
-        || recorded.pending.len() != trials
-    {
+    let slots = config.populations() * config.learning.slots() * config.parameters();
+    let weights = if config.learning.method == Method::Tournament { 0 } else { slots };
+    let (numbers, trial) = (recorded.rows * 7 * size_of::<f64>(), (policies + fitness + weights) * size_of::<f32>());
+    if bytes.len() != numbers + trials * trial || recorded.rows != trials * (last + 1) {
         return Err(refuse("what came out of the run does not fit its config"));
     }
     let (numbers, rest) = bytes.split_at(numbers);
@@ -65,15 +64,15 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
             (Row { experiment: 0, trial, generation, best_g, mean_g, champion_g }, seconds)
         })
         .collect();
-    let trial = |bytes: &[u8]| {
-        let mut policies_and_fitness = floats(bytes);
-        let fitness = policies_and_fitness.split_off(policies);
-        (policies_and_fitness, fitness)
+    let parts: Vec<Vec<f32>> = rest.chunks_exact(trial).map(floats).collect();
+    let part = |range: Range<usize>| parts.iter().map(move |part| &part[range.clone()]);
+    let policies_of: Vec<&[f32]> = part(0..policies).collect();
+    let copies = |range| part(range).map(<[f32]>::to_vec).collect();
+    let rest = policies + fitness;
+    let ending = Ending {
+        weights: if weights == 0 { vec![] } else { copies(rest..rest + weights) },
+        fitness: copies(policies..rest),
     };
-    let (policies, fitness): (Vec<_>, Vec<_>) =
-        rest.chunks_exact((policies + fitness) * size_of::<f32>()).map(trial).unzip();
-    let policies: Vec<&[f32]> = policies.iter().map(|policies| &policies[..]).collect();
-    let ending = Some(Ending { fitness, pending: recorded.pending.clone() });
     let run = Run {
         version: flotilla::VERSION.into(),
         commit: flotilla::COMMIT.map(String::from),
@@ -89,7 +88,7 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
         ..Run::new(&config)
     };
     let mut zip = Zip { folder: recorded.name.clone(), writer: ZipWriter::new(Cursor::new(Vec::new())) };
-    let finished = Finished { config: &config, rows: &rows, policies: &policies, ending, run };
+    let finished = Finished { config: &config, rows: &rows, policies: &policies_of, ending: Some(ending), run };
     let digest = ops::train::save(finished, &mut zip).map_err(refuse)?;
     let archive = zip.writer.finish().map_err(refuse)?.into_inner();
     Ok((json!({ "digest": digest }), archive))

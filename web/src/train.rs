@@ -166,23 +166,22 @@ impl Training {
 
     /// Returns the results of a run's trials that this worker has finished.
     ///
-    /// The numbers are, per trial, the policies and then the fitness, as f32.
+    /// The numbers are, per trial, the policies, the fitness, and the weights after the last generation if they are needed, as f32.
     pub fn ends(&mut self, run: usize) -> Result<Answer, Refusal> {
         let (mut words, mut numbers) = (Vec::new(), Vec::<u8>::new());
         for Batch { trainer, arms } in self.batches.iter_mut().filter(|batch| batch.trainer.is_done()) {
             let own: Vec<usize> = (0..arms.len()).filter(|&arm| arms[arm].0 == run).collect();
             for ((policies, end), &arm) in trainer.ends(&own).into_iter().zip(&own) {
-                let trials = policies.iter().zip(&end.fitness).zip(&end.pending).enumerate();
-                for (trial, ((policies, fitness), pending)) in trials {
-                    let pending = pending.map(|row| [row.best_g, row.mean_g]);
+                for (trial, (policies, fitness)) in policies.iter().zip(&end.fitness).enumerate() {
+                    let weights = end.weights.get(trial).copied().unwrap_or_default();
                     words.push(json!({
                         "trial": arms[arm].1.unwrap_or(trial),
                         "policies": policies.len(),
-                        "fitness": fitness.len(),
-                        "pending": pending,
+                        "numbers": policies.len() + fitness.len() + weights.len(),
                     }));
-                    numbers.extend_from_slice(bytemuck::cast_slice(policies));
-                    numbers.extend_from_slice(bytemuck::cast_slice(fitness));
+                    for part in [*policies, *fitness, weights] {
+                        numbers.extend_from_slice(bytemuck::cast_slice(part));
+                    }
                 }
             }
         }
