@@ -1014,7 +1014,7 @@ fn the_papers_figures_come_with_its_claims() {
     ]);
     for figure in 4..=6 {
         let svg = fs::read_to_string(out.join(format!("figure{figure}.svg"))).unwrap();
-        assert!(svg.contains("All leaders") && svg.contains("Leaders and followers"));
+        assert!(svg.contains("All-leaders teams") && svg.contains("Leader-follower teams"));
         assert!(svg.contains("best constant speed") && svg.contains("best of as many random networks"));
         assert!(fs::metadata(out.join(format!("figure{figure}.png"))).unwrap().len() > 10_000);
         assert!(fs::metadata(out.join(format!("figure{figure}.pdf"))).unwrap().len() > 10_000);

@@ -31,7 +31,7 @@ type Given<'py> = (
 );
 /// Policies `[trials, populations, policies + 1, parameters]`, teams `[trials, teams, leaders]`, and starts
 /// `[trials, episodes, agents (+ pois), 2]`.
-type Asked<'py> = (Bound<'py, PyArray4<f32>>, Bound<'py, PyArray3<u32>>, Bound<'py, PyArray4<f32>>);
+type Candidates<'py> = (Bound<'py, PyArray4<f32>>, Bound<'py, PyArray3<u32>>, Bound<'py, PyArray4<f32>>);
 
 /// A training whose caller decides what policies are worth.
 #[pyclass(frozen)]
@@ -83,7 +83,7 @@ impl Coevolution {
         Ok(self.lock()?.is_done())
     }
 
-    fn ask<'py>(&self, py: Python<'py>) -> PyResult<Asked<'py>> {
+    fn ask<'py>(&self, py: Python<'py>) -> PyResult<Candidates<'py>> {
         let mut inner = self.lock()?;
         let config = inner.config().clone();
         let (leaders, count) = (inner.world().0.leaders(), inner.world().1);

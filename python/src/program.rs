@@ -9,7 +9,7 @@ use flotilla::backend::OpenBackend;
 use flotilla::backend::gpu::device;
 use flotilla::choice::Work;
 use flotilla::cli;
-use flotilla::ops::{self, Context, Event, Player, Request};
+use flotilla::ops::{self, BackendSource, Context, Event, Request};
 use flotilla::trainer::Row;
 use pyo3::exceptions::{PyRuntimeWarning, PyValueError};
 use pyo3::prelude::*;
@@ -38,7 +38,7 @@ const PATIENCE: Duration = Duration::from_millis(50);
 #[pyfunction]
 pub fn answer(py: Python<'_>, request: &str, backend: &str, command: &str) -> PyResult<String> {
     let request: Request = serde_json::from_str(request).map_err(|error| PyValueError::new_err(error.to_string()))?;
-    perform(py, backend, command, &|_, _, _| Ok(false), |player, context| ops::answer(&request, player, context))
+    perform(py, backend, command, &|_, _, _| Ok(false), |backends, context| ops::answer(&request, backends, context))
         .map(|outcome| outcome.to_string())
 }
 
@@ -52,9 +52,9 @@ pub fn perform<R: Send>(
     backend: &str,
     command: &str,
     watch: Watch<'_>,
-    work: impl FnOnce(&mut dyn Player, Context<'_>) -> Result<R, ops::Error> + Send,
+    work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, ops::Error> + Send,
 ) -> PyResult<R> {
-    let mut player = Lazy { name: backend, open: None, error: None };
+    let mut backends = Lazy { name: backend, open: None, error: None };
     let (outcome, interrupted) = workers::aside(py, || {
         let [stop, end] = [false; 2].map(AtomicBool::new);
         let (asked, interrupted) = (Cell::new(Instant::now()), Cell::new(None));
@@ -65,6 +65,9 @@ pub fn perform<R: Send>(
             let found = match event {
                 Event::Warning(text) => {
                     Python::attach(|py| warn(py, text.trim_start_matches("warning: "))).map(|()| false)
+                }
+                Event::Note(text) if text.starts_with("note: ") => {
+                    Python::attach(|py| warn(py, text.trim_start_matches("note: "))).map(|()| false)
                 }
                 Event::Begin(_, _, to) => {
                     last.set(to);
@@ -96,14 +99,14 @@ pub fn perform<R: Send>(
         };
         let mut context = Context::new(&tell);
         (context.stop, context.end, context.command) = (&stop, &end, command);
-        let outcome = work(&mut player, context);
+        let outcome = work(&mut backends, context);
         (outcome, interrupted.into_inner())
     });
-    if let Some(error) = interrupted.or(player.error) {
+    if let Some(error) = interrupted.or(backends.error) {
         return Err(error);
     }
     let outcome = outcome.raise()?;
-    if let Some(lent) = player.open {
+    if let Some(lent) = backends.open {
         lent.give_back();
     }
     Ok(outcome)
@@ -122,7 +125,7 @@ struct Lazy<'a> {
     error: Option<PyErr>,
 }
 
-impl Player for Lazy<'_> {
+impl BackendSource for Lazy<'_> {
     fn open(&mut self, work: Work) -> Result<(&mut OpenBackend, String), ops::Error> {
         if self.open.is_none() {
             match Lent::open(self.name, work) {

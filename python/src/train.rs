@@ -165,8 +165,8 @@ pub fn train<'py>(
 ) -> PyResult<(Outcomes<'py>, Played, Vec<f64>)> {
     let watcher = Watcher { callback: callback.as_ref(), populations: config.0.populations() };
     let (InMemory { trained, seconds, processor, .. }, digest) =
-        perform(py, backend, "", &|rows, last, champions| watcher.tell(rows, last, champions), |player, context| {
-            let done = ops::train::in_memory(&config.0, champions, player, context)?;
+        perform(py, backend, "", &|rows, last, champions| watcher.tell(rows, last, champions), |backends, context| {
+            let done = ops::train::in_memory(&config.0, champions, backends, context)?;
             let digest = done.trained.digest();
             Ok((done, digest))
         })?;
@@ -221,7 +221,7 @@ pub fn train_into(
     let request = Request { config, name: "run".into(), out: Some(out), start, init, tensorboard: false };
     let watcher = Watcher { callback: callback.as_ref(), populations: 0 };
     let watch = |rows: &[Row], last, _: Option<&[f32]>| watcher.tell(rows, last, None);
-    perform(py, backend, command, &watch, |player, context| ops::train::run(&request, player, context)).map(drop)
+    perform(py, backend, command, &watch, |backends, context| ops::train::run(&request, backends, context)).map(drop)
 }
 
 /// Reads a finished run.

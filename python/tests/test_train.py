@@ -124,6 +124,14 @@ def test_a_run_has_the_same_files_however_it_was_trained(config, program, tmp_pa
         assert (extended["digest"], extended["trained_generations"]) == (longer, 10), folder
 
 
+@pytest.mark.parametrize("out", [None, "run"])
+def test_a_config_that_is_likely_a_mistake_is_warned_of(config, out):
+    with pytest.warns(RuntimeWarning, match="degrees"):
+        train(config.replace(world={"heading": 90.0}), out=out)
+    with pytest.warns(RuntimeWarning, match="cannot be reached"):
+        train(config.replace(world={"steps": 2}), out=out, force=out is not None)
+
+
 def test_a_folder_is_gone_on_with_or_written_over(config):
     first = train(config, out="run")
     with pytest.raises(FileExistsError, match="run"):

@@ -7,7 +7,7 @@ use super::recovery::{self, Loss, Signals};
 use super::{Error, RunOptions, backend, say};
 use crate::backend::OpenBackend;
 use crate::choice::Work;
-use crate::ops::{Context, Event, Player};
+use crate::ops::{BackendSource, Context, Event};
 use crate::report::progress::{Board, Meter};
 
 /// The flags of a command that concern every use case.
@@ -23,7 +23,7 @@ struct Machine<'a> {
     open: Option<(OpenBackend, String)>,
 }
 
-impl Player for Machine<'_> {
+impl BackendSource for Machine<'_> {
     fn open(&mut self, work: Work) -> Result<(&mut OpenBackend, String), Error> {
         let (open, description) = match &mut self.open {
             Some(open) => open,
@@ -43,7 +43,10 @@ impl<'a> Console<'a> {
     ///
     /// # Errors
     /// The use case fails, or the system does not allow signal handlers.
-    pub fn run<R>(&mut self, work: impl FnOnce(&mut dyn Player, Context<'_>) -> Result<R, Error>) -> Result<R, Error> {
+    pub fn run<R>(
+        &mut self,
+        work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
+    ) -> Result<R, Error> {
         self.with(&Signals::listen()?, work)
     }
 
@@ -51,14 +54,17 @@ impl<'a> Console<'a> {
     ///
     /// # Errors
     /// The use case fails.
-    pub fn play<R>(&mut self, work: impl FnOnce(&mut dyn Player, Context<'_>) -> Result<R, Error>) -> Result<R, Error> {
+    pub fn play<R>(
+        &mut self,
+        work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
+    ) -> Result<R, Error> {
         self.with(&Signals::default(), work)
     }
 
     fn with<R>(
         &mut self,
         signals: &Signals,
-        work: impl FnOnce(&mut dyn Player, Context<'_>) -> Result<R, Error>,
+        work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
     ) -> Result<R, Error> {
         let flags = recovery::words_of_machine(self.machine.options, self.loss);
         told(self.quiet, signals, &flags, self.loss.falls_back(), |context| work(&mut self.machine, context))

@@ -3,7 +3,7 @@
 use super::{Failure, Generation, Trained, champions, start_from, trainer_of};
 use crate::backend::Backend;
 use crate::config::Config;
-use crate::trainer::{Asked, Row, Snapshot, Trainer};
+use crate::trainer::{Candidates, Row, Snapshot, Trainer};
 use crate::world::World;
 
 /// Training by ask and tell: the caller decides what each leader of each team was worth.
@@ -87,13 +87,13 @@ impl Coevolution {
     ///
     /// # Errors
     /// All generations were played.
-    pub fn ask(&mut self) -> Result<Vec<Asked<'_>>, Failure> {
+    pub fn ask(&mut self) -> Result<Vec<Candidates<'_>>, Failure> {
         if self.is_done() { Err(Failure::Done) } else { Ok(self.trainer.ask(0)) }
     }
 
     /// Returns the world of the generation, and its teams per trial, without the champions'.
     pub fn world(&self) -> (&World, usize) {
-        self.trainer.asked_world(0)
+        self.trainer.candidates_world(0)
     }
 
     /// Plays the generation. Returns G, `[trials][teams]`, and the config's fitness of each leader,
@@ -106,7 +106,7 @@ impl Coevolution {
             return Err(Failure::Done);
         }
         if !self.played {
-            self.trainer.play_asked(0, backend)?;
+            self.trainer.play_candidates(0, backend)?;
             self.played = true;
         }
         Ok(self.trainer.played(0))
@@ -137,7 +137,7 @@ impl Coevolution {
             }
         }
         if !self.played {
-            self.trainer.play_asked(0, backend)?;
+            self.trainer.play_candidates(0, backend)?;
         }
         let first = self.rows.len();
         self.rows.extend(self.trainer.tell(0, fitness));
@@ -152,7 +152,7 @@ impl Coevolution {
 
     /// Plays the champions of the last generation, which completes its rows.
     fn end(&mut self, backend: &mut dyn Backend) -> Result<(), Failure> {
-        self.trainer.play_asked(0, backend)?;
+        self.trainer.play_candidates(0, backend)?;
         self.rows.extend(self.trainer.tell(0, None));
         Ok(())
     }

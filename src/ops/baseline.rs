@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::{ConfigText, Context, Error, Player, Processor};
+use super::{BackendSource, ConfigText, Context, Error, Processor};
 use crate::backend::Backend;
 use crate::baseline::{self, Baselines, SPEEDS};
 use crate::choice::Work;
@@ -87,9 +87,9 @@ pub struct Found {
 ///
 /// # Errors
 /// The config is invalid, or the backend fails.
-pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let config = request.config.read()?;
-    let ((backend, machine), on) = player.open(Work::of([&config]))?;
+    let ((backend, machine), on) = backends.open(Work::of([&config]))?;
     context.message(format_args!("playing on {on}"));
     let outcomes = play(&config, request.seeds as usize, request.episodes, &mut **backend, context);
     context.pause();

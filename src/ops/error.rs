@@ -76,8 +76,8 @@ pub enum Error {
     #[error("{}{}", .0, remedy::run(.0))]
     Run(#[from] RunError),
     /// A run that could not be read to show it.
-    #[error("{}{}", .0, remedy::shown(.0))]
-    Shown(#[from] ReadError),
+    #[error("{}{}", .0, remedy::read(.0))]
+    Read(#[from] ReadError),
     /// A question that could not be answered.
     #[error(transparent)]
     Unanswered(#[from] Unanswered),
@@ -127,7 +127,7 @@ impl Error {
             _ if self.is_usage() => "usage",
             Error::Config(ConfigError::Unreadable { .. }) => "config_unreadable",
             Error::Config(ConfigError::Invalid { .. }) => "config_invalid",
-            Error::Record(error) | Error::Run(RunError::Record(error)) | Error::Shown(ReadError::Record(error)) => {
+            Error::Record(error) | Error::Run(RunError::Record(error)) | Error::Read(ReadError::Record(error)) => {
                 of_record(error)
             }
             Error::Unanswered(Unanswered::Record(error)) => of_record(error),
@@ -138,9 +138,9 @@ impl Error {
             | Error::Replayed(ReplayError::Backend(_))
             | Error::Unanswered(Unanswered::Backend(_)) => "backend",
             Error::NoneToVerify(_) => "no_adapter",
-            Error::Shown(error)
+            Error::Read(error)
             | Error::Replayed(ReplayError::Run(error))
-            | Error::Unanswered(Unanswered::Read(error)) => of_shown(error),
+            | Error::Unanswered(Unanswered::Read(error)) => of_read(error),
             Error::Replayed(ReplayError::Differs { .. }) | Error::Different(_) => "different",
             Error::Replayed(_) | Error::Unanswered(Unanswered::Comparison(_)) | Error::Refused(_) => "refused",
             Error::Output(_) => "output",
@@ -159,7 +159,7 @@ impl Error {
             Error::NoneToVerify(error) => error.to_string(),
             Error::Record(error) => error.to_string(),
             Error::Run(error) => error.to_string(),
-            Error::Shown(error) => error.to_string(),
+            Error::Read(error) => error.to_string(),
             Error::Replayed(error) => error.to_string(),
             Error::Usage(said)
             | Error::Different(said)
@@ -246,7 +246,7 @@ fn of_record(error: &RecordError) -> &'static str {
     }
 }
 
-fn of_shown(error: &ReadError) -> &'static str {
+fn of_read(error: &ReadError) -> &'static str {
     match error {
         ReadError::Missing(_) | ReadError::NoFolder(_) => "no_run",
         ReadError::Unfinished { .. } => "unfinished",

@@ -158,6 +158,11 @@ impl Context<'_> {
         (self.tell)(Event::Fraction(part, text.to_string()));
     }
 
+    /// Reports notes for the author of a config.
+    fn notes(&self, notes: &[String]) {
+        notes.iter().for_each(|note| self.note(format_args!("note: {note}")));
+    }
+
     pub(crate) fn pause(&self) {
         (self.tell)(Event::Pause);
     }
@@ -217,7 +222,7 @@ impl Context<'_> {
 }
 
 /// Opens the backend when it is needed, so that requests are checked first.
-pub trait Player {
+pub trait BackendSource {
     /// Returns the backend that plays some work, and its description for people.
     ///
     /// # Errors
@@ -225,7 +230,7 @@ pub trait Player {
     fn open(&mut self, work: Work) -> Result<(&mut OpenBackend, String), Error>;
 }
 
-impl Player for &mut OpenBackend {
+impl BackendSource for &mut OpenBackend {
     fn open(&mut self, _: Work) -> Result<(&mut OpenBackend, String), Error> {
         let description = self.0.describe();
         Ok((self, description))
@@ -257,7 +262,7 @@ impl ConfigText {
     /// Reads the config. Reports notes for its author, and returns them, too.
     fn read_noted(&self, context: Context<'_>) -> Result<(Config, Vec<String>), Error> {
         let (config, notes) = Config::read_noted(&Document::parse(&self.text), &self.name, &[], &self.set)?;
-        notes.iter().for_each(|note| context.note(format_args!("note: {note}")));
+        context.notes(&notes);
         Ok((config, notes))
     }
 }
@@ -354,20 +359,24 @@ pub enum Request {
 /// # Errors
 /// Those of the use case. A sweep with missing points, and a comparison with the CPU that finds a difference, are
 /// outcomes.
-pub fn answer(request: &Request, player: &mut dyn Player, context: Context<'_>) -> Result<serde_json::Value, Error> {
+pub fn answer(
+    request: &Request,
+    backends: &mut dyn BackendSource,
+    context: Context<'_>,
+) -> Result<serde_json::Value, Error> {
     let outcome = match request {
-        Request::Paper(request) => serde_json::to_value(paper::run(request, player, context)?),
-        Request::Questions(request) => serde_json::to_value(questions::run(request, player, context)?),
-        Request::Sweep(request) => serde_json::to_value(sweep::run(request, player, context)?),
+        Request::Paper(request) => serde_json::to_value(paper::run(request, backends, context)?),
+        Request::Questions(request) => serde_json::to_value(questions::run(request, backends, context)?),
+        Request::Sweep(request) => serde_json::to_value(sweep::run(request, backends, context)?),
         Request::Compare(request) => serde_json::to_value(compare::run(request, context)?),
         Request::Verify(request) => serde_json::to_value(verify::run(request, context)?),
-        Request::Train(request) => serde_json::to_value(train::run(request, player, context)?),
+        Request::Train(request) => serde_json::to_value(train::run(request, backends, context)?),
         Request::Check(request) => serde_json::to_value(check::run(request, context)?),
-        Request::Rollout(request) => serde_json::to_value(rollout::run(request, player, context)?),
-        Request::Replay(request) => serde_json::to_value(replay::run(request, player, context)?),
+        Request::Rollout(request) => serde_json::to_value(rollout::run(request, backends, context)?),
+        Request::Replay(request) => serde_json::to_value(replay::run(request, backends, context)?),
         Request::Plot(request) => serde_json::to_value(plot::run(request, context)?),
-        Request::Baseline(request) => serde_json::to_value(baseline::run(request, player, context)?),
-        Request::Tasks(request) => serde_json::to_value(tasks::run(request, player, context)?),
+        Request::Baseline(request) => serde_json::to_value(baseline::run(request, backends, context)?),
+        Request::Tasks(request) => serde_json::to_value(tasks::run(request, backends, context)?),
     };
     Ok(outcome.expect("outcomes are JSON"))
 }

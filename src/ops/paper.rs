@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{Context, Error, Event, Player, Processor, said};
+use super::{BackendSource, Context, Error, Event, Processor, said};
 use crate::baseline::Baselines;
 use crate::choice::Work;
 use crate::config::{self, Actions, Fitness, Override, Paradigm};
@@ -57,7 +57,7 @@ impl Request {
 /// A trained experiment.
 #[derive(Clone, Debug, Serialize)]
 #[non_exhaustive]
-pub struct Arm {
+pub struct ExperimentOutcome {
     /// The name, which is that of its folder.
     pub name: String,
     /// The run's folder.
@@ -108,7 +108,7 @@ pub struct Outcome {
     /// Training time in seconds, including earlier sessions.
     pub seconds: f64,
     /// The experiments.
-    pub arms: Vec<Arm>,
+    pub arms: Vec<ExperimentOutcome>,
     /// The paper's claims with their verdicts.
     pub claims: Vec<Claim>,
     /// The files.
@@ -122,16 +122,16 @@ pub struct Outcome {
 ///
 /// # Errors
 /// The folder or a config cannot be used, training fails or is stopped, or files cannot be written.
-pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let Request { out, start, .. } = request;
     let start = *start;
     let mut arms = paper::arms(&request.set)?;
     let marks = Marks::of(&arms[0].config.learning);
     marks.compare(out, start)?;
     let (configs, places) = paper::trained(&arms);
-    let (player, on) = player.open(Work::of(&configs))?;
+    let (backend, on) = backends.open(Work::of(&configs))?;
     let plan = memory::Peaks::of(&configs, current_num_threads());
-    plan.check(player.1.backend == "gpu").map_err(RunError::from)?;
+    plan.check(backend.1.backend == "gpu").map_err(RunError::from)?;
     let disk = Disk::default();
     disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
     let disk = ownership::enter(&disk, out, request.is_out_named())?;
@@ -178,7 +178,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
             let rows: Vec<Row> = now.rows.iter().flat_map(of_arms).collect();
             context.rows(next(now.generations), &rows);
         };
-        let ended = context.train(&mut watch, |options| session.train(player, options));
+        let ended = context.train(&mut watch, |options| session.train(backend, options));
         (context.tell)(Event::Pause);
         if ended? == Ended::Stopped {
             return Err(Error::Stopped(
@@ -207,8 +207,8 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
         if context.is_stopped() {
             return Err(Error::Stopped("before all that needs no learning was played, with every run done".into()));
         }
-        if let Err(error) = baselines.advance(&mut *player.0) {
-            *player = context.instead(&error).ok_or(error)?;
+        if let Err(error) = baselines.advance(&mut *backend.0) {
+            *backend = context.instead(&error).ok_or(error)?;
             continue;
         }
         let (generation, last) = (baselines.generation(), learning.generations);
@@ -255,7 +255,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
     };
     let summary = serde_json::to_string(&summary).expect("plain fields are JSON") + "\n";
     write(SUMMARY.into(), summary.as_bytes())?;
-    let arm = |(index, arm): (usize, &Experiment)| Arm {
+    let arm = |(index, arm): (usize, &Experiment)| ExperimentOutcome {
         name: arm_name(arm),
         folder: folders[index].escaped().to_string(),
         layout: arm.layout.name,

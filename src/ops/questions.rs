@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::paper::Request;
 use super::sweep::{claim, free_memory, same_sweep};
-use super::{Context, Error, Event, Player, check_memory, said};
+use super::{BackendSource, Context, Error, Event, check_memory, said};
 use crate::choice::Work;
 use crate::config::Config;
 use crate::escape::PathExt;
@@ -71,7 +71,7 @@ fn files() -> impl Iterator<Item = String> {
 ///
 /// # Errors
 /// The folder or a config cannot be used, training fails or is stopped, or files cannot be written.
-pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let (out, start) = (&request.out, request.start);
     let parts: Vec<(&Study, Sweep)> = questions::parts(&request.questions)
         .into_iter()
@@ -97,8 +97,8 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
         )));
     }
     let configs = || parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config);
-    let (player, on) = player.open(Work::of(configs()))?;
-    check_memory(configs(), player)?;
+    let (backend, on) = backends.open(Work::of(configs()))?;
+    check_memory(configs(), backend)?;
     let disk = Disk::default();
     disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
     let disk = ownership::enter(&disk, out, request.is_out_named())?;
@@ -132,7 +132,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
             (context.tell)(Event::Fraction((before + share * cost(sweep)) / whole, text));
         };
         let ended =
-            super::sweep::train_points(context, sweep, &points, &folder, start, &disk, free_memory(), player, &share)?;
+            super::sweep::train_points(context, sweep, &points, &folder, start, &disk, free_memory(), backend, &share)?;
         if ended == Ended::Stopped {
             return Err(stopped());
         }
@@ -147,7 +147,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
         let mut watch = |_: &crate::run::Progress<'_>| {
             (context.tell)(Event::Fraction(before / whole, format!("{}: warm starts", part.name)));
         };
-        if !session.is_done() && context.train(&mut watch, |options| session.train(player, options))? == Ended::Stopped
+        if !session.is_done() && context.train(&mut watch, |options| session.train(backend, options))? == Ended::Stopped
         {
             return Err(stopped());
         }
@@ -164,7 +164,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
             let sweep = parts.iter().find(|(other, _)| other.name == part.name).map(|(_, sweep)| sweep);
             let Some(sweep) = sweep else { continue };
             (context.tell)(Event::Fraction(1.0, format!("comparing {}", part.name)));
-            let answer = part.answer(sweep, out, &mut *player.0)?;
+            let answer = part.answer(sweep, out, &mut *backend.0)?;
             for kind in Format::ALL {
                 let path = out.join(format!("{}.{}", part.name, kind.extension()));
                 let bytes = answer.scene().file(kind, PRINT);

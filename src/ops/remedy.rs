@@ -154,7 +154,7 @@ pub fn run(error: &RunError) -> String {
 pub(crate) const RUNS: &str = "runs";
 
 /// Returns advice on a run that could not be shown.
-pub fn shown(error: &runs::ReadError) -> String {
+pub fn read(error: &runs::ReadError) -> String {
     match error {
         runs::ReadError::Missing(folder) if Path::new(RUNS).join(folder).is_dir() => {
             format!("; did you mean {}?", Path::new(RUNS).join(folder).escaped())
@@ -184,7 +184,7 @@ pub fn shown(error: &runs::ReadError) -> String {
 /// Returns advice on an episode that could not be replayed.
 pub fn replayed(error: &ReplayError) -> String {
     match error {
-        ReplayError::Run(error) => shown(error),
+        ReplayError::Run(error) => read(error),
         ReplayError::Backend(error) => backend(error).into(),
         ReplayError::NoGeneration { newest: Some(_), .. } => ", or finish the run with --resume".into(),
         ReplayError::NoGeneration { .. }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::output::Destination;
-use super::{Context, Error, Player, escaped, points, said};
+use super::{BackendSource, Context, Error, escaped, points, said};
 use crate::choice::Work;
 use crate::config::{Config, Learning};
 use crate::escape::PathExt;
@@ -182,7 +182,7 @@ impl WhichTrial {
 ///
 /// # Errors
 /// The run cannot be read, the request does not fit it, the backend fails, or a file cannot be written.
-pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let Request { generation, team, compare, step, width, fps, unverified, .. } = *request;
     let verification = Verification::unless(unverified);
     let opened = RunFolder::open(&request.folder)?;
@@ -220,7 +220,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
         return refused(format!("--step {step}: the episode has steps 0 to {steps}"));
     }
     let learning = Learning { trials: 1, ..config.learning.clone() };
-    let ((backend, _), _) = player.open(Work::of([&Config { learning, ..config.clone() }]))?;
+    let ((backend, _), _) = backends.open(Work::of([&Config { learning, ..config.clone() }]))?;
     let last = generations.iter().max().copied().unwrap_or(0);
     let mut watch = |generation: usize| {
         let text = format!("training trial {trial} again: generation {generation} of {last}");

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{ConfigText, Context, Error, Player, Processor, output, points, said};
+use super::{BackendSource, ConfigText, Context, Error, Processor, output, points, said};
 use crate::backend::{Backend, Group, Moment};
 use crate::choice::Work;
 use crate::config::{self, Config, Override, Sharing};
@@ -119,7 +119,7 @@ impl Request {
 ///
 /// # Errors
 /// The config or the policies cannot be used, the backend fails, or a file cannot be written.
-pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let opened = RunFolder::open(&request.path)?;
     let (config_path, trained) = match opened.path() {
         path if path.is_dir() => {
@@ -157,7 +157,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
     let own = policies.policies * world.leaders() * world.parameters();
     let sharing = if policies.weights.len() == own { Sharing::PerLeader } else { Sharing::Shared };
     let work = Work::of_teams(&config, policies.policies * request.episodes.unwrap_or(1) as usize);
-    let ((backend, machine), on) = player.open(work)?;
+    let ((backend, machine), on) = backends.open(work)?;
     context.message(format_args!("playing on {on}"));
     let teams = evaluate::one_policy_a_team(policies.policies, world.leaders());
     let group = Group {

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::{Context, Error, Event, Player, check_memory};
+use super::{BackendSource, Context, Error, Event, check_memory};
 use crate::backend::OpenBackend;
 use crate::choice::Work;
 use crate::config::{self, Config, ConfigError, Override, Problem};
@@ -197,10 +197,10 @@ impl Outcome {
 ///
 /// # Errors
 /// The sweep is invalid, the folder cannot be used, or training fails or is stopped.
-pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let sweep = request.read()?;
     let axes = picture_axes(&sweep, &request.results.axes)?;
-    train(request, &sweep, player, context)?;
+    train(request, &sweep, backends, context)?;
     collect(request, &sweep, &axes, context)
 }
 
@@ -307,14 +307,19 @@ fn enter(out: &Path, named: bool) -> Result<Disk, Error> {
 ///
 /// # Errors
 /// The folder cannot be used, or training fails or is stopped.
-pub fn train(request: &Request, sweep: &Sweep, player: &mut dyn Player, context: Context<'_>) -> Result<(), Error> {
+pub fn train(
+    request: &Request,
+    sweep: &Sweep,
+    backends: &mut dyn BackendSource,
+    context: Context<'_>,
+) -> Result<(), Error> {
     let out = &*request.out;
     let shard = request.shard.map_or(Ok(Shard::WHOLE), |(index, count)| Shard::new(index, count));
     let shard = shard.map_err(|error| Error::Usage(error.into()))?;
     same_sweep(sweep, out)?;
     let points = shard.take(&sweep.points);
-    let (player, on) = player.open(Work::of(points.iter().map(|point| &point.config)))?;
-    check_memory(points.iter().map(|point| &point.config), player)?;
+    let (backend, on) = backends.open(Work::of(points.iter().map(|point| &point.config)))?;
+    check_memory(points.iter().map(|point| &point.config), backend)?;
     warn_of_unreachable(sweep, &points, context);
     claim(&Disk::default(), sweep, out)?;
     let disk = enter(out, request.named)?;
@@ -333,7 +338,7 @@ pub fn train(request: &Request, sweep: &Sweep, player: &mut dyn Player, context:
             format!("{done}/{points} points done, {batch} side by side at generation {}/{last}", generation.min(last));
         (context.tell)(Event::Fraction(played as f64 / total.max(1) as f64, text));
     };
-    match train_points(context, sweep, &points, out, request.start, &disk, memory, player, &share)? {
+    match train_points(context, sweep, &points, out, request.start, &disk, memory, backend, &share)? {
         Ended::Done => Ok(()),
         Ended::Stopped => Err(Error::Stopped("everything is saved".into())),
     }
@@ -349,7 +354,7 @@ pub(super) fn train_points(
     start: Start,
     disk: &Disk,
     memory: usize,
-    player: &mut OpenBackend,
+    backend: &mut OpenBackend,
     share: &dyn Fn(&SweepProgress),
 ) -> Result<Ended, Error> {
     let mut options = run::SweepOptions {
@@ -372,7 +377,7 @@ pub(super) fn train_points(
             }
         },
     };
-    let ended = run::run(points, out, player, &mut options);
+    let ended = run::run(points, out, backend, &mut options);
     (context.tell)(Event::Pause);
     Ok(ended?)
 }

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{ConfigText, Context, Error, Event, Player, baseline, check_memory};
+use super::{BackendSource, ConfigText, Context, Error, Event, baseline, check_memory};
 use crate::backend::{Backend, OpenBackend};
 use crate::baseline::Outcome as Played;
 use crate::choice::Work;
@@ -132,7 +132,7 @@ impl Trained {
 /// # Errors
 /// A config is invalid, the folder cannot be used, or training fails or is stopped. A task that is not admitted is an
 /// outcome.
-pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let mut tasks: Vec<(&Task, [Option<Config>; 2])> = Vec::new();
     for task in &request.tasks {
         let name = &task.name;
@@ -159,7 +159,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
         // One training after the other.
         FITNESSES.iter().for_each(|_| work += Work::of([config]));
     }
-    let (player, on) = player.open(work)?;
+    let (backend, on) = backends.open(work)?;
     let disk = Disk::default();
     disk.create_folder(&request.out).map_err(RecordError::write(&request.out))?;
     let disk = ownership::enter(&disk, &request.out, request.named)?;
@@ -169,7 +169,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
         context.message(format_args!("{name}: playing baselines and training on {on}"));
         let small = configs[0].as_ref().expect("small populations are always trained");
         let quiet = Context { tell: &|_| (), ..context };
-        let played = baseline::play(small, SEEDS, EPISODES, &mut *player.0, quiet)?;
+        let played = baseline::play(small, SEEDS, EPISODES, &mut *backend.0, quiet)?;
         let g = |of: fn(&Played) -> f64| played.iter().map(of).collect();
         let baselines = [g(|played| played.constants[played.best_constant]), g(|p| p.action), g(|p| p.network)];
         let mut trained = Vec::new();
@@ -181,8 +181,8 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
                 let parent = request.out.join(name);
                 disk.create_folder(&parent).map_err(RecordError::write(&parent))?;
                 let folder = parent.join(format!("{}-{fitness}", config.learning.population));
-                train(&config, name, &folder, request.start, &disk, player, context)?;
-                trained.push(measure(&config, &folder, &mut *player.0)?);
+                train(&config, name, &folder, request.start, &disk, backend, context)?;
+                trained.push(measure(&config, &folder, &mut *backend.0)?);
             }
         }
         let (scripted, refused) = (task.scripted, reason(&baselines, &trained, task.scripted));
@@ -199,10 +199,10 @@ fn train(
     folder: &Path,
     start: Start,
     disk: &Disk,
-    player: &mut OpenBackend,
+    backend: &mut OpenBackend,
     context: Context<'_>,
 ) -> Result<(), Error> {
-    check_memory([config], player)?;
+    check_memory([config], backend)?;
     let (mut session, _) = Session::open(vec![(config.clone(), folder.into())], start, disk)?;
     if session.is_done() {
         return Ok(());
@@ -212,7 +212,7 @@ fn train(
     let names = vec![(title, Some(config.world.pois.len()))];
     (context.tell)(Event::Begin(names, session.generations()[0], learning.generations));
     let mut watch = |now: &Progress<'_>| context.rows(now.generations[0], now.rows);
-    let ended = context.train(&mut watch, |options| session.train(player, options));
+    let ended = context.train(&mut watch, |options| session.train(backend, options));
     context.pause();
     match ended? {
         Ended::Done => Ok(()),

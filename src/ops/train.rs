@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::remedy::RUNS;
-use super::{ConfigText, Context, Error, Event, Player, Processor, check_memory, escaped, said};
+use super::{BackendSource, ConfigText, Context, Error, Event, Processor, check_memory, escaped, said};
 use crate::choice::Work;
 use crate::config::Config;
 use crate::escape::PathExt;
@@ -194,11 +194,11 @@ pub(crate) fn refuse_zip(path: &Path) -> Result<(), Error> {
 ///
 /// # Errors
 /// The config is invalid, the folder cannot be used, or training fails or is stopped.
-pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     request.out.iter().try_for_each(|path| refuse_zip(path))?;
     let (config, notes) = request.config.read_noted(context)?;
-    let (player, on) = player.open(Work::of([&config]))?;
-    check_memory([&config], player)?;
+    let (backend, on) = backends.open(Work::of([&config]))?;
+    check_memory([&config], backend)?;
     context.warn_of_unreachable(&config);
     let (init, start) = (request.init.as_deref(), request.start);
     let first = init.map(|path| policies::read_init(path, &config)).transpose()?;
@@ -246,7 +246,7 @@ pub fn run(request: &Request, player: &mut dyn Player, context: Context<'_>) -> 
             context.rows(progress.generations[0], progress.rows);
             events.add(progress.rows);
         };
-        let ended = context.train(&mut watch, |options| session.train(player, options));
+        let ended = context.train(&mut watch, |options| session.train(backend, options));
         context.pause();
         events.flush();
         if ended? == Ended::Done {
@@ -318,10 +318,13 @@ pub struct InMemory {
 pub fn in_memory(
     config: &Config,
     champions: bool,
-    player: &mut dyn Player,
+    backends: &mut dyn BackendSource,
     context: Context<'_>,
 ) -> Result<InMemory, Error> {
-    let (player, on) = player.open(Work::of([config]))?;
+    config.validate()?;
+    let (backend, on) = backends.open(Work::of([config]))?;
+    context.notes(&config.notes());
+    context.warn_of_unreachable(config);
     (context.tell)(Event::Begin(vec![(String::new(), config.pois())], 0, config.learning.generations));
     let (since, mut seconds, mut stopped) = (Instant::now(), Vec::new(), false);
     let watch = |generation: Generation<'_>| {
@@ -335,8 +338,8 @@ pub fn in_memory(
         ControlFlow::Break(())
     };
     let trained = match champions {
-        true => front::train_with_champions(config, &mut *player.0, watch),
-        false => front::train(config, &mut *player.0, watch),
+        true => front::train_with_champions(config, &mut *backend.0, watch),
+        false => front::train(config, &mut *backend.0, watch),
     };
     let trained = trained.map_err(Error::of_training)?;
     if stopped {
@@ -344,7 +347,7 @@ pub fn in_memory(
     }
     // After an early end, one more generation is played, of which nobody is told.
     seconds.resize(trained.config.learning.generations + 1, since.elapsed().as_secs_f64());
-    Ok(InMemory { trained, seconds, processor: Processor::of(&player.1, &on) })
+    Ok(InMemory { trained, seconds, processor: Processor::of(&backend.1, &on) })
 }
 
 /// Writes a finished run that was trained in memory, with the files of [`run`]. Returns its digest.

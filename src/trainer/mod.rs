@@ -23,7 +23,7 @@ use crate::host::Instant;
 use crate::parallel::*;
 use crate::world::World;
 
-mod asked;
+mod ask_tell;
 mod experiment;
 mod populations;
 mod residency;
@@ -32,7 +32,7 @@ mod schedule;
 mod size;
 mod stages;
 
-pub use asked::Asked;
+pub use ask_tell::Candidates;
 pub use size::{bytes, next_bytes, snapshot_bytes};
 
 use experiment::Experiment;

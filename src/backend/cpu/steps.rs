@@ -58,7 +58,7 @@ pub struct Noise<'a> {
 
 impl<'a> StepArrays<'a> {
     /// Returns the index of the first array that is neither empty nor as long as needed.
-    fn misfit(&self, sizes: [usize; 8], teams: usize) -> Option<usize> {
+    fn wrong_length(&self, sizes: [usize; 8], teams: usize) -> Option<usize> {
         let StepArrays { positions, headings, speeds, inputs, outputs, actions, near, observed_at } = self;
         let found = [positions, headings, speeds, inputs, outputs, actions].map(|array| array.len());
         let found = found.into_iter().chain([near.len(), observed_at.len()]);
@@ -105,7 +105,7 @@ impl Cpu {
         let [run] = &batches[..] else {
             return Err(BackendError::InvalidInput("steps are recorded of groups of one world".into()));
         };
-        if let Some(index) = arrays.misfit(step_sizes(run.world), run.teams) {
+        if let Some(index) = arrays.wrong_length(step_sizes(run.world), run.teams) {
             return Err(BackendError::InvalidInput(format!("array {index} of the steps has the wrong length")));
         }
         if noise.is_some_and(|noise| noise.deviations.len() != run.world.leaders()) {

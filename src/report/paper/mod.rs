@@ -300,8 +300,8 @@ pub fn figure(results: Evidence<'_>, layout: usize) -> Figure {
 
 fn title(paradigm: Paradigm) -> &'static str {
     match paradigm {
-        Paradigm::AllLeaders => "All leaders",
-        Paradigm::LeaderFollower => "Leaders and followers",
+        Paradigm::AllLeaders => "All-leaders teams",
+        Paradigm::LeaderFollower => "Leader-follower teams",
     }
 }
 

@@ -40,7 +40,7 @@ pub const QUESTIONS: &[OpenQuestion] = &[
         parts: &[
             part!(
                 "groups",
-                title: "One policy or many: groups with their POIs straight ahead",
+                title: "One policy for all leaders or one each, by number of groups",
                 by: "sharing",
                 panels: Some("paradigm"),
                 words: &[SHARING],
@@ -48,7 +48,7 @@ pub const QUESTIONS: &[OpenQuestion] = &[
             ),
             part!(
                 "asymmetry",
-                title: "One policy or many: four groups with less and less in common",
+                title: "One policy for all leaders or one each, in four layouts of increasing asymmetry",
                 by: "sharing",
                 panels: Some("paradigm"),
                 words: &[SHARING, ("pois", &["ahead", "to either side", "ahead and behind", "each another way"])],
@@ -74,7 +74,7 @@ pub const QUESTIONS: &[OpenQuestion] = &[
         parts: &[
             part!(
                 "relay",
-                title: "A relay of two leaders, by how long its last POIs can be observed",
+                title: "Relay of two leaders, by the time in which its last POIs can be observed",
                 by: "fitness",
                 words: &[("windows", &[
                     "1 step",
@@ -90,7 +90,7 @@ pub const QUESTIONS: &[OpenQuestion] = &[
             ),
             part!(
                 "relay_forced",
-                title: "A relay whose hand-over is forced",
+                title: "Relay with an enforced hand-over",
                 by: "fitness",
                 words: &[("windows", &["1 step", "10 steps", "20 steps", "30 steps"])],
                 pairs: OF_CREDIT,
@@ -98,7 +98,7 @@ pub const QUESTIONS: &[OpenQuestion] = &[
             ),
             part!(
                 "relay_order",
-                title: "The relay's world with its POIs in order instead of in windows",
+                title: "The relay's layout with POIs in a fixed order instead of time windows",
                 by: "fitness",
                 words: &[("after", &["any order", "in order"])],
                 pairs: OF_CREDIT,
@@ -113,7 +113,7 @@ pub const QUESTIONS: &[OpenQuestion] = &[
             ),
             part!(
                 "relay_led",
-                title: "The relay by Dt, who leads a follower told in other ways",
+                title: "Relay under Dt, with other rules for who leads a follower",
                 by: "led_within",
                 words: &[("led_within", &["all steps", "the present step", "the last 10 steps"])],
                 pairs: &[[0, 1], [0, 2]],
@@ -124,7 +124,7 @@ pub const QUESTIONS: &[OpenQuestion] = &[
         letter: 'd',
         title: "Followers as the only observers",
         parts: &[
-            part!("observers", title: "Only followers count, by followers of each leader", by: "fitness", pairs: OF_CREDIT),
+            part!("observers", title: "Only followers observe, by number of followers per leader", by: "fitness", pairs: OF_CREDIT),
         ],
     },
     OpenQuestion {
@@ -132,7 +132,7 @@ pub const QUESTIONS: &[OpenQuestion] = &[
         title: "Curricula over coupling",
         parts: &[part!(
             "curricula",
-            title: "Coupling at once, or step by step",
+            title: "Full coupling from the start, or raised in stages",
             by: "stages",
             panels: Some("paradigm"),
             words: &[("stages", &["at once", "step by step"])],
@@ -143,7 +143,7 @@ pub const QUESTIONS: &[OpenQuestion] = &[
         title: "Warm starts from one layout to another",
         parts: &[part!(
             "warm",
-            title: "POIs each another way, from random policies or from those of other layouts",
+            title: "POIs in different directions, from random policies or from policies of other layouts",
             pairs: &[[0, 1], [0, 2], [0, 3]],
             at: &[0, 10, 100],
             // These points are leader-follower teams in which each leader has its own policy.
@@ -155,7 +155,7 @@ pub const QUESTIONS: &[OpenQuestion] = &[
         title: "Learned on fixed POIs, played on moved ones, and the other way round",
         parts: &[part!(
             "places",
-            title: "Champions where POIs stand and where they are moved",
+            title: "Champions on fixed and on moved POIs",
             by: "poi_jitter",
             words: &[("poi_jitter", &["learned on fixed POIs", "learned on moved POIs"])],
             pairs: &[[0, 1], [0, 2], [1, 2]],

@@ -14,7 +14,7 @@ use crate::world::World;
 
 /// Teams that one trial plays in a generation.
 #[derive(Clone, Copy, Debug)]
-pub struct Asked<'a> {
+pub struct Candidates<'a> {
     /// The populations, `[populations][slots][parameters]`, see [`Learning::slots`](crate::config::Learning::slots).
     pub weights: &'a [f32],
     /// The policy of each leader in each team, `[teams + 1][leaders]`. The last team is the champions'.
@@ -25,11 +25,11 @@ pub struct Asked<'a> {
 
 impl Trainer {
     /// Forms the teams of the generation that an experiment plays next, and returns them, one entry per trial.
-    pub fn ask(&mut self, experiment: usize) -> Vec<Asked<'_>> {
+    pub fn ask(&mut self, experiment: usize) -> Vec<Candidates<'_>> {
         let experiment = &mut self.experiments[experiment];
         experiment.prepare(self.level);
         let pairs = experiment.trials.iter().zip(&experiment.schedules);
-        let asked = pairs.map(|(trial, schedule)| Asked {
+        let asked = pairs.map(|(trial, schedule)| Candidates {
             weights: &trial.weights,
             teams: &schedule.teams,
             starts: &schedule.starts,
@@ -41,7 +41,7 @@ impl Trainer {
     ///
     /// # Errors
     /// The backend failed.
-    pub fn play_asked(&mut self, experiment: usize, backend: &mut dyn Backend) -> Result<(), BackendError> {
+    pub fn play_candidates(&mut self, experiment: usize, backend: &mut dyn Backend) -> Result<(), BackendError> {
         let level = self.level;
         scope(|_| {
             let experiment = &mut self.experiments[experiment];
@@ -55,14 +55,14 @@ impl Trainer {
 
     /// Returns the world that the teams of [`Trainer::ask`] play in, the number of teams without the champions', and of
     /// the champions of a finished experiment 0.
-    pub fn asked_world(&self, experiment: usize) -> (&World, usize) {
+    pub fn candidates_world(&self, experiment: usize) -> (&World, usize) {
         let experiment = &self.experiments[experiment];
         let stage = experiment.stage();
         (&stage.world, if experiment.is_over() { 0 } else { stage.config.learning.teams() })
     }
 
     /// Returns G, `[trials][teams]`, and the config's fitness of each leader, `[trials][teams][leaders]`, of the teams
-    /// that [`Trainer::play_asked`] played, as means over episodes.
+    /// that [`Trainer::play_candidates`] played, as means over episodes.
     pub fn played(&self, experiment: usize) -> (Vec<f64>, Vec<f32>) {
         let experiment = &self.experiments[experiment];
         let stage = experiment.stage();
