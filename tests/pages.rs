@@ -6,8 +6,9 @@
 //! - A fenced block without a language (or `sh`), and an indented one, holds commands, each a line of its own (`\` goes on
 //!   in the next). What is printed, and what is not for a shell, has a language: `text`, `toml`, `yaml`.
 //! - A `toml` block is a file where the paragraph before it names one (`` `sweep.toml` ``).
-//! - `<!-- not run: WHY -->` before a block leaves it out; `<!-- long: WHY -->` leaves it to `FLOTILLA_LONG=1`.
-//!
+//! - `<!-- not run: WHY -->` before a block leaves it out.
+//! - `<!-- long: WHY -->` leaves it to `FLOTILLA_LONG=1`. With `<!-- short: FLAGS -->` beside it, it is run in any case, but
+//!   with these flags, each with a value: they replace those of a command, or are added where the command takes them.
 //! - `<!-- output -->` before a `text` block holds the block to what the last command printed: its lines are printed in this
 //!   order, with others between them or not; `…` stands for any part of a line.
 //!
@@ -31,6 +32,8 @@ use tempfile::TempDir;
 
 /// The time limit of one command.
 const PATIENCE: Duration = Duration::from_secs(300);
+/// The same where a block is long by its own account.
+const LONG_PATIENCE: Duration = Duration::from_secs(3 * 3600);
 
 fn pages() -> Vec<PathBuf> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -57,6 +60,8 @@ struct Block {
     /// Why it is left out, always or unless there is time.
     not_run: Option<String>,
     long: Option<String>,
+    /// Flags that make its commands short.
+    short: Option<String>,
     /// Whether the last command printed this.
     output: bool,
     /// The file that a `toml` block is.
@@ -95,6 +100,7 @@ fn read(text: &str) -> (Vec<Block>, Vec<(usize, String)>) {
         if let Some(comment) = comment {
             let why = |kind: &str| comment.strip_prefix(kind).map(|why| why.trim().to_string());
             (next.not_run, next.long) = (why("not run:").or(next.not_run), why("long:").or(next.long));
+            next.short = why("short:").or(next.short);
             next.output |= comment == "output";
         } else if let Some(fence) = line.trim_start().strip_prefix("```") {
             let mut block = Block { language: fence.trim().into(), ..std::mem::take(&mut next) };
@@ -163,8 +169,32 @@ fn calls(line: &str) -> Vec<String> {
     parts.collect()
 }
 
+/// Returns a command with flags that make it short.
+fn shortened(command: &str, flags: &str) -> String {
+    let mut command = command.split(" #").next().unwrap_or_default().trim_end().to_string();
+    if !command.starts_with("flotilla ") {
+        return command;
+    }
+    let words: Vec<&str> = flags.split_whitespace().collect();
+    for flag in words.chunks(2) {
+        let [name, value] = flag else { panic!("{flags}: not every flag has a value") };
+        let before = command.clone();
+        let mut parts: Vec<&str> = before.split(' ').collect();
+        let place = parts.iter().position(|part| part == name);
+        match place {
+            Some(place) => parts[place + 1] = value,
+            None => parts.extend([name, value]),
+        }
+        let after = parts.join(" ");
+        if place.is_some() || misread(&after).is_none() {
+            command = after;
+        }
+    }
+    command
+}
+
 /// Runs a command as a shell does, and returns what it printed, as an error if it failed.
-fn run(command: &str, folder: &Path) -> Result<String, String> {
+fn run(command: &str, folder: &Path, patience: Duration) -> Result<String, String> {
     let said = folder.join(".said");
     let output = fs::File::create(&said).unwrap();
     let mut bash = support::shell("bash", command);
@@ -174,10 +204,10 @@ fn run(command: &str, folder: &Path) -> Result<String, String> {
     let status = loop {
         match child.try_wait().unwrap() {
             Some(status) => break status.to_string(),
-            None if start.elapsed() > PATIENCE => {
+            None if start.elapsed() > patience => {
                 let _ = child.kill();
                 let _ = child.wait();
-                break format!("it was ended after {PATIENCE:?}");
+                break format!("it was ended after {patience:?}");
             }
             None => std::thread::sleep(Duration::from_millis(5)),
         }
@@ -261,14 +291,17 @@ fn try_page(name: &str, text: &str, long: bool) -> Tried {
             "" | "sh" | "bash" => {}
             _ => continue,
         }
-        let why = block.not_run.as_ref().or(block.long.as_ref().filter(|_| !long));
+        let short = block.short.as_ref().filter(|_| !long);
+        let why = block.not_run.as_ref().or(block.long.as_ref().filter(|_| !long && short.is_none()));
+        let patience = if long && block.long.is_some() { LONG_PATIENCE } else { PATIENCE };
         for (number, command) in block.commands() {
             if let Some(why) = why {
                 calls(&command).iter().for_each(|call| parse(&mut tried, number, call));
                 tried.left_out.push(format!("{name}:{number}: {command}  ({why})"));
             } else if !broken {
                 tried.ran += 1;
-                match run(&command, folder.path()) {
+                let command = short.map_or(command.clone(), |flags| shortened(&command, flags));
+                match run(&command, folder.path(), patience) {
                     Ok(output) => printed = output,
                     Err(output) => {
                         tried.failed.push(format!("{name}:{number}: {command}\n{output}"));
@@ -322,6 +355,17 @@ fn what_fails_in_a_page_is_told_with_its_place() {
     let expected = ["p.md:23: flotilla plot --ot x", "p.md:13: flotilla chekc x", "p.md:21: flotilla check --sed 1"];
     assert_eq!(places, expected, "{failed:?}");
     assert!(failed[1].contains("exit status: 2\n") && failed[1].contains("chekc"), "{failed:?}");
+}
+
+#[test]
+fn a_long_command_is_run_in_short() {
+    let flags = "--trials 2 --population 20";
+    let short = |command| shortened(command, flags);
+    assert_eq!(short("flotilla paper --trials 200 --out a # b"), "flotilla paper --trials 2 --out a");
+    assert_eq!(short("flotilla train c.toml --population 5000"), "flotilla train c.toml --population 20 --trials 2");
+    assert_eq!(short("flotilla compare a --csv"), "flotilla compare a --csv");
+    let page = "<!-- long: WHY -->\n<!-- short: --teams 2 -->\n```\nfalse\n```\n";
+    assert_eq!(try_page("p.md", page, false).failed.len(), 1);
 }
 
 #[test]
