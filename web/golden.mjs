@@ -25,11 +25,11 @@ assert.equal(machine.description, "cpu (SIMD128, 1 thread)");
 const SMALL = [["learning.trials", "2"], ["learning.generations", "8"], ["learning.population", "20"]];
 async function digest(layout, changes) {
   const { words } = await player.ask({ ask: "resolve", text: text(`layout-${layout}`), name: layout, changes: [...SMALL, ...changes] });
-  const training = new Training([{ ...words, label: layout, command: "" }], machine);
+  const training = new Training([{ ...words, name: "web", label: layout, command: "" }], machine);
   await training.start([player]);
   await training.play(() => Infinity, () => {});
   assert.equal(training.state, "done");
-  return { toml: words.toml, digest: training.arms[0].digest };
+  return { toml: words.toml, digest: training.arms[0].digest, zip: training.arms[0].zip };
 }
 
 const golden = Object.fromEntries(source("../tests/golden.txt").split("\n").map(line => line.split(/\s+/)).map(words => [words[0], words[2]]));
@@ -72,6 +72,22 @@ try {
       assert.equal(found, JSON.parse(readFileSync(join(out, "run.json"), "utf8")).digest, `${layout}, ${paradigm}`);
       console.log(`${layout}, ${paradigm}: the program's digest`);
     }
+  }
+  for (const method of ["tournament", "openai-es"]) {
+    const { toml, digest: found, zip } = await digest("chaotic", [["learning.method", `'${method}'`]]);
+    const [config, archive, run] = ["config.toml", "run.zip", "web-chaotic"].map(name => join(folder, name));
+    rmSync(run, { recursive: true, force: true });
+    writeFileSync(config, toml);
+    writeFileSync(archive, zip);
+    execFileSync("python3", ["-m", "zipfile", "-e", archive, folder]);
+    assert.equal(JSON.parse(readFileSync(join(run, "run.json"), "utf8")).digest, found);
+    const train = (config, out, ...flags) => JSON.parse(execFileSync(
+      flotilla, ["train", config, "--out", join(folder, out), "--generations", "18", "--json", "--quiet", "--backend", "cpu", ...flags],
+    ));
+    const extended = train(join(run, "config.toml"), "web-chaotic", "--resume");
+    assert.equal(extended.digest, train(config, `straight-${method}`).digest, method);
+    assert.equal(extended.trained_generations, 10, `${method}: generations are trained again`);
+    console.log(`${method}: the program extends the page's run without training again`);
   }
 } finally {
   rmSync(folder, { recursive: true });
