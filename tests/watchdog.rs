@@ -5,7 +5,7 @@
 
 mod support;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering::SeqCst};
 use std::sync::{Arc, Mutex, mpsc};
 use std::thread;
@@ -19,6 +19,7 @@ use flotilla::backend::gpu::faults::Faults;
 use flotilla::backend::gpu::{self, self_test};
 use flotilla::backend::{Backend, BackendError, Group};
 use flotilla::config::{Config, Fitness, Sharing};
+use flotilla::evolve::{Breeding, Key, Purpose};
 use flotilla::sample;
 use flotilla::trainer::{Row, Trainer};
 use flotilla::world::World;
@@ -26,6 +27,8 @@ use flotilla::world::World;
 fn config() -> Config {
     let mut config = Config::parse(support::SMALL, "small.toml").unwrap();
     config.learning.fitness = Fitness::Df;
+    // Few teams observe these at first, and more later, so that rows show who has played.
+    config.world.pois = vec![[10.0, 10.0], [20.0, 10.5]];
     config
 }
 
@@ -79,6 +82,8 @@ fn train(mut device: GpuBackend) -> (Vec<Row>, Vec<Vec<f32>>, usize) {
 fn expected() -> (Vec<Row>, Vec<Vec<f32>>) {
     let mut trainer = Trainer::new([config().validate().unwrap()]);
     let rows = trainer.finish(&mut Cpu::default()).unwrap();
+    let different: HashSet<_> = rows.iter().map(|row| row.mean_g.to_bits()).collect();
+    assert!(different.len() > 8, "rows do not show who has played: {different:?}");
     (rows, trainer.policies(0))
 }
 
@@ -100,7 +105,7 @@ fn a_dropped_submission_is_a_lost_device() {
     let (rows, policies) = expected();
     for (request, info) in support::adapters("a_dropped_submission_is_a_lost_device") {
         for way in WAYS {
-            for what in ["episodes", "breeding", "reading back"] {
+            for what in ["a population", "episodes", "breeding", "reading back"] {
                 for nth in 1.. {
                     let faults = Arc::new(Dropping { what, left: AtomicUsize::new(nth) });
                     let found = train(backend(failing(&opened(&request), &faults), way));
@@ -114,6 +119,40 @@ fn a_dropped_submission_is_a_lost_device() {
                         break;
                     }
                 }
+            }
+        }
+    }
+}
+
+/// A watchdog may also end breeding after some of its workgroups. The host may fetch the policies before they play.
+#[test]
+fn breeding_that_was_not_done_or_not_finished_is_a_lost_device() {
+    const SIZES: [usize; 3] = [2, 50, 64];
+    let learning = config().learning;
+    let weights: Vec<f32> = (0..SIZES.iter().product()).map(|index| index as f32).collect();
+    let parents: Vec<u32> = (0..SIZES[0] * SIZES[1]).map(|place| (place * 7 % SIZES[1]) as u32).collect();
+    let key = Key::new(0, 0, Purpose::Mutation);
+    let breeding = |generation| Breeding { parents: &parents, key, generation, learning: &learning };
+    let in_part: fn(String) -> String = |text| {
+        let start = "let counters = (brood.parameters";
+        text.replace(start, &format!("if workgroup.x == 2u {{ return; }}\n    {start}"))
+    };
+    for (request, info) in support::adapters("breeding_that_was_not_done_or_not_finished_is_a_lost_device") {
+        let gpu = opened(&request);
+        let dropping = |nth| Arc::new(Dropping { what: "breeding", left: AtomicUsize::new(nth) });
+        let cases = [
+            ("nothing", gpu.clone(), true),
+            ("the first breeding", failing(&gpu, &dropping(1)), false),
+            ("the second breeding", failing(&opened(&request), &dropping(2)), false),
+            ("a workgroup", failing(&opened(&request), &Arc::new(Edited(in_part))), false),
+        ];
+        for (left_out, gpu, expected) in cases {
+            let case = format!("{info}: {left_out} is left out");
+            let mut held = backend(gpu, WAYS[2]).hold(&weights, SIZES).unwrap().expect("all are held");
+            (0..2).for_each(|generation| held.breed(&breeding(generation)).unwrap());
+            match held.fetch(&mut vec![0.0; weights.len()]) {
+                Err(BackendError::Gpu(DeviceError::Lost { .. })) => assert!(!expected, "{case}"),
+                found => assert!(found.is_ok() && expected, "{case}: {found:?}"),
             }
         }
     }

@@ -5,7 +5,11 @@ use glam::Vec2;
 use super::{BackendError, DevicePopulation};
 use crate::config::{Fitness, Sharing};
 use crate::credit::RecordRequest;
+use crate::parallel::*;
 use crate::world::World;
+
+/// Choices of policies per rayon task.
+const CHECKED_TOGETHER: usize = 1 << 16;
 
 /// Teams of one world that start at the same positions and choose from the same policies.
 #[derive(Clone, Copy, Debug)]
@@ -83,8 +87,9 @@ impl<'a> Group<'a> {
             let found = weights.len();
             return invalid(format!("{found} weights, but {populations} populations of {policies} have {numbers}"));
         }
-        // The largest number is found by vectors.
-        if teams.iter().copied().max().is_none_or(|policy| (policy as usize) < policies) {
+        // The largest number of a chunk is found by vectors.
+        let exist = |teams: &[u32]| teams.iter().copied().max().is_none_or(|policy| (policy as usize) < policies);
+        if teams.par_chunks(CHECKED_TOGETHER).all(exist) {
             return Ok(());
         }
         match teams.iter().position(|&policy| policy as usize >= policies) {

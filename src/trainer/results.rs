@@ -12,6 +12,9 @@ use crate::backend::{Backend, BackendError, Group, GroupScores, Weights};
 use crate::config::{Learning, Leniency, Sharing};
 use crate::parallel::*;
 
+/// Teams per rayon task when their G is added up.
+const TEAMS_TOGETHER: usize = 1 << 16;
+
 /// Plays the teams of every trial of some experiments as one batch. Returns their scores, for [`keep`]. An experiment
 /// that is over plays its champions only.
 pub(super) fn play<'a>(
@@ -130,8 +133,15 @@ impl TrialState {
 /// Returns G of the best team, and the mean over teams. `episodes` are the scores of each episode.
 fn team_g(episodes: &[GroupScores], pois: usize, teams: usize) -> [f64; 2] {
     let observed = |team: usize| episodes.iter().map(|episode| u64::from(episode.observed[team])).sum();
+    let fold = |all: (u64, u64), (best, total)| (all.0.max(best), all.1 + total);
+    let chunk = |first: usize| {
+        let teams = first..teams.min(first + TEAMS_TOGETHER);
+        teams.map(observed).map(|g: u64| (g, g)).fold((0, 0), fold)
+    };
+    let chunks: Vec<_> =
+        (0..teams.div_ceil(TEAMS_TOGETHER)).into_par_iter().map(|index| chunk(index * TEAMS_TOGETHER)).collect();
+    let (best, total) = chunks.into_iter().fold((0, 0), fold);
     let whole = (pois * episodes.len()) as f64;
-    let (best, total) = (0..teams).map(observed).fold((0, 0), |(best, total): (u64, u64), g| (best.max(g), total + g));
     [best as f64 / whole, total as f64 / (whole * teams as f64)]
 }
 

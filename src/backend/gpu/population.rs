@@ -132,11 +132,11 @@ impl Kernels {
         let status = gpu.buffer("the status of a population", (words * size_of::<u32>()) as u64, usage)?;
         for (buffer, index, piece) in pieces {
             let nonce = gpu.nonces(1);
-            gpu.scoped("a population", || {
-                gpu.write(buffer, (index * PIECE) as u64, bytemuck::cast_slice(piece));
-                gpu.write(&status, (done.len() * size_of::<u32>()) as u64, &nonce.to_ne_bytes());
-                gpu.queue.submit([]);
-            })?;
+            let writes: [(_, _, &[u8]); 2] = [
+                (buffer, index * PIECE, bytemuck::cast_slice(piece)),
+                (&status, done.len() * size_of::<u32>(), &nonce.to_ne_bytes()),
+            ];
+            gpu.scoped("a population", || gpu.submit_writes("a population", &writes))?;
             gpu.wait()?;
             done.push(nonce);
         }

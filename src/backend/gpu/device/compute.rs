@@ -156,10 +156,24 @@ impl Gpu {
         encoder: wgpu::CommandEncoder,
     ) -> wgpu::SubmissionIndex {
         let commands = encoder.finish();
-        match &self.faults {
-            Some(faults) if faults.drops(what, turns) => self.queue.submit([]),
-            _ => self.queue.submit([commands]),
+        match self.drops(what, turns) {
+            true => self.queue.submit([]),
+            false => self.queue.submit([commands]),
         }
+    }
+
+    /// Writes to buffers, see [`Gpu::write`], and submits that.
+    pub(in crate::backend::gpu) fn submit_writes(&self, what: &str, writes: &[(&wgpu::Buffer, usize, &[u8])]) {
+        let dropped = self.drops(what, 0);
+        for (buffer, offset, bytes) in writes.iter().filter(|_| !dropped) {
+            self.write(buffer, *offset as u64, bytes);
+        }
+        self.queue.submit([]);
+    }
+
+    /// Reports whether a submission is dropped under injected faults.
+    fn drops(&self, what: &str, turns: u64) -> bool {
+        self.faults.as_ref().is_some_and(|faults| faults.drops(what, turns))
     }
 
     /// Submits one dispatch, without waiting for it.

@@ -20,8 +20,9 @@ pub(super) const KEPT: f64 = 1.0 / 16.0;
 /// Words of a packed record beyond that share.
 const KEPT_AT_LEAST: usize = 256;
 
-/// Jobs to gather from populations on the device, and the policies of these teams, `[teams][leaders]` each.
-type Gathering<'a> = (Vec<(GatherJob, &'a Population)>, Vec<u32>);
+/// Jobs to gather from populations on the device, and the policies of these teams, `[teams][leaders]` each, of which one
+/// follows the other on the device.
+type Gathering<'a> = (Vec<(GatherJob, &'a Population)>, Vec<&'a [u32]>);
 
 /// The device's buffers of one batch. They only grow.
 #[derive(Default)]
@@ -234,9 +235,18 @@ impl GpuBackend {
         if let Some(kernels) = self.kernels.as_ref().filter(|_| !jobs.is_empty()) {
             let structs: Vec<GatherJob> = jobs.iter().map(|(job, _)| *job).collect();
             let structs = upload(&mut buffers.jobs, "jobs", &parts(&structs))?;
-            let choices = upload(&mut buffers.choices, "choices", bytemuck::cast_slice(&choices))?;
+            let bytes = choices.iter().map(|choices| size_of_val(*choices) as u64).sum();
+            let buffer = grown(gpu, &mut buffers.choices, "choices", bytes, input)?;
+            gpu.scoped("choices", || {
+                let mut to = 0;
+                for choices in &choices {
+                    gpu.write(buffer, to, bytemuck::cast_slice(choices));
+                    to += size_of_val(*choices) as u64;
+                }
+            })?;
+            let choices = buffer;
             for (part, (job, population)) in jobs.iter().enumerate() {
-                gathers.push(kernels.gather((&structs, part), job, &choices, population, &weights)?);
+                gathers.push(kernels.gather((&structs, part), job, choices, population, &weights)?);
             }
         }
         let record = grown(gpu, &mut buffers.record, "record", record_bytes, output)?;
@@ -352,7 +362,7 @@ impl GpuBackend {
 
     /// Returns what a batch has to gather on the device.
     fn jobs<'a>(&self, groups: &[Group<'a>], work: &BatchPlan) -> Result<Gathering<'a>, BackendError> {
-        let (mut jobs, mut choices) = (Vec::new(), Vec::new());
+        let (mut jobs, mut choices, mut chosen) = (Vec::new(), Vec::new(), 0);
         for shares in work.shares.chunk_by(|a, b| a.group == b.group) {
             let group = &groups[shares[0].group];
             let Weights::OnDevice(held) = group.weights else { continue };
@@ -369,12 +379,13 @@ impl GpuBackend {
                     parameters: group.world.constants.policy.parameters,
                     teams,
                     teams_a_task: shares[0].task.teams,
-                    choices: choices.len() as u32,
+                    choices: chosen as u32,
                     weights: shares[0].task.weights,
                 };
                 jobs.push((job, population));
             }
-            choices.extend(&group.teams[shares[0].first_team * leaders..][..teams as usize * leaders]);
+            choices.push(&group.teams[shares[0].first_team * leaders..][..teams as usize * leaders]);
+            chosen += teams as usize * leaders;
         }
         Ok((jobs, choices))
     }

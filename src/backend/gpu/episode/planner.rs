@@ -180,7 +180,9 @@ impl BatchPlan {
             let (world, need) = (groups[share.group].world, groups[share.group].records());
             need.least(1).is_some() && !world.rule.is_timed() && pack_turns(groups, share) <= TURNS
         };
-        if !records.packs((self.record * size_of::<u32>()) as u64) || !self.shares.iter().all(packs) {
+        // The first task of a group is the largest.
+        let all_pack = self.shares.chunk_by(|a, b| a.group == b.group).all(|shares| packs(&shares[0]));
+        if !records.packs((self.record * size_of::<u32>()) as u64) || !all_pack {
             return;
         }
         let mut head = 0;
@@ -287,6 +289,7 @@ pub(super) fn plan(
                 // The shader finds headings behind the POIs.
                 work.places.extend(&world.headings);
                 work.worlds.push(world.constants);
+                work.shapes.insert(shape);
                 (work.worlds.len() - 1, Task { starts, pois, ..Task::default() })
             });
             let task = Task {
@@ -306,7 +309,6 @@ pub(super) fn plan(
             work.sets += world.set_words() * teams;
             work.moments += moments_a_team * teams;
             work.states += states_a_team * teams;
-            work.shapes.insert(shape);
             let turns_a_step = turns_a_step * packing.workgroup;
             work.shares.push(PlannedTask { group: index, first_team, shape, task, steps_a_dispatch, turns_a_step });
         }
