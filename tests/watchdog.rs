@@ -124,9 +124,9 @@ fn a_dropped_submission_is_a_lost_device() {
     }
 }
 
-/// A watchdog may also end breeding after some of its workgroups. The host may fetch the policies before they play.
+/// A watchdog may also end breeding after some of its workgroups. The host may fetch policies that have not played.
 #[test]
-fn breeding_that_was_not_done_or_not_finished_is_a_lost_device() {
+fn a_fetched_population_that_was_not_copied_or_bred_is_a_lost_device() {
     const SIZES: [usize; 3] = [2, 50, 64];
     let learning = config().learning;
     let weights: Vec<f32> = (0..SIZES.iter().product()).map(|index| index as f32).collect();
@@ -137,13 +137,14 @@ fn breeding_that_was_not_done_or_not_finished_is_a_lost_device() {
         let start = "let counters = (brood.parameters";
         text.replace(start, &format!("if workgroup.x == 2u {{ return; }}\n    {start}"))
     };
-    for (request, info) in support::adapters("breeding_that_was_not_done_or_not_finished_is_a_lost_device") {
+    for (request, info) in support::adapters("a_fetched_population_that_was_not_copied_or_bred_is_a_lost_device") {
         let gpu = opened(&request);
-        let dropping = |nth| Arc::new(Dropping { what: "breeding", left: AtomicUsize::new(nth) });
+        let dropping = |what, nth| Arc::new(Dropping { what, left: AtomicUsize::new(nth) });
         let cases = [
             ("nothing", gpu.clone(), true),
-            ("the first breeding", failing(&gpu, &dropping(1)), false),
-            ("the second breeding", failing(&opened(&request), &dropping(2)), false),
+            ("the second population", failing(&gpu, &dropping("a population", 2)), false),
+            ("the first breeding", failing(&opened(&request), &dropping("breeding", 1)), false),
+            ("the second breeding", failing(&opened(&request), &dropping("breeding", 2)), false),
             ("a workgroup", failing(&opened(&request), &Arc::new(Edited(in_part))), false),
         ];
         for (left_out, gpu, expected) in cases {
