@@ -82,7 +82,7 @@ pub struct Snapshot<N = Vec<f32>> {
     pub pending: Vec<Option<Row>>,
 }
 
-/// What a finished experiment continues from if it is extended, beside its rows and policies.
+/// State from which a finished experiment is extended, beside its rows and policies.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Ending {
     /// With an evolution strategy, a trial's weights after the last generation, as in [`Snapshot`]. Empty after
