@@ -19,7 +19,7 @@ use crate::backend::gpu::{
     episode::{GpuBackend, ResidencyPolicy},
 };
 use crate::backend::{Backend, BackendError, Group, GroupScores, Machine, OpenBackend};
-use crate::config::{Config, ConfigError, Fitness, MAX_POPULATION, Sharing, ValidConfig};
+use crate::config::{Config, ConfigError, Fitness, MAX_POPULATION, Method, Sharing, ValidConfig};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
 use crate::evolve::{self, Key, MAX_WEIGHT, Purpose};
 use crate::memory::{self, Peaks, TooLittle};
@@ -391,7 +391,7 @@ fn train_by(
     let (mut trainer, mut rows, mut stopped) = (trainer_of(valid)?, Vec::new(), false);
     start_from(&mut trainer, &config, policies, first)?;
     while !trainer.is_done() {
-        // These play beside the next generation, and complete the rows of their own.
+        // Champions play together with the next generation, which completes the rows of theirs.
         let best = with_champions.then(|| champions(&mut trainer, &config)).transpose()?;
         let played = trainer.advance(backend)?;
         if let Some(&Row { generation, .. }) = played.first().filter(|_| !stopped) {
@@ -426,7 +426,9 @@ fn trainer_of(config: ValidConfig) -> Result<Trainer, Failure> {
     let plan = Peaks::of([&*config], current_num_threads());
     // Nothing is saved during training, but the results stay in memory: every row twice, and the policies.
     let rows = config.learning.trials as u64 * (config.learning.generations as u64 + 1);
-    let kept = rows * (size_of::<Row>() + 3 * size_of::<f64>()) as u64 + config.policy_bytes();
+    // With an evolution strategy, its last state stays, too.
+    let copies = if config.learning.method == Method::Tournament { 1 } else { 2 };
+    let kept = rows * (size_of::<Row>() + 3 * size_of::<f64>()) as u64 + copies * config.policy_bytes();
     let needed = (plan.host.min(plan.gpu_host) - plan.checkpoint).saturating_add(kept);
     memory::check(needed, 0)?;
     Ok(Trainer::new([config]))

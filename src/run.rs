@@ -569,10 +569,8 @@ impl Member {
         let last = Checkpoint { config: config_digest(&self.config), init, seconds: in_all, metrics, snapshot: end };
         if last.snapshot.weights.is_empty() {
             let bytes = self.config.policy_bytes();
-            let snapshot = last
-                .snapshot
-                .copy()
-                .map_err(|error| RunError::of_snapshot(error.into(), "the scores of the last generation", bytes))?;
+            let memory = |_| RunError::Memory { what: "the scores of the last generation", bytes };
+            let snapshot = last.snapshot.copy().map_err(memory)?;
             let Checkpoint { config, init, seconds, metrics, .. } = last;
             keeper.save(Checkpoint { config, init, seconds, metrics, snapshot }, output, since)?;
         } else {

@@ -70,6 +70,26 @@ fn recorded_from(config: &Config, folder: &Path, init: Option<Init>) -> String {
 }
 
 #[test]
+fn champions_are_given_without_changing_the_training() {
+    let mut config = Config::parse(include_str!("../configs/chaotic.toml"), "chaotic.toml").expect("it is valid");
+    (config.learning.generations, config.learning.trials) = (6, 3);
+    let mut told = Vec::new();
+    let watch = |generation: front::Generation<'_>| {
+        told.push(generation.champions.expect("they were asked for").to_vec());
+        Continue(())
+    };
+    let trained = front::train_with_champions(&config, &mut Cpu::default(), watch).expect("it trains");
+    assert_eq!(trained, flotilla::train(&config, &mut Cpu::default(), |_| Continue(())).expect("it trains"));
+    let (population, parameters) = (config.learning.population, config.parameters());
+    let populations = trained.policies.iter().flat_map(|trial| trial.chunks(population * parameters));
+    let best: Vec<f32> = populations.flat_map(|policies| policies[..parameters].to_vec()).collect();
+    assert_eq!(told.len(), 7);
+    assert_eq!(told[6], best);
+    // Otherwise, the champions of the generation before would pass, too.
+    assert_ne!(told[5], best);
+}
+
+#[test]
 fn training_comes_to_what_a_run_comes_to() {
     let folder = tempfile::tempdir().expect("a folder for runs");
     for seed in 0..6 {

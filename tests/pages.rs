@@ -32,7 +32,7 @@ use tempfile::TempDir;
 
 /// The time limit of one command.
 const PATIENCE: Duration = Duration::from_secs(300);
-/// The same where a block is long by its own account.
+/// The time limit of one command in a block that is marked as long.
 const LONG_PATIENCE: Duration = Duration::from_secs(3 * 3600);
 
 fn pages() -> Vec<PathBuf> {

@@ -16,7 +16,7 @@ Floats = NDArray[np.float32]
 
 # Bytes: required for zero-copy exchange with JAX, and fits cache lines and vector instructions.
 ALIGNMENT = 64
-# Bytes that small arrays share. An array that is kept keeps its whole block.
+# Bytes of a block that small arrays share. The whole block stays in memory as long as one of them is used.
 BLOCK = 16_384
 
 

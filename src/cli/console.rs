@@ -102,7 +102,7 @@ struct Display {
 enum Shown {
     Nothing,
     Curves(Board),
-    Share(Meter),
+    Meter(Meter),
 }
 
 impl Display {
@@ -119,17 +119,17 @@ impl Display {
                 *shown = Shown::Curves(Board::new(names, from, last, self.quiet));
             }
             (Event::Rows { next, rows, .. }, Shown::Curves(board)) => board.show(next, rows),
-            (Event::Fraction(part, text), Shown::Share(meter)) => meter.show(part, || text),
+            (Event::Fraction(part, text), Shown::Meter(meter)) => meter.show(part, || text),
             (Event::Fraction(part, text), shown) => {
                 let mut meter = Meter::new(self.quiet);
                 meter.show(part, || text);
-                *shown = Shown::Share(meter);
+                *shown = Shown::Meter(meter);
             }
             (Event::Pause, shown) => {
                 match shown {
                     Shown::Nothing => {}
                     Shown::Curves(board) => board.clear(),
-                    Shown::Share(meter) => meter.clear(),
+                    Shown::Meter(meter) => meter.clear(),
                 }
                 *shown = Shown::Nothing;
             }

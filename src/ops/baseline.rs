@@ -149,7 +149,7 @@ pub(super) fn play(
             baselines.advance(backend)?;
             let done = seed * generations + baselines.generation();
             let part = done as f64 / (seeds * generations) as f64;
-            context.share(part, format!("playing random teams of seed {seed}"));
+            context.fraction(part, format!("playing random teams of seed {seed}"));
             context.go_on()?;
         }
         outcomes.extend(baselines.outcomes(backend, episodes)?.concat());

@@ -154,7 +154,7 @@ impl Context<'_> {
     }
 
     /// Reports the fraction of the work that is done.
-    pub(crate) fn share(&self, part: f64, text: impl ToString) {
+    pub(crate) fn fraction(&self, part: f64, text: impl ToString) {
         (self.tell)(Event::Fraction(part, text.to_string()));
     }
 

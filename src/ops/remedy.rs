@@ -153,7 +153,7 @@ pub fn run(error: &RunError) -> String {
 /// The folder for runs whose folder is not named.
 pub(crate) const RUNS: &str = "runs";
 
-/// Returns advice on a run that could not be shown.
+/// Returns advice on a run that could not be read.
 pub fn read(error: &runs::ReadError) -> String {
     match error {
         runs::ReadError::Missing(folder) if Path::new(RUNS).join(folder).is_dir() => {

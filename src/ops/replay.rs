@@ -224,7 +224,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let last = generations.iter().max().copied().unwrap_or(0);
     let mut watch = |generation: usize| {
         let text = format!("training trial {trial} again: generation {generation} of {last}");
-        context.share(generation as f64 / (last + 1) as f64, text);
+        context.fraction(generation as f64 / (last + 1) as f64, text);
         !context.is_stopped()
     };
     let played = replay::replay(folder, trial, &generations, team, verification, &mut **backend, &mut watch);

@@ -170,7 +170,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         fitnesses: if request.scores.is_some() { evaluate::SCORES_AND_DT } else { evaluate::SCORES },
     };
     let playing = format!("playing {}", counted(policies.policies, starts.episodes()));
-    let share = &mut |part| context.share(part, &playing);
+    let share = &mut |part| context.fraction(part, &playing);
     let until = &mut |_: Batch<'_>| if context.is_stopped() { Break(()) } else { Continue(()) };
     let evaluation = evaluate::evaluate_until(&mut **backend, &group, &starts, share, until);
     context.pause();
@@ -295,7 +295,8 @@ fn write_trace(
                     }
                 }
                 let done = episode * whole + first + trace.teams;
-                context.share(done as f64 / (whole * episodes) as f64, format!("tracing {}", counted(whole, episodes)));
+                context
+                    .fraction(done as f64 / (whole * episodes) as f64, format!("tracing {}", counted(whole, episodes)));
             }
         }
         Ok(())

@@ -345,7 +345,7 @@ pub fn in_memory(
     if stopped {
         return Err(Error::Stopped(said("before the last generation", "nothing was saved")));
     }
-    // After an early end, one more generation is played, of which nobody is told.
+    // After an early end, one more generation is played and not reported.
     seconds.resize(trained.config.learning.generations + 1, since.elapsed().as_secs_f64());
     Ok(InMemory { trained, seconds, processor: Processor::of(&backend.1, &on) })
 }

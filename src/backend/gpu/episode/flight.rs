@@ -20,8 +20,8 @@ pub(super) const KEPT: f64 = 1.0 / 16.0;
 /// Words of a packed record beyond that share.
 const KEPT_AT_LEAST: usize = 256;
 
-/// Jobs to gather from populations on the device, and the policies of these teams, `[teams][leaders]` each, of which one
-/// follows the other on the device.
+/// Jobs to gather from populations on the device, and the policies of the teams, one slice `[teams][leaders]` per group. The
+/// slices are adjacent on the device.
 type Gathering<'a> = (Vec<(GatherJob, &'a Population)>, Vec<&'a [u32]>);
 
 /// The device's buffers of one batch. They only grow.
@@ -235,18 +235,17 @@ impl GpuBackend {
         if let Some(kernels) = self.kernels.as_ref().filter(|_| !jobs.is_empty()) {
             let structs: Vec<GatherJob> = jobs.iter().map(|(job, _)| *job).collect();
             let structs = upload(&mut buffers.jobs, "jobs", &parts(&structs))?;
-            let bytes = choices.iter().map(|choices| size_of_val(*choices) as u64).sum();
+            let bytes = choices.iter().map(|slice| size_of_val(*slice) as u64).sum();
             let buffer = grown(gpu, &mut buffers.choices, "choices", bytes, input)?;
             gpu.scoped("choices", || {
-                let mut to = 0;
-                for choices in &choices {
-                    gpu.write(buffer, to, bytemuck::cast_slice(choices));
-                    to += size_of_val(*choices) as u64;
+                let mut offset = 0;
+                for slice in &choices {
+                    gpu.write(buffer, offset, bytemuck::cast_slice(slice));
+                    offset += size_of_val(*slice) as u64;
                 }
             })?;
-            let choices = buffer;
             for (part, (job, population)) in jobs.iter().enumerate() {
-                gathers.push(kernels.gather((&structs, part), job, choices, population, &weights)?);
+                gathers.push(kernels.gather((&structs, part), job, buffer, population, &weights)?);
             }
         }
         let record = grown(gpu, &mut buffers.record, "record", record_bytes, output)?;
