@@ -47,13 +47,15 @@ def test_fed_with_a_policy_s_answers_it_gives_the_bits_of_a_rollout(seed, reward
     assert np.array_equal(env.observed.sum(1), scores.observed)
 
 
-def test_a_buffer_that_keeps_references_keeps_every_step():
+# The arrays of one team share blocks, those of 70 teams only in part.
+@pytest.mark.parametrize("teams", [1, 70])
+def test_a_buffer_that_keeps_references_keeps_every_step(teams):
     config = Config.paper()
-    env, other = VectorEnv(config, 70), VectorEnv(config, 70)
+    env, other = VectorEnv(config, teams), VectorEnv(config, teams)
     rng = np.random.default_rng(1)
     kept, expected = [env.reset()[0]], [other.reset()[0].copy()]
     for _ in range(1000):
-        actions = rng.uniform(-1, 1, (70, 4, 2)).astype(np.float32)
+        actions = rng.uniform(-1, 1, (teams, 4, 2)).astype(np.float32)
         kept.extend(env.step(actions)[:2])
         expected.extend(array.copy() for array in other.step(actions)[:2])
     assert len({array.__array_interface__["data"][0] for array in kept}) == len(kept)
