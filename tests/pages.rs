@@ -7,8 +7,8 @@
 //!   in the next). What is printed, and what is not for a shell, has a language: `text`, `toml`, `yaml`.
 //! - A `toml` block is a file where the paragraph before it names one (`` `sweep.toml` ``).
 //! - `<!-- not run: WHY -->` before a block leaves it out.
-//! - `<!-- long: WHY -->` leaves it to `FLOTILLA_LONG=1`. With `<!-- short: FLAGS -->` beside it, it is run in any case, but
-//!   with these flags, each with a value: they replace those of a command, or are added where the command takes them.
+//! - `<!-- short: FLAGS -->` before a block of long studies runs it with these flags, each with a value. They replace those of a
+//!   command, or are added where the command takes them.
 //! - `<!-- output -->` before a `text` block holds the block to what the last command printed: its lines are printed in this
 //!   order, with others between them or not; `…` stands for any part of a line.
 //!
@@ -32,8 +32,6 @@ use tempfile::TempDir;
 
 /// The time limit of one command.
 const PATIENCE: Duration = Duration::from_secs(300);
-/// The time limit of one command in a block that is marked as long.
-const LONG_PATIENCE: Duration = Duration::from_secs(3 * 3600);
 
 fn pages() -> Vec<PathBuf> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -57,9 +55,8 @@ fn pages() -> Vec<PathBuf> {
 #[derive(Debug, Default, PartialEq)]
 struct Block {
     language: String,
-    /// Why it is left out, always or unless there is time.
+    /// Why it is left out.
     not_run: Option<String>,
-    long: Option<String>,
     /// Flags that make its commands short.
     short: Option<String>,
     /// Whether the last command printed this.
@@ -99,7 +96,7 @@ fn read(text: &str) -> (Vec<Block>, Vec<(usize, String)>) {
         let comment = line.trim().strip_prefix("<!--").and_then(|line| line.strip_suffix("-->")).map(str::trim);
         if let Some(comment) = comment {
             let why = |kind: &str| comment.strip_prefix(kind).map(|why| why.trim().to_string());
-            (next.not_run, next.long) = (why("not run:").or(next.not_run), why("long:").or(next.long));
+            next.not_run = why("not run:").or(next.not_run);
             next.short = why("short:").or(next.short);
             next.output |= comment == "output";
         } else if let Some(fence) = line.trim_start().strip_prefix("```") {
@@ -194,7 +191,7 @@ fn shortened(command: &str, flags: &str) -> String {
 }
 
 /// Runs a command as a shell does, and returns what it printed, as an error if it failed.
-fn run(command: &str, folder: &Path, patience: Duration) -> Result<String, String> {
+fn run(command: &str, folder: &Path) -> Result<String, String> {
     let said = folder.join(".said");
     let output = fs::File::create(&said).unwrap();
     let mut bash = support::shell("bash", command);
@@ -204,10 +201,10 @@ fn run(command: &str, folder: &Path, patience: Duration) -> Result<String, Strin
     let status = loop {
         match child.try_wait().unwrap() {
             Some(status) => break status.to_string(),
-            None if start.elapsed() > patience => {
+            None if start.elapsed() > PATIENCE => {
                 let _ = child.kill();
                 let _ = child.wait();
-                break format!("it was ended after {patience:?}");
+                break format!("it was ended after {PATIENCE:?}");
             }
             None => std::thread::sleep(Duration::from_millis(5)),
         }
@@ -254,7 +251,7 @@ struct Tried {
     failed: Vec<String>,
 }
 
-fn try_page(name: &str, text: &str, long: bool) -> Tried {
+fn try_page(name: &str, text: &str) -> Tried {
     let folder: TempDir = tempfile::tempdir().unwrap();
     copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("configs"), &folder.path().join("configs"));
     let mut tried = Tried::default();
@@ -291,17 +288,14 @@ fn try_page(name: &str, text: &str, long: bool) -> Tried {
             "" | "sh" | "bash" => {}
             _ => continue,
         }
-        let short = block.short.as_ref().filter(|_| !long);
-        let why = block.not_run.as_ref().or(block.long.as_ref().filter(|_| !long && short.is_none()));
-        let patience = if long && block.long.is_some() { LONG_PATIENCE } else { PATIENCE };
         for (number, command) in block.commands() {
-            if let Some(why) = why {
+            if let Some(why) = &block.not_run {
                 calls(&command).iter().for_each(|call| parse(&mut tried, number, call));
                 tried.left_out.push(format!("{name}:{number}: {command}  ({why})"));
             } else if !broken {
                 tried.ran += 1;
-                let command = short.map_or(command.clone(), |flags| shortened(&command, flags));
-                match run(&command, folder.path(), patience) {
+                let command = block.short.as_ref().map_or(command.clone(), |flags| shortened(&command, flags));
+                match run(&command, folder.path()) {
                     Ok(output) => printed = output,
                     Err(output) => {
                         tried.failed.push(format!("{name}:{number}: {command}\n{output}"));
@@ -317,7 +311,6 @@ fn try_page(name: &str, text: &str, long: bool) -> Tried {
 
 #[test]
 fn every_command_of_the_pages_does_what_it_says() {
-    let long = std::env::var("FLOTILLA_LONG").is_ok_and(|long| long == "1");
     let (mut failed, mut told) = (Vec::new(), String::new());
     let mut all = 0;
     let only = std::env::var("FLOTILLA_PAGE").unwrap_or_default();
@@ -326,7 +319,7 @@ fn every_command_of_the_pages_does_what_it_says() {
         if !name.contains(&only) {
             continue;
         }
-        let mut tried = try_page(&name, &fs::read_to_string(&page).unwrap(), long);
+        let mut tried = try_page(&name, &fs::read_to_string(&page).unwrap());
         all += tried.ran;
         told += &format!(
             "{name}: {} commands run, {} only read, {} left out\n",
@@ -348,7 +341,7 @@ fn what_fails_in_a_page_is_told_with_its_place() {
     let page = "# Page\n\n`few.toml` is\n\n```toml\n[x]\n```\n\n```\ncat few.toml # it is there\ntrue \\\n  && ls configs\n\
                 flotilla chekc x\n```\n\n    false\n\n<!-- not run: WHY -->\n\n```\nflotilla check --sed 1\n```\n\
                 Text `flotilla train CONFIG --trials N`, `flotilla plot --ot x`.\n\n```text\nno command\n```\n";
-    let Tried { ran, failed, left_out, parsed } = try_page("p.md", page, false);
+    let Tried { ran, failed, left_out, parsed } = try_page("p.md", page);
     assert_eq!((ran, parsed), (3, 3), "{failed:?}");
     assert_eq!(left_out, ["p.md:21: flotilla check --sed 1  (WHY)"]);
     let places: Vec<_> = failed.iter().map(|failed| failed.lines().next().unwrap()).collect();
@@ -364,26 +357,26 @@ fn a_long_command_is_run_in_short() {
     assert_eq!(short("flotilla paper --trials 200 --out a # b"), "flotilla paper --trials 2 --out a");
     assert_eq!(short("flotilla train c.toml --population 5000"), "flotilla train c.toml --population 20 --trials 2");
     assert_eq!(short("flotilla compare a --csv"), "flotilla compare a --csv");
-    let page = "<!-- long: WHY -->\n<!-- short: --teams 2 -->\n```\nfalse\n```\n";
-    assert_eq!(try_page("p.md", page, false).failed.len(), 1);
+    let page = "<!-- short: --teams 2 -->\n```\nfalse\n```\n";
+    assert_eq!(try_page("p.md", page).failed.len(), 1);
 }
 
 #[test]
 fn output_of_python_is_left_to_pythons_tests() {
     let page = "```\necho one\n```\n\n```python\nprint(2)\n```\n\n<!-- output -->\n\n```text\n2\n```\n";
-    assert!(try_page("p.md", page, false).failed.is_empty());
+    assert!(try_page("p.md", page).failed.is_empty());
     let page = page.replace("python\nprint(2)", "\necho two");
-    assert_eq!(try_page("p.md", &page, false).failed.len(), 1);
+    assert_eq!(try_page("p.md", &page).failed.len(), 1);
 }
 
 #[test]
 fn output_that_differs_is_reported() {
     let page = "```\nprintf 'one 1\\ntwo 2\\nthree 3\\n'\n```\n\n<!-- output -->\n\n```text\none 1\nth…3\n```\n";
-    assert!(try_page("p.md", page, false).failed.is_empty());
+    assert!(try_page("p.md", page).failed.is_empty());
     for (from, to) in [("one 1\nth…3", "th…3\none 1"), ("th…3", "th…4"), ("one 1\n", "one\n")] {
         let page =
             page.replace(&format!("text\n{}", "one 1\nth…3"), &format!("text\n{}", "one 1\nth…3".replace(from, to)));
-        assert_eq!(try_page("p.md", &page, false).failed.len(), 1, "{page}");
+        assert_eq!(try_page("p.md", &page).failed.len(), 1, "{page}");
     }
 }
 
