@@ -62,7 +62,7 @@
 //! | add a density | `model/sense.rs` and its shader `shaders/sense.wgsl`, `bench/operations.rs` |
 //! | add a fitness | `config/learning.rs`, `credit/` (`mod.rs`, `replay.rs`; `record.rs` for what it needs, `fast.rs` for speed) |
 //! | show a fitness beside the others | `evaluate.rs`, `cli/rollout.rs`, `report/replay/page.rs` |
-//! | add a place that holds populations | `trainer/residency.rs`, `trainer/populations.rs`, `trainer/results.rs`, `backend/batch.rs` |
+//! | add a place that holds populations | a backend with `Backend::hold` and a `DevicePopulation`, see `backend/gpu/population.rs` |
 //! | add a claim of the paper | `report/paper/claims/list.rs` |
 //! | add an open question | `sweep/questions/list.rs`, `configs/questions/` |
 //! | add a kind of value in configs | `reader/request.rs`, `reader/allowed.rs` |

@@ -96,10 +96,11 @@ fn told<R>(
 /// Shows events on standard error.
 struct Display {
     quiet: bool,
-    shown: RefCell<Shown>,
+    shown: RefCell<View>,
 }
 
-enum Shown {
+/// What is drawn at present.
+enum View {
     Nothing,
     Curves(Board),
     Meter(Meter),
@@ -107,7 +108,7 @@ enum Shown {
 
 impl Display {
     fn new(quiet: bool) -> Display {
-        Display { quiet, shown: RefCell::new(Shown::Nothing) }
+        Display { quiet, shown: RefCell::new(View::Nothing) }
     }
 
     fn event(&self, event: Event<'_>) {
@@ -116,22 +117,22 @@ impl Display {
             (Event::Warning(text) | Event::Note(text), _) => say(text),
             (Event::Message(text), _) if !self.quiet => say(text),
             (Event::Begin(names, from, last), shown) => {
-                *shown = Shown::Curves(Board::new(names, from, last, self.quiet));
+                *shown = View::Curves(Board::new(names, from, last, self.quiet));
             }
-            (Event::Rows { next, rows, .. }, Shown::Curves(board)) => board.show(next, rows),
-            (Event::Fraction(part, text), Shown::Meter(meter)) => meter.show(part, || text),
+            (Event::Rows { next, rows, .. }, View::Curves(board)) => board.show(next, rows),
+            (Event::Fraction(part, text), View::Meter(meter)) => meter.show(part, || text),
             (Event::Fraction(part, text), shown) => {
                 let mut meter = Meter::new(self.quiet);
                 meter.show(part, || text);
-                *shown = Shown::Meter(meter);
+                *shown = View::Meter(meter);
             }
             (Event::Pause, shown) => {
                 match shown {
-                    Shown::Nothing => {}
-                    Shown::Curves(board) => board.clear(),
-                    Shown::Meter(meter) => meter.clear(),
+                    View::Nothing => {}
+                    View::Curves(board) => board.clear(),
+                    View::Meter(meter) => meter.clear(),
                 }
-                *shown = Shown::Nothing;
+                *shown = View::Nothing;
             }
             (Event::Message(_) | Event::Rows { .. }, _) => {}
         }
