@@ -8,7 +8,7 @@ use super::random::Key;
 use super::selection::UNCHANGED;
 use super::weights::within_limits;
 use crate::config::{Learning, Mutation};
-use crate::kernels::math;
+use crate::kernels::{math, prefetch};
 
 /// Mutates a policy: every weight, with the configured probability, gains noise, `N(0, sigma)` or that times itself.
 ///
@@ -103,7 +103,7 @@ pub struct Offspring<'a> {
     pub population: usize,
     /// The index of the first slot.
     pub first: usize,
-    /// Each slot's entry of the plan, see [`draw_parents`](super::draw_parents).
+    /// The plan of all slots of the population, see [`draw_parents`](super::draw_parents).
     pub parents: &'a [u32],
     /// The population that ends, `[policies + 1][parameters]`.
     pub policies: &'a [f32],
@@ -111,13 +111,11 @@ pub struct Offspring<'a> {
 
 /// Fills slots, `[slots][parameters]`: copies each one's parent and [`mutate`]s it. `scratch` may hold anything.
 pub fn breed(level: Level, learning: &Learning, brood: Offspring<'_>, children: &mut [f32], scratch: &mut Vec<u32>) {
-    let parameters = children.len() / brood.parents.len();
+    let parameters = brood.policies.len() / brood.parents.len();
     // As many policies as fit into the first-level cache.
     let together = (BRED_TOGETHER / parameters).clamp(1, WIDEST);
-    for (batch, (children, parents)) in
-        children.chunks_mut(together * parameters).zip(brood.parents.chunks(together)).enumerate()
-    {
-        let batch = Offspring { first: brood.first + batch * together, parents, ..brood };
+    for (batch, children) in children.chunks_mut(together * parameters).enumerate() {
+        let batch = Offspring { first: brood.first + batch * together, ..brood };
         dispatch!(level, simd => mutate_brood(simd, learning, batch, children, scratch));
     }
 }
@@ -133,9 +131,11 @@ fn mutate_brood<S: Simd>(
     children: &mut [f32],
     scratch: &mut Vec<u32>,
 ) {
-    let parameters = children.len() / brood.parents.len();
-    let mut chosen = Chosen::new(scratch, brood.parents.len(), parameters);
-    for (batch, parents) in brood.parents.chunks(S::f32s::LEN).enumerate() {
+    let parameters = brood.policies.len() / brood.parents.len();
+    let policy = |parent: u32| &brood.policies[(parent & !UNCHANGED) as usize * parameters..][..parameters];
+    let (parents, later) = brood.parents[brood.first..].split_at(children.len() / parameters);
+    let mut chosen = Chosen::new(scratch, parents.len(), parameters);
+    for (batch, parents) in parents.chunks(S::f32s::LEN).enumerate() {
         let first = batch * S::f32s::LEN;
         let slots = S::u32s::from_fn(simd, |lane| (brood.first + first + lane) as u32);
         let keys = brood.key.at_lanes::<S>(brood.generation, brood.population, slots);
@@ -145,9 +145,11 @@ fn mutate_brood<S: Simd>(
         let mutating = || (0..).zip(parents).filter(|(_, parent)| *parent & UNCHANGED == 0).map(|(lane, _)| lane);
         // These loops are separate so that the processor draws for several policies at once.
         for (lane, &parent) in parents.iter().enumerate() {
-            // The copies' loads overlap with the arithmetic of the draws.
-            let (to, from) = ((first + lane) * parameters, (parent & !UNCHANGED) as usize * parameters);
-            copy(simd, &brood.policies[from..from + parameters], &mut children[to..to + parameters]);
+            // Parents of the next slots come from memory meanwhile.
+            if let Some(&parent) = later.get(first + lane) {
+                prefetch(policy(parent));
+            }
+            copy(simd, policy(parent), &mut children[(first + lane) * parameters..][..parameters]);
             if parent & UNCHANGED != 0 {
                 continue;
             }

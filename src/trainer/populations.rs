@@ -197,9 +197,9 @@ impl Experiment {
             let populations = weights.par_chunks_exact(stride).zip(children.par_chunks_exact_mut(stride));
             plans.zip(populations).enumerate().for_each(|(leader, ((fitness, parents), (policies, children)))| {
                 plan(level, learning, tournaments, (generation, last), leader, fitness, parents);
-                let broods = parents.par_chunks(BROOD).zip(children.par_chunks_mut(BROOD * parameters));
+                let broods = children.par_chunks_mut(BROOD * parameters);
                 // Small tasks, so that no thread is left with a long one at the end.
-                broods.with_max_len(4).enumerate().for_each(|(index, (parents, children))| {
+                broods.with_max_len(4).enumerate().for_each(|(index, children)| {
                     let first = index * BROOD;
                     let brood = evolve::Offspring { key, generation, population: leader, first, parents, policies };
                     SCRATCH.with_borrow_mut(|scratch| evolve::breed(level, learning, brood, children, scratch));

@@ -1,6 +1,9 @@
 //! Teams that may share a block: those of consecutive groups in the same world.
 
-use crate::backend::Group;
+use std::ops::Range;
+
+use crate::backend::{Group, Weights};
+use crate::kernels::prefetch;
 use crate::world::World;
 
 /// Consecutive groups in the same world. Their teams may share a block.
@@ -33,6 +36,26 @@ impl<'a> WorldBatch<'a> {
     pub(super) fn locate(&self, team: usize) -> (usize, usize) {
         let group = self.ends.partition_point(|&end| end <= team);
         (group, team - group.checked_sub(1).map_or(0, |before| self.ends[before]))
+    }
+
+    /// Returns the policy of a leader of a group's team.
+    #[inline(always)]
+    pub(super) fn policy(&self, leader: usize, (group, team): (usize, usize)) -> &'a [f32] {
+        let group = &self.groups[group];
+        let policy = group.teams[team * self.world.leaders() + leader] as usize;
+        let Weights::OnHost(weights) = group.weights else { unreachable!("seen before playing") };
+        &weights[group.place(leader, policy)..][..self.world.parameters()]
+    }
+
+    /// Loads the policies of some teams into the cache, a part of them at every step of teams that play before, so that
+    /// memory keeps up.
+    #[inline(always)]
+    pub(super) fn prefetch(&self, teams: Range<usize>, step: usize) {
+        let (steps, policies) = (self.world.steps(), teams.len() * self.world.leaders());
+        for index in policies * step / steps..policies * (step + 1) / steps {
+            let (leader, team) = (index / teams.len(), teams.start + index % teams.len());
+            prefetch(self.policy(leader, self.locate(team)));
+        }
     }
 }
 

@@ -72,14 +72,14 @@ impl<S: Simd> EpisodeBlock<S> {
         network.load(batch, places);
     }
 
-    /// Plays some steps.
+    /// Plays some steps. Calls `before` before each.
     #[inline(always)]
-    pub(super) fn play(&mut self, world: &World, steps: Range<usize>) {
+    pub(super) fn play(&mut self, world: &World, steps: Range<usize>, before: impl Fn(usize)) {
         let EpisodeBlock { block, network, moved, sets, sights, .. } = self;
         if moved.is_empty() {
-            play(block, network, &world.pois, sets, sights, steps);
+            play(block, network, &world.pois, sets, sights, steps, before);
         } else {
-            play(block, network, moved, sets, sights, steps);
+            play(block, network, moved, sets, sights, steps, before);
         }
         self.store_counts();
     }
@@ -143,10 +143,12 @@ fn play<S: Simd>(
     sets: &mut [u32],
     sights: &mut [u32],
     steps: Range<usize>,
+    before: impl Fn(usize),
 ) {
     let size = pois.len() * block.world.constants.words as usize * S::f32s::LEN;
     let of_step = sights.len() / block.world.constants.steps as usize;
     for step in steps {
+        before(step);
         block.look(pois);
         network.decide(&block.inputs, &mut block.outputs);
         if of_step > 0 {

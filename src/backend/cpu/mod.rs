@@ -122,6 +122,10 @@ impl Backend for Cpu {
     }
 }
 
+/// From how many vectors of teams per thread on a thread takes the next before it has played one, and loads their policies
+/// into the cache meanwhile. With fewer, they are likely in the cache, and threads would wait for each other at the end.
+const EARLY: usize = 32;
+
 /// Plays all groups. Threads take one vector of teams after another from a common counter, so that none waits for a lock
 /// and none is left with much to do at the end.
 fn play<S: Simd>(simd: S, groups: &[Group<'_>], workspaces: &mut Option<Box<dyn Any + Send>>, scores: &ScoreTable<'_>) {
@@ -133,8 +137,12 @@ fn play<S: Simd>(simd: S, groups: &[Group<'_>], workspaces: &mut Option<Box<dyn 
     own.resize_with(current_num_threads(), || None);
     let next = AtomicUsize::new(0);
     let threads = own.len().min(blocks.len());
+    let early = blocks.len() >= EARLY * threads;
     own[..threads].par_iter_mut().with_max_len(1).for_each(|workspace| {
-        while let Some(&(batch, first)) = blocks.get(next.fetch_add(1, Relaxed)) {
+        let take = || blocks.get(next.fetch_add(1, Relaxed));
+        let mut current = take();
+        while let Some(&(batch, first)) = current {
+            let following = if early { take() } else { None };
             let episodes = match workspace {
                 Some(episodes) if episodes.fits(batch.world, batch.sighted) => episodes,
                 // It is of another world.
@@ -145,13 +153,21 @@ fn play<S: Simd>(simd: S, groups: &[Group<'_>], workspaces: &mut Option<Box<dyn 
                 #[inline(always)]
                 || {
                     episodes.load(batch, first, teams);
-                    episodes.play(batch.world, 0..batch.world.steps());
+                    match following {
+                        Some((next, first)) if std::ptr::eq(*next, batch) => {
+                            let teams = *first..(first + width).min(batch.teams);
+                            let prefetch = |step| batch.prefetch(teams.clone(), step);
+                            episodes.play(batch.world, 0..batch.world.steps(), prefetch);
+                        }
+                        _ => episodes.play(batch.world, 0..batch.world.steps(), |_| ()),
+                    }
                 },
             );
             for lane in 0..teams {
                 let (group, team) = batch.locate(first + lane);
                 scores.score(batch.first + group, team, &episodes.episode(lane));
             }
+            current = if early { following } else { take() };
         }
     });
     *workspaces = Some(own);
@@ -172,7 +188,7 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
             if step > 0 {
                 simd.vectorize(
                     #[inline(always)]
-                    || episodes.play(world, step - 1..step),
+                    || episodes.play(world, step - 1..step, |_| ()),
                 );
             }
             for lane in 0..lanes {

@@ -4,7 +4,6 @@ use fearless_simd::{Simd, prelude::*};
 
 use super::batch::WorldBatch;
 use super::transpose::transpose_rows;
-use crate::backend::Weights;
 use crate::kernels::{math, splat};
 use crate::model::policy;
 use crate::model::policy::PolicyConstants;
@@ -55,16 +54,9 @@ impl<S: Simd> Network<S> {
     /// Loads the policies of each lane's group and team.
     #[inline(always)]
     pub(super) fn load(&mut self, batch: &WorldBatch<'_>, places: &[(usize, usize)]) {
-        let (leaders, parameters) = (batch.world.leaders(), batch.world.parameters());
         self.load_policies(
             #[inline(always)]
-            |leader, lane| {
-                let (group, team) = places[lane];
-                let group = &batch.groups[group];
-                let policy = group.teams[team * leaders + leader] as usize;
-                let Weights::OnHost(weights) = group.weights else { unreachable!("seen before playing") };
-                &weights[group.place(leader, policy)..][..parameters]
-            },
+            |leader, lane| batch.policy(leader, places[lane]),
         );
     }
 
