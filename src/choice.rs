@@ -175,7 +175,7 @@ pub fn find(
 
 /// Returns the agent-steps of one trial's generation.
 fn generation(config: &Config) -> f64 {
-    ((config.learning.teams() + 1) * config.learning.episodes_per_team) as f64 * team(config)
+    (config.max_teams() * config.learning.episodes_per_team) as f64 * team(config)
 }
 
 /// Returns the agent-steps of one team's episode.

@@ -19,7 +19,7 @@ use crate::backend::gpu::{
     episode::{GpuBackend, ResidencyPolicy},
 };
 use crate::backend::{Backend, BackendError, Group, GroupScores, Machine, OpenBackend};
-use crate::config::{Config, ConfigError, Fitness, MAX_POPULATION, Method, Sharing, ValidConfig};
+use crate::config::{Config, ConfigError, Fitness, MAX_POPULATION, Sharing, ValidConfig};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
 use crate::evolve::{self, Key, MAX_WEIGHT, Purpose};
 use crate::memory::{self, Peaks, TooLittle};
@@ -33,7 +33,7 @@ use crate::record::{
     hex, metrics, policies, runs,
 };
 use crate::stepping::{StepError, Stepper};
-use crate::trainer::{Ending, Row, Snapshot, Trainer};
+use crate::trainer::{self, Ending, Row, Snapshot, Trainer};
 use crate::world::{INPUTS, OUTPUTS, World};
 
 mod coevolution;
@@ -426,9 +426,9 @@ fn trainer_of(config: ValidConfig) -> Result<Trainer, Failure> {
     let plan = Peaks::of([&*config], current_num_threads());
     // Nothing is saved during training, but the results stay in memory: every row twice, and the policies.
     let rows = config.learning.trials as u64 * (config.learning.generations as u64 + 1);
-    // With an evolution strategy, its last state stays, too.
-    let copies = if config.learning.method == Method::Tournament { 1 } else { 2 };
-    let kept = rows * (size_of::<Row>() + 3 * size_of::<f64>()) as u64 + copies * config.policy_bytes();
+    // The last slots stay too, if they are needed to extend the run.
+    let slots = if config.learning.extends_from_policies() { 0 } else { trainer::snapshot_bytes(&config) };
+    let kept = rows * (size_of::<Row>() + 3 * size_of::<f64>()) as u64 + config.policy_bytes() + slots;
     let needed = (plan.host.min(plan.gpu_host) - plan.checkpoint).saturating_add(kept);
     memory::check(needed, 0)?;
     Ok(Trainer::new([config]))

@@ -69,9 +69,7 @@ impl Peaks {
                 staged.iter().map(|(config, world)| size(config, world)).max().unwrap_or(0)
             };
             let (trials, policies) = (config.learning.trials as u64, config.learning.population);
-            let teams = |config: &Config| {
-                trials * config.learning.episodes_per_team as u64 * (config.learning.teams() as u64 + 1)
-            };
+            let teams = |config: &Config| trials * config.learning.episodes_per_team as u64 * config.max_teams() as u64;
             training += trainer::bytes(config);
             next += trainer::next_bytes(config);
             checkpoint += checkpoint_bytes(config);
@@ -83,7 +81,8 @@ impl Peaks {
             order = order.max((policies * ranked) as u64);
             populations += trials * config.populations() as u64;
             if !strategy {
-                held += trials * backend::held_bytes([config.populations(), policies + 1, config.parameters()]);
+                held +=
+                    trials * backend::held_bytes([config.populations(), config.learning.slots(), config.parameters()]);
             }
             weights = weights.saturating_add(most(&|config, world| teams(config) * backend::weight_bytes(world)));
             record = record.saturating_add(most(&|config, world| {

@@ -256,6 +256,7 @@ fn plain_world(seed: u64) -> Config {
             fitness: word(rng),
             population: rng.random_range(2..=20),
             partners: 1,
+            hall_of_fame: 0,
             leniency: Leniency::Mean,
             generations: 3,
             trials: 1,

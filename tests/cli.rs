@@ -237,6 +237,22 @@ fn every_wrong_value_is_named_with_line_and_range() {
             "partners = 2\npopulation = 600000",
             "learning.partners: found 2, which makes 1200000 teams per generation, allowed 1048576",
         ),
+        (23, "hall_of_fame = 1001", "learning.hall_of_fame: found 1001, allowed 0 to 1000"),
+        (
+            23,
+            "hall_of_fame = 3\nsharing = \"all\"",
+            "learning.hall_of_fame: found 3 with learning.sharing = \"all\", allowed 0: a team has a single policy",
+        ),
+        (
+            23,
+            "hall_of_fame = 3\nmethod = \"snes\"",
+            "learning.hall_of_fame: found 3, allowed 0 unless learning.method is \"tournament\"",
+        ),
+        (
+            23,
+            "hall_of_fame = 3\npopulation = 400000",
+            "learning.hall_of_fame: found 3, which makes 1200000 teams per generation, allowed 1048576",
+        ),
         (23, "leniency = \"min\"", "learning.leniency: found \"min\", allowed \"mean\" or \"max\""),
         (23, "generations = -1", "learning.generations: found -1, allowed 0 to 1000000"),
         (23, "trials = 0", "learning.trials: found 0, allowed 1 to 4096"),
@@ -283,6 +299,9 @@ fn every_wrong_value_is_named_with_line_and_range() {
     let crowd =
         GOOD.replace("[[12, 2], [8, 2], [22, 2], [18, 2]]", &many(1023)).replace("[[10, 5], [20, 5]]", &many(5));
     assert_eq!(refusal(check(crowd, &[])), format!("x.toml:4: world.followers: {agents}"));
+    let single = GOOD.replace("[[10, 5], [20, 5]]", "[[10, 5]]") + "hall_of_fame = 3\n";
+    let expected = "x.toml:24: learning.hall_of_fame: found 3 with a single leader, allowed 0: it has no partners";
+    assert_eq!(refusal(check(single, &[])), expected);
 }
 
 #[test]
@@ -304,7 +323,7 @@ x.toml:6: world.coupling: found 9, allowed 1 to 6 (the number of agents)
 x.toml:13: motion.max_sped: unknown key, did you mean `motion.max_speed`?
 x.toml:21: policy.hidden[0]: found 65, allowed 1 to 64
 x.toml:24: learning.trials: found 0, allowed 1 to 4096
-x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, fitness, generations, led_by, \
+x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, fitness, generations, hall_of_fame, led_by, \
          led_within, leniency, method, mutation, mutation_probability, mutation_sigma, paradigm, parents, partners, poi_jitter, population, search_sigma, search_step, seed, sharing, start_jitter, trials
 --population: found 1, allowed 2 to 1048576"
     );

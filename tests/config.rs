@@ -4,9 +4,9 @@ use std::path::Path;
 
 use flotilla::config::{
     Actions, CheckpointConfig, Config, ConfigError, Coupling, Density, Elites, Fitness, Follow, Heading, Learning,
-    LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, MAX_PARTNERS, MAX_POPULATION,
-    MAX_STEPS, MAX_TRIALS, Method, Motion, Mutation, Observers, Override, Paradigm, Parents, Policy, Problem, Sense,
-    Sharing, WorldConfig,
+    LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS,
+    MAX_PARTNERS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Method, Motion, Mutation, Observers, Override, Paradigm,
+    Parents, Policy, Problem, Sense, Sharing, WorldConfig,
 };
 use flotilla::reader::Document;
 use proptest::collection::vec;
@@ -62,6 +62,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             fitness: Fitness::Df,
             population: 50,
             partners: 1,
+            hall_of_fame: 0,
             leniency: Leniency::Mean,
             generations: 100,
             trials: 5,
@@ -294,7 +295,7 @@ fn configs() -> impl Strategy<Value = Config> {
     let policy = (vec(1..=MAX_HIDDEN_UNITS, 0..=MAX_HIDDEN_LAYERS), word())
         .prop_map(|(hidden, actions)| Policy { hidden, actions });
     let elites = prop_oneof![(0.0..=1.0f64).prop_map(Ok), size(1e-3, 100.0).prop_map(Err)];
-    let teams = (2..=5000usize, 1..=MAX_PARTNERS, word());
+    let teams = (2..=5000usize, 1..=MAX_PARTNERS, 0..=MAX_HALL_OF_FAME, word());
     let sizes = (teams, 0..=MAX_GENERATIONS, 1..=9usize, (elites, word()), 1..=MAX_EPISODES);
     let mutation = (word(), size_or_zero(1e-6, 1.0), size_or_zero(1e-6, 100.0));
     let mutation = (mutation, 0..=MAX_STEPS, word());
@@ -304,7 +305,7 @@ fn configs() -> impl Strategy<Value = Config> {
         |(
             (paradigm, sharing),
             fitness,
-            ((population, partners, leniency), generations, trials, (part, parents), episodes_per_team),
+            ((population, partners, hall_of_fame, leniency), generations, trials, (part, parents), episodes_per_team),
             (mutation, (method, search_sigma, search_step)),
             (start_jitter, poi_jitter),
             seed,
@@ -316,6 +317,8 @@ fn configs() -> impl Strategy<Value = Config> {
                 fitness,
                 population,
                 partners: if sharing == Sharing::Shared { 1 } else { partners },
+                // Leaders with partners and a tournament are needed for a hall of fame.
+                hall_of_fame: if sharing == Sharing::Shared || method != Method::Tournament { 0 } else { hall_of_fame },
                 leniency,
                 generations,
                 trials,
@@ -349,7 +352,11 @@ fn configs() -> impl Strategy<Value = Config> {
             if learning.paradigm == Paradigm::AllLeaders && world.observers == Observers::Followers {
                 world.observers = Observers::Leaders;
             }
-            Config { world, motion, follow, sense, policy, learning, checkpoint, stages: vec![] }
+            let mut config = Config { world, motion, follow, sense, policy, learning, checkpoint, stages: vec![] };
+            if config.learners() == 1 {
+                config.learning.hall_of_fame = 0;
+            }
+            config
         },
     )
 }

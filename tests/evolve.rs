@@ -19,7 +19,7 @@ use flotilla::world::{GRID, World};
 use glam::Vec2;
 use proptest::prelude::*;
 
-const PURPOSES: [Purpose; 11] = [
+const PURPOSES: [Purpose; 12] = [
     Purpose::Weights,
     Purpose::Teams,
     Purpose::Starts,
@@ -31,6 +31,7 @@ const PURPOSES: [Purpose; 11] = [
     Purpose::HeldOutPois,
     Purpose::ConstantActions,
     Purpose::Search,
+    Purpose::HallOfFame,
 ];
 const GENERALLY_FORWARD: &str = "generally_forward";
 const STRICTLY_FORWARD: &str = "strictly_forward";
@@ -211,6 +212,44 @@ fn a_policy_has_other_partners_in_every_round() {
     teams.sort_unstable();
     teams.dedup();
     assert_eq!(teams.len(), 60, "no team plays twice");
+}
+
+#[test]
+fn past_champions_are_drawn_from_those_that_are_kept() {
+    let learning = config(CHAOTIC, |config| config.learning.hall_of_fame = 4).learning;
+    let (first, mut counts) = (learning.population + 1, [0; 4]);
+    assert_eq!(learning.slots(), first + 4);
+    for generation in 0..2000 {
+        let slot = evolve::past_champions(&learning, 1, generation);
+        match generation {
+            0 => assert_eq!(slot, None, "there are no past champions"),
+            _ => assert!((first..first + generation.min(4)).contains(&slot.unwrap()), "{generation}: {slot:?}"),
+        }
+        // The age of the champions, in generations.
+        if let Some(slot) = slot.filter(|_| generation >= 4) {
+            counts[(generation - 1 - (slot - first)) % 4] += 1;
+        }
+    }
+    chi_square("ages of past champions", &counts, |_| 0.25);
+}
+
+#[test]
+fn the_champion_replaces_the_oldest_of_the_hall_of_fame() {
+    let scores = [0.1, 0.3, 0.2];
+    for generation in 0..7 {
+        let (mut plan, mut kept) = ([0; 6], [0; 6]);
+        let (key, selection) = (Key::new(3, 0, Purpose::Tournament), Selection { elites: 1, parents: Parents::All });
+        evolve::draw_parents(Level::new(), key, generation, 0, selection, &scores, &mut plan);
+        let mut expected = [1, 4, 5].map(|slot| slot | UNCHANGED);
+        if generation % 2 == 0 {
+            expected[1] = 1 | UNCHANGED
+        } else {
+            expected[2] = 1 | UNCHANGED
+        }
+        assert_eq!(plan[3..], expected, "generation {generation}");
+        evolve::keep_parents(&scores, &mut kept);
+        assert_eq!(kept[4..], [4, 5].map(|slot| slot | UNCHANGED), "the hall stays after the last generation");
+    }
 }
 
 #[test]
@@ -534,6 +573,18 @@ fn arms() -> Vec<Config> {
             (config.learning.start_jitter, config.learning.episodes_per_team) = (0.5, 2);
         }),
         config(GENERALLY_FORWARD, |config| {
+            small(config, 8, 6, 2);
+            (config.learning.hall_of_fame, config.learning.fitness) = (3, Fitness::D);
+            config.world.coupling = flotilla::config::Coupling::Same(2);
+        }),
+        config(STRICTLY_FORWARD, |config| {
+            small(config, 7, 5, 1);
+            (config.learning.hall_of_fame, config.learning.paradigm) = (9, Paradigm::AllLeaders);
+            (config.learning.partners, config.learning.leniency) = (2, Leniency::Max);
+            (config.learning.start_jitter, config.learning.episodes_per_team) = (0.5, 2);
+            config.world.coupling = flotilla::config::Coupling::Same(1);
+        }),
+        config(GENERALLY_FORWARD, |config| {
             small(config, 11, 4, 2);
             (config.learning.sharing, config.learning.fitness) = (Sharing::Shared, Fitness::D);
             (config.learning.start_jitter, config.learning.episodes_per_team) = (0.5, 2);
@@ -597,6 +648,22 @@ set = { 'learning.partners' = 1, 'world.coupling' = 2 }
 [[stages]]
 from = 5
 set = { 'learning.partners' = 3, 'learning.leniency' = 'mean', 'learning.fitness' = 'D' }
+",
+        ),
+        // Past champions play in stages that they did not come from.
+        staged(
+            GENERALLY_FORWARD,
+            "[learning]
+population = 6
+generations = 6
+trials = 2
+hall_of_fame = 2
+[[stages]]
+from = 3
+set = { 'world.coupling' = 2, 'learning.partners' = 2, 'learning.fitness' = 'D++' }
+[[stages]]
+from = 5
+set = { 'learning.leniency' = 'max', 'world.pois' = [[10, 12], [40, 20]] }
 ",
         ),
         // Its first stage begins at once, its last is its last generation.
@@ -712,9 +779,11 @@ impl Plain<'_> {
         };
         let leaders = self.world.leaders();
         let mut rows = Vec::new();
+        // The champions of all generations.
+        let mut past: Vec<Vec<Vec<f32>>> = Vec::new();
         for generation in 0..=generations {
             let stage = self.config.at(generation);
-            let Learning { partners, leniency, .. } = stage.learning;
+            let Learning { partners, leniency, hall_of_fame, .. } = stage.learning;
             let mut teams = vec![0; partners * population * leaders];
             for (round, teams) in teams.chunks_mut(population * leaders).enumerate() {
                 evolve::form_teams(self.key(Purpose::Teams), generation, round, leaders, teams);
@@ -737,11 +806,24 @@ impl Plain<'_> {
                     .enumerate()
                     .for_each(|(leader, (&policy, score))| scored[leader][policy].push(score));
             }
+            let kept = hall_of_fame.min(generation);
+            if kept > 0 {
+                let word = self.key(Purpose::HallOfFame).at(generation, 0, 0).draw(0)[0];
+                let champions = &past[generation - 1 - (uniform(word) * kept as f64) as usize];
+                self.policies.iter_mut().zip(champions).for_each(|(policies, past)| policies.push(past.clone()));
+                for (leader, policy) in (0..leaders).flat_map(|leader| (0..population).map(move |of| (leader, of))) {
+                    let mut team = vec![population; leaders];
+                    team[leader] = policy;
+                    scored[leader][policy].push(self.play(generation, &stage, &team).1[leader]);
+                }
+                self.policies.iter_mut().for_each(|policies| policies.truncate(population));
+            }
+            let teams_of_each = partners + usize::from(kept > 0);
             for (fitness, scores) in fitness.iter_mut().flatten().zip(scored.iter().flatten()).filter(|_| !shared) {
-                assert_eq!(scores.len(), partners);
+                assert_eq!(scores.len(), teams_of_each);
                 *fitness = match leniency {
                     Leniency::Mean => {
-                        (scores.iter().map(|&score| f64::from(score)).sum::<f64>() / partners as f64) as f32
+                        (scores.iter().map(|&score| f64::from(score)).sum::<f64>() / teams_of_each as f64) as f32
                     }
                     Leniency::Max => scores.iter().copied().reduce(f32::max).unwrap(),
                 };
@@ -767,6 +849,8 @@ impl Plain<'_> {
             }
             // The champion plays along with the next generation, so from the starts of that.
             let champion: Vec<usize> = (0..leaders).map(|leader| ranked[if shared { 0 } else { leader }][0]).collect();
+            let of_leader = |leader: usize| self.policies[if shared { 0 } else { leader }][champion[leader]].clone();
+            past.push((0..leaders).map(of_leader).collect());
             let (champion, _) = self.play(generation + 1, &stage, &champion);
             rows.push(Row {
                 experiment: 0,

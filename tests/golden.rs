@@ -38,7 +38,7 @@ coupling = 4
 type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Together these cases cover every choice that a config has, and sizes on both sides of every special case.
-const CASES: [Case; 32] = [
+const CASES: [Case; 33] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -203,6 +203,17 @@ const CASES: [Case; 32] = [
             ("learning.paradigm", "'all-leaders'"),
             ("learning.start_jitter", "0.5"),
             ("learning.episodes_per_team", "2"),
+            ("world.coupling", "3"),
+        ],
+    ),
+    (
+        "hall-of-fame",
+        "two teams a policy and one with the champions of a generation out of the last three, all-leaders, Df",
+        CHAOTIC,
+        &[
+            ("learning.hall_of_fame", "3"),
+            ("learning.partners", "2"),
+            ("learning.paradigm", "'all-leaders'"),
             ("world.coupling", "3"),
         ],
     ),

@@ -125,7 +125,11 @@ fn arms() -> Vec<Config> {
     (eighth.learning.trials, eighth.learning.generations, eighth.learning.population) = (1, 4, 12);
     (eighth.learning.method, eighth.learning.sharing) = (Method::Snes, Sharing::Shared);
     eighth.world.coupling = Coupling::Same(1);
-    vec![first, second, third, fourth, fifth, sixth, seventh, eighth]
+    // Every policy plays with past champions, too.
+    let mut ninth = support::layout("generally_forward");
+    (ninth.learning.trials, ninth.learning.generations, ninth.learning.population) = (2, 6, 9);
+    (ninth.learning.hall_of_fame, ninth.world.coupling) = (3, Coupling::Same(2));
+    vec![first, second, third, fourth, fifth, sixth, seventh, eighth, ninth]
 }
 
 /// The result of a trainer of [`arms`], and its snapshot before each generation.

@@ -203,6 +203,7 @@ fn keys_at_their_defaults_leave_a_configs_digest_as_it_was() {
         ("sense.gain", "2.0"),
         ("learning.parents", "'elites'"),
         ("learning.partners", "2"),
+        ("learning.hall_of_fame", "2"),
         ("learning.leniency", "'max'"),
         ("learning.method", "'snes'"),
         ("learning.search_sigma", "0.5"),
@@ -214,5 +215,5 @@ fn keys_at_their_defaults_leave_a_configs_digest_as_it_was() {
     }
     digests.sort();
     digests.dedup();
-    assert_eq!(digests.len(), 13, "each key has a say");
+    assert_eq!(digests.len(), 14, "each key has a say");
 }

@@ -81,6 +81,11 @@ fn what_is_wrong_with_a_stage_is_told_by_its_line() {
             3,
             "stages[0].set.learning.population: this is the same in all stages",
         ),
+        (
+            stage("0", "'learning.hall_of_fame' = 2"),
+            3,
+            "stages[0].set.learning.hall_of_fame: this is the same in all stages",
+        ),
         (stage("0", "'learning.elites' = '50%'"), 3, "stages[0].set.learning.elites: this is the same in all stages"),
         (
             stage("0", "'learning.parents' = 'elites'"),
@@ -233,6 +238,48 @@ fn a_run_with_several_partners_goes_on() {
         replay(&whole, 0, &generations, Which::Number(23), Verification::Required, &mut backend, &mut |_| true)
     };
     assert!(team(2).is_ok() && team(3).is_err());
+}
+
+/// A run with past champions resumes to the same bits, also beyond the end of a shorter run.
+#[test]
+fn past_champions_go_on() {
+    const FAR: &str = "pois = [[10, 12], [20, 13]]\ncoupling = 1\nsteps = 20";
+    let place = tempfile::tempdir().unwrap();
+    let small = SMALL.replace("pois = [[10, 9], [20, 9]]\ncoupling = 2\nsteps = 9", FAR);
+    let small = small.replace("population = 8", "population = 8\nhall_of_fame = 3");
+    let stage = "[[stages]]\nfrom = 3\nset = { learning.partners = 2, world.coupling = 2 }\n";
+    let config = config(&[&small, stage].concat());
+    let whole = place.path().join("whole");
+    let expected = train(&config, &whole, None, Start::Fresh, 99).unwrap().unwrap();
+    let plain = Config { stages: vec![], ..config.clone() };
+    let longer = place.path().join("longer");
+    train(&plain, &longer, None, Start::Fresh, 99).unwrap();
+    let mut without = config.clone();
+    without.learning.hall_of_fame = 0;
+    let without_path = place.path().join("without");
+    train(&without, &without_path, None, Start::Fresh, 99).unwrap();
+    assert!(bytes(&without_path) != bytes(&whole), "past champions changed nothing");
+    for until in 1..=7 {
+        let path = place.path().join("stopped");
+        assert_eq!(train(&config, &path, None, Start::Force, until).unwrap(), None, "{until}");
+        assert_eq!(train(&config, &path, None, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
+        assert_eq!((rows(&path), bytes(&path)), (rows(&whole), bytes(&whole)), "{until}");
+    }
+    for generations in [0, 1, 3, 5] {
+        let extended = place.path().join("extended");
+        let mut short = plain.clone();
+        short.learning.generations = generations;
+        train(&short, &extended, None, Start::Force, 99).unwrap();
+        let (mut session, _) =
+            Session::open(vec![(plain.clone(), extended.clone())], Start::Resume, &Disk::default()).unwrap();
+        assert_eq!(session.generations(), [generations + 1], "it does not begin again");
+        assert!(go_on(&mut session, |_| false).unwrap() == Ended::Done);
+        assert_eq!((rows(&extended), bytes(&extended)), (rows(&longer), bytes(&longer)), "from {generations} on");
+    }
+    for which in [Which::Best, Which::Champion] {
+        let again = replay(&whole, 1, &[0, 2, 3, 6], which, Verification::Required, &mut Cpu::default(), &mut |_| true);
+        assert_eq!(again.unwrap_or_else(|error| panic!("{which:?}: {error}")).len(), 4);
+    }
 }
 
 /// An evolution strategy resumes from its mean and standard deviations to the same bits, also beyond the end of a shorter

@@ -19,9 +19,9 @@ class Asked(NamedTuple):
 
     policies: Floats
     """`[trials, leaders, policies + 1, parameters]`, or `[trials, 1, ...]` if leaders share a policy. The last is the
-    champion of the previous generation."""
+    champion of the previous generation. With `learning.hall_of_fame` past champions follow."""
     teams: NDArray[np.uint32]
-    """The policy of each leader in each team, `[trials, teams, leaders]`."""
+    """The policy of each leader in each team, `[trials, teams, leaders]`. Teams with past champions are the last."""
     starts: Floats
     """Start positions of agents, leaders first, `[trials, episodes, agents, 2]`; if POIs move, their positions follow."""
 

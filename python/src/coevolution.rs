@@ -29,7 +29,7 @@ type Given<'py> = (
     Vec<(usize, usize, f64, f64, f64)>,
     Vec<(usize, usize, f64, f64, f64)>,
 );
-/// Policies `[trials, populations, policies + 1, parameters]`, teams `[trials, teams, leaders]`, and starts
+/// Policies `[trials, populations, slots, parameters]`, teams `[trials, teams, leaders]`, and starts
 /// `[trials, episodes, agents (+ pois), 2]`.
 type Candidates<'py> = (Bound<'py, PyArray4<f32>>, Bound<'py, PyArray3<u32>>, Bound<'py, PyArray4<f32>>);
 

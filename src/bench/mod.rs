@@ -187,7 +187,7 @@ pub(crate) fn measure(config: &Config, player: &mut Subject, generations: Genera
         }
     };
     Ok(Timing {
-        teams: config.learning.teams(),
+        teams: config.max_teams() - 1,
         leaders: world.leaders(),
         followers: world.followers(),
         pois: world.pois.len(),
@@ -235,7 +235,9 @@ fn rollout(
     for (policy, weights) in weights.chunks_exact_mut(world.parameters()).enumerate() {
         random_policy(Level::new(), key.at(0, policy / population, policy % population), weights);
     }
-    let teams = teams_of(&config.learning, 0, 0, leaders);
+    // Teams with past champions take as long as others, which stand in for them.
+    let count = config.max_teams() - 1;
+    let teams: Vec<u32> = teams_of(&config.learning, 0, 0, leaders).into_iter().cycle().take(count * leaders).collect();
     // If generations play from the device's memory, so do these rollouts.
     let held = backend.hold(&weights, [config.populations(), population, world.parameters()])?;
     let played = held.as_deref().map_or(weights[..].into(), Weights::OnDevice);
@@ -254,7 +256,7 @@ fn rollout(
         Ok(())
     };
     let times = time(play, ceiling)?;
-    let mean_g = f64::from(observed) / (config.learning.teams() * world.pois.len()) as f64;
+    let mean_g = f64::from(observed) / (count * world.pois.len()) as f64;
     let pairs = world.steps() * world.agents() * world.agents();
     let traced = (TRACED_PAIRS / pairs).clamp(1, TRACED_TEAMS).min(population);
     // The CPU traces, because every backend's trace is the same.

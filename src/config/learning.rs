@@ -11,6 +11,8 @@ use crate::reader::{NumberOrPercentage, Reader, between, section};
 pub const MAX_POPULATION: usize = 1 << 20;
 /// Maximum number of teams that a policy plays in per generation.
 pub const MAX_PARTNERS: usize = 16;
+/// Maximum number of generations whose champions are kept as partners.
+pub const MAX_HALL_OF_FAME: usize = 1000;
 /// Maximum number of generations after the random start.
 pub const MAX_GENERATIONS: usize = 1_000_000;
 /// Maximum number of trials in one run.
@@ -35,6 +37,9 @@ section! {
         partners: usize = "teams", "",
         /// what a policy's fitness is: the mean score of its teams, or the largest, which is lenient with bad partners
         leniency: Leniency = "", "",
+        /// h: last generations whose champions are kept; from generation 1 on, each policy also plays in a team with the
+        /// champions of one of them, drawn at random; 0 means none
+        hall_of_fame: usize = "generations", "",
         /// number of generations after the random start
         generations: usize = "generations", "4.3, Alg. 1",
         /// independent repetitions
@@ -208,12 +213,18 @@ impl Paradigm {
 
 impl Learning {
     /// Returns the number of policies' places in a population's memory: its policies, the champion of the previous
-    /// generation, which is the mean of an evolution strategy, and for such a strategy its standard deviations.
+    /// generation, which is the mean of an evolution strategy, for such a strategy its standard deviations, and the
+    /// champions of the hall of fame.
     pub fn slots(&self) -> usize {
-        self.population + 1 + usize::from(self.method != Method::Tournament)
+        self.population + 1 + usize::from(self.method != Method::Tournament) + self.hall_of_fame
     }
 
-    /// Returns the number of teams per generation of a trial, without the champions' team.
+    /// Reports whether a finished run can be extended from its policies and their fitness, without the other slots.
+    pub fn extends_from_policies(&self) -> bool {
+        self.method == Method::Tournament && self.hall_of_fame == 0
+    }
+
+    /// Returns the number of teams of contemporaries per generation of a trial, without the champions' team.
     pub fn teams(&self) -> usize {
         self.population * self.partners
     }
@@ -230,6 +241,16 @@ impl Learning {
             let teams = population * partners;
             let text = format!("found {partners}, which makes {teams} teams per generation, allowed {MAX_POPULATION}");
             r.report_key("learning.partners", text);
+        }
+        let method = Learning::method(r).choice(Method::Tournament);
+        let hall_of_fame = Learning::hall_of_fame(r).number(between(0, MAX_HALL_OF_FAME), 0);
+        if hall_of_fame > 0 && sharing == Sharing::Shared {
+            let text =
+                format!("found {hall_of_fame} with learning.sharing = \"all\", allowed 0: a team has a single policy");
+            r.report_key("learning.hall_of_fame", text);
+        } else if hall_of_fame > 0 && method != Method::Tournament {
+            let text = format!("found {hall_of_fame}, allowed 0 unless learning.method is \"tournament\"");
+            r.report_key("learning.hall_of_fame", text);
         }
         let elites = Learning::elites(r).number_or_percentage(between(0, population).because("learning.population"), 1);
         let elites = match elites {
@@ -250,11 +271,12 @@ impl Learning {
             population,
             partners,
             leniency: Learning::leniency(r).choice(Leniency::Mean),
+            hall_of_fame,
             generations: Learning::generations(r).number(between(0, MAX_GENERATIONS), 100),
             trials: Learning::trials(r).number(between(1, MAX_TRIALS), 5),
             elites,
             parents,
-            method: Learning::method(r).choice(Method::Tournament),
+            method,
             search_sigma: Learning::search_sigma(r).number(between(LEAST, 100.0), 0.3),
             search_step: Learning::search_step(r).number(between(LEAST, 100.0), 1.0),
             mutation: Learning::mutation(r).choice(Mutation::Scaled),

@@ -21,8 +21,8 @@ pub use crate::model::sense::{Density, Sense};
 pub use crate::model::start::Heading;
 pub use crate::reader::{Definition, Override, Problem};
 pub use learning::{
-    CheckpointConfig, Elites, Fitness, Learning, LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_PARTNERS,
-    MAX_POPULATION, MAX_TRIALS, Method, Mutation, Paradigm, Parents, Sharing,
+    CheckpointConfig, Elites, Fitness, Learning, LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME,
+    MAX_PARTNERS, MAX_POPULATION, MAX_TRIALS, Method, Mutation, Paradigm, Parents, Sharing,
 };
 pub use load::name;
 pub(crate) use load::{is_standard_input, read_file};
@@ -213,6 +213,17 @@ impl Config {
         }
     }
 
+    /// Returns the number of teams with past champions in a generation of a trial: one per policy of every population.
+    pub fn hall_teams(&self, generation: usize) -> usize {
+        let plays = self.learning.hall_of_fame > 0 && generation > 0;
+        if plays { self.populations() * self.learning.population } else { 0 }
+    }
+
+    /// Returns the largest number of teams in a generation of a trial, including the champions' team.
+    pub fn max_teams(&self) -> usize {
+        self.learning.teams() + self.hall_teams(1) + 1
+    }
+
     /// Returns the number of weights in one policy, including biases.
     pub fn parameters(&self) -> usize {
         self.policy.parameters()
@@ -239,10 +250,22 @@ impl Config {
             checkpoint: CheckpointConfig::read(r),
             stages: vec![],
         };
-        if r.error_count() == 0 && config.policy_bytes() > MAX_POLICY_BYTES {
+        let Learning { population, hall_of_fame, .. } = config.learning;
+        if r.error_count() == 0 && hall_of_fame > 0 {
+            let teams = config.max_teams() - 1;
+            if config.learners() == 1 {
+                let text = format!("found {hall_of_fame} with a single leader, allowed 0: it has no partners");
+                r.report_key("learning.hall_of_fame", text);
+            } else if teams > MAX_POPULATION {
+                let text =
+                    format!("found {hall_of_fame}, which makes {teams} teams per generation, allowed {MAX_POPULATION}");
+                r.report_key("learning.hall_of_fame", text);
+            }
+        }
+        let bytes = config.policy_bytes() / population as u64 * (population + hall_of_fame) as u64;
+        if r.error_count() == 0 && bytes > MAX_POLICY_BYTES {
             let gib = |bytes: u64| bytes.div_ceil(1 << 30);
-            let (bytes, most) = (gib(config.policy_bytes()), gib(MAX_POLICY_BYTES));
-            let population = config.learning.population;
+            let (bytes, most) = (gib(bytes), gib(MAX_POLICY_BYTES));
             let text = format!("found {population}, whose policies of all trials take {bytes} GiB, allowed {most} GiB");
             r.report_key("learning.population", text);
         }

@@ -19,12 +19,13 @@ pub(crate) const MAX_STAGES: usize = 256;
 /// The key with the length of a run.
 pub const GENERATIONS: &str = "learning.generations";
 /// Keys that stages cannot change. A name that ends with a dot is a whole section.
-const FIXED: [&str; 12] = [
+const FIXED: [&str; 13] = [
     "policy.",
     "checkpoint.",
     "learning.paradigm",
     "learning.sharing",
     "learning.population",
+    "learning.hall_of_fame",
     "learning.elites",
     "learning.parents",
     "learning.method",

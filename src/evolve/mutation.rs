@@ -105,7 +105,7 @@ pub struct Offspring<'a> {
     pub first: usize,
     /// The plan of all slots of the population, see [`draw_parents`](super::draw_parents).
     pub parents: &'a [u32],
-    /// The population that ends, `[policies + 1][parameters]`.
+    /// The population that ends, `[slots][parameters]`.
     pub policies: &'a [f32],
 }
 

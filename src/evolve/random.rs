@@ -32,6 +32,8 @@ pub enum Purpose {
     Exploration = 11,
     /// The samples of an evolution strategy, see [`Strategy::sample`](super::Strategy::sample).
     Search = 12,
+    /// The past champions that policies play with, see [`past_champions`](super::past_champions).
+    HallOfFame = 13,
 }
 
 /// A key of the counter-based random number generator. [`Key::draw`] returns the words of a counter.

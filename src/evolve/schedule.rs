@@ -19,8 +19,8 @@ pub fn form_teams(key: Key, generation: usize, round: usize, leaders: usize, tea
     }
 }
 
-/// Returns the teams of one generation of a trial, `[teams][leaders]`, round by round. With a shared population, team `t`
-/// is policy `t`; otherwise see [`form_teams`].
+/// Returns the teams of contemporaries in one generation of a trial, `[teams][leaders]`, round by round. With a shared
+/// population, team `t` is policy `t`; otherwise see [`form_teams`].
 pub fn teams_of(learning: &Learning, trial: usize, generation: usize, leaders: usize) -> Vec<u32> {
     let mut teams = one_policy_a_team(learning.population, leaders);
     if learning.sharing == Sharing::PerLeader {
@@ -37,6 +37,19 @@ pub fn teams_of(learning: &Learning, trial: usize, generation: usize, leaders: u
 /// Returns teams in which team `t` is every leader's policy `t`, `[teams][leaders]`.
 pub fn one_policy_a_team(teams: usize, leaders: usize) -> Vec<u32> {
     (0..teams as u32).flat_map(|policy| std::iter::repeat_n(policy, leaders)).collect()
+}
+
+/// Returns the slot of the past champions that the policies of a generation play with, or `None` if there are none yet.
+/// It is the same for all policies, so that the scores differ only because of them.
+pub fn past_champions(learning: &Learning, trial: usize, generation: usize) -> Option<usize> {
+    let Learning { seed, population, hall_of_fame, .. } = *learning;
+    let kept = hall_of_fame.min(generation);
+    if kept == 0 {
+        return None;
+    }
+    let [word, ..] = Key::new(seed, trial, Purpose::HallOfFame).at(generation, 0, 0).draw(0);
+    let past = generation - 1 - pick(word, kept);
+    Some(population + 1 + past % hall_of_fame)
 }
 
 /// Writes one population's policy in each team of a round, see [`form_teams`].

@@ -74,11 +74,12 @@ impl Selection {
     }
 }
 
-/// Plans one population's next generation: the policy that each slot is copied from, `[policies + 1]`, with
-/// [`UNCHANGED`] if it does not mutate.
+/// Plans one population's next generation: the policy that each slot is copied from, `[slots]`, with [`UNCHANGED`] if it
+/// does not mutate.
 ///
 /// The first slots are the elites', best first. The others' parents win [`tournament`]s, or with [`Parents::Elites`]
-/// are elites, each with the same probability. The last slot gets the best of all, the champion. `key` is of
+/// are elites, each with the same probability. The slot after the policies gets the best of all, the champion. Any slots
+/// after it are the hall of fame, in which the champion replaces the oldest. `key` is of
 /// [`Purpose::Tournament`](super::Purpose::Tournament), `scores` are `[policies]`.
 pub fn draw_parents(
     level: Level,
@@ -102,7 +103,13 @@ pub fn draw_parents(
     for (parent, elite) in parents.iter_mut().zip(&best[..selection.elites]) {
         *parent = *elite as u32 | UNCHANGED;
     }
-    parents[policies] = best[0] as u32 | UNCHANGED;
+    let champion = best[0] as u32 | UNCHANGED;
+    parents[policies] = champion;
+    let first = policies + 1;
+    (first..).zip(&mut parents[first..]).for_each(|(slot, parent)| *parent = slot as u32 | UNCHANGED);
+    if let Some(oldest) = generation.checked_rem(parents.len() - first) {
+        parents[first + oldest] = champion;
+    }
 }
 
 /// Plans that every policy stays, after the last generation. The champion gets its slot.

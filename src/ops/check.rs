@@ -92,12 +92,12 @@ impl Cost {
         let [mut teams, mut team_steps, mut agent_steps] = [0; 3];
         let (mut agents, mut record_bytes, mut travel) = (0, 0, 0.0_f64);
         // Over the stages, played episodes and steps add up. Sizes are those of the largest stage.
-        for share in config.shares() {
+        for (stage, share) in config.shares().into_iter().enumerate() {
             let (world, learning) = (World::new(&share), &share.learning);
-            let played = wide(learning.trials)
-                * wide(learning.generations + 1)
-                * wide(learning.teams() + 1)
-                * wide(learning.episodes_per_team);
+            // Generation 0 has no past champions.
+            let without = if stage == 0 { wide(share.hall_teams(1)) } else { 0 };
+            let of_trial = wide(learning.generations + 1) * wide(share.max_teams()) - without;
+            let played = wide(learning.trials) * of_trial * wide(learning.episodes_per_team);
             teams += played;
             team_steps += played * wide(world.steps());
             agent_steps += played * wide(world.steps()) * wide(world.agents());

@@ -294,7 +294,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         files: FILES.into_iter().map(|(name, file)| (name, folder.join(file).escaped().to_string())).collect(),
         processor: Processor::of_run(session.run(0)),
         story: results.story.clone(),
-        teams: learning.teams(),
+        teams: config.max_teams() - 1,
         trained_on: (!was_done).then_some(on),
         folder,
     })

@@ -5,8 +5,8 @@
 //! checksum of [`super::tensors`] protects it.
 //!
 //! A finished run leaves one more checkpoint, so that the run can be extended. Its weights are those of
-//! `policies.safetensors`, put back into the order given by their fitness. With an evolution strategy it has weights of
-//! its own, because the search distribution is more than the policies.
+//! `policies.safetensors`, put back into the order given by their fitness. With an evolution strategy or a hall of fame it
+//! has weights of its own, because the run continues from more than the policies.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -22,7 +22,7 @@ use super::metrics::Extent;
 use super::policies;
 use super::tensors::{self, Tensor, TensorFile};
 use super::{RecordError, config_digest};
-use crate::config::{Config, Method};
+use crate::config::Config;
 use crate::evolve;
 use crate::file;
 use crate::host::Instant;
@@ -186,7 +186,7 @@ impl Checkpoint {
     fn complete(&mut self, mut file: TensorFile<impl Read + Seek>, of: &Config) -> bool {
         // A file without a kind has no checksum either: another program wrote it.
         let is_of_run = file.kind().is_some() && file.metadata(policies::CONFIG) == Some(&self.config);
-        if !is_of_run || of.learning.method != Method::Tournament {
+        if !is_of_run || !of.learning.extends_from_policies() {
             return false;
         }
         let (population, parameters) = (of.learning.population, of.parameters());

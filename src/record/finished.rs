@@ -9,7 +9,7 @@ use super::checkpoint::{self, Checkpoint};
 use super::folder::{CHECKPOINTS, CONFIG, FileSums, Folder, METRICS, POLICIES, RUN, Run, Status};
 use super::metrics::{self, Extent, Lines};
 use super::{RecordError, config_digest, hex, ownership, policies};
-use crate::config::{Config, Method};
+use crate::config::Config;
 use crate::trainer::{Ending, Row, Snapshot};
 
 /// The place that the files of a run are written to: a folder or an archive.
@@ -112,7 +112,7 @@ pub(crate) fn read_ending(folder: &Path, config: &Config) -> Option<Ending> {
     let found = Checkpoint::read(crate::file::open(&path).ok()?, config).ok()?;
     let is_of = found.is_of(config);
     let Snapshot { generation, last, weights, fitness, .. } = found.snapshot;
-    let whole = weights.is_empty() == (config.learning.method == Method::Tournament);
+    let whole = weights.is_empty() == config.learning.extends_from_policies();
     let fits = is_of && whole && last + 1 == generation && last == config.learning.generations;
     fits.then_some(Ending { weights, fitness })
 }

@@ -225,7 +225,7 @@ fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
 
 /// Keys of later versions with their default values. A config's digest omits these lines, so that runs of earlier
 /// versions can be resumed.
-const LATER: [&str; 15] = [
+const LATER: [&str; 16] = [
     "observers = \"all\"\n",
     "windows = []\n",
     "after = []\n",
@@ -238,6 +238,7 @@ const LATER: [&str; 15] = [
     "parents = \"all\"\n",
     "partners = 1\n",
     "leniency = \"mean\"\n",
+    "hall_of_fame = 0\n",
     "method = \"tournament\"\n",
     "search_sigma = 0.3\n",
     "search_step = 1.0\n",

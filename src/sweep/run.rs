@@ -54,8 +54,8 @@ pub struct SweepProgress {
 pub fn bytes(config: &Config) -> usize {
     let learning = &config.learning;
     let episodes = config.staged().iter().map(|(_, config)| config.learning.episodes_per_team).max().unwrap_or(1);
-    let scores = learning.trials * (learning.teams() + 1) * (config.learners() + 1) * (episodes + 2);
-    let champions = learning.trials * config.populations() * config.parameters();
+    let scores = learning.trials * config.max_teams() * (config.learners() + 1) * (episodes + 2);
+    let champions = learning.trials * config.populations() * config.parameters() * (1 + learning.hall_of_fame);
     let bytes = 3 * config.policy_bytes() + ((3 * champions + scores) * size_of::<f32>()) as u64;
     bytes.try_into().unwrap_or(usize::MAX)
 }
@@ -64,7 +64,7 @@ pub fn bytes(config: &Config) -> usize {
 fn team_steps(config: &Config) -> u128 {
     let of_stage = |config: Config| {
         let learning = &config.learning;
-        let teams = learning.trials * (learning.teams() + 1) * learning.episodes_per_team;
+        let teams = learning.trials * config.max_teams() * learning.episodes_per_team;
         teams as u128 * config.world.steps as u128 * (learning.generations + 1) as u128
     };
     config.shares().into_iter().map(of_stage).sum()

@@ -129,7 +129,7 @@ fn cost_of_stage(config: &Config) -> u128 {
     let wide = |count: usize| count as u128;
     let teams = wide(learning.trials)
         * wide(learning.generations + 1)
-        * wide(learning.teams() + 1)
+        * wide(config.max_teams())
         * wide(learning.episodes_per_team);
     let (agents, leaders, pois) = (wide(world.agents()), wide(world.leaders()), wide(world.pois.len()));
     let step = leaders * (2 * wide(world.parameters()) + 25 * pois) + agents * (4 * agents + 6 * pois + 100);

@@ -17,7 +17,8 @@ use crate::world::World;
 pub struct Candidates<'a> {
     /// The populations, `[populations][slots][parameters]`, see [`Learning::slots`](crate::config::Learning::slots).
     pub weights: &'a [f32],
-    /// The policy of each leader in each team, `[teams + 1][leaders]`. The last team is the champions'.
+    /// The policy of each leader in each team, `[teams + 1][leaders]`. The teams with past champions come after the
+    /// others, and the champions' team is the last.
     pub teams: &'a [u32],
     /// Start positions of every episode, followed by POI positions if POIs move, `[episodes][agents + pois]`.
     pub starts: &'a [Vec<Vec2>],
@@ -58,7 +59,7 @@ impl Trainer {
     pub fn candidates_world(&self, experiment: usize) -> (&World, usize) {
         let experiment = &self.experiments[experiment];
         let stage = experiment.stage();
-        (&stage.world, if experiment.is_over() { 0 } else { stage.config.learning.teams() })
+        (&stage.world, if experiment.is_over() { 0 } else { experiment.teams() })
     }
 
     /// Returns G, `[trials][teams]`, and the config's fitness of each leader, `[trials][teams][leaders]`, of the teams
@@ -66,7 +67,7 @@ impl Trainer {
     pub fn played(&self, experiment: usize) -> (Vec<f64>, Vec<f32>) {
         let experiment = &self.experiments[experiment];
         let stage = experiment.stage();
-        let (teams, leaders) = (stage.config.learning.teams(), stage.world.leaders());
+        let (teams, leaders) = (experiment.teams(), stage.world.leaders());
         let (mut g, mut scores) = (Vec::new(), Vec::new());
         for trial in &experiment.trials {
             let all = (stage.world.pois.len() * trial.scores.len()) as f64;

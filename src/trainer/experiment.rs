@@ -30,7 +30,7 @@ pub(super) struct Experiment {
 /// One trial's populations, and scratch memory for its generations.
 ///
 /// A population has more slots than policies, see [`Learning::slots`]. The one after the policies holds the champion of
-/// the previous generation, which plays along as one more team.
+/// the previous generation, which plays along as one more team. Past champions, if any are kept, are in those after it.
 pub(super) struct TrialState {
     /// The trial's number within its config.
     pub index: usize,
@@ -43,7 +43,7 @@ pub(super) struct TrialState {
     pub previous_stage_scores: Vec<GroupScores>,
     /// The mean score of every policy, `[populations][policies]`.
     pub fitness: Vec<f32>,
-    /// The plan of the next generation, see [`evolve::draw_parents`], `[populations][policies + 1]`.
+    /// The plan of the next generation, see [`evolve::draw_parents`], `[populations][slots]`.
     pub parents: Vec<u32>,
     /// The row of the previous generation, whose champion has yet to play.
     pub pending: Option<Row>,
@@ -83,6 +83,12 @@ impl Experiment {
     /// Reports whether the populations are past the last generation, and only champions play.
     pub fn is_over(&self) -> bool {
         self.residency.generation() > self.last()
+    }
+
+    /// Teams of a trial in the generation of the populations, without the champion's.
+    pub fn teams(&self) -> usize {
+        let config = &self.stage().config;
+        config.learning.teams() + config.hall_teams(self.residency.generation())
     }
 
     /// Numbers in the policies of one trial, without the champions' slots.
@@ -177,7 +183,7 @@ impl TrialState {
             scores: vec![],
             previous_stage_scores: vec![],
             fitness: vec![0.0; populations * population],
-            parents: vec![0; populations * (population + 1)],
+            parents: vec![0; populations * config.learning.slots()],
             pending: None,
         }
     }

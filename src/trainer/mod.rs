@@ -18,7 +18,7 @@ use std::time::Duration;
 use fearless_simd::Level;
 
 use crate::backend::{Backend, BackendError};
-use crate::config::{Method, ValidConfig};
+use crate::config::ValidConfig;
 use crate::host::Instant;
 use crate::parallel::*;
 use crate::world::World;
@@ -85,8 +85,8 @@ pub struct Snapshot<N = Vec<f32>> {
 /// State from which a finished experiment is extended, beside its rows and policies.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Ending {
-    /// With an evolution strategy, a trial's weights after the last generation, as in [`Snapshot`]. Empty after
-    /// tournaments, because the policies and their fitness are enough.
+    /// A trial's weights after the last generation, as in [`Snapshot`]. Empty if the policies and their fitness are
+    /// enough, see [`Learning::extends_from_policies`](crate::config::Learning::extends_from_policies).
     pub weights: Vec<Vec<f32>>,
     /// A trial's scores of the last generation, `[populations][policies]`.
     pub fitness: Vec<Vec<f32>>,
@@ -286,8 +286,7 @@ impl Trainer {
     }
 
     /// Returns the outcomes of experiments that are done: [`Trainer::policies`], in the next generation's memory, and
-    /// the snapshot after the last generation. After tournaments its weights are empty, because they are the policies in
-    /// another order.
+    /// the snapshot after the last generation. Its weights are empty if they are only the policies in another order.
     pub fn ends(&mut self, experiments: &[usize]) -> Vec<End<'_>> {
         for &experiment in experiments {
             let experiment = &mut self.experiments[experiment];
@@ -304,7 +303,7 @@ impl Trainer {
             let len = experiment.policy_len();
             let sorted = experiment.trials.iter().map(|trial| &trial.children[..len]).collect();
             let mut snapshot = Snapshot { generation: experiment.last() + 1, ..experiment.snapshot() };
-            if experiment.stage().config.learning.method == Method::Tournament {
+            if experiment.stage().config.learning.extends_from_policies() {
                 snapshot.weights.clear();
             }
             (sorted, snapshot)

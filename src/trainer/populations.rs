@@ -94,10 +94,10 @@ impl Experiment {
         let Experiment { stages, trials, residency, .. } = self;
         let Residency::Device { populations, .. } = residency else { return Ok(()) };
         let (learning, last) = (&stages.of(generation).config.learning, stages.last_generation);
-        let (seed, population) = (learning.seed, learning.population);
+        let Learning { seed, population, .. } = *learning;
         trials.par_iter_mut().for_each(|trial| {
             let key = Key::new(seed, trial.index, Purpose::Tournament);
-            let plans = trial.parents.par_chunks_exact_mut(population + 1);
+            let plans = trial.parents.par_chunks_exact_mut(learning.slots());
             plans.zip(trial.fitness.par_chunks_exact(population)).enumerate().for_each(
                 |(leader, (parents, fitness))| plan(level, learning, key, (generation, last), leader, fitness, parents),
             );
@@ -188,12 +188,13 @@ impl Experiment {
         let (learning, last) = (&config.learning, stages.last_generation);
         let Learning { seed, population, .. } = *learning;
         let parameters = world.parameters();
-        let stride = (population + 1) * parameters;
+        let slots = learning.slots();
+        let stride = slots * parameters;
         trials.par_iter_mut().for_each(|trial| {
             let tournaments = Key::new(seed, trial.index, Purpose::Tournament);
             let key = Key::new(seed, trial.index, Purpose::Mutation);
             let TrialState { weights, children, parents, fitness, .. } = trial;
-            let plans = fitness.par_chunks_exact(population).zip(parents.par_chunks_exact_mut(population + 1));
+            let plans = fitness.par_chunks_exact(population).zip(parents.par_chunks_exact_mut(slots));
             let populations = weights.par_chunks_exact(stride).zip(children.par_chunks_exact_mut(stride));
             plans.zip(populations).enumerate().for_each(|(leader, ((fitness, parents), (policies, children)))| {
                 plan(level, learning, tournaments, (generation, last), leader, fitness, parents);

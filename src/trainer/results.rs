@@ -24,7 +24,7 @@ pub(super) fn play<'a>(
     let mut groups = Vec::new();
     for (_, experiment) in experiments {
         let (stage, range) = (experiment.stage(), experiment.playing());
-        let (teams, leaders) = (stage.config.learning.teams(), stage.world.leaders());
+        let (teams, leaders) = (experiment.teams(), stage.world.leaders());
         let previous = experiment.stages.ending_before(experiment.residency.generation());
         let on_device = experiment.residency.on_device();
         for (index, (trial, schedule)) in experiment.trials.iter().zip(&experiment.schedules).enumerate() {
@@ -67,7 +67,7 @@ impl Experiment {
     /// The teams that play, by index. The last is the champion's: the first generation has no champion before it, and
     /// after the last generation champions play alone.
     fn playing(&self) -> Range<usize> {
-        let teams = self.stage().config.learning.teams();
+        let teams = self.teams();
         let first = if self.is_over() { teams } else { 0 };
         first..teams + usize::from(self.residency.generation() > 0)
     }
@@ -75,14 +75,14 @@ impl Experiment {
     /// Turns a generation's scores into fitness, and returns the rows that its champions complete. `index` is the
     /// experiment's in its trainer. `told` replaces the scores, `[trials][teams][leaders]`.
     pub fn collect_results(&mut self, index: usize, told: Option<&[f32]>) -> Vec<Row> {
-        let generation = self.residency.generation();
+        let (generation, size) = (self.residency.generation(), self.teams() * self.stage().world.leaders());
         let Experiment { stages, trials, schedules, .. } = self;
         let Stage { config, world, .. } = stages.of(generation);
-        let teams = config.learning.teams();
+        let (teams, hall) = (config.learning.teams(), config.hall_teams(generation) > 0);
         let pois_before = stages.ending_before(generation).map_or(world.pois.len(), |stage| stage.world.pois.len());
         let mut rows = Vec::with_capacity(trials.len());
         for (number, (trial, schedule)) in trials.iter_mut().zip(schedules).enumerate() {
-            let size = teams * world.leaders();
+            // Teams with past champions are not among the k·m teams whose best and mean count.
             let [best_g, mean_g] = team_g(&trial.scores, world.pois.len(), teams);
             rows.extend(trial.pending.map(|row| Row { champion_g: trial.champion_g(pois_before), ..row }));
             trial.pending =
@@ -92,7 +92,7 @@ impl Experiment {
                 None => mean_score(&trial.scores, place),
             };
             match config.learning.sharing {
-                Sharing::PerLeader => assign_fitness(score, schedule, &config.learning, &mut trial.fitness),
+                Sharing::PerLeader => assign_fitness(score, schedule, hall, &config.learning, &mut trial.fitness),
                 Sharing::Shared => assign_shared_fitness(score, world.leaders(), &mut trial.fitness),
             }
             trial.forget_scores();
@@ -145,24 +145,30 @@ fn team_g(episodes: &[GroupScores], pois: usize, teams: usize) -> [f64; 2] {
     [best as f64 / whole, total as f64 / (whole * teams as f64)]
 }
 
-/// Assigns each policy its leader's score in its team, or with several partners the mean or the largest of its scores.
-/// `score` takes a place of `[teams][leaders]`, `fitness` is `[leaders][policies]`.
+/// Assigns each policy its leader's score in its team, or the mean or the largest of its scores in several teams. `hall`
+/// means that the last of these has past champions. `score` takes a place of `[teams][leaders]`, `fitness` is
+/// `[leaders][policies]`.
 ///
-/// The mean adds scores in 64 bits, in the order of the rounds, and rounds to 32 bits once.
+/// The mean adds scores in 64 bits, in the order of the teams, and rounds to 32 bits once.
 fn assign_fitness(
     score: impl Fn(usize) -> f32 + Sync,
     schedule: &TeamSchedule,
+    hall: bool,
     learning: &Learning,
     fitness: &mut [f32],
 ) {
     let Learning { population, partners, leniency, .. } = *learning;
-    let leaders = fitness.len() / population;
+    let (leaders, played) = (fitness.len() / population, partners + usize::from(hall));
     let populations = fitness.par_chunks_exact_mut(population).with_min_len(min_populations_per_task(population));
     populations.enumerate().for_each(|(leader, fitness)| {
         let policies = schedule.teams[leader..partners * population * leaders].iter().step_by(leaders);
         let scores = (leader..).step_by(leaders).zip(policies).map(|(place, &policy)| (policy as usize, score(place)));
+        let first = partners * population + leader * population;
+        let with_past = 0..if hall { population } else { 0 };
+        let with_past = with_past.map(|policy| (policy, score((first + policy) * leaders + leader)));
+        let scores = scores.chain(with_past);
         match leniency {
-            _ if partners == 1 => scores.for_each(|(policy, score)| fitness[policy] = score),
+            _ if played == 1 => scores.for_each(|(policy, score)| fitness[policy] = score),
             Leniency::Max => {
                 fitness.fill(f32::NEG_INFINITY);
                 // Not `f32::max`, which may return either of two zeros.
@@ -175,7 +181,7 @@ fn assign_fitness(
             Leniency::Mean => {
                 let mut totals = vec![0.0; population];
                 scores.for_each(|(policy, score)| totals[policy] += f64::from(score));
-                fitness.iter_mut().zip(totals).for_each(|(mean, total)| *mean = (total / partners as f64) as f32);
+                fitness.iter_mut().zip(totals).for_each(|(mean, total)| *mean = (total / played as f64) as f32);
             }
         }
     });

@@ -24,7 +24,8 @@ pub(super) struct TeamSchedule {
     drawn_for: Option<(usize, usize)>,
     /// Scratch memory: each population's policies in the order of their teams, `[rounds][populations][policies]`.
     orders: Vec<u32>,
-    /// The policy of each leader, `[teams + 1][leaders]`, round by round. The last team is the champion's.
+    /// The policy of each leader, `[teams + 1][leaders]`, round by round, followed by the teams with past champions, if
+    /// any, `[populations][policies]`. The last team is the champion's.
     pub teams: Vec<u32>,
     /// Start positions, followed by POI positions if POIs move, `[episodes][agents + pois]`.
     pub starts: Vec<Vec<Vec2>>,
@@ -86,6 +87,14 @@ impl TeamSchedule {
                 for (policy, order) in policies.iter_mut().zip(orders.chunks_exact(population)) {
                     *policy = order[team];
                 }
+            });
+        }
+        if let Some(slot) = evolve::past_champions(learning, trial, generation) {
+            let first = self.teams.len();
+            self.teams.resize(first + leaders * of_round, slot as u32);
+            let teams = self.teams[first..].par_chunks_exact_mut(of_round);
+            teams.with_min_len(min_populations_per_task(population)).enumerate().for_each(|(leader, teams)| {
+                teams.iter_mut().skip(leader).step_by(leaders).zip(0..).for_each(|(to, policy)| *to = policy);
             });
         }
         self.teams.extend(std::iter::repeat_n(population as u32, leaders));

@@ -28,12 +28,13 @@ fn max_over_stages(config: &Config, bytes: fn(&Config) -> u64) -> u64 {
 fn bytes_of_stage(config: &Config) -> u64 {
     let ([trials, populations, policies, parameters], leaders) = (sizes(config), config.learners() as u64);
     let (slots, episodes) = (config.learning.slots() as u64, config.learning.episodes_per_team as u64);
-    let teams = config.learning.teams() as u64 + 1;
+    let teams = config.max_teams() as u64;
     let weights = 2 * populations * slots * parameters;
-    let fitness_and_parents = populations * (2 * policies + 1);
+    let fitness_and_parents = populations * (policies + slots);
     let observed_and_scores = episodes * teams * (1 + leaders);
     // Scores are added up in 64 bits.
-    let totals = if config.learning.partners > 1 { 2 * populations * policies } else { 0 };
+    let totals =
+        if config.learning.partners > 1 || config.learning.hall_of_fame > 0 { 2 * populations * policies } else { 0 };
     4 * trials * (weights + fitness_and_parents + observed_and_scores + totals + episodes * EPISODE)
         + schedule_bytes(config)
 }
@@ -46,7 +47,7 @@ fn previous_stage_bytes(config: &Config) -> u64 {
 fn schedule_bytes(config: &Config) -> u64 {
     let ([trials, populations, ..], leaders) = (sizes(config), config.learners() as u64);
     let teams = config.learning.teams() as u64;
-    4 * trials * (populations * teams + leaders * (teams + 1)) + start_bytes(config)
+    4 * trials * (populations * teams + leaders * config.max_teams() as u64) + start_bytes(config)
 }
 
 fn start_bytes(config: &Config) -> u64 {

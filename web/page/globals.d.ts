@@ -22,7 +22,7 @@ interface Config {
   motion: { max_speed: number };
   follow: { attraction_radius: number };
   learning: {
-    paradigm: Kind, fitness: string, seed: string, generations: number, trials: number, population: number, partners?: number,
+    paradigm: Kind, fitness: string, seed: string, generations: number, trials: number, population: number, partners?: number, hall_of_fame?: number,
     episodes_per_team: number,
   };
 }

@@ -74,8 +74,12 @@ export class Training {
         for (let at = 0; at < numbers.length; at += 6) {
           const [run, trial, generation, best, mean, champion] = numbers.subarray(at, at + 6);
           this.arms[run].trials[trial][generation] = { best, mean, champion, seconds };
-          const { population, partners, episodes_per_team } = this.arms[run].config.learning;
-          this.teams += (population * (partners ?? 1) + 1) * episodes_per_team;
+          const { world, learning } = this.arms[run].config;
+          const { population, partners, hall_of_fame, paradigm, episodes_per_team } = learning;
+          const learners = world.leaders.length + (paradigm === "all-leaders" ? world.followers.length : 0);
+          // Generation 0 has no past champions.
+          const past = hall_of_fame && generation > 0 ? learners : 0;
+          this.teams += (population * ((partners ?? 1) + past) + 1) * episodes_per_team;
         }
         this.busy[index] += words.seconds;
         next = words.next;

@@ -4,7 +4,7 @@ use std::io::{self, Cursor, Read};
 use std::ops::Range;
 
 use flotilla::backend::{Group, cpu::Cpu};
-use flotilla::config::{Config, Method, Sharing};
+use flotilla::config::{Config, Sharing};
 use flotilla::evolve;
 use flotilla::ops;
 use flotilla::record::finished::{Content, Finished, Storage};
@@ -26,7 +26,7 @@ const MOST: u64 = 1 << 30;
 ///
 /// The numbers start with the rows, `[rows][7]` f64, in the order of `metrics.csv`. A row is run, trial, generation,
 /// best, mean and champion G, seconds. After the rows follow each trial's policies and fitness, as f32, and with an
-/// evolution strategy the weights after the last generation.
+/// evolution strategy or a hall of fame the weights after the last generation.
 #[derive(Deserialize)]
 pub struct Recorded {
     /// The folder in the archive that holds the run.
@@ -49,7 +49,7 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
     let fitness = config.populations() * config.learning.population;
     let policies = fitness * config.parameters();
     let slots = config.populations() * config.learning.slots() * config.parameters();
-    let weights = if config.learning.method == Method::Tournament { 0 } else { slots };
+    let weights = if config.learning.extends_from_policies() { 0 } else { slots };
     let (numbers, trial) = (recorded.rows * 7 * size_of::<f64>(), (policies + fitness + weights) * size_of::<f32>());
     if bytes.len() != numbers + trials * trial || recorded.rows != trials * (last + 1) {
         return Err(refuse("what came out of the run does not fit its config"));
