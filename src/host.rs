@@ -1,7 +1,26 @@
-//! The clock, blocking waits and threads. No other module uses the system's directly.
+//! The clock, blocking waits, threads and the cache. No other module uses the system's directly.
 //!
 //! Native programs use the system's. WebAssembly has neither, so its embedder provides them with `install`. Without a
 //! clock, time stands still there. Without a way to park, waiting polls in a loop.
+
+/// Asks the processor to load numbers into its cache, and does not wait for them. A no-op on processors other than x86-64.
+#[inline(always)]
+pub(crate) fn prefetch(numbers: &[f32]) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        const LINE: usize = 64 / size_of::<f32>();
+        // The last number may be in one more line.
+        for number in numbers.iter().step_by(LINE).chain(numbers.last()) {
+            #[expect(unsafe_code, reason = "a hint, which reads nothing")]
+            unsafe {
+                _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(number).cast());
+            }
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = numbers;
+}
 
 #[cfg(not(target_family = "wasm"))]
 mod native {

@@ -75,7 +75,7 @@
 //! | module | feature | contents |
 //! |---|---|---|
 //! | [`escape`], [`mod@file`], [`shell`] | | reading and writing of names, files and command lines |
-//! | [`host`], [`parallel`] | | time, waiting and threads |
+//! | [`host`], [`parallel`] | | time, waiting, threads and the cache |
 //! | [`config_enum`], [`gpu_struct`] | | enums that configs write as words, structs shared with shaders |
 //! | [`reader`] | | reading a TOML text key by key |
 //! | [`kernels`] | | vector arithmetic on many teams at once |

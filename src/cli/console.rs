@@ -99,7 +99,7 @@ struct Display {
     shown: RefCell<View>,
 }
 
-/// What is drawn at present.
+/// The drawing on the terminal.
 enum View {
     Nothing,
     Curves(Board),

@@ -8,7 +8,8 @@ use super::random::Key;
 use super::selection::UNCHANGED;
 use super::weights::within_limits;
 use crate::config::{Learning, Mutation};
-use crate::kernels::{math, prefetch};
+use crate::host::prefetch;
+use crate::kernels::math;
 
 /// Mutates a policy: every weight, with the configured probability, gains noise, `N(0, sigma)` or that times itself.
 ///
@@ -145,7 +146,7 @@ fn mutate_brood<S: Simd>(
         let mutating = || (0..).zip(parents).filter(|(_, parent)| *parent & UNCHANGED == 0).map(|(lane, _)| lane);
         // These loops are separate so that the processor draws for several policies at once.
         for (lane, &parent) in parents.iter().enumerate() {
-            // Parents of the next slots come from memory meanwhile.
+            // Parents are in random places of memory. While one batch mutates, those of the next are loaded.
             if let Some(&parent) = later.get(first + lane) {
                 prefetch(policy(parent));
             }

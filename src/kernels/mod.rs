@@ -8,26 +8,6 @@ use fearless_simd::{Select, Simd, prelude::*};
 
 pub mod math;
 
-/// Starts to load numbers into the cache, so that they are there when they are needed. Does nothing on other processors than
-/// x86-64.
-#[inline(always)]
-pub(crate) fn prefetch(numbers: &[f32]) {
-    #[cfg(target_arch = "x86_64")]
-    {
-        use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
-        const LINE: usize = 64 / size_of::<f32>();
-        // The last number may lie in one more line.
-        for number in numbers.iter().step_by(LINE).chain(numbers.last()) {
-            #[expect(unsafe_code, reason = "a hint, which reads nothing")]
-            unsafe {
-                _mm_prefetch::<_MM_HINT_T1>(std::ptr::from_ref(number).cast());
-            }
-        }
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = numbers;
-}
-
 /// `if_true` in the lanes in which `condition` holds, else `if_false`. The arguments are in WGSL's order.
 #[inline(always)]
 pub(crate) fn select<S: Simd>(if_false: S::f32s, if_true: S::f32s, condition: S::mask32s) -> S::f32s {

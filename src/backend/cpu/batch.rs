@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use crate::backend::{Group, Weights};
-use crate::kernels::prefetch;
+use crate::host::prefetch;
 use crate::world::World;
 
 /// Consecutive groups in the same world. Their teams may share a block.
@@ -47,8 +47,8 @@ impl<'a> WorldBatch<'a> {
         &weights[group.place(leader, policy)..][..self.world.parameters()]
     }
 
-    /// Loads the policies of some teams into the cache, a part of them at every step of teams that play before, so that
-    /// memory keeps up.
+    /// Prefetches a share of the policies of some teams. The calls of all steps of an episode prefetch all of them: a few at
+    /// a time, because the processor has room for few requests.
     #[inline(always)]
     pub(super) fn prefetch(&self, teams: Range<usize>, step: usize) {
         let (steps, policies) = (self.world.steps(), teams.len() * self.world.leaders());

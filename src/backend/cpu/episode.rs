@@ -72,7 +72,7 @@ impl<S: Simd> EpisodeBlock<S> {
         network.load(batch, places);
     }
 
-    /// Plays some steps. Calls `before` before each.
+    /// Plays some steps. Calls `before` with the number of each step before it plays.
     #[inline(always)]
     pub(super) fn play(&mut self, world: &World, steps: Range<usize>, before: impl Fn(usize)) {
         let EpisodeBlock { block, network, moved, sets, sights, .. } = self;

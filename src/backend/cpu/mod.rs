@@ -122,9 +122,9 @@ impl Backend for Cpu {
     }
 }
 
-/// From how many vectors of teams per thread on a thread takes the next before it has played one, and loads their policies
-/// into the cache meanwhile. With fewer, they are likely in the cache, and threads would wait for each other at the end.
-const EARLY: usize = 32;
+/// Minimum number of vectors of teams per thread for prefetching: a thread then takes its next vector before it plays
+/// one. Policies of fewer teams fit into the cache, and threads that take vectors early finish less evenly.
+const PREFETCH_FROM: usize = 32;
 
 /// Plays all groups. Threads take one vector of teams after another from a common counter, so that none waits for a lock
 /// and none is left with much to do at the end.
@@ -137,7 +137,7 @@ fn play<S: Simd>(simd: S, groups: &[Group<'_>], workspaces: &mut Option<Box<dyn 
     own.resize_with(current_num_threads(), || None);
     let next = AtomicUsize::new(0);
     let threads = own.len().min(blocks.len());
-    let early = blocks.len() >= EARLY * threads;
+    let early = blocks.len() >= PREFETCH_FROM * threads;
     own[..threads].par_iter_mut().with_max_len(1).for_each(|workspace| {
         let take = || blocks.get(next.fetch_add(1, Relaxed));
         let mut current = take();
