@@ -77,8 +77,8 @@ flotilla does not control the following. Each line names the functions in `tests
 | instruction sets round alike | masks and conversions differ in corner cases | `levels_give_the_same_bits`, `every_instruction_set` |
 | text becomes the nearest float, and floats become text and back | Rust's own library does both | `the_program_tells_the_same_digest` |
 
-Three things are not promised: times; the last digits of p-values and intervals, for which the `statrs` crate uses the platform's
-logarithms; and processes that change the rounding mode of their threads.
+Two things are not promised: times, and processes that change the rounding mode of their threads. Intervals and p-values are computed
+with `libm`, too.
 
 On Metal only the guarded pass is used. It does not depend on compiler options. Between a product and the sum after it stands an integer
 operation with a word read from a buffer, whose value no compiler can know. Nobody has run flotilla on a hardware GPU, on Metal or on DirectX

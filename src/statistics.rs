@@ -7,13 +7,15 @@
 //!
 //! Some functions make fewer assumptions about the distribution. [`bootstrap`] gives the interval of a mean or a
 //! difference, [`rank_sum`] tests two samples, and [`signed_rank`] tests pairs. [`holm`] corrects for multiple tests. G
-//! takes few values, so ranks have many ties. `statrs` has no exact p-values for ties, so both rank tests compute them
-//! here.
+//! takes few values, so ranks have many ties, and both rank tests compute exact p-values for ties here.
+//!
+//! The special functions are those of `special`, which calls `libm` only: a table has the same digits on every system.
+//! Other crates of statistics call the system's functions as soon as any dependency asks for that.
 
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 use serde::Serialize;
-use statrs::distribution::{Beta, ContinuousCDF, Normal, StudentsT};
+use special::{Beta, Error};
 
 /// Confidence level of all intervals.
 pub(crate) const CONFIDENCE: f64 = 0.95;
@@ -130,7 +132,7 @@ pub(crate) fn half_width(count: usize) -> f64 {
 }
 
 fn half_width_at(confidence: f64, count: usize) -> f64 {
-    if count < 2 { 0.0 } else { student(count).inverse_cdf(1.0 - (1.0 - confidence) / 2.0) }
+    if count < 2 { 0.0 } else { student((1.0 - confidence) / 2.0, (count - 1) as f64) }
 }
 
 /// Returns a share with the exact interval of Clopper and Pearson. None if `of` is 0.
@@ -141,12 +143,12 @@ pub fn share(count: usize, of: usize) -> Option<Estimate> {
 /// Returns the same as [`share`], with an interval of any confidence level.
 pub(crate) fn share_at(confidence: f64, count: usize, of: usize) -> Option<Estimate> {
     let (some, others) = (count as f64, of.checked_sub(count)? as f64);
-    let bound = |a: f64, b: f64, at: f64| Some(Beta::new(a, b).ok()?.inverse_cdf(at));
+    let bound = |a: f64, b: f64, at: f64| at.inv_inc_beta(a, b, a.ln_beta(b));
     let tail = (1.0 - confidence) / 2.0;
     Some(Estimate {
         value: (of > 0).then_some(some / of as f64)?,
-        low: if count == 0 { 0.0 } else { bound(some, others + 1.0, tail)? },
-        high: if count == of { 1.0 } else { bound(some + 1.0, others, 1.0 - tail)? },
+        low: if count == 0 { 0.0 } else { bound(some, others + 1.0, tail) },
+        high: if count == of { 1.0 } else { bound(some + 1.0, others, 1.0 - tail) },
     })
 }
 
@@ -188,9 +190,25 @@ fn moments(values: &[f64]) -> Option<(f64, f64)> {
     (average.count > 1).then(|| (average.mean(), average.error()))
 }
 
-/// Returns Student's distribution for the mean of `count` values, at least 2.
-fn student(count: usize) -> StudentsT {
-    StudentsT::new(0.0, 1.0, (count - 1) as f64).expect("two values leave a degree of freedom")
+/// Returns the value that Student's distribution exceeds with probability `tail`, at most 0.5.
+fn student(tail: f64, freedom: f64) -> f64 {
+    // With one degree of freedom it is Cauchy's, and the general formula loses digits.
+    if freedom == 1.0 {
+        return 1.0 / libm::tan(std::f64::consts::PI * tail);
+    }
+    let half = freedom / 2.0;
+    let share = (2.0 * tail).inv_inc_beta(half, 0.5, half.ln_beta(0.5));
+    (freedom * (1.0 - share) / share).sqrt()
+}
+
+/// Returns the probability that a normal variable exceeds `z`.
+fn normal_above(z: f64) -> f64 {
+    (z * std::f64::consts::FRAC_1_SQRT_2).compl_error() / 2.0
+}
+
+/// Returns the value that a normal variable is below with probability `p`.
+fn normal_quantile(p: f64) -> f64 {
+    std::f64::consts::SQRT_2 * (2.0 * p - 1.0).inv_error()
 }
 
 /// Returns the mean of the first sample, minus that of the second if given, with its bootstrap interval. None if a
@@ -232,11 +250,10 @@ pub fn bootstrap(samples: &[&[f64]]) -> Option<Estimate> {
     // Means that differ only by rounding count as equal.
     let grain = 1e-9 * spread.sqrt();
     let [below, most] = [value - grain, value + grain].map(|at| drawn.partition_point(|&drawn| drawn < at));
-    let normal = Normal::standard();
-    let bias = normal.inverse_cdf((below + most) as f64 / 2.0 / RESAMPLES as f64);
+    let bias = normal_quantile((below + most) as f64 / 2.0 / RESAMPLES as f64);
     let end = |tail: f64| {
-        let shifted = bias + normal.inverse_cdf(tail);
-        let place = normal.cdf(bias + shifted / (1.0 - acceleration * shifted)) * (RESAMPLES - 1) as f64;
+        let shifted = bias + normal_quantile(tail);
+        let place = normal_above(-bias - shifted / (1.0 - acceleration * shifted)) * (RESAMPLES - 1) as f64;
         let (left, right) = (drawn[place.floor() as usize], drawn[place.ceil() as usize]);
         left + (right - left) * place.fract()
     };
@@ -368,5 +385,5 @@ fn two_sided(ways: &[f64], sum: usize) -> f64 {
 fn normal(off: f64, variance: f64) -> f64 {
     // Continuity correction: half a rank is 1 after doubling.
     let z = (off.abs() - 1.0) / variance.sqrt();
-    if variance > 0.0 { (2.0 * Normal::standard().sf(z)).min(1.0) } else { 1.0 }
+    if variance > 0.0 { (2.0 * normal_above(z)).min(1.0) } else { 1.0 }
 }

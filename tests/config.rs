@@ -367,19 +367,11 @@ fn token() -> impl Strategy<Value = String> {
                  99999999999999999999 1e-40 true 1979-05-27 [world] [learning] [grid] \
                  world.dt leaders pois coupling hidden = [] [[1,2],[3]] é \u{1f6a2}";
     let known: Vec<String> = known.split(' ').map(str::to_string).chain(["\n".into(), "\\u0000".into()]).collect();
-    prop_oneof![
-        4 => prop::sample::select(known),
-        1 => vec(any::<char>(), 0..7).prop_map(String::from_iter),
-    ]
-}
-
-/// Returns the number of cases: `count`, or 20 times as many with `FLOTILLA_LONG=1`. They are the same in every run.
-fn cases(count: u32) -> u32 {
-    if std::env::var("FLOTILLA_LONG").is_ok_and(|long| long == "1") { 20 * count } else { count }
+    prop_oneof![4 => (0..known.len()).prop_map(move |index| known[index].clone()), 1 => "\\PC{0,6}"]
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(cases(256)))]
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
     fn what_is_written_reads_back_the_same(config in configs()) {
@@ -419,9 +411,7 @@ proptest! {
             text.splice(at..end, token.into_bytes());
         }
         let text = String::from_utf8_lossy(&text);
-        let read = std::panic::catch_unwind(|| Config::parse(&text, "test.toml"));
-        prop_assert!(read.is_ok(), "panics on {:?}", text);
-        if let Ok(Err(error)) = read {
+        if let Err(error) = Config::parse(&text, "test.toml") {
             prop_assert!(error.to_string().contains("test.toml"));
         }
     }

@@ -374,12 +374,6 @@ fn every_sweep_of_the_repository_can_run() {
     assert!(found >= 9);
 }
 
-/// Returns texts of some characters, up to a length.
-fn text_of(characters: &'static str, most: usize) -> impl Strategy<Value = String> {
-    let characters: Vec<char> = characters.chars().collect();
-    prop::collection::vec(prop::sample::select(characters), 0..=most).prop_map(String::from_iter)
-}
-
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
@@ -404,14 +398,8 @@ proptest! {
     }
 
     #[test]
-    fn no_text_makes_a_sweep_panic(
-        grid: bool,
-        lines in prop::collection::vec((text_of("az.\"", 12), text_of("[]09az,.\"{}", 20)), 0..6),
-    ) {
-        let lines = lines.into_iter().map(|(key, value)| format!("{key} = {value}\n"));
-        let text = String::from_iter(grid.then(|| "[grid]\n".to_string()).into_iter().chain(lines));
-        let read = std::panic::catch_unwind(|| Sweep::read(&text, "x.toml", &[], true).is_ok());
-        prop_assert!(read.is_ok(), "{}", text);
+    fn no_text_makes_a_sweep_panic(text in "(\\[grid\\]\n)?([a-z.\"]{0,12} ?= ?[\\[\\]0-9a-z,.\"{}]{0,20}\n){0,6}") {
+        let _ = Sweep::read(&text, "x.toml", &[], true);
     }
 }
 
