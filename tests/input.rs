@@ -422,6 +422,8 @@ fn a_wrong_value_by_flag_is_wrong_usage_wherever_it_is_found() {
         &["sweep", "grid.toml", "--fitness", "G"],
         &["sweep", "grid.toml", "--axes", "steps"],
         &["paper", "--trials", "0"],
+        &["paper", "--set", "learning.fitness=G"],
+        &["paper", "--questions=d", "--set", "learning.fitness=G"],
         &["replay", "run", "--trial", "2"],
         &["replay", "run", "--generation", "5"],
         &["replay", "run", "--compare", "5"],

@@ -1008,6 +1008,8 @@ fn the_papers_figures_come_with_its_claims() {
         "2",
         "--generations",
         "3",
+        "--set",
+        "learning.population=40",
         "--backend",
         "cpu",
         "--quiet",
@@ -1040,6 +1042,7 @@ fn the_papers_figures_come_with_its_claims() {
         arm["mean"][3].as_f64().unwrap() / arm["pois"].as_f64().unwrap()
     };
     for folder in &folders {
+        assert!(fs::read_to_string(folder.join("config.toml")).unwrap().contains("\npopulation = 40\n"));
         let text = fs::read_to_string(folder.join("metrics.csv")).unwrap();
         let champion = text.lines().next().unwrap().split(',').position(|name| name == "champion_g").unwrap();
         let best: Vec<f64> = text

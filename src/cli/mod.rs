@@ -497,7 +497,7 @@ pub struct Overrides {
 }
 
 /// The flag that sets any key of a config.
-#[derive(clap::Args, Default)]
+#[derive(clap::Args, Clone, Default)]
 pub struct SetKeys {
     /// Set any config key, for example world.steps=60; can be repeated
     #[arg(long, help_heading = IN_CONFIG, value_name = "KEY=VALUE", value_parser = assignment)]

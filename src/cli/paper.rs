@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use super::console::Console;
 use super::recovery::{self, Checkpoints, Loss};
-use super::{Error, Overrides, Printed, RunOptions, There, number};
+use super::{Error, Overrides, Printed, RunOptions, SetKeys, There, number};
 use crate::config::Override;
 use crate::escape::PathExt;
 use crate::ops;
@@ -33,6 +33,8 @@ pub struct Args {
     #[arg(long, value_name = "N", value_parser = number)]
     seed: Option<String>,
     #[command(flatten)]
+    set: SetKeys,
+    #[command(flatten)]
     there: There,
     #[command(flatten)]
     printed: Printed,
@@ -46,9 +48,9 @@ pub struct Args {
 
 impl Args {
     fn overrides(&self) -> Vec<Override> {
-        let Args { seed, trials, generations, .. } = self;
+        let Args { seed, trials, generations, set, .. } = self;
         let [seed, trials, generations] = [seed, trials, generations].map(Clone::clone);
-        let overrides = Overrides { seed, trials, generations, ..Overrides::default() };
+        let overrides = Overrides { seed, trials, generations, set: set.clone(), ..Overrides::default() };
         [overrides.list(), self.checkpoints.list()].concat()
     }
 

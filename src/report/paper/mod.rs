@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use super::curves::{Band, Curve, Figure, Panel};
 use crate::baseline::Baseline;
-use crate::config::{Config, ConfigError, Fitness, Override, Paradigm};
+use crate::config::{Config, ConfigError, Fitness, Override, Paradigm, Problem};
 use crate::model::policy::Actions;
 use crate::statistics::Average;
 use crate::trainer::Row;
@@ -71,14 +71,28 @@ pub struct Experiment {
     pub best: Vec<Vec<f64>>,
 }
 
+/// The keys in which the experiments differ.
+const VARIED: [&str; 3] = ["learning.paradigm", "learning.fitness", "policy.actions"];
+
 /// Returns all experiments of the paper, with some keys changed in each.
 ///
 /// The order is by layout, then paradigm, then fitness. The experiments that "learn to select between policies" follow.
 /// They are all-leaders, on the layouts of the paper's figures.
 ///
 /// # Errors
-/// An override is invalid.
+/// An override is invalid, or is of a key in which the experiments differ.
 pub fn arms(overrides: &[Override]) -> Result<Vec<Experiment>, ConfigError> {
+    let problems: Vec<_> = overrides
+        .iter()
+        .filter(|set| VARIED.contains(&set.key.as_str()))
+        .map(|set| {
+            let message = "the paper's experiments differ in this key: leave it out".to_string();
+            Problem { line: None, key: set.name.clone(), message }
+        })
+        .collect();
+    if !problems.is_empty() {
+        return Err(ConfigError::Invalid { name: "the paper's experiments".into(), problems, unlisted: 0 });
+    }
     let shown = |layout: &Layout| layout.figure.is_some();
     let places = LAYOUTS.into_iter().flat_map(|layout| PARADIGMS.map(|paradigm| (layout, paradigm, false)));
     let rivals = LAYOUTS.into_iter().filter(shown).map(|layout| (layout, Paradigm::AllLeaders, true));
