@@ -37,9 +37,9 @@ fn shader(expression: &str) -> String {
     )
 }
 
-fn foreign(expression: &str) -> Vec<String> {
+fn inexact(expression: &str) -> Vec<String> {
     let (module, _) = exact::parse(&shader(expression)).unwrap_or_else(|error| panic!("{expression}: {error}"));
-    exact::foreign_operations(&module)
+    exact::inexact_operations(&module)
 }
 
 fn files(folder: &Path) -> Vec<PathBuf> {
@@ -61,7 +61,7 @@ fn every_shader_file_is_walked() {
 fn no_shader_leaves_the_core() {
     for (name, text) in shaders() {
         let (module, _) = exact::parse(&text).unwrap_or_else(|error| panic!("{name} {error}"));
-        assert_eq!(exact::foreign_operations(&module), Vec::<String>::new(), "{name}");
+        assert_eq!(exact::inexact_operations(&module), Vec::<String>::new(), "{name}");
     }
 }
 
@@ -84,7 +84,7 @@ fn the_lint_knows_the_core() {
         "select(0u, 1u, any(v < u) || all(v == u))",
         "atomicAdd(&word, 1u) + atomicLoad(&word)",
     ] {
-        assert_eq!(foreign(inside), Vec::<String>::new(), "{inside}");
+        assert_eq!(inexact(inside), Vec::<String>::new(), "{inside}");
     }
 }
 
@@ -125,18 +125,18 @@ fn the_lint_names_what_is_outside() {
         ("unpack2x16snorm(j).x", "Unpack2x16snorm"),
         ("(values.m * v).x", "Matrix"),
     ] {
-        let found = foreign(outside);
+        let found = inexact(outside);
         assert!(found.iter().any(|line| line.starts_with("main: ") && line.contains(named)), "{outside}: {found:?}");
     }
 }
 
 #[test]
-fn a_foreign_operation_inside_a_function_and_a_loop_is_found() {
+fn an_inexact_operation_inside_a_function_and_a_loop_is_found() {
     let text = "fn deep(x: f32) -> f32 { var y = x; loop { if y > 9.0 { break; } y = y + 1.0 / x; } return y; }
         @group(0) @binding(1) var<storage, read_write> value: f32;
         @compute @workgroup_size(1) fn main() { value = deep(value); }";
     let (module, _) = exact::parse(text).expect("it is sound WGSL");
-    assert_eq!(exact::foreign_operations(&module), ["deep: float Divide"]);
+    assert_eq!(exact::inexact_operations(&module), ["deep: float Divide"]);
 }
 
 /// Functions that Rust takes from the platform's mathematical library, which rounds them as it likes: results and
@@ -408,7 +408,7 @@ fn all_of_the_core_can_be_guarded() {
             agents[group.x * 64u + lane] = agent;
         }";
     let (module, _) = exact::parse(text).unwrap_or_else(|error| panic!("{error}"));
-    assert_eq!(exact::foreign_operations(&module), Vec::<String>::new());
+    assert_eq!(exact::inexact_operations(&module), Vec::<String>::new());
     let guarded = exact::guarded(&module).unwrap_or_else(|error| panic!("{error}"));
     assert!(exact::unguarded(&module).expect("it is valid") > 10);
     assert_eq!(exact::unguarded(&guarded).expect("it is valid"), 0);
@@ -430,7 +430,7 @@ fn all_of_the_core_can_be_guarded() {
 #[test]
 fn shaders_that_no_pass_can_save_are_refused() {
     let (module, _) = exact::parse(&shader("x / y")).expect("it is valid");
-    assert!(matches!(exact::guarded(&module), Err(ShaderError::Foreign(_))));
+    assert!(matches!(exact::guarded(&module), Err(ShaderError::Inexact(_))));
     let (module, _) = exact::parse(&shader("x * y").replace("binding(1)", "binding(0)")).expect("it is valid");
     assert!(matches!(exact::guarded(&module), Err(ShaderError::GuardTaken)));
     let error = exact::parse(&shader("x * nothing")).expect_err("it has no such name").to_string();

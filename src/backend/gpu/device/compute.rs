@@ -120,7 +120,7 @@ impl Gpu {
     /// must match the layout, `checked` or not.
     ///
     /// # Errors
-    /// The shader leaves the exact core, exceeds the device's limits, or the driver refuses it.
+    /// The shader uses operations that differ between devices, exceeds the device's limits, or the driver refuses it.
     #[expect(unsafe_code, reason = "shaders of the crate's own are compiled without bounds checks")]
     pub unsafe fn pipeline(
         &self,
