@@ -1,7 +1,7 @@
 // The arithmetic ceiling: independent chains in registers, 6 of products and 6 of sums per thread. One iteration is
 // OPERATIONS_PER_ITERATION lane operations (src/bench/gpu_ceiling.rs).
 
-// Factor, term, and a sum that never results.
+// A factor, a term, and a value that the sum never equals.
 @group(0) @binding(1) var<storage, read> numbers: array<f32>;
 // The number of iterations.
 @group(0) @binding(2) var<storage, read> turns: array<u32>;

@@ -11,7 +11,7 @@
 //   TALLY      whether a follower counts the leaders it sees in registers (SIGHTS of them), not in the record
 //   shape      the sizes
 //   variant    the choices between formulas
-//   adopt      sets both for a task
+//   set_shape      sets both for a task
 //   decide     a leader's policy
 //
 // Neighbouring threads play the same agent of neighbouring teams. They execute the same code, load neighbouring
@@ -43,7 +43,7 @@ struct Agent {
     team: u32,
     agent: u32,
     // Its index in `positions`.
-    seat: u32,
+    index: u32,
     x: f32,
     y: f32,
     hx: f32,
@@ -58,16 +58,16 @@ struct Agent {
     force: vec2<f32>,
 }
 
-// Returns the agent that place `index` of the workgroup plays.
-fn find_seat(index: u32, teams: u32) -> Agent {
+// Returns the agent of a place in the workgroup.
+fn assign_agent(place: u32, teams: u32) -> Agent {
     var agent: Agent;
     let leaders = shape.teams * shape.leaders;
     let first_follower = (leaders + ROLE - 1u) / ROLE * ROLE;
-    let follows = index >= first_follower;
-    agent.seat = select(index, index - first_follower + leaders, follows);
-    agent.team = agent.seat % shape.teams;
-    agent.agent = agent.seat / shape.teams;
-    agent.plays = (follows || index < leaders) && agent.agent < shape.agents && agent.team < teams;
+    let follows = place >= first_follower;
+    agent.index = select(place, place - first_follower + leaders, follows);
+    agent.team = agent.index % shape.teams;
+    agent.agent = agent.index / shape.teams;
+    agent.plays = (follows || place < leaders) && agent.agent < shape.agents && agent.team < teams;
     return agent;
 }
 
@@ -156,7 +156,7 @@ fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
 }
 
 // Moves the agent.
-fn go(me: ptr<function, Agent>) {
+fn move_agent(me: ptr<function, Agent>) {
     let next = (*me).next;
     let heading = renormalize(next.hx, next.hy);
     let speed = accelerate((*me).speed, next.speed);
@@ -257,7 +257,7 @@ fn resume(task: Task, me: ptr<function, Agent>) {
 }
 
 // Stores the state at the end of a dispatch.
-fn leave(task: Task, me: ptr<function, Agent>) {
+fn store_state(task: Task, me: ptr<function, Agent>) {
     for (var leader = 0u; TALLY && leader < shape.leaders && (*me).agent >= shape.leaders; leader++) {
         record[sight(task, me, leader)] = (*me).seen[leader];
     }
@@ -277,20 +277,20 @@ fn episode(
     let index = workgroup.y * workgroups.x + workgroup.x;
     let task = tasks[index];
     world = worlds[task.world];
-    adopt(task);
+    set_shape(task);
 
-    var crew: array<Agent, SLOTS>;
+    var agents: array<Agent, SLOTS>;
     for (var slot = 0u; slot < SLOTS; slot++) {
-        var me = find_seat(slot * WORKGROUP + thread, task.teams);
+        var me = assign_agent(slot * WORKGROUP + thread, task.teams);
         if me.plays {
             if task.first == 0u {
                 begin(task, &me);
             } else {
                 resume(task, &me);
             }
-            positions[me.seat] = vec2(me.x, me.y);
+            positions[me.index] = vec2(me.x, me.y);
         }
-        crew[slot] = me;
+        agents[slot] = me;
     }
     workgroupBarrier();
 
@@ -301,29 +301,29 @@ fn episode(
             watch(task, step, now, thread);
         }
         for (var slot = 0u; slot < SLOTS; slot++) {
-            var me = crew[slot];
+            var me = agents[slot];
             if me.plays {
                 if me.agent < shape.leaders {
                     lead(task, now + me.team, &me);
                 } else {
                     follow(task, now + me.team, &me);
                 }
-                go(&me);
-                positions[next + me.seat] = vec2(me.x, me.y);
+                move_agent(&me);
+                positions[next + me.index] = vec2(me.x, me.y);
                 if TRACE {
                     trace(task, step + 1u, &me);
                 }
             }
-            crew[slot] = me;
+            agents[slot] = me;
         }
         workgroupBarrier();
         couple(task, step, next, thread);
         now = next;
     }
     for (var slot = 0u; slot < SLOTS; slot++) {
-        var me = crew[slot];
+        var me = agents[slot];
         if me.plays {
-            leave(task, &me);
+            store_state(task, &me);
         }
     }
     // Empty tasks have no status word. Later dispatches of a task count up, so that none of them can be missing.

@@ -78,8 +78,8 @@ fn sizes(pull: SteeringForce) -> vec2<f32> {
 
 // Turns the heading towards the force by at most the maximum turn. Returns the heading and the wanted speed.
 //
-// No angle is computed. If the force's direction is within the maximum turn, it becomes the heading; its sine or cosine
-// tells. Otherwise the heading turns by the maximum, to the side of the force.
+// No angle is computed. The sine or cosine shows whether the force's direction is within the maximum turn. If so, it
+// becomes the heading. Otherwise the heading turns by the maximum, to the side of the force.
 fn steer(pull: SteeringForce, sizes: vec2<f32>, hx: f32, hy: f32, speed: f32) -> Course {
     let force2 = sizes.x;
     let inverse = sizes.y;

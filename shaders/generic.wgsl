@@ -1,4 +1,4 @@
-// What the generic kernel has instead of constants: the sizes of a task's world.
+// The sizes of a task's world, which are constants in specialised kernels.
 //
 // The host prepends:
 //   WIDEST         the widest layer of any policy, inputs included
@@ -8,7 +8,7 @@
 var<private> shape: Shape;
 var<private> variant: Variant;
 
-fn adopt(task: Task) {
+fn set_shape(task: Task) {
     let agents = world.leaders + world.followers;
     // An empty task has no team, but the number is a divisor.
     let teams = max(task.teams, 1u);

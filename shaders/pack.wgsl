@@ -153,12 +153,12 @@ fn pack(
     }
     let nobody = select(0xffffu, 0xffu, sizes.leaders < 255u);
     let bits = select(16u, 8u, sizes.leaders < 255u);
-    let a_word = 32u / bits;
-    let owner_items = select((sizes.followers + a_word - 1u) / a_word * task.teams, 0u, task.owners == NOWHERE);
+    let owners_per_word = 32u / bits;
+    let owner_items = select((sizes.followers + owners_per_word - 1u) / owners_per_word * task.teams, 0u, task.owners == NOWHERE);
     for (var item = thread; item < owner_items; item += WORKGROUP) {
         let team = item % task.teams;
-        let first = item / task.teams * a_word;
-        let last = min(first + a_word, sizes.followers);
+        let first = item / task.teams * owners_per_word;
+        let last = min(first + owners_per_word, sizes.followers);
         var word = 0u;
         for (var follower = first; follower < last; follower++) {
             word |= owner(task, sizes, team, follower, nobody) << ((follower - first) * bits);

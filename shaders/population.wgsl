@@ -3,7 +3,7 @@
 //
 // The host prepends:
 //   WORKGROUP         threads per workgroup, a multiple of TILE
-//   Brood, GatherJob  declared in src/backend/gpu/population.rs
+//   BreedJob, GatherJob  declared in src/backend/gpu/population.rs
 
 // The range of sizes of a weight other than 0.
 const MIN_WEIGHT: f32 = 0x1p-30f;
@@ -11,7 +11,7 @@ const MAX_WEIGHT: f32 = 1048576.0;
 
 const UNCHANGED: u32 = 0x80000000u;
 
-@group(0) @binding(1) var<storage, read> brood: Brood;
+@group(0) @binding(1) var<storage, read> breed_job: BreedJob;
 // The slot that each slot is copied from, with UNCHANGED set if it does not mutate.
 @group(0) @binding(2) var<storage, read> plan: array<u32>;
 @group(0) @binding(3) var<storage, read> policies: array<f32>;
@@ -42,8 +42,8 @@ fn within_limits(weight: f32) -> f32 {
 // Returns a mutated weight. `index` is its index in the policy, `noises` the policy's noise key.
 fn mutated(noises: vec4<u32>, index: u32, weight: f32) -> f32 {
     let words = words(noises, index);
-    let plain = normal(words.x, words.y) * brood.sigma;
-    let noise = select(plain, plain * weight, brood.scaled != 0u);
+    let plain = normal(words.x, words.y) * breed_job.sigma;
+    let noise = select(plain, plain * weight, breed_job.scaled != 0u);
     return within_limits(weight + noise);
 }
 
@@ -55,41 +55,41 @@ fn breed(
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    let counters = (brood.parameters + 63u) / 64u * 16u;
+    let counters = (breed_job.parameters + 63u) / 64u * 16u;
     let item = (workgroup.y * workgroups.x + workgroup.x) * WORKGROUP + thread;
     let slot = item / counters;
     let counter = item % counters;
-    if slot < brood.slots {
+    if slot < breed_job.slots {
         fill(slot, counter);
     }
     storageBarrier();
     if thread == 0u {
-        atomicAdd(&finished[brood.leader], 1u);
+        atomicAdd(&finished[breed_job.leader], 1u);
     }
 }
 
 // Copies four weights of a slot's parent, and mutates them.
 fn fill(slot: u32, counter: u32) {
-    let planned = plan[brood.parents + slot];
-    let parent = (planned & ~UNCHANGED) * brood.parameters;
-    let child = slot * brood.parameters;
+    let planned = plan[breed_job.parents + slot];
+    let parent = (planned & ~UNCHANGED) * breed_job.parameters;
+    let child = slot * breed_job.parameters;
     let first = counter / 16u * 64u + counter % 16u;
-    for (var word = 0u; word < 4u && first + 16u * word < brood.parameters; word++) {
+    for (var word = 0u; word < 4u && first + 16u * word < breed_job.parameters; word++) {
         let index = first + 16u * word;
         children[child + index] = policies[parent + index];
     }
     if (planned & UNCHANGED) != 0u {
         return;
     }
-    let key = pcg4d(vec4(brood.key[0], brood.key[1], brood.key[2] ^ slot, brood.key[3]));
-    let below = words(key, counter) < vec4(brood.threshold);
+    let key = pcg4d(vec4(breed_job.key[0], breed_job.key[1], breed_job.key[2] ^ slot, breed_job.key[3]));
+    let below = words(key, counter) < vec4(breed_job.threshold);
     let bits = select(vec4(0u), vec4(1u, 2u, 4u, 8u), below);
     // Each thread iterates over its own mutations only: a warp takes as many iterations as its busiest thread.
-    var left = select(bits.x | bits.y | bits.z | bits.w, 15u, brood.all != 0u);
+    var left = select(bits.x | bits.y | bits.z | bits.w, 15u, breed_job.all != 0u);
     let noises = words(key, 0xffffffffu);
     while left != 0u {
         let index = first + 16u * firstTrailingBit(left);
-        if index < brood.parameters {
+        if index < breed_job.parameters {
             children[child + index] = mutated(noises, index, policies[parent + index]);
         }
         left &= left - 1u;
@@ -141,8 +141,8 @@ fn gather(
     let policy = first_policy + column;
     let team = policy % job.teams;
     let leader = job.first + policy / job.teams;
-    let before = team / job.teams_a_task * job.teams_a_task;
-    let teams = min(job.teams_a_task, job.teams - before);
+    let before = team / job.teams_per_task * job.teams_per_task;
+    let teams = min(job.teams_per_task, job.teams - before);
     let fours = (job.parameters + 3u) / 4u;
     let task = job.weights + before * job.leaders * fours;
     for (var row = thread / TILE; row < TILE / 4u && policy < played; row += WORKGROUP / TILE) {

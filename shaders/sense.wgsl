@@ -1,6 +1,6 @@
-// What a leader senses: the density of POIs and of agents in four quadrants around its heading (paper, Section 3.1).
+// Sensing: the density of POIs and of agents in four quadrants around a leader's heading (paper, Section 3.1).
 
-// Returns the density of an entity at offset (`dx`, `dy`), if it is in range.
+// Returns the density of an entity at offset (`dx`, `dy`). The caller checks that it is in range.
 fn density(dx: f32, dy: f32) -> f32 {
     let d2 = dx * dx + dy * dy;
     if variant.density == DENSITY_LINEAR {

@@ -222,7 +222,7 @@ struct Round<'a> {
 /// Plays all teams from all their starts as one batch. Returns the POIs that each team of each round observes over all
 /// starts, `[rounds][teams]`.
 fn play(backend: &mut dyn Backend, rounds: &[Round<'_>]) -> Result<Vec<Vec<u32>>, BackendError> {
-    let teams = |round: &Round<'_>| evolve::one_policy_a_team(round.teams, round.world.leaders());
+    let teams = |round: &Round<'_>| evolve::aligned_teams(round.teams, round.world.leaders());
     let teams: Vec<Vec<u32>> = rounds.iter().map(teams).collect();
     let mut groups = Vec::new();
     for (round, teams) in rounds.iter().zip(&teams) {

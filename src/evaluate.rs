@@ -13,7 +13,7 @@ use crate::host::Instant;
 use crate::statistics::{self, Estimate};
 use crate::world::World;
 
-pub use crate::evolve::one_policy_a_team;
+pub use crate::evolve::aligned_teams;
 
 /// The fitnesses of an evaluation, besides G.
 pub(crate) const SCORES: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp];

@@ -67,7 +67,7 @@ pub enum Failure {
     /// The number of weights does not match the teams.
     #[error(
         "{found} weights for {teams} teams; [leaders][teams][parameters] are [{leaders}][{teams}][{parameters}], or \
-         [1][{teams}][{parameters}] where leaders share a policy"
+         [1][{teams}][{parameters}] if leaders share a policy"
     )]
     Weights {
         /// Number of weights given.
@@ -80,7 +80,9 @@ pub enum Failure {
         parameters: usize,
     },
     /// The number of trials with given policies does not match the config.
-    #[error("policies of {found} trials, where {trials} are trained; give each its own, or all the same")]
+    #[error(
+        "{found} trials have policies, but the config has {trials} trials; pass one array for all trials, or one per trial"
+    )]
     Trials {
         /// Number of trials given.
         found: usize,
@@ -89,7 +91,7 @@ pub enum Failure {
     },
     /// A weight is too large or not a number.
     #[error(
-        "weight {parameter} of the policy of leader {leader} in team {team} is {value}, allowed is a size up to {MAX_WEIGHT}"
+        "weight {parameter} of the policy of leader {leader} in team {team} is {value}, allowed are -{MAX_WEIGHT} to {MAX_WEIGHT}"
     )]
     Weight {
         /// Index of the leader in its team.
@@ -103,7 +105,7 @@ pub enum Failure {
     },
     /// The starts cannot be drawn.
     #[error(
-        "{episodes} episodes from starts moved by up to {jitter}; there may be 1 to {MAX_EPISODES}, and a jitter from 0 on"
+        "{episodes} episodes from starts moved by up to {jitter}; allowed are 1 to {MAX_EPISODES} episodes and a jitter of 0 or more"
     )]
     Starts {
         /// Number of episodes per team.
@@ -297,7 +299,7 @@ impl Trained {
         })?;
         if !in_turn {
             let path = folder.join(crate::record::folder::METRICS);
-            let reason = "its rows are not one a trial and generation, in their order".into();
+            let reason = "it must have one row per trial and generation, in order".into();
             return Err(RecordError::Damaged { path, reason }.into());
         }
         let (found, expected) = (rows.len(), config.learning.trials * (config.learning.generations + 1));
@@ -506,7 +508,7 @@ pub fn play_until(
     starts: &Starts,
     each: &mut dyn FnMut(evaluate::Batch<'_>) -> ControlFlow<()>,
 ) -> Result<Evaluation, Failure> {
-    let cast = Cast::new(config, teams, weights, starts)?;
+    let cast = CheckedTeams::new(config, teams, weights, starts)?;
     let group = Group { fitnesses: scores_of(config), ..cast.group(&cast.world.starts) };
     Ok(evaluate::evaluate_until(backend, &group, starts, &mut |_| (), each)?)
 }
@@ -558,7 +560,7 @@ pub fn record(
     noise: Option<ActionNoise<'_>>,
     arrays: StepArrays<'_>,
 ) -> Result<Vec<GroupScores>, Failure> {
-    let cast = Cast::new(config, teams, weights, starts)?;
+    let cast = CheckedTeams::new(config, teams, weights, starts)?;
     if episodes.end > starts.episodes() || episodes.is_empty() {
         return Err(Failure::NoEpisode { episode: episodes.end, episodes: starts.episodes() });
     }
@@ -605,14 +607,14 @@ pub fn trace(
     starts: &Starts,
     episode: usize,
 ) -> Result<Traced, Failure> {
-    let cast = Cast::new(config, teams, weights, starts)?;
+    let cast = CheckedTeams::new(config, teams, weights, starts)?;
     if episode >= starts.episodes() {
         return Err(Failure::NoEpisode { episode, episodes: starts.episodes() });
     }
     let world = &cast.world;
     let (agents, leaders, steps) = (world.agents(), world.leaders(), world.steps());
-    let a_team = (steps + 1) * agents * 5 + steps * leaders * (INPUTS + OUTPUTS) + world.set_words();
-    let bytes = a_team as u128 * 4 * teams as u128;
+    let words_per_team = (steps + 1) * agents * 5 + steps * leaders * (INPUTS + OUTPUTS) + world.set_words();
+    let bytes = words_per_team as u128 * 4 * teams as u128;
     let fits = usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok());
     if !fits {
         return Err(Failure::Memory { what: "all steps of all teams", bytes });
@@ -661,7 +663,7 @@ pub fn stepper(config: &Config, teams: usize, recording: bool) -> Result<Stepper
 }
 
 /// Teams of given policies after all checks.
-struct Cast<'a> {
+struct CheckedTeams<'a> {
     world: World,
     weights: Cow<'a, [f32]>,
     policies: usize,
@@ -669,8 +671,8 @@ struct Cast<'a> {
     teams: Vec<u32>,
 }
 
-impl<'a> Cast<'a> {
-    fn new(config: &Config, teams: usize, weights: &'a [f32], starts: &Starts) -> Result<Cast<'a>, Failure> {
+impl<'a> CheckedTeams<'a> {
+    fn new(config: &Config, teams: usize, weights: &'a [f32], starts: &Starts) -> Result<CheckedTeams<'a>, Failure> {
         let world = World::new(&*config.validate()?);
         if !(1..=MAX_POPULATION).contains(&teams) {
             return Err(Failure::Teams(teams));
@@ -698,13 +700,13 @@ impl<'a> Cast<'a> {
             let (policy, parameter, value) = (place / parameters, place % parameters, weights[place]);
             return Err(Failure::Weight { leader: policy / teams, team: policy % teams, parameter, value });
         }
-        let order = evaluate::one_policy_a_team(teams, leaders);
+        let order = evaluate::aligned_teams(teams, leaders);
         let sharing = if shared { Sharing::Shared } else { Sharing::PerLeader };
-        Ok(Cast { world, weights, policies: teams, sharing, teams: order })
+        Ok(CheckedTeams { world, weights, policies: teams, sharing, teams: order })
     }
 
     fn group<'b>(&'b self, starts: &'b [glam::Vec2]) -> Group<'b> {
-        let &Cast { ref world, ref weights, policies, sharing, ref teams } = self;
+        let &CheckedTeams { ref world, ref weights, policies, sharing, ref teams } = self;
         Group { world, starts, weights: weights[..].into(), policies, sharing, teams, fitnesses: &[] }
     }
 }

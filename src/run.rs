@@ -13,7 +13,7 @@ use crate::memory::{self, TooLittle};
 use crate::record::checkpoint::{self, Checkpoint, Keeper, Schedule};
 use crate::record::disk::Disk;
 use crate::record::folder::{
-    self, FileSums, Folder, METRICS, Note, Origin, POLICIES, Run, RunSums, Start, StartFrom, Status, Story,
+    self, FileSums, FirstAndLastRows, Folder, METRICS, Note, Origin, POLICIES, Run, RunSums, Start, StartFrom, Status,
 };
 use crate::record::metrics::{self, Extent};
 use crate::record::policies::{self, Init, Policies};
@@ -24,6 +24,7 @@ use crate::trainer::{Row, Snapshot, SnapshotError, Trainer};
 const FLUSH: Duration = Duration::from_secs(1);
 /// Maximum number of runs whose files are flushed at the same time, each on its own thread.
 const MAX_WRITERS: usize = 32;
+
 /// Reason why a run failed.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
@@ -107,7 +108,7 @@ pub struct Progress<'a> {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Results {
     /// Rows of the first and the last generation of every trial.
-    pub story: Story,
+    pub rows: FirstAndLastRows,
     /// Digest of the run. See [`Folder::digest`].
     pub digest: String,
 }
@@ -135,7 +136,7 @@ pub struct Session {
 /// A run in its folder.
 struct Member {
     config: Config,
-    going: Option<Going>,
+    unfinished: Option<Unfinished>,
     folder: Folder,
     run: Run,
     results: Option<Results>,
@@ -144,7 +145,7 @@ struct Member {
 }
 
 /// State of an unfinished run.
-struct Going {
+struct Unfinished {
     /// Index of its experiment in the trainer.
     experiment: usize,
     metrics: metrics::Writer,
@@ -179,7 +180,7 @@ impl Session {
         start: Start,
         disk: &Disk,
     ) -> Result<(Session, Vec<(usize, Note)>), RunError> {
-        Session::open_all(runs, StartFrom::Unsaid, start, disk)
+        Session::open_all(runs, StartFrom::Unspecified, start, disk)
     }
 
     fn open_all(
@@ -207,37 +208,37 @@ impl Session {
             members.push(member);
             snapshots.push(snapshot);
         }
-        let going = members.iter().zip(configs).filter(|(member, _)| member.going.is_some());
-        let mut trainer = Trainer::new(going.map(|(_, config)| config));
+        let unfinished = members.iter().zip(configs).filter(|(member, _)| member.unfinished.is_some());
+        let mut trainer = Trainer::new(unfinished.map(|(_, config)| config));
         let mut generations = Vec::with_capacity(members.len());
         let mut arms = Vec::new();
         for (run, (member, snapshot)) in members.iter_mut().zip(snapshots).enumerate() {
-            let Some(going) = &mut member.going else {
+            let Some(unfinished) = &mut member.unfinished else {
                 generations.push(member.config.learning.generations + 2);
                 continue;
             };
-            going.experiment = arms.len();
+            unfinished.experiment = arms.len();
             arms.push(run);
             let fits = match snapshot {
-                Beginning::Checkpoint(snapshot) => trainer.restore(going.experiment, snapshot),
-                Beginning::Policies(Init { trials, .. }) => {
+                InitialState::Checkpoint(snapshot) => trainer.restore(unfinished.experiment, snapshot),
+                InitialState::Policies(Init { trials, .. }) => {
                     (trials.into_iter().enumerate()).all(|(trial, Policies { policies, weights })| {
-                        trainer.start_from(going.experiment, trial, policies, &weights)
+                        trainer.start_from(unfinished.experiment, trial, policies, &weights)
                     })
                 }
-                Beginning::Chance => true,
+                InitialState::Random => true,
             };
             if !fits {
                 unreachable!("checkpoints and policies are read in the sizes of their config");
             }
-            generations.push(trainer.generation(going.experiment));
+            generations.push(trainer.generation(unfinished.experiment));
         }
         Ok((Session { members, generations, trainer, arms, since: Instant::now() }, notes))
     }
 
     /// Returns whether all runs are finished.
     pub fn is_done(&self) -> bool {
-        self.members.iter().all(|member| member.going.is_none())
+        self.members.iter().all(|member| member.unfinished.is_none())
     }
 
     /// See [`Progress::generations`].
@@ -271,12 +272,12 @@ impl Session {
     /// The backend fails (earlier generations are saved first), or a file cannot be written.
     pub fn train(&mut self, player: &mut OpenBackend, options: &mut Options<'_>) -> Result<Ended, RunError> {
         self.since = Instant::now();
-        for member in self.members.iter_mut().filter(|member| member.going.is_some()) {
+        for member in self.members.iter_mut().filter(|member| member.unfinished.is_some()) {
             member.run.sessions = member.run.sessions.saturating_add(1);
             member.run.command = options.command.into();
             member.run.origin = Some(Origin::of(&member.config));
         }
-        self.settle_on(player);
+        self.record_machine(player);
         self.write_runs(Status::Running)?;
         self.save_starts()?;
         let (mut flushed, mut setback, mut told) = (Instant::now(), None, false);
@@ -295,11 +296,11 @@ impl Session {
                     Some(other) => {
                         setback = None;
                         *player = other;
-                        self.settle_on(player);
+                        self.record_machine(player);
                         continue;
                     }
                     None => {
-                        let generation = self.going().map(|run| self.generations[run]).min().unwrap_or(0);
+                        let generation = self.unfinished().map(|run| self.generations[run]).min().unwrap_or(0);
                         return Err(RunError::Backend { error, generation, saved: self.stop().map_err(Box::new) });
                     }
                 },
@@ -348,7 +349,7 @@ impl Session {
     pub fn end(&mut self) -> Result<usize, RunError> {
         let mut last = 0;
         for member in &mut self.members {
-            if let Some(Going { experiment, keeper, .. }) = &mut member.going {
+            if let Some(Unfinished { experiment, keeper, .. }) = &mut member.unfinished {
                 let shorter = checkpoint::of_length(&member.config, self.trainer.end(*experiment));
                 if shorter != member.config {
                     keeper.shorten(&shorter)?;
@@ -363,13 +364,13 @@ impl Session {
     }
 
     /// Returns the indices of the unfinished runs.
-    fn going(&self) -> impl Iterator<Item = usize> {
-        self.members.iter().enumerate().filter(|(_, member)| member.going.is_some()).map(|(run, _)| run)
+    fn unfinished(&self) -> impl Iterator<Item = usize> {
+        self.members.iter().enumerate().filter(|(_, member)| member.unfinished.is_some()).map(|(run, _)| run)
     }
 
     /// Records the backend of all unfinished runs.
-    fn settle_on(&mut self, (backend, machine): &OpenBackend) {
-        for run in self.members.iter_mut().filter(|member| member.going.is_some()).map(|member| &mut member.run) {
+    fn record_machine(&mut self, (backend, machine): &OpenBackend) {
+        for run in self.members.iter_mut().filter(|member| member.unfinished.is_some()).map(|member| &mut member.run) {
             let Machine { backend: kind, adapter, driver, threads } = machine.clone();
             let (version, commit) = (crate::VERSION.into(), crate::COMMIT.map(String::from));
             let description = backend.describe();
@@ -396,7 +397,7 @@ impl Session {
         let over = self.members.iter_mut().zip(&self.generations);
         let over = over.filter(|(member, next)| **next > member.config.learning.generations + 1);
         let (arms, over): (Vec<usize>, Vec<&mut Member>) =
-            over.filter_map(|(member, _)| Some((member.going.as_ref()?.experiment, member))).unzip();
+            over.filter_map(|(member, _)| Some((member.unfinished.as_ref()?.experiment, member))).unzip();
         if over.is_empty() {
             return Ok(());
         }
@@ -413,7 +414,7 @@ impl Session {
     fn save(&mut self) -> Result<(), RunError> {
         let seconds = self.seconds();
         let (mut held, mut writing) = (Ok(()), Vec::new());
-        for run in self.going().collect::<Vec<_>>() {
+        for run in self.unfinished().collect::<Vec<_>>() {
             let member = &mut self.members[run];
             match member.save(&mut self.trainer, self.generations[run], seconds) {
                 // The populations of the other runs may still be available.
@@ -431,9 +432,9 @@ impl Session {
     /// Writes a checkpoint of every run that starts now from given policies, so that it can be resumed without them.
     fn save_starts(&mut self) -> Result<(), RunError> {
         let seconds = self.seconds();
-        for run in self.going().collect::<Vec<_>>() {
+        for run in self.unfinished().collect::<Vec<_>>() {
             let member = &mut self.members[run];
-            let first = member.going.as_ref().is_some_and(|going| going.keeper.newest().is_none());
+            let first = member.unfinished.as_ref().is_some_and(|unfinished| unfinished.keeper.newest().is_none());
             if member.run.init.is_some() && first && self.generations[run] == 0 {
                 member.save(&mut self.trainer, 0, seconds)?;
             }
@@ -452,8 +453,9 @@ impl Session {
     /// Writes `run.json` of every unfinished run.
     fn write_runs(&mut self, state: Status) -> Result<(), RunError> {
         let seconds = self.seconds();
-        let going = self.members.iter_mut().zip(&self.generations).filter(|(member, _)| member.going.is_some());
-        side_by_side(going.collect(), |(member, &next)| member.write_run(state, next, seconds, None)).map(drop)
+        let unfinished =
+            self.members.iter_mut().zip(&self.generations).filter(|(member, _)| member.unfinished.is_some());
+        side_by_side(unfinished.collect(), |(member, &next)| member.write_run(state, next, seconds, None)).map(drop)
     }
 
     /// Returns the training time of this session in seconds.
@@ -463,10 +465,10 @@ impl Session {
 }
 
 /// State from which a run starts or resumes.
-enum Beginning {
+enum InitialState {
     Checkpoint(Snapshot),
     Policies(Init),
-    Chance,
+    Random,
 }
 
 impl Member {
@@ -478,54 +480,64 @@ impl Member {
         otherwise: StartFrom<'_>,
         start: Start,
         disk: &Disk,
-    ) -> Result<(Member, Beginning, Vec<Note>), RunError> {
+    ) -> Result<(Member, InitialState, Vec<Note>), RunError> {
         let from = init.as_ref().map_or(otherwise, |init| StartFrom::Policies(&init.digest));
         let (folder, found) = Folder::open(&path, start, &config, from, disk.clone())?;
         let run = found.run.unwrap_or_else(|| Run::new(&config));
-        let member = Member { config, going: None, folder, run, results: None, before: 0.0 };
-        if let Some((story, digest)) = found.finished.zip(member.run.digest.clone()) {
-            return Ok((Member { results: Some(Results { story, digest }), ..member }, Beginning::Chance, found.notes));
+        let member = Member { config, unfinished: None, folder, run, results: None, before: 0.0 };
+        if let Some((rows, digest)) = found.finished.zip(member.run.digest.clone()) {
+            return Ok((
+                Member { results: Some(Results { rows, digest }), ..member },
+                InitialState::Random,
+                found.notes,
+            ));
         }
         let (metrics, before, from) = match found.checkpoint {
             Some((Checkpoint { snapshot, seconds, .. }, metrics)) => {
-                (metrics, seconds, Beginning::Checkpoint(snapshot))
+                (metrics, seconds, InitialState::Checkpoint(snapshot))
             }
             None => {
                 let metrics =
                     metrics::Writer::create(&member.folder.disk, &member.folder.file(METRICS), &member.config);
-                (metrics.map_err(member.metrics_failed())?, 0.0, init.map_or(Beginning::Chance, Beginning::Policies))
+                (
+                    metrics.map_err(member.metrics_failed())?,
+                    0.0,
+                    init.map_or(InitialState::Random, InitialState::Policies),
+                )
             }
         };
-        let generation = if let Beginning::Checkpoint(snapshot) = &from { snapshot.generation } else { 0 };
+        let generation = if let InitialState::Checkpoint(snapshot) = &from { snapshot.generation } else { 0 };
         let checkpoints = member.folder.file(folder::CHECKPOINTS);
         let keeper =
             Keeper::new(member.folder.disk.clone(), checkpoints, member.config.clone(), found.kept, generation);
-        let going = Some(Going { experiment: 0, metrics, keeper, ending: None });
-        Ok((Member { going, before, ..member }, from, found.notes))
+        let unfinished = Some(Unfinished { experiment: 0, metrics, keeper, ending: None });
+        Ok((Member { unfinished, before, ..member }, from, found.notes))
     }
 
     fn flush(&mut self) -> Result<(), RunError> {
         let failed = self.metrics_failed();
-        self.going.as_mut().map_or(Ok(()), |going| going.metrics.flush().map_err(failed))
+        self.unfinished.as_mut().map_or(Ok(()), |unfinished| unfinished.metrics.flush().map_err(failed))
     }
 
     fn poll(&mut self) -> Result<(), RunError> {
-        Ok(self.going.as_mut().map_or(Ok(()), |going| going.keeper.poll())?)
+        Ok(self.unfinished.as_mut().map_or(Ok(()), |unfinished| unfinished.keeper.poll())?)
     }
 
     fn wait(&mut self) -> Result<(), RunError> {
-        Ok(self.going.as_mut().map_or(Ok(()), |going| going.keeper.wait())?)
+        Ok(self.unfinished.as_mut().map_or(Ok(()), |unfinished| unfinished.keeper.wait())?)
     }
 
     fn is_due(&self, next: usize) -> bool {
         let config::CheckpointConfig { generations, seconds } = self.config.checkpoint;
-        self.going.as_ref().is_some_and(|going| going.keeper.is_due(&Schedule { generations, seconds }, next))
+        self.unfinished
+            .as_ref()
+            .is_some_and(|unfinished| unfinished.keeper.is_due(&Schedule { generations, seconds }, next))
     }
 
     /// Adds complete rows.
     fn add(&mut self, rows: &[Row], seconds: f64) -> Result<(), RunError> {
         let failed = self.metrics_failed();
-        let Some(Going { metrics, ending, .. }) = &mut self.going else { return Ok(()) };
+        let Some(Unfinished { metrics, ending, .. }) = &mut self.unfinished else { return Ok(()) };
         let mut add = || {
             if rows.iter().any(|row| row.generation == self.config.learning.generations) {
                 *ending = Some(metrics.mark()?.0);
@@ -539,7 +551,7 @@ impl Member {
     /// large checkpoint is written before training continues, because there may not be memory for any copy.
     fn save(&mut self, trainer: &mut Trainer, next: usize, seconds: f64) -> Result<(), RunError> {
         let failed = self.metrics_failed();
-        let Some(Going { experiment, metrics, keeper, .. }) = &mut self.going else { return Ok(()) };
+        let Some(Unfinished { experiment, metrics, keeper, .. }) = &mut self.unfinished else { return Ok(()) };
         keeper.wait()?;
         if keeper.newest() == Some(next) {
             return Ok(());
@@ -560,7 +572,7 @@ impl Member {
     /// Writes the results in an order that leaves a usable checkpoint at any moment.
     fn finish(&mut self, policies: &[&[f32]], end: Snapshot<&[f32]>, seconds: f64) -> Result<(), RunError> {
         let failed = self.metrics_failed();
-        let Some(Going { metrics, keeper, ending, .. }) = &mut self.going else { return Ok(()) };
+        let Some(Unfinished { metrics, keeper, ending, .. }) = &mut self.unfinished else { return Ok(()) };
         let since = Instant::now();
         let (mark, output) = metrics.mark().map_err(failed)?;
         let (init, in_all) = (self.run.init.clone(), self.before + seconds);
@@ -583,12 +595,12 @@ impl Member {
             keeper.wait()?;
         }
         let checksum = policies::write(&self.folder.disk, &path, &self.config, policies)?;
-        let (story, RunSums { run: digest, metrics }) = self.folder.digest(&self.config, policies)?;
+        let (rows, RunSums { run: digest, metrics }) = self.folder.digest(&self.config, policies)?;
         keeper.wait()?;
         self.run.files = Some(FileSums { metrics, policies: checksum });
         self.write_run(Status::Done, next, seconds, Some(digest.clone()))?;
-        self.results = Some(Results { story, digest });
-        self.going = None;
+        self.results = Some(Results { rows, digest });
+        self.unfinished = None;
         Ok(())
     }
 

@@ -190,7 +190,7 @@ fn random_baselines_are_the_best_of_the_teams_that_a_backend_plays() {
 
 /// POIs that each team observes from the world's own starts; team j is every leader's policy j.
 fn observed(world: &World, weights: &[f32], policies: usize) -> Vec<u32> {
-    let teams = evolve::one_policy_a_team(policies, world.leaders());
+    let teams = evolve::aligned_teams(policies, world.leaders());
     let (weights, starts, sharing) = (weights.into(), &world.starts, Sharing::PerLeader);
     let group = Group { world, starts, weights, policies, sharing, teams: &teams, fitnesses: &[] };
     Cpu::default().play(&[group]).unwrap().remove(0).observed
@@ -233,7 +233,7 @@ fn where_pois_move_baselines_are_measured_from_held_out_starts() {
     for (place, policy) in weights.chunks_mut(world.parameters()).enumerate() {
         baseline::constant_policy(&constants[place % policies], policy);
     }
-    let teams = evolve::one_policy_a_team(policies, world.leaders());
+    let teams = evolve::aligned_teams(policies, world.leaders());
     let (weights, starts, sharing) = (weights[..].into(), &world.starts, Sharing::PerLeader);
     let group = Group { world: &world, starts, weights, policies, sharing, teams: &teams, fitnesses: &[] };
     let held_out = Starts::Drawn { episodes: 30, seed: 0, jitter: 0.0, poi_jitter: 5.0 };

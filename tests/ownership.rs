@@ -251,10 +251,10 @@ fn tables_and_pictures_of_others_in_a_sweep_are_left_alone() {
 
 #[test]
 fn only_the_owners_folders_are_written_in_unless_they_are_named() {
-    assert!(ownership::may_enter(1000, 1000, false));
-    assert!(!ownership::may_enter(1001, 1000, false));
-    assert!(!ownership::may_enter(0, 1000, false) && !ownership::may_enter(1000, 0, false));
-    assert!(ownership::may_enter(1001, 1000, true));
+    assert!(ownership::may_write(1000, 1000, false));
+    assert!(!ownership::may_write(1001, 1000, false));
+    assert!(!ownership::may_write(0, 1000, false) && !ownership::may_write(1000, 0, false));
+    assert!(ownership::may_write(1001, 1000, true));
 }
 
 #[cfg(unix)]

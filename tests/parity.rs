@@ -11,7 +11,7 @@ use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::device::Request;
 use flotilla::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy, State, Task};
 use flotilla::backend::gpu::exact::{self, Pass};
-use flotilla::backend::gpu::population::{Brood, GatherJob};
+use flotilla::backend::gpu::population::{BreedJob, GatherJob};
 use flotilla::backend::{Backend, Group, Moment, Weights};
 use flotilla::config::{Config, Coupling, Fitness, Observers, Sharing, ValidConfig};
 use flotilla::evaluate::{SCORES_AND_DT, Starts, evaluate};
@@ -28,7 +28,7 @@ const KERNELS: [Kernel; 2] = [Kernel::Generic, Kernel::Specialised];
 /// One that holds all populations and packs all records.
 fn open(request: &Request, pass: Pass, kernel: Kernel) -> GpuBackend {
     let gpu = gpu::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
-    GpuBackend::new(gpu).unwrap().playing(kernel).holding(ResidencyPolicy::Always).bringing(Records::Packed)
+    GpuBackend::new(gpu).unwrap().playing(kernel).holding(ResidencyPolicy::Always).with_records(Records::Packed)
 }
 
 /// Teams that choose from each leader's own policies, scored by every fitness.
@@ -64,7 +64,7 @@ fn checked_shaders_and_default_limits_agree() {
             for (kernel, seeds) in KERNELS.into_iter().zip([100..112, 100..102]) {
                 let gpu = gpu::open(request.clone()).unwrap();
                 let backend = GpuBackend::new(gpu).unwrap().playing(kernel);
-                let backend = backend.holding(ResidencyPolicy::Always).bringing(Records::Packed);
+                let backend = backend.holding(ResidencyPolicy::Always).with_records(Records::Packed);
                 assert_eq!(check(&Plan::random(seeds, 5), backend).mismatch, None, "{info}, {kernel}, {request:?}");
             }
         }
@@ -129,7 +129,7 @@ fn large_worlds_agree() {
     for (request, info) in support::adapters("large_worlds_agree") {
         let worlds = vec![("crowd".into(), crowd.clone()), ("leaders only".into(), leaders_only.clone())];
         let plan = Plan { worlds, teams: 2, seed: 0, generations: 0 };
-        let backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().bringing(Records::Packed);
+        let backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().with_records(Records::Packed);
         // Training them would take the software drivers minutes: traces and batches are enough.
         let plan = Plan { worlds: plan.worlds.into_iter().map(small_population).collect(), ..plan };
         assert_eq!(check(&plan, backend).mismatch, None, "{info}");
@@ -151,7 +151,7 @@ fn long_episodes_agree() {
         for kernel in KERNELS {
             let plan = Plan { worlds: vec![("long".into(), config.clone())], teams: 9, seed: 0, generations: 0 };
             let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().playing(kernel);
-            let backend = backend.bringing(Records::Packed);
+            let backend = backend.with_records(Records::Packed);
             assert_eq!(check(&plan, backend).mismatch, None, "{info}, {kernel}");
         }
     }
@@ -222,7 +222,7 @@ fn structs_lie_alike_on_both_sides() {
     check::<Constants>(&modules);
     check::<Task>(&modules);
     check::<State>(&modules);
-    check::<Brood>(&modules);
+    check::<BreedJob>(&modules);
     check::<GatherJob>(&modules);
     check::<Moment>(&modules);
 }
@@ -439,7 +439,7 @@ fn own_headings_and_ranges_of_zero_agree() {
         for kernel in KERNELS {
             let plan = Plan { worlds: worlds.clone(), teams: 9, seed: 3, generations: 2 };
             let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().playing(kernel);
-            assert_eq!(check(&plan, backend.bringing(Records::Packed)).mismatch, None, "{info}, {kernel}");
+            assert_eq!(check(&plan, backend.with_records(Records::Packed)).mismatch, None, "{info}, {kernel}");
         }
     }
 }

@@ -92,7 +92,7 @@ fn all_observed(scores: &[GroupScores], pois: u32) -> bool {
 }
 
 fn open(request: &Request, records: Records) -> GpuBackend {
-    GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().bringing(records)
+    GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().with_records(records)
 }
 
 /// Returns the bytes of the status words of this many workgroups.
@@ -347,7 +347,8 @@ fn compiling() {
     for (request, info) in support::adapters("compiling") {
         for (name, configs) in &cases {
             let backend = || GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
-            let gpu = backend().playing(Kernel::Best).holding(ResidencyPolicy::Always).bringing(Records::PackedFrom(0));
+            let gpu =
+                backend().playing(Kernel::Best).holding(ResidencyPolicy::Always).with_records(Records::PackedFrom(0));
             for (what, mut backend) in [("by default", backend()), ("as on a GPU", gpu)] {
                 let mut trainer = Trainer::new(ValidConfig::all(configs).unwrap());
                 let mut seconds = || {

@@ -549,12 +549,12 @@ fn a_changed_config_is_refused_by_the_names_of_its_keys() {
 fn a_folder_is_one_process_at_a_time_and_one_run() {
     let config = small();
     let (_folder, path, _) = stopped_run(&config);
-    let refused = |start| match Folder::open(&path, start, &config, StartFrom::Unsaid, Disk::default()) {
+    let refused = |start| match Folder::open(&path, start, &config, StartFrom::Unspecified, Disk::default()) {
         Err(error) => error,
         Ok(_) => panic!("opened"),
     };
     assert!(matches!(refused(Start::Fresh), RecordError::Exists { .. }));
-    let held = Folder::open(&path, Start::Resume, &config, StartFrom::Unsaid, Disk::default()).unwrap();
+    let held = Folder::open(&path, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
     assert!(matches!(refused(Start::Resume), RecordError::Locked { .. }));
     assert!(matches!(refused(Start::Force), RecordError::Locked { .. }));
     drop(held);
@@ -885,7 +885,7 @@ fn where_one_of_several_runs_cannot_start_none_is_touched() {
         let runs = [&free, &taken].map(|path| (small(), path.clone()));
         Session::open(runs.into(), start, &Disk::default()).err().expect("one is taken").to_string()
     };
-    let held = Folder::open(&taken, Start::Fresh, &small(), StartFrom::Unsaid, Disk::default()).unwrap();
+    let held = Folder::open(&taken, Start::Fresh, &small(), StartFrom::Unspecified, Disk::default()).unwrap();
     assert!(open(Start::Fresh).contains("holds a run already") && !free.exists());
     fs::create_dir(&free).unwrap();
     fs::write(free.join(METRICS), metrics::HEADER).unwrap();
@@ -964,7 +964,7 @@ fn a_refused_paper_is_left_as_it_was() {
     arms.sort();
     for arm in [&arms[0], &arms[arms.len() - 1]] {
         let config = Config::load(&arm.join(CONFIG)).unwrap();
-        let held = Folder::open(arm, Start::Resume, &config, StartFrom::Unsaid, Disk::default()).unwrap();
+        let held = Folder::open(arm, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
         let all = || arms.iter().map(|arm| what_came_out(arm)).collect::<Vec<_>>();
         let runs = all();
         for flags in

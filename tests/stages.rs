@@ -417,7 +417,7 @@ fn a_run_goes_on_from_the_policies_that_it_started_from() {
         assert!(before == [&whole, &first].map(|path| everything(path)), "what was refused was changed");
     }
     let bare = place.path().join("bare");
-    let (folder, _) = Folder::open(&bare, Start::Fresh, &config, StartFrom::Unsaid, Disk::default()).unwrap();
+    let (folder, _) = Folder::open(&bare, Start::Fresh, &config, StartFrom::Unspecified, Disk::default()).unwrap();
     folder.write_run(&Run { init: Some(digest), ..Run::new(&config) }).unwrap();
     drop(folder);
     let error = train(&config, &bare, None, Start::Resume, 99).unwrap_err().to_string();

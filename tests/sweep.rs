@@ -778,7 +778,7 @@ fn what_another_process_trains_is_left_alone_with_all_else() {
     let before = all();
     let point = out.join("points/0005");
     let config = Config::load(&point.join("config.toml")).unwrap();
-    let held = Folder::open(&point, Start::Resume, &config, StartFrom::Unsaid, Disk::default()).unwrap();
+    let held = Folder::open(&point, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
     for memory in ["1", "0.000001"] {
         let error = failed(flotilla(&sweep, &out, &["--quiet", "--force", "--memory", memory]), 1);
         let expected = format!("error: another process is training in {}; ", point.display());

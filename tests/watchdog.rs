@@ -12,7 +12,7 @@ use std::thread;
 use std::time::Duration;
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::gpu::device::{DeviceError, Gpu, Patience, Request, report_stalls};
+use flotilla::backend::gpu::device::{DeviceError, Gpu, Request, WaitLimit, report_stalls};
 use flotilla::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy};
 use flotilla::backend::gpu::exact::Pass;
 use flotilla::backend::gpu::faults::Faults;
@@ -55,7 +55,7 @@ const WAYS: [(ResidencyPolicy, Records); 4] = [
 ];
 
 fn backend(gpu: Gpu, (holding, records): (ResidencyPolicy, Records)) -> GpuBackend {
-    GpuBackend::new(gpu).unwrap().playing(Kernel::Generic).holding(holding).bringing(records)
+    GpuBackend::new(gpu).unwrap().playing(Kernel::Generic).holding(holding).with_records(records)
 }
 
 /// Trains to the end. Changes to the CPU if the device is lost. Returns the rows, the policies and how often it was lost.
@@ -281,7 +281,7 @@ fn stall() {
     let (rows, policies) = expected();
     for (request, info) in support::adapters("a_device_without_progress_is_reported_and_lost") {
         let faults = Arc::new(Stalled(AtomicUsize::new(0)));
-        let patience = Patience { wait: Duration::from_millis(20), waits: 3 };
+        let patience = WaitLimit { wait: Duration::from_millis(20), waits: 3 };
         let found = train(backend(failing(&opened(&request), &faults).waiting(patience), WAYS[0]));
         assert_eq!((found.0, found.1, found.2), (rows.clone(), policies.clone(), 1), "{info}");
         assert_eq!(faults.0.load(SeqCst), 3);
@@ -374,7 +374,7 @@ fn the_faster_packing_is_kept_and_each_gives_the_same_records() {
         {
             let case = format!("{info}, {favoured} teams per workgroup, {records:?}");
             let device = GpuBackend::new(failing(&gpu, &Arc::new(Favours(favoured)))).unwrap();
-            let mut device = device.playing(Kernel::Specialised).bringing(records).packing(None);
+            let mut device = device.playing(Kernel::Specialised).with_records(records).packing(None);
             // Too few teams to tell.
             assert_eq!(device.trace(&few).unwrap(), trace, "{case}");
             assert_eq!(device.packed(), None, "{case}");

@@ -40,7 +40,7 @@ fn weights<'a>(config: &Config, policies: &'a PyReadonlyArray3<'_, f32>) -> PyRe
     if parameters != expected || ![1, all].contains(&leaders) || teams == 0 {
         return Err(PyValueError::new_err(format!(
             "policies are [{leaders}, {teams}, {parameters}], allowed is [leaders, teams, parameters] = [{all}, 1 or more, \
-             {expected}], or [1, 1 or more, {expected}] where leaders share a policy"
+             {expected}], or [1, 1 or more, {expected}] if leaders share a policy"
         )));
     }
     Ok((teams, policies.as_slice().map_err(|_| PyValueError::new_err("policies are not C-contiguous"))?))
@@ -245,7 +245,8 @@ pub fn forward(
     if let Some(place) = evolve::admit(&mut weights) {
         let (policy, parameter) = (place / parameters as usize, place % parameters as usize);
         let value = weights[place];
-        let text = format!("weight {parameter} of policy {policy} is {value}, allowed is a size up to {MAX_WEIGHT}");
+        let text =
+            format!("weight {parameter} of policy {policy} is {value}, allowed are -{MAX_WEIGHT} to {MAX_WEIGHT}");
         return Err(PyValueError::new_err(text));
     }
     workers::aside(py, || cpu::forward(&policy, &weights, inputs, &|row| chosen[row] as usize, outputs));

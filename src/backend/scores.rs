@@ -8,7 +8,7 @@ use crate::config::Fitness;
 use crate::credit::{Credit, Episode};
 use crate::parallel::*;
 
-/// Scores that one thread sets to zero, at least.
+/// Minimum number of scores per rayon task that sets them to zero.
 const ZEROED_TOGETHER: usize = 1 << 16;
 
 /// The scores of the groups of a batch. Several threads may write at a time; each team is scored once.

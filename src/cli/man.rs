@@ -27,7 +27,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let disk = Disk::default();
     let failed = |path: PathBuf| move |error| RecordError::Write { path, error };
     disk.create_folder(&args.out).map_err(failed(args.out.clone()))?;
-    let disk = ownership::enter(&disk, &args.out, true)?;
+    let disk = ownership::open_output_folder(&disk, &args.out, true)?;
     let mut all = Cli::command().disable_help_subcommand(true);
     all.build();
     let commands: Vec<_> = std::iter::once(&all).chain(all.get_subcommands()).cloned().collect();

@@ -72,7 +72,7 @@ fn time(seconds: f64) -> String {
 
 /// Returns the report of a run for people.
 fn report(found: &Outcome) -> String {
-    let Outcome { folder, story, digest, .. } = found;
+    let Outcome { folder, rows: ends, digest, .. } = found;
     let trained = match &found.trained_on {
         None => "This run was done already".into(),
         Some(on) => format!(
@@ -91,7 +91,7 @@ fn report(found: &Outcome) -> String {
     let mut text = format!("{trained}.\n\n{what}: mean over trials (lowest to highest trial)\n");
     let last = format!("generation {}", found.generations);
     let mut table = vec![["", SCORES[0].0, SCORES[1].0, SCORES[2].0].map(String::from)];
-    let rows = [("start", &story.first), (&*last, &story.last)];
+    let rows = [("start", &ends.first), (&*last, &ends.last)];
     // A run without generations after the start has one row.
     let shown = if found.generations == 0 { 1 } else { rows.len() };
     for (name, rows) in rows.into_iter().take(shown) {
@@ -110,7 +110,7 @@ fn report(found: &Outcome) -> String {
     }
     let replayed = quoted(folder);
     let film = quoted(&folder.join("champion.gif"));
-    let best = story.last.iter().reduce(|a, b| if b.champion_g > a.champion_g { b } else { a });
+    let best = ends.last.iter().reduce(|a, b| if b.champion_g > a.champion_g { b } else { a });
     let (best, observed) = best.map_or((0, 0.0), |row| (row.trial, row.champion_g * pois as f64));
     let what = pois_of_all.map_or("share of POIs".into(), |pois| format!("of {pois} POIs"));
     let _ = match observed > 0.0 {

@@ -212,9 +212,10 @@ impl Paradigm {
 }
 
 impl Learning {
-    /// Returns the number of policies' places in a population's memory: its policies, the champion of the previous
-    /// generation, which is the mean of an evolution strategy, for such a strategy its standard deviations, and the
-    /// champions of the hall of fame.
+    /// Returns the number of slots for policies in a population's memory.
+    ///
+    /// The policies come first, then the champion of the previous generation, then the champions of the hall of fame. An
+    /// evolution strategy has its mean in place of the champion, and its standard deviations after that.
     pub fn slots(&self) -> usize {
         self.population + 1 + usize::from(self.method != Method::Tournament) + self.hall_of_fame
     }
@@ -293,7 +294,7 @@ impl Learning {
 }
 
 section! {
-    /// `[checkpoint]`: how often a run saves what it needs to go on, without a say in its results; 0 is never.
+    /// `[checkpoint]`: how often a run writes a checkpoint. Results do not depend on it.
     CheckpointConfig = "checkpoint" {
         /// generations between checkpoints, which do not affect results; 0 means never
         generations: usize = "generations", "",

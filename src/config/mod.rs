@@ -93,12 +93,12 @@ impl Config {
 
     /// Reads a config with some keys set by overrides, and checks text and overrides together.
     ///
-    /// Sections named in `foreign`, such as a sweep's `grid`, are ignored.
+    /// Sections named in `ignored`, such as a sweep's `grid`, are ignored.
     ///
     /// # Errors
     /// Fails if the text or an override is invalid. The error lists their problems.
-    pub fn read(text: &str, name: &str, foreign: &[&str], overrides: &[Override]) -> Result<Config, ConfigError> {
-        Config::read_document(&Document::parse(text), name, foreign, overrides)
+    pub fn read(text: &str, name: &str, ignored: &[&str], overrides: &[Override]) -> Result<Config, ConfigError> {
+        Config::read_document(&Document::parse(text), name, ignored, overrides)
     }
 
     /// Reads a config from a parsed text, as [`Config::read`] does.
@@ -108,10 +108,10 @@ impl Config {
     pub(crate) fn read_document(
         document: &Document<'_>,
         name: &str,
-        foreign: &[&str],
+        ignored: &[&str],
         overrides: &[Override],
     ) -> Result<Config, ConfigError> {
-        Ok(Config::read_noted(document, name, foreign, overrides)?.0)
+        Ok(Config::read_noted(document, name, ignored, overrides)?.0)
     }
 
     /// Reads a config as [`Config::read_document`] does, and returns notes for its author. The notes report defaults
@@ -122,13 +122,13 @@ impl Config {
     pub fn read_noted(
         document: &Document<'_>,
         name: &str,
-        foreign: &[&str],
+        ignored: &[&str],
         overrides: &[Override],
     ) -> Result<(Config, Vec<String>), ConfigError> {
         let (staging, overrides): (Vec<_>, Vec<_>) =
             overrides.iter().cloned().partition(|set| set.key == stages::STAGES);
         let invalid = |problems, unlisted| ConfigError::Invalid { name: name.to_string(), problems, unlisted };
-        let (own, mut notes) = Config::without_stages(document, foreign, &overrides)
+        let (own, mut notes) = Config::without_stages(document, ignored, &overrides)
             .map_err(|reader::Problems { listed, unlisted }| invalid(listed, unlisted))?;
         let shortened = overrides.iter().any(|set| set.key == stages::GENERATIONS);
         let stages = match staging.last() {
@@ -138,7 +138,7 @@ impl Config {
             }
             None => stages::read(document, false, &own, shortened).map_err(|problems| {
                 let is_valid = |overrides: &[Override]| {
-                    Config::without_stages(document, foreign, overrides)
+                    Config::without_stages(document, ignored, overrides)
                         .is_ok_and(|(own, _)| stages::read(document, false, &own, shortened).is_ok())
                 };
                 stages::attribute(problems, &overrides, is_valid)
@@ -173,12 +173,12 @@ impl Config {
     /// Reads all keys except the stages, which change the config that these keys make.
     fn without_stages(
         document: &Document<'_>,
-        foreign: &[&str],
+        ignored: &[&str],
         overrides: &[Override],
     ) -> Result<(Config, Vec<String>), reader::Problems> {
-        let others = reader::Others {
-            foreign: &[foreign, &[stages::STAGES]].concat(),
-            refused: if foreign.contains(&GRID) { &[] } else { &[GRID, VARY] },
+        let others = reader::OtherSections {
+            ignored: &[ignored, &[stages::STAGES]].concat(),
+            refused: if ignored.contains(&GRID) { &[] } else { &[GRID, VARY] },
             message: "this makes the file a sweep, of many configs; use `flotilla sweep`",
         };
         reader::read(document, others, overrides, Config::ask)

@@ -191,7 +191,7 @@ pub(super) fn read(
         for (key, Written { line, text }) in &written {
             let name = format!("{name}.set.{key}");
             if FIXED.iter().any(|fixed| key == fixed || fixed.ends_with('.') && key.starts_with(fixed)) {
-                let message = "this is the same in all stages, for it makes the populations or the run".into();
+                let message = "this key cannot change between stages".into();
                 report_line(*line, name, message);
             } else {
                 overrides.push(Override { key: key.clone(), text: text.to_string(), name });

@@ -34,13 +34,13 @@ section! {
         pois: Vec<[f64; 2]> = "units", "3.1, Fig. 3",
         /// Agents needed at each POI (C).
         coupling: Coupling,
-        /// Within this distance of a POI an agent is at it (σ₀), in units.
+        /// Observation radius σ₀, in units.
         observation_radius: f64,
-        /// Whose presence at a POI counts.
+        /// The agents whose presence at a POI counts.
         observers: Observers,
-        /// The first and the last step, from 1, at which each POI can be observed; empty where that is any.
+        /// The first and the last step, from 1, at which each POI can be observed. Empty if POIs are always open.
         windows: Vec<[usize; 2]>,
-        /// The POIs that each comes after; empty where none comes after any.
+        /// For each POI, those that must be observed before it. Empty if the order is free.
         after: Vec<Vec<usize>>,
         /// T: length of an episode
         steps: usize = "steps", "3.2, Eq. 2",

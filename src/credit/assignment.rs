@@ -5,10 +5,10 @@ use crate::config::LedBy;
 use crate::world::{Led, World};
 
 /// The owner of an agent that belongs to no group.
-pub(crate) const NOBODY: u32 = u32::MAX;
+pub(crate) const UNASSIGNED: u32 = u32::MAX;
 
 /// Assigns each follower to the leader that it saw at most steps. Ties go to the lower index. Followers that saw no
-/// leader get [`NOBODY`].
+/// leader get [`UNASSIGNED`].
 ///
 /// Writes the owner of every agent, `[agents]`. A leader owns itself.
 pub(crate) fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
@@ -18,7 +18,7 @@ pub(crate) fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
     let followers = 0..world.followers();
     match seen {
         Seen::Counts(seen) => owner.extend(followers.map(|follower| {
-            let (mut most, mut best) = (0, NOBODY);
+            let (mut most, mut best) = (0, UNASSIGNED);
             for leader in 0..leaders {
                 let steps = seen.get(follower * leaders as usize + leader as usize);
                 if steps > most {
@@ -29,10 +29,11 @@ pub(crate) fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
         })),
         Seen::Owners(owners) => {
             let bits = owner_bits(leaders);
-            let (a_word, nobody) = ((32 / bits) as usize, (1 << bits) - 1);
+            let (owners_per_word, nobody) = ((32 / bits) as usize, (1 << bits) - 1);
             owner.extend(followers.map(|follower| {
-                let owner = owners.get(follower / a_word) >> (follower % a_word * bits as usize) & nobody;
-                if owner == nobody { NOBODY } else { owner }
+                let owner =
+                    owners.get(follower / owners_per_word) >> (follower % owners_per_word * bits as usize) & nobody;
+                if owner == nobody { UNASSIGNED } else { owner }
             }));
         }
     }
@@ -42,7 +43,7 @@ pub(crate) fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
 pub(super) fn gather(owner: &[u32], world: &World, groups: &mut Vec<u32>) {
     let words = world.constants.words as usize;
     groups.resize(world.leaders() * words, 0);
-    for (agent, &leader) in owner.iter().enumerate().filter(|&(_, &leader)| leader != NOBODY) {
+    for (agent, &leader) in owner.iter().enumerate().filter(|&(_, &leader)| leader != UNASSIGNED) {
         groups[leader as usize * words + agent / 32] |= 1 << (agent % 32);
     }
 }

@@ -15,7 +15,7 @@ mod fast;
 mod record;
 mod replay;
 
-pub(crate) use assignment::{NOBODY, assign};
+pub(crate) use assignment::{UNASSIGNED, assign};
 pub use assignment::{lead, leads};
 pub use record::{Episode, RecordRequest, Seen, Strided, owner_bits};
 pub use replay::observed_at;
@@ -52,7 +52,7 @@ pub struct Credit {
     critical: Vec<u32>,
     /// POIs lost without the leader, `[leaders]`.
     lost: Vec<u32>,
-    /// The leader that each agent belongs to, or [`NOBODY`], `[agents]`.
+    /// The leader that each agent belongs to, or [`UNASSIGNED`], `[agents]`.
     owner: Vec<u32>,
     /// The agents of each leader's group, `[leaders][words]`; empty until needed.
     groups: Vec<u32>,

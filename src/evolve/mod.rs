@@ -13,9 +13,7 @@ pub mod weights;
 
 pub use mutation::{Breeding, InvalidInput, Offspring, breed, mutate, mutation_threshold};
 pub use random::{Key, Purpose, noise};
-pub use schedule::{
-    form_teams, jitter_pois, jitter_starts, one_policy_a_team, past_champions, places, shuffle, teams_of,
-};
+pub use schedule::{aligned_teams, form_teams, jitter_pois, jitter_starts, past_champions, places, shuffle, teams_of};
 pub use selection::{Selection, UNCHANGED, best, draw_parents, keep_parents, tournament};
 pub use strategy::{Samples, Strategy};
 pub use weights::{MAX_WEIGHT, MIN_WEIGHT, admit, is_weight, random_policy};

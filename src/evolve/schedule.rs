@@ -22,7 +22,7 @@ pub fn form_teams(key: Key, generation: usize, round: usize, leaders: usize, tea
 /// Returns the teams of contemporaries in one generation of a trial, `[teams][leaders]`, round by round. With a shared
 /// population, team `t` is policy `t`; otherwise see [`form_teams`].
 pub fn teams_of(learning: &Learning, trial: usize, generation: usize, leaders: usize) -> Vec<u32> {
-    let mut teams = one_policy_a_team(learning.population, leaders);
+    let mut teams = aligned_teams(learning.population, leaders);
     if learning.sharing == Sharing::PerLeader {
         let key = Key::new(learning.seed, trial, Purpose::Teams);
         let of_round = teams.len();
@@ -35,7 +35,7 @@ pub fn teams_of(learning: &Learning, trial: usize, generation: usize, leaders: u
 }
 
 /// Returns teams in which team `t` is every leader's policy `t`, `[teams][leaders]`.
-pub fn one_policy_a_team(teams: usize, leaders: usize) -> Vec<u32> {
+pub fn aligned_teams(teams: usize, leaders: usize) -> Vec<u32> {
     (0..teams as u32).flat_map(|policy| std::iter::repeat_n(policy, leaders)).collect()
 }
 

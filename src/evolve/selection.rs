@@ -20,7 +20,7 @@ pub fn best(scores: &[f32], count: usize) -> Vec<usize> {
         }
         return order;
     }
-    // Numbers in the order of the scores, each followed by its index, sort faster than indices by what they refer to.
+    // Sorting keys of score and index is faster than sorting indices by their scores.
     let key = |(index, score): (u64, &f32)| {
         let bits = score.to_bits();
         let ascending = bits ^ if bits >> 31 == 0 { 1 << 31 } else { u32::MAX };
@@ -38,8 +38,8 @@ pub fn best(scores: &[f32], count: usize) -> Vec<usize> {
 /// Up to this count, [`best`] searches without sorting.
 const FEW: usize = 16;
 
-/// Returns the winner of one slot's binary tournament: of two distinct random policies, the one with the higher score.
-/// Ties go to the lower index.
+/// Returns the winner of one slot's binary tournament: of two distinct random policies, the one with the higher score
+/// (`scores` is `[policies]`). Ties go to the lower index.
 pub fn tournament(key: Key, scores: &[f32]) -> usize {
     let [first, second, ..] = key.draw(0);
     winner(first, second, scores)
@@ -112,7 +112,8 @@ pub fn draw_parents(
     }
 }
 
-/// Plans that every policy stays, after the last generation. The champion gets its slot.
+/// Plans the end of the last generation: every policy stays, and the champion gets its slot. `scores` is `[policies]`,
+/// `parents` is `[slots]`.
 pub fn keep_parents(scores: &[f32], parents: &mut [u32]) {
     for (slot, parent) in parents.iter_mut().enumerate() {
         *parent = slot as u32 | UNCHANGED;

@@ -181,8 +181,8 @@ pub fn sizes<S: Simd>(pull: &SteeringForce<S>) -> (S::f32s, S::f32s) {
 /// Turns the heading towards the force by at most the maximum turn. Returns the heading and the wanted speed. The
 /// second argument is the force's [`sizes`].
 ///
-/// No angle is computed. If the force's direction is within the maximum turn, it becomes the heading; its sine or
-/// cosine tells. Otherwise the heading turns by the maximum, to the side of the force.
+/// No angle is computed. The sine or cosine shows whether the force's direction is within the maximum turn. If so, it
+/// becomes the heading. Otherwise the heading turns by the maximum, to the side of the force.
 ///
 /// A cosine near 1 cannot resolve small angles, and a sine near 1 cannot resolve large ones. So `BY_SINE` is set if the
 /// maximum turn is small.

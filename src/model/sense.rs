@@ -1,4 +1,4 @@
-//! Sensing: the density of POIs and of agents in four quadrants around its heading (paper, Section 3.1).
+//! Sensing: the density of POIs and of agents in four quadrants around a leader's heading (paper, Section 3.1).
 
 use fearless_simd::{Simd, prelude::*};
 
@@ -100,7 +100,7 @@ impl SenseConstants {
     }
 }
 
-/// Returns the density of an entity at offset (`dx`, `dy`), if it is in range.
+/// Returns the density of an entity at offset (`dx`, `dy`). The caller checks that it is in range.
 #[inline(always)]
 pub(crate) fn density<S: Simd, const DENSITY: u32>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::f32s {
     let one = splat(dx.token(), 1.0);

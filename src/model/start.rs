@@ -17,7 +17,7 @@ pub enum Heading {
 }
 
 impl Heading {
-    /// Reads the key; `counts` are the numbers of leaders and followers, none if these are not known.
+    /// Reads the key. `counts` are the numbers of leaders and followers, `None` if they are unknown.
     pub(crate) fn read(r: &mut Reader<'_>, counts: Option<[usize; 2]>) -> Heading {
         let errors_before = r.error_count();
         let heading = r
@@ -66,7 +66,7 @@ impl Heading {
         ))
     }
 
-    /// The heading of each agent, leaders first, given where all start.
+    /// Returns the heading of each agent in radians, leaders first, from the start positions.
     pub fn of_each(&self, leaders: &[[f64; 2]], followers: &[[f64; 2]]) -> Vec<f64> {
         match self {
             Heading::Same(heading) => vec![*heading; leaders.len() + followers.len()],
@@ -79,7 +79,7 @@ impl Heading {
     }
 }
 
-/// The index of the nearest of some places; the first of those equally near.
+/// Returns the index of the nearest place. Ties go to the first.
 pub fn nearest(from: &[f64; 2], places: &[[f64; 2]]) -> usize {
     let distance2 = |at: &[f64; 2]| (at[0] - from[0]).powi(2) + (at[1] - from[1]).powi(2);
     (0..places.len()).min_by(|&a, &b| distance2(&places[a]).total_cmp(&distance2(&places[b]))).unwrap_or(0)

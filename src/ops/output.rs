@@ -63,7 +63,11 @@ impl Destination {
 
     /// Returns a disk that is limited to the file's folder.
     fn disk(&self) -> Result<Disk, RecordError> {
-        ownership::enter(&Disk::default(), file::folder(self.path()), matches!(self, Destination::Named(_)))
+        ownership::open_output_folder(
+            &Disk::default(),
+            file::folder(self.path()),
+            matches!(self, Destination::Named(_)),
+        )
     }
 }
 

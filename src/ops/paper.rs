@@ -134,7 +134,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     plan.check(backend.1.backend == "gpu").map_err(RunError::from)?;
     let disk = Disk::default();
     disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
-    let disk = ownership::enter(&disk, out, request.is_out_named())?;
+    let disk = ownership::open_output_folder(&disk, out, request.is_out_named())?;
     let _lock = folder::lock(&disk, out)?;
     // Compared again, because another process could write here until the folder was locked.
     marks.compare(out, start)?;
@@ -393,7 +393,7 @@ impl Marks {
             |error| RecordError::Write { path, error }
         };
         if start == Start::Force {
-            products().try_for_each(|name| ownership::withdraw(disk, &out.join(name)))?;
+            products().try_for_each(|name| ownership::remove_published(disk, &out.join(name)))?;
         }
         let path = out.join(PAPER);
         Ok(disk.replace(&path, |output| output.write_all(self.text().as_bytes())).map_err(failed(&path))?)

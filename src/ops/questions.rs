@@ -101,7 +101,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     check_memory(configs(), backend)?;
     let disk = Disk::default();
     disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
-    let disk = ownership::enter(&disk, out, request.is_out_named())?;
+    let disk = ownership::open_output_folder(&disk, out, request.is_out_named())?;
     let _lock = folder::lock(&disk, out)?;
     ownership::check(&disk, files().chain([PAGE.into()]).map(|name| out.join(name)))?;
     let points: usize = parts.iter().map(|(_, sweep)| sweep.points.len()).sum();

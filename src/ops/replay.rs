@@ -269,7 +269,7 @@ fn write_film(numbered: &Numbered, out: &Path, frames: &replay::Frames<'_>) -> R
     {
         return Err(RecordError::NotOurs { path }.into());
     }
-    let disk = ownership::enter(&Disk::default(), file::folder(out), true)?;
+    let disk = ownership::open_output_folder(&Disk::default(), file::folder(out), true)?;
     for (number, &moment) in frames.places.iter().enumerate() {
         let (scene, per_mm) = frames.scene(moment);
         let (path, content) = (place(number), scene.png(per_mm));

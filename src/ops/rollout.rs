@@ -159,7 +159,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let work = Work::of_teams(&config, policies.policies * request.episodes.unwrap_or(1) as usize);
     let ((backend, machine), on) = backends.open(work)?;
     context.message(format_args!("playing on {on}"));
-    let teams = evaluate::one_policy_a_team(policies.policies, world.leaders());
+    let teams = evaluate::aligned_teams(policies.policies, world.leaders());
     let group = Group {
         world: &world,
         starts: &world.starts,

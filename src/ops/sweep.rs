@@ -297,7 +297,7 @@ pub(crate) fn claim(disk: &Disk, sweep: &Sweep, out: &Path) -> Result<(), Error>
 
 /// Enters a sweep's folder. Refuses it if a file to be written there was not made by flotilla.
 fn enter(out: &Path, named: bool) -> Result<Disk, Error> {
-    let disk = ownership::enter(&Disk::default(), out, named)?;
+    let disk = ownership::open_output_folder(&Disk::default(), out, named)?;
     let products = pictures::names().chain([folder::RESULTS, folder::POINTS].map(String::from));
     ownership::check(&disk, products.map(|name| out.join(name)))?;
     Ok(disk)

@@ -162,7 +162,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let (backend, on) = backends.open(work)?;
     let disk = Disk::default();
     disk.create_folder(&request.out).map_err(RecordError::write(&request.out))?;
-    let disk = ownership::enter(&disk, &request.out, request.named)?;
+    let disk = ownership::open_output_folder(&disk, &request.out, request.named)?;
     let mut found = Vec::new();
     for (task, configs) in &tasks {
         let name = &task.name;

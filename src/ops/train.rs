@@ -21,7 +21,7 @@ use crate::record::archive;
 use crate::record::digests::Verification;
 use crate::record::disk::Disk;
 use crate::record::finished::{Finished, Storage};
-use crate::record::folder::{self, CONFIG, METRICS, POLICIES, RUN, Start, Story};
+use crate::record::folder::{self, CONFIG, FirstAndLastRows, METRICS, POLICIES, RUN, Start};
 use crate::record::ownership::{self, CURVES};
 use crate::record::policies;
 use crate::report::curves::Band;
@@ -99,7 +99,7 @@ pub struct Outcome {
     pub processor: Processor,
     /// The rows of the random start and of the last generation.
     #[serde(skip)]
-    pub story: Story,
+    pub rows: FirstAndLastRows,
     /// Number of teams per generation.
     #[serde(skip)]
     pub teams: usize,
@@ -176,7 +176,7 @@ impl Request {
 
 /// Refuses a run in a zip file, because its folder would be removed at the end. The message says how to unpack and resume it.
 pub(crate) fn refuse_zip(path: &Path) -> Result<(), Error> {
-    let Some(top) = archive::top(path) else { return Ok(()) };
+    let Some(top) = archive::run_prefix(path) else { return Ok(()) };
     let inner = if top.is_empty() { file::stem(path, "run") } else { top.clone() };
     let mut unpack = vec!["unzip".into(), shell::argument(path)];
     if top.is_empty() {
@@ -213,7 +213,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     }
     let disk = Disk::default();
     if folder.is_dir() {
-        let disk = ownership::enter(&disk, &folder, request.out.is_some())?;
+        let disk = ownership::open_output_folder(&disk, &folder, request.out.is_some())?;
         // A foreign picture must not prevent a run from being resumed.
         if start != Start::Resume {
             ownership::check(&disk, [folder.join(CURVES)])?;
@@ -289,11 +289,11 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         trained_generations: if was_done { 0 } else { (last + 1).saturating_sub(from) },
         seconds: if was_done { 0.0 } else { since.elapsed().as_secs_f64() },
         notes,
-        first: Course::of(&results.story.first),
-        last: Course::of(&results.story.last),
+        first: Course::of(&results.rows.first),
+        last: Course::of(&results.rows.last),
         files: FILES.into_iter().map(|(name, file)| (name, folder.join(file).escaped().to_string())).collect(),
         processor: Processor::of_run(session.run(0)),
-        story: results.story.clone(),
+        rows: results.rows.clone(),
         teams: config.max_teams() - 1,
         trained_on: (!was_done).then_some(on),
         folder,

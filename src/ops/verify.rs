@@ -328,7 +328,7 @@ fn verify(
         return Ok(Agreement { mismatch: Some(mismatch.to_string()), ..Agreement::default() });
     }
     let gpu = GpuBackend::new(gpu)?.playing(combination.kernel);
-    let mut gpu = gpu.holding(ResidencyPolicy::Always).bringing(Records::Packed);
+    let mut gpu = gpu.holding(ResidencyPolicy::Always).with_records(Records::Packed);
     Ok(compare_within(plan, budget, |part, before| {
         compare(part, &mut Cpu::default(), &mut gpu, |now| {
             let now = Agreement { worlds: before.worlds + now.worlds, ..now.clone() };

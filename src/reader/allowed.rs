@@ -59,7 +59,7 @@ impl<T: Number> Allowed<T> {
 }
 
 impl<T: Number> Allowed<T> {
-    /// Returns the range for any config: a bound that depends on other keys is their names.
+    /// Returns the range for any config. A bound that depends on other keys is written as their names.
     pub(super) fn in_general(&self) -> String {
         match self.because {
             "" => self.in_detail(),
@@ -68,7 +68,7 @@ impl<T: Number> Allowed<T> {
         }
     }
 
-    /// The range with its gap between 0 and the least other number, if it has one.
+    /// Returns the range, including the gap between 0 and the smallest other number.
     pub(super) fn in_detail(&self) -> String {
         match (self.zero, self.low < self.high) {
             (true, true) => format!("0 or {}", Allowed { zero: false, ..*self }),
@@ -77,7 +77,7 @@ impl<T: Number> Allowed<T> {
     }
 }
 
-/// The plain range: the gap above 0 is only worth a word to who wrote a number within it.
+/// Writes the range without the gap above 0. Only readers who wrote a number in that gap need [`Allowed::in_detail`].
 impl<T: Number> Display for Allowed<T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Allowed { low, high, .. } = self;

@@ -87,9 +87,9 @@ pub struct Problems {
 
 /// Sections of a text that its reader does not read.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Others<'a> {
+pub struct OtherSections<'a> {
     /// Sections that are ignored.
-    pub foreign: &'a [&'a str],
+    pub ignored: &'a [&'a str],
     /// Sections that make the text something else. They are reported alone.
     pub refused: &'a [&'a str],
     /// The message about such a text.
@@ -162,7 +162,7 @@ impl LineNumbers {
 /// All problems of the text and the overrides.
 pub(crate) fn read<T>(
     document: &Document<'_>,
-    others: Others<'_>,
+    others: OtherSections<'_>,
     overrides: &[Override],
     ask: impl FnOnce(&mut Reader<'_>) -> T,
 ) -> Result<(T, Vec<String>), Problems> {
@@ -187,7 +187,7 @@ pub(crate) fn read<T>(
         }
     }
     if reader.problems.is_empty() {
-        reader.fill(table.clone(), text, others.foreign, overrides);
+        reader.fill(table.clone(), text, others.ignored, overrides);
         let read = ask(&mut reader);
         reader.report_unknown();
         if reader.problems.is_empty() {
@@ -317,11 +317,11 @@ macro_rules! section {
 pub(crate) use section;
 
 impl<'a> Reader<'a> {
-    fn fill(&mut self, document: DeTable<'a>, text: &'a str, foreign: &[&str], overrides: &'a [Override]) {
+    fn fill(&mut self, document: DeTable<'a>, text: &'a str, ignored: &[&str], overrides: &'a [Override]) {
         for (section, value) in document {
             let start = section.span().start;
             let section = section.into_inner().into_owned();
-            if foreign.contains(&section.as_str()) {
+            if ignored.contains(&section.as_str()) {
                 continue;
             }
             let span = value.span();

@@ -17,7 +17,7 @@ const MAX_BYTES: u64 = 16 << 30;
 /// Every zip file that is not empty starts with these bytes.
 const MAGIC: [u8; 4] = *b"PK\x03\x04";
 
-/// The folder of a run: the named one, or a temporary one with what a zip file holds, which is removed at the end.
+/// The folder of a run: the named folder, or a temporary one with the unpacked zip file, which is removed at the end.
 #[derive(Debug)]
 pub(crate) struct RunFolder {
     path: PathBuf,
@@ -64,8 +64,8 @@ fn zip_file(path: &Path) -> Result<Option<File>, RecordError> {
     Ok(Some(file))
 }
 
-/// Returns the folder that holds the run in a zip file, empty if there is none. Returns none if the path is no zip file of a run.
-pub(crate) fn top(path: &Path) -> Option<String> {
+/// Returns the folder of the run within a zip file, empty at the top. Returns `None` unless the path is a zip file with a run.
+pub(crate) fn run_prefix(path: &Path) -> Option<String> {
     let archive = ZipArchive::new(zip_file(path).ok()??).ok()?;
     let names: Vec<String> = archive.file_names().flatten().map(Into::into).collect();
     Some(names.iter().find_map(|name| inside(name, CONFIG))?.trim_end_matches('/').into())
@@ -79,8 +79,8 @@ fn unpack(path: &Path, file: File, folder: &Path) -> Result<(), RecordError> {
     let runs: Vec<&str> = names.iter().filter_map(|name| inside(name, CONFIG)).collect();
     let &[top] = &runs[..] else {
         let reason = match runs.len() {
-            0 => format!("it is no run's archive: it has no {CONFIG}"),
-            count => format!("it holds {count} runs; unpack it and name the folder of one"),
+            0 => format!("it is not the archive of a run (no {CONFIG})"),
+            count => format!("it has {count} runs; unpack it and name the folder of one"),
         };
         return Err(RecordError::damaged(path, reason));
     };

@@ -58,11 +58,11 @@ const MAX_LIST_BYTES: u64 = 1 << 24;
 ///
 /// # Errors
 /// The folder cannot be opened, or it belongs to another user and was not named.
-pub fn enter(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordError> {
+pub fn open_output_folder(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordError> {
     let inside = disk.within(folder).map_err(RecordError::write(folder))?;
     let owners = inside.root().map_or(Ok(None), |root| root.owners()).map_err(RecordError::write(folder))?;
     match owners {
-        Some([owner, user]) if !may_enter(owner, user, named) => {
+        Some([owner, user]) if !may_write(owner, user, named) => {
             Err(RecordError::OfAnotherUser { path: folder.into() })
         }
         _ => Ok(inside),
@@ -70,7 +70,7 @@ pub fn enter(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordErro
 }
 
 /// Returns whether a user may write in the folder of an owner.
-pub fn may_enter(owner: u32, user: u32, named: bool) -> bool {
+pub fn may_write(owner: u32, user: u32, named: bool) -> bool {
     named || owner == user
 }
 
@@ -197,7 +197,7 @@ pub fn publish(
 ///
 /// # Errors
 /// The file cannot be read or deleted.
-pub(crate) fn withdraw(disk: &Disk, path: &Path) -> Result<(), RecordError> {
+pub(crate) fn remove_published(disk: &Disk, path: &Path) -> Result<(), RecordError> {
     match check(disk, [path]) {
         Ok(()) => disk.remove(path).map_err(RecordError::write(path)),
         Err(RecordError::NotOurs { .. }) => Ok(()),

@@ -66,7 +66,7 @@ pub fn draw(
         Ok(scenes) => scenes,
         Err(reason) => return Ok((vec![], Some(reason))),
     };
-    let disk = ownership::enter(&Disk::default(), out, true)?;
+    let disk = ownership::open_output_folder(&Disk::default(), out, true)?;
     let mut names = Vec::new();
     for (name, mut scene) in scenes {
         if options.verification.is_skipped() {

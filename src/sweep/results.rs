@@ -97,7 +97,7 @@ pub enum Missing {
 /// # Errors
 /// The files cannot be written.
 pub fn write(sweep: &Sweep, out: &Path, options: &Detail) -> Result<Vec<Result<Outcome, Missing>>, RecordError> {
-    let disk = ownership::enter(&Disk::default(), out, true)?;
+    let disk = ownership::open_output_folder(&Disk::default(), out, true)?;
     let mut outcomes = Vec::new();
     let path = out.join(RESULTS);
     let rows = |output: &mut dyn Write| {

@@ -1,6 +1,6 @@
-//! Ask and tell: the caller decides what the policies of a generation are worth.
+//! Ask and tell: the caller scores the policies of a generation.
 //!
-//! The populations stay on the host. Told the scores that the backend's episodes give, the results are those of
+//! The populations stay on the host. With the scores of [`Trainer::play_candidates`], the results equal those of
 //! [`Trainer::advance`].
 
 use glam::Vec2;
@@ -54,12 +54,12 @@ impl Trainer {
         })
     }
 
-    /// Returns the world that the teams of [`Trainer::ask`] play in, the number of teams without the champions', and of
-    /// the champions of a finished experiment 0.
+    /// Returns the world of the next generation and its number of teams, without the champions' team. The number is 0 if
+    /// only the champions still have to play.
     pub fn candidates_world(&self, experiment: usize) -> (&World, usize) {
         let experiment = &self.experiments[experiment];
         let stage = experiment.stage();
-        (&stage.world, if experiment.is_over() { 0 } else { experiment.teams() })
+        (&stage.world, if experiment.only_champions_left() { 0 } else { experiment.teams() })
     }
 
     /// Returns G, `[trials][teams]`, and the config's fitness of each leader, `[trials][teams][leaders]`, of the teams
@@ -91,7 +91,7 @@ impl Trainer {
         let level = self.level;
         scope(|_| {
             let experiment: &mut Experiment = &mut self.experiments[index];
-            let mut rows = if experiment.is_over() {
+            let mut rows = if experiment.only_champions_left() {
                 experiment.collect_last_rows()
             } else {
                 let rows = experiment.collect_results(index, fitness);

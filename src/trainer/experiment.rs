@@ -29,8 +29,8 @@ pub(super) struct Experiment {
 
 /// One trial's populations, and scratch memory for its generations.
 ///
-/// A population has more slots than policies, see [`Learning::slots`]. The one after the policies holds the champion of
-/// the previous generation, which plays along as one more team. Past champions, if any are kept, are in those after it.
+/// A population has more slots than policies, see [`Learning::slots`]. The one after the policies is that of the champion,
+/// which plays along as one more team.
 pub(super) struct TrialState {
     /// The trial's number within its config.
     pub index: usize,
@@ -76,12 +76,12 @@ impl Experiment {
     }
 
     /// Reports whether the populations are of a generation that was played already, so that it has to be replayed.
-    pub fn is_behind(&self) -> bool {
+    pub fn needs_replay(&self) -> bool {
         self.residency.generation() < self.generation && !self.is_done()
     }
 
     /// Reports whether the populations are past the last generation, and only champions play.
-    pub fn is_over(&self) -> bool {
+    pub fn only_champions_left(&self) -> bool {
         self.residency.generation() > self.last()
     }
 
@@ -110,7 +110,7 @@ impl Experiment {
 
     /// Draws the next generation's schedules, beside those of the one that plays.
     pub fn prepare_next(&self, level: Level, next: &mut Vec<TeamSchedule>) {
-        if self.is_over() {
+        if self.only_champions_left() {
             return;
         }
         let Stage { config, world, .. } = self.stage();

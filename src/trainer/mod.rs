@@ -123,8 +123,9 @@ pub struct Times {
     pub breed: Duration,
 }
 
-/// The outcome of an experiment: the sorted policies of each trial, and the snapshot after the last generation. The snapshot has
-/// no weights if the sorted policies and their fitness are enough to continue from.
+/// The outcome of an experiment: the sorted policies of each trial, and the snapshot after the last generation.
+///
+/// The snapshot has no weights if the sorted policies and their fitness are enough to continue from.
 pub type End<'a> = (Vec<&'a [f32]>, Snapshot<&'a [f32]>);
 
 /// Why there is no snapshot.
@@ -221,8 +222,8 @@ impl Trainer {
     /// Replays the generations that were lost, then plays the next one. Returns only the rows of that, because the rows
     /// of replayed generations were returned before.
     fn replay_and_play(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
-        while self.experiments.iter().any(Experiment::is_behind) {
-            self.play_generation(Experiment::is_behind, backend)?;
+        while self.experiments.iter().any(Experiment::needs_replay) {
+            self.play_generation(Experiment::needs_replay, backend)?;
         }
         let rows = self.play_generation(|experiment| !experiment.is_done(), backend)?;
         let unfinished = self.experiments.iter_mut().filter(|experiment| !experiment.is_done());
@@ -252,16 +253,16 @@ impl Trainer {
         playing.par_iter_mut().for_each(|(_, experiment)| experiment.prepare(level));
         let prepared = Instant::now();
         play_and_draw_next(&mut playing, level, backend)?;
-        let mut over = playing.iter_mut().filter(|(_, experiment)| experiment.is_over());
+        let mut over = playing.iter_mut().filter(|(_, experiment)| experiment.only_champions_left());
         over.try_for_each(|(_, experiment)| experiment.fetch())?;
         let played = Instant::now();
-        let collect = |(index, experiment): &mut (usize, &mut Experiment)| match experiment.is_over() {
+        let collect = |(index, experiment): &mut (usize, &mut Experiment)| match experiment.only_champions_left() {
             true => experiment.collect_last_rows(),
             false => experiment.collect_results(*index, None),
         };
         let mut rows = playing.par_iter_mut().flat_map_iter(collect).collect::<Vec<_>>();
         let collected = Instant::now();
-        playing.retain(|(_, experiment)| !experiment.is_over());
+        playing.retain(|(_, experiment)| !experiment.only_champions_left());
         let setbacks: Vec<_> =
             playing.par_iter_mut().filter_map(|(_, experiment)| experiment.breed(level).err()).collect();
         self.setback = setbacks.into_iter().next().or(self.setback.take());

@@ -60,7 +60,7 @@ impl Experiment {
 
     /// Makes the host's weights those of the generation that plays next, for a snapshot.
     pub fn bring_up_to_date(&mut self) -> Result<(), BackendError> {
-        if self.is_behind() {
+        if self.needs_replay() {
             return Err(BackendError::Gone);
         }
         let fetched = self.fetch();

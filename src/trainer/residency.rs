@@ -4,14 +4,6 @@ use crate::backend::DevicePopulation;
 
 /// Where the populations of all trials of an experiment are.
 ///
-/// ```text
-///                 accept                      breed (device)
-///   Host ───────────────────────▶ Device ──────────────┐
-///    ▲  ▲                          │  │ ◀─────────────┘
-///    │  └── release (fetched) ─────┘  │
-///    └───── lose (not fetched) ───────┘
-/// ```
-///
 /// After [`Residency::lose`] the host's copy may be older than the generation that plays next. The experiment then
 /// replays the generations in between, with the same results.
 #[derive(Debug)]

@@ -64,11 +64,11 @@ pub(super) fn keep(scores: Vec<GroupScores>, experiments: &mut [(usize, &mut Exp
 }
 
 impl Experiment {
-    /// The teams that play, by index. The last is the champion's: the first generation has no champion before it, and
-    /// after the last generation champions play alone.
+    /// Returns the range of teams to play. The last is the champions' team: it does not play in the first generation, and
+    /// plays alone after the last one.
     fn playing(&self) -> Range<usize> {
         let teams = self.teams();
-        let first = if self.is_over() { teams } else { 0 };
+        let first = if self.only_champions_left() { teams } else { 0 };
         first..teams + usize::from(self.residency.generation() > 0)
     }
 

@@ -10,7 +10,7 @@ use crate::config::{Config, Learning, Sharing};
 use crate::evolve::{self, Key, Purpose};
 use crate::parallel::*;
 
-/// Policies per rayon task for cheap work, at least: fewer are done before another thread wakes up.
+/// Minimum number of policies per rayon task for cheap work. Fewer are finished before another thread wakes up.
 pub(super) const MIN_POLICIES_PER_TASK: usize = 2048;
 
 /// Returns the number of populations that have [`MIN_POLICIES_PER_TASK`] policies together.
@@ -39,8 +39,8 @@ impl TeamSchedule {
         TeamSchedule {
             drawn_for: None,
             orders: vec![0; populations * population],
-            // The champion's team, the last, is every population's last slot.
-            teams: evolve::one_policy_a_team(population + 1, leaders),
+            // The last team consists of the slot after the policies of every population, which holds the champion.
+            teams: evolve::aligned_teams(population + 1, leaders),
             starts: vec![],
             previous_stage_starts: vec![],
         }

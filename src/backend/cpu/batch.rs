@@ -1,4 +1,4 @@
-//! Teams that may share a block: those of consecutive groups in the same world.
+//! Teams of several groups that play together.
 
 use std::ops::Range;
 
@@ -43,7 +43,7 @@ impl<'a> WorldBatch<'a> {
     pub(super) fn policy(&self, leader: usize, (group, team): (usize, usize)) -> &'a [f32] {
         let group = &self.groups[group];
         let policy = group.teams[team * self.world.leaders() + leader] as usize;
-        let Weights::OnHost(weights) = group.weights else { unreachable!("seen before playing") };
+        let Weights::OnHost(weights) = group.weights else { unreachable!("the backend checks this before playing") };
         &weights[group.place(leader, policy)..][..self.world.parameters()]
     }
 

@@ -34,8 +34,8 @@ impl<S: Simd> PoiPosition<S> for [S::f32s; 2] {
     }
 }
 
-/// The state of one vector of teams, one team per lane, with scratch memory for a step. A step reads the state before
-/// it only.
+/// The state of one vector of teams, one team per lane, with scratch memory for a step. A step reads only the
+/// previous state.
 pub(crate) struct Block<S: Simd> {
     pub(super) simd: S,
     pub(super) world: Lanes<S>,

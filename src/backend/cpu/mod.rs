@@ -145,7 +145,7 @@ fn play<S: Simd>(simd: S, groups: &[Group<'_>], workspaces: &mut Option<Box<dyn 
             let following = if early { take() } else { None };
             let episodes = match workspace {
                 Some(episodes) if episodes.fits(batch.world, batch.sighted) => episodes,
-                // It is of another world.
+                // There is none yet, or it is for another world.
                 _ => workspace.insert(EpisodeBlock::new(simd, batch.world, batch.sighted)),
             };
             let teams = width.min(batch.teams - first);

@@ -17,14 +17,14 @@ use crate::gpu_struct::{GpuStruct, gpu_struct};
 const WORKGROUP: usize = 256;
 /// Rows and columns of the tile that a workgroup of `gather` transposes (`TILE` in the shader).
 const TILE: usize = 32;
-/// Leaders per gather dispatch: as many buffers as every WebGPU device can bind besides the others.
+/// Leaders per gather dispatch. With three other storage buffers they stay below the 8 that every WebGPU device allows.
 pub(super) const TOGETHER: usize = 4;
 /// Bytes per transfer, so that little memory is needed besides the populations.
 const PIECE: usize = 64 << 20;
 
 gpu_struct! {
     /// How to breed one leader's next generation.
-    pub struct Brood {
+    pub struct BreedJob {
         /// The slots' key before the slot is xored in, see [`Key::of_population`](crate::evolve::Key::of_population).
         pub key: [u32; 4],
         /// Policies, including the champion's slot.
@@ -58,7 +58,7 @@ gpu_struct! {
         /// Teams of these tasks.
         pub teams: u32,
         /// Teams per task. The last task has the remainder.
-        pub teams_a_task: u32,
+        pub teams_per_task: u32,
         /// The offset of the teams' policies in their buffer.
         pub choices: u32,
         /// The offset of the output.
@@ -122,7 +122,7 @@ impl Kernels {
         let buffer = |_| gpu.buffer("a population", (size * size_of::<f32>()) as u64, usage);
         let buffers = (0..=leaders).map(buffer).collect::<Result<Vec<_>, _>>()?;
         let input = Usage::STORAGE | Usage::COPY_DST;
-        let broods = gpu.buffer("broods", (leaders * BINDING_ALIGNMENT) as u64, input)?;
+        let breed_jobs = gpu.buffer("breed_jobs", (leaders * BINDING_ALIGNMENT) as u64, input)?;
         let plan = gpu.buffer("the parents", (leaders * slots * size_of::<u32>()) as u64, input)?;
         let pieces = weights.chunks_exact(size).zip(&buffers).flat_map(|(weights, buffer)| {
             weights.chunks(PIECE / size_of::<f32>()).enumerate().map(move |(index, piece)| (buffer, index, piece))
@@ -140,7 +140,7 @@ impl Kernels {
             gpu.wait()?;
             done.push(nonce);
         }
-        Ok(Population { kernels: self.clone(), buffers, broods, plan, status, done, leaders, slots, parameters })
+        Ok(Population { kernels: self.clone(), buffers, breed_jobs, plan, status, done, leaders, slots, parameters })
     }
 
     /// Returns the dispatch that gathers the policies of a job. The job is an aligned element of a buffer, `(buffer,
@@ -191,7 +191,7 @@ pub(super) struct Population {
     kernels: Arc<Kernels>,
     /// One buffer per leader, `[slots][parameters]`, and one more for the children of the first.
     buffers: Vec<wgpu::Buffer>,
-    broods: wgpu::Buffer,
+    breed_jobs: wgpu::Buffer,
     plan: wgpu::Buffer,
     /// Per leader the number of workgroups that have bred, then the nonces of the pieces that were copied to the device.
     status: wgpu::Buffer,
@@ -236,8 +236,8 @@ impl DevicePopulation for Population {
         let Kernels { gpu, breed: (pipeline, layout), .. } = &*self.kernels;
         let Breeding { parents, key, generation, learning } = *breeding;
         let threshold = evolve::mutation_threshold(learning.mutation_probability);
-        let broods: Vec<Brood> = (0..self.leaders)
-            .map(|leader| Brood {
+        let breed_jobs: Vec<BreedJob> = (0..self.leaders)
+            .map(|leader| BreedJob {
                 key: key.of_population(generation, leader),
                 slots: self.slots as u32,
                 parameters: self.parameters as u32,
@@ -256,7 +256,7 @@ impl DevicePopulation for Population {
         let mut groups = Vec::with_capacity(self.leaders);
         for (leader, (policies, children)) in self.buffers[..self.leaders].iter().zip(homes).enumerate() {
             let buffers = [
-                part_of::<Brood>(&self.broods, leader),
+                part_of::<BreedJob>(&self.breed_jobs, leader),
                 self.plan.as_entire_buffer_binding(),
                 policies.as_entire_buffer_binding(),
                 children.as_entire_buffer_binding(),
@@ -265,7 +265,7 @@ impl DevicePopulation for Population {
             groups.push(gpu.bind("breed", layout, &buffers)?);
         }
         gpu.scoped("breeding", || {
-            gpu.write(&self.broods, 0, &parts(&broods));
+            gpu.write(&self.breed_jobs, 0, &parts(&breed_jobs));
             gpu.write(&self.plan, 0, bytemuck::cast_slice(parents));
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             let mut pass = encoder.begin_compute_pass(&Default::default());
@@ -305,7 +305,7 @@ impl DevicePopulation for Population {
 fn source() -> String {
     exact::assemble(&[
         &format!("const WORKGROUP: u32 = {WORKGROUP}u;"),
-        &[Brood::wgsl(), GatherJob::wgsl()].concat(),
+        &[BreedJob::wgsl(), GatherJob::wgsl()].concat(),
         include_str!("../../../shaders/lib/math.wgsl"),
         include_str!("../../../shaders/population.wgsl"),
     ])

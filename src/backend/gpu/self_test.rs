@@ -268,7 +268,7 @@ fn training(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     let kernels = if gpu.adapter.kind == Kind::Software { &kernels[..1] } else { &kernels };
     for &kernel in kernels {
         let backend = GpuBackend::new(gpu.clone())?.playing(kernel);
-        let mut backend = backend.holding(ResidencyPolicy::Always).bringing(Records::Packed);
+        let mut backend = backend.holding(ResidencyPolicy::Always).with_records(Records::Packed);
         let held = backend.hold(&weights, [leaders, TEAMS, parameters]).map_err(failed)?;
         let held = held.expect("the device holds all populations");
         let group = Group { weights: Weights::OnDevice(&*held), ..group };

@@ -26,7 +26,7 @@ mod run;
 
 pub use paths::{around, collection, latest, owner};
 pub(crate) use paths::{holds_run, next_free};
-pub use resume::{Story, differences};
+pub use resume::{FirstAndLastRows, differences};
 pub(crate) use run::RunSums;
 pub use run::{FileSums, Origin, Run, Status, now};
 
@@ -54,7 +54,7 @@ pub enum Start {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StartFrom<'a> {
     /// Not specified: a resumed run keeps its own start.
-    Unsaid,
+    Unspecified,
     /// Random policies. The caller knows that the run cannot have started from others.
     Random,
     /// Given policies with this [`super::policies::Init::digest`].
@@ -86,7 +86,7 @@ pub struct Resumed {
     /// Content of `run.json` after the folder was opened.
     pub run: Option<Run>,
     /// Results of a finished run, if all its files match their digests. Checkpoints are not searched in that case.
-    pub finished: Option<Story>,
+    pub finished: Option<FirstAndLastRows>,
     /// Notes for the user.
     pub notes: Vec<Note>,
 }
@@ -97,7 +97,7 @@ pub enum Note {
     /// A checkpoint cannot be used, for this reason.
     SetAside(String),
     /// A small file cannot be read, for this reason.
-    WrittenAnew(String),
+    Rewritten(String),
     /// The text of `config.toml` was written by hand, and another text replaces it.
     ConfigKept {
         /// Path of the copy of the old text.
@@ -106,7 +106,7 @@ pub enum Note {
     /// The replacement of a run was interrupted.
     Replacing,
     /// The run resumes from a checkpoint.
-    GoingOn {
+    Resuming {
         /// Generation that is played next.
         generation: usize,
     },
@@ -121,7 +121,7 @@ pub enum Note {
 impl Note {
     /// Returns whether the user must be warned. The other notes are normal for a resumed run.
     pub fn is_damage(&self) -> bool {
-        matches!(self, Note::SetAside(_) | Note::WrittenAnew(_) | Note::StartingOver | Note::NotLocked)
+        matches!(self, Note::SetAside(_) | Note::Rewritten(_) | Note::StartingOver | Note::NotLocked)
     }
 }
 
@@ -129,12 +129,12 @@ impl fmt::Display for Note {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Note::SetAside(reason) => write!(f, "{reason}; set aside, and the one before is used"),
-            Note::WrittenAnew(reason) => write!(f, "{reason}; it is rewritten"),
+            Note::Rewritten(reason) => write!(f, "{reason}; it is rewritten"),
             Note::ConfigKept { path } => {
                 write!(f, "{CONFIG} has changed; its old text is kept as {}", path.display())
             }
             Note::Replacing => f.write_str("the replacement of a run was interrupted: the rest of that run is removed"),
-            Note::GoingOn { generation } => write!(f, "resuming at generation {generation}"),
+            Note::Resuming { generation } => write!(f, "resuming at generation {generation}"),
             Note::StartingOver => f.write_str("no checkpoint can be used: starting over, to the same results"),
             Note::NotLocked => {
                 f.write_str("this file system has no locks, so start only one process at a time in this folder")
@@ -171,7 +171,7 @@ impl Folder {
         };
         holds_run()?;
         disk.create_folder(path).map_err(RecordError::write(path))?;
-        let disk = ownership::enter(&disk, path, true)?;
+        let disk = ownership::open_output_folder(&disk, path, true)?;
         ownership::refuse_links(&disk, path)?;
         let mark = path.join(INIT_MARK);
         if from.digest().is_some() && !file::exists(&path.join(RUN)).map_err(RecordError::read(path))? {
@@ -275,7 +275,7 @@ impl Folder {
             self.disk.remove(&path).map_err(RecordError::write(&path))?;
         }
         for name in [CURVES, REPLAY] {
-            ownership::withdraw(&self.disk, &self.file(name))?;
+            ownership::remove_published(&self.disk, &self.file(name))?;
         }
         // The config is replaced as a whole, because the new run may have been read from it.
         if Config::load(&self.file(CONFIG)).ok().as_ref() != Some(config) {

@@ -16,7 +16,7 @@ use crate::trainer::Row;
 
 /// Rows of a run's first and last generation, `[trials]` each.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Story {
+pub struct FirstAndLastRows {
     /// Rows of generation 0.
     pub first: Vec<Row>,
     /// Rows of the last generation.
@@ -34,7 +34,7 @@ impl Folder {
         match Run::read(&self.file(RUN)) {
             Ok(run) => found.run = Some(run),
             Err(RecordError::Read { error, .. }) if error.kind() == ErrorKind::NotFound => {}
-            Err(error @ RecordError::Damaged { .. }) => found.notes.push(Note::WrittenAnew(error.to_string())),
+            Err(error @ RecordError::Damaged { .. }) => found.notes.push(Note::Rewritten(error.to_string())),
             Err(error) => return Err(error),
         }
         found.finished = found.run.as_ref().map_or(Ok(None), |run| self.finished(run, config))?;
@@ -97,7 +97,7 @@ impl Folder {
         if let Some(edited) = edited.filter(|_| found.checkpoint.is_none()) {
             return Err(edited);
         }
-        if began.is_none() && found.checkpoint.is_none() && from == StartFrom::Unsaid {
+        if began.is_none() && found.checkpoint.is_none() && from == StartFrom::Unspecified {
             let is_there = |name: &str| file::exists(&self.file(name)).map_err(RecordError::read(&self.file(name)));
             if any || is_there(INIT_MARK)? || is_there(RUN)? || is_there(METRICS)? || is_there(POLICIES)? {
                 return Err(RecordError::OriginUnknown { path: self.path.clone() });
@@ -110,7 +110,7 @@ impl Folder {
             }
         }
         found.notes.push(match &found.checkpoint {
-            Some((checkpoint, _)) => Note::GoingOn { generation: checkpoint.snapshot.generation },
+            Some((checkpoint, _)) => Note::Resuming { generation: checkpoint.snapshot.generation },
             None if any => Note::StartingOver,
             None => Note::Starting,
         });
@@ -162,7 +162,7 @@ impl Folder {
             }
             Err(_) if !path.exists() && !checkpoints => Ok(None),
             Err(error) => {
-                found.notes.push(Note::WrittenAnew(error.to_string()));
+                found.notes.push(Note::Rewritten(error.to_string()));
                 Ok(None)
             }
         }
@@ -176,12 +176,16 @@ impl Folder {
     ///
     /// # Errors
     /// The metrics cannot be read, or they do not have exactly one row per trial and generation.
-    pub fn digest(&self, config: &Config, policies: &[impl AsRef<[f32]>]) -> Result<(Story, RunSums), RecordError> {
+    pub fn digest(
+        &self,
+        config: &Config,
+        policies: &[impl AsRef<[f32]>],
+    ) -> Result<(FirstAndLastRows, RunSums), RecordError> {
         let path = self.file(METRICS);
         let damaged = |reason: String| RecordError::damaged(&path, reason);
         let mut rows = metrics::open(&path)?;
         let (trials, last) = (config.learning.trials, config.learning.generations);
-        let mut story = Story { first: vec![], last: vec![] };
+        let mut ends = FirstAndLastRows { first: vec![], last: vec![] };
         let mut count = 0;
         for row in &mut rows {
             let (row, _) = row.map_err(|error| match error {
@@ -193,10 +197,10 @@ impl Folder {
                 return Err(damaged(format!("line {} is not trial {trial}, generation {generation}", count + 2)));
             }
             if row.generation == 0 {
-                story.first.push(row);
+                ends.first.push(row);
             }
             if row.generation == last {
-                story.last.push(row);
+                ends.last.push(row);
             }
             count += 1;
         }
@@ -206,11 +210,11 @@ impl Folder {
         let mut hash: Sha256 = rows.digest();
         let metrics = hex(&hash.clone().finalize());
         policies.iter().for_each(|weights| hash.update(bytemuck::cast_slice::<f32, u8>(weights.as_ref())));
-        Ok((story, RunSums { run: hex(&hash.finalize()), metrics }))
+        Ok((ends, RunSums { run: hex(&hash.finalize()), metrics }))
     }
 
     /// Returns the results of a finished run, or `None` if a file has changed since the run ended.
-    fn finished(&self, run: &Run, config: &Config) -> Result<Option<Story>, RecordError> {
+    fn finished(&self, run: &Run, config: &Config) -> Result<Option<FirstAndLastRows>, RecordError> {
         let Some(digest) = run.digest.as_ref().filter(|_| run.state == Status::Done) else { return Ok(None) };
         if run.generations != config.learning.generations + 1 {
             return Ok(None);
@@ -230,7 +234,7 @@ impl Folder {
             found.run == *digest && same
         };
         match policies.and_then(|policies| self.digest(config, &policies)) {
-            Ok((story, found)) => Ok(same(&found).then_some(story)),
+            Ok((rows, found)) => Ok(same(&found).then_some(rows)),
             // Missing or damaged files are written again. A file that cannot be read now may still be intact, so that
             // is an error.
             Err(RecordError::Read { path, error }) if error.kind() != ErrorKind::NotFound => {

@@ -71,8 +71,8 @@ pub struct Experiment {
     pub best: Vec<Vec<f64>>,
 }
 
-/// The keys in which the experiments differ.
-const VARIED: [&str; 3] = ["learning.paradigm", "learning.fitness", "policy.actions"];
+/// The keys that the experiments fix. Stages could change the fitness.
+const FIXED: [&str; 4] = ["learning.paradigm", "learning.fitness", "policy.actions", "stages"];
 
 /// Returns all experiments of the paper, with some keys changed in each.
 ///
@@ -84,9 +84,9 @@ const VARIED: [&str; 3] = ["learning.paradigm", "learning.fitness", "policy.acti
 pub fn arms(overrides: &[Override]) -> Result<Vec<Experiment>, ConfigError> {
     let problems: Vec<_> = overrides
         .iter()
-        .filter(|set| VARIED.contains(&set.key.as_str()))
+        .filter(|set| FIXED.contains(&set.key.as_str()))
         .map(|set| {
-            let message = "the paper's experiments differ in this key: leave it out".to_string();
+            let message = "the paper's experiments fix this key: leave it out".to_string();
             Problem { line: None, key: set.name.clone(), message }
         })
         .collect();

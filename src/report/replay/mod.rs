@@ -166,7 +166,7 @@ pub struct Replayed {
     pub trace: Trace,
     /// The scores of this episode.
     pub scores: Scores,
-    /// The leader to whose group each agent belongs for Df, or [`credit::NOBODY`]. `[agents]`.
+    /// The leader to whose group each agent belongs for Df, or [`credit::UNASSIGNED`]. `[agents]`.
     pub owner: Vec<u32>,
     /// The leaders of each follower at each step, as [`credit::lead`] writes them. Empty unless the run's fitness is
     /// Dt.
@@ -569,7 +569,7 @@ impl Replayed {
             // The start shows the groups of the first step, whose sights precede any motion.
             Some(follower) => (0..leaders)
                 .find(|&leader| credit::leads(&self.led, &self.world, step.saturating_sub(1), follower, leader)),
-            None => (self.owner[agent] != credit::NOBODY).then_some(self.owner[agent] as usize),
+            None => (self.owner[agent] != credit::UNASSIGNED).then_some(self.owner[agent] as usize),
         }
     }
 

@@ -142,7 +142,7 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
         near.extend((0..world.pois.len()).flat_map(|poi| (played.near(step, poi) as u16).to_le_bytes()));
     }
     let owner: Vec<i64> =
-        played.owner.iter().map(|&owner| if owner == credit::NOBODY { -1 } else { i64::from(owner) }).collect();
+        played.owner.iter().map(|&owner| if owner == credit::UNASSIGNED { -1 } else { i64::from(owner) }).collect();
     json!({
         "trial": played.trial,
         "generation": played.generation,

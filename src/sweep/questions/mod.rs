@@ -249,7 +249,7 @@ impl Study {
             let mut config = config.clone();
             config.learning.poi_jitter = poi_jitter;
             let world = World::new(&config);
-            let teams = evaluate::one_policy_a_team(trials, world.leaders());
+            let teams = evaluate::aligned_teams(trials, world.leaders());
             let seed = config.learning.seed;
             let starts = match episodes {
                 1 => Starts::Own,

@@ -34,7 +34,7 @@ pub use buffers::Traffic;
 pub(super) use compute::{BINDING_ALIGNMENT, Stopwatch, grid, timed};
 pub use compute::{Binding, Bindings};
 pub use error::DeviceError;
-pub use waiting::{Patience, report_stalls};
+pub use waiting::{WaitLimit, report_stalls};
 
 use error::chain;
 
@@ -67,9 +67,10 @@ pub struct Gpu {
     traffic: Arc<[AtomicU64; 2]>,
     /// The next nonce, see [`Gpu::nonces`].
     nonce: Arc<AtomicU32>,
-    patience: Patience,
-    /// Pipelines that the device's tests have compiled, and whether more are kept.
+    wait_limit: WaitLimit,
+    /// Pipelines that the self-test has compiled.
     kept: Arc<Mutex<HashMap<Compiled, wgpu::ComputePipeline>>>,
+    /// Whether this clone adds to them.
     keeps: bool,
     /// Faults that tests inject.
     faults: Option<Arc<dyn Faults>>,
@@ -122,7 +123,7 @@ impl Gpu {
         });
         // Another value in each process, because memory may keep nonces of a process before.
         let nonce = Arc::new(AtomicU32::new(host::since_1970().as_nanos() as u32));
-        let patience = if info.kind == Kind::Software { Patience::WITH_SOFTWARE } else { Patience::WITH_GPUS };
+        let wait_limit = if info.kind == Kind::Software { WaitLimit::WITH_SOFTWARE } else { WaitLimit::WITH_GPUS };
         Ok(Gpu {
             adapter: info,
             limits,
@@ -134,14 +135,14 @@ impl Gpu {
             errors,
             traffic: Arc::default(),
             nonce,
-            patience,
+            wait_limit,
             kept: Arc::default(),
             keeps: false,
             faults: None,
         })
     }
 
-    /// Returns the device such that the crate's own pipelines that it compiles are reused by its other clones.
+    /// Returns a clone that keeps the pipelines that it compiles. All other clones reuse them.
     pub(super) fn keeping_pipelines(&self) -> Gpu {
         Gpu { keeps: true, ..self.clone() }
     }
@@ -189,7 +190,7 @@ impl Gpu {
         self.faults.as_ref().and_then(|faults| faults.rollout_takes(teams)).unwrap_or(elapsed)
     }
 
-    /// Returns an error if the device was lost, or if anything failed outside the calls below. To be called after every
+    /// Returns an error if the device was lost, or if anything failed outside of [`Gpu::scoped`]. Call it after every
     /// wait.
     ///
     /// # Errors

@@ -10,19 +10,19 @@ use crate::host;
 
 /// How long to wait for a device that makes no progress.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Patience {
+pub struct WaitLimit {
     /// The time of one wait. After the first, the second, the fourth and so on, the device is reported as slow.
     pub wait: Duration,
     /// Waits without progress after which the device counts as lost.
     pub waits: u32,
 }
 
-impl Patience {
-    /// The patience with a GPU: a message after 10 s, and an error after 2 minutes. No submission takes longer than a
+impl WaitLimit {
+    /// The wait_limit with a GPU: a message after 10 s, and an error after 2 minutes. No submission takes longer than a
     /// second.
-    pub const WITH_GPUS: Patience = Patience { wait: Duration::from_secs(10), waits: 12 };
-    /// The patience with a software renderer, which waits for the processor as any other program does: an hour.
-    pub const WITH_SOFTWARE: Patience = Patience { wait: Duration::from_secs(10), waits: 360 };
+    pub const WITH_GPUS: WaitLimit = WaitLimit { wait: Duration::from_secs(10), waits: 12 };
+    /// The wait_limit with a software renderer, which waits for the processor as any other program does: an hour.
+    pub const WITH_SOFTWARE: WaitLimit = WaitLimit { wait: Duration::from_secs(10), waits: 360 };
 }
 
 /// Reports a device without progress to people, see [`report_stalls`].
@@ -36,8 +36,8 @@ pub fn report_stalls(report: fn(&str)) {
 
 impl Gpu {
     /// Sets how long to wait for a device that makes no progress.
-    pub fn waiting(self, patience: Patience) -> Gpu {
-        Gpu { patience, ..self }
+    pub fn waiting(self, wait_limit: WaitLimit) -> Gpu {
+        Gpu { wait_limit, ..self }
     }
 
     /// Waits until everything submitted is done.
@@ -64,7 +64,7 @@ impl Gpu {
             let _ = host::wait(done);
             return self.check();
         }
-        let Patience { wait, waits } = self.patience;
+        let WaitLimit { wait, waits } = self.wait_limit;
         for waited in 1..=waits {
             let wanted = wgpu::PollType::Wait { submission_index: submission_index.clone(), timeout: Some(wait) };
             let polled = match self.faults.as_ref().is_some_and(|faults| faults.stalls()) {

@@ -377,7 +377,7 @@ impl GpuBackend {
                     count: TOGETHER.min(leaders - first) as u32,
                     parameters: group.world.constants.policy.parameters,
                     teams,
-                    teams_a_task: shares[0].task.teams,
+                    teams_per_task: shares[0].task.teams,
                     choices: chosen as u32,
                     weights: shares[0].task.weights,
                 };

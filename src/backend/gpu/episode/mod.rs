@@ -220,7 +220,7 @@ impl GpuBackend {
     }
 
     /// Chooses how records are copied to the host.
-    pub fn bringing(self, records: Records) -> GpuBackend {
+    pub fn with_records(self, records: Records) -> GpuBackend {
         GpuBackend { records, ..self }
     }
 

@@ -79,7 +79,7 @@ gpu_struct! {
 }
 
 /// Returns the estimated loop iterations per thread and step, over all loops.
-fn turns_a_step(world: &World, packing: Packing, records: Kept) -> usize {
+fn turns_per_step(world: &World, packing: Packing, records: Kept) -> usize {
     let Constants { words, policy: PolicyConstants { widths, .. }, .. } = world.constants;
     let network: u32 = widths.windows(2).map(|w| (w[0] + 2) * w[1]).sum();
     // A leader iterates over all agents, and again over those in reach.
@@ -91,18 +91,18 @@ fn turns_a_step(world: &World, packing: Packing, records: Kept) -> usize {
 }
 
 /// Returns the maximum steps per dispatch, see [`TURNS`].
-fn steps_a_dispatch(world: &World, packing: Packing, records: Kept) -> usize {
-    (TURNS / turns_a_step(world, packing, records)).max(1)
+fn steps_per_dispatch(world: &World, packing: Packing, records: Kept) -> usize {
+    (TURNS / turns_per_step(world, packing, records)).max(1)
 }
 
-/// Returns the bytes of a team's states between two dispatches, 0 if one dispatch plays the whole episode. An adapter that
-/// allows larger workgroups than every WebGPU device does may need none where this counts some.
+/// Returns the bytes of a team's states between two dispatches, 0 if one dispatch plays the whole episode. This is an
+/// upper bound: adapters with larger workgroups may need none.
 pub(crate) fn state_bytes(world: &World, request: RecordRequest<'_>) -> u64 {
     let kept = Kept { trace: false, sights: request.sights() && world.followers() > 0 };
     let generic = Packing::generic(world, WORKGROUPS[2]);
     let specialised = Packing::specialised(world, Capacity::of_workgroups(MAX_THREADS));
     let packings = [generic].into_iter().chain(specialised);
-    let parted = packings.into_iter().any(|packing| world.steps() > steps_a_dispatch(world, packing, kept));
+    let parted = packings.into_iter().any(|packing| world.steps() > steps_per_dispatch(world, packing, kept));
     if parted { (world.agents() * size_of::<State>()) as u64 } else { 0 }
 }
 
@@ -113,15 +113,15 @@ pub(super) struct PlannedTask {
     pub(super) shape: Shape,
     /// The task, with all steps of the episode.
     pub(super) task: Task,
-    pub(super) steps_a_dispatch: usize,
+    pub(super) steps_per_dispatch: usize,
     /// The estimated work of a step: loop iterations over all threads.
-    pub(super) turns_a_step: usize,
+    pub(super) turns_per_step: usize,
 }
 
 impl PlannedTask {
     /// Returns the estimated work of a round: loop iterations over all threads.
     pub(super) fn turns(&self, round: &Task) -> u64 {
-        u64::from(round.end - round.first) * self.turns_a_step as u64
+        u64::from(round.end - round.first) * self.turns_per_step as u64
     }
 
     /// Returns the number of weights of its teams, in fours.
@@ -131,13 +131,13 @@ impl PlannedTask {
 
     /// Returns the number of rounds of dispatches.
     pub(super) fn rounds(&self) -> usize {
-        (self.task.end as usize).div_ceil(self.steps_a_dispatch)
+        (self.task.end as usize).div_ceil(self.steps_per_dispatch)
     }
 
     /// Returns the task with the steps of one round of dispatches, or `None` after its last round.
     pub(super) fn round(&self, round: usize, nonce: u32) -> Option<Task> {
-        let first = (round * self.steps_a_dispatch) as u32;
-        let end = self.task.end.min(first + self.steps_a_dispatch as u32);
+        let first = (round * self.steps_per_dispatch) as u32;
+        let end = self.task.end.min(first + self.steps_per_dispatch as u32);
         (first < end).then_some(Task { first, end, nonce, ..self.task })
     }
 
@@ -242,11 +242,11 @@ pub(super) fn plan(
             let packing = Packing::generic(world, room.workgroup);
             (packing, Shape::generic(world, packing, kept))
         });
-        let (steps_a_dispatch, turns_a_step) =
-            (steps_a_dispatch(world, packing, kept), turns_a_step(world, packing, kept));
-        let states_a_team = if world.steps() > steps_a_dispatch { world.agents() } else { 0 };
+        let (steps_per_dispatch, turns_per_step) =
+            (steps_per_dispatch(world, packing, kept), turns_per_step(world, packing, kept));
+        let states_a_team = if world.steps() > steps_per_dispatch { world.agents() } else { 0 };
         // Every buffer that grows with the teams is one of these, or smaller than one of them.
-        let bytes_a_team = [
+        let bytes_per_team = [
             (record_words(world, group.records()) + STATUS) * size_of::<u32>(),
             fours(world) * size_of::<[f32; FOUR]>(),
             moments_a_team * size_of::<Moment>(),
@@ -255,20 +255,20 @@ pub(super) fn plan(
         .into_iter()
         .max()
         .unwrap_or(0) as u64;
-        if bytes_a_team > room.buffer {
+        if bytes_per_team > room.buffer {
             return Err(BackendError::TooLarge(format!(
-                "one team takes {bytes_a_team} bytes in one buffer, this adapter allows {}; \
+                "one team takes {bytes_per_team} bytes in one buffer, this adapter allows {}; \
                  use the CPU, fewer steps or fewer POIs",
                 room.buffer
             )));
         }
-        let teams_a_task = packing.teams.min((target / bytes_a_team.max(1)).max(1) as usize);
+        let teams_per_task = packing.teams.min((target / bytes_per_team.max(1)).max(1) as usize);
         // A group's world, starts and POIs are stored once per batch.
         let mut stored: Option<(usize, Task)> = None;
-        for first_team in (0..group.team_count()).step_by(teams_a_task) {
-            let teams = teams_a_task.min(group.team_count() - first_team);
+        for first_team in (0..group.team_count()).step_by(teams_per_task) {
+            let teams = teams_per_task.min(group.team_count() - first_team);
             let mut work = batches.last_mut().expect("there is a batch");
-            let full = |used: usize, size: usize| used as u64 * size as u64 + teams as u64 * bytes_a_team > target;
+            let full = |used: usize, size: usize| used as u64 * size as u64 + teams as u64 * bytes_per_team > target;
             if full(work.record, size_of::<u32>())
                 || full(work.weights, size_of::<[f32; FOUR]>())
                 || full(work.moments, size_of::<Moment>())
@@ -309,8 +309,8 @@ pub(super) fn plan(
             work.sets += world.set_words() * teams;
             work.moments += moments_a_team * teams;
             work.states += states_a_team * teams;
-            let turns_a_step = turns_a_step * packing.workgroup;
-            work.shares.push(PlannedTask { group: index, first_team, shape, task, steps_a_dispatch, turns_a_step });
+            let turns_per_step = turns_per_step * packing.workgroup;
+            work.shares.push(PlannedTask { group: index, first_team, shape, task, steps_per_dispatch, turns_per_step });
         }
     }
     batches.retain(|work| !work.shares.is_empty());

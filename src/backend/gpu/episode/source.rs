@@ -58,7 +58,7 @@ pub(super) fn source(shape: Shape) -> String {
         }
         Sizes::Fixed { teams, leaders, agents, pois, widths, variant } => format!(
             "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u);\nconst variant = {variant};\n\
-             fn adopt(task: Task) {{}}\n{}",
+             fn set_shape(task: Task) {{}}\n{}",
             straight_policy(&widths),
             words = agents.div_ceil(32),
             variant = variant.value()

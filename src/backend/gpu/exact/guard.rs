@@ -14,7 +14,7 @@
 //! when an operation between two guards disappeared, as the first `0.0 + product` of an unrolled sum does. It cancelled
 //! the two guards and fused the product with the next sum.
 //!
-//! What compilers can still do with guards is harmless:
+//! Compilers may still do the following with guards, which is harmless:
 //!
 //! - Merge two guards if the operation between them disappears (`0.0 + x`, `1.0 * x`, a selection, a copy). The one that
 //!   remains still separates `x` from the next operation.
