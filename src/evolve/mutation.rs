@@ -112,13 +112,19 @@ pub struct Offspring<'a> {
 }
 
 /// Fills slots, `[slots][parameters]`: copies each one's parent and [`mutate`]s it. `scratch` may hold anything.
-pub fn breed(level: Level, learning: &Learning, brood: Offspring<'_>, children: &mut [f32], scratch: &mut Vec<u32>) {
-    let parameters = brood.policies.len() / brood.parents.len();
+pub fn breed(
+    level: Level,
+    learning: &Learning,
+    offspring: Offspring<'_>,
+    children: &mut [f32],
+    scratch: &mut Vec<u32>,
+) {
+    let parameters = offspring.policies.len() / offspring.parents.len();
     // As many policies as fit into the first-level cache.
     let together = (BRED_TOGETHER / parameters).clamp(1, WIDEST);
     for (batch, children) in children.chunks_mut(together * parameters).enumerate() {
-        let batch = Offspring { first: brood.first + batch * together, ..brood };
-        dispatch!(level, simd => mutate_brood(simd, learning, batch, children, scratch));
+        let batch = Offspring { first: offspring.first + batch * together, ..offspring };
+        dispatch!(level, simd => mutate_offspring(simd, learning, batch, children, scratch));
     }
 }
 
@@ -126,21 +132,21 @@ pub fn breed(level: Level, learning: &Learning, brood: Offspring<'_>, children: 
 const BRED_TOGETHER: usize = 2048;
 
 #[inline(always)]
-fn mutate_brood<S: Simd>(
+fn mutate_offspring<S: Simd>(
     simd: S,
     learning: &Learning,
-    brood: Offspring<'_>,
+    offspring: Offspring<'_>,
     children: &mut [f32],
     scratch: &mut Vec<u32>,
 ) {
-    let parameters = brood.policies.len() / brood.parents.len();
-    let policy = |parent: u32| &brood.policies[(parent & !UNCHANGED) as usize * parameters..][..parameters];
-    let (parents, later) = brood.parents[brood.first..].split_at(children.len() / parameters);
+    let parameters = offspring.policies.len() / offspring.parents.len();
+    let policy = |parent: u32| &offspring.policies[(parent & !UNCHANGED) as usize * parameters..][..parameters];
+    let (parents, later) = offspring.parents[offspring.first..].split_at(children.len() / parameters);
     let mut chosen = Chosen::new(scratch, parents.len(), parameters);
     for (batch, parents) in parents.chunks(S::f32s::LEN).enumerate() {
         let first = batch * S::f32s::LEN;
-        let slots = S::u32s::from_fn(simd, |lane| (brood.first + first + lane) as u32);
-        let keys = brood.key.at_lanes::<S>(brood.generation, brood.population, slots);
+        let slots = S::u32s::from_fn(simd, |lane| (offspring.first + first + lane) as u32);
+        let keys = offspring.key.at_lanes::<S>(offspring.generation, offspring.population, slots);
         let [x, y, z, w] = keys;
         let forks = math::pcg4d::<S>(x, y, z, w ^ u32::MAX);
         let key = |of: &[S::u32s; 4], lane: usize| Key([of[0][lane], of[1][lane], of[2][lane], of[3][lane]]);
