@@ -1,6 +1,8 @@
-//! Teams, starts, selection and mutation are what the paper's Algorithm 1 says, and the trainer puts them together so.
+//! Tests teams, starts, selection and mutation, and compares the trainer with a plain implementation of the paper's
+//! Algorithm 1.
 //!
-//! Statistics are of seeded draws: counts and means have to lie within five standard deviations of what they should be.
+//! Statistical tests use seeded draws. Counts and means must be within five standard deviations of their expected
+//! values.
 
 mod support;
 
@@ -40,7 +42,7 @@ const CHAOTIC: &str = "chaotic";
 fn config(layout: &str, change: impl FnOnce(&mut Config)) -> Config {
     let mut config = support::layout(layout);
     change(&mut config);
-    // What a test asks for has to be what a user may ask for.
+    // Tests use only configs that the program accepts.
     config.with(&[]).unwrap()
 }
 
@@ -52,27 +54,27 @@ fn learning(mutation: Mutation, probability: f64, sigma: f64) -> Learning {
     config(GENERALLY_FORWARD, change).learning
 }
 
-/// With scratch that another policy has been through.
+/// Mutates with scratch memory that is not empty, as after another policy.
 fn mutate(level: Level, key: Key, learning: &Learning, weights: &mut [f32]) {
     evolve::mutate(level, key, learning, weights, &mut vec![7; 9]);
 }
 
 #[track_caller]
-fn near(what: &str, found: f64, expected: f64, deviation: f64) {
-    assert!((found - expected).abs() <= 5.0 * deviation, "{what}: {found}, expected {expected} ± {deviation}");
+fn assert_near(what: &str, actual: f64, expected: f64, deviation: f64) {
+    assert!((actual - expected).abs() <= 5.0 * deviation, "{what}: {actual}, expected {expected} ± {deviation}");
 }
 
-/// Whether counts are as likely as they should be, given the probability of each.
+/// Compares counts with the probability of each index, using a chi-square test.
 #[track_caller]
-fn chi_square(what: &str, counts: &[u32], probability: impl Fn(usize) -> f64) {
+fn assert_distribution(what: &str, counts: &[u32], probability: impl Fn(usize) -> f64) {
     let total: u32 = counts.iter().sum();
     let term = |(index, &count): (usize, &u32)| {
         let expected = f64::from(total) * probability(index);
-        assert!(expected > 5.0, "{what}: too few to tell");
+        assert!(expected > 5.0, "{what}: too few draws for a chi-square test");
         (f64::from(count) - expected).powi(2) / expected
     };
     let freedom = (counts.len() - 1) as f64;
-    near(what, counts.iter().enumerate().map(term).sum(), freedom, (2.0 * freedom).sqrt());
+    assert_near(what, counts.iter().enumerate().map(term).sum(), freedom, (2.0 * freedom).sqrt());
 }
 
 fn uniform(word: u32) -> f64 {
@@ -85,7 +87,7 @@ fn bits(weights: &[f32]) -> Vec<u32> {
 
 proptest! {
     #[test]
-    fn every_policy_is_on_one_team_of_a_round(
+    fn every_policy_is_on_exactly_one_team_per_round(
         seed: u64, generation in 0usize..200, round in 0usize..16, leaders in 1usize..30, population in 1usize..300,
     ) {
         let mut teams = vec![u32::MAX; population * leaders];
@@ -97,21 +99,23 @@ proptest! {
         }
     }
 
-    /// Few distinct scores, so that nearly all are tied.
+    /// Scores have few distinct values, so that nearly all are tied.
     #[test]
-    fn elites_come_best_first_and_ties_go_to_the_lower_index(
+    fn elites_are_sorted_and_ties_go_to_the_lower_index(
         scores in prop::collection::vec(0u8..6, 1..80), share in 0.0..=1.0f64,
     ) {
         let scores: Vec<f32> = scores.into_iter().map(|score| f32::from(score) / 4.0).collect();
         let count = (share * scores.len() as f64) as usize;
         let mut order: Vec<usize> = (0..scores.len()).collect();
-        // A stable sort leaves ties as they were.
+        // A stable sort keeps the order of ties.
         order.sort_by(|&a, &b| scores[b].partial_cmp(&scores[a]).unwrap());
         prop_assert_eq!(evolve::best(&scores, count), &order[..count]);
     }
 
     #[test]
-    fn starts_stay_on_the_map_and_on_the_grid(seed: u64, jitter in 1e-6..30.0f64, width in 1.0..60.0f64, height in 1.0..60.0f64) {
+    fn starts_stay_on_the_map_and_on_the_grid(
+        seed: u64, jitter in 1e-6..30.0f64, width in 1.0..60.0f64, height in 1.0..60.0f64,
+    ) {
         let world = World::new(&config(GENERALLY_FORWARD, |config| {
             config.world.map = [width, height];
             for places in [&mut config.world.leaders, &mut config.world.followers, &mut config.world.pois] {
@@ -125,39 +129,40 @@ proptest! {
             for (at, from, wall) in [(start.x, from.x, world.map().x), (start.y, from.y, world.map().y)] {
                 prop_assert!((0.0..=wall).contains(&at));
                 prop_assert!((at * GRID).fract() == 0.0 || at == wall, "{} is off the grid", at);
-                prop_assert!(f64::from((at - from).abs()) <= jitter + 1.0 / f64::from(GRID) + 1e-5, "{} from {}", at, from);
+                let farthest = jitter + 1.0 / f64::from(GRID) + 1e-5;
+                prop_assert!(f64::from((at - from).abs()) <= farthest, "{} from {}", at, from);
             }
         }
     }
 }
 
 #[test]
-fn every_way_to_form_teams_is_as_likely() {
+fn all_ways_to_form_teams_are_equally_likely() {
     let (leaders, population) = (3, 4);
     let mut teams = vec![0; population * leaders];
-    // Where policy 0 of each population plays, together: the populations are shuffled apart from each other.
-    let mut together = vec![0; population * population * population];
+    // Counts the three teams of the policies 0 jointly, because the populations are shuffled independently.
+    let mut joint = vec![0; population * population * population];
     let mut orders = vec![0; 256];
     for generation in 0..12_000 {
         evolve::form_teams(Key::new(5, 0, Purpose::Teams), generation, 0, leaders, &mut teams);
         let team = |leader: usize| (0..population).position(|team| teams[team * leaders + leader] == 0).unwrap();
-        together[(team(0) * population + team(1)) * population + team(2)] += 1;
+        joint[(team(0) * population + team(1)) * population + team(2)] += 1;
         let order = (0..population).fold(0, |order, team| order * 4 + teams[team * leaders] as usize);
         orders[order] += 1;
     }
-    chi_square("places of policy 0", &together, |_| 1.0 / 64.0);
+    assert_distribution("teams of the policies 0", &joint, |_| 1.0 / 64.0);
     orders.retain(|&count| count > 0);
     assert_eq!(orders.len(), 24);
-    chi_square("orders of four policies", &orders, |_| 1.0 / 24.0);
+    assert_distribution("orders of four policies", &orders, |_| 1.0 / 24.0);
 }
 
 #[test]
-fn starts_are_jittered_evenly_and_anew_for_every_episode() {
+fn start_jitter_is_uniform_and_differs_between_episodes() {
     let world = World::new(&config(GENERALLY_FORWARD, |_| ()));
     let key = Key::new(1, 2, Purpose::Starts);
     let mut starts = Vec::new();
     evolve::jitter_starts(key, 3, 4, &world, 0.0, &mut starts);
-    assert_eq!(starts, world.starts, "without jitter, all start where the config says");
+    assert_eq!(starts, world.starts, "without jitter, starts are those of the config");
 
     let (jitter, mut counts, mut seen) = (1.5, vec![0; 30], HashSet::new());
     for generation in 0..100 {
@@ -172,12 +177,12 @@ fn starts_are_jittered_evenly_and_anew_for_every_episode() {
             seen.insert(starts.iter().flat_map(|start| start.to_array().map(f32::to_bits)).collect::<Vec<_>>());
         }
     }
-    chi_square("offsets", &counts, |_| 1.0 / 30.0);
+    assert_distribution("offsets", &counts, |_| 1.0 / 30.0);
     assert_eq!(seen.len(), 1000, "no two episodes start alike");
 }
 
 #[test]
-fn a_tournament_is_between_any_two_policies() {
+fn a_tournament_draws_every_pair_of_policies_with_the_same_probability() {
     let population = 20;
     let rising: Vec<f32> = (0..population).map(|index| index as f32).collect();
     let tied = vec![0.5; population];
@@ -186,36 +191,37 @@ fn a_tournament_is_between_any_two_policies() {
     for generation in 0..400 {
         for slot in 0..100 {
             let key = tournaments.at(generation, 1, slot);
-            // One draw, seen from both sides: rising scores tell the higher index, ties the lower.
+            // The same draw twice. With rising scores the higher index wins, with ties the lower, so that both policies
+            // are known.
             let (high, low) = (evolve::tournament(key, &rising), evolve::tournament(key, &tied));
-            assert!(low < high, "two distinct policies, and ties to the lower index: {low}, {high}");
+            assert!(low < high, "expected two distinct policies, and the lower index for ties: {low}, {high}");
             counts[low * population + high] += 1;
             let falling: Vec<f32> = rising.iter().map(|score| -score).collect();
             assert_eq!(evolve::tournament(key, &falling), low, "the higher score wins");
         }
     }
     counts.retain(|&count| count > 0);
-    assert_eq!(counts.len(), 190, "every pair meets");
-    chi_square("pairs", &counts, |_| 1.0 / 190.0);
+    assert_eq!(counts.len(), 190, "number of pairs");
+    assert_distribution("pairs", &counts, |_| 1.0 / 190.0);
     let mut duels = (0..100).map(|slot| evolve::tournament(tournaments.at(0, 0, slot), &[0.0, 1.0]));
-    assert!(duels.all(|winner| winner == 1), "of two policies, both play");
+    assert!(duels.all(|winner| winner == 1), "with two policies, both are drawn");
 }
 
 #[test]
-fn a_policy_has_other_partners_in_every_round() {
+fn a_policy_has_different_partners_in_every_round() {
     let learning = config(CHAOTIC, |config| (config.learning.partners, config.learning.population) = (3, 20)).learning;
-    let one = Learning { partners: 1, ..learning.clone() };
-    let (all, first) = (evolve::teams_of(&learning, 1, 5, 4), evolve::teams_of(&one, 1, 5, 4));
-    assert_eq!((all.len(), learning.teams()), (3 * 20 * 4, 60));
-    assert_eq!(all[..20 * 4], first, "the first round is that of a single partner");
-    let mut teams: Vec<&[u32]> = all.chunks(4).collect();
+    let single = Learning { partners: 1, ..learning.clone() };
+    let (all_rounds, first_round) = (evolve::teams_of(&learning, 1, 5, 4), evolve::teams_of(&single, 1, 5, 4));
+    assert_eq!((all_rounds.len(), learning.teams()), (3 * 20 * 4, 60));
+    assert_eq!(all_rounds[..20 * 4], first_round, "the first round equals that with a single partner");
+    let mut teams: Vec<&[u32]> = all_rounds.chunks(4).collect();
     teams.sort_unstable();
     teams.dedup();
     assert_eq!(teams.len(), 60, "no team plays twice");
 }
 
 #[test]
-fn past_champions_are_drawn_from_those_that_are_kept() {
+fn past_champions_are_drawn_uniformly_from_the_hall_of_fame() {
     let learning = config(CHAOTIC, |config| config.learning.hall_of_fame = 4).learning;
     let (first, mut counts) = (learning.population + 1, [0; 4]);
     assert_eq!(learning.slots(), first + 4);
@@ -225,19 +231,19 @@ fn past_champions_are_drawn_from_those_that_are_kept() {
             0 => assert_eq!(slot, None, "there are no past champions"),
             _ => assert!((first..first + generation.min(4)).contains(&slot.unwrap()), "{generation}: {slot:?}"),
         }
-        // The age of the champions, in generations.
+        // The age of the drawn champions, in generations.
         if let Some(slot) = slot.filter(|_| generation >= 4) {
             counts[(generation - 1 - (slot - first)) % 4] += 1;
         }
     }
-    chi_square("ages of past champions", &counts, |_| 0.25);
+    assert_distribution("ages of past champions", &counts, |_| 0.25);
 }
 
 #[test]
 fn the_champion_replaces_the_oldest_of_the_hall_of_fame() {
     let scores = [0.1, 0.3, 0.2];
     for generation in 0..7 {
-        let (mut plan, mut kept) = ([0; 6], [0; 6]);
+        let (mut plan, mut last_plan) = ([0; 6], [0; 6]);
         let (key, selection) = (Key::new(3, 0, Purpose::Tournament), Selection { elites: 1, parents: Parents::All });
         evolve::draw_parents(Level::new(), key, generation, 0, selection, &scores, &mut plan);
         let mut expected = [1, 4, 5].map(|slot| slot | UNCHANGED);
@@ -247,8 +253,12 @@ fn the_champion_replaces_the_oldest_of_the_hall_of_fame() {
             expected[2] = 1 | UNCHANGED
         }
         assert_eq!(plan[3..], expected, "generation {generation}");
-        evolve::keep_parents(&scores, &mut kept);
-        assert_eq!(kept[4..], [4, 5].map(|slot| slot | UNCHANGED), "the hall stays after the last generation");
+        evolve::keep_parents(&scores, &mut last_plan);
+        assert_eq!(
+            last_plan[4..],
+            [4, 5].map(|slot| slot | UNCHANGED),
+            "the hall of fame is kept after the last generation"
+        );
     }
 }
 
@@ -273,11 +283,11 @@ fn truncation_draws_every_elite_as_parent_with_the_same_probability() {
         }
         assert_eq!(plan[policies], UNCHANGED, "the champion is the best policy, which is policy 0");
     }
-    chi_square("elites as parents", &counts, |_| 1.0 / elites as f64);
+    assert_distribution("elites as parents", &counts, |_| 1.0 / elites as f64);
 }
 
 #[test]
-fn a_share_of_elites_is_rounded_to_the_nearest_number_and_at_least_one() {
+fn a_percentage_of_elites_is_rounded_to_the_nearest_number_and_at_least_one() {
     for (percentage, population, count) in
         [(10.0, 50, 5), (10.0, 5000, 500), (1.0, 50, 1), (1.0, 149, 1), (1.0, 150, 2), (0.001, 50, 1), (100.0, 7, 7)]
     {
@@ -286,31 +296,31 @@ fn a_share_of_elites_is_rounded_to_the_nearest_number_and_at_least_one() {
     assert_eq!(Elites::Count(9).count(7), 7, "there are no more elites than policies");
 }
 
-/// Mean, standard deviation and shape of numbers that should be N(0, 1).
+/// Compares the mean, standard deviation and distribution of numbers with N(0, 1).
 #[track_caller]
-fn normal(what: &str, numbers: &[f64]) {
+fn assert_normal(what: &str, numbers: &[f64]) {
     let count = numbers.len() as f64;
     let mean = numbers.iter().sum::<f64>() / count;
     let deviation = (numbers.iter().map(|number| (number - mean).powi(2)).sum::<f64>() / count).sqrt();
-    near(what, mean, 0.0, 1.0 / count.sqrt());
-    near(what, deviation, 1.0, 1.0 / (2.0 * count).sqrt());
-    // Φ at 0, 0.5, … 3, from tables.
+    assert_near(what, mean, 0.0, 1.0 / count.sqrt());
+    assert_near(what, deviation, 1.0, 1.0 / (2.0 * count).sqrt());
+    // Φ at 0, 0.5, … 3, from tables, and 1 as the end of the last bin.
     let below = [0.5, 0.691462461, 0.841344746, 0.933192799, 0.977249868, 0.993790335, 0.998650102, 1.0];
     let cumulative = |bin: usize| if bin < 7 { 1.0 - below[7 - bin] } else { below[bin - 7] };
     let mut counts = vec![0; 14];
     numbers.iter().for_each(|number| counts[((number * 2.0).floor() + 7.0).clamp(0.0, 13.0) as usize] += 1);
-    chi_square(what, &counts, |bin| cumulative(bin + 1) - cumulative(bin));
+    assert_distribution(what, &counts, |bin| cumulative(bin + 1) - cumulative(bin));
 }
 
 #[test]
-fn new_policies_are_normal() {
+fn weights_of_new_policies_are_normally_distributed() {
     let mut weights = vec![0.0; 200_000];
     evolve::random_policy(Level::new(), Key::new(0, 0, Purpose::Weights).at(0, 0, 0), &mut weights);
-    normal("new weights", &weights.iter().map(|&weight| f64::from(weight)).collect::<Vec<_>>());
+    assert_normal("new weights", &weights.iter().map(|&weight| f64::from(weight)).collect::<Vec<_>>());
 }
 
 #[test]
-fn mutation_touches_its_share_of_weights_with_its_noise() {
+fn mutation_adds_normal_noise_to_the_configured_share_of_weights() {
     let old: Vec<f32> = (0..200_000).map(|index| [-2.0, 0.5, 1.25][index % 3] + (index % 97) as f32 * 1e-3).collect();
     let key = Key::new(3, 1, Purpose::Mutation).at(17, 2, 5);
     for (mutation, sigma) in [(Mutation::Scaled, 0.1), (Mutation::Additive, 0.1), (Mutation::Additive, 2.5)] {
@@ -324,24 +334,24 @@ fn mutation_touches_its_share_of_weights_with_its_noise() {
             };
             let noise: Vec<f64> = old.iter().zip(&new).filter_map(noise).collect();
             let count = old.len() as f64;
-            // Noise too small to show in f32 is as good as never.
+            // Noise that is too small for f32 leaves a weight unchanged, which lowers the count.
             let deviation = (count * probability * (1.0 - probability)).sqrt() + 2.0 * probability;
-            near(&what, noise.len() as f64, count * probability, deviation);
+            assert_near(&what, noise.len() as f64, count * probability, deviation);
             if probability == 0.0 {
                 assert_eq!(bits(&new), bits(&old), "{what}");
             } else {
-                normal(&what, &noise);
+                assert_normal(&what, &noise);
             }
         }
     }
     let mut new = old.clone();
     mutate(Level::new(), key, &learning(Mutation::Additive, 1.0, 0.0), &mut new);
-    assert_eq!(bits(&new), bits(&old), "noise of no size");
+    assert_eq!(bits(&new), bits(&old), "with sigma 0");
 }
 
-/// Weight by weight: Box and Muller's formula in f64, from the draws that the counters give.
+/// Compares every weight with the Box-Muller transform in f64 of the draws for its index.
 #[test]
-fn weights_follow_from_their_own_counters() {
+fn weights_equal_the_box_muller_transform_of_their_draws() {
     let (weights, mutations) = (Key::new(8, 0, Purpose::Weights).at(0, 1, 2), Key::new(8, 0, Purpose::Mutation));
     let deviate = |a: u32, b: u32| {
         let unit = (f64::from(a >> 8) + 1.0) / (1u32 << 24) as f64;
@@ -369,7 +379,7 @@ fn weights_follow_from_their_own_counters() {
     }
 }
 
-/// Every weight has a size that the kernels can take, however often and hard policies are mutated.
+/// Tests that weights stay in the range that the kernels support, after many and strong mutations.
 #[test]
 fn weights_stay_in_bounds() {
     let starts = [MAX_WEIGHT, -MAX_WEIGHT, MIN_WEIGHT, -MIN_WEIGHT, 0.0, 1e-4, 1.0, -1e5];
@@ -395,23 +405,26 @@ fn weights_stay_in_bounds() {
             }
         }
     }
-    assert!(largest == MAX_WEIGHT && smallest < 2.0 * MIN_WEIGHT && zeros > 0, "{largest}, {smallest}: ends not met");
+    assert!(
+        largest == MAX_WEIGHT && smallest < 2.0 * MIN_WEIGHT && zeros > 0,
+        "{largest}, {smallest}: bounds not reached"
+    );
 }
 
-/// A place in the space of all randomness: seed, trial, purpose, generation, population, slot, counter.
-type Place = [u64; 7];
+/// Coordinates of a random draw: seed, trial, purpose, generation, population, slot, counter.
+type Coordinates = [u64; 7];
 
-fn draw(place: Place) -> [u32; 4] {
-    let [seed, trial, purpose, generation, population, slot, counter] = place;
+fn draw(coordinates: Coordinates) -> [u32; 4] {
+    let [seed, trial, purpose, generation, population, slot, counter] = coordinates;
     let key = Key::new(seed, trial as usize, PURPOSES[purpose as usize]);
     key.at(generation as usize, population as usize, slot as usize).draw(counter as u32)
 }
 
 #[test]
-fn no_two_places_share_a_draw() {
+fn no_two_coordinates_share_a_draw() {
     let mut seen = HashSet::new();
-    let mut places: Vec<Place> = vec![[0; 7]];
-    // Of each coordinate, small numbers, and one whose high bits alone differ.
+    let mut points: Vec<Coordinates> = vec![[0; 7]];
+    // Per coordinate, small values and one that differs only in its high bits.
     let values: [&[u64]; 7] = [
         &[0, 1, 1 << 32, 1 << 62],
         &[0, 1, 4095],
@@ -421,26 +434,26 @@ fn no_two_places_share_a_draw() {
         &[0, 1, 2, (1 << 20) - 1],
         &[0, 1, 2, 1 << 12],
     ];
-    for (coordinate, values) in values.into_iter().enumerate() {
-        let with = |place: &Place| {
-            let mut place = *place;
+    for (axis, values) in values.into_iter().enumerate() {
+        let with_each_value = |point: &Coordinates| {
+            let mut point = *point;
             values.iter().map(move |&value| {
-                place[coordinate] = value;
-                place
+                point[axis] = value;
+                point
             })
         };
-        places = places.iter().flat_map(with).collect();
+        points = points.iter().flat_map(with_each_value).collect();
     }
-    let draws: usize = places.iter().map(|&place| usize::from(seen.insert(draw(place)))).sum();
-    assert_eq!((draws, draws), (places.len(), 4 * 3 * 9 * 3 * 3 * 4 * 4));
+    let draws: usize = points.iter().map(|&point| usize::from(seen.insert(draw(point)))).sum();
+    assert_eq!((draws, draws), (points.len(), 4 * 3 * 9 * 3 * 3 * 4 * 4));
 }
 
-/// Draws at neighbouring places are no more alike than any two: neither bit by bit nor as numbers.
+/// Tests that draws at neighbouring coordinates are uncorrelated, both as bits and as numbers.
 #[test]
 fn neighbouring_draws_are_uncorrelated() {
     let pairs = 8192;
-    // Steps along each coordinate, the high half of the seed's too; of the purposes there are only five.
-    let steps: [Place; 7] = [
+    // Steps along each coordinate but the purpose, and along the high half of the seed. Purposes are paired below.
+    let steps: [Coordinates; 7] = [
         [1, 0, 0, 0, 0, 0, 0],
         [1 << 32, 0, 0, 0, 0, 0, 0],
         [0, 1, 0, 0, 0, 0, 0],
@@ -449,9 +462,8 @@ fn neighbouring_draws_are_uncorrelated() {
         [0, 0, 0, 0, 0, 1, 0],
         [0, 0, 0, 0, 0, 0, 1],
     ];
-    let along = |step: Place, from: Place, index: u64| {
-        std::array::from_fn(|coordinate| from[coordinate] + step[coordinate] * index)
-    };
+    let along =
+        |step: Coordinates, from: Coordinates, index: u64| std::array::from_fn(|axis| from[axis] + step[axis] * index);
     let mut rows: Vec<(String, Vec<[[u32; 4]; 2]>)> = Vec::new();
     for purpose in 0..5u64 {
         for step in steps {
@@ -467,54 +479,55 @@ fn neighbouring_draws_are_uncorrelated() {
     for (what, pairs) in rows {
         let differ = |[a, b]: &[[u32; 4]; 2]| a.iter().zip(b).map(|(a, b)| (a ^ b).count_ones()).sum::<u32>();
         let differing = f64::from(pairs.iter().map(differ).sum::<u32>()) / count;
-        near(&format!("{what}: differing bits"), differing, 64.0, (32.0 / count).sqrt());
+        assert_near(&format!("{what}: differing bits"), differing, 64.0, (32.0 / count).sqrt());
         for (a, b) in (0..16).map(|index| (index / 4, index % 4)) {
             let product = |[x, y]: &[[u32; 4]; 2]| (uniform(x[a]) - 0.5) * (uniform(y[b]) - 0.5) * 12.0;
             let correlation = pairs.iter().map(product).sum::<f64>() / count;
-            near(&format!("{what}: words {a} and {b}"), correlation, 0.0, 1.0 / count.sqrt());
+            assert_near(&format!("{what}: words {a} and {b}"), correlation, 0.0, 1.0 / count.sqrt());
         }
         for word in 0..4 {
             let mut counts = vec![0; 64];
             pairs.iter().for_each(|[x, _]| counts[(x[word] >> 26) as usize] += 1);
-            chi_square(&format!("{what}: high bits of word {word}"), &counts, |_| 1.0 / 64.0);
+            assert_distribution(&format!("{what}: high bits of word {word}"), &counts, |_| 1.0 / 64.0);
             counts.fill(0);
             pairs.iter().for_each(|[x, _]| counts[(x[word] & 63) as usize] += 1);
-            chi_square(&format!("{what}: low bits of word {word}"), &counts, |_| 1.0 / 64.0);
+            assert_distribution(&format!("{what}: low bits of word {word}"), &counts, |_| 1.0 / 64.0);
         }
     }
 }
 
-/// Every instruction set gives the same policies, and a weight depends on its index alone, not on how many follow.
+/// Tests that every instruction set gives the same policies. A weight depends on its index, not on the number of
+/// weights.
 #[test]
-fn policies_depend_on_no_instruction_set() {
+fn policies_are_equal_on_all_instruction_sets() {
     let key = |purpose| Key::new(77, 1, purpose).at(3, 4, 5);
     let evolved = |level, parameters: usize| {
         let mut weights = vec![0.0; parameters];
         evolve::random_policy(level, key(Purpose::Weights), &mut weights);
-        let mut all = vec![weights];
+        let mut policies = vec![weights];
         for learning in [
             learning(Mutation::Scaled, 0.15, 0.1),
             learning(Mutation::Additive, 0.5, 100.0),
             learning(Mutation::Scaled, 1.0, 100.0),
         ] {
-            let mut child = all.last().unwrap().clone();
+            let mut child = policies.last().unwrap().clone();
             mutate(level, key(Purpose::Mutation), &learning, &mut child);
-            all.push(child);
+            policies.push(child);
         }
-        all
+        policies
     };
     let expected = evolved(Level::baseline(), 9_000);
     assert_ne!(expected[0], expected[1]);
     for level in Cpu::levels() {
         for parameters in (1..70).chain([112, 8_999, 9_000]) {
-            for (found, expected) in evolved(level, parameters).iter().zip(&expected) {
-                assert_eq!(bits(found), bits(&expected[..parameters]), "{}, {parameters}", level_name(level));
+            for (actual, expected) in evolved(level, parameters).iter().zip(&expected) {
+                assert_eq!(bits(actual), bits(&expected[..parameters]), "{}, {parameters}", level_name(level));
             }
         }
     }
 }
 
-/// A layout with a `[learning]` and stages of its own.
+/// Returns the world of a layout with these `[learning]` and `[[stages]]` sections.
 fn staged(layout: &str, rest: &str) -> Config {
     let path = format!("{}/configs/{layout}.toml", env!("CARGO_MANIFEST_DIR"));
     let text = std::fs::read_to_string(path).unwrap();
@@ -522,8 +535,8 @@ fn staged(layout: &str, rest: &str) -> Config {
     Config::parse(&format!("{world}\n{rest}"), "staged").unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// Arms of every kind that end at different generations.
-fn arms() -> Vec<Config> {
+/// Returns small experiments of every kind, with different numbers of generations.
+fn experiments() -> Vec<Config> {
     let small = |config: &mut Config, population, generations, trials| {
         let Learning { population: p, generations: g, trials: t, .. } = &mut config.learning;
         (*p, *g, *t) = (population, generations, trials);
@@ -629,7 +642,7 @@ from = 6
 set = { 'learning.poi_jitter' = 2.0, 'learning.episodes_per_team' = 2 }
 ",
         ),
-        // Leniency ends early, as in Panait, Luke and Wiegand (2006), and partners come and go.
+        // Leniency ends early, as in Panait, Luke and Wiegand (2006), and the number of partners changes.
         staged(
             STRICTLY_FORWARD,
             "[learning]
@@ -650,7 +663,7 @@ from = 5
 set = { 'learning.partners' = 3, 'learning.leniency' = 'mean', 'learning.fitness' = 'D' }
 ",
         ),
-        // Past champions play in stages that they did not come from.
+        // Past champions play in later stages than their own.
         staged(
             GENERALLY_FORWARD,
             "[learning]
@@ -666,7 +679,7 @@ from = 5
 set = { 'learning.leniency' = 'max', 'world.pois' = [[10, 12], [40, 20]] }
 ",
         ),
-        // Its first stage begins at once, its last is its last generation.
+        // The first stage begins at generation 0, the last at the last generation.
         staged(
             STRICTLY_FORWARD,
             "[learning]
@@ -684,35 +697,36 @@ set = { world.coupling = [1, 2], motion.max_speed = 5.0 }
     ]
 }
 
-/// Rows and policies of every arm.
+/// Trains all experiments together. Returns the rows and policies of each.
 fn train(configs: &[Config]) -> Vec<(Vec<Row>, Vec<Vec<f32>>)> {
     let (mut trainer, mut backend) = (Trainer::new(ValidConfig::all(configs).unwrap()), Cpu::default());
     let mut rows = vec![Vec::new(); configs.len()];
     for row in trainer.finish(&mut backend).unwrap() {
         rows[row.experiment].push(row);
     }
-    rows.into_iter().enumerate().map(|(arm, rows)| (rows, trainer.policies(arm))).collect()
+    rows.into_iter().enumerate().map(|(experiment, rows)| (rows, trainer.policies(experiment))).collect()
 }
 
 #[test]
-fn arms_side_by_side_come_out_as_alone() {
-    let configs = arms();
-    for (arm, (rows, policies)) in train(&configs).into_iter().enumerate() {
-        let (mut alone, same) = train(&configs[arm..=arm]).remove(0);
-        alone.iter_mut().for_each(|row| row.experiment = arm);
-        assert_eq!(rows, alone, "arm {arm}");
-        assert_eq!(policies, same, "arm {arm}");
-        let config = &configs[arm].learning;
+fn experiments_trained_together_equal_experiments_trained_alone() {
+    let configs = experiments();
+    for (experiment, (rows, policies)) in train(&configs).into_iter().enumerate() {
+        let (mut rows_alone, policies_alone) = train(&configs[experiment..=experiment]).remove(0);
+        rows_alone.iter_mut().for_each(|row| row.experiment = experiment);
+        assert_eq!(rows, rows_alone, "experiment {experiment}");
+        assert_eq!(policies, policies_alone, "experiment {experiment}");
+        let config = &configs[experiment].learning;
         let expected = (0..=config.generations).flat_map(|g| (0..config.trials).map(move |trial| (g, trial)));
         assert!(
             rows.iter().map(|row| (row.generation, row.trial)).eq(expected),
-            "arm {arm}: a row a generation and trial"
+            "experiment {experiment}: expected one row per generation and trial"
         );
     }
 }
 
-/// One trial as Algorithm 1 has it, plainly: every team is played by itself, from weights of its own.
-struct Plain<'a> {
+/// A plain implementation of Algorithm 1 for one trial. It plays every team separately, with its own copy of the
+/// weights.
+struct PlainTrial<'a> {
     config: &'a Config,
     world: World,
     trial: usize,
@@ -720,16 +734,16 @@ struct Plain<'a> {
     policies: Vec<Vec<Vec<f32>>>,
 }
 
-impl Plain<'_> {
+impl PlainTrial<'_> {
     fn key(&self, purpose: Purpose) -> Key {
         Key::new(self.config.learning.seed, self.trial, purpose)
     }
 
-    /// Observed POIs over all episodes with a generation's draws, played in a stage, over all that could be observed; and each
-    /// leader's mean score.
+    /// Plays a team in a stage, with the random numbers of a generation. Returns the share of POIs observed over all
+    /// episodes, and each leader's mean score.
     fn play(&self, generation: usize, stage: &Config, team: &[usize]) -> (f64, Vec<f32>) {
         let Learning { fitness, episodes_per_team, start_jitter, poi_jitter, .. } = stage.learning;
-        let of_stage = World::new(stage);
+        let world = World::new(stage);
         let population = |leader: usize| &self.policies[if self.policies.len() == 1 { 0 } else { leader }];
         let weights: Vec<f32> =
             team.iter().enumerate().flat_map(|(leader, &policy)| population(leader)[policy].clone()).collect();
@@ -737,11 +751,11 @@ impl Plain<'_> {
         for episode in 0..episodes_per_team {
             let mut starts = Vec::new();
             let key = self.key(Purpose::Starts);
-            evolve::jitter_starts(key, generation, episode, &of_stage, start_jitter, &mut starts);
-            evolve::jitter_pois(self.key(Purpose::Pois), generation, episode, &of_stage, poi_jitter, &mut starts);
+            evolve::jitter_starts(key, generation, episode, &world, start_jitter, &mut starts);
+            evolve::jitter_pois(self.key(Purpose::Pois), generation, episode, &world, poi_jitter, &mut starts);
             let teams = vec![0; team.len()];
             let group = Group {
-                world: &of_stage,
+                world: &world,
                 starts: &starts,
                 weights: weights[..].into(),
                 policies: 1,
@@ -749,10 +763,10 @@ impl Plain<'_> {
                 teams: &teams,
                 fitnesses: &[Fitness::Dt],
             };
-            // From the whole record.
+            // Scores come from the full trace, which is independent of the scores that `play` of a backend returns.
             let trace = Cpu::default().trace(&group).unwrap();
-            let scores = Credit::default().all(&trace.episode(&of_stage, 0), &of_stage);
-            let mine = match fitness {
+            let scores = Credit::default().all(&trace.episode(&world, 0), &world);
+            let by_leader = match fitness {
                 Fitness::G => vec![scores.g; team.len()],
                 Fitness::D => scores.d,
                 Fitness::Df => scores.df,
@@ -760,15 +774,15 @@ impl Plain<'_> {
                 Fitness::Dt => scores.dt,
             };
             observed += scores.observed;
-            totals.iter_mut().zip(mine).for_each(|(total, score)| *total += f64::from(score));
+            totals.iter_mut().zip(by_leader).for_each(|(total, score)| *total += f64::from(score));
         }
         (
-            f64::from(observed) / (of_stage.pois.len() * episodes_per_team) as f64,
+            f64::from(observed) / (world.pois.len() * episodes_per_team) as f64,
             totals.iter().map(|total| (total / episodes_per_team as f64) as f32).collect(),
         )
     }
 
-    /// Rows, then the policies best first.
+    /// Trains to the end. Returns the rows, and the policies with the best first.
     fn train(mut self) -> (Vec<Row>, Vec<f32>) {
         let Learning { population, generations, elites, parents, .. } = self.config.learning;
         let parameters = self.world.parameters();
@@ -779,7 +793,7 @@ impl Plain<'_> {
         };
         let leaders = self.world.leaders();
         let mut rows = Vec::new();
-        // The champions of all generations.
+        // The champions of all past generations.
         let mut past: Vec<Vec<Vec<f32>>> = Vec::new();
         for generation in 0..=generations {
             let stage = self.config.at(generation);
@@ -806,24 +820,26 @@ impl Plain<'_> {
                     .enumerate()
                     .for_each(|(leader, (&policy, score))| scored[leader][policy].push(score));
             }
-            let kept = hall_of_fame.min(generation);
-            if kept > 0 {
+            let hall = hall_of_fame.min(generation);
+            if hall > 0 {
                 let word = self.key(Purpose::HallOfFame).at(generation, 0, 0).draw(0)[0];
-                let champions = &past[generation - 1 - (uniform(word) * kept as f64) as usize];
+                let champions = &past[generation - 1 - (uniform(word) * hall as f64) as usize];
                 self.policies.iter_mut().zip(champions).for_each(|(policies, past)| policies.push(past.clone()));
-                for (leader, policy) in (0..leaders).flat_map(|leader| (0..population).map(move |of| (leader, of))) {
+                for (leader, policy) in
+                    (0..leaders).flat_map(|leader| (0..population).map(move |policy| (leader, policy)))
+                {
                     let mut team = vec![population; leaders];
                     team[leader] = policy;
                     scored[leader][policy].push(self.play(generation, &stage, &team).1[leader]);
                 }
                 self.policies.iter_mut().for_each(|policies| policies.truncate(population));
             }
-            let teams_of_each = partners + usize::from(kept > 0);
+            let scores_per_policy = partners + usize::from(hall > 0);
             for (fitness, scores) in fitness.iter_mut().flatten().zip(scored.iter().flatten()).filter(|_| !shared) {
-                assert_eq!(scores.len(), teams_of_each);
+                assert_eq!(scores.len(), scores_per_policy);
                 *fitness = match leniency {
                     Leniency::Mean => {
-                        (scores.iter().map(|&score| f64::from(score)).sum::<f64>() / teams_of_each as f64) as f32
+                        (scores.iter().map(|&score| f64::from(score)).sum::<f64>() / scores_per_policy as f64) as f32
                     }
                     Leniency::Max => scores.iter().copied().reduce(f32::max).unwrap(),
                 };
@@ -835,19 +851,20 @@ impl Plain<'_> {
                     order
                 })
                 .collect();
-            // With an evolution strategy the champion is the mean, which joins the policies for an episode.
+            // With an evolution strategy, the champion is the mean of its distribution. It is added to the policies for
+            // one episode.
             let strategy = evolve::Strategy::of(Level::baseline(), &stage.learning, parameters);
             let mut ranked = ranked;
             for (leader, search) in search.iter_mut().enumerate() {
                 if let Some(strategy) = &strategy {
-                    let mut whole = [self.policies[leader].concat(), search.clone()].concat();
-                    strategy.update(Level::baseline(), generation, &fitness[leader], &mut whole);
-                    *search = whole.split_off(population * parameters);
+                    let mut state = [self.policies[leader].concat(), search.clone()].concat();
+                    strategy.update(Level::baseline(), generation, &fitness[leader], &mut state);
+                    *search = state.split_off(population * parameters);
                     self.policies[leader].push(search[..parameters].to_vec());
                     ranked[leader].insert(0, population);
                 }
             }
-            // The champion plays along with the next generation, so from the starts of that.
+            // The champion plays together with the next generation, so it has that generation's starts.
             let champion: Vec<usize> = (0..leaders).map(|leader| ranked[if shared { 0 } else { leader }][0]).collect();
             let of_leader = |leader: usize| self.policies[if shared { 0 } else { leader }][champion[leader]].clone();
             past.push((0..leaders).map(of_leader).collect());
@@ -885,7 +902,7 @@ impl Plain<'_> {
                     let key = self.key(Purpose::Tournament).at(generation, leader, slot);
                     let parent = match parents {
                         Parents::All => evolve::tournament(key, &fitness[leader]),
-                        // The upper bits of the slot's first random word.
+                        // The upper bits of the slot's first random word select the elite.
                         Parents::Elites => order[(uniform(key.draw(0)[0]) * elites as f64) as usize],
                     };
                     let mut child = policies[parent].clone();
@@ -899,14 +916,14 @@ impl Plain<'_> {
     }
 }
 
-/// The mean of shares, by what was observed in all.
+/// Returns the mean of shares, computed from whole numbers of observed POIs.
 fn mean(shares: &[f64], stage: &Config) -> f64 {
     let whole = (stage.world.pois.len() * stage.learning.episodes_per_team) as f64;
     let total: f64 = shares.iter().map(|share| (share * whole).round()).sum();
     total / (whole * shares.len() as f64)
 }
 
-/// Where all leaders share a policy it scores their mean, not only something that ranks policies alike.
+/// Compares the fitness of shared policies by value. Comparisons of trained policies only depend on their ranks.
 #[test]
 fn a_shared_policy_scores_the_mean_of_its_leaders() {
     let config = config(GENERALLY_FORWARD, |config| {
@@ -918,22 +935,22 @@ fn a_shared_policy_scores_the_mean_of_its_leaders() {
     let (world, leaders) = (World::new(&config), config.learners());
     let mut trainer = Trainer::new([config.validate().unwrap()]);
     let weights = trainer.weights(0, 0).unwrap().chunks(world.parameters()).map(<[f32]>::to_vec).collect();
-    let plain = Plain { config: &config, world, trial: 0, policies: vec![weights] };
+    let plain = PlainTrial { config: &config, world, trial: 0, policies: vec![weights] };
     trainer.advance(&mut Cpu::default()).unwrap();
-    let found = trainer.snapshot(0).unwrap().fitness.remove(0);
-    let mut differ = 0;
-    for (policy, found) in found.into_iter().enumerate() {
+    let fitness = trainer.snapshot(0).unwrap().fitness.remove(0);
+    let mut different = 0;
+    for (policy, fitness) in fitness.into_iter().enumerate() {
         let (_, scores) = plain.play(0, &config, &vec![policy; leaders]);
         let sum: f64 = scores.iter().map(|&score| f64::from(score)).sum();
-        assert_eq!(found, (sum / leaders as f64) as f32, "policy {policy}");
-        differ += usize::from(scores.iter().any(|&score| score != scores[0]));
+        assert_eq!(fitness, (sum / leaders as f64) as f32, "policy {policy}");
+        different += usize::from(scores.iter().any(|&score| score != scores[0]));
     }
-    assert!(differ > 3, "leaders of {differ} teams differ in what they score");
+    assert!(different > 3, "leaders' scores differ in only {different} teams");
 }
 
-/// POIs move as starts do, by draws of their own, and nothing is said of them where they stay.
+/// Tests that POIs are moved like starts, with separate random numbers. Without jitter, no places of POIs are appended.
 #[test]
-fn pois_are_jittered_by_draws_of_their_own() {
+fn pois_are_jittered_with_separate_random_numbers() {
     let world = World::new(&config(GENERALLY_FORWARD, |config| config.world.pois[0] = [0.5, 49.5]));
     let [starts, pois] = [Purpose::Starts, Purpose::Pois].map(|purpose| Key::new(4, 0, purpose));
     let draw = |key, generation, episode| {
@@ -941,7 +958,7 @@ fn pois_are_jittered_by_draws_of_their_own() {
         evolve::jitter_pois(key, generation, episode, &world, 2.0, &mut places);
         places
     };
-    let (mut sum, mut least, mut most) = (Vec2::ZERO, f32::INFINITY, f32::NEG_INFINITY);
+    let (mut sum, mut smallest, mut largest) = (Vec2::ZERO, f32::INFINITY, f32::NEG_INFINITY);
     for generation in 0..500 {
         for (index, (place, from)) in draw(pois, generation, 1).iter().zip(&world.pois).enumerate() {
             let moved = place - from;
@@ -949,25 +966,28 @@ fn pois_are_jittered_by_draws_of_their_own() {
             assert!(place.min_element() >= 0.0 && place.max_element() <= 50.0, "{place}");
             if index > 0 {
                 sum += moved;
-                (least, most) = (least.min(moved.min_element()), most.max(moved.max_element()));
+                (smallest, largest) = (smallest.min(moved.min_element()), largest.max(moved.max_element()));
             }
         }
         assert_ne!(draw(pois, generation, 0), draw(pois, generation, 1));
         assert_ne!(draw(pois, generation, 0), draw(starts, generation, 0));
     }
-    // Of 1500 uniform offsets of deviation 2/√3.
-    assert!(sum.abs().max_element() / 1500.0 < 0.15 && least < -1.95 && most > 1.95, "{sum}, {least}, {most}");
+    // Bounds for 1500 uniform offsets with standard deviation 2/√3.
+    assert!(
+        sum.abs().max_element() / 1500.0 < 0.15 && smallest < -1.95 && largest > 1.95,
+        "{sum}, {smallest}, {largest}"
+    );
     let mut places = world.starts.clone();
     evolve::jitter_pois(pois, 0, 0, &world, 0.0, &mut places);
     assert_eq!(places, world.starts);
 }
 
 #[test]
-fn the_trainer_is_algorithm_1() {
-    let configs = arms();
+fn the_trainer_equals_algorithm_1() {
+    let configs = experiments();
     let mut improved = 0;
-    for (arm, (rows, policies)) in train(&configs).into_iter().enumerate() {
-        let config = &configs[arm];
+    for (experiment, (rows, policies)) in train(&configs).into_iter().enumerate() {
+        let config = &configs[experiment];
         for (trial, policies) in policies.iter().enumerate() {
             let world = World::new(config);
             let key = Key::new(config.learning.seed, trial, Purpose::Weights);
@@ -978,13 +998,13 @@ fn the_trainer_is_algorithm_1() {
             };
             let population = |leader| (0..config.learning.population).map(|slot| policy(leader, slot)).collect();
             let fresh = (0..config.populations()).map(population).collect();
-            let (expected, weights) = Plain { config, world, trial, policies: fresh }.train();
+            let (expected, weights) = PlainTrial { config, world, trial, policies: fresh }.train();
             let rows: Vec<Row> =
                 rows.iter().filter(|row| row.trial == trial).map(|&row| Row { experiment: 0, ..row }).collect();
-            assert_eq!(rows, expected, "arm {arm}, trial {trial}");
-            assert_eq!(bits(policies), bits(&weights), "arm {arm}, trial {trial}");
+            assert_eq!(rows, expected, "experiment {experiment}, trial {trial}");
+            assert_eq!(bits(policies), bits(&weights), "experiment {experiment}, trial {trial}");
             improved += usize::from(rows.last().unwrap().mean_g > rows[0].mean_g);
         }
     }
-    assert!(improved > 2, "nothing was learned, so selection had no say");
+    assert!(improved > 2, "only {improved} trials improved, which hardly tests selection");
 }

@@ -1,6 +1,7 @@
-//! A run that was stopped at any point goes on as if nothing had happened, to the same bits.
+//! Tests that a run stopped at any point resumes to the same bits as an uninterrupted run.
 //!
-//! `FLOTILLA_KILLS` is how often the real program is killed (20 if left out).
+//! Runs are stopped between generations, by failing disk operations, lost devices, kills and signals. `FLOTILLA_KILLS`
+//! sets how often the real program is killed (default: 20).
 
 #![cfg(feature = "cli")]
 
@@ -43,9 +44,9 @@ fn cpu() -> OpenBackend {
     (Box::new(Cpu::default()), Machine::default())
 }
 
-/// What one session came to: how it ended and with what, what was told of the folder, and the generations it started
-/// before and reached.
-struct Told {
+/// Outcome of one session. `notes` are about the folder. `start` and `reached` are the next generations at its start
+/// and at its end.
+struct Outcome {
     end: Result<Ended, RunError>,
     results: Option<Results>,
     notes: Vec<Note>,
@@ -60,22 +61,22 @@ fn session(
     disk: Disk,
     player: OpenBackend,
     stop_at: Option<usize>,
-) -> Told {
+) -> Outcome {
     let (mut session, notes) = match Session::open(vec![(config.clone(), path.into())], start, &disk) {
         Ok(opened) => opened,
-        Err(error) => return Told { end: Err(error), results: None, notes: vec![], start: 0, reached: 0 },
+        Err(error) => return Outcome { end: Err(error), results: None, notes: vec![], start: 0, reached: 0 },
     };
     let notes = notes.into_iter().map(|(_, note)| note).collect();
     if session.is_done() {
         let results = session.results(0).cloned();
-        return Told { end: Ok(Ended::Done), results, notes, start: 0, reached: 0 };
+        return Outcome { end: Ok(Ended::Done), results, notes, start: 0, reached: 0 };
     }
     let start = session.generations()[0];
     let end = train(&mut session, player, &mut |_| None, &mut |next| stop_at.is_some_and(|at| next[0] >= at));
-    Told { end, results: session.results(0).cloned(), notes, start, reached: session.generations()[0] }
+    Outcome { end, results: session.results(0).cloned(), notes, start, reached: session.generations()[0] }
 }
 
-/// Trains until told to stop.
+/// Trains until `stops` returns true or the runs are finished.
 fn train(
     session: &mut Session,
     mut player: OpenBackend,
@@ -94,15 +95,15 @@ fn train(
     session.train(&mut player, &mut options)
 }
 
-/// Goes on to the end on a good disk.
-fn resume(config: &Config, path: &Path) -> (Results, Told) {
-    let told = session(config, path, Start::Resume, Disk::default(), cpu(), None);
-    assert!(matches!(told.end, Ok(Ended::Done)), "{:?}", told.end);
-    (told.results.clone().unwrap(), told)
+/// Resumes a run to its end, on a disk without failures.
+fn resume(config: &Config, path: &Path) -> (Results, Outcome) {
+    let outcome = session(config, path, Start::Resume, Disk::default(), cpu(), None);
+    assert!(matches!(outcome.end, Ok(Ended::Done)), "{:?}", outcome.end);
+    (outcome.results.clone().unwrap(), outcome)
 }
 
-/// The metrics without the seconds, and the policies.
-fn what_came_out(path: &Path) -> (String, Vec<u8>) {
+/// Returns the metrics without the column of seconds, and the policies.
+fn result_files(path: &Path) -> (String, Vec<u8>) {
     let metrics = fs::read_to_string(path.join(METRICS)).unwrap();
     let shared = |line: &str| {
         let fields = line.split(',').enumerate().filter(|&(at, _)| at != 5).map(|(_, field)| field);
@@ -111,17 +112,17 @@ fn what_came_out(path: &Path) -> (String, Vec<u8>) {
     (metrics.lines().map(shared).collect(), fs::read(path.join(POLICIES)).unwrap())
 }
 
-/// An uninterrupted run: its results and files.
+/// Trains without interruption. Returns the results and the files.
 fn reference(config: &Config) -> (Results, (String, Vec<u8>)) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run");
-    let told = session(config, &path, Start::Fresh, Disk::default(), cpu(), None);
-    assert!(matches!(told.end, Ok(Ended::Done)), "{:?}", told.end);
-    (told.results.unwrap(), what_came_out(&path))
+    let outcome = session(config, &path, Start::Fresh, Disk::default(), cpu(), None);
+    assert!(matches!(outcome.end, Ok(Ended::Done)), "{:?}", outcome.end);
+    (outcome.results.unwrap(), result_files(&path))
 }
 
 #[test]
-fn checkpointing_has_no_say_in_the_results() {
+fn checkpoints_do_not_change_results() {
     let config = small();
     let mut never = config.clone();
     never.checkpoint.generations = 0;
@@ -129,25 +130,25 @@ fn checkpointing_has_no_say_in_the_results() {
 }
 
 #[test]
-fn a_run_stopped_before_any_generation_goes_on_to_the_same_results() {
+fn a_run_stopped_before_any_generation_resumes_to_the_same_results() {
     let config = small();
     let expected = reference(&config);
     for stop_at in 1..=config.learning.generations + 2 {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run");
-        let told = session(&config, &path, Start::Fresh, Disk::default(), cpu(), Some(stop_at));
-        // The last step completes the run, so there is nothing left to stop.
+        let outcome = session(&config, &path, Start::Fresh, Disk::default(), cpu(), Some(stop_at));
+        // The last step completes the run, which leaves nothing to stop.
         let done = stop_at == config.learning.generations + 2;
-        assert_eq!(told.end.unwrap(), if done { Ended::Done } else { Ended::Stopped });
-        assert_eq!(told.reached, stop_at);
-        let (results, told) = resume(&config, &path);
-        assert_eq!(told.start, if done { 0 } else { stop_at });
-        assert_eq!((results, what_came_out(&path)), expected, "stopped before generation {stop_at}");
+        assert_eq!(outcome.end.unwrap(), if done { Ended::Done } else { Ended::Stopped });
+        assert_eq!(outcome.reached, stop_at);
+        let (results, outcome) = resume(&config, &path);
+        assert_eq!(outcome.start, if done { 0 } else { stop_at });
+        assert_eq!((results, result_files(&path)), expected, "stopped before generation {stop_at}");
     }
 }
 
 #[test]
-fn a_run_that_is_done_is_not_run_again() {
+fn a_finished_run_is_not_trained_again() {
     let config = small();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run");
@@ -158,53 +159,53 @@ fn a_run_that_is_done_is_not_run_again() {
         Operation::CreateFolder => Ok(()),
         _ => panic!("{operation:?} {}", path.display()),
     });
-    let told = session(&config, &path, Start::Resume, disk, cpu(), None);
-    assert_eq!((told.end.unwrap(), told.results), (Ended::Done, Some(expected.0.clone())));
+    let outcome = session(&config, &path, Start::Resume, disk, cpu(), None);
+    assert_eq!((outcome.end.unwrap(), outcome.results), (Ended::Done, Some(expected.0.clone())));
     assert_eq!(fs::read(path.join(METRICS)).unwrap(), before);
-    // With one of its results damaged, it goes on from its last checkpoint to restore it.
+    // If a result file is damaged, the run resumes from its last checkpoint and restores the file.
     for (name, at) in [(POLICIES, 500), (METRICS, 60)] {
         let mut bytes = fs::read(path.join(name)).unwrap();
         bytes[at] ^= 1;
         fs::write(path.join(name), bytes).unwrap();
         let (results, _) = resume(&config, &path);
-        assert_eq!((results, what_came_out(&path)), expected, "{name}");
+        assert_eq!((results, result_files(&path)), expected, "{name}");
     }
 }
 
-/// The same config for so many generations.
-fn of_length(config: &Config, generations: usize) -> Config {
+/// Returns the config with another number of generations.
+fn with_generations(config: &Config, generations: usize) -> Config {
     let mut config = config.clone();
     config.learning.generations = generations;
     config
 }
 
 #[test]
-fn a_run_of_any_length_is_extended_to_the_same_results() {
+fn a_run_extended_from_any_length_has_the_same_results() {
     let config = small();
     let expected = reference(&config);
-    // Checkpoints of its own, or none but the one that it ends with.
-    for every in [0, 1, 4] {
+    // With an interval of 0, the only checkpoint is the one at the end.
+    for interval in [0, 1, 4] {
         for length in 1..config.learning.generations {
-            let mut short = of_length(&config, length);
-            short.checkpoint.generations = every;
+            let mut short = with_generations(&config, length);
+            short.checkpoint.generations = interval;
             let folder = tempfile::tempdir().unwrap();
             let path = folder.path().join("run");
             session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
-            let (results, told) = resume(&config, &path);
-            assert_eq!(told.start, length + 1, "{:?}", told.notes);
-            assert_eq!((results, what_came_out(&path)), expected, "from {length} generations");
+            let (results, outcome) = resume(&config, &path);
+            assert_eq!(outcome.start, length + 1, "{:?}", outcome.notes);
+            assert_eq!((results, result_files(&path)), expected, "from {length} generations");
             assert_eq!(fs::read_to_string(path.join("config.toml")).unwrap(), config.to_toml());
-            // And it is done.
+            // The extended run is finished.
             assert_eq!(resume(&config, &path).1.reached, 0);
         }
     }
 }
 
 #[test]
-fn a_run_is_extended_from_whatever_is_left_of_it() {
+fn a_run_with_missing_or_damaged_files_is_extended() {
     let config = small();
     let expected = reference(&config);
-    let short = of_length(&config, 7);
+    let short = with_generations(&config, 7);
     let run = || {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run");
@@ -213,20 +214,20 @@ fn a_run_is_extended_from_whatever_is_left_of_it() {
         assert_eq!(checkpoint::list(&checkpoints).unwrap(), [7, 8]);
         (folder, path, [7, 8].map(|generation| checkpoint::path(&checkpoints, generation)))
     };
-    let goes_on = |path: &Path, start: usize| {
-        let (results, told) = resume(&config, path);
-        assert_eq!(told.start, start, "{:?}", told.notes);
-        assert_eq!((results, what_came_out(path)), expected);
+    let resumes = |path: &Path, start: usize| {
+        let (results, outcome) = resume(&config, path);
+        assert_eq!(outcome.start, start, "{:?}", outcome.notes);
+        assert_eq!((results, result_files(path)), expected);
     };
-    // As runs of earlier versions are, which left nothing at their end.
+    // Runs of earlier versions have no checkpoint of their end.
     let (_folder, path, [_, end]) = run();
     fs::remove_file(&end).unwrap();
-    goes_on(&path, 7);
+    resumes(&path, 7);
     let (_folder, path, ends) = run();
     ends.iter().for_each(|end| fs::remove_file(end).unwrap());
-    goes_on(&path, 0);
-    // Its policies are another run's, or damaged, or gone.
-    let other = of_length(&config, 6);
+    resumes(&path, 0);
+    // The policies are another run's, damaged, or missing.
+    let other = with_generations(&config, 6);
     let other_folder = tempfile::tempdir().unwrap();
     session(&other, other_folder.path(), Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
     let others = fs::read(other_folder.path().join(POLICIES)).unwrap();
@@ -236,11 +237,11 @@ fn a_run_is_extended_from_whatever_is_left_of_it() {
             Some(bytes) => fs::write(path.join(POLICIES), bytes).unwrap(),
             None => fs::remove_file(path.join(POLICIES)).unwrap(),
         }
-        let (results, told) = resume(&config, &path);
-        assert_eq!((told.start, told.notes.len()), (7, 1), "{damage}: {:?}", told.notes);
-        assert_eq!((results, what_came_out(&path)), expected);
+        let (results, outcome) = resume(&config, &path);
+        assert_eq!((outcome.start, outcome.notes.len()), (7, 1), "{damage}: {:?}", outcome.notes);
+        assert_eq!((results, result_files(&path)), expected);
     }
-    // They cannot be read now, but another time.
+    // The policies cannot be read for now: a folder has the file's name.
     let (_folder, path, _) = run();
     let (policies, elsewhere) = (path.join(POLICIES), path.join("elsewhere"));
     fs::rename(&policies, &elsewhere).unwrap();
@@ -249,31 +250,32 @@ fn a_run_is_extended_from_whatever_is_left_of_it() {
     assert!(error.contains("policies.safetensors: cannot be read"), "{error}");
     fs::remove_dir(&policies).unwrap();
     fs::rename(&elsewhere, &policies).unwrap();
-    goes_on(&path, 8);
-    // A checkpoint from after the last generation that has its weights.
+    resumes(&path, 8);
+    // A run stopped after its last generation, before its end, has the weights in its checkpoint.
     let stopped = tempfile::tempdir().unwrap();
     session(&short, stopped.path(), Start::Fresh, Disk::default(), cpu(), Some(8)).end.unwrap();
-    goes_on(stopped.path(), 8);
+    resumes(stopped.path(), 8);
 
-    // It cannot become shorter, and what is refused is left as it is.
+    // A run cannot become shorter. The refusal changes no file.
     let (_folder, path, _) = run();
-    let whole = what_came_out(&path);
-    let told = session(&of_length(&config, 6), &path, Start::Resume, Disk::default(), cpu(), None);
-    let error = told.end.unwrap_err().to_string();
+    let before = result_files(&path);
+    let outcome = session(&with_generations(&config, 6), &path, Start::Resume, Disk::default(), cpu(), None);
+    let error = outcome.end.unwrap_err().to_string();
     assert!(error.contains("is a run of 7 generations, which cannot become one of 6"), "{error}");
-    assert_eq!(what_came_out(&path), whole);
-    // Nor does anything else change with its length.
-    let mut other = config.clone();
-    other.learning.seed = 3;
-    let error = session(&other, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err().to_string();
+    assert_eq!(result_files(&path), before);
+    // An extension cannot change other keys.
+    let mut changed = config.clone();
+    changed.learning.seed = 3;
+    let error = session(&changed, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err().to_string();
     assert!(error.contains("learning.seed: 0 there, 3 here") && !error.contains("generations:"), "{error}");
 }
 
-/// Every operation of an extension fails once, alone or with all after it.
+/// Lets every disk operation of an extension fail once, alone or with all later ones. Each time, the run must resume to
+/// the same results.
 #[test]
-fn no_failing_disk_operation_costs_an_extension() {
-    let config = of_length(&small(), 9);
-    let mut short = of_length(&config, 5);
+fn an_extension_survives_every_failing_disk_operation() {
+    let config = with_generations(&small(), 9);
+    let mut short = with_generations(&config, 5);
     short.checkpoint.generations = 3;
     let expected = reference(&config);
     let attempt = |fails: Box<dyn Fn(usize) -> bool + Send + Sync>| {
@@ -288,39 +290,40 @@ fn no_failing_disk_operation_costs_an_extension() {
                 false => Ok(()),
             }
         });
-        let mut rare = config.clone();
-        rare.checkpoint.generations = 0;
-        let told = session(&rare, &path, Start::Resume, disk, cpu(), None);
-        (folder, path, told, count.load(SeqCst))
+        let mut without_checkpoints = config.clone();
+        without_checkpoints.checkpoint.generations = 0;
+        let outcome = session(&without_checkpoints, &path, Start::Resume, disk, cpu(), None);
+        (folder, path, outcome, count.load(SeqCst))
     };
-    let (_, _, told, operations) = attempt(Box::new(|_| false));
-    assert_eq!(told.results, Some(expected.0.clone()));
+    let (_, _, outcome, operations) = attempt(Box::new(|_| false));
+    assert_eq!(outcome.results, Some(expected.0.clone()));
     assert!(operations > 20, "{operations}");
     for at in 0..operations {
-        for all_after in [false, true] {
+        for and_later in [false, true] {
             let (_folder, path, _, _) =
-                attempt(Box::new(move |operation| operation == at || all_after && operation > at));
-            let (results, again) = resume(&config, &path);
-            assert_eq!((results, what_came_out(&path)), expected, "operation {at}");
-            assert!(again.notes.len() <= 1, "operation {at}: {:?}", again.notes);
-            // It goes on from the end of the run that was extended, or is over.
-            assert!(again.start >= 6 || again.reached == 0, "operation {at}: {:?}", again.notes);
+                attempt(Box::new(move |operation| operation == at || and_later && operation > at));
+            let (results, resumed) = resume(&config, &path);
+            assert_eq!((results, result_files(&path)), expected, "operation {at}");
+            assert!(resumed.notes.len() <= 1, "operation {at}: {:?}", resumed.notes);
+            // The run resumes from the end of the shorter run, or is already finished.
+            assert!(resumed.start >= 6 || resumed.reached == 0, "operation {at}: {:?}", resumed.notes);
             assert_eq!(leftovers(&path), Vec::<PathBuf>::new(), "operation {at}");
         }
     }
 }
 
-/// Runs of different lengths, sizes and ages, driven together, come to what each comes to alone.
+/// Trains runs of different lengths, sizes and progress in one session, and compares each with the same run trained
+/// alone.
 #[test]
-fn runs_side_by_side_come_to_what_they_come_to_alone() {
-    let mut configs = [small(), of_length(&small(), 5), of_length(&small(), 9), small()];
+fn runs_trained_together_equal_runs_trained_alone() {
+    let mut configs = [small(), with_generations(&small(), 5), with_generations(&small(), 9), small()];
     configs[2].learning.population = 9;
     configs[3].learning.seed = 4;
     configs[3].checkpoint.generations = 0;
     let expected: Vec<_> = configs.iter().map(reference).collect();
     let folder = tempfile::tempdir().unwrap();
     let path = |run: usize| folder.path().join(run.to_string());
-    // One has come far, one is done, the others have not started.
+    // The first run is stopped before generation 11, the second is finished, and the others have not started.
     session(&configs[0], &path(0), Start::Fresh, Disk::default(), cpu(), Some(11)).end.unwrap();
     session(&configs[1], &path(1), Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
     let open = || {
@@ -338,21 +341,22 @@ fn runs_side_by_side_come_to_what_they_come_to_alone() {
     assert_eq!((done.unwrap(), session.generations()), (Ended::Done, &[16, 7, 11, 16][..]));
     for (run, expected) in expected.iter().enumerate() {
         assert_eq!(
-            (session.results(run), what_came_out(&path(run))),
+            (session.results(run), result_files(&path(run))),
             (Some(&expected.0), expected.1.clone()),
             "run {run}"
         );
     }
-    // Where one of the folders cannot be taken, none is touched.
+    // If one of the folders cannot be used, no folder is changed.
     drop(session);
     let runs = [(configs[0].clone(), folder.path().join("new")), (configs[1].clone(), path(1))];
     assert!(Session::open(runs.to_vec(), Start::Fresh, &Disk::default()).is_err());
     assert!(!folder.path().join("new").exists());
 }
 
-/// Every operation of a run fails once, alone or with all after it; a write that fails leaves its first half.
+/// Lets every disk operation of a run fail once, alone or with all later ones. A write that fails leaves its first
+/// half. Each time, the run must resume to the same results.
 #[test]
-fn no_failing_disk_operation_costs_a_run() {
+fn a_run_survives_every_failing_disk_operation() {
     let config = small();
     let expected = reference(&config);
     let attempt = |fails: Box<dyn Fn(usize) -> bool + Send + Sync>| {
@@ -370,35 +374,35 @@ fn no_failing_disk_operation_costs_a_run() {
             }
         });
         let path = folder.path().join("run");
-        let told = session(&config, &path, Start::Fresh, disk, cpu(), None);
+        let outcome = session(&config, &path, Start::Fresh, disk, cpu(), None);
         let failed = failed.lock().unwrap().clone();
-        (folder, path, told, count.load(SeqCst), failed)
+        (folder, path, outcome, count.load(SeqCst), failed)
     };
-    let (_, _, told, operations, _) = attempt(Box::new(|_| false));
-    assert_eq!((told.end.unwrap(), told.results), (Ended::Done, Some(expected.0.clone())));
+    let (_, _, outcome, operations, _) = attempt(Box::new(|_| false));
+    assert_eq!((outcome.end.unwrap(), outcome.results), (Ended::Done, Some(expected.0.clone())));
     assert!(operations > 14 * 5, "{operations}");
-    let mut kinds = Vec::new();
+    let mut reported = Vec::new();
     for at in 0..operations {
-        for all_after in [false, true] {
-            let (_folder, path, told, _, failed) =
-                attempt(Box::new(move |operation| operation == at || all_after && operation > at));
-            let (operation, file) = failed.expect("the operation was reached");
+        for and_later in [false, true] {
+            let (_folder, path, outcome, _, failed) =
+                attempt(Box::new(move |operation| operation == at || and_later && operation > at));
+            let (operation, file) = failed.expect("a failed operation");
             let context = format!("operation {at}: {operation:?} {}", file.display());
-            if let Err(error) = told.end {
+            if let Err(error) = outcome.end {
                 let error = flotilla::cli::Error::from(error).to_string();
                 assert!(error.contains("free some space, then continue with --resume"), "{context}: {error}");
-                kinds.push(operation);
+                reported.push(operation);
             }
-            let (results, again) = resume(&config, &path);
-            assert_eq!((results, what_came_out(&path)), expected, "{context}");
-            // Nothing is found torn, and there is one thing to tell at most: where it goes on.
-            assert!(again.notes.len() <= 1, "{context}: {:?}", again.notes);
-            // With a checkpoint every generation, the one before what was played last is whole.
+            let (results, resumed) = resume(&config, &path);
+            assert_eq!((results, result_files(&path)), expected, "{context}");
+            // No file is reported as damaged. The only possible note is the generation of the resume.
+            assert!(resumed.notes.len() <= 1, "{context}: {:?}", resumed.notes);
+            // With a checkpoint per generation, at most two generations are played again.
             assert!(
-                again.start + 2 >= told.reached || told.reached > 15,
+                resumed.start + 2 >= outcome.reached || outcome.reached > 15,
                 "{context}: {} {}",
-                again.start,
-                told.reached
+                resumed.start,
+                outcome.reached
             );
             assert_eq!(leftovers(&path), Vec::<PathBuf>::new(), "{context}");
         }
@@ -411,23 +415,23 @@ fn no_failing_disk_operation_costs_a_run() {
         Operation::Rename,
         Operation::Remove,
     ] {
-        assert!(kinds.contains(&operation), "{operation:?} never failed");
+        assert!(reported.contains(&operation), "no failure of {operation:?} was reported");
     }
 }
 
-/// A folder whose flushes cost nothing, where the system has such a place.
+/// Creates a folder in memory, where flushes are fast, if the system has `/dev/shm`.
 fn in_memory() -> TempDir {
     tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap()
 }
 
-/// Files that an interrupted writer left.
+/// Returns the temporary files that an interrupted write has left.
 fn leftovers(path: &Path) -> Vec<PathBuf> {
     let checkpoints = path.join("checkpoints");
     let entries = [path, &checkpoints].into_iter().flat_map(|folder| fs::read_dir(folder).into_iter().flatten());
     entries.map(|entry| entry.unwrap().path()).filter(|path| path.extension().is_some_and(|e| e == "tmp")).collect()
 }
 
-/// The checkpoints of a run that was stopped, oldest first.
+/// Trains a run that stops before generation 9. Returns its folder and its checkpoints, oldest first.
 fn stopped_run(config: &Config) -> (TempDir, PathBuf, Vec<PathBuf>) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run");
@@ -439,7 +443,7 @@ fn stopped_run(config: &Config) -> (TempDir, PathBuf, Vec<PathBuf>) {
     (folder, path, paths)
 }
 
-/// Every way to cut a file short, and three ways to flip each of its bytes.
+/// Returns damaged copies of a file: cut to every length, every byte changed in three ways, and one byte longer.
 fn damaged(whole: &[u8]) -> impl Iterator<Item = (String, Vec<u8>)> {
     let cut = (0..whole.len()).map(|length| (format!("cut to {length}"), whole[..length].to_vec()));
     let flipped = (0..whole.len()).flat_map(|at| [0x01, 0x20, 0xff].map(|mask| (at, mask))).map(|(at, mask)| {
@@ -452,7 +456,7 @@ fn damaged(whole: &[u8]) -> impl Iterator<Item = (String, Vec<u8>)> {
 }
 
 #[test]
-fn every_damaged_byte_of_a_checkpoint_is_found() {
+fn every_damaged_byte_of_a_checkpoint_is_detected() {
     let config = small();
     let (_folder, _, paths) = stopped_run(&config);
     let whole = fs::read(&paths[1]).unwrap();
@@ -464,7 +468,7 @@ fn every_damaged_byte_of_a_checkpoint_is_found() {
 }
 
 #[test]
-fn every_damaged_byte_of_a_policies_file_is_found() {
+fn every_damaged_byte_of_a_policies_file_is_detected() {
     let config = small();
     let (_, (_, whole)) = reference(&config);
     for trial in [None, Some(0), Some(1)] {
@@ -476,53 +480,53 @@ fn every_damaged_byte_of_a_policies_file_is_found() {
 }
 
 #[test]
-fn a_damaged_checkpoint_is_named_and_the_one_before_is_used() {
+fn a_damaged_checkpoint_is_reported_and_the_previous_one_is_used() {
     let config = small();
     let expected = reference(&config);
     let (_folder, path, paths) = stopped_run(&config);
-    let kept: Vec<_> = paths.iter().map(|path| (path, fs::read(path).unwrap())).collect();
+    let originals: Vec<_> = paths.iter().map(|path| (path, fs::read(path).unwrap())).collect();
     let metrics = fs::read(path.join(METRICS)).unwrap();
-    for (damage, bytes) in damaged(&kept[1].1).step_by(97) {
-        for (path, bytes) in &kept {
+    for (damage, bytes) in damaged(&originals[1].1).step_by(97) {
+        for (path, bytes) in &originals {
             fs::write(path, bytes).unwrap();
         }
         fs::write(path.join(METRICS), &metrics).unwrap();
         fs::write(&paths[1], bytes).unwrap();
-        let told = session(&config, &path, Start::Resume, Disk::default(), cpu(), Some(10));
-        assert_eq!(told.start, 8, "{damage}");
-        let note = told.notes[0].to_string();
-        assert!(told.notes[0].is_damage() && note.contains("000000009.safetensors: "), "{damage}: {note}");
+        let outcome = session(&config, &path, Start::Resume, Disk::default(), cpu(), Some(10));
+        assert_eq!(outcome.start, 8, "{damage}");
+        let note = outcome.notes[0].to_string();
+        assert!(outcome.notes[0].is_damage() && note.contains("000000009.safetensors: "), "{damage}: {note}");
         assert_eq!(checkpoint::list(&path.join("checkpoints")).unwrap(), [9, 10]);
         for generation in [9, 10] {
             fs::remove_file(checkpoint::path(&path.join("checkpoints"), generation)).unwrap();
         }
     }
-    // Both damaged: the run starts over.
-    for (path, bytes) in &kept {
+    // If both checkpoints are damaged, the run starts over.
+    for (path, bytes) in &originals {
         fs::write(path, &bytes[..bytes.len() - 1]).unwrap();
     }
     fs::write(path.join(METRICS), &metrics).unwrap();
-    let (results, told) = resume(&config, &path);
-    assert_eq!((told.start, told.notes.len()), (0, 3), "{:?}", told.notes);
-    assert_eq!((results, what_came_out(&path)), expected);
+    let (results, outcome) = resume(&config, &path);
+    assert_eq!((outcome.start, outcome.notes.len()), (0, 3), "{:?}", outcome.notes);
+    assert_eq!((results, result_files(&path)), expected);
 }
 
 #[test]
-fn damaged_metrics_send_a_run_back_to_where_they_are_whole() {
+fn a_run_with_cut_metrics_resumes_before_the_cut() {
     let config = small();
     let expected = reference(&config);
     for (cut, start) in [(0, 9), (1, 8), (100, 0)] {
         let (_folder, path, _) = stopped_run(&config);
         let metrics = fs::read(path.join(METRICS)).unwrap();
         fs::write(path.join(METRICS), &metrics[..metrics.len() - cut]).unwrap();
-        let (results, told) = resume(&config, &path);
-        assert_eq!(told.start, start, "{:?}", told.notes);
-        assert_eq!((results, what_came_out(&path)), expected);
+        let (results, outcome) = resume(&config, &path);
+        assert_eq!(outcome.start, start, "{:?}", outcome.notes);
+        assert_eq!((results, result_files(&path)), expected);
     }
 }
 
 #[test]
-fn a_changed_config_is_refused_by_the_names_of_its_keys() {
+fn a_changed_config_is_refused_with_the_names_of_its_keys() {
     let config = small();
     let (_folder, path, _) = stopped_run(&config);
     let mut changed = config.clone();
@@ -535,18 +539,18 @@ fn a_changed_config_is_refused_by_the_names_of_its_keys() {
         "{error}"
     );
     assert!(!error.contains("checkpoint."), "{error}");
-    // Also where the config's file is gone, since a checkpoint knows whose it is.
+    // Without the config file, the checkpoint still identifies its config.
     fs::remove_file(path.join("config.toml")).unwrap();
     let error = session(&changed, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err();
     assert!(matches!(error, RunError::Record(RecordError::ConfigDiffers { .. })), "{error}");
-    // How often checkpoints are made may change.
+    // The interval of checkpoints may change.
     let mut rarer = config;
     rarer.checkpoint.generations = 0;
     assert_eq!(resume(&rarer, &path).1.start, 9);
 }
 
 #[test]
-fn a_folder_is_one_process_at_a_time_and_one_run() {
+fn a_folder_has_one_process_at_a_time_and_one_run() {
     let config = small();
     let (_folder, path, _) = stopped_run(&config);
     let refused = |start| match Folder::open(&path, start, &config, StartFrom::Unspecified, Disk::default()) {
@@ -559,13 +563,13 @@ fn a_folder_is_one_process_at_a_time_and_one_run() {
     assert!(matches!(refused(Start::Force), RecordError::Locked { .. }));
     drop(held);
     fs::write(path.join("notes.txt"), "mine").unwrap();
-    let told = session(&config, &path, Start::Force, Disk::default(), cpu(), Some(3));
-    assert_eq!(told.start, 0);
+    let outcome = session(&config, &path, Start::Force, Disk::default(), cpu(), Some(3));
+    assert_eq!(outcome.start, 0);
     assert_eq!(checkpoint::list(&path.join("checkpoints")).unwrap(), [2, 3]);
     assert_eq!(fs::read(path.join("notes.txt")).unwrap(), b"mine");
 }
 
-/// Fails at one call of `play`.
+/// A backend that fails after this many successful calls of `play`.
 struct Failing {
     cpu: Cpu,
     left: usize,
@@ -573,7 +577,7 @@ struct Failing {
 
 impl Backend for Failing {
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
-        // Half the work is done when it fails.
+        // A device may fail after half of its work.
         self.cpu.play(&groups[..groups.len().div_ceil(2)])?;
         self.left = self
             .left
@@ -592,42 +596,42 @@ impl Backend for Failing {
 }
 
 #[test]
-fn a_lost_device_costs_nothing() {
+fn a_lost_device_does_not_change_results() {
     let config = Config::parse(&tiny(14, "seconds = 0"), "small.toml").unwrap();
     let expected = reference(&config);
     for left in 0..=config.learning.generations + 1 {
         let failing = || -> OpenBackend { (Box::new(Failing { cpu: Cpu::default(), left }), Machine::default()) };
         let folder = tempfile::tempdir().unwrap();
-        // It saves, and is resumed.
+        // Without another device, the run is saved and can be resumed.
         let path = folder.path().join("stop");
-        let told = session(&config, &path, Start::Fresh, Disk::default(), failing(), None);
-        let error = flotilla::cli::Error::from(told.end.unwrap_err()).to_string();
+        let outcome = session(&config, &path, Start::Fresh, Disk::default(), failing(), None);
+        let error = flotilla::cli::Error::from(outcome.end.unwrap_err()).to_string();
         assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
         assert_eq!(Run::read(&path.join("run.json")).unwrap().state, Status::Stopped);
-        let (results, told) = resume(&config, &path);
-        assert_eq!((told.start, results), (left, expected.0.clone()));
-        assert_eq!(what_came_out(&path), expected.1);
+        let (results, outcome) = resume(&config, &path);
+        assert_eq!((outcome.start, results), (left, expected.0.clone()));
+        assert_eq!(result_files(&path), expected.1);
 
-        // It goes on with the CPU.
+        // With the CPU as replacement, the run continues.
         let path = folder.path().join("cpu");
         let runs = vec![(config.clone(), path.clone())];
         let (mut session, _) = Session::open(runs, Start::Fresh, &Disk::default()).unwrap();
-        let mut asked = 0;
+        let mut requests = 0;
         let mut instead = |_: &_| {
-            asked += 1;
+            requests += 1;
             Some(cpu())
         };
         assert_eq!(train(&mut session, failing(), &mut instead, &mut |_| false).unwrap(), Ended::Done);
         assert_eq!(session.results(0), Some(&expected.0));
-        assert_eq!((asked, what_came_out(&path)), (1, expected.1.clone()));
+        assert_eq!((requests, result_files(&path)), (1, expected.1.clone()));
     }
 }
 
 #[test]
-fn a_run_may_change_to_another_processor_and_back() {
+fn a_run_can_alternate_between_cpu_and_gpu() {
     let config = small();
     let expected = reference(&config);
-    for (request, info) in support::adapters("a_run_may_change_to_another_processor_and_back") {
+    for (request, info) in support::adapters("a_run_can_alternate_between_cpu_and_gpu") {
         let gpu = || -> OpenBackend {
             let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
             (Box::new(backend), Machine { backend: "gpu".into(), ..Machine::default() })
@@ -635,26 +639,26 @@ fn a_run_may_change_to_another_processor_and_back() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run");
         for (stop_at, player) in [(4, cpu()), (9, gpu()), (12, cpu())] {
-            let told = session(&config, &path, Start::Resume, Disk::default(), player, Some(stop_at));
-            assert_eq!((told.end.unwrap(), told.reached), (Ended::Stopped, stop_at));
+            let outcome = session(&config, &path, Start::Resume, Disk::default(), player, Some(stop_at));
+            assert_eq!((outcome.end.unwrap(), outcome.reached), (Ended::Stopped, stop_at));
         }
-        let told = session(&config, &path, Start::Resume, Disk::default(), gpu(), None);
-        assert_eq!((told.end.unwrap(), told.results), (Ended::Done, Some(expected.0.clone())), "{info}");
-        assert_eq!(what_came_out(&path), expected.1, "{info}");
+        let outcome = session(&config, &path, Start::Resume, Disk::default(), gpu(), None);
+        assert_eq!((outcome.end.unwrap(), outcome.results), (Ended::Done, Some(expected.0.clone())), "{info}");
+        assert_eq!(result_files(&path), expected.1, "{info}");
     }
 }
 
-/// The real program.
+/// Returns a command of the real program, with captured output.
 fn flotilla() -> Command {
     let mut command = support::flotilla();
     command.stdout(Stdio::piped()).stderr(Stdio::piped());
     command
 }
 
-/// A command that trains in a folder.
+/// Returns a command that trains in a folder.
 fn flotilla_train(config: &Path, out: &Path, flags: &[&str]) -> Command {
     let mut command = flotilla();
-    // No time is lost on looking for GPUs.
+    // `--backend cpu` saves the search for GPUs.
     command.arg("train").arg(config).arg("--out").arg(out).args(["--backend", "cpu"]).args(flags);
     command
 }
@@ -669,19 +673,19 @@ fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// Removes warnings: no agent reaches the POIs of these short episodes.
+/// Removes warnings. These short episodes cause one, because no agent reaches a POI.
 fn without_warnings(text: &str) -> String {
     text.split_inclusive('\n').filter(|line| !line.starts_with("warning: ")).collect()
 }
 
-/// Generations whose rows are all in the metrics.
+/// Returns the number of generations with complete rows in the metrics.
 fn generations_recorded(path: &Path) -> usize {
     let metrics = fs::read_to_string(path.join(METRICS)).unwrap_or_default();
     let whole = metrics.rfind('\n').map_or("", |end| &metrics[..end]);
     whole.lines().skip(1).filter(|line| line.starts_with("1,")).count()
 }
 
-/// A run of a second or two, most of which goes into checkpoints.
+/// A run of one or two seconds, most of which are spent on checkpoints.
 const HEAVY: &str = "
 [world]
 leaders = [[10, 5], [20, 5], [30, 5], [40, 5]]
@@ -701,28 +705,28 @@ seconds = 0
 ";
 
 #[test]
-fn a_killed_run_goes_on_to_the_same_results() {
+fn a_killed_run_resumes_to_the_same_results() {
     let kills: usize = std::env::var("FLOTILLA_KILLS").map_or(20, |text| text.parse().expect("a number of kills"));
     let config = Config::parse(HEAVY, "heavy.toml").unwrap();
     let expected = reference(&config);
     let folder = tempfile::tempdir().unwrap();
     let file = config_file(folder.path(), HEAVY);
     let mut random = ChaCha8Rng::seed_from_u64(1);
-    let (mut killed, mut inside, mut runs) = (0, 0, 0);
+    let (mut killed, mut while_writing, mut runs) = (0, 0, 0);
     while killed < kills {
         let out = folder.path().join(format!("run-{runs}"));
         runs += 1;
-        // Every other run is at first a shorter one, which comes to its end.
+        // Every second run first finishes with 25 generations, and is then extended.
         let mut lengths = if runs % 2 == 0 { vec!["60"] } else { vec!["60", "25"] };
         loop {
             let recorded = generations_recorded(&out);
-            // Another number of threads each time.
+            // The number of threads differs between starts.
             let threads = (1 + random.random_range(0..3)).to_string();
-            let length = lengths.last().expect("there is one to go");
+            let length = lengths.last().expect("a length that remains");
             let flags = ["--resume", "--threads", &threads, "--generations", length];
             let mut child = flotilla_train(&file, &out, &flags).spawn().unwrap();
             let moment = Instant::now() + Duration::from_micros(random.random_range(0..150_000));
-            let over = loop {
+            let ended = loop {
                 match child.try_wait().unwrap() {
                     Some(status) => break Some(status),
                     None if killed < kills && Instant::now() >= moment => {
@@ -733,24 +737,25 @@ fn a_killed_run_goes_on_to_the_same_results() {
                     None => std::thread::sleep(Duration::from_micros(200)),
                 }
             };
-            let told = without_warnings(&read_all(child.stderr.take()));
-            // A row is written once the checkpoint before its generation's is whole, and none of that is done again.
-            if let Some((_, start)) = told.split_once("resuming at generation ") {
+            let stderr = without_warnings(&read_all(child.stderr.take()));
+            // A generation's row is written after the checkpoint before that generation. No recorded generation is
+            // played again.
+            if let Some((_, start)) = stderr.split_once("resuming at generation ") {
                 let start: usize = start.split_whitespace().next().unwrap().parse().unwrap();
-                // Only the last row is there before the policies, without which the end is none to go on from.
+                // The last row is written before the policies. Without these, the run resumes at its last generation.
                 let last: usize = length.parse().unwrap();
-                assert!(start >= recorded.min(last), "{recorded} generations were recorded: {told}");
+                assert!(start >= recorded.min(last), "{recorded} generations were recorded: {stderr}");
             } else {
-                assert!(recorded == 0 || !told.contains("generation"), "{recorded} recorded: {told}");
+                assert!(recorded == 0 || !stderr.contains("generation"), "{recorded} recorded: {stderr}");
             }
-            assert!(!told.contains("set aside") && !told.contains("rewritten"), "{told}");
-            match over {
+            assert!(!stderr.contains("set aside") && !stderr.contains("rewritten"), "{stderr}");
+            match ended {
                 None => {
                     killed += 1;
-                    inside += usize::from(!leftovers(&out).is_empty());
+                    while_writing += usize::from(!leftovers(&out).is_empty());
                 }
                 Some(status) => {
-                    assert_eq!(status.code(), Some(0), "{told}");
+                    assert_eq!(status.code(), Some(0), "{stderr}");
                     lengths.pop();
                     if lengths.is_empty() {
                         break;
@@ -758,14 +763,14 @@ fn a_killed_run_goes_on_to_the_same_results() {
                 }
             }
         }
-        assert_eq!(what_came_out(&out), expected.1);
+        assert_eq!(result_files(&out), expected.1);
         assert_eq!(Run::read(&out.join("run.json")).unwrap().digest, Some(expected.0.digest.clone()));
         fs::remove_dir_all(out).unwrap();
     }
-    println!("killed {killed} times, {inside} of them inside writing a file, in {runs} runs");
+    println!("killed {killed} times, {while_writing} of them while a file was written, in {runs} runs");
 }
 
-/// Kills a run some milliseconds after its start, again and again, until it comes to its end.
+/// Kills and resumes a run up to `kills` times, then lets it finish. Returns the number of kills.
 fn finish_under_kills(file: &Path, out: &Path, flags: &[&str], kills: usize) -> usize {
     let mut random = ChaCha8Rng::seed_from_u64(2);
     let mut killed = 0;
@@ -773,12 +778,12 @@ fn finish_under_kills(file: &Path, out: &Path, flags: &[&str], kills: usize) -> 
         let mut child = flotilla_train(file, out, &[&["--resume"], flags].concat()).spawn().unwrap();
         let before = generations_recorded(out);
         let start = Instant::now();
-        // Killed once it has come further, at the latest after a while: so that it ever comes to its end.
-        let over = loop {
-            let further = generations_recorded(out) > before + random.random_range(0..9);
+        // Every kill waits for some progress, or 20 seconds, so that the run finishes eventually.
+        let ended = loop {
+            let progressed = generations_recorded(out) > before + random.random_range(0..9);
             match child.try_wait().unwrap() {
                 Some(status) => break Some(status),
-                None if killed < kills && (further || start.elapsed() > Duration::from_secs(20)) => {
+                None if killed < kills && (progressed || start.elapsed() > Duration::from_secs(20)) => {
                     child.kill().unwrap();
                     child.wait().unwrap();
                     break None;
@@ -786,12 +791,12 @@ fn finish_under_kills(file: &Path, out: &Path, flags: &[&str], kills: usize) -> 
                 None => std::thread::sleep(Duration::from_micros(200)),
             }
         };
-        let told = read_all(child.stderr.take());
-        assert!(!told.contains("set aside") && !told.contains("rewritten"), "{told}");
-        match over {
+        let stderr = read_all(child.stderr.take());
+        assert!(!stderr.contains("set aside") && !stderr.contains("rewritten"), "{stderr}");
+        match ended {
             None => killed += 1,
             Some(status) => {
-                assert_eq!(status.code(), Some(0), "{told}");
+                assert_eq!(status.code(), Some(0), "{stderr}");
                 return killed;
             }
         }
@@ -799,7 +804,7 @@ fn finish_under_kills(file: &Path, out: &Path, flags: &[&str], kills: usize) -> 
 }
 
 #[test]
-fn a_run_killed_around_a_change_of_stage_goes_on_to_the_same_results() {
+fn a_run_killed_around_changes_of_stage_resumes_to_the_same_results() {
     let staged = (1..20).map(|stage| {
         let (from, coupling) = (3 * stage, 1 + stage % 3);
         format!("[[stages]]\nfrom = {from}\nset = {{ world.coupling = {coupling}, learning.start_jitter = 0.5 }}\n")
@@ -810,15 +815,15 @@ fn a_run_killed_around_a_change_of_stage_goes_on_to_the_same_results() {
     let (file, out) = (config_file(folder.path(), &text), folder.path().join("run"));
     let killed = finish_under_kills(&file, &out, &[], 8);
     assert!(killed >= 4, "killed {killed} times");
-    assert_eq!(what_came_out(&out), expected.1);
+    assert_eq!(result_files(&out), expected.1);
     assert_eq!(Run::read(&out.join("run.json")).unwrap().digest, Some(expected.0.digest));
 }
 
 #[test]
-fn a_killed_run_that_started_warm_goes_on_to_the_same_results() {
+fn a_killed_run_with_init_resumes_to_the_same_results() {
     let folder = tempfile::tempdir().unwrap();
     let file = config_file(folder.path(), HEAVY);
-    let [source, whole, out] = ["source", "whole", "run"].map(|name| folder.path().join(name));
+    let [source, uninterrupted, out] = ["source", "whole", "run"].map(|name| folder.path().join(name));
     let run = |out: &Path, flags: &[&str]| {
         let done = flotilla_train(&file, out, flags).output().unwrap();
         assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
@@ -826,12 +831,12 @@ fn a_killed_run_that_started_warm_goes_on_to_the_same_results() {
     run(&source, &["--generations", "3"]);
     let policies = source.join("policies.safetensors");
     let init = ["--init", policies.to_str().unwrap()];
-    run(&whole, &init);
+    run(&uninterrupted, &init);
     let killed = finish_under_kills(&file, &out, &init, 5);
     assert!(killed >= 3, "killed {killed} times");
-    assert_eq!(what_came_out(&out), what_came_out(&whole));
+    assert_eq!(result_files(&out), result_files(&uninterrupted));
     let digest = |path: &Path| Run::read(&path.join("run.json")).unwrap().digest;
-    assert_eq!(digest(&out), digest(&whole));
+    assert_eq!(digest(&out), digest(&uninterrupted));
     assert_ne!(digest(&out), Some(reference(&Config::parse(HEAVY, "heavy.toml").unwrap()).0.digest));
 }
 
@@ -841,22 +846,22 @@ fn read_all(pipe: Option<impl Read>) -> String {
     text
 }
 
-/// Waits for something that should come soon.
-fn until(what: &str, mut there: impl FnMut() -> bool) {
+/// Waits until a condition is true, for at most 60 seconds.
+fn wait_until(what: &str, mut condition: impl FnMut() -> bool) {
     let start = Instant::now();
-    while !there() {
-        assert!(start.elapsed() < Duration::from_secs(60), "{what}");
+    while !condition() {
+        assert!(start.elapsed() < Duration::from_secs(60), "waited for 60 s: {what}");
         std::thread::sleep(Duration::from_millis(2));
     }
 }
 
 #[test]
-fn a_second_process_is_refused_until_the_first_is_gone() {
+fn a_second_process_is_refused_until_the_first_ends() {
     let folder = tempfile::tempdir().unwrap();
     let file = config_file(folder.path(), &HEAVY.replace("generations = 60", "generations = 100000"));
     let out = folder.path().join("run");
     let mut first = flotilla_train(&file, &out, &[]).spawn().unwrap();
-    until("the run starts", || generations_recorded(&out) > 0);
+    wait_until("the run starts", || generations_recorded(&out) > 0);
     for flags in [&["--resume"][..], &["--force"]] {
         let second = flotilla_train(&file, &out, flags).output().unwrap();
         assert_eq!(second.status.code(), Some(1));
@@ -870,20 +875,20 @@ fn a_second_process_is_refused_until_the_first_is_gone() {
     let changed = flotilla_train(&file, &out, &["--resume", "--seed", "3"]).output().unwrap();
     assert_eq!(changed.status.code(), Some(1));
     assert!(stderr(&changed).contains("learning.seed: 0 there, 3 here"), "{}", stderr(&changed));
-    let mut again = flotilla_train(&file, &out, &["--resume"]).spawn().unwrap();
+    let mut resumed = flotilla_train(&file, &out, &["--resume"]).spawn().unwrap();
     let recorded = generations_recorded(&out);
-    until("the run goes on", || generations_recorded(&out) > recorded + 2);
-    again.kill().unwrap();
-    again.wait().unwrap();
+    wait_until("the run continues", || generations_recorded(&out) > recorded + 2);
+    resumed.kill().unwrap();
+    resumed.wait().unwrap();
 }
 
 #[test]
-fn where_one_of_several_runs_cannot_start_none_is_touched() {
+fn no_folder_is_changed_if_one_of_several_runs_cannot_start() {
     let place = tempfile::tempdir().unwrap();
     let [free, taken] = ["free", "taken"].map(|name| place.path().join(name));
     let open = |start: Start| {
         let runs = [&free, &taken].map(|path| (small(), path.clone()));
-        Session::open(runs.into(), start, &Disk::default()).err().expect("one is taken").to_string()
+        Session::open(runs.into(), start, &Disk::default()).err().expect("an error about the taken folder").to_string()
     };
     let held = Folder::open(&taken, Start::Fresh, &small(), StartFrom::Unspecified, Disk::default()).unwrap();
     assert!(open(Start::Fresh).contains("holds a run already") && !free.exists());
@@ -894,15 +899,15 @@ fn where_one_of_several_runs_cannot_start_none_is_touched() {
     drop(held);
 }
 
-/// No flag overwrites files that are not of a run.
+/// Tests that no flag overwrites files that flotilla has not written.
 #[test]
-fn other_files_are_left_alone() {
+fn files_of_others_are_not_overwritten() {
     let place = tempfile::tempdir().unwrap();
     let text = format!("# Mine.\n{}", small().to_toml());
     let out = place.path().join("mine");
     fs::create_dir(&out).unwrap();
     let file = config_file(&out, &text);
-    // A config by itself is what a run may start from, and stays as it was written.
+    // A run may start in a folder that has only its config file. That file is not rewritten.
     let done = flotilla_train(&file, &out, &["--resume", "--quiet"]).output().unwrap();
     assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
     assert_eq!(fs::read_to_string(&file).unwrap(), text);
@@ -912,17 +917,18 @@ fn other_files_are_left_alone() {
         fs::write(out.join(name), "of another program").unwrap();
         for flag in ["--resume", "--force"] {
             let refused = flotilla_train(&file, &out, &[flag]).output().unwrap();
-            let told = stderr(&refused);
+            let message = stderr(&refused);
             assert!(
-                refused.status.code() == Some(1) && told.contains("was not made by flotilla and would be overwritten"),
-                "{told}"
+                refused.status.code() == Some(1)
+                    && message.contains("was not made by flotilla and would be overwritten"),
+                "{message}"
             );
-            assert!(told.contains(name) && told.contains("move it away"), "{told}");
+            assert!(message.contains(name) && message.contains("move it away"), "{message}");
             assert_eq!(fs::read_to_string(out.join(name)).unwrap(), "of another program");
             assert!(!out.join(RUN).exists());
         }
     }
-    // Nor is what a run starts from.
+    // The policies of --init are not overwritten either.
     let policies = out.join(POLICIES);
     let before = fs::read(&policies).unwrap();
     for flag in ["--resume", "--force"] {
@@ -931,7 +937,7 @@ fn other_files_are_left_alone() {
         assert!(stderr(&refused).contains("would be written over it"), "{}", stderr(&refused));
         assert!(fs::read(&policies).unwrap() == before && out.join(RUN).exists());
     }
-    // A run whose config is gone is still no other config's.
+    // A run without its config file still refuses another config.
     fs::remove_file(&file).unwrap();
     let other = config_file(place.path(), &text);
     let refused = flotilla_train(&other, &out, &["--resume", "--seed", "3"]).output().unwrap();
@@ -941,9 +947,9 @@ fn other_files_are_left_alone() {
     assert!(fs::read(&policies).unwrap() == before);
 }
 
-/// A paper that cannot be written over stays a paper.
+/// Tests that a refused --force or --resume leaves all files of a paper unchanged.
 #[test]
-fn a_refused_paper_is_left_as_it_was() {
+fn a_refused_paper_is_unchanged() {
     let place = tempfile::tempdir().unwrap();
     let out = place.path().join("paper");
     let paper = |flags: &[&str]| {
@@ -959,20 +965,20 @@ fn a_refused_paper_is_left_as_it_was() {
         files.sort();
         files
     };
-    let before = files();
+    let files_before = files();
     let mut arms: Vec<_> = fs::read_dir(out.join("arms")).unwrap().map(|entry| entry.unwrap().path()).collect();
     arms.sort();
     for arm in [&arms[0], &arms[arms.len() - 1]] {
         let config = Config::load(&arm.join(CONFIG)).unwrap();
-        let held = Folder::open(arm, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
-        let all = || arms.iter().map(|arm| what_came_out(arm)).collect::<Vec<_>>();
-        let runs = all();
+        let held = Folder::open(arm, Start::Resume, &config, StartFrom::Unsaid, Disk::default()).unwrap();
+        let results = || arms.iter().map(|arm| result_files(arm)).collect::<Vec<_>>();
+        let results_before = results();
         for flags in
             [&["--generations", "1", "--force", "--seed", "1"], &["--generations", "2", "--resume", "--seed", "0"]]
         {
             let refused = paper(flags);
             assert!(stderr(&refused).contains("another process is training in"), "{}", stderr(&refused));
-            assert!(files() == before && all() == runs, "{flags:?}");
+            assert!(files() == files_before && results() == results_before, "{flags:?}");
         }
         drop(held);
     }
@@ -987,36 +993,38 @@ mod unix {
         assert!(status.success());
     }
 
-    fn ended(child: Child) -> (ExitStatus, String) {
+    /// Waits for the end of a process. Returns its status and what it printed to standard error.
+    fn wait_for_end(child: Child) -> (ExitStatus, String) {
         let output = child.wait_with_output().unwrap();
         (output.status, stderr(&output))
     }
 
     #[test]
-    fn a_signal_stops_a_run_after_its_generation_and_says_how_to_go_on() {
+    fn a_signal_stops_a_run_after_its_generation_and_prints_how_to_resume() {
         let config = Config::parse(HEAVY, "heavy.toml").unwrap();
         let expected = reference(&config);
         let folder = tempfile::tempdir().unwrap();
         let file = config_file(folder.path(), HEAVY);
-        // Checkpoints come from signals alone here.
+        // Only signals cause checkpoints here.
         let flags = ["--checkpoint-generations", "0", "--checkpoint-seconds", "0", "--quiet"];
         for name in ["TERM", "INT"] {
             let out = folder.path().join(name);
             let child = flotilla_train(&file, &out, &flags).spawn().unwrap();
-            until("the run starts", || out.join("run.json").exists());
+            wait_until("the run starts", || out.join("run.json").exists());
             signal(&child, name);
-            let (status, told) = ended(child);
-            assert_eq!(status.code(), Some(75), "{told}");
-            let (_, command) = told.split_once("continue with\n  flotilla ").expect(&told);
+            let (status, message) = wait_for_end(child);
+            assert_eq!(status.code(), Some(75), "{message}");
+            let (_, command) = message.split_once("continue with\n  flotilla ").expect(&message);
             assert!(
-                without_warnings(&told).starts_with("stopped: before generation") && command.contains("--backend cpu"),
-                "{told}"
+                without_warnings(&message).starts_with("stopped: before generation")
+                    && command.contains("--backend cpu"),
+                "{message}"
             );
-            let again = flotilla().args(command.split_whitespace()).output().unwrap();
-            assert_eq!(again.status.code(), Some(0), "{}", stderr(&again));
-            assert!(stderr(&again).contains("resuming at generation"), "{}", stderr(&again));
-            assert!(String::from_utf8_lossy(&again.stdout).contains(&expected.0.digest));
-            assert_eq!(what_came_out(&out), expected.1);
+            let resumed = flotilla().args(command.split_whitespace()).output().unwrap();
+            assert_eq!(resumed.status.code(), Some(0), "{}", stderr(&resumed));
+            assert!(stderr(&resumed).contains("resuming at generation"), "{}", stderr(&resumed));
+            assert!(String::from_utf8_lossy(&resumed.stdout).contains(&expected.0.digest));
+            assert_eq!(result_files(&out), expected.1);
         }
     }
 
@@ -1027,36 +1035,36 @@ mod unix {
         let file = config_file(folder.path(), &text);
         let out = folder.path().join("run");
         let child = flotilla_train(&file, &out, &["--threads", "1"]).spawn().unwrap();
-        until("the run starts", || out.join("run.json").exists());
+        wait_until("the run starts", || out.join("run.json").exists());
         let start = Instant::now();
         signal(&child, "TERM");
         std::thread::sleep(Duration::from_millis(100));
         signal(&child, "INT");
-        assert_eq!(ended(child).0.code(), Some(130));
+        assert_eq!(wait_for_end(child).0.code(), Some(130));
         assert!(start.elapsed() < Duration::from_secs(5));
     }
 
     #[test]
-    fn sigusr1_saves_and_goes_on() {
+    fn sigusr1_writes_a_checkpoint_and_the_run_continues() {
         let folder = tempfile::tempdir().unwrap();
         let file = config_file(folder.path(), &HEAVY.replace("generations = 60", "generations = 100000"));
         let out = folder.path().join("run");
         let flags = ["--checkpoint-generations", "0", "--checkpoint-seconds", "0"];
         let child = flotilla_train(&file, &out, &flags).spawn().unwrap();
-        until("the run starts", || out.join("run.json").exists());
+        wait_until("the run starts", || out.join("run.json").exists());
         let checkpoints = out.join("checkpoints");
         assert!(checkpoint::list(&checkpoints).unwrap().is_empty());
         for count in [1, 2] {
             signal(&child, "USR1");
-            until("a checkpoint", || checkpoint::list(&checkpoints).unwrap().len() == count);
+            wait_until("a checkpoint", || checkpoint::list(&checkpoints).unwrap().len() == count);
         }
         signal(&child, "TERM");
-        assert_eq!(ended(child).0.code(), Some(75));
+        assert_eq!(wait_for_end(child).0.code(), Some(75));
     }
 
-    /// The system itself refuses to write more than some bytes to a file.
+    /// Limits the size of files with `ulimit -f`, so that the system itself refuses a write.
     #[test]
-    fn a_write_that_the_system_refuses_is_told_and_leaves_the_last_checkpoint() {
+    fn a_write_that_the_system_refuses_is_reported_and_the_run_resumes() {
         let config = Config::parse(HEAVY, "heavy.toml").unwrap();
         let expected = reference(&config);
         let folder = tempfile::tempdir().unwrap();
@@ -1073,20 +1081,20 @@ mod unix {
         let refused = limited("100");
         assert_eq!(refused.status.code(), Some(1), "{}", stderr(&refused));
         assert!(stderr(&refused).contains(".safetensors: cannot be written"), "{}", stderr(&refused));
-        let again = flotilla_train(&file, &out, &["--resume"]).output().unwrap();
-        assert_eq!(again.status.code(), Some(0), "{}", stderr(&again));
-        assert_eq!(what_came_out(&out), expected.1);
+        let resumed = flotilla_train(&file, &out, &["--resume"]).output().unwrap();
+        assert_eq!(resumed.status.code(), Some(0), "{}", stderr(&resumed));
+        assert_eq!(result_files(&out), expected.1);
     }
 
     #[test]
-    fn a_folder_that_cannot_be_is_told() {
+    fn an_output_folder_that_cannot_be_created_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let file = config_file(folder.path(), &text());
         let output = flotilla_train(&file, &file, &[]).output().unwrap();
         assert_eq!(output.status.code(), Some(1));
-        let told = stderr(&output);
-        assert!(told.starts_with("error: ") && told.contains("is a file; choose a folder"), "{told}");
-        // A file stands where the folder should be.
+        let message = stderr(&output);
+        assert!(message.starts_with("error: ") && message.contains("is a file; choose a folder"), "{message}");
+        // The parent is a file.
         let output = flotilla_train(&file, &file.join("run"), &[]).output().unwrap();
         assert_eq!(output.status.code(), Some(1));
         assert!(stderr(&output).contains("cannot be written"), "{}", stderr(&output));
