@@ -1,5 +1,6 @@
-//! Sweeps: what a file expands to, how points are shared out, and that neither sharing, batching nor killing shows in
-//! the results.
+//! Tests sweeps: the points of a sweep file, their division into shards, and the results.
+//!
+//! Results must not depend on shards, batches or kills.
 
 #![cfg(feature = "cli")]
 
@@ -22,7 +23,7 @@ use flotilla::trainer::Trainer;
 use proptest::prelude::*;
 use tempfile::TempDir;
 
-/// Six points of different sizes, couplings, steps and lengths.
+/// Eight points of different couplings, steps and lengths.
 const SMALL: &str = "\
 [world]
 leaders = [[10, 5], [20, 5]]
@@ -41,16 +42,16 @@ seconds = 0
 \"learning.generations\" = [3, 12]
 ";
 
-fn sweep_of(text: &str) -> Sweep {
+fn parse(text: &str) -> Sweep {
     Sweep::read(text, "x.toml", &[], false).unwrap_or_else(|error| panic!("{error}"))
 }
 
-fn refusal(text: &str) -> String {
+fn parse_error(text: &str) -> String {
     Sweep::read(text, "x.toml", &[], false).unwrap_err().to_string()
 }
 
-/// A folder with a sweep file in it.
-fn written(text: &str) -> (TempDir, PathBuf) {
+/// Writes a sweep file into a new folder. Returns the folder and the path of the file.
+fn write_sweep(text: &str) -> (TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("x.toml");
     fs::write(&path, text).unwrap();
@@ -67,25 +68,27 @@ fn flotilla(sweep: &Path, out: &Path, flags: &[&str]) -> Output {
     command(sweep, out, flags).output().unwrap()
 }
 
-fn done(output: Output) -> String {
+/// Checks that a command succeeded. Returns its standard output.
+fn succeed(output: Output) -> String {
     let error = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(0), "{error}");
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// The error, without warnings: these small sweeps have POIs that no agent reaches.
-fn failed(output: Output, code: i32) -> String {
+/// Checks the exit code. Returns standard error without warnings, because no agent reaches the POIs of these small
+/// sweeps.
+fn fail(output: Output, code: i32) -> String {
     let error = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(code), "{error}");
     error.split_inclusive('\n').filter(|line| !line.starts_with("warning: ")).collect()
 }
 
-/// Everything that a sweep's folder holds, but the runs themselves.
+/// Returns the files of a folder, without its subfolders.
 fn results(out: &Path) -> Vec<(String, Vec<u8>)> {
     let mut files: Vec<_> = fs::read_dir(out)
         .unwrap()
         .map(|entry| entry.unwrap().path())
-        // The list of what was made has lines of earlier versions, too.
+        // The list of written files is left out, because it keeps lines about earlier versions.
         .filter(|path| path.is_file() && !path.ends_with(LIST))
         .map(|path| (path.file_name().unwrap().to_str().unwrap().to_string(), fs::read(&path).unwrap()))
         .collect();
@@ -93,23 +96,23 @@ fn results(out: &Path) -> Vec<(String, Vec<u8>)> {
     files
 }
 
-/// Every point's policies.
+/// Returns the policies of every point.
 fn policies(out: &Path) -> Vec<Vec<u8>> {
     let mut points: Vec<_> = fs::read_dir(out.join("points")).unwrap().map(|entry| entry.unwrap().path()).collect();
     points.sort();
     points.iter().map(|point| fs::read(point.join("policies.safetensors")).unwrap()).collect()
 }
 
-/// Metrics without the column that tells the time.
-fn timeless(metrics: &Path) -> Vec<String> {
+/// Returns the lines of a metrics file without the last column, the elapsed time.
+fn metrics_without_time(metrics: &Path) -> Vec<String> {
     let text = fs::read_to_string(metrics).unwrap();
     text.lines().map(|line| line.rsplit_once(',').unwrap().0.to_string()).collect()
 }
 
 #[test]
 fn the_first_axis_changes_slowest_and_every_point_has_its_values() {
-    let sweep = sweep_of(SMALL);
-    let found: Vec<_> = sweep
+    let sweep = parse(SMALL);
+    let actual: Vec<_> = sweep
         .points
         .iter()
         .map(|point| {
@@ -117,36 +120,38 @@ fn the_first_axis_changes_slowest_and_every_point_has_its_values() {
             (coupling, point.config.world.steps, point.config.learning.generations)
         })
         .collect();
-    let wanted = [(1, 8, 3), (1, 8, 12), (1, 25, 3), (1, 25, 12), (3, 8, 3), (3, 8, 12), (3, 25, 3), (3, 25, 12)];
-    assert_eq!(found, wanted);
+    let expected = [(1, 8, 3), (1, 8, 12), (1, 25, 3), (1, 25, 12), (3, 8, 3), (3, 8, 12), (3, 25, 3), (3, 25, 12)];
+    assert_eq!(actual, expected);
     assert_eq!(sweep.describe(&sweep.points[5]), "world.coupling = 3, world.steps = 8, learning.generations = 12");
-    // What is written into the folder is the same sweep again.
-    let again = sweep_of(&sweep.text);
-    assert_eq!((again.text.as_str(), &again.points), (sweep.text.as_str(), &sweep.points));
+    // The text that is written into the folder describes the same sweep.
+    let reparsed = parse(&sweep.text);
+    assert_eq!((reparsed.text.as_str(), &reparsed.points), (sweep.text.as_str(), &sweep.points));
 }
 
 #[test]
 fn keys_need_no_quotes_and_values_may_be_lists() {
     let text = "[world]\nleaders = [[1, 1]]\npois = [[5, 5], [9, 9]]\n[grid]\nworld.coupling = [1, [1, 1]]\n\
                 policy.hidden = [[4], [6, 5]]\n";
-    let sweep = sweep_of(text);
+    let sweep = parse(text);
     assert_eq!(sweep.points.len(), 4);
     assert_eq!(sweep.points[2].config.world.coupling, Coupling::Each(vec![1, 1]));
     assert_eq!(sweep.points[3].config.policy.hidden, [6, 5]);
 }
 
-fn laid_out(followers: usize, groups: usize) -> Config {
+/// Returns the config of a layout with this many followers per leader and this many groups.
+fn config_of_layout(followers: usize, groups: usize) -> Config {
     let text = format!(
-        "[world]\ncoupling = 1\n[learning]\npopulation = 2\n[grid]\nfollowers_per_leader = [{followers}]\ngroups = [{groups}]\n"
+        "[world]\ncoupling = 1\n[learning]\npopulation = 2\n\
+         [grid]\nfollowers_per_leader = [{followers}]\ngroups = [{groups}]\n"
     );
-    sweep_of(&text).points.remove(0).config
+    parse(&text).points.remove(0).config
 }
 
 #[test]
-fn the_paper_s_layouts_are_points_of_the_axes() {
+fn axes_reproduce_the_papers_layouts() {
     for (name, followers) in [("generally_forward", 2), ("chaotic", 4)] {
         let paper = Config::load(Path::new(&format!("configs/{name}.toml"))).unwrap().world;
-        let world = laid_out(followers, 4).world;
+        let world = config_of_layout(followers, 4).world;
         let set = |places: &[[f64; 2]]| places.iter().map(|place| place.map(f64::to_bits)).collect::<BTreeSet<_>>();
         assert_eq!((world.map, &world.leaders, &world.pois), (paper.map, &paper.leaders, &paper.pois), "{name}");
         assert_eq!(set(&world.followers), set(&paper.followers), "{name}");
@@ -156,10 +161,10 @@ fn the_paper_s_layouts_are_points_of_the_axes() {
 
 #[test]
 fn any_layout_keeps_agents_apart_and_on_the_map() {
-    let reach = laid_out(0, 1).follow.attraction_radius;
+    let reach = config_of_layout(0, 1).follow.attraction_radius;
     for groups in [1, 2, 4, 15] {
         for followers in 0..=layout::MAX_FOLLOWERS {
-            let world = laid_out(followers, groups).world;
+            let world = config_of_layout(followers, groups).world;
             assert_eq!(world.followers.len(), groups * followers);
             assert_eq!(world.pois.len(), groups);
             let distance = |a: &[f64; 2], b: &[f64; 2]| (a[0] - b[0]).hypot(a[1] - b[1]);
@@ -171,7 +176,7 @@ fn any_layout_keeps_agents_apart_and_on_the_map() {
             }
             for (index, follower) in world.followers.iter().enumerate() {
                 let own = &world.leaders[index / followers];
-                assert!(distance(follower, own) <= reach, "a follower starts where its leader attracts it");
+                assert!(distance(follower, own) <= reach, "a follower starts outside its leader's attraction radius");
                 assert!(world.leaders.iter().all(|leader| distance(follower, own) <= distance(follower, leader)));
             }
         }
@@ -179,18 +184,18 @@ fn any_layout_keeps_agents_apart_and_on_the_map() {
 }
 
 #[test]
-fn fewer_followers_are_more_with_some_left_out() {
+fn places_of_followers_do_not_depend_on_their_number() {
     let places = layout::places();
     assert_eq!(places.len(), layout::MAX_FOLLOWERS);
     assert_eq!(places[..4], [[2, -3], [-2, -3], [2, 2], [-2, 2]]);
-    let ten = laid_out(10, 1).world.followers;
-    assert_eq!(laid_out(7, 1).world.followers, ten[..7]);
+    let ten = config_of_layout(10, 1).world.followers;
+    assert_eq!(config_of_layout(7, 1).world.followers, ten[..7]);
 }
 
 #[test]
-fn wrong_sweeps_are_told_with_their_lines() {
-    let with = |grid: &str| refusal(&SMALL.replace("\"world.coupling\" = [1, 3]", grid));
-    for (grid, wanted) in [
+fn errors_in_sweeps_name_the_line() {
+    let error_of = |grid: &str| parse_error(&SMALL.replace("\"world.coupling\" = [1, 3]", grid));
+    for (grid, expected) in [
         (
             "\"world.copling\" = [1, 3]",
             "x.toml:13: grid.\"world.copling\"[0]: unknown key, did you mean `world.coupling`?",
@@ -208,44 +213,44 @@ fn wrong_sweeps_are_told_with_their_lines() {
         ("\"world.dt\" = [0.2", "array"),
         ("\"checkpoint.folder\" = ['/']", "grid.\"checkpoint.folder\"[0]: unknown key"),
     ] {
-        let error = with(grid);
-        assert!(error.contains(wanted), "{grid}: {error}");
+        let error = error_of(grid);
+        assert!(error.contains(expected), "{grid}: {error}");
     }
     let without = SMALL.split("[grid]").next().unwrap();
-    assert!(refusal(without).contains("missing, a sweep has a section [grid]"));
-    assert!(refusal(&format!("{without}[grid]\n")).contains("it has no axis"));
-    assert!(refusal(&format!("grid = 3\n{without}")).contains("x.toml:1: grid: allowed a section [grid]"));
+    assert!(parse_error(without).contains("missing, a sweep has a section [grid]"));
+    assert!(parse_error(&format!("{without}[grid]\n")).contains("it has no axis"));
+    assert!(parse_error(&format!("grid = 3\n{without}")).contains("x.toml:1: grid: allowed a section [grid]"));
     let many: Vec<_> = (0..100).map(|value| value.to_string()).collect();
     let axis = |key: &str| format!("\"{key}\" = [{}]\n", many.join(", "));
     let huge =
         [without, "[grid]\n", &axis("learning.seed"), &axis("world.steps"), &axis("learning.population")].concat();
-    assert!(refusal(&huge).contains("found 100 × 100 × 100 points, allowed 1 to 65536"), "{}", refusal(&huge));
+    assert!(parse_error(&huge).contains("found 100 × 100 × 100 points, allowed 1 to 65536"), "{}", parse_error(&huge));
 }
 
 #[test]
-fn impossible_points_are_told_together_or_left_out_on_request() {
+fn impossible_points_are_reported_together_or_skipped_on_request() {
     let text = SMALL.replace("[1, 3]", "[1, 6, 7, 8]").replace("\"world.steps\" = [8, 25]", "");
-    let error = refusal(&text);
+    let error = parse_error(&text);
     for line in ["[2]: found 7, allowed 1 to 6 (the number of agents)", "[3]: found 8, allowed 1 to 6"] {
         assert!(error.contains(line), "{error}");
     }
     assert!(error.contains("at 2 of 8 points, the first world.coupling = 7, learning.generations = 3"), "{error}");
-    // A value that works nowhere is a slip even then.
+    // A value that is impossible at every point is an error even if impossible points are skipped.
     let error = Sweep::read(&text, "x.toml", &[], true).unwrap_err().to_string();
     assert!(error.contains("found 7") && error.contains("found 8"), "{error}");
 
     let triangle =
         "[learning]\npopulation = 2\n[grid]\nfollowers_per_leader = [0, 1, 2]\n\"world.coupling\" = [4, 8, 12]\n";
-    assert!(refusal(triangle).contains("--skip-impossible leaves such points out"), "{}", refusal(triangle));
+    assert!(parse_error(triangle).contains("--skip-impossible leaves such points out"), "{}", parse_error(triangle));
     for sweep in
-        [Sweep::read(triangle, "x.toml", &[], true).unwrap(), sweep_of(&format!("{triangle}skip_impossible = true\n"))]
+        [Sweep::read(triangle, "x.toml", &[], true).unwrap(), parse(&format!("{triangle}skip_impossible = true\n"))]
     {
         assert_eq!((sweep.points.len(), sweep.skipped), (6, 3));
         assert_eq!(sweep.points.iter().map(|point| point.index).collect::<Vec<_>>(), [0, 3, 4, 6, 7, 8]);
     }
 }
 
-/// Two fitnesses, and with each of them two keys changed one at a time.
+/// Returns a sweep with two fitnesses. For each fitness, two other keys change one at a time.
 fn varied() -> String {
     let base = SMALL.split("[grid]").next().unwrap().replace("seed = 5", "seed = 5\ngenerations = 6");
     let grid = "[grid]\n\"learning.fitness\" = [\"G\", \"Df\"]\n";
@@ -255,8 +260,8 @@ fn varied() -> String {
 #[test]
 fn varied_keys_change_one_at_a_time() {
     let text = varied().replace("[1, 7]", "[1, 2]");
-    let sweep = sweep_of(&text);
-    let told: Vec<_> = sweep.points.iter().map(|point| sweep.describe(point)).collect();
+    let sweep = parse(&text);
+    let descriptions: Vec<_> = sweep.points.iter().map(|point| sweep.describe(point)).collect();
     let changes = [
         "",
         ", learning.generations = 3",
@@ -264,31 +269,34 @@ fn varied_keys_change_one_at_a_time() {
         ", world.coupling = 1",
         ", world.coupling = 2",
     ];
-    let wanted: Vec<_> =
+    let expected: Vec<_> =
         ["G", "Df"].iter().flat_map(|f| changes.map(|change| format!("learning.fitness = {f}{change}"))).collect();
-    assert_eq!(told, wanted);
+    assert_eq!(descriptions, expected);
     for (index, point) in sweep.points.iter().enumerate() {
         let (generations, coupling) = [(6, 3), (3, 3), (12, 3), (6, 1), (6, 2)][index % 5];
         assert_eq!(point.config.learning.generations, generations);
         assert_eq!(point.config.world.coupling, Coupling::Same(coupling));
     }
-    // The first value of a varied key is the file's own, written there or not.
+    // The first value of a varied key is the file's value, or the default if the file has none.
     assert_eq!((sweep.axes[1].label(0), sweep.axes[2].label(0)), ("6".into(), "3".into()));
-    let again = sweep_of(&sweep.text);
-    assert_eq!((again.text.as_str(), &again.points), (sweep.text.as_str(), &sweep.points));
+    let reparsed = parse(&sweep.text);
+    assert_eq!((reparsed.text.as_str(), &reparsed.points), (sweep.text.as_str(), &sweep.points));
 
-    // No grid is one combination.
-    let alone = text.replace("[grid]\n\"learning.fitness\" = [\"G\", \"Df\"]\n", "");
-    let alone = sweep_of(&alone);
-    assert_eq!((alone.points.len(), alone.describe(&alone.points[0]).as_str()), (5, "as in the file"));
-    assert_eq!(alone.describe(&alone.points[4]), "world.coupling = 2");
-    assert_eq!(sweep_of(&alone.text).points, alone.points);
+    // Without a grid, the only combination is the file's own.
+    let without_grid = text.replace("[grid]\n\"learning.fitness\" = [\"G\", \"Df\"]\n", "");
+    let without_grid = parse(&without_grid);
+    assert_eq!(
+        (without_grid.points.len(), without_grid.describe(&without_grid.points[0]).as_str()),
+        (5, "as in the file")
+    );
+    assert_eq!(without_grid.describe(&without_grid.points[4]), "world.coupling = 2");
+    assert_eq!(parse(&without_grid.text).points, without_grid.points);
 }
 
 #[test]
-fn wrong_varied_keys_are_told_with_their_lines() {
-    let with = |keys: &str| refusal(&varied().replace("world.coupling = [1, 7]", keys));
-    for (keys, wanted) in [
+fn errors_in_varied_keys_name_the_line() {
+    let error_of = |keys: &str| parse_error(&varied().replace("world.coupling = [1, 7]", keys));
+    for (keys, expected) in [
         ("\"learning.fitness\" = [\"D\"]", "x.toml:17: vary.\"learning.fitness\": it is also in [grid]"),
         (
             "\"world.coupling\" = [1, 3]",
@@ -309,16 +317,16 @@ fn wrong_varied_keys_are_told_with_their_lines() {
         ("followers_per_leader = [3]", "x.toml:17: vary.followers_per_leader: it lays out whole teams"),
         ("skip_impossible = true", "x.toml:17: vary.skip_impossible: found true, allowed a list of values"),
     ] {
-        let error = with(keys);
-        assert!(error.contains(wanted), "{keys}: {error}");
+        let error = error_of(keys);
+        assert!(error.contains(expected), "{keys}: {error}");
     }
     let base = SMALL.split("[grid]").next().unwrap();
-    assert!(refusal(&format!("{base}[vary]\n")).contains("x.toml:12: vary: it has no key"));
-    assert!(refusal(&format!("vary = 3\n{base}")).contains("x.toml:1: vary: allowed a section [vary]"));
+    assert!(parse_error(&format!("{base}[vary]\n")).contains("x.toml:12: vary: it has no key"));
+    assert!(parse_error(&format!("vary = 3\n{base}")).contains("x.toml:1: vary: allowed a section [vary]"));
     let flag = Override::new("learning.generations", 5, "--generations");
     let error = Sweep::read(&varied(), "x.toml", &[flag], true).unwrap_err().to_string();
     assert!(error.contains("--generations: [vary] has learning.generations already"), "{error}");
-    // One impossible value of two leaves the other.
+    // If one of two values is impossible, only that value is skipped.
     let grid = varied().replace(
         "[\"G\", \"Df\"]",
         "[\"G\"]\n\"world.followers\" = [[[12, 2]], [[12, 2], [8, 2], [9, 2], [7, 2], [6, 2]]]",
@@ -329,56 +337,60 @@ fn wrong_varied_keys_are_told_with_their_lines() {
 
 #[test]
 fn a_varied_sweep_has_columns_and_a_picture_of_its_keys() {
-    let (folder, sweep) = written(&varied());
-    let (whole, sharded) = (folder.path().join("whole"), folder.path().join("sharded"));
+    let (folder, sweep) = write_sweep(&varied());
+    let (unsharded, sharded) = (folder.path().join("whole"), folder.path().join("sharded"));
     let skip = "--skip-impossible";
-    assert!(failed(flotilla(&sweep, &whole, &[]), 1).contains("found 7"));
+    assert!(fail(flotilla(&sweep, &unsharded, &[]), 1).contains("found 7"));
     fs::write(&sweep, varied().replace("[1, 7]", "[1, 2]")).unwrap();
-    let listed = done(flotilla(&sweep, &whole, &["--list"]));
+    let listed = succeed(flotilla(&sweep, &unsharded, &["--list"]));
     assert!(listed.contains("learning.fitness = Df, world.coupling = 2\n"), "{listed}");
-    let told = done(flotilla(&sweep, &whole, &["--quiet", skip]));
-    assert!(told.contains("10 of 10 points are done") && told.contains("  final (.svg, .png, .pdf)"), "{told}");
+    let stdout = succeed(flotilla(&sweep, &unsharded, &["--quiet", skip]));
+    assert!(stdout.contains("10 of 10 points are done") && stdout.contains("  final (.svg, .png, .pdf)"), "{stdout}");
 
-    let table = fs::read_to_string(whole.join("points.csv")).unwrap();
+    let table = fs::read_to_string(unsharded.join("points.csv")).unwrap();
     let rows: Vec<Vec<&str>> = table.lines().map(|line| line.split(',').collect()).collect();
     assert_eq!(rows[0][..4], ["learning.fitness", "learning.generations", "world.coupling", "point"]);
     let axes: Vec<&[&str]> = rows[1..].iter().map(|row| &row[..3]).collect();
     assert_eq!(axes[..3], [["G", "6", "3"], ["G", "3", "3"], ["G", "12", "3"]]);
     assert_eq!(axes[8..], [["Df", "6", "1"], ["Df", "6", "2"]]);
-    let names: Vec<String> = results(&whole).into_iter().map(|(name, _)| name).collect();
+    let names: Vec<String> = results(&unsharded).into_iter().map(|(name, _)| name).collect();
     assert_eq!(names, ["final.pdf", "final.png", "final.svg", "points.csv", "results.csv", "sweep.toml"]);
 
-    let picture = fs::read_to_string(whole.join("final.svg")).unwrap();
+    let picture = fs::read_to_string(unsharded.join("final.svg")).unwrap();
     assert!(picture.contains("as in the file; generations (6): 3 "), "{}", &picture[..800]);
-    // A dot for each value; the files' own values are lines.
-    assert_eq!(fs::read_to_string(whole.join("final.svg")).unwrap().matches("<circle").count(), 8);
+    // Every varied value is a dot. The file's own values are lines.
+    assert_eq!(fs::read_to_string(unsharded.join("final.svg")).unwrap().matches("<circle").count(), 8);
 
     for shard in ["1/2", "2/2"] {
-        done(flotilla(&sweep, &sharded, &["--quiet", skip, "--shard", shard]));
+        succeed(flotilla(&sweep, &sharded, &["--quiet", skip, "--shard", shard]));
     }
-    done(flotilla(&sweep, &sharded, &["--collect", skip]));
-    assert_eq!(results(&whole), results(&sharded));
-    assert!(failed(flotilla(&sweep, &whole, &["--collect", "--axes", "coupling"]), 2).contains("one picture"));
+    succeed(flotilla(&sweep, &sharded, &["--collect", skip]));
+    assert_eq!(results(&unsharded), results(&sharded));
+    assert!(fail(flotilla(&sweep, &unsharded, &["--collect", "--axes", "coupling"]), 2).contains("one picture"));
 }
 
 #[test]
-fn every_sweep_of_the_repository_can_run() {
-    let mut found = 0;
+fn every_sweep_of_the_repository_is_valid() {
+    let mut count = 0;
     for entry in fs::read_dir("configs/sweeps").unwrap() {
         let path = entry.unwrap().path();
         let sweep = Sweep::load(&path, &[], false).unwrap_or_else(|error| panic!("{error}"));
         assert!(!sweep.points.is_empty(), "{}", path.display());
-        assert!(fs::read_to_string(&path).unwrap().starts_with("# "), "{} opens by what it shows", path.display());
-        found += 1;
+        assert!(
+            fs::read_to_string(&path).unwrap().starts_with("# "),
+            "{} does not begin with a comment",
+            path.display()
+        );
+        count += 1;
     }
-    assert!(found >= 9);
+    assert!(count >= 9);
 }
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
     #[test]
-    fn shards_part_the_points_evenly(
+    fn shards_divide_the_points_evenly(
         steps in prop::collection::btree_set(1usize..2000, 1..12),
         populations in prop::collection::btree_set(2usize..200, 1..6),
         count in 1usize..20,
@@ -386,15 +398,15 @@ proptest! {
         let text = SMALL.split("[grid]").next().unwrap().to_string()
             + &format!("[grid]\n\"world.steps\" = {steps:?}\n\"learning.population\" = {populations:?}\n")
                 .replace('{', "[").replace('}', "]");
-        let sweep = sweep_of(&text);
+        let sweep = parse(&text);
         let shards: Vec<_> = (1..=count).map(|index| Shard::new(index, count).unwrap().take(&sweep.points)).collect();
         let mut taken: Vec<_> = shards.iter().flatten().map(|point| point.index).collect();
         taken.sort_unstable();
         prop_assert_eq!(taken, (0..sweep.points.len()).collect::<Vec<_>>());
-        // Dealt out greedily, no shard is ahead of another by more than one point.
-        let dearest = sweep.points.iter().map(cost).max().unwrap();
+        // The assignment is greedy, so that loads differ by the cost of one point at most.
+        let largest = sweep.points.iter().map(cost).max().unwrap();
         let loads: Vec<u128> = shards.iter().map(|points| points.iter().map(|point| cost(point)).sum()).collect();
-        prop_assert!(loads.iter().max().unwrap() - loads.iter().min().unwrap() <= dearest);
+        prop_assert!(loads.iter().max().unwrap() - loads.iter().min().unwrap() <= largest);
     }
 
     #[test]
@@ -404,7 +416,7 @@ proptest! {
 }
 
 #[test]
-fn job_arrays_tell_the_shard() {
+fn the_shard_is_read_from_the_variables_of_job_arrays() {
     let shard = |pairs: &[(&str, &str)]| {
         let pairs = pairs.to_vec();
         Shard::from_env(move |name| pairs.iter().find(|(key, _)| *key == name).map(|(_, value)| value.to_string()))
@@ -430,17 +442,17 @@ fn job_arrays_tell_the_shard() {
 }
 
 #[test]
-fn points_come_out_of_one_batch_as_they_do_alone() {
-    let sweep = sweep_of(SMALL);
+fn points_trained_in_one_batch_equal_points_trained_alone() {
+    let sweep = parse(SMALL);
     let train = |configs: Vec<Config>| {
-        let arms = configs.len();
+        let experiments = configs.len();
         let mut trainer = Trainer::new(ValidConfig::all(&configs).unwrap());
         let rows = trainer.finish(&mut Cpu::default()).unwrap();
         (0..arms)
-            .map(|arm| {
-                let rows = rows.iter().filter(|row| row.experiment == arm);
+            .map(|experiment| {
+                let rows = rows.iter().filter(|row| row.experiment == experiment);
                 let rows: Vec<_> = rows.map(|r| (r.trial, r.generation, r.best_g, r.mean_g, r.champion_g)).collect();
-                (rows, trainer.policies(arm))
+                (rows, trainer.policies(experiment))
             })
             .collect::<Vec<_>>()
     };
@@ -452,11 +464,11 @@ fn points_come_out_of_one_batch_as_they_do_alone() {
 
 #[test]
 fn batches_fit_in_memory() {
-    let sweep = sweep_of(SMALL);
+    let sweep = parse(SMALL);
     let points: Vec<_> = sweep.points.iter().collect();
-    let one = run::bytes(&points[0].config);
-    assert!(one as u64 > points[0].config.policy_bytes());
-    for memory in [0, one, 2 * one, 3 * one, usize::MAX] {
+    let single = run::bytes(&points[0].config);
+    assert!(single as u64 > points[0].config.policy_bytes());
+    for memory in [0, single, 2 * single, 3 * single, usize::MAX] {
         let batches = run::batches(&points, memory);
         assert_eq!(batches.concat().iter().map(|point| point.index).collect::<Vec<_>>(), (0..8).collect::<Vec<_>>());
         for batch in batches {
@@ -467,14 +479,14 @@ fn batches_fit_in_memory() {
 }
 
 #[test]
-fn the_union_of_any_shards_is_the_unsharded_run() {
-    let (folder, sweep) = written(SMALL);
-    let whole = folder.path().join("whole");
-    let told = done(flotilla(&sweep, &whole, &["--quiet"]));
-    assert!(told.contains("8 of 8 points are done"), "{told}");
-    let wanted = results(&whole);
+fn collected_shards_equal_the_unsharded_sweep() {
+    let (folder, sweep) = write_sweep(SMALL);
+    let unsharded = folder.path().join("whole");
+    let stdout = succeed(flotilla(&sweep, &unsharded, &["--quiet"]));
+    assert!(stdout.contains("8 of 8 points are done"), "{stdout}");
+    let expected = results(&unsharded);
     assert_eq!(
-        wanted.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>(),
+        expected.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>(),
         [
             "curves.pdf",
             "curves.png",
@@ -490,70 +502,70 @@ fn the_union_of_any_shards_is_the_unsharded_run() {
             "sweep.toml"
         ]
     );
-    // Both the heat map and the curves label G in the same way, and the colours are explained.
+    // Heat maps and curves have the same label for G, and explain their colours.
     for (picture, labels) in [
         ("final.svg", &["G of the best team", "mean over trials; below: 95 % interval"][..]),
         ("reach.svg", &["Median generation that reaches G 0.75", "below: trials that reach it"]),
         ("curves.svg", &["G of the best team", "mean and 95 % interval over 2 trials"]),
     ] {
-        let svg = fs::read_to_string(whole.join(picture)).unwrap();
+        let svg = fs::read_to_string(unsharded.join(picture)).unwrap();
         for label in labels {
             assert!(svg.contains(&format!("aria-label=\"{label}\"")), "{picture}: {label}");
         }
     }
-    let text = fs::read_to_string(whole.join("results.csv")).unwrap();
+    let text = fs::read_to_string(unsharded.join("results.csv")).unwrap();
     let head = "world.coupling,world.steps,learning.generations,point,trial,generation,best_g,mean_g,champion_g";
     assert_eq!(text.lines().next(), Some(head));
-    // 4 points of 3 generations and 4 of 12, two trials each, and every run's random start.
+    // Two trials each of 4 points with 3 generations and 4 points with 12, each plus generation 0.
     assert_eq!(text.lines().count(), 1 + 2 * (4 * 4 + 4 * 13));
 
-    done(flotilla(&sweep, &whole, &["--collect", "--measure", "champion", "--band", "error"]));
-    let svg = fs::read_to_string(whole.join("final.svg")).unwrap();
+    succeed(flotilla(&sweep, &unsharded, &["--collect", "--measure", "champion", "--band", "error"]));
+    let svg = fs::read_to_string(unsharded.join("final.svg")).unwrap();
     assert!(svg.contains("G of the champion") && svg.contains("below: ± standard error"), "{svg}");
 
     for count in [2, 3, 11] {
         let out = folder.path().join(format!("{count}"));
         for index in (1..=count).rev() {
             if index == 1 {
-                let error = failed(flotilla(&sweep, &out, &["--collect"]), 1);
+                let error = fail(flotilla(&sweep, &out, &["--collect"]), 1);
                 assert!(error.contains("points are missing") && error.contains("it was not run"), "{error}");
             }
-            // Each also in batches of another size.
+            // Shards also differ in the size of their batches.
             let memory = if index % 2 == 0 { "0.00001" } else { "1" };
-            done(flotilla(&sweep, &out, &["--quiet", "--shard", &format!("{index}/{count}"), "--memory", memory]));
+            succeed(flotilla(&sweep, &out, &["--quiet", "--shard", &format!("{index}/{count}"), "--memory", memory]));
         }
-        done(flotilla(&sweep, &out, &["--collect"]));
-        assert!(results(&out) == wanted, "{count} shards");
-        assert!(policies(&out) == policies(&whole), "{count} shards");
+        succeed(flotilla(&sweep, &out, &["--collect"]));
+        assert!(results(&out) == expected, "{count} shards");
+        assert!(policies(&out) == policies(&unsharded), "{count} shards");
     }
 
-    // A job array's tasks are the same shards.
+    // The tasks of a job array are the same shards.
     let out = folder.path().join("array");
     for task in 0..2 {
         let mut command = command(&sweep, &out, &["--quiet"]);
         command.env("SLURM_ARRAY_TASK_ID", task.to_string()).env("SLURM_ARRAY_TASK_COUNT", "2");
-        done(command.env("SLURM_ARRAY_TASK_MIN", "0").output().unwrap());
+        succeed(command.env("SLURM_ARRAY_TASK_MIN", "0").output().unwrap());
     }
-    done(flotilla(&sweep, &out, &["--collect"]));
-    assert!(results(&out) == wanted, "a job array");
+    succeed(flotilla(&sweep, &out, &["--collect"]));
+    assert!(results(&out) == expected, "a job array");
 
-    // A point is a run like any other.
-    let point = whole.join("points/0003");
+    // A point equals a run with the same config.
+    let point = unsharded.join("points/0003");
     let alone = folder.path().join("alone");
     let mut train = support::flotilla();
     train.arg("train").arg(point.join("config.toml")).arg("--out").arg(&alone).args(["--quiet", "--backend", "cpu"]);
-    done(train.output().unwrap());
-    assert_eq!(timeless(&alone.join("metrics.csv")), timeless(&point.join("metrics.csv")));
+    succeed(train.output().unwrap());
+    assert_eq!(metrics_without_time(&alone.join("metrics.csv")), metrics_without_time(&point.join("metrics.csv")));
     assert!(
         fs::read(alone.join("policies.safetensors")).unwrap() == fs::read(point.join("policies.safetensors")).unwrap()
     );
 }
 
 #[test]
-fn every_few_generations_are_kept_and_the_last() {
-    let (folder, sweep) = written(SMALL);
+fn results_have_every_fifth_generation_and_the_last() {
+    let (folder, sweep) = write_sweep(SMALL);
     let out = folder.path().join("out");
-    done(flotilla(&sweep, &out, &["--quiet", "--every", "5", "--reach", "0.5", "--axes", "steps"]));
+    succeed(flotilla(&sweep, &out, &["--quiet", "--every", "5", "--reach", "0.5", "--axes", "steps"]));
     let mut table = csv::Reader::from_path(out.join("results.csv")).unwrap();
     let rows: Vec<(usize, usize, usize)> = table
         .records()
@@ -563,7 +575,7 @@ fn every_few_generations_are_kept_and_the_last() {
     let first: Vec<_> = rows.iter().filter(|row| row.0 <= 1 && row.1 == 0).map(|row| row.2).collect();
     assert_eq!(first, [0, 3, 0, 5, 10, 12]);
 
-    // points.csv says of each point what its rows and metrics say.
+    // points.csv agrees with the metrics of every point.
     let mut points = csv::Reader::from_path(out.join("points.csv")).unwrap();
     for point in points.records() {
         let point = point.unwrap();
@@ -580,25 +592,25 @@ fn every_few_generations_are_kept_and_the_last() {
         let median = reached[0].zip(reached[1]).map(|(a, b)| (a + b) / 2.0);
         assert_eq!(point[11].parse::<f64>().ok(), median, "{point:?}");
     }
-    let error = failed(flotilla(&sweep, &out, &["--collect", "--axes", "radius"]), 2);
+    let error = fail(flotilla(&sweep, &out, &["--collect", "--axes", "radius"]), 2);
     assert!(error.contains("it has world.coupling, world.steps, learning.generations"), "{error}");
 }
 
-/// Longer, so that there is a half-way.
+/// Returns a sweep that takes long enough to be killed halfway.
 fn long() -> String {
     SMALL.replace("[3, 12]", "[40, 120]").replace("[8, 25]", "[100, 101]")
 }
 
-/// Every checkpoint in a sweep's folder.
+/// Returns every complete checkpoint in a sweep's folder.
 fn checkpoints(out: &Path) -> BTreeSet<PathBuf> {
     let points = fs::read_dir(out.join("points")).into_iter().flatten().flatten();
     let files = points.flat_map(|point| fs::read_dir(point.path().join("checkpoints")).into_iter().flatten().flatten());
-    let whole = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "safetensors");
-    files.map(|file| file.path()).filter(whole).collect()
+    let is_complete = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "safetensors");
+    files.map(|file| file.path()).filter(is_complete).collect()
 }
 
-/// Starts a shard and waits until it has made checkpoints of its own, or is done.
-fn started(sweep: &Path, out: &Path, flags: &[&str]) -> Child {
+/// Starts a shard and waits until it has written a new checkpoint, or has finished.
+fn start_until_checkpoint(sweep: &Path, out: &Path, flags: &[&str]) -> Child {
     let before = checkpoints(out);
     let mut child = command(sweep, out, flags).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
     let start = Instant::now();
@@ -611,16 +623,16 @@ fn started(sweep: &Path, out: &Path, flags: &[&str]) -> Child {
 
 #[test]
 fn killed_shards_resume_to_the_same_bytes() {
-    let (folder, sweep) = written(&long());
-    let whole = folder.path().join("whole");
-    done(flotilla(&sweep, &whole, &["--quiet"]));
+    let (folder, sweep) = write_sweep(&long());
+    let uninterrupted = folder.path().join("whole");
+    succeed(flotilla(&sweep, &uninterrupted, &["--quiet"]));
 
     let out = folder.path().join("out");
     let shards = ["1/2", "2/2"];
     for (at, shard) in shards.into_iter().enumerate() {
-        // Killed three times at different places, the second shard politely.
+        // Stops each shard three times, after different pauses: the first with SIGKILL, the second with SIGTERM.
         for pause in [0, 15, 40] {
-            let mut child = started(&sweep, &out, &["--quiet", "--resume", "--shard", shard]);
+            let mut child = start_until_checkpoint(&sweep, &out, &["--quiet", "--resume", "--shard", shard]);
             std::thread::sleep(Duration::from_millis(pause));
             if at == 0 {
                 let _ = child.kill();
@@ -629,51 +641,51 @@ fn killed_shards_resume_to_the_same_bytes() {
                 let id = child.id().to_string();
                 let _ = Command::new("kill").args(["-TERM", &id]).status().unwrap();
                 let output = child.wait_with_output().unwrap();
-                let told = String::from_utf8(output.stderr).unwrap();
-                assert!(matches!(output.status.code(), Some(75 | 0)), "{told}");
+                let message = String::from_utf8(output.stderr).unwrap();
+                assert!(matches!(output.status.code(), Some(75 | 0)), "{message}");
                 if output.status.code() == Some(75) {
-                    let command = told.lines().last().unwrap();
-                    assert!(told.starts_with("stopped: everything is saved; continue with"), "{told}");
-                    assert!(command.contains("--backend cpu --shard 2/2 --resume"), "{told}");
+                    let command = message.lines().last().unwrap();
+                    assert!(message.starts_with("stopped: everything is saved; continue with"), "{message}");
+                    assert!(command.contains("--backend cpu --shard 2/2 --resume"), "{message}");
                 }
             }
         }
     }
-    failed(flotilla(&sweep, &out, &["--quiet", "--shard", "1/2"]), 1);
+    fail(flotilla(&sweep, &out, &["--quiet", "--shard", "1/2"]), 1);
     for shard in shards {
-        done(flotilla(&sweep, &out, &["--quiet", "--resume", "--shard", shard]));
+        succeed(flotilla(&sweep, &out, &["--quiet", "--resume", "--shard", shard]));
     }
-    done(flotilla(&sweep, &out, &["--collect"]));
-    assert!(results(&out) == results(&whole));
-    assert!(policies(&out) == policies(&whole));
-    // What is done is not done again.
+    succeed(flotilla(&sweep, &out, &["--collect"]));
+    assert!(results(&out) == results(&uninterrupted));
+    assert!(policies(&out) == policies(&uninterrupted));
+    // Finished points are not trained again.
     let before = fs::read(out.join("points/0000/run.json")).unwrap();
-    done(flotilla(&sweep, &out, &["--quiet", "--resume"]));
+    succeed(flotilla(&sweep, &out, &["--quiet", "--resume"]));
     assert!(fs::read(out.join("points/0000/run.json")).unwrap() == before);
 }
 
 #[test]
-fn points_killed_at_different_generations_go_on_apart() {
-    let (folder, sweep) = written(&long());
-    let (whole, out) = (folder.path().join("whole"), folder.path().join("out"));
-    done(flotilla(&sweep, &whole, &["--quiet"]));
-    let mut child = started(&sweep, &out, &["--quiet"]);
+fn points_killed_at_different_generations_resume_independently() {
+    let (folder, sweep) = write_sweep(&long());
+    let (uninterrupted, out) = (folder.path().join("whole"), folder.path().join("out"));
+    succeed(flotilla(&sweep, &uninterrupted, &["--quiet"]));
+    let mut child = start_until_checkpoint(&sweep, &out, &["--quiet"]);
     std::thread::sleep(Duration::from_millis(60));
     child.kill().unwrap();
     child.wait().unwrap();
-    // One point loses its checkpoints, another all but its config.
+    // One point loses its checkpoints, another its whole folder.
     fs::remove_dir_all(out.join("points/0001/checkpoints")).unwrap();
     fs::remove_dir_all(out.join("points/0002")).unwrap();
-    done(flotilla(&sweep, &out, &["--quiet", "--resume"]));
-    assert!(results(&out) == results(&whole));
-    assert!(policies(&out) == policies(&whole));
+    succeed(flotilla(&sweep, &out, &["--quiet", "--resume"]));
+    assert!(results(&out) == results(&uninterrupted));
+    assert!(policies(&out) == policies(&uninterrupted));
 }
 
 #[test]
 fn wrong_usage_is_refused_before_any_work() {
-    let (folder, sweep) = written(SMALL);
+    let (folder, sweep) = write_sweep(SMALL);
     let out = folder.path().join("out");
-    for (shard, wanted) in [
+    for (shard, expected) in [
         ("5/4", "there is no shard 5 of 4; they are 1/4 to 4/4"),
         ("0/4", "there is no shard 0 of 4"),
         ("1/0", "found 0 shards"),
@@ -681,61 +693,61 @@ fn wrong_usage_is_refused_before_any_work() {
         ("-1/2", "allowed I/N"),
         ("1/99999999999", "allowed 1 to 65536"),
     ] {
-        let error = failed(flotilla(&sweep, &out, &["--shard", shard]), 2);
-        assert!(error.contains(wanted), "{shard}: {error}");
+        let error = fail(flotilla(&sweep, &out, &["--shard", shard]), 2);
+        assert!(error.contains(expected), "{shard}: {error}");
     }
-    let error = failed(flotilla(&sweep, &out, &["--seed", "3", "--skip-impossible", "--generations", "3"]), 2);
+    let error = fail(flotilla(&sweep, &out, &["--seed", "3", "--skip-impossible", "--generations", "3"]), 2);
     assert!(error.contains("--generations: the grid has learning.generations already"), "{error}");
     let mut array = command(&sweep, &out, &[]);
-    let error = failed(array.env("JOB_COMPLETION_INDEX", "1").output().unwrap(), 2);
+    let error = fail(array.env("JOB_COMPLETION_INDEX", "1").output().unwrap(), 2);
     assert!(error.contains("FLOTILLA_SHARDS"), "{error}");
-    let error = failed(flotilla(&sweep, &out, &["--collect"]), 2);
+    let error = fail(flotilla(&sweep, &out, &["--collect"]), 2);
     assert!(error.contains("holds no sweep"), "{error}");
-    let (_other, wrong) = written(&SMALL.replace("[1, 3]", "[1, 9]"));
-    let error = failed(flotilla(&wrong, &out, &[]), 1);
+    let (_other, impossible) = write_sweep(&SMALL.replace("[1, 3]", "[1, 9]"));
+    let error = fail(flotilla(&impossible, &out, &[]), 1);
     assert!(error.contains("x.toml:13: ") && error.contains("found 9, allowed 1 to 6"), "{error}");
-    let (_other, empty) = written(&SMALL.replace("[1, 3]", "[]"));
-    assert!(failed(flotilla(&empty, &out, &[]), 1).contains("found no values"));
-    assert!(failed(flotilla(&out, &out, &[]), 1).contains("cannot be read"));
+    let (_other, empty) = write_sweep(&SMALL.replace("[1, 3]", "[]"));
+    assert!(fail(flotilla(&empty, &out, &[]), 1).contains("found no values"));
+    assert!(fail(flotilla(&out, &out, &[]), 1).contains("cannot be read"));
     assert!(!out.exists(), "nothing was written");
 }
 
 #[test]
-fn a_folder_of_something_else_is_refused() {
-    let (folder, sweep) = written(SMALL);
+fn a_folder_with_another_sweep_or_a_run_is_refused() {
+    let (folder, sweep) = write_sweep(SMALL);
     let out = folder.path().join("out");
-    done(flotilla(&sweep, &out, &["--quiet"]));
+    succeed(flotilla(&sweep, &out, &["--quiet"]));
     let before = results(&out);
-    let (_other, another) = written(&SMALL.replace("[1, 3]", "[1, 2, 3]"));
+    let (_other, another) = write_sweep(&SMALL.replace("[1, 3]", "[1, 2, 3]"));
     for flags in [&["--resume"][..], &["--force"], &["--collect"], &["--shard", "1/3"], &[]] {
-        let error = failed(flotilla(&another, &out, flags), 1);
+        let error = fail(flotilla(&another, &out, flags), 1);
         assert!(error.contains("holds another sweep"), "{error}");
         assert!(error.contains("there: \"world.coupling\" = [1, 3]"), "{error}");
         assert!(error.contains("here: \"world.coupling\" = [1, 2, 3]"), "{error}");
     }
-    // Other seeds are another sweep, other comments are not.
-    assert!(failed(flotilla(&sweep, &out, &["--seed", "6", "--resume"]), 1).contains("there: seed = 5"));
-    let (_other, same) = written(&format!("# The same.\n{SMALL}"));
-    done(flotilla(&same, &out, &["--quiet", "--resume"]));
+    // Another seed makes another sweep. Another comment does not.
+    assert!(fail(flotilla(&sweep, &out, &["--seed", "6", "--resume"]), 1).contains("there: seed = 5"));
+    let (_other, same) = write_sweep(&format!("# The same.\n{SMALL}"));
+    succeed(flotilla(&same, &out, &["--quiet", "--resume"]));
     assert!(results(&out) == before);
-    // Neither is a run's folder a sweep's.
-    let error = failed(flotilla(&sweep, &out.join("points/0000"), &[]), 1);
+    // A sweep does not write into a run's folder.
+    let error = fail(flotilla(&sweep, &out.join("points/0000"), &[]), 1);
     assert!(error.contains("holds a run, not a sweep"), "{error}");
-    // Twice needs a word, and --force writes over what is there, to the same results.
-    assert!(failed(flotilla(&sweep, &out, &["--quiet"]), 1).contains("--resume"));
-    done(flotilla(&sweep, &out, &["--quiet", "--force"]));
+    // A finished sweep needs --resume or --force. With --force, it is trained again to the same results.
+    assert!(fail(flotilla(&sweep, &out, &["--quiet"]), 1).contains("--resume"));
+    succeed(flotilla(&sweep, &out, &["--quiet", "--force"]));
     assert!(results(&out) == before);
 }
 
-/// Files that a sweep would write are a sweep's only beside its file; that may be written by hand.
+/// Tests that files with the names of results are overwritten only beside a sweep.toml, which a user may have written.
 #[test]
-fn other_files_in_a_sweeps_folder_are_left_alone() {
-    let (folder, sweep) = written(SMALL);
+fn files_of_others_in_a_sweeps_folder_are_not_overwritten() {
+    let (folder, sweep) = write_sweep(SMALL);
     for name in ["results.csv", "points.csv", "final.svg"] {
         let out = folder.path().join(name);
         fs::create_dir(&out).unwrap();
         fs::write(out.join(name), "mine").unwrap();
-        let error = failed(flotilla(&sweep, &out, &["--quiet", "--force"]), 1);
+        let error = fail(flotilla(&sweep, &out, &["--quiet", "--force"]), 1);
         assert!(error.contains(&format!("holds {name}, but no sweep.toml")), "{error}");
         assert_eq!(fs::read_to_string(out.join(name)).unwrap(), "mine");
     }
@@ -743,62 +755,62 @@ fn other_files_in_a_sweeps_folder_are_left_alone() {
     fs::create_dir(&own).unwrap();
     let text = format!("# Mine.\n{SMALL}");
     fs::write(own.join("sweep.toml"), &text).unwrap();
-    done(flotilla(&own.join("sweep.toml"), &own, &["--quiet"]));
+    succeed(flotilla(&own.join("sweep.toml"), &own, &["--quiet"]));
     assert_eq!(fs::read_to_string(own.join("sweep.toml")).unwrap(), text);
-    // How often it is saved has no say in what a point came to.
+    // A point may be resumed with another interval of checkpoints, which does not change its results.
     let point = own.join("points/0000");
     let config = point.join("config.toml");
     fs::remove_file(point.join("run.json")).unwrap();
-    let mut again = support::flotilla();
-    again.arg("train").arg(&config).arg("--out").arg(&point);
-    done(again.args(["--resume", "--checkpoint-seconds", "5", "--backend", "cpu", "--quiet"]).output().unwrap());
-    done(flotilla(&own.join("sweep.toml"), &own, &["--collect"]));
-    // What no machine has is told before anything starts.
-    let (_large, huge) = written(&SMALL.replacen(
+    let mut resumed = support::flotilla();
+    resumed.arg("train").arg(&config).arg("--out").arg(&point);
+    succeed(resumed.args(["--resume", "--checkpoint-seconds", "5", "--backend", "cpu", "--quiet"]).output().unwrap());
+    succeed(flotilla(&own.join("sweep.toml"), &own, &["--collect"]));
+    // A sweep that needs more memory than any machine has is refused before anything starts.
+    let (_large, huge) = write_sweep(&SMALL.replacen(
         "[grid]",
         "[grid]\n\"learning.population\" = [1048576]\n\"policy.hidden\" = [[64, 64]]\n\"learning.trials\" = [1000]",
         1,
     ));
     let out = folder.path().join("huge");
-    let error = failed(flotilla(&huge, &out, &["--quiet"]), 1);
+    let error = fail(flotilla(&huge, &out, &["--quiet"]), 1);
     assert!(error.contains("GiB") && !out.join("sweep.toml").exists(), "{error}");
 }
 
-/// Nothing is written over where another process trains one of the points, in whatever batch that is.
+/// Tests that --force overwrites nothing while another process trains a point, whatever its batch.
 #[test]
-fn what_another_process_trains_is_left_alone_with_all_else() {
-    let (folder, sweep) = written(SMALL);
+fn nothing_is_overwritten_while_another_process_trains_a_point() {
+    let (folder, sweep) = write_sweep(SMALL);
     let out = folder.path().join("out");
-    done(flotilla(&sweep, &out, &["--quiet"]));
-    let all = || {
+    succeed(flotilla(&sweep, &out, &["--quiet"]));
+    let all_files = || {
         let points = (0..8).map(|point| out.join(format!("points/{point:04}")));
         let files = points.flat_map(|point| [results(&point), results(&point.join("checkpoints"))]);
         (results(&out), files.collect::<Vec<_>>())
     };
-    let before = all();
+    let before = all_files();
     let point = out.join("points/0005");
     let config = Config::load(&point.join("config.toml")).unwrap();
     let held = Folder::open(&point, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
     for memory in ["1", "0.000001"] {
-        let error = failed(flotilla(&sweep, &out, &["--quiet", "--force", "--memory", memory]), 1);
+        let error = fail(flotilla(&sweep, &out, &["--quiet", "--force", "--memory", memory]), 1);
         let expected = format!("error: another process is training in {}; ", point.display());
         assert!(error.starts_with(&expected) && error.lines().count() == 1, "{error}");
-        assert!(all() == before, "something was written over, in batches of {memory} GiB");
+        assert!(all_files() == before, "files were overwritten, with --memory {memory}");
     }
     drop(held);
-    done(flotilla(&sweep, &out, &["--quiet", "--force", "--memory", "0.000001"]));
-    // Nor does a later batch come too late to say that runs are there.
+    succeed(flotilla(&sweep, &out, &["--quiet", "--force", "--memory", "0.000001"]));
+    // Existing runs of later batches are reported before the first batch starts.
     fs::remove_dir_all(out.join("points/0000")).unwrap();
-    let error = failed(flotilla(&sweep, &out, &["--quiet", "--memory", "0.000001"]), 1);
+    let error = fail(flotilla(&sweep, &out, &["--quiet", "--memory", "0.000001"]), 1);
     assert!(error.contains("points/0001 holds a run already") && !out.join("points/0000").exists(), "{error}");
 }
 
 #[test]
-fn damaged_points_are_missing_not_wrong() {
-    let (folder, sweep) = written(SMALL);
+fn damaged_points_are_reported_as_missing() {
+    let (folder, sweep) = write_sweep(SMALL);
     let out = folder.path().join("out");
-    done(flotilla(&sweep, &out, &["--quiet"]));
-    let wanted = results(&out);
+    succeed(flotilla(&sweep, &out, &["--quiet"]));
+    let before = results(&out);
     let metrics = |point: usize| out.join(format!("points/{point:04}/metrics.csv"));
     let text = fs::read_to_string(metrics(1)).unwrap();
     let lines: Vec<&str> = text.lines().collect();
@@ -809,42 +821,43 @@ fn damaged_points_are_missing_not_wrong() {
     fs::write(metrics(2), text.replacen("\n0,0,", "\n0,0,7", 1)).unwrap();
     fs::remove_file(metrics(3)).unwrap();
     fs::copy(out.join("points/0000/config.toml"), out.join("points/0004/config.toml")).unwrap();
-    let error = failed(flotilla(&sweep, &out, &["--collect"]), 1);
-    for wanted in [
+    let error = fail(flotilla(&sweep, &out, &["--collect"]), 1);
+    for expected in [
         "4 of 8 points are missing",
-        "point 0001 (world.coupling = 1, world.steps = 8, learning.generations = 12): it has reached generation 2 of 12",
+        "point 0001 (world.coupling = 1, world.steps = 8, learning.generations = 12): \
+         it has reached generation 2 of 12",
         "point 0002",
         "metrics.csv: line 2 is not",
         "it was not run",
         "it is of another config",
     ] {
-        assert!(error.contains(wanted), "{wanted}: {error}");
+        assert!(error.contains(expected), "{expected}: {error}");
     }
-    // Resuming mends what can be mended; another config is for a person to look at.
-    assert!(failed(flotilla(&sweep, &out, &["--quiet", "--resume"]), 1).contains("another config"));
+    // --resume trains damaged points again, but refuses a point with another config.
+    assert!(fail(flotilla(&sweep, &out, &["--quiet", "--resume"]), 1).contains("another config"));
     fs::remove_dir_all(out.join("points/0004")).unwrap();
-    done(flotilla(&sweep, &out, &["--quiet", "--resume"]));
-    assert!(results(&out) == wanted);
+    succeed(flotilla(&sweep, &out, &["--quiet", "--resume"]));
+    assert!(results(&out) == before);
 }
 
 #[test]
-fn a_summary_may_be_json() {
-    let (folder, sweep) = written(SMALL);
+fn json_summaries_agree_with_the_files() {
+    let (folder, sweep) = write_sweep(SMALL);
     let out = folder.path().join("out");
-    let told = done(flotilla(&sweep, &out, &["--quiet", "--json", "--shard", "1/2"]));
-    let said: serde_json::Value = serde_json::from_str(&told).unwrap();
-    assert_eq!((&said["shard"], &said["folder"]), (&"1/2".into(), &out.to_str().unwrap().into()));
-    assert!(said["collect"].as_str().unwrap().ends_with("--collect"));
+    let stdout = succeed(flotilla(&sweep, &out, &["--quiet", "--json", "--shard", "1/2"]));
+    let summary: serde_json::Value = serde_json::from_str(&stdout).unwrap();
+    assert_eq!((&summary["shard"], &summary["folder"]), (&"1/2".into(), &out.to_str().unwrap().into()));
+    assert!(summary["collect"].as_str().unwrap().ends_with("--collect"));
     let output = flotilla(&sweep, &out, &["--collect", "--json"]);
     assert_eq!(output.status.code(), Some(1));
-    let said: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let missing =
-        said["points"].as_array().unwrap().iter().filter(|point| point["missing"] == "it was not run").count();
-    assert!((1..8).contains(&missing), "{said}");
-    let said: serde_json::Value =
-        serde_json::from_str(&done(flotilla(&sweep, &out, &["--quiet", "--json", "--resume"]))).unwrap();
-    let mut table = csv::Reader::from_path(said["files"]["points"].as_str().unwrap()).unwrap();
-    for (row, point) in table.records().map(|row| row.unwrap()).zip(said["points"].as_array().unwrap()) {
+        summary["points"].as_array().unwrap().iter().filter(|point| point["missing"] == "it was not run").count();
+    assert!((1..8).contains(&missing), "{summary}");
+    let summary: serde_json::Value =
+        serde_json::from_str(&succeed(flotilla(&sweep, &out, &["--quiet", "--json", "--resume"]))).unwrap();
+    let mut table = csv::Reader::from_path(summary["files"]["points"].as_str().unwrap()).unwrap();
+    for (row, point) in table.records().map(|row| row.unwrap()).zip(summary["points"].as_array().unwrap()) {
         assert_eq!(row[0], point["values"]["world.coupling"].to_string());
         assert_eq!(row[3], point["point"].to_string());
         assert_eq!(row[6].parse::<f64>().unwrap(), point["best_g"].as_f64().unwrap());
@@ -852,35 +865,39 @@ fn a_summary_may_be_json() {
         let run = fs::read_to_string(Path::new(point["folder"].as_str().unwrap()).join("run.json")).unwrap();
         assert!(run.contains(point["digest"].as_str().unwrap()));
     }
-    for picture in said["files"]["pictures"].as_array().unwrap() {
+    for picture in summary["files"]["pictures"].as_array().unwrap() {
         assert!(Path::new(picture.as_str().unwrap()).exists(), "{picture}");
     }
 }
 
 #[test]
-fn a_file_is_no_folder() {
-    let (_folder, sweep) = written(SMALL);
-    let told = failed(flotilla(&sweep, &sweep, &[]), 1);
-    assert!(told.starts_with("error: ") && told.contains("is a file; choose a folder"), "{told}");
+fn a_file_as_output_folder_is_refused() {
+    let (_folder, sweep) = write_sweep(SMALL);
+    let error = fail(flotilla(&sweep, &sweep, &[]), 1);
+    assert!(error.starts_with("error: ") && error.contains("is a file; choose a folder"), "{error}");
 }
 
 #[test]
-fn the_list_tells_costs_and_shards() {
-    let (folder, sweep) = written(SMALL);
-    let told = done(flotilla(&sweep, &folder.path().join("out"), &["--list", "--shards", "3"]));
-    assert_eq!(told.lines().count(), 10, "{told}");
-    let parts: f64 =
-        told.lines().skip(1).take(8).map(|line| line.split_whitespace().nth(1).unwrap().parse::<f64>().unwrap()).sum();
-    assert!((parts - 100.0).abs() < 0.1, "{told}");
+fn list_prints_costs_and_shards() {
+    let (folder, sweep) = write_sweep(SMALL);
+    let stdout = succeed(flotilla(&sweep, &folder.path().join("out"), &["--list", "--shards", "3"]));
+    assert_eq!(stdout.lines().count(), 10, "{stdout}");
+    let shares: f64 = stdout
+        .lines()
+        .skip(1)
+        .take(8)
+        .map(|line| line.split_whitespace().nth(1).unwrap().parse::<f64>().unwrap())
+        .sum();
+    assert!((shares - 100.0).abs() < 0.1, "{stdout}");
     assert!(!folder.path().join("out").exists());
 }
 
 #[test]
-fn the_batch_script_is_one_that_bash_takes() {
-    let (folder, sweep) = written(SMALL);
+fn the_batch_script_runs_in_bash() {
+    let (folder, sweep) = write_sweep(SMALL);
     let out = folder.path().join("a folder's");
     let flags = ["--slurm", "--shards", "3", "--time", "02:00:00", "--threads", "4", "--seed", "7"];
-    let script = done(flotilla(&sweep, &out, &[&flags[..], &["--sbatch=--partition=long"]].concat()));
+    let script = succeed(flotilla(&sweep, &out, &[&flags[..], &["--sbatch=--partition=long"]].concat()));
     for line in [
         "#SBATCH --array=1-3",
         "#SBATCH --time=02:00:00",
@@ -889,36 +906,37 @@ fn the_batch_script_is_one_that_bash_takes() {
         "#SBATCH --requeue",
         "#SBATCH --partition=long",
     ] {
-        assert!(script.lines().any(|found| found == line), "{line}: {script}");
+        assert!(script.lines().any(|other| other == line), "{line}: {script}");
     }
-    assert!(!script.contains("--gpus"), "the CPU was asked for: {script}");
+    assert!(!script.contains("--gpus"), "a GPU is requested for a sweep on the CPU: {script}");
     let host = ["--slurm", "--seed", "7", "--breed", "host", "--on-device-loss", "cpu"];
-    let script_of_host = done(flotilla(&sweep, &out, &host));
-    assert!(script_of_host.contains("--backend cpu --breed host --on-device-loss cpu --shard"), "{script_of_host}");
+    let host_script = succeed(flotilla(&sweep, &out, &host));
+    assert!(host_script.contains("--backend cpu --breed host --on-device-loss cpu --shard"), "{host_script}");
     assert!(
         script.contains("--seed 7 --backend cpu --threads 4 --shard \"$SLURM_ARRAY_TASK_ID/3\" --resume"),
         "{script}"
     );
-    // Run by hand as a task of the array, it runs its shard; the folder's name is a hard one.
+    // As a task of the array, the script trains its shard. The folder's name needs quotes.
     let path = folder.path().join("job.sh");
-    done(flotilla(&sweep, &out, &[&flags[..1], &flags[1..]].concat()));
+    succeed(flotilla(&sweep, &out, &[&flags[..1], &flags[1..]].concat()));
     let file = format!("--slurm={}", path.display());
-    done(flotilla(&sweep, &out, &[&[&*file], &flags[1..]].concat()));
+    succeed(flotilla(&sweep, &out, &[&[&*file], &flags[1..]].concat()));
     for task in ["1", "2", "3"] {
         let output = Command::new("bash").arg(&path).env("SLURM_ARRAY_TASK_ID", task).output().unwrap();
-        done(output);
+        succeed(output);
     }
-    done(flotilla(&sweep, &out, &["--collect", "--seed", "7"]));
+    succeed(flotilla(&sweep, &out, &["--collect", "--seed", "7"]));
 }
 
-/// `cargo test --release --test sweep -- --ignored --nocapture` on an idle machine; the figures are in
-/// `benches/README.md`.
+/// Measures how much longer a batch takes than its points one by one. `benches/README.md` has results.
+///
+/// Run with `cargo test --release --test sweep -- --ignored --nocapture` on an idle machine.
 #[test]
 #[ignore = "a measurement"]
-fn a_batch_of_unequal_points_costs_what_its_parts_do() {
+fn a_batch_of_unequal_points_takes_as_long_as_its_points() {
     let text = "[learning]\ngenerations = 20\ntrials = 2\n[grid]\nfollowers_per_leader = [0, 1, 4, 16]\n\
                 \"world.coupling\" = [1, 4]\n\"world.steps\" = [10, 25, 100]\n";
-    let sweep = sweep_of(text);
+    let sweep = parse(text);
     let seconds = |configs: Vec<Config>| {
         let mut trainer = Trainer::new(ValidConfig::all(&configs).unwrap());
         let mut backend = Cpu::default();
@@ -940,19 +958,19 @@ fn a_batch_of_unequal_points_costs_what_its_parts_do() {
 
 #[cfg(unix)]
 #[test]
-fn more_files_are_asked_for_than_a_process_is_given_and_too_few_are_told() {
+fn the_limit_of_open_files_is_raised_if_possible_and_reported_otherwise() {
     let points = "1, 2, 3, 4, 5, 6, 7, 8";
-    let (folder, _) = written(&format!("{SMALL}\"learning.seed\" = [{points}]\n"));
+    let (folder, _) = write_sweep(&format!("{SMALL}\"learning.seed\" = [{points}]\n"));
     let run = |limit: &str, out: &str, flags: &str| {
         let script = format!("ulimit {limit} 48; exec flotilla sweep x.toml --quiet --backend cpu --out {out} {flags}");
         support::shell("bash", &script).current_dir(folder.path()).output().unwrap()
     };
-    // A limit that may be raised is.
-    done(run("-S -n", "soft", ""));
-    let error = failed(run("-n", "hard", ""), 1);
+    // The program raises a soft limit.
+    succeed(run("-S -n", "soft", ""));
+    let error = fail(run("-n", "hard", ""), 1);
     assert!(error.contains("ulimit -n") && error.contains("--resume"), "{error}");
     assert_eq!(error.lines().count(), 1, "{error}");
-    // What was done stands.
-    done(run("-S -n", "hard", "--resume"));
+    // The points that were finished are kept.
+    succeed(run("-S -n", "hard", "--resume"));
     assert_eq!(policies(&folder.path().join("hard")), policies(&folder.path().join("soft")));
 }
