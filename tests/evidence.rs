@@ -1,4 +1,5 @@
-//! `flotilla verify --report` writes what it found, and `docs/develop/evidence.md` is what the files of `docs/develop/evidence/` make.
+//! Tests `flotilla verify --report`, and that `docs/develop/evidence.md` agrees with the files in
+//! `docs/develop/evidence/`.
 
 #![cfg(feature = "cli")]
 
@@ -19,9 +20,9 @@ fn root() -> PathBuf {
     env!("CARGO_MANIFEST_DIR").into()
 }
 
-fn verify_command(words: &[&str]) -> assert_cmd::Command {
+fn verify_command(arguments: &[&str]) -> assert_cmd::Command {
     let mut command = cargo_bin_cmd!("flotilla");
-    command.args(["verify", "-q", "--worlds", "2", "--teams", "3"]).args(words);
+    command.args(["verify", "-q", "--worlds", "2", "--teams", "3"]).args(arguments);
     command.envs([("VK_DRIVER_FILES", "/nonexistent"), ("VK_ICD_FILENAMES", "/nonexistent")]);
     command.env("WGPU_BACKEND", "vulkan");
     command
@@ -36,40 +37,45 @@ fn a_report_needs_no_gpu() {
     let table = String::from_utf8(output.stdout).unwrap();
 
     let text = fs::read_to_string(&file).unwrap();
-    let found = MachineReport::parse(&text).unwrap();
-    assert_eq!((found.schema, found.tier, found.note.as_deref()), (SCHEMA, Tier::Executed, Some("a test")));
-    assert_eq!(found.date.len(), "2026-01-31".len());
-    assert!(found.target.starts_with(std::env::consts::ARCH), "{}", found.target);
-    assert!(found.toolchain.starts_with("rustc 1."), "{}", found.toolchain);
-    assert_eq!(found.comparisons.len(), Cpu::levels().len() - 1, "every instruction set but the narrowest");
-    for comparison in &found.comparisons {
+    let report = MachineReport::parse(&text).unwrap();
+    assert_eq!((report.schema, report.tier, report.note.as_deref()), (SCHEMA, Tier::Executed, Some("a test")));
+    assert_eq!(report.date.len(), "2026-01-31".len());
+    assert!(report.target.starts_with(std::env::consts::ARCH), "{}", report.target);
+    assert!(report.toolchain.starts_with("rustc 1."), "{}", report.toolchain);
+    assert_eq!(report.comparisons.len(), Cpu::levels().len() - 1, "expected every instruction set but the narrowest");
+    for comparison in &report.comparisons {
         let Compared { adapter, worlds, agent_steps, equal, .. } = comparison;
         assert!(adapter.starts_with("cpu (") && (*worlds, *equal) == (2, true) && *agent_steps > 0, "{comparison:?}");
         assert_ne!(*adapter, comparison.against);
         assert!(table.contains(adapter), "{table}");
     }
-    // To the digests of all machines that sent one in.
+    // The digests equal those of all other machines with a report.
     let digests = evidence::digests(&evidence::read(&root().join("docs/develop/evidence")).unwrap());
-    assert_eq!(found.trained.len(), 6);
-    for came in found.trained {
-        assert_eq!(digests.get(&came.config), Some(&came.digest), "{}: not what the rows say", came.config);
+    assert_eq!(report.trained.len(), 6);
+    for training in report.trained {
+        assert_eq!(
+            digests.get(&training.config),
+            Some(&training.digest),
+            "{}: differs from the reports",
+            training.config
+        );
     }
 }
 
-/// Right but where scores of one kind are asked for: there teams play each other's policies.
-struct Liar {
+/// A backend that is correct except for one list of fitnesses. For that list, it reverses the order of the teams.
+struct FaultyBackend {
     cpu: Cpu,
-    about: &'static [Fitness],
+    fitnesses: &'static [Fitness],
 }
 
-impl Backend for Liar {
+impl Backend for FaultyBackend {
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         let reversed: Vec<Vec<u32>> = groups.iter().map(|group| group.teams.iter().rev().copied().collect()).collect();
-        let told = groups.iter().zip(&reversed);
-        let told: Vec<Group<'_>> = told
-            .map(|(group, teams)| if group.fitnesses == self.about { Group { teams, ..*group } } else { *group })
+        let groups = groups.iter().zip(&reversed);
+        let groups: Vec<Group<'_>> = groups
+            .map(|(group, teams)| if group.fitnesses == self.fitnesses { Group { teams, ..*group } } else { *group })
             .collect();
-        self.cpu.play(&told)
+        self.cpu.play(&groups)
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
@@ -77,36 +83,42 @@ impl Backend for Liar {
     }
 
     fn describe(&self) -> String {
-        "a liar".into()
+        "a faulty backend".into()
     }
 }
 
 #[test]
-fn one_world_is_asked_for_scores_of_every_kind() {
+fn a_single_world_is_compared_with_every_kind_of_scores() {
     let worlds = verify::short_trainings().into_iter().take(1).collect();
     let plan = Plan { worlds, teams: 64, seed: 0, generations: 0 };
-    for about in verify::KINDS {
-        let mut liar = Liar { cpu: Cpu::default(), about };
-        let found = verify::compare(&plan, &mut Cpu::default(), &mut liar, |_| {}).unwrap();
-        assert!(found.mismatch.as_ref().is_some_and(|told| told.contains("stage credit")), "{about:?}: {found:?}");
+    for fitnesses in verify::KINDS {
+        let mut faulty = FaultyBackend { cpu: Cpu::default(), fitnesses };
+        let outcome = verify::compare(&plan, &mut Cpu::default(), &mut faulty, |_| {}).unwrap();
+        assert!(
+            outcome.mismatch.as_ref().is_some_and(|message| message.contains("stage credit")),
+            "{fitnesses:?}: {outcome:?}"
+        );
     }
 }
 
 #[test]
-fn without_a_gpu_only_a_report_can_be_had() {
+fn without_a_gpu_verify_needs_report() {
     let output = verify_command(&[]).output().unwrap();
     assert_eq!(output.status.code(), Some(1));
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert!(told.contains("no GPU adapter") && told.contains("--report") && !told.contains("--backend"), "{told}");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(
+        stderr.contains("no GPU adapter") && stderr.contains("--report") && !stderr.contains("--backend"),
+        "{stderr}"
+    );
     let output = verify_command(&["--adapter", "mine"]).output().unwrap();
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert!(told.contains("mine") && told.contains("--report") && !told.contains("--backend"), "{told}");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(stderr.contains("mine") && stderr.contains("--report") && !stderr.contains("--backend"), "{stderr}");
     let output = verify_command(&["--note", "no report"]).output().unwrap();
     assert_eq!(output.status.code(), Some(2));
 }
 
 #[test]
-fn a_report_is_written_over_no_input_and_nowhere() {
+fn a_report_needs_a_folder_and_does_not_overwrite_an_input() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("my.toml");
     fs::copy(root().join("configs/chaotic.toml"), &config).unwrap();
@@ -118,17 +130,20 @@ fn a_report_is_written_over_no_input_and_nowhere() {
 }
 
 #[test]
-fn the_page_is_what_the_files_make() {
-    let made = evidence::page(&root().join("docs/develop/evidence")).unwrap();
-    let there = fs::read_to_string(root().join("docs/develop/evidence.md")).unwrap();
-    let first = made.lines().zip(there.lines()).find(|(made, there)| made != there);
-    assert!(made == there, "docs/develop/evidence.md is another, say cargo run --example evidence: {first:#?}");
+fn the_page_is_up_to_date() {
+    let expected = evidence::page(&root().join("docs/develop/evidence")).unwrap();
+    let actual = fs::read_to_string(root().join("docs/develop/evidence.md")).unwrap();
+    let difference = expected.lines().zip(actual.lines()).find(|(expected, actual)| expected != actual);
+    assert!(
+        expected == actual,
+        "docs/develop/evidence.md is out of date; run cargo run --example evidence: {difference:#?}"
+    );
 }
 
 #[test]
-fn a_row_that_differs_shows() {
+fn the_page_shows_differences_and_names_invalid_files() {
     let folder = tempfile::tempdir().unwrap();
-    let row = |name: &str, digest: &str, failure: Option<&str>| {
+    let write_report = |name: &str, digest: &str, failure: Option<&str>| {
         let comparison = Compared {
             adapter: "A GPU (discrete GPU, vulkan)".into(),
             pass: Some("guarded".into()),
@@ -144,11 +159,11 @@ fn a_row_that_differs_shows() {
         let evidence = MachineReport { comparisons: vec![comparison], trained, ..MachineReport::new(Tier::Executed) };
         fs::write(folder.path().join(format!("{name}.json")), evidence.to_json()).unwrap();
     };
-    row("one", "aa", None);
-    row("two", "aa", None);
+    write_report("one", "aa", None);
+    write_report("two", "aa", None);
     let page = evidence::page(folder.path()).unwrap();
     assert!(page.contains("| 1 234 567 | equal | equal |") && page.contains("| chaotic | `aa` |"), "{page}");
-    row("three", "bb", Some("stage move, team 1"));
+    write_report("three", "bb", Some("stage move, team 1"));
     let page = evidence::page(folder.path()).unwrap();
     assert!(page.contains("**1 of 1 different**") && page.contains("**1 of 1 other digests**"), "{page}");
     assert!(page.contains("**stage move, team 1**"), "{page}");
@@ -157,9 +172,9 @@ fn a_row_that_differs_shows() {
     assert!(error.contains("four.json"), "{error}");
 }
 
-/// Every test that the page names exists.
+/// Tests that every test that the page names exists.
 #[test]
-fn the_tests_that_the_page_names_are_there() {
+fn tests_that_the_page_names_exist() {
     let page = fs::read_to_string(root().join("docs/develop/evidence.md")).unwrap();
     let table = page.split("## What exactness relies on").nth(1).unwrap();
     let rows = table.lines().filter(|line| line.starts_with("| "));

@@ -1,7 +1,8 @@
-//! The shaders stay inside the exact core, the compile passes reach all of their arithmetic, and devices obey.
+//! Tests that shaders use only exact operations, that the compile passes cover all arithmetic, and that devices are
+//! exact.
 
 #![cfg(feature = "cli")]
-#![expect(unsafe_code, reason = "shaders of the test's own are compiled without bounds checks")]
+#![expect(unsafe_code, reason = "test shaders are compiled without bounds checks")]
 
 mod support;
 
@@ -20,10 +21,11 @@ use naga::{BinaryOperator, Expression, Function, Module, ScalarKind};
 use wgpu::BufferUsages;
 
 const BOTH: [Pass; 2] = [Pass::NoContraction, Pass::Guarded];
-/// The one shader that works on integers alone.
+/// The only shader without floats.
 const INTEGERS: &str = "pack";
 
-/// A shader that computes one expression of the floats x, y, the vectors v, u, the matrix m and the integers i, j.
+/// Returns a shader that computes one expression of the floats x, y, the vectors v, u, the matrix values.m and the
+/// integers i, j.
 fn shader(expression: &str) -> String {
     format!(
         "struct Values {{ m: mat2x2<f32>, x: f32, y: f32, i: i32, j: u32, v: vec2<f32>, u: vec2<f32> }}
@@ -37,28 +39,30 @@ fn shader(expression: &str) -> String {
     )
 }
 
+/// Returns the inexact operations that the lint finds in an expression.
 fn inexact(expression: &str) -> Vec<String> {
     let (module, _) = exact::parse(&shader(expression)).unwrap_or_else(|error| panic!("{expression}: {error}"));
     exact::inexact_operations(&module)
 }
 
+/// Returns all files below a folder.
 fn files(folder: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(folder).expect("the shaders' folder can be listed");
-    let paths = entries.map(|entry| entry.expect("its entries too").path());
+    let entries = std::fs::read_dir(folder).expect("a readable folder");
+    let paths = entries.map(|entry| entry.expect("a readable entry").path());
     paths.flat_map(|path| if path.is_dir() { files(&path) } else { vec![path] }).collect()
 }
 
 #[test]
-fn every_shader_file_is_walked() {
+fn every_shader_file_is_part_of_a_tested_shader() {
     let texts = shaders();
     for path in files(&Path::new(env!("CARGO_MANIFEST_DIR")).join("shaders")) {
-        let file = std::fs::read_to_string(&path).expect("a shader is text");
+        let file = std::fs::read_to_string(&path).expect("a text file");
         assert!(texts.iter().any(|(_, text)| text.contains(file.trim())), "{} is in no shader", path.display());
     }
 }
 
 #[test]
-fn no_shader_leaves_the_core() {
+fn shaders_use_only_core_operations() {
     for (name, text) in shaders() {
         let (module, _) = exact::parse(&text).unwrap_or_else(|error| panic!("{name} {error}"));
         assert_eq!(exact::inexact_operations(&module), Vec::<String>::new(), "{name}");
@@ -66,8 +70,8 @@ fn no_shader_leaves_the_core() {
 }
 
 #[test]
-fn the_lint_knows_the_core() {
-    for inside in [
+fn the_lint_accepts_core_operations() {
+    for expression in [
         "x + y * x - 2.0",
         "-x",
         "abs(x)",
@@ -84,13 +88,13 @@ fn the_lint_knows_the_core() {
         "select(0u, 1u, any(v < u) || all(v == u))",
         "atomicAdd(&word, 1u) + atomicLoad(&word)",
     ] {
-        assert_eq!(inexact(inside), Vec::<String>::new(), "{inside}");
+        assert_eq!(inexact(expression), Vec::<String>::new(), "{expression}");
     }
 }
 
 #[test]
-fn the_lint_names_what_is_outside() {
-    for (outside, named) in [
+fn the_lint_names_inexact_operations() {
+    for (expression, name) in [
         ("x / y", "Divide"),
         ("x % y", "Modulo"),
         ("(v / u).x", "Divide"),
@@ -125,8 +129,11 @@ fn the_lint_names_what_is_outside() {
         ("unpack2x16snorm(j).x", "Unpack2x16snorm"),
         ("(values.m * v).x", "Matrix"),
     ] {
-        let found = inexact(outside);
-        assert!(found.iter().any(|line| line.starts_with("main: ") && line.contains(named)), "{outside}: {found:?}");
+        let reported = inexact(expression);
+        assert!(
+            reported.iter().any(|line| line.starts_with("main: ") && line.contains(name)),
+            "{expression}: {reported:?}"
+        );
     }
 }
 
@@ -135,14 +142,14 @@ fn an_inexact_operation_inside_a_function_and_a_loop_is_found() {
     let text = "fn deep(x: f32) -> f32 { var y = x; loop { if y > 9.0 { break; } y = y + 1.0 / x; } return y; }
         @group(0) @binding(1) var<storage, read_write> value: f32;
         @compute @workgroup_size(1) fn main() { value = deep(value); }";
-    let (module, _) = exact::parse(text).expect("it is sound WGSL");
+    let (module, _) = exact::parse(text).expect("valid WGSL");
     assert_eq!(exact::inexact_operations(&module), ["deep: float Divide"]);
 }
 
-/// Functions that Rust takes from the platform's mathematical library, which rounds them as it likes: results and
-/// pictures would hang on it.
+/// Tests that src/ does not call the platform's math library. Its rounding differs between platforms, which would
+/// change results and pictures.
 #[test]
-fn nothing_asks_the_platform_for_a_function() {
+fn no_source_calls_the_platforms_math_functions() {
     const PLATFORM: [&str; 22] = [
         "sin", "cos", "tan", "sin_cos", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2",
         "exp_m1", "ln", "ln_1p", "log", "log2", "log10", "powf", "cbrt", "hypot",
@@ -154,7 +161,11 @@ fn nothing_asks_the_platform_for_a_function() {
         let text = std::fs::read_to_string(&path).unwrap();
         for name in PLATFORM {
             for call in [format!(".{name}("), format!("f32::{name}("), format!("f64::{name}(")] {
-                assert!(!text.contains(&call), "{}: {call}…) is the platform's, take libm's", path.display());
+                assert!(
+                    !text.contains(&call),
+                    "{}: {call}…) calls the platform's function; use libm's",
+                    path.display()
+                );
             }
         }
     }
@@ -165,12 +176,16 @@ fn every_float_result_is_decorated() {
     for (name, text) in shaders() {
         let (module, info) = exact::parse(&text).expect("shaders are valid");
         for checked in [false, true] {
-            let plain = exact::emit(&module, &info, checked).expect("shaders have SPIR-V");
-            let exact = exact::spirv(&text, checked).expect("shaders have SPIR-V");
-            let some = exact::undecorated(&plain) > 0 || name == INTEGERS;
-            assert!(some, "{name}: naga decorates by itself, so this test shows nothing");
+            let plain = exact::emit(&module, &info, checked).expect("shaders compile to SPIR-V");
+            let exact = exact::spirv(&text, checked).expect("shaders compile to SPIR-V");
+            let has_undecorated = exact::undecorated(&plain) > 0 || name == INTEGERS;
+            assert!(has_undecorated, "{name}: naga already decorates everything, so this test cannot fail");
             assert_eq!(exact::undecorated(&exact), 0, "{name}");
-            assert_eq!(exact.len(), plain.len() + 3 * exact::undecorated(&plain), "{name}: only decorations are added");
+            assert_eq!(
+                exact.len(),
+                plain.len() + 3 * exact::undecorated(&plain),
+                "{name}: the pass changed more than decorations"
+            );
         }
     }
 }
@@ -178,8 +193,8 @@ fn every_float_result_is_decorated() {
 #[test]
 fn every_kind_of_float_arithmetic_is_decorated() {
     for expression in ["x + y", "x - y", "x * y", "-x", "x / y", "x % y", "(v * x).x", "dot(v, u)", "fma(x, y, x)"] {
-        let (module, info) = exact::parse(&shader(expression)).expect("it is valid");
-        let plain = exact::emit(&module, &info, false).expect("it has SPIR-V");
+        let (module, info) = exact::parse(&shader(expression)).expect("a valid module");
+        let plain = exact::emit(&module, &info, false).expect("the shader compiles to SPIR-V");
         assert!(exact::undecorated(&plain) > 0, "{expression}");
         assert_eq!(exact::undecorated(&exact::decorate(&plain)), 0, "{expression}");
     }
@@ -195,14 +210,14 @@ fn every_sum_and_product_is_guarded() {
     }
 }
 
-/// A guard may be spared only where whole numbers alone are compared by the bits: whoever else reads them may give them to a
-/// float operation again, or be moved by a compiler as if it were one.
+/// Tests which results need no guard: only those whose bits are compared as integers. Any other use may pass the result
+/// to a float operation, or let a compiler treat it as one.
 #[test]
-fn only_what_is_compared_by_its_bits_needs_no_guard() {
-    let guards = |statement: &str| {
+fn only_results_compared_as_integers_need_no_guard() {
+    let count_guards = |statement: &str| {
         let text = format!(
             "@group(0) @binding(1) var<storage, read_write> values: array<f32, 4>;
-            fn tell(yes: bool) {{ values[3] = select(0.0, 1.0, yes); }}
+            fn write_flag(value: bool) {{ values[3] = select(0.0, 1.0, value); }}
             fn use_it(x: f32) -> bool {{ return bitcast<i32>(x) < 7; }}
             @compute @workgroup_size(1) fn main() {{
                 let a = values[0]; let b = values[1]; let c = values[2]; var kept = 0.0; {statement}
@@ -210,56 +225,56 @@ fn only_what_is_compared_by_its_bits_needs_no_guard() {
         );
         let (module, _) = exact::parse(&text).unwrap_or_else(|error| panic!("{statement}: {error}"));
         let guarded = exact::guarded(&module).unwrap_or_else(|error| panic!("{statement}: {error}"));
-        assert_eq!(exact::unguarded(&guarded).expect("it is valid"), 0, "{statement}");
+        assert_eq!(exact::unguarded(&guarded).expect("a valid module"), 0, "{statement}");
         let is_or = |e: &Expression| matches!(e, Expression::Binary { op: BinaryOperator::InclusiveOr, .. });
-        let ors = |module: &Module| {
+        let count_ors = |module: &Module| {
             module.entry_points[0].function.expressions.iter().filter(|(_, expression)| is_or(expression)).count()
         };
-        (ors(&guarded) - ors(&module), exact::unguarded(&module).expect("it is valid"))
+        (count_ors(&guarded) - count_ors(&module), exact::unguarded(&module).expect("a valid module"))
     };
     for (statement, expected) in [
-        ("tell(bitcast<i32>(a + b) <= bitcast<i32>(c));", 0),
-        ("tell(bitcast<u32>(a * b) == 9u);", 0),
-        ("let d = a + b; tell(bitcast<i32>(d) < 1 || bitcast<i32>(d) > 8);", 0),
-        // What leads to it is guarded.
-        ("tell(bitcast<i32>(a * a + b * b) <= bitcast<i32>(c));", 2),
-        ("tell(bitcast<i32>((a + b) + c) <= 5);", 1),
-        // Others read it.
-        ("tell(a + b <= c);", 1),
+        ("write_flag(bitcast<i32>(a + b) <= bitcast<i32>(c));", 0),
+        ("write_flag(bitcast<u32>(a * b) == 9u);", 0),
+        ("let d = a + b; write_flag(bitcast<i32>(d) < 1 || bitcast<i32>(d) > 8);", 0),
+        // Results that the compared one is computed from are guarded.
+        ("write_flag(bitcast<i32>(a * a + b * b) <= bitcast<i32>(c));", 2),
+        ("write_flag(bitcast<i32>((a + b) + c) <= 5);", 1),
+        // The result has other uses.
+        ("write_flag(a + b <= c);", 1),
         ("values[0] = floor(a + b);", 1),
         ("values[0] = a + b;", 1),
         ("kept = a + b;", 1),
-        ("tell(use_it(a + b));", 1),
-        ("let d = a + b; tell(bitcast<i32>(d) <= 3); values[0] = d;", 1),
-        ("let d = a + b; tell(bitcast<i32>(d) <= 3); tell(d < c);", 1),
-        ("tell(u32(a + b) < 3u);", 1),
-        ("tell(bitcast<i32>(abs(a + b)) <= 3);", 1),
-        ("tell(bitcast<i32>(-(a + b)) <= 3);", 1),
-        ("tell((bitcast<u32>(a + b) & 7u) < 3u);", 1),
-        ("tell((bitcast<u32>(a + b) | 1u) < 3u);", 1),
-        ("tell((bitcast<u32>(a + b) ^ bitcast<u32>(a - b)) == 0u);", 2),
+        ("write_flag(use_it(a + b));", 1),
+        ("let d = a + b; write_flag(bitcast<i32>(d) <= 3); values[0] = d;", 1),
+        ("let d = a + b; write_flag(bitcast<i32>(d) <= 3); write_flag(d < c);", 1),
+        ("write_flag(u32(a + b) < 3u);", 1),
+        ("write_flag(bitcast<i32>(abs(a + b)) <= 3);", 1),
+        ("write_flag(bitcast<i32>(-(a + b)) <= 3);", 1),
+        ("write_flag((bitcast<u32>(a + b) & 7u) < 3u);", 1),
+        ("write_flag((bitcast<u32>(a + b) | 1u) < 3u);", 1),
+        ("write_flag((bitcast<u32>(a + b) ^ bitcast<u32>(a - b)) == 0u);", 2),
         ("values[0] = bitcast<f32>(bitcast<u32>(a + b));", 1),
-        ("tell(bitcast<i32>(select(a + b, c, a < b)) < 3);", 1),
+        ("write_flag(bitcast<i32>(select(a + b, c, a < b)) < 3);", 1),
     ] {
-        assert_eq!(guards(statement), (expected, expected), "{statement}");
+        assert_eq!(count_guards(statement), (expected, expected), "{statement}");
     }
 }
 
-/// Every shader, and the episode's kernels that are made for the paper's layouts.
+/// Returns every shader, and the specialised episode kernels of the paper's six experiments.
 fn kernels() -> Vec<(String, String)> {
-    let made = short_trainings().into_iter().flat_map(|(name, config)| {
+    let specialised = short_trainings().into_iter().flat_map(|(name, config)| {
         let world = World::new(&config);
         [64, 256, 1024].map(|threads| {
             let text = episode::shader_of(&world, Kernel::Specialised, threads);
             (format!("{name}, {threads} threads"), text)
         })
     });
-    shaders().into_iter().map(|(name, text)| (name.to_string(), text)).chain(made).collect()
+    shaders().into_iter().map(|(name, text)| (name.to_string(), text)).chain(specialised).collect()
 }
 
-/// How many sums, differences and products of floats a module has.
+/// Returns the number of used float sums, differences and products of a module.
 fn rounding_operations(module: &Module) -> usize {
-    let info = Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(module).expect("it is valid");
+    let info = Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(module).expect("a valid module");
     let floats = |function: &Function, info: &FunctionInfo| {
         let rounds = function.expressions.iter().filter(|(handle, expression)| {
             let float = info[*handle].ty.inner_with(&module.types).scalar_kind() == Some(ScalarKind::Float);
@@ -276,9 +291,9 @@ fn rounding_operations(module: &Module) -> usize {
     functions.chain(entries.map(|(at, entry)| floats(&entry.function, info.get_entry_point(at)))).sum()
 }
 
-/// How often a text takes a sum, difference or product by its bits, `cast`, and joins these with something by `|`.
+/// Counts the sums, differences and products in a text that are inside one of `casts` and are followed by ` | `.
 fn guarded_operations(text: &str, casts: &[&str]) -> usize {
-    let guarded = |inside: &str| {
+    let is_guarded = |inside: &str| {
         let (mut depth, mut operator) = (0, false);
         for (at, letter) in inside.char_indices() {
             let (before, after) = (&inside[..at], &inside[at + letter.len_utf8()..]);
@@ -292,25 +307,24 @@ fn guarded_operations(text: &str, casts: &[&str]) -> usize {
         }
         false
     };
-    let found = casts.iter().flat_map(|cast| text.match_indices(cast));
-    found.filter(|(at, cast)| guarded(&text[at + cast.len()..])).count()
+    let positions = casts.iter().flat_map(|cast| text.match_indices(cast));
+    positions.filter(|(at, cast)| is_guarded(&text[at + cast.len()..])).count()
 }
 
-/// Metal and DirectX compile texts, and by default Metal's compiler may fuse and reorder: a guard has to stand in the text
-/// around every single sum and product but the few that are compared by their bits alone, whatever options the text was
-/// written by.
+/// Counts the guards in the text for Metal and DirectX, with several options. By default, Metal's compiler may fuse and
+/// reorder operations. So every sum and product needs a guard, except the few that are compared by their bits.
 #[test]
-fn every_product_is_guarded_in_metals_and_directx_text() {
+fn every_sum_and_product_is_guarded_in_metal_and_directx_text() {
     for (name, text) in kernels() {
         let (module, _) = exact::parse(&text).unwrap_or_else(|error| panic!("{name} {error}"));
         let guarded = exact::guarded(&module).unwrap_or_else(|error| panic!("{name} {error}"));
         let info =
-            Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&guarded).expect("it is valid");
-        // The sum of the one function that compares by bits, and two that the probes compare so.
-        let compared = |function: &Function| usize::from(function.name.as_deref() == Some("within"));
-        let spared: usize = guarded.functions.iter().map(|(_, function)| compared(function)).sum();
-        let there = rounding_operations(&guarded) - spared - if name == "probe" { 2 } else { 0 };
-        assert!(there > 0 || name == INTEGERS, "{name}: nothing to guard");
+            Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&guarded).expect("a valid module");
+        // Results that are compared by their bits: one in `within`, and two in the probe.
+        let count_exempt = |function: &Function| usize::from(function.name.as_deref() == Some("within"));
+        let exempt: usize = guarded.functions.iter().map(|(_, function)| count_exempt(function)).sum();
+        let expected = rounding_operations(&guarded) - exempt - if name == "probe" { 2 } else { 0 };
+        assert!(expected > 0 || name == INTEGERS, "{name}: nothing to guard");
         let policy = |checked| match checked {
             true => BoundsCheckPolicy::Restrict,
             false => BoundsCheckPolicy::Unchecked,
@@ -335,7 +349,7 @@ fn every_product_is_guarded_in_metals_and_directx_text() {
             check_text(
                 &format!("{name}, Metal {lang_version:?}"),
                 &metal,
-                there,
+                expected,
                 &["as_type<uint>(", "as_type<metal::uint2>(", "as_type<metal::uint3>(", "as_type<metal::uint4>("],
             );
         }
@@ -343,26 +357,26 @@ fn every_product_is_guarded_in_metals_and_directx_text() {
         let (options, pipeline) = (hlsl::Options::default(), hlsl::PipelineOptions::default());
         let written = hlsl::Writer::new(&mut directx, &options, &pipeline).write(&guarded, &info, None);
         written.unwrap_or_else(|error| panic!("{name}: {error}"));
-        check_text(&format!("{name}, DirectX"), &directx, there, &["asuint(("]);
-        // Without the pass nothing is guarded, or this test shows nothing.
+        check_text(&format!("{name}, DirectX"), &directx, expected, &["asuint(("]);
+        // Without the pass, no operation may count as guarded. Otherwise this test could not fail.
         let info =
-            Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&module).expect("it is valid");
+            Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&module).expect("a valid module");
         let (plain, _) =
             msl::write_string(&module, &info, &Default::default(), &Default::default()).expect("it has text");
         assert_eq!(guarded_operations(&plain, &["as_type<uint>("]), 0, "{name}");
     }
 }
 
-fn check_text(name: &str, text: &str, there: usize, casts: &[&str]) {
-    assert_eq!(guarded_operations(text, casts), there, "{name}: operations that stand guarded in\n{text}");
-    for never in ["fma(", "mad(", "fast::", "dot(", "mix(", "lerp(", "#pragma"] {
-        assert!(!text.contains(never), "{name} has {never}");
+fn check_text(name: &str, text: &str, expected: usize, casts: &[&str]) {
+    assert_eq!(guarded_operations(text, casts), expected, "{name}: number of guarded operations in\n{text}");
+    for forbidden in ["fma(", "mad(", "fast::", "dot(", "mix(", "lerp(", "#pragma"] {
+        assert!(!text.contains(forbidden), "{name} contains {forbidden}");
     }
 }
 
-/// Statements and expressions of the core that the probe does not use.
+/// Tests the passes with statements and expressions of the core that the probes do not use.
 #[test]
-fn all_of_the_core_can_be_guarded() {
+fn all_core_statements_can_be_guarded() {
     let text = "struct Agent { place: vec2<f32>, speed: f32, seen: array<u32, 3> }
         @group(0) @binding(1) var<storage, read_write> agents: array<Agent>;
         @group(0) @binding(2) var<storage, read_write> counts: array<atomic<u32>>;
@@ -410,9 +424,9 @@ fn all_of_the_core_can_be_guarded() {
     let (module, _) = exact::parse(text).unwrap_or_else(|error| panic!("{error}"));
     assert_eq!(exact::inexact_operations(&module), Vec::<String>::new());
     let guarded = exact::guarded(&module).unwrap_or_else(|error| panic!("{error}"));
-    assert!(exact::unguarded(&module).expect("it is valid") > 10);
-    assert_eq!(exact::unguarded(&guarded).expect("it is valid"), 0);
-    for (request, _) in support::adapters("all_of_the_core_can_be_guarded") {
+    assert!(exact::unguarded(&module).expect("a valid module") > 10);
+    assert_eq!(exact::unguarded(&guarded).expect("a valid module"), 0);
+    for (request, _) in support::adapters("all_core_statements_can_be_guarded") {
         for (pass, checked) in [(BOTH[0], false), (BOTH[0], true), (BOTH[1], false), (BOTH[1], true)] {
             let gpu = match gpu::open(Request { pass: Some(pass), checked, ..request.clone() }) {
                 Err(DeviceError::Refused { .. }) if pass == Pass::NoContraction => continue,
@@ -420,7 +434,7 @@ fn all_of_the_core_can_be_guarded() {
             };
             let layout = gpu.layout("core", &[Binding::Write, Binding::Write, Binding::Uniform]);
             let layout = layout.unwrap_or_else(|error| panic!("{error}"));
-            // SAFETY: it is compiled, and never run.
+            // SAFETY: the shader is compiled, but never run.
             let compiled = unsafe { gpu.pipeline("core", text, "main", &layout) };
             compiled.unwrap_or_else(|error| panic!("{error}"));
         }
@@ -428,12 +442,12 @@ fn all_of_the_core_can_be_guarded() {
 }
 
 #[test]
-fn shaders_that_no_pass_can_save_are_refused() {
-    let (module, _) = exact::parse(&shader("x / y")).expect("it is valid");
+fn shaders_that_cannot_be_exact_are_refused() {
+    let (module, _) = exact::parse(&shader("x / y")).expect("a valid module");
     assert!(matches!(exact::guarded(&module), Err(ShaderError::Inexact(_))));
-    let (module, _) = exact::parse(&shader("x * y").replace("binding(1)", "binding(0)")).expect("it is valid");
+    let (module, _) = exact::parse(&shader("x * y").replace("binding(1)", "binding(0)")).expect("a valid module");
     assert!(matches!(exact::guarded(&module), Err(ShaderError::GuardTaken)));
-    let error = exact::parse(&shader("x * nothing")).expect_err("it has no such name").to_string();
+    let error = exact::parse(&shader("x * nothing")).expect_err("an unknown name").to_string();
     assert!(error.contains("x * nothing"), "{error}");
     assert!(matches!(exact::parse(&shader("x * i")), Err(ShaderError::Invalid(_))));
 }
@@ -451,18 +465,18 @@ fn devices_are_exact_under_both_passes() {
             }
         }
         let gpu = gpu::open(request).unwrap_or_else(|error| panic!("{error}"));
-        assert_eq!(gpu.pass == Pass::NoContraction, info.backend == "vulkan", "{info}: the cheaper pass is taken");
+        assert_eq!(gpu.pass == Pass::NoContraction, info.backend == "vulkan", "{info}: expected the cheaper pass");
     }
 }
 
-/// The canary: a device known to be inexact has to be caught, or the probes are blind.
+/// Tests that the probes can fail: they must detect devices that are known to be inexact without a pass.
 #[test]
 fn the_probes_catch_a_device_without_a_pass() {
     for (request, info) in support::adapters("the_probes_catch_a_device_without_a_pass") {
         let gpu = gpu::open(Request { pass: Some(Pass::Plain), ..request }).unwrap_or_else(|error| panic!("{error}"));
         let mismatch = gpu::self_test(&gpu).unwrap_or_else(|error| panic!("{error}"));
         if ["llvmpipe", "SwiftShader"].iter().any(|known| info.name.contains(known)) {
-            let mismatch = mismatch.unwrap_or_else(|| panic!("{info} reassociates, but no probe shows it"));
+            let mismatch = mismatch.unwrap_or_else(|| panic!("{info} reassociates, but no probe detects it"));
             assert_ne!(mismatch.cpu, mismatch.gpu, "{mismatch}");
         }
     }
@@ -473,7 +487,8 @@ fn webgpus_default_limits_are_enough() {
     for (request, _) in support::adapters("webgpus_default_limits_are_enough") {
         let gpu = gpu::open(Request { default_limits: true, ..request }).unwrap_or_else(|error| panic!("{error}"));
         assert_eq!(gpu.limits, wgpu::Limits::defaults());
-        let error = gpu.buffer("the weights", (128 << 20) + 4, BufferUsages::STORAGE).expect_err("it is over 128 MiB");
+        let error =
+            gpu.buffer("the weights", (128 << 20) + 4, BufferUsages::STORAGE).expect_err("a buffer over 128 MiB");
         assert!(matches!(error, DeviceError::TooLarge { allowed, .. } if allowed == 128 << 20), "{error}");
         let message = error.to_string();
         assert!(message.contains("the weights") && message.contains("smaller batch"), "{message}");
@@ -494,9 +509,9 @@ fn a_shader_over_the_devices_limits_is_refused() {
             let heavy = "var<workgroup> much: array<u32, 4097>;
                 @compute @workgroup_size(1) fn main() { much[0] = 1u; }";
             for (text, named) in [(wide, "257"), (heavy, "16388")] {
-                // SAFETY: it is refused, or at least never run.
+                // SAFETY: the shader should be refused, and is never run.
                 let compiled = unsafe { gpu.pipeline("test", text, "main", &layout) };
-                let error = compiled.expect_err("it is over the limits").to_string();
+                let error = compiled.expect_err("a shader over the limits").to_string();
                 assert!(error.contains(named), "{error}");
             }
         }
@@ -504,34 +519,34 @@ fn a_shader_over_the_devices_limits_is_refused() {
 }
 
 #[test]
-fn an_unknown_adapter_lists_those_there_are() {
+fn the_error_about_an_unknown_adapter_lists_all_adapters() {
     let error = gpu::open(Wanted::Named("no such adapter".into())).expect_err("there is no such adapter");
     let message = flotilla::cli::Error::from(error).to_string();
     assert!(message.contains("no such adapter") && message.contains("--backend cpu") || !device::adapters().is_empty());
     for info in device::adapters() {
         assert!(message.contains(&info.name), "{message}");
     }
-    for (request, info) in support::adapters("an_unknown_adapter_lists_those_there_are") {
+    for (request, info) in support::adapters("the_error_about_an_unknown_adapter_lists_all_adapters") {
         let by_name = Wanted::Named(info.name.to_uppercase());
         let gpu = gpu::open(Request { choice: by_name, ..request }).unwrap_or_else(|error| panic!("{error}"));
         assert_eq!(gpu.adapter.name, info.name);
     }
 }
 
-/// Two adapters whose names are full of digits.
-fn two() -> Vec<AdapterInfo> {
-    let named = |name: &str, kind| AdapterInfo {
+/// Returns two adapters with digits in their names.
+fn two_adapters() -> Vec<AdapterInfo> {
+    let adapter = |name: &str, kind| AdapterInfo {
         name: name.into(),
         driver: "Mesa 22.3.6".into(),
         backend: "vulkan".into(),
         kind,
     };
-    vec![named("GeForce RTX 4090", Kind::Discrete), named("llvmpipe (LLVM 15.0.6, 256 bits)", Kind::Software)]
+    vec![adapter("GeForce RTX 4090", Kind::Discrete), adapter("llvmpipe (LLVM 15.0.6, 256 bits)", Kind::Software)]
 }
 
 #[test]
-fn a_number_is_an_index_and_nothing_is_no_name() {
-    let find = |name: &str| device::position(&Wanted::Named(name.into()), &two());
+fn adapters_are_found_by_index_or_by_part_of_the_name() {
+    let find = |name: &str| device::position(&Wanted::Named(name.into()), &two_adapters());
     for (name, index) in [("0", 0), ("1", 1), ("rtx 4090", 0), ("LLVM", 1), ("LLVM 15", 1)] {
         assert_eq!(find(name).expect(name), index, "{name}");
     }
@@ -542,15 +557,15 @@ fn a_number_is_an_index_and_nothing_is_no_name() {
 }
 
 #[test]
-fn a_software_renderer_is_taken_by_name_alone() {
-    let software = &two()[1..];
+fn a_software_renderer_is_used_only_by_name() {
+    let software = &two_adapters()[1..];
     let error = device::position(&Wanted::Real, software).expect_err("there is no GPU");
     let error = flotilla::cli::Error::from(error).to_string();
     assert!(
         error.contains("0: llvmpipe") && error.contains("--adapter 0") && error.contains("--backend cpu"),
         "{error}"
     );
-    assert_eq!(device::position(&Wanted::Real, &two()).unwrap(), 0);
+    assert_eq!(device::position(&Wanted::Real, &two_adapters()).unwrap(), 0);
     assert!(matches!(device::position(&Wanted::Real, &[]), Err(DeviceError::NoAdapter)));
 }
 
@@ -571,7 +586,7 @@ fn a_real_gpu_is_never_a_software_renderer() {
 fn a_lost_device_is_an_error() {
     for (request, info) in support::adapters("a_lost_device_is_an_error") {
         let gpu = gpu::open(request).unwrap_or_else(|error| panic!("{error}"));
-        gpu.check().expect("nothing has happened yet");
+        gpu.check().expect("the device is not lost yet");
         gpu.device.destroy();
         let error = gpu.wait().and_then(|()| gpu.buffer("a buffer", 64, BufferUsages::STORAGE).map(drop));
         let error = error.expect_err("the device is gone");
@@ -585,10 +600,10 @@ fn running_out_of_memory_is_an_error() {
     for (request, info) in support::adapters("running_out_of_memory_is_an_error") {
         let gpu = gpu::open(request).unwrap_or_else(|error| panic!("{error}"));
         let bytes = gpu.limits.max_storage_buffer_binding_size.min(gpu.limits.max_buffer_size) & !3;
-        // SwiftShader has less memory than one buffer may take; elsewhere two of the largest may well fit.
-        let made = [(); 2].map(|()| gpu.buffer("the sets", bytes, BufferUsages::STORAGE));
-        assert!(made[1].is_err() || !info.name.contains("SwiftShader"), "{info}");
-        for error in made.into_iter().filter_map(Result::err) {
+        // SwiftShader has too little memory for two of the largest buffers. On other devices, both may fit.
+        let buffers = [(); 2].map(|()| gpu.buffer("the sets", bytes, BufferUsages::STORAGE));
+        assert!(buffers[1].is_err() || !info.name.contains("SwiftShader"), "{info}");
+        for error in buffers.into_iter().filter_map(Result::err) {
             assert!(matches!(error, DeviceError::OutOfMemory { .. }), "{error}");
             assert!(error.to_string().contains("the sets") && error.to_string().contains("smaller batch"), "{error}");
         }

@@ -1,9 +1,12 @@
-//! One step of an episode in float64, as docs/explain/model.md states it, against the kernels on random worlds.
+//! Compares the kernels with a float64 model of a step, as described in docs/explain/model.md, on random worlds.
 //!
-//! The model starts every step from the kernels' own state, since radii and quadrants turn roundings into units within
-//! a few steps. A step on which a threshold is met within rounding may fall on either side and is counted instead of
-//! compared, unless every operation before the threshold was exact: the ties of a layout must fall as the page says.
-//! Counted too is a step on which roundings grow beyond [`STATE`]: a policy may be steep, and forces may cancel.
+//! The model starts every step from the kernels' state, because radii and quadrants amplify rounding errors within a
+//! few steps.
+//!
+//! A step is borderline if a value is so close to a threshold that rounding may decide. Borderline steps are counted,
+//! but not compared. If all operations before a threshold are exact, the step is compared, so that ties in a layout are
+//! tested. A step is also borderline if its rounding errors exceed [`STATE`], because a policy may be steep and forces
+//! may cancel.
 
 #![cfg(feature = "cli")]
 
@@ -23,16 +26,16 @@ use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 use rayon::prelude::*;
 
-/// A threshold met more closely than this, in proportion to what is compared with it, decides nothing.
+/// Relative distance from a threshold below which rounding may decide.
 const MARGIN: f64 = 3e-7;
-/// Largest difference of a position, a heading or a speed.
+/// Tolerance of positions, headings and speeds.
 const STATE: f64 = 3e-5;
-/// Largest difference of a sensed density, and of a force in proportion to its parts.
+/// Tolerance of sensed densities, and of forces relative to the lengths of their parts.
 const INPUT: f64 = 1e-5;
-/// Largest difference of an output for the same inputs, beside what the network makes of roundings.
+/// Tolerance of outputs for the same inputs, in addition to the rounding errors that the network amplifies.
 const OUTPUT: f64 = 1e-5;
 
-/// An offset between two points, and whether it and its square are the same in f32.
+/// An offset between two points. `exact` is true if f32 gives the same offset and the same squared length.
 struct Offset {
     r: DVec2,
     d: f64,
@@ -47,21 +50,22 @@ impl Offset {
         Offset { r, d: (r.x * r.x + r.y * r.y).sqrt(), exact }
     }
 
-    /// d ≤ radius; `shaky` if that may differ in f32.
-    fn within(&self, radius: f64, shaky: &mut bool) -> bool {
+    /// Returns d ≤ radius. Sets `borderline` if f32 may give another answer.
+    fn within(&self, radius: f64, borderline: &mut bool) -> bool {
         let square = radius * radius;
-        *shaky |= (self.d - radius).abs() < MARGIN * radius && !(self.exact && f64::from(square as f32) == square);
+        *borderline |= (self.d - radius).abs() < MARGIN * radius && !(self.exact && f64::from(square as f32) == square);
         self.d <= radius
     }
 }
 
-/// a + b of two products; `shaky` if its sign may differ in f32, where only the products and the sum are rounded.
-fn signed_sum(a: f64, b: f64, shaky: &mut bool) -> f64 {
-    *shaky |= a + b != 0.0 && (a + b).abs() < MARGIN * (a.abs() + b.abs()) && a != 0.0 && b != 0.0;
+/// Returns the sum of two products. Sets `borderline` if its sign may differ in f32, where products and sum are
+/// rounded.
+fn signed_sum(a: f64, b: f64, borderline: &mut bool) -> f64 {
+    *borderline |= a + b != 0.0 && (a + b).abs() < MARGIN * (a.abs() + b.abs()) && a != 0.0 && b != 0.0;
     a + b
 }
 
-/// A mean offset times a factor, and whether its zeros are zeros in f32.
+/// Sum of the offsets to agents. `exact` is true if f32 gives the same sum.
 #[derive(Default)]
 struct Pull {
     sum: DVec2,
@@ -89,27 +93,27 @@ impl Pull {
     }
 }
 
-/// The followers' rule, applied to an agent's surroundings.
+/// The force on a follower.
 struct Force {
     s: DVec2,
-    /// Lengths of all parts together: roundings of `s` are in proportion to it.
+    /// Sum of the lengths of all parts. Rounding errors of `s` are proportional to it.
     parts: f64,
-    /// Somebody or a wall is near.
+    /// Whether another agent or a wall is in range.
     near: bool,
-    /// A zero of s on this axis is one in f32.
+    /// Per axis, whether a zero of `s` is also zero in f32.
     sure_zero: [bool; 2],
-    /// One part alone, from an exact sum: its scale may be rounded, its direction is not.
+    /// Whether `s` has a single part, from an exact sum. Rounding may change its length, but not its direction.
     plain: bool,
 }
 
 impl Force {
-    /// How far f32 may turn `s`, in radians: where parts cancel, their roundings remain.
+    /// Returns how far rounding may turn `s`, in radians. If parts cancel, their rounding errors remain.
     fn blur(&self) -> f64 {
         if self.plain || self.s == DVec2::ZERO { 0.0 } else { MARGIN * self.parts / self.s.length() }
     }
 }
 
-/// One agent's state.
+/// State of an agent.
 #[derive(Clone, Copy)]
 struct State {
     position: DVec2,
@@ -130,7 +134,7 @@ struct Model {
     agents: usize,
     map: DVec2,
     pois: Vec<DVec2>,
-    /// Whether an episode has them there, not its world.
+    /// Positions of the POIs in the episode, if they differ from those of the world.
     moved: Option<Vec<DVec2>>,
 }
 
@@ -151,20 +155,20 @@ impl Model {
         }
     }
 
-    /// 1: what a leader senses.
-    fn sense(&self, states: &[State], leader: usize, shaky: &mut bool) -> [f64; 8] {
+    /// Part 1 of a step: returns what a leader senses.
+    fn sense(&self, states: &[State], leader: usize, borderline: &mut bool) -> [f64; 8] {
         let sense = &self.config.sense;
         let here = states[leader];
         let diagonal = 2f64.sqrt() * self.map.max_element();
         let mut inputs = [0.0; 8];
-        let mut class = |first: usize, points: &[DVec2], range: f64, size: usize| {
+        let mut add_points = |first: usize, points: &[DVec2], range: f64, size: usize| {
             for &point in points {
                 let offset = Offset::new(here.position, point);
-                if !offset.within(range, shaky) {
+                if !offset.within(range, borderline) {
                     continue;
                 }
-                let fx = signed_sum(here.heading.x * offset.r.x, here.heading.y * offset.r.y, shaky);
-                let fy = signed_sum(here.heading.x * offset.r.y, -here.heading.y * offset.r.x, shaky);
+                let fx = signed_sum(here.heading.x * offset.r.x, here.heading.y * offset.r.y, borderline);
+                let fy = signed_sum(here.heading.x * offset.r.y, -here.heading.y * offset.r.x, borderline);
                 let left = fy > 0.0 || (fy == 0.0 && fx >= 0.0);
                 let front = fx > 0.0 || (fx == 0.0 && fy <= 0.0);
                 let quadrant = match (front, left) {
@@ -180,13 +184,14 @@ impl Model {
                 inputs[first + quadrant] += value / size as f64;
             }
         };
-        class(0, &self.pois, sense.poi_range, self.pois.len());
+        add_points(0, &self.pois, sense.poi_range, self.pois.len());
         let others = states.iter().enumerate().filter(|&(agent, _)| agent != leader).map(|(_, state)| state.position);
-        class(4, &others.collect::<Vec<_>>(), sense.agent_range, self.agents);
+        add_points(4, &others.collect::<Vec<_>>(), sense.agent_range, self.agents);
         inputs
     }
 
-    /// 2: a leader's policy; with every output, how far f32 may be from it if the inputs differ by up to `error`.
+    /// Part 2: returns the outputs of a leader's policy, each with a bound on the error of f32 if inputs differ by up
+    /// to `error`.
     fn policy(&self, weights: &[f32], inputs: [f64; 8], error: f64) -> Vec<(f64, f64)> {
         let mut values: Vec<(f64, f64)> = inputs.map(|input| (input, error)).to_vec();
         let mut first = 0;
@@ -213,22 +218,22 @@ impl Model {
         values
     }
 
-    /// 2, where outputs choose a behaviour: the wanted turn and speed, as a direct policy would answer them. None where f32
-    /// may choose another.
+    /// Part 2 if outputs choose a behaviour: returns the outputs of a direct policy for the same turn and speed.
+    /// Returns None if f32 may choose another behaviour.
     fn choose(&self, weights: &[f32], inputs: [f64; 8]) -> Option<[f64; 2]> {
         let outputs = self.policy(weights, inputs, 0.0);
         let chosen = (0..5).fold(0, |best, index| if outputs[index].0 > outputs[best].0 { index } else { best });
-        let sure = |other: usize| {
+        let is_certain = |other: usize| {
             other == chosen || outputs[chosen].0 - outputs[other].0 > OUTPUT + outputs[chosen].1 + outputs[other].1
         };
-        if !(0..5).all(sure) {
+        if !(0..5).all(is_certain) {
             return None;
         }
         const MIDDLES: [f64; 4] = [-0.75, -0.25, 0.25, 0.75];
         let towards = |first: usize, opposite: usize| {
             let densities = &inputs[first..first + 4];
-            let most = densities.iter().copied().fold(0.0, f64::max);
-            let quadrant = densities.iter().position(|&density| density == most && most > 0.0);
+            let largest = densities.iter().copied().fold(0.0, f64::max);
+            let quadrant = densities.iter().position(|&density| density == largest && largest > 0.0);
             [quadrant.map_or(0.0, |quadrant| MIDDLES[(quadrant + opposite) % 4]), 1.0]
         };
         Some(match chosen {
@@ -240,14 +245,16 @@ impl Model {
         })
     }
 
-    /// 4, first half: the forces on a follower.
-    fn force(&self, states: &[State], agent: usize, shaky: &mut bool) -> Force {
+    /// Part 4, first half: returns the force on a follower.
+    fn force(&self, states: &[State], agent: usize, borderline: &mut bool) -> Force {
         let follow = &self.config.follow;
         let (mut repulsion, mut attraction) = (Pull::new(), Pull::new());
         for other in (0..self.agents).filter(|&other| other != agent) {
             let offset = Offset::new(states[agent].position, states[other].position);
-            let (near, close) =
-                (offset.within(follow.attraction_radius, shaky), offset.within(follow.repulsion_radius, shaky));
+            let (near, close) = (
+                offset.within(follow.attraction_radius, borderline),
+                offset.within(follow.repulsion_radius, borderline),
+            );
             if close {
                 repulsion.add(&offset);
             } else if near {
@@ -261,8 +268,8 @@ impl Model {
             let at = states[agent].position[axis];
             for (distance, away) in [(at, 1.0), (self.map[axis] - at, -1.0)] {
                 let rounding = (f64::from(distance as f32) - distance).abs();
-                // A push sets in at 0, so that only the question whether there is one at all can fall either way.
-                *shaky |= !someone && (distance - radius).abs() < rounding;
+                // The push of a wall grows from 0. So rounding at its radius only matters if no agent is in range.
+                *borderline |= !someone && (distance - radius).abs() < rounding;
                 if distance <= radius {
                     wall = true;
                     push[axis] += away * follow.wall_gain * (radius - distance);
@@ -288,20 +295,20 @@ impl Model {
         }
     }
 
-    /// 4, second half: the wanted change of heading, and the wanted speed. `None` keeps both.
-    fn follow(&self, state: &State, force: &Force, shaky: &mut bool) -> Option<(f64, f64)> {
+    /// Part 4, second half: returns the wanted change of heading and the wanted speed. None keeps both.
+    fn follow(&self, state: &State, force: &Force, borderline: &mut bool) -> Option<(f64, f64)> {
         if !force.near {
             return None;
         }
         let Force { s, sure_zero, .. } = *force;
         let length = s.length();
         if length == 0.0 {
-            *shaky |= !(sure_zero[0] && sure_zero[1]);
+            *borderline |= !(sure_zero[0] && sure_zero[1]);
             return Some((0.0, 0.0));
         }
         let blur = force.blur();
-        *shaky |= blur > 0.1;
-        // One term alone, the other a true zero, keeps its sign however small it is.
+        *borderline |= blur > 0.1;
+        // If one term is exactly zero, the sum has the sign of the other, however small.
         let (mut zeros, mut signs) = ([false; 2], [false; 2]);
         for axis in 0..2 {
             zeros[axis] = s[axis] == 0.0 && sure_zero[axis];
@@ -311,37 +318,37 @@ impl Model {
         let sure = |x: f64, y: f64| (x == 0.0 || zeros[0]) && signs[1] || (y == 0.0 || zeros[1]) && signs[0];
         let (dot, cross) = (heading.dot(unit), heading.perp_dot(unit));
         let close = |sum: f64, term: f64| sum.abs() < MARGIN * (term.abs() + (sum - term).abs()) + blur;
-        *shaky |= close(dot, heading.x * unit.x) && !sure(heading.x, heading.y);
+        *borderline |= close(dot, heading.x * unit.x) && !sure(heading.x, heading.y);
         let any_turn = self.config.motion.max_turn_rate * self.config.world.dt >= PI;
-        *shaky |= !any_turn && dot < 0.0 && close(cross, heading.x * unit.y) && !sure(heading.y, heading.x);
-        // Of the two half turns the one to the left, whatever the sign of the zero.
+        *borderline |= !any_turn && dot < 0.0 && close(cross, heading.x * unit.y) && !sure(heading.y, heading.x);
+        // A half turn is to the left, whatever the sign of the zero.
         let angle = if cross == 0.0 { 0f64.atan2(dot) } else { cross.atan2(dot) };
         Some((angle, if angle.abs() < PI / 2.0 && dot > 0.0 { length } else { self.config.motion.min_speed }))
     }
 
-    /// 5: the proportional controller and its limits.
+    /// Part 5: applies the proportional controller and its limits.
     fn step(&self, state: &State, turn: f64, wanted: f64) -> State {
         let (motion, dt) = (&self.config.motion, self.config.world.dt);
-        let (most, change) = (motion.max_turn_rate * dt, motion.max_acceleration * dt);
-        let angle = state.heading.y.atan2(state.heading.x) + turn.clamp(-most, most);
+        let (max_turn, max_change) = (motion.max_turn_rate * dt, motion.max_acceleration * dt);
+        let angle = state.heading.y.atan2(state.heading.x) + turn.clamp(-max_turn, max_turn);
         let heading = DVec2::new(angle.cos(), angle.sin());
-        let speed = state.speed + (wanted - state.speed).clamp(-change, change);
+        let speed = state.speed + (wanted - state.speed).clamp(-max_change, max_change);
         let speed = speed.clamp(motion.min_speed, motion.max_speed);
         let position = (state.position + heading * speed * dt).clamp(DVec2::ZERO, self.map);
         State { position, heading, speed }
     }
 }
 
-/// The number of comparisons, and the largest difference.
+/// Numbers of comparisons, and the differences.
 #[derive(Default)]
 struct Tally {
     agent_steps: u64,
     borderline: u64,
-    /// Likewise, of the worlds where leaders choose behaviours.
+    /// Agent-steps and borderline ones in worlds where leaders choose behaviours.
     choosing: [u64; 2],
-    /// Choices of a behaviour that the model leaves open.
+    /// Number of choices of a behaviour that rounding may change.
     unchosen: u64,
-    /// Largest differences: inputs, outputs, force over its parts, position, heading, speed.
+    /// Largest differences of inputs, outputs, force, position, heading and speed.
     worst: [f64; 6],
     wrong: Vec<String>,
 }
@@ -357,15 +364,15 @@ impl Tally {
         self
     }
 
-    /// Holds values of one stage against the model's; the largest difference.
-    fn compare(&mut self, stage: usize, found: &[f32], expected: &[f64], tolerance: f64, place: &str) -> f64 {
+    /// Compares values of one stage with the model's. Returns the largest difference.
+    fn compare(&mut self, stage: usize, actual: &[f32], expected: &[f64], tolerance: f64, place: &str) -> f64 {
         let mut largest = 0f64;
-        for (&found, &expected) in found.iter().zip(expected) {
-            let difference = (f64::from(found) - expected).abs();
+        for (&actual, &expected) in actual.iter().zip(expected) {
+            let difference = (f64::from(actual) - expected).abs();
             let agrees = difference <= tolerance; // a NaN does not
             if !agrees {
                 let name = ["input", "output", "force", "position", "heading", "speed"][stage];
-                self.wrong.push(format!("{place}: {name} {found}, expected {expected} within {tolerance:e}"));
+                self.wrong.push(format!("{place}: {name} {actual}, expected {expected} within {tolerance:e}"));
             }
             largest = largest.max(difference);
         }
@@ -374,7 +381,7 @@ impl Tally {
     }
 }
 
-/// Plays `teams` teams of the world and holds every step of every agent against the model.
+/// Plays teams in a world, and compares every step of every agent with the model.
 fn check(cpu: &mut Cpu, world: &Config, model: &Model, seed: u64) -> Tally {
     const TEAMS: usize = 9;
     let compiled = World::new(world);
@@ -387,7 +394,7 @@ fn check(cpu: &mut Cpu, world: &Config, model: &Model, seed: u64) -> Tally {
         .map(|start| start + Vec2::new(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0)) * jitter)
         .map(|start| on_grid(start, model.map.as_vec2()))
         .collect();
-    // POIs of an episode may be elsewhere than the world's.
+    // An episode may have POIs in other places than its world.
     let moved: Vec<Vec2> = model.moved.iter().flatten().map(|poi| poi.as_vec2()).collect();
     let places = [&starts[..], &moved].concat();
     let group = Group {
@@ -426,39 +433,40 @@ fn check_team<'a>(
     let mut states: Vec<State> = (0..agents).map(|agent| State::of(trace.moment(0, team, agent))).collect();
     let headings = config.world.headings();
     for (agent, state) in states.iter().enumerate() {
-        let tidy = |component: f64| if component.abs() < 1e-6 { 0.0 } else { f64::from(component as f32) };
+        let rounded = |component: f64| if component.abs() < 1e-6 { 0.0 } else { f64::from(component as f32) };
         assert_eq!(state.position, starts[agent].as_dvec2());
         let heading = DVec2::new(headings[agent].cos(), headings[agent].sin());
-        assert_eq!(state.heading, DVec2::new(tidy(heading.x), tidy(heading.y)));
+        assert_eq!(state.heading, DVec2::new(rounded(heading.x), rounded(heading.y)));
         assert_eq!(state.speed, f64::from(config.world.speed as f32));
     }
-    // At least and at most so many steps, where some are borderline.
+    // Smallest and largest possible number of steps in which each follower sees each leader. Borderline steps make them
+    // differ.
     let mut seen = vec![(0, 0); (agents - leaders) * leaders];
     for step in 1..=steps {
         let moments: Vec<&Moment> = (0..agents).map(|agent| trace.moment(step, team, agent)).collect();
         for agent in 0..agents {
-            let (found, place) = (moments[agent], format!("seed {seed} team {team} step {step} agent {agent}"));
-            let mut shaky = false;
+            let (actual, place) = (moments[agent], format!("seed {seed} team {team} step {step} agent {agent}"));
+            let mut borderline = false;
             let slack;
             let wanted = if agent < leaders {
-                let mut inputs = model.sense(&states, agent, &mut shaky);
-                if shaky {
-                    inputs = found.inputs.map(f64::from);
+                let mut inputs = model.sense(&states, agent, &mut borderline);
+                if borderline {
+                    inputs = actual.inputs.map(f64::from);
                 } else {
-                    tally.compare(0, &found.inputs, &inputs, INPUT, &place);
+                    tally.compare(0, &actual.inputs, &inputs, INPUT, &place);
                 }
-                let sensed = found.inputs.map(f64::from);
+                let sensed = actual.inputs.map(f64::from);
                 let wanted = if config.policy.actions == Actions::Behaviours {
                     let chosen = model.choose(policy(agent), sensed);
                     match chosen {
-                        Some(expected) => _ = tally.compare(1, &found.outputs, &expected, 0.0, &place),
+                        Some(expected) => _ = tally.compare(1, &actual.outputs, &expected, 0.0, &place),
                         None => tally.unchosen += 1,
                     }
-                    chosen.unwrap_or(found.outputs.map(f64::from)).map(|output| (output, 1e-6))
+                    chosen.unwrap_or(actual.outputs.map(f64::from)).map(|output| (output, 1e-6))
                 } else {
                     let outputs = model.policy(policy(agent), sensed, 0.0);
-                    for (found, (expected, error)) in found.outputs.iter().zip(outputs) {
-                        tally.compare(1, &[*found], &[expected], OUTPUT + error, &place);
+                    for (actual, (expected, error)) in actual.outputs.iter().zip(outputs) {
+                        tally.compare(1, &[*actual], &[expected], OUTPUT + error, &place);
                     }
                     let outputs = model.policy(policy(agent), inputs, 1e-6);
                     [outputs[0], outputs[1]]
@@ -467,10 +475,10 @@ fn check_team<'a>(
                 slack = (PI * turn_error, speed_error * config.motion.max_speed / 2.0);
                 Some((PI * turn, (speed + 1.0) / 2.0 * config.motion.max_speed))
             } else {
-                let force = model.force(&states, agent, &mut shaky);
-                if !shaky {
+                let force = model.force(&states, agent, &mut borderline);
+                if !borderline {
                     let expected = if force.near { force.s } else { DVec2::ZERO };
-                    tally.compare(2, &found.force, &expected.to_array(), INPUT * (1.0 + force.parts), &place);
+                    tally.compare(2, &actual.force, &expected.to_array(), INPUT * (1.0 + force.parts), &place);
                 }
                 for leader in 0..leaders {
                     let mut tie = false;
@@ -487,43 +495,44 @@ fn check_team<'a>(
                     }
                 }
                 slack = (force.blur(), MARGIN * force.parts);
-                model.follow(&states[agent], &force, &mut shaky)
+                model.follow(&states[agent], &force, &mut borderline)
             };
             let kept = states[agent];
             let expected = match wanted {
                 Some((turn, speed)) => model.step(&kept, turn, speed),
                 None => model.step(&kept, 0.0, kept.speed),
             };
-            if agent < leaders || !shaky {
+            if agent < leaders || !borderline {
                 let heading = expected.heading.to_array();
                 let moved = config.world.dt * (slack.0 * config.motion.max_speed + slack.1);
                 let position = expected.position.to_array();
-                let largest = tally.compare(3, &found.position, &position, STATE + moved, &place);
-                let largest = largest.max(tally.compare(4, &found.heading, &heading, STATE + slack.0, &place));
-                let largest = largest.max(tally.compare(5, &[found.speed], &[expected.speed], STATE + slack.1, &place));
-                shaky |= largest > STATE;
+                let largest = tally.compare(3, &actual.position, &position, STATE + moved, &place);
+                let largest = largest.max(tally.compare(4, &actual.heading, &heading, STATE + slack.0, &place));
+                let largest =
+                    largest.max(tally.compare(5, &[actual.speed], &[expected.speed], STATE + slack.1, &place));
+                borderline |= largest > STATE;
             }
-            let after = State::of(found);
+            let after = State::of(actual);
             for (poi, &point) in model.pois.iter().enumerate() {
                 let mut tie = false;
                 let near = Offset::new(after.position, point).within(config.world.observation_radius, &mut tie);
                 let words = agents.div_ceil(32);
                 let set = (team * steps + step - 1) * model.pois.len() + poi;
-                let found = trace.sets[set * words + agent / 32] >> (agent % 32) & 1 == 1;
-                if found != near && !tie {
-                    tally.wrong.push(format!("{place}: near POI {poi} {found}, expected {near}"));
+                let actual = trace.sets[set * words + agent / 32] >> (agent % 32) & 1 == 1;
+                if actual != near && !tie {
+                    tally.wrong.push(format!("{place}: near POI {poi} {actual}, expected {near}"));
                 }
-                shaky |= tie;
+                borderline |= tie;
             }
             tally.agent_steps += 1;
-            tally.borderline += shaky as u64;
+            tally.borderline += borderline as u64;
         }
         states = moments.into_iter().map(State::of).collect();
     }
-    let found = &trace.seen[team * seen.len()..][..seen.len()];
-    for (index, (&found, &(least, most))) in found.iter().zip(&seen).enumerate() {
-        if !(least..=most).contains(&found) {
-            tally.wrong.push(format!("seed {seed} team {team}: seen {index} {found}, expected {least} to {most}"));
+    let actual = &trace.seen[team * seen.len()..][..seen.len()];
+    for (index, (&actual, &(least, most))) in actual.iter().zip(&seen).enumerate() {
+        if !(least..=most).contains(&actual) {
+            tally.wrong.push(format!("seed {seed} team {team}: seen {index} {actual}, expected {least} to {most}"));
         }
     }
 }
@@ -536,7 +545,7 @@ fn kernels_follow_the_model() {
             let config = sample::world(seed);
             let mut model = Model::new(&config);
             if seed % 3 == 0 {
-                // Each where another was, and the last at the first leader's start.
+                // Moves every POI to the place of another, and the last one to the first leader's start.
                 model.pois.rotate_left(1);
                 *model.pois.last_mut().unwrap() = World::new(&config).starts[0].as_dvec2();
                 model.moved = Some(model.pois.clone());
@@ -549,23 +558,24 @@ fn kernels_follow_the_model() {
         .reduce(Tally::default, Tally::merge);
     let Tally { agent_steps, borderline, choosing, unchosen, worst, wrong } = tally;
     println!(
-        "{agent_steps} agent-steps, {borderline} borderline ({choosing:?} where behaviours are chosen), {unchosen} open choices, worst differences {worst:?}"
+        "{agent_steps} agent-steps, {borderline} borderline ({choosing:?} where behaviours are chosen), \
+         {unchosen} open choices, worst differences {worst:?}"
     );
     assert!(wrong.is_empty(), "{} differences, the first:\n{}", wrong.len(), wrong[..wrong.len().min(10)].join("\n"));
     assert!(agent_steps >= 1_000_000, "{agent_steps} agent-steps");
-    // Leaders that choose among a few turns often come to lie alike, on ties.
+    // Leaders that choose among few turns often reach symmetric positions, which are ties.
     let direct = [agent_steps - choosing[0], borderline - choosing[1]];
     for ([steps, borderline], rarely) in [(direct, 1000), (choosing, 50)] {
         assert!(steps > 10_000 && borderline * rarely < steps, "{borderline} of {steps} agent-steps are borderline");
     }
-    // Many, since large weights leave several outputs at 1.
+    // Open choices are frequent, because large weights saturate several outputs at 1.
     assert!(unchosen * 20 < agent_steps, "{unchosen} of {agent_steps} agent-steps are open choices");
 }
 
-/// Ties, of outputs and of quadrants, and who senses nothing.
+/// Tests ties between outputs and between quadrants, and leaders that sense nothing.
 #[test]
-fn the_first_of_the_most_wanted_behaviours_is_done() {
-    // A leader in the middle that faces up, with a POI in every quadrant but the last, a leader far off, no hidden layer.
+fn ties_between_behaviours_or_quadrants_go_to_the_first() {
+    // A leader in the middle faces up. POIs are in all quadrants but the last. The other leader is out of range.
     let text = "[world]
 leaders = [[25, 25], [1, 1]]
 pois = [[30, 20], [30, 30], [20, 30]]
@@ -578,7 +588,7 @@ actions = 'behaviours'";
         (&[0], [0.0, -1.0]),
         (&[1], back_right),
         (&[2], [0.25, 1.0]),
-        // Nobody is in reach: straight ahead.
+        // No agent is in range: straight ahead.
         (&[3], [0.0, 1.0]),
         (&[4], [0.0, 1.0]),
         (&[1, 2, 4], back_right),
@@ -587,10 +597,10 @@ actions = 'behaviours'";
     ];
     let config = Config::parse(text, "choice").unwrap();
     let world = World::new(&config);
-    for (most, expected) in cases {
+    for (largest, expected) in cases {
         let mut weights = vec![0.0; world.parameters()];
         let biases = weights.len() - 5;
-        most.iter().for_each(|&behaviour| weights[biases + behaviour] = 0.5);
+        largest.iter().for_each(|&behaviour| weights[biases + behaviour] = 0.5);
         let (weights, teams) = (weights.repeat(2), [0, 0]);
         let group = Group {
             world: &world,
@@ -603,12 +613,12 @@ actions = 'behaviours'";
         };
         for level in Cpu::levels() {
             let trace = Cpu::at_level(level).trace(&group).unwrap();
-            assert_eq!(trace.moment(1, 0, 0).outputs, expected, "{most:?}, {}", level_name(level));
+            assert_eq!(trace.moment(1, 0, 0).outputs, expected, "{largest:?}, {}", level_name(level));
         }
     }
-    // Of two equally dense quadrants the first, from back right on; the third POI breaks the tie.
-    let two = Config::parse(&text.replace("[30, 20], ", ""), "choice").unwrap();
-    let world = World::new(&two);
+    // Without the POI in the back right, the first of two equally dense quadrants is the front right.
+    let two_pois = Config::parse(&text.replace("[30, 20], ", ""), "choice").unwrap();
+    let world = World::new(&two_pois);
     let mut weights = vec![0.0; world.parameters() * 2];
     let biases = world.parameters() - 5;
     weights[biases + 1] = 0.5;
@@ -627,7 +637,8 @@ actions = 'behaviours'";
     assert_eq!(trace.moment(1, 0, 0).inputs[1], trace.moment(1, 0, 0).inputs[2]);
 }
 
-/// So do crowds, whose pairs are found by bounds: of just more than 32 agents, and around the ends of words and vectors.
+/// Compares worlds of more than 32 agents, whose pairs are found with bounds. Sizes are around multiples of words and
+/// vectors.
 #[test]
 fn crowds_follow_the_model() {
     let layout = support::layout("generally_forward");
@@ -647,9 +658,9 @@ fn crowds_follow_the_model() {
     }
 }
 
-/// The comparison can fail: a model with one constant changed by a thousandth, or one rule changed, is told apart.
+/// Tests that the comparison can fail: it must detect a model with one slightly changed constant.
 #[test]
-fn a_wrong_model_is_noticed() {
+fn a_wrong_model_is_detected() {
     type Edit = fn(&mut Config);
     let edits: [(&str, Edit); 14] = [
         ("map", |c| c.world.map = c.world.map.map(|side| side * 0.999)),
@@ -669,35 +680,43 @@ fn a_wrong_model_is_noticed() {
     ];
     let mut cpu = Cpu::default();
     for (name, edit) in edits {
-        let noticed = (0..60u64).any(|seed| {
+        let detected = (0..60u64).any(|seed| {
             let config = sample::world(seed);
             let mut edited = config.clone();
             edit(&mut edited);
             !check(&mut cpu, &config, &Model::new(&edited), seed).wrong.is_empty()
         });
-        assert!(noticed, "{name}");
+        assert!(detected, "{name}");
     }
 }
 
-/// The random worlds are of every kind.
+/// Tests that the random worlds cover every kind of config.
 #[test]
-fn random_worlds_are_a_spread() {
+fn random_worlds_cover_every_kind() {
     let worlds: Vec<Config> = (0..100).map(sample::world).collect();
-    let some = |kind: fn(&Config) -> bool| worlds.iter().filter(|&world| kind(world)).count() >= 3;
+    let at_least_three = |kind: fn(&Config) -> bool| worlds.iter().filter(|&world| kind(world)).count() >= 3;
     let agents = |c: &Config| c.world.leaders.len() + c.world.followers.len();
     let sizes: Vec<usize> = worlds.iter().map(agents).collect();
     assert!(sizes.contains(&1) && sizes.iter().any(|&size| size > 32) && sizes.iter().all(|&size| size <= 40));
-    assert!(some(|c| c.learning.paradigm == Paradigm::AllLeaders));
-    assert!(some(|c| c.learning.paradigm == Paradigm::LeaderFollower && !c.world.followers.is_empty()));
-    assert!(some(|c| c.world.followers.is_empty()));
-    assert!(some(|c| c.sense.density == Density::Linear) && some(|c| c.sense.density == Density::Inverse));
-    assert!(some(|c| c.sense.poi_range.is_infinite()) && some(|c| c.sense.agent_range.is_infinite()));
-    assert!(some(|c| matches!(c.world.coupling, Coupling::Each(_))));
+    assert!(at_least_three(|c| c.learning.paradigm == Paradigm::AllLeaders));
+    assert!(at_least_three(|c| c.learning.paradigm == Paradigm::LeaderFollower && !c.world.followers.is_empty()));
+    assert!(at_least_three(|c| c.world.followers.is_empty()));
+    assert!(
+        at_least_three(|c| c.sense.density == Density::Linear)
+            && at_least_three(|c| c.sense.density == Density::Inverse)
+    );
+    assert!(
+        at_least_three(|c| c.sense.poi_range.is_infinite()) && at_least_three(|c| c.sense.agent_range.is_infinite())
+    );
+    assert!(at_least_three(|c| matches!(c.world.coupling, Coupling::Each(_))));
     for layers in [0, 1, 2, 3] {
         assert!(worlds.iter().any(|c| c.policy.hidden.len() == layers), "{layers} hidden layers");
     }
-    assert!(some(|c| c.motion.max_turn_rate == 0.0) && some(|c| c.motion.max_turn_rate * c.world.dt > PI));
-    assert!(some(|c| c.follow.attraction_gain == 0.0) && some(|c| c.follow.repulsion_gain == 0.0));
+    assert!(
+        at_least_three(|c| c.motion.max_turn_rate == 0.0)
+            && at_least_three(|c| c.motion.max_turn_rate * c.world.dt > PI)
+    );
+    assert!(at_least_three(|c| c.follow.attraction_gain == 0.0) && at_least_three(|c| c.follow.repulsion_gain == 0.0));
     let inside = |c: &Config| {
         let points = c.world.leaders.iter().chain(&c.world.followers).chain(&c.world.pois);
         points.into_iter().all(|p| (0.0..=c.world.map[0]).contains(&p[0]) && (0.0..=c.world.map[1]).contains(&p[1]))
