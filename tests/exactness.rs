@@ -589,7 +589,7 @@ fn a_lost_device_is_an_error() {
         gpu.check().expect("the device is not lost yet");
         gpu.device.destroy();
         let error = gpu.wait().and_then(|()| gpu.buffer("a buffer", 64, BufferUsages::STORAGE).map(drop));
-        let error = error.expect_err("the device is gone");
+        let error = error.expect_err("the device was destroyed");
         assert!(matches!(error, DeviceError::Lost { .. }), "{error}");
         assert!(error.to_string().contains(&info.name), "{error}");
     }

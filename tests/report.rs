@@ -1162,8 +1162,8 @@ fn a_paper_is_overwritten_only_with_force() {
     // --resume restores missing files, and does not train the other arms again.
     let run = out.join("arms/chaotic-leader-follower-G/run.json");
     let before = fs::read(&run).unwrap();
-    for gone in ["figure5.svg", "claims.md", "arms/chaotic-all-leaders-Df/policies.safetensors"] {
-        fs::remove_file(out.join(gone)).unwrap();
+    for missing in ["figure5.svg", "claims.md", "arms/chaotic-all-leaders-Df/policies.safetensors"] {
+        fs::remove_file(out.join(missing)).unwrap();
     }
     assert!(paper(&out, &["--generations", "4", "--resume"]).status.success());
     assert!(outcome(&out) == original && fs::read(&run).unwrap() == before);

@@ -116,7 +116,7 @@ fn the_first_axis_changes_slowest_and_every_point_has_its_values() {
         .points
         .iter()
         .map(|point| {
-            let Coupling::Same(coupling) = point.config.world.coupling else { panic!("one number was given") };
+            let Coupling::Same(coupling) = point.config.world.coupling else { panic!("a list of couplings") };
             (coupling, point.config.world.steps, point.config.learning.generations)
         })
         .collect();
@@ -751,20 +751,20 @@ fn files_of_others_in_a_sweeps_folder_are_not_overwritten() {
         assert!(error.contains(&format!("holds {name}, but no sweep.toml")), "{error}");
         assert_eq!(fs::read_to_string(out.join(name)).unwrap(), "mine");
     }
-    let own = folder.path().join("own");
-    fs::create_dir(&own).unwrap();
+    let started_by_hand = folder.path().join("own");
+    fs::create_dir(&started_by_hand).unwrap();
     let text = format!("# Mine.\n{SMALL}");
-    fs::write(own.join("sweep.toml"), &text).unwrap();
-    succeed(flotilla(&own.join("sweep.toml"), &own, &["--quiet"]));
-    assert_eq!(fs::read_to_string(own.join("sweep.toml")).unwrap(), text);
+    fs::write(started_by_hand.join("sweep.toml"), &text).unwrap();
+    succeed(flotilla(&started_by_hand.join("sweep.toml"), &started_by_hand, &["--quiet"]));
+    assert_eq!(fs::read_to_string(started_by_hand.join("sweep.toml")).unwrap(), text);
     // A point may be resumed with another interval of checkpoints, which does not change its results.
-    let point = own.join("points/0000");
+    let point = started_by_hand.join("points/0000");
     let config = point.join("config.toml");
     fs::remove_file(point.join("run.json")).unwrap();
     let mut resumed = support::flotilla();
     resumed.arg("train").arg(&config).arg("--out").arg(&point);
     succeed(resumed.args(["--resume", "--checkpoint-seconds", "5", "--backend", "cpu", "--quiet"]).output().unwrap());
-    succeed(flotilla(&own.join("sweep.toml"), &own, &["--collect"]));
+    succeed(flotilla(&started_by_hand.join("sweep.toml"), &started_by_hand, &["--collect"]));
     // A sweep that needs more memory than any machine has is refused before anything starts.
     let (_large, huge) = write_sweep(&SMALL.replacen(
         "[grid]",
@@ -790,14 +790,14 @@ fn nothing_is_overwritten_while_another_process_trains_a_point() {
     let before = all_files();
     let point = out.join("points/0005");
     let config = Config::load(&point.join("config.toml")).unwrap();
-    let held = Folder::open(&point, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
+    let lock = Folder::open(&point, Start::Resume, &config, StartFrom::Unsaid, Disk::default()).unwrap();
     for memory in ["1", "0.000001"] {
         let error = fail(flotilla(&sweep, &out, &["--quiet", "--force", "--memory", memory]), 1);
         let expected = format!("error: another process is training in {}; ", point.display());
         assert!(error.starts_with(&expected) && error.lines().count() == 1, "{error}");
         assert!(all_files() == before, "files were overwritten, with --memory {memory}");
     }
-    drop(held);
+    drop(lock);
     succeed(flotilla(&sweep, &out, &["--quiet", "--force", "--memory", "0.000001"]));
     // Existing runs of later batches are reported before the first batch starts.
     fs::remove_dir_all(out.join("points/0000")).unwrap();
