@@ -124,10 +124,10 @@ fn training_comes_to_what_a_run_comes_to() {
     let late = read(&[&lines[..], &[&late]].concat());
     assert!(late.contains("line 23 is trial 2, generation 7, which the run's config.toml does not have"), "{late}");
     let more = read(&[&lines[..], &lines[lines.len() - 1..]].concat());
-    assert!(more.contains("its rows are not one a trial and generation, in their order"), "{more}");
+    assert!(more.contains("it must have one row per trial and generation, in order"), "{more}");
     lines.swap(1, 4);
     let mixed = read(&lines);
-    assert!(mixed.contains("its rows are not one a trial and generation, in their order"), "{mixed}");
+    assert!(mixed.contains("it must have one row per trial and generation, in order"), "{mixed}");
     // Policies of another run: fewer of each leader, and of another network.
     lines.swap(1, 4);
     fs::write(&path, lines.join("\n") + "\n").expect("the folder can be written");

@@ -558,7 +558,7 @@ fn a_folder_has_one_process_at_a_time_and_one_run() {
         Ok(_) => panic!("opened"),
     };
     assert!(matches!(refused(Start::Fresh), RecordError::Exists { .. }));
-    let lock = Folder::open(&path, Start::Resume, &config, StartFrom::Unsaid, Disk::default()).unwrap();
+    let lock = Folder::open(&path, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
     assert!(matches!(refused(Start::Resume), RecordError::Locked { .. }));
     assert!(matches!(refused(Start::Force), RecordError::Locked { .. }));
     drop(lock);
@@ -890,7 +890,7 @@ fn no_folder_is_changed_if_one_of_several_runs_cannot_start() {
         let runs = [&free, &taken].map(|path| (small(), path.clone()));
         Session::open(runs.into(), start, &Disk::default()).err().expect("an error about the taken folder").to_string()
     };
-    let lock = Folder::open(&taken, Start::Fresh, &small(), StartFrom::Unsaid, Disk::default()).unwrap();
+    let lock = Folder::open(&taken, Start::Fresh, &small(), StartFrom::Unspecified, Disk::default()).unwrap();
     assert!(open(Start::Fresh).contains("holds a run already") && !free.exists());
     fs::create_dir(&free).unwrap();
     fs::write(free.join(METRICS), metrics::HEADER).unwrap();
@@ -970,7 +970,7 @@ fn a_refused_paper_is_unchanged() {
     arms.sort();
     for arm in [&arms[0], &arms[arms.len() - 1]] {
         let config = Config::load(&arm.join(CONFIG)).unwrap();
-        let lock = Folder::open(arm, Start::Resume, &config, StartFrom::Unsaid, Disk::default()).unwrap();
+        let lock = Folder::open(arm, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
         let results = || arms.iter().map(|arm| result_files(arm)).collect::<Vec<_>>();
         let results_before = results();
         for flags in

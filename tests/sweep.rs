@@ -790,7 +790,7 @@ fn nothing_is_overwritten_while_another_process_trains_a_point() {
     let before = all_files();
     let point = out.join("points/0005");
     let config = Config::load(&point.join("config.toml")).unwrap();
-    let lock = Folder::open(&point, Start::Resume, &config, StartFrom::Unsaid, Disk::default()).unwrap();
+    let lock = Folder::open(&point, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
     for memory in ["1", "0.000001"] {
         let error = fail(flotilla(&sweep, &out, &["--quiet", "--force", "--memory", memory]), 1);
         let expected = format!("error: another process is training in {}; ", point.display());
